@@ -197,7 +197,7 @@ class Workspace:
     def targets(self, cameras: Cameras, settings: RasterSettings | None = None, **options: Any) -> Targets:
         """Return the targets of views: photos, or renders of the prior."""
         if self.scene.targets == "photos":
-            return Photos(cameras, **options)
+            return Photos(cameras, background=self.scene.background, **options)
         if self.lifted:
             raise InputError(f"scene {self.scene.name}: a point cloud has no renders; set targets = 'photos'")
         kind = TeacherRenders if self.scene.targets == "teacher" else PhotosOrRenders

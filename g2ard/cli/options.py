@@ -12,6 +12,7 @@ import typer
 from g2ard.cli.budget_options import Count
 from g2ard.config.choices import (
     BLACK,
+    Alpha,
     Convention,
     Engine,
     FormatName,
@@ -70,6 +71,34 @@ ViewsOrMadeOption = Annotated[
         "By default those found beside the scene; 'made' generates views.",
     ),
 ]
+ImagesOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--images",
+        metavar="DIR",
+        help="Folder of the photos of --views, if they are elsewhere.",
+    ),
+]
+AlphaOption = Annotated[
+    Alpha,
+    typer.Option(
+        "--alpha", help="Photos with alpha: composite them over the background, or mask what is transparent."
+    ),
+]
+
+
+def with_images(views: Path | None, images: Path | None, alpha: Alpha = "composite") -> Any:
+    """Return --views together with the options for its photos."""
+    given = views is not None and not is_made(views)
+    if images is not None and not given:
+        raise typer.BadParameter("--images goes with --views VIEWS")
+    if not given or (images is None and alpha == "composite"):
+        return views
+    from g2ard.io import ViewFiles
+
+    return ViewFiles(Path(str(views)), images, alpha)
+
+
 LookOption = Annotated[
     Path, typer.Option("--views", metavar="VIEWS", help="Cameras, with photos unless --teacher is given.")
 ]

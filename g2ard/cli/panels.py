@@ -12,8 +12,8 @@ GROUPED = ("distill", "simplify", "recover", "adapt", "register", "lod")
 _PANELS = {
     "Budget": ("count", "ratio", "ratios", "fit", "min_psnr"),
     "Views": (
-        *("views", "teacher", "photos", "held_out", "split", "size", "background", "up", "no_views"),
-        *("poses", "pool", "intrinsics", "focal"),
+        *("views", "images", "alpha", "teacher", "photos", "held_out", "split", "size", "background"),
+        *("up", "no_views", "poses", "pool", "intrinsics", "focal"),
     ),
     "Method": (
         *("method", "preset", "keep_region", "clean", "anchors"),

@@ -51,6 +51,9 @@ REFINEMENTS: tuple[Refinement, ...] = get_args(Refinement)
 Keep = Literal["registered", "uncertain", "all"]
 """Photos whose poses registration keeps."""
 
+Alpha = Literal["composite", "mask"]
+"""Treatment of transparent pixels of photos (`g2ard.io.ViewFiles`)."""
+
 Convention = Literal["gsplat", "inria"]
 """Rasteriser conventions that renderers disagree on (`g2ard.rendering.renderer`)."""
 CONVENTIONS: tuple[Convention, ...] = get_args(Convention)

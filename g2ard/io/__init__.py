@@ -25,9 +25,10 @@ if TYPE_CHECKING:
 
     from numpy.typing import ArrayLike
 
+    from g2ard.config.choices import Alpha
     from g2ard.io.point_stream import PointStream
     from g2ard.io.stream import SceneStream
-    from g2ard.io.types import Cloud, Note, Points, Scene, ViewSet
+    from g2ard.io.types import Cloud, Note, Points, Scene, ViewFiles, ViewSet
     from g2ard.scene.cameras import Cameras
     from g2ard.scene.splats import Splats
 
@@ -36,6 +37,7 @@ __all__ = [
     "Note",
     "Points",
     "Scene",
+    "ViewFiles",
     "ViewSet",
     "atomic_folder",
     "atomic_output",
@@ -60,7 +62,7 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    if name in ("Cloud", "Note", "Points", "Scene", "ViewSet"):
+    if name in ("Cloud", "Note", "Points", "Scene", "ViewFiles", "ViewSet"):
         from g2ard.io import types
 
         return getattr(types, name)
@@ -286,34 +288,50 @@ def read_views(path: str | Path, *, images: str | Path | None = None, split: str
 
 
 def read_view_set(
-    path: str | Path,
+    path: str | Path | ViewFiles,
     *,
     images: str | Path | None = None,
     split: str = "all",
     unpictured: bool = False,
+    alpha: Alpha = "composite",
 ) -> ViewSet:
-    """Read views with their splits, weights and notes; `unpictured` keeps views without photos."""
+    """Read views with their splits, weights and notes.
+
+    Args:
+        path: as for `read_views`, or `ViewFiles`, whose `images` and `alpha` then count.
+        images: as for `read_views`.
+        split: as for `read_views`.
+        unpictured: whether to keep views without photos among others.
+        alpha: "mask" makes a photo with alpha and without a mask its own mask.
+    """
     from importlib import import_module
 
     from g2ard.errors import InputError
     from g2ard.io.detect import KINDS, file_format, run_views
-    from g2ard.io.photos import pictured
+    from g2ard.io.photos import alpha_as_masks, pictured
+    from g2ard.io.types import ViewFiles
     from g2ard.scene.splits import split_mask
 
-    path = run_views(path)
+    files = (
+        path
+        if isinstance(path, ViewFiles)
+        else ViewFiles(Path(path), Path(images) if images else None, alpha)
+    )
+    path, images = run_views(files.path), files.images
     found = file_format(path)
     if KINDS[found] != "views":
         what = "a Gaussian scene" if KINDS[found] == "splats" else "a point cloud"
         raise InputError(
             f"expected views (a COLMAP folder, transforms.json, g2ard's .json), found {what}", path=path
         )
-    if images is not None and not Path(images).is_dir():
+    if images is not None and not images.is_dir():
         raise InputError("no such folder of photos", path=images)
     try:
-        views = import_module(f"g2ard.io.{found}").read(path, Path(images) if images else None)
+        views = import_module(f"g2ard.io.{found}").read(path, images)
     except OSError as error:  # invalid photo name, unreadable folder
         raise InputError(error.strerror or str(error), path=path) from error
     views = views if unpictured else pictured(views)
+    views = alpha_as_masks(views) if files.alpha == "mask" else views
     return views.take(split_mask(path, views.cameras.names, split, stated=views.splits))
 
 

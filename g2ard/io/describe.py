@@ -12,8 +12,10 @@ from numpy.typing import NDArray
 from g2ard.io import kind, read_cloud, read_scene, read_view_set
 from g2ard.io.detect import file_format, run_scene
 from g2ard.io.sog import chunks_of
-from g2ard.io.types import Points, ViewSet
+from g2ard.io.types import Note, Points, ViewSet
+from g2ard.progress import plural
 from g2ard.scene.cameras import Cameras
+from g2ard.scene.images import colour_text, photo_traits
 from g2ard.scene.splats import Splats
 
 _QUANTILES = (0, 1, 25, 50, 75, 99, 100)
@@ -37,7 +39,7 @@ def describe(path: str | Path) -> dict[str, Any]:
         notes, figures = cloud.notes, _points(cloud.points)
     else:
         views = read_view_set(path)
-        notes, figures = views.notes, _views(views)
+        notes, figures = (*views.notes, *_photo_notes(views.cameras)), _views(views)
     return {
         "path": str(path),
         "kind": what,
@@ -118,6 +120,25 @@ def _views(views: ViewSet) -> dict[str, Any]:
         "splits": dict(Counter(s for s in views.splits if s)),
         "extent": _extent(cameras.positions),
     }
+
+
+def _photo_notes(cameras: Cameras) -> list[Note]:
+    """Return notes on alpha, a constant border colour and mixed sizes of the photos."""
+    photos = [photo for photo in cameras.image_paths if photo is not None]
+    traits = photo_traits(photos)
+    notes = []
+    if traits.alpha:
+        text = f"{plural(traits.alpha, 'photo')} of {len(photos)} have alpha (see --background and --alpha)"
+        notes.append(Note("alpha", traits.alpha, text))
+    if traits.border is not None:
+        text = f"the photos have a constant border colour: {colour_text(traits.border)} (see --background)"
+        notes.append(Note("constant_border", len(photos), text))
+    if len(traits.sizes) > 1:
+        (width, height), most = max(traits.sizes.items(), key=lambda item: item[1])
+        others = sum(traits.sizes.values()) - most
+        text = f"{plural(most, 'photo')} of {width}×{height} pixels, {others} of other sizes"
+        notes.append(Note("mixed_sizes", others, text))
+    return notes
 
 
 def _fov(cameras: Cameras) -> NDArray[np.float64]:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from g2ard.io.jsonfile import fields_of, number, numbers, read_json_list, text, whole
-from g2ard.io.photos import Frame, find_photo, inverse, rigid, view_set
+from g2ard.io.photos import ASPECT_SLACK, Frame, find_photo, inverse, photo_size, rigid, view_set
 from g2ard.io.types import Note, ViewSet
 from g2ard.progress import plural
 
@@ -32,10 +32,13 @@ def read(path: Path, images: Path | None = None) -> ViewSet:
 
     Args:
         path: the JSON, or the model's folder.
-        images: folder to search for photos by name; None reads poses only.
+        images: folder to search for photos by name; None takes `images` beside the JSON, if it has any of
+            them. Cameras are scaled to resized photos.
     """
     file = path / NAME if path.is_dir() else path
     listed = read_json_list(file)
+    if images is None and (file.parent / "images").is_dir():
+        images = file.parent / "images"
     frames = [_frame(file, i, camera, images) for i, camera in enumerate(listed)]
     times = Counter(frame.name for frame in frames)
     twice = {name for name, count in times.items() if count > 1}
@@ -58,11 +61,17 @@ def _frame(path: Path, index: int, entry: Any, images: Path | None) -> Frame:
     world_from_camera[:3, :3] = numbers(camera, "rotation", 3, 3)
     world_from_camera[:3, 3] = numbers(camera, "position", 3)
     width, height = whole(camera, "width"), whole(camera, "height")
-    K = [[number(camera, "fx"), 0, width / 2], [0, number(camera, "fy"), height / 2], [0, 0, 1]]
+    fx, fy = number(camera, "fx"), number(camera, "fy")
+    photo = find_photo(images / Path(name).name) if images else None
+    if photo is not None and photo.is_file() and width and height:
+        (shown_width, shown_height), full = photo_size(photo, path), (width, height)
+        if abs(shown_width * height - shown_height * width) <= ASPECT_SLACK * shown_height * width:
+            width, height = shown_width, shown_height
+            fx, fy = fx * width / full[0], fy * height / full[1]
     return Frame(
         name=name,
         viewmat=inverse(rigid(world_from_camera, camera.place.to("rotation"))),
-        K=np.array(K),
+        K=np.array([[fx, 0, width / 2], [0, fy, height / 2], [0, 0, 1]]),
         size=(width, height),
-        photo=find_photo(images / Path(name).name) if images else None,
+        photo=photo,
     )

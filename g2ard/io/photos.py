@@ -18,6 +18,9 @@ from g2ard.io.types import Note, ViewSet
 from g2ard.progress import plural
 from g2ard.scene.cameras import Cameras
 
+ASPECT_SLACK = 0.02
+"""Relative difference in aspect ratio that rounding may cause; more means another photo."""
+
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG", ".webp")
 
 
@@ -158,3 +161,26 @@ def pictured(found: ViewSet) -> ViewSet:
     text = f"{plural(missing, 'view')} of {len(has)} skipped: no photo (the first is {first!r})"
     notes = (*found.notes, Note("missing_photos", missing, text))
     return replace(found.take(has), notes=notes)
+
+
+def alpha_as_masks(found: ViewSet) -> ViewSet:
+    """Make each photo with alpha and without a mask its own mask, and note how many."""
+    cameras = found.cameras
+    own = [
+        mask is None and photo is not None and has_alpha(photo)
+        for photo, mask in zip(cameras.image_paths, cameras.mask_paths, strict=True)
+    ]
+    pairs = zip(own, cameras.image_paths, cameras.mask_paths, strict=True)
+    masks = tuple(photo if use else mask for use, photo, mask in pairs)
+    text = f"{plural(sum(own), 'photo')} of {len(own)} masked by alpha"
+    notes = (*found.notes, Note("alpha_masks", sum(own), text))
+    return replace(found, cameras=replace(cameras, mask_paths=masks), notes=notes)
+
+
+def has_alpha(photo: Path) -> bool:
+    """Return whether a photo's header declares transparency; False if it cannot be read."""
+    try:
+        with opened_image(photo) as image:
+            return image.has_transparency_data
+    except (InputError, FileNotFoundError):
+        return False

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,12 +13,14 @@ from numpy.typing import NDArray
 from g2ard.errors import InputError
 from g2ard.io.jsonfile import Fields, fields_of, matrix, number, optional_text, read_json, text, whole
 from g2ard.io.photos import Frame, find_photo, inverse, photo_size, rigid, view_set
-from g2ard.io.types import ViewSet
+from g2ard.io.types import Note, ViewSet
 
 _MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
 
 _LEAST_ANGLE = 1e-6
 """Smallest distance of a field of view from 0 and π, radians."""
+
+_TRAIN, _TEST = "transforms_train.json", "transforms_test.json"
 
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 """OpenGL camera axes (y up, looking along −z) to OpenCV's (y down, looking along z)."""
@@ -28,10 +31,20 @@ def read(path: Path, images: Path | None = None) -> ViewSet:
 
     Args:
         path: the JSON, or a folder with transforms.json, or with transforms_train.json and
-            transforms_test.json, which then are the splits.
+            transforms_test.json, which then are the splits. Either finds a transforms_test.json beside
+            transforms_train.json.
         images: folder to search for photos by file name; None uses the paths in the JSON.
     """
-    return view_set(path, frames(path, images))
+    if path.name != _TRAIN:
+        return view_set(path, frames(path, images))
+    if (path.parent / _TEST).is_file():
+        note = Note("test_beside", 1, f"{_TEST} beside it has the test views")
+        both = [*_frames(path, images, "train"), *_frames(path.parent / _TEST, images, "test")]
+    else:
+        note = Note("no_test_beside", 1, f"no {_TEST} beside it; every 8th of its views is held out")
+        both = frames(path, images)
+    found = view_set(path, both)
+    return replace(found, notes=(*found.notes, note))
 
 
 def frames(path: Path, images: Path | None = None) -> list[Frame]:

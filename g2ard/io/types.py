@@ -11,6 +11,9 @@ from numpy.typing import NDArray
 from g2ard.errors import InputError
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
+    from g2ard.config.choices import Alpha
     from g2ard.scene.cameras import Cameras
     from g2ard.scene.splats import Splats
 
@@ -74,6 +77,24 @@ class Cloud:
 
     points: Points
     notes: tuple[Note, ...] = ()
+
+
+@dataclass(frozen=True)
+class ViewFiles:
+    """Views on disk, with options for their photos; usable wherever a path of views is.
+
+    Args:
+        path: the views, as for `g2ard.io.read_views`.
+        images: folder to search for photos by file name; None uses those that the views name.
+        alpha: "composite" shows transparent pixels over the background; "mask" ignores them.
+    """
+
+    path: Path
+    images: Path | None = None
+    alpha: Alpha = "composite"
+
+    def __str__(self) -> str:
+        return str(self.path)
 
 
 @dataclass(frozen=True, eq=False)

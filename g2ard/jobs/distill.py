@@ -13,7 +13,7 @@ from g2ard.jobs.budget import Budget
 from g2ard.jobs.distill_options import DistillOptions
 from g2ard.jobs.inputs import load_scene, say_regions
 from g2ard.jobs.job import DistillJob
-from g2ard.jobs.view_checks import warn_of_photos
+from g2ard.jobs.view_checks import propose_background, warn_of_photos
 from g2ard.jobs.views import RunViews, is_made, views_of
 from g2ard.progress import Progress, Say, plural, silent, unsaid
 from g2ard.scene.splats import Splats
@@ -130,7 +130,7 @@ def prepare(
     recover = options.config.recover  # rejects invalid settings before anything is read
     if scene is None:
         scene = _points(budgets, options, progress, say)
-    read = _read(scene, options, progress, say)
+    read = _read(scene, budgets, options, progress, say)
     prior, cleaned = read.prior, None
     if options.clean:
         prior, cleaned = _cleaned(prior, options, progress, say)
@@ -153,6 +153,9 @@ def prepare(
     )
     sources = _sources(views, options.photos, read.lifted)
     regularizers, why, measured = _regularizers(prior, views, options, sources, read.lifted)
+    if sources.photos:
+        given = options.named("recover.background") is not None
+        propose_background(views.train.cameras, recover.background, given, say)
     if sources.photos and not read.lifted:
         warn_of_photos(prior, views.train.cameras, recover.background, say)
     say(_task(prior, aims, views, sources))
@@ -270,17 +273,21 @@ def _points(budgets: Sequence[Budget], options: DistillOptions, progress: Progre
         raise InputError("missing; without a scene, pass photos with poses as views", parameter="scene")
     from g2ard.jobs.photos import points_of_photos
 
-    wanted = max((budget.count for budget in budgets if budget.count is not None), default=None)
     return points_of_photos(
         options.views,
         options.held_out,
-        wanted,
+        _wanted(budgets),
         asked=budgets[0].kind,
         background=options.config.recover.background,
         seed=options.config.recover.seed,
         progress=progress,
         say=say,
     )
+
+
+def _wanted(budgets: Sequence[Budget]) -> int | None:
+    """Return the largest requested count; None if no budget is a count."""
+    return max((budget.count for budget in budgets if budget.count is not None), default=None)
 
 
 @dataclass(frozen=True, eq=False)
@@ -301,9 +308,13 @@ class _Read:
 
 
 def _read(
-    scene: Splats | Points | str | Path, options: DistillOptions, progress: Progress, say: Say
+    scene: Splats | Points | str | Path,
+    budgets: Sequence[Budget],
+    options: DistillOptions,
+    progress: Progress,
+    say: Say,
 ) -> _Read:
-    """Read the dense scene, or lift a point cloud, which needs views with photos."""
+    """Read the dense scene, or lift a point cloud, which needs views with photos and at least the budget."""
     from g2ard.io import kind, read_cloud
     from g2ard.stages.lift import lift
 
@@ -320,6 +331,20 @@ def _read(
     if options.views is None or is_made(options.views):
         raise InputError(
             "a point cloud cannot render training images", path=name, hint="give its photos with {views}"
+        )
+    wanted = _wanted(budgets) or 0
+    if len(scene) < wanted:
+        from g2ard.jobs.photos import topped_up
+
+        scene = topped_up(
+            scene,
+            options.views,
+            options.held_out,
+            wanted,
+            background=options.config.recover.background,
+            seed=options.config.recover.seed,
+            progress=progress,
+            say=say,
         )
     lifted = lift(scene.positions, scene.colors, **vars(options.config.lift), progress=progress)
     return _Read(lifted, True, options.beside, name)

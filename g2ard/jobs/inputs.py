@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from g2ard.io import Note, ViewSet
+    from g2ard.io import Note, ViewFiles, ViewSet
     from g2ard.rendering.renderer import RasterSettings, Renderer
     from g2ard.scene.cameras import Cameras
     from g2ard.scene.splats import Splats
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from g2ard.stages.clean import Cleaning
     from g2ard.stages.simplify import SimplifyConfig
 
-    Views = Cameras | ViewSet | str | Path  # cameras, or the path of views
+    Views = Cameras | ViewSet | ViewFiles | str | Path  # cameras, or the path of views
 
 _CLUTTER_VIEWS, _CLUTTER_SIDE = 96, 400
 """Number of generated views for finding clutter, and their longer side in pixels."""
@@ -182,16 +182,16 @@ def load_split_views(
 
 def _read(views: Views, say: Say, *, unpictured: bool = False) -> tuple[ViewSet, Path | None]:
     """Return the views, and their path if they were read."""
-    from g2ard.io import ViewSet, read_view_set
+    from g2ard.io import ViewFiles, ViewSet, read_view_set
 
     if isinstance(views, ViewSet):
         return views, None
-    if not isinstance(views, str | Path):
+    if not isinstance(views, str | Path | ViewFiles):
         return ViewSet(views), None
     found = read_view_set(views, unpictured=unpictured)
     for note in found.notes:
         say(f"{views}: {note}")
-    return found, Path(views)
+    return found, views.path if isinstance(views, ViewFiles) else Path(views)
 
 
 def make_targets(
@@ -228,7 +228,7 @@ def make_targets(
     if exposures:
         say(f"exposure.json: corrected the exposure of {plural(len(exposures), 'photo')}")
     if teacher is None:
-        return Photos(cameras, exposures=exposures)
+        return Photos(cameras, background=background, exposures=exposures)
     return PhotosOrRenders(
         cameras,
         teacher,

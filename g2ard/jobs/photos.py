@@ -67,8 +67,10 @@ def points_of_photos(
     Raises:
         InputError: a view without a photo, or no sparse points and no `count`.
     """
-    sparse = None if not isinstance(views, str | Path) else sparse_points(Path(views))
-    found = len(sparse) if sparse is not None else 0
+    from g2ard.io import ViewFiles
+
+    path = views.path if isinstance(views, ViewFiles) else views
+    sparse = sparse_points(Path(path)) if isinstance(path, str | Path) else None
     if count is None and sparse is None:
         raise InputError(
             "needs sparse points, and there are none",
@@ -76,8 +78,26 @@ def points_of_photos(
             path=str(views),
             hint="give {count=COUNT}",
         )
-    wanting = max(0, (count or 0) - found)
-    parts = [] if sparse is None else [sparse]
+    return topped_up(
+        sparse, views, held_out, count or 0, background=background, seed=seed, progress=progress, say=say
+    )
+
+
+def topped_up(
+    points: Points | None,
+    views: Views,
+    held_out: Views | None,
+    count: int,
+    *,
+    background: Colour = BLACK,
+    seed: int = 0,
+    progress: Progress = silent,
+    say: Say = unsaid,
+) -> Points:
+    """Add points along camera rays until there are `count`; arguments as for `points_of_photos`."""
+    found = 0 if points is None else len(points)
+    wanting = max(0, count - found)
+    parts = [] if points is None else [points]
     if wanting:
         train = (
             load_view_sets(views, ["train"], _SIDE)[0]
@@ -102,7 +122,8 @@ def points_of_photos(
 
 
 def sparse_points(views: Path) -> Points | None:
-    """Return the points of a COLMAP model or of a transforms.json's `ply_file_path`, or None."""
+    """Return the points of a COLMAP model, of a transforms.json's `ply_file_path`, or of the input.ply beside
+    INRIA's cameras.json; None if there are none."""
     from g2ard.io import read_points
     from g2ard.io.detect import file_format
     from g2ard.io.jsonfile import read_json
@@ -115,6 +136,8 @@ def sparse_points(views: Path) -> Points | None:
             file = views / "transforms.json" if views.is_dir() else views
             listed = read_json(file).get("ply_file_path") if file.is_file() else None
             return read_points(file.parent / str(listed)) if listed else None
+        if found == "inria":
+            return read_points((views if views.is_dir() else views.parent) / "input.ply")
     except InputError:
         return None
     return None
@@ -151,7 +174,7 @@ def points_within_sight(
     bare = [name for name, path in zip(cameras.names, cameras.image_paths, strict=True) if path is None]
     if bare:
         raise InputError(f"photos: view {bare[0]} has no photo; pass views with photos, or a scene")
-    photos = [load_image(cameras, i) for i in range(len(cameras))]
+    photos = [load_image(cameras, i, background) for i in range(len(cameras))]
     rng = np.random.default_rng([seed, 11])
     middle = _looked_at(cameras)
     reach = np.linalg.norm(cameras.positions - middle, axis=1)

@@ -10,9 +10,10 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from g2ard.config.choices import Alpha
 from g2ard.errors import InputError
 from g2ard.io import read_view_set
-from g2ard.io.photos import photo_size
+from g2ard.io.photos import has_alpha, photo_size
 from g2ard.progress import Progress, Say, silent, unsaid
 from g2ard.scene.cameras import Camera, Cameras
 from g2ard.scene.splats import Splats
@@ -30,6 +31,7 @@ def photos_of(
     split: str = "all",
     intrinsics: Path | None = None,
     focal: float | None = None,
+    alpha: Alpha = "composite",
     say: Say = unsaid,
 ) -> Cameras:
     """Read photos with their intrinsics.
@@ -40,6 +42,7 @@ def photos_of(
         intrinsics: for a folder: views with the intrinsics of each photo by name, or the same for all.
         focal: for a folder: focal length in pixels of the stored photo; centred principal point, no
             distortion.
+        alpha: "mask" ignores transparent pixels instead of showing them over the background.
         say: called with notes.
 
     Returns:
@@ -51,7 +54,7 @@ def photos_of(
     """
     files = _photos_in(path)
     if not files:
-        found = read_view_set(path, split=split)
+        found = read_view_set(path, split=split, alpha=alpha)
         for note in found.notes:
             say(f"{path}: {note}")
         missing = next((v.name for v in found.cameras if v.image_path is None), None)
@@ -77,7 +80,13 @@ def photos_of(
         views = _lenses(intrinsics, names)
         _check_aspects(files, sizes, views)
     return Cameras.of(
-        replace(view, name=name, image_path=file, mask_path=None, viewmat=np.eye(4))
+        replace(
+            view,
+            name=name,
+            image_path=file,
+            mask_path=file if alpha == "mask" and has_alpha(file) else None,
+            viewmat=np.eye(4),
+        )
         for view, name, file in zip(views, names, files, strict=True)
     )
 

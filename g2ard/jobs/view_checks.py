@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+    from g2ard.config.choices import Colour
     from g2ard.scene.cameras import Cameras
     from g2ard.scene.splats import Splats
 
@@ -27,6 +28,8 @@ _ALIKE = 0.2
 """Correlation below which a photo and a render are considered unrelated. Medians of five: fox and caliterra
 with their own scenes (2,000 Gaussians, 20 steps) 0.86 and 0.50; with others −0.26 to 0.06.
 """
+_DIFFERENT = 4 / 255
+"""Difference of two background colours that matters."""
 _BLIND = 0.1
 """Share of given views that may see nothing of the scene without a warning."""
 
@@ -91,9 +94,7 @@ def check_sight(splats: Splats, cameras: Cameras, say: Say = unsaid) -> None:
     warn_of_sight(splats, cameras, say)
 
 
-def warn_of_photos(
-    splats: Splats, cameras: Cameras, background: tuple[float, float, float], say: Say
-) -> None:
+def warn_of_photos(splats: Splats, cameras: Cameras, background: Colour, say: Say) -> None:
     """Warn if the scene's renders look unlike its photos.
 
     The measure is the correlation of pixel brightness, as the median over a few small photos.
@@ -105,7 +106,7 @@ def warn_of_photos(
 
     pictured = np.flatnonzero([path is not None for path in cameras.image_paths])
     tried = np.unique(np.linspace(0, len(pictured) - 1, min(_LOOKED_AT, len(pictured))).astype(int))
-    photos = Photos(cameras.take(pictured[tried]).resized(_SMALL))
+    photos = Photos(cameras.take(pictured[tried]).resized(_SMALL), background=background)
     renderer = Renderer(splats, background=background)
     alike = []
     for view in range(len(tried)):
@@ -119,6 +120,35 @@ def warn_of_photos(
         say(
             f"warning: the scene does not look like the photos (correlation {np.median(alike):.2f}); check "
             "the views with `g2ard render --views`, or ignore the photos with --renders"
+        )
+
+
+def propose_background(cameras: Cameras, background: Colour, given: bool, say: Say) -> None:
+    """Say which background fits the photos if they have alpha, or a border of another colour.
+
+    Args:
+        cameras: views, some with photos.
+        background: RGB in use.
+        given: whether it was chosen rather than the default.
+        say: called with a note that states the flag.
+    """
+    from g2ard.scene.images import colour_text, photo_traits
+
+    pairs = zip(cameras.image_paths, cameras.mask_paths, strict=True)
+    photos = [photo for photo, mask in pairs if photo is not None and mask != photo]
+    traits = photo_traits(photos)
+    used = colour_text(background)
+    if traits.alpha and not given:
+        say(
+            f"note: {plural(traits.alpha, 'photo')} with alpha, composited over {used}, the default; most "
+            "published scores use --background white"
+        )
+    border = traits.border
+    if border is not None and max(abs(a - b) for a, b in zip(border, background, strict=True)) > _DIFFERENT:
+        fitting = colour_text(border)
+        say(
+            f"note: the photos have a constant border of {fitting}, but the background is {used}; if the "
+            f"scene ends there, give --background {fitting}"
         )
 
 

@@ -173,9 +173,9 @@ class Renderer:
         background: Sequence[float] = BLACK,
         settings: RasterSettings | None = None,
     ) -> None:
-        self._background = [float(c) for c in background]
-        if len(self._background) != 3:
-            raise InputError(f"expected 3 numbers, got {len(self._background)}", parameter="background")
+        self.background = [float(c) for c in background]
+        if len(self.background) != 3:
+            raise InputError(f"expected 3 numbers, got {len(self.background)}", parameter="background")
         if settings is not None and not isinstance(settings.near, int | float | None):
             raise InputError("expected one distance for all views", parameter="near")
         self._offset, middle = splats.offset, middle_of(splats)
@@ -235,7 +235,7 @@ class Renderer:
             here = here.recentred(self._middle)
         settings = self._settings
         view = view_of(here, 0, settings)
-        return self._rasterizer.forward(self._arrays, view, settings, self._background, depths)
+        return self._rasterizer.forward(self._arrays, view, settings, self.background, depths)
 
 
 def render(

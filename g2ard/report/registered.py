@@ -67,7 +67,7 @@ def registration_report(
     for i in sorted(seen, key=lambda i: -1.0 if rows[i].zncc is None else rows[i].zncc)[:_VIEWS]:
         row, one = rows[i], photos.take([i]).resized(_SIZE)
         try:
-            photo = to_bytes(load_image(one, 0))
+            photo = to_bytes(load_image(one, 0, background))
         except InputError:
             continue  # deleted since it was registered
         found = renderer.image(replace(one[0], viewmat=np.array(row.camera_from_world)))

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -12,28 +14,33 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from PIL import Image, ImageDraw, ImageFont
 
+from g2ard.config.choices import BLACK, Colour
 from g2ard.errors import InputError
 from g2ard.io.atomic import atomic_output
 from g2ard.io.limits import opened_image
+from g2ard.io.photos import ASPECT_SLACK
 from g2ard.scene.cameras import Cameras
 
-_ASPECT_SLACK = 0.02
-"""Relative difference in aspect ratio that rounding may cause; more means another photo."""
+_LOOKED_AT = 5
+"""Photos whose borders are compared."""
+_SAME_COLOUR, _CONSTANT = 3 / 255, 0.8
+"""Largest difference from a constant border colour, and the least share of border pixels that have it."""
 
 _GAP = 6
 """Pixels between the images of a contact sheet."""
 
 
-def load_image(cameras: Cameras, index: int) -> NDArray[np.float32]:
+def load_image(cameras: Cameras, index: int, background: Sequence[float] = BLACK) -> NDArray[np.float32]:
     """Read the photo of a view as an image of its pinhole camera.
 
     A distorted photo is undistorted at its own resolution, then resized by area. Beyond the photo's edge, the
     edge is repeated. EXIF orientation is ignored, because poses refer to stored pixels. Grey becomes three
-    equal channels; alpha is composited over black.
+    equal channels; alpha is composited over the background.
 
     Args:
         cameras: C views.
         index: index of the view.
+        background: RGB in [0, 1] behind transparent pixels.
 
     Returns:
         (H, W, 3) float32 in [0, 1].
@@ -41,6 +48,27 @@ def load_image(cameras: Cameras, index: int) -> NDArray[np.float32]:
     Raises:
         InputError: the view has no photo, or the photo is missing, broken, or of another aspect ratio.
     """
+    image = _fitted(cameras, index)
+    if image.shape[2] == 4:
+        image = image[..., :3] + (1 - image[..., 3:]) * np.asarray(background, np.float32)
+    return np.ascontiguousarray(image)
+
+
+def load_alpha(cameras: Cameras, index: int) -> NDArray[np.float32] | None:
+    """Read the opacity of a view's photo, in the pixels of `load_image`.
+
+    Returns:
+        (H, W) float32 in [0, 1]; None if the photo has no alpha.
+
+    Raises:
+        InputError: as for `load_image`.
+    """
+    image = _fitted(cameras, index)
+    return np.ascontiguousarray(image[..., 3]) if image.shape[2] == 4 else None
+
+
+def _fitted(cameras: Cameras, index: int) -> NDArray[np.float32]:
+    """Read a photo undistorted and at its view's size, as RGB or as RGBA with RGB premultiplied."""
     path, name = cameras.image_paths[index], cameras.names[index]
     if path is None:
         raise InputError(f"({name}) has no photo", index=index, item="view", hint="pass views with photos")
@@ -51,7 +79,7 @@ def load_image(cameras: Cameras, index: int) -> NDArray[np.float32]:
         raise error.at(hint="; ".join(filter(None, (error.hint, named))) or None) from error
     height, width = image.shape[:2]
     target = int(cameras.widths[index]), int(cameras.heights[index])
-    if abs(width * target[1] - height * target[0]) > _ASPECT_SLACK * height * target[0]:
+    if abs(width * target[1] - height * target[0]) > ASPECT_SLACK * height * target[0]:
         raise InputError(
             f"the photo is {width}×{height}, its view {target[0]}×{target[1]}: the aspects differ",
             path=path,
@@ -64,6 +92,57 @@ def load_image(cameras: Cameras, index: int) -> NDArray[np.float32]:
     return resized(image, target)
 
 
+@dataclass(frozen=True)
+class PhotoTraits:
+    """Properties of photos that decide which background fits them.
+
+    Args:
+        alpha: number of photos with alpha; 0 if none of a few has transparent pixels.
+        border: colour that a few photos share along their borders; None if it varies, or with alpha.
+        sizes: number of photos by width and height.
+    """
+
+    alpha: int
+    border: Colour | None
+    sizes: Mapping[tuple[int, int], int]
+
+
+def photo_traits(photos: Sequence[Path]) -> PhotoTraits:
+    """Look at the headers of all photos and the borders of a few; unreadable photos are ignored."""
+    sizes: Counter[tuple[int, int]] = Counter()
+    alpha = 0
+    for photo in photos:
+        with suppress(InputError, FileNotFoundError), opened_image(photo) as header:
+            sizes[header.size] += 1
+            alpha += header.has_transparency_data
+    few = np.unique(np.linspace(0, len(photos) - 1, min(_LOOKED_AT, len(photos))).astype(int))
+    shown = []
+    for i in few:
+        with suppress(InputError):
+            shown.append(_open(photos[i]))
+    if not any(image.shape[2] == 4 and image[..., 3].min() < 1 for image in shown):
+        alpha = 0
+    edges = [np.concatenate([image[0], image[-1], image[:, 0], image[:, -1]])[:, :3] for image in shown]
+    if alpha or not edges:
+        return PhotoTraits(alpha, None, sizes)
+    border = np.concatenate(edges)
+    colour = np.median(border, axis=0)
+    same = (np.abs(border - colour).max(1) <= _SAME_COLOUR).mean() >= _CONSTANT
+    red, green, blue = colour.tolist()
+    return PhotoTraits(0, (red, green, blue) if same else None, sizes)
+
+
+def colour_text(colour: Colour) -> str:
+    """Return a colour as `--background` takes it.
+
+    >>> colour_text((1, 1, 1)), colour_text((0.5, 0.25, 1))
+    ('white', '0.5,0.25,1')
+    """
+    named = {(0.0, 0.0, 0.0): "black", (1.0, 1.0, 1.0): "white"}
+    red, green, blue = (round(float(value), 3) for value in colour)
+    return named.get((red, green, blue), f"{red:g},{green:g},{blue:g}")
+
+
 def load_mask(cameras: Cameras, index: int) -> NDArray[np.bool_] | None:
     """Read the mask of a view's photo, in the pixels of `load_image`.
 
@@ -72,7 +151,8 @@ def load_mask(cameras: Cameras, index: int) -> NDArray[np.bool_] | None:
         index: index of the view.
 
     Returns:
-        (H, W), True if the mask is brighter than half; None if the view has no mask.
+        (H, W), True if the mask is brighter than half, or, for a photo that is its own mask, if its alpha is
+        above half; None if the view has no mask.
 
     Raises:
         InputError: as for `load_image`.
@@ -80,11 +160,15 @@ def load_mask(cameras: Cameras, index: int) -> NDArray[np.bool_] | None:
     path = cameras.mask_paths[index]
     if path is None:
         return None
+    if path == cameras.image_paths[index]:
+        alpha = load_alpha(cameras, index)
+        return None if alpha is None else alpha > 0.5
     image = load_image(replace(cameras, image_paths=cameras.mask_paths), index)
     return np.ascontiguousarray(image.mean(2) > 0.5)
 
 
 def _open(path: Path) -> NDArray[np.float32]:
+    """Decode a photo as (H, W, 3) RGB, or as (H, W, 4) RGBA with RGB premultiplied."""
     try:
         with opened_image(path) as image:
             if image.mode.startswith("I") or image.mode == "F":  # 16-bit grey has several modes
@@ -93,7 +177,8 @@ def _open(path: Path) -> NDArray[np.float32]:
                 return np.repeat((values / np.float32(top))[..., None], 3, axis=2)
             if image.has_transparency_data:
                 rgba = np.asarray(image.convert("RGBA"), np.float32) / np.float32(255)
-                return rgba[..., :3] * rgba[..., 3:]
+                rgba[..., :3] *= rgba[..., 3:]
+                return rgba
             return np.asarray(image.convert("RGB"), np.float32) / np.float32(255)
     except FileNotFoundError as error:
         raise InputError("no such photo", path=path) from error
@@ -105,7 +190,7 @@ def _undistorted(
     """Sample the distorted photo for each pixel of the pinhole image, bilinearly."""
     height, width = image.shape[:2]
     rows, columns, down, right = _lookup(width, height, tuple(K.ravel()), tuple(distortion))
-    flat = image.reshape(-1, 3)
+    flat = image.reshape(height * width, -1)
     at = rows * width + columns
     top = flat[at] * (1 - right) + flat[at + 1] * right
     bottom = flat[at + width] * (1 - right) + flat[at + width + 1] * right

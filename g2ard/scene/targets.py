@@ -133,11 +133,12 @@ class _Cached(ABC):
 class Photos(_Cached):
     """Photos of `cameras`, undistorted and at each camera's size; cached as 8-bit.
 
-    A photo with a mask is black outside of it. For a photo with an exposure, the affine colour transform C
-    that trainers fit (photo = C·render), C is inverted.
+    Alpha is composited over the background. A photo with a mask is black outside of it. For a photo with an
+    exposure, the affine colour transform C that trainers fit (photo = C·render), C is inverted.
 
     Args:
         cameras: views, all with a photo.
+        background: RGB behind transparent pixels.
         exposures: (3, 4) exposures by view name, for photos that have one.
         limit: bytes cached in memory.
 
@@ -149,6 +150,7 @@ class Photos(_Cached):
         self,
         cameras: Cameras,
         *,
+        background: Colour = BLACK,
         exposures: Mapping[str, NDArray[np.float64]] | None = None,
         limit: int = CACHE_BYTES,
     ) -> None:
@@ -161,6 +163,7 @@ class Photos(_Cached):
                 hint="pass views with photos, or render them from {teacher=SCENE}",
             )
         super().__init__(cameras, limit)
+        self._background = background
         self.source = "photos " + " ".join(str(path) for path in cameras.image_paths)
         if any(cameras.mask_paths):
             self.source += " masks " + " ".join(str(path) for path in cameras.mask_paths)
@@ -188,7 +191,7 @@ class Photos(_Cached):
     def _make(self, view: int) -> NDArray[np.uint8]:
         from g2ard.scene.images import load_image
 
-        return np.rint(load_image(self.cameras, view) * 255).astype(np.uint8)
+        return np.rint(load_image(self.cameras, view, self._background) * 255).astype(np.uint8)
 
     def __getitem__(self, view: int) -> NDArray[np.float32]:
         photo = self._stored(view).astype(np.float32) / np.float32(255)
@@ -275,7 +278,7 @@ class PhotosOrRenders:
     Args:
         cameras: views with or without photos.
         teacher: the dense scene.
-        background: RGB behind it.
+        background: RGB behind it, and behind transparent pixels of photos.
         exposures: exposures of the photos, see `Photos`.
         settings: the renderer's conventions; None means gsplat's.
         limit: bytes cached in memory per kind.
@@ -302,7 +305,9 @@ class PhotosOrRenders:
     ) -> None:
         self.cameras = cameras
         pictured = np.array([path is not None for path in cameras.image_paths], bool)
-        photos = Photos(cameras.take(np.flatnonzero(pictured)), exposures=exposures, limit=limit)
+        photos = Photos(
+            cameras.take(np.flatnonzero(pictured)), background=background, exposures=exposures, limit=limit
+        )
         renders = TeacherRenders(
             teacher,
             cameras.take(np.flatnonzero(~pictured)),

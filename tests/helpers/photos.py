@@ -1,9 +1,11 @@
 """Photos of a small scene in a folder."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from PIL import Image
 
 import g2ard
 from g2ard.io import Points, write_points
@@ -13,6 +15,7 @@ from helpers.scenes import around, checkered_ball
 from helpers.view_files import edit, transforms
 
 BALL = checkered_ball(1200)
+OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 def cloud_of(path: Path, scene: g2ard.Splats) -> None:
@@ -43,3 +46,27 @@ def photos_of(folder: Path, points: bool = False, scene: g2ard.Splats = BALL, co
     if points:
         cloud_of(folder / "sparse.ply", scene)
         edit(folder / "transforms.json", lambda content: content.update(ply_file_path="sparse.ply"))
+
+
+def rgba_photos_of(folder: Path, scene: g2ard.Splats = BALL, count: int = 24) -> g2ard.Cameras:
+    """Write RGBA photos of a scene as NeRF's synthetic scenes have them, a third of them for testing."""
+    views = around(count)
+    names = []
+    for i in range(count):
+        found = g2ard.render(scene, views[i])
+        alpha = found.alpha[..., None]
+        straight = np.clip(found.image / np.maximum(alpha, 1e-3), 0, 1)
+        names.append(f"{'test' if i % 3 == 0 else 'train'}/r_{i}")
+        path = folder / f"{names[-1]}.png"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(np.rint(np.concatenate([straight, alpha], 2) * 255).astype(np.uint8)).save(path)
+    angle = 2 * float(np.arctan(views.widths[0] / 2 / views.Ks[0, 0, 0]))
+    for split in ("train", "test"):
+        listed = [
+            {"file_path": f"./{name}", "transform_matrix": (np.linalg.inv(view) @ OPENGL).tolist()}
+            for name, view in zip(names, views.viewmats, strict=True)
+            if name.startswith(split)
+        ]
+        content = {"camera_angle_x": angle, "frames": listed}
+        (folder / f"transforms_{split}.json").write_text(json.dumps(content))
+    return views

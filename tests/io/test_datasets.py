@@ -33,7 +33,7 @@ def test_matrix_citys_pose_folder_states_its_splits(tmp_path: Path) -> None:
     np.testing.assert_allclose(test.viewmats, POSES[6:], atol=1e-9)
     assert test.Ks[0, 0, 0] == 231.8
     assert load_image(test, 2)[0, 0, 0] == pytest.approx(80 / 255)
-    assert len(io.read_views(pose / "transforms_train.json")) == 6
+    assert len(io.read_views(pose / "transforms_train.json", split="train")) == 6
 
 
 def test_matrix_citys_blocks_have_numbers_and_small_rotations(tmp_path: Path) -> None:

@@ -9,7 +9,9 @@ import typer
 
 from g2ard.cli.frame import Run, command
 from g2ard.cli.options import (
+    AlphaOption,
     BackgroundOption,
+    ImagesOption,
     LookOption,
     OutputOption,
     PaperOption,
@@ -19,6 +21,7 @@ from g2ard.cli.options import (
     SplitOption,
     TeacherOption,
     trained_on,
+    with_images,
 )
 from g2ard.config.choices import AdaptSchedule
 from g2ard.progress import plural
@@ -30,6 +33,8 @@ def adapt(
     compact: Annotated[Path, typer.Argument(metavar="COMPACT", help="Scene to adapt.")],
     views: LookOption,
     output: OutputOption,
+    images: ImagesOption = None,
+    alpha: AlphaOption = "composite",
     teacher: TeacherOption = None,
     steps: Annotated[int | None, typer.Option(min=1, help="Maximum steps; 7,000 by default.")] = None,
     tolerance: Annotated[
@@ -61,7 +66,7 @@ def adapt(
     from g2ard.config.presets import PRESETS, configured
     from g2ard.io import check_scene_output, write_splats
     from g2ard.jobs.inputs import load_scene, load_trained, make_targets
-    from g2ard.jobs.view_checks import warn_of_sight
+    from g2ard.jobs.view_checks import propose_background, warn_of_sight
     from g2ard.pipeline.adapt import AdaptConfig
     from g2ard.pipeline.adapt import adapt as refit
 
@@ -77,8 +82,12 @@ def adapt(
     check_stopped(run, work, resume, output)
     splats = load_scene(compact, run.say)
     dense = load_scene(teacher, run.say) if teacher else None
-    cameras = load_trained(views, split, size, run.say, unpictured=dense is not None).cameras
+    cameras = load_trained(
+        with_images(views, images, alpha), split, size, run.say, unpictured=dense is not None
+    ).cameras
     warn_of_sight(splats, cameras, run.say)
+    if dense is None:
+        propose_background(cameras, config.background, background is not None, run.say)
     targets = make_targets(cameras, dense, config.background, progress=run.progress, say=run.say)
     with stoppable(run, work, resume):
         work.mkdir(parents=True, exist_ok=True)

@@ -19,9 +19,11 @@ from g2ard.cli.budget_options import (
 )
 from g2ard.cli.frame import Run, command
 from g2ard.cli.options import (
+    AlphaOption,
     BackgroundOption,
     CropOption,
     FormatOption,
+    ImagesOption,
     KeepRegionOption,
     MethodOption,
     PresetOption,
@@ -34,6 +36,7 @@ from g2ard.cli.options import (
     ViewsOrMadeOption,
     is_made,
     recovery_engine,
+    with_images,
 )
 from g2ard.cli.outputs import Outputs, budgets_of
 from g2ard.cli.run_folder import (
@@ -87,6 +90,8 @@ def distill(
     min_psnr: MinPsnrOption = None,
     min_ssim: MinSsimOption = None,
     views: ViewsOrMadeOption = None,
+    images: ImagesOption = None,
+    alpha: AlphaOption = "composite",
     photos: Annotated[
         bool | None,
         typer.Option(
@@ -193,9 +198,9 @@ def distill(
     if scene is not None and kind(scene) != "splats" and not given:
         raise typer.BadParameter("a point cloud cannot render training images; give photos with --views")
     options = DistillOptions(
-        views=views,
+        views=with_images(views, images, alpha),
         photos=photos,
-        held_out=held_out,
+        held_out=None if held_out is None else with_images(held_out, images, alpha),
         up=up,
         size=size,
         clean=clean,

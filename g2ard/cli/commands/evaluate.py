@@ -9,14 +9,17 @@ import typer
 
 from g2ard.cli.frame import Run, command
 from g2ard.cli.options import (
+    AlphaOption,
     BackgroundOption,
     ConventionOption,
+    ImagesOption,
     SizeOption,
     SplitOption,
     TeacherOption,
     ViewsOrMadeOption,
     can_be_made,
     views_or_teacher,
+    with_images,
 )
 from g2ard.config.choices import BLACK, LpipsInput
 from g2ard.progress import plural
@@ -27,6 +30,8 @@ def evaluate(
     run: Run,
     scenes: Annotated[list[Path], typer.Argument(metavar="SCENE...", help="Scenes to score.")],
     views: ViewsOrMadeOption = None,
+    images: ImagesOption = None,
+    alpha: AlphaOption = "composite",
     teacher: TeacherOption = None,
     photos: Annotated[
         bool,
@@ -59,7 +64,7 @@ def evaluate(
     from g2ard.io import check_scene
     from g2ard.io.describe import bytes_of
     from g2ard.jobs.inputs import load_scene, load_views, make_targets
-    from g2ard.jobs.view_checks import warn_of_sight
+    from g2ard.jobs.view_checks import propose_background, warn_of_sight
     from g2ard.rendering.lpips import load_lpips
     from g2ard.rendering.renderer import RasterSettings
     from g2ard.stages.evaluate import evaluate as score
@@ -70,6 +75,7 @@ def evaluate(
     if lpips_input != "scaled" and lpips is None:
         raise typer.BadParameter("--lpips-input goes with --lpips; give --lpips DIR")
     can_be_made(views, teacher)
+    views = with_images(views, images, alpha)
     for path in scenes:
         check_scene(path)
     colour, settings = background or BLACK, RasterSettings(convention=convention)
@@ -77,6 +83,8 @@ def evaluate(
     frozen = load_scene(anchors, run.say) if anchors else None
     views = views_or_teacher(run, views, teacher, dense)
     cameras = load_views(views, split, size, run.say, unpictured=dense is not None)
+    if dense is None or photos:
+        propose_background(cameras, colour, background is not None, run.say)
     targets = make_targets(
         cameras, dense, colour, photos=photos, settings=settings, progress=run.progress, say=run.say
     )

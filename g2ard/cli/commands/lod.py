@@ -10,7 +10,15 @@ import typer
 
 from g2ard.cli.budget_options import Ratios
 from g2ard.cli.frame import Run, command
-from g2ard.cli.options import BackgroundOption, ResumeOption, SizeOption, UpOption, ViewsOrMadeOption
+from g2ard.cli.options import (
+    BackgroundOption,
+    ImagesOption,
+    ResumeOption,
+    SizeOption,
+    UpOption,
+    ViewsOrMadeOption,
+    with_images,
+)
 from g2ard.cli.tile_options import (
     MemoryOption,
     SchedulerOption,
@@ -88,6 +96,7 @@ def lod(
         ),
     ] = 8,
     views: ViewsOrMadeOption = None,
+    images: ImagesOption = None,
     steps: Annotated[
         int | None, typer.Option(min=1, help="Steps per level; by default until it converges.")
     ] = None,
@@ -127,6 +136,7 @@ def lod(
         rule = Cut(most * 1024, extent, least * 1024)
     except InputError as error:
         raise typer.BadParameter(in_flags(error, run.flags)) from None
+    views = with_images(views, images)
     meta, stopped = output / "lod-meta.json", output.with_name(f".{output.name}.unfinished")
     run.spare_inputs(meta)
     tiling = tiling_of(run, scene, output, tile_rows, memory, workers, scheduler, work)

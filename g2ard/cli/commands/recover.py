@@ -9,7 +9,9 @@ import typer
 
 from g2ard.cli.frame import Run, command
 from g2ard.cli.options import (
+    AlphaOption,
     BackgroundOption,
+    ImagesOption,
     OutputOption,
     PresetOption,
     RecoveryTimeOption,
@@ -25,6 +27,7 @@ from g2ard.cli.options import (
     recovery_engine,
     trained_on,
     views_or_teacher,
+    with_images,
 )
 from g2ard.progress import plural
 
@@ -44,6 +47,8 @@ def recover(
     student: Annotated[Path, typer.Argument(metavar="STUDENT", help="Simplified scene to recover.")],
     output: OutputOption,
     views: ViewsOrMadeOption = None,
+    images: ImagesOption = None,
+    alpha: AlphaOption = "composite",
     teacher: TeacherOption = None,
     photos: Annotated[
         bool,
@@ -78,7 +83,7 @@ def recover(
     from g2ard.io import check_scene_output, write_splats
     from g2ard.jobs.inputs import load_scene, load_split_views, load_trained, make_targets
     from g2ard.jobs.score import scores_by_kind
-    from g2ard.jobs.view_checks import warn_of_sight
+    from g2ard.jobs.view_checks import propose_background, warn_of_sight
     from g2ard.scene.targets import kinds_of
     from g2ard.stages.recover import RecoverConfig
     from g2ard.stages.recover import recover as optimize
@@ -94,6 +99,7 @@ def recover(
     if photos and teacher is None:
         raise typer.BadParameter("--photos goes with --teacher; without a teacher, all targets are photos")
     can_be_made(views, teacher)
+    views = with_images(views, images, alpha)
     checkpoint = output.parent / f".{output.name}.checkpoint.npz"
     if left_at(checkpoint) or not (resume and output.exists()):
         check_scene_output(output, run.overwrite)
@@ -104,6 +110,9 @@ def recover(
     views = views_or_teacher(run, views, teacher, dense)
     chosen = load_trained(views, split, size, run.say, unpictured=dense is not None)
     warn_of_sight(splats, chosen.cameras, run.say)
+    if dense is None or photos:
+        colour = configured(RecoverConfig(), preset, settings).background
+        propose_background(chosen.cameras, colour, background is not None, run.say)
     targets = make_targets(
         chosen.cameras,
         dense,

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from g2ard.cli.frame import Run, command
-from g2ard.cli.options import BackgroundOption, OutputOption, SceneArgument
+from g2ard.cli.options import AlphaOption, BackgroundOption, OutputOption, SceneArgument
 from g2ard.config.choices import BLACK, Keep, Refinement
 from g2ard.progress import plural
 
@@ -98,6 +98,7 @@ def register(
         Path | None,
         typer.Option(metavar="FILE.html", help="Also write a page of renders overlaid on photos."),
     ] = None,
+    alpha: AlphaOption = "composite",
     background: BackgroundOption = None,
 ) -> None:
     """Estimate camera poses of photos by matching them with renders of a scene.
@@ -144,7 +145,7 @@ def register(
         if report.suffix.lower() not in (".html", ".htm"):
             raise typer.BadParameter(f"--report {report}: expected a name that ends in .html")
         check_output(report, run.overwrite)
-    taken = photos_of(photos, split=split, intrinsics=intrinsics, focal=focal, say=run.say)
+    taken = photos_of(photos, split=split, intrinsics=intrinsics, focal=focal, alpha=alpha, say=run.say)
     folder = photos.is_dir() and (intrinsics is not None or focal is not None)
     if poses is None and pool is None and folder:
         raise InputError(f"{photos}: photos have no initial pose; give --poses or --pool")

@@ -14,12 +14,14 @@ from g2ard.cli.frame import Run, command
 from g2ard.cli.options import (
     BackgroundOption,
     ConventionOption,
+    ImagesOption,
     SceneArgument,
     SizeOption,
     SplitOption,
     ViewsOrMadeOption,
     is_made,
     picture,
+    with_images,
 )
 from g2ard.config.choices import BLACK, Method
 from g2ard.progress import plural
@@ -41,6 +43,7 @@ def render(
         Path | None, typer.Option("-o", "--output", metavar="DIR", help="Output folder for PNGs.")
     ] = None,
     views: ViewsOrMadeOption = None,
+    images: ImagesOption = None,
     sheet: Annotated[
         Path | None,
         typer.Option(parser=picture, metavar="FILE.png", help="Write all views as one contact sheet."),
@@ -78,6 +81,7 @@ def render(
     if output is None and sheet is None:
         raise typer.BadParameter("give -o DIR, --sheet FILE.png or both")
     looks = _looks(color, count, ratio, parents, views)
+    views = with_images(views, images)
     if output is not None:
         check_output(output, run.overwrite, folder=True)
     if sheet is not None:

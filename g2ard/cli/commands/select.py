@@ -10,6 +10,7 @@ import typer
 from g2ard.cli.budget_options import Count
 from g2ard.cli.frame import Run, command
 from g2ard.cli.options import (
+    ImagesOption,
     OutputOption,
     PaperOption,
     PolicyOption,
@@ -17,6 +18,7 @@ from g2ard.cli.options import (
     SplitOption,
     ViewsOption,
     views_count,
+    with_images,
 )
 from g2ard.progress import plural
 
@@ -39,6 +41,7 @@ def select(
         ),
     ] = None,
     views: ViewsOption = None,
+    images: ImagesOption = None,
     policy: PolicyOption = None,
     split: SplitOption = "train",
     preset: PaperOption = None,
@@ -69,7 +72,7 @@ def select(
         raise typer.BadParameter("give the number of views with -k K")
     check_views_output(output, run.overwrite)
     splats = load_scene(scene, run.say)
-    pool, candidates = load_split_views(views, split, run.say)
+    pool, candidates = load_split_views(with_images(views, images), split, run.say)
     cameras = pool.cameras.take(candidates)
     warn_of_sight(splats, cameras, run.say)
     chosen = choose(

@@ -11,6 +11,7 @@ import typer
 from g2ard.cli.budget_options import CountsOption, FitOption, MinPsnrOption, MinSsimOption, RatiosOption
 from g2ard.cli.frame import Run, command
 from g2ard.cli.options import (
+    ImagesOption,
     KeepRegionOption,
     MethodOption,
     OutputOption,
@@ -19,6 +20,7 @@ from g2ard.cli.options import (
     UpOption,
     ViewsOrMadeOption,
     is_made,
+    with_images,
 )
 from g2ard.cli.outputs import Outputs, budgets_of
 from g2ard.cli.run_result import say_weight, tell_quality
@@ -49,6 +51,7 @@ def simplify(
     min_psnr: MinPsnrOption = None,
     min_ssim: MinSsimOption = None,
     views: ViewsOrMadeOption = None,
+    images: ImagesOption = None,
     no_views: Annotated[
         bool,
         typer.Option("--no-views", help="Use no cameras, neither found nor generated."),
@@ -108,7 +111,7 @@ def simplify(
         ]
         refuse_whole(scene, given)
         tiled = TiledCommand(run, scene, outputs, tiling, budgets)
-        tiled.simplify(config, views, no_views, up)
+        tiled.simplify(config, with_images(views, images), no_views, up)
         return
     check_memory(scene, tiling, WHOLE_TIMES)
     maps = None if parents is None else Outputs(run, parents, budgets, name="--parents")
@@ -122,7 +125,7 @@ def simplify(
     clock.append(time.perf_counter())
     reduce = Reduction(
         found.splats,
-        views=views,
+        views=with_images(views, images),
         blind=no_views,
         config=config,
         beside=scene,

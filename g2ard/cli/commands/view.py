@@ -8,7 +8,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from g2ard.cli.frame import Run, command
-from g2ard.cli.options import BackgroundOption, OutputOption, UpOption, ViewsOrMadeOption
+from g2ard.cli.options import (
+    BackgroundOption,
+    ImagesOption,
+    OutputOption,
+    UpOption,
+    ViewsOrMadeOption,
+    with_images,
+)
 from g2ard.config.choices import BLACK
 from g2ard.progress import plural
 
@@ -28,6 +35,7 @@ def view(
         typer.Argument(metavar="[SCENE|RUN]", help="Second scene to compare with, right of a divider."),
     ] = None,
     views: ViewsOrMadeOption = None,
+    images: ImagesOption = None,
     start: Annotated[
         str | None,
         typer.Option(metavar="NAME", help="View to open with; by default the one that shows most."),
@@ -41,6 +49,7 @@ def view(
     from g2ard.jobs.viewer_frame import frame_of
     from g2ard.viewer import check_page_output, write_page
 
+    views = with_images(views, images)
     check_page_output(output, run.overwrite)
     paths = [run_scene(path) for path in (scene, other) if path is not None]
     run.spare_inputs(output)

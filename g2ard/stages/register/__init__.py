@@ -163,7 +163,7 @@ def _one(
     if given is None and pool is None:
         return replace(refused, reason="no pose to start from"), None
     try:
-        photo = loaded(photos, index, search.config)
+        photo = loaded(photos, index, search.config, search.renderer.background)
     except InputError as error:
         return replace(refused, reason=str(error)), None
     search.renders = 0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -76,15 +77,15 @@ class Candidate:
     solved: Solved | None = None
 
 
-def loaded(photos: Cameras, index: int, config: RegisterConfig) -> Photo:
-    """Read a photo and shrink it to each size.
+def loaded(photos: Cameras, index: int, config: RegisterConfig, background: Sequence[float]) -> Photo:
+    """Read a photo, composited over the background, and shrink it to each size.
 
     Raises:
         InputError: it cannot be read.
     """
     sizes = config.levels()
     one = photos.take([index]).resized(max(config.size, sizes[-1]))
-    image, mask = load_image(one, 0), load_mask(one, 0)
+    image, mask = load_image(one, 0, background), load_mask(one, 0)
     everywhere = np.ones(image.shape[:2], bool) if mask is None else mask
     planes = np.stack([grey_of(image), everywhere], 2).astype(np.float32)
     levels: list[_Planes] = []
