@@ -20,6 +20,7 @@ PAGES = sorted(
     page for pattern in ("*.md", "docs/**/*.md", "benchmarks/record/*.md") for page in ROOT.glob(pattern)
 )
 NAMES = [str(page.relative_to(ROOT)) for page in PAGES]
+BALL = checkered_ball(400)
 
 
 def without_code(text: str) -> str:
@@ -138,6 +139,17 @@ def test_python_examples_parse_and_their_names_exist(name: str) -> None:
                 assert node.attr in g2ard.__all__, f"{name}: g2ard.{node.attr}"
 
 
+def test_the_python_guide_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    g2ard.save("scene.ply", BALL)
+    text = (ROOT / "docs/how-to/from-python.md").read_text(encoding="utf-8")
+    names: dict[str, Any] = {}
+    for block in re.findall(r"(?ms)^```python\n(.*?)^```", text):
+        exec(compile(block, "from-python.md", "exec"), names)
+    assert len(names["better"].splats) == len(names["small"].splats) == len(BALL) // 10
+    assert g2ard.load("better.sog").means.shape == (len(BALL) // 10, 3)
+
+
 def test_the_api_page_has_every_public_name_once() -> None:
     text = (ROOT / "docs" / "api.md").read_text(encoding="utf-8")
     listed = re.findall(r"\.\. auto\w+:: (\w+)", text)
@@ -185,9 +197,6 @@ def test_the_readme_names_every_command_and_scene_format() -> None:
     names = {"sog": "SOG", "compressed_ply": ".compressed.ply", "usd": "OpenUSD", "tiles": "folders of tiles"}
     kinds = [name for name, kind in KINDS.items() if kind == "splats"]
     assert [name for name in kinds if names.get(name, f".{name}") not in scenes] == []
-
-
-BALL = checkered_ball(400)
 
 
 def test_scripts_need_no_deep_imports() -> None:

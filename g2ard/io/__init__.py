@@ -82,11 +82,10 @@ def read_splats(path: str | Path) -> Splats:
     Raises:
         InputError: the file is missing, damaged, not a scene, or has no finite row.
 
-    >>> import tempfile
-    >>> from g2ard.scene.splats import Splats
+    >>> import tempfile, g2ard
     >>> path = Path(tempfile.mkdtemp()) / "two.ply"
-    >>> write_splats(path, Splats.create([[0, 0, 0], [1, 0, 0]], scales=[[1, 1, 1], [1, 2, 3]]))
-    >>> read_splats(path).scales.round(5).tolist()
+    >>> g2ard.save(path, g2ard.Splats.create([[0, 0, 0], [1, 0, 0]], scales=[[1, 1, 1], [1, 2, 3]]))
+    >>> g2ard.load(path).scales.round(5).tolist()
     [[1.0, 1.0, 1.0], [1.0, 2.0, 3.0]]
     """
     return read_scene(path).splats
@@ -186,6 +185,12 @@ def write_splats(path: str | Path, splats: Splats, *, overwrite: bool = False, *
         OutputError: the file exists or cannot be written, or the extension or an option is unsupported.
         InputError: the scene is empty, has a non-finite value, or one that the format cannot store.
         MissingDependencyError: .spz of version 4 before Python 3.14 without `pip install backports.zstd`.
+
+    >>> import tempfile, g2ard
+    >>> path = Path(tempfile.mkdtemp()) / "one.sog"
+    >>> g2ard.save(path, g2ard.Splats.create([[0, 0, 0]], scales=[[1, 2, 3]]))
+    >>> len(g2ard.load(path))
+    1
     """
     from importlib import import_module
 

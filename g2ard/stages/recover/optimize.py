@@ -92,6 +92,16 @@ def recover(
     Raises:
         InputError: no Gaussians, no views, invalid weights, or a checkpoint of another run.
         KeyboardInterrupt: after Ctrl-C, when the checkpoint is written.
+
+    >>> import g2ard
+    >>> rng = np.random.default_rng(0)
+    >>> means, sh0 = rng.normal(size=(500, 3)), rng.normal(size=(500, 1, 3))
+    >>> scene = Splats.create(means, scales=np.full((500, 3), 0.1), sh0=sh0)
+    >>> targets = g2ard.TeacherRenders(scene, g2ard.make_pool(scene, 8, size=(64, 48)))
+    >>> small = g2ard.simplify(scene, ratio=5).splats
+    >>> better = g2ard.recover(small, targets, g2ard.RecoverConfig(steps=30))
+    >>> len(better.splats), better.report.psnr.after > better.report.psnr.before
+    (100, True)
     """
     config = config or RecoverConfig()
     if not len(student) or not len(targets.cameras):
