@@ -169,7 +169,10 @@ RatioOption = Annotated[
 FitOption = Annotated[
     str | None,
     typer.Option(
-        "--fit", metavar="5MB|quest3|mobile|web", help="Largest scene that fits a file size or a device."
+        "--fit",
+        metavar="5MB|DEVICE",
+        help="Largest scene that fits a file size or a device: "
+        "quest3, visionpro, android, ios, mobile, web, desktop.",
     ),
 ]
 MinPsnrOption = Annotated[

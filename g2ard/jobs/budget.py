@@ -10,9 +10,17 @@ from numbers import Real
 from g2ard.errors import InputError
 from g2ard.progress import plural
 
-DEVICES = {"quest3": 400_000, "mobile": 1_000_000, "web": 2_000_000}
-"""Gaussians that render smoothly: reports of Quest 3 users; PlayCanvas' defaults for streamed scenes on
-phones and in desktop browsers.
+DEVICES = {
+    "quest3": 400_000,
+    "visionpro": 750_000,
+    "android": 1_000_000,
+    "ios": 1_500_000,
+    "mobile": 1_000_000,
+    "web": 2_000_000,
+    "desktop": 2_500_000,
+}
+"""Gaussians that render smoothly: the defaults of Spark and of SuperSplat's viewer; fewer for Quest 3, after
+reports of its users. Sources are in `docs/how-to/headset-budget.md`.
 """
 
 _BYTES = re.compile(r"(\d+(?:\.\d+)?)\s*([kKmMgG])[bB]")
@@ -27,8 +35,8 @@ class Budget:
         count: exact number.
         ratio: reduction factor, at least 1; keeps round(N/ratio), at least 1.
         share: share to keep, in (0, 1]; rounded up.
-        fit: as many as fit into a file of this size, such as 5MB or 800kB, or render smoothly on a device of
-            `DEVICES`.
+        fit: as many as fit into a file of this size, such as 5MB or 800kB, or render smoothly on a device:
+            quest3, visionpro, android, ios, mobile, web or desktop.
         min_psnr: approximately the fewest that keep this PSNR (dB) against renders of the scene.
         min_ssim: approximately the fewest that keep this SSIM; with `min_psnr` both hold.
 

@@ -64,7 +64,7 @@ def distill(
             (`g2ard.jobs.photos`).
         count: Gaussians of the result, at most those of the scene.
         ratio: reduction factor, at least 1.
-        fit: largest file, such as "5MB", or a device: quest3, mobile or web.
+        fit: largest file, such as "5MB", or a device (see `Budget`).
         min_psnr: PSNR (dB) that simplification alone must keep against the scene, in generated views.
         min_ssim: SSIM to keep likewise; with `min_psnr` both hold. `say` receives the result's quality.
         views, photos, held_out, beside, up, size, clean, format, preset: see `g2ard.DistillOptions`.

@@ -48,7 +48,7 @@ def simplify(
         scene: the dense scene, or its path.
         count: Gaussians to keep, at most those of the scene.
         ratio: reduction factor, at least 1; the result has round(N/ratio).
-        fit: largest file, such as "5MB", or a device: quest3, mobile or web.
+        fit: largest file, such as "5MB", or a device (see `Budget`).
         min_psnr: PSNR (dB) to keep against the scene, in generated views.
         min_ssim: SSIM to keep; with `min_psnr` both hold. `say` receives the result's quality.
         format: file format for `fit`: ply, compressed.ply, sog, spz, glb, splat, usda or usdc.
