@@ -1,4 +1,4 @@
-"""What tests of several stages share: the program as a user types it, and a folder to type it in."""
+"""Fixtures of several stages: the program as a user types it, and a folder with inputs."""
 
 import contextlib
 import gc
@@ -20,7 +20,7 @@ from helpers.scenes import around, checkered_ball
 Said = tuple[int, str, str]
 
 _OF_THE_PROCESS = {"--threads", "--device", "--devices"}
-"""Options that set what a process has once: calls with them get one of their own."""
+"""Options that change the whole process: calls with them run in a process of their own."""
 
 
 @pytest.fixture(scope="session")

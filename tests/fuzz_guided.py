@@ -46,7 +46,7 @@ def packing(content: bytes) -> tuple[bytes, Callable[[bytes], bytes]]:
 
 
 def run_case(what: str, seconds: int, seed: int) -> None:
-    """Fuzz one case for so long; libFuzzer ends the process, with status 0 where nothing was found."""
+    """Fuzz one case for `seconds`; libFuzzer then ends the process, with status 0 if nothing is found."""
     import atheris
 
     with atheris.instrument_imports(include=["g2ard.io", "laspy", "plyfile"]):

@@ -1,4 +1,4 @@
-"""`import g2ard`: what it gives, and that it does what the shell does, to the bit."""
+"""`import g2ard`: its names, and results with the same bits as the commands'."""
 
 import inspect
 import json
@@ -34,7 +34,7 @@ def assert_same_bits(ours: Splats, theirs: Splats, path: Path) -> None:
         np.testing.assert_array_equal(getattr(written, name), getattr(theirs, name))
 
 
-def test_every_name_is_there_and_functions_are_no_modules() -> None:
+def test_every_public_name_exists_and_no_function_is_a_module() -> None:
     for name in g2ard.__all__:
         found = getattr(g2ard, name)
         assert not inspect.ismodule(found), name
@@ -57,7 +57,7 @@ def test_every_name_is_there_and_functions_are_no_modules() -> None:
         (["--min-psnr", 24, "--min-ssim", 0.5], {"min_psnr": 24, "min_ssim": 0.5}),
     ],
 )
-def test_simplify_does_what_the_shell_does(
+def test_simplify_equals_the_command(
     typed: list[object], given: dict[str, object], command_line: CommandLine, folder: Path
 ) -> None:
     succeeds(command_line, folder, "simplify", "ball.ply", "-o", "small.ply", *typed)
@@ -79,7 +79,7 @@ def test_simplify_does_what_the_shell_does(
         ),
     ],
 )
-def test_distill_does_what_the_shell_does(
+def test_distill_equals_the_command(
     typed: list[object], given: dict[str, object], command_line: CommandLine, folder: Path
 ) -> None:
     succeeds(command_line, folder, "distill", "ball.ply", "-o", "run", "--size", 64, "--seed", 3, *typed)
@@ -131,7 +131,7 @@ def test_one_camera_is_a_view_of_many() -> None:
     assert g2ard.render(BALL, pool[2]).image.shape == (600, 800, 3)
 
 
-def test_what_measures_others_is_never_imported() -> None:
+def test_benchmarks_and_torch_are_never_imported() -> None:
     code = """
 import sys, numpy as np, g2ard
 ball = np.random.default_rng(0).normal(size=(900, 3))

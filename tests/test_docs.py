@@ -1,4 +1,4 @@
-"""What the documentation says against what there is: links, commands, options, names, records, plots."""
+"""Documentation against the code: links, commands, options, names, records, plots."""
 
 import ast
 import importlib.util
@@ -29,7 +29,7 @@ def without_code(text: str) -> str:
 
 
 def anchors(page: Path) -> set[str]:
-    """The fragments that a page's headings make, as GitHub does."""
+    """Return the fragments of a page's headings, as GitHub makes them."""
     titles = re.findall(
         r"(?m)^#{1,6} (.+)$", re.sub(r"(?ms)^```.*?^```", "", page.read_text(encoding="utf-8"))
     )
@@ -51,7 +51,7 @@ def test_relative_links_lead_somewhere(name: str) -> None:
 
 @cache
 def command_options() -> dict[str, set[str]]:
-    """Each command, as "bench raster", and the options that it takes."""
+    """Return the options of each command."""
     from typer.main import get_command
 
     from g2ard.cli.commands import register_commands
@@ -71,21 +71,21 @@ def command_options() -> dict[str, set[str]]:
 
 
 def shell_lines(text: str) -> list[str]:
-    """The lines of a page's shell blocks, and what it quotes of calls in running text."""
+    """Return the lines of a page's shell blocks, and calls quoted in its text."""
     blocks = re.findall(r"(?ms)^```sh\n(.*?)^```", text)
     quoted = re.findall(r"`(g2ard [^`\n]+)`", re.sub(r"(?ms)^```.*?^```", "", text))
     return [line for block in blocks for line in block.splitlines()] + quoted
 
 
 def calls_in(text: str) -> list[list[str]]:
-    """The arguments of every `g2ard …` in a page."""
+    """Return the arguments of every `g2ard …` in a page."""
     parts = [part for line in shell_lines(text) for part in re.split(r"&&|\|", line)]
     calls = [part.replace("…", "") for part in parts if re.match(r"\s*g2ard\s", part)]
     return [shlex.split(call, comments=True)[1:] for call in calls]
 
 
 def unknown_in(arguments: list[str]) -> str:
-    """The first command or option that there is not; "" if all are known."""
+    """Return the first unknown command or option; "" if all are known."""
     commands = command_options()
     path = ""
     while arguments and f"{path} {arguments[0]}".strip() in commands:
@@ -172,7 +172,7 @@ def test_an_index_lists_every_page_of_its_folder(index: str, folder: str) -> Non
             assert f"{page.name})" in text, f"{index} does not list {page.name}"
 
 
-def test_plots_are_what_the_recorded_rows_give() -> None:
+def test_plots_match_the_recorded_rows() -> None:
     path = ROOT / "benchmarks" / "plots.py"
     spec = importlib.util.spec_from_file_location("plots", path)
     assert spec
@@ -200,7 +200,7 @@ def test_the_readme_names_every_command_and_scene_format() -> None:
 
 
 def test_scripts_need_no_deep_imports() -> None:
-    """Examples and pages import `g2ard` and what stands right under it."""
+    """Examples and pages use only names of `g2ard` itself."""
     pages = [*ROOT.glob("examples/*.py"), *ROOT.glob("docs/methods/*.md"), ROOT / "README.md"]
     pages += [page for page in ROOT.glob("docs/*.md") if page.name != "benchmarks.md"]
     deep = [

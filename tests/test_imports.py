@@ -1,4 +1,4 @@
-"""What modules import: no cycles, stages only foundations, and nothing heavy with `import g2ard`."""
+"""Imports: no cycles, stages import only foundations, and `import g2ard` loads nothing heavy."""
 
 import ast
 from collections.abc import Iterator
@@ -32,7 +32,7 @@ def modules() -> dict[str, Path]:
 
 
 def imported(path: Path) -> Iterator[str]:
-    """What a module imports of g2ard, in functions too; not what only type checkers read."""
+    """Return what a module imports of g2ard, also in functions, except for type checkers."""
     tree = ast.parse(path.read_text(encoding="utf-8"))
     for node in ast.walk(tree):
         if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.dump(node.test):
@@ -55,7 +55,7 @@ def graph() -> dict[str, set[str]]:
 
 
 def reachable(edges: dict[str, set[str]], start: str) -> set[str]:
-    """All modules that a module comes to by its imports."""
+    """Return all modules that a module imports, directly or not."""
     seen: set[str] = set()
     waiting = list(edges[start])
     while waiting:

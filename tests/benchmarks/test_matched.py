@@ -103,7 +103,7 @@ def test_stages_survive_an_interruption_and_failures_are_rows(tmp_path: Path) ->
 
 
 @needs_processes
-def test_reduction_that_takes_all_the_time_is_scored_without_recovery(tmp_path: Path) -> None:
+def test_a_reduction_that_uses_all_the_time_is_scored_without_recovery(tmp_path: Path) -> None:
     text = STUDY.replace("seconds = [3]", "seconds = [1e-5]").replace("steps = [9]", "")
     _, rows, _ = run(tmp_path, text)
     assert [(row["steps"], row["count"]) for row in rows] == [(0, 300)] * 4
@@ -271,7 +271,7 @@ def test_scores_are_those_of_evaluate_and_black_renders_are_left_out(tmp_path: P
 
 
 @needs_processes
-def test_what_is_scored_is_not_trained_on(tmp_path: Path) -> None:
+def test_scored_views_are_not_trained_on(tmp_path: Path) -> None:
     views = around(16, size=(48, 36))
     io.write_views(tmp_path / "val.json", views.take(range(4)))
     text = HEAD.replace("12", "4") + 'methods = ["random"]\n' + SCENE + 'score = { val = "val.json" }\n'

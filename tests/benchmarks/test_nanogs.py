@@ -88,7 +88,7 @@ def naive(s: Splats, budget: int) -> list[dict]:
 
 
 @pytest.mark.parametrize("budget", [33, 20, 7, 1])
-def test_nanogs_is_what_a_naive_twin_finds(budget: int) -> None:
+def test_nanogs_equals_a_naive_twin(budget: int) -> None:
     found, expected = unpack(nanogs(scene(), budget)), naive(scene(), budget)
     assert len(found) == len(expected) == budget
     for f, e in zip(found, expected, strict=True):
@@ -107,7 +107,7 @@ def test_nanogs_counts_are_exact_where_its_cut_would_leave_too_few() -> None:
     np.testing.assert_array_equal(kept.means, np.delete(s.means, weakest, 0))
 
 
-def test_nanogs_refuses_what_it_cannot_do() -> None:
+def test_nanogs_rejects_invalid_budgets_and_means() -> None:
     with pytest.raises(InputError, match="budget"):
         nanogs(scene(), 0)
     broken = scene()

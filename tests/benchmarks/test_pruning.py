@@ -84,7 +84,7 @@ def test_pup_prunes_the_singular_first_and_looks_at_a_quarter() -> None:
     assert rounds(1000, 33)[-1] == 33
 
 
-def test_lightgaussians_significance_is_what_pixels_say() -> None:
+def test_lightgaussians_significance_equals_the_twins() -> None:
     s = scene(10)
     volume = s.scales.astype(float).prod(1)
     typical = sorted(volume, reverse=True)[9]
@@ -101,7 +101,7 @@ def test_lightgaussians_significance_is_what_pixels_say() -> None:
 
 
 @pytest.mark.parametrize("indoor", [True, False])
-def test_mini_splattings_importance_is_what_pixels_say(indoor: bool) -> None:
+def test_mini_splattings_importance_equals_the_twins(indoor: bool) -> None:
     s = scene(14)
     expected, leads = np.zeros(len(s)), np.zeros(len(s))
     for i in range(len(VIEWS)):
@@ -116,7 +116,7 @@ def test_mini_splattings_importance_is_what_pixels_say(indoor: bool) -> None:
     np.testing.assert_allclose(importance(s, VIEWS, indoor=indoor), expected, rtol=1e-4)
 
 
-def test_sampling_takes_each_with_its_weight() -> None:
+def test_sampling_follows_the_weights() -> None:
     weights = np.array([1.0, 2.0, 0.0, 5.0])
     first = np.zeros(4)
     for seed in range(4000):

@@ -1,4 +1,4 @@
-"""The raster study's figures hang together (their size depends on the machine)."""
+"""The raster study's figures are consistent (their size depends on the machine)."""
 
 from dataclasses import replace
 from pathlib import Path

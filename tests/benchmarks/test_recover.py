@@ -1,4 +1,4 @@
-"""The study of recovery: its rows, resuming, and what it makes of them."""
+"""The study of recovery: its rows, resuming and summary."""
 
 from dataclasses import replace
 from pathlib import Path

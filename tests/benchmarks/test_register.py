@@ -1,4 +1,4 @@
-"""The study of registration: starts are as far off as they say, rows hold what was found."""
+"""The study of registration: distances of starts, and recorded results."""
 
 import json
 from dataclasses import replace
@@ -36,7 +36,7 @@ def test_starts_are_as_far_off_as_they_say() -> None:
         assert degrees == pytest.approx(15)
 
 
-def test_rows_say_what_was_found_and_from_where(tmp_path: Path, command_line: CommandLine) -> None:
+def test_rows_hold_starts_and_results(tmp_path: Path, command_line: CommandLine) -> None:
     write_views(tmp_path / "views.json", _site(tmp_path))
     call = ("benchmarks", "run", "register", "ball.ply", "--views", "views.json", "--methods", "direct")
     few = ("--size", "128", "--seeds", "0", "--set", "metres_per_unit=2", "--json", "-")

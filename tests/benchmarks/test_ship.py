@@ -9,7 +9,7 @@ from g2ard.io import write_splats
 from helpers.scenes import checkered_ball
 
 
-def test_formats_lose_what_their_quanta_say(tmp_path: Path) -> None:
+def test_formats_lose_as_much_as_their_quanta(tmp_path: Path) -> None:
     write_splats(tmp_path / "ball.ply", checkered_ball(600))
     made = read_study(DEFINITIONS / "ship.toml").narrowed({"ratios": "1,5", "methods": "sog,splat"})
     rows = run([replace(made, scenes=(SceneSpec("ball", str(tmp_path / "ball.ply")),))], tmp_path / "out")

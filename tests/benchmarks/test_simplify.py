@@ -50,7 +50,7 @@ def test_measures_writes_and_resumes(tmp_path: Path) -> None:
 
 
 @needs_processes
-def test_standing_views_are_no_ones_own(tmp_path: Path) -> None:
+def test_every_kind_of_view_is_scored(tmp_path: Path) -> None:
     path = tmp_path / "ball.ply"
     io.write_splats(path, checkered_ball(3000))
     rows = ask(SceneSpec("ball", str(path)), tmp_path / "out", "default,fast", protocol="both")
@@ -68,7 +68,7 @@ def test_standing_views_are_no_ones_own(tmp_path: Path) -> None:
     assert (tmp_path / "out" / "rows.csv").read_text() == text
 
 
-def test_a_standing_file_beside_the_scene_is_what_counts(tmp_path: Path) -> None:
+def test_a_standing_file_beside_the_scene_takes_precedence(tmp_path: Path) -> None:
     splats, folder = checkered_ball(1500), tmp_path / "ball"
     folder.mkdir()
     io.write_splats(folder / "ball.ply", splats)

@@ -1,4 +1,4 @@
-"""Studies of any kind: what is read, what is measured once, and what the command and the report show."""
+"""Studies of any kind: reading, measuring once, and the command's and report's output."""
 
 import json
 import re
@@ -136,7 +136,7 @@ def test_the_report_shows_rows_seeds_and_failures(tmp_path: Path) -> None:
         (('title = "Balls"', 'kind = "cake"'), "kind: expected one of matched"),
     ],
 )
-def test_studies_say_what_is_wrong(tmp_path: Path, change: tuple[str, str], message: str) -> None:
+def test_invalid_studies_name_the_cause(tmp_path: Path, change: tuple[str, str], message: str) -> None:
     with pytest.raises(InputError, match=re.escape(message)) as caught:
         read_study(study(tmp_path, STUDY.replace(*change)))
     assert "balls.toml" in str(caught.value)

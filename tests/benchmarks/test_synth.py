@@ -155,7 +155,7 @@ def test_a_scan_in_parts_is_as_the_scan_at_once(large, large_scan, monkeypatch):
         assert away.max() < 6 * large.config.noise
 
 
-def test_a_million_is_so_many_points_on_a_city_of_that_size(tmp_path, command_line):
+def test_million_and_points_make_the_same_city(tmp_path, command_line):
     few = ("--views", "8", "--size", "32x24")
     succeeds(command_line, tmp_path, *SYNTH, "-o", "a", "--million", "0.012", *few)
     given = (*SYNTH, "-o", "b", "--points", "12k", "--blocks", "1", *few)
@@ -303,7 +303,7 @@ def test_interrupted_leaves_nothing(tmp_path):
         {"seed": -1},
     ],
 )
-def test_refuses_what_makes_no_city(options):
+def test_invalid_cities_are_rejected(options):
     with pytest.raises(InputError, match=next(iter(options)).replace("size", "width")):
         CityConfig(**options)
 

@@ -11,7 +11,7 @@ from helpers.commands import CommandLine, refused, succeeds
 from helpers.scenes import checkered_ball
 
 
-def test_several_budgets_are_what_single_runs_give(command_line: CommandLine, folder: Path) -> None:
+def test_several_budgets_equal_single_runs(command_line: CommandLine, folder: Path) -> None:
     several = ("simplify", "ball.ply", "-r", "4,5", "-r", 10, "-o", "s_{ratio}x_{count}.ply", "--json", "-")
     out = succeeds(command_line, folder, *several).out
     assert [run["output_count"] for run in json.loads(out)["runs"]] == [100, 80, 40]

@@ -25,7 +25,7 @@ def test_import_and_help_load_nothing_heavy() -> None:
     assert imported_by(show_help, "torch", "numpy", "PIL", "markdown_it", "pygments") == []
 
 
-def test_what_help_defers_of_rich_loads_when_it_is_used() -> None:
+def test_deferred_parts_of_rich_load_on_use() -> None:
     code = """
 from g2ard.cli.lazy_rich import defer_rich
 defer_rich()
@@ -63,7 +63,7 @@ def test_usage_errors(arguments: list[str], words: str, command_line: CommandLin
 
 @pytest.mark.parametrize("mark", [b"", b"\xef\xbb\xbf"])
 def test_config_files_are_utf_8(tmp_path: Path, mark: bytes) -> None:
-    """In any locale, also with the byte order mark that editors on Windows write."""
+    """Any locale works, also with the byte order mark that editors on Windows write."""
     (tmp_path / "c.toml").write_bytes(mark + 'output = "größe/×.ply"\n'.encode())
     code = "import sys; from pathlib import Path; from g2ard.cli.config import _read;"
     code += "print(ascii(_read(Path(sys.argv[1]))))"
@@ -89,7 +89,7 @@ def test_progress_lines(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.
     assert lines[-1].startswith("recover: 40/40")
 
 
-def test_quiet_says_errors_only(capsys: pytest.CaptureFixture[str]) -> None:
+def test_quiet_prints_errors_only(capsys: pytest.CaptureFixture[str]) -> None:
     console = Console(quiet=True)
     console.say("hello")
     console("stage", 1, 1)
@@ -119,7 +119,7 @@ def test_unknown_output_formats(
 
 
 def test_an_interrupt_while_a_string_is_executed_ends_with_130_too(tmp_path: Path) -> None:
-    """`python -m` would end by the signal, though the interrupt was handled."""
+    """`python -m` would end by the signal although the interrupt was handled."""
     (tmp_path / "stopped.py").write_text("""
 import sys
 import g2ard.cli

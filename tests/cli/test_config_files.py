@@ -48,7 +48,7 @@ def test_wrong_names_and_values_are_named(
     assert words in refused(command_line, folder, *ask)
 
 
-def test_tables_and_what_stands_above_them(command_line: CommandLine, folder: Path) -> None:
+def test_keys_above_tables_apply_to_every_command(command_line: CommandLine, folder: Path) -> None:
     (folder / "c.toml").write_text("seed = 5\nsize = 64\n[simplify]\nratio = [10]\n[render]\nsplit = 'test'")
     ask = ("simplify", "ball.ply", "-o", "s.ply", "--config", "c.toml", "--json", "-")
     found = json.loads(succeeds(command_line, folder, *ask).out)

@@ -29,7 +29,7 @@ def test_convert_merges_crops_moves(tmp_path: Path, command_line: CommandLine) -
     np.testing.assert_allclose(found.shN, expected.shN, atol=1e-5)
 
 
-def test_convert_says_what_is_wrong(tmp_path: Path, command_line: CommandLine) -> None:
+def test_convert_errors_name_the_cause(tmp_path: Path, command_line: CommandLine) -> None:
     write_splats(tmp_path / "a.ply", directional())
     for words, code, message in (
         (("b.ksplat",), 1, "scenes are written as"),
@@ -45,7 +45,7 @@ def test_convert_says_what_is_wrong(tmp_path: Path, command_line: CommandLine) -
     assert read_splats(tmp_path / "b.spz").sh_degree == 1
 
 
-def test_convert_takes_its_output_as_the_others_do(command_line: CommandLine, folder: Path) -> None:
+def test_convert_takes_its_output_with_or_without_o(command_line: CommandLine, folder: Path) -> None:
     written = [("ball.ply", "-o", "a.splat"), ("-o", "b.splat", "ball.ply"), ("ball.ply", "c.splat")]
     for arguments in written:
         out = succeeds(command_line, folder, "convert", *arguments, "--json", "-").out

@@ -80,7 +80,7 @@ def test_unwritable_json(tmp_path: Path, command_line: CommandLine) -> None:
     assert [p.name for p in tmp_path.iterdir()] == ["a.ply"]
 
 
-def test_playbot_as_its_readme_says() -> None:
+def test_playbot_matches_its_readme() -> None:
     found = describe(real("playbot"))
     assert (found["count"], found["sh_degree"], found["notes"]) == (500_000, 2, [])
     np.testing.assert_allclose(found["extent"]["min"], [-1.03, -1.08, -1.04], atol=0.005)
@@ -98,7 +98,7 @@ def test_info_of_several_files_and_of_a_run(command_line: CommandLine, folder: P
     assert "made from" in command_line("info", "run", cwd=folder)[1]
 
 
-def test_info_goes_on_after_what_it_cannot_read(command_line: CommandLine, folder: Path) -> None:
+def test_info_continues_after_unreadable_files(command_line: CommandLine, folder: Path) -> None:
     (folder / "text.ply").write_text("hello")
     ask = ("info", "ball.ply", "gone.ply", "text.ply", "views.json")
     status, out, error = command_line(*ask, cwd=folder)

@@ -12,7 +12,9 @@ from helpers.photos import cloud_of, photos_of
 from helpers.scenes import checkered_ball
 
 
-def test_the_wrong_kind_of_input_is_told_what_takes_it(command_line: CommandLine, folder: Path) -> None:
+def test_a_wrong_kind_of_input_names_the_command_that_takes_it(
+    command_line: CommandLine, folder: Path
+) -> None:
     photos_of(folder / "photos", points=True)
     for ask, status, words in (
         (("distill", "photos", "-n", 100, "-o", "x"), 2, "photos holds views, not a scene"),
@@ -80,7 +82,7 @@ def test_missing_and_conflicting_options_are_named_before_any_work(
     assert sorted(path.name for path in folder.iterdir()) == ["ball.ply", "views.json"]
 
 
-def test_photos_below_their_poses_are_told_of_them(folder: Path) -> None:
+def test_errors_point_to_the_poses_of_photos(folder: Path) -> None:
     (folder / "scan" / "shots").mkdir(parents=True)
     Image.new("RGB", (8, 8)).save(folder / "scan" / "shots" / "a.png")
     shots = folder / "scan" / "shots"
@@ -97,7 +99,7 @@ def test_photos_below_their_poses_are_told_of_them(folder: Path) -> None:
         g2ard.load_views(shots)
 
 
-def test_a_folder_that_is_nothing_says_what_in_it_would_do(command_line: CommandLine, folder: Path) -> None:
+def test_an_unreadable_folder_names_readable_contents(command_line: CommandLine, folder: Path) -> None:
     for name in ("bare/photo.jpg", "project/images/photo.PNG", "empty"):
         place = folder / name
         (place.parent if place.suffix else place).mkdir(parents=True, exist_ok=True)
@@ -122,7 +124,7 @@ def test_a_folder_that_is_nothing_says_what_in_it_would_do(command_line: Command
 BALL = checkered_ball(400)
 
 
-def test_views_without_photos_say_what_stands_in(command_line: CommandLine, folder: Path) -> None:
+def test_views_without_photos_name_the_substitute(command_line: CommandLine, folder: Path) -> None:
     cloud_of(folder / "cloud.ply", BALL)
     to = ("-r", 4, "-o", "x", "--views", "views.json")
     for ask, words in (
@@ -136,14 +138,14 @@ def test_views_without_photos_say_what_stands_in(command_line: CommandLine, fold
         assert (status, "has no" in last or "has none" in last, words in last) == (1, True, True), error
 
 
-def test_what_is_of_the_wrong_kind_says_what_it_is(folder: Path) -> None:
+def test_an_input_of_the_wrong_kind_is_named(folder: Path) -> None:
     with pytest.raises(InputError, match="found views; give the scene's file"):
         g2ard.load(folder / "views.json")
     with pytest.raises(InputError, match=r"expected views .*, found a Gaussian scene"):
         g2ard.load_views(folder / "ball.ply")
 
 
-def test_a_name_mistyped_is_told_with_one_alike(command_line: CommandLine, folder: Path) -> None:
+def test_a_mistyped_name_gets_a_suggestion(command_line: CommandLine, folder: Path) -> None:
     ask = ("simplify", "bal.ply", "-r", 2, "-o", "o.ply")
     assert "bal.ply: no such file or folder; did you mean ball.ply?\n" in refused(
         command_line, folder, *ask, status=1
@@ -163,7 +165,7 @@ def test_a_damaged_file_comes_with_advice(suffix: str, command_line: CommandLine
     assert error.endswith("; the file is damaged: copy or export it again\n")
 
 
-def test_what_is_missing_or_too_much_is_named(command_line: CommandLine, folder: Path) -> None:
+def test_errors_for_common_mistakes_end_with_advice(command_line: CommandLine, folder: Path) -> None:
     """Errors for common mistakes end with advice."""
     for name in ("bare", "d.ply"):
         (folder / name).mkdir()

@@ -19,7 +19,7 @@ from helpers.photos import BALL, cloud_of, photos_of
 from helpers.scenes import around, checkered_ball
 
 
-def test_a_result_that_outweighs_its_input_says_so(command_line: CommandLine, tmp_path: Path) -> None:
+def test_a_result_larger_than_its_input_is_noted(command_line: CommandLine, tmp_path: Path) -> None:
     photos_of(tmp_path / "photos", points=True)
     ask = ("distill", "photos/sparse.ply", "--views", "photos", "-n", 1000, "--steps", 3)
     error = command_line(*ask, "-o", "run", cwd=tmp_path)[2]
@@ -28,7 +28,7 @@ def test_a_result_that_outweighs_its_input_says_so(command_line: CommandLine, tm
     assert "MB" not in command_line("simplify", "ball.ply", "-r", 2, "-o", "s.ply", cwd=tmp_path)[2]
 
 
-def test_a_lift_that_outweighs_its_cloud_says_so(command_line: CommandLine, folder: Path) -> None:
+def test_a_lift_larger_than_its_cloud_is_noted(command_line: CommandLine, folder: Path) -> None:
     cloud_of(folder / "cloud.ply", BALL)
     assert (
         "lift.ply: 0.07 MB, cloud.ply has 0.03 MB: packed formats"
@@ -60,7 +60,7 @@ def test_one_is_one(command_line: CommandLine, folder: Path) -> None:
     assert re.findall(r"(?<![\d.,])1 [A-Za-z]*(?:Gaussian|view|step|point|photo|disc)s\b", error) == []
 
 
-def test_views_of_another_world_are_told(command_line: CommandLine, folder: Path) -> None:
+def test_views_of_another_world_are_noted(command_line: CommandLine, folder: Path) -> None:
     cameras = around(16, (48, 36))
     far = np.where(np.arange(16)[:, None] < 10, [[1e3, 0, 0]], 0)
     for count, name in ((10, "some.json"), (16, "none.json")):
@@ -103,7 +103,7 @@ def test_views_of_another_world(ask: tuple[object, ...], command_line: CommandLi
         assert ("views see nothing of the scene; check" in error) == warned, error
 
 
-def test_photos_of_another_world_are_told(command_line: CommandLine, folder: Path) -> None:
+def test_photos_of_another_world_are_noted(command_line: CommandLine, folder: Path) -> None:
     """The views may still see much of the scene, because both lie around the origin."""
     photos_of(folder / "photos")
     ask = ("-n", 50, "--views", "photos", "--steps", 2, "--dry-run")
@@ -141,6 +141,6 @@ def test_the_table_has_a_row_per_kind_of_view() -> None:
 
 
 @pytest.mark.parametrize(("unseen", "lines"), [(0.004, 0), (0.005, 0), (0.02, 1)])
-def test_what_no_view_sees_is_told_if_it_is_not_nothing(unseen: float, lines: int) -> None:
+def test_a_share_of_unseen_gaussians_is_noted(unseen: float, lines: int) -> None:
     found = told({"rounds": [], "kinds": [], "unseen": unseen})
     assert (len(found), any("0%" in line for line in found)) == (lines, False)

@@ -1,4 +1,4 @@
-"""What is refused of options, config files and outputs, and in which words; Ctrl-C before any command."""
+"""Rejected options, config files and outputs, with their messages; Ctrl-C before any command."""
 
 import json
 import subprocess
@@ -46,7 +46,7 @@ def test_a_format_is_named_in_any_case(folder: Path, command_line: CommandLine) 
     assert "none.ply: no such file" in said[2]
 
 
-def test_a_scene_that_lies_down_is_seen_upright_if_told(folder: Path, command_line: CommandLine) -> None:
+def test_up_changes_the_generated_views(folder: Path, command_line: CommandLine) -> None:
     for up in ("0,0,1", "1,0,0"):
         ask = ("distill", "a.ply", "-n", 20, "--views", "made", "--steps", 1, "--size", 48)
         succeeds(command_line, folder, *ask, "--up", up, "-o", up[:1])
@@ -151,7 +151,7 @@ def test_a_signal_before_a_command_is_one_line(moment: str, by: str, status: int
     assert (done.returncode, done.stderr) == (status, "g2ard: interrupted\n")
 
 
-def test_recover_says_what_became_of_steps_that_lost(tmp_path: Path, command_line: CommandLine) -> None:
+def test_recover_reports_losing_steps(tmp_path: Path, command_line: CommandLine) -> None:
     ball = checkered_ball(800)
     grain = np.random.default_rng(0).normal(0, 1e-3, ball.sh0.shape).astype(np.float32)
     write_splats(tmp_path / "ball.ply", ball)

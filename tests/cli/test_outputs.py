@@ -33,7 +33,7 @@ def test_a_folder_has_one_scene(command_line: CommandLine, folder: Path) -> None
 
 
 @pytest.mark.parametrize("option", ["render --sheet", "clean --dry-run --preview"])
-def test_a_picture_is_what_its_name_says(option: str, command_line: CommandLine, folder: Path) -> None:
+def test_a_pictures_format_follows_its_suffix(option: str, command_line: CommandLine, folder: Path) -> None:
     command, *options = option.split()
     error = refused(command_line, folder, command, "ball.ply", *options, "a.jpg")
     assert "ends in .png, got 'a.jpg'" in error

@@ -1,4 +1,4 @@
-"""What commands make of a checkpoint that a stopped run left: gone on from, refused, or replaced under -w."""
+"""Checkpoints of interrupted runs: resumed, rejected, or replaced with -w."""
 
 import io
 import json
@@ -54,7 +54,7 @@ def test_checkpoints_are_kept(folder: Path, command_line: CommandLine, command: 
 
 
 @pytest.mark.parametrize("command", ["recover", "adapt"])
-def test_what_is_said_names_the_split(folder: Path, command_line: CommandLine, command: str) -> None:
+def test_messages_name_the_split(folder: Path, command_line: CommandLine, command: str) -> None:
     ask = (command, "a.ply", "--steps", 2, "--views", "views.json", "--teacher", "a.ply", "-wo", "out.ply")
     for split, words in (("train", "training views "), ("test", ", test views "), ("all", ", all views ")):
         assert words in succeeds(command_line, folder, *ask, "--split", split).err
@@ -102,7 +102,7 @@ def bytes_of(save: Callable[[io.BytesIO], None]) -> bytes:
         bytes_of(lambda file: np.savez(file, meta=np.array([{}], object))),
     ],
 )
-def test_a_file_that_is_no_checkpoint_is_named(tmp_path: Path, content: bytes) -> None:
+def test_a_file_that_is_not_a_checkpoint_is_named(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "c.npz"
     path.write_bytes(content)
     with pytest.raises(InputError) as caught:

@@ -1,4 +1,4 @@
-"""A folder that `distill` wrote, given where a scene or views are wanted."""
+"""A run folder of `distill`, passed as a scene or as views."""
 
 import json
 from pathlib import Path

@@ -16,7 +16,7 @@ from helpers.systems import needs_signals
 
 @pytest.mark.parametrize("stream", ["stdout", "stderr"])
 def test_a_closed_pipe_loses_no_result(stream: str, folder: Path) -> None:
-    """As under `| head -0`: the reader exits before anything is written."""
+    """The reader exits before anything is written, as with `| head -0`."""
     reader, writer = os.pipe()
     os.close(reader)
     quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE, stream: writer}

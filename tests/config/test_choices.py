@@ -16,7 +16,7 @@ from g2ard.stages.select import select
 from g2ard.stages.simplify import SimplifyConfig
 
 
-def test_names_and_what_they_name_agree() -> None:
+def test_every_list_of_names_matches_its_table() -> None:
     assert tuple(SCHEDULES) == choices.SCHEDULE_NAMES
     assert set(FORMATS) == set(get_args(choices.FormatName))
     presets = {"auto", *PRESETS, "paper", *(f"paper-{name}" for name in PAPER_PRESETS)}

@@ -50,7 +50,7 @@ DISTILL = ("distill", "ball.ply", "-r", 3, "--views", "v.json", "-o", "run", "--
 SHORT = (*DISTILL, "--steps", 8)
 
 
-def test_distill_does_all_that_the_paper_says(folder: Path, command_line: CommandLine) -> None:
+def test_preset_paper_sets_every_stage_of_distill(folder: Path, command_line: CommandLine) -> None:
     report = run(command_line, folder, *DISTILL, "--preset", "paper")
     whole = preset("paper")
     used = changed(whole, {"recover.schedule": FEW, "recover.steps": 75})
@@ -73,7 +73,7 @@ def test_rounds_without_regularisers_are_named_once(folder: Path, command_line: 
     assert "there were 20 to 75" in error
 
 
-def test_what_is_said_beside_the_preset_stands(folder: Path, command_line: CommandLine) -> None:
+def test_explicit_options_override_the_preset(folder: Path, command_line: CommandLine) -> None:
     (folder / "c.toml").write_text('[distill]\nmethod = "default"\n[distill.set]\npolicy = "pose-diverse"\n')
     said = ("--config", "c.toml", "--method", "fast", "--set", "views_count=4", "--set", "anchor=0.3")
     report = run(command_line, folder, *SHORT, "--preset", "paper", *said, "--set", "sh_degree=1")
@@ -90,7 +90,7 @@ def test_what_is_said_beside_the_preset_stands(folder: Path, command_line: Comma
     assert settings["recover.regularizers.period"] == 7
 
 
-def test_a_cloud_takes_the_lift_s_row(folder: Path, command_line: CommandLine) -> None:
+def test_a_point_cloud_gets_the_weights_of_lifts(folder: Path, command_line: CommandLine) -> None:
     cloud_with_photos(folder, PRIOR)
     ask = ("distill", "cloud.ply", "-r", 3, "--views", "views.json", "-o", "run", "--steps", 8)
     report = run(command_line, folder, *ask, "--preset", "paper", "--set", "lift.neighbors=8")
@@ -154,7 +154,7 @@ def test_anchors_hold_from_construction_to_the_end(targets: TeacherRenders) -> N
     assert distill(PRIOR, 1000, targets, held).report.rounds[-1].recover[-1].drift95 < last.drift95
 
 
-def test_the_paper_s_steps_are_kept_whatever_comes_of_them(targets: TeacherRenders) -> None:
+def test_the_papers_schedule_keeps_losing_steps(targets: TeacherRenders) -> None:
     config = RecoverConfig(schedule=PAPER, steps=30, regularizers=FREE)
     grain = np.random.default_rng(0).normal(0, 1e-3, PRIOR.sh0.shape).astype(np.float32)
     start = replace(PRIOR, sh0=PRIOR.sh0 + grain)  # so near that such steps only lose
@@ -184,7 +184,7 @@ def test_the_paper_s_rates_do_not_depend_on_the_unit() -> None:
     assert PAPER.within(0.0) == PAPER
 
 
-def test_what_was_kept_gives_the_drift_again(folder: Path, command_line: CommandLine) -> None:
+def test_a_kept_scene_reproduces_the_drift(folder: Path, command_line: CommandLine) -> None:
     report = run(command_line, folder, *DISTILL, "--preset", "paper", "--keep")
     kept = folder / "run" / "simplified" / "scene.ply"
     ask = ("evaluate", "run/scene.ply", "--views", "v.json", "--teacher", "ball.ply", "--anchors", kept)

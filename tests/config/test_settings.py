@@ -165,7 +165,7 @@ def test_settings_in_a_config_file_and_over_it(folder: Path, command_line: Comma
         assert words in error
 
 
-def test_a_setting_does_what_it_says(folder: Path, command_line: CommandLine) -> None:
+def test_settings_reach_their_stage(folder: Path, command_line: CommandLine) -> None:
     for growth in (1, 2):
         ask = ("simplify", "a.ply", "-r", 10, "-o", f"{growth}.ply", "--set", f"max_growth={growth}")
         succeeds(command_line, folder, *ask, "--no-views")
@@ -185,7 +185,7 @@ PRIOR = checkered_ball()
         (("recover", "a.ply", "-o", "o.ply", "--set", "nothing=1"), "nothing"),
     ],
 )
-def test_a_printed_config_has_no_setting_that_is_not_known(
+def test_a_printed_config_has_only_known_settings(
     folder: Path, command_line: CommandLine, arguments: tuple[object, ...], told: str
 ) -> None:
     status, out, error = command_line(*arguments, "--print-config", cwd=folder)

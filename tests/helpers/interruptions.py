@@ -6,7 +6,7 @@ from g2ard.progress import Progress
 
 
 def interrupt_at(stage: str, step: int = 0) -> Progress:
-    """Return a progress callback that interrupts once a stage has done so many steps."""
+    """Return a progress callback that interrupts a stage after a number of steps."""
 
     def progress(now: str, done: int, total: int, info: object = None) -> None:
         if now == stage and done >= step:

@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from typing import Any
 
 WRONG: tuple[Any, ...] = (None, True, "x", "", -1, 1e300, [], {}, [[]], ["x"])
-"""What a JSON property may be mistaken for."""
+"""Values of other types that replace a JSON property."""
 RAW = ("NaN", "1e999", "1" + "0" * 400)
 """The same as text, for what no program writes."""
 

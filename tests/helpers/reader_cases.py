@@ -118,4 +118,4 @@ READ = {
     "dataset_train.txt": "college",
     "reconstruction.nvm": "college",
 }
-"""What to read instead of the damaged file, in the test's folder."""
+"""The path to read instead of the damaged file, in the test's folder."""

@@ -1,4 +1,4 @@
-"""What tests need of the system, as marks that say what is missing."""
+"""Marks that skip tests and name the missing part of the system."""
 
 import os
 import sys
@@ -14,19 +14,19 @@ __all__ = ["is_worker", "needs_links", "needs_modes", "needs_proc", "needs_proce
 needs_signals = pytest.mark.skipif(
     os.name == "nt", reason="on Windows a program is sent no signal: it is ended at once"
 )
-"""For tests that send SIGINT or SIGTERM to another process."""
+"""Mark of tests that send SIGINT or SIGTERM to another process."""
 
 needs_processes = pytest.mark.skipif(
     not hasattr(os, "posix_spawnp"), reason="what a process took is measured by POSIX's calls"
 )
-"""For tests of benchmarks that run commands as processes."""
+"""Mark of tests of benchmarks that run commands as processes."""
 
 needs_modes = pytest.mark.skipif(os.name == "nt", reason="on Windows a folder's mode keeps nobody out")
 
 needs_proc = pytest.mark.skipif(
     not Path(f"/proc/self/task/{os.getpid()}/children").exists(), reason="no /proc tells of children"
 )
-"""For tests that look for workers."""
+"""Mark of tests that look for worker processes."""
 
 
 @cache

@@ -15,7 +15,7 @@ POSES = orbit(10)
 
 
 def inria(path: Path, viewmats: list[np.ndarray] = POSES, **extra: Any) -> Path:
-    """As 3DGS writes it: test cameras first, ids in that order, rotations as rows of world_from_camera."""
+    """Write cameras as 3DGS does: test cameras first, ids in that order, rows of world_from_camera."""
     order = [*range(0, len(viewmats), 8), *(i for i in range(len(viewmats)) if i % 8)]
     cameras = []
     for number, i in enumerate(order):
@@ -39,7 +39,7 @@ def inria(path: Path, viewmats: list[np.ndarray] = POSES, **extra: Any) -> Path:
 # nerfstudio
 
 T = np.eye(4)
-"""What auto-orienting and centring does."""
+"""A transform like nerfstudio's auto-orienting and centring."""
 
 
 A = np.array([[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1.0]])
@@ -115,7 +115,7 @@ def trained(view: np.ndarray) -> np.ndarray:
 
 
 def export(folder: Path, photos: Path, name: str, rows: range) -> Path:
-    """As `ns-export cameras`: a list of 3×4 world_from_camera with OpenGL's axes."""
+    """Return a list of 3×4 world_from_camera with OpenGL's axes, as `ns-export cameras` writes it."""
     folder.mkdir(parents=True, exist_ok=True)
     frames = []
     for i in rows:

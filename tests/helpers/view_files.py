@@ -85,7 +85,7 @@ def colmap(folder: Path, viewmats: list[np.ndarray], text: bool, model: int = 1)
 
 
 def transforms(path: Path, viewmats: list[np.ndarray], **extra: Any) -> Path:
-    """As instant-ngp writes it: camera to world, y up and looking along −z."""
+    """Write views as instant-ngp does: camera to world, y up, looking along −z."""
     frames = []
     for i, view in enumerate(viewmats):
         world = np.linalg.inv(view)

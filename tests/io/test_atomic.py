@@ -46,7 +46,7 @@ def test_full_disk_is_an_output_error(tmp_path: Path) -> None:
         raise OSError(28, "No space left on device")
 
 
-def test_failure_of_an_input_stays_what_it_is(tmp_path: Path) -> None:
+def test_a_failing_input_keeps_its_own_error(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError), atomic_output(tmp_path / "a"):
         (tmp_path / "input").read_text()
 

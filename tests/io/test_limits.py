@@ -1,4 +1,4 @@
-"""What files may claim: a claim past the limits is one line that names the file, and nothing is written."""
+"""Claims past the limits: one line that names the file, and nothing is written."""
 
 import gzip
 import json

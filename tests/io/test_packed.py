@@ -149,7 +149,7 @@ def test_splat_round_trip(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("size", [0, 33])
-def test_odd_size_is_no_splat(tmp_path: Path, size: int) -> None:
+def test_an_odd_size_is_not_a_splat_file(tmp_path: Path, size: int) -> None:
     (tmp_path / "a.splat").write_bytes(b"\0" * size)
     with pytest.raises(InputError, match="multiple of 32"):
         read_splats(tmp_path / "a.splat")

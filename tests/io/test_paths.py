@@ -26,7 +26,7 @@ def scene(tmp_path: Path) -> Path:
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="pipes with names are of POSIX")
-def test_a_pipe_is_no_file(tmp_path: Path, scene: Path, command_line: CommandLine) -> None:
+def test_a_pipe_is_rejected_as_a_file(tmp_path: Path, scene: Path, command_line: CommandLine) -> None:
     for name in ("a.ply", "a.spz", "a.las", "a.json"):
         os.mkfifo(tmp_path / name)
         with pytest.raises(InputError, match=rf"{name}: not a regular file$"):

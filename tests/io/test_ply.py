@@ -148,7 +148,7 @@ def test_meaningful_infinities_are_clamped(tmp_path: Path) -> None:
     np.testing.assert_array_equal(found.splats.quats[7], [1, 0, 0, 0])
 
 
-def test_a_scene_of_which_nothing_shows_is_noted(tmp_path: Path) -> None:
+def test_an_invisible_scene_is_noted(tmp_path: Path) -> None:
     properties = {name: values.copy() for name, values in columns(scene(count=8)).items()}
     for faintest, codes in ((-6, ["invisible"]), (-5, [])):
         properties["opacity"][:] = -7

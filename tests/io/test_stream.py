@@ -116,7 +116,7 @@ def test_several_are_one_scene(tmp_path: Path) -> None:
         open_stream([])
 
 
-def test_clouds_are_no_scenes(tmp_path: Path) -> None:
+def test_point_clouds_are_rejected_as_scenes(tmp_path: Path) -> None:
     path = save(tmp_path / "a.ply", {n: np.zeros(2) for n in ("x", "y", "z", "red", "green", "blue")})
     with pytest.raises(InputError, match="expected a Gaussian scene"):
         open_stream(path)

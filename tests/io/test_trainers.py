@@ -87,7 +87,7 @@ def test_bad_cameras_json(tmp_path: Path, change: Callable[[dict[str, Any]], Any
         read_view_set(path)
 
 
-def test_other_lists_are_no_cameras(tmp_path: Path) -> None:
+def test_other_json_lists_are_not_cameras(tmp_path: Path) -> None:
     for content in ("[]", "[1, 2]", '[{"a": 1}]'):
         (tmp_path / "cameras.json").write_text(content)
         with pytest.raises(InputError, match=r"cameras\.json: .*list"):

@@ -76,7 +76,7 @@ def test_a_whole_width_may_be_a_float(tmp_path: Path) -> None:
     assert read_views(tmp_path / "a.json").widths.tolist() == [8, 80]
 
 
-def test_own_views_refuse_what_does_not_fit(tmp_path: Path) -> None:
+def test_own_views_reject_mismatched_values(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="do not match"):
         write_views(tmp_path / "a.json", views(2), weights=[1])
     with pytest.raises(OutputError, match=r"written as \.json"):

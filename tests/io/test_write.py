@@ -83,7 +83,7 @@ def test_odd_scenes(tmp_path: Path, name: str) -> None:
 
 
 @pytest.mark.parametrize("name", FORMATS)
-def test_what_cannot_be_written_is_one_line(tmp_path: Path, name: str) -> None:
+def test_unwritable_values_are_one_line(tmp_path: Path, name: str) -> None:
     with pytest.raises(InputError, match="the scene has no Gaussians"):
         saved(tmp_path, name, scene().take(slice(0, 0)))
     broken = scene()

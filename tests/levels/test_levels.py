@@ -54,7 +54,7 @@ def test_levels_that_do_not_fit_together_are_refused() -> None:
         Cut(extent=0)
 
 
-def test_errors_are_none_for_the_same_all_for_nothing_and_never_fall() -> None:
+def test_errors_range_from_zero_to_one_and_never_fall() -> None:
     fine = checkered_ball(1500)
     gone = Splats.create(fine.means[:1], scales=[[1e-4] * 3], logit_opacities=[-20])
     half = fine.take(np.arange(0, 1500, 2))

@@ -114,7 +114,7 @@ def test_command_on_a_trained_scene(command_line: CommandLine, tmp_path: Path) -
     assert "-w" in error
 
 
-def test_a_loss_in_any_kind_of_views_is_told() -> None:
+def test_a_loss_in_any_kind_of_view_is_reported() -> None:
     from g2ard.cli.run_result import told
     from g2ard.report.kinds import by_kind
 

@@ -1,4 +1,4 @@
-"""How distillation chooses and weighs its views, and what it says of those it leaves out."""
+"""Choice and weights of a distillation's views, and messages about skipped ones."""
 
 import json
 from dataclasses import replace
@@ -36,7 +36,7 @@ def crowded() -> Cameras:
 
 
 class Watched(TeacherRenders):
-    """Remembers which targets were asked for."""
+    """Targets that remember which views were read."""
 
     def __init__(self, cameras: Cameras) -> None:
         super().__init__(PRIOR, cameras, lazy=True)
@@ -69,7 +69,7 @@ def test_only_chosen_views_are_looked_at_and_the_rest_is_accounted_for() -> None
     assert report.seconds.select > 0
 
 
-def test_auto_takes_as_many_as_the_curve_asks_for() -> None:
+def test_auto_chooses_the_count_from_the_curve() -> None:
     targets = TeacherRenders(PRIOR, crowded())
     report = distill(
         PRIOR, 200, targets, changed(SHORT, {"select.views_count": "auto", "select.policy": "coverage"})
@@ -89,7 +89,7 @@ def test_given_weights_stand() -> None:
         distill(PRIOR, 200, targets, changed(SHORT, {"select.views_count": 3, "select.policy": "best"}))
 
 
-def test_selects_once_unless_asked(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_views_are_selected_once_by_default(monkeypatch: pytest.MonkeyPatch) -> None:
     import g2ard.stages.select as stage
 
     counts: list[int] = []
@@ -139,7 +139,7 @@ def test_an_interrupted_run_resumes_with_the_same_views(tmp_path: Path) -> None:
         distill(PRIOR, 600, targets, changed(config, {"select.views_count": 7}), work=tmp_path)
 
 
-def test_the_command_reports_what_it_left_out(command_line: CommandLine, tmp_path: Path) -> None:
+def test_the_command_reports_unchosen_views(command_line: CommandLine, tmp_path: Path) -> None:
     write_splats(tmp_path / "ball.ply", PRIOR)
     write_views(tmp_path / "pool.json", crowded())
     ask = ("distill", "ball.ply", "-n", 200, "--views", "pool.json", "--method", "paper", "--steps", 20)

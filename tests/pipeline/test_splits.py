@@ -58,7 +58,7 @@ def g2ard(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Program:
 
 
 class Watch:
-    """What each stage looked at: names of views."""
+    """Names of the views that each stage used."""
 
     def __init__(self) -> None:
         self.trained: list[set[str]] = []
@@ -92,7 +92,7 @@ def watch(monkeypatch: pytest.MonkeyPatch) -> Watch:
     return seen
 
 
-def test_select_takes_training_views_and_hands_the_others_on(folder: Path, g2ard: Program) -> None:
+def test_select_chooses_training_views_and_keeps_the_rest(folder: Path, g2ard: Program) -> None:
     g2ard("select", "ball.ply", "--views", "photos", "-k", 6, "-o", "chosen.json", "--json", "said.json")
     said = json.loads((folder / "said.json").read_text())
     order = [view["name"] for view in said["views"]]
@@ -213,7 +213,7 @@ def test_a_split_that_is_not_stated_is_one_line(command_line: CommandLine, folde
     assert "train.json: all of its 16 views are for training" in refused(command_line, folder, *ask, status=1)
 
 
-def test_training_on_test_views_is_said(command_line: CommandLine, folder: Path) -> None:
+def test_training_on_test_views_is_noted(command_line: CommandLine, folder: Path) -> None:
     look = ("--views", "photos", "--steps", 4, "-o")
     for command in ("recover", "adapt"):
         for split, words in (("all", "4 of the 16"), ("test", "4 of the 4"), ("train", None)):

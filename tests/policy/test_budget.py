@@ -88,8 +88,8 @@ def test_a_measured_budget_in_a_name(words: list[str], tmp_path: Path, command_l
     assert (code, told.count("\n")) == (2, 1), told
 
 
-def test_what_is_merged_on_keeps_its_parents() -> None:
-    """If the file came out too large: rows, flags and figures are those of both reductions."""
+def test_merging_further_keeps_parents() -> None:
+    """If the file is too large at first, rows, flags and figures are those of both reductions."""
     scene = checkered_ball(3000)
     first = simplify(scene, 1000)
     most = file_bytes(first.splats, "a.ply") // 2

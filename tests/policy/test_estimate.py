@@ -1,4 +1,4 @@
-"""What `distill --dry-run` says: counts exactly, seconds and bytes about."""
+"""`distill --dry-run`: exact counts, approximate seconds and bytes."""
 
 import json
 import subprocess
@@ -78,8 +78,8 @@ def test_a_dry_run_says_which_file_it_writes(tmp_path: Path, command_line: Comma
 
 @pytest.mark.skipif(peak_rss() is None, reason="the system tells no memory")
 @pytest.mark.parametrize("source", ["scene", "photos"])
-def test_memory_is_about_what_the_run_takes(source: str, tmp_path: Path) -> None:
-    """Includes the program itself, most of it for a small scene."""
+def test_the_estimate_of_memory_is_close(source: str, tmp_path: Path) -> None:
+    """The estimate includes the program itself, which dominates for a small scene."""
     if source == "scene":
         g2ard.save(tmp_path / "ball.ply", ball(20_000))
         ask = ["distill", "ball.ply", "-r", "4", "--steps", "12", "--size", "320"]

@@ -1,4 +1,4 @@
-"""Cameras beside a scene: used where no views are given, said, and left where they do not fit."""
+"""Cameras beside a scene: used without `--views`, reported, and skipped if they do not fit."""
 
 import json
 from collections.abc import Callable

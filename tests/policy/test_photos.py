@@ -31,7 +31,7 @@ def test_photos_alone_are_enough(points: bool, command_line: CommandLine, tmp_pa
     assert "give a SCENE, or photos" in refused(command_line, tmp_path, "distill", "-n", 500, "-o", "run")
 
 
-def test_a_result_that_outweighs_the_photos_points_says_so(command_line: CommandLine, tmp_path: Path) -> None:
+def test_a_result_larger_than_its_points_is_noted(command_line: CommandLine, tmp_path: Path) -> None:
     photos_of(tmp_path / "photos", points=True)
     ask = ("distill", "--views", "photos", "-n", 900, "--steps", 3)
     error = command_line(*ask, "-o", "run", cwd=tmp_path)[2]
@@ -40,7 +40,7 @@ def test_a_result_that_outweighs_the_photos_points_says_so(command_line: Command
     assert "lifted as they are" not in light, light
 
 
-def test_points_within_sight_lie_on_what_is_seen(tmp_path: Path) -> None:
+def test_points_within_sight_lie_on_the_surface(tmp_path: Path) -> None:
     photos_of(tmp_path / "photos")
     cameras = g2ard.load_views(tmp_path / "photos")
     found = points_within_sight(cameras, 600)

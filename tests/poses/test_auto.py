@@ -1,4 +1,4 @@
-"""What `auto` joins: poses within rooms, near views, places from where an open scene is in focus."""
+"""Pools of kind `auto`: poses within rooms, near views, and places from where an open scene is in focus."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from reference import poses as naive
 
 
 def tell(done: int, total: int) -> None:
-    """Nobody listens."""
+    """Ignore progress."""
 
 
 @pytest.fixture(scope="module")
@@ -59,7 +59,7 @@ def test_a_room_is_seen_from_within(room) -> None:
 
 
 @pytest.mark.parametrize("make", [naive.statue, naive.town])
-def test_nobody_stands_inside_objects_and_houses(make) -> None:
+def test_no_pose_stands_inside_objects_or_houses(make) -> None:
     site = Site.of(make())
     inside = find_inside(site, 0)
     assert inside.share < 0.005
@@ -95,7 +95,7 @@ def test_poses_in_focus_are_full_fine_and_free(open_scene) -> None:
 
 
 @pytest.mark.parametrize("layers", [400, 1500])
-def test_what_hides_behind_its_sky_is_not_seen_from_around(open_scene, layers) -> None:
+def test_a_scene_behind_its_sky_is_not_orbited(open_scene, layers) -> None:
     up = fibonacci(layers, low=0.0)
     pool = plan_pool(naive.joined(open_scene, naive.discs(6.2 * up, up, 2.0)), 24)
     assert "orbit" not in pool.kind
@@ -161,7 +161,7 @@ def test_a_pool_grows_where_a_view_holds_little_of_the_scene(make, grown) -> Non
         assert more.unseen < plain.unseen + 0.02
 
 
-def test_some_step_nearer_to_what_is_seen_under_a_pixel_only() -> None:
+def test_poses_step_nearer_to_matter_under_a_pixel() -> None:
     statue = naive.statue()
     fine = replace(statue, scales=statue.scales * np.float32(0.1))
     coarse, fair = plan_pool(fine, 32, near=0.25), plan_pool(statue, 32, near=0.25)
@@ -178,7 +178,7 @@ def test_pools_for_looks_step_nearer_where_a_view_holds_little(room) -> None:
     assert "near" not in plan_pool(naive.statue(), 32, near=0.25, looks=True).kind
 
 
-def test_a_pool_tells_what_it_does_not_see(room) -> None:
+def test_a_pool_reports_its_unseen_share(room) -> None:
     all_around, few = plan_pool(room, 64), plan_pool(room, 1)
     assert all_around.unseen < 0.3
     assert few.unseen > 0.6

@@ -1,4 +1,4 @@
-"""What pools of poses are planned with: even sequences, fair orders, the occupancy grid, the ground."""
+"""Parts of the pose planners: even sequences, fair orders, the occupancy grid, the ground."""
 
 from __future__ import annotations
 

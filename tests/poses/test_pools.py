@@ -33,7 +33,7 @@ def scenes() -> dict[str, Splats]:
 
 
 def inside_matter(name: str, eyes: np.ndarray) -> np.ndarray:
-    """By geometry alone: in a solid or hollow body, under the ground, or outside the room."""
+    """Return whether a position is in a solid or hollow body, under the ground, or outside the room."""
 
     def within(low, high, margin=0.0):
         return ((eyes > np.array(low) - margin) & (eyes < np.array(high) + margin)).all(axis=1)
@@ -139,7 +139,7 @@ def test_row_order_does_not_show(name, scenes) -> None:
     np.testing.assert_array_equal(here.viewmats, there.viewmats)
 
 
-def test_row_order_does_not_show_among_alike_rows() -> None:
+def test_the_order_of_equal_rows_does_not_matter() -> None:
     points = np.random.default_rng(0).normal(size=(3000, 3))
     splats = Splats.create(points, scales=np.full((3000, 3), 0.05))
     mixed = splats.take(np.random.default_rng(1).permutation(3000))
@@ -235,7 +235,7 @@ def test_tiny_scenes_are_looked_at_from_outside(splats) -> None:
         ({"kind": "walk"}, "free place .*`g2ard poses --kind`.*give views"),
     ],
 )
-def test_what_cannot_be_is_one_clear_error(change, words) -> None:
+def test_invalid_requests_are_one_clear_error(change, words) -> None:
     with pytest.raises(InputError, match=words):
         make_pool(one(), **{"count": 4, **change})
 
@@ -247,7 +247,7 @@ def test_invisible_scenes_are_refused() -> None:
         make_pool(Splats.create([[np.nan, 0, 0]], scales=[[1, 1, 1]]))
 
 
-def test_progress_is_told(scenes) -> None:
+def test_progress_is_reported(scenes) -> None:
     seen = []
     make_pool(scenes["statue"], 8, progress=lambda *a: seen.append(a))
     assert seen[-1][1:3] == (8, 8)

@@ -49,7 +49,7 @@ def maps(image: np.ndarray, backbone: dict) -> list[np.ndarray]:
     return out
 
 
-def test_distance_is_what_a_naive_network_says() -> None:
+def test_the_distance_equals_a_naive_networks() -> None:
     rng = np.random.default_rng(0)
     a, b = rng.random((70, 66, 3), np.float32), rng.random((70, 66, 3), np.float32)
     backbone, linear = weights()
@@ -73,7 +73,7 @@ def test_evaluate_scores_with_it() -> None:
     assert evaluate(ball, TeacherRenders(ball, views)).as_dict()["lpips"] is None
 
 
-def test_weights_come_from_a_folder_and_nowhere_else(tmp_path: Path) -> None:
+def test_weights_are_read_from_a_folder_only(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no LPIPS weights"):
         load_lpips(tmp_path)
     backbone, linear = weights()

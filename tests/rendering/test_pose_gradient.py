@@ -77,7 +77,7 @@ def test_its_bits_do_not_depend_on_threads() -> None:
     assert len(set(on_threads(gradient))) == 1
 
 
-def test_it_follows_a_render_and_no_depth() -> None:
+def test_a_pose_gradient_needs_a_forward_pass() -> None:
     arrays = arrays_of(checkered_ball(50))
     with pytest.raises(InputError, match="pose gradient: expected a forward pass before it"):
         _core.Rasterizer().pose_gradient(arrays, np.zeros((4, 4, 3), np.float32))

@@ -236,7 +236,7 @@ def test_calls_are_independent() -> None:
         assert torch.allclose(m.grad, expected, rtol=1e-5, atol=1e-6)  # type: ignore[arg-type]
 
 
-def test_visibility_counts_what_the_oracle_counts() -> None:
+def test_visibility_equals_the_oracles() -> None:
     p = scene(4, 150, 0, size=0.1)
     cameras = camera(48, 36)
     want, _ = oracle(p, cameras, RasterSettings(), (0, 0, 0))

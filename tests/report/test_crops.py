@@ -1,4 +1,4 @@
-"""Regions of interest in reports: where a view is worst, or as asked for, at the images' own resolution."""
+"""Regions of interest in reports: the worst part of a view, or a given one, at full resolution."""
 
 import base64
 import json
@@ -91,7 +91,7 @@ def test_command(command_line: CommandLine, tmp_path: Path) -> None:
     assert command_line(*common, "--crop", "9,9,9,9", "-o", "none", cwd=tmp_path)[0] == 2
 
 
-def test_a_crop_s_caption_says_whose_figure_it_gives() -> None:
+def test_the_caption_of_a_crop_names_its_image() -> None:
     page = Page("report", "")
     grey = np.full((60, 80, 3), 128, np.uint8)
     page.comparison(Comparison("view", grey, [Shown("small", grey // 2, "23.40 dB")]))

@@ -30,7 +30,7 @@ def test_the_page_works_in_a_browser(tmp_path: Path) -> None:
     assert dom.count('src="data:image/jpeg;base64,') == 8  # a pair and two crops of three
 
 
-def test_pareto_is_what_no_other_beats() -> None:
+def test_pareto_points_are_beaten_by_none() -> None:
     rng = np.random.default_rng(0)
     points = [Point(x, y, 0) for x, y in rng.normal(size=(60, 2)).round(1)]
     expected = {

@@ -1,4 +1,4 @@
-"""What simplification sees, painted on the scene, and the command that renders it."""
+"""Simplification's cells and flags painted on the scene, and the command that renders them."""
 
 from pathlib import Path
 

@@ -130,7 +130,7 @@ def test_undistorted_photo_is_the_pinhole_picture(tmp_path: Path, scale: int) ->
     assert np.abs(undone[inside] - expected[inside]).max() > 0.02  # it was distorted
 
 
-def test_what_cannot_be_loaded_is_named(tmp_path: Path) -> None:
+def test_photos_that_cannot_be_loaded_are_named(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"view 0 \(view\) has no photo"):
         load_image(camera(None, (4, 4)), 0)
     with pytest.raises(InputError, match=r"gone\.png: no such photo"):

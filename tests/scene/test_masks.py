@@ -1,4 +1,4 @@
-"""Masks and exposures: found where a scene has them, and then only what counts counts."""
+"""Masks and exposures: found beside photos, and respected by training and scores."""
 
 import json
 from dataclasses import replace
@@ -96,7 +96,7 @@ def test_transforms_json_names_masks(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("engine", ["fused", "torch"])
-def test_what_a_mask_hides_does_not_matter(student: Splats, tmp_path: Path, engine: Any) -> None:
+def test_masked_content_does_not_matter(student: Splats, tmp_path: Path, engine: Any) -> None:
     config = RecoverConfig(steps=30, engine=engine, regularizers=BARE)
     found = [
         recover(student, Photos(photographed(tmp_path / str(spoil), spoil=spoil)), config)
@@ -107,7 +107,7 @@ def test_what_a_mask_hides_does_not_matter(student: Splats, tmp_path: Path, engi
     assert found[0].report.psnr == found[1].report.psnr
 
 
-def test_masked_photos_teach_what_whole_ones_do(student: Splats, tmp_path: Path) -> None:
+def test_masked_photos_teach_like_whole_ones(student: Splats, tmp_path: Path) -> None:
     config = RecoverConfig(steps=150)
     whole = Photos(photographed(tmp_path / "whole", masks=False))
     scores = [
@@ -120,7 +120,7 @@ def test_masked_photos_teach_what_whole_ones_do(student: Splats, tmp_path: Path)
     assert scores[0] > scores[1] + 3
 
 
-def test_both_engines_step_alike_under_a_mask(student: Splats, tmp_path: Path) -> None:
+def test_both_engines_agree_under_a_mask(student: Splats, tmp_path: Path) -> None:
     targets = Photos(photographed(tmp_path, spoil=1.0))
     losses = [
         recover(student, targets, RecoverConfig(steps=3, engine=engine, regularizers=BARE)).report.loss
@@ -129,7 +129,7 @@ def test_both_engines_step_alike_under_a_mask(student: Splats, tmp_path: Path) -
     assert losses[0] == pytest.approx(losses[1], abs=2e-4)
 
 
-def test_metrics_look_only_where_the_mask_says() -> None:
+def test_metrics_use_unmasked_pixels_only() -> None:
     rng = np.random.default_rng(0)
     a = rng.random((40, 50, 3)).astype(np.float32)
     mask = np.zeros((40, 50), bool)

@@ -38,7 +38,7 @@ def around(count: int = 12) -> Cameras:
 @pytest.mark.parametrize("method", ["default", "fast"])
 @pytest.mark.parametrize("unit", [2.0**-10, 0.5, 2.0**9])
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_what_views_see_scales_by_powers_of_two_exactly(method, unit, dtype):
+def test_visibility_scales_exactly_by_powers_of_two(method, unit, dtype):
     scene, cameras = replace(ball(), means=ball().means.astype(dtype)), around()
     small, near = in_units(scene, cameras, unit)
     here = simplify(scene, 150, method=method, visibility=visibility_source(cameras))

@@ -1,4 +1,4 @@
-"""Which views are for training and which are held out."""
+"""Splits of views into training and held-out ones."""
 
 import json
 from pathlib import Path

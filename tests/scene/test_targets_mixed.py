@@ -1,4 +1,4 @@
-"""Of each view its photo where there is one, else the dense scene's render: in training and in scores."""
+"""Mixed targets: a view's photo if it has one, otherwise the dense scene's render."""
 
 import json
 from dataclasses import replace

@@ -28,7 +28,7 @@ def test_a_moved_scene_looks_the_same_from_moved_cameras(degree: int) -> None:
         assert np.abs(render(wrong, after[0]).image - render(splats, views[0]).image).max() > 0.05
 
 
-def test_a_full_turn_in_three_steps_is_none() -> None:
+def test_three_thirds_of_a_turn_are_the_identity() -> None:
     splats, third = directional(), turn(1)
     a, b = turn(2), turn(3)
     rest = np.linalg.inv(third @ b @ a)
@@ -59,7 +59,7 @@ def test_offsets_move_along() -> None:
         (np.diag([0, 0, 0, 1]), "flattens"),
     ],
 )
-def test_matrices_that_are_no_similarity(given: np.ndarray, message: str) -> None:
+def test_matrices_that_are_not_similarities_are_rejected(given: np.ndarray, message: str) -> None:
     with pytest.raises(InputError, match=message):
         similarity(given)
 

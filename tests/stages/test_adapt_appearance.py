@@ -42,14 +42,14 @@ def test_a_change_of_light_is_found_and_made() -> None:
         np.testing.assert_allclose(got, want, atol=0.02)
 
 
-def test_no_change_of_light_is_none() -> None:
+def test_an_unchanged_light_gives_the_identity() -> None:
     ball = checkered_ball(500)
     change = colour_change(ball, TeacherRenders(ball, VIEWS), (0.0, 0.0, 0.0))
     np.testing.assert_allclose(change.matrix, np.eye(3), atol=1e-6)
     assert adapt(ball, TeacherRenders(ball, VIEWS), AdaptConfig(steps=5)).report.colour_change is None
 
 
-def test_masked_pixels_say_nothing(tmp_path: Path) -> None:
+def test_masked_pixels_are_ignored(tmp_path: Path) -> None:
     ball, lit = evening(500)
 
     class HalfBlack(TeacherRenders):
@@ -85,7 +85,7 @@ def test_a_blend_goes_its_share_of_the_way() -> None:
     np.testing.assert_array_equal(mixed.means, ball.means)
 
 
-def test_few_images_change_what_no_image_shows_too() -> None:
+def test_few_images_also_change_unseen_gaussians() -> None:
     """Three photos of one side: the other side gets the light but no noise."""
     ball, lit = evening(1500)
     targets = TeacherRenders(lit, VIEWS)
@@ -102,7 +102,7 @@ def test_few_images_change_what_no_image_shows_too() -> None:
     assert 0.3 < done.report.prior_share < 0.95
 
 
-def test_the_paper_s_schedule_takes_the_fit_as_it_is() -> None:
+def test_the_papers_schedule_blends_nothing() -> None:
     ball, lit = evening(300)
     done = adapt(ball, TeacherRenders(lit, VIEWS), AdaptConfig(steps=20, schedule="paper"))
     assert (done.report.colour_change, done.report.prior_share) == (None, 0.0)

@@ -1,4 +1,4 @@
-"""What `g2ard clean` takes, and what it leaves."""
+"""`g2ard clean`: Gaussians that it removes and keeps."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -68,7 +68,7 @@ def test_the_invisible_are_invisible() -> None:
         assert psnr(np.clip(without, 0, 1), np.clip(with_all, 0, 1)) > 55
 
 
-def test_what_no_view_looks_at_stays() -> None:
+def test_gaussians_outside_all_views_stay() -> None:
     splats, _ = junk()
     view = around(24).take([0])
     behind = replace(splats, means=splats.means + (100 * view.positions[0]).astype(np.float32))
@@ -78,8 +78,8 @@ def test_what_no_view_looks_at_stays() -> None:
     np.testing.assert_array_equal(found.kind >= 0, splats.logit_opacities < -5.54)
 
 
-def test_what_lies_behind_a_wall_stays() -> None:
-    """What stands behind the wall is in the frame, but no view sees it."""
+def test_gaussians_behind_a_wall_stay() -> None:
+    """Gaussians behind the wall are in the frame, but no view sees them."""
     x, z = np.meshgrid(np.linspace(-3, 3, 61), np.linspace(-3, 3, 61))
     means = np.stack([x.ravel(), np.zeros(x.size), z.ravel()], 1)
     wall = Splats.create(means, scales=np.full((x.size, 3), 0.1), logit_opacities=np.full(x.size, 9.0))
@@ -98,7 +98,7 @@ def test_what_lies_behind_a_wall_stays() -> None:
     assert (kinds[x.size : -1] < 0).all()
 
 
-def test_a_chain_of_thin_ones_is_no_needle() -> None:
+def test_a_chain_of_thin_gaussians_is_not_a_needle() -> None:
     """A string: each end lies inside the next Gaussian."""
     along = np.linspace(-1, 1, 21)[:, None] * [1, 0, 0]
     string = Splats.create(along, scales=np.tile([0.05, 0.001, 0.001], (21, 1)), logit_opacities=[3] * 21)

@@ -95,7 +95,7 @@ def test_command(command_line: CommandLine, tmp_path: Path) -> None:
     assert "--photos goes with --teacher" in refused(command_line, tmp_path, "evaluate", *common, "--photos")
 
 
-def test_sizes_say_of_what_they_are(command_line: CommandLine, folder: Path) -> None:
+def test_reports_state_file_sizes(command_line: CommandLine, folder: Path) -> None:
     assert command_line("convert", "ball.ply", "ball.sog", cwd=folder)[0] == 0
     assert command_line("convert", "ball.ply", "folder/meta.json", cwd=folder)[0] == 0
     ask = ("evaluate", "ball.ply", "ball.sog", "folder", "--teacher", "ball.ply", "--views", "views.json")

@@ -195,7 +195,7 @@ def test_both_engines_limit_the_same_gaussians(student: Splats, targets: Teacher
     assert np.linalg.norm(fused.means - student.means) < 0.8 * np.linalg.norm(free.means - student.means)
 
 
-def test_a_start_that_is_nearly_there_takes_small_steps_without_trials(targets: TeacherRenders) -> None:
+def test_a_nearly_perfect_start_takes_small_steps_without_trials(targets: TeacherRenders) -> None:
     near = replace(TEACHER, sh0=TEACHER.sh0 + np.float32(0.004))
     report = recover(near, targets, RecoverConfig(recovery_time=0.05)).report
     assert report.trials == ()
@@ -203,7 +203,7 @@ def test_a_start_that_is_nearly_there_takes_small_steps_without_trials(targets: 
 
 
 @pytest.mark.parametrize("engine", ["fused", "torch"])
-def test_masked_gaussians_are_left_alone(student: Splats, engine: Any) -> None:
+def test_gaussians_behind_a_mask_do_not_change(student: Splats, engine: Any) -> None:
     kept = 20  # columns that count
 
     class Masked(TeacherRenders):
@@ -269,7 +269,7 @@ def test_progress_figures(student: Splats, targets: TeacherRenders, monkeypatch:
         assert float(value) == pytest.approx(want, abs=0.0051)
 
 
-def test_watching_costs_no_time_and_changes_no_bit(student: Splats, targets: TeacherRenders) -> None:
+def test_watching_costs_no_counted_time_and_changes_no_bit(student: Splats, targets: TeacherRenders) -> None:
     counts: list[tuple[int, float]] = []
 
     def watch(step: int, seconds: float, splats: Any) -> None:
@@ -377,7 +377,7 @@ def test_a_change_that_ends_too_low_is_cut_back() -> None:
     assert Guard(score, ball, 0.0).judge(end)[0] is ball
 
 
-def test_views_of_another_kind_decide_what_stays() -> None:
+def test_validation_views_scale_back_harmful_changes() -> None:
     start = checkered_ball(4)
     end = replace(start, means=start.means + 1)
     views = np.array([1.0, 5.0, 20.0, 400.0])

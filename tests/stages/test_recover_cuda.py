@@ -60,7 +60,7 @@ def oracle_rasterization(**given: Any) -> tuple[torch.Tensor, None, None]:
     return out.image[None].float(), None, None
 
 
-def test_the_engine_hands_gsplat_what_it_documents(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_engine_passes_gsplats_documented_arguments(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "gsplat", SimpleNamespace(rasterization=oracle_rasterization))
     monkeypatch.setattr(gsplat_engine, "check_cuda", lambda: None)
     monkeypatch.setattr(gsplat_engine.GsplatEngine, "device", torch.device("cpu"))
@@ -88,7 +88,7 @@ def test_the_loss_in_plain_torch_is_the_fused_one() -> None:
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a CUDA device")
-def test_without_cuda_one_line_says_so(tmp_path: Path, command_line: CommandLine) -> None:
+def test_without_cuda_the_error_is_one_line(tmp_path: Path, command_line: CommandLine) -> None:
     with pytest.raises(InputError, match="torch finds no CUDA device"):
         recover(BALL, TARGETS, RecoverConfig(steps=1, engine="gsplat"))
     io.write_splats(tmp_path / "b.ply", BALL)

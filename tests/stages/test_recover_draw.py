@@ -51,14 +51,14 @@ def test_every_epoch_draws_within_one_of_the_weights(raw: list[float], epoch: in
     assert not counts[weights == 0].any()
 
 
-def test_many_epochs_draw_what_the_weights_say() -> None:
+def test_many_epochs_draw_views_by_weight() -> None:
     weights = checked_weights(np.random.default_rng(0).random(20) ** 3, 20)
     counts = sum(np.bincount(drawn(1, epoch, 20, weights), minlength=20) for epoch in range(400))
     np.testing.assert_allclose(counts / 400, weights, atol=0.08)
 
 
 @pytest.mark.parametrize("value", [1.0, 0.3, 7e-200])
-def test_equal_weights_draw_as_no_weights(value: float) -> None:
+def test_equal_weights_draw_like_no_weights(value: float) -> None:
     weights = checked_weights(np.full(23, value), 23)
     for epoch in range(3):
         np.testing.assert_array_equal(drawn(5, epoch, 23, weights), drawn(5, epoch, 23))

@@ -136,7 +136,7 @@ def test_steps_are_torch_s(degree: int, isa: str) -> None:
 
 
 @pytest.mark.parametrize("isa", _core.instruction_sets())
-def test_what_is_large_in_a_view_moves_less(isa: str) -> None:
+def test_large_gaussians_on_screen_move_less(isa: str) -> None:
     p, cameras, targets = problem()
     p["log_scales"][::7] += 2
     p["log_scales"][::7, 1] -= 9
@@ -173,7 +173,7 @@ def test_sizes_on_the_screen_are_the_naive_ones() -> None:
 
 
 def test_dense_steps_are_torch_optim_s() -> None:
-    """With every Gaussian in view, sparse Adam is `torch.optim.Adam`."""
+    """Sparse Adam equals `torch.optim.Adam` if every Gaussian is in view."""
     p, cameras, targets = problem(n=60)
     p["means"] *= 0.5
     p["logit_opacities"] = np.abs(p["logit_opacities"])
@@ -248,7 +248,7 @@ def test_bits_do_not_depend_on_threads() -> None:
     ],
 )
 def test_regularizers_are_torch_s(weights: Regularizers) -> None:
-    """From a scene that has left its anchors, with needles: the step follows the summed gradient."""
+    """The step follows the summed gradient, from a scene with needles that has left its anchors."""
     p, cameras, targets = problem(n=100, degree=0)
     anchors = Anchors.of(splats_of(p))
     rng = np.random.default_rng(3)

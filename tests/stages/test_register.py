@@ -1,4 +1,4 @@
-"""Photos registered: what is kept, what is refused, how it is scored, and the command's contract."""
+"""Registration of photos: results kept and refused, scores, and the command's contract."""
 
 import json
 from dataclasses import replace
@@ -63,7 +63,7 @@ def test_poses_as_text_are_camera_from_world(site: Path) -> None:
         ("# nothing\n", "no poses found"),
     ],
 )
-def test_text_that_holds_no_poses_is_refused(text: str, words: str, tmp_path: Path) -> None:
+def test_text_without_poses_is_rejected(text: str, words: str, tmp_path: Path) -> None:
     (tmp_path / "p.txt").write_text(text)
     with pytest.raises(InputError, match=words):
         ace.read(tmp_path / "p.txt")
@@ -225,8 +225,8 @@ def test_photos_to_poses_to_an_adapted_scene(site: Path, command_line: CommandLi
     assert after > before + 3
 
 
-def test_all_keeps_the_start_of_what_has_no_pose(site: Path) -> None:
-    """As in GS-CPR; the scores count it."""
+def test_keep_all_writes_the_start_of_photos_without_a_pose(site: Path) -> None:
+    """The scores count a photo that keeps its start, as in GS-CPR."""
     pytest.importorskip("pycolmap")
     photos = photos_of(site / "views.json")
     starts = {name: off(pose, 0.05, 1, 3) for name, pose in read_poses(site / "views.json").items()}
@@ -269,7 +269,9 @@ def test_broken_photos_are_refused_rows(site: Path, command_line: CommandLine, t
         assert (tmp_path / "page.html").is_file()
 
 
-def test_what_keeps_its_start_is_in_the_report(site: Path, command_line: CommandLine, tmp_path: Path) -> None:
+def test_photos_that_keep_their_start_are_in_the_report(
+    site: Path, command_line: CommandLine, tmp_path: Path
+) -> None:
     (tmp_path / "wild.py").write_text(
         "import numpy as np\n"
         "def match(photo, render):\n"

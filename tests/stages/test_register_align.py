@@ -61,7 +61,7 @@ def test_normal_equations_are_the_twins(seed: int, masked: bool) -> None:
 
 @settings(max_examples=15, deadline=None)
 @given(st.integers(0, 10_000))
-def test_what_a_render_is_to_alignment_is_the_twins(seed: int) -> None:
+def test_the_render_for_alignment_equals_the_twins(seed: int) -> None:
     rng = np.random.default_rng(seed)
     shape = int(rng.integers(1, 9)), int(rng.integers(1, 12))
     image = rng.uniform(-0.2, 1.3, (*shape, 3)).astype(np.float32)
@@ -90,7 +90,7 @@ def test_local_zncc_is_the_twins(seed: int) -> None:
     assert local_zncc(a, b, mask, 5) == pytest.approx(twin.local_zncc(a, b, mask, 5), abs=1e-9)
 
 
-def test_zncc_knows_alike_from_unlike() -> None:
+def test_zncc_separates_similar_from_different_images() -> None:
     rng = np.random.default_rng(0)
     a, other = rng.random((2, 40, 50))
     everywhere = np.ones(a.shape, bool)
@@ -140,7 +140,7 @@ def test_known_errors_are_taken_back(view: int) -> None:
     assert np.linalg.eigvalsh(found.covariance)[0] > 0
 
 
-def test_what_is_hidden_does_not_count() -> None:
+def test_masked_pixels_do_not_count() -> None:
     """A mask over a painted block: without it the block pulls, with it the pose is as good as before."""
     camera = around(5, (160, 120), 2.5)[2]
     renderer = Renderer(BALL)

@@ -1,4 +1,4 @@
-"""Features: matches against a naive twin, points lifted, poses solved, and matchers that are not."""
+"""Features: matches against a naive twin, lifted points, solved poses, and invalid matchers."""
 
 import subprocess
 import sys
@@ -141,7 +141,7 @@ def test_features_find_the_pose(tmp_path: Path) -> None:
     assert all(row.inliers == 0 and row.reprojection is None for row in direct.report.photos)
 
 
-def test_both_are_no_worse_than_the_better_of_two(tmp_path: Path) -> None:
+def test_features_and_alignment_are_no_worse_than_either(tmp_path: Path) -> None:
     pytest.importorskip("pycolmap")
     views = _photographed(tmp_path)
     truth = dict(zip(views.names, views.viewmats, strict=True))
@@ -227,7 +227,7 @@ def test_extras_name_pycolmap_where_it_has_wheels() -> None:
                     assert named == ((system, machine) in module._WHEELS)
 
 
-def test_a_pycolmap_that_does_not_load_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_pycolmap_that_does_not_load_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("pycolmap")
 
     def broken(name: str) -> None:
@@ -289,7 +289,7 @@ def _one_view(folder: Path) -> None:
 
 
 @pytest.mark.parametrize(("gain", "bias"), [(0.6, 0.0), (1.6, 0.0), (1.0, 0.1), (1.0, -0.1)])
-def test_light_moves_no_pose(gain: float, bias: float, tmp_path: Path) -> None:
+def test_a_change_of_light_does_not_move_the_pose(gain: float, bias: float, tmp_path: Path) -> None:
     """The pose changes by less than a tenth of what registration corrects."""
     pytest.importorskip("pycolmap")
     view = around(2, (400, 300), 2.5)[0]
@@ -301,8 +301,8 @@ def test_light_moves_no_pose(gain: float, bias: float, tmp_path: Path) -> None:
     assert row.error.rotation < 0.1 * row.start_error.rotation
 
 
-def test_an_occluder_is_no_error_of_the_pose(tmp_path: Path) -> None:
-    """A fifth of the photo is something else, and the pose is right within 2σ."""
+def test_an_occluder_does_not_move_the_pose(tmp_path: Path) -> None:
+    """The pose is right within 2σ although a fifth of the photo is foreign."""
     pytest.importorskip("pycolmap")
     rng = np.random.default_rng(4)
     for i in range(2):

@@ -1,4 +1,4 @@
-"""Polishing: its energy's gradient, its minimum, and what features hold it to."""
+"""Polishing: its energy's gradient, its minimum, and the features' prior."""
 
 from dataclasses import replace
 

@@ -246,7 +246,7 @@ def test_auto_reaches_first():
     assert unreached[0].tolist() == [0, 1, 3, 4]  # nothing like anything: usable ones in the order given
 
 
-def test_of_views_alike_the_one_that_sees_more_is_taken():
+def test_among_similar_views_the_one_that_sees_more_wins():
     """Five pairs of twins; the second of each sees more."""
     alike = np.kron(np.eye(5), np.ones((2, 2)))
     shares = np.tile([0.2, 0.3], 5)
@@ -254,7 +254,7 @@ def test_of_views_alike_the_one_that_sees_more_is_taken():
     assert set(order[:5].tolist()) == {1, 3, 5, 7, 9}
 
 
-def test_outlooks_count_what_lies_in_front():
+def test_outlooks_count_surface_in_front():
     scene = ball()
     coarse = surface(scene, 2000)
     facing, back = views([[0, -4.0, 0], [0, -4.0, 0]]), views([[0, -4.0, 0]], targets=[[0, -8.0, 0]])
@@ -369,7 +369,7 @@ def test_invalid_arguments_are_named(k, policy, words):
 
 
 @pytest.mark.parametrize("policy", ["auto", "directional"])
-def test_refuses_images_no_raster_takes(policy):
+def test_images_too_large_for_the_rasteriser_are_rejected(policy):
     pool = around(3)
     huge = replace(pool, widths=np.array([64, 60_000, 64]))
     with pytest.raises(InputError, match=r"v001: expected at most 32768 pixels"):

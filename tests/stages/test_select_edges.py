@@ -1,4 +1,4 @@
-"""Pools that no one would make on purpose: through the function and through the command."""
+"""Degenerate pools, through the function and through the command."""
 
 import json
 from dataclasses import replace
@@ -53,7 +53,7 @@ def test_views_without_overlap_are_worth_the_same(policy: str) -> None:
 
 
 @pytest.mark.parametrize("policy", MEASURING)
-def test_duplicates_come_after_all_that_differ(policy: str) -> None:
+def test_duplicate_poses_are_chosen_last(policy: str) -> None:
     places = around(5).viewmats
     pool = cameras([places[i] for i in (0, 0, 0, 1, 1, 2, 3, 4, 4, 4)])
     first = {0: 0, 1: 0, 2: 0, 3: 1, 4: 1, 5: 2, 6: 3, 7: 4, 8: 4, 9: 4}
@@ -83,7 +83,7 @@ def test_the_curve_is_where_k_can_be_read_off() -> None:
     assert np.all(np.diff(few.curve) >= 0)
 
 
-def test_poses_that_are_no_poses_are_refused() -> None:
+def test_invalid_poses_are_rejected() -> None:
     pool = around(3)
     for field, value, words in (
         ("viewmats", np.nan, "view 1 .*not finite"),

@@ -1,4 +1,4 @@
-"""Simplification: what must hold whatever the policy, and the command."""
+"""Simplification: properties of every method, and the command."""
 
 import json
 from dataclasses import replace
@@ -131,7 +131,7 @@ def test_floaters_that_fade_are_counted():
     assert set(np.flatnonzero(faint)) == set(out.parents[:40][faint[out.parents[:40]]])
 
 
-def test_the_paper_says_what_it_skipped():
+def test_the_papers_schedule_reports_skipped_steps():
     prior = scene(2000)
     out = simplify(prior, 1500, method="paper")
     assert out.report.skipped["coverages"] == sum(r.refused["energy"] for r in out.report.rounds)
@@ -142,7 +142,7 @@ def test_the_paper_says_what_it_skipped():
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_what_is_dropped_is_told_where_nothing_merges(method):
+def test_dropped_rows_are_reported_even_if_nothing_merges(method):
     faint = replace(scene(1000), logit_opacities=np.where(np.arange(1000) < 300, -9, 3).astype(np.float32))
     out = simplify(faint, 700, method=method)
     assert (out.parents == -1).tolist() == [True] * 300 + [False] * 700
@@ -215,7 +215,7 @@ def test_the_report_adds_up(method):
 
 @pytest.mark.parametrize("logit", [-16, -1e4, -np.inf])
 @pytest.mark.parametrize("method", METHODS)
-def test_a_scene_of_which_nothing_shows_shrinks_evenly(method, logit):
+def test_an_invisible_scene_shrinks_evenly(method, logit):
     rng = np.random.default_rng(6)
     prior = Splats.create(
         rng.uniform(-1, 1, (2000, 3)), scales=np.full((2000, 3), 0.05), logit_opacities=np.full(2000, logit)

@@ -1,4 +1,4 @@
-"""The policies default and fast: clusters against their float64 twins, and what views see of them."""
+"""The methods default and fast: clusters against their float64 twins, and visibility."""
 
 from dataclasses import replace
 from typing import Any
@@ -18,7 +18,7 @@ from reference import simplify as naive
 
 
 @pytest.mark.parametrize(("method", "least"), [("default", 0.6), ("fast", 0.55)])  # fast cuts coarser
-def test_what_is_seen_is_kept_finer(method, least):
+def test_visible_gaussians_keep_more_detail(method, least):
     prior = scene(4000)
     left = prior.means[:, 0] < 0
     seen = Views(np.where(left, 100.0, 0.0), np.where(left, 0.01, np.inf))
@@ -32,7 +32,7 @@ def test_what_is_seen_is_kept_finer(method, least):
         simplify(prior, 400, method=method, visibility=Views(np.ones(3), np.ones(4000)))
 
 
-def test_a_function_of_visibility_is_asked_again_for_the_result():
+def test_visibility_is_measured_again_for_the_result():
     prior, asked = scene(4000), []
 
     def look(splats):
@@ -46,7 +46,7 @@ def test_a_function_of_visibility_is_asked_again_for_the_result():
     assert out.report.unseen == 0
 
 
-def test_what_no_view_sees_is_counted():
+def test_unseen_gaussians_are_counted():
     prior = scene(4000)
     unseen = prior.means[:, 0] < 0
 
@@ -129,7 +129,7 @@ def test_no_merged_cluster_is_dropped():
 
 @pytest.mark.parametrize("method", ["default", "fast"])
 @pytest.mark.parametrize("scale", [1.0, 2.0**-10])
-def test_what_is_seen_does_not_depend_on_the_order_of_rows(method, scale):
+def test_visibility_does_not_depend_on_the_order_of_rows(method, scale):
 
     wall, cameras = opaque_wall()
     viewmats = cameras.viewmats.copy()
@@ -144,7 +144,7 @@ def test_what_is_seen_does_not_depend_on_the_order_of_rows(method, scale):
     assert a.report.fitted > 40
 
 
-def test_bands_of_zeros_are_skipped_and_come_back():
+def test_bands_of_zeros_are_not_stored():
     prior = scene(600).with_sh_degree(1)
     padded = prior.with_sh_degree(3)
     a, b = simplify(prior, 60), simplify(padded, 60)

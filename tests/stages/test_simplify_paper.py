@@ -1,4 +1,4 @@
-"""The paper's policy: merging, trimming, dropping and flags against their float64 twins."""
+"""The paper's method: merging, trimming, dropping and flags against their float64 twins."""
 
 import numpy as np
 import pytest
@@ -205,7 +205,7 @@ def test_groups_of_one_color_bin_pass_the_energy(count, least):
     assert passed >= 100 * least
 
 
-def test_a_colour_ramp_is_no_texture():
+def test_a_colour_ramp_is_not_texture():
     points = sheet(4)
     ramp = 0.26 + 0.05 * points[:, :1]
     assert one_group(points, ramp).merged == 15
@@ -270,7 +270,7 @@ def test_coverage_parts_at_six_tenths_of_the_footprint_area(flat, passes):
 
 
 ALONE = SimplifyConfig(retention=1e-9, min_coverage=2)
-"""Nothing merges: what is left is what the trim keeps."""
+"""The trim alone decides which Gaussians stay, because nothing merges."""
 
 
 def thinned(areas, alphas, budget, flags=None):
@@ -286,7 +286,7 @@ def thinned(areas, alphas, budget, flags=None):
 
 
 @pytest.mark.parametrize("by", ["area", "opacity"])
-def test_protection_is_worth_eleven_times_the_mass_and_no_exemption(by):
+def test_protection_multiplies_priority_by_eleven_and_exempts_nothing(by):
     """(1 + λ_h p), λ_h = 10; "softly boosts optical mass … rather than granting a hard exemption"."""
     times = np.repeat([1.0, 10.5, 11.5], 20)
     flags = times == 1
@@ -298,7 +298,7 @@ def test_protection_is_worth_eleven_times_the_mass_and_no_exemption(by):
     np.testing.assert_array_equal(thinned(areas, alphas, 40), times != 1)
 
 
-def test_what_is_under_a_hundredth_opaque_goes_first_whatever_its_size():
+def test_opacity_below_a_hundredth_is_dropped_first():
     alphas = np.repeat([0.009, 0.011, 0.5], 40)
     areas = np.where(alphas == 0.5, 0.001, 1.0)
     areas[alphas == 0.009] = 4

@@ -35,7 +35,7 @@ def large_problem(seed: int, count: int = 12_000) -> Problem:
 
 
 def differing(problem: Problem) -> list[str]:
-    """What differs between thread counts; nothing, if all is well."""
+    """Return the arrays that differ between thread counts; empty if none does."""
     before = _core.num_threads()
     try:
         found = []

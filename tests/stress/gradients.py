@@ -13,7 +13,7 @@ from stress.scenes import NAMES, Params, Problem, random_problem, weighted
 __all__ = ["ENGINE_TOLERANCE", "TWIN_TOLERANCE", "Tally", "check_problem", "crossings"]
 
 TWIN_TOLERANCE, ENGINE_TOLERANCE = 1e-6, 1e-3
-"""Of max(|g|, 1e-3 of the class's largest |g|)."""
+"""Tolerance as a share of max(|g|, 1e-3 of the class's largest |g|)."""
 
 CENTRAL = ((-2, 1 / 12), (-1, -8 / 12), (1, 8 / 12), (2, -1 / 12))
 FORWARD = ((0, -25 / 12), (1, 48 / 12), (2, -36 / 12), (3, 16 / 12), (4, -3 / 12))
@@ -29,7 +29,7 @@ LONGER = (8.0, 4.0, 2.0, *LADDER[:2])
 
 @dataclass
 class Tally:
-    """What came of the cases of one parameter class."""
+    """Results of the cases of one parameter class."""
 
     central: int = 0
     one_sided: int = 0
@@ -46,7 +46,7 @@ class Tally:
 
 
 def crossings(a: Oracle, b: Oracle) -> list[str]:
-    """Which discrete decisions two renders differ in; none if they lie on one smooth piece."""
+    """Return the discrete decisions in which two renders differ; empty if they lie on one smooth piece."""
     mine, other = a.decisions, b.decisions
     if not torch.equal(mine["order"], other["order"]):
         same = torch.equal(mine["order"].sort().values, other["order"].sort().values)
@@ -79,7 +79,7 @@ class _Line:
         return self.known[step]
 
     def noise(self, h: float) -> float:
-        """What rounding of the functional's terms, each on its own, leaves uncertain in a slope."""
+        """Return the uncertainty of a slope due to rounding of the functional's terms."""
         out = self.render(0.0)[1]
         parts = torch.cat([out.image, out.alpha[..., None], out.depth[..., None]], -1)
         spread = float((parts * torch.from_numpy(self.problem.weights)).norm())

@@ -34,7 +34,7 @@ _PER_CLASS = 3
 
 @dataclass
 class Outcome:
-    """Everything a run found."""
+    """Results of a run."""
 
     tallies: dict[str, Tally] = field(default_factory=lambda: {name: Tally() for name in NAMES})
     problems: int = 0
@@ -49,7 +49,7 @@ class Outcome:
         return sum(tally.checked - tally.unsettled for tally in self.tallies.values())
 
     def close(self, errors: list[np.ndarray]) -> None:
-        """The verdict, once all cases are in."""
+        """Return the verdict over all cases."""
         every = np.concatenate(errors)
         self.pixels, self.worst_image_error = len(every), float(every.max())
         self.image_error = float(np.quantile(every, 0.999))

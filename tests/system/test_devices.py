@@ -33,7 +33,7 @@ SEEN_ALIKE = 0.999
 """Share of (view, cell) that must agree."""
 
 DECIBELS = 0.05
-"""What renders of a scene made on a GPU may lose against one made on the CPU."""
+"""PSNR (dB) that a scene made on a GPU may lose against one made on the CPU."""
 
 
 @pytest.fixture
@@ -245,7 +245,7 @@ def test_the_report_says_what_was_sent(tmp_path: Path, command_line: CommandLine
     assert "device" not in json.loads(out)
 
 
-def test_failures_are_told_when_they_happen(capsys: pytest.CaptureFixture, gpu: None) -> None:
+def test_failures_are_reported_at_once(capsys: pytest.CaptureFixture, gpu: None) -> None:
     common = dict.fromkeys(("overwrite", "verbose", "quiet", "json", "config")) | {"seed": 0, "threads": 0}
     run = Run("simplify", {**common, "device": "gpu"}, {})
     _core.set_device("gpu", 64)  # too small for a row
@@ -322,7 +322,7 @@ def test_without_an_adapter_one_line_and_the_cpu(
     assert json.loads(out) == {**json.loads(out), "adapters": []}
 
 
-def test_nothing_to_do_is_said(tmp_path: Path, command_line: CommandLine) -> None:
+def test_nothing_to_do_is_reported(tmp_path: Path, command_line: CommandLine) -> None:
     write_splats(tmp_path / "a.ply", checkered_ball(500))
     fast = ("simplify", "a.ply", "-r", "5", "--method", "fast", "-o", "b.ply", "--device", "gpu")
     told = succeeds(command_line, tmp_path, *fast).err
@@ -350,7 +350,7 @@ def _whole() -> None:
         )
 
 
-def test_a_gpu_in_software_is_told(command_line: CommandLine, folder: Path, gpu: None) -> None:
+def test_a_software_gpu_is_reported(command_line: CommandLine, folder: Path, gpu: None) -> None:
     found = devices.adapters()
     assert found
     if found[0].kind != "cpu":

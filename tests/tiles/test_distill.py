@@ -1,4 +1,4 @@
-"""Commands on scenes in tiles: files, refusals, and recovery with frozen surroundings."""
+"""Commands on scenes in tiles: files, rejected options, and recovery with frozen surroundings."""
 
 import json
 import os
@@ -114,7 +114,7 @@ def test_tiles_are_read_as_one_scene(command_line: CommandLine, folder: Path, tm
     assert (tmp_path / "one.ply").read_bytes() == (tmp_path / "two.ply").read_bytes()
 
 
-def test_a_killed_command_leaves_no_workers_and_goes_on(folder: Path, tmp_path: Path) -> None:
+def test_a_killed_command_leaves_no_workers_and_resumes(folder: Path, tmp_path: Path) -> None:
     words = ["simplify", folder / "town.ply", "-r", "10", "-o", tmp_path / "x.ply", "--tile-rows", "700"]
     command = [sys.executable, "-m", "g2ard", *map(str, words), "--workers", "2", "--no-views"]
     steps = tmp_path / ".x.ply.tiles" / "steps"
@@ -184,7 +184,7 @@ def test_distill_in_one_piece_heeds_memory(command_line: CommandLine, folder: Pa
     assert not list(tmp_path.iterdir())
 
 
-def test_memory_decides_how_many_work_and_nothing_else(folder: Path, tmp_path: Path) -> None:
+def test_memory_decides_only_the_number_of_workers(folder: Path, tmp_path: Path) -> None:
     store = ingest(folder / "town.ply", tmp_path / "tiles", tile_rows=2500)
     need = 10**9
     assert workers_for(store, Tiling(memory=need, cores=64)) < workers_for(

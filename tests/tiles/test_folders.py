@@ -1,4 +1,4 @@
-"""Folders of tiles and of work: one process at a time, damage found or mended, nothing of the user's lost."""
+"""Folders of tiles and of work: one process at a time, damage found or repaired, no user's file lost."""
 
 import subprocess
 import sys
@@ -38,7 +38,7 @@ def flipped(path: Path) -> None:
     path.write_bytes(content)
 
 
-def test_a_folder_has_one_holder_and_a_dead_one_is_none(tmp_path: Path) -> None:
+def test_a_folder_has_one_live_owner(tmp_path: Path) -> None:
     holds = (
         "import sys, time; from pathlib import Path; from g2ard.io.lock import locked\n"
         "with locked(Path(sys.argv[1])): print('held', flush=True); time.sleep(60)"
@@ -65,7 +65,9 @@ def test_two_ingests_do_not_meet(place: Path, tmp_path: Path) -> None:
     assert not (folder / LOCK).exists()
 
 
-def test_a_work_folder_takes_one_command(command_line: CommandLine, place: Path, tmp_path: Path) -> None:
+def test_a_work_folder_serves_one_command_at_a_time(
+    command_line: CommandLine, place: Path, tmp_path: Path
+) -> None:
     simplify = ("simplify", place / "town.ply", "-n", 300, *BLIND, "-o", "a.ply", "--work", "work")
     (tmp_path / "work").mkdir()
     with locked(tmp_path / "work"):
@@ -169,7 +171,7 @@ def test_killed_levels_leave_nothing_beside_the_output(tmp_path: Path) -> None:
         (("--no-views", "--scheduler", "tcp://127.0.0.1:9"), "no answer"),
     ],
 )
-def test_what_can_be_refused_first_is(
+def test_invalid_options_are_rejected_before_any_work(
     command_line: CommandLine,
     place: Path,
     tmp_path: Path,
@@ -203,7 +205,9 @@ def test_errors_leave_no_copy_of_the_scene(command_line: CommandLine, place: Pat
     assert [path.name for path in tmp_path.iterdir()] == ["a.ply"]
 
 
-def test_work_takes_no_folder_of_the_user(command_line: CommandLine, place: Path, tmp_path: Path) -> None:
+def test_work_rejects_a_folder_with_other_files(
+    command_line: CommandLine, place: Path, tmp_path: Path
+) -> None:
     tiled = ("simplify", place / "town.ply", "-n", 300, *BLIND)
     own, tiles = tmp_path / "own", tmp_path / "tiles"
     own.mkdir()

@@ -113,7 +113,7 @@ def test_neither_blocks_nor_order_decide(tmp_path: Path) -> None:
         assert_same_sets(halos_of(store), halos_of(first))
 
 
-def test_a_sample_decides_no_more_by_order(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_sample_does_not_depend_on_the_order(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("g2ard.tiles.pour._SAMPLE", 400)
     scene = town(20_000)
     source = saved(tmp_path / "town.ply", scene)
@@ -211,7 +211,7 @@ def test_the_same_again_is_skipped_and_another_refused(tmp_path: Path) -> None:
     assert len(list(folder.glob("tile-*.f32"))) == len(TileStore.open(folder).tiles)
 
 
-def test_foreign_folders_are_left_alone(tmp_path: Path) -> None:
+def test_foreign_folders_are_not_touched(tmp_path: Path) -> None:
     source = saved(tmp_path / "town.ply", town(100))
     (tmp_path / "letters").mkdir()
     (tmp_path / "letters" / "dear.txt").write_text("keep me")
@@ -296,7 +296,7 @@ def test_nothing_finite_leaves_nothing(tmp_path: Path) -> None:
     assert list((tmp_path / "tiles").iterdir()) == []
 
 
-def test_a_disk_with_too_little_room_is_told_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_too_little_disk_space_is_reported_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
     source = saved(tmp_path / "town.ply", town())
     monkeypatch.setattr("shutil.disk_usage", lambda path: SimpleNamespace(free=300_000))

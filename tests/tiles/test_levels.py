@@ -1,4 +1,4 @@
-"""Levels of detail in tiles: the same files as of the whole, exact counts, and nothing done twice."""
+"""Levels of detail in tiles: the same files as in one piece, exact counts, and no repeated work."""
 
 import json
 from pathlib import Path
@@ -82,7 +82,9 @@ def test_levels_on_disk_give_the_files_of_levels_in_memory(tmp_path: Path, degre
     assert files_of(tmp_path / "a") == files_of(tmp_path / "b")
 
 
-def test_what_is_measured_and_written_is_not_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_measured_and_written_levels_are_not_repeated(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     levels, work = [scattered(2000), scattered(300, 1)], tmp_path / "work"
     work.mkdir()
     save_levels(tmp_path / "whole", levels, cut=Cut(most=200))

@@ -1,4 +1,4 @@
-"""Memory of tiles: what is refused says what it takes, and what it advises is accepted."""
+"""Memory of tiles: an error states the memory needed and a tile size that is then accepted."""
 
 import re
 from pathlib import Path
@@ -56,7 +56,7 @@ def test_tiles_that_are_advised_fit(scene: Path, tmp_path: Path, memory: str) ->
     assert workers_for(again, Tiling(memory=size), RECOVERY_TIMES) == 1
 
 
-def test_where_no_tiles_fit_the_least_is_told_and_does(scene: Path, tmp_path: Path) -> None:
+def test_an_error_names_the_least_memory_that_works(scene: Path, tmp_path: Path) -> None:
     store, _ = tiles(scene, tmp_path / "a", 6000)
     for refuse in (
         lambda: check_memory(scene, Tiling(memory=200_000_000), LEVELS_TIMES, RECOVERY_TIMES),

@@ -62,7 +62,7 @@ def test_blocks_are_the_cloud(tmp_path: Path, name: str) -> None:
 
 
 def test_lifted_tiles_are_the_lifted_cloud(tmp_path: Path) -> None:
-    """A halo reaches four spacings here, and two hold a point's ten neighbours."""
+    """A halo of four spacings holds a point's ten neighbours, which lie within two."""
     points = streets(60_000, offset=UTM)
     path = ply(tmp_path / "cloud.ply", points)
     store = ingest(path, tmp_path / "tiles", tile_rows=20_000)
@@ -141,7 +141,7 @@ def test_an_interruption_costs_a_block_or_a_tile(tmp_path: Path, stage: str) -> 
     assert manifest["settings"]["lift"]["neighbors"] == 10
 
 
-def test_bad_points_are_dropped_and_told(tmp_path: Path) -> None:
+def test_bad_points_are_dropped_and_noted(tmp_path: Path) -> None:
 
     points = streets(500)
     properties = {axis: points.positions[:, i].copy() for i, axis in enumerate("xyz")}

@@ -1,4 +1,4 @@
-"""What tiles do not have, and options out of range: one line, in the words that were typed."""
+"""Options that tiles do not support or that are out of range: one line that names the option as typed."""
 
 from pathlib import Path
 
@@ -54,7 +54,7 @@ _DISTILL = ("distill", "-r", "10", "-o", "x", "--views", "views.json")
         (("distill", "-o", "x"), "--fit 50kB", "--fit 50kB"),
     ],
 )
-def test_what_takes_the_scene_in_one_piece_is_named_as_it_is_typed(
+def test_options_that_need_one_piece_are_named_as_typed(
     command_line: CommandLine, folder: Path, command: tuple[str, ...], given: str, named: str
 ) -> None:
     words = (*command, "town.ply", *given.split(), "--tile-rows", "1500")
@@ -80,7 +80,7 @@ def test_rows_of_tiles_that_lie_in_a_folder_are_theirs(command_line: CommandLine
 
 
 @pytest.mark.parametrize("rows", ["0", "25%", "200%", "x"])
-def test_rows_of_a_tile_are_no_share(command_line: CommandLine, folder: Path, rows: str) -> None:
+def test_tile_rows_is_a_count_not_a_share(command_line: CommandLine, folder: Path, rows: str) -> None:
     for words in (_SIMPLIFY, ("ingest", "-o", "other")):
         told = refused(command_line, folder, 2, *words, "town.ply", "--tile-rows", rows)
         assert f"'--tile-rows': expected a positive count such as 250000, 250k or 1.5M, got '{rows}'" in told

@@ -1,4 +1,4 @@
-"""Runs in tiles that are stopped, gone on with, or asked for what tiles do not have."""
+"""Interrupted and resumed runs in tiles, and options that tiles do not support."""
 
 from pathlib import Path
 from typing import Any

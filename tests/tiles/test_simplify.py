@@ -182,7 +182,7 @@ def _children() -> list[int]:
     return [pid for pid in pids if is_worker(pid)]
 
 
-def test_what_is_done_is_not_done_again(store: TileStore, tmp_path: Path, fingerprint: str) -> None:
+def test_finished_work_is_not_repeated(store: TileStore, tmp_path: Path, fingerprint: str) -> None:
     class StopError(Exception):
         pass
 

@@ -48,7 +48,7 @@ def scattered(count: int = 4000, seed: int = 0) -> Splats:
 
 
 @pytest.mark.parametrize("up", [(0.0, 0.0, 1.0), (0.3, -1.0, 0.2)])
-def test_a_page_shows_what_we_render(browser: Browser, tmp_path: Path, up: tuple[float, ...]) -> None:
+def test_a_page_shows_g2ards_render(browser: Browser, tmp_path: Path, up: tuple[float, ...]) -> None:
     scene = scattered()
     camera = Camera.facing([1.8, -1.6, 0.9], [0, 0, 0], width=WIDTH, height=HEIGHT, fov=55, up=up)
     browser.requests.clear()
@@ -65,7 +65,7 @@ def test_an_opaque_surface_shows_its_front(browser: Browser, tmp_path: Path) -> 
     assert_shows(browser, rendered(scene), 38)
 
 
-def test_a_real_scene_shows_what_we_render(browser: Browser, tmp_path: Path) -> None:
+def test_a_real_scene_shows_g2ards_render(browser: Browser, tmp_path: Path) -> None:
     scene = read_splats(real("playbot", "0_0"))
     camera = Camera.facing([1.6, -0.9, 1.3], [0, -0.35, 0], width=WIDTH, height=HEIGHT, fov=50, up=(0, -1, 0))
     show(browser, save(tmp_path / "playbot.html", scene, camera=camera, up=(0, -1, 0)))
@@ -106,7 +106,7 @@ def test_two_scenes_share_a_camera_and_a_divider(browser: Browser, tmp_path: Pat
             assert psnr(picture[rows, part], sides[1 - side][rows, part]) < 25, (share, side)
 
 
-def test_the_right_scene_follows_where_the_left_one_is_turned_to(browser: Browser, tmp_path: Path) -> None:
+def test_both_scenes_share_a_camera(browser: Browser, tmp_path: Path) -> None:
     scene = scattered()
     show(browser, save(tmp_path / "two.html", scene, scene))
     before = assert_shows(browser, rendered(scene), 38)
