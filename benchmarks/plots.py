@@ -1,4 +1,4 @@
-"""Draw docs/plots/*.svg from the recorded CSVs: `python benchmarks/plots.py` in the repository's root.
+"""Draw docs/plots/*.svg from the recorded CSVs: `python -m benchmarks.plots` in the repository's root.
 
 tests/test_docs.py checks that the plots are up to date.
 """
@@ -9,7 +9,7 @@ import csv
 from collections.abc import Iterable
 from pathlib import Path
 
-from g2ard.report.charts import Point, chart
+from benchmarks.charts import Point, chart
 
 ROOT = Path(__file__).resolve().parent.parent
 RECORD = ROOT / "benchmarks" / "record"

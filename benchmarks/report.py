@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from html import escape
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -11,12 +12,12 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
+from benchmarks.charts import COLORS, STYLE, Point, chart, legend, pareto, side_by_side
 from benchmarks.process import machine
 from benchmarks.rows import Row, shown
 from benchmarks.study import Study
 from g2ard import __version__
-from g2ard.report.charts import Point, chart, pareto
-from g2ard.report.page import COLORS, Comparison, Page, Shown, legend
+from g2ard.report.page import Comparison, Page, Shown
 
 __all__ = ["write_report"]
 
@@ -35,6 +36,7 @@ def write_report(folder: Path, studies: Sequence[Study], rows: Sequence[Row]) ->
         rows: rows of `benchmarks.runner.run`.
     """
     page = Page("g2ard benchmarks", f"g2ard {__version__} on {machine()}")
+    page.html(STYLE)
     page.paragraph(
         "PSNR and SSIM on views that no method has used. Step-matched cells took the same number of "
         "optimiser steps, time-matched ones the same seconds for reduction and recovery together. If "
@@ -50,7 +52,7 @@ def _study(page: Page, folder: Path, study: Study, rows: list[Row]) -> None:
     page.heading(study.title)
     if study.differs:
         page.paragraph("Differs from the paper:")
-        page.items(study.differs)
+        page.html(f"<ul>{''.join(f'<li>{escape(line)}</li>' for line in study.differs)}</ul>")
     names = list(dict.fromkeys(map(_name, rows)))
     page.html(legend(names, [kind for kind in _MARKS if any(row.get("matched") == kind for row in rows)]))
     for line in dict.fromkeys(line for row in rows for line in _notes(row)):
@@ -58,7 +60,7 @@ def _study(page: Page, folder: Path, study: Study, rows: list[Row]) -> None:
     summary = study.summary(rows)
     if summary is not None:
         page.paragraph(summary[0])
-        page.table(summary[1], summary[2], set())
+        page.table(summary[1], summary[2])
 
     def place(row: Row) -> tuple[str, str, str]:
         return row["scene"], row.get("split", "") or row.get("views_kind", ""), row.get("against", "")
@@ -69,7 +71,7 @@ def _study(page: Page, folder: Path, study: Study, rows: list[Row]) -> None:
         views = f": {group[0]['views']} {split} views" if "views" in group[0] else ""
         page.heading(f"{scene}{views}{f' against {against}' if against else ''}", 3)
         if "psnr" in group[0]:
-            page.charts(_charts(group, names))
+            page.html(side_by_side(_charts(group, names)))
         for line in _over_seeds(group):
             page.paragraph(line)
         columns, cells = shown(row for row in group if row.get("final", 1))

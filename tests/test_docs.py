@@ -183,7 +183,7 @@ def test_plots_match_the_recorded_rows() -> None:
     folder = ROOT / "docs" / "plots"
     assert sorted(drawn) == sorted(p.name for p in folder.glob("*.svg"))
     for name, svg in drawn.items():
-        assert svg == (folder / name).read_text(encoding="utf-8"), f"{name}: run python benchmarks/plots.py"
+        assert svg == (folder / name).read_text(encoding="utf-8"), f"{name}: run python -m benchmarks.plots"
 
 
 def test_the_readme_names_every_command_and_scene_format() -> None:

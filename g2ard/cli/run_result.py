@@ -29,13 +29,12 @@ def write_table(run: Run, report: dict[str, Any]) -> None:
     seconds = {name: value for name, value in report["seconds"].items() if name != "resumed"}
     times = ", ".join(f"{name} {value:.1f} s" for name, value in seconds.items())
     before = plural(report["input_count"], "point" if report["lifted"] else "Gaussian")
-    write_kinds(
-        run,
+    run.say(
         f"{before} → {plural(report['output_count'], 'Gaussian')}, "
-        f"{size['input'] / 1e6:.2f} → {size['output'] / 1e6:.2f} MB as .ply; {times}\n"
-        f"held-out views against {report['against']}, simplified → recovered:",
-        [KindScore.of(kind) for kind in report["kinds"]],
+        f"{size['input'] / 1e6:.2f} → {size['output'] / 1e6:.2f} MB as .ply; {times}"
     )
+    title = f"held-out views against {report['against']}, simplified → recovered:"
+    write_kinds(run, title, [KindScore.of(kind) for kind in report["kinds"]])
 
 
 def write_kinds(run: Run, title: str, kinds: Sequence[KindScore]) -> None:

@@ -1,9 +1,11 @@
-"""Pages and the preview picture of a distillation, also of one in tiles."""
+"""Report page and preview picture of a distillation, and the report page of a run in tiles."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import zip_longest
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 import numpy as np
@@ -13,19 +15,16 @@ from g2ard.errors import InputError
 from g2ard.progress import plural
 from g2ard.rendering.metrics import psnr
 from g2ard.rendering.renderer import Renderer
-from g2ard.report.charts import Point, chart
-from g2ard.report.page import Comparison, Page, Shown, legend
+from g2ard.report.kinds import KindScore
+from g2ard.report.page import Comparison, Page, Shown
 from g2ard.report.window import Crop
 from g2ard.scene.images import contact_sheet, to_bytes, write_png
 from g2ard.scene.splats import Splats
+from g2ard.scene.splits import rows_by_kind
 from g2ard.scene.targets import Targets
 
-_VIEWS = 6
-_STRETCHES = 25
-"""Segments of the loss curve, averaged because views differ more than steps."""
-
-_PREVIEWED = 3
-"""Rows of the preview picture."""
+_SHOWN = 3
+"""Pictures of the page, and rows of the preview picture."""
 
 _STAGES = ("simplified", "recovered")
 
@@ -34,82 +33,107 @@ def distill_report(
     path: Path,
     title: str,
     scenes: Sequence[tuple[str, Splats]],
-    targets: Targets,
+    targets: Sequence[Targets],
     report: dict[str, Any],
     background: Colour = BLACK,
     *,
     told: Sequence[str] = (),
     crops: Sequence[Crop] = (),
 ) -> None:
-    """Write the HTML page of one run: error against time and count, the loss, and views in order of error.
-
-    Views with crops come first.
+    """Write the HTML page of one run: a verdict, scores by kind of view, and pictures of the worst views.
 
     Args:
         path: output file.
         title: title of the page.
         scenes: (name, scene) of `simplified` and `recovered`, as `report["scores"]` names them.
-        targets: held-out photos or teacher renders.
+        targets: photos or teacher renders of the held-out views, and of the views of other kinds, if any.
         report: what `g2ard distill` writes as report.json.
         background: RGB behind the scenes.
         told: summary lines that the command prints.
-        crops: regions to magnify; by default the worst regions of each view.
+        crops: regions to magnify; by default the worst regions of each view. Their views are shown first.
 
     Raises:
-        InputError: a crop names a view that is not among the targets.
+        InputError: a crop names a view that is not held out.
     """
-    check_crops(crops, targets.cameras.names)
-    against = report["against"]
-    page = Page(title, f"{plural(len(targets.cameras), 'held-out view')} against {against}")
-    scores, seconds = report["scores"], report["seconds"]
-    names = [name for name, _ in scenes]
-    took = [seconds["simplify"], seconds["simplify"] + seconds["recover"]]
-    page.html(legend(names))
-    page.charts([*_error_charts(scenes, scores, took), *_loss_charts(report["rounds"])])
-    apart = report.get("apart")
-    near = ["PSNR near", "SSIM near"] if apart else []
+    check_crops(crops, targets[0].cameras.names)
+    page = Page(title, verdict(report))
     page.table(
-        ["scene", "Gaussians", "MB as .ply", "PSNR", "SSIM", *near, "seconds"],
+        ["kind of view", "views", "PSNR simplified, dB", "recovered, dB", "SSIM", "worst view", "dB"],
         [
             [
-                name,
-                f"{len(splats):,}",
-                f"{splats.nbytes / 1e6:.2f}",
-                f"{scores[name]['psnr']:.2f}",
-                f"{scores[name]['ssim']:.4f}",
-                *([f"{apart[name]['psnr']:.2f}", f"{apart[name]['ssim']:.4f}"] if apart else []),
-                f"{spent:.1f}",
+                kind.kind,
+                str(kind.views),
+                f"{kind.psnr.before:.2f}",
+                f"{kind.psnr.after:.2f}",
+                f"{kind.ssim.after:.4f}",
+                kind.worst,
+                f"{kind.worst_psnr.after:.2f}",
             ]
-            for (name, splats), spent in zip(scenes, took, strict=True)
+            for kind in map(KindScore.of, report["kinds"])
         ],
-        set(),
     )
-    page.paragraph(
-        f"From {plural(report['input_count'], 'Gaussian')} "
-        f"({report['bytes']['input'] / 1e6:.2f} MB as .ply). Regularisers: {report['preset']}."
-    )
-    if apart:
-        count = len(apart[names[-1]]["views"])
-        page.paragraph(
-            f"Near: {plural(count, 'view')} of another kind, nearer to the scene, not used for training."
-        )
     for line in told:
         page.paragraph(line)
-    page.heading("Worst views first")
-    last = names[-1]
-    figures = [view["psnr"] for view in scores[last]["views"]]
-    asked = [targets.cameras.names.index(crop.view) for crop in crops if crop.view is not None]
-    worst = map(int, np.argsort(figures, kind="stable")[:_VIEWS])
+    page.heading("Worst views")
+    page.paragraph(
+        f"Left of the divider: the {'photo' if 'photo' in report['against'] else 'dense scene'}. "
+        "Right: the result. Below: its worst regions, magnified."
+    )
+    views = [(part, row) for part in targets for row in range(len(part.cameras))]
+    parts = [report["scores"], *([report["apart"]] if report["apart"] else [])]
+    scores = {name: [view for part in parts for view in part[name]["views"]] for name, _ in scenes}
     renderers = [(name, Renderer(splats, background=background)) for name, splats in reversed(scenes)]
-    for view in dict.fromkeys([*asked, *worst]):
-        name = targets.cameras.names[view]
+    for view in _worst(scores[scenes[-1][0]], crops):
+        part, row = views[view]
+        camera, name = part.cameras[row], part.cameras.names[row]
+        shown = [
+            Shown(stage, to_bytes(renderer.image(camera)), f"{scores[stage][view]['psnr']:.2f} dB")
+            for stage, renderer in renderers
+        ]
         windows = [crop.window for crop in crops if crop.view in (None, name)]
-        shown = []
-        for name, renderer in renderers:
-            image = renderer.image(targets.cameras[view])
-            shown.append(Shown(name, to_bytes(image), f"{scores[name]['views'][view]['psnr']:.2f} dB"))
-        page.comparison(Comparison(targets.cameras.names[view], to_bytes(targets[view]), shown, windows))
+        page.comparison(Comparison(name, to_bytes(part[row]), shown, windows))
+    size, seconds = report["bytes"], report["seconds"]
+    page.paragraph(
+        f"{size['input'] / 1e6:.2f} → {size['output'] / 1e6:.2f} MB as .ply, in {seconds['total']:,.0f} s. "
+        f"Scored against {report['against']} in views that were not trained on."
+    )
     page.write(path)
+
+
+def verdict(report: dict[str, Any]) -> str:
+    """Summarise a run in one sentence.
+
+    Args:
+        report: what `g2ard distill` writes as report.json.
+
+    >>> change = {"before": 30.0, "after": 36.6}
+    >>> kind = {"kind": "near", "views": 1, "psnr": change, "ssim": change, "worst": "near_0003",
+    ...         "worst_psnr": change, "lost": 0}
+    >>> verdict({"input_count": 5000, "output_count": 500, "lifted": False, "against": "teacher renders",
+    ...          "kinds": [kind]})
+    '500 of 5,000 Gaussians reproduce the scene at 36.6 dB on average; the worst view is near_0003 (36.6 dB).'
+    """
+    kinds = [KindScore.of(kind) for kind in report["kinds"]]
+    weakest = min(kinds, key=lambda kind: kind.psnr.after)
+    last = f"the worst view is {weakest.worst} ({weakest.worst_psnr.after:.1f} dB)"
+    if len(kinds) > 1:
+        last = f"{weakest.kind} views are weakest ({weakest.psnr.after:.1f} dB)"
+    count = f"{report['output_count']:,} of {plural(report['input_count'], 'Gaussian')}"
+    if report["lifted"]:
+        count = f"{plural(report['output_count'], 'Gaussian')} from {plural(report['input_count'], 'point')}"
+    what = "photos" if "photo" in report["against"] else "scene"
+    mean = fmean(kind.psnr.after for kind in kinds)
+    return f"{count} reproduce the {what} at {mean:.1f} dB on average; {last}."
+
+
+def _worst(scores: Sequence[dict[str, Any]], crops: Sequence[Crop]) -> list[int]:
+    """Choose the views to show: those of `crops`, then the worst of each kind in turn, weakest kind first."""
+    names = [view["name"] for view in scores]
+    kinds = [sorted(rows, key=lambda row: scores[row]["psnr"]) for rows in rows_by_kind(names).values()]
+    kinds.sort(key=lambda rows: fmean(scores[row]["psnr"] for row in rows))
+    worst = [row for turn in zip_longest(*kinds) for row in turn if row is not None]
+    asked = [names.index(crop.view) for crop in crops if crop.view is not None]
+    return list(dict.fromkeys([*asked, *worst]))[: max(_SHOWN, len(set(asked)))]
 
 
 def check_crops(crops: Sequence[Crop], names: Sequence[str]) -> None:
@@ -127,38 +151,6 @@ def check_crops(crops: Sequence[Crop], names: Sequence[str]) -> None:
             )
 
 
-def _error_charts(
-    scenes: Sequence[tuple[str, Splats]], scores: dict[str, Any], took: Sequence[float]
-) -> list[tuple[str, str]]:
-    def points(xs: Sequence[float]) -> list[Point]:
-        return [
-            Point(x, scores[name]["psnr"], i, 0, f"{name}: {scores[name]['psnr']:.2f} dB", name)
-            for i, ((name, _), x) in enumerate(zip(scenes, xs, strict=True))
-        ]
-
-    over_time = chart(
-        points([max(t, 1e-3) for t in took]), x_label="seconds", y_label="PSNR, dB", log=True, front=True
-    )
-    over_count = chart(
-        points([len(splats) for _, splats in scenes]), x_label="Gaussians", y_label="PSNR, dB", log=True
-    )
-    return [("Error against time; dashed: the Pareto front", over_time), ("Error against count", over_count)]
-
-
-def _loss_charts(rounds: Sequence[dict[str, Any]]) -> list[tuple[str, str]]:
-    """Draw the loss of the last recovery."""
-    runs = [run for entry in rounds for run in entry.get("recover", [])]
-    if not runs or not runs[-1]["loss"]:
-        return []
-    steps = runs[-1]["steps"]
-    parts = np.array_split(np.array(runs[-1]["loss"]), _STRETCHES)
-    curve = [float(part.mean()) for part in parts if len(part)]
-    points = [
-        Point((k + 1) / len(curve) * steps, value, 1, 0, f"{value:.4f}") for k, value in enumerate(curve)
-    ]
-    return [("Loss of the last recovery", chart(points, x_label="step", y_label="loss", joined=True))]
-
-
 def tiled_report(path: Path, title: str, report: dict[str, Any]) -> None:
     """Write the HTML page of a run in tiles.
 
@@ -168,22 +160,16 @@ def tiled_report(path: Path, title: str, report: dict[str, Any]) -> None:
         report: content of report.json from `g2ard distill` in tiles.
     """
     scores, views = report["scores"], report["views"]
-    unseen, tiles = plural(views["test"], "held-out view"), plural(len(scores["tiles"]), "tile")
-    page = Page(title, f"{unseen} against teacher renders, in {tiles}")
-    page.table(
-        ["scene", "Gaussians", "PSNR"],
-        [[stage, f"{report['output_count']:,}", f"{scores[stage]:.2f}"] for stage in _STAGES],
-        set(),
-    )
+    shown = sorted((t for t in scores["tiles"] if t["pixels"]), key=lambda t: (t["recovered"], t["tile"]))
+    count = f"{report['output_count']:,} of {plural(report['input_count'], 'Gaussian')}"
+    weakest = f"; tile {shown[0]['tile']} is weakest ({shown[0]['recovered']:.1f} dB)" if shown else ""
+    page = Page(title, f"{count} reproduce the scene at {scores['recovered']:.1f} dB on average{weakest}.")
     page.paragraph(
-        f"From {plural(report['input_count'], 'Gaussian')}, in {report['seconds']['total']:,.0f} s and "
-        f"{scores['steps']:,} recovery steps of all tiles together; "
-        f"{plural(views['train'], 'training view')}. "
-        f"PSNR is over the {scores['pixels']:,} pixels owned by tiles."
+        f"Simplified {scores['simplified']:.2f} dB, recovered {scores['recovered']:.2f} dB, over the "
+        f"{scores['pixels']:,} pixels that tiles own in {plural(views['test'], 'held-out view')}; "
+        f"{plural(views['train'], 'training view')}, {scores['steps']:,} recovery steps of all tiles "
+        f"together, {report['seconds']['total']:,.0f} s."
     )
-    shown = [tile for tile in scores["tiles"] if tile["pixels"]]
-    page.html(legend(_STAGES))
-    page.charts([("Error of each tile against its Gaussians", _tile_chart(shown))])
     page.heading("Tiles, worst first")
     page.table(
         ["tile", "Gaussians", "simplified, dB", "recovered, dB", "steps", "pixels"],
@@ -195,22 +181,12 @@ def tiled_report(path: Path, title: str, report: dict[str, Any]) -> None:
                 f"{tile['steps']:,}",
                 f"{tile['pixels']:,}",
             ]
-            for tile in sorted(shown, key=lambda tile: (tile["recovered"], tile["tile"]))
+            for tile in shown
         ],
-        set(),
     )
     if others := len(scores["tiles"]) - len(shown):
         page.paragraph(f"The {plural(others, 'other tile')} own no pixel in a held-out view.")
     page.write(path)
-
-
-def _tile_chart(tiles: list[dict[str, Any]]) -> str:
-    points = [
-        Point(max(1, tile["count"]), tile[stage], i, 0, f"tile {tile['tile']}, {stage}: {tile[stage]:.2f} dB")
-        for tile in tiles
-        for i, stage in enumerate(_STAGES)
-    ]
-    return chart(points, x_label="Gaussians", y_label="PSNR, dB", log=True) if points else ""
 
 
 def preview(
@@ -228,7 +204,7 @@ def preview(
         background: RGB behind the scenes.
     """
     count = len(targets.cameras)
-    chosen = np.unique(np.linspace(0, count - 1, min(count, _PREVIEWED)).round().astype(int))
+    chosen = np.unique(np.linspace(0, count - 1, min(count, _SHOWN)).round().astype(int))
     rows, captions = [], []
     renderers = [Renderer(splats, background=background) for _, splats in scenes]
     for view in map(int, chosen):

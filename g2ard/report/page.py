@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 import json
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from html import escape
 from io import BytesIO
@@ -17,11 +17,10 @@ from g2ard.io.atomic import atomic_output
 from g2ard.report.window import Window
 from g2ard.scene.images import to_bytes
 
-COLORS = ("#2563eb", "#d97706", "#059669", "#db2777", "#7c3aed", "#64748b", "#0891b2", "#b91c1c", "#65a30d")
 _WINDOW, _CROPS = 0.28, 2
 """Side of an automatic crop as a share of the image's, and number of crops."""
 
-_LONGEST = 640
+_LONGEST = 1280
 _QUALITY = 86
 
 
@@ -79,9 +78,9 @@ def worst_windows(image: NDArray[np.uint8], target: NDArray[np.uint8]) -> list[W
 class Page:
     """An HTML page built section by section and written atomically."""
 
-    def __init__(self, title: str, subtitle: str = "") -> None:
+    def __init__(self, title: str, lead: str = "") -> None:
         self._title = title
-        self._parts = [f"<h1>{escape(title)}</h1>", f'<p class="sub">{escape(subtitle)}</p>']
+        self._parts = [f"<h1>{escape(title)}</h1>", f'<p class="lead">{escape(lead)}</p>']
         self._images: list[str] = []
 
     def html(self, text: str) -> None:
@@ -94,11 +93,11 @@ class Page:
     def paragraph(self, text: str) -> None:
         self._parts.append(f"<p>{escape(text)}</p>")
 
-    def items(self, lines: Sequence[str]) -> None:
-        self._parts.append(f"<ul>{''.join(f'<li>{escape(line)}</li>' for line in lines)}</ul>")
-
     def table(
-        self, columns: Sequence[str], rows: Sequence[Sequence[str]], best: set[tuple[int, int]]
+        self,
+        columns: Sequence[str],
+        rows: Sequence[Sequence[str]],
+        best: Collection[tuple[int, int]] = (),
     ) -> None:
         """Add a table; cells (row, column) in `best` are bold."""
         head = "".join(f"<th>{escape(name)}</th>" for name in columns)
@@ -114,18 +113,9 @@ class Page:
             f"<tbody>{''.join(body)}</tbody></table></div>"
         )
 
-    def charts(self, charts: Sequence[tuple[str, str]]) -> None:
-        """Add charts side by side, each with its caption."""
-        figures = [
-            f"<figure>{svg}<figcaption>{escape(caption)}</figcaption></figure>"
-            for caption, svg in charts
-            if svg
-        ]
-        self._parts.append(f'<div class="row">{"".join(figures)}</div>')
-
     def figure(self, image: NDArray[np.uint8], caption: str) -> None:
-        """Add a wide picture, up to twice the usual width."""
-        number, text = self._image(image, 2 * _LONGEST), escape(caption)
+        """Add a picture."""
+        number, text = self._image(image), escape(caption)
         self._parts.append(
             f'<figure class="wide"><img data-i="{number}" alt="{text}">'
             f"<figcaption>{text}</figcaption></figure>"
@@ -173,11 +163,11 @@ class Page:
             f"<figcaption>{escape(shown.name)}{whole}</figcaption></figure>"
         )
 
-    def _image(self, image: NDArray[np.uint8], longest: int = _LONGEST) -> int:
+    def _image(self, image: NDArray[np.uint8]) -> int:
         from PIL import Image
 
         picture = Image.fromarray(to_bytes(image))
-        picture.thumbnail((longest, longest))
+        picture.thumbnail((_LONGEST, _LONGEST))
         buffer = BytesIO()
         picture.save(buffer, "JPEG", quality=_QUALITY)
         self._images.append(base64.b64encode(buffer.getvalue()).decode())
@@ -185,14 +175,11 @@ class Page:
 
     def text(self) -> str:
         """Return the HTML of the page."""
-        colors = "".join(
-            f".s{i}{{--c:{color}}}" for i, color in enumerate(COLORS)
-        )  # one class per series, for charts and legends
         images = json.dumps(self._images)
         return (
             '<!doctype html><html lang="en"><head><meta charset="utf-8">'
             '<meta name="viewport" content="width=device-width,initial-scale=1">'
-            f"<title>{escape(self._title)}</title><style>{_STYLE}{colors}</style></head><body><main>"
+            f"<title>{escape(self._title)}</title><style>{_STYLE}</style></head><body><main>"
             f"{''.join(self._parts)}</main>"
             f'<script type="application/json" id="images">{images}</script>'
             f"<script>{_SCRIPT}</script></body></html>\n"
@@ -204,16 +191,6 @@ class Page:
             temporary.write_text(self.text(), encoding="utf-8", newline="\n")
 
 
-def legend(series: Sequence[str], marks: Sequence[str] = ()) -> str:
-    """Return the legend of colours (methods) and shapes (budgets)."""
-    shapes = ("●", "■", "◆", "▲")
-    items = [
-        f'<span><i class="s{i % len(COLORS)}"></i>{escape(name)}</span>' for i, name in enumerate(series)
-    ]
-    items += [f"<span>{shapes[i % len(shapes)]} {escape(name)}</span>" for i, name in enumerate(marks)]
-    return f'<p class="legend">{"".join(items)}</p>'
-
-
 _STYLE = """
 :root{color-scheme:light dark;--bg:#fff;--fg:#1b2430;--soft:#5b6675;--line:#e3e7ec;--card:#f6f8fa}
 @media(prefers-color-scheme:dark){:root{--bg:#12161c;--fg:#e6eaf0;--soft:#98a3b3;--line:#2a313b;--card:#1a2029}}
@@ -221,20 +198,13 @@ body{margin:0;background:var(--bg);color:var(--fg);font:15px/1.5 system-ui,sans-
 main{max-width:1200px;margin:0 auto;padding:24px 20px 80px}
 h1{font-size:26px;margin:0}h2{margin:48px 0 4px;border-top:1px solid var(--line);padding-top:24px}
 h3{margin:28px 0 4px}h4{margin:0 0 8px;font-weight:600}
-.sub,figcaption,.legend{color:var(--soft);font-size:13px}
-.row{display:flex;flex-wrap:wrap;gap:16px}.row figure{flex:1 1 440px;margin:0;min-width:0;max-width:600px}
-.chart{width:100%;height:auto;background:var(--card);border-radius:8px}
-.grid{stroke:var(--line)}.tick,.axis,.name{font-size:11px;fill:var(--soft)}.name{fill:var(--fg)}
-.dot{fill:var(--c);stroke:var(--bg);stroke-width:1.2}.line{fill:none;stroke:var(--c);stroke-width:2}
-.front{fill:none;stroke:var(--soft);stroke-dasharray:5 4;stroke-width:1.3}
-.legend span{margin-right:16px;white-space:nowrap}
-.legend i{display:inline-block;width:11px;height:11px;border-radius:3px;background:var(--c);margin-right:6px}
+.lead{font-size:18px;margin:6px 0 18px}figcaption{color:var(--soft);font-size:13px}
 .scroll{overflow-x:auto}
 table{border-collapse:collapse;font-size:13px;font-variant-numeric:tabular-nums;margin:8px 0}
 th,td{padding:4px 10px;text-align:right;border-bottom:1px solid var(--line);white-space:nowrap}
 th:first-child,td:first-child{text-align:left}th{color:var(--soft);font-weight:600}.best{font-weight:700}
 .view{background:var(--card);border-radius:8px;padding:14px;margin:14px 0}
-.pair{max-width:640px}.slider{position:relative;overflow:hidden;border-radius:6px}
+.slider{position:relative;overflow:hidden;border-radius:6px}
 .slider img{position:absolute;inset:0;width:100%;height:100%;user-select:none}
 .slider .over{clip-path:inset(0 0 0 50%)}
 .slider input{position:absolute;inset:0;width:100%;height:100%;margin:0;opacity:0;cursor:ew-resize}
@@ -249,7 +219,6 @@ select{font:inherit;max-width:100%}
 .crops{display:flex;flex-wrap:wrap;gap:10px;margin-top:10px}.crop{margin:0;width:190px}
 .wide{margin:8px 0}.wide img{display:block;max-width:100%}
 .crop img{display:block;width:100%;box-sizing:border-box;border:2px solid var(--roi)}
-@media(max-width:600px){.row figure{flex-basis:100%}}
 """
 
 _SCRIPT = """

@@ -59,7 +59,6 @@ def registration_report(
     page.table(
         ["photo", "status", "ZNCC", "σ position", "σ rotation, °", "error", "error, °", "why"],
         [_cells(row) for row in rows],
-        set(),
     )
     page.heading("Least alike first")
     seen = [i for i, row in enumerate(rows) if row.camera_from_world is not None]

@@ -56,7 +56,7 @@ def test_crops_are_cut_at_full_resolution() -> None:
     html = page.text()
     check_page(html)
     whole, same, *crops = images_of(html)
-    assert max(whole.shape) == max(same.shape) == 640
+    assert max(whole.shape) == max(same.shape) == 1280
     assert [crop.shape for crop in crops] == [(300, 400, 3)] * 2
     expected = target[300:600, 200:600].astype(float)
     assert np.abs(crops[0] - expected).mean() < 12  # JPEG
@@ -83,7 +83,8 @@ def test_command(command_line: CommandLine, tmp_path: Path) -> None:
     assert "<h4>view_008</h4>" in first
     assert first.count('class="roi') == 2
     assert second.count('class="roi') == 1
-    assert {image.shape[:2] for image in images_of(html)} == {(36, 48), (18, 24), (9, 24)}
+    assert {(36, 48), (18, 24), (9, 24)} <= {image.shape[:2] for image in images_of(html)}
+    assert html.count('<section class="view">') == 3
     status, _, err = command_line(*common, "--crop", "moon:0,0,1,1", "-o", "none", cwd=tmp_path)
     assert (status, "Traceback" in err) == (1, False)
     assert "--crop: expected one of the 2 scored views (view_000, view_008), got moon" in err

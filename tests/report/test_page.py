@@ -1,5 +1,6 @@
-"""Report pages: their charts, and that they work in a browser."""
+"""Report pages: what the page of a run says, and that pages work in a browser."""
 
+import re
 import shutil
 import subprocess
 from pathlib import Path
@@ -7,8 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from g2ard.report.charts import Point, chart, pareto
+from g2ard.report.distilled import _worst, verdict
+from g2ard.report.kinds import by_kind
 from g2ard.report.page import Comparison, Page, Shown
+from g2ard.report.window import Crop
 from helpers.commands import CommandLine, succeeds
 from helpers.studies import check_page, study
 
@@ -30,24 +33,46 @@ def test_the_page_works_in_a_browser(tmp_path: Path) -> None:
     assert dom.count('src="data:image/jpeg;base64,') == 8  # a pair and two crops of three
 
 
-def test_pareto_points_are_beaten_by_none() -> None:
-    rng = np.random.default_rng(0)
-    points = [Point(x, y, 0) for x, y in rng.normal(size=(60, 2)).round(1)]
-    expected = {
-        (p.x, p.y)
-        for p in points
-        if not any((q.x <= p.x and q.y >= p.y and (q.x, q.y) != (p.x, p.y)) for q in points)
-    }
-    assert {(p.x, p.y) for p in pareto(points)} == expected
-    assert chart([], x_label="x", y_label="y") == ""
-    assert "NaN" not in chart([Point(1, 2, 0)], x_label="x", y_label="y", log=True, joined=True, front=True)
-
-
 def test_distill_writes_a_report(command_line: CommandLine, tmp_path: Path) -> None:
     study(tmp_path)
     options = ["-r", "4", "--views", "views.json", "--steps", "5", "-o", "run"]
     succeeds(command_line, tmp_path, "distill", "ball.ply", *options)
     html = (tmp_path / "run" / "report.html").read_text()
     check_page(html)
-    assert "Worst views first" in html
+    assert re.search(r'<p class="lead">300 of 1,200 Gaussians reproduce the scene at \d+\.\d dB', html)
+    assert html.index("<table>") < html.index("Worst views")
     assert "ball.ply" in html
+
+
+VIEWS = [
+    {"name": name, "psnr": psnr, "ssim": 0.9}
+    for name, psnr in (
+        ("pose_0", 38.0),
+        ("pose_1", 30.0),
+        ("near_0", 29.0),
+        ("near_1", 25.0),
+        ("near_2", 27.0),
+    )
+]
+
+
+def test_pictures_are_the_worst_view_of_each_kind_in_turn() -> None:
+    assert [VIEWS[row]["name"] for row in _worst(VIEWS, [])] == ["near_1", "pose_1", "near_2"]
+    asked = [Crop.parse("pose_0:0,0,1,1"), Crop.parse("0,0,1,1")]
+    assert [VIEWS[row]["name"] for row in _worst(VIEWS, asked)] == ["pose_0", "near_1", "pose_1"]
+    assert _worst(VIEWS[:1], []) == [0]
+
+
+def test_the_verdict_names_the_weakest_kind_of_view() -> None:
+    kinds = [kind.as_dict() for kind in by_kind(VIEWS, VIEWS)]
+    report = {
+        "input_count": 90,
+        "output_count": 9,
+        "lifted": False,
+        "against": "teacher renders",
+        "kinds": kinds,
+    }
+    told = "9 of 90 Gaussians reproduce the scene at 30.5 dB on average; near views are weakest (27.0 dB)."
+    assert verdict(report) == told
+    of_photos = verdict(report | {"lifted": True, "against": "photos"})
+    assert of_photos.startswith("9 Gaussians from 90 points reproduce the photos at")

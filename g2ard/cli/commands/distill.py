@@ -304,7 +304,7 @@ def _distil(
             output / "report.html",
             f"{source.name}: {len(job.prior):,} → {len(result.splats):,}",
             [("simplified", result.simplified), ("recovered", result.splats)],
-            job.held_out,
+            [job.held_out] if job.apart[1] is None else [job.held_out, job.apart[1]],
             report,
             colour,
             told=told(report),

@@ -1,4 +1,4 @@
-"""Scatter and line charts as SVG that follows the page's light or dark colours."""
+"""Scatter and line charts as SVG that follows the report page's light or dark colours."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from html import escape
 from itertools import pairwise
 
+COLORS = ("#2563eb", "#d97706", "#059669", "#db2777", "#7c3aed", "#64748b", "#0891b2", "#b91c1c", "#65a30d")
 _WIDTH, _HEIGHT = 560, 340
 _LEFT, _RIGHT, _TOP, _BOTTOM = 54, 14, 12, 44
 _MARKS = ("circle", "square", "diamond", "triangle")
@@ -216,3 +217,39 @@ def _names(points: Sequence[Point], x: _Axis, y: _Axis) -> list[str]:
         text = escape(point.label)
         out.append(f'<text class="name" x="{at:.1f}" y="{bottom:.1f}" text-anchor="{anchor}">{text}</text>')
     return out
+
+
+def side_by_side(charts: Sequence[tuple[str, str]]) -> str:
+    """Return HTML of (caption, svg) charts side by side."""
+    figures = (
+        f"<figure>{svg}<figcaption>{escape(caption)}</figcaption></figure>" for caption, svg in charts if svg
+    )
+    return f'<div class="row">{"".join(figures)}</div>'
+
+
+def legend(series: Sequence[str], marks: Sequence[str] = ()) -> str:
+    """Return the legend of colours (methods) and shapes (budgets)."""
+    shapes = ("●", "■", "◆", "▲")
+    items = [
+        f'<span><i class="s{i % len(COLORS)}"></i>{escape(name)}</span>' for i, name in enumerate(series)
+    ]
+    items += [f"<span>{shapes[i % len(shapes)]} {escape(name)}</span>" for i, name in enumerate(marks)]
+    return f'<p class="legend">{"".join(items)}</p>'
+
+
+STYLE = (
+    """<style>
+.legend{color:var(--soft);font-size:13px}
+.row{display:flex;flex-wrap:wrap;gap:16px}.row figure{flex:1 1 440px;margin:0;min-width:0;max-width:600px}
+.chart{width:100%;height:auto;background:var(--card);border-radius:8px}
+.grid{stroke:var(--line)}.tick,.axis,.name{font-size:11px;fill:var(--soft)}.name{fill:var(--fg)}
+.dot{fill:var(--c);stroke:var(--bg);stroke-width:1.2}.line{fill:none;stroke:var(--c);stroke-width:2}
+.front{fill:none;stroke:var(--soft);stroke-dasharray:5 4;stroke-width:1.3}
+.legend span{margin-right:16px;white-space:nowrap}
+.legend i{display:inline-block;width:11px;height:11px;border-radius:3px;background:var(--c);margin-right:6px}
+@media(max-width:600px){.row figure{flex-basis:100%}}
+"""
+    + "".join(f".s{i}{{--c:{color}}}" for i, color in enumerate(COLORS))
+    + "</style>"
+)
+"""Style of charts and legends on a page; one class per series."""

@@ -1,0 +1,18 @@
+"""Charts of benchmark reports."""
+
+import numpy as np
+
+from benchmarks.charts import Point, chart, pareto
+
+
+def test_pareto_points_are_beaten_by_none() -> None:
+    rng = np.random.default_rng(0)
+    points = [Point(x, y, 0) for x, y in rng.normal(size=(60, 2)).round(1)]
+    expected = {
+        (p.x, p.y)
+        for p in points
+        if not any((q.x <= p.x and q.y >= p.y and (q.x, q.y) != (p.x, p.y)) for q in points)
+    }
+    assert {(p.x, p.y) for p in pareto(points)} == expected
+    assert chart([], x_label="x", y_label="y") == ""
+    assert "NaN" not in chart([Point(1, 2, 0)], x_label="x", y_label="y", log=True, joined=True, front=True)
