@@ -2,6 +2,7 @@
 
 import ast
 import importlib.util
+import json
 import re
 import shlex
 from functools import cache
@@ -148,6 +149,21 @@ def test_the_python_guide_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
         exec(compile(block, "from-python.md", "exec"), names)
     assert len(names["better"].splats) == len(names["small"].splats) == len(BALL) // 10
     assert g2ard.load("better.sog").means.shape == (len(BALL) // 10, 3)
+
+
+def test_the_notebook_runs_and_holds_its_output(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    cells = json.loads((ROOT / "examples/quickstart.ipynb").read_text(encoding="utf-8"))["cells"]
+    code = [cell for cell in cells if cell["cell_type"] == "code"]
+    assert [cell["execution_count"] for cell in code] == [*range(1, len(code) + 1)]
+    assert not [cell for cell in code if any(out["output_type"] == "error" for out in cell["outputs"])]
+    monkeypatch.chdir(tmp_path)
+    g2ard.save("scene.ply", BALL)
+    monkeypatch.setenv("G2ARD_SCENE", "scene.ply")
+    names: dict[str, Any] = {}
+    for cell in code:
+        exec(compile("".join(cell["source"]), "quickstart.ipynb", "exec"), names)
+    assert len(names["result"].splats) == len(BALL) // 10
+    assert g2ard.load("small.sog").means.shape == (len(BALL) // 10, 3)
 
 
 def test_the_api_page_has_every_public_name_once() -> None:
