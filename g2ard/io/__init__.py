@@ -179,7 +179,7 @@ def write_splats(path: str | Path, splats: Splats, *, overwrite: bool = False, *
         splats: the scene.
         overwrite: whether to replace an existing file.
         **options: format options: `normals=True` adds nx ny nz to a .ply, `spz_version=4` writes .spz
-            version 4 instead of 3.
+            version 4 instead of 3, `compress="spz"` an SPZ inside of a .glb.
 
     Raises:
         OutputError: the file exists or cannot be written, or the extension or an option is unsupported.

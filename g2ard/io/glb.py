@@ -1,7 +1,10 @@
-"""Reader and writer for .glb with KHR_gaussian_splatting: float32 attributes of a point primitive.
+"""Reader and writer for .glb with KHR_gaussian_splatting: attributes of a point primitive, or an SPZ.
 
 glTF has y up and z forward; a 3DGS .ply has y down and z forward. They differ by half a turn about z, which
 changes the signs of x and y, of the quaternion's x and y, and of harmonics of odd order m.
+
+The values of an SPZ (KHR_gaussian_splatting_compression_spz_2) are glTF coordinates, as CesiumJS reads them.
+The draft asks for SPZ's own axes, which differ by half a turn about y.
 """
 
 from __future__ import annotations
@@ -9,6 +12,7 @@ from __future__ import annotations
 import json
 import struct
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard.errors import DAMAGED, InputError
+from g2ard.io import spz
 from g2ard.io.atomic import atomic_output
 from g2ard.io.jsonfile import (
     Fields,
@@ -29,15 +34,18 @@ from g2ard.io.jsonfile import (
     text,
     whole,
 )
-from g2ard.io.packing import unit_quats, writable
+from g2ard.io.packing import morton_order, unit_quats, writable
 from g2ard.io.sanitize import Raw, cleaned
 from g2ard.io.types import Note, Scene
 from g2ard.progress import plural
 from g2ard.scene.splats import Splats
+from g2ard.scene.transform import placed
 
 EXTENSION = "KHR_gaussian_splatting"
+SPZ_EXTENSION = f"{EXTENSION}_compression_spz_2"
+_SPZ_VERSION = 3
 _MAGIC, _JSON, _BIN = 0x46546C67, 0x4E4F534A, 0x004E4942
-_FLOAT, _USHORT = 5126, 5123
+_FLOAT, _USHORT, _UBYTE = 5126, 5123, 5121
 _TYPES = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 _DTYPES = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
 _FLIPS = np.array([-1, 1, -1, 1, -1, 1, -1, 1, -1, 1, -1, 1, -1, 1, -1], np.float32)
@@ -45,13 +53,23 @@ _FLIPS = np.array([-1, 1, -1, 1, -1, 1, -1, 1, -1, 1, -1, 1, -1, 1, -1], np.floa
 _TURN = np.array([-1.0, -1, 1])
 
 
-def write(path: Path, splats: Splats, *, overwrite: bool = False) -> None:
+def write(path: Path, splats: Splats, *, overwrite: bool = False, compress: str | None = None) -> None:
     """Write a .glb with KHR_gaussian_splatting; equal scenes give equal bytes.
 
     SCALE and OPACITY are linear, ROTATION is x y z w. COLOR_0 is for viewers that only draw points: the base
     colour clipped to [0, 1] and decoded from sRGB, and α. `offset` is the node's translation.
+    `compress="spz"` writes an SPZ of version 3 instead of attributes, for CesiumJS.
     """
+    if compress not in (None, "spz"):
+        raise InputError(f"expected spz, got {compress!r}", parameter="compress")
     splats = writable(path, splats)
+    content = _plain(path, splats) if compress is None else spz_glb(path, splats)
+    with atomic_output(path, overwrite) as temporary, temporary.open("wb") as file:
+        file.writelines(content)
+
+
+def _plain(path: Path, splats: Splats) -> list[bytes]:
+    """Return the parts of a .glb with float32 attributes."""
     attributes = _attributes(splats)
     views: list[dict[str, Any]] = []
     accessors: list[dict[str, Any]] = []
@@ -73,17 +91,68 @@ def write(path: Path, splats: Splats, *, overwrite: bool = False) -> None:
         accessors.append(accessor)
         blobs.append(blob)
         start += len(blob)
-    document = _document(splats, list(attributes), views, accessors, start)
+    node: dict[str, Any] = {"mesh": 0}
+    if splats.offset.any():
+        node["translation"] = (splats.offset * _TURN).tolist()
+    document = _document(node, list(attributes), views, accessors, start)
+    return _glb(path, document, blobs)
+
+
+def spz_glb(path: Path, splats: Splats, centre: NDArray[np.float64] | None = None) -> list[bytes]:
+    """Return the parts of a .glb that holds an SPZ; `path` names it in messages.
+
+    Args:
+        path: the file.
+        splats: the scene, whose `offset` is the node's translation.
+        centre: (3,) moved from the means to the node's translation, so that coordinates are fine.
+    """
+    splats = splats.take(morton_order(splats.means))
+    centre = np.zeros(3) if centre is None else centre
+    means = (splats.means.astype(np.float64) - centre) * (-1, 1, -1)
+    bits = spz.fraction_bits(path, means, splats)
+    blob = spz.encoded(path, _about_y(splats), means, bits, _SPZ_VERSION)
+    stored = np.rint(means * (1, -1, -1) * (1 << bits)) / (1 << bits)
+    ends = {end: getattr(stored, end)(axis=0).tolist() for end in ("min", "max")}
+    names = {"POSITION": "VEC3", "COLOR_0": "VEC4"}
+    names |= {f"{EXTENSION}:SCALE": "VEC3", f"{EXTENSION}:ROTATION": "VEC4"}
+    names |= {name: "VEC3" for name, _ in _harmonics(splats.sh_degree)}
+    accessors: list[dict[str, Any]] = [
+        {"componentType": _FLOAT, "count": len(splats), "type": kind} for kind in names.values()
+    ]
+    accessors[0] |= ends
+    accessors[1] |= {"componentType": _UBYTE, "normalized": True}
+    # CesiumJS needs a `matrix`, and takes the SPZ from the first buffer view.
+    matrix = np.eye(4)
+    matrix[3, :3] = (splats.offset + centre) * _TURN
+    node = {"mesh": 0, "matrix": matrix.ravel().tolist()}
+    view = {"buffer": 0, "byteOffset": 0, "byteLength": len(blob)}
+    blob += b"\0" * (-len(blob) % 4)
+    document = _document(node, list(names), [view], accessors, len(blob))
+    splatting = document["meshes"][0]["primitives"][0]["extensions"][EXTENSION]
+    splatting["extensions"] = {SPZ_EXTENSION: {"bufferView": 0}}
+    document["extensionsUsed"] = document["extensionsRequired"] = [EXTENSION, SPZ_EXTENSION]
+    return _glb(path, document, [blob])
+
+
+def _about_y(splats: Splats) -> Splats:
+    """Turn a scene by half a turn about y, exactly: from SPZ's axes to glTF's, seen in those of a .ply."""
+    signs = (_FLIPS * spz.FLIPS)[: splats.shN.shape[1], None]
+    means = splats.means * np.array([-1, 1, -1], splats.means.dtype)
+    return replace(
+        splats, means=means, quats=splats.quats * np.array([1, -1, 1, -1], np.float32), shN=splats.shN * signs
+    )
+
+
+def _glb(path: Path, document: dict[str, Any], blobs: list[bytes]) -> list[bytes]:
+    """Return the parts of a .glb file."""
+    start = sum(map(len, blobs))
     text = json.dumps(document, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 4)
     total = 12 + 8 + len(text) + 8 + start
     if total >= 1 << 32:
         raise InputError(f"not written: {total:,} bytes exceed the 4 GiB of a .glb", path=path)
-    with atomic_output(path, overwrite) as temporary, temporary.open("wb") as file:
-        file.write(struct.pack("<III", _MAGIC, 2, total))
-        file.write(struct.pack("<II", len(text), _JSON) + text)
-        file.write(struct.pack("<II", start, _BIN))
-        file.writelines(blobs)
+    head = struct.pack("<III", _MAGIC, 2, total) + struct.pack("<II", len(text), _JSON)
+    return [head, text, struct.pack("<II", start, _BIN), *blobs]
 
 
 def _attributes(splats: Splats) -> dict[str, NDArray[Any]]:
@@ -116,14 +185,11 @@ def _harmonics(degree: int) -> list[tuple[str, int]]:
 
 
 def _document(
-    splats: Splats, names: list[str], views: list[Any], accessors: list[Any], size: int
+    node: dict[str, Any], names: list[str], views: list[Any], accessors: list[Any], size: int
 ) -> dict[str, Any]:
     from g2ard import __version__
 
-    node: dict[str, Any] = {"mesh": 0}
-    if splats.offset.any():
-        node["translation"] = (splats.offset * _TURN).tolist()
-    splatting = {
+    splatting: dict[str, Any] = {
         "kernel": "ellipse",
         "colorSpace": "srgb_rec709_display",
         "projection": "perspective",
@@ -148,7 +214,7 @@ def _document(
 
 
 def read(path: Path) -> Scene:
-    """Read the splat primitive of a .glb; its node's translation becomes the `offset`."""
+    """Read the splat primitive of a .glb as its nodes place it; a mere translation becomes the `offset`."""
     content, binary = _chunks(path)
     return _scene(path, fields_of(path, content), binary)
 
@@ -178,10 +244,32 @@ def _scene(path: Path, document: Fields, binary: bytes) -> Scene:
         raise InputError(f"has {len(splatting)} primitives with {EXTENSION}, expected 1", path=path)
     mesh, primitive = splatting[0]
     splats = object_of(_extensions(primitive), EXTENSION)
-    if packed := sorted(_extensions(splats)):
-        raise InputError(f"unsupported extension {packed[0]!r}", path=path)
-    if splats.get("kernel") != "ellipse":
+    packed = _extensions(splats)
+    if unknown := sorted(set(packed) - {SPZ_EXTENSION}):
+        raise InputError(f"unsupported extension {unknown[0]!r}", path=path)
+    if splats.get("kernel", "ellipse") != "ellipse":
         raise InputError("unsupported kernel; expected 'ellipse'", path=path)
+    notes = []
+    if others := sum(map(len, primitives)) - 1:
+        notes.append(Note("ignored_meshes", others, f"{plural(others, 'other primitive')} ignored"))
+    if splats.get("colorSpace") == "lin_rec709_display":
+        notes.append(Note("linear_colors", 1, "linear colours are taken as sRGB, so renders are too dark"))
+    place = _placement(path, document, mesh)
+    if packed:
+        view, start = _view(path, document, object_of(packed, SPZ_EXTENSION), "the SPZ")
+        scene = spz.decoded(path, binary[start : start + whole(view, "byteLength")])
+        scene = replace(scene, splats=_about_y(scene.splats))
+    else:
+        scene = _attributes_of(path, document, binary, primitive)
+    try:
+        moved = placed(scene.splats, place)
+    except InputError as error:
+        raise error.at(path=path, parameter=None, message=f"a node {error.message}") from None
+    return replace(scene, splats=moved, notes=(*notes, *scene.notes))
+
+
+def _attributes_of(path: Path, document: Fields, binary: bytes, primitive: Fields) -> Scene:
+    """Read the float or integer attributes of a primitive, in the axes of a .ply."""
     names = object_of(primitive, "attributes")
 
     def values(name: str, width: int) -> NDArray[np.float32]:
@@ -201,10 +289,7 @@ def _scene(path: Path, document: Fields, binary: bytes) -> Scene:
         raw.sh0[:, 0] = values(f"{EXTENSION}:SH_DEGREE_0_COEF_0", 3)
         for name, k in _harmonics(degree):
             raw.shN[:, k] = values(name, 3) * _FLIPS[k]
-    raw.offset = _translation(path, document, mesh)
-    others = sum(map(len, primitives)) - 1
-    notes = [Note("ignored_meshes", others, f"{plural(others, 'other primitive')} ignored")] if others else []
-    return cleaned(path, raw, notes)
+    return cleaned(path, raw)
 
 
 def _extensions(of: Fields) -> Fields:
@@ -217,6 +302,14 @@ def _pointed(document: Fields, table: str, holder: Fields, name: str) -> Fields:
     return object_of(entries, index_of(holder, name, len(entries)))
 
 
+def _view(path: Path, document: Fields, holder: Fields, what: str) -> tuple[Fields, int]:
+    """Return the buffer view that `holder` points to, and its start in the binary chunk."""
+    view = _pointed(document, "bufferViews", holder, "bufferView")
+    if view["buffer"] != 0 or "uri" in _pointed(document, "buffers", view, "buffer"):
+        raise InputError(f"{what} lies outside the file", path=path)
+    return view, whole(view, "byteOffset", 0)
+
+
 def _accessor(
     path: Path, document: Fields, binary: bytes, names: Fields, name: str, width: int
 ) -> NDArray[np.float32]:
@@ -225,12 +318,10 @@ def _accessor(
     kind = whole(accessor, "componentType")
     if kind not in _DTYPES or _TYPES.get(text(accessor, "type")) != width or "sparse" in accessor:
         raise InputError(f"attribute {name!r} has an unsupported type", path=path)
-    view = _pointed(document, "bufferViews", accessor, "bufferView")
-    if view["buffer"] != 0 or "uri" in _pointed(document, "buffers", view, "buffer"):
-        raise InputError(f"attribute {name!r} lies outside the file", path=path)
+    view, start = _view(path, document, accessor, f"attribute {name!r}")
     dtype, count = np.dtype(_DTYPES[kind]), whole(accessor, "count")
     step = whole(view, "byteStride", width * dtype.itemsize)
-    start = whole(view, "byteOffset", 0) + whole(accessor, "byteOffset", 0)
+    start += whole(accessor, "byteOffset", 0)
     if step < width * dtype.itemsize:
         raise InputError(
             f"attribute {name!r} has a stride of {step} bytes, less than its elements", path=path
@@ -244,8 +335,8 @@ def _accessor(
     return np.maximum(rows.astype(np.float32) / np.float32(top), np.float32(-1))
 
 
-def _translation(path: Path, document: Fields, mesh: int) -> NDArray[np.float64]:
-    """Return the (3,) translation of the mesh's only node."""
+def _placement(path: Path, document: Fields, mesh: int) -> NDArray[np.float64]:
+    """Return the (4, 4) placement by the mesh's only node and its ancestors, in the axes of a .ply."""
     nodes = objects(document, "nodes")
     parents: dict[int, list[int]] = {}
     for i, node in enumerate(nodes):
@@ -255,27 +346,34 @@ def _translation(path: Path, document: Fields, mesh: int) -> NDArray[np.float64]
     at = [i for i, node in enumerate(nodes) if node.get("mesh") == mesh]
     if len(at) > 1:
         raise InputError(f"{len(at)} nodes show the splats, expected 1", path=path)
-    total = np.zeros(3)
+    total = np.eye(4)
     seen: set[int] = set()
     while at:
         if at[0] in seen:
             raise InputError(f"node {at[0]} is its own ancestor", path=path)
         seen.add(at[0])
-        node = nodes[at[0]]
-        moved = _numbers(node, "translation", (0, 0, 0))
-        matrix = _numbers(node, "matrix", np.eye(4).ravel()).reshape(4, 4).T
-        turned = (_numbers(node, "rotation", (0, 0, 0, 1)) != (0, 0, 0, 1)).any()
-        scaled = (_numbers(node, "scale", (1, 1, 1)) != 1).any()
-        if turned or scaled or (matrix[:3, :3] != np.eye(3)).any():
-            raise InputError("a node rotates or scales the splats, which is not supported", path=path)
         with np.errstate(over="ignore", invalid="ignore"):
-            total += moved + matrix[:3, 3]
+            total = _local(nodes[at[0]]) @ total
         at = parents.get(at[0], [])
         if len(at) > 1:
             raise InputError(f"a node has {len(at)} parents", path=path)
-    if not np.isfinite(total).all():
-        raise InputError(f"invalid translation {tuple(total.tolist())}", path=path)
-    return total * _TURN
+    if not np.isfinite(total[:3, 3]).all():
+        raise InputError(f"invalid translation {tuple(total[:3, 3].tolist())}", path=path)
+    return total * np.outer((*_TURN, 1), (*_TURN, 1))
+
+
+def _local(node: Fields) -> NDArray[np.float64]:
+    """Return a node's (4, 4) matrix, given as such or as translation, rotation and scale."""
+    if "matrix" in node:
+        return _numbers(node, "matrix", np.eye(4).ravel()).reshape(4, 4).T
+    matrix = np.eye(4)
+    matrix[:3, 3] = _numbers(node, "translation", (0, 0, 0))
+    if "rotation" in node or "scale" in node:
+        w, x, y, z = unit_quats(_numbers(node, "rotation", (0, 0, 0, 1))[[3, 0, 1, 2]][None])[0]
+        cross = np.cross(np.eye(3), (x, y, z))
+        rotation = np.eye(3) + 2 * w * cross + 2 * cross @ cross
+        matrix[:3, :3] = rotation * _numbers(node, "scale", (1, 1, 1))
+    return matrix
 
 
 def _numbers(node: Fields, key: str, default: Sequence[float] | NDArray[np.float64]) -> NDArray[np.float64]:

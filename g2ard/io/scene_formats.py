@@ -30,7 +30,7 @@ FORMATS: dict[FormatName, SceneFormat] = {
     "ply": SceneFormat(".ply", "ply", options=("normals",)),
     "sog": SceneFormat(".sog", "sog_write"),
     "spz": SceneFormat(".spz", "spz", options=("spz_version",)),
-    "glb": SceneFormat(".glb", "glb"),
+    "glb": SceneFormat(".glb", "glb", options=("compress",)),
     "splat": SceneFormat(".splat", "splat"),
     "usda": SceneFormat(".usda", "usd"),
     "usdc": SceneFormat(".usdc", "usd"),

@@ -54,7 +54,11 @@ _BUCKETS = (8, 16)
 
 def read(path: Path) -> Scene:
     """Read an .spz of version 2, 3 or 4; bands past degree 3 are ignored with a note."""
-    data = path.read_bytes()
+    return decoded(path, path.read_bytes())
+
+
+def decoded(path: Path, data: bytes) -> Scene:
+    """Read the bytes of an .spz like `read`; `path` names their file in messages."""
     if data[:2] == b"\x1f\x8b":
         data = _gunzip(path, data)
     if data[:4] == _MAGIC and len(data) < _HEADER:
@@ -221,19 +225,22 @@ def write(path: Path, splats: Splats, *, overwrite: bool = False, spz_version: i
     splats = writable(path, splats)
     splats = splats.take(morton_order(splats.means))
     means = world_means(path, splats, ".spz")
-    bits = fraction_bits(path, means, splats)
+    content = encoded(path, splats, means, fraction_bits(path, means, splats), spz_version)
+    with atomic_output(path, overwrite) as temporary:
+        temporary.write_bytes(content)
+
+
+def encoded(path: Path, splats: Splats, means: NDArray[np.float64], bits: int, spz_version: int) -> bytes:
+    """Return the bytes of an .spz with these means, in `bits` fractional bits and the order of the rows."""
     streams = _streams(splats, means, bits, spz_version)
     head = _MAGIC + struct.pack("<IIBBB", spz_version, len(splats), splats.sh_degree, bits, 0)
     if spz_version < 4:
-        content = gzip.compress(head + b"\0" + b"".join(streams), 9, mtime=0)
-    else:
-        zstd = _zstandard(path)
-        packed = [zstd.compress(stream, 19) for stream in streams]
-        sizes = zip(packed, streams, strict=True)
-        table = b"".join(struct.pack("<QQ", len(p), len(stream)) for p, stream in sizes)
-        content = head + struct.pack("<BI12x", len(streams), 32) + table + b"".join(packed)
-    with atomic_output(path, overwrite) as temporary:
-        temporary.write_bytes(content)
+        return gzip.compress(head + b"\0" + b"".join(streams), 9, mtime=0)
+    zstd = _zstandard(path)
+    packed = [zstd.compress(stream, 19) for stream in streams]
+    sizes = zip(packed, streams, strict=True)
+    table = b"".join(struct.pack("<QQ", len(p), len(stream)) for p, stream in sizes)
+    return head + struct.pack("<BI12x", len(streams), 32) + table + b"".join(packed)
 
 
 def fraction_bits(path: Path, means: NDArray[np.float64], splats: Splats) -> int:

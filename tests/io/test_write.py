@@ -2,6 +2,7 @@
 
 import json
 import math
+import struct
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,12 +12,13 @@ import pytest
 from g2ard import _core
 from g2ard.errors import InputError, OutputError
 from g2ard.io import check_scene_output, read_scene, read_splats, write_splats
-from g2ard.io.glb import EXTENSION
+from g2ard.io.glb import EXTENSION, SPZ_EXTENSION
 from g2ard.io.packing import morton_order, unit_quats
 from g2ard.io.sog_write import nearest, palette_size, sog_files
 from g2ard.io.spz import fraction_bits
 from g2ard.scene.splats import Splats
 from g2ard.scene.transform import transform
+from g2ard.stages.recover.anchors import rotation_matrices
 from helpers.glb_files import glb_parts
 from helpers.peers import adobe_spz, gltf_report, splat_transform
 from helpers.realdata import real
@@ -418,3 +420,67 @@ def test_a_real_scene_keeps_its_values(tmp_path: Path) -> None:
     assert np.abs(found.opacities - order.opacities).max() <= 0.5 / 255 + 1e-6
     assert np.sqrt(((found.log_scales - order.log_scales) ** 2).mean()) < 0.02
     assert np.sqrt(((found.sh0 - order.sh0) ** 2).mean()) < 0.01
+
+
+# ── .glb with an SPZ inside, and placed by nodes ─────────────────────────────────────────────────────
+
+
+@pytest.mark.parametrize("degree", [0, 1, 3])
+def test_glb_with_spz_holds_gltf_coordinates(tmp_path: Path, degree: int) -> None:
+    truth = replace(in_order(scene(700, degree)), offset=np.array([443_000.0, 5_411_000.5, 120.25]))
+    path = saved(tmp_path, "glb", truth, compress="spz")
+    document, binary = glb_parts(path)
+    (primitive,) = document["meshes"][0]["primitives"]
+    splatting = primitive["extensions"][EXTENSION]
+    assert splatting["extensions"][SPZ_EXTENSION] == {"bufferView": 0}
+    assert document["extensionsRequired"] == document["extensionsUsed"] == [EXTENSION, SPZ_EXTENSION]
+    accessors = {name: document["accessors"][index] for name, index in primitive["attributes"].items()}
+    assert {accessor["count"] for accessor in accessors.values()} == {700}
+    assert sum("SH_DEGREE" in name for name in accessors) == (degree + 1) ** 2 - 1
+    assert document["nodes"][0]["matrix"][12:15] == [-443_000.0, -5_411_000.5, 120.25]
+    (tmp_path / "inside.spz").write_bytes(binary[: document["bufferViews"][0]["byteLength"]])
+    inside = read_splats(tmp_path / "inside.spz")  # as if of SPZ's axes: y and z changed their sign
+    stored = inside.means * (1, -1, -1)
+    np.testing.assert_allclose(stored, truth.means * (-1, -1, 1), atol=2.0**-13)
+    np.testing.assert_allclose(stored.min(0), accessors["POSITION"]["min"], atol=1e-6)
+    np.testing.assert_allclose(stored.max(0), accessors["POSITION"]["max"], atol=1e-6)
+    turned_scene = transform(replace(truth, offset=np.zeros(3)), np.diag([-1.0, 1, -1, 1]))
+    np.testing.assert_allclose(inside.shN, turned_scene.shN, atol=0.07)
+    found = read_splats(path)
+    np.testing.assert_array_equal(found.offset, truth.offset)
+    np.testing.assert_allclose(found.means, truth.means, atol=2.0**-13)
+    np.testing.assert_allclose(found.shN, truth.shN, atol=0.07)
+    np.testing.assert_allclose(spreads(found), spreads(truth), rtol=0.1, atol=0.02 * truth.scales.max() ** 2)
+
+
+def spreads(splats: Splats) -> np.ndarray:
+    """Covariances."""
+    frames = rotation_matrices(splats.quats) * splats.scales[:, None].astype(float)
+    return frames @ frames.swapaxes(1, 2)
+
+
+@pytest.mark.parametrize("compress", [None, "spz"])
+def test_nodes_of_a_glb_turn_scale_and_move(tmp_path: Path, compress: str | None) -> None:
+    truth = in_order(scene(60, 3))
+    path = saved(tmp_path, "glb", truth, **({} if compress is None else {"compress": compress}))
+    plain = read_splats(path)
+    third = [0.5, 0.5, 0.5, 0.5]  # x → y → z → x
+    above = {"children": [0], "rotation": third, "scale": [2, 2, 2], "translation": [1, 2, 3]}
+    document, binary = glb_parts(path)
+    node_file(path, {**document, "nodes": [document["nodes"][0], above]}, binary)
+    cycle, turn = np.eye(4), np.diag([-1.0, -1, 1, 1])
+    cycle[:3] = [[0, 0, 2, 1], [2, 0, 0, 2], [0, 2, 0, 3]]
+    wanted, found = transform(plain, turn @ cycle @ turn), read_splats(path)
+    np.testing.assert_allclose(found.means + found.offset, wanted.means + wanted.offset, atol=1e-5)
+    np.testing.assert_allclose(spreads(found), spreads(wanted), rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(found.shN, wanted.shN, atol=1e-5)
+    node_file(path, {**document, "nodes": [document["nodes"][0], above | {"scale": [1, 2, 1]}]}, binary)
+    with pytest.raises(InputError, match="a node shears, or scales differently"):
+        read_splats(path)
+
+
+def node_file(path: Path, document: dict, binary: bytes) -> None:
+    text = json.dumps(document).encode()
+    text += b" " * (-len(text) % 4)
+    head = struct.pack("<4sIIII", b"glTF", 2, 28 + len(text) + len(binary), len(text), 0x4E4F534A)
+    path.write_bytes(head + text + struct.pack("<II", len(binary), 0x004E4942) + binary)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -52,6 +52,9 @@ def convert(
     spz_version: Annotated[
         int | None, typer.Option(min=2, max=4, help="Version of .spz files; 3 by default, 4 is smaller.")
     ] = None,
+    compress: Annotated[
+        Literal["spz"] | None, typer.Option(help="Write an SPZ inside of a .glb, for CesiumJS.")
+    ] = None,
 ) -> None:
     """Convert scenes to another format, and merge, crop or move them."""
     from dataclasses import replace
@@ -65,7 +68,8 @@ def convert(
     from g2ard.scene.transform import transform as moved
 
     scenes, output = _parted(run, scenes, output)
-    options: dict[str, Any] = {} if spz_version is None else {"spz_version": spz_version}
+    given = {"spz_version": spz_version, "compress": compress}
+    options: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
     corners = None if box is None else numbers("--box", box, 6)
     ball = None if sphere is None else numbers("--sphere", sphere, 4)
     matrix = None if transform is None else _matrix(transform)
