@@ -56,7 +56,8 @@ def write_kinds(run: Run, title: str, kinds: Sequence[KindScore]) -> None:
 
 
 def told(report: dict[str, Any], *, verbose: bool = False) -> list[str]:
-    """Return lines on recovery's outcome, losses and unseen parts; `verbose` adds idle regularisers."""
+    """Return lines on recovery's outcome, losses, likely causes and unseen parts; `verbose` adds idle
+    regularisers."""
     from g2ard.report.kinds import KindScore
     from g2ard.stages.recover.report import RecoverReport, outcome, unregularized_rounds
 
@@ -64,6 +65,7 @@ def told(report: dict[str, Any], *, verbose: bool = False) -> list[str]:
     lines = [outcome(one) for entry in rounds for one in entry]
     lines += [unregularized_rounds(rounds)] if verbose else []
     lines += [loss(KindScore.of(kind)) for kind in report["kinds"]]
+    lines += report["causes"]
     if report["unseen"] and report["unseen"] > _FEW:
         lines.append(f"{report['unseen']:.0%} of the scene is in no view: simplified but not recovered")
     return [line for line in lines if line is not None]

@@ -25,9 +25,11 @@ def report_of(job: DistillJob, done: Distilled) -> dict[str, Any]:
 
     Returns:
         Counts, bytes, scores in held-out views (`scores`) and in views of other kinds (`apart`, or None),
-        their summary by kind (`kinds`), rounds, seconds by stage, and every setting by path.
+        their summary by kind (`kinds`), likely causes of a poor result (`causes`), rounds, seconds by stage,
+        and every setting by path.
     """
     from g2ard.config.paths import listed
+    from g2ard.jobs.causes import likely_causes
     from g2ard.report.kinds import by_kind
     from g2ard.scene.splits import USUAL
 
@@ -38,6 +40,7 @@ def report_of(job: DistillJob, done: Distilled) -> dict[str, Any]:
         for name in ("simplified", "recovered")
     )
     made = job.views.pool is not None and "test" in job.views.pool.splits
+    recoveries = [recovery for entry in done.report.rounds for recovery in entry.recover]
     config = replace(job.config, simplify=job.config.simplify.resolved())
     found = done.report.as_dict()
     return {
@@ -49,6 +52,14 @@ def report_of(job: DistillJob, done: Distilled) -> dict[str, Any]:
         "scores": scores,
         "apart": apart,
         "kinds": [kind.as_dict() for kind in by_kind(before, after, USUAL if made else "given")],
+        "causes": likely_causes(
+            done.splats,
+            job.held_out,
+            job.views.train.cameras,
+            recoveries[-1],
+            scores["recovered"]["psnr"],
+            config.recover.background,
+        ),
         "unseen": _unseen(job, done),
         "against": job.against,
         "preset": job.preset,

@@ -101,6 +101,7 @@ def warn_of_photos(splats: Splats, cameras: Cameras, background: Colour, say: Sa
     """
     import numpy as np
 
+    from g2ard.jobs.causes import correlation
     from g2ard.rendering.renderer import Renderer
     from g2ard.scene.targets import Photos, mask_of
 
@@ -112,10 +113,8 @@ def warn_of_photos(splats: Splats, cameras: Cameras, background: Colour, say: Sa
     for view in range(len(tried)):
         mask = mask_of(photos, view)
         counted = np.ones(photos[view].shape[:2], bool) if mask is None else mask
-        pair = renderer.render(photos.cameras[view]).image[counted], photos[view][counted]
-        centred = [image.mean(axis=1) - image.mean() for image in pair]
-        scale = np.linalg.norm(centred[0]) * np.linalg.norm(centred[1])
-        alike.append(float(centred[0] @ centred[1] / scale) if scale > 0 else 0.0)
+        image = renderer.render(photos.cameras[view]).image
+        alike.append(correlation(image[counted], photos[view][counted]))
     if alike and np.median(alike) < _ALIKE:
         say(
             f"warning: the scene does not look like the photos (correlation {np.median(alike):.2f}); check "

@@ -144,5 +144,5 @@ def test_the_table_has_a_row_per_kind_of_view() -> None:
 
 @pytest.mark.parametrize(("unseen", "lines"), [(0.004, 0), (0.005, 0), (0.02, 1)])
 def test_a_share_of_unseen_gaussians_is_noted(unseen: float, lines: int) -> None:
-    found = told({"rounds": [], "kinds": [], "unseen": unseen})
+    found = told({"rounds": [], "kinds": [], "causes": [], "unseen": unseen})
     assert (len(found), any("0%" in line for line in found)) == (lines, False)

@@ -81,6 +81,7 @@ def recover(
     from g2ard.config.paths import listed
     from g2ard.config.presets import PRESETS, configured
     from g2ard.io import check_scene_output, write_splats
+    from g2ard.jobs.causes import likely_causes
     from g2ard.jobs.inputs import load_scene, load_split_views, load_trained, make_targets
     from g2ard.jobs.score import scores_by_kind
     from g2ard.jobs.view_checks import propose_background, warn_of_sight
@@ -159,7 +160,12 @@ def recover(
         )
         kinds = scores_by_kind(splats, result.splats, held_out, config.background, run.progress)
         write_kinds(run, f"held-out views against {kinds_of(held_out)}, before → after:", kinds)
-        for line in filter(None, (loss(kind, "the student is better there") for kind in kinds)):
+        lines = [loss(kind, "the student is better there") for kind in kinds]
+        scored = sum(kind.views * kind.psnr.after for kind in kinds) / len(tested)
+        lines += likely_causes(
+            result.splats, held_out, chosen.cameras, result.report, scored, config.background
+        )
+        for line in filter(None, lines):
             run.say(line)
     gain, count = result.report.psnr, plural(len(splats), "Gaussian")
     run.say(f"{output}: {count}, {trained_on(split)} {gain.before:.2f} → {gain.after:.2f} dB")
