@@ -176,7 +176,7 @@ def _snapped(axis: Floats) -> Floats:
 def _signed(sample: Sample, axis: Floats, grounded: bool, why: str) -> Up:
     lean = _lean(sample, axis) if grounded else -_balance(sample, axis)
     if abs(lean) > 0.05:
-        side = "most matter lies above it" if grounded else "its heavier end is down"
+        side = "most of the scene lies above it" if grounded else "its heavier end is down"
         return Up(axis * np.copysign(1.0, lean), grounded, f"{why}, {side}")
     usual = (1.0, -1.0, 1.0)[int(np.argmax(np.abs(axis)))]
     sign = np.copysign(1.0, usual * axis[int(np.argmax(np.abs(axis)))])

@@ -128,7 +128,7 @@ def within_reach(splats: Splats, cameras: Cameras, progress: Progress = silent) 
         rows = np.flatnonzero(framed)
         there = depths[v[rows].astype(int), u[rows].astype(int)]
         out[rows[(there == 0) | (z[rows] < (1 + _BEHIND) * there)]] = True
-        progress("reach", done, len(cameras), {})
+        progress("depths", done, len(cameras), {})
     return out
 
 

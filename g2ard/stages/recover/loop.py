@@ -251,7 +251,7 @@ class Loop:
         if self.config.recovery_time is not None:
             total = max(self.done, round(self.done / max(self._share(), 1e-9)))
         shown, at = self.probe.latest(self.engine.splats, self.done, self.seconds)
-        figures = {"loss": f"{recent:.4f}", "PSNR": f"{shown:.2f} @{at}", "steps/s": f"{speed:.1f}"}
+        figures = {"loss": f"{recent:.4f}", "PSNR": f"{shown:.2f} dB at step {at}", "steps/s": f"{speed:.1f}"}
         progress(stage, self.done, total, figures)
 
     def curve(self) -> list[float]:

@@ -161,13 +161,12 @@ def preset_for(
 
 
 def _judged(m: PriorMeasures) -> tuple[str, str]:
-    figures = f"{m.needle:.1%} needles, thickness {m.thickness:.2f} within ×{m.thickness_spread:.1f}"
-    if m.consistency is not None:
-        figures += f", {m.consistency:.0%} of the surface consistent between neighbouring views"
+    needles = f"{m.needle:.1%} of the Gaussians are needles"
     if not m.view_dependent and m.thickness <= _LIFT_THICKNESS and m.thickness_spread <= _LIFT_SPREAD:
-        return "lift", f"uniform thin discs, not trained; {figures}"
+        return "lift", "thin discs of equal proportions and colours without view dependence: not trained yet"
     if m.needle > _MANY_NEEDLES:
-        return "noisy", f"over {_MANY_NEEDLES:.0%} needles; {figures}"
-    if m.consistency is not None and m.consistency < _INCONSISTENT:
-        return "noisy", f"views see through each other's surfaces; {figures}"
-    return "trained", figures
+        return "noisy", needles
+    if m.consistency is None:
+        return "trained", needles
+    agree = f"{m.consistency:.0%} of the surface agrees between neighbouring views"
+    return ("noisy" if m.consistency < _INCONSISTENT else "trained"), f"{needles}, {agree}"
