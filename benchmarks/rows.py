@@ -58,6 +58,7 @@ COLUMNS: dict[str, Column] = {
     "seconds": Column(float, ".1f", "by the clock: recovery so far; with reduction where time is matched"),
     "bytes": Column(int, ",", "of the file; of float32 arrays where nothing is written"),
     "psnr": Column(float, ".2f", "mean over the views, dB"),
+    "psnr_worst": Column(float, ".2f", "of the worst view, dB"),
     "ssim": Column(float, ".4f", "mean over the views"),
     "lpips_vgg": Column(float, ".4f", "mean over the views"),
     "lpips_alex": Column(float, ".4f", "mean over the views"),

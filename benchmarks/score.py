@@ -61,9 +61,10 @@ class Scored:
     def figures(self) -> Row:
         """Return the columns of a row."""
         means = {name: self.mean(name) for name in ("psnr", "ssim", "lpips_vgg", "lpips_alex")}
+        worst = min(view.psnr for view in self.counted)
         drift = float(np.mean([abs(view.luma) for view in self.counted]))
         black = sum(view.black for view in self.views)
-        return {**means, "luma_drift": drift, "views": len(self.counted), "black": black}
+        return {**means, "psnr_worst": worst, "luma_drift": drift, "views": len(self.counted), "black": black}
 
 
 def luma(image: NDArray[np.float32], mask: NDArray[np.bool_] | None = None) -> float:

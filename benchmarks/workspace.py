@@ -29,19 +29,32 @@ from g2ard.scene.targets import Photos, PhotosOrRenders, Targets, TeacherRenders
 from g2ard.stages.lift import lift
 from g2ard.stages.simplify import simplify
 
-__all__ = ["PROTOCOLS", "Workspace", "budget_of", "reduced"]
+__all__ = ["PROTOCOLS", "Workspace", "budget_of", "kinds_for", "reduced"]
 
 PROTOCOLS: dict[str, tuple[str, ...]] = {
+    "all": ("pool", "near", "standing", "anywhere"),
     "pool": ("pool",),
     "standing": ("near", "standing"),
-    "both": ("pool", "near", "standing"),
     "anywhere": ("anywhere",),
 }
-"""Protocol → kinds of views to score."""
+"""Protocol → kinds of views to score; photos exist for the pool alone."""
 
 _POOL = 128
 _MAX_LOGIT = 20.0
 """Largest logit. Opacities of exactly 1 become 1 − 2e-9, since some programs cannot read infinite logits."""
+
+
+def kinds_for(protocol: str, scene: SceneSpec) -> tuple[str, ...]:
+    """Return the kinds of views to score.
+
+    Raises:
+        InputError: photos, and a protocol that needs renders.
+    """
+    if scene.targets != "photos":
+        return PROTOCOLS[protocol]
+    if protocol not in ("all", "pool"):
+        raise InputError("protocol: expected 'pool' for photos; other views need a trained scene")
+    return ("pool",)
 
 
 def budget_of(count: int, ratio: float) -> int:
@@ -206,16 +219,16 @@ class Workspace:
 
     @cached_property
     def kinds_of_views(self) -> dict[str, Targets]:
-        """Kind of views → targets: "pool" (the scored views), and with "near" and "standing" as there are.
+        """Kind of views → targets: "pool" (the scored views), and the protocol's others if there is room.
 
-        Those two are never seen by a method (`benchmarks.standing.standing_views`).
+        No method sees the others (`benchmarks.standing.standing_views`, `benchmarks.views.anywhere_views`).
         """
         found = {"pool": self.targets(next(iter(self.scored.values())))}
-        if self.scene.targets == "photos":
-            return found
+        wanted = kinds_for(getattr(self.study, "protocol", "pool"), self.scene)
         source, seed = self.place / self.scene.prior, self.study.pool_seed
         size, background = self.study.size, self.scene.background
-        if getattr(self.study, "protocol", "pool") == "anywhere":
-            cameras = anywhere_views(self.splats, seed=seed).resized(size)
-            return {**found, "anywhere": TeacherRenders(self.splats, cameras, background=background)}
-        return {**found, **standing_targets(self.splats, source, seed, size=size, background=background)}
+        if "standing" in wanted:
+            found |= standing_targets(self.splats, source, seed, size=size, background=background)
+        if "anywhere" in wanted and len(cameras := anywhere_views(self.splats, seed=seed).resized(size)):
+            found["anywhere"] = TeacherRenders(self.splats, cameras, background=background)
+        return found

@@ -15,7 +15,7 @@ from benchmarks.rows import Row
 from benchmarks.runner import Cell
 from benchmarks.score import score
 from benchmarks.study import SceneSpec, Study, checked, key
-from benchmarks.workspace import PROTOCOLS, Workspace, budget_of
+from benchmarks.workspace import PROTOCOLS, Workspace, budget_of, kinds_for
 from g2ard.errors import InputError
 from g2ard.pipeline import DistillConfig, distill
 from g2ard.rendering.visibility import visibility_source
@@ -78,12 +78,12 @@ class Recover(Study):
         methods: tables of `Variant`.
         steps: steps of variants with the default schedule; only the last unless a variant runs each.
         seconds: seconds of recovery over all rounds, instead of steps.
-        protocol: "pool", "standing" (near and standing views), "both" or "anywhere".
+        protocol: kinds of views to score: "pool", "standing" (near and standing views), "anywhere", or "all".
     """
 
     steps: tuple[int, ...] = key((1000,), least=1, axis=True)
     seconds: float | None = key(None, least=1e-6)
-    protocol: str = key("pool", choices=tuple(PROTOCOLS), axis=True)
+    protocol: str = key("all", choices=tuple(PROTOCOLS), axis=True)
 
     @classmethod
     def method(cls, name: str, values: Mapping[str, Any]) -> Variant:
@@ -95,8 +95,7 @@ class Recover(Study):
 
     def cells(self, scene: SceneSpec, work: Path) -> Iterator[Cell]:
         """Yield a cell per ratio, variant and seed."""
-        if self.protocol != "pool" and scene.targets == "photos":
-            raise InputError("protocol: expected 'pool' for photos; other views need a trained scene")
+        kinds = kinds_for(self.protocol, scene)
         place = _Workspace(work, self, scene)
         label = scene.name + (f" {self.size}px" if self.size else "")  # decibels depend on it
         for ratio in self.ratios:
@@ -106,7 +105,6 @@ class Recover(Study):
                     horizon = None if variant.schedule == "paper" or self.seconds else steps
                     for seed in self.seeds:
                         names = {"scene": label, "ratio": ratio, "variant": name, "seed": seed}
-                        kinds = PROTOCOLS[self.protocol]
                         run = partial(self._run, place, ratio, variant, horizon, seed, kinds)
                         yield Cell(names, run, kinds, [repr(variant), horizon])
 
@@ -124,6 +122,7 @@ class Recover(Study):
     def summary(self, rows: list[Row]) -> tuple[str, list[str], list[list[str]]] | None:
         """Return the default's time to reach the final PSNR of other variants."""
         lines = []
+        rows = [row for row in rows if "error" not in row]
         for other in rows:
             if not other.get("final") or other["variant"].startswith("default@"):
                 continue
@@ -263,7 +262,9 @@ class _Run:
     def _looks(self, splats: Splats, step: int, seconds: float, final: int) -> Iterator[Row]:
         for kind in self.kinds:
             if kind not in self.place.kinds_of_views:
-                raise InputError(f"the scene has no {kind} views")
+                if final:
+                    yield {"views_kind": kind, "error": f"no place for {kind} views"}
+                continue
             scored = score(splats, self.place.kinds_of_views[kind], self.place.scene.background)
             yield {
                 "views_kind": kind,

@@ -17,7 +17,7 @@ from benchmarks.rows import Row
 from benchmarks.runner import Cell
 from benchmarks.score import score
 from benchmarks.study import SceneSpec, Study, key
-from benchmarks.workspace import PROTOCOLS, Workspace, budget_of
+from benchmarks.workspace import PROTOCOLS, Workspace, budget_of, kinds_for
 from g2ard import io
 from g2ard.scene.splats import Splats
 
@@ -33,19 +33,19 @@ class Simplify(Study):
     with a pool of its own, as its user runs it.
 
     Args:
-        protocol: "pool", "standing" (near and standing views), "both" or "anywhere".
+        protocol: kinds of views to score: "pool", "standing" (near and standing views), "anywhere", or "all".
         splat_transform: path of splat-transform; None uses PATH.
     """
 
     METHODS: ClassVar[Mapping[str, Any]] = {name: name for name in REDUCERS}
     PROCESSES: ClassVar[bool] = True
 
-    protocol: str = key("pool", choices=tuple(PROTOCOLS), axis=True)
+    protocol: str = key("all", choices=tuple(PROTOCOLS), axis=True)
     splat_transform: str | None = key(None, axis=True)
 
     def cells(self, scene: SceneSpec, work: Path) -> Iterator[Cell]:
         """Yield a cell per ratio and method."""
-        place, kinds = Workspace(work, self, scene), PROTOCOLS[self.protocol]
+        place, kinds = Workspace(work, self, scene), kinds_for(self.protocol, scene)
         for ratio in self.ratios:
             for method in self.methods:
                 names = {"ratio": ratio, "method": method}

@@ -24,7 +24,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> SceneSpec:
 
 
 def ask(scene: SceneSpec, out: Path, name: str, **options: str) -> list[Row]:
-    made = read_study(DEFINITIONS / f"recover-{name}.toml").narrowed(options)
+    made = read_study(DEFINITIONS / f"recover-{name}.toml").narrowed({"protocol": "pool", **options})
     rows = run([replace(made, scenes=(scene,))], out)
     assert [row["error"] for row in rows if "error" in row] == []
     return rows
@@ -70,25 +70,26 @@ def test_rounds_take_the_time_they_are_given(scene: SceneSpec, tmp_path: Path) -
     assert any(row["count"] > 500 for row in found)  # looks within rounds
 
 
-def test_standing_views_are_scored_beside_the_pools(scene: SceneSpec, tmp_path: Path) -> None:
+def test_every_kind_of_view_is_scored(scene: SceneSpec, tmp_path: Path) -> None:
     options = {"methods": "default", "ratios": "5", "steps": "50", "size": "48"}
-    found = ask(scene, tmp_path, "curves", **options, protocol="both")
-    kinds = ["pool", "near", "standing"]
+    found = ask(scene, tmp_path, "curves", **options, protocol="all")
+    kinds = ["pool", "near", "standing", "anywhere"]
     ends = [row for row in found if row["final"]]
     assert [row["views_kind"] for row in ends] == kinds
     assert {row["scene"] for row in found} == {"ball 48px"}
     on_the_way = [(row["views_kind"], row["step"]) for row in found if not row["final"]]
     assert sorted(on_the_way) == [(kind, step) for kind in sorted(kinds) for step in (25, 50)]
-    assert len({row["psnr"] for row in ends}) == 3
+    assert len({row["psnr"] for row in ends}) == 4
+    assert all(row["psnr_worst"] < row["psnr"] for row in ends)
     before = (tmp_path / "rows.csv").read_text()
     ask(scene, tmp_path, "curves", **options, protocol="standing")
     assert (tmp_path / "rows.csv").read_text() == before  # nothing was run again
     with pytest.raises(InputError, match="need a trained scene"):
-        ask(replace(scene, targets="photos"), tmp_path, "curves", protocol="both")
+        ask(replace(scene, targets="photos"), tmp_path, "curves", protocol="standing")
 
 
 def test_command(scene: SceneSpec, tmp_path: Path, command_line: CommandLine) -> None:
-    asked = ("--methods", "×1,chosen", "--steps", "30", "--ratios", "5")
+    asked = ("--methods", "×1,chosen", "--steps", "30", "--ratios", "5", "--set", "protocol=pool")
     place = ("benchmarks", "run", "recover-multiplier", scene.prior, "--views", scene.train)
     told = succeeds(command_line, tmp_path, *place, *asked).err
     assert "×1" in told

@@ -21,7 +21,9 @@ METHODS = ("default", "fast", "paper", "nanogs", "lightgaussian")
 
 
 def ask(scene: SceneSpec, out: Path, methods: str, **options: str) -> list[Row]:
-    made = read_study(DEFINITIONS / "simplify.toml").narrowed({"ratios": "4", "methods": methods, **options})
+    made = read_study(DEFINITIONS / "simplify.toml").narrowed(
+        {"ratios": "4", "methods": methods, "protocol": "pool", **options}
+    )
     return run([replace(made, scenes=(scene,))], out)
 
 
@@ -53,16 +55,16 @@ def test_measures_writes_and_resumes(tmp_path: Path) -> None:
 def test_every_kind_of_view_is_scored(tmp_path: Path) -> None:
     path = tmp_path / "ball.ply"
     io.write_splats(path, checkered_ball(3000))
-    rows = ask(SceneSpec("ball", str(path)), tmp_path / "out", "default,fast", protocol="both")
-    kinds = ["pool", "near", "standing"]
+    rows = ask(SceneSpec("ball", str(path)), tmp_path / "out", "default,fast", protocol="all")
+    kinds = ["pool", "near", "standing", "anywhere"]
     assert [(r["method"], r["views_kind"]) for r in rows] == [
         (method, kind) for method in ("default", "fast") for kind in kinds
     ]
     standing = standing_views(io.read_splats(path), path).values()
     assert [r["views"] for r in rows[:3]] == [16, *(len(v) for v in standing)]
     assert rows[0]["psnr"] != rows[2]["psnr"]
-    assert len({r["cpu_s"] for r in rows[:3]}) == 2  # with the pool's views, and with its own
-    assert len({r["cpu_s"] for r in rows[3:]}) == 1  # run alike for all, so run once
+    assert len({r["cpu_s"] for r in rows[:4]}) == 2  # with the pool's views, and with its own
+    assert len({r["cpu_s"] for r in rows[4:]}) == 1  # run alike for all, so run once
     text = (tmp_path / "out" / "rows.csv").read_text()
     ask(SceneSpec("ball", str(path)), tmp_path / "out", "default", protocol="standing")
     assert (tmp_path / "out" / "rows.csv").read_text() == text

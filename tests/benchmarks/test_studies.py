@@ -211,7 +211,10 @@ def test_command(command_line: CommandLine, tmp_path: Path) -> None:
         (("nothing",), "no study 'nothing'"),
         (("balls.toml", "--views", "views.json"), "go with scenes"),
         (("balls.toml", "--set", "ratios"), "expected KEY=VALUE"),
-        (("simplify", "ball.ply", "--set", "protocol=sitting"), "protocol: expected one of pool, standing"),
+        (
+            ("simplify", "ball.ply", "--set", "protocol=sitting"),
+            "protocol: expected one of all, pool",
+        ),
     ):
         status, _, err = command_line("benchmarks", "run", *wrong, "-o", "x", cwd=tmp_path)
         assert status in (1, 2)
