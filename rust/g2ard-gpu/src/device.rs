@@ -1,4 +1,4 @@
-//! The device as policies see it: the twins where they work, the CPU where they do not, and the reasons.
+//! The backend that callers use: GPU kernels while they work, then the CPU, with the reasons.
 
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -22,14 +22,14 @@ pub enum Choice {
     Cpu,
     /// The best adapter, software ones too.
     Gpu,
-    /// A real GPU, for scenes large enough, if it is the faster one on a probe.
+    /// A real GPU, for large scenes, if it is faster than the CPU on a probe.
     Auto,
 }
 
-/// Rows below which opening a device takes longer than the CPU needs for the work.
+/// Smallest number of rows for which opening a device pays.
 const WORTH_OPENING: usize = 200_000;
 
-/// A backend that runs the twins, and only the CPU's kernels once a device has failed: a failed device is not retried.
+/// A backend that runs GPU kernels. After a device fails, it uses the CPU and does not retry.
 #[derive(Debug, Default)]
 pub struct Device {
     choice: Choice,
@@ -65,17 +65,17 @@ impl Device {
         }
     }
 
-    /// Lines for the user since last asked.
+    /// Messages for the user since the last call.
     pub fn notes(&self) -> Vec<String> {
         std::mem::take(&mut *lock(&self.notes))
     }
 
-    /// How many kernels ran on the GPU.
+    /// Number of kernels that ran on the GPU.
     pub fn served(&self) -> u64 {
         self.served.load(Ordering::Relaxed)
     }
 
-    /// The open device, if there is one.
+    /// The open device, if any.
     pub fn gpu(&self) -> Option<Arc<Gpu>> {
         match &*lock(&self.state) {
             State::Open(gpu) => Some(gpu.clone()),
@@ -83,7 +83,7 @@ impl Device {
         }
     }
 
-    /// The device for work on `rows` rows, opened when first worth it.
+    /// The device for work on `rows` rows; opened on first use if the work is large enough.
     fn ready(&self, rows: usize) -> Option<Arc<Gpu>> {
         let mut state = lock(&self.state);
         match &*state {
@@ -120,7 +120,7 @@ impl Device {
         }
     }
 
-    /// A real GPU that is faster than the CPU. Having none, or too little memory for one, is not reported.
+    /// A real GPU that is faster than the CPU. A missing GPU, or too little memory for one, is not reported.
     fn worthwhile(&self) -> crate::runtime::Result<Option<Gpu>> {
         guarded(|| match Gpu::open(false, self.options) {
             Ok(gpu) => Ok(probe::pays(&gpu)?.then_some(gpu)),
@@ -137,7 +137,7 @@ impl Device {
         }
     }
 
-    /// `twin` on the device; None if the CPU must answer.
+    /// Run `twin` on the device; None if the CPU must answer.
     fn attempt<T>(
         &self,
         rows: usize,
@@ -162,7 +162,7 @@ impl Device {
         }
     }
 
-    /// `twin` on the device, else `cpu`.
+    /// Run `twin` on the device, or `cpu` as a fallback.
     fn either<T>(
         &self,
         rows: usize,
@@ -260,7 +260,7 @@ struct RunOnDevice<'a> {
 }
 
 impl RunOnDevice<'_> {
-    /// `twin` on the device, after the upload of the rows that it lacks; else `cpu`.
+    /// Upload the missing rows and run `twin` on the device, or `cpu` as a fallback.
     fn either<T>(
         &self,
         splats: &Splats,

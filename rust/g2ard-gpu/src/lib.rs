@@ -1,7 +1,7 @@
-//! Compute-shader twins of g2ard-core's kernels, for any GPU that speaks Vulkan, Metal or DirectX 12.
+//! Compute shaders equivalent to g2ard-core's kernels, for any GPU with Vulkan, Metal or DirectX 12.
 //!
-//! [`Device`] is a [`g2ard_core::Backend`]: policies call it as they call the CPU, and get the same results within rounding. Each
-//! twin has a folder of its own, WGSL beside Rust; only `runtime` calls wgpu.
+//! [`Device`] is a [`g2ard_core::Backend`] and gives the CPU's results within rounding. Each kernel, called a twin, has
+//! a folder with its WGSL beside Rust; only `runtime` calls wgpu.
 
 mod device;
 mod groups;

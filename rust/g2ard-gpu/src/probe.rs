@@ -1,4 +1,4 @@
-//! Whether a device computes correctly, and whether it is faster.
+//! A check that a device computes correctly, and a race against the CPU.
 
 use std::time::{Duration, Instant};
 
@@ -10,30 +10,30 @@ use crate::groups;
 use crate::rows::{Numbered, Rows};
 use crate::runtime::{Error, Gpu, Result};
 
-/// Groups of a check, and of a race; rows of each.
+/// Groups of the check, groups of the race, and rows per group.
 const FEW: usize = 128;
 const MANY: usize = 1 << 15;
 const ROWS: usize = 8;
 
-/// What energies of groups of eight scattered rows may differ by, relative.
+/// Largest relative difference of energies of groups of eight scattered rows.
 const TOLERANCE: f64 = 1e-6;
 
-/// The CPU must need this many times as long: below, transfers outweigh the gain.
+/// The CPU must take at least this many times as long; otherwise transfers outweigh the gain.
 const PAYS: f64 = 1.5;
 
-/// Whether the device's answers are the CPU's within rounding.
+/// Check that the device's answers equal the CPU's within rounding.
 pub fn check(gpu: &Gpu) -> Result<()> {
     race(gpu, FEW).map(|_| ())
 }
 
-/// Whether it is also faster, once its kernels are compiled.
+/// Check that the device is also faster than the CPU, once its kernels are compiled.
 pub fn pays(gpu: &Gpu) -> Result<bool> {
     check(gpu)?;
     let (here, there) = race(gpu, MANY)?;
     Ok(here.as_secs_f64() > PAYS * there.as_secs_f64())
 }
 
-/// Seconds of the CPU and of the device over the same groups.
+/// Seconds of the CPU and of the device for the same groups.
 fn race(gpu: &Gpu, groups: usize) -> Result<(Duration, Duration)> {
     let splats = sample(groups * ROWS);
     let numbers: Vec<u32> = (0..splats.len() as u32).collect();
@@ -64,7 +64,7 @@ fn race(gpu: &Gpu, groups: usize) -> Result<(Duration, Duration)> {
     Ok((here, there))
 }
 
-/// Rows without any pattern.
+/// Random rows.
 fn sample(count: usize) -> Splats {
     let mut random = Lcg(1);
     let mut next = || random.centred();

@@ -1,11 +1,11 @@
-//! What the tests of twins share.
+//! Helpers for tests of GPU kernels.
 
 use g2ard_core::Splats;
 use g2ard_core::random::Lcg;
 
 use crate::runtime::{Error, Gpu, Options};
 
-/// Ends a test that no adapter serves: it fails, unless the environment says that this machine tests no GPU.
+/// End a test without an adapter: it fails, unless the environment says that this machine tests no GPU.
 pub fn no_adapter(what: &str) {
     let skipped = std::env::var_os("G2ARD_NO_GPU_TESTS").is_some_and(|v| v == "1");
     assert!(
@@ -14,7 +14,7 @@ pub fn no_adapter(what: &str) {
     );
 }
 
-/// Any adapter, software too; None where tests of GPUs are off.
+/// Any adapter, software included; None if GPU tests are switched off.
 pub fn gpu(what: &str) -> Option<Gpu> {
     gpu_with(what, Options::default())
 }
@@ -61,7 +61,7 @@ fn sheets(count: usize, random: &mut Lcg) -> Splats {
     splats
 }
 
-/// Scenes that hurt: each kernel is held against its CPU twin on all of them.
+/// Difficult scenes on which each kernel is compared with the CPU's.
 pub fn scenes(count: usize) -> Vec<(&'static str, Splats)> {
     let mut random = Lcg(11);
     let plain = sheets(count, &mut random);
@@ -84,7 +84,7 @@ pub fn scenes(count: usize) -> Vec<(&'static str, Splats)> {
         s.scales[i] = s.scales[0];
     });
     let flat = with(&|i, s| s.means[i][2] = 0.0);
-    // Fits that rest on one row alone.
+    // Fits that depend on a single row.
     let spikes = with(&|i, s| {
         s.means[i][2] = if i % 9 == 0 {
             0.02 + 1e-3 * i as f64
@@ -107,7 +107,7 @@ pub fn scenes(count: usize) -> Vec<(&'static str, Splats)> {
             s.means[i] = s.means[i - 1];
         }
     });
-    // Nothing that merging could weigh by.
+    // Rows without any mass to weigh by.
     let massless = with(&|i, s| s.scales[i] = [s.scales[i][0], 0.0, 0.0]);
     let small = |n: usize| {
         let mut random = Lcg(7);

@@ -1,4 +1,4 @@
-//! The device as policies see it: the paper's policy whole, and every way in which a device fails.
+//! The device as callers use it: the paper's method as a whole, and every way in which a device fails.
 
 use g2ard_core::random::Lcg;
 use g2ard_core::scene::{Means, Ordered, SceneRef};
@@ -81,8 +81,8 @@ fn adapter(what: &str) -> bool {
     found
 }
 
-/// The budget exactly, and rows that come of the same rows: a group whose energy or coverage lies within rounding of its
-/// limit may be decided otherwise, and others then take its place.
+/// Check that the budget is exact and that rows come from the same rows. A group whose energy or coverage is within
+/// rounding of its limit may be decided otherwise, and others then take its place.
 fn assert_close(got: &Outcome<PaperRound>, want: &Outcome<PaperRound>) {
     assert_eq!(got.splats.means.len(), want.splats.means.len());
     let firsts = |parents: &[i64]| {
@@ -160,7 +160,7 @@ fn tiny_buffers_work_in_pieces_or_go_to_the_cpu() {
     if !adapter("tiny buffers") {
         return;
     }
-    // The second is too small for a row.
+    // The second limit is too small for a row.
     for (rows, bytes, refused) in [(700, 1 << 14, false), (60, 1 << 6, true)] {
         let scene = scene(rows);
         let want = simplify(&scene, &Cpu);

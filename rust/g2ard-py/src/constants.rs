@@ -1,4 +1,4 @@
-//! Structs of constants: read from a Python config's attributes of the same names, and handed out as defaults.
+//! Structs of constants: read from attributes of a Python config with the same names, and returned as defaults.
 
 use g2ard_core::constants::{Constants, Slot};
 use g2ard_core::lift::LiftConfig;

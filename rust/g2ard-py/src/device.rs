@@ -1,4 +1,4 @@
-//! `g2ard.system.devices`: which device the kernels run on, for the whole process as their threads are.
+//! `g2ard.system.devices`: the device that runs the kernels, for the whole process.
 
 use std::sync::{Arc, PoisonError, RwLock};
 
@@ -21,19 +21,19 @@ pub type Kernels = Cpu;
 
 static KERNELS: RwLock<Option<Arc<Kernels>>> = RwLock::new(None);
 
-/// The kernels to call: the CPU's until somebody asks for others.
+/// The kernels in use; the CPU's unless others were chosen.
 pub fn kernels() -> Arc<Kernels> {
     let chosen = KERNELS.read().unwrap_or_else(PoisonError::into_inner);
     chosen.clone().unwrap_or_default()
 }
 
-/// As policies take them.
+/// The kernels as the core takes them.
 pub fn backend(kernels: &Arc<Kernels>) -> &dyn Backend {
     &**kernels
 }
 
-/// Chooses cpu, gpu or auto for every kernel from now on; `max_binding` bytes bound at once at most (for tests);
-/// `timed` keeps time of every kernel.
+/// Choose cpu, gpu or auto for all kernels from now on. For tests, `max_binding` limits the bytes bound at once;
+/// `timed` measures the time of every kernel.
 #[cfg(feature = "gpu")]
 #[pyfunction]
 #[pyo3(signature = (name, max_binding=None, timed=false))]
@@ -49,7 +49,7 @@ fn set_device(name: &str, max_binding: Option<u64>, timed: bool) -> PyResult<()>
     Ok(())
 }
 
-/// There is only the CPU in this build.
+/// Accept cpu and auto; this build has no GPU kernels.
 #[cfg(not(feature = "gpu"))]
 #[pyfunction]
 #[pyo3(signature = (name, max_binding=None, timed=false))]
@@ -66,8 +66,8 @@ fn unknown(name: &str) -> PyErr {
     PyValueError::new_err(format!("device: expected cpu, gpu or auto, got {name:?}"))
 }
 
-/// {adapter, served, uploaded_bytes, seconds}: what is in use, how many kernels it ran, what was sent for them, and
-/// seconds by kernel.
+/// Return {adapter, served, uploaded_bytes, seconds}: the device in use, the number of kernels that it ran, bytes sent,
+/// and seconds per kernel.
 #[pyfunction]
 fn device_state(py: Python<'_>) -> PyResult<Bound<'_, PyDict>> {
     let out = PyDict::new(py);
@@ -90,7 +90,7 @@ fn device_state(py: Python<'_>) -> PyResult<Bound<'_, PyDict>> {
     Ok(out)
 }
 
-/// Lines for the user since last asked.
+/// Return messages for the user since the last call.
 #[pyfunction]
 fn device_notes() -> Vec<String> {
     #[cfg(feature = "gpu")]
@@ -99,7 +99,7 @@ fn device_notes() -> Vec<String> {
     Vec::new()
 }
 
-/// Every adapter, the one to use first; None where this build has no GPU kernels.
+/// Return every adapter, the preferred one first; None if this build has no GPU kernels.
 #[pyfunction]
 fn adapters(py: Python<'_>) -> PyResult<Option<Vec<Bound<'_, PyDict>>>> {
     #[cfg(feature = "gpu")]

@@ -1,4 +1,4 @@
-//! The one place where core errors become Python exceptions.
+//! Conversion of core errors into Python exceptions.
 
 use g2ard_core::Error;
 use pyo3::exceptions::{PyKeyboardInterrupt, PyRuntimeError};

@@ -1,4 +1,4 @@
-//! `g2ard._core`: registration only; one small file per stage.
+//! `g2ard._core`: registration only; one file per stage.
 
 use pyo3::prelude::*;
 

@@ -10,7 +10,7 @@ use crate::work::long;
 
 type Discs<'py> = (Bound<'py, PyArray2<f32>>, Bound<'py, PyArray2<f32>>);
 
-/// (quats, scales) of the discs of centred (N, 3) points.
+/// Return (quats, scales) of the discs of centred (N, 3) points.
 #[pyfunction]
 #[pyo3(signature = (points, config, progress=None))]
 fn lift_points<'py>(

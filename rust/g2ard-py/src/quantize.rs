@@ -9,7 +9,7 @@ use pyo3::prelude::*;
 use crate::arrays;
 use crate::work::{long, quick};
 
-/// (count,) ascending numbers with the least Σ w (v − nearest)²; the last is repeated where fewer do.
+/// Return (count,) ascending numbers with the least Σ w (v − nearest)²; the last one repeats if fewer suffice.
 #[pyfunction]
 #[pyo3(signature = (values, count, weights=None))]
 fn codebook<'py>(
@@ -29,7 +29,7 @@ fn codebook<'py>(
 
 type Found<'py> = (Bound<'py, PyArray2<f32>>, Bound<'py, PyArray1<u32>>);
 
-/// (K, D) entries, K at most `count`, and (N,) the entry of each row of (N, D), by k-means.
+/// Return (K, D) entries, K at most `count`, and (N,) the entry of each row of (N, D), by k-means.
 #[pyfunction]
 #[pyo3(signature = (points, count, steps, weights=None, progress=None))]
 fn palette<'py>(

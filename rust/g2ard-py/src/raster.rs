@@ -1,4 +1,4 @@
-//! `_core.Rasterizer`: one view's buffers, forward, backward and the sums visibility is made of.
+//! `_core.Rasterizer`: buffers of one view, forward and backward passes, and sums for visibility.
 
 use g2ard_core::raster::limits::measure;
 use g2ard_core::raster::simd::Isa;
@@ -26,7 +26,7 @@ pub fn slice<'a>(name: &'static str, array: &'a Floats<'_>) -> PyResult<&'a [f32
     })
 }
 
-/// The six parameter arrays, in the order every method takes them.
+/// The six parameter arrays, in the order that every method takes them.
 #[derive(FromPyObject)]
 pub struct Arrays<'py>(
     Floats<'py>,
@@ -72,13 +72,13 @@ pub fn isa_named(name: Option<&str>) -> PyResult<Isa> {
     }
 }
 
-/// The names of the instruction sets this machine can run, the fastest first.
+/// Return the names of the instruction sets that this machine can run, fastest first.
 #[pyfunction]
 fn instruction_sets() -> Vec<&'static str> {
     Isa::available().into_iter().map(Isa::name).collect()
 }
 
-/// (FMA 10⁹ flops/s, read 10⁹ bytes/s) of all threads, measured now.
+/// Measure and return (FMA 10⁹ flops/s, read 10⁹ bytes/s) of all threads.
 #[pyfunction]
 #[pyo3(signature = (isa = None))]
 fn machine_limits(py: Python<'_>, isa: Option<&str>) -> PyResult<(f64, f64)> {
@@ -117,7 +117,8 @@ impl PyRasterizer {
         })
     }
 
-    /// (image (H, W, 3), alpha (H, W), depth (H, W) or None, median depth (H, W) or None): the first `depths` of the two.
+    /// Return image (H, W, 3), alpha (H, W), depth (H, W) and median depth (H, W); the first `depths` of the two
+    /// depths, None for the others.
     #[pyo3(signature = (arrays, view, options, background, depths = 1))]
     #[allow(clippy::type_complexity)]
     fn forward<'py>(
@@ -161,7 +162,7 @@ impl PyRasterizer {
         ))
     }
 
-    /// Gradients of the six arrays, each in its array's shape.
+    /// Return gradients of the six arrays, each in its array's shape.
     #[pyo3(signature = (arrays, image, alpha = None, depth = None))]
     fn backward<'py>(
         &mut self,
@@ -215,7 +216,7 @@ impl PyRasterizer {
             .collect()
     }
 
-    /// dL/d(v, ω) of the last forward pass's pose T, T ← exp(v, ω)·T, from dL/d(image).
+    /// Return dL/d(v, ω) of the last forward pass's pose T, T ← exp(v, ω)·T, from dL/d(image).
     fn pose_gradient<'py>(
         &mut self,
         py: Python<'py>,
@@ -232,12 +233,12 @@ impl PyRasterizer {
         work::quick(py, || inner.pose_gradient(&params, &gradients))
     }
 
-    /// Seconds the passes of the last calls took.
+    /// Return the seconds of the last calls' passes.
     fn passes<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
         passes(py, &self.inner.passes())
     }
 
-    /// Work done by the last forward pass.
+    /// Return the work done by the last forward pass.
     fn counts<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
         let counts = self.inner.counts();
         let dict = PyDict::new(py);
@@ -263,7 +264,7 @@ pub fn passes<'py>(py: Python<'py>, passes: &Passes) -> PyResult<Bound<'py, PyDi
     Ok(dict)
 }
 
-/// Per-Gaussian sums over all `views`: a dict of (N,) arrays.
+/// Return sums per Gaussian over all `views`: a dict of (N,) arrays.
 #[pyfunction]
 #[pyo3(signature = (arrays, views, options, progress = None))]
 fn accumulate<'py>(
@@ -296,7 +297,7 @@ fn accumulate<'py>(
     Ok(dict)
 }
 
-/// (N, 21) upper triangles of Σ g gᵀ over all pixels, channels and `views`, g = ∂C/∂(mean, log scale).
+/// Return (N, 21) upper triangles of Σ g gᵀ over all pixels, channels and `views`, g = ∂C/∂(mean, log scale).
 #[pyfunction]
 #[pyo3(signature = (arrays, views, options, progress = None))]
 fn sensitivity<'py>(

@@ -1,4 +1,4 @@
-//! `_core.shot`, `_core.normal_equations`, `_core.flow`, `_core.local_zncc`: registration's images.
+//! `_core.shot`, `_core.normal_equations`, `_core.flow`, `_core.local_zncc`: images for registration.
 
 use g2ard_core::Error;
 use g2ard_core::register::{self, Lens, Light, Photo, Render, Size};
@@ -23,7 +23,7 @@ fn size(image: &Grey<'_>) -> Size {
     }
 }
 
-/// The values of an (H, W) image of that size.
+/// The values of an (H, W) image, whose size is checked.
 fn plane<'a, T: Element>(
     name: &'static str,
     image: &'a PyReadonlyArray<'_, T, Ix2>,
@@ -47,7 +47,7 @@ type Planes<'py> = (
     Bound<'py, PyArray2<bool>>,
 );
 
-/// (grey, depth, mask) of a render; see `g2ard_core::register::shot`.
+/// Return (grey, depth, mask) of a render; see `g2ard_core::register::shot`.
 #[pyfunction]
 fn shot<'py>(
     py: Python<'py>,
@@ -76,8 +76,8 @@ fn shot<'py>(
 
 type Normal = ([[f64; 8]; 8], [f64; 8], f64, f64, f64);
 
-/// (matrix, right, scale, cost, weights) of one step. `photo` is (grey, right, down, mask), `shot` as `shot` returns it,
-/// `lens` (fx, fy, cx, cy) and `light` (gain, bias).
+/// Return (matrix, right, scale, cost, weights) of one step. `photo` is (grey, right, down, mask), `shot` the result of
+/// `shot`, `lens` (fx, fy, cx, cy) and `light` (gain, bias).
 #[pyfunction]
 #[pyo3(signature = (photo, shot, lens, light, scale = None))]
 fn normal_equations<'py>(
@@ -115,7 +115,7 @@ fn render<'a>(shot: &'a (Grey<'_>, Grey<'_>, Mask<'_>), size: Size) -> PyResult<
     })
 }
 
-/// Root of the mean square, in pixels, of how far ξ moves the pixels that count.
+/// Return the root mean square, in pixels, by which ξ moves the unmasked pixels.
 #[pyfunction]
 fn flow<'py>(
     py: Python<'py>,
@@ -129,7 +129,7 @@ fn flow<'py>(
     work::quick(py, || register::flow(&shot, size, &lens, &xi))
 }
 
-/// Median ZNCC over windows; see `g2ard_core::register::local_zncc`.
+/// Return the median ZNCC over windows; see `g2ard_core::register::local_zncc`.
 #[pyfunction]
 fn local_zncc(
     py: Python<'_>,

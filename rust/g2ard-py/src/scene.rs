@@ -1,4 +1,4 @@
-//! `_core.Scene`: a scene that stages share, put in order once.
+//! `_core.Scene`: a scene that stages share, ordered once.
 
 use std::sync::Arc;
 
@@ -13,7 +13,7 @@ use pyo3::{PyTraverseError, PyVisit};
 use crate::arrays;
 use crate::work::long;
 
-/// Means in whichever float the caller holds them.
+/// Means as float32 or float64.
 #[derive(FromPyObject)]
 enum PyMeans<'py> {
     F32(PyReadonlyArray2<'py, f32>),
@@ -49,7 +49,7 @@ impl PySplats<'_> {
     }
 }
 
-/// A `g2ard.Splats` and its order. The arrays must not change while it is used.
+/// A `g2ard.Splats` and its order. The arrays must not change while it exists.
 #[pyclass(name = "Scene", module = "g2ard._core", frozen)]
 pub struct PyScene {
     splats: Py<PyAny>,
@@ -57,7 +57,7 @@ pub struct PyScene {
 }
 
 impl PyScene {
-    /// The arrays, for as long as what this returns is held.
+    /// The arrays, borrowed while the result is alive.
     pub fn splats<'py>(&self, py: Python<'py>) -> PyResult<PySplats<'py>> {
         self.splats.bind(py).extract()
     }
@@ -65,7 +65,7 @@ impl PyScene {
 
 #[pymethods]
 impl PyScene {
-    /// `known`: the `order` and `bounds` of the same scene, found before.
+    /// `known`: `order` and `bounds` of the same scene, computed before.
     #[new]
     #[pyo3(signature = (splats, known = None))]
     fn new(
@@ -95,7 +95,7 @@ impl PyScene {
         })
     }
 
-    /// A scene holds its `Scene`, which holds the scene: the collector must see that.
+    /// Let the garbage collector see the reference cycle between a scene and its `Scene`.
     fn __traverse__(&self, visit: PyVisit<'_>) -> Result<(), PyTraverseError> {
         visit.call(&self.splats)
     }
@@ -106,14 +106,14 @@ impl PyScene {
         self.ordered.bounds.origin
     }
 
-    /// The median point, and the radius of the cube about it that Morton codes divide.
+    /// The median point, and the radius of the cube around it that Morton codes divide.
     #[getter]
     fn bounds(&self) -> [f64; 4] {
         let [x, y, z] = self.ordered.bounds.origin;
         [x, y, z, self.ordered.bounds.radius]
     }
 
-    /// (N,) the rows in the order that only the scene's content decides.
+    /// (N,) rows in the order that only the scene's content decides.
     #[getter]
     fn order<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<u32>> {
         PyArray1::from_slice(py, &self.ordered.rows)

@@ -35,7 +35,7 @@ impl Scene<'_> {
     }
 }
 
-/// Surface cells: centers, normals, confidence, weights, size.
+/// Return surface cells: centers, normals, confidence, weights, size.
 #[pyfunction]
 fn select_surface<'py>(
     py: Python<'py>,
@@ -54,7 +54,7 @@ fn select_surface<'py>(
     Ok(out)
 }
 
-/// The median depth of every pixel of a view.
+/// Return the median depth of every pixel of a view.
 #[pyfunction]
 fn select_depth<'py>(
     py: Python<'py>,
@@ -66,7 +66,7 @@ fn select_depth<'py>(
     PyArray1::from_vec(py, depth).reshape([camera.height, camera.width])
 }
 
-/// (C, 2): the share of each view's pixels that show the scene, and the median of their depths.
+/// Return (C, 2): the share of each view's pixels that show the scene, and the median of their depths.
 #[pyfunction]
 #[pyo3(signature = (scene, views, progress=None))]
 fn select_view_statistics<'py>(
@@ -119,7 +119,7 @@ fn surface_of(parts: &Surfaces<'_>) -> PyResult<Surface> {
 
 type Lists<'py> = (Bound<'py, PyArray1<u64>>, Bound<'py, PyArray1<u32>>);
 
-/// (starts (C + 1,), cells): view v sees cells[starts[v]..starts[v + 1]].
+/// Return (starts (C + 1,), cells): view v sees cells[starts[v]..starts[v + 1]].
 #[pyfunction]
 #[pyo3(signature = (scene, surface, views, *, tolerance, progress=None))]
 fn select_visible<'py>(
@@ -155,7 +155,7 @@ type Views<'py> = (
     PyReadonlyArray2<'py, f64>,
 );
 
-/// (views, gains, evaluations) of greedy maximisation.
+/// Return (views, gains, evaluations) of greedy maximisation.
 #[pyfunction]
 #[pyo3(signature = (surface, views, k, directional, config, progress=None))]
 fn select_greedy<'py>(

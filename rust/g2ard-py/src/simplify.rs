@@ -13,7 +13,7 @@ use crate::device::{backend, kernels};
 use crate::scene::PyScene;
 use crate::work::long;
 
-/// What views see of each row, such as a `g2ard.rendering.visibility.SampledVisibility`.
+/// Visibility of each row, such as a `g2ard.rendering.visibility.SampledVisibility`.
 #[derive(FromPyObject)]
 pub struct PyVisibility<'py> {
     weight: PyReadonlyArray1<'py, f32>,

@@ -11,7 +11,7 @@ use crate::arrays;
 use crate::error::to_py;
 use crate::work::quick;
 
-/// (N, k) rows of the points nearest to each of (N, 3) finite points, itself excepted, by (distance, row).
+/// Return (N, k) rows of the points nearest to each of (N, 3) finite points, without itself, by (distance, row).
 #[pyfunction]
 fn knn<'py>(
     py: Python<'py>,
@@ -52,7 +52,7 @@ fn neighbors(points: &[[f64; 3]], k: usize) -> Array2<u32> {
     rows
 }
 
-/// (M,) distances at which unit rays first meet a cell of 0 steps; infinite where they do not.
+/// Return (M,) distances at which unit rays first meet a cell of 0 steps; infinite if they meet none.
 #[pyfunction]
 fn cast_rays<'py>(
     py: Python<'py>,

@@ -40,7 +40,7 @@ fn pair<'a>(
     inner().map_err(to_py)
 }
 
-/// (loss, dloss/dimage) of (1 − λ)·L1 + λ·(1 − SSIM).
+/// Return (loss, dloss/dimage) of (1 − λ)·L1 + λ·(1 − SSIM).
 #[pyfunction]
 fn l1_ssim<'py>(
     py: Python<'py>,
@@ -59,7 +59,7 @@ fn l1_ssim<'py>(
     Ok((loss, gradient))
 }
 
-/// Mean SSIM of two (H, W, C) images in 0–1.
+/// Return the mean SSIM of two (H, W, C) images in 0–1.
 #[pyfunction]
 #[pyo3(name = "ssim")]
 fn ssim_metric(py: Python<'_>, image: Image<'_>, target: Image<'_>) -> PyResult<f64> {
@@ -67,7 +67,7 @@ fn ssim_metric(py: Python<'_>, image: Image<'_>, target: Image<'_>) -> PyResult<
     work::quick(py, || ssim::ssim(a, b, shape))
 }
 
-/// PSNR in dB of two (H, W, C) images in 0–1.
+/// Return the PSNR in dB of two (H, W, C) images in 0–1.
 #[pyfunction]
 fn psnr(py: Python<'_>, image: Image<'_>, target: Image<'_>) -> PyResult<f64> {
     let (a, b, shape) = pair(&image, &target)?;

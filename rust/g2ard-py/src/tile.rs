@@ -1,4 +1,4 @@
-//! `_core.TileMerging`: simplification of one tile, in the steps that tiles agree between.
+//! `_core.TileMerging`: simplification of one tile, in steps that all tiles share.
 
 use g2ard_core::simplify::{Frame, Importance, Pairwise, Tile};
 use numpy::{PyArray1, PyReadonlyArray1};
@@ -14,7 +14,7 @@ use crate::work::long;
 type Floats<'py> = Bound<'py, PyArray1<f32>>;
 type Rows<'py> = Bound<'py, PyArray1<u32>>;
 
-/// What all tiles of a scene are measured in.
+/// Units of measure of all tiles of a scene.
 #[pyclass(name = "TileFrame", module = "g2ard._core", frozen, from_py_object)]
 #[derive(Clone, Copy)]
 struct PyFrame(Frame);
@@ -31,7 +31,7 @@ impl PyFrame {
         })
     }
 
-    /// That of a fair sample of a scene, without views.
+    /// The frame of a fair sample of a scene, without views.
     #[staticmethod]
     fn of_sample(py: Python<'_>, scene: &PyScene, config: Config<Pairwise>) -> PyResult<Self> {
         let (splats, ordered) = (scene.splats(py)?, &scene.ordered);
@@ -42,12 +42,12 @@ impl PyFrame {
         )))
     }
 
-    /// The same with views: the usual size of a pixel, and `sums` added up over all tiles.
+    /// The frame with views: the usual size of a pixel, and `sums` added up over all tiles.
     fn with_views(&self, pixel_size: f32, weight: f64, mass: f64) -> Self {
         Self(self.0.with_views(pixel_size, weight, mass))
     }
 
-    /// The arguments that make it.
+    /// The arguments of the constructor.
     fn values(&self) -> (f64, f32, f32, f64, f64) {
         let f = self.0;
         (
@@ -104,18 +104,18 @@ impl PyTileMerging {
         }
     }
 
-    /// Σ αT of the views, and mass, of the rows that are kept.
+    /// Return Σ αT of the views, and mass, of the kept rows.
     fn sums(&self, py: Python<'_>) -> PyResult<(f64, f64)> {
         self.with(py, |tile| long(py, None, |_| tile.sums()))
     }
 
-    /// What closing each gap between neighbours in Morton order costs, from the first kept row on.
+    /// Return the cost of closing each gap between neighbours in Morton order, from the first kept row on.
     fn run_costs<'py>(&self, py: Python<'py>) -> PyResult<Floats<'py>> {
         let costs = self.with(py, |tile| long(py, None, |_| tile.run_costs()))?;
         Ok(PyArray1::from_vec(py, costs))
     }
 
-    /// The run of each row in the scene's order, or 2³² − 1, and merges `a`, `b` of runs with their costs.
+    /// Return the run of each row in the scene's order, or 2³² − 1, and merges `a`, `b` of runs with their costs.
     #[pyo3(signature = (runs, schedule, costs, progress=None))]
     fn plan<'py>(
         &self,
@@ -143,7 +143,7 @@ impl PyTileMerging {
         ))
     }
 
-    /// The Gaussians of a partition into `count` clusters: as `simplify_pairwise`.
+    /// Return the Gaussians of a partition into `count` clusters, like `simplify_pairwise`.
     #[pyo3(signature = (of, count, progress=None))]
     fn assemble<'py>(
         &self,

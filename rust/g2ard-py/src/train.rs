@@ -25,7 +25,7 @@ struct PyRates {
     sh0: f32,
     #[pyo3(attribute("shN"))]
     sh_n: f32,
-    /// A share of the longer side of a view.
+    /// Share of the longer side of a view.
     reach: f64,
 }
 
@@ -50,7 +50,7 @@ impl From<PyRates> for Rates {
     }
 }
 
-/// The attributes of a `g2ard.stages.recover.engine.Objective` that are alike in all steps.
+/// The attributes of a `g2ard.stages.recover.engine.Objective` that are equal in all steps.
 #[derive(FromPyObject)]
 struct PyObjective {
     settings: RasterOptions,
@@ -110,7 +110,7 @@ impl PyTrainer {
         })
     }
 
-    /// Freezes the anchors: means (N, 3), frames (N, 3, 3) with columns t1, t2, n, and the two radii (N,).
+    /// Freeze the anchors: means (N, 3), frames (N, 3, 3) with columns t1, t2, n, and the two radii (N,).
     fn anchor(
         &mut self,
         means: Floats<'_>,
@@ -128,7 +128,7 @@ impl PyTrainer {
             .map_err(crate::error::to_py)
     }
 
-    /// (N,) rows that no step changes.
+    /// Freeze rows, given as an (N,) mask: no step changes them.
     fn freeze(&mut self, frozen: PyReadonlyArray1<'_, bool>) -> PyResult<()> {
         let frozen = crate::arrays::flat("frozen", &frozen)?;
         self.inner.freeze(frozen).map_err(crate::error::to_py)
@@ -176,7 +176,7 @@ impl PyTrainer {
         Ok(report.loss)
     }
 
-    /// The six parameter arrays as they stand, rows in the caller's order.
+    /// Return the six parameter arrays, rows in the caller's order.
     fn arrays<'py>(&self, py: Python<'py>) -> PyResult<Vec<Bound<'py, PyArrayDyn<f32>>>> {
         let store = self.inner.store();
         let (n, rest) = (store.len(), store.sh_coeffs() - 1);
@@ -196,7 +196,7 @@ impl PyTrainer {
             .collect()
     }
 
-    /// Everything a bitwise resume needs: a dict of arrays.
+    /// Return everything that a bitwise resume needs: a dict of arrays.
     fn state<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
         let state = self.inner.store().export();
         let dict = PyDict::new(py);
@@ -213,7 +213,7 @@ impl PyTrainer {
         Ok(dict)
     }
 
-    /// Takes up a `state` again; anchors must be set afresh.
+    /// Restore a `state`; anchors must be set again.
     fn load(&mut self, state: &Bound<'_, PyDict>) -> PyResult<()> {
         let state = Exported {
             values: vector(state, "values")?,
@@ -226,7 +226,7 @@ impl PyTrainer {
         self.inner.import(&state).map_err(crate::error::to_py)
     }
 
-    /// Gaussian steps left out since the start because a gradient was not finite.
+    /// Number of Gaussian steps skipped since the start because a gradient was not finite.
     #[getter]
     fn skipped(&self) -> usize {
         self.skipped
@@ -237,7 +237,7 @@ impl PyTrainer {
         self.isa.name()
     }
 
-    /// Bytes held: "gaussians" by what grows with them, "images" by what grows with the image.
+    /// Return the bytes held: "gaussians" grow with the Gaussians, "images" with the image.
     fn memory<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
         let memory = self.inner.memory();
         let dict = PyDict::new(py);
@@ -246,7 +246,7 @@ impl PyTrainer {
         Ok(dict)
     }
 
-    /// Seconds of the last step by pass; "gather" holds Adam.
+    /// Return the seconds of the last step by pass; "gather" holds Adam.
     fn passes<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
         let dict = crate::raster::passes(py, &self.inner.passes())?;
         dict.set_item("loss", self.seconds_loss)?;

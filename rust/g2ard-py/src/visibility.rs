@@ -1,4 +1,4 @@
-//! `_core.VisibilityAccumulator`: what views see of a scene, view by view.
+//! `_core.VisibilityAccumulator`: visibility of a scene, summed view by view.
 
 use std::sync::Arc;
 
@@ -14,7 +14,7 @@ use crate::work::long;
 #[pyclass(name = "VisibilityAccumulator", module = "g2ard._core")]
 struct PyVisibilityAccumulator {
     sums: VisibilityAccumulator,
-    /// Those chosen when it was made.
+    /// The kernels chosen when it was created.
     kernels: Arc<Kernels>,
 }
 
@@ -29,7 +29,7 @@ impl PyVisibilityAccumulator {
         Ok(Self { sums, kernels })
     }
 
-    /// Adds views; returns how many rows have been seen so far.
+    /// Add views; return how many rows have been seen so far.
     #[pyo3(signature = (views, options, progress = None))]
     fn add(
         &mut self,
@@ -47,7 +47,7 @@ impl PyVisibilityAccumulator {
         })
     }
 
-    /// (N,) Σ αT and (N,) the smallest size of a pixel, ∞ where no view contains the mean.
+    /// Return (N,) Σ αT and (N,) the smallest size of a pixel, ∞ if no view contains the mean.
     fn by_row<'py>(
         &self,
         py: Python<'py>,

@@ -1,4 +1,4 @@
-//! Running kernels away from the GIL, on a pool whose size the caller chose, with Ctrl-C and progress.
+//! Running kernels without the GIL, on a pool of the chosen size, with Ctrl-C and progress.
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::mpsc::{RecvTimeoutError, channel};
@@ -14,7 +14,7 @@ use crate::error::to_py;
 
 static POOL: RwLock<Option<Arc<ThreadPool>>> = RwLock::new(None);
 
-/// How often long work looks for Ctrl-C and reports progress.
+/// Interval at which long work checks for Ctrl-C and reports progress.
 const POLL: Duration = Duration::from_millis(50);
 
 fn pool() -> PyResult<Arc<ThreadPool>> {
@@ -33,7 +33,7 @@ fn panicked() -> PyErr {
     PyRuntimeError::new_err("a kernel panicked: this is a bug in g2ard; its message is above")
 }
 
-/// Sets how many threads every kernel uses from now on; 0 means all cores.
+/// Set the number of threads of every kernel from now on; 0 means all cores.
 #[pyfunction]
 fn set_num_threads(threads: usize) -> PyResult<()> {
     let built = ThreadPoolBuilder::new()
@@ -49,7 +49,7 @@ fn num_threads() -> PyResult<usize> {
     Ok(pool()?.current_num_threads())
 }
 
-/// Runs a kernel of a few milliseconds: GIL released, no Ctrl-C check.
+/// Run a kernel of a few milliseconds: GIL released, no Ctrl-C check.
 pub fn quick<R: Send>(py: Python<'_>, f: impl FnOnce() -> Result<R> + Send) -> PyResult<R> {
     let pool = pool()?;
     match py.detach(|| catch_unwind(AssertUnwindSafe(|| pool.install(f)))) {
@@ -58,7 +58,7 @@ pub fn quick<R: Send>(py: Python<'_>, f: impl FnOnce() -> Result<R> + Send) -> P
     }
 }
 
-/// Runs long work: GIL released; every 50 ms Ctrl-C is looked for and `progress(done, total)` is called.
+/// Run long work: GIL released; every 50 ms check for Ctrl-C and call `progress(done, total)`.
 pub fn long<R: Send>(
     py: Python<'_>,
     progress: Option<&Bound<'_, PyAny>>,
@@ -75,7 +75,7 @@ pub fn long<R: Send>(
             let _ = send.send(result); // the receiver outlives the scope: it cannot fail
         });
         loop {
-            // A Receiver is Send but not Sync: it goes along and comes back.
+            // A Receiver is Send but not Sync, so it moves into the closure and back.
             let (received, back) = py.detach(move || (receive.recv_timeout(POLL), receive));
             receive = back;
             match received {

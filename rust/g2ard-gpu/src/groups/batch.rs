@@ -1,4 +1,4 @@
-//! Groups in batches that fit the device; while it computes one, the next is assembled on the CPU.
+//! Groups in batches that fit the device. The CPU assembles one batch while the device computes the previous one.
 
 use g2ard_core::Control;
 use g2ard_core::simplify::Group;
@@ -7,54 +7,55 @@ use rayon::prelude::*;
 use crate::rows::{Part, Rows};
 use crate::runtime::{Buffer, Gpu, Kernel, Pending, Result, Work};
 
-/// A kernel with one thread for each group.
+/// A kernel with one thread per group.
 pub struct Twin {
     pub kernel: Kernel,
-    /// What it reads of the members.
+    /// The part of a member's row that it reads.
     pub part: Part,
-    /// Words of an answer.
+    /// Words per answer.
     pub answer: usize,
 }
 
-/// Rows as the device has them, the numbers they go by, and what else a kernel reads.
+/// Rows on the device, their numbers, and further inputs of a kernel.
 #[derive(Clone, Copy)]
 pub struct Source<'a> {
     pub rows: &'a Rows,
     pub numbers: &'a [u32],
     pub extra: Option<&'a Buffer>,
-    /// What a kernel reads beside them.
+    /// Further constants of the kernel.
     pub constants: [u32; 2],
 }
 
 pub struct Found {
-    /// `answer` words for each group, zeros for the large ones.
+    /// `answer` words per group; zeros for large groups.
     pub answers: Vec<u32>,
     /// Groups too large for one thread.
     pub large: Vec<usize>,
 }
 
-/// Words that say where a group is.
+/// Words that locate a group.
 const SEGMENT: usize = 2;
 
-/// More rows than this would keep one thread busy while all others are idle: such groups are rare and go to the CPU.
+/// Largest group that a thread processes. Larger ones would keep one thread busy while others idle; they are rare and
+/// go to the CPU.
 const LARGEST: usize = 1024;
 
-/// Rounds of loops that a row takes at most.
+/// Most loop iterations per row.
 const ROUNDS: usize = 160;
 
-/// Rows of a batch: enough to fill a device, few enough that drivers do not time out.
+/// Rows per batch: enough to fill a device, few enough that drivers do not time out.
 const ROWS: usize = 1 << 19;
 
-/// Groups that are put together between two checks of the control, and by one task.
+/// Groups per task, and between two checks of the control.
 const CHUNK: usize = 1 << 14;
 const TASK: usize = 256;
 
-/// Threads of a workgroup.
+/// Threads per workgroup.
 const THREADS: usize = 64;
 
 #[derive(Default)]
 struct Batch {
-    /// The rows of its groups, one group after the other.
+    /// Rows of all groups, one group after the other.
     rows: Vec<u32>,
     groups: Vec<Segment>,
 }
@@ -109,7 +110,7 @@ pub fn run(
     Ok(found)
 }
 
-/// Some groups, and those that are too large.
+/// Assemble some groups; return the batch and the groups that are too large.
 fn part(ids: &[usize], largest: usize, group: &Group<'_>) -> (Batch, Vec<usize>) {
     let (mut batch, mut large, mut rows) = (Batch::default(), Vec::new(), Vec::new());
     for &id in ids {
@@ -138,7 +139,7 @@ impl Batch {
         self.rows.extend_from_slice(rows);
     }
 
-    /// Submits the batch and reads the results of the one before.
+    /// Submit the batch and read the results of the previous one.
     fn start<'a>(
         &mut self,
         gpu: &'a Gpu,
@@ -151,7 +152,7 @@ impl Batch {
         if groups.is_empty() {
             return Ok(());
         }
-        // Threads that run side by side take equally long.
+        // Sort by size, so that threads which run together take equally long.
         groups.sort_by_key(|g| std::cmp::Reverse(g.count));
         let segments: Vec<[u32; SEGMENT]> = groups
             .iter()
@@ -179,7 +180,7 @@ impl Batch {
     }
 }
 
-/// Reads the results of a batch.
+/// Read the results of a batch.
 fn finish(twin: &Twin, submitted: &mut Submitted<'_>, found: &mut Found) -> Result<()> {
     let Some((ids, pending)) = submitted.take() else {
         return Ok(());

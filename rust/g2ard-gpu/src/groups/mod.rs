@@ -1,4 +1,4 @@
-//! Twins that work group by group: affine energy, and merging with the coverage guard.
+//! GPU kernels over groups: affine energy, and merging with the coverage guard.
 
 mod batch;
 
@@ -58,8 +58,8 @@ pub fn energies(
     Ok(energies)
 }
 
-/// See [`GroupKernels::merges`]. Opacity and SH are averaged here: to send a row's 180 bytes of SH to a device takes
-/// longer than to add them up.
+/// See [`GroupKernels::merges`]. Opacity and SH are averaged on the CPU, because sending a row's 180 bytes of SH to a
+/// device takes longer than adding them up.
 pub fn merges(
     gpu: &Gpu,
     held: &Rows,
@@ -103,11 +103,11 @@ pub fn merges(
     Ok(merges)
 }
 
-/// Words of an answer in which the share covered and the power of two of its lengths stand.
+/// Words of an answer that hold the covered share and the exponent of its lengths.
 const COVERED: usize = 30;
 const POWER: usize = 31;
 
-/// Mean (relative to the first row's), axes and scales as the kernel leaves them.
+/// Mean (relative to the first row's), axes and scales, as the kernel returns them.
 fn gaussian(answer: &[u32], first: [f64; 3]) -> Gaussian {
     let numbers: Vec<f64> = answer[..COVERED].chunks(2).map(number).collect();
     let unit = 2f64.powi(answer[POWER] as i32);
@@ -192,8 +192,8 @@ mod tests {
         }
     }
 
-    /// What energies, relative, and moments, of the merged footprint, may differ by. So may coverages, except where one of
-    /// the points that they count lies on the edge: at most one group in a hundred.
+    /// Largest difference of energies (relative) and of moments (relative to the merged footprint). Coverages may
+    /// differ more in at most one group in a hundred, where a sample point lies on the edge.
     const TOLERANCE: f64 = 1e-5;
 
     fn moments_apart(a: &Gaussian, b: &Gaussian) -> f64 {

@@ -1,5 +1,5 @@
-//! The rows of a run on the device. A row is uploaded once, when it is made, and addressed by its number from then on;
-//! groups are sent as the numbers of their members, whose rows are gathered on the device.
+//! The rows of a run on the device. A row is uploaded once, when it is created, and keeps its number. Groups are sent
+//! as the numbers of their members, which the device gathers.
 
 use g2ard_core::Splats;
 use g2ard_core::simplify::{GONE, optical_mass};
@@ -15,10 +15,10 @@ const GATHER: Kernel = Kernel {
     entry: "gather",
 };
 
-/// Words of a row: SH of band 0 (3), mean (6), optical mass (2), scales (3), quaternion (4).
+/// Words per row: SH of band 0 (3), mean (6), optical mass (2), scales (3), quaternion (4).
 const ROW: usize = 18;
 
-/// Some of a row's words.
+/// A range of a row's words.
 #[derive(Debug, Clone, Copy)]
 pub struct Part {
     from: usize,
@@ -31,14 +31,14 @@ pub const WEIGHED: Part = Part { from: 3, words: 15 };
 
 const THREADS: usize = 64;
 
-/// Rows with the numbers that the device knows them by.
+/// Rows with their numbers on the device.
 #[derive(Debug, Clone, Copy)]
 pub struct Numbered<'a> {
     pub splats: &'a Splats,
     pub numbers: &'a [u32],
 }
 
-/// The numbers of the rows of a run: every row that is made gets the next, and a copy keeps its own.
+/// Numbers of a run's rows: each new row gets the next number, and a copy keeps its own.
 #[derive(Debug, Default)]
 pub struct Numbers {
     of_row: Vec<u32>,
@@ -72,7 +72,7 @@ impl Numbers {
 /// Rows that the device has, in pieces that each fit into a buffer.
 #[derive(Debug, Default)]
 pub struct Rows {
-    /// That of the first rows: later ones are merged from them.
+    /// Frame of the first rows; later rows are merged from them.
     frame: Option<Frame>,
     count: usize,
     pieces: Vec<Piece>,
@@ -86,7 +86,7 @@ struct Piece {
 }
 
 impl Rows {
-    /// Uploads the rows that are new: those whose numbers follow on the last. Returns the frame of all.
+    /// Upload new rows, whose numbers follow the last uploaded one. Return the frame of all rows.
     pub fn follow(&mut self, gpu: &Gpu, rows: Numbered<'_>) -> Result<Frame> {
         let means = &rows.splats.means;
         let around = || Frame::around(means, &RobustBounds::of(means));
@@ -121,7 +121,7 @@ impl Rows {
         Ok(frame)
     }
 
-    /// A part of the rows of these numbers, in their order.
+    /// Gather a part of the rows with these numbers, in their order.
     pub fn gather(
         &self,
         gpu: &Gpu,
@@ -147,7 +147,7 @@ impl Rows {
     }
 }
 
-/// A row as kernels read it.
+/// A row in the layout that kernels read.
 fn words(splats: &Splats, i: usize, frame: Frame) -> [u32; ROW] {
     let [r, g, b] = splats.sh_of(i)[0].map(f32::to_bits);
     let mean = frame.fixed(splats.means[i]);
@@ -160,7 +160,7 @@ fn words(splats: &Splats, i: usize, frame: Frame) -> [u32; ROW] {
     ]
 }
 
-/// An optical mass as an f32 in [1, 2] and a power of two: masses span more than f32 does.
+/// An optical mass as an f32 in [1, 2] and a power of two, because masses exceed the range of f32.
 fn mass(splats: &Splats, i: usize) -> [u32; 2] {
     let scales = splats.scales[i].map(f64::from);
     let mass = optical_mass(f64::from(splats.logit_opacities[i]), scales);
@@ -188,7 +188,7 @@ mod tests {
     use crate::runtime::Options;
     use crate::testing::{gpu_with, scenes};
 
-    /// Rows of a scene, in any order, under other numbers.
+    /// Some rows of a scene, in any order, under new numbers.
     fn some(splats: &Splats, rows: &[usize]) -> Splats {
         let mut out = Splats {
             sh_coeffs: splats.sh_coeffs,
@@ -226,7 +226,7 @@ mod tests {
             let splats = some(&scene, &first);
             assert_eq!(sent(&splats, &numbers), 700 * 4 * ROW);
             assert_eq!(sent(&splats, &numbers), 0);
-            // A few stay, two come into being.
+            // Some rows stay, and two are new.
             let numbers = [699, 700, 3, 701, 42];
             let splats = some(&scene, &[699, 800, 3, 801, 42]);
             assert_eq!(sent(&splats, &numbers), 2 * 4 * ROW);

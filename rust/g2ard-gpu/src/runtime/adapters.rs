@@ -1,10 +1,10 @@
-//! Which devices this machine has.
+//! The devices of this machine.
 
 use std::sync::OnceLock;
 
 use wgpu::{Backends, DeviceType, Instance, InstanceDescriptor, InstanceFlags};
 
-/// What a driver says of one device.
+/// A driver's description of a device.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Adapter {
     pub name: String,
@@ -13,7 +13,7 @@ pub struct Adapter {
     /// vulkan, metal or dx12.
     pub backend: &'static str,
     pub driver: String,
-    /// Largest buffer, and largest part of one that a kernel sees at once, in bytes.
+    /// Largest buffer, and largest part of a buffer that a kernel can bind, in bytes.
     pub max_buffer: u64,
     pub max_binding: u64,
     pub max_workgroup_memory: u64,
@@ -21,7 +21,7 @@ pub struct Adapter {
 }
 
 impl Adapter {
-    /// A driver that computes on the processor: right, but no faster than the CPU path.
+    /// A driver that computes on the processor: correct, but no faster than the CPU kernels.
     pub fn is_software(&self) -> bool {
         self.kind == "cpu"
     }
@@ -54,7 +54,7 @@ impl Adapter {
     }
 }
 
-/// One for the process: drivers do not like to be loaded twice.
+/// One instance per process, because loading drivers twice can fail.
 fn instance() -> &'static Instance {
     static INSTANCE: OnceLock<Instance> = OnceLock::new();
     INSTANCE.get_or_init(|| {
@@ -66,7 +66,7 @@ fn instance() -> &'static Instance {
     })
 }
 
-/// Every adapter, the one to use first: real devices before software, larger kinds before smaller.
+/// Every adapter, in order of preference: real devices before software, larger kinds before smaller.
 pub(super) fn found() -> Vec<(Adapter, wgpu::Adapter)> {
     let adapters = pollster::block_on(instance().enumerate_adapters(Backends::all()));
     let mut found: Vec<_> = adapters.into_iter().map(|a| (Adapter::of(&a), a)).collect();

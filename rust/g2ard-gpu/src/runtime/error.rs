@@ -1,6 +1,6 @@
-//! What can go wrong on a device. Every case ends on the CPU path; none panics.
+//! Errors of a device. After any of them the CPU continues; none panics.
 
-/// One line each: the program shows it before it goes on without the device.
+/// Every message is one line, printed before the program continues without the device.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum Error {
     #[error("no adapter: no graphics driver that speaks Vulkan, Metal or DirectX 12 was found")]
@@ -41,7 +41,7 @@ pub enum Error {
 }
 
 impl Error {
-    /// Whether it says nothing about the next kernel, which may be asked for less.
+    /// Whether the failure depends on the amount of work, so that a smaller kernel may succeed.
     pub fn is_of_size(&self) -> bool {
         matches!(self, Self::TooLarge { .. } | Self::TooMany { .. })
     }
@@ -50,7 +50,7 @@ impl Error {
 pub type Result<T> = std::result::Result<T, Error>;
 
 impl From<g2ard_core::Error> for Error {
-    /// Of the core's errors only this one can come out of a twin: inputs were checked before.
+    /// The only error of the core that a twin can return, because inputs are checked before.
     fn from(error: g2ard_core::Error) -> Self {
         match error {
             g2ard_core::Error::Interrupted => Self::Interrupted,

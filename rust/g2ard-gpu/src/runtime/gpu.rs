@@ -1,4 +1,4 @@
-//! An open device: its buffers, its pipelines, and whether it is still well.
+//! An open device: its buffers, pipelines and health.
 
 use std::collections::{BTreeMap, HashMap};
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -10,19 +10,19 @@ use super::adapters::{self, Adapter};
 use super::room::{RESERVE, Room, to_open};
 use super::{Error, Result};
 
-/// How a device is opened; the default takes what the adapter offers.
+/// Options for opening a device; the default uses the adapter's own limits.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Options {
-    /// Binds no more than this many bytes, as if the adapter could not.
+    /// Largest binding in bytes, below the adapter's limit.
     pub max_binding: Option<u64>,
-    /// Keeps time of every kernel, where the adapter can.
+    /// Measure the time of every kernel, if the adapter can.
     pub timed: bool,
 }
 
-/// Stands before every kernel.
+/// Source that precedes every kernel.
 const DISPATCH: &str = include_str!("dispatch.wgsl");
 
-/// One entry point of a shader: the sources are joined in order, behind dispatch.wgsl.
+/// One entry point of a shader. Its sources follow dispatch.wgsl in order.
 #[derive(Debug, Clone, Copy)]
 pub struct Kernel {
     pub name: &'static str,
@@ -30,7 +30,7 @@ pub struct Kernel {
     pub entry: &'static str,
 }
 
-/// Words on the device.
+/// A buffer of words on the device.
 #[derive(Debug, Clone)]
 pub struct Buffer {
     pub(super) inner: wgpu::Buffer,
@@ -43,7 +43,7 @@ impl Buffer {
     }
 }
 
-/// The first thing that went wrong since it was last asked.
+/// The first error since the last check.
 type Health = Arc<Mutex<Option<Error>>>;
 
 #[derive(Debug)]
@@ -62,7 +62,7 @@ pub struct Gpu {
 }
 
 impl Gpu {
-    /// Opens the best adapter; software ones only where `software` allows them.
+    /// Open the best adapter; software adapters only if `software` is set.
     pub fn open(software: bool, options: Options) -> Result<Self> {
         let room = Room::of_process();
         room.check(to_open())?;
@@ -97,12 +97,12 @@ impl Gpu {
         })
     }
 
-    /// Words that one buffer may hold.
+    /// Most words that one buffer can hold.
     pub fn max_words(&self) -> usize {
         usize::try_from(self.max_binding / 4).unwrap_or(usize::MAX)
     }
 
-    /// Rounds that all loops of one thread may take together. Mesa's llvmpipe ends them, silently, at 65,535.
+    /// Most loop iterations per thread, over all its loops. Mesa's llvmpipe silently ends them at 65,535.
     pub fn max_rounds(&self) -> usize {
         if self.adapter.is_software() {
             48_000
@@ -111,17 +111,17 @@ impl Gpu {
         }
     }
 
-    /// Whether everything so far went well; tells of a failure once.
+    /// Return the first error since the last check.
     pub fn check(&self) -> Result<()> {
         if lock(&self.health).is_none() {
             return Ok(());
         }
-        // What fails on a lost device says that it is invalid; that it is lost is only told when polled.
+        // Operations on a lost device only report invalid objects; polling reports the loss itself.
         let _ = self.device.poll(wgpu::PollType::Poll);
         lock(&self.health).take().map_or(Ok(()), Err)
     }
 
-    /// A buffer of zeros; at least one word, for empty ones cannot be bound.
+    /// A buffer of zeros, with at least one word because empty buffers cannot be bound.
     pub fn buffer(&self, what: &'static str, words: usize) -> Result<Buffer> {
         let bytes = 4 * words.max(1) as u64;
         if bytes > self.max_binding {
@@ -151,7 +151,7 @@ impl Gpu {
         Ok(buffer)
     }
 
-    /// Small constants of one dispatch.
+    /// A uniform buffer with the constants of one dispatch.
     pub(super) fn constants(&self, values: &[u32]) -> wgpu::Buffer {
         let buffer = self.device.create_buffer(&BufferDescriptor {
             label: Some("constants"),
@@ -173,7 +173,7 @@ impl Gpu {
         self.sent.load(Ordering::Relaxed)
     }
 
-    /// The pipeline of a kernel, compiled when first asked for.
+    /// The pipeline of a kernel, compiled on first use.
     pub(super) fn pipeline(&self, kernel: &Kernel) -> Result<ComputePipeline> {
         let mut pipelines = lock(&self.pipelines);
         if let Some(pipeline) = pipelines.get(kernel.name) {
@@ -197,7 +197,7 @@ impl Gpu {
                 module: &module,
                 entry_point: Some(kernel.entry),
                 compilation_options: wgpu::PipelineCompilationOptions {
-                    // Kernels write all of the workgroup memory that they read.
+                    // Kernels write all workgroup memory before they read it.
                     zero_initialize_workgroup_memory: false,
                     ..Default::default()
                 },
@@ -208,12 +208,12 @@ impl Gpu {
         Ok(pipeline)
     }
 
-    /// Loses the device, as a driver's reset would.
+    /// Lose the device, as after a driver's reset.
     pub fn lose(&self) {
         self.device.destroy();
     }
 
-    /// Seconds on the device by kernel, where time is kept.
+    /// Seconds on the device per kernel, if they are measured.
     pub fn timings(&self) -> BTreeMap<&'static str, f64> {
         lock(&self.timings).clone()
     }
@@ -227,7 +227,7 @@ impl Gpu {
     }
 }
 
-/// Errors come out of `check`, never out of a panic.
+/// Collect errors for `check` instead of panicking.
 fn watch(device: &wgpu::Device, health: &Health) {
     let seen = health.clone();
     device.on_uncaptured_error(Arc::new(move |error: wgpu::Error| {
@@ -248,7 +248,7 @@ fn one_line(text: &str) -> String {
     text.split_whitespace().collect::<Vec<_>>().join(" ")
 }
 
-/// Nothing panics while it holds these locks, and what they guard is whole at every step.
+/// Lock a mutex. Poisoning is ignored: no code panics while it holds one, and its data is always consistent.
 fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }

@@ -1,4 +1,4 @@
-//! The one door to a device: adapters, buffers, pipelines, work, and what went wrong.
+//! All access to a device: adapters, buffers, pipelines, work and errors.
 
 mod adapters;
 mod error;

@@ -1,4 +1,4 @@
-//! Panics of a driver's or of wgpu's: one more way in which a device fails, and no noise.
+//! Panics in a driver or in wgpu become errors of the device, and print nothing.
 
 use std::any::Any;
 use std::cell::Cell;
@@ -8,12 +8,12 @@ use std::sync::Once;
 use super::{Error, Result};
 
 thread_local! {
-    /// Whether this thread's panics are caught here, and told of in the caller's one line.
+    /// Whether panics of this thread are caught here and reported by the caller.
     static CAUGHT: Cell<bool> = const { Cell::new(false) };
 }
 
-/// What `f` makes of it, a panic included. The hook that prints panics is wrapped once, and for this thread's panics
-/// within `f` stays silent; all other threads', and this one's before and after, reach it as they did.
+/// Run `f` and return its panic as an error. The panic hook is wrapped once and stays silent only for this thread while
+/// `f` runs.
 pub fn guarded<T>(f: impl FnOnce() -> Result<T>) -> Result<T> {
     static WRAPPED: Once = Once::new();
     WRAPPED.call_once(|| {
@@ -47,7 +47,7 @@ mod tests {
 
     const CHILD: &str = "G2ARD_TEST_PANICS";
 
-    /// Runs itself once more, as a process whose stderr can be read.
+    /// Run this test once more as a process whose stderr can be read.
     #[test]
     fn only_caught_panics_are_silent() {
         if std::env::var_os(CHILD).is_some() {

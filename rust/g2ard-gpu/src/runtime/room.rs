@@ -1,5 +1,5 @@
-//! Address space that the process may still take. Where it is limited (`ulimit -v`) and runs out, drivers do not
-//! report it: they end the process. So the memory they need is checked before.
+//! Free address space of the process. If it is limited (`ulimit -v`) and runs out, drivers end the process instead of
+//! reporting it, so g2ard checks it first.
 
 use std::fs::read_to_string;
 use std::num::NonZero;
@@ -7,17 +7,17 @@ use std::thread::available_parallelism;
 
 use super::{Error, Result};
 
-/// What opening a device and its first kernels may take: 0.72 GB were seen with Mesa's llvmpipe on one thread, and
-/// 0.15 GB more for the stack and the heap of each further one.
+/// Address space for opening a device and its first kernels: 0.72 GB were measured with Mesa's llvmpipe on one thread,
+/// and 0.15 GB more for the stack and heap of each further thread.
 pub fn to_open() -> u64 {
     let threads = available_parallelism().map_or(1, NonZero::get);
     (640 + 192 * threads as u64) << 20
 }
 
-/// What must stay free for whatever a driver does beside what it is asked for.
+/// Address space that stays free for the driver's own needs.
 pub const RESERVE: u64 = 256 << 20;
 
-/// The limit under which the process began to use a device; None where there is none, or the system tells of none.
+/// The limit on address space when the process began to use a device; None if it is unlimited or unknown.
 #[derive(Debug, Clone, Copy)]
 pub struct Room(Option<u64>);
 
@@ -30,7 +30,7 @@ impl Room {
         )
     }
 
-    /// Whether `bytes` more fit.
+    /// Fail if `bytes` more do not fit.
     pub fn check(self, bytes: u64) -> Result<()> {
         let Some(limit) = self.0 else { return Ok(()) };
         let status = read_to_string("/proc/self/status").unwrap_or_default();
@@ -42,7 +42,7 @@ impl Room {
     }
 }
 
-/// The limit on address space, in bytes; None if there is none.
+/// The limit on address space in bytes; None if it is unlimited.
 fn limit(limits: &str) -> Option<u64> {
     let line = limits
         .lines()
@@ -50,7 +50,7 @@ fn limit(limits: &str) -> Option<u64> {
     line.split_whitespace().next()?.parse().ok()
 }
 
-/// The address space in use, in bytes.
+/// Address space in use, in bytes.
 fn taken(status: &str) -> Option<u64> {
     let line = status
         .lines()

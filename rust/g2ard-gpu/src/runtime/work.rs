@@ -1,4 +1,4 @@
-//! Dispatches in order, and what they leave to be read.
+//! Recorded dispatches, and results to read when they are done.
 
 use std::sync::mpsc::{Receiver, channel};
 use std::time::Duration;
@@ -12,34 +12,34 @@ use wgpu::{
 use super::gpu::{Buffer, Gpu, Kernel};
 use super::{Error, Result};
 
-/// Workgroups along one axis of a dispatch; WebGPU promises no more.
+/// Most workgroups along one axis of a dispatch that WebGPU guarantees.
 const MAX_GROUPS: usize = 65_535;
 
-/// Kernels of one submission that are timed; the rest goes untimed.
+/// Most kernels of one submission that are timed.
 const MAX_TIMED: usize = 2048;
 
-/// A driver that answers in no such time hangs.
+/// Seconds after which a driver that does not answer is considered hung.
 const PATIENCE: u64 = 120;
 
-/// Work being written down; nothing runs before `submit`.
+/// Recorded work; nothing runs before `submit`.
 pub struct Work<'a> {
     gpu: &'a Gpu,
     encoder: CommandEncoder,
     clock: Option<Clock>,
 }
 
-/// When each kernel began and ended.
+/// Start and end of each kernel.
 struct Clock {
     ticks: QuerySet,
     kernels: Vec<&'static str>,
 }
 
-/// Results on their way.
+/// Results that are not read yet.
 pub struct Pending<'a> {
     gpu: &'a Gpu,
     index: wgpu::SubmissionIndex,
     reads: Vec<(wgpu::Buffer, Receiver<bool>)>,
-    /// The kernels whose ticks are the last read.
+    /// Kernels whose ticks form the last read.
     timed: Option<Vec<&'static str>>,
 }
 
@@ -61,9 +61,9 @@ impl<'a> Work<'a> {
         }
     }
 
-    /// Runs a kernel in `groups` workgroups. Binding 0 holds `constants` (none if empty); `buffers` follow.
+    /// Run a kernel in `groups` workgroups. Binding 0 holds `constants` (none if empty); `buffers` follow.
     ///
-    /// Groups beyond a row of the dispatch go on in its next; kernels count y·(groups along x) + x.
+    /// Workgroups beyond one row of the dispatch continue in the next; kernels count y·(groups along x) + x.
     pub fn run(
         &mut self,
         kernel: &Kernel,
@@ -75,7 +75,7 @@ impl<'a> Work<'a> {
         self.run_at(kernel, groups, constants, &bound)
     }
 
-    /// The same, with the binding of each buffer: for kernels that do not use all that their file declares.
+    /// Run a kernel with explicit binding numbers, for kernels that do not use every binding of their file.
     pub fn run_at(
         &mut self,
         kernel: &Kernel,
@@ -113,12 +113,12 @@ impl<'a> Work<'a> {
         Ok(())
     }
 
-    /// Sets a buffer to zeros.
+    /// Fill a buffer with zeros.
     pub fn clear(&mut self, buffer: &Buffer) {
         self.encoder.clear_buffer(&buffer.inner, 0, None);
     }
 
-    /// Starts it all; the words asked for (of a buffer, from its start) are read when it is done.
+    /// Submit the work. Each of `reads` is a buffer and the number of its first words to read when the work is done.
     pub fn submit(mut self, reads: &[(&Buffer, usize)]) -> Result<Pending<'a>> {
         let mut copies: Vec<_> = reads
             .iter()
@@ -158,7 +158,7 @@ impl<'a> Work<'a> {
         })
     }
 
-    /// A copy that can be read here.
+    /// A copy of a buffer that the CPU can map.
     fn readback(&mut self, from: &wgpu::Buffer, size: u64) -> wgpu::Buffer {
         let copy = self.gpu.device.create_buffer(&BufferDescriptor {
             label: Some("readback"),
@@ -187,7 +187,7 @@ impl Clock {
 }
 
 impl Pending<'_> {
-    /// Waits; the words of each read.
+    /// Wait for the results; return the words of each read.
     pub fn take(self) -> Result<Vec<Vec<u32>>> {
         let waited = self.gpu.device.poll(PollType::Wait {
             submission_index: Some(self.index),

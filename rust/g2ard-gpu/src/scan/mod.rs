@@ -15,7 +15,7 @@ const ADD: Kernel = Kernel {
 };
 const BLOCK: usize = 1024;
 
-/// Replaces the first `count` words by the sums of those before them; the word returned is the sum of all.
+/// Replace the first `count` words by the sums of the words before them; the returned word is the total.
 pub fn exclusive(gpu: &Gpu, work: &mut Work, values: &Buffer, count: usize) -> Result<Buffer> {
     let blocks = count.div_ceil(BLOCK).max(1);
     let totals = gpu.buffer("scan", blocks)?;

@@ -17,7 +17,7 @@ const SCATTER: Kernel = Kernel {
 const BLOCK: usize = 1024;
 const DIGIT: usize = 4;
 
-/// 64-bit keys, two words each, and a word with each.
+/// 64-bit keys of two words each, and one word of payload per key.
 pub struct Keyed {
     pub keys: Buffer,
     pub words: Buffer,
@@ -32,7 +32,7 @@ impl Keyed {
     }
 }
 
-/// The first `count` of `keyed` in ascending order of the bits in `bits`; equal keys keep their order.
+/// Sort the first `count` of `keyed` by the bits in `bits`, ascending; equal keys keep their order.
 pub fn sort(
     gpu: &Gpu,
     work: &mut Work,

@@ -1,12 +1,12 @@
-//! Arithmetic on pairs of f32, for what f32 is too coarse for; and coordinates as integers.
+//! Arithmetic on pairs of f32 where f32 is too coarse, and coordinates as integers.
 
 use g2ard_core::spatial::RobustBounds;
 use rayon::prelude::*;
 
-/// WGSL that kernels are preceded by.
+/// WGSL source that precedes kernels.
 pub const TWO: &str = include_str!("two.wgsl");
 
-/// The number that two words from the device stand for.
+/// The number that two words from the device represent.
 pub fn number(words: &[u32]) -> f64 {
     f64::from(f32::from_bits(words[0])) + f64::from(f32::from_bits(words[1]))
 }
@@ -23,7 +23,7 @@ pub struct Frame {
 /// Bits of the farthest coordinate.
 const BITS: i32 = 60;
 
-/// Points farther out than this many radii of the scene are put there; no cell of the lattice reaches as far.
+/// Points farther out than this many radii of the scene are clamped; no cell of the lattice reaches as far.
 const FARTHEST: f64 = (1 << 24) as f64;
 
 impl Frame {
@@ -58,7 +58,7 @@ mod tests {
     use g2ard_core::linalg::{outer, symmetric_eigen};
     use g2ard_core::random::Lcg;
 
-    /// What an operation may lose, of the larger operand: 2⁻⁴⁵ and more.
+    /// Largest relative error of an operation, in terms of the larger operand: slightly over 2⁻⁴⁵.
     const DIGITS: f64 = 3e-14;
 
     const OPERATIONS: &str = r"
@@ -109,13 +109,13 @@ mod tests {
         }
     ";
 
-    /// A number as kernels take it.
+    /// A number in the layout that kernels read.
     fn two(x: f64) -> [f32; 2] {
         let high = x as f32;
         [high, (x - f64::from(high)) as f32]
     }
 
-    /// `out` numbers for each of `rows` rows.
+    /// Run a kernel that returns `out` numbers per row.
     fn answers<T: bytemuck::NoUninit>(
         gpu: &Gpu,
         name: &'static str,

@@ -1,4 +1,4 @@
-//! Cells of a surface against the image.
+//! Visibility of a surface's cells.
 
 use g2ard_core::select::Surface;
 
@@ -43,7 +43,7 @@ impl Cells {
         (0..self.constants.count as u32).filter(bit).collect()
     }
 
-    /// Light in the pixels that cells fall into: only their depths are needed.
+    /// Light in the pixels that contain a cell; other depths are not needed.
     pub fn light(&self, gpu: &Gpu, work: &mut Work, view: &View) -> Result<Buffer> {
         let light = gpu.buffer("light", view.pixels())?;
         let groups = self.constants.count.div_ceil(THREADS);
@@ -52,7 +52,7 @@ impl Cells {
         Ok(light)
     }
 
-    /// A bit for each cell that the depths show.
+    /// One bit per cell: set if the depths show it.
     pub fn seen(&self, gpu: &Gpu, work: &mut Work, view: &View, depth: &Buffer) -> Result<Buffer> {
         let words = self.constants.count.div_ceil(32);
         let bits = gpu.buffer("seen", words)?;

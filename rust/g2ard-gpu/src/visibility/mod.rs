@@ -1,10 +1,10 @@
-//! Twins of what views see: the median depths and cells of `g2ard_core::select`, and each Gaussian's Σ αT of
+//! GPU kernels for visibility: the median depths and cells of `g2ard_core::select`, and each Gaussian's Σ αT of
 //! `g2ard_core::visibility`.
 //!
-//! A view takes two trips. The first projects all rows, marks those that the image may show and counts the tiles
-//! they touch. With the counts known, the second sorts the marked ones by depth, spreads them over their tiles and
-//! draws. While one view is drawn the next is projected. Arithmetic is f32; drivers may fuse operations and round
-//! divisions and exponentials otherwise, so ties within that rounding may fall elsewhere.
+//! A view takes two submissions. The first projects all rows, marks those that the image may show and counts the tiles
+//! they touch. With the counts known, the second sorts the marked rows by depth, distributes them over their tiles and
+//! draws. While one view is drawn, the next is projected. Arithmetic is f32. Drivers may fuse operations and round
+//! divisions and exponentials differently, so ties within that rounding may be decided differently.
 
 mod cells;
 mod raster;
@@ -52,12 +52,12 @@ pub fn visible_cells(
     each(gpu, &scene, cameras, &MEDIAN, &look, control, read)
 }
 
-/// Whether there is a twin of what these settings draw.
+/// Whether these settings can be drawn on the device.
 pub fn serves(settings: &Settings) -> bool {
     settings.convention == Convention::Gsplat && !settings.antialiased
 }
 
-/// Σ αT of every row over these views, in the order of `sums`. The device keeps the scene from call to call.
+/// Σ αT of every row over these views, in the order of `sums`. The device keeps the scene between calls.
 pub fn weights(
     gpu: &Gpu,
     sums: &mut VisibilityAccumulator,
@@ -82,7 +82,7 @@ pub fn weights(
         .collect())
 }
 
-/// A pixel ends at its median depth.
+/// Settings for median depths, at which a pixel ends.
 const MEDIAN: Settings = Settings {
     convention: Convention::Gsplat,
     antialiased: false,
@@ -90,7 +90,7 @@ const MEDIAN: Settings = Settings {
     transmittance_min: 0.5,
 };
 
-/// What is looked for in each view.
+/// Result requested per view.
 enum Look<'a> {
     Depths,
     Cells(&'a Cells),
@@ -104,7 +104,7 @@ struct Begun<'a> {
     marked: Marked<'a>,
 }
 
-/// What `read` makes of each view's answer: its depths, a bit for each cell, or nothing.
+/// Pass each view's answer to `read`: its depths, one bit per cell, or nothing.
 fn each<T>(
     gpu: &Gpu,
     scene: &Scene,
@@ -141,7 +141,7 @@ fn each<T>(
     Ok(found)
 }
 
-/// The first trip.
+/// Submit the first part of a view.
 fn begin<'a>(gpu: &'a Gpu, scene: &Scene, view: View, look: &Look<'_>) -> Result<Begun<'a>> {
     let mut work = Work::new(gpu);
     let light = match look {
@@ -156,7 +156,7 @@ fn begin<'a>(gpu: &'a Gpu, scene: &Scene, view: View, look: &Look<'_>) -> Result
     })
 }
 
-/// The second.
+/// Submit the second part of a view.
 fn finish<'a>(
     gpu: &'a Gpu,
     scene: &Scene,

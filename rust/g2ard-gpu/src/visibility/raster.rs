@@ -1,4 +1,4 @@
-//! The raster: rows that a view may show, sorted by depth, spread over tiles, drawn front to back.
+//! The raster: rows that a view may show, sorted by depth, distributed over tiles and drawn front to back.
 
 use super::scene::Scene;
 use super::view::{Constants, View};
@@ -32,21 +32,21 @@ const COLLECT: Kernel = kernel("visibility.collect", TILES, "collect");
 const DEPTHS: Kernel = kernel("visibility.depths", DRAW, "depths");
 const WEIGH: Kernel = kernel("visibility.weigh", DRAW, "weigh");
 
-/// Rows of a workgroup that projects them, and threads of all others.
+/// Rows per workgroup of the projection, and threads per workgroup of all other kernels.
 const BLOCK: usize = 256;
 pub const THREADS: usize = 64;
 /// Words of a splat.
 const SPLAT: usize = 10;
 /// Pixels along a side of a tile.
 const TILE: usize = 16;
-/// Depths are positive floats: their bits sort as they do.
+/// Depths are positive floats, so their bits sort like their values.
 const DEPTH_BITS: usize = 32;
-/// Pairs of splat and tile that prefix sums can count.
+/// Most pairs of splat and tile that prefix sums can count.
 const MAX_PAIRS: u64 = 1 << 31;
-/// Rounds of loops that `weigh` takes for a pair.
+/// Loop iterations of `weigh` per pair.
 const WEIGH_ROUNDS: usize = 7;
 
-/// What drawing leaves.
+/// Result of drawing.
 #[derive(Clone, Copy)]
 pub enum Goal<'a> {
     /// The median depth of each pixel.
@@ -55,14 +55,14 @@ pub enum Goal<'a> {
     Weights(&'a Buffer),
 }
 
-/// Rows that a view may show, being marked.
+/// Marked rows of a view, which it may show.
 pub struct Marked<'a> {
     sums: Buffer,
     pending: Pending<'a>,
 }
 
 impl Marked<'_> {
-    /// Starts to mark the rows of a scene.
+    /// Start to mark the rows of a scene.
     pub fn begin<'a>(
         gpu: &'a Gpu,
         mut work: Work<'a>,
@@ -82,8 +82,8 @@ impl Marked<'_> {
         })
     }
 
-    /// Draws the marked rows onto what is left of the light. Pairs that do not fit at once are drawn in turns: the
-    /// nearer before the farther.
+    /// Draw the marked rows onto the remaining light. Pairs that do not fit at once are drawn in several passes, nearer
+    /// ones first.
     pub fn draw(
         self,
         gpu: &Gpu,

@@ -18,7 +18,7 @@ pub struct Scene {
 }
 
 impl Scene {
-    /// What may hide something, in Morton order, as `g2ard_core::select::Occluders` has it.
+    /// Gaussians that may hide something, in Morton order, as in `g2ard_core::select::Occluders`.
     pub fn of_gaussians(gpu: &Gpu, scene: &Gaussians<'_>) -> Result<Self> {
         let order = order(&codes(scene.means, &RobustBounds::of(scene.means)));
         let rows: Vec<_> = order

@@ -41,8 +41,8 @@ fn cameras(center: [f64; 3], radius: f64) -> Vec<Camera> {
         .collect()
 }
 
-/// What Σ αT of all Gaussians may differ by, of their sum; and for how many of them by more than a thousandth: those
-/// whose order by depth is within rounding.
+/// Largest difference of Σ αT summed over all Gaussians, as a share of that sum; and the share of Gaussians that may
+/// differ by over a thousandth, because their order by depth is within rounding.
 const TOLERANCE: f64 = 1e-5;
 
 fn compare_weights(gpu: &Gpu, what: &str, splats: &Splats, cameras: &[Camera]) {
@@ -122,7 +122,7 @@ fn compare(gpu: &Gpu, what: &str) {
         let want = Cpu.view_statistics(&scene, &cameras, &control).unwrap();
         let got = view_statistics(gpu, &scene, &cameras, &control).unwrap();
         for (a, b) in want.iter().zip(&got) {
-            // Of the widest needles the CPU's determinants in f32 keep no digit.
+            // For the widest needles, the CPU's determinants in f32 have no correct digit.
             let close =
                 |k: usize| (a[k] - b[k]).abs() <= 1e-4 * a[k].abs() || name.contains("wild");
             assert!(close(0) && close(1), "{name}: {a:?} {b:?}");
@@ -160,7 +160,7 @@ fn a_crowded_tile_is_drawn_to_its_end() {
     let Some(gpu) = gpu("a crowded tile") else {
         return;
     };
-    // A crowd in one corner, and behind it what fills the image.
+    // A crowd in one corner, and an image-filling background behind it.
     let mut means = vec![[-0.49, -0.49, 0.0]; 70_000];
     means.push([0.0, 0.0, 1.0]);
     let n = means.len();

@@ -1,18 +1,18 @@
-//! A camera as kernels are handed it.
+//! A camera in the layout that kernels read.
 
 use g2ard_core::raster::{Camera, Settings};
 use g2ard_core::select::Pinhole;
 
 use crate::runtime::{Error, Result};
 
-/// Spans of pixels are 16 bits.
+/// Pixel spans have 16 bits.
 const MAX_SIDE: usize = u16::MAX as usize;
 
-/// `View` of pinhole.wgsl, but for what changes from kernel to kernel.
+/// `View` of pinhole.wgsl, except for the fields that change per kernel.
 pub struct View {
     pinhole: Pinhole,
     eye: [f64; 3],
-    /// α is clipped here, and pixels end before their light would fall to this.
+    /// Upper limit of α; the transmittance at which a pixel ends.
     alpha_max: f32,
     light_min: f32,
 }
@@ -45,16 +45,16 @@ impl View {
     }
 }
 
-/// What one kernel is told of a view.
+/// Fields of a view that change per kernel.
 #[derive(Default, Clone, Copy)]
 pub struct Constants {
-    /// Rows, cells or splats there are.
+    /// Number of rows, cells or splats.
     pub count: usize,
-    /// The first pair of splat and tile, how many from there on, and how many in all.
+    /// The first pair of splat and tile, the number of pairs from there, and the total.
     pub first: usize,
     pub pairs: usize,
     pub all_pairs: usize,
-    /// Edge of a cell, and the share of its depth that it may lie off the depths.
+    /// Edge of a cell, and its depth tolerance as a share of its depth.
     pub cell: f32,
     pub tolerance: f32,
 }

@@ -1,5 +1,5 @@
-//! Twin of `g2ard_core::spatial::Cells::adaptive`. Cells are found in integers, the same on every device; points within
-//! rounding of a border may fall into the cell beside the CPU's.
+//! GPU kernels for `g2ard_core::spatial::Cells::adaptive`. Cells are computed in integers, equal on every device;
+//! points within rounding of a border may fall into the cell next to the CPU's.
 
 use g2ard_core::simplify::means_of;
 use g2ard_core::spatial::{BITS, Cells, OCTAVES, RobustBounds, octave_counts, search_size, unit};
@@ -33,11 +33,11 @@ const COMPACT: Kernel = Kernel {
     entry: "compact",
 };
 
-/// Rows a workgroup of 64 threads, or of 256 with four each, takes.
+/// Rows per workgroup: 64 threads with one row each, or 256 with four.
 const THREADS: usize = 64;
 const BLOCK: usize = 1024;
 
-/// Words that a position takes, and a key.
+/// Words per position, and per key.
 const POINT: usize = 6;
 const KEY: usize = 2;
 
@@ -81,7 +81,7 @@ pub fn of_rows(
     Lattice::new(gpu, pieces, frame, &points, bounds).adaptive(target)
 }
 
-/// Points that one buffer may hold.
+/// Most points that one buffer can hold.
 fn most_points(gpu: &Gpu) -> usize {
     (gpu.max_words() / POINT).max(1)
 }
@@ -119,7 +119,7 @@ impl<'a> Lattice<'a> {
         }
     }
 
-    /// About `target` cells.
+    /// Cells of which about `target` are occupied.
     fn adaptive(&self, target: usize) -> Result<Cells> {
         if self.count == 0 {
             return Ok(Cells::with_size(&[], &self.bounds, self.bounds.radius));
@@ -129,8 +129,8 @@ impl<'a> Lattice<'a> {
         self.cells(size)
     }
 
-    /// The lattice's words in voxels.wgsl but for those of a piece. Rounded so that points on a border, as those are that
-    /// the bounds were picked from, fall into the upper cell.
+    /// The lattice's fields in voxels.wgsl, except for those of a piece. Rounded so that points on a border, such as
+    /// those that define the bounds, fall into the upper cell.
     fn words(&self, size: f64) -> [u32; 8] {
         let RobustBounds { origin, radius } = self.bounds;
         let corner = self.frame.fixed(origin.map(|v| v - radius)).map(|v| v - 2);
@@ -156,13 +156,13 @@ impl<'a> Lattice<'a> {
         sort(self.gpu, work, keyed, self.count, 0..self.bits(size))
     }
 
-    /// Bits in which keys at this size differ, and one more, which only the outside has.
+    /// Number of bits in which keys at this size differ, plus one that only points outside have.
     fn bits(&self, size: f64) -> usize {
         let cells = (self.reach / size).max(1.0).log2() as u32 + 1;
         (3 * cells.min(BITS) + 1) as usize
     }
 
-    /// How many neighbours in Morton order first fall apart at each octave.
+    /// Number of neighbours in Morton order that first separate at each octave.
     fn apart(&self) -> Result<[usize; OCTAVES]> {
         let mut work = Work::new(self.gpu);
         let sorted = self.sorted(&mut work, unit(&self.bounds), true)?;
@@ -179,20 +179,20 @@ impl<'a> Lattice<'a> {
         Ok(apart)
     }
 
-    /// Occupied cells of a size.
+    /// Number of occupied cells of a size.
     fn occupied(&self, size: f64) -> Result<usize> {
         let mut work = Work::new(self.gpu);
         let (.., total) = self.edges(&mut work, size)?;
         Ok(work.submit(&[(&total, 1)])?.take()?[0][0] as usize)
     }
 
-    /// Sorted keys, the number of cells before each, and the number of all.
+    /// Sorted keys, the number of cells before each, and the number of all cells.
     fn edges(&self, work: &mut Work, size: f64) -> Result<(Keyed, Buffer, Buffer)> {
         let sorted = self.sorted(work, size, false)?;
         let ranks = self.gpu.buffer("ranks", self.count)?;
         let constants = [self.count as u32, 0, 0, 0];
         let groups = self.count.div_ceil(THREADS);
-        // Bindings are numbered: `ranks` stands behind `counts`, which this kernel does not use.
+        // Bindings are numbered: `ranks` follows `counts`, which this kernel does not use.
         let bound = [(1, &sorted.keys), (3, &ranks)];
         work.run_at(&EDGES, groups, &constants, &bound)?;
         let total = scan::exclusive(self.gpu, work, &ranks, self.count)?;
@@ -230,10 +230,11 @@ mod tests {
     use crate::testing::{gpu_with, scenes};
     use std::collections::HashMap;
 
-    /// Points nearer than this share of a cell to its border may fall into the one beside.
+    /// Points nearer to a border than this share of a cell may fall into the next cell.
     const BORDER: f64 = 1e-6;
 
-    /// Cells of one size hold the same rows as the CPU's, but for rows on a border; about as many are found.
+    /// Compare cells with the CPU's: cells of one size hold the same rows, except for rows on a border, and about as
+    /// many cells are found.
     fn compare(gpu: &Gpu, what: &str) {
         for (name, splats) in scenes(12_000) {
             let points = &splats.means;
