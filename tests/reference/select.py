@@ -4,7 +4,7 @@ import numpy as np
 
 
 def median_depth(splats, viewmat, K, pixels):
-    """(n,) depth at which less than half the light is left along each pixel (n, 2), 0 where there is none.
+    """Return the (n,) depths at which transmittance falls below one half in pixels (n, 2); 0 if it does not.
 
     Every Gaussian is evaluated at every pixel.
     """

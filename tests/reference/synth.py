@@ -6,7 +6,7 @@ from benchmarks.synth.shapes import Kind, Shapes
 
 
 def first_hits(shapes: Shapes, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """t (n,) and primitive (n,) of the first hits of rays (n, 3); inf and −1 where there is none."""
+    """Return t (n,) and primitive (n,) of the first hits of rays (n, 3); inf and −1 without a hit."""
     best, hit = np.full(len(directions), np.inf), np.full(len(directions), -1)
     for p in range(len(shapes)):
         for t in _crossings(Kind(shapes.kinds[p]), shapes.lo[p], shapes.hi[p], origins, directions):

@@ -103,7 +103,7 @@ mod simplify {
         bencher.bench(|| run().expect("never cancelled"));
     }
 
-    /// Its flags included.
+    /// The paper's flags included.
     #[divan::bench(args = COUNTS)]
     fn paper_policy(bencher: Bencher, count: usize) {
         let (scene, paper, counts) = (Scene::of(count), Paper::default(), schedule(count, 0.75));
@@ -244,7 +244,7 @@ mod select {
         bencher.bench(|| surface(&scene));
     }
 
-    /// What 64 views of 320×240 see.
+    /// The cells that 64 views of 320×240 see.
     #[divan::bench(args = COUNTS)]
     fn cells_seen(bencher: Bencher, count: usize) {
         let (scene, views) = (Scene::of(count), views());

@@ -1,4 +1,4 @@
-//! Where the heavy kernels of simplification and selection run: on the CPU, or on a device.
+//! Choice of the device for the heavy kernels of simplification and selection: the CPU, or another device.
 //!
 //! Stages know only the traits of their own kernels; this module alone knows both.
 

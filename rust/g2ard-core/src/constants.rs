@@ -1,6 +1,6 @@
 //! Structs of constants, which Python reads and sets by name.
 
-/// Where the value of one constant lies.
+/// The location of one constant's value.
 #[derive(Debug)]
 pub enum Slot<'a> {
     F64(&'a mut f64),

@@ -1,4 +1,4 @@
-//! How a caller watches and stops long work: counters it may read, a flag it may set.
+//! Progress and cancellation of long work: counters that a caller may read, and a flag that it may set.
 
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 

@@ -1,6 +1,6 @@
-//! The one error type of the core.
+//! The error type of the core.
 
-/// What can go wrong in a kernel. Messages are one line and name the field, what was expected and what came.
+/// Errors of kernels. Messages are one line that names the field, the expected and the actual value.
 #[derive(Debug, thiserror::Error, PartialEq)]
 pub enum Error {
     #[error("{name}: expected {expected}, got {got}")]

@@ -107,8 +107,8 @@ fn patch(points: &[[f64; 3]], row: u32, near: &[Neighbor<f64>], config: &LiftCon
     }
 }
 
-/// Sizes in the order of the points. A patch without extent (its neighbours all at one place) takes the
-/// median extent of the nearest patches that have one; where none has, 1: its size is unknown.
+/// Sizes in the order of the points. A patch without extent (all neighbours at one place) takes the median extent of
+/// the nearest patches that have one, or 1 if none has.
 fn discs(tree: &Tree, patches: &[Patch], config: &LiftConfig) -> Discs {
     let sized: Vec<usize> = (0..patches.len())
         .filter(|&at| patches[at].tangential[0] > 0.0)
@@ -130,7 +130,7 @@ fn discs(tree: &Tree, patches: &[Patch], config: &LiftConfig) -> Discs {
     out
 }
 
-/// Of the `count` patches around `at` in Morton order, among those that have an extent.
+/// Median extent of those of the `count` patches around `at` in Morton order that have one.
 fn local_median(patches: &[Patch], sized: &[usize], at: usize, count: usize) -> f64 {
     let middle = sized.partition_point(|&s| s < at);
     let window =

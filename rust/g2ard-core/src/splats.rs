@@ -1,4 +1,4 @@
-//! The one scene type: a structure of arrays.
+//! The scene type: a structure of arrays.
 
 use crate::{Error, Result};
 

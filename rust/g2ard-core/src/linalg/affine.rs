@@ -1,4 +1,4 @@
-//! How well an affine function of position predicts colour: the residual behind flags and the energy guard.
+//! The residual of predicting colour by an affine function of position, for flags and the energy guard.
 
 use glam::DVec3;
 

@@ -1,4 +1,4 @@
-//! Rows split into cells, always those with the most error: where a palette begins.
+//! Rows split into cells, always the cell with the most error: the start of a palette.
 
 use rayon::prelude::*;
 
@@ -25,7 +25,7 @@ impl Cell {
     }
 }
 
-/// At most `count` means, and of every row the cell it is in. Cells near each other have near numbers.
+/// At most `count` means, and the cell of every row. Cells near each other have near numbers.
 pub fn split(points: &Rows, count: usize) -> (Vec<f32>, Vec<u32>) {
     let mut cells = vec![Cell::of(points, (0..points.len() as u32).collect())];
     loop {

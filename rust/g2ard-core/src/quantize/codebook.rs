@@ -4,7 +4,7 @@ use rayon::prelude::*;
 
 use crate::{Error, Result};
 
-/// Values are merged into at most twice as many bins; as many distinct ones or fewer are kept apart.
+/// More distinct values than this are merged into at most twice as many bins; fewer are kept separate.
 const BINS: usize = 4096;
 
 /// Sums over the bins before each one, of values from which a centre was taken.
@@ -85,7 +85,7 @@ fn check(values: &[f32], weights: Option<&[f32]>, count: usize) -> Result<()> {
     super::palette::check_finite("values", values, 1)
 }
 
-/// One layer: with k + 1 clusters, where the last of them begins for every number of bins.
+/// One layer of the dynamic programme: with k + 1 clusters, the start of the last one for every number of bins.
 fn layer(sums: &Sums, best: &[f64], next: &mut [f64], start: &mut [u16], k: usize, bins: usize) {
     let mut stack = vec![(k + 1, bins, k, bins - 1)];
     while let Some((low, high, first, last)) = stack.pop() {

@@ -1,4 +1,4 @@
-//! Which entries of a palette lie near each other, found among groups of them.
+//! Neighbouring entries of a palette, searched among groups of entries.
 
 use rayon::prelude::*;
 
@@ -11,7 +11,7 @@ const GROUPS: usize = 8;
 /// Neighbours of an entry. Fewer entries than that are all neighbours of each other.
 pub const NEIGHBORS: usize = 24;
 
-/// Of every entry its nearest others, at most `NEIGHBORS`.
+/// The nearest other entries of every entry, at most `NEIGHBORS`.
 pub fn neighbors(entries: &[f32], dims: usize) -> Vec<Vec<u32>> {
     let count = entries.len() / dims;
     let middles: Vec<f32> = entries

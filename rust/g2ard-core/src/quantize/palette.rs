@@ -8,7 +8,7 @@ use crate::{Control, Error, Result};
 /// Steps between looks at which entries are neighbours.
 const RENEWED: usize = 3;
 
-/// Which entry stands for each row.
+/// A palette, and the entry of each row.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Palette {
     /// Entries × dims.
@@ -17,7 +17,7 @@ pub struct Palette {
     pub labels: Vec<u32>,
 }
 
-/// N rows of `dims` values and what each of them counts.
+/// N rows of `dims` values and their weights.
 pub struct Rows<'a> {
     pub dims: usize,
     values: &'a [f32],
@@ -41,7 +41,7 @@ impl Rows<'_> {
         distance(self.row(row), to)
     }
 
-    /// Σ w row / Σ w, in the order given; the plain mean where nothing has weight.
+    /// Σ w row / Σ w, in the given order; the plain mean if all weights are zero.
     pub fn mean(&self, rows: &[u32]) -> Vec<f32> {
         let total: f64 = rows.iter().map(|&r| self.weight(r)).sum();
         let weighted = total > 0.0;
@@ -123,7 +123,7 @@ pub fn palette(
     Ok(Palette { entries, labels })
 }
 
-/// Rows go to the nearest of their entry and its neighbours; how many moved.
+/// Assign each row to the nearest of its entry and that entry's neighbours; return the number of rows that changed.
 fn assign(points: &Rows, entries: &[f32], around: &[Vec<u32>], labels: &mut [u32]) -> usize {
     let at = |label: u32| &entries[label as usize * points.dims..][..points.dims];
     let move_one = |(row, label): (usize, &mut u32)| {
@@ -140,7 +140,7 @@ fn assign(points: &Rows, entries: &[f32], around: &[Vec<u32>], labels: &mut [u32
     labels.par_iter_mut().enumerate().map(move_one).sum()
 }
 
-/// Entries go to the means of their rows; those without any stay.
+/// Move entries to the means of their rows; entries without rows stay.
 fn update(points: &Rows, entries: &mut [f32], labels: &[u32]) {
     let mut ends = vec![0_usize; entries.len() / points.dims + 1];
     labels

@@ -1,4 +1,4 @@
-//! What each Gaussian contributes to a view: the sums that visibility, pruning and counting are made of.
+//! The contribution of each Gaussian to a view: sums for visibility, pruning and counting.
 
 use rayon::prelude::*;
 
@@ -42,7 +42,7 @@ impl Accumulated {
     }
 }
 
-/// Sums that threads add to, each to rows of its own.
+/// Sums that threads add to, each to its own rows.
 #[derive(Clone, Copy)]
 pub(super) struct SharedSums {
     weight: DisjointSlice<f64>,
@@ -78,14 +78,14 @@ impl SharedSums {
     }
 }
 
-/// How many sums a pair has: its weight alone, or transmittance, hits, dominant and peak as well.
+/// Number of sums per pair: the weight alone, or also transmittance, hits, dominant and peak.
 pub const WEIGHT: usize = 1;
 pub const ALL: usize = 5;
 
-/// A row of lanes' state from front to back; what a pair touches lies side by side.
+/// A row of lanes' state from front to back; values of one pair are adjacent.
 #[derive(Clone, Copy)]
 struct Row {
-    /// The light that would be left if nothing ever stopped: see the forward kernel.
+    /// The light that would remain if no pixel ever stopped: see the forward kernel.
     unstopped: Lanes16,
     /// The largest αT so far, and the number of its pair, −1 for none.
     most: Lanes16,
@@ -225,7 +225,7 @@ fn folded<B: Vector>(lanes: B, with: impl Fn(f32, f32) -> f32) -> f32 {
     row.0[0]
 }
 
-/// One Gaussian's sums over a view: see [`Accumulated`]. Zero but for the weight if no others were asked for.
+/// One Gaussian's sums over a view: see [`Accumulated`]. Sums that were not requested are zero.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Total {
     pub weight: f64,

@@ -1,4 +1,4 @@
-//! One tile from back to front, Gaussian by Gaussian: every pair's ten sums go to its own slot.
+//! One tile from back to front, Gaussian by Gaussian. Every pair's ten sums go to its own slot.
 
 use super::blocks::{BlockMasks, MOST_BLOCKS, blocks, by_pair, row_and_part};
 use super::disjoint::DisjointSlice;
@@ -12,11 +12,11 @@ use super::tile_batch::{
 use super::tiles::Pair;
 use super::{ALPHA_MIN, ROWS, Settings, TILE};
 
-/// Sums a pair leaves behind: Σ h·(1, u, v, u², uv, v²), Σ w·(dR, dG, dB), Σ w·dDepth; h = dL/d(ln α), w = αT.
+/// Sums per pair: Σ h·(1, u, v, u², uv, v²), Σ w·(dR, dG, dB), Σ w·dDepth; h = dL/d(ln α), w = αT.
 pub const SUMS: usize = 10;
 
-/// A tile's incoming gradients and the state carried from back to front, row by row of lanes: what a row needs lies side
-/// by side: loads and stores 4 KiB apart would alias.
+/// A tile's incoming gradients and the state carried from back to front. Values of one row of lanes are adjacent,
+/// because loads and stores 4 KiB apart would alias.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Incoming([Row; ROWS]);
 
@@ -95,7 +95,7 @@ pub struct Backward<'a, const WITH_DEPTH: bool> {
     pub batch: &'a mut TileSplats,
     /// Sums of each pair.
     pub slots: DisjointSlice<[f32; SUMS]>,
-    /// 1 where a slot was written; the others hold what was there before.
+    /// 1 if a slot was written; other slots hold stale values.
     pub written: DisjointSlice<u8>,
 }
 
@@ -176,8 +176,8 @@ fn split<B: Vector>(item: Item) -> (usize, usize) {
     (pair.min(BATCH), item as usize % blocks::<B>())
 }
 
-/// The items of a batch from its last pair to its first, then one of the pair that reaches nothing. Returns how many
-/// without that.
+/// The items of a batch from its last pair to its first, then one of the pair that reaches nothing. Return their number
+/// without the latter.
 #[inline(always)]
 fn list_items<B: Vector>(
     block_masks: &BlockMasks,
@@ -204,14 +204,14 @@ fn list_items<B: Vector>(
     count
 }
 
-/// What evaluating the items of a batch needs.
+/// Inputs for evaluating the items of a batch.
 struct Evaluator<'a, B: Vector> {
     batch: &'a TileSplats,
     minimum: B,
     clip: B,
 }
 
-/// What an item is at its block's pixels.
+/// An item's values at its block's pixels.
 #[derive(Clone, Copy)]
 struct Evaluated<B: Vector> {
     u: B,
@@ -220,7 +220,7 @@ struct Evaluated<B: Vector> {
     a: B,
     /// 1/(1 − α).
     inverse_rest: B,
-    /// Where α is not clipped, and so follows its arguments.
+    /// Lanes in which α is not clipped and therefore depends on its arguments.
     free: B::Mask,
 }
 
@@ -274,7 +274,7 @@ impl<B: Vector> Evaluated<B> {
         let behind = B::load_part(&g.behind, part);
         let gain = seen - behind;
         self.a.fma(gain, behind).store_part(&mut g.behind, part);
-        // Where α is clipped it does not follow its arguments.
+        // A clipped α does not depend on its arguments.
         let h = (w * gain).only(self.free);
         let (hu, hv) = (h * self.u, h * self.v);
         sums[0] = sums[0] + h;

@@ -15,7 +15,7 @@ pub const fn blocks<B: Vector>() -> usize {
     TILE * TILE / B::COUNT
 }
 
-/// Which row a block's pixels are in, and which part of it they are.
+/// The row that a block's pixels are in, and the block's position within it.
 #[inline(always)]
 pub fn row_and_part<B: Vector>(block: usize) -> (usize, usize) {
     let parts = LANES / B::COUNT;

@@ -6,7 +6,8 @@ use super::disjoint::DisjointSlice;
 
 const BITS: u32 = 11;
 const BINS: usize = 1 << BITS;
-/// Entries per histogram: fixed, so that the passes split alike for any number of threads. Fewer under Miri, which sorts few.
+/// Entries per histogram: fixed, so that work is split equally for any number of threads. Fewer under Miri, which sorts
+/// few.
 const CHUNK: usize = if cfg!(miri) { 1 << 6 } else { 1 << 14 };
 
 /// A splat's depth (positive floats order as their bits) and its index.

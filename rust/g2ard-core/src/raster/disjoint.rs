@@ -1,4 +1,4 @@
-//! A slice that threads write to at the same time, each to elements of its own.
+//! A slice that several threads write to at the same time, each to its own elements.
 
 /// A write target shared by threads that write disjoint elements.
 #[derive(Clone, Copy)]

@@ -12,7 +12,7 @@ use super::{ALPHA_MIN, ROWS, Settings};
 pub struct Pixels {
     pub rgb: [[Lanes16; ROWS]; 3],
     pub depth: [Lanes16; ROWS],
-    /// Depth of the first splat behind which less than half the light is left; 0 if there is none.
+    /// Depth of the splat at which transmittance falls below one half; 0 if it never does.
     pub median: [Lanes16; ROWS],
 }
 
@@ -34,7 +34,7 @@ pub struct Forward<'a, const DEPTH: bool> {
     pub splats: &'a [Splat],
     pub rect: TileRect,
     pub settings: &'a Settings,
-    /// Of each batch.
+    /// Masks of each batch.
     pub block_masks: &'a mut [BlockMasks],
     pub transmittance: &'a mut [Lanes16; ROWS],
     /// Number within the tile of each pixel's last pair, −1 for none.
@@ -52,8 +52,8 @@ impl<const DEPTH: bool> Kernel for Forward<'_, DEPTH> {
         *self.pixels = Pixels::default();
         *self.transmittance = [Lanes16([1.0; LANES]); ROWS];
         *self.last = [Lanes16([-1.0; LANES]); ROWS];
-        // The light that would be left if nothing ever stopped. A stopped pixel's only falls further below the
-        // minimum, so whether it would stop here needs no state, and the loop below depends on one product alone.
+        // The light that would remain if no pixel ever stopped. A stopped pixel's light only falls further below the
+        // minimum, so stopping needs no state, and the loop below depends on one product alone.
         let mut unstopped = self.rect.light::<F>();
         let minimum = F::Block::splat(ALPHA_MIN.log2());
         let stop = F::Block::splat(self.settings.transmittance_min);

@@ -1,14 +1,14 @@
-//! Which boxes can touch an image: a conservative test over groups of rows, in f64.
+//! A conservative test whether boxes can touch an image, over groups of rows, in f64.
 //!
-//! [`crate::select::Pinhole`] has its own, in f32 with the slack that takes: it bounds Gaussians by their own traces
-//! and reaches, as its projection does, where this one knows only the largest scale.
+//! [`crate::select::Pinhole`] has its own test in f32, with the slack that f32 needs. It bounds Gaussians by their own
+//! traces and reaches, like its projection, whereas this one only knows the largest scale.
 
 use super::{Camera, DILATION, TILE};
 
 /// Standard deviations at which an opacity of 1 falls to α = 1/255, and a little more.
 const REACH: f64 = 3.4;
 
-/// One camera's test: it may keep a box that touches nothing, but never refuses one that does.
+/// The test for one camera: it may keep a box that touches nothing, but never rejects one that touches the image.
 pub struct Frustum<'a> {
     camera: &'a Camera,
     near: f64,
@@ -33,8 +33,8 @@ impl<'a> Frustum<'a> {
         }
     }
 
-    /// Whether Gaussians with means in a box, given by its centre and half its sides, and no larger scale than `scale`
-    /// can touch the image: the first and the last row of tiles that they can.
+    /// The first and the last row of tiles that Gaussians can touch, given the box of their means by its centre and
+    /// half its sides, and their largest scale; None if they cannot touch the image.
     pub fn tile_rows(&self, centre: [f32; 3], half: [f32; 3], scale: f32) -> Option<[u16; 2]> {
         let c = self.camera;
         let (middle, reach) = self.in_camera(centre, half);

@@ -13,7 +13,7 @@ pub(crate) trait Sink: Copy + Sync {
     fn take<F: Lanes>(&self, group: usize, touched: u16, gradients: &RowGradients<F>);
 }
 
-/// Gradients in the torch layout, one slice for each of [`Params`]; rows no pixel saw are left as they are.
+/// Gradients in the torch layout, one slice per field of [`Params`]; rows that no pixel saw are not written.
 #[derive(Debug)]
 pub struct Gradients<'a> {
     pub means: &'a mut [f32],
@@ -145,7 +145,7 @@ impl Sink for Discard {
     }
 }
 
-/// Adds up the slots of one chunk's splats and hands every group that was touched to the sink.
+/// Adds up the slots of one chunk's splats and passes every touched group to the sink.
 pub(crate) struct Gather<'a, S: Source, K: Sink> {
     pub view: &'a View,
     pub source: S,

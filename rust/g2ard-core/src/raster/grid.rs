@@ -10,7 +10,7 @@ use super::{Camera, TILE};
 pub struct TileGrid {
     /// Tiles in a row.
     pub columns: usize,
-    /// The image's row of tiles that is the first of these.
+    /// The image's row of tiles that comes first here.
     pub first_row: usize,
     pub rows: usize,
 }
@@ -43,7 +43,7 @@ impl TileGrid {
         self.tiles() <= 1 << 16
     }
 
-    /// Where a tile lies in the image.
+    /// The position of a tile in the image.
     pub fn rect(&self, tile: usize, camera: &Camera) -> TileRect {
         let tile = tile + self.first_row * self.columns;
         TileRect::of(tile, self.columns, camera.width, camera.height)

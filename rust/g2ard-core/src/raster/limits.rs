@@ -1,4 +1,4 @@
-//! What this machine can do at best, measured: the yardstick of `g2ard bench raster`.
+//! Measured limits of this machine, to compare the raster step with (`python -m benchmarks run raster`).
 
 use std::time::Instant;
 
@@ -18,7 +18,7 @@ pub struct Limits {
 const CHAINS: usize = 12;
 const TURNS: usize = 40_000;
 const REPEATS: usize = 12;
-/// Read by each thread: well past any cache.
+/// Bytes read by each thread: well past any cache.
 const BYTES: usize = 96 << 20;
 
 struct Multiply;

@@ -1,4 +1,4 @@
-//! What the passes need to know of memory: sizes and prefetches.
+//! Sizes and prefetches of memory for the passes.
 
 /// Bytes of a buffer, used or not.
 pub(crate) fn bytes<T>(buffer: &Vec<T>) -> usize {

@@ -138,12 +138,12 @@ impl Camera {
     }
 }
 
-/// Which rasteriser to agree with where they differ.
+/// The rasteriser to agree with where conventions differ.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Convention {
     #[default]
     Gsplat,
-    /// Also cuts each splat to the tiles its 3σ square meets, and floors the antialiasing factor at √2.5e-5.
+    /// Also limits each splat to the tiles that its 3σ square meets, and the antialiasing factor to at least √2.5e-5.
     Inria,
 }
 
@@ -152,7 +152,7 @@ pub struct Settings {
     pub convention: Convention,
     /// Opacity × √(det Σ₂ / det(Σ₂ + 0.3 I)): splats under a pixel fade instead of growing.
     pub antialiased: bool,
-    /// α is clipped here; 0.99 (3DGS, gsplat) or 0.999 (gsplat ≥ 1.5 with `packed` kernels).
+    /// α is clipped here; 0.99 (3DGS, gsplat) or 0.999 (older gsplat).
     pub alpha_max: f32,
     /// A pixel stops before its transmittance would fall to this.
     pub transmittance_min: f32,

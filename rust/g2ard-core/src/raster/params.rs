@@ -1,4 +1,4 @@
-//! Where the Gaussians' stored values come from, sixteen rows at a time.
+//! Access to the Gaussians' stored values, sixteen rows at a time.
 
 use super::simd::{LANES, Lanes, Lanes16};
 use crate::{Error, Result};

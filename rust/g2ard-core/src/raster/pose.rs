@@ -9,7 +9,7 @@ use super::simd::{Kernel, LANES, Lanes, Lanes16};
 /// dL/d(v, ω); see [`unproject_to_pose`].
 pub type PoseGradient = [f64; 6];
 
-/// Adds up the slots of one chunk's splats and what they say of the pose.
+/// Adds up the slots of one chunk's splats and their contribution to the pose's gradient.
 pub(crate) struct GatherPose<'a, S: Source> {
     pub view: &'a View,
     pub source: S,

@@ -72,7 +72,7 @@ impl View {
     }
 }
 
-/// What blending needs of one Gaussian: a cache line.
+/// Values of one Gaussian that blending needs: a cache line.
 #[derive(Debug, Clone, Copy, Default)]
 #[repr(C, align(64))]
 pub struct Splat {
@@ -89,12 +89,12 @@ pub struct Splat {
     pub depth: f32,
     /// The Gaussian's row.
     pub row: u32,
-    /// Tiles it meets, and the number of its first slot among those of its chunk.
+    /// Number of tiles that it meets, and the number of its first slot within its chunk.
     pub tiles: u32,
     pub slot: u32,
 }
 
-/// Everything the forward and the backward projection share.
+/// Intermediate values that the forward and the backward projection share.
 pub struct Projected<F: Lanes> {
     /// Lanes that can touch the image.
     pub visible: F::Mask,
@@ -254,7 +254,7 @@ fn on_image<F: Lanes>(centre: F, extent: F, size: f32) -> F::Mask {
     after.and(F::splat(size - 0.5).ge(centre - extent))
 }
 
-/// The logarithm of an opacity, where asked for times √(det0 / det).
+/// The logarithm of an opacity, times √(det0 / det) if antialiased.
 #[inline(always)]
 fn antialiased<F: Lanes>(view: &View, log2_opacity: F, det0: F, det: F) -> F {
     if !view.antialiased {
@@ -343,7 +343,7 @@ pub fn colour<F: Lanes, S: Source>(source: &S, group: usize, basis: &[F; 16]) ->
 
 #[cfg(test)]
 impl Splat {
-    /// As [`Ellipses::level`].
+    /// See [`Ellipses::level`].
     pub fn level(&self) -> f32 {
         (self.log2_opacity - ALPHA_MIN.log2()).max(0.0) * 1.000_1 + 1e-4
     }

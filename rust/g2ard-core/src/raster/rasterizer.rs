@@ -1,4 +1,4 @@
-//! The passes in order, and the buffers they share: those of one view, reused from call to call.
+//! The passes in order, and the buffers of one view that they share and reuse from call to call.
 
 mod accumulated;
 mod posed;
@@ -36,7 +36,7 @@ use views::lap;
 /// Groups of sixteen rows projected as one piece of work; one under Miri, which runs few rows.
 const CHUNK: usize = if cfg!(miri) { 1 } else { 64 };
 
-/// One chunk of rows after the backward pass: its visible splats and where their sums lie.
+/// One chunk of rows after the backward pass: its visible splats and the location of their sums.
 pub(crate) struct ChunkSums<'a> {
     pub view: &'a View,
     pub first_group: usize,
@@ -55,7 +55,7 @@ struct ForwardState {
     rows: usize,
 }
 
-/// Renders one view and remembers what its backward pass needs; every buffer is reused by the next view.
+/// Renders one view and keeps what its backward pass needs; the next view reuses every buffer.
 pub struct Rasterizer {
     isa: Isa,
     state: Option<ForwardState>,
@@ -206,8 +206,8 @@ impl Rasterizer {
         self.passes.forward = lap(&mut clock);
     }
 
-    /// Fills the slots, then calls `finish(chunk, slots of the chunk's splats)` for every chunk of rows, in parallel,
-    /// and returns what the calls do, in order.
+    /// Fill the slots, then call `finish(chunk, slots of the chunk's splats)` for every chunk of rows in parallel;
+    /// return the results in order.
     pub(crate) fn backward_by_chunk<T: Send>(
         &mut self,
         image: &ImageGradients,
@@ -244,7 +244,7 @@ impl Rasterizer {
         })
     }
 
-    /// What the buffers hold now.
+    /// Memory that the buffers hold now.
     pub fn memory(&self) -> Memory {
         let Bins { pairs, starts, .. } = &self.bins;
         Memory {
@@ -269,7 +269,7 @@ impl Rasterizer {
         }
     }
 
-    /// How long the last calls' passes took.
+    /// Times of the last calls' passes.
     pub fn passes(&self) -> Passes {
         self.passes
     }

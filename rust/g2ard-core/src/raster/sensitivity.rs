@@ -23,7 +23,7 @@ pub const MOMENTS: usize = 30;
 const BY_CHANNEL: usize = 12;
 const WEIGHT: usize = 27;
 
-/// Where φᵢφⱼ lies among the first moments: u², uv, v², u³, u²v, uv², v³, u⁴, u³v, u²v², uv³, v⁴.
+/// Positions of φᵢφⱼ among the first moments: u², uv, v², u³, u²v, uv², v³, u⁴, u³v, u²v², uv³, v⁴.
 const PRODUCT: [[usize; 5]; 5] = [
     [0, 1, 3, 4, 5],
     [1, 2, 4, 5, 6],
@@ -102,7 +102,7 @@ impl Kernel for Sensitivity<'_> {
                         * (F::Block::splat(1.0) - a).recip();
                     t.store_part(&mut g.transmittance, part);
                     let w = a * t;
-                    // Where α is clipped it does not follow its arguments.
+                    // A clipped α does not depend on its arguments.
                     let follows = w.only(clip.ge(raw));
                     let (uu, uv, vv) = (u * u, u * v, v * v);
                     let phi = [u, v, uu, uv, vv];

@@ -7,7 +7,7 @@ const C1: f32 = 0.488_602_51;
 const C2: [f32; 3] = [1.092_548_4, 0.315_391_57, 0.546_274_2];
 const C3: [f32; 4] = [0.590_043_6, 2.890_611_4, 0.457_045_8, 0.373_176_33];
 
-/// The first `coeffs` basis functions at the unit vector (x, y, z); the rest are left as they are.
+/// The first `coeffs` basis functions at the unit vector (x, y, z); the others are not written.
 #[inline(always)]
 pub fn basis<F: Lanes>(coeffs: usize, x: F, y: F, z: F, out: &mut [F; 16]) {
     let s = F::splat;

@@ -48,7 +48,7 @@ impl Small {
     }
 }
 
-/// From three units away; no side is a whole number of tiles.
+/// A view from three units away; no side is a whole number of tiles.
 pub(crate) fn camera() -> Camera {
     let (width, height) = if cfg!(miri) { (18, 17) } else { (75, 50) };
     Camera {
@@ -73,7 +73,8 @@ pub(crate) fn noise(values: usize, seed: u64) -> Vec<f32> {
     (0..values).map(|_| random.uniform_f32()).collect()
 }
 
-/// What `run` gives on one thread; it must give the same on two and on three. Under Miri two run once.
+/// Run on one thread, check that two and three threads give the same, and return the result. Under Miri only two are
+/// used.
 pub(crate) fn on_any_threads<T: PartialEq + Send>(run: impl Fn() -> T + Sync) -> T {
     let on = |threads| {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build();

@@ -13,7 +13,7 @@ pub const BATCH: usize = 64;
 /// A tile's splats lie scattered in memory: each is prefetched this many pairs before it is needed.
 const AHEAD: usize = 24;
 
-/// A pair's splat relative to the tile's first pixel centre: what the pixels' loops read, in one cache line.
+/// A pair's splat relative to the tile's first pixel centre, in one cache line for the loops over pixels.
 #[derive(Clone, Copy)]
 #[repr(C, align(64))]
 pub struct TileSplat {
@@ -98,7 +98,7 @@ pub struct TileRect {
     /// Its first pixel.
     pub x: usize,
     pub y: usize,
-    /// How many of its 16 columns and rows are on the image.
+    /// Number of its 16 columns and rows that are on the image.
     pub columns: usize,
     pub rows: usize,
 }
@@ -272,7 +272,7 @@ pub fn log2_alpha<F: Vector>(s: &TileSplat, x: F, y: F) -> (F, F, F) {
     (u, v, u.fnma(u, v.fnma(v, F::splat(s.log2_opacity))))
 }
 
-/// α before clipping, where its log2 is above the minimum; elsewhere anything, even NaN: to be masked.
+/// α before clipping where its log2 is above the minimum; elsewhere any value, even NaN, to be masked.
 #[inline(always)]
 pub fn alpha<F: Vector>(log2: F) -> F {
     log2.exp2()

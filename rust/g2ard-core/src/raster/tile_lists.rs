@@ -1,4 +1,4 @@
-//! Which tiles each splat meets, exactly.
+//! The exact tiles that each splat meets.
 
 use std::ops::Range;
 
@@ -100,7 +100,7 @@ fn span<F: Lanes>(low: F, high: F, bounds: [F; 2]) -> [F; 2] {
     ]
 }
 
-/// The tiles INRIA's kernel gives a splat of this radius: those its square touches.
+/// The tiles that INRIA's kernel assigns to a splat of this radius: those that its square touches.
 #[inline(always)]
 fn square_span<F: Lanes>(centre: F, radius: Option<F>, tiles: Range<usize>) -> [F; 2] {
     let (first, last) = (F::splat(tiles.start as f32), F::splat(tiles.end as f32));
@@ -124,7 +124,7 @@ fn whole(value: f32) -> usize {
     unsafe { value.to_int_unchecked::<i32>() as usize }
 }
 
-/// Intersects a chunk's ellipses with tiles: what its lists overflow into, and scratch.
+/// Intersects a chunk's ellipses with tiles; holds the overflow of its lists, and scratch memory.
 #[derive(Debug, Default)]
 pub struct TileIntersector {
     /// Tiles that do not fit into their lists.

@@ -10,9 +10,9 @@ use super::grid::TileGrid;
 use super::memory::{bytes, prefetch};
 use super::tile_lists::{TileIntersector, TileList};
 
-/// How many stretches the depth order is cut into: fixed, so that the work splits alike for any number of threads.
+/// Number of stretches of the depth order: fixed, so that work is split equally for any number of threads.
 const STRETCHES: usize = 16;
-/// Keys a stretch prefetches ahead of itself: what they point at lies scattered.
+/// Number of keys that a stretch prefetches ahead, because their splats are scattered in memory.
 const AHEAD: usize = 16;
 /// A splat in a tile, and the slot this pair's gradient goes to.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]

@@ -1,4 +1,4 @@
-//! How alike a render and a photo are, whatever the light.
+//! Likeness of a render and a photo, independent of the light.
 
 use rayon::prelude::*;
 
@@ -6,13 +6,13 @@ use super::normal::median;
 use super::{Size, dot};
 use crate::{Error, Result};
 
-/// Variance of grey in a window, in [0, 1]², below which there is nothing to compare: 1 % of contrast.
+/// Variance of grey in a window, in [0, 1]², below which it has no contrast to compare (1 %).
 const FLAT: f64 = 1e-4;
-/// Sums over windows: a, b, a², b², ab and how many pixels count.
+/// Sums over windows: a, b, a², b², ab and the number of unmasked pixels.
 const MOMENTS: usize = 6;
 
-/// Median ZNCC of two grey images over the `side`×`side` windows all of whose pixels count and in which `b` has contrast;
-/// 0 where no window tells. A window counts 0 where `a` is flat.
+/// Median ZNCC of two grey images over the `side`×`side` windows without masked pixels in which `b` has contrast; 0 if
+/// there is no such window. A window in which `a` is flat has ZNCC 0.
 pub fn local_zncc(a: &[f64], b: &[f64], mask: &[bool], size: Size, side: usize) -> Result<f64> {
     size.check("a", a, 1)?;
     size.check("b", b, 1)?;

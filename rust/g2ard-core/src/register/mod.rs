@@ -1,4 +1,4 @@
-//! Images compared to register photos: what direct alignment solves, and how alike a render and a photo are.
+//! Comparison of images for registration: direct alignment, and the likeness of a render and a photo.
 //!
 //! All in f64 and row by row; a row's sums are added in order, so the bits do not depend on threads.
 

@@ -5,17 +5,17 @@ use rayon::prelude::*;
 use super::{Size, dot, slope};
 use crate::{Error, Result};
 
-/// Residuals of more standard deviations than this count nothing: 95 % as efficient as least squares.
+/// Residuals beyond this many standard deviations have no weight (Tukey): 95 % as efficient as least squares.
 const TUKEY: f64 = 4.685;
 /// Standard deviations of a normal distribution in its median absolute deviation.
 const SIGMAS: f64 = 1.4826;
-/// Of residuals: a quarter of an 8-bit step.
+/// Smallest scale of the residuals: a quarter of an 8-bit step.
 const LEAST_SCALE: f64 = 1e-3;
 /// v, ω, gain and bias.
 const UNKNOWNS: usize = 8;
 const MOTION: usize = 6;
 
-/// A photo at one size: grey, blurred; its gradients; its pixels that count.
+/// A photo at one size: grey, blurred; its gradients; its mask.
 #[derive(Debug, Clone, Copy)]
 pub struct Photo<'a> {
     pub grey: &'a [f64],
@@ -24,7 +24,7 @@ pub struct Photo<'a> {
     pub mask: &'a [bool],
 }
 
-/// A render as [`super::shot`] makes it.
+/// A render as [`super::shot`] returns it.
 #[derive(Debug, Clone, Copy)]
 pub struct Render<'a> {
     pub grey: &'a [f64],
@@ -55,13 +55,13 @@ pub struct Normal {
     pub right: [f64; UNKNOWNS],
     /// σ of the residuals, by their median absolute deviation.
     pub scale: f64,
-    /// Mean of Tukey's ρ(r/σ) over the pixels that count, in [0, 1]; NaN where none does.
+    /// Mean of Tukey's ρ(r/σ) over the unmasked pixels, in [0, 1]; NaN without any.
     pub cost: f64,
     /// Σ w.
     pub weights: f64,
 }
 
-/// Of one row of pixels that count: the unknowns' derivatives, the residuals and their weights.
+/// One row of unmasked pixels: the unknowns' derivatives, the residuals and their weights.
 type Columns = [Vec<f64>; UNKNOWNS + 2];
 
 /// Sums of one row of pixels.
@@ -204,7 +204,7 @@ fn added(rows: &[Sums], scale: f64, number: usize) -> Normal {
     out
 }
 
-/// 1.4826 × the median absolute deviation; 0 of nothing.
+/// 1.4826 × the median absolute deviation; 0 for no values.
 fn deviation(mut values: Vec<f64>) -> f64 {
     let middle = median(&mut values);
     for value in &mut values {
@@ -213,7 +213,7 @@ fn deviation(mut values: Vec<f64>) -> f64 {
     SIGMAS * median(&mut values)
 }
 
-/// The middle value, or the mean of the two; 0 of nothing. Reorders the values.
+/// The middle value, or the mean of the middle two; 0 for no values. Reorders the values.
 pub(super) fn median(values: &mut [f64]) -> f64 {
     let count = values.len();
     if count == 0 {
@@ -227,7 +227,7 @@ pub(super) fn median(values: &mut [f64]) -> f64 {
     lower.map_or(upper, |lower| (lower + upper) / 2.0)
 }
 
-/// Root of the mean square, in pixels, of how far ξ moves the pixels that count; NaN where none does.
+/// Root mean square, in pixels, by which ξ moves the unmasked pixels; NaN without any.
 pub fn flow(shot: &Render, size: Size, lens: &Lens, xi: &[f64; MOTION]) -> Result<f64> {
     size.check("shot's depth", shot.depth, 1)?;
     size.check("shot's mask", shot.mask, 1)?;

@@ -12,16 +12,15 @@ const LUMA: [f64; 3] = [0.299, 0.587, 0.114];
 pub struct Shot {
     /// Luma of the render clipped to [0, 1], blurred by (1, 4, 6, 4, 1)/16 along both axes.
     pub grey: Vec<f64>,
-    /// Expected depth; 1 where nothing counts.
+    /// Expected depth; 1 in masked pixels.
     pub depth: Vec<f64>,
     /// Opaque enough, and not beside an edge of depth.
     pub mask: Vec<bool>,
 }
 
-/// What alignment needs of a render.
-///
-/// `rgb` is (H, W, 3), `alpha` and `depth` (H, W), depth times alpha. A pixel counts where alpha is at least `min_alpha`
-/// and depth jumps by at most `max_edge` of the lesser to each of its four neighbours.
+/// A render as alignment needs it. `rgb` is (H, W, 3), `alpha` and `depth` (H, W), depth times alpha. A pixel is
+/// unmasked if alpha is at least `min_alpha` and depth differs by at most `max_edge` of the lesser from each of its
+/// four neighbours.
 pub fn shot(
     rgb: &[f32],
     alpha: &[f32],
@@ -71,7 +70,7 @@ fn luma(rgb: &[f32]) -> f64 {
     clipped(0) * LUMA[0] + clipped(1) * LUMA[1] + clipped(2) * LUMA[2]
 }
 
-/// Down the columns, then along the rows; what is beyond an edge is the edge.
+/// Blur along the columns, then along the rows, repeating the border.
 fn blurred(grey: &[f64], size: Size) -> Vec<f64> {
     let Size { height, width } = size;
     let mut out = vec![0.0; grey.len()];

@@ -1,5 +1,5 @@
-//! Where stored values are cut, in one place. Files hold infinite logits (an opacity of 255 in a byte) and scales whose
-//! square leaves f32.
+//! Limits of stored values, in one place. Files hold infinite logits (an opacity byte of 255) and scales whose square
+//! exceeds f32.
 
 /// The logit that α = 0 and α = 1, stated exactly, count as in sums: 1e-7 away from them. Readers of files clamp to
 /// it too.

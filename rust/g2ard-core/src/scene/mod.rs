@@ -1,5 +1,4 @@
-//! A caller's scene, borrowed, and what every stage first makes of it: finite values and an order that only its
-//! content decides.
+//! A caller's scene, borrowed, with checked values and an order that only its content decides.
 
 mod gaussian;
 pub mod limits;

@@ -7,8 +7,8 @@ use crate::linalg::{rotation_from_quat, sub};
 use crate::spatial::{RobustBounds, code, codes, order};
 use crate::{Error, Result, Splats};
 
-/// Merged means lie on a grid of this share of the scene's radius (rounded down to a power of two), so
-/// that adding back a dyadic origin rounds nothing.
+/// Merged means lie on a grid of this share of the scene's radius (rounded down to a power of two), so that adding a
+/// dyadic origin back is exact.
 const MEAN_GRID: f64 = 1.0 / (1u64 << 36) as f64;
 
 /// The order of a scene: Morton, ties by all attribute bits, by row only between identical rows.
@@ -16,7 +16,7 @@ const MEAN_GRID: f64 = 1.0 / (1u64 << 36) as f64;
 pub struct Ordered {
     /// The input row of each ordered row.
     pub rows: Vec<u32>,
-    /// Of the means; everything is computed relative to the origin, the median point.
+    /// Bounds of the means; everything is computed relative to the origin, the median point.
     pub bounds: RobustBounds,
     /// Spacing of merged means, a power of two.
     pub grid: f64,
@@ -81,7 +81,7 @@ impl Ordered {
             .collect()
     }
 
-    /// One row's geometry about the origin.
+    /// One row's geometry relative to the origin.
     pub fn gaussian(&self, scene: &SceneRef, row: usize) -> Gaussian {
         Gaussian {
             mean: sub(scene.means.get(row), self.bounds.origin),

@@ -10,13 +10,13 @@ use crate::constants::constants;
 use crate::linalg::{dot, sub};
 use crate::{Control, Error, Result};
 
-/// Most directions a cell may be asked to be seen from.
+/// Most directions per cell.
 const MAX_ANCHORS: usize = 64;
 /// Cells summed together: the order of the sum does not depend on the number of threads.
 const CHUNK: usize = 4096;
 
 constants! {
-    /// What the objective rewards.
+    /// Options of the objective.
     pub struct Coverage {
         /// Sharpness of the observation kernel and of the targets.
         pub kappa: f64 = 20.0,
@@ -26,7 +26,7 @@ constants! {
         pub offset: f64 = 1.0,
         /// Directions on the sphere that targets and observations are laid out on.
         pub anchors: usize = 32,
-        /// ε of C_jk / (P_jk + ε): keeps the ratio finite where a target is next to nothing.
+        /// ε of C_jk / (P_jk + ε): keeps the ratio finite where a target is almost zero.
         pub epsilon: f64 = 1e-9,
         /// Evaluate again only the view that leads by its bound (CELF), not all of them each time.
         pub lazy: bool = true,
@@ -82,7 +82,7 @@ pub struct Chosen {
     pub views: Vec<u32>,
     /// F(S ∪ v) − F(S) of each.
     pub gains: Vec<f64>,
-    /// How often a view's gain was computed.
+    /// Number of gains computed.
     pub evaluations: u64,
 }
 

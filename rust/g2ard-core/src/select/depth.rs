@@ -1,27 +1,27 @@
-//! The scene's median depth at the pixels that are wanted. No other pixel is computed: far cheaper than an image, and
-//! exactly its values.
+//! The scene's median depth at requested pixels. No other pixel is computed: much cheaper than an image, with exactly
+//! its values.
 
 use super::occluders::Occluders;
 use super::pinhole::{ALPHA_MIN, Pinhole, Splat};
 use crate::raster::Camera;
 use crate::scene::limits::MAX_OPACITY;
 
-/// As gsplat: opacity ends at 0.99.
+/// Upper limit of α, as in gsplat.
 const ALPHA_MAX: f32 = MAX_OPACITY as f32;
 
-/// What one thread needs for a view; kept from view to view.
+/// Buffers of one thread for a view, reused from view to view.
 #[derive(Default)]
 pub(super) struct Scratch {
     splats: Vec<Splat>,
     keys: Vec<u64>,
     spare: Vec<u64>,
-    /// Transmittance left at each pixel: 1 at first where the depth is wanted, 0 elsewhere.
+    /// Transmittance at each pixel: initially 1 in requested pixels and 0 elsewhere.
     pub light: Vec<f32>,
     pub depth: Vec<f32>,
 }
 
 impl Scratch {
-    /// Prepares for a view: with `light` 1 every pixel is wanted, with 0 none yet.
+    /// Prepare for a view: `light` 1 requests every pixel, 0 none yet.
     pub fn clear(&mut self, view: &Pinhole, light: f32) {
         let size = view.width * view.height;
         self.light.clear();
@@ -32,7 +32,7 @@ impl Scratch {
         self.keys.clear();
     }
 
-    /// Depth of the splat behind which less than half the light is left, 0 where there is none.
+    /// Depth of the splat at which transmittance falls below one half; 0 if it never does.
     pub fn trace(&mut self, scene: &Occluders, view: &Pinhole) {
         for row in scene.rows_in(view) {
             if let Some((z, splat)) = view.project(row)
@@ -51,7 +51,7 @@ impl Scratch {
         }
     }
 
-    /// Whether a splat may reach a wanted pixel; wide ones are taken untested.
+    /// Whether a splat may reach a requested pixel; wide splats are accepted untested.
     fn touches(&self, view: &Pinhole, s: &Splat) -> bool {
         let row = |j: u32| j as usize * view.width;
         (s.columns[1] - s.columns[0]) * (s.rows[1] - s.rows[0]) > 64

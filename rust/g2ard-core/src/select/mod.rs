@@ -1,4 +1,4 @@
-//! Which views are worth having: surface cells, what each view sees of them, and greedy choices.
+//! View selection: surface cells, their visibility in each view, and greedy choices.
 
 mod coverage;
 mod depth;

@@ -1,4 +1,4 @@
-//! The Gaussians that can hide anything, in blocks that lie close together, ready to be projected.
+//! The Gaussians that can hide something, in blocks of neighbours, ready to be projected.
 
 use rayon::prelude::*;
 
@@ -6,7 +6,7 @@ use super::Gaussians;
 use super::pinhole::{ALPHA_MIN, Pinhole};
 use crate::spatial::{RobustBounds, codes, order};
 
-/// Rows in a block: few enough that blocks are small, many enough that testing blocks costs next to nothing.
+/// Rows per block: few enough that blocks are small, enough that testing blocks is cheap.
 const BLOCK: usize = 64;
 
 /// A scene's Gaussians in Morton order.
@@ -29,7 +29,7 @@ pub struct Occluder {
     pub reach: f32,
 }
 
-/// What bounds `BLOCK` rows.
+/// Bounds of `BLOCK` rows.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Block {
     pub center: [f32; 3],

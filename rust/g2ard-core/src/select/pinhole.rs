@@ -7,7 +7,7 @@ use super::occluders::{Block, Occluder};
 pub(super) use crate::raster::ALPHA_MIN;
 use crate::raster::{Camera, DILATION};
 
-/// What float32 may lose of a coordinate on its way into the camera's frame, of its size.
+/// Relative rounding error of a coordinate in the camera's frame in float32.
 const ROUNDING: f32 = 1e-6;
 
 /// A splat on the image.
@@ -20,14 +20,14 @@ pub(super) struct Splat {
     pub rows: [u32; 2],
 }
 
-/// One camera's numbers.
+/// Parameters of one camera.
 #[derive(Debug, Clone)]
 pub struct Pinhole {
     pub rotation: [[f32; 3]; 3],
     pub translation: [f32; 3],
     pub focal: [f32; 2],
     pub center: [f32; 2],
-    /// Where x/z and y/z are clamped: [low, high] of each.
+    /// Limits to which x/z and y/z are clamped: [low, high] of each.
     pub limits: [[f32; 2]; 2],
     pub near: f32,
     pub width: usize,

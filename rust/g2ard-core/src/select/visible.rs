@@ -1,4 +1,4 @@
-//! What each view sees: its depths, and which surface cells.
+//! Visibility of surface cells and depths in each view.
 
 use rayon::prelude::*;
 
@@ -9,7 +9,7 @@ use super::pinhole::Pinhole;
 use crate::raster::Camera;
 use crate::{Control, Result};
 
-/// For each camera the share of its pixels that show the scene, and their median depth: see [`statistics_of`].
+/// The share of each camera's pixels that show the scene, and their median depth: see [`statistics_of`].
 pub fn view_statistics(
     scene: &Occluders,
     cameras: &[Camera],
@@ -41,8 +41,8 @@ pub fn statistics_of(image: &[f32]) -> [f32; 2] {
     [share, median]
 }
 
-/// For each camera the cells it sees, ascending: the cell's centre falls on the image and lies within
-/// max(cell size, `tolerance` · its depth) of the median depth in that pixel.
+/// The cells that each camera sees, ascending: the cell's centre falls on the image and lies within max(cell size,
+/// `tolerance` · its depth) of the median depth in that pixel.
 pub fn visible_cells(
     scene: &Occluders,
     surface: &Surface,

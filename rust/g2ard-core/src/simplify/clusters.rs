@@ -1,4 +1,4 @@
-//! From a partition of the rows to Gaussians: each cluster's moments in f64, from its raw members.
+//! Gaussians from a partition of the rows: each cluster's moments in f64, from its raw members.
 
 use rayon::prelude::*;
 
@@ -16,7 +16,7 @@ pub struct Pair {
     pub cost: f32,
 }
 
-/// Which cluster each ordered row belongs to ([`GONE`] for none).
+/// The cluster of each ordered row ([`GONE`] if it has none).
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Partition {
     pub of: Vec<u32>,

@@ -10,7 +10,7 @@ use std::f32::consts::PI;
 use crate::raster::simd::{Real, exp_negative};
 use crate::scene::limits::MAX_OPACITY;
 
-/// Six axes in eight places, which fill a register; the last two repeat and weigh nothing.
+/// Six axes in eight lanes, to fill a register; the last two are repeated with weight zero.
 const PLACES: usize = 8;
 const USED: usize = 6;
 
@@ -28,7 +28,7 @@ const AXES: [[f32; PLACES]; 3] = {
 /// A symmetric 3×3 matrix: xx, xy, xz, yy, yz, zz.
 pub type Sym<T = f32> = [T; 6];
 
-/// One cluster, in units of the scene's typical size; with lanes for `T`, sixteen of them.
+/// One cluster, in units of the scene's typical size; sixteen clusters if `T` has lanes.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct Node<T = f32> {
     pub mean: [T; 3],
@@ -48,7 +48,7 @@ pub struct Node<T = f32> {
 /// α never exceeds it: renderers clip there.
 pub const MAX_ALPHA: f32 = MAX_OPACITY as f32;
 
-/// Renderers draw nothing fainter.
+/// Renderers skip fainter contributions.
 const MIN_ALPHA: f32 = 1.0 / 255.0;
 
 #[inline(always)]

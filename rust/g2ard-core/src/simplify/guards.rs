@@ -26,14 +26,14 @@ pub fn disc() -> &'static [[f64; 2]; SAMPLES] {
 
 /// A footprint cast on a plane along its normal.
 struct Shadow {
-    /// Of the mean.
+    /// Position of the mean.
     center: DVec2,
     /// L of LLᵀ, the covariance in the plane: rows (l₁₁, 0) and (l₂₁, l₂₂).
     factor: [DVec2; 2],
 }
 
 impl Shadow {
-    /// On the plane along the axes `x` and `y`; `offset` is the mean's from the plane's origin.
+    /// The footprint on the plane with axes `x` and `y`; `offset` is the mean's from the plane's origin.
     fn of(g: &Gaussian, offset: DVec3, [x, y]: [DVec3; 2]) -> Self {
         // Σ^½ times each axis: their products are the covariance in the plane.
         let axes = [0, 1, 2].map(|k| DVec3::from(g.axis(k)));
@@ -54,7 +54,7 @@ impl Shadow {
         }
     }
 
-    /// As A, the product of two scales: for a disc A·|n_i·n|.
+    /// Area like A, the product of two scales: for a disc A·|n_i·n|.
     fn area(&self) -> f64 {
         self.factor[0].x * self.factor[1].y
     }
@@ -114,7 +114,7 @@ mod tests {
     use super::*;
     use crate::simplify::pool;
 
-    /// As far as INRIA's renderer draws.
+    /// Support as far as INRIA's renderer draws.
     const SUPPORT: f64 = 3.0;
 
     fn disc_at(mean: [f64; 3], quat: [f64; 4]) -> Gaussian {

@@ -1,12 +1,12 @@
-//! How much a row counts where there are no views: an estimate of Σ αT.
+//! The weight of a row without views: an estimate of Σ αT.
 
 use super::cost::Node;
 
 /// m^a · α^b, in units of the median mass.
 ///
-/// Where all Gaussians are of about one size, or grow with the distance from the middle as those of an unbounded
-/// scene do, large ones fill as much of an image as they are large, and a is 1. Where sizes spread for another
-/// reason, large ones are plain or hidden, small ones carry the detail: every one counts alike.
+/// If all Gaussians have about the same size, or grow with the distance from the middle as in an unbounded scene, large
+/// ones fill as much of an image as their size says, and a is 1. If sizes spread for another reason, large ones are
+/// plain or hidden and small ones carry the detail, so all have equal weight.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Importance {
     /// a.
@@ -97,7 +97,7 @@ impl Moments {
         })
     }
 
-    /// Of the first.
+    /// Standard deviation of the first variable.
     fn deviation(&self) -> f64 {
         (self.square[0] / self.count.max(1.0)).sqrt()
     }
@@ -112,7 +112,7 @@ impl Moments {
     }
 }
 
-/// The middle value; `None` of nothing.
+/// The middle value; `None` for no values.
 pub fn median(mut values: Vec<f32>) -> Option<f32> {
     let middle = values.len().checked_sub(1)? / 2;
     Some(*values.select_nth_unstable_by(middle, f32::total_cmp).1)
@@ -122,7 +122,7 @@ pub fn median(mut values: Vec<f32>) -> Option<f32> {
 mod tests {
     use super::*;
 
-    /// Rows on a line, `step` apart, of scales that `size` gives.
+    /// Rows on a line, `step` apart, with scales given by `size`.
     fn line(count: usize, size: impl Fn(usize) -> f32) -> Vec<Node> {
         let node = |i: usize| {
             let s = size(i);

@@ -37,12 +37,12 @@ pub trait GroupKernels: Sync {
         control: &Control,
     ) -> Result<Vec<(Merged, f64)>>;
 
-    /// Says that the next calls are about new rows: `copied` names the old row that each is a copy of, or
-    /// [`super::GONE`]. A device that holds rows sends only those that are no copies.
+    /// Announce that the next calls use new rows: `copied` is the old row that each copies, or [`super::GONE`]. A
+    /// device that holds rows then sends only new ones.
     fn rows_replaced(&self, _copied: &[u32]) {}
 }
 
-/// The means of the rows in `kept`; without a copy where those are all rows.
+/// The means of the rows in `kept`; borrowed if those are all rows.
 pub fn means_of<'a>(splats: &'a Splats, kept: &[u32]) -> Cow<'a, [[f64; 3]]> {
     let means = &splats.means;
     if kept.len() == means.len() && kept.is_sorted() {

@@ -11,7 +11,7 @@ use super::rows::Rows;
 use super::tile::Frame;
 use crate::scene::{Ordered, SceneRef};
 
-/// What a few views do not see counts as this share of its mass: other views will see some of it.
+/// Gaussians that a few views do not see keep this share of their mass, because other views will see some of them.
 const UNSEEN: f32 = 0.2;
 
 /// Largest scale and coordinate in typical sizes: beyond, f32 products of four of them would overflow.
@@ -27,7 +27,7 @@ pub struct Leaves<'a> {
     /// The variance that rendering adds to each ordered row.
     blur: &'a [f32],
     visibility: Option<Visibility<'a>>,
-    /// What the scene's lengths are divided by.
+    /// Unit of the scene's lengths.
     unit: f64,
     /// Σ αT that a unit of mass counts for though no view sees it.
     floor: f32,
@@ -85,7 +85,7 @@ impl<'a> Leaves<'a> {
         (total, mass)
     }
 
-    /// What a row counts for without views, as [`Self::new`] finds it.
+    /// The weight of rows without views, as computed by [`Self::new`].
     pub fn importance(&self) -> Importance {
         self.importance
     }
@@ -96,7 +96,7 @@ impl<'a> Leaves<'a> {
         self.kept.iter().map(|&i| codes[i as usize]).collect()
     }
 
-    /// Every row as a node of its own.
+    /// Every row as a separate node.
     pub fn nodes(&self) -> Nodes {
         let width = self.width();
         let mut sh = vec![0.0; self.len() * width];
@@ -170,7 +170,7 @@ pub fn floor(weight: f64, mass: f64) -> f32 {
         }
 }
 
-/// A power of two near the median of the middle scale, so that dividing by it rounds nothing.
+/// A power of two near the median of the middle scale, so that dividing by it is exact.
 pub fn typical_size(scene: &SceneRef) -> f64 {
     let middle = |s: &[f32; 3]| s[0].max(s[1]).min(s[2]).max(s[0].min(s[1]));
     let positive = scene

@@ -200,8 +200,8 @@ pub fn candidates(
     Ok(lists)
 }
 
-/// Among many nodes at one position the nearest by index would be the same few for all of them, and a round could
-/// merge only those few: take the next in order instead.
+/// Among many nodes at one position the nearest by index would be the same few for all of them, and a round could merge
+/// only those few. Take the next in order instead.
 fn spread_duplicates(i: usize, k: usize, n: usize, near: &mut Vec<(f32, u32)>) {
     near.clear();
     let first = i.saturating_sub(k / 2).min(n.saturating_sub(k + 1));

@@ -1,4 +1,4 @@
-//! Moment matching: what a group of Gaussians weighs, where it lies and how far it spreads.
+//! Moment matching: the mass, mean and covariance of a group of Gaussians.
 
 use crate::Splats;
 use crate::linalg::{Sym3, outer, sub};
@@ -74,7 +74,7 @@ pub struct Merged {
     pub clamped: bool,
 }
 
-/// What each row weighs in a merged group, and Σm. A group without any mass is averaged evenly.
+/// The weight of each row in a merged group, and Σm. A group without mass is averaged evenly.
 pub fn weights(splats: &Splats, rows: &[u32]) -> (Vec<f64>, f64) {
     let weigh = |&i: &u32| {
         let logit = f64::from(splats.logit_opacities[i as usize]);

@@ -1,4 +1,4 @@
-//! From the rounds of a policy back to the rows and the coordinates of the caller.
+//! Conversion from the rounds of a method back to the caller's rows and coordinates.
 
 use super::{GONE, Step};
 use crate::Splats;

@@ -27,7 +27,7 @@ constants! {
         pub min_opacity: f64 = 0.004,
         /// Down to this many times the budget, rows merge along Morton order alone; infinite for never.
         pub morton_premerge_ratio: f64 = 3.0,
-        /// In so many steps, each on a shifted lattice; every step but the first halves the count.
+        /// Number of merging steps, each on a shifted lattice; every step except the first halves the count.
         pub morton_premerge_steps: usize = 1,
         /// Nearest clusters that one may merge with.
         pub neighbors: usize = 6,
@@ -37,12 +37,12 @@ constants! {
         pub dilation: f64 = 0.4,
         /// Without views: size of a pixel over the median largest scale.
         pub pixel_scale: f64 = 0.2,
-        /// How much larger than its moments say a cluster may be, in area, where α alone cannot hold its mass.
+        /// Largest growth of a cluster's area over its moments, where α alone cannot hold its mass.
         pub max_growth: f64 = 1.25,
     }
 }
 
-/// What views show of each input row.
+/// Visibility of each input row.
 #[derive(Debug, Clone, Copy)]
 pub struct Visibility<'a> {
     /// Σ αT over the pixels of the views.
@@ -51,7 +51,7 @@ pub struct Visibility<'a> {
     pub pixel_size: &'a [f32],
 }
 
-/// What one round did, in rows.
+/// Counts of one round, in rows.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct PairwiseRound {
     pub before: usize,
@@ -72,7 +72,7 @@ impl PairwiseRound {
 }
 
 impl Pairwise {
-    /// The share of the geometric weight that is left without views: much of what it weighs is then hidden.
+    /// Share of the geometric weight without views, because much of the geometry is then hidden.
     pub const BLIND: f64 = 0.5;
 
     /// Along Morton order down to the budget, on two lattices: no graph of neighbours.
@@ -156,8 +156,8 @@ impl Pairwise {
         Ok(())
     }
 
-    /// Merges runs of Morton order down to `morton_premerge_ratio` times the budget. Each time the lattice lies
-    /// elsewhere, so that what one cut apart the next may join.
+    /// Merge runs of Morton order down to `morton_premerge_ratio` times the budget. The lattice is shifted in each
+    /// step, so that one step can join what another cut apart.
     fn premerge(
         &self,
         leaves: Leaves,
@@ -229,7 +229,7 @@ impl Pairwise {
         Ok(())
     }
 
-    /// The variance that rendering adds to each ordered row. `usual` is the size of a pixel where no view tells it;
+    /// The variance that rendering adds to each ordered row. `usual` is the pixel size of rows that no view sees;
     /// `None` takes the scene's median.
     pub(super) fn blurs(
         &self,
@@ -261,8 +261,7 @@ impl Pairwise {
         self.pixel_scale as f32 * median(largest.collect()).unwrap_or(1.0)
     }
 
-    /// Every row that can be seen a cluster of its own; if those are fewer than the budget, the most opaque
-    /// of the others too.
+    /// Make every visible row a cluster; if there are fewer than the budget, also the most opaque of the others.
     pub(super) fn drop_transparent(
         &self,
         scene: &SceneRef,
@@ -286,7 +285,7 @@ impl Pairwise {
     }
 }
 
-/// Merging along Morton order, and what it does to the partition.
+/// Merging along Morton order, and its effect on the partition.
 struct RunMerging<'a> {
     geometric: f32,
     partition: &'a mut Partition,
@@ -343,6 +342,6 @@ fn merge(nodes: &mut Nodes, pairs: &[Pair]) -> Vec<u32> {
     map
 }
 
-/// By how much the Morton lattice is shifted in each step, along x, y and z, in shares of the bounds' radius: any
-/// numbers without a common measure, so that no plane that parts cells in one step does so in the next.
+/// Shifts of the Morton lattice per step, along x, y and z, as shares of the bounds' radius: incommensurable, so that
+/// no plane that separates cells in one step does so in the next.
 const LATTICES: [[f64; 3]; 3] = [[0.0; 3], [0.31, 0.17, 0.43], [0.13, 0.41, 0.23]];

@@ -21,7 +21,7 @@ constants! {
         pub max_energy: f64 = 0.01,
         /// Least share of the members' footprint that the merged one covers.
         pub min_coverage: f64 = 0.6,
-        /// Where a footprint ends, in standard deviations: see [`super::coverage`].
+        /// End of a footprint, in standard deviations: see [`super::coverage`].
         pub support: f64 = 3.0,
         /// ε_h: a cell of higher affine residual is protected.
         pub flag_threshold: f64 = 0.01,
@@ -41,7 +41,7 @@ pub struct PaperPlan<'a> {
     pub cells: usize,
 }
 
-/// What one round did, in rows unless said otherwise.
+/// Counts of one round, in rows unless stated otherwise.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct PaperRound {
     pub before: usize,
@@ -51,7 +51,7 @@ pub struct PaperRound {
     pub alone: usize,
     pub merged_groups: usize,
     pub merged_members: usize,
-    /// Groups refused by each guard; energy is asked first.
+    /// Groups rejected by each guard; energy is tested first.
     pub refused_energy: usize,
     pub refused_coverage: usize,
     /// Merges taken back because they would have undershot the budget.
@@ -62,7 +62,7 @@ pub struct PaperRound {
     pub after: usize,
 }
 
-/// What a round aims at.
+/// Targets of a round.
 #[derive(Clone, Copy)]
 struct Target {
     budget: usize,
@@ -123,7 +123,7 @@ impl Paper {
         Ok(outcome)
     }
 
-    /// One round, to exactly the budget (all rows when there are no more than that).
+    /// Run one round to exactly the budget, or keep all rows if there are no more.
     fn round(
         &self,
         splats: &Splats,
@@ -216,7 +216,7 @@ impl Paper {
         color.map(|c| ((c / self.color_bin) as i32).min(last))
     }
 
-    /// Each group's merged Gaussian where both guards pass: energy is asked first.
+    /// Each group's merged Gaussian if both guards pass; energy is tested first.
     fn judge(
         &self,
         splats: &Splats,

@@ -16,12 +16,12 @@ use super::{GONE, Outcome, Pairwise, Visibility};
 use crate::scene::{Ordered, SceneRef};
 use crate::{Control, Error, Result};
 
-/// What tiles must agree on for their costs to compare.
+/// Units that tiles share so that their costs compare.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Frame {
-    /// What lengths are divided by.
+    /// Unit of lengths.
     pub unit: f64,
-    /// The size of a pixel where no view tells it.
+    /// Pixel size of rows that no view sees.
     pub pixel_size: f32,
     /// Σ αT that a unit of mass counts for though no view sees it.
     pub floor: f32,
@@ -59,13 +59,13 @@ impl Frame {
 pub struct TilePlan {
     /// The run of each ordered row, or [`GONE`] where it is dropped.
     pub run_of: Vec<u32>,
-    /// How many runs there are.
+    /// Number of runs.
     pub runs: usize,
     /// Runs `b` joins `a`; each is named by the run that it began with.
     pub merges: Vec<Pair>,
 }
 
-/// A tile and what it is measured by.
+/// A tile and its units.
 pub struct Tile<'a> {
     pub policy: Pairwise,
     pub scene: &'a SceneRef<'a>,
@@ -82,7 +82,7 @@ impl Tile<'_> {
         Ok(self.leaves(kept, &blur).sums())
     }
 
-    /// What closing each gap between neighbours in Morton order costs, from the first kept row on.
+    /// The cost of closing each gap between neighbours in Morton order, from the first kept row on.
     pub fn run_costs(&self) -> Result<Vec<f32>> {
         self.policy.check(self.scene, self.visibility, None)?;
         let (blur, kept) = (self.blurs(), self.kept());
@@ -90,8 +90,8 @@ impl Tile<'_> {
         Ok(merge_costs(&leaves.codes(), &leaves, self.geometric()))
     }
 
-    /// Merges down to `runs` runs along Morton order, then pairs of neighbours in rounds down to each count of
-    /// `schedule`; `costs` are those of [`Tile::run_costs`].
+    /// Merge down to `runs` runs along Morton order, then pairs of neighbours in rounds down to each count of
+    /// `schedule`; `costs` come from [`Tile::run_costs`].
     pub fn plan(
         &self,
         runs: usize,

@@ -18,7 +18,7 @@ pub fn best(scores: &[f64], keep: usize) -> Vec<u32> {
     rows
 }
 
-/// One-to-one, with neighbours sent far apart (the finaliser of MurmurHash3).
+/// A bijection that scatters neighbours (the finaliser of MurmurHash3).
 fn mixed(row: u32) -> u32 {
     let mut h = row;
     h = (h ^ (h >> 16)).wrapping_mul(0x85eb_ca6b);

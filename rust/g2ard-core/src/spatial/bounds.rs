@@ -1,4 +1,4 @@
-//! Where a scene is and how large, untouched by its floaters.
+//! Position and size of a scene, robust against floaters.
 
 use rayon::prelude::*;
 

@@ -227,7 +227,7 @@ impl<T: Coordinate> Tree<T> {
         }
     }
 
-    /// Offers those points of a block that `mask` names to the search of one point.
+    /// Offer the points of a block that are set in `mask` to the search of one point.
     #[inline(always)]
     fn scan(&self, block: usize, lane: usize, mask: u32, search: &mut Search<T>) {
         let points = &self.blocks[block];

@@ -1,4 +1,4 @@
-//! What rays meet first in a box of cells whose distance to the nearest full cell is known.
+//! First hits of rays in a box of cells whose distance to the nearest full cell is known.
 
 use rayon::prelude::*;
 
@@ -6,7 +6,7 @@ use crate::{Error, Result};
 
 /// Shortest stride, in cells: across the corner of a cell beside a full one.
 const LEAST: f64 = 0.6;
-/// How far within the box a ray from outside begins, in cells.
+/// Distance within the box, in cells, at which a ray from outside begins.
 const INSET: f64 = 0.01;
 
 /// Cells of side `cell` from `low`; `steps` are king's moves to the nearest full one, 0 in it, the last axis running.

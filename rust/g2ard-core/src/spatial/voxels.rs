@@ -1,4 +1,4 @@
-//! Cells of one size, chosen so that about as many are occupied as asked for.
+//! Cells of one size, chosen so that about a target number of them is occupied.
 
 use std::convert::Infallible;
 
@@ -7,7 +7,7 @@ use rayon::prelude::*;
 use super::morton::{BITS, code_inside, decode, encode, unit};
 use super::{RobustBounds, codes};
 
-/// How far the count of occupied cells may be off, and how often the size is changed to get there.
+/// Tolerance of the count of occupied cells, and most changes of the size to reach it.
 const TOLERANCE: f64 = 0.02;
 const MAX_STEPS: usize = 20;
 
@@ -136,12 +136,13 @@ fn counts_by_octave(points: &[[f64; 3]], bounds: &RobustBounds) -> Vec<usize> {
 /// The octaves of a lattice, its whole cube among them.
 pub const OCTAVES: usize = BITS as usize + 1;
 
-/// Neighbours in Morton order that first differ in bit 3b … 3b+2 fall apart at octave b and at every finer one.
+/// The octave b at which two neighbours in Morton order separate: they first differ in bit 3b … 3b+2, and are apart at
+/// every finer octave.
 pub fn first_apart(a: u64, b: u64) -> usize {
     (63 - (a ^ b).leading_zeros()) as usize / 3
 }
 
-/// Occupied cells by octave, given how many neighbours in Morton order first fall apart at each.
+/// Occupied cells per octave, from the number of neighbours in Morton order that first separate at each.
 pub fn octave_counts(apart: &[usize; OCTAVES]) -> Vec<usize> {
     let mut total = 1;
     let mut counts: Vec<usize> = (0..OCTAVES)

@@ -13,7 +13,7 @@ use crate::raster::memory::bytes;
 use crate::raster::simd::{Isa, LANES, dispatch};
 use bands::{Backward, Forward, span};
 
-/// Rows worked on together: fixed, so that sums split alike for any number of threads.
+/// Rows processed together: fixed, so that sums are split equally for any number of threads.
 const BAND: usize = 32;
 /// x, e, x² + y² and e² are blurred going forward; three derivatives going back.
 const FORWARD: usize = 4;

@@ -1,4 +1,4 @@
-//! One Adam step of every Gaussian a view touched, sixteen at a time.
+//! One Adam step of every Gaussian that a view touched, sixteen at a time.
 
 use super::Rates;
 use super::anchors::{Anchors, Regularizers};
@@ -40,7 +40,7 @@ pub struct Update<'a> {
     pub rates: &'a Rates,
     pub reach: Option<f32>,
     pub regularize: Option<(&'a Regularizers, &'a Anchors)>,
-    /// A bit for each row of a group, 0 where it is frozen; `None` freezes nothing.
+    /// One bit per row of a group, 0 if it is frozen; `None` freezes nothing.
     pub free: Option<&'a [u16]>,
 }
 
@@ -100,7 +100,7 @@ fn zero_unseen<F: Lanes>(g: &mut RowGradients<F>, seen: F::Mask) {
     g.logit_opacity = g.logit_opacity.only(seen);
 }
 
-/// Lanes without any gradient, such as those that a mask hides: they are left alone too.
+/// Lanes without a gradient, such as those behind a mask; they do not change either.
 #[inline(always)]
 fn zero<F: Lanes>(g: &RowGradients<F>) -> F::Mask {
     let none = F::splat(0.0);
@@ -135,7 +135,7 @@ fn finite<F: Lanes>(g: &RowGradients<F>) -> F::Mask {
     ok
 }
 
-/// What the attributes of one block share.
+/// Values that the attributes of one block share.
 struct Step<F: Lanes> {
     good: F::Mask,
     bias1: F,
@@ -187,7 +187,7 @@ impl Update<'_> {
         }
     }
 
-    /// 1/(1 + (σ/c)¹⁶) of what is σ pixels large, from σ².
+    /// 1/(1 + (σ/c)¹⁶) from σ², where σ is a size in pixels.
     #[inline(always)]
     fn share<F: Lanes>(&self, variance: F) -> F {
         let one = F::splat(1.0);

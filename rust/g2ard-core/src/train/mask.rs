@@ -1,12 +1,12 @@
-//! A loss over some of the pixels only, made of the loss over all of them.
+//! A loss over unmasked pixels only, from the loss over all of them.
 
 use crate::{Error, Result};
 
-/// Pixels that count, and how many.
+/// Unmasked pixels, and their number.
 #[derive(Debug, Clone, Copy)]
 pub struct Mask<'a> {
     counts: &'a [bool],
-    /// All pixels over those that count: turns a mean over all into one over these.
+    /// All pixels over the unmasked ones: turns a mean over all pixels into one over the unmasked.
     pub share: f32,
 }
 
@@ -21,7 +21,7 @@ impl<'a> Mask<'a> {
         Ok(Self { counts, share })
     }
 
-    /// Makes the image equal to the target where nothing counts, so that nothing differs there.
+    /// Set masked pixels of the image to the target, so that they have no error.
     pub fn cover(&self, image: &mut [f32], target: &[f32]) {
         let pixels = image.chunks_exact_mut(3).zip(target.chunks_exact(3));
         for ((pixel, wanted), _) in pixels.zip(self.counts).filter(|(_, counts)| !**counts) {
@@ -29,7 +29,7 @@ impl<'a> Mask<'a> {
         }
     }
 
-    /// The gradient of the mean over the pixels that count, from that over all.
+    /// Convert the gradient of the mean over all pixels to that over the unmasked ones.
     pub fn clear(&self, gradient: &mut [f32]) {
         for (pixel, counts) in gradient.chunks_exact_mut(3).zip(self.counts) {
             let factor = if *counts { self.share } else { 0.0 };

@@ -41,7 +41,7 @@ pub struct Rates {
     pub sh_n: f32,
 }
 
-/// What one step takes in: a view, its target, and how to learn from it.
+/// Inputs of one step: a view, its target, and the rates.
 #[derive(Debug, Clone, Copy)]
 pub struct StepInput<'a> {
     pub camera: &'a Camera,
@@ -54,8 +54,9 @@ pub struct StepInput<'a> {
     /// λ of (1 − λ)·L1 + λ·(1 − SSIM).
     pub ssim_weight: f32,
     pub rates: Rates,
-    /// σ in pixels, c: the rates of what is larger in this view are multiplied by 1/(1 + (σ/c)¹⁶), means and rotations
-    /// by σ of the Gaussian's longer side, each scale by that of its own axis. `None` lets all learn alike.
+    /// c, a size in pixels: rates of Gaussians that are larger in this view are multiplied by 1/(1 + (σ/c)¹⁶). For
+    /// means and rotations σ is the Gaussian's longer side, for each scale its own axis. `None` leaves all rates
+    /// unchanged.
     pub reach: Option<f32>,
     /// Added to the loss of this step; needs anchors.
     pub regularizers: Option<Regularizers>,
@@ -73,7 +74,7 @@ pub struct Report {
     pub seconds_loss: f64,
 }
 
-/// Parameters, Adam's moments, and everything a step needs.
+/// Parameters, Adam's moments, and buffers of a step.
 pub struct Trainer {
     store: Store,
     anchors: Option<Anchors>,
@@ -84,14 +85,14 @@ pub struct Trainer {
     image: Vec<f32>,
     alpha: Vec<f32>,
     gradient: Vec<f32>,
-    /// As the caller numbers rows; empty where nothing is frozen.
+    /// Frozen rows in the caller's order; empty if none is frozen.
     frozen: Vec<bool>,
-    /// A bit for each row of a group of the store, 0 where it is frozen; empty where nothing is.
+    /// One bit per row of a group of the store, 0 if it is frozen; empty if none is.
     free: Vec<u16>,
 }
 
 impl Trainer {
-    /// `units`: what each Gaussian's means rate is multiplied by; `None` means 1.
+    /// `units`: factor of each Gaussian's rate of the mean; `None` means 1.
     pub fn new(params: &Params, units: Option<&[f32]>, isa: Isa) -> Result<Self> {
         Ok(Self {
             store: Store::new(params, units)?,
@@ -162,12 +163,12 @@ impl Trainer {
         Ok(())
     }
 
-    /// How long the rasteriser's passes of the last step took; Adam is in `gather`.
+    /// Times of the rasteriser's passes in the last step; Adam is in `gather`.
     pub fn passes(&self) -> Passes {
         self.rasterizer.passes()
     }
 
-    /// What the parameters, the moments and all buffers hold now; without anchors.
+    /// Memory of the parameters, the moments and all buffers, without anchors.
     pub fn memory(&self) -> Memory {
         let rasterizer = self.rasterizer.memory();
         let planes = [&self.image, &self.alpha, &self.gradient].map(bytes);

@@ -23,7 +23,7 @@ pub struct Store {
     values: Vec<Lanes16>,
     first: Vec<Lanes16>,
     second: Vec<Lanes16>,
-    /// What the means' rate is multiplied by.
+    /// Factors of the means' rate.
     units: Vec<Lanes16>,
     steps: Vec<u32>,
     /// An upper bound of `steps`.
@@ -32,7 +32,7 @@ pub struct Store {
     order: Vec<u32>,
 }
 
-/// All of a [`Store`], rows as the caller numbers them, attributes side by side: what a checkpoint holds.
+/// All of a [`Store`], rows in the caller's order, one attribute after the other, as a checkpoint holds it.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Exported {
     /// N × (11 + 3K): means, quats, log-scales, logit, SH.
@@ -242,7 +242,7 @@ pub(crate) struct ParameterView<'a> {
     values: &'a [Lanes16],
     /// The group that `values` begin with.
     first_group: usize,
-    /// Of the whole store.
+    /// Rows of the whole store.
     rows: usize,
     sh_coeffs: usize,
 }
@@ -279,9 +279,9 @@ pub(crate) struct Block<'a> {
     pub values: &'a mut [Lanes16],
     pub first: &'a mut [Lanes16],
     pub second: &'a mut [Lanes16],
-    /// Of each lane.
+    /// Step count of each lane.
     pub steps: &'a mut [u32],
-    /// What the rate of the means is multiplied by.
+    /// Factors of the means' rate.
     pub units: &'a Lanes16,
     rows: usize,
     pub sh_coeffs: usize,
@@ -312,7 +312,7 @@ impl<'a> Blocks<'a> {
 }
 
 impl Block<'_> {
-    /// Its parameters, to be read.
+    /// Its parameters, for reading.
     #[inline(always)]
     pub fn parameters(&self) -> ParameterView<'_> {
         ParameterView {

@@ -1,14 +1,14 @@
-//! The scene in groups of sixteen rows, and those of them that a view can see.
+//! The scene in groups of sixteen rows, and the groups that a view can see.
 
 use crate::raster::Frustum;
 use crate::raster::params::Source;
 use crate::raster::simd::{LANES, Lanes, Lanes16};
 use crate::scene::{SceneRef, limits};
 
-/// What bounds some rows: apart from their values, for a view reads the bounds of all.
+/// Bounds of some rows, stored apart from their values because a view reads the bounds of all groups.
 #[derive(Debug, Clone, Copy)]
 pub struct Bounds {
-    /// Of the means' box.
+    /// Centre of the means' box.
     centre: [f32; 3],
     /// Half the sides of that box.
     half: [f32; 3],
@@ -26,7 +26,7 @@ impl Bounds {
         }
     }
 
-    /// What bounds all of them, wide enough that a view which refuses it refuses each of them.
+    /// Bounds of all parts, wide enough that a view which rejects them rejects each part.
     pub fn around(parts: &[Self]) -> Self {
         let (mut low, mut high) = ([f32::INFINITY; 3], [f32::NEG_INFINITY; 3]);
         for part in parts {
@@ -57,7 +57,8 @@ const WIDER: f32 = 1.0001;
 
 /// The values of sixteen rows.
 pub struct Group {
-    /// Mean, quaternion, scales (linear, so that a unit twice as long rounds alike), logit; the last row again in lanes past the end.
+    /// Mean, quaternion, scales (linear, so that a unit twice as long rounds equally), logit; lanes past the end repeat
+    /// the last row.
     values: [Lanes16; 11],
 }
 

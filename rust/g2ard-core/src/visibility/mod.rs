@@ -1,4 +1,4 @@
-//! What views see of a whole scene, in little memory: each view projects only the groups of rows about its frustum.
+//! Visibility of a whole scene in little memory: each view projects only the groups of rows around its frustum.
 
 mod groups;
 mod kernels;
@@ -27,7 +27,7 @@ pub struct VisibilityAccumulator {
     /// Around [`BLOCK`] groups each.
     blocks: Vec<Bounds>,
     ordered: Arc<Ordered>,
-    /// What f64 means are taken relative to; f32 means stay as they are.
+    /// Origin of f64 means; f32 means are used as they are.
     shift: [f64; 3],
     weight: Vec<f64>,
     pixel_size: Vec<f32>,
@@ -36,7 +36,7 @@ pub struct VisibilityAccumulator {
     rasterizer: Rasterizer,
     /// Groups that a band of the image may meet.
     band: usize,
-    /// What a device keeps of the scene between calls.
+    /// Data that a device keeps of the scene between calls.
     pub held: Option<Box<dyn Any + Send + Sync>>,
 }
 
@@ -64,7 +64,7 @@ impl VisibilityAccumulator {
         })
     }
 
-    /// How many Gaussians there are.
+    /// Number of Gaussians.
     pub fn len(&self) -> usize {
         self.weight.len()
     }
@@ -78,7 +78,7 @@ impl VisibilityAccumulator {
         self.groups[number / LANES].row(number % LANES)
     }
 
-    /// A camera in the coordinates of those means.
+    /// A camera in the coordinates of the shifted means.
     pub fn relative(&self, camera: &Camera) -> Camera {
         let mut camera = *camera;
         for r in &mut camera.viewmat {
@@ -249,7 +249,7 @@ mod tests {
         (means, quats, scales, logits)
     }
 
-    /// A scene of those arrays, but for its means and scales.
+    /// A scene of these arrays with other means and scales.
     fn made<'a>(means: Means<'a>, scales: &'a [[f32; 3]], rows: &'a Arrays) -> SceneRef<'a> {
         SceneRef {
             means,

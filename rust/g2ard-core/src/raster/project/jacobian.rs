@@ -1,4 +1,4 @@
-//! From the world's axes to the camera's and the screen's.
+//! Transforms from the world's axes to the camera's and the screen's.
 
 use super::View;
 use crate::raster::params::Source;
@@ -27,7 +27,7 @@ pub fn scales<F: Lanes, S: Source>(source: &S, group: usize) -> [F; 3] {
     s
 }
 
-/// J·W, the projection's Jacobian times the camera's rotation, and what it was made of: see [`Projected`].
+/// J·W, the projection's Jacobian times the camera's rotation, and its factors: see [`Projected`].
 pub struct Jacobian<F: Lanes> {
     pub t: [F; 2],
     pub inside: [F::Mask; 2],

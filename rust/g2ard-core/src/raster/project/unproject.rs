@@ -24,7 +24,7 @@ pub struct RowGradients<F: Lanes> {
     pub extent: Extent<F>,
 }
 
-/// How large a Gaussian is on the screen before dilation, px²; 0 behind the near plane.
+/// Size of a Gaussian on the screen before dilation, px²; 0 behind the near plane.
 pub struct Extent<F: Lanes> {
     /// The larger variance of its ellipse.
     pub largest: F,
@@ -51,11 +51,11 @@ impl<F: Lanes> Extent<F> {
 struct Geometry<F: Lanes> {
     p: Projected<F>,
     log_scale: [F; 3],
-    /// Of the Gaussian's rotation.
+    /// dL/d(the Gaussian's rotation).
     dr: [[F; 3]; 3],
-    /// Of J·W.
+    /// dL/d(J·W).
     djw: [[F; 3]; 2],
-    /// Of the mean, in the camera's axes.
+    /// dL/d(mean), in the camera's axes.
     camera: [F; 3],
 }
 
@@ -175,8 +175,8 @@ pub fn unproject_to_pose<F: Lanes, S: Source>(
     out
 }
 
-/// Adds to dL/d(mean) what the colour's direction gives. Returns the SH basis and dL/d(colour) where the colour was not
-/// cut at 0.
+/// Add to dL/d(mean) the part that comes through the colour's direction. Return the SH basis, and dL/d(colour) where
+/// the colour was not clipped at 0.
 #[inline(always)]
 fn through_colour<F: Lanes, S: Source>(
     view: &View,
@@ -209,8 +209,8 @@ fn through_colour<F: Lanes, S: Source>(
     (basis, rgb)
 }
 
-/// Adds to dL/dM what the factor √(det0 / det) of the opacity gives: det = det0 + 0.3·tr + 0.09, det0 = |minors|²,
-/// minors = M₀ × M₁; `h` is the gradient of the opacity's logarithm.
+/// Add to dL/dM the part of the opacity's factor √(det0 / det): det = det0 + 0.3·tr + 0.09, det0 = |minors|², minors =
+/// M₀ × M₁; `h` is the gradient of the opacity's logarithm.
 #[inline(always)]
 fn add_antialiasing<F: Lanes>(view: &View, p: &Projected<F>, h: F, dm: &mut [[F; 3]; 2]) {
     let mut weight = h;

@@ -1,4 +1,4 @@
-//! What a view adds to every Gaussian's sums: see [`crate::raster::accumulate`].
+//! A view's contribution to every Gaussian's sums: see [`crate::raster::accumulate`].
 
 use rayon::prelude::*;
 

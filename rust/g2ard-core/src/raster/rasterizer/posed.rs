@@ -1,4 +1,4 @@
-//! How an image changes with the pose it is seen from.
+//! The derivative of an image with respect to its pose.
 
 use super::{ChunkSums, ImageGradients, Rasterizer};
 use crate::raster::params::Params;

@@ -149,7 +149,7 @@ impl Rasterizer {
         );
     }
 
-    /// Slots keep stale sums: `written` says which of them count.
+    /// Clear the marks of written slots; slots without a mark hold stale sums.
     pub(super) fn clear_slots(&mut self) {
         let pairs = self.bins.pairs.len();
         self.slots.resize(pairs, [0.0; SUMS]);

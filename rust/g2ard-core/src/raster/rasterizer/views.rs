@@ -5,15 +5,15 @@ use std::time::Instant;
 use crate::raster::Camera;
 use crate::{Error, Result};
 
-/// Where the forward pass writes: row-major, `height × width` (× 3 interleaved).
+/// Outputs of the forward pass: row-major, `height × width` (× 3 interleaved).
 #[derive(Debug)]
 pub struct Image<'a> {
     pub rgb: &'a mut [f32],
-    /// 1 − the light left.
+    /// 1 − transmittance.
     pub alpha: &'a mut [f32],
     /// Σ αT·z: *not* divided by alpha.
     pub depth: Option<&'a mut [f32]>,
-    /// Depth of the first splat behind which less than half the light is left; 0 where there is none.
+    /// Depth of the splat at which transmittance falls below one half; 0 if it never does.
     pub median: Option<&'a mut [f32]>,
 }
 
@@ -25,7 +25,7 @@ pub struct ImageGradients<'a> {
     pub depth: Option<&'a [f32]>,
 }
 
-/// How much work the last forward pass was.
+/// Work done by the last forward pass.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct Counts {
     pub visible: usize,
@@ -34,7 +34,7 @@ pub struct Counts {
     pub evaluated: u64,
 }
 
-/// Seconds the passes of the last calls took.
+/// Seconds per pass of the last calls.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct Passes {
     pub project: f64,
@@ -43,7 +43,7 @@ pub struct Passes {
     pub forward: f64,
     /// Tiles, from the image's gradient to the slots.
     pub backward: f64,
-    /// From the slots to the parameters, and what the caller does with their gradient.
+    /// From the slots to the parameters, and the caller's use of their gradient.
     pub gather: f64,
 }
 
@@ -55,7 +55,7 @@ pub fn lap(from: &mut Instant) -> f64 {
     seconds
 }
 
-/// Bytes held: by buffers that grow with the Gaussians and their pairs, and by those that grow with the image.
+/// Bytes held by buffers that grow with the Gaussians and their pairs, and by those that grow with the image.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct Memory {
     pub gaussians: usize,
@@ -70,7 +70,7 @@ fn check(name: &'static str, got: usize, expected: usize) -> Result<()> {
 }
 
 impl Image<'_> {
-    /// Every plane has the camera's size.
+    /// Check that every plane has the camera's size.
     pub(crate) fn validate(&self, camera: &Camera) -> Result<()> {
         let pixels = camera.width * camera.height;
         let length = |plane: &Option<&mut [f32]>| plane.as_ref().map_or(pixels, |p| p.len());
@@ -82,7 +82,7 @@ impl Image<'_> {
 }
 
 impl ImageGradients<'_> {
-    /// As for [`Image`].
+    /// Check sizes like [`Image`].
     pub(crate) fn validate(&self, camera: &Camera) -> Result<()> {
         let pixels = camera.width * camera.height;
         let length = |plane: Option<&[f32]>| plane.map_or(pixels, <[f32]>::len);

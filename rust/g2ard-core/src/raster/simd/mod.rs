@@ -59,7 +59,7 @@ pub trait Wide: Copy + Add<Output = Self> + Mul<Output = Self> + Div<Output = Se
 pub trait Vector: Real<Mask: Mask> {
     type Wide: Wide;
 
-    /// How many.
+    /// Number of lanes.
     const COUNT: usize;
 
     /// `COUNT` values from `at`, which may be unaligned.
@@ -174,8 +174,8 @@ pub trait Vector: Real<Mask: Mask> {
 
 /// Sixteen f32 lanes.
 pub trait Lanes: Vector {
-    /// What blocks of pixels are worked on with: 16 lanes are 4×4 pixels, 8 are 4×2, of which fewer are evaluated in
-    /// vain.
+    /// Lanes that process a block of pixels: 16 lanes are 4×4 pixels; 8 are 4×2, of which fewer are evaluated without
+    /// effect.
     type Block: Vector;
 
     #[inline(always)]
@@ -213,7 +213,7 @@ const EXP2: [f32; 6] = [
 /// 1.5·2²³: added to a small number it leaves the nearest integer in the low bits, without a rounding instruction.
 pub const TO_NEAREST: f32 = 12_582_912.0;
 
-/// Which instruction set the kernels run on.
+/// The instruction set that kernels run on.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Isa {
     Avx512,
@@ -223,7 +223,7 @@ pub enum Isa {
 }
 
 impl Isa {
-    /// Those this machine can run, the fastest first.
+    /// The instruction sets that this machine can run, fastest first.
     pub fn available() -> Vec<Self> {
         let all = [Self::Avx512, Self::Avx2, Self::Neon, Self::Portable];
         all.into_iter().filter(|isa| isa.runs_here()).collect()

@@ -1,4 +1,4 @@
-//! Plain arrays of eight lanes: runs anywhere, and is what the other lanes are tested against.
+//! Plain arrays of eight lanes, which run anywhere and are the reference for the other lanes.
 
 use std::ops::{Add, Div, Mul, Neg, Sub};
 

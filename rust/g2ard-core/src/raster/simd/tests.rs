@@ -101,7 +101,7 @@ fn sums_and_masks_keep_their_places() {
     }
 }
 
-/// What every operation of the lanes gives for a and b, in bits.
+/// Results of every lane operation for a and b, in bits.
 struct Operations<'a>(&'a Lanes16, &'a Lanes16);
 
 impl Kernel for Operations<'_> {

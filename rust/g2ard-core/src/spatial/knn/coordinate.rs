@@ -1,4 +1,4 @@
-//! The numbers that points are made of, and keys that order what is found by distance and row.
+//! Coordinates of points, and keys that order results by distance and row.
 
 use std::ops::{AddAssign, Mul, Sub};
 

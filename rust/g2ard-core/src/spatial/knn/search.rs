@@ -3,11 +3,11 @@
 use super::coordinate::{Coordinate, Neighbor};
 use super::{Lanes, WIDTH};
 
-/// What has been found near the eight points of a block.
+/// Neighbours of the eight points of a block found so far.
 pub struct Search<T: Coordinate> {
     pub k: usize,
     pub points: [Lanes<T>; 3],
-    /// Nothing farther than this can still get in.
+    /// Distances beyond which no point can be among the nearest.
     pub limits: Lanes<T>,
     /// The nearest `k` of every point, ascending.
     keys: Vec<T::Key>,
@@ -23,7 +23,7 @@ impl<T: Coordinate> Search<T> {
         }
     }
 
-    /// Farther than all there is.
+    /// A key beyond all others.
     fn nothing() -> T::Key {
         T::INFINITY.key(u32::MAX)
     }

@@ -1,4 +1,4 @@
-//! One band of rows of the fused loss, there and back.
+//! Forward and backward pass of the fused loss over one band of rows.
 
 use super::{BACK, FORWARD};
 use crate::raster::simd::{Kernel, LANES, Lanes, Lanes16, Mask};
@@ -217,7 +217,7 @@ pub struct Backward<'a> {
     pub weights: [f32; TAPS],
     pub first: usize,
     pub maps: &'a [f32],
-    /// What |e| and SSIM weigh, per value.
+    /// Weights of |e| and SSIM per value.
     pub scale: [f32; 2],
     pub out: &'a mut [f32],
 }
