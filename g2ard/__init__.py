@@ -13,7 +13,7 @@
 | `recover` | optimise a fixed set of Gaussians against photos or a teacher's renders |
 | `adapt` | fit a new appearance on frozen geometry |
 | `register` | estimate poses of photos |
-| `lod`, `save_levels` | compute levels of detail, write them as streamed SOG |
+| `lod`, `save_levels`, `save_tileset` | compute levels of detail, write them as streamed SOG or 3D Tiles |
 | `render`, `Renderer`, `evaluate` | render images and depths; measure PSNR and SSIM |
 
 They exchange `Splats`, `Camera`, `Cameras`, `Points`, and targets: `Photos`, `TeacherRenders`, or any object
@@ -52,7 +52,7 @@ if TYPE_CHECKING:
     from g2ard.jobs.distill_options import DistillOptions
     from g2ard.jobs.levels import lod
     from g2ard.jobs.simplify import simplify
-    from g2ard.levels import save_levels
+    from g2ard.levels import Georeference, save_levels, save_tileset
     from g2ard.pipeline import DistillConfig, Distilled, SelectConfig
     from g2ard.pipeline import distill as distill_against
     from g2ard.pipeline.adapt import AdaptConfig, Adapted, adapt
@@ -82,6 +82,7 @@ __all__ = [
     "Distilled",
     "Evaluation",
     "G2ardError",
+    "Georeference",
     "InputError",
     "MissingDependencyError",
     "OutputError",
@@ -121,6 +122,7 @@ __all__ = [
     "render",
     "save",
     "save_levels",
+    "save_tileset",
     "save_views",
     "select",
     "simplify",
@@ -132,7 +134,7 @@ _HOMES = {
     "errors": ("G2ardError", "InputError", "MissingDependencyError", "OutputError"),
     "io.types": ("Points",),
     "pipeline": ("DistillConfig", "Distilled", "SelectConfig"),
-    "levels": ("save_levels",),
+    "levels": ("Georeference", "save_levels", "save_tileset"),
     "jobs.distill": ("distill",),
     "jobs.distill_options": ("DistillOptions",),
     "jobs.levels": ("lod",),

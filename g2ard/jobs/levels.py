@@ -10,6 +10,8 @@ from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from g2ard.config.choices import BLACK, Colour
 from g2ard.jobs.budget import Budget
 from g2ard.jobs.inputs import make_targets
@@ -18,13 +20,19 @@ from g2ard.report.base import Report
 from g2ard.scene.splats import Splats
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from g2ard.jobs.inputs import Views
     from g2ard.jobs.job import DistillJob
+    from g2ard.levels.tree import Level
     from g2ard.scene.cameras import Cameras
     from g2ard.scene.targets import Targets
 
 RATIOS = (1.0, 2.0, 4.0, 8.0, 16.0)
 """Reduction factors; each level has half the Gaussians of the previous one, as in viewers' own tools."""
+
+_ROWS = 100_000
+"""Gaussians used to estimate the up direction."""
 
 _SMALLEST = 200
 """Smallest longer side of a level's views in pixels; below it, edges dominate the error."""
@@ -217,6 +225,17 @@ def _targets(job: DistillJob, cameras: Cameras, longest: int) -> Targets:
         progress=job.progress,
         say=job.say,
     )
+
+
+def tileset_up(levels: Sequence[Level], up: Sequence[float] | None = None) -> NDArray[np.float64]:
+    """Return the (3,) up direction for 3D Tiles: `up`, z in map coordinates, or an estimate."""
+    from g2ard.jobs.viewer_frame import up_of
+
+    coarse = levels[-1]
+    if up is None and coarse.offset.any():
+        return np.array([0.0, 0, 1])
+    rows = np.linspace(0, len(coarse) - 1, min(len(coarse), _ROWS)).astype(np.int64)
+    return up_of(coarse.take(rows), up)
 
 
 def level_size(cameras: Cameras, ratio: float) -> int:

@@ -99,7 +99,7 @@ def frame_of(
         if start is not None or not (views is None or is_made(views)):
             raise
         say(f"no pose to start at: {error}")
-        return ViewerFrame(_turn(_estimated(scene, up)), _middle(scene))
+        return ViewerFrame(_turn(up_of(scene, up)), _middle(scene))
     cameras = load_views(found, "all", None, say)
     return frame_with(scene, cameras, start=start, up=up)
 
@@ -113,7 +113,7 @@ def frame_with(
         InputError: no view of that name, or an invalid `up`.
     """
     axis = _level(cameras) if up is None else None
-    stand = ViewerFrame(_turn(_estimated(scene, up) if axis is None else axis), _middle(scene))
+    stand = ViewerFrame(_turn(up_of(scene, up) if axis is None else axis), _middle(scene))
     points = opaque_points(scene)
     view = cameras[_chosen(cameras, points, start)]
     return replace(stand, start=_start(stand, view, points), name=view.name)
@@ -130,7 +130,7 @@ def _level(cameras: Cameras) -> NDArray[np.float64] | None:
     return axis if axis @ up >= 0 else -axis
 
 
-def _estimated(scene: Splats, up: Sequence[float] | None) -> NDArray[np.float64]:
+def up_of(scene: Splats, up: Sequence[float] | None = None) -> NDArray[np.float64]:
     """Return `up` if given, otherwise estimate it from the scene, with −y as a fallback."""
     from g2ard.poses.site import Site
 

@@ -1,10 +1,10 @@
-"""`g2ard lod`: a scene → levels of detail as streamed SOG."""
+"""`g2ard lod`: a scene → levels of detail as streamed SOG or 3D Tiles."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -36,7 +36,8 @@ if TYPE_CHECKING:
     from g2ard.jobs.levels import Levels
     from g2ard.jobs.tiled import TiledLevels
     from g2ard.jobs.tiling import Tiling
-    from g2ard.levels import Cut
+    from g2ard.levels import Cut, Georeference
+    from g2ard.levels.tree import Level
 
 
 @command("lod", example="g2ard lod scene.ply -r 1,2,4,8,16 -o streamed/")
@@ -50,7 +51,12 @@ def lod(
     ],
     output: Annotated[
         Path,
-        typer.Option("-o", "--output", metavar="DIR", help="Output folder for lod-meta.json and its files."),
+        typer.Option(
+            "-o",
+            "--output",
+            metavar="DIR",
+            help="Output folder for lod-meta.json or tileset.json, and its files.",
+        ),
     ],
     ratios: Annotated[
         Ratios,
@@ -95,6 +101,19 @@ def lod(
             help="Do not split chunks of fewer Gaussians, in units of 1024.",
         ),
     ] = 8,
+    kind: Annotated[
+        Literal["sog", "3dtiles"],
+        typer.Option("--format", help="Streamed SOG, or 3D Tiles 1.1 for CesiumJS."),
+    ] = "sog",
+    place: Annotated[
+        str | None,
+        typer.Option(
+            "--georeference",
+            metavar="LON,LAT,HEIGHT[,HEADING]",
+            help="Place 3D Tiles on the globe: degrees and metres of the scene's offset, and the direction "
+            "of its y axis (z if -y is up), clockwise from north.",
+        ),
+    ] = None,
     views: ViewsOrMadeOption = None,
     images: ImagesOption = None,
     steps: Annotated[
@@ -110,7 +129,7 @@ def lod(
     scheduler: SchedulerOption = None,
     work: WorkOption = None,
 ) -> None:
-    """Write levels of detail as streamed SOG.
+    """Write levels of detail as streamed SOG or 3D Tiles.
 
     Each level is merged from the one before, then recovered.
     Scenes larger than memory and folders of tiles are processed tile by tile.
@@ -118,26 +137,30 @@ def lod(
     from g2ard.cli.resume import check_stopped, left_at, stoppable
     from g2ard.cli.run_folder import check_same_options, note_options
     from g2ard.errors import InputError
-    from g2ard.io import kind
+    from g2ard.io import kind as kind_of
     from g2ard.io.atomic import check_output
     from g2ard.jobs.distill_options import DistillOptions
     from g2ard.jobs.levels import check_ratios, recovery_settings
     from g2ard.jobs.levels import lod as levels_of
     from g2ard.jobs.tiled import working
     from g2ard.jobs.tiling import LEVELS_TIMES, RECOVERY_TIMES, check_memory, is_tiled
-    from g2ard.levels import Cut, save_levels
+    from g2ard.levels import Cut
 
-    if kind(scene) == "points":
+    if kind_of(scene) == "points":
         raise typer.BadParameter(
             "a point cloud cannot render training images; distil it first, then run `lod` on the result"
         )
     try:
         check_ratios(ratios)
         rule = Cut(most * 1024, extent, least * 1024)
+        spot = None if place is None else _georeference(place)
     except InputError as error:
         raise typer.BadParameter(in_flags(error, run.flags)) from None
     views = with_images(views, images)
-    meta, stopped = output / "lod-meta.json", output.with_name(f".{output.name}.unfinished")
+    if spot is not None and kind == "sog":
+        raise typer.BadParameter("--georeference needs --format 3dtiles")
+    meta = output / ("lod-meta.json" if kind == "sog" else "tileset.json")
+    stopped = output.with_name(f".{output.name}.unfinished")
     run.spare_inputs(meta)
     tiling = tiling_of(run, scene, output, tile_rows, memory, workers, scheduler, work)
     tiled = is_tiled(scene, tiling)
@@ -155,11 +178,11 @@ def lod(
             settings=recovery_settings(steps, background or BLACK, run.seed),
         )
         with working(tiling, views):
-            _in_tiles(run, scene, output, ratios, tiling, options, recover, rule, errors)
+            _in_tiles(run, scene, output, ratios, tiling, options, recover, rule, errors, kind, spot)
         return
     check_memory(scene, tiling, LEVELS_TIMES, RECOVERY_TIMES)
     if going_on:
-        check_same_options(run, stopped, besides=("errors", "most", "extent", "least"))
+        check_same_options(run, stopped, besides=("errors", "most", "extent", "least", "kind", "place"))
     with stoppable(run, stopped, resume):
         note_options(run, stopped)
         levels = levels_of(
@@ -176,9 +199,7 @@ def lod(
             progress=run.progress,
             say=run.say,
         )
-        size_of_all = save_levels(
-            output, levels.splats, cut=rule, errors=errors, overwrite=run.overwrite, progress=run.progress
-        )
+        size_of_all = _save(run, output, levels.splats, rule, errors, kind, spot, up)
     _tell(run, output, levels, size_of_all)
 
 
@@ -192,10 +213,11 @@ def _in_tiles(
     recover: bool,
     rule: Cut,
     errors: bool,
+    kind: str,
+    spot: Georeference | None,
 ) -> None:
     """Write levels tile by tile; finished steps stay in the tiling's folder until the command succeeds."""
     from g2ard.jobs.tiled import lod_in_tiles
-    from g2ard.levels import save_levels
     from g2ard.system.memory import peak_rss_of_all
 
     assert tiling.folder is not None
@@ -203,16 +225,45 @@ def _in_tiles(
     levels = lod_in_tiles(scene, ratios, tiling, options, recover=recover, progress=run.progress, say=run.say)
     begun = tiling.folder / f"written-{levels.key(rule, errors)}"
     begun.mkdir(exist_ok=True)
-    size = save_levels(
-        output,
-        levels.scenes,
-        cut=rule,
-        errors=errors,
-        overwrite=run.overwrite,
-        work=begun,
-        progress=run.progress,
-    )
+    size = _save(run, output, levels.scenes, rule, errors, kind, spot, options.up, begun)
     _tell(run, output, levels, size, peak_rss_bytes=peak_rss_of_all())
+
+
+def _save(
+    run: Run,
+    output: Path,
+    levels: Sequence[Level],
+    rule: Cut,
+    errors: bool,
+    kind: str,
+    spot: Georeference | None,
+    up: Sequence[float] | None,
+    work: Path | None = None,
+) -> int:
+    """Write the output folder and return its bytes."""
+    from g2ard.jobs.levels import tileset_up
+    from g2ard.levels import save_levels, save_tileset
+
+    common: dict[str, Any] = {
+        "cut": rule,
+        "overwrite": run.overwrite,
+        "work": work,
+        "progress": run.progress,
+    }
+    if kind == "sog":
+        return save_levels(output, levels, errors=errors, **common)
+    axis = tileset_up(levels, up)
+    run.say(
+        f"up is {', '.join(f'{value:.3g}' for value in axis)}" + ("" if up else "; --up X,Y,Z changes it")
+    )
+    return save_tileset(output, levels, up=axis, place=spot, **common)
+
+
+def _georeference(text: str) -> Georeference:
+    from g2ard.cli.options import numbers
+    from g2ard.levels import Georeference
+
+    return Georeference(*numbers("--georeference", text, 4 if text.count(",") == 3 else 3))
 
 
 def _check_same(meta: Path, ratios: Sequence[float]) -> None:
@@ -221,7 +272,8 @@ def _check_same(meta: Path, ratios: Sequence[float]) -> None:
 
     from g2ard.errors import OutputError
 
-    counts = json.loads(meta.read_text(encoding="utf-8")).get("counts") or [0]
+    content = json.loads(meta.read_text(encoding="utf-8"))
+    counts = {**content.get("extras", {}), **content}.get("counts") or [0]
     wanted = [counts[0] * ratios[0] / ratio for ratio in ratios]
     if len(counts) != len(wanted) or any(abs(c - w) > ratios[0] for c, w in zip(counts, wanted, strict=True)):
         levels = ", ".join(f"{count:,}" for count in counts)

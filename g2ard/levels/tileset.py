@@ -1,0 +1,227 @@
+"""Writer for 3D Tiles 1.1: a tree of .glb files with SPZ, coarse levels above fine ones, for CesiumJS.
+
+A tile shows one level in one node of the kd-tree. It is replaced by tiles of the next finer level, in the
+node's children or in the leaf itself.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from g2ard.errors import InputError, require
+from g2ard.levels.tree import Cut, Leaf, Node
+from g2ard.levels.tree import cut as cut_tree
+from g2ard.progress import Progress, silent
+
+if TYPE_CHECKING:
+    from g2ard.levels.tree import Level
+
+Float = NDArray[np.float64]
+
+_TILE_OF_SCENE = np.array([[-1.0, 0, 0], [0, 0, -1], [0, -1, 0]])
+"""From the scene's axes to a tile's: glTF's (half a turn about z), then z up instead of y."""
+
+_MOST_ERROR = 16.0
+"""Error on the screen in pixels at which viewers refine a tile by default (maximumScreenSpaceError)."""
+
+_MAJOR, _FLATTENING = 6378137.0, 1 / 298.257223563
+"""Major half axis in metres and flattening of the ellipsoid WGS 84."""
+
+
+@dataclass(frozen=True)
+class Georeference:
+    """Place of the scene's local origin, its `offset`, on the ellipsoid WGS 84.
+
+    Args:
+        longitude, latitude: degrees.
+        height: metres above the ellipsoid.
+        heading: direction of the scene's y axis if z is up, of z if −y is up, degrees clockwise from north.
+
+    Raises:
+        InputError: a value out of range.
+    """
+
+    longitude: float
+    latitude: float
+    height: float
+    heading: float = 0.0
+
+    def __post_init__(self) -> None:
+        require("longitude", self.longitude, abs(self.longitude) <= 180, "-180 to 180 degrees")
+        require("latitude", self.latitude, abs(self.latitude) <= 90, "-90 to 90 degrees")
+        for name in ("height", "heading"):
+            require(name, getattr(self, name), bool(np.isfinite(getattr(self, name))), "a finite number")
+
+    def matrix(self) -> Float:
+        """Return the (4, 4) matrix from x, y (along the heading), z up to earth-centred coordinates."""
+        lon, lat, turn = np.radians((self.longitude, self.latitude, self.heading))
+        east = np.array([-np.sin(lon), np.cos(lon), 0])
+        up = np.array([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)])
+        north = np.cross(up, east)
+        squared = _FLATTENING * (2 - _FLATTENING)
+        normal = _MAJOR / np.sqrt(1 - squared * np.sin(lat) ** 2)
+        matrix = np.eye(4)
+        matrix[:3, 0] = np.cos(turn) * east - np.sin(turn) * north
+        matrix[:3, 1] = np.sin(turn) * east + np.cos(turn) * north
+        matrix[:3, 2] = up
+        matrix[:3, 3] = (normal + self.height) * up - (0, 0, squared * normal * np.sin(lat))
+        return matrix
+
+
+def save_tileset(
+    path: str | Path,
+    levels: Sequence[Level],
+    *,
+    up: ArrayLike,
+    place: Georeference | None = None,
+    cut: Cut | None = None,
+    overwrite: bool = False,
+    work: Path | None = None,
+    progress: Progress = silent,
+) -> int:
+    """Write levels of detail as 3D Tiles 1.1: `tileset.json` and `LEVEL_N.glb`.
+
+    A tile's geometric error is 16 standard deviations of its median Gaussian, so that viewers refine it where
+    these exceed a pixel at the usual 16 pixels of screen-space error.
+
+    Args:
+        path: the output folder.
+        levels: the same scene at several levels, finest first, with equal offsets, in metres.
+        up: (3,) direction away from the ground.
+        place: where the scene's `offset` lies on the globe; None leaves it at the tileset's origin, z up.
+        cut: splitting rule of the tree, and the most Gaussians of a tile; None means `Cut()`.
+        overwrite: replace files in the folder, and remove files of its previous `tileset.json`.
+        work: folder for temporary files, which saves memory.
+        progress: called for files written.
+
+    Returns:
+        Bytes written.
+
+    Raises:
+        InputError: no levels, a level that is empty or not finite, or different offsets.
+        OutputError: see `atomic_folder`.
+    """
+    from g2ard import __version__
+    from g2ard.io.atomic import atomic_folder
+    from g2ard.io.glb import EXTENSION, SPZ_EXTENSION
+
+    path, rule = Path(path), cut or Cut()
+    tree = cut_tree(levels, rule, work)
+    tiles = _Tiles(levels, rule.most, path)
+    parts = tiles.of(tree, len(levels) - 1)
+    size = float(np.linalg.norm(tree.high - tree.low))
+    root = parts[0] if len(parts) == 1 else _tile(tree, size, parts)
+    matrix = np.eye(4) if place is None else place.matrix()
+    turn = np.eye(4)
+    turn[:3, :3] = _upright(up) @ _TILE_OF_SCENE.T
+    root["transform"] = (matrix @ turn).T.ravel().tolist()
+    extensions = [EXTENSION, SPZ_EXTENSION]
+    tileset = {
+        "asset": {"version": "1.1", "generator": f"g2ard {__version__}"},
+        "extras": {"counts": [len(level) for level in levels]},
+        "extensionsUsed": ["3DTILES_content_gltf"],
+        "extensions": {
+            "3DTILES_content_gltf": {"extensionsUsed": extensions, "extensionsRequired": extensions}
+        },
+        "geometricError": max(size, root["geometricError"]),
+        "root": root,
+    }
+    before = _named_in(path / "tileset.json")
+    with atomic_folder(path, overwrite) as folder:
+        written = 0
+        for number, name in enumerate(tiles.files, start=1):
+            content = b"".join(tiles.content(name))
+            (folder / name).write_bytes(content)
+            written += len(content)
+            progress("write", number, len(tiles.files))
+        text = json.dumps(tileset, separators=(",", ":"))
+        (folder / "tileset.json").write_text(text, encoding="utf-8", newline="\n")
+    for name in before - tiles.files.keys():
+        (path / name).unlink(missing_ok=True)
+    return written + len(text)
+
+
+def _upright(up: ArrayLike) -> Float:
+    """Return the (3, 3) rotation of `up` to z, which keeps x in the plane of x and z."""
+    axis = np.asarray(up, np.float64)
+    if axis.shape != (3,) or not np.isfinite(axis).all() or not axis.any():
+        raise InputError(f"expected three finite numbers, not all zero, got {up!r}", parameter="up")
+    axis = axis / np.linalg.norm(axis)
+    east = np.eye(3)[0 if abs(axis[0]) < 0.9 else 1]
+    east = east - (east @ axis) * axis
+    east /= np.linalg.norm(east)
+    return np.stack([east, np.cross(axis, east), axis])
+
+
+@dataclass
+class _Tiles:
+    """The tiles of a tree, and the rows of their files."""
+
+    levels: Sequence[Level]
+    most: int
+    path: Path
+    files: dict[str, tuple[int, list[NDArray[np.int64]], Float]] = field(default_factory=dict)
+
+    def of(self, node: Node | Leaf, level: int) -> list[dict[str, Any]]:
+        """Return tiles that together show a level, or finer ones where it is empty, and all below it."""
+        below: tuple[Node | Leaf, ...] = (node,) if isinstance(node, Leaf) else node.children
+        rows = [leaf.rows[level] for leaf in ([node] if isinstance(node, Leaf) else node.leaves())]
+        count = sum(map(len, rows))
+        if count > self.most and isinstance(node, Node):
+            return [tile for part in below for tile in self.of(part, level)]
+        finer = [tile for part in below for tile in self.of(part, level - 1)] if level else []
+        if not count:
+            return finer
+        error = max([self._error(level, rows), *(tile["geometricError"] for tile in finer)]) if finer else 0.0
+        name = f"{level}_{len(self.files)}.glb"
+        self.files[name] = level, rows, (node.low + node.high) / 2
+        return [_tile(node, error, finer) | {"content": {"uri": name}}]
+
+    def _error(self, level: int, rows: list[NDArray[np.int64]]) -> float:
+        """Return 16 standard deviations of the median Gaussian, along its two longer axes."""
+        scales = np.sort(self.levels[level].take(np.concatenate(rows)).scales, axis=1)[:, 1:]
+        return _MOST_ERROR * float(np.median(np.sqrt(scales.astype(np.float64).prod(axis=1))))
+
+    def content(self, name: str) -> list[bytes]:
+        """Return the .glb of a tile, whose node is moved to the middle of its box."""
+        from dataclasses import replace
+
+        from g2ard.io.glb import spz_glb
+        from g2ard.io.packing import writable
+
+        level, rows, middle = self.files[name]
+        splats = replace(self.levels[level].take(np.concatenate(rows)), offset=np.zeros(3))
+        return spz_glb(self.path / name, writable(self.path / name, splats), np.rint(middle))
+
+
+def _tile(node: Node | Leaf, error: float, children: list[dict[str, Any]]) -> dict[str, Any]:
+    middle = _TILE_OF_SCENE @ (node.low + node.high) / 2
+    half = np.abs(_TILE_OF_SCENE @ (node.high - node.low)) / 2
+    tile: dict[str, Any] = {
+        "boundingVolume": {"box": [*middle.tolist(), *np.diag(half).ravel().tolist()]},
+        "geometricError": error,
+        "refine": "REPLACE",
+    }
+    return {**tile, "children": children} if children else tile
+
+
+def _named_in(file: Path) -> set[str]:
+    """Return the names of the .glb files beside a tileset.json that it names."""
+    try:
+        text = file.read_text(encoding="utf-8")
+        tiles = [json.loads(text)["root"]]
+    except (OSError, ValueError, KeyError, TypeError):
+        return set()
+    found = set()
+    while tiles:
+        tile = tiles.pop()
+        found.add(str(tile.get("content", {}).get("uri", "")))
+        tiles += tile.get("children", [])
+    return {name for name in found if name.endswith(".glb") and "/" not in name and "\\" not in name}

@@ -1,0 +1,130 @@
+"""3D Tiles: the tree, what each tile holds, and where it stands on the globe."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from g2ard.errors import InputError
+from g2ard.io import read_splats, write_splats
+from g2ard.levels import Cut, Georeference, save_tileset
+from g2ard.scene.splats import Splats
+from helpers.commands import CommandLine, refused, succeeds
+from helpers.glb_files import glb_parts
+from helpers.level_files import scattered
+from helpers.scenes import checkered_ball
+
+UTM = (443_000.0, 5_411_000.5, 120.25)
+
+
+def tiles_of(tile: dict, level: int = 0) -> list[tuple[dict, dict | None]]:
+    """All tiles below and with this one, each with its parent."""
+    below = [(child, tile) for child in tile.get("children", [])]
+    return [*below, *(found for child, _ in below for found in tiles_of(child))]
+
+
+def ends(tile: dict) -> tuple[np.ndarray, np.ndarray]:
+    box = np.array(tile["boundingVolume"]["box"])
+    half = np.abs(box[3:].reshape(3, 3)).sum(0)
+    return box[:3] - half, box[:3] + half
+
+
+def points_of(file: Path) -> np.ndarray:
+    """Means of a tile in its own axes, z up: from the node's matrix and the SPZ, as CesiumJS does."""
+    document, binary = glb_parts(file)
+    view = document["bufferViews"][0]
+    inside = file.with_suffix(".spz")
+    inside.write_bytes(binary[: view["byteLength"]])
+    stored = read_splats(inside).means * (1, -1, -1)
+    inside.unlink()
+    x, y, z = (stored + document["nodes"][0]["matrix"][12:15]).T
+    return np.stack([x, -z, y], axis=1)
+
+
+@pytest.mark.parametrize("rule", [Cut(), Cut(most=300), Cut(most=30), Cut(extent=2, least=20)])
+def test_each_level_is_whole_and_tiles_shrink_downwards(tmp_path: Path, rule: Cut) -> None:
+    levels = [scattered(900), scattered(400, 1), scattered(150, 2), scattered(40, 3)]
+    size = save_tileset(tmp_path, levels, up=(0, 0, 1), cut=rule)
+    tileset = json.loads((tmp_path / "tileset.json").read_text())
+    assert size == sum(file.stat().st_size for file in tmp_path.iterdir())
+    root = tileset["root"]
+    assert root["geometricError"] <= tileset["geometricError"]
+    counts = [0] * 4
+    for tile, parent in [(root, None), *tiles_of(root)]:
+        low, high = ends(tile)
+        if parent is not None:
+            assert tile["geometricError"] <= parent["geometricError"]
+            assert (low >= ends(parent)[0] - 1e-6).all()
+            assert (high <= ends(parent)[1] + 1e-6).all()
+        assert tile["refine"] == "REPLACE"
+        assert ("children" in tile) == (tile["geometricError"] > 0)
+        if "content" not in tile:
+            assert tile is root
+            continue
+        points = points_of(tmp_path / tile["content"]["uri"])
+        assert len(points) <= max(rule.most, 1)
+        assert (points >= low - 1e-3).all()
+        assert (points <= high + 1e-3).all()
+        counts[int(tile["content"]["uri"][0])] += len(points)
+    assert counts == [900, 400, 150, 40]
+    save_tileset(tmp_path, levels[:1], up=(0, 0, 1), overwrite=True)
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["0_0.glb", "tileset.json"]
+
+
+def geocentric(lon: float, lat: float, height: float) -> np.ndarray:
+    """WGS 84 by its two half axes, in the order of a textbook."""
+    a, b = 6378137.0, 6356752.314245179
+    lon, lat = np.radians((lon, lat))
+    n = a * a / np.hypot(a * np.cos(lat), b * np.sin(lat))
+    r = (n + height) * np.cos(lat)
+    return np.array([r * np.cos(lon), r * np.sin(lon), (b * b / (a * a) * n + height) * np.sin(lat)])
+
+
+@pytest.mark.parametrize("heading", [0.0, 90.0, 200.0])
+@pytest.mark.parametrize("up", [(0, 0, 1), (0, -1, 0), (0, 1, 0)])
+def test_points_lie_where_the_georeference_says(tmp_path: Path, up: tuple, heading: float) -> None:
+    forward = {(0, 0, 1): (0, 1, 0), (0, -1, 0): (0, 0, 1), (0, 1, 0): (0, 0, -1)}[up]
+    means = np.float32([(0, 0, 0), np.multiply(40, forward), np.multiply(25, up), (30, 0, 0)])
+    scene = Splats.create(means, scales=np.full((4, 3), 0.5), offset=UTM)
+    lon, lat, height = 24.75, 59.43, 31.5
+    save_tileset(tmp_path, [scene], up=up, place=Georeference(lon, lat, height, heading))
+    root = json.loads((tmp_path / "tileset.json").read_text())["root"]
+    matrix = np.array(root["transform"]).reshape(4, 4).T
+    found = points_of(tmp_path / root["content"]["uri"]) @ matrix[:3, :3].T + matrix[:3, 3]
+    step = 1e-5
+    north = (geocentric(lon, lat + step, height) - geocentric(lon, lat - step, height)) / 2
+    east = (geocentric(lon + step, lat, height) - geocentric(lon - step, lat, height)) / 2
+    north, east = north / np.linalg.norm(north), east / np.linalg.norm(east)
+    angle = np.radians(heading)
+    ahead = np.cos(angle) * north + np.sin(angle) * east
+    right = np.cos(angle) * east - np.sin(angle) * north
+    origin = geocentric(lon, lat, height)
+    wanted = {(0, 0, 0): origin, (30, 0, 0): origin + 30 * right}
+    wanted[tuple(means[1])] = origin + 40 * ahead
+    wanted[tuple(means[2])] = geocentric(lon, lat, height + 25)
+    for point in wanted.values():
+        assert np.linalg.norm(found - point, axis=1).min() < 1e-3
+
+
+def test_an_impossible_place_is_refused() -> None:
+    with pytest.raises(InputError, match="latitude: expected"):
+        Georeference(0, 91, 0)
+    with pytest.raises(InputError, match="heading: expected"):
+        Georeference(0, 0, 0, float("nan"))
+
+
+def test_the_command_writes_3d_tiles(tmp_path: Path, command_line: CommandLine) -> None:
+    write_splats(tmp_path / "a.ply", replace(checkered_ball(800), offset=np.array(UTM)))
+    words = ["lod", "a.ply", "-r", "1,4", "--merge-only", "--format", "3dtiles", "-o"]
+    there = ["--georeference", "24.75,59.43,31.5,45"]
+    assert "up is 0, 0, 1" in succeeds(command_line, tmp_path, *words, "out", *there).err
+    tileset = json.loads((tmp_path / "out" / "tileset.json").read_text())
+    assert tileset["extras"]["counts"] == [800, 200]
+    origin = np.array(tileset["root"]["transform"][12:15])
+    np.testing.assert_allclose(origin, geocentric(24.75, 59.43, 31.5), atol=1e-6)
+    succeeds(command_line, tmp_path, *words, "out", *there, "--resume")
+    message = refused(command_line, tmp_path, "lod", "a.ply", "-o", "b", "--georeference", "0,0,0")
+    assert "--format 3dtiles" in message
+    assert "latitude" in refused(command_line, tmp_path, *words, "c", "--georeference", "0,99,0")
