@@ -71,7 +71,7 @@ def anywhere_views(splats: Splats, count: int = 24, seed: int = 0) -> Cameras:
 def _is_clear(arrays: Any, view: Any, splats: Splats, row: int, close: Any, near: float) -> bool:
     """Return whether a small render shows the aim through little matter, and little that is close."""
     camera = _cameras([view], _TRIED).recentred(splats.offset)
-    settings = RasterSettings(near=near)
+    settings = RasterSettings(antialiased=False, near=near)
     sums: dict[str, Any] = _core.accumulate(arrays, [view_of(camera, 0, settings)], settings, None)
     if sums["weight"][close].sum() > _MURK * _TRIED[0] * _TRIED[1] or not sums["hits"][row]:
         return False

@@ -99,7 +99,7 @@ def built_in_view(splats: Splats, width: int, height: int) -> Cameras:
 
 
 def _row(splats: Splats, cameras: Cameras, isa: str, repeats: int) -> Row:
-    settings = RasterSettings()
+    settings = RasterSettings(antialiased=False)
     local = cameras.recentred(splats.offset)
     arrays, view = arrays_of(splats), view_of(local, 0, settings)
     width, height = view[2]

@@ -15,7 +15,7 @@ from contextlib import contextmanager
 from itertools import combinations
 from pathlib import Path
 from types import MappingProxyType
-from typing import Annotated, Any, NoReturn
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
 
@@ -25,9 +25,13 @@ from g2ard.cli.config import load_config, printed
 from g2ard.cli.console import Console
 from g2ard.cli.panels import COMMON, GROUPED, into_panels
 from g2ard.cli.usage import flags_of, in_flags, typed
+from g2ard.config.choices import RenderModel
 from g2ard.errors import G2ardError
 from g2ard.progress import plural
 from g2ard.system import interrupt
+
+if TYPE_CHECKING:
+    from g2ard.scene.splats import Splats
 
 __all__ = ["Run", "app", "command", "group", "one_line"]
 
@@ -81,6 +85,11 @@ _SET = typer.Option(
 )
 
 
+_RENDER_MODEL = typer.Option(
+    "--render-model", help="How the scenes are drawn, if their files do not say it or say it wrongly."
+)
+
+
 class Run:
     """One invocation of a command: its common options, its console and its result."""
 
@@ -100,6 +109,7 @@ class Run:
         self.verbose: bool = common["verbose"]
         self.json: str | None = common["json"]
         self.console = Console(quiet=common["quiet"])
+        self.render_model: RenderModel | None = common.get("render_model")
         self.only_checks = False  # end after checking the settings
         self.noted = False  # whether a GPU failed
         self._adapter: str | None = None  # last adapter in use
@@ -110,8 +120,7 @@ class Run:
         self._inputs = [p for p in paths if isinstance(p, Path) and all(p is not w for w in written)]
         own = {name: _flat(value) for name, value in options.items()}
         self.config = {**own, "seed": self.seed, "threads": self.threads, "device": self.device}
-        if "set" in common:
-            self.config["set"] = common["set"]
+        self.config |= {name: common[name] for name in ("set", "render_model") if name in common}
 
     def settings(self, config: Any, *names: str, preset: str | None = None) -> dict[str, Any]:
         """Collect config values by path from options and --set, which wins.
@@ -191,6 +200,21 @@ class Run:
         used = {"adapter": state.adapter, "kernels": state.served, "uploaded_bytes": state.uploaded_bytes}
         return {"device": used}
 
+    def load(self, path: Path) -> Splats:
+        """Read a scene with --render-model, and report its notes."""
+        from g2ard.jobs.inputs import load_scene
+
+        return load_scene(path, self.say, self.render_model)
+
+    def write(self, path: Path, splats: Splats, *, overwrite: bool = False, **options: Any) -> None:
+        """Write a scene, and report what its format cannot hold."""
+        from g2ard.io import write_splats
+        from g2ard.io.scene_formats import lost_in
+
+        write_splats(path, splats, overwrite=self.overwrite or overwrite, **options)
+        for note in lost_in(path, splats):
+            self.say(f"note: {path}: {note}")
+
     def spare_inputs(self, *outputs: Path) -> None:
         """Raise a usage error if an output is also an input, even with --overwrite."""
         from g2ard.io.detect import run_scene
@@ -232,7 +256,13 @@ def group(name: str, text: str) -> typer.Typer:
 
 
 def command(
-    name: str, *, example: str, parent: typer.Typer = app, cuda: bool = False, settings: bool = False
+    name: str,
+    *,
+    example: str,
+    parent: typer.Typer = app,
+    cuda: bool = False,
+    settings: bool = False,
+    scenes: bool = False,
 ) -> Callable[[Any], Any]:
     """Register `fn(run, **options)` as a command.
 
@@ -242,11 +272,16 @@ def command(
         parent: group it belongs to.
         cuda: whether it supports --device cuda.
         settings: whether it takes --set, see `Run.settings`.
+        scenes: whether it reads scenes and takes --render-model, see `Run.load`.
     """
 
     def register(fn: Callable[..., None]) -> Callable[..., None]:
         own = list(inspect.signature(fn, eval_str=True).parameters.values())[1:]
-        shared_options = {**_COMMON, "set": (list[str] | None, None, _SET)} if settings else _COMMON
+        shared_options = dict(_COMMON)
+        if settings:
+            shared_options["set"] = (list[str] | None, None, _SET)
+        if scenes:
+            shared_options["render_model"] = (RenderModel | None, None, _RENDER_MODEL)
         common = [
             inspect.Parameter(
                 key, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=Annotated[kind, option]

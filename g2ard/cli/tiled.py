@@ -49,6 +49,7 @@ class TiledCommand:
                 config=config,
                 up=up,
                 seed=run.seed,
+                render_model=run.render_model,
                 progress=run.progress,
                 say=run.say,
             )
@@ -60,7 +61,9 @@ class TiledCommand:
                     "views": small.views,
                     "unseen": small.unseen,
                     "method": "default",
-                    "settings": listed(config.resolved("default")),
+                    "settings": listed(
+                        config.resolved("default", antialiased=small.render_model == "antialiased")
+                    ),
                 }
                 seconds = report["seconds"]["total"]
                 run.say(f"{place}: {len(small):,} of {store.count:,} Gaussians in {seconds:.1f} s")
@@ -124,15 +127,15 @@ class TiledCommand:
         run.result(reports[0] if len(reports) == 1 else {"runs": [reports[at] for at in sorted(reports)]})
 
     def _write(self, place: Path, store: TileStore, small: TiledScene) -> None:
-        from g2ard import io
         from g2ard.io.ply import write_parts
         from g2ard.io.scene_formats import scene_format
 
         if scene_format(place).suffix == ".ply":
-            overwrite = self.run.overwrite
-            write_parts(place, small, len(small), small.sh_degree, small.offset, overwrite=overwrite)
+            parts = small, len(small), small.sh_degree, small.offset
+            model = small.render_model
+            write_parts(place, *parts, render_model=model, overwrite=self.run.overwrite)
         else:
-            io.write_splats(place, small.whole(), overwrite=self.run.overwrite)
+            self.run.write(place, small.whole())
 
 
 def _report(store: TileStore, small: TiledScene, began: float) -> dict[str, Any]:

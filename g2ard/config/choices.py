@@ -58,6 +58,10 @@ Convention = Literal["gsplat", "inria"]
 """Rasteriser conventions that renderers disagree on (`g2ard.rendering.renderer`)."""
 CONVENTIONS: tuple[Convention, ...] = get_args(Convention)
 
+RenderModel = Literal["classic", "antialiased"]
+"""Renderings that scenes are trained for; antialiased is also called mip (`g2ard.rendering.renderer`)."""
+RENDER_MODELS: tuple[RenderModel, ...] = get_args(RenderModel)
+
 LpipsInput = Literal["scaled", "unscaled"]
 """Value range of the images passed to LPIPS's networks (`g2ard.rendering.lpips`)."""
 LPIPS_INPUTS: tuple[LpipsInput, ...] = get_args(LpipsInput)

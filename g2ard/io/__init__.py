@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import ArrayLike
 
-    from g2ard.config.choices import Alpha
+    from g2ard.config.choices import Alpha, RenderModel
     from g2ard.io.point_stream import PointStream
     from g2ard.io.stream import SceneStream
     from g2ard.io.types import Cloud, Note, Points, Scene, ViewFiles, ViewSet
@@ -69,12 +69,13 @@ def __getattr__(name: str) -> Any:
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
-def read_splats(path: str | Path) -> Splats:
+def read_splats(path: str | Path, *, render_model: RenderModel | None = None) -> Splats:
     """Read a Gaussian scene.
 
     Args:
         path: .ply (3DGS), .compressed.ply, .sog or a SOG folder, .spz, .glb, .splat, OpenUSD (.usda,
             .usdc); or a folder written by `distill` or `ingest`.
+        render_model: "classic" or "antialiased"; None means what the file says, classic if it says nothing.
 
     Returns:
         The scene: linear scales, logit opacities, means relative to `offset`.
@@ -88,22 +89,29 @@ def read_splats(path: str | Path) -> Splats:
     >>> g2ard.load(path).scales.round(5).tolist()
     [[1.0, 1.0, 1.0], [1.0, 2.0, 3.0]]
     """
-    return read_scene(path).splats
+    return read_scene(path, render_model=render_model).splats
 
 
-def read_scene(path: str | Path) -> Scene:
+def read_scene(path: str | Path, *, render_model: RenderModel | None = None) -> Scene:
     """Read a Gaussian scene with notes on dropped rows, clamped values and ignored properties."""
+    from dataclasses import replace
     from importlib import import_module
 
     path, found = check_scene(path)
-    return import_module(f"g2ard.io.{found}").read(path)
+    scene: Scene = import_module(f"g2ard.io.{found}").read(path)
+    if render_model is None:
+        return scene
+    return replace(scene, splats=replace(scene.splats, render_model=render_model))
 
 
-def open_stream(path: str | Path | Sequence[str | Path]) -> SceneStream:
+def open_stream(
+    path: str | Path | Sequence[str | Path], *, render_model: RenderModel | None = None
+) -> SceneStream:
     """Open a scene, or several as one, for reading in blocks.
 
     Memory holds one block of a .ply, .compressed.ply or .splat, one chunk of a SOG, one tile, or the whole
-    file of other formats. Several scenes get the offset of the first and the highest of their SH degrees.
+    file of other formats. Several scenes get the offset of the first and the highest of their SH degrees;
+    their render models must agree. `render_model` overrides what files say.
     """
     from importlib import import_module
 
@@ -111,7 +119,7 @@ def open_stream(path: str | Path | Sequence[str | Path]) -> SceneStream:
     from g2ard.io.stream import JoinedScenes, PartsStream, file_identity
 
     if not isinstance(path, str | Path):
-        streams = [open_stream(part) for part in path]
+        streams = [open_stream(part, render_model=render_model) for part in path]
         if not streams:
             raise InputError("no scene given")
         return streams[0] if len(streams) == 1 else JoinedScenes(streams)
@@ -119,11 +127,13 @@ def open_stream(path: str | Path | Sequence[str | Path]) -> SceneStream:
     module = import_module(f"g2ard.io.{found}")
     if hasattr(module, "stream"):
         stream: SceneStream = module.stream(path)
-        return stream
-    scene: Scene = module.read(path)
-    splats = scene.splats
-    parts = [len(splats)], lambda _: splats, splats.sh_degree, splats.offset
-    return PartsStream(path, *parts, file_identity([path]), scene.notes)
+    else:
+        scene: Scene = module.read(path)
+        splats = scene.splats
+        parts = [len(splats)], lambda _: splats, splats.sh_degree, splats.offset
+        stream = PartsStream(path, *parts, file_identity([path]), scene.notes, splats.render_model)
+    stream.render_model = render_model or stream.render_model
+    return stream
 
 
 def check_scene(path: str | Path) -> tuple[Path, str]:
@@ -181,6 +191,9 @@ def write_splats(path: str | Path, splats: Splats, *, overwrite: bool = False, *
         **options: format options: `normals=True` adds nx ny nz to a .ply, `spz_version=4` writes .spz
             version 4 instead of 3, `compress="spz"` an SPZ inside of a .glb.
 
+    Warns:
+        UserWarning: an antialiased scene in a format that cannot say so (.glb, .splat, OpenUSD).
+
     Raises:
         OutputError: the file exists or cannot be written, or the extension or an option is unsupported.
         InputError: the scene is empty, has a non-finite value, or one that the format cannot store.
@@ -192,13 +205,16 @@ def write_splats(path: str | Path, splats: Splats, *, overwrite: bool = False, *
     >>> len(g2ard.load(path))
     1
     """
+    import warnings
     from importlib import import_module
 
-    from g2ard.io.scene_formats import check_options
+    from g2ard.io.scene_formats import check_options, lost_in
 
     found = check_options(path, options)
     writer = getattr(import_module(f"g2ard.io.{found.module}"), found.function)
     writer(Path(path), splats, overwrite=overwrite, **options)
+    for note in lost_in(path, splats):
+        warnings.warn(f"{path}: {note}", stacklevel=2)
 
 
 def read_points(path: str | Path) -> Points:

@@ -26,9 +26,9 @@ def describe(path: str | Path) -> dict[str, Any]:
 
     Returns:
         `path`, `kind`, `format`, `bytes`, `count`, `extent` {min, max, robust_min, robust_max: the 1st and
-        99th percentiles} and `notes` [{code, count, text}]. Scenes add `sh_degree`, `odd`, and `opacity`,
-        `largest_scale`, `smallest_scale`, `elongation` as quantiles by percentage. Point clouds add `color`,
-        views `photos`, `sizes`, `fov_degrees`, `splits`.
+        99th percentiles} and `notes` [{code, count, text}]. Scenes add `sh_degree`, `render_model`, `odd`,
+        and `opacity`, `largest_scale`, `smallest_scale`, `elongation` as quantiles by percentage. Point
+        clouds add `color`, views `photos`, `sizes`, `fov_degrees`, `splits`.
     """
     path, what = Path(path), kind(path)
     if what == "splats":
@@ -80,6 +80,7 @@ def _splats(splats: Splats) -> dict[str, Any]:
     return {
         "count": len(splats),
         "sh_degree": splats.sh_degree,
+        "render_model": splats.render_model,
         "bytes_as_ply": splats.nbytes,
         "offset": splats.offset.tolist(),
         "extent": _extent(splats.means.astype(np.float64) + splats.offset),

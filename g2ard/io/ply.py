@@ -11,9 +11,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from g2ard.config.choices import RenderModel
 from g2ard.errors import InputError
 from g2ard.io.atomic import atomic_output
-from g2ard.io.plyfiles import offset_of, read_element, read_header, require, row_blocks, spread_rows
+from g2ard.io.plyfiles import (
+    comments_of,
+    offset_of,
+    read_element,
+    read_header,
+    render_model_of,
+    require,
+    row_blocks,
+    spread_rows,
+)
 from g2ard.io.sanitize import BLOCK, LOG_SCALE_LIMIT, Raw, cleaned
 from g2ard.io.stream import SceneStream, file_identity
 from g2ard.io.types import Note, Scene
@@ -27,6 +37,8 @@ _QUATS = ["rot_0", "rot_1", "rot_2", "rot_3"]
 _NEEDED = [*_MEANS, *_DC, "opacity", *_SCALES, *_QUATS]
 _NORMALS = ["nx", "ny", "nz"]
 _REST_OF_BANDS = (0, 3, 8, 15)
+_FLAT = np.log(np.float32(1e-3))
+"""Logarithm of the thickness of 2D Gaussians over their shorter scale."""
 
 
 @dataclass(frozen=True)
@@ -40,18 +52,28 @@ class _Layout:
     offset: NDArray[np.float64]
     shift: NDArray[np.float64]
     notes: list[Note]
+    render_model: RenderModel
+    flat: bool
 
     @classmethod
     def of(cls, path: Path) -> _Layout:
         header = read_header(path)
         properties = header.properties.get("vertex", [])
-        require(path, properties, _NEEDED, "a 3DGS scene")
+        mode = render_model_of(header)
+        flat = mode == "2dgs" or ("scale_1" in properties and "scale_2" not in properties)
+        needed = [name for name in _NEEDED if not flat or name != "scale_2"]
+        require(path, properties, needed, "a 3DGS scene")
         rest = sorted((p for p in properties if re.fullmatch(r"f_rest_\d{1,3}", p)), key=lambda p: int(p[7:]))
         stored, kept = _bands(path, rest)
         (rows,) = read_element(path, header, "vertex")
         shift = _recentre(spread_rows(rows)) if rows.dtype["x"].itemsize == 8 else np.zeros(3)
         offset = offset_of(path, header) + shift
-        return cls(rows, rest, stored, kept, offset, shift, _ignored(properties, rest, stored, kept))
+        notes = _ignored(properties, rest, stored, kept)
+        if flat:
+            text = "2DGS scene read as flat Gaussians; renders differ where surfaces are seen at a slant"
+            notes.append(Note("flat_gaussians", len(rows), text))
+        model: RenderModel = "antialiased" if mode == "antialiased" and not flat else "classic"
+        return cls(rows, rest, stored, kept, offset, shift, notes, model, flat)
 
     def raw(self, rows: NDArray[Any]) -> Raw:
         raw = Raw.empty(len(rows), self.kept)
@@ -59,7 +81,7 @@ class _Layout:
         with np.errstate(over="ignore", invalid="ignore"):  # rows beyond float32 become inf and are dropped
             for start in range(0, len(rows), BLOCK):
                 at = slice(start, start + BLOCK)
-                _read_block(rows[at], raw, at, self.rest, self.stored, self.shift)
+                _read_block(rows[at], raw, at, self)
         return raw
 
 
@@ -69,7 +91,7 @@ def read(path: Path) -> Scene:
     float64 positions that float32 cannot represent are recentred; the shift is stored in `offset`.
     """
     layout = _Layout.of(path)
-    return cleaned(path, layout.raw(np.asarray(layout.rows)), layout.notes)
+    return cleaned(path, layout.raw(np.asarray(layout.rows)), layout.notes, layout.render_model)
 
 
 def stream(path: Path) -> SceneStream:
@@ -80,7 +102,8 @@ def stream(path: Path) -> SceneStream:
 class _PlyStream(SceneStream):
     def __init__(self, path: Path) -> None:
         layout = self._layout = _Layout.of(path)
-        super().__init__(path, len(layout.rows), layout.kept, layout.offset, tuple(layout.notes))
+        notes, model = tuple(layout.notes), layout.render_model
+        super().__init__(path, len(layout.rows), layout.kept, layout.offset, notes, model)
 
     def identity(self) -> list[Any]:
         return file_identity([self.path])
@@ -130,14 +153,17 @@ def _recentre(sample: NDArray[Any]) -> NDArray[np.float64]:
     return np.where(far.any(), np.rint(middle), 0.0)
 
 
-def _read_block(
-    block: NDArray[Any], raw: Raw, at: slice, rest: list[str], stored: int, shift: NDArray[np.float64]
-) -> None:
+def _read_block(block: NDArray[Any], raw: Raw, at: slice, layout: _Layout) -> None:
     from numpy.lib.recfunctions import structured_to_unstructured
 
-    raw.means[at] = _means(block, shift)
+    rest, stored = layout.rest, layout.stored
+    raw.means[at] = _means(block, layout.shift)
     raw.sh0[at, 0] = structured_to_unstructured(block[_DC])
-    raw.log_scales[at] = structured_to_unstructured(block[_SCALES])
+    if layout.flat:
+        raw.log_scales[at, :2] = structured_to_unstructured(block[_SCALES[:2]])
+        raw.log_scales[at, 2] = raw.log_scales[at, :2].min(axis=1) + _FLAT
+    else:
+        raw.log_scales[at] = structured_to_unstructured(block[_SCALES])
     raw.quats[at] = structured_to_unstructured(block[_QUATS])
     raw.logit_opacities[at] = block["opacity"]
     if rest:  # channel-major: all of red's coefficients, then green's, then blue's
@@ -156,8 +182,9 @@ def _means(block: NDArray[Any], shift: NDArray[np.float64]) -> NDArray[np.float3
 def write(path: Path, splats: Splats, *, overwrite: bool = False, normals: bool = False) -> None:
     """Write a binary little-endian 3DGS .ply: x y z, f_dc, f_rest, opacity, scale, rot.
 
-    A non-zero `offset` is stored in a comment, which `read` restores. `normals` adds zero nx ny nz, 12 bytes
-    per Gaussian, for programs with a fixed layout such as INRIA's SIBR viewer (which also needs SH degree 3).
+    A non-zero `offset` and an antialiased render model are stored in comments, which `read` restores.
+    `normals` adds zero nx ny nz, 12 bytes per Gaussian, for programs with a fixed layout such as INRIA's SIBR
+    viewer (which also needs SH degree 3).
     """
     write_parts(
         path,
@@ -165,6 +192,7 @@ def write(path: Path, splats: Splats, *, overwrite: bool = False, normals: bool 
         len(splats),
         splats.sh_degree,
         splats.offset,
+        render_model=splats.render_model,
         overwrite=overwrite,
         normals=normals,
     )
@@ -177,6 +205,7 @@ def write_parts(
     sh_degree: int,
     offset: NDArray[np.float64],
     *,
+    render_model: RenderModel = "classic",
     overwrite: bool = False,
     normals: bool = False,
 ) -> None:
@@ -190,9 +219,7 @@ def write_parts(
     names += [f"f_rest_{k}" for k in range(rest)] + ["opacity", *_SCALES, *_QUATS]
     one_row = np.zeros(1, [(name, "<f4") for name in names])
     rows = PlyElement.describe(np.broadcast_to(one_row, count), "vertex")  # costs no memory
-    comments = ["generated by g2ard"]
-    if offset.any():
-        comments.append("g2ard offset " + " ".join(repr(float(v)) for v in offset))
+    comments = comments_of(offset, render_model)
     header = PlyData([rows], byte_order="<", comments=comments).header
     with atomic_output(path, overwrite) as temporary, temporary.open("wb") as file:
         file.write(header.encode("ascii") + b"\n")

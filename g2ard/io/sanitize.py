@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from g2ard.config.choices import RenderModel
 from g2ard.errors import InputError
 from g2ard.io.types import Note, Scene
 from g2ard.progress import plural
@@ -58,14 +59,23 @@ class Raw:
             self.offset,
         )
 
-    def activated(self) -> Splats:
+    def activated(self, render_model: RenderModel = "classic") -> Splats:
         """Return the scene, after `Tally.clean` has exponentiated `log_scales` in place."""
         return Splats(
-            self.means, self.quats, self.log_scales, self.logit_opacities, self.sh0, self.shN, self.offset
+            self.means,
+            self.quats,
+            self.log_scales,
+            self.logit_opacities,
+            self.sh0,
+            self.shN,
+            self.offset,
+            render_model,
         )
 
 
-def cleaned(path: Path, raw: Raw, notes: list[Note] | None = None) -> Scene:
+def cleaned(
+    path: Path, raw: Raw, notes: list[Note] | None = None, render_model: RenderModel = "classic"
+) -> Scene:
     """Check, clamp and activate a scene, whose arrays become those of the result.
 
     Rows with NaN or meaningless infinities are dropped. Logits (|x| > 16) and log-scales (|x| > 43) are
@@ -78,7 +88,7 @@ def cleaned(path: Path, raw: Raw, notes: list[Note] | None = None) -> Scene:
         rows = slice(start, start + BLOCK)
         keep[rows] = tally.clean(raw.take(rows))
     notes = [*(notes or ()), *tally.notes(path)]
-    splats = raw.activated()
+    splats = raw.activated(render_model)
     return Scene(splats.take(keep) if tally.dropped else splats, tuple(notes))
 
 

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from g2ard.config.choices import FormatName
 from g2ard.errors import OutputError
+
+if TYPE_CHECKING:
+    from g2ard.io.types import Note
+    from g2ard.scene.splats import Splats
 
 
 class SceneFormat(NamedTuple):
@@ -17,12 +21,14 @@ class SceneFormat(NamedTuple):
         module: its module in `g2ard.io`.
         function: the writer in the module, `fn(path, splats, *, overwrite, **options)`.
         options: names of its options.
+        models: whether it can state the render model.
     """
 
     suffix: str
     module: str
     function: str = "write"
     options: tuple[str, ...] = ()
+    models: bool = True
 
 
 FORMATS: dict[FormatName, SceneFormat] = {
@@ -30,10 +36,10 @@ FORMATS: dict[FormatName, SceneFormat] = {
     "ply": SceneFormat(".ply", "ply", options=("normals",)),
     "sog": SceneFormat(".sog", "sog_write"),
     "spz": SceneFormat(".spz", "spz", options=("spz_version",)),
-    "glb": SceneFormat(".glb", "glb", options=("compress",)),
-    "splat": SceneFormat(".splat", "splat"),
-    "usda": SceneFormat(".usda", "usd"),
-    "usdc": SceneFormat(".usdc", "usd"),
+    "glb": SceneFormat(".glb", "glb", options=("compress",), models=False),
+    "splat": SceneFormat(".splat", "splat", models=False),
+    "usda": SceneFormat(".usda", "usd", models=False),
+    "usdc": SceneFormat(".usdc", "usd", models=False),
 }
 """Formats by name, longer suffixes first."""
 
@@ -54,6 +60,17 @@ def scene_format(path: str | Path) -> SceneFormat:
             return found
     known = ", ".join(f.suffix for f in FORMATS.values())
     raise OutputError(f"scenes are written as {known}, or as a SOG folder (NAME/meta.json)", path=path)
+
+
+def lost_in(path: str | Path, splats: Splats) -> list[Note]:
+    """Return notes on what the format of an output path cannot hold."""
+    found = scene_format(path)
+    if found.models or not splats.antialiased:
+        return []
+    from g2ard.io.types import Note
+
+    text = f"{found.suffix} cannot say that the scene is antialiased, so other programs draw it too opaque"
+    return [Note("lost_render_model", 1, text)]
 
 
 def check_options(path: str | Path, options: dict[str, object]) -> SceneFormat:

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from g2ard.config.choices import RenderModel
 from g2ard.errors import DAMAGED, InputError
 from g2ard.io.jsonfile import (
     Fields,
@@ -34,10 +35,11 @@ from g2ard.io.jsonfile import (
 from g2ard.io.limits import check_unpacked
 from g2ard.io.paths import check_regular
 from g2ard.io.sanitize import Raw, cleaned
-from g2ard.io.sog_chunk import Chunk, Decoder, count_of, means_of, rest_of
+from g2ard.io.sog_chunk import Chunk, Decoder, count_of, means_of, render_model_of, rest_of
 from g2ard.io.stream import SceneStream, file_identity
 from g2ard.io.types import Note, Scene
 from g2ard.progress import plural
+from g2ard.scene.transform import one_model
 
 _CHUNK_NAME = re.compile(r"(\d+)_(\d+)")
 
@@ -95,8 +97,8 @@ def read(path: Path) -> Scene:
         for chunk, count in zip(chunks, counts, strict=True):
             Decoder(chunk, count).fill(slice(0, count), raw.take(slice(start, start + count)))
             start += count
-        raw.offset = _offset(chunks)
-    return cleaned(path, raw, _left_out(path, len(chunks)))
+        raw.offset, model = _offset(chunks), _render_model(chunks)
+    return cleaned(path, raw, _left_out(path, len(chunks)), model)
 
 
 def stream(path: Path) -> SceneStream:
@@ -105,10 +107,11 @@ def stream(path: Path) -> SceneStream:
         counts = [count_of(chunk) for chunk in chunks]
         rest = max(map(rest_of, chunks), default=0)
         offset, notes = _offset(chunks), tuple(_left_out(path, len(chunks)))
+        model = _render_model(chunks)
     files = [path]
     if path.suffix.lower() != ".sog":
         files = sorted(file for folder in chunks_of(path) for file in folder.iterdir() if file.is_file())
-    return _SogStream(path, counts, rest, offset, notes, files, lambda: _opened(path))
+    return _SogStream(path, counts, rest, offset, notes, model, files, lambda: _opened(path))
 
 
 def _offset(chunks: list[Chunk]) -> NDArray[np.float64]:
@@ -118,6 +121,10 @@ def _offset(chunks: list[Chunk]) -> NDArray[np.float64]:
         own = object_of(chunk.meta, "g2ard") if "g2ard" in chunk.meta else Fields({})
         found.add(tuple(numbers(own, "offset", 3)) if "offset" in own else (0.0, 0.0, 0.0))
     return np.array(found.pop() if len(found) == 1 else (0, 0, 0), np.float64)
+
+
+def _render_model(chunks: list[Chunk]) -> RenderModel:
+    return one_model([render_model_of(chunk) for chunk in chunks] or ["classic"])
 
 
 def _left_out(path: Path, read_count: int) -> list[Note]:
@@ -139,6 +146,7 @@ class _SogStream(SceneStream):
         rest: largest number of coefficients past band 0.
         offset: (3,) float64.
         notes: notes so far.
+        render_model: see `Splats`.
         files: files of the scene.
         opened: function that opens the chunks.
     """
@@ -150,10 +158,11 @@ class _SogStream(SceneStream):
         rest: int,
         offset: NDArray[np.float64],
         notes: tuple[Note, ...],
+        render_model: RenderModel,
         files: list[Path],
         opened: Callable[[], AbstractContextManager[list[Chunk]]],
     ) -> None:
-        super().__init__(path, sum(counts), rest, offset, notes)
+        super().__init__(path, sum(counts), rest, offset, notes, render_model)
         self._counts, self._rest, self._files, self._opened = counts, rest, files, opened
 
     def identity(self) -> list[Any]:

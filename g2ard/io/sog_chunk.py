@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from g2ard.config.choices import RenderModel
 from g2ard.errors import InputError
 from g2ard.io.jsonfile import Fields, listed, names_of, numbers, object_of, whole
 
@@ -47,6 +48,12 @@ def count_of(chunk: Chunk) -> int:
             pixels = image.width * image.height
             raise InputError(f"has {pixels:,} pixels for {count:,} Gaussians", path=chunk.place / first)
     return count
+
+
+def render_model_of(chunk: Chunk) -> RenderModel:
+    """Return the render model: "model", or in older files "antialias"."""
+    found = chunk.meta.get("model", "antialiased" if chunk.meta.get("antialias") is True else "default")
+    return "antialiased" if found == "antialiased" else "classic"
 
 
 def rest_of(chunk: Chunk) -> int:

@@ -86,7 +86,9 @@ def sog_files(path: Path, splats: Splats, *, ordered: bool = False) -> dict[str,
         splats = splats.take(morton_order(splats.means))
     width, height = _size(path, len(splats))
     files, meta = {}, {"version": 2, "asset": {"generator": f"g2ard {__version__}"}, "count": len(splats)}
-    meta["antialias"] = False
+    meta["antialias"] = splats.antialiased
+    if splats.antialiased:
+        meta["model"] = "antialiased"  # newer spelling
 
     def image(name: str, pixels: NDArray[Any]) -> str:
         room = np.zeros((width * height, 4), np.uint8)

@@ -40,7 +40,7 @@ _HEADER = 16
 
 _POSITION_BITS = 24
 _COEFFICIENTS = (0, 3, 8, 15, 24)
-_HAS_EXTENSIONS = 0x2
+_ANTIALIASED, _HAS_EXTENSIONS = 0x1, 0x2
 _COLOR_SCALE = 0.15
 """SPZ's factor for band 0, which leaves room for colours outside [0, 1]."""
 
@@ -86,7 +86,7 @@ def decoded(path: Path, data: bytes) -> Scene:
         notes.append(Note("ignored_bands", 1, "spherical harmonics past degree 3 ignored"))
     if flags & _HAS_EXTENSIONS:
         notes.append(Note("ignored_extensions", 1, "SPZ extensions ignored"))
-    return cleaned(path, raw, notes)
+    return cleaned(path, raw, notes, "antialiased" if flags & _ANTIALIASED else "classic")
 
 
 def _gunzip(path: Path, data: bytes) -> bytes:
@@ -233,7 +233,8 @@ def write(path: Path, splats: Splats, *, overwrite: bool = False, spz_version: i
 def encoded(path: Path, splats: Splats, means: NDArray[np.float64], bits: int, spz_version: int) -> bytes:
     """Return the bytes of an .spz with these means, in `bits` fractional bits and the order of the rows."""
     streams = _streams(splats, means, bits, spz_version)
-    head = _MAGIC + struct.pack("<IIBBB", spz_version, len(splats), splats.sh_degree, bits, 0)
+    flags = _ANTIALIASED if splats.antialiased else 0
+    head = _MAGIC + struct.pack("<IIBBB", spz_version, len(splats), splats.sh_degree, bits, flags)
     if spz_version < 4:
         return gzip.compress(head + b"\0" + b"".join(streams), 9, mtime=0)
     zstd = _zstandard(path)

@@ -12,10 +12,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from g2ard.config.choices import RenderModel
 from g2ard.errors import InputError
 from g2ard.io.sanitize import BLOCK, Raw, Tally
 from g2ard.io.types import Note
 from g2ard.scene.splats import Splats
+from g2ard.scene.transform import one_model
 
 _ENDS = 1 << 16
 """Bytes at each end of a file to hash."""
@@ -32,6 +34,7 @@ class SceneStream(ABC):
         sh_degree: 0–3.
         offset: (3,) float64, world = means + offset.
         notes: notes on the header.
+        render_model: see `Splats`; may be changed before reading.
         tally: counts over the rows that `blocks` has read.
     """
 
@@ -42,8 +45,10 @@ class SceneStream(ABC):
         rest: int = 0,
         offset: NDArray[np.float64] | None = None,
         notes: tuple[Note, ...] = (),
+        render_model: RenderModel = "classic",
     ) -> None:
         self.path, self.count, self.notes, self.tally = path, count, notes, Tally()
+        self.render_model = render_model
         self.sh_degree = _DEGREE_OF_REST[rest]
         self.offset = np.zeros(3) if offset is None else offset
 
@@ -66,7 +71,7 @@ class SceneStream(ABC):
             for first in range(0, len(keep), BLOCK):
                 part = slice(first, first + BLOCK)
                 keep[part] = self.tally.clean(raw.take(part))
-            splats = raw.activated()
+            splats = raw.activated(self.render_model)
             yield splats if self.tally.dropped == before else splats.take(keep)
 
     def all_notes(self) -> tuple[Note, ...]:
@@ -85,6 +90,7 @@ class PartsStream(SceneStream):
         offset: (3,) float64 offset of all parts.
         identity: JSON that identifies the scene.
         notes: notes on the scene.
+        render_model: see `Splats`.
     """
 
     def __init__(
@@ -96,8 +102,9 @@ class PartsStream(SceneStream):
         offset: NDArray[np.float64],
         identity: list[Any],
         notes: tuple[Note, ...] = (),
+        render_model: RenderModel = "classic",
     ) -> None:
-        super().__init__(path, sum(counts), (sh_degree + 1) ** 2 - 1, offset, notes)
+        super().__init__(path, sum(counts), (sh_degree + 1) ** 2 - 1, offset, notes, render_model)
         self._counts, self._part, self._identity = counts, part, identity
 
     def identity(self) -> list[Any]:
@@ -124,7 +131,7 @@ class PartsStream(SceneStream):
     def _pieces(self, rows: int, start: int) -> Iterator[Splats]:
         for number, count in enumerate(self._counts):
             if start < count:
-                part = self._part(number)
+                part = replace(self._part(number), render_model=self.render_model)
                 for first in range(start, count, rows):
                     yield part.take(slice(first, first + rows))
             start = max(0, start - count)
@@ -141,7 +148,8 @@ class JoinedScenes(SceneStream):
         rest = (highest + 1) ** 2 - 1
         count = sum(stream.count for stream in streams)
         notes = [replace(n, text=f"{s.path}: {n.text}") for s in streams for n in s.notes]
-        super().__init__(streams[0].path, count, rest, streams[0].offset, tuple(notes))
+        model = one_model([stream.render_model for stream in streams])
+        super().__init__(streams[0].path, count, rest, streams[0].offset, tuple(notes), model)
         self._streams, self._rest = streams, rest
 
     def identity(self) -> list[Any]:

@@ -23,4 +23,13 @@ def stream(path: Path) -> PartsStream:
 
     store = TileStore.open(path)
     counts = [tile.rows for tile in store.tiles]
-    return PartsStream(path, counts, store.read, store.sh_degree, store.offset, [store.key], store.notes)
+    return PartsStream(
+        path,
+        counts,
+        store.read,
+        store.sh_degree,
+        store.offset,
+        [store.key],
+        store.notes,
+        store.render_model,
+    )

@@ -19,6 +19,7 @@ from g2ard.progress import Progress, Say, plural, silent, unsaid
 from g2ard.scene.splats import Splats
 
 if TYPE_CHECKING:
+    from g2ard.config.choices import RenderModel
     from g2ard.io.types import Points
     from g2ard.jobs.fit import Aim
     from g2ard.jobs.inputs import Views
@@ -44,6 +45,7 @@ def distill(
     up: Sequence[float] | None = None,
     size: int | None = None,
     clean: bool = False,
+    render_model: RenderModel | None = None,
     format: str = "ply",
     preset: str = "auto",
     settings: Mapping[str, Any] | None = None,
@@ -67,7 +69,8 @@ def distill(
         fit: largest file, such as "5MB", or a device (see `Budget`).
         min_psnr: PSNR (dB) that simplification alone must keep against the scene, in generated views.
         min_ssim: SSIM to keep likewise; with `min_psnr` both hold. `say` receives the result's quality.
-        views, photos, held_out, beside, up, size, clean, format, preset: see `g2ard.DistillOptions`.
+        views, photos, held_out, beside, up, size, clean, render_model, format, preset: see
+            `g2ard.DistillOptions`.
         settings: values of `g2ard.DistillConfig` by path, such as {"recover.schedule.rates.means": 1e-3};
             they override the preset.
         work: folder for finished rounds and checkpoints; the same call resumes from it after Ctrl-C.
@@ -101,6 +104,7 @@ def distill(
         up=up,
         size=size,
         clean=clean,
+        render_model=render_model,
         format=format,
         preset=preset,
         settings={name: value for name, value in fields.items() if value is not None} | dict(settings or {}),
@@ -323,7 +327,9 @@ def _read(
     name = "cloud"
     if isinstance(scene, str | Path):
         if kind(scene) == "splats":
-            return _Read(load_scene(scene, say), False, options.beside or scene, str(scene))
+            return _Read(
+                load_scene(scene, say, options.render_model), False, options.beside or scene, str(scene)
+            )
         name, cloud = str(scene), read_cloud(scene)
         for note in cloud.notes:
             say(f"{scene}: {note}")

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from g2ard.config.choices import RenderModel
     from g2ard.jobs.inputs import Views
     from g2ard.pipeline import DistillConfig
     from g2ard.stages.recover.anchors import Regularizers
@@ -29,6 +30,7 @@ class DistillOptions:
         up: (3,) direction away from the ground for generated views; None estimates it.
         size: longer side of the views in pixels, if they are larger.
         clean: remove clutter first (`g2ard.stages.clean`).
+        render_model: overrides what the scene's file says: "classic" or "antialiased".
         format: file format for a budget in bytes: ply, compressed.ply, sog, spz, glb, splat, usda or usdc.
         preset: settings by name, see `g2ard.config.presets`.
         settings: values of `DistillConfig` by path, which override the preset.
@@ -41,6 +43,7 @@ class DistillOptions:
     up: Sequence[float] | None = None
     size: int | None = None
     clean: bool = False
+    render_model: RenderModel | None = None
     format: str = "ply"
     preset: str = "auto"
     settings: Mapping[str, Any] = field(default_factory=dict)

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+    from g2ard.config.choices import RenderModel
     from g2ard.io import Note, ViewFiles, ViewSet
     from g2ard.rendering.renderer import RasterSettings, Renderer
     from g2ard.scene.cameras import Cameras
@@ -31,11 +32,11 @@ _CLUTTER_NEAR = 0.25
 """Share of nearer views among them."""
 
 
-def load_scene(path: str | Path, say: Say = unsaid) -> Splats:
+def load_scene(path: str | Path, say: Say = unsaid, render_model: RenderModel | None = None) -> Splats:
     """Read a scene and report its notes."""
     from g2ard.io import read_scene
 
-    scene = read_scene(path)
+    scene = read_scene(path, render_model=render_model)
     say_notes(path, scene.notes, say)
     return scene.splats
 

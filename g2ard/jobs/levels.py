@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from g2ard.config.choices import BLACK, Colour
+from g2ard.config.choices import BLACK, Colour, RenderModel
 from g2ard.jobs.budget import Budget
 from g2ard.jobs.inputs import make_targets
 from g2ard.progress import Progress, Say, plural, silent, unsaid
@@ -78,6 +78,7 @@ def lod(
     background: Colour = BLACK,
     beside: str | Path | None = None,
     up: Sequence[float] | None = None,
+    render_model: RenderModel | None = None,
     seed: int = 0,
     work: Path | None = None,
     progress: Progress = silent,
@@ -100,6 +101,7 @@ def lod(
         background: RGB in [0, 1] behind the scene.
         beside: where to look for cameras, if `scene` is not a path.
         up: (3,) direction away from the ground for generated views; None estimates it.
+        render_model: overrides what the scene's file says.
         seed: random seed.
         work: folder for finished levels and checkpoints; the same call resumes from it after Ctrl-C.
         progress: called by all stages.
@@ -132,6 +134,7 @@ def lod(
             size=size,
             beside=beside,
             up=up,
+            render_model=render_model,
             settings=recovery_settings(steps, background, seed),
         ),
         progress=progress,

@@ -41,7 +41,7 @@ def report_of(job: DistillJob, done: Distilled) -> dict[str, Any]:
     )
     made = job.views.pool is not None and "test" in job.views.pool.splits
     recoveries = [recovery for entry in done.report.rounds for recovery in entry.recover]
-    config = replace(job.config, simplify=job.config.simplify.resolved())
+    config = replace(job.config, simplify=job.config.simplify.resolved(antialiased=job.prior.antialiased))
     found = done.report.as_dict()
     return {
         "input_count": len(job.prior),

@@ -14,6 +14,7 @@ from g2ard.progress import Progress, Say, silent, unsaid
 from g2ard.scene.splats import Splats
 
 if TYPE_CHECKING:
+    from g2ard.config.choices import RenderModel
     from g2ard.jobs.inputs import Views
     from g2ard.stages.simplify import Simplified, SimplifyConfig, Visibility, VisibilitySource
 
@@ -35,6 +36,7 @@ def simplify(
     settings: Mapping[str, Any] | None = None,
     beside: str | Path | None = None,
     up: Sequence[float] | None = None,
+    render_model: RenderModel | None = None,
     seed: int = 0,
     progress: Progress = silent,
     say: Say = unsaid,
@@ -63,6 +65,7 @@ def simplify(
             else.
         beside: where to look for cameras, if `scene` is not a path: in its folder and its trainer's.
         up: (3,) direction away from the ground for generated views; None estimates it.
+        render_model: overrides what the scene's file says.
         seed: seed of generated views.
         progress: called during planning, visibility and merging.
         say: called with log messages.
@@ -89,7 +92,7 @@ def simplify(
     given = {name: value for name, value in fields.items() if value is not None}
     config = configured(config or SimplifyConfig(), settings=given | dict(settings or {}))
     wanted = Budget(count, ratio, fit=fit, min_psnr=min_psnr, min_ssim=min_ssim)
-    splats, beside, name = _scene(scene, beside, say)
+    splats, beside, name = _scene(scene, beside, render_model, say)
     reduce = Reduction(
         splats,
         views=views,
@@ -174,12 +177,12 @@ class Reduction:
 
 
 def _scene(
-    scene: Splats | str | Path, beside: str | Path | None, say: Say
+    scene: Splats | str | Path, beside: str | Path | None, render_model: RenderModel | None, say: Say
 ) -> tuple[Splats, str | Path | None, str]:
     """Return the scene, where to look for cameras, and its name in errors."""
     if isinstance(scene, Splats):
         return scene, beside, "scene"
-    return load_scene(scene, say), beside or scene, str(scene)
+    return load_scene(scene, say, render_model), beside or scene, str(scene)
 
 
 def _remembering(look: VisibilitySource) -> VisibilitySource:

@@ -11,13 +11,14 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from g2ard.errors import G2ardError, OutputError
+from g2ard.errors import G2ardError, InputError, OutputError
 from g2ard.jobs.budget import Budget
 from g2ard.jobs.levels import LevelReport, check_ratios, level_size
 from g2ard.jobs.tiling import RECOVERY_TIMES, Tiling, refuse_whole, whole_options, workers_for
 from g2ard.progress import Progress, Say, plural, silent, unsaid
 
 if TYPE_CHECKING:
+    from g2ard.config.choices import RenderModel
     from g2ard.jobs.distill_options import DistillOptions
     from g2ard.jobs.inputs import Views
     from g2ard.jobs.views import RunViews
@@ -123,7 +124,12 @@ def _worth_keeping(folder: Path, error: G2ardError) -> bool:
 
 @contextmanager
 def _tiles_and_workers(
-    scene: Path, tiling: Tiling, times: float, progress: Progress, say: Say
+    scene: Path,
+    tiling: Tiling,
+    times: float,
+    render_model: RenderModel | None,
+    progress: Progress,
+    say: Say,
 ) -> Iterator[tuple[TileStore, Workers]]:
     """Open the tiles of a scene, streamed into `tiling.folder` if it is a file, and start workers.
 
@@ -131,6 +137,7 @@ def _tiles_and_workers(
         scene: its file, or a folder of tiles.
         tiling: how. Tiles of another size are replaced unless the user named the folder.
         times: memory of a tile relative to merging it.
+        render_model: overrides what a file says.
         progress: receives rows written.
         say: receives log lines.
 
@@ -143,10 +150,24 @@ def _tiles_and_workers(
 
     if (scene / MANIFEST).is_file():
         store = TileStore.open(scene)
+        if render_model not in (None, store.render_model):
+            raise InputError(
+                f"these tiles are {store.render_model}",
+                path=scene,
+                hint=f"run `g2ard ingest --render-model {render_model}` on their scene",
+            )
     else:
         folder = _folder(tiling) / "tiles"
         rows, replace_others = tiling.most_rows, not tiling.keep
-        store = ingest(scene, folder, tile_rows=rows, overwrite=replace_others, progress=progress, say=say)
+        store = ingest(
+            scene,
+            folder,
+            tile_rows=rows,
+            render_model=render_model,
+            overwrite=replace_others,
+            progress=progress,
+            say=say,
+        )
     workers = workers_for(store, tiling, times)
     threads = max(1, tiling.usable_cores // workers)
     say(f"{len(store.tiles):,} tiles of {store.count:,} Gaussians, {workers} at a time")
@@ -164,6 +185,7 @@ def simplify_in_tiles(
     config: SimplifyConfig | None = None,
     up: Sequence[float] | None = None,
     seed: int = 0,
+    render_model: RenderModel | None = None,
     progress: Progress = silent,
     say: Say = unsaid,
 ) -> Iterator[tuple[TileStore, TiledScene]]:
@@ -178,6 +200,7 @@ def simplify_in_tiles(
         config: constants.
         up: (3,) away from the ground, for generated views.
         seed: of generated views.
+        render_model: overrides what a file says.
         progress: receives the number of finished tasks.
         say: receives log lines.
 
@@ -186,7 +209,7 @@ def simplify_in_tiles(
     """
     from g2ard.tiles.merging import simplify_tiles
 
-    with _tiles_and_workers(scene, tiling, 1.0, progress, say) as (store, workers):
+    with _tiles_and_workers(scene, tiling, 1.0, render_model, progress, say) as (store, workers):
         for budget in budgets:
             yield (
                 store,
@@ -415,7 +438,8 @@ def _job(
     from g2ard.stages.recover.presets import preset_for
     from g2ard.tiles.merging import sample_of
 
-    with _tiles_and_workers(scene, tiling, RECOVERY_TIMES, progress, say) as (store, workers):
+    model = options.render_model
+    with _tiles_and_workers(scene, tiling, RECOVERY_TIMES, model, progress, say) as (store, workers):
         sample = sample_of(store, workers)
         views = views_of(
             sample,

@@ -79,7 +79,7 @@ class Glance:
         widen = min(_MOST_WIDENED, np.sqrt(represents * len(rows) / max(1, len(some))))
         shortest = np.arange(3) == np.argmin(sample.scales, axis=1)[:, None]
         logs = np.log(np.maximum(sample.scales, np.finfo(np.float32).tiny))
-        self._means = means
+        self._means, self._antialiased = means, sample.antialiased
         self._arrays: tuple[NDArray[np.float32], ...] = (
             np.ascontiguousarray(means, np.float32),
             np.ascontiguousarray(sample.quats, np.float32),
@@ -97,7 +97,7 @@ class Glance:
             return Focus(*np.zeros((3, 0)))
         here = cameras.resized(_LONGEST).recentred(self._middle)
         distance = float(np.median(norms(here.positions)))
-        settings = RasterSettings(near=1e-3 * distance or None)
+        settings = RasterSettings(antialiased=self._antialiased, near=1e-3 * distance or None)
         figures = np.zeros((3, len(here)))
         for i in range(len(here)):
             sums: dict[str, Any] = _core.accumulate(

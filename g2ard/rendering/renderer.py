@@ -27,8 +27,8 @@ class RasterSettings:
     Args:
         convention: "gsplat" (default, used by current trainers) or "inria" (also limits each splat to the
             tiles that its 3σ square touches).
-        antialiased: opacity × √(det Σ₂ / det(Σ₂ + 0.3 I)), Mip-Splatting's factor; for scenes trained with
-            it.
+        antialiased: opacity × √(det Σ₂ / det(Σ₂ + 0.3 I)), Mip-Splatting's factor; None means as the scene's
+            `render_model` says.
         alpha_max: upper limit of α: 0.99 as in 3DGS; some trainers use 0.999.
         near: near plane, scene units; None means the convention's 0.01 (gsplat) or 0.2 (inria), and less in a
             small scene (`settings_for`). A sequence holds one distance per camera.
@@ -41,7 +41,7 @@ class RasterSettings:
     """
 
     convention: Convention = "gsplat"
-    antialiased: bool = False
+    antialiased: bool | None = None
     alpha_max: float = MAX_OPACITY
     near: float | Sequence[float] | None = None
 
@@ -62,8 +62,10 @@ class RasterSettings:
         return float(self.near[index])
 
 
-def settings_for(means: NDArray[Any], settings: RasterSettings | None = None) -> RasterSettings:
-    """Scale the default near plane down for scenes in a small unit.
+def settings_for(
+    means: NDArray[Any], settings: RasterSettings | None = None, *, antialiased: bool = False
+) -> RasterSettings:
+    """Fill in what settings leave to the scene: its render model, and a near plane for its unit.
 
     The conventions' near planes suit scenes a few units across. If half of the Gaussians lie within r < ½ of
     the median, the near plane is 2r times the convention's.
@@ -71,6 +73,7 @@ def settings_for(means: NDArray[Any], settings: RasterSettings | None = None) ->
     Args:
         means: (N, 3) scene units.
         settings: None means gsplat's convention. A given near plane is kept.
+        antialiased: the scene's render model, unless the settings say.
 
     >>> import numpy as np
     >>> corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float)
@@ -78,6 +81,8 @@ def settings_for(means: NDArray[Any], settings: RasterSettings | None = None) ->
     (0.01, 1.6915e-05)
     """
     settings = settings or RasterSettings()
+    if settings.antialiased is None:
+        settings = replace(settings, antialiased=antialiased)
     if settings.near is not None or not len(means):
         return settings
     sample = means[:: -(-len(means) // _NEAR_SAMPLE)].astype(np.float64)
@@ -182,7 +187,7 @@ class Renderer:
         if middle is not None:
             splats = splats.recentred(splats.offset + middle)
         self._middle = middle
-        self._settings = settings_for(splats.means, settings)
+        self._settings = settings_for(splats.means, settings, antialiased=splats.antialiased)
         self._arrays = arrays_of(splats)
         self._rasterizer = _core.Rasterizer()
 

@@ -78,7 +78,7 @@ def visibility(
     (True, [0.04, 0.22])
     """
     splats, cameras = centred(splats, cameras)
-    settings = settings_for(splats.means, settings)
+    settings = settings_for(splats.means, settings, antialiased=splats.antialiased)
     views = [view_of(cameras, i, settings) for i in range(len(cameras))]
     sums: dict[str, Any] = _core.accumulate(
         arrays_of(splats), views, settings, counter(progress, "visibility")
@@ -133,7 +133,7 @@ def visibility_source(
         here = small.recentred(scene.offset)
         if not enough:  # near plane in the scene's unit
             distance = np.median(np.linalg.norm(here.positions - core.origin, axis=1))
-            settings = RasterSettings(near=NEAR * float(distance) or None)
+            settings = RasterSettings(antialiased=scene.antialiased, near=NEAR * float(distance) or None)
         seen = 0
         for number, some in enumerate(rounds, 1):
             views = [view_of(here, i, settings) for i in some]

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from g2ard.config.choices import RENDER_MODELS, RenderModel
 from g2ard.errors import InputError
 
 SH_C0 = 0.28209479177387814
@@ -36,9 +37,11 @@ class Splats:
         sh0: (N, 1, 3) float32, band-0 coefficients; colour = 0.5 + SH_C0·sh0 + higher bands.
         shN: (N, K−1, 3) float32, K−1 in {0, 3, 8, 15}: SH degree 0–3.
         offset: (3,) float64, world = means + offset. Large map coordinates (UTM) go here.
+        render_model: the rendering that the scene was trained for: "classic", or "antialiased" with
+            Mip-Splatting's factor on opacities. All renders follow it.
 
     Raises:
-        InputError: mismatched array shapes.
+        InputError: mismatched array shapes, or an unknown render model.
 
     >>> s = Splats.create(means=np.zeros((2, 3)), scales=np.ones((2, 3)))
     >>> len(s), s.sh_degree, s.opacities
@@ -52,6 +55,7 @@ class Splats:
     sh0: NDArray[np.float32]
     shN: NDArray[np.float32]
     offset: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
+    render_model: RenderModel = "classic"
 
     def __post_init__(self) -> None:
         if self.means.ndim != 2 or self.means.shape[1] != 3:
@@ -70,6 +74,10 @@ class Splats:
                 raise InputError(f"expected shape {shape}, got {got}", parameter=name)
         if rest not in _DEGREE_OF_REST:
             raise InputError(f"expected 0, 3, 8 or 15 coefficients, got {rest}", parameter="shN")
+        if self.render_model not in RENDER_MODELS:
+            raise InputError(
+                f"expected {' or '.join(RENDER_MODELS)}, got {self.render_model!r}", parameter="render_model"
+            )
 
     @classmethod
     def create(
@@ -82,6 +90,7 @@ class Splats:
         sh0: ArrayLike | None = None,
         shN: ArrayLike | None = None,
         offset: ArrayLike = (0.0, 0.0, 0.0),
+        render_model: RenderModel = "classic",
     ) -> Splats:
         """Create from array-likes; by default no rotation, opacity 0.5, mid grey, SH degree 0."""
         points = np.asarray(means)
@@ -103,6 +112,7 @@ class Splats:
             sh0=rows(sh0, 0, (n, 1, 3)),
             shN=rows(shN, 0, (n, 0, 3)),
             offset=np.array(offset, dtype=np.float64),
+            render_model=render_model,
         )
 
     def __len__(self) -> int:
@@ -112,6 +122,11 @@ class Splats:
     def sh_degree(self) -> int:
         """SH degree, 0 to 3."""
         return _DEGREE_OF_REST[self.shN.shape[1]]
+
+    @property
+    def antialiased(self) -> bool:
+        """Whether the render model is "antialiased"."""
+        return self.render_model == "antialiased"
 
     @property
     def opacities(self) -> NDArray[np.float32]:
@@ -136,7 +151,7 @@ class Splats:
         return 4 * len(self) * (14 + 3 * self.shN.shape[1])
 
     def fingerprint(self) -> str:
-        """Return a hash of all arrays.
+        """Return a hash of all arrays and the render model.
 
         It is computed once; later changes of arrays in place do not affect it.
         """
@@ -147,6 +162,8 @@ class Splats:
         digest = hashlib.sha256()
         for name in ("means", "quats", "scales", "logit_opacities", "sh0", "shN", "offset"):
             digest.update(np.ascontiguousarray(getattr(self, name)).tobytes())
+        if self.antialiased:
+            digest.update(b"antialiased")
         return digest.hexdigest()
 
     def take(self, index: Any) -> Splats:

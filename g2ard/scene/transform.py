@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from g2ard.config.choices import RenderModel
 from g2ard.errors import InputError
 from g2ard.scene.splats import Splats
 
@@ -151,7 +152,7 @@ def join(scenes: Sequence[Splats]) -> Splats:
     """Join scenes into one, relative to the first one's offset and at the highest SH degree.
 
     Raises:
-        InputError: no scene.
+        InputError: no scene, or scenes of different render models.
 
     >>> a = Splats.create([[0, 0, 0]], scales=[[1, 1, 1]], offset=[100, 0, 0])
     >>> b = Splats.create([[1, 0, 0]], scales=[[1, 1, 1]])
@@ -160,11 +161,22 @@ def join(scenes: Sequence[Splats]) -> Splats:
     """
     if not scenes:
         raise InputError("no scenes", parameter="scenes")
+    model = one_model([scene.render_model for scene in scenes])
     degree = max(scene.sh_degree for scene in scenes)
     parts = [scene.recentred(scenes[0].offset).with_sh_degree(degree) for scene in scenes]
     names = ("means", "quats", "scales", "logit_opacities", "sh0", "shN")
     together = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
-    return Splats(**together, offset=scenes[0].offset)
+    return Splats(**together, offset=scenes[0].offset, render_model=model)
+
+
+def one_model(models: Sequence[RenderModel]) -> RenderModel:
+    """Return the render model that all scenes share; raise an `InputError` if they differ."""
+    if len(set(models)) > 1:
+        raise InputError(
+            f"the scenes have different render models ({', '.join(models)}) and cannot be combined",
+            hint="if a file is tagged wrongly, {render_model=MODEL} reads all of them as one",
+        )
+    return models[0]
 
 
 def in_box(splats: Splats, low: ArrayLike, high: ArrayLike) -> NDArray[np.bool_]:

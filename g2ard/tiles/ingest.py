@@ -10,6 +10,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from g2ard.config.choices import RenderModel
 from g2ard.errors import InputError, OutputError
 from g2ard.io import kind, open_point_stream, open_stream
 from g2ard.io.lock import LOCK, locked
@@ -39,6 +40,7 @@ def ingest(
     block_rows: int | None = None,
     lift: LiftConfig | None = None,
     like: TileStore | None = None,
+    render_model: RenderModel | None = None,
     overwrite: bool = False,
     progress: Progress = silent,
     say: Say = unsaid,
@@ -64,6 +66,7 @@ def ingest(
         block_rows: rows in memory at a time; None means 16 MiB of rows.
         lift: constants for lifting points; None means `LiftConfig()`.
         like: reuse the tree and margin of these tiles, ignoring `tile_rows`.
+        render_model: overrides what the files of scenes say.
         overwrite: replace tiles of another scene or of other settings.
         progress: called with the number of rows done.
         say: called with messages.
@@ -87,7 +90,7 @@ def ingest(
     folder = Path(folder)
     if tile_rows < 1 or (block_rows is not None and block_rows < 1):
         raise InputError(f"tile_rows and block_rows: expected at least 1, got {tile_rows}, {block_rows}")
-    feed, sources = _feed(source, lift or LiftConfig())
+    feed, sources = _feed(source, lift or LiftConfig(), render_model)
     fewest = -(-feed.stream.count // MOST_TILES)
     if like is None and tile_rows < fewest:
         raise InputError(
@@ -98,6 +101,8 @@ def ingest(
     settings: dict[str, Any] = {"tile_rows": tile_rows} if like is None else {"like": like.key}
     if isinstance(feed, PointFeed):
         settings["lift"] = asdict(feed.config)
+    if feed.render_model != "classic":
+        settings["render_model"] = feed.render_model
     feed.settings, key = settings, _key(feed.stream.identity(), settings)
     done = _done(folder, key, overwrite)
     if done is not None:
@@ -120,6 +125,7 @@ def ingest(
         notes = [*feed.stream.all_notes(), *([] if like else _overfull_note(journal, tile_rows))]
         manifest = {
             "sh_degree": feed.sh_degree,
+            "render_model": feed.render_model,
             "offset": feed.stream.offset.tolist(),
             "source": sources,
             "settings": settings,
@@ -130,7 +136,9 @@ def ingest(
 
 
 def _feed(
-    source: str | Path | Sequence[str | Path] | SceneStream, config: LiftConfig
+    source: str | Path | Sequence[str | Path] | SceneStream,
+    config: LiftConfig,
+    render_model: RenderModel | None,
 ) -> tuple[SceneFeed | PointFeed, list[str]]:
     """Return the feed of a source and the names of its files."""
     if isinstance(source, SceneStream):
@@ -139,7 +147,7 @@ def _feed(
     names = [str(path) for path in sources]
     if sources and all(kind(path) == "points" for path in sources):
         return PointFeed(open_point_stream(sources), config), names
-    return SceneFeed(open_stream(sources)), names
+    return SceneFeed(open_stream(sources, render_model=render_model)), names
 
 
 def _key(identity: list[Any], settings: dict[str, Any]) -> str:

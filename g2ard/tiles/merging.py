@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from g2ard.config.choices import RenderModel
 from g2ard.errors import InputError
 from g2ard.io.stream import PartsStream
 from g2ard.progress import Say, unsaid
@@ -50,6 +51,7 @@ class TiledScene:
         views: number of views used; 0 without views.
         unseen: Gaussians of the dense scene that no view sees; None without views.
         surroundings: placement of the dense tiles, for recovery; None without views.
+        render_model: see `Splats`.
     """
 
     counts: tuple[int, ...]
@@ -60,6 +62,7 @@ class TiledScene:
     views: int = 0
     unseen: int | None = None
     surroundings: Surroundings | None = None
+    render_model: RenderModel = "classic"
 
     def __len__(self) -> int:
         return sum(self.counts)
@@ -70,7 +73,8 @@ class TiledScene:
     def stream(self) -> PartsStream:
         """Return a stream over the tiles, as `g2ard.tiles.ingest.ingest` takes it."""
         name = Path(f"simplified-{self.key}")
-        return PartsStream(name, self.counts, self.tiles, self.sh_degree, self.offset, [self.key])
+        parts = self.counts, self.tiles, self.sh_degree, self.offset
+        return PartsStream(name, *parts, [self.key], render_model=self.render_model)
 
     def whole(self) -> Splats:
         """Return all tiles as one scene in memory."""
@@ -198,7 +202,8 @@ def _scene(
     def tile(i: int) -> Splats:
         return finished(small_scene(files[i], mean), store.sh_degree)
 
-    return TiledScene(counts, tile, store.sh_degree, store.offset, key_of(files))
+    parts = counts, tile, store.sh_degree, store.offset
+    return TiledScene(*parts, key_of(files), render_model=store.render_model)
 
 
 def _as_it_is(store: TileStore, sights: Sights | None) -> TiledScene:
@@ -210,6 +215,7 @@ def _as_it_is(store: TileStore, sights: Sights | None) -> TiledScene:
         key_of(store.key),
         0 if sights is None else len(sights.cameras),
         surroundings=None if sights is None else sights.surroundings,
+        render_model=store.render_model,
     )
 
 

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from g2ard.config.choices import RenderModel
 from g2ard.errors import OutputError
 from g2ard.io.point_stream import PointStream, PointTally
 from g2ard.io.stream import SceneStream
@@ -44,12 +45,14 @@ class Feed(ABC):
         row_bytes: bytes per row; a row begins with its float32 position.
         room: bytes on disk per row in the end, including all copies.
         settings: settings stored in the journal.
+        render_model: see `Splats`.
     """
 
     stream: SceneStream | PointStream
     row_bytes: int
     room: int
     sh_degree = 0
+    render_model: RenderModel = "classic"
 
     def __init__(self) -> None:
         self.settings: dict[str, Any] = {}
@@ -70,7 +73,7 @@ class SceneFeed(Feed):
         super().__init__()
         self.stream: SceneStream = stream
         self.row_bytes = self.room = 4 * row_width(stream.sh_degree)
-        self.sh_degree = stream.sh_degree
+        self.sh_degree, self.render_model = stream.sh_degree, stream.render_model
 
     def positions(self, rows: int) -> Iterator[Points]:
         return self.stream.positions(rows)

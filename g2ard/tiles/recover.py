@@ -251,6 +251,7 @@ def recover_tiles(
         store.offset,
         key_of([paths, degree]),
         surroundings=around,
+        render_model=store.render_model,
     )
     return scene, scores
 

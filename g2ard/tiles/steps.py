@@ -109,7 +109,7 @@ def glance(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
     tiles = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
     scene = as_prepared(join(parts))
     cameras = cameras_of(inputs["views"]).recentred(scene.offset)
-    settings = RasterSettings(near=arguments["near"])
+    settings = RasterSettings(antialiased=scene.antialiased, near=arguments["near"])
     weights = np.zeros((len(arguments["views"]), len(parts)))
     for row, view in enumerate(arguments["views"]):
         sums = _core.VisibilityAccumulator(scene.core)
@@ -142,7 +142,7 @@ def look(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
     cameras = cameras_of(inputs["views"]).recentred(own.offset)
     here = cameras.take(arguments["views"])
     distance = np.median(np.linalg.norm(here.positions - own.core.origin, axis=1)) if len(here) else 0.0
-    settings = RasterSettings(near=NEAR * float(distance) or None)
+    settings = RasterSettings(antialiased=own.antialiased, near=NEAR * float(distance) or None)
     here = cropped(here, own, settings)
     sums = _core.VisibilityAccumulator(with_surroundings(own, arguments, inputs, places).core)
     stride = max(1, math.ceil(len(here) / ROUND))
@@ -261,7 +261,7 @@ def look_again(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
     core = as_prepared(scene_of(inputs["merged"], "scene").with_sh_degree(0))
     used, share, near = load(inputs["look"], "used", "share", "near")
     cameras = cameras_of(inputs["views"]).recentred(core.offset).take(used)
-    settings = RasterSettings(near=float(near))
+    settings = RasterSettings(antialiased=core.antialiased, near=float(near))
     cameras = cropped(cameras, core, settings)
     sums = _core.VisibilityAccumulator(with_surroundings(core, arguments, inputs, places).core)
     sums.add([view_of(cameras, i, settings) for i in range(len(cameras))], settings, None)
@@ -307,7 +307,8 @@ class TiledRun:
     def __init__(self, store: TileStore, workers: Workers, config: SimplifyConfig):
         self.store, self.workers = store, workers
         workers.folder.mkdir(parents=True, exist_ok=True)
-        self.config = asdict(config.resolved("default"))
+        model = store.render_model
+        self.config = asdict(config.resolved("default", antialiased=model == "antialiased"))
         self.sizes = [tile.rows for tile in store.tiles]
         self.coarse: list[Path] = []
 

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from g2ard.config.choices import RENDER_MODELS, RenderModel
 from g2ard.errors import InputError
 from g2ard.io.detect import MANIFEST
 from g2ard.io.jsonfile import read_json
@@ -65,7 +66,7 @@ def packed(splats: Splats) -> NDArray[np.float32]:
     return rows
 
 
-def _unpacked(rows: NDArray[np.float32], offset: NDArray[np.float64]) -> Splats:
+def _unpacked(rows: NDArray[np.float32], store: TileStore) -> Splats:
     """Return the scene of packed rows."""
     rest = (rows.shape[1] - 14) // 3
     return Splats(
@@ -75,7 +76,8 @@ def _unpacked(rows: NDArray[np.float32], offset: NDArray[np.float64]) -> Splats:
         logit_opacities=np.ascontiguousarray(rows[:, 10]),
         sh0=np.ascontiguousarray(rows[:, None, 11:14]),
         shN=np.ascontiguousarray(rows[:, 14:]).reshape(len(rows), rest, 3),
-        offset=offset.copy(),
+        offset=store.offset.copy(),
+        render_model=store.render_model,
     )
 
 
@@ -114,6 +116,7 @@ class TileStore:
         notes: notes from ingestion.
         key: SHA-256 of everything that determines the content: source and settings.
         settings: the settings of ingestion.
+        render_model: see `Splats`.
     """
 
     folder: Path
@@ -126,6 +129,7 @@ class TileStore:
     notes: tuple[Note, ...]
     key: str
     settings: Mapping[str, Any]
+    render_model: RenderModel = "classic"
 
     @classmethod
     def open(cls, folder: str | Path) -> TileStore:
@@ -175,8 +179,10 @@ class TileStore:
             notes,
             str(content["key"]),
             dict(content["settings"]),
+            content.get("render_model", "classic"),
         )
         fits = offset.shape == (3,) and store.sh_degree in range(4) and tree.leaves == len(tiles)
+        fits = fits and store.render_model in RENDER_MODELS
         finite = np.isfinite([*offset.ravel(), store.margin, *(x for t in tiles for x in (*t.low, *t.high))])
         if not fits or not finite.all() or sum(tile.rows for tile in tiles) != store.count:
             raise ValueError("inconsistent counts or values that are not finite")
@@ -272,7 +278,7 @@ class TileStore:
                 logits[at], sh0[at, 0] = rows[:, 10], rows[:, 11:14]
                 shN[at] = rows[:, 14 : 14 + 3 * rest].reshape(len(rows), rest, 3)
         self._check_contents(name, crc, check)
-        return Splats(means, quats, scales, logits, sh0, shN, self.offset.copy())
+        return Splats(means, quats, scales, logits, sh0, shN, self.offset.copy(), self.render_model)
 
 
 class StoredScene:
@@ -303,4 +309,4 @@ class StoredScene:
         for tile in np.unique(tiles):
             here = tiles == tile
             rows[here] = self.store.rows(tile)[index[here] - self._starts[tile]]
-        return _unpacked(rows, self.offset)
+        return _unpacked(rows, self.store)

@@ -33,12 +33,12 @@ Inputs = Mapping[str, Any]
 Places = Mapping[str, Path]
 """Parameters of a task's function, see `Task`."""
 
-_FIELDS = ("means", "quats", "scales", "logit_opacities", "sh0", "shN", "offset")
+_FIELDS = ("means", "quats", "scales", "logit_opacities", "sh0", "shN", "offset", "render_model")
 
 _OUTLINE, _BESIDE = 20_000, 8
 """Number of means that outline a tile for cropping, and the pixels kept around them."""
 
-_VERSION = 3
+_VERSION = 4
 """Version of the functions' output; raise it when a change makes earlier files unusable."""
 
 _DAMAGED = (zipfile.BadZipFile, zlib.error, ValueError, EOFError, LookupError, RuntimeError)
@@ -152,7 +152,9 @@ def small_scene(files: Mapping[str, Path], mean: float | None) -> Splats:
 
 def scene_of(path: Path, name: str) -> Splats:
     """Read a scene from a task's file."""
-    return Splats(*load(path, *(f"{name}_{field}" for field in _FIELDS)))
+    *arrays, model = load(path, *(f"{name}_{field}" for field in _FIELDS))
+    means, quats, scales, logits, sh0, shN, offset = arrays
+    return Splats(means, quats, scales, logits, sh0, shN, offset, model.item())
 
 
 def cameras_of(path: Path) -> Cameras:
@@ -221,4 +223,4 @@ def cropped(
 
 
 def arrays_of(scene: Splats, name: str) -> Arrays:
-    return {f"{name}_{field}": getattr(scene, field) for field in _FIELDS}
+    return {f"{name}_{field}": np.asarray(getattr(scene, field)) for field in _FIELDS}

@@ -16,7 +16,7 @@ async function module(base64) {
   return import(URL.createObjectURL(new Blob([text], { type: 'text/javascript' })));
 }
 
-const { start, background, files } = JSON.parse(read('view'));
+const { start, background, files, antialiased } = JSON.parse(read('view'));
 const settings = {
   version: 2,
   tonemapping: 'none',
@@ -38,27 +38,42 @@ const settings = {
 // Gaussians are drawn as they were trained, where the engine's own rules differ: blurred by 0.3 px², not 0.075; out to
 // where α = 1/255, not to √8 σ with lower tails; ordered by depth, not distance; α at most 0.99. The blur is put on the
 // scales, as 3 axes of the width that it has at the Gaussian's depth. GROWN is the factor on variances that makes the
-// engine's quads, of √8 σ, reach as far as α = 1/255 of an opaque Gaussian does.
+// engine's quads, of √8 σ, reach as far as α = 1/255 of an opaque Gaussian does. In antialiased scenes α is multiplied
+// by the square root of the ratio of the footprint's determinants without and with the blur; a footprint's determinant
+// is proportional to dᵀ·adj(Σ)·d, d the direction of the view.
 const GROWN = Math.log(255) / 4;
 
-function asTrained(gsplat) {
+function asTrained(gsplat, mip) {
   gsplat.radialSorting = false;
   gsplat.minPixelSize = 0;
   gsplat.minContribution = 0;
   const chunks = gsplat.material.getShaderChunks('glsl');
   chunks.set('gsplatModifyVS', `
     float pixelVariance(vec3 center);
+    float footprint(vec3 center, vec4 rotation, vec3 variances);
+    float mipFactor = 1.0;
     void modifySplatCenter(inout vec3 center) {}
     void modifySplatRotationScale(vec3 original, vec3 center, inout vec4 rotation, inout vec3 scale) {
+      ${mip ? `
+      vec3 variances = scale * scale / pixelVariance(center);
+      mipFactor = sqrt(footprint(center, rotation, variances) / footprint(center, rotation, variances + 0.3));
+      ` : ''}
       scale = sqrt(${GROWN} * scale * scale + (0.3 * ${GROWN} - 0.075) * pixelVariance(center));
     }
-    void modifySplatColor(vec3 center, inout vec4 color) {}
+    void modifySplatColor(vec3 center, inout vec4 color) { color.a *= mipFactor; }
   `);
   chunks.set('gsplatOutputVS', `
     float pixelVariance(vec3 center) {
       float depth = (matrix_view * matrix_model * vec4(center, 1.0)).z;
       float size = 2.0 * depth / (viewport_size.x * matrix_projection[0][0]);
       return size * size;
+    }
+    float footprint(vec3 center, vec4 rotation, vec3 variances) {
+      mat4 modelView = matrix_view * matrix_model;
+      vec3 d = normalize(transpose(mat3(modelView)) * (modelView * vec4(center, 1.0)).xyz);
+      vec3 t = 2.0 * cross(d, rotation.xyz);
+      d += rotation.w * t + cross(t, rotation.xyz);
+      return dot(d * d, variances.yxx * variances.zzy);
     }
     vec3 prepareOutputFromGamma(vec3 color, float depth) { return color; }
   `);
@@ -109,7 +124,7 @@ async function viewer(createViewer, index, container) {
     ui: index === 0,
     noanim: true
   });
-  asTrained(handle.app.scene.gsplat);
+  asTrained(handle.app.scene.gsplat, antialiased[index]);
   sortToTheEnd(handle.app);
   const drawn = new Promise(resolve => {
     if (handle.state.loaded) resolve();

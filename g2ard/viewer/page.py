@@ -94,6 +94,7 @@ def write_page(
         "start": None if start is None else asdict(start),
         "background": [float(channel) for channel in background],
         "files": [f"scene{index}.sog" for index in range(len(scenes))],
+        "antialiased": [splats.antialiased for _, splats in scenes],
     }
     text = _page([label for label, _ in scenes], shown, packed)
     with atomic_output(path, overwrite) as temporary:

@@ -57,11 +57,11 @@ def tensors_of(p: Params) -> list[torch.Tensor]:
 
 
 VARIANTS = {
-    "default": RasterSettings(),
+    "default": RasterSettings(antialiased=False),
     "antialiased": RasterSettings(antialiased=True),
-    "inria": RasterSettings(convention="inria"),
+    "inria": RasterSettings(convention="inria", antialiased=False),
     "inria-antialiased": RasterSettings(convention="inria", antialiased=True),
-    "clip-0.999": RasterSettings(alpha_max=0.999, near=0.5),
+    "clip-0.999": RasterSettings(antialiased=False, alpha_max=0.999, near=0.5),
 }
 
 
@@ -84,7 +84,7 @@ def oracle(
         height=int(cameras.heights[0]),
         near=settings.near_of(0),
         background=background,
-        antialiased=settings.antialiased,
+        antialiased=bool(settings.antialiased),
         inria=settings.convention == "inria",
         alpha_max=settings.alpha_max,
     )

@@ -169,7 +169,7 @@ def test_no_rows(tmp_path: Path) -> None:
         read_splats(path)
 
 
-@pytest.mark.parametrize("name", ["z", "f_dc_1", "opacity", "scale_2", "rot_0"])
+@pytest.mark.parametrize("name", ["z", "f_dc_1", "opacity", "scale_1", "rot_0"])
 def test_missing_property_is_named(tmp_path: Path, name: str) -> None:
     properties = columns(scene())
     del properties[name]

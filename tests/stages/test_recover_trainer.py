@@ -24,7 +24,7 @@ from helpers.threads import on_threads
 
 RATES = {"means": 2e-3, "quats": 1e-2, "log_scales": 2e-2, "logit_opacities": 5e-2, "sh0": 2e-2, "shN": 2e-3}
 BACKGROUND = (0.1, 0.2, 0.3)
-SETTINGS = RasterSettings()
+SETTINGS = RasterSettings(antialiased=False)
 
 
 def arrays(p: Params) -> tuple[NDArray[np.float32], ...]:

@@ -133,12 +133,12 @@ def _rendered(scene: Splats, views: Cameras) -> Arrays:
         RasterSettings(antialiased=True, alpha_max=0.999),
     ):
         renderer = Renderer(scene, settings=settings)
-        name = f"{settings.convention}{' antialiased' * settings.antialiased}"
+        name = f"{settings.convention}{' antialiased' * bool(settings.antialiased)}"
         for view in (0, 7):
             out = renderer.render(views[view], median=True)
             for part in ("image", "alpha", "depth", "median"):
                 yield f"{name} {view} {part}", getattr(out, part)
-    here, settings = views.recentred(scene.offset), RasterSettings()
+    here, settings = views.recentred(scene.offset), RasterSettings(antialiased=False)
     for isa in _core.instruction_sets():
         raster = _core.Rasterizer(isa)
         arrays, view = arrays_of(scene), view_of(here, 0, settings)
@@ -155,7 +155,7 @@ def _seen(scene: Splats, views: Cameras) -> Arrays:
     sampled = visibility.visibility_source(views, longest=80)(scene)
     yield "sampled weight", sampled.weight
     yield "sampled pixel_size", sampled.pixel_size
-    settings = RasterSettings()
+    settings = RasterSettings(antialiased=False)
     here = [view_of(views.recentred(scene.offset), i, settings) for i in range(3)]
     yield "sensitivity", _core.sensitivity(arrays_of(scene), here, settings)
 

@@ -51,7 +51,7 @@ class Problem:
             height=height,
             near=self.settings.near_of(0),
             background=self.background,
-            antialiased=self.settings.antialiased,
+            antialiased=bool(self.settings.antialiased),
             inria=self.settings.convention == "inria",
             alpha_max=self.settings.alpha_max,
             clip_margin=2e-6,  # a clip is continuous: on its wrong side only the slope is another

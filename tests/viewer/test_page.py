@@ -90,6 +90,7 @@ def test_a_page_holds_viewer_and_scene_and_names_no_address(tmp_path: Path) -> N
         "start": {"position": [1, 2, 3], "target": [0, 0, 0.5], "fov": 42},
         "background": [1, 0.5, 0.25],
         "files": ["scene0.sog"],
+        "antialiased": [False],
     }
     assert base64.b64decode(parts.scripts["viewer"]) == (BUNDLE / "index.js.gz").read_bytes()
     back = parts.scene(0, tmp_path)

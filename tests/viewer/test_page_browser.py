@@ -3,6 +3,7 @@
 import base64
 import re
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -57,6 +58,16 @@ def test_a_page_shows_g2ards_render(browser: Browser, tmp_path: Path, up: tuple[
     assert psnr(picture[:, ::-1], rendered(scene, camera)) < 30  # and would tell another picture apart
     assert {re.split(r"[:/]", url)[0] for url in browser.requests} <= {"file", "blob", "data"}
     assert browser.run("document.getElementById('trouble').hidden")
+
+
+def test_an_antialiased_scene_is_drawn_as_such(browser: Browser, tmp_path: Path) -> None:
+    fine = scattered(20_000)
+    fine = replace(fine, scales=fine.scales / 10, logit_opacities=fine.logit_opacities + 2)
+    scene = replace(fine, render_model="antialiased")
+    show(browser, save(tmp_path / "mip.html", scene, fine))
+    assert_shows(browser, rendered(scene), 38)
+    assert_shows(browser, rendered(fine), 38, 1)
+    assert psnr(rendered(scene), rendered(fine)) < 25
 
 
 def test_an_opaque_surface_shows_its_front(browser: Browser, tmp_path: Path) -> None:

@@ -27,7 +27,7 @@ from g2ard.config.choices import AdaptSchedule
 from g2ard.progress import plural
 
 
-@command("adapt", example="g2ard adapt small.ply --views winter/ -o winter.ply", settings=True)
+@command("adapt", example="g2ard adapt small.ply --views winter/ -o winter.ply", settings=True, scenes=True)
 def adapt(
     run: Run,
     compact: Annotated[Path, typer.Argument(metavar="COMPACT", help="Scene to adapt.")],
@@ -64,8 +64,8 @@ def adapt(
     from g2ard.cli.resume import check_stopped, left_at, stoppable
     from g2ard.config.paths import listed
     from g2ard.config.presets import PRESETS, configured
-    from g2ard.io import check_scene_output, write_splats
-    from g2ard.jobs.inputs import load_scene, load_trained, make_targets
+    from g2ard.io import check_scene_output
+    from g2ard.jobs.inputs import load_trained, make_targets
     from g2ard.jobs.view_checks import propose_background, warn_of_sight
     from g2ard.pipeline.adapt import AdaptConfig
     from g2ard.pipeline.adapt import adapt as refit
@@ -80,8 +80,8 @@ def adapt(
     if left_at(work) or not (resume and output.exists()):
         check_scene_output(output, run.overwrite)
     check_stopped(run, work, resume, output)
-    splats = load_scene(compact, run.say)
-    dense = load_scene(teacher, run.say) if teacher else None
+    splats = run.load(compact)
+    dense = run.load(teacher) if teacher else None
     cameras = load_trained(
         with_images(views, images, alpha), split, size, run.say, unpictured=dense is not None
     ).cameras
@@ -92,7 +92,7 @@ def adapt(
     with stoppable(run, work, resume):
         work.mkdir(parents=True, exist_ok=True)
         result = refit(splats, targets, config, work=work, progress=run.progress)
-        write_splats(output, result.splats, overwrite=run.overwrite)
+        run.write(output, result.splats)
     gain, end = result.report.psnr, "converged" if result.report.converged else "all steps taken"
     run.say(
         f"{output}: {plural(len(splats), 'Gaussian')}, {plural(result.report.steps, 'step')} ({end}), "

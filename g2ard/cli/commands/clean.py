@@ -25,7 +25,7 @@ _COLORS = {
 }
 
 
-@command("clean", example="g2ard clean garden.ply -o garden_clean.ply --preview found.png")
+@command("clean", example="g2ard clean garden.ply -o garden_clean.ply --preview found.png", scenes=True)
 def clean(
     run: Run,
     scene: SceneArgument,
@@ -54,7 +54,7 @@ def clean(
     """
     from g2ard import io
     from g2ard.errors import InputError
-    from g2ard.jobs.inputs import clutter_seen, load_scene
+    from g2ard.jobs.inputs import clutter_seen
     from g2ard.stages.clean import KINDS
 
     kinds = KINDS if only is None else tuple(word.strip() for word in only.split(","))
@@ -70,7 +70,7 @@ def clean(
         if real_path(preview) in {real_path(path) for path in (scene, output) if path}:
             raise typer.BadParameter(f"--preview: {preview} is also the input or output; name another file")
         io.check_output(preview, run.overwrite)
-    splats = load_scene(scene, run.say)
+    splats = run.load(scene)
     found, cameras = clutter_seen(splats, kinds, seed=run.seed, progress=run.progress, say=run.say)
     if preview is not None:
         _paint(preview, splats, found, cameras, run.overwrite)
@@ -80,7 +80,7 @@ def clean(
     if not dry_run and output is not None:
         if not kept:
             raise InputError(f"{scene}: every Gaussian would be removed; inspect it with --dry-run --preview")
-        io.write_splats(output, splats.take(found.keep), overwrite=run.overwrite)
+        run.write(output, splats.take(found.keep))
         run.say(f"{output}: {plural(kept, 'Gaussian')}")
     run.result({"input_count": len(splats), "output_count": kept, "found": found.counts})
 

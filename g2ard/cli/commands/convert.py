@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from g2ard.scene.splats import Splats
 
 
-@command("convert", example="g2ard convert room.ply tree.spz --box -2,-2,-2,2,2,2 both.sog")
+@command("convert", example="g2ard convert room.ply tree.spz --box -2,-2,-2,2,2,2 both.sog", scenes=True)
 def convert(
     run: Run,
     scenes: Annotated[
@@ -63,7 +63,6 @@ def convert(
 
     from g2ard import io
     from g2ard.io.scene_formats import check_options
-    from g2ard.jobs.inputs import load_scene
     from g2ard.scene.transform import in_box, in_sphere, join
     from g2ard.scene.transform import transform as moved
 
@@ -75,7 +74,7 @@ def convert(
     matrix = None if transform is None else _matrix(transform)
     check_options(output, options)
     io.check_scene_output(output, run.overwrite)
-    splats = join([load_scene(path, run.say) for path in scenes])
+    splats = join([run.load(path) for path in scenes])
     read = len(splats)
     if corners is not None:
         splats = splats.take(in_box(splats, corners[:3], corners[3:]))
@@ -88,7 +87,7 @@ def convert(
         splats = replace(splats, offset=np.zeros(3))
     if sh_degree is not None:
         splats = splats.with_sh_degree(sh_degree)
-    io.write_splats(output, splats, overwrite=run.overwrite, **options)
+    run.write(output, splats, **options)
     size = _size(output)
     kept = f"{len(splats):,}" if len(splats) == read else f"{len(splats):,} of {read:,}"
     what = "Gaussian" if kept == "1" else "Gaussians"

@@ -73,7 +73,7 @@ if TYPE_CHECKING:
     Colour = tuple[float, float, float]
 
 
-@command("distill", example="g2ard distill scene.ply -r 10 -o run/", cuda=True, settings=True)
+@command("distill", example="g2ard distill scene.ply -r 10 -o run/", cuda=True, settings=True, scenes=True)
 def distill(
     run: Run,
     *,
@@ -204,6 +204,7 @@ def distill(
         up=up,
         size=size,
         clean=clean,
+        render_model=run.render_model,
         format=format,
         preset=preset,
         settings=settings,
@@ -334,12 +335,11 @@ def _write(
     run: Run, place: Path, result: Distilled, unseen: Targets, colour: Colour, report: dict[str, Any]
 ) -> None:
     """Write the picture, the scene and, last, the report."""
-    from g2ard.io import write_splats
     from g2ard.report.distilled import preview
 
     scenes = [("simplified", result.simplified), ("recovered", result.splats)]
     preview(place.parent / "preview.png", unseen, scenes, colour)
-    write_splats(place, result.splats, overwrite=True)
+    run.write(place, result.splats, overwrite=True)
     drop_older(place)
     report["bytes"]["file"] = place.stat().st_size
     write_report(place.parent, {**report, "config": run.config})

@@ -25,7 +25,11 @@ from g2ard.config.choices import BLACK, LpipsInput
 from g2ard.progress import plural
 
 
-@command("evaluate", example="g2ard evaluate small.ply --views poses.json --teacher scene.ply --json -")
+@command(
+    "evaluate",
+    example="g2ard evaluate small.ply --views poses.json --teacher scene.ply --json -",
+    scenes=True,
+)
 def evaluate(
     run: Run,
     scenes: Annotated[list[Path], typer.Argument(metavar="SCENE...", help="Scenes to score.")],
@@ -63,7 +67,7 @@ def evaluate(
     from g2ard.errors import InputError
     from g2ard.io import check_scene
     from g2ard.io.describe import bytes_of
-    from g2ard.jobs.inputs import load_scene, load_views, make_targets
+    from g2ard.jobs.inputs import load_views, make_targets
     from g2ard.jobs.view_checks import propose_background, warn_of_sight
     from g2ard.rendering.lpips import load_lpips
     from g2ard.rendering.renderer import RasterSettings
@@ -79,8 +83,8 @@ def evaluate(
     for path in scenes:
         check_scene(path)
     colour, settings = background or BLACK, RasterSettings(convention=convention)
-    dense = load_scene(teacher, run.say) if teacher else None
-    frozen = load_scene(anchors, run.say) if anchors else None
+    dense = run.load(teacher) if teacher else None
+    frozen = run.load(anchors) if anchors else None
     views = views_or_teacher(run, views, teacher, dense)
     cameras = load_views(views, split, size, run.say, unpictured=dense is not None)
     if dense is None or photos:
@@ -91,7 +95,7 @@ def evaluate(
     networks = load_lpips(lpips, scaled=lpips_input == "scaled") if lpips else None
     rows: list[dict[str, Any]] = []
     for path in scenes:
-        splats = load_scene(path, run.say)
+        splats = run.load(path)
         warn_of_sight(splats, cameras, run.say)
         scored = score(
             splats,

@@ -148,6 +148,7 @@ def _rows(figures: dict[str, Any]) -> list[list[str]]:
     if figures["kind"] == "splats":
         rows.append(["bytes per Gaussian", f"{figures['bytes'] / figures['count']:.1f}"])
         rows.append(["SH degree", str(figures["sh_degree"])])
+        rows.append(["render model", figures["render_model"]])
     if any(figures.get("offset", ())):
         rows.append(["offset", _vector(figures["offset"])])
     extent = figures["extent"]

@@ -13,7 +13,7 @@ from g2ard.cli.options import ResumeOption
 from g2ard.progress import plural
 
 
-@command("ingest", example="g2ard ingest city.ply -o tiles/ --tile-rows 2M", settings=True)
+@command("ingest", example="g2ard ingest city.ply -o tiles/ --tile-rows 2M", settings=True, scenes=True)
 def ingest(
     run: Run,
     scenes: Annotated[
@@ -56,6 +56,7 @@ def ingest(
         output,
         tile_rows=TILE_ROWS if tile_rows is None else tile_rows.of(0),
         lift=config,
+        render_model=run.render_model,
         overwrite=run.overwrite,
         progress=run.progress,
         say=run.say,
@@ -78,6 +79,7 @@ def ingest(
             "margin": store.margin,
             "bytes": store.nbytes,
             "sh_degree": store.sh_degree,
+            "render_model": store.render_model,
             "offset": store.offset,
             "notes": {note.code: note.count for note in store.notes},
             "seconds": seconds,

@@ -51,7 +51,7 @@ def lift(
         progress=run.progress,
     )
     lifted = time.perf_counter()
-    io.write_splats(output, splats, overwrite=run.overwrite)
+    run.write(output, splats)
     written = time.perf_counter()
     say_weight(run, cloud, output, splats)
     discs, points = plural(len(splats), "disc"), plural(len(found.points), "point")

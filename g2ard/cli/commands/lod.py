@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from g2ard.levels.tree import Level
 
 
-@command("lod", example="g2ard lod scene.ply -r 1,2,4,8,16 -o streamed/")
+@command("lod", example="g2ard lod scene.ply -r 1,2,4,8,16 -o streamed/", scenes=True)
 def lod(
     run: Run,
     scene: Annotated[
@@ -175,6 +175,7 @@ def lod(
             views=views,
             size=size,
             up=up,
+            render_model=run.render_model,
             settings=recovery_settings(steps, background or BLACK, run.seed),
         )
         with working(tiling, views):
@@ -194,6 +195,7 @@ def lod(
             size=size,
             background=background or BLACK,
             up=up,
+            render_model=run.render_model,
             seed=run.seed,
             work=stopped,
             progress=run.progress,

@@ -32,7 +32,7 @@ def _size(text: str) -> _Size:
     return _Size((int(match[1]), int(match[2])))
 
 
-@command("poses", example="g2ard poses scene.ply --count 128 -o poses.json")
+@command("poses", example="g2ard poses scene.ply --count 128 -o poses.json", scenes=True)
 def poses(
     run: Run,
     scene: SceneArgument,
@@ -58,12 +58,11 @@ def poses(
 ) -> None:
     """Generate views for a scene: poses in free space that see it well."""
     from g2ard.io import check_views_output, write_views
-    from g2ard.jobs.inputs import load_scene
     from g2ard.poses import plan_pool
     from g2ard.scene.splits import splits_of
 
     check_views_output(output, run.overwrite)
-    splats = load_scene(scene, run.say)
+    splats = run.load(scene)
     pool = plan_pool(
         splats,
         count,

@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     example="g2ard recover small.ply --views poses.json --teacher scene.ply -o better.ply",
     cuda=True,
     settings=True,
+    scenes=True,
 )
 def recover(
     run: Run,
@@ -80,9 +81,9 @@ def recover(
     from g2ard.cli.run_result import loss, write_kinds
     from g2ard.config.paths import listed
     from g2ard.config.presets import PRESETS, configured
-    from g2ard.io import check_scene_output, write_splats
+    from g2ard.io import check_scene_output
     from g2ard.jobs.causes import likely_causes
-    from g2ard.jobs.inputs import load_scene, load_split_views, load_trained, make_targets
+    from g2ard.jobs.inputs import load_split_views, load_trained, make_targets
     from g2ard.jobs.score import scores_by_kind
     from g2ard.jobs.view_checks import propose_background, warn_of_sight
     from g2ard.scene.targets import kinds_of
@@ -106,8 +107,8 @@ def recover(
         check_scene_output(output, run.overwrite)
     check_stopped(run, checkpoint, resume, output)
     settings.setdefault("recover.engine", recovery_engine(run))
-    splats = load_scene(student, run.say)
-    dense = load_scene(teacher, run.say) if teacher else None
+    splats = run.load(student)
+    dense = run.load(teacher) if teacher else None
     views = views_or_teacher(run, views, teacher, dense)
     chosen = load_trained(views, split, size, run.say, unpictured=dense is not None)
     warn_of_sight(splats, chosen.cameras, run.say)
@@ -146,7 +147,7 @@ def recover(
             checkpoint=checkpoint,
             progress=run.progress,
         )
-        write_splats(output, result.splats, overwrite=run.overwrite)
+        run.write(output, result.splats)
     if (told := outcome(result.report)) is not None:
         run.say(told)
     if run.verbose and (told := unregularized(result.report)) is not None:
@@ -177,9 +178,8 @@ def recover(
 def _built(run: Run, path: Path, student: Splats) -> Splats:
     """Read the student as it was built, in its present coordinates."""
     from g2ard.errors import InputError
-    from g2ard.jobs.inputs import load_scene
 
-    scene = load_scene(path, run.say)
+    scene = run.load(path)
     if len(scene) != len(student):
         raise InputError(
             f"has {plural(len(scene), 'Gaussian')}, the student has {len(student):,}",

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     "register",
     example="g2ard register small.ply --photos new/ --focal 1200 --poses coarse.txt -o poses.json",
     settings=True,
+    scenes=True,
 )
 def register(
     run: Run,
@@ -110,7 +111,6 @@ def register(
     from g2ard.errors import InputError
     from g2ard.io import check_views_output, write_views
     from g2ard.io.atomic import check_output
-    from g2ard.jobs.inputs import load_scene
     from g2ard.jobs.register import photos_of, pool_of, poses_for
     from g2ard.stages.register import RegisterConfig
     from g2ard.stages.register import register as find
@@ -155,7 +155,7 @@ def register(
     elif pool is None:
         starts = dict(zip(taken.names, taken.viewmats, strict=True))
     true = {} if truth is None else poses_for(truth, taken.names)
-    splats = load_scene(scene, run.say)
+    splats = run.load(scene)
     places = pool_of(splats, pool, run.seed, run.progress, run.say) if pool is not None else None
     found = find(
         splats,

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 Color = Literal["scene", "flags", "cells", "parents"]
 
 
-@command("render", example="g2ard render scene.ply -n 4 --sheet look.png")
+@command("render", example="g2ard render scene.ply -n 4 --sheet look.png", scenes=True)
 def render(
     run: Run,
     scene: SceneArgument,
@@ -72,7 +72,7 @@ def render(
 
     from g2ard.io.atomic import check_output
     from g2ard.io.paths import output_names
-    from g2ard.jobs.inputs import load_scene, load_views
+    from g2ard.jobs.inputs import load_views
     from g2ard.jobs.view_checks import warn_of_sight
     from g2ard.jobs.views import views_or_pool
     from g2ard.rendering.renderer import RasterSettings, Renderer
@@ -86,7 +86,7 @@ def render(
         check_output(output, run.overwrite, folder=True)
     if sheet is not None:
         check_output(sheet, run.overwrite)
-    splats, settings = load_scene(scene, run.say), RasterSettings(convention=convention)
+    splats, settings = run.load(scene), RasterSettings(convention=convention)
     if color != "scene":
         budget = None if parents else one_budget(count, ratio).of(len(splats), str(scene))
         splats = _painted(run, splats, color, budget, method, parents)

@@ -26,7 +26,12 @@ if TYPE_CHECKING:
     from g2ard.io import ViewSet
 
 
-@command("select", example="g2ard select scene.ply --views poses.json -k 100 -o chosen.json", settings=True)
+@command(
+    "select",
+    example="g2ard select scene.ply --views poses.json -k 100 -o chosen.json",
+    settings=True,
+    scenes=True,
+)
 def select(
     run: Run,
     scene: SceneArgument,
@@ -54,7 +59,7 @@ def select(
     from g2ard.config.presets import configured
     from g2ard.errors import InputError
     from g2ard.io import check_views_output
-    from g2ard.jobs.inputs import load_scene, load_split_views
+    from g2ard.jobs.inputs import load_split_views
     from g2ard.jobs.view_checks import warn_of_sight
     from g2ard.pipeline import SelectConfig
     from g2ard.stages.select import select as choose
@@ -71,7 +76,7 @@ def select(
     if config.views_count is None:
         raise typer.BadParameter("give the number of views with -k K")
     check_views_output(output, run.overwrite)
-    splats = load_scene(scene, run.say)
+    splats = run.load(scene)
     pool, candidates = load_split_views(with_images(views, images), split, run.say)
     cameras = pool.cameras.take(candidates)
     warn_of_sight(splats, cameras, run.say)

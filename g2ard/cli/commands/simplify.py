@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from g2ard.stages.simplify import Simplified, SimplifyConfig
 
 
-@command("simplify", example="g2ard simplify garden.ply -r 10 -o garden_10x.ply", settings=True)
+@command("simplify", example="g2ard simplify garden.ply -r 10 -o garden_10x.ply", settings=True, scenes=True)
 def simplify(
     run: Run,
     *,
@@ -118,7 +118,7 @@ def simplify(
     if maps is not None:
         maps.check(lambda path, _: _check_parents(run, path, scene, views))
     clock = [time.perf_counter()]
-    found = io.read_scene(scene)
+    found = io.read_scene(scene, render_model=run.render_model)
     say_notes(scene, found.notes, run.say)
     total = len(found.splats)
     outputs.check(lambda path, _: io.check_scene_output(path, run.overwrite), total)
@@ -152,11 +152,11 @@ def simplify(
     for aim, (place, rows) in zip(aims, places, strict=True):
         small = aim.shrink_simplified(reduce(aim.count), run.say)
         clock.append(time.perf_counter())
-        io.write_splats(place, small.splats, overwrite=run.overwrite)
+        run.write(place, small.splats)
         if rows is not None:
             _write_parents(run, rows, small)
         clock.append(time.perf_counter())
-        reports.append(_report(found, small, config.resolved(), clock))
+        reports.append(_report(found, small, config.resolved(antialiased=small.splats.antialiased), clock))
         _tell(run, scene, small, place, total, clock[-1] - clock[0])
         if aim.bytes is not None:
             run.say(f"{place}: {_bytes_of(place):,} of {aim.bytes:,} bytes")

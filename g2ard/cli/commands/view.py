@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from g2ard.scene.splats import Splats
 
 
-@command("view", example="g2ard view run/ dense.ply -o compare.html")
+@command("view", example="g2ard view run/ dense.ply -o compare.html", scenes=True)
 def view(
     run: Run,
     scene: Annotated[
@@ -45,7 +45,6 @@ def view(
 ) -> None:
     """Write an HTML page that shows one scene, or compares two, in any browser."""
     from g2ard.io.detect import run_scene
-    from g2ard.jobs.inputs import load_scene
     from g2ard.jobs.viewer_frame import frame_of
     from g2ard.viewer import check_page_output, write_page
 
@@ -53,7 +52,7 @@ def view(
     check_page_output(output, run.overwrite)
     paths = [run_scene(path) for path in (scene, other) if path is not None]
     run.spare_inputs(output)
-    loaded = [load_scene(path, run.say) for path in paths]
+    loaded = [run.load(path) for path in paths]
     if views is None and scene.is_dir() and (scene / "views.json").is_file():
         views = scene / "views.json"
     stand = frame_of(

@@ -32,7 +32,7 @@ def save(path: Path, key: str, meta: dict[str, Any], arrays: dict[str, NDArray[A
         np.savez(temporary, **everything)
 
 
-def load(path: Path, key: str) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
+def load(path: Path, key: str) -> tuple[dict[str, Any], dict[str, Any]]:
     """Read a checkpoint back.
 
     Raises:

@@ -66,6 +66,7 @@ class FusedEngine:
             sh0=sh0,
             shN=shN,
             offset=self._objective.start.offset,
+            render_model=self._objective.start.render_model,
         )
 
     def state(self) -> dict[str, NDArray[Any]]:

@@ -59,6 +59,7 @@ class GsplatEngine(TorchEngine):
             sh_degree=round(coefficients.shape[1] ** 0.5) - 1,
             backgrounds=torch.tensor([objective.background], device=self.device),
             near_plane=self._settings.near_of(view),
+            rasterize_mode="antialiased" if self._settings.antialiased else "classic",
             packed=False,
         )
         return image[0]

@@ -165,7 +165,7 @@ class Guard:
             return {}
         return {f"{_BEST}{name}": getattr(self.best, name) for name in _ARRAYS}
 
-    def load(self, meta: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> None:
+    def load(self, meta: dict[str, Any], arrays: dict[str, Any]) -> None:
         """Restore the state from `meta` and `arrays`, and remove the best scene's arrays from `arrays`."""
         self.looked, self.backed_off = int(meta["looked"]), list(meta["backed_off"])
         self.stopped, self.best_score = meta["stopped"], float(meta["best_score"])
@@ -209,4 +209,4 @@ def blended(start: Splats, end: Splats, share: ArrayLike) -> Splats:
         (a + weight.reshape(-1, *[1] * (a.ndim - 1)) * (b - a)).astype(np.float32) for a, b in pairs
     )
     scales = np.exp(log_scales.astype(np.float64)).astype(np.float32)
-    return Splats(means, quats, scales, logits, sh0, shN, end.offset)
+    return Splats(means, quats, scales, logits, sh0, shN, end.offset, end.render_model)

@@ -104,7 +104,7 @@ class Loop:
     def _new_engine(self, start: Splats | None = None) -> Engine:
         config, student = self.config, self.student if start is None else start
         objective = Objective(
-            settings=settings_for(self.anchors.means),
+            settings=settings_for(self.anchors.means, antialiased=student.antialiased),
             background=config.background,
             ssim_weight=config.ssim_weight,
             start=student,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -92,7 +93,7 @@ def rasterize(
         cameras: the views' cameras.
         index: index of the view.
         background: RGB behind the scene; not differentiated.
-        settings: conventions; None means gsplat's.
+        settings: conventions; None means gsplat's, not antialiased.
 
     Returns:
         image (H, W, 3), alpha (H, W) and depth (H, W) = Σ αT·z (not divided by alpha), float32.
@@ -113,6 +114,8 @@ def rasterize(
     True
     """
     settings = settings or RasterSettings()
+    if settings.antialiased is None:
+        settings = replace(settings, antialiased=False)
     if not 0 <= index < len(cameras):
         raise InputError(f"expected a view index below {len(cameras)}, got {index}")
     params = (means, quats, log_scales, logit_opacities, sh0, shN)

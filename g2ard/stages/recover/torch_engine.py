@@ -125,6 +125,7 @@ class TorchEngine:
             sh0=p["sh0"].numpy().copy(),
             shN=p["shN"].numpy().copy(),
             offset=self._objective.start.offset,
+            render_model=self._objective.start.render_model,
         )
 
     def state(self) -> dict[str, NDArray[Any]]:

@@ -48,7 +48,7 @@ class SimplifyConfig:
         geometric_weight: `default`, `fast`: weight of the coverage error relative to the colour error; halved
             without views, because much of the scene is hidden.
         dilation: `default`, `fast`: standard deviation of the renderer's blur, in pixels (fully √0.3; 0.4
-            measured best).
+            measured best); 0 for antialiased scenes.
         pixel_scale: `default`, `fast` without views: pixel size over the median of the largest scales.
         max_growth: `default`, `fast`: factor by which a cluster's area may grow, along its two longer axes,
             if α ≤ 0.99 cannot hold its mass. With 1, opaque surfaces show gaps.
@@ -134,8 +134,10 @@ class SimplifyConfig:
         if self.min_opacity is not None and self.min_opacity > 1:
             raise InputError(f"expected a number in [0, 1], got {self.min_opacity}", parameter="min_opacity")
 
-    def resolved(self, method: str | None = None) -> SimplifyConfig:
+    def resolved(self, method: str | None = None, *, antialiased: bool = False) -> SimplifyConfig:
         """Return the config for a method (by default its own), with None replaced by the method's constants.
+
+        Antialiased scenes get no dilation: their renderer takes from opacity what its blur adds in area.
 
         >>> SimplifyConfig().resolved("paper").retention
         0.75
@@ -146,6 +148,8 @@ class SimplifyConfig:
             for name, value in _CORE[method].items()
             if name in _OF_METHOD and getattr(self, name) is None
         }
+        if antialiased:
+            own["dilation"] = 0.0
         return replace(self, method=method, retention=self.retention_of(method), **own)
 
     def retention_of(self, method: str) -> float:

@@ -91,7 +91,7 @@ def merge(
     tell: Callable[[int, int], None],
 ) -> dict[str, Any]:
     """Merge by `default` or `fast`; `visibility` has one row per Gaussian of the scene."""
-    config = config.resolved(method)
+    config = config.resolved(method, antialiased=scene.antialiased)
     return _core.simplify_pairwise(
         scene.core,
         round_counts(len(scene), budget, config.retention_of(method), config.fold),
@@ -178,4 +178,5 @@ def splats_of(like: Splats, out: dict[str, Any]) -> Splats:
         sh0=np.ascontiguousarray(sh[:, :1]),
         shN=np.ascontiguousarray(sh[:, 1:]),
         offset=like.offset,
+        render_model=like.render_model,
     )
