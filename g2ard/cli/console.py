@@ -36,6 +36,7 @@ class Console:
         self._bars: Progress | None = None
         self._tasks: dict[str, TaskID] = {}
         self._plain: dict[str, tuple[float, float]] = {}  # stage → (began, last line)
+        self._done: dict[str, int] = {}
 
     def __enter__(self) -> Console:
         return self
@@ -57,7 +58,7 @@ class Console:
         self._end_bars()
         print(f"g2ard: {text}", file=sys.stderr, flush=True)
 
-    def table(self, title: str, columns: list[str], rows: list[list[str]]) -> None:
+    def table(self, title: str, columns: list[str], rows: list[list[str]], *, stdout: bool = False) -> None:
         """Print a table; all columns but the first are right-aligned, and empty names show no header."""
         if self.quiet:
             return
@@ -70,12 +71,18 @@ class Console:
             table.add_column(name, justify="left" if i == 0 else "right")
         for row in rows:
             table.add_row(*row)
-        Rich(stderr=True, width=None if sys.stderr.isatty() else 120).print(table)
+        stream = sys.stdout if stdout else sys.stderr
+        Rich(file=stream, width=None if stream.isatty() else 120).print(table)
 
     def __call__(self, stage: str, done: int, total: int, info: Mapping[str, Any] | None = None) -> None:
         if self.quiet:
             return
         figures = "  ".join(f"{k} {v}" for k, v in (info or {}).items())
+        if done < self._done.get(stage, 0):  # the next part of a job runs this stage anew
+            self._plain.pop(stage, None)
+            if self._bars is not None and stage in self._tasks:
+                self._bars.reset(self._tasks[stage])
+        self._done[stage] = done
         if sys.stderr.isatty():
             self._draw(stage, done, total, figures)
         else:

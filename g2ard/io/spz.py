@@ -48,8 +48,6 @@ FLIPS = np.array([-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], np.float
 """Sign of each harmonic of bands 1–3 when y and z change sign (PLY order: y z x | xy yz z² xz x²−y² | …)."""
 
 _USUAL_BITS, _MOST_BITS = 12, 20
-_BUCKETS = (8, 16)
-"""Rounding steps of band 1 and of higher bands, 5 and 4 of 8 bits, as in SPZ's packer."""
 
 
 def read(path: Path) -> Scene:
@@ -306,8 +304,6 @@ def _packed(quats: NDArray[np.float64]) -> bytes:
 
 
 def _harmonics(splats: Splats) -> bytes:
-    """Pack harmonics as 128x + 128, rounded to the centres of buckets."""
+    """Pack harmonics as 128x + 128, in all 8 bits: rounding to fewer is where other writers lose most."""
     rest = splats.shN.shape[1]
-    codes = np.rint(splats.shN.astype(np.float64) * FLIPS[:rest, None] * 128 + 128)
-    bucket = np.where(np.arange(rest) < 3, *_BUCKETS)[:, None]
-    return _bytes(np.floor((codes + bucket // 2) / bucket) * bucket)
+    return _bytes(splats.shN.astype(np.float64) * FLIPS[:rest, None] * 128 + 128)

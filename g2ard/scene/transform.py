@@ -55,6 +55,23 @@ def transform(splats: Splats, matrix: ArrayLike) -> Splats:
     )
 
 
+def moving(scale: float, degrees: Sequence[float], shift: Sequence[float]) -> NDArray[np.float64]:
+    """Return the 4×4 matrix that scales, then rotates about x, y and z in turn, then moves.
+
+    >>> moving(2, (0, 0, 90), (5, 0, 0)).round(6)[:2].tolist()
+    [[0.0, -2.0, 0.0, 5.0], [2.0, 0.0, 0.0, 0.0]]
+    """
+    rotation = np.eye(3)
+    for axis, angle in enumerate(np.radians(degrees)):
+        turn, (a, b) = np.eye(3), ((1, 2), (2, 0), (0, 1))[axis]
+        turn[a, a] = turn[b, b] = np.cos(angle)
+        turn[b, a], turn[a, b] = np.sin(angle), -np.sin(angle)
+        rotation = turn @ rotation
+    out = np.eye(4)
+    out[:3, :3], out[:3, 3] = scale * rotation, shift
+    return out
+
+
 def placed(splats: Splats, matrix: NDArray[np.float64]) -> Splats:
     """Apply a 4×4 similarity like `transform`; a mere translation only changes `offset`."""
     if (matrix[:3, :3] == np.eye(3)).all():

@@ -59,3 +59,13 @@ def test_convert_takes_its_output_with_or_without_o(command_line: CommandLine, f
     assert "SCENE… OUT, or SCENE… -o OUT" in refused(command_line, folder, "convert", "ball.ply")
     for arguments in (("ball.ply", "./ball.ply"), ("ball.ply", "-o", "ball.ply")):
         assert "is both an input and the output" in refused(command_line, folder, "convert", *arguments, "-w")
+
+
+def test_convert_scales_then_rotates_then_translates(tmp_path: Path, command_line: CommandLine) -> None:
+    scene = directional()
+    write_splats(tmp_path / "a.ply", scene)
+    words = ("--scale", "2", "--rotate", "90,0,90", "--translate", "1,2,3")
+    succeeds(command_line, tmp_path, "convert", "a.ply", "b.ply", *words)
+    x, y, z = 2 * scene.means.astype(float).T
+    expected = np.stack([z + 1, x + 2, y + 3], 1)  # about x: y → z, z → −y; then about z: x → y, y → −x
+    np.testing.assert_allclose(read_splats(tmp_path / "b.ply").means, expected, atol=1e-5)

@@ -20,6 +20,7 @@ COMMANDS = (
     "view",
     "lod",
     "evaluate",
+    "compare",
     "info",
 )
 

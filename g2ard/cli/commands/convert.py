@@ -47,6 +47,16 @@ def convert(
             help="Then apply a 4×4 matrix (row-major) of uniform scale, rotation and translation.",
         ),
     ] = None,
+    scale: Annotated[
+        float | None, typer.Option(min=1e-9, help="Then scale about the origin by this factor.")
+    ] = None,
+    rotate: Annotated[
+        str | None,
+        typer.Option(metavar="X,Y,Z", help="Then rotate about the x, y and z axes in turn, degrees."),
+    ] = None,
+    translate: Annotated[
+        str | None, typer.Option(metavar="X,Y,Z", help="Then move by this, scene units.")
+    ] = None,
     recentre: Annotated[bool, typer.Option("--recentre", help="Drop the offset to map coordinates.")] = False,
     sh_degree: ShDegreeOption = None,
     spz_version: Annotated[
@@ -63,7 +73,7 @@ def convert(
 
     from g2ard import io
     from g2ard.io.scene_formats import check_options
-    from g2ard.scene.transform import in_box, in_sphere, join
+    from g2ard.scene.transform import in_box, in_sphere, join, moving
     from g2ard.scene.transform import transform as moved
 
     scenes, output = _parted(run, scenes, output)
@@ -71,7 +81,13 @@ def convert(
     options: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
     corners = None if box is None else numbers("--box", box, 6)
     ball = None if sphere is None else numbers("--sphere", sphere, 4)
-    matrix = None if transform is None else _matrix(transform)
+    turn = None if rotate is None else numbers("--rotate", rotate, 3)
+    shift = None if translate is None else numbers("--translate", translate, 3)
+    matrix = None if transform is None else np.array(_matrix(transform))
+    if any(given is not None for given in (scale, turn, shift)):
+        matrix = moving(scale or 1, turn or (0, 0, 0), shift or (0, 0, 0)) @ (
+            np.eye(4) if matrix is None else matrix
+        )
     check_options(output, options)
     io.check_scene_output(output, run.overwrite)
     splats = join([run.load(path) for path in scenes])

@@ -68,7 +68,7 @@ def evaluate(
     from g2ard.io import check_scene
     from g2ard.io.describe import bytes_of
     from g2ard.jobs.inputs import load_views, make_targets
-    from g2ard.jobs.view_checks import propose_background, warn_of_sight
+    from g2ard.jobs.view_checks import check_sight, propose_background
     from g2ard.rendering.lpips import load_lpips
     from g2ard.rendering.renderer import RasterSettings
     from g2ard.stages.evaluate import evaluate as score
@@ -96,7 +96,7 @@ def evaluate(
     rows: list[dict[str, Any]] = []
     for path in scenes:
         splats = run.load(path)
-        warn_of_sight(splats, cameras, run.say)
+        check_sight(splats, cameras, run.say)
         scored = score(
             splats,
             targets,
@@ -171,4 +171,5 @@ def _table(run: Run, title: str, rows: list[dict[str, Any]]) -> None:
             ]
             for r in rows
         ],
+        stdout=run.json != "-",
     )

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -40,10 +40,21 @@ def render(
     run: Run,
     scene: SceneArgument,
     output: Annotated[
-        Path | None, typer.Option("-o", "--output", metavar="DIR", help="Output folder for PNGs.")
+        Path | None,
+        typer.Option(
+            "-o",
+            "--output",
+            metavar="DIR|FILE",
+            help="Folder for PNGs, or an animation of the views in order: .gif, .webp, .mp4 (needs ffmpeg).",
+        ),
     ] = None,
     views: ViewsOrMadeOption = None,
     images: ImagesOption = None,
+    turn: Annotated[
+        int | None,
+        typer.Option("--orbit", min=1, metavar="N", help="Render N views on a circle around the scene."),
+    ] = None,
+    fps: Annotated[float, typer.Option(min=0.1, help="Images a second of an animation.")] = 25.0,
     sheet: Annotated[
         Path | None,
         typer.Option(parser=picture, metavar="FILE.png", help="Write all views as one contact sheet."),
@@ -73,13 +84,24 @@ def render(
     from g2ard.io.atomic import check_output
     from g2ard.io.paths import output_names
     from g2ard.jobs.inputs import load_views
+    from g2ard.jobs.orbit import orbit
     from g2ard.jobs.view_checks import warn_of_sight
     from g2ard.jobs.views import views_or_pool
     from g2ard.rendering.renderer import RasterSettings, Renderer
-    from g2ard.scene.images import write_png
+    from g2ard.scene.animation import SUFFIXES, check_animation, write_animation
+    from g2ard.scene.images import to_bytes, write_png
 
     if output is None and sheet is None:
         raise typer.BadParameter("give -o DIR, --sheet FILE.png or both")
+    if turn is not None and (views is not None or count is not None):
+        raise typer.BadParameter("--orbit generates its views, so it excludes --views and -n")
+    animation = output if output is not None and output.suffix.lower() in SUFFIXES else None
+    if animation is not None:
+        if depth:
+            raise typer.BadParameter("--depth needs a folder; give -o DIR")
+        check_output(animation, run.overwrite)
+        check_animation(animation)
+        output = None
     looks = _looks(color, count, ratio, parents, views)
     views = with_images(views, images)
     if output is not None:
@@ -90,25 +112,30 @@ def render(
     if color != "scene":
         budget = None if parents else one_budget(count, ratio).of(len(splats), str(scene))
         splats = _painted(run, splats, color, budget, method, parents)
-    found = views_or_pool(
-        splats,
-        "made" if looks is not None else views,
-        beside=scene,
-        count=looks,
-        seed=run.seed,
-        progress=run.progress,
-        say=run.say,
-    )
+    found: Any
+    if turn is not None:
+        found = orbit(splats, turn, seed=run.seed, progress=run.progress)
+    else:
+        found = views_or_pool(
+            splats,
+            "made" if looks is not None else views,
+            beside=scene,
+            count=looks,
+            seed=run.seed,
+            progress=run.progress,
+            say=run.say,
+        )
     cameras = load_views(found, split, size, run.say)
     warn_of_sight(splats, cameras, run.say)
     places = output_names(cameras.source or str(views), cameras.names) if output is not None else []
-    shown: list[NDArray[np.float32]] = []
+    shown: list[NDArray[np.uint8]] = []
+    wanted = sheet is not None or animation is not None
     renderer = Renderer(splats, background=background or BLACK, settings=settings)
     with _folder(output, run.overwrite) as folder:
         for view in range(len(cameras)):
             rendered = renderer.render(cameras[view])
-            if sheet is not None:
-                shown.append(np.clip(rendered.image, 0, 1))
+            if wanted:
+                shown.append(to_bytes(rendered.image))
             if folder is not None:
                 stem = folder / places[view]
                 stem.parent.mkdir(parents=True, exist_ok=True)
@@ -118,8 +145,11 @@ def render(
             run.progress("render", view + 1, len(cameras))
     if sheet is not None:
         _write_sheet(sheet, shown, cameras.names, run.overwrite)
-    run.say(f"{plural(len(cameras), 'image')} in {' and '.join(str(p) for p in (output, sheet) if p)}")
-    run.result({"images": len(cameras), "output": str(output or sheet)})
+    if animation is not None:
+        write_animation(animation, shown, fps=fps, overwrite=run.overwrite)
+    written = [str(path) for path in (output, animation, sheet) if path]
+    run.say(f"{plural(len(cameras), 'image')} in {' and '.join(written)}")
+    run.result({"images": len(cameras), "output": written[0]})
 
 
 @contextmanager
@@ -134,7 +164,7 @@ def _folder(path: Path | None, overwrite: bool) -> Iterator[Path | None]:
 
 
 def _write_sheet(
-    path: Path, images: list[NDArray[np.float32]], names: tuple[str, ...], overwrite: bool
+    path: Path, images: list[NDArray[np.uint8]], names: tuple[str, ...], overwrite: bool
 ) -> None:
     """Write a roughly square grid of all images, captioned by row."""
     import math

@@ -1,0 +1,90 @@
+"""`g2ard compare`: how far a scene is from another."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from g2ard.cli.frame import Run, command
+from g2ard.cli.options import BackgroundOption, ImagesOption, SizeOption, ViewsOrMadeOption, with_images
+from g2ard.config.choices import BLACK
+from g2ard.progress import plural
+
+if TYPE_CHECKING:
+    from g2ard.stages.evaluate import ViewScore
+
+_WORST = 3
+"""Views that the table names."""
+
+
+@command("compare", example="g2ard compare dense.ply small.ply -o compare.html", scenes=True)
+def compare(
+    run: Run,
+    first: Annotated[
+        Path, typer.Argument(metavar="SCENE|RUN", help="The reference, such as the dense scene.")
+    ],
+    second: Annotated[Path, typer.Argument(metavar="SCENE|RUN", help="The scene to compare with it.")],
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            "-o", "--output", metavar="FILE.html", help="Write a page with a divider, open at the worst view."
+        ),
+    ] = None,
+    views: ViewsOrMadeOption = None,
+    images: ImagesOption = None,
+    count: Annotated[int, typer.Option("-n", "--count", min=1, help="Views to generate.")] = 24,
+    size: SizeOption = None,
+    background: BackgroundOption = None,
+) -> None:
+    """Compare renders of two scenes: PSNR, SSIM, the worst views, and a page to look at."""
+    from g2ard.io.detect import run_scene
+    from g2ard.jobs.inputs import load_views
+    from g2ard.jobs.view_checks import check_sight
+    from g2ard.jobs.viewer_frame import frame_with
+    from g2ard.jobs.views import views_or_pool
+    from g2ard.scene.targets import TeacherRenders
+    from g2ard.stages.evaluate import evaluate
+    from g2ard.viewer import check_page_output, write_page
+
+    colour, paths = background or BLACK, (run_scene(first), run_scene(second))
+    if output is not None:
+        check_page_output(output, run.overwrite)
+        run.spare_inputs(output)
+    reference, other = (run.load(path) for path in paths)
+    found = views_or_pool(
+        reference,
+        with_images(views, images),
+        beside=paths[0],
+        count=count,
+        seed=run.seed,
+        progress=run.progress,
+        say=run.say,
+    )
+    cameras = load_views(found, "all", size, run.say)
+    check_sight(reference, cameras, run.say)
+    targets = TeacherRenders(reference, cameras, background=colour)
+    scores = evaluate(other, targets, background=colour, progress=run.progress)
+    worst = sorted(scores.views, key=lambda view: view.psnr)[:_WORST]
+    run.console.table(
+        f"{second} against {first}: {plural(len(cameras), 'view')}",
+        ["", "Gaussians", "PSNR, dB", "SSIM"],
+        [
+            ["mean", f"{len(other):,} of {len(reference):,}", f"{scores.psnr:.2f}", f"{scores.ssim:.4f}"],
+            *(_row(view) for view in worst),
+        ],
+        stdout=run.json != "-",
+    )
+    if output is not None:
+        stand = frame_with(reference, cameras, start=worst[0].name)
+        scenes = [
+            (path.name, stand.of(splats)) for path, splats in zip(paths, (reference, other), strict=True)
+        ]
+        write_page(output, scenes, start=stand.start, background=colour, overwrite=run.overwrite)
+        run.say(f"{output}: opens at {worst[0].name}")
+    run.result({**scores.as_dict(), "output": None if output is None else str(output)})
+
+
+def _row(view: ViewScore) -> list[str]:
+    return [f"worst: {view.name}", "", f"{view.psnr:.2f}", f"{view.ssim:.4f}"]

@@ -1,0 +1,59 @@
+"""Turntables: ordered views around a scene."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from g2ard.jobs.view_checks import opaque_points
+from g2ard.poses import plan_pool
+from g2ard.progress import Progress, silent
+from g2ard.scene.cameras import Cameras, look_at
+from g2ard.scene.splats import Splats
+
+_POOL = 32
+"""Generated poses, of which the one that shows most of the scene begins the turn."""
+
+
+def orbit(
+    scene: Splats,
+    count: int,
+    *,
+    size: tuple[int, int] = (800, 600),
+    up: Sequence[float] | None = None,
+    seed: int = 0,
+    progress: Progress = silent,
+) -> Cameras:
+    """Return views at equal angles on a level circle, all of which look at its middle.
+
+    The first view is the generated one that shows most of the scene; the circle's middle is what lies at the
+    median depth in its direction.
+
+    Args:
+        scene: the scene.
+        count: number of views; the one after the last would be the first again.
+        size: width and height, pixels.
+        up: (3,) axis of the circle; estimated by default.
+        seed: seed of the generated views.
+        progress: called during planning.
+
+    Raises:
+        InputError: nothing visible to look at, or an invalid `up`.
+    """
+    pool = plan_pool(scene, _POOL, size=size, up=up, seed=seed, progress=progress)
+    points, axis = opaque_points(scene), np.asarray(pool.up, np.float64)
+    first = max(pool.cameras, key=lambda view: float(view.holds(points).mean()))
+    eye, ahead = first.position, first.viewmat[2, :3]
+    held = points[first.holds(points)]
+    target = eye + float(np.median((held - eye) @ ahead)) * ahead
+    height = ((eye - target) @ axis) * axis
+    level = eye - target - height
+    across = np.cross(axis, level)
+    views = []
+    for k in range(count):
+        angle = 2 * np.pi * k / count
+        position = target + height + np.cos(angle) * level + np.sin(angle) * across
+        views.append(replace(first, viewmat=look_at(position, target, axis), name=f"{k:04d}"))
+    return Cameras.of(views)

@@ -1,0 +1,72 @@
+"""Turntables and animations of `render`, and `compare`."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from g2ard.io import write_splats
+from g2ard.jobs.orbit import orbit
+from helpers.commands import CommandLine, refused, succeeds
+from helpers.scenes import checkered_ball
+
+
+def test_an_orbit_keeps_its_distance_and_turns_by_equal_angles() -> None:
+    views = orbit(checkered_ball(800), 8, size=(64, 48), up=(0, 0, 1))
+    positions = views.positions
+    middle = positions.mean(0)
+    np.testing.assert_allclose(positions[:, 2], positions[0, 2], atol=1e-9)
+    spokes = positions - middle
+    assert np.ptp(np.linalg.norm(spokes, axis=1)) < 1e-9
+    turns = [float(a @ b) / float(a @ a) for a, b in zip(spokes, np.roll(spokes, -1, 0), strict=True)]
+    np.testing.assert_allclose(turns, np.cos(np.pi / 4), atol=1e-9)
+    meets = views.viewmats @ np.append(middle, 1)  # the axis passes the middle of every image
+    np.testing.assert_allclose(meets[:, 0], 0, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", ["turn.gif", "turn.webp"])
+def test_render_writes_an_animation(tmp_path: Path, command_line: CommandLine, name: str) -> None:
+    write_splats(tmp_path / "ball.ply", checkered_ball(800))
+    ask = ("render", "ball.ply", "--orbit", 5, "--size", 64, "--fps", 10, "-o", name)
+    succeeds(command_line, tmp_path, *ask)
+    with Image.open(tmp_path / name) as found:
+        assert (found.n_frames, found.size) == (5, (64, 48))
+        found.seek(1)
+        found.load()
+        assert found.info["duration"] == 100
+    assert "exists" in refused(command_line, tmp_path, *ask, status=1)
+
+
+def test_an_mp4_without_ffmpeg_says_so(
+    tmp_path: Path, command_line: CommandLine, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("PATH", "")
+    write_splats(tmp_path / "ball.ply", checkered_ball(100))
+    told = refused(command_line, tmp_path, "render", "ball.ply", "--orbit", 2, "-o", "a.mp4", status=1)
+    assert "ffmpeg" in told
+
+
+def test_orbits_exclude_other_views(tmp_path: Path, command_line: CommandLine) -> None:
+    write_splats(tmp_path / "ball.ply", checkered_ball(100))
+    told = refused(command_line, tmp_path, "render", "ball.ply", "--orbit", 2, "-n", 3, "-o", "a")
+    assert "--orbit" in told
+
+
+def test_compare_prints_scores_and_opens_at_the_worst_view(tmp_path: Path, command_line: CommandLine) -> None:
+    ball = checkered_ball(800)
+    write_splats(tmp_path / "a.ply", ball)
+    write_splats(tmp_path / "b.ply", ball.take(np.arange(800) % 2 == 0))
+    ask = ("compare", "a.ply", "b.ply", "-n", 4, "--size", 64)
+    out = succeeds(command_line, tmp_path, *ask, "--json", "-", "-o", "page.html").out
+    found = json.loads(out)
+    assert len(found["views"]) == 4
+    assert found["psnr"] == pytest.approx(np.mean([view["psnr"] for view in found["views"]]))
+    assert found["psnr"] < 40
+    assert (tmp_path / "page.html").stat().st_size > 10_000
+    assert "worst: " in succeeds(command_line, tmp_path, *ask).out
+    same = json.loads(
+        succeeds(command_line, tmp_path, "compare", "a.ply", "a.ply", *ask[3:], "--json", "-").out
+    )
+    assert same["psnr"] == 100
