@@ -212,7 +212,7 @@ class Run:
         from g2ard.io.scene_formats import lost_in
 
         write_splats(path, splats, overwrite=self.overwrite or overwrite, **options)
-        for note in lost_in(path, splats):
+        for note in lost_in(path, splats, **options):
             self.say(f"note: {path}: {note}")
 
     def spare_inputs(self, *outputs: Path) -> None:

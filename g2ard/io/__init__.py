@@ -213,7 +213,7 @@ def write_splats(path: str | Path, splats: Splats, *, overwrite: bool = False, *
     found = check_options(path, options)
     writer = getattr(import_module(f"g2ard.io.{found.module}"), found.function)
     writer(Path(path), splats, overwrite=overwrite, **options)
-    for note in lost_in(path, splats):
+    for note in lost_in(path, splats, **options):
         warnings.warn(f"{path}: {note}", stacklevel=2)
 
 

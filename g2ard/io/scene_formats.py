@@ -62,10 +62,10 @@ def scene_format(path: str | Path) -> SceneFormat:
     raise OutputError(f"scenes are written as {known}, or as a SOG folder (NAME/meta.json)", path=path)
 
 
-def lost_in(path: str | Path, splats: Splats) -> list[Note]:
+def lost_in(path: str | Path, splats: Splats, **options: object) -> list[Note]:
     """Return notes on what the format of an output path cannot hold."""
     found = scene_format(path)
-    if found.models or not splats.antialiased:
+    if found.models or options.get("compress") == "spz" or not splats.antialiased:
         return []
     from g2ard.io.types import Note
 

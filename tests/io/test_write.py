@@ -427,6 +427,7 @@ def test_a_real_scene_keeps_its_values(tmp_path: Path) -> None:
 @pytest.mark.parametrize("degree", [0, 1, 3])
 def test_glb_with_spz_holds_gltf_coordinates(tmp_path: Path, degree: int) -> None:
     truth = replace(in_order(scene(700, degree)), offset=np.array([443_000.0, 5_411_000.5, 120.25]))
+    truth = replace(truth, render_model="antialiased")
     path = saved(tmp_path, "glb", truth, compress="spz")
     document, binary = glb_parts(path)
     (primitive,) = document["meshes"][0]["primitives"]
@@ -446,6 +447,7 @@ def test_glb_with_spz_holds_gltf_coordinates(tmp_path: Path, degree: int) -> Non
     turned_scene = transform(replace(truth, offset=np.zeros(3)), np.diag([-1.0, 1, -1, 1]))
     np.testing.assert_allclose(inside.shN, turned_scene.shN, atol=0.07)
     found = read_splats(path)
+    assert found.antialiased
     np.testing.assert_array_equal(found.offset, truth.offset)
     np.testing.assert_allclose(found.means, truth.means, atol=2.0**-13)
     np.testing.assert_allclose(found.shN, truth.shN, atol=0.07)
