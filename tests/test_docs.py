@@ -175,7 +175,6 @@ def test_the_api_page_has_every_public_name_once() -> None:
 @pytest.mark.parametrize(
     ("index", "folder"),
     [
-        ("docs/decisions.md", "docs/decisions"),
         ("docs/methods/index.md", "docs/methods"),
         ("benchmarks/record/README.md", "benchmarks/record"),
         ("docs/how-to/index.md", "docs/how-to"),

@@ -98,7 +98,7 @@ PRESETS = {
     "noisy": Regularizers(anchor=5e-2, shape=1.0, effective_rank=True),
 }
 """Weights for g2ard's schedule of a thousand steps, only ten of them regularised, so that larger weights are
-needed (`docs/decisions.md`).
+needed (decision 0019).
 """
 
 

@@ -165,7 +165,7 @@ TUNED = Schedule(
     rates=Rates(means=0.05, log_scales=6e-2, quats=1.5e-2, logit_opacities=7e-2, sh0=3e-2, shN=3e-3),
     steps=1000,
 )
-"""g2ard's schedule: rates in units of each Gaussian and a cosine to 1 % (figures in `docs/decisions.md`)."""
+"""g2ard's schedule: rates in units of each Gaussian and a cosine to 1 % (figures in decision 0016)."""
 
 PAPER = Schedule(
     rates=Rates(means=9.2e-4, log_scales=5e-3, quats=1e-3, logit_opacities=5e-3, sh0=2.5e-3, shN=1.25e-4),
@@ -181,7 +181,7 @@ PAPER = Schedule(
 )
 """The paper's schedule (supplement, `tab:s_config`): 8,000 steps per round and 30,000 at the end, with 3DGS's
 rates where the paper states none. Its rate of means lacks a unit; 9.2e-4 is 3DGS's 1.6e-4 × extent at an
-extent of 5.75, so it is read that way (`docs/decisions.md`). `PAPER.scaled(3000)` has a tenth of the steps.
+extent of 5.75, so it is read that way (decision 0023). `PAPER.scaled(3000)` has a tenth of the steps.
 """
 
 SCHEDULES: dict[str, Schedule] = {

@@ -21,7 +21,7 @@ use crate::{Control, Error, Result};
 
 constants! {
     /// The constants, named as in Python, which takes its defaults from here. They are what measured best
-    /// (docs/decisions.md).
+    /// (decisions 0005 to 0009).
     pub struct Pairwise {
         /// Below this α a Gaussian is dropped: no renderer draws it.
         pub min_opacity: f64 = 0.004,
