@@ -181,7 +181,7 @@ MinPsnrOption = Annotated[
 ]
 MinSsimOption = Annotated[
     float | None,
-    typer.Option(min=0.01, max=0.9999, help="Smallest scene with at least this SSIM.", hidden=True),
+    typer.Option(min=0.01, max=0.9999, help="Smallest scene with at least this SSIM."),
 ]
 
 

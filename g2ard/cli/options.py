@@ -22,7 +22,6 @@ from g2ard.config.choices import (
     PresetName,
     ScheduleName,
 )
-from g2ard.report.window import Crop
 
 if TYPE_CHECKING:
     from g2ard.cli.frame import Run
@@ -239,28 +238,6 @@ TeacherOption = Annotated[
 ConventionOption = Annotated[
     Convention,
     typer.Option(help="Renderer to follow; inria has near plane 0.2 and cuts splats at 3σ tiles."),
-]
-
-
-def _crop(text: str) -> Crop:
-    from g2ard.errors import InputError
-
-    try:
-        return Crop.parse(text)
-    except InputError as error:
-        raise typer.BadParameter(error.message) from None
-
-
-CropOption = Annotated[
-    list[Crop] | None,
-    typer.Option(
-        "--crop",
-        parser=_crop,
-        metavar="[VIEW:]X,Y,W,H",
-        help="Magnify a part in the report: left, top, width, height as shares of the image "
-        "(front.png:0.4,0.3,0.2,0.2); repeatable.",
-        hidden=True,
-    ),
 ]
 
 PresetOption = Annotated[

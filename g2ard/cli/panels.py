@@ -10,24 +10,24 @@ GROUPED = ("distill", "simplify", "recover", "adapt", "register", "lod")
 """Commands whose own options are grouped."""
 
 _PANELS = {
-    "Budget": ("count", "ratio", "ratios", "fit", "min_psnr"),
+    "Budget": ("count", "ratio", "ratios", "fit", "min_psnr", "min_ssim"),
     "Views": (
         *("views", "images", "alpha", "teacher", "photos", "held_out", "split", "size", "background"),
         *("up", "no_views", "poses", "pool", "intrinsics", "focal"),
     ),
     "Method": (
         *("method", "preset", "keep_region", "clean", "anchors"),
-        *("matcher", "refine", "passes", "accept", "keep", "protocol"),
+        *("matcher", "refine", "passes", "accept", "protocol"),
     ),
     "Recovery": (
         *("recover", "schedule", "steps", "recovery_time", "weighted"),
         *("tolerance", "prior_views", "sh_degree"),
     ),
     "Output": (
-        *("output", "format", "parents", "resume", "dry_run", "report", "truth", "metres_per_unit"),
-        *("errors", "most", "extent", "least"),
+        *("output", "format", "keep", "view", "parents", "resume", "dry_run", "report", "truth"),
+        *("metres_per_unit", "errors", "most", "extent", "least"),
     ),
-    "Large scenes": ("memory", "workers"),
+    "Large scenes": ("memory", "workers", "tile_rows", "scheduler", "work"),
 }
 
 

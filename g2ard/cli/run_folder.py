@@ -24,7 +24,7 @@ REPORT = "report.json"
 """The run's numbers, written last."""
 
 _OF_THE_CALL = (
-    *("output", "resume", "keep", "view", "crop", "dry_run", "threads", "device"),
+    *("output", "resume", "keep", "view", "dry_run", "threads", "device"),
     *("memory", "workers", "scheduler", "work"),
 )
 """Options that may change when a run is resumed. `device` may change except to or from CUDA."""

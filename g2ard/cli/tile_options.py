@@ -20,7 +20,6 @@ TileRowsOption = Annotated[
         parser=Count.parse_absolute,
         metavar="COUNT",
         help="Maximum Gaussians per tile; larger scenes are processed in tiles. 5M by default.",
-        hidden=True,
     ),
 ]
 MemoryOption = Annotated[
@@ -36,7 +35,6 @@ SchedulerOption = Annotated[
     typer.Option(
         metavar="ADDRESS",
         help="Dask scheduler for tiles: tcp://HOST:PORT or local (needs the extra `distributed`).",
-        hidden=True,
     ),
 ]
 WorkOption = Annotated[
@@ -45,7 +43,6 @@ WorkOption = Annotated[
         metavar="DIR",
         help="Keep tiles and finished steps here, for other budgets; by default in .NAME.tiles beside the "
         "output, until the command succeeds.",
-        hidden=True,
     ),
 ]
 

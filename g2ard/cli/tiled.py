@@ -85,7 +85,7 @@ class TiledCommand:
 
         run, began = self.run, time.perf_counter()
         with working(self.tiling, options.views, options.held_out):
-            own = [name for name in ("dry_run", "keep", "crop") if run.config[name]]
+            own = [name for name in ("dry_run", "keep") if run.config[name]]
             given = [*whole_options(options), *whole_budgets(self.budgets)]
             refuse_whole(self.scene, given + [f"--{name.replace('_', '-')}" for name in own])
             run.kept = [

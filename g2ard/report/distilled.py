@@ -11,13 +11,11 @@ from typing import Any
 import numpy as np
 
 from g2ard.config.choices import BLACK, Colour
-from g2ard.errors import InputError
 from g2ard.progress import plural
 from g2ard.rendering.metrics import psnr
 from g2ard.rendering.renderer import Renderer
 from g2ard.report.kinds import KindScore
 from g2ard.report.page import Comparison, Page, Shown
-from g2ard.report.window import Crop
 from g2ard.scene.images import contact_sheet, to_bytes, write_png
 from g2ard.scene.splats import Splats
 from g2ard.scene.splits import rows_by_kind
@@ -36,9 +34,7 @@ def distill_report(
     targets: Sequence[Targets],
     report: dict[str, Any],
     background: Colour = BLACK,
-    *,
     told: Sequence[str] = (),
-    crops: Sequence[Crop] = (),
 ) -> None:
     """Write the HTML page of one run: a verdict, scores by kind of view, and pictures of the worst views.
 
@@ -50,12 +46,7 @@ def distill_report(
         report: what `g2ard distill` writes as report.json.
         background: RGB behind the scenes.
         told: summary lines that the command prints.
-        crops: regions to magnify; by default the worst regions of each view. Their views are shown first.
-
-    Raises:
-        InputError: a crop names a view that is not held out.
     """
-    check_crops(crops, targets[0].cameras.names)
     page = Page(title, verdict(report))
     page.table(
         ["kind of view", "views", "PSNR simplified, dB", "recovered, dB", "SSIM", "worst view", "dB"],
@@ -83,15 +74,14 @@ def distill_report(
     parts = [report["scores"], *([report["apart"]] if report["apart"] else [])]
     scores = {name: [view for part in parts for view in part[name]["views"]] for name, _ in scenes}
     renderers = [(name, Renderer(splats, background=background)) for name, splats in reversed(scenes)]
-    for view in _worst(scores[scenes[-1][0]], crops):
+    for view in _worst(scores[scenes[-1][0]]):
         part, row = views[view]
-        camera, name = part.cameras[row], part.cameras.names[row]
+        camera = part.cameras[row]
         shown = [
             Shown(stage, to_bytes(renderer.image(camera)), f"{scores[stage][view]['psnr']:.2f} dB")
             for stage, renderer in renderers
         ]
-        windows = [crop.window for crop in crops if crop.view in (None, name)]
-        page.comparison(Comparison(name, to_bytes(part[row]), shown, windows))
+        page.comparison(Comparison(part.cameras.names[row], to_bytes(part[row]), shown))
     size, seconds = report["bytes"], report["seconds"]
     page.paragraph(
         f"{size['input'] / 1e6:.2f} → {size['output'] / 1e6:.2f} MB as .ply, in {seconds['total']:,.0f} s. "
@@ -126,29 +116,12 @@ def verdict(report: dict[str, Any]) -> str:
     return f"{count} reproduce the {what} at {mean:.1f} dB on average; {last}."
 
 
-def _worst(scores: Sequence[dict[str, Any]], crops: Sequence[Crop]) -> list[int]:
-    """Choose the views to show: those of `crops`, then the worst of each kind in turn, weakest kind first."""
+def _worst(scores: Sequence[dict[str, Any]]) -> list[int]:
+    """Choose the views to show: the worst of each kind in turn, weakest kind first."""
     names = [view["name"] for view in scores]
     kinds = [sorted(rows, key=lambda row: scores[row]["psnr"]) for rows in rows_by_kind(names).values()]
     kinds.sort(key=lambda rows: fmean(scores[row]["psnr"] for row in rows))
-    worst = [row for turn in zip_longest(*kinds) for row in turn if row is not None]
-    asked = [names.index(crop.view) for crop in crops if crop.view is not None]
-    return list(dict.fromkeys([*asked, *worst]))[: max(_SHOWN, len(set(asked)))]
-
-
-def check_crops(crops: Sequence[Crop], names: Sequence[str]) -> None:
-    """Reject crops of views that are not scored.
-
-    Raises:
-        InputError: a crop names another view.
-    """
-    for crop in crops:
-        if crop.view is not None and crop.view not in names:
-            few = ", ".join(names[:4]) + (", …" if len(names) > 4 else "")
-            raise InputError(
-                f"expected one of the {plural(len(names), 'scored view')} ({few}), got {crop.view}",
-                parameter="crop",
-            )
+    return [row for turn in zip_longest(*kinds) for row in turn if row is not None][:_SHOWN]
 
 
 def tiled_report(path: Path, title: str, report: dict[str, Any]) -> None:

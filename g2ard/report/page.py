@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard.io.atomic import atomic_output
-from g2ard.report.window import Window
 from g2ard.scene.images import to_bytes
 
 _WINDOW, _CROPS = 0.28, 2
@@ -37,13 +36,36 @@ class Shown:
 class Comparison:
     """A view's target and its renderings by several methods, the first of which is shown initially.
 
-    Without `crops`, the worst regions of the first rendering are magnified.
+    The worst regions of the first rendering are magnified.
     """
 
     title: str
     target: NDArray[np.uint8]
     shown: Sequence[Shown]
-    crops: Sequence[Window] = ()
+
+
+@dataclass(frozen=True)
+class Window:
+    """A rectangle of an image, as fractions of its width and height.
+
+    >>> Window(0.25, 0.5, 0.25, 0.25).pixels(100, 200)
+    (slice(50, 75, None), slice(50, 100, None))
+    """
+
+    left: float
+    top: float
+    width: float
+    height: float
+
+    def pixels(self, height: int, width: int) -> tuple[slice, slice]:
+        """Return the rows and columns in an image of that size, at least one of each."""
+        rows = _span(self.top, self.height, height)
+        return rows, _span(self.left, self.width, width)
+
+
+def _span(start: float, extent: float, size: int) -> slice:
+    first = min(int(start * size + 1e-6), size - 1)
+    return slice(first, max(first + 1, min(size, round((start + extent) * size))))
 
 
 def worst_windows(image: NDArray[np.uint8], target: NDArray[np.uint8]) -> list[Window]:
@@ -128,7 +150,7 @@ class Page:
         """
         target = self._image(view.target)
         numbers = [self._image(shown.image) for shown in view.shown]
-        windows = list(view.crops) or worst_windows(view.shown[0].image, view.target)
+        windows = worst_windows(view.shown[0].image, view.target)
         height, width = view.target.shape[:2]
         options = "".join(
             f'<option value="{n}">{escape(s.name)} {escape(s.caption)}</option>'

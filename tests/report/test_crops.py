@@ -1,21 +1,14 @@
-"""Regions of interest in reports: the worst part of a view, or a given one, at full resolution."""
+"""Crops in reports: the worst parts of a view, at full resolution."""
 
 import base64
 import json
 import re
 from io import BytesIO
-from pathlib import Path
 
 import numpy as np
-import pytest
 from PIL import Image
 
-from g2ard import io
-from g2ard.errors import InputError
 from g2ard.report.page import Comparison, Page, Shown, worst_windows
-from g2ard.report.window import Crop, Window
-from helpers.commands import CommandLine, succeeds
-from helpers.scenes import around, checkered_ball
 from helpers.studies import check_page
 
 
@@ -50,46 +43,18 @@ def test_worst_windows_hold_the_error_and_do_not_overlap() -> None:
 def test_crops_are_cut_at_full_resolution() -> None:
     rng = np.random.default_rng(0)
     target = np.repeat(np.repeat(rng.integers(0, 255, (75, 100, 3), np.uint8), 20, 0), 20, 1)
+    wrong = target.copy()
+    wrong[300:720, 200:760] = 255 - target[300:720, 200:760]  # a window's size: 28 % of each side
     page = Page("A page")
-    window = Window(0.1, 0.2, 0.2, 0.2)
-    page.comparison(Comparison("a view", target, [Shown("same", target, "9 dB")], [window]))
+    page.comparison(Comparison("a view", target, [Shown("wrong", wrong, "9 dB")]))
     html = page.text()
     check_page(html)
-    whole, same, *crops = images_of(html)
-    assert max(whole.shape) == max(same.shape) == 1280
-    assert [crop.shape for crop in crops] == [(300, 400, 3)] * 2
-    expected = target[300:600, 200:600].astype(float)
-    assert np.abs(crops[0] - expected).mean() < 12  # JPEG
-    assert "left:10.00%;top:20.00%;width:20.00%;height:20.00%" in html
-
-
-@pytest.mark.parametrize(
-    "text", ["1,2", "0,0,0,1", "0.9,0,0.2,0.1", "-1,0,.5,.5", "a,b,c,d", "x:", "nan,0,1,1"]
-)
-def test_invalid_crops_are_named(text: str) -> None:
-    with pytest.raises(InputError, match="crop"):
-        Crop.parse(text)
-
-
-def test_command(command_line: CommandLine, tmp_path: Path) -> None:
-    io.write_splats(tmp_path / "ball.ply", checkered_ball(600))
-    io.write_views(tmp_path / "views.json", around(16, size=(48, 36)))
-    common = ["distill", "ball.ply", "-r", "4", "--views", "views.json", "--steps", "5"]
-    crops = ["--crop", "view_008:0.25,0.25,0.5,0.5", "--crop", "0,0,0.5,0.25"]
-    succeeds(command_line, tmp_path, *common, *crops, "-o", "run")
-    html = (tmp_path / "run" / "report.html").read_text()
-    check_page(html)
-    first, second = html.split('<section class="view">')[1:3]
-    assert "<h4>view_008</h4>" in first
-    assert first.count('class="roi') == 2
-    assert second.count('class="roi') == 1
-    assert {(36, 48), (18, 24), (9, 24)} <= {image.shape[:2] for image in images_of(html)}
-    assert html.count('<section class="view">') == 3
-    status, _, err = command_line(*common, "--crop", "moon:0,0,1,1", "-o", "none", cwd=tmp_path)
-    assert (status, "Traceback" in err) == (1, False)
-    assert "--crop: expected one of the 2 scored views (view_000, view_008), got moon" in err
-    assert not (tmp_path / "none").exists()
-    assert command_line(*common, "--crop", "9,9,9,9", "-o", "none", cwd=tmp_path)[0] == 2
+    whole, over, *crops = images_of(html)
+    assert max(whole.shape) == max(over.shape) == 1280
+    assert [crop.shape for crop in crops] == [(420, 560, 3)] * 4
+    for crop, image in zip(crops, (target, wrong), strict=False):
+        assert np.abs(crop - image[300:720, 200:760].astype(float)).mean() < 12  # JPEG
+    assert "left:10.00%;top:20.00%;width:28.00%;height:28.00%" in html
 
 
 def test_the_caption_of_a_crop_names_its_image() -> None:

@@ -11,7 +11,6 @@ import pytest
 from g2ard.report.distilled import _worst, verdict
 from g2ard.report.kinds import by_kind
 from g2ard.report.page import Comparison, Page, Shown
-from g2ard.report.window import Crop
 from helpers.commands import CommandLine, succeeds
 from helpers.studies import check_page, study
 
@@ -57,10 +56,8 @@ VIEWS = [
 
 
 def test_pictures_are_the_worst_view_of_each_kind_in_turn() -> None:
-    assert [VIEWS[row]["name"] for row in _worst(VIEWS, [])] == ["near_1", "pose_1", "near_2"]
-    asked = [Crop.parse("pose_0:0,0,1,1"), Crop.parse("0,0,1,1")]
-    assert [VIEWS[row]["name"] for row in _worst(VIEWS, asked)] == ["pose_0", "near_1", "pose_1"]
-    assert _worst(VIEWS[:1], []) == [0]
+    assert [VIEWS[row]["name"] for row in _worst(VIEWS)] == ["near_1", "pose_1", "near_2"]
+    assert _worst(VIEWS[:1]) == [0]
 
 
 def test_the_verdict_names_the_weakest_kind_of_view() -> None:

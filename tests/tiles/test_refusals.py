@@ -49,7 +49,6 @@ _DISTILL = ("distill", "-r", "10", "-o", "x", "--views", "views.json")
         (_DISTILL, "--recovery-time 5m", "--recovery-time"),
         (_DISTILL, "--dry-run", "--dry-run"),
         (_DISTILL, "--keep", "--keep"),
-        (_DISTILL, "--crop 0,0,0.5,0.5", "--crop"),
         (("simplify", "-o", "x.ply"), "--min-ssim 0.9", "--min-ssim 0.9"),
         (("distill", "-o", "x"), "--fit 50kB", "--fit 50kB"),
     ],

@@ -21,7 +21,6 @@ from g2ard.cli.frame import Run, command
 from g2ard.cli.options import (
     AlphaOption,
     BackgroundOption,
-    CropOption,
     FormatOption,
     ImagesOption,
     KeepRegionOption,
@@ -66,7 +65,6 @@ if TYPE_CHECKING:
     from g2ard.jobs.budget import Budget
     from g2ard.jobs.job import DistillJob
     from g2ard.pipeline import Distilled
-    from g2ard.report.window import Crop
     from g2ard.scene.splats import Splats
     from g2ard.scene.targets import Targets
 
@@ -117,7 +115,6 @@ def distill(
         typer.Option(
             "--keep",
             help="Keep the simplified scene too, in RUN/simplified.",
-            hidden=True,
         ),
     ] = False,
     output: Annotated[
@@ -131,10 +128,9 @@ def distill(
     ] = False,
     view: Annotated[
         bool,
-        typer.Option("--view/--no-view", help="Write view.html, a viewer page with the scene.", hidden=True),
+        typer.Option("--view/--no-view", help="Write view.html, a viewer page with the scene."),
     ] = True,
     resume: ResumeOption = False,
-    crop: CropOption = None,
     size: SizeOption = None,
     background: BackgroundOption = None,
     up: UpOption = None,
@@ -175,7 +171,6 @@ def distill(
     from g2ard.jobs.distill_options import DistillOptions
     from g2ard.jobs.estimate import check_memory
     from g2ard.jobs.tiling import is_tiled
-    from g2ard.report.distilled import check_crops
 
     began = time.monotonic()
     settings.setdefault("recover.engine", recovery_engine(run))
@@ -221,7 +216,6 @@ def distill(
         progress=run.progress,
         say=run.say,
     )
-    check_crops(crop or [], job.views.test.names)
     places = [folder / name for folder in outputs.paths(len(job.prior))]
     if dry_run:
         _tell_estimates(run, job, [place.parent for place in places], page=view)
@@ -237,7 +231,7 @@ def distill(
             continue
         tell_anew(run, place.parent, resume)
         result, report = _distil(
-            run, scene or Path(str(views)), job, aim.count, place, resume, keep, view, crop or [], began
+            run, scene or Path(str(views)), job, aim.count, place, resume, keep, view, began
         )
         reports.append(report)
         run.kept.append(f"{place.parent} is finished{others}")
@@ -289,7 +283,6 @@ def _distil(
     resume: bool,
     keep: bool,
     view: bool,
-    crops: list[Crop],
     began: float,
 ) -> tuple[Distilled, dict[str, Any]]:
     """Distil to one budget and write the run's folder; `place` is the scene's file."""
@@ -309,7 +302,6 @@ def _distil(
             report,
             colour,
             told=told(report),
-            crops=crops,
         )
         page = _view(place, result.splats if view else None, job, report)
         _write(run, place, result, job.held_out, colour, report)
