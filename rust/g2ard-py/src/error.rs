@@ -3,6 +3,7 @@
 use g2ard_core::Error;
 use pyo3::exceptions::{PyKeyboardInterrupt, PyRuntimeError};
 use pyo3::prelude::*;
+use pyo3::types::PyDict;
 
 /// `InvalidInput` and `NonFinite` → `g2ard.errors.InputError`; `Interrupted` → `KeyboardInterrupt`.
 pub fn to_py(error: Error) -> PyErr {
@@ -10,12 +11,33 @@ pub fn to_py(error: Error) -> PyErr {
         return PyKeyboardInterrupt::new_err(());
     }
     Python::attach(|py| {
-        let class = py
-            .import("g2ard.errors")
-            .and_then(|m| m.getattr("InputError"));
-        match class.and_then(|c| c.call1((error.to_string(),))) {
-            Ok(value) => PyErr::from_value(value),
-            Err(_) => PyRuntimeError::new_err(error.to_string()),
-        }
+        input_error(py, &error).unwrap_or_else(|_| PyRuntimeError::new_err(error.to_string()))
     })
+}
+
+/// An `InputError` whose `parameter` is the field at fault, and whose `index` its first row that is not finite.
+fn input_error(py: Python<'_>, error: &Error) -> PyResult<PyErr> {
+    let fields = PyDict::new(py);
+    let message = match error {
+        Error::InvalidInput {
+            name,
+            expected,
+            got,
+        } => {
+            fields.set_item("parameter", name)?;
+            format!("expected {expected}, got {got}")
+        }
+        Error::NonFinite {
+            field,
+            count,
+            first_index,
+        } => {
+            fields.set_item("parameter", field)?;
+            fields.set_item("index", first_index)?;
+            format!("is the first of {count} with a non-finite value")
+        }
+        Error::Interrupted => error.to_string(),
+    };
+    let class = py.import("g2ard.errors")?.getattr("InputError")?;
+    Ok(PyErr::from_value(class.call((message,), Some(&fields))?))
 }
