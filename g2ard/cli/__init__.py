@@ -10,7 +10,6 @@ import typer
 
 from g2ard.cli.commands import register_commands
 from g2ard.cli.frame import app
-from g2ard.cli.lazy_rich import defer_rich
 from g2ard.cli.pipes import outlive_readers
 from g2ard.cli.usage import usage_line
 from g2ard.system import interrupt
@@ -32,7 +31,6 @@ def run_program(app: typer.Typer, name: str) -> None:
     # BLAS threads would only spin (3 % of a short command), since kernels use their own threads.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     outlive_readers()
-    defer_rich()
     gc.set_threshold(50_000)  # imports create no garbage; looking for it takes 5 % of a short command
     try:
         status = app(prog_name=name, standalone_mode=False)
