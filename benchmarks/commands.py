@@ -9,7 +9,6 @@ from typing import Annotated, Any
 import typer
 
 from g2ard.cli.frame import Run, command
-from g2ard.cli.resume import rows_kept
 from g2ard.errors import InputError
 from g2ard.progress import plural
 
@@ -115,8 +114,13 @@ def run_(
             there = f"no scene {only!r} (it has {', '.join(s.name for s in one.scenes)})"
             raise InputError(f"{path}: {there if one.scenes else 'no scenes: give some'}")
         studies.append(replace(one, scenes=wanted))
-    with rows_kept(run, output / "rows.csv", goes_on=True):
+    table = output / "rows.csv"
+    try:
         rows = run_studies(studies, output, keep=keep, again=run.overwrite, progress=run.progress)
+    except KeyboardInterrupt:
+        if table.exists():
+            run.kept.append(f"finished rows are in {table}; run the same command to continue")
+        raise
     write_report(output, studies, rows)
     for one in studies:
         own = [row for row in rows if row["study"] == one.name]
@@ -124,7 +128,7 @@ def run_(
         summary = one.summary(own)
         if summary is not None:
             run.console.table(*summary)
-    run.say(f"rows: {output / 'rows.csv'}\nreport: {output / 'report.html'}")
+    run.say(f"rows: {table}\nreport: {output / 'report.html'}")
     run.result({"rows": rows})
     failed = sum("error" in row for row in rows)
     if failed:

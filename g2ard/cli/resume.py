@@ -30,7 +30,7 @@ def check_stopped(run: Run, place: Path, resume: bool, output: Path) -> bool:
     if resume and not left:
         run.say(f"{output}: nothing to resume, starting over")
     if left and not (resume or run.overwrite):
-        raise OutputError(f"{place}: left by an interrupted run; --resume continues it, -w starts over")
+        raise OutputError("left by an interrupted run; --resume continues it, -w starts over", path=place)
     return resume and left
 
 
@@ -50,18 +50,6 @@ def stoppable(run: Run, place: Path, resume: bool) -> Iterator[None]:
     finally:
         if not left_at(place):
             _remove(place)
-
-
-@contextmanager
-def rows_kept(run: Run, table: Path, *, goes_on: bool) -> Iterator[None]:
-    """Report finished rows of a table on Ctrl-C, and whether running the command again continues."""
-    try:
-        yield
-    except KeyboardInterrupt:
-        if table.exists():
-            onward = "run the same command to continue" if goes_on else "-w starts over"
-            run.kept.append(f"finished rows are in {table}; {onward}")
-        raise
 
 
 def left_at(place: Path) -> bool:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from g2ard.cli.frame import Run
-from g2ard.cli.resume import rows_kept, stoppable
+from g2ard.cli.resume import stoppable
 from g2ard.cli.run_folder import work_folder
 from g2ard.errors import InputError
 from g2ard.io import write_splats, write_views
@@ -145,12 +145,3 @@ def test_the_total_of_a_resumed_run_holds_what_was_done_before(
     seconds = json.loads(out)["seconds"]
     assert seconds["total"] > seconds["resumed"] == 50.0
     assert f"recover 60.0 s, total {seconds['total']:.1f} s" in " ".join((out + error).split())
-
-
-def test_an_interrupt_says_which_rows_stay(folder: Path) -> None:
-    common = dict.fromkeys(("overwrite", "verbose", "quiet", "json", "config")) | {"seed": 0, "threads": 0}
-    for table, told in ((folder / "a.ply", ["to continue"]), (folder / "none.csv", [])):
-        run = Run("simplify", {**common, "device": "cpu"}, {})
-        with pytest.raises(KeyboardInterrupt), rows_kept(run, table, goes_on=True):
-            raise KeyboardInterrupt
-        assert [line.split("run the same command ")[-1] for line in run.kept] == told
