@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from g2ard.config.choices import ADAPT_SCHEDULES, BLACK, AdaptSchedule, Colour
+from g2ard.config.choices import ADAPT_SCHEDULES, AdaptSchedule
 from g2ard.errors import InputError, require
 from g2ard.progress import Progress, silent
 from g2ard.report.base import Report
@@ -18,6 +18,7 @@ from g2ard.scene.splats import Splats
 from g2ard.scene.targets import Targets, fingerprint_of
 from g2ard.stages.recover import RecoverConfig, checkpoint, recover
 from g2ard.stages.recover.anchors import Regularizers
+from g2ard.stages.recover.config import FitConfig
 from g2ard.stages.recover.probe import Probe
 from g2ard.stages.recover.report import Gain
 from g2ard.stages.recover.schedule import PAPER, TUNED, Schedule
@@ -27,8 +28,8 @@ _FREE = Regularizers(anchor=0.0, shape=0.0, effective_rank=False)
 
 
 @dataclass(frozen=True)
-class AdaptConfig:
-    """Options of adaptation.
+class AdaptConfig(FitConfig):
+    """Options of adaptation, in addition to `FitConfig`.
 
     Args:
         steps: most steps; 7,000 as in the paper.
@@ -38,12 +39,8 @@ class AdaptConfig:
             steps at once, with rates that decay to a tenth, without colour change or blending.
         prior_views: weight of the appearance before the fit, in views. A Gaussian seen by v views moves v/(v
             + prior_views) of the way to its fit. 0 keeps the fit.
-        sh_degree: SH degree of the result; None keeps the scene's. Highlights need higher bands.
-        background: RGB behind the scene.
-        seed: seed of the order of views.
         first_stretch: steps of the first stretch.
         colour_worth: least gain (dB) on the images for changing all colours at once.
-        ssim_weight: λ of the photometric loss, see `RecoverConfig`.
         recovery: rates and decay of a stretch with frozen geometry, see `appearance_only`; None means those
             of `schedule`.
 
@@ -55,15 +52,12 @@ class AdaptConfig:
     tolerance: float = 0.05
     schedule: AdaptSchedule = "default"
     prior_views: float = 1.0
-    sh_degree: int | None = None
-    background: Colour = BLACK
-    seed: int = 0
     first_stretch: int = 500
     colour_worth: float = 0.3
-    ssim_weight: float = RecoverConfig.ssim_weight
     recovery: Schedule | None = None
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if self.steps < 1 or not self.tolerance >= 0:
             raise InputError(
                 f"expected steps ≥ 1 and tolerance ≥ 0, got {self.steps} and {self.tolerance}",

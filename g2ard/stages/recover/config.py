@@ -11,19 +11,39 @@ from g2ard.stages.recover.schedule import TUNED, Schedule
 
 
 @dataclass(frozen=True)
-class RecoverConfig:
-    """Options of recovery.
+class FitConfig:
+    """Options of every fit to images.
+
+    Args:
+        sh_degree: SH degree of the result; None keeps the scene's. Highlights need higher bands.
+        ssim_weight: λ in (1−λ)·L1 + λ·(1−SSIM); 0.2 as in 3DGS.
+        background: RGB behind the scene.
+        seed: seed of the order of views.
+
+    Raises:
+        InputError: a value out of range.
+    """
+
+    sh_degree: int | None = None
+    ssim_weight: float = 0.2
+    background: Colour = BLACK
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.ssim_weight <= 1:
+            raise InputError(f"expected a value in [0, 1], got {self.ssim_weight}", parameter="ssim_weight")
+
+
+@dataclass(frozen=True)
+class RecoverConfig(FitConfig):
+    """Options of recovery, in addition to `FitConfig`.
 
     Args:
         schedule: rates, number of steps and decay.
         steps: number of steps; overrides the schedule's.
         recovery_time: time limit in seconds instead of steps; the result then depends on the machine's speed.
         regularizers: weights of L_anchor and L_shape (`tab:s_recovery`).
-        sh_degree: SH degree of the result; None keeps the input's.
-        ssim_weight: λ in (1−λ)·L1 + λ·(1−SSIM); 0.2 as in 3DGS.
-        background: RGB behind the scene.
         final: whether this is the recovery at the target count; the paper's rounds have another decay.
-        seed: seed of the order of views.
         engine: "fused" runs whole steps in Rust; "torch" uses autograd and `SelectiveAdam`, with equal
             results up to rounding; "gsplat" is the same on an NVIDIA GPU.
 
@@ -35,22 +55,17 @@ class RecoverConfig:
     steps: int | None = None
     recovery_time: float | None = None
     regularizers: Regularizers = PRESETS["trained"]
-    sh_degree: int | None = None
-    ssim_weight: float = 0.2
-    background: Colour = BLACK
     final: bool = field(default=True, metadata={"setting": False})
-    seed: int = 0
     engine: Engine = "fused"
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if self.steps is not None and self.steps < 1:
             raise InputError(f"expected at least 1, got {self.steps}", parameter="steps")
         if self.recovery_time is not None and not 0 < self.recovery_time < float("inf"):
             raise InputError(
                 f"expected more than 0 seconds, got {self.recovery_time}", parameter="recovery_time"
             )
-        if not 0 <= self.ssim_weight <= 1:
-            raise InputError(f"expected a value in [0, 1], got {self.ssim_weight}", parameter="ssim_weight")
 
     @property
     def horizon(self) -> int:
