@@ -112,10 +112,12 @@ def load_lpips(folder: Path, *, scaled: bool = True) -> dict[str, Lpips]:
             try:
                 files.append(torch.load(path, map_location="cpu", weights_only=True))
             except Exception as error:  # torch raises any exception from unpickling
-                raise InputError(f"{path}: not a torch state dict ({type(error).__name__})") from None
+                raise InputError(f"not a torch state dict ({type(error).__name__})", path=path) from None
         out[net] = Lpips(net, files[0], files[1], scaled=scaled)
     if not out:
-        raise InputError(f"{folder}: no LPIPS weights (alexnet*.pth and alex.pth, or vgg16*.pth and vgg.pth)")
+        raise InputError(
+            "no LPIPS weights (alexnet*.pth and alex.pth, or vgg16*.pth and vgg.pth)", path=folder
+        )
     return out
 
 

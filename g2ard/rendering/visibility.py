@@ -118,35 +118,52 @@ def visibility_source(
         scene → `SampledVisibility`. The scene's arrays are C-contiguous and float32, except its means. A
         `g2ard.scene.prepared.PreparedScene` is not sorted again.
     """
-    sample = np.unique(np.linspace(0, len(cameras) - 1, min(views, len(cameras))).round().astype(int))
-    full = cameras.take(sample)
-    small = full.resized(longest)
-    factor = np.float32((small.widths / full.widths).mean())
-    apart = max(1, math.ceil(len(small) / ROUND))
-    rounds = [range(first, len(small), apart) for first in spread(apart)]
-    enough, settings = 0, RasterSettings()
+    return _Sampler(cameras, views, longest, progress)
 
-    def find(scene: Splats) -> SampledVisibility:
-        nonlocal enough, settings
+
+class _Sampler:
+    """Function of `visibility_source`: `rounds` of views, of which the first `used` are rendered."""
+
+    def __init__(self, cameras: Cameras, views: int, longest: int, progress: Progress) -> None:
+        sample = np.unique(np.linspace(0, len(cameras) - 1, min(views, len(cameras))).round().astype(int))
+        full = cameras.take(sample)
+        self.cameras = full.resized(longest)
+        self.shrunk = np.float32((self.cameras.widths / full.widths).mean())
+        apart = max(1, math.ceil(len(self.cameras) / ROUND))
+        self.rounds = [range(first, len(self.cameras), apart) for first in spread(apart)]
+        self.used = 0  # until the first scene decides it
+        self.settings = RasterSettings()
+        self.progress = progress
+
+    def __call__(self, scene: Splats) -> SampledVisibility:
         core = as_prepared(scene).core
         sums = _core.VisibilityAccumulator(core)
-        here = small.recentred(scene.offset)
-        if not enough:  # near plane in the scene's unit
+        here = self.cameras.recentred(scene.offset)
+        if self.used:
+            for views in self.rounds[: self.used]:
+                self._add(sums, here, views)
+        else:
             distance = np.median(np.linalg.norm(here.positions - core.origin, axis=1))
-            settings = RasterSettings(antialiased=scene.antialiased, near=NEAR * float(distance) or None)
-        seen = 0
-        for number, some in enumerate(rounds, 1):
-            views = [view_of(here, i, settings) for i in some]
-            before, seen = seen, sums.add(views, settings, counter(progress, "visibility"))
-            converged = number > 1 and seen - before < CONVERGED * len(scene)
-            cheap = number * ROUND * len(scene) < _CHEAP
-            if number == enough or (not enough and converged and not cheap):
-                break
-        enough = number
+            self.settings = RasterSettings(antialiased=scene.antialiased, near=NEAR * float(distance) or None)
+            self.used = self._add_until_converged(sums, here, len(scene))
         weight, pixel_size = sums.by_row()
-        return SampledVisibility(weight, pixel_size * factor)
+        return SampledVisibility(weight, pixel_size * self.shrunk)
 
-    return find
+    def _add_until_converged(self, sums: _core.VisibilityAccumulator, cameras: Cameras, rows: int) -> int:
+        """Add rounds while they are cheap or find new Gaussians; return their number."""
+        number = seen = 0
+        for number, views in enumerate(self.rounds, 1):
+            before, seen = seen, self._add(sums, cameras, views)
+            converged = number > 1 and seen - before < CONVERGED * rows
+            cheap = number * ROUND * rows < _CHEAP
+            if converged and not cheap:
+                break
+        return number
+
+    def _add(self, sums: _core.VisibilityAccumulator, cameras: Cameras, views: range) -> int:
+        """Add a round of views; return the number of Gaussians seen so far."""
+        made = [view_of(cameras, i, self.settings) for i in views]
+        return sums.add(made, self.settings, counter(self.progress, "visibility"))
 
 
 def fewest_looks(gaussians: int) -> int:

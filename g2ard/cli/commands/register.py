@@ -110,7 +110,6 @@ def register(
     from g2ard.config.presets import GS_CPR
     from g2ard.errors import InputError
     from g2ard.io import check_views_output, write_views
-    from g2ard.io.atomic import check_output
     from g2ard.jobs.register import photos_of, pool_of, poses_for
     from g2ard.stages.register import RegisterConfig
     from g2ard.stages.register import register as find
@@ -119,15 +118,7 @@ def register(
     names = ("size", "matcher", "refine", "passes", "accept")
     settings = run.settings(RegisterConfig(), *names)
     if protocol == "gs-cpr":
-        given = {
-            "--passes": passes not in (None, 1),
-            "--refine": refine not in (None, "none"),
-            "--keep": keep not in ("registered", "all"),
-        }
-        if contradicted := [name for name, said in given.items() if said] + ["--matcher"] * (
-            matcher == "direct"
-        ):
-            raise typer.BadParameter(f"--protocol gs-cpr sets {contradicted[0]}; remove {contradicted[0]}")
+        _refuse_contradictions(passes, refine, keep, matcher)
         settings, keep = GS_CPR | settings, "all"
         run.config |= {"keep": keep}
     config = changed(RegisterConfig(), settings)
@@ -137,18 +128,11 @@ def register(
         raise typer.BadParameter("--intrinsics and --focal exclude each other; give one")
     check_views_output(output, run.overwrite)
     if report is not None:
-        from g2ard.io.paths import real_path
-
-        others = (output, scene, poses, truth, intrinsics, photos)
-        if real_path(report) in {real_path(p) for p in others if p}:
-            raise typer.BadParameter(f"--report {report} is also an input or the output; name another file")
-        if report.suffix.lower() not in (".html", ".htm"):
-            raise typer.BadParameter(f"--report {report}: expected a name that ends in .html")
-        check_output(report, run.overwrite)
+        _check_report(run, report, (output, scene, poses, truth, intrinsics, photos))
     taken = photos_of(photos, split=split, intrinsics=intrinsics, focal=focal, alpha=alpha, say=run.say)
     folder = photos.is_dir() and (intrinsics is not None or focal is not None)
     if poses is None and pool is None and folder:
-        raise InputError(f"{photos}: photos have no initial pose; give --poses or --pool")
+        raise InputError("photos have no initial pose; give --poses or --pool", path=photos)
     starts = {}
     if poses is not None:
         starts = poses_for(poses, taken.names)
@@ -176,18 +160,17 @@ def register(
     if report is not None:
         from g2ard.report.registered import registration_report
 
-        colour = background or BLACK
         registration_report(
             report,
             f"Photos in {scene.name}",
             splats,
             taken,
-            found.report.photos,
+            rows,
             starts,
             matches=found.matches,
             side=config.size,
             told=lines,
-            background=colour,
+            background=background or BLACK,
         )
     if len(found.cameras):
         write_views(output, found.cameras, overwrite=run.overwrite)
@@ -204,6 +187,32 @@ def register(
         first = next(row for row in rows if row.status != "registered")
         raise InputError(f"none of {plural(len(rows), 'photo')} was registered; {first.name}: {first.reason}")
     run.say(f"{output}: {len(found.cameras)} of {plural(len(rows), 'photo')}")
+
+
+def _refuse_contradictions(
+    passes: int | None, refine: Refinement | None, keep: Keep, matcher: str | None
+) -> None:
+    """Reject options that contradict --protocol gs-cpr."""
+    contradicts = {
+        "--passes": passes not in (None, 1),
+        "--refine": refine not in (None, "none"),
+        "--keep": keep not in ("registered", "all"),
+        "--matcher": matcher == "direct",
+    }
+    if found := next((name for name, given in contradicts.items() if given), None):
+        raise typer.BadParameter(f"--protocol gs-cpr sets {found}; remove {found}")
+
+
+def _check_report(run: Run, report: Path, others: tuple[Path | None, ...]) -> None:
+    """Reject a report that is no .html file, cannot be written, or is one of the `others`."""
+    from g2ard.io.atomic import check_output
+    from g2ard.io.paths import real_path
+
+    if real_path(report) in {real_path(path) for path in others if path}:
+        raise typer.BadParameter(f"--report {report} is also an input or the output; name another file")
+    if report.suffix.lower() not in (".html", ".htm"):
+        raise typer.BadParameter(f"--report {report}: expected a name that ends in .html")
+    check_output(report, run.overwrite)
 
 
 def _told(summary: Summary) -> list[str]:

@@ -97,21 +97,7 @@ def select(
     >>> select(ball, views, 2).order.tolist()
     [1, 3]
     """
-    if policy not in POLICIES:
-        raise InputError(f"expected {', '.join(POLICIES)}, got {policy!r}", parameter="policy")
-    if k == "auto" and policy in UNMEASURED:
-        raise InputError(f"'auto' needs a policy that measures gains, got {policy!r}", parameter="k")
-    if k != "auto" and not isinstance(k, int | np.integer):
-        raise InputError(f"expected 'auto' or a whole number of views, got {k!r}", parameter="k")
-    large = np.maximum(cameras.widths, cameras.heights) > _LARGEST
-    if large.any():
-        i = int(np.argmax(large))
-        size = f"{cameras.widths[i]}×{cameras.heights[i]}"
-        raise InputError(f"view {cameras.names[i]}: expected at most {_LARGEST} pixels per side, got {size}")
-    if k != "auto" and k < 1:
-        raise InputError(f"expected at least 1 view, got {k}", parameter="k")
-    if not len(cameras):
-        raise InputError("no candidate views to select from")
+    _check(cameras, k, policy)
     began = time.perf_counter()
     seconds: dict[str, float] = {}
     coarse = surface(splats, min(_COARSE, max(1, len(splats))))
@@ -151,6 +137,25 @@ def select(
         evaluations=evaluations,
         seconds=seconds,
     )
+
+
+def _check(cameras: Cameras, k: int | Literal["auto"], policy: str) -> None:
+    """Reject an invalid number of views, an unknown policy, and candidates that are missing or too large."""
+    if policy not in POLICIES:
+        raise InputError(f"expected {', '.join(POLICIES)}, got {policy!r}", parameter="policy")
+    if k == "auto" and policy in UNMEASURED:
+        raise InputError(f"'auto' needs a policy that measures gains, got {policy!r}", parameter="k")
+    if k != "auto" and not isinstance(k, int | np.integer):
+        raise InputError(f"expected 'auto' or a whole number of views, got {k!r}", parameter="k")
+    if k != "auto" and k < 1:
+        raise InputError(f"expected at least 1 view, got {k}", parameter="k")
+    if not len(cameras):
+        raise InputError("no candidate views to select from")
+    large = np.maximum(cameras.widths, cameras.heights) > _LARGEST
+    if large.any():
+        i = int(np.argmax(large))
+        size = f"{cameras.widths[i]}×{cameras.heights[i]}"
+        raise InputError(f"view {cameras.names[i]}: expected at most {_LARGEST} pixels per side, got {size}")
 
 
 def _blind(policy: str, rows: Order, k: int | Literal["auto"], seed: int) -> Order:
