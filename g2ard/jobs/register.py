@@ -59,12 +59,16 @@ def photos_of(
             say(f"{path}: {note}")
         missing = next((v.name for v in found.cameras if v.image_path is None), None)
         if missing is not None:
-            raise InputError(f"{path}: view {missing} has no photo to register; pass the folder of photos")
+            raise InputError(f"view {missing} has no photo to register; pass the folder of photos", path=path)
         if intrinsics is not None or focal is not None:
-            raise InputError(f"{path}: these views state their intrinsics; drop the option that gives others")
+            raise InputError(
+                "these views state their intrinsics; drop the option that gives others", path=path
+            )
         return found.cameras
     if split != "all":
-        raise InputError(f"{path}: a folder of photos has no split {split!r}; pass views, or drop the split")
+        raise InputError(
+            f"a folder of photos has no split {split!r}; pass views, or drop the split", path=path
+        )
     if (intrinsics is None) == (focal is None):
         raise InputError(
             "photos without views need their intrinsics",
@@ -102,7 +106,7 @@ def _photos_in(path: Path) -> list[Path]:
     except InputError:
         files = sorted(f for f in path.rglob("*") if is_photo(f) and f.is_file())
         if not files:
-            raise InputError(f"{path}: neither photos nor views in this folder") from None
+            raise InputError("neither photos nor views in this folder", path=path) from None
         return files
     return []
 
@@ -137,8 +141,9 @@ def _lenses(path: Path, names: list[str]) -> list[Camera]:
     missing = next((name for name in names if name not in by_name), None)
     if missing is not None and not shared:
         raise InputError(
-            f"{path}: no intrinsics for {missing}, and its views have different ones; add that name, or "
-            "use the same intrinsics for all"
+            f"no intrinsics for {missing}, and its views have different ones; add that name, or "
+            "use the same intrinsics for all",
+            path=path,
         )
     return [by_name.get(name, one) for name in names]
 
@@ -156,8 +161,9 @@ def _check_aspects(files: list[Path], sizes: list[tuple[int, int]], views: list[
     if all(off) and any(sizes[0]):
         (w, h), view = sizes[0], views[0]
         raise InputError(
-            f"{files[0]}: the photo is {w}×{h}, but its intrinsics are for {view.width}×{view.height}; "
-            "pass intrinsics with the aspect ratio of these photos"
+            f"the photo is {w}×{h}, but its intrinsics are for {view.width}×{view.height}; "
+            "pass intrinsics with the aspect ratio of these photos",
+            path=files[0],
         )
 
 
@@ -183,7 +189,7 @@ def poses_for(path: Path, names: Sequence[str]) -> Poses:
     """
     found = matched(read_poses(path), names)
     if not found:
-        raise InputError(f"{path}: no pose has the name of a photo (the first photo is {names[0]})")
+        raise InputError(f"no pose has the name of a photo (the first photo is {names[0]})", path=path)
     return found
 
 

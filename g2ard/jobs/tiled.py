@@ -92,12 +92,12 @@ def _check_folder(folder: Path) -> None:
     try:
         names = sorted(path.name for path in folder.iterdir()) if folder.exists() else []
     except OSError as error:
-        raise OutputError(f"{folder}: cannot write: {error.strerror}; choose another folder") from error
+        raise OutputError(f"cannot write: {error.strerror}; choose another folder", path=folder) from error
     of_tiles = [name for name in names if is_ours(name)]
     others = [name for name in names if not name.startswith(".")]
     if of_tiles or (others and not any(map(_OURS.fullmatch, names))):
         raise OutputError(
-            f"{folder}: holds {(of_tiles or others)[0]} and is not a work folder; choose another folder"
+            f"holds {(of_tiles or others)[0]} and is not a work folder; choose another folder", path=folder
         )
 
 

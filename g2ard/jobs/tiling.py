@@ -232,9 +232,10 @@ def check_memory(scene: Path, tiling: Tiling, times: float, tile_times: float = 
     if need > tiling.memory:
         tiles = TileMemory(stream.count, row_bytes, tile_times, _folder_of_tiles(scene))
         raise InputError(
-            f"{scene}: {stream.count:,} Gaussians in one piece take about {amount(need, up=True)}, "
+            f"{stream.count:,} Gaussians in one piece take about {amount(need, up=True)}, "
             f"{amount(_TASK_BYTES)} of it the program, more than {tiling.memory_limit}; "
-            f"{tiles.advice(tiling.memory, max(1, stream.count // 2), _foretold(scene))}"
+            f"{tiles.advice(tiling.memory, max(1, stream.count // 2), _foretold(scene))}",
+            path=scene,
         )
 
 
@@ -304,8 +305,9 @@ def refuse_whole(scene: Path, options: Sequence[str]) -> None:
     one = cut_into(_folder_of_tiles(scene), open_stream(scene).count)
     takes = "needs" if len(options) == 1 else "need"
     raise InputError(
-        f"{scene}: {' and '.join(options)} {takes} the whole scene in memory, but it is processed in tiles; "
-        f"use {one} for one piece"
+        f"{' and '.join(options)} {takes} the whole scene in memory, but it is processed in tiles; "
+        f"use {one} for one piece",
+        path=scene,
     )
 
 

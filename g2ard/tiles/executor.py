@@ -246,7 +246,7 @@ class DaskExecutor:
                 continue
             if missing := [task.output for task in tasks if not task.done]:
                 raise InputError(
-                    f"{missing[0]}: written by a worker but missing here; share the folder with all workers"
+                    "written by a worker but missing here; share the folder with all workers", path=missing[0]
                 )
         return [task.output for task in tasks]
 

@@ -94,8 +94,9 @@ def ingest(
     fewest = -(-feed.stream.count // MOST_TILES)
     if like is None and tile_rows < fewest:
         raise InputError(
-            f"{feed.stream.path}: {feed.stream.count:,} rows are too many for tiles of {tile_rows:,}; "
+            f"{feed.stream.count:,} rows are too many for tiles of {tile_rows:,}; "
             f"use at least {fewest:,} rows per tile",
+            path=feed.stream.path,
             parameter="tile_rows",
         )
     settings: dict[str, Any] = {"tile_rows": tile_rows} if like is None else {"like": like.key}
@@ -174,16 +175,16 @@ def _done(folder: Path, key: str, overwrite: bool) -> TileStore | None:
 def _check_foreign(folder: Path) -> None:
     """Create the folder; reject one that holds anything but tiles."""
     if folder.is_file():
-        raise OutputError(f"{folder}: is a file; expected a folder")
+        raise OutputError("is a file; expected a folder", path=folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         names = {path.name for path in folder.iterdir()}
     except OSError as error:
-        raise OutputError(f"{folder}: cannot write: {error.strerror}") from error
+        raise OutputError(f"cannot write: {error.strerror}", path=folder) from error
     foreign = sorted(name for name in names if not (is_ours(name) or name == LOCK))
     if foreign:
         raise OutputError(
-            f"{folder}: holds {foreign[0]}, which does not belong to tiles; choose another folder"
+            f"holds {foreign[0]}, which does not belong to tiles; choose another folder", path=folder
         )
 
 

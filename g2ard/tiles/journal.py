@@ -113,7 +113,7 @@ class Journal:
                     raise ValueError(f"{len(files.rows)} {kind} of {tree.leaves}")
                 setattr(journal, kind, files)
         except (LookupError, TypeError, ValueError, AttributeError, OverflowError, RecursionError) as error:
-            raise InputError(f"{path}: malformed journal ({error!r})") from error
+            raise InputError(f"malformed journal ({error!r})", path=path) from error
         return journal
 
     def cut(self) -> None:
@@ -122,7 +122,7 @@ class Journal:
             path = self.folder / name
             with path.open("ab") as file:
                 if file.tell() < rows * self.row_bytes:
-                    raise InputError(f"{path}: {file.tell():,} bytes, fewer than the journal says")
+                    raise InputError(f"{file.tell():,} bytes, fewer than the journal says", path=path)
                 file.truncate(rows * self.row_bytes)
 
     def _named(self) -> list[tuple[str, int]]:
@@ -164,7 +164,7 @@ class Journal:
             with (self.folder / name).open("ab") as file:
                 file.write(data)
         except OSError as error:
-            raise OutputError(f"{self.folder / name}: cannot write: {error.strerror or error}") from error
+            raise OutputError(f"cannot write: {error.strerror or error}", path=self.folder / name) from error
         files.rows[index] += len(chosen)
         files.checks[index] = zlib.crc32(data, files.checks[index])
 

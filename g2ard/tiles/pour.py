@@ -181,7 +181,7 @@ def _started(
     needed, free = int((feed.stream.count + around) * feed.room), shutil.disk_usage(folder).free
     if needed > free:
         raise OutputError(
-            f"{folder}: the tiles need {needed / 1e9:,.1f} GB, the disk has {free / 1e9:,.1f} GB free"
+            f"the tiles need {needed / 1e9:,.1f} GB, the disk has {free / 1e9:,.1f} GB free", path=folder
         )
     journal.cut()
     journal.save()

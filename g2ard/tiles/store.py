@@ -142,16 +142,16 @@ class TileStore:
         folder = Path(folder)
         path = folder / MANIFEST
         if not path.is_file():
-            raise InputError(f"{folder}: no finished tiles ({MANIFEST} is missing)")
+            raise InputError(f"no finished tiles ({MANIFEST} is missing)", path=folder)
         content = read_json(path)
         if content.get("format") != FORMAT:
-            raise InputError(f"{path}: not a manifest of tiles")
+            raise InputError("not a manifest of tiles", path=path)
         if content.get("version") != VERSION:
-            raise InputError(f"{path}: unsupported version {content.get('version')!r}; expected {VERSION}")
+            raise InputError(f"unsupported version {content.get('version')!r}; expected {VERSION}", path=path)
         try:
             store = cls._parsed(folder, content)
         except (LookupError, TypeError, ValueError, AttributeError, OverflowError, RecursionError) as error:
-            raise InputError(f"{path}: malformed manifest ({error!r})") from error
+            raise InputError(f"malformed manifest ({error!r})", path=path) from error
         for tile in store.tiles:
             store._check_size(tile_name(tile.index), tile.rows)
             store._check_size(halo_name(tile.index), tile.halo)
@@ -194,9 +194,9 @@ class TileStore:
         try:
             size = path.stat().st_size
         except OSError as error:
-            raise InputError(f"{path}: {error.strerror}") from error
+            raise InputError(f"{error.strerror}", path=path) from error
         if size != expected:
-            raise InputError(f"{path}: {size:,} bytes, but the manifest says {expected:,}")
+            raise InputError(f"{size:,} bytes, but the manifest says {expected:,}", path=path)
 
     @property
     def row_bytes(self) -> int:
@@ -257,8 +257,9 @@ class TileStore:
     def _check_contents(self, name: str, crc: int, expected: int) -> None:
         if crc != expected:
             raise InputError(
-                f"{self.folder / name}: its contents changed after writing; remove it and run "
-                "the command that wrote the tiles again"
+                "its contents changed after writing; remove it and run "
+                "the command that wrote the tiles again",
+                path=self.folder / name,
             )
 
     def _read(self, name: str, count: int, check: int, sh: bool) -> Splats:

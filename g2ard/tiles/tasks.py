@@ -132,7 +132,7 @@ def load(path: Path, *names: str) -> list[NDArray[Any]]:
             return [arrays[name] for name in names]
     except _DAMAGED as error:
         raise InputError(
-            f"{path}: its contents changed after writing; remove it and run the same command again"
+            "its contents changed after writing; remove it and run the same command again", path=path
         ) from error
 
 

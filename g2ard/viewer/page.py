@@ -56,7 +56,7 @@ def check_page_output(path: str | Path, overwrite: bool = False) -> Path:
     from g2ard.io.atomic import check_output
 
     if Path(path).suffix.lower() not in (".html", ".htm"):
-        raise OutputError(f"{path}: expected a file name that ends in .html")
+        raise OutputError("expected a file name that ends in .html", path=path)
     return check_output(path, overwrite)
 
 
@@ -113,8 +113,9 @@ def _sog(path: Path, label: str, splats: Splats) -> bytes:
     packed = sog_bytes(path, replace(splats, offset=np.zeros(3)))
     if len(packed) > _LARGEST:
         raise InputError(
-            f"{path}: {label} has {len(packed) / 1e6:.0f} MB as SOG, but browsers accept at most"
-            f" {_LARGEST / 1e6:.0f} in a page; simplify it first"
+            f"{label} has {len(packed) / 1e6:.0f} MB as SOG, but browsers accept at most"
+            f" {_LARGEST / 1e6:.0f} in a page; simplify it first",
+            path=path,
         )
     return packed
 

@@ -79,7 +79,9 @@ def clean(
     kept = int(found.keep.sum())
     if not dry_run and output is not None:
         if not kept:
-            raise InputError(f"{scene}: every Gaussian would be removed; inspect it with --dry-run --preview")
+            raise InputError(
+                "every Gaussian would be removed; inspect it with --dry-run --preview", path=scene
+            )
         run.write(output, splats.take(found.keep))
         run.say(f"{output}: {plural(kept, 'Gaussian')}")
     run.result({"input_count": len(splats), "output_count": kept, "found": found.counts})

@@ -156,7 +156,7 @@ def _matrix(given: str) -> list[list[float]]:
         rows = [content[at : at + 4] for at in (0, 4, 8, 12)] if len(content) == 16 else content
         matrix = [[float(value) for value in row] for row in rows]
     except (TypeError, ValueError) as error:
-        raise InputError(f"{path}: expected a matrix of 4×4 numbers ({error})") from error
+        raise InputError(f"expected a matrix of 4×4 numbers ({error})", path=path) from error
     if [len(row) for row in matrix] != [4] * 4:
-        raise InputError(f"{path}: expected a matrix of 4×4 numbers")
+        raise InputError("expected a matrix of 4×4 numbers", path=path)
     return matrix

@@ -111,7 +111,7 @@ def evaluate(
         row["file_bytes"] = bytes_of(path)
         if frozen is not None:
             if len(frozen) != len(splats):
-                raise InputError(f"{anchors}: has {len(frozen):,} Gaussians, {path} has {len(splats):,}")
+                raise InputError(f"has {len(frozen):,} Gaussians, {path} has {len(splats):,}", path=anchors)
             row["drift95"] = drift95(Anchors.of(frozen), splats.means)
         rows.append(row)
     against = _against(rows[0]["views"])

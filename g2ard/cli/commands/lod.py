@@ -280,7 +280,7 @@ def _check_same(meta: Path, ratios: Sequence[float]) -> None:
     if len(counts) != len(wanted) or any(abs(c - w) > ratios[0] for c, w in zip(counts, wanted, strict=True)):
         levels = ", ".join(f"{count:,}" for count in counts)
         raise OutputError(
-            f"{meta}: was written with another -r (levels of {levels} Gaussians); -w replaces it"
+            f"was written with another -r (levels of {levels} Gaussians); -w replaces it", path=meta
         )
 
 

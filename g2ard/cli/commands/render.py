@@ -240,7 +240,7 @@ def _read_parents(path: Path, count: int) -> NDArray[np.int64]:
     try:
         labels = np.load(path, allow_pickle=False)
     except (OSError, ValueError, EOFError) as error:
-        raise InputError(f"{path}: not a NumPy array ({error})") from None
+        raise InputError(f"not a NumPy array ({error})", path=path) from None
     if not isinstance(labels, np.ndarray) or labels.dtype.kind not in "iu" or labels.shape != (count,):
-        raise InputError(f"{path}: expected {count} whole numbers, one per Gaussian of the scene")
+        raise InputError(f"expected {count} whole numbers, one per Gaussian of the scene", path=path)
     return labels.astype(np.int64)
