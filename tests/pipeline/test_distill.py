@@ -4,7 +4,6 @@ import json
 import re
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -22,6 +21,7 @@ from g2ard.stages.recover.schedule import PAPER, TUNED
 from g2ard.stages.simplify import SimplifyConfig
 from helpers.cloud_files import las
 from helpers.commands import CommandLine, refused, succeeds
+from helpers.interruptions import interrupt_at
 from helpers.photos import cloud_with_photos
 from helpers.scenes import around, assert_same_bits, checkered_ball
 
@@ -60,16 +60,8 @@ def test_rounds_follow_the_paper_s_counts(targets: TeacherRenders) -> None:
 def test_an_interrupted_run_resumes_to_the_same_bits(targets: TeacherRenders, tmp_path: Path) -> None:
     config = PAPER_ROUNDS
     whole = distill(PRIOR, 1000, targets, config)
-    calls = 0
-
-    def stop(stage: str, done: int, total: int, info: Any = None) -> None:
-        nonlocal calls
-        calls += stage == "recover round-3"
-        if calls == 5:
-            raise KeyboardInterrupt
-
     with pytest.raises(KeyboardInterrupt):
-        distill(PRIOR, 1000, targets, config, work=tmp_path, progress=stop)
+        distill(PRIOR, 1000, targets, config, work=tmp_path, progress=interrupt_at("recover round-3", 5))
     resumed = distill(PRIOR, 1000, targets, config, work=tmp_path)
     kept = resumed.report.rounds[:3]
     earlier = [entry.recover[0].seconds for entry in kept[:2]] + [

@@ -19,6 +19,7 @@ from g2ard.stages.recover.schedule import TUNED
 from g2ard.stages.select import select
 from g2ard.stages.simplify import SimplifyConfig
 from helpers.commands import CommandLine, refused, succeeds
+from helpers.interruptions import interrupt_at
 from helpers.scenes import ARRAYS, around, assert_same_bits, checkered_ball
 
 PRIOR = checkered_ball(1500)
@@ -122,16 +123,8 @@ def test_an_interrupted_run_resumes_with_the_same_views(tmp_path: Path) -> None:
     )
     targets = TeacherRenders(PRIOR, crowded())
     whole = distill(PRIOR, 600, targets, config)
-    calls = 0
-
-    def stop(stage: str, done: int, total: int, info: Any = None) -> None:
-        nonlocal calls
-        calls += stage == "recover round-2"
-        if calls == 4:
-            raise KeyboardInterrupt
-
     with pytest.raises(KeyboardInterrupt):
-        distill(PRIOR, 600, targets, config, work=tmp_path, progress=stop)
+        distill(PRIOR, 600, targets, config, work=tmp_path, progress=interrupt_at("recover round-2", 4))
     again = distill(PRIOR, 600, targets, config, work=tmp_path)
     assert_same_bits(whole.splats, again.splats)
     assert whole.report.views == again.report.views

@@ -2,6 +2,8 @@
 
 import numpy as np
 
+from reference.simplify import rotation
+
 
 def median_depth(splats, viewmat, K, pixels):
     """Return the (n,) depths at which transmittance falls below one half in pixels (n, 2); 0 if it does not.
@@ -32,17 +34,6 @@ def median_depth(splats, viewmat, K, pixels):
         light *= 1 - alpha
         depth[(before >= 0.5) & (light < 0.5)] = z
     return depth
-
-
-def rotation(q):
-    w, x, y, z = q / np.linalg.norm(q)
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
 
 
 def anchors(count=32):
