@@ -62,6 +62,15 @@ RenderModel = Literal["classic", "antialiased"]
 """Renderings that scenes are trained for; antialiased is also called mip (`g2ard.rendering.renderer`)."""
 RENDER_MODELS: tuple[RenderModel, ...] = get_args(RenderModel)
 
+# fmt: off
+Axes = Literal[
+    "LDB", "RDB", "LUB", "RUB", "LDF", "RDF", "LUF", "RUF",
+    "LFD", "RFD", "LFU", "RFU", "LBD", "RBD", "LBU", "RBU",
+]
+# fmt: on
+"""Axes by the directions of x, y and z: left or right, down or up, back or forward (`g2ard.scene.axes`)."""
+AXES: tuple[Axes, ...] = get_args(Axes)
+
 LpipsInput = Literal["scaled", "unscaled"]
 """Value range of the images passed to LPIPS's networks (`g2ard.rendering.lpips`)."""
 LPIPS_INPUTS: tuple[LpipsInput, ...] = get_args(LpipsInput)

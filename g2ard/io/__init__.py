@@ -189,7 +189,8 @@ def write_splats(path: str | Path, splats: Splats, *, overwrite: bool = False, *
         splats: the scene.
         overwrite: whether to replace an existing file.
         **options: format options: `normals=True` adds nx ny nz to a .ply, `spz_version=4` writes .spz
-            version 4 instead of 3, `compress="spz"` an SPZ inside of a .glb.
+            version 4 instead of 3, which `axes="RFU"` stores in other axes than right-up-back, and
+            `compress="spz"` writes an SPZ inside of a .glb.
 
     Warns:
         UserWarning: an antialiased scene in a format that cannot say so (.glb, .splat, OpenUSD).

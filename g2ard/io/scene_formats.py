@@ -22,6 +22,7 @@ class SceneFormat(NamedTuple):
         function: the writer in the module, `fn(path, splats, *, overwrite, **options)`.
         options: names of its options.
         models: whether it can state the render model.
+        axes: of its coordinates, by definition or unless it states others; None if scenes bring their own.
     """
 
     suffix: str
@@ -29,17 +30,18 @@ class SceneFormat(NamedTuple):
     function: str = "write"
     options: tuple[str, ...] = ()
     models: bool = True
+    axes: str | None = None
 
 
 FORMATS: dict[FormatName, SceneFormat] = {
     "compressed.ply": SceneFormat(".compressed.ply", "compressed_ply"),
     "ply": SceneFormat(".ply", "ply", options=("normals",)),
     "sog": SceneFormat(".sog", "sog_write"),
-    "spz": SceneFormat(".spz", "spz", options=("spz_version",)),
-    "glb": SceneFormat(".glb", "glb", options=("compress",), models=False),
+    "spz": SceneFormat(".spz", "spz", options=("spz_version", "axes"), axes="RUB"),
+    "glb": SceneFormat(".glb", "glb", options=("compress",), models=False, axes="LUF"),
     "splat": SceneFormat(".splat", "splat", models=False),
-    "usda": SceneFormat(".usda", "usd", models=False),
-    "usdc": SceneFormat(".usdc", "usd", models=False),
+    "usda": SceneFormat(".usda", "usd", models=False, axes="RUB"),
+    "usdc": SceneFormat(".usdc", "usd", models=False, axes="RUB"),
 }
 """Formats by name, longer suffixes first."""
 

@@ -1,7 +1,8 @@
 """Reader and writer for Niantic's .spz: 8-bit attributes, gzipped (versions 2, 3) or in Zstandard (4).
 
 SPZ has right-up-back axes; a 3DGS .ply has right-down-forward. Therefore y and z change sign, as do the
-quaternion's y and z and every harmonic odd in them.
+quaternion's y and z and every harmonic odd in them. Version 4 may name other axes in an extension, a record
+of type, length and content between header and table of streams.
 """
 
 from __future__ import annotations
@@ -12,12 +13,14 @@ import struct
 import sys
 import zlib
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from g2ard.config.choices import Axes
 from g2ard.errors import DAMAGED, InputError, missing
 from g2ard.io.atomic import atomic_output
 from g2ard.io.limits import check_unpacked
@@ -32,6 +35,7 @@ from g2ard.io.packing import (
 )
 from g2ard.io.sanitize import Raw, cleaned
 from g2ard.io.types import Note, Scene
+from g2ard.scene.axes import change_of_axes, with_axes
 from g2ard.scene.splats import Splats
 
 _MAGIC = b"NGSP"
@@ -41,6 +45,18 @@ _HEADER = 16
 _POSITION_BITS = 24
 _COEFFICIENTS = (0, 3, 8, 15, 24)
 _ANTIALIASED, _HAS_EXTENSIONS = 0x1, 0x2
+_COORDINATE_SYSTEM = 0xADBE0003
+_HEADER_4 = 32
+"""Size of the header of version 4, bytes."""
+
+_SYSTEMS: tuple[Axes, ...] = (
+    *("LDB", "RDB", "LUB", "RUB", "LDF", "RDF", "LUF", "RUF"),
+    *("LBU", "RBU", "LFU", "RFU", "LBD", "RBD", "LFD", "RFD"),
+)
+"""Axes of the extension SPZ_ADOBE_coordinate_system, from number 1 on, as @adobe/spz 0.2.3 stores and reads
+them. Its header swaps the names of 9 and 15, and of 10 and 16.
+"""
+
 _COLOR_SCALE = 0.15
 """SPZ's factor for band 0, which leaves room for colours outside [0, 1]."""
 
@@ -82,9 +98,35 @@ def decoded(path: Path, data: bytes) -> Scene:
     notes = []
     if stored > kept:
         notes.append(Note("ignored_bands", 1, "spherical harmonics past degree 3 ignored"))
+    axes: Axes = "RUB"
     if flags & _HAS_EXTENSIONS:
-        notes.append(Note("ignored_extensions", 1, "SPZ extensions ignored"))
-    return cleaned(path, raw, notes, "antialiased" if flags & _ANTIALIASED else "classic")
+        axes, ignored = _extensions(path, data) if version == 4 else (axes, 1)
+        if ignored:
+            notes.append(Note("ignored_extensions", ignored, "SPZ extensions ignored"))
+    scene = cleaned(path, raw, notes, "antialiased" if flags & _ANTIALIASED else "classic")
+    if axes == "RUB":
+        return scene
+    matrix = change_of_axes(axes, "RDF") @ change_of_axes("RDF", "RUB")  # so far taken for RUB
+    return replace(scene, splats=with_axes(scene.splats, matrix))
+
+
+def _extensions(path: Path, data: bytes) -> tuple[Axes, int]:
+    """Return the axes that the records of version 4 name, and the number of other records."""
+    axes, others, at = _SYSTEMS[3], 0, _HEADER_4
+    (end,) = struct.unpack_from("<I", data, 16)
+    while at + 8 <= min(end, len(data)):
+        kind, size = struct.unpack_from("<II", data, at)
+        if at + 8 + size > min(end, len(data)):
+            raise InputError("truncated: an extension is cut off", path=path, hint=DAMAGED)
+        if kind == _COORDINATE_SYSTEM and size == 4:
+            (number,) = struct.unpack_from("<I", data, at + 8)
+            if number > len(_SYSTEMS):
+                raise InputError(f"unknown coordinate system {number}; expected 0 to 16", path=path)
+            axes = _SYSTEMS[number - 1] if number else axes
+        else:
+            others += 1
+        at += 8 + size
+    return axes, others
 
 
 def _gunzip(path: Path, data: bytes) -> bytes:
@@ -212,26 +254,47 @@ def _quats_packed(codes: NDArray[np.uint8]) -> NDArray[np.float64]:
     return xyzw[:, [3, 0, 1, 2]]
 
 
-def write(path: Path, splats: Splats, *, overwrite: bool = False, spz_version: int = 3) -> None:
+def write(
+    path: Path, splats: Splats, *, overwrite: bool = False, spz_version: int = 3, axes: Axes = "RUB"
+) -> None:
     """Write an .spz; equal scenes give equal bytes.
 
     Scales are clamped to e^−10 … e^5.94, harmonics to ±1, colours to slightly more than [0, 1].
-    Version 3 uses gzip, 4 Zstandard (smaller files), 2 gzip with coarser rotations.
+    Version 3 uses gzip, 4 Zstandard (smaller files), 2 gzip with coarser rotations. Version 4 can store other
+    `axes`, which it names; readers that ignore extensions show such a scene turned or mirrored.
     """
     if spz_version not in (2, 3, 4):
         raise InputError(f"expected 2, 3 or 4, got {spz_version}", parameter="spz_version")
+    if axes != "RUB":
+        if spz_version != 4:
+            raise InputError(
+                f"version {spz_version} has right-up-back axes only",
+                path=path,
+                hint="{spz_version=4} can name others",
+            )
+        splats = with_axes(splats, change_of_axes("RUB", "RDF") @ change_of_axes("RDF", axes))
     splats = writable(path, splats)
     splats = splats.take(morton_order(splats.means))
     means = world_means(path, splats, ".spz")
-    content = encoded(path, splats, means, fraction_bits(path, means, splats), spz_version)
+    content = encoded(path, splats, means, fraction_bits(path, means, splats), spz_version, axes)
     with atomic_output(path, overwrite) as temporary:
         temporary.write_bytes(content)
 
 
-def encoded(path: Path, splats: Splats, means: NDArray[np.float64], bits: int, spz_version: int) -> bytes:
+def encoded(
+    path: Path,
+    splats: Splats,
+    means: NDArray[np.float64],
+    bits: int,
+    spz_version: int,
+    axes: Axes = "RUB",
+) -> bytes:
     """Return the bytes of an .spz with these means, in `bits` fractional bits and the order of the rows."""
     streams = _streams(splats, means, bits, spz_version)
-    flags = _ANTIALIASED if splats.antialiased else 0
+    flags, records = _ANTIALIASED if splats.antialiased else 0, b""
+    if axes != "RUB":
+        flags |= _HAS_EXTENSIONS
+        records = struct.pack("<III", _COORDINATE_SYSTEM, 4, _SYSTEMS.index(axes) + 1)
     head = _MAGIC + struct.pack("<IIBBB", spz_version, len(splats), splats.sh_degree, bits, flags)
     if spz_version < 4:
         return gzip.compress(head + b"\0" + b"".join(streams), 9, mtime=0)
@@ -239,7 +302,8 @@ def encoded(path: Path, splats: Splats, means: NDArray[np.float64], bits: int, s
     packed = [zstd.compress(stream, 19) for stream in streams]
     sizes = zip(packed, streams, strict=True)
     table = b"".join(struct.pack("<QQ", len(p), len(stream)) for p, stream in sizes)
-    return head + struct.pack("<BI12x", len(streams), 32) + table + b"".join(packed)
+    start = struct.pack("<BI12x", len(streams), _HEADER_4 + len(records))
+    return head + start + records + table + b"".join(packed)
 
 
 def fraction_bits(path: Path, means: NDArray[np.float64], splats: Splats) -> int:

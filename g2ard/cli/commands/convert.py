@@ -9,8 +9,12 @@ import typer
 
 from g2ard.cli.frame import Run, command
 from g2ard.cli.options import ShDegreeOption, numbers
+from g2ard.config.choices import Axes
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
     from g2ard.scene.splats import Splats
 
 
@@ -58,6 +62,14 @@ def convert(
         str | None, typer.Option(metavar="X,Y,Z", help="Then move by this, scene units.")
     ] = None,
     recentre: Annotated[bool, typer.Option("--recentre", help="Drop the offset to map coordinates.")] = False,
+    to_axes: Annotated[
+        Axes | None,
+        typer.Option(
+            case_sensitive=False,
+            metavar="NAME",
+            help="Store coordinates in these axes, such as RFU (right, forward, up); scenes are RDF.",
+        ),
+    ] = None,
     sh_degree: ShDegreeOption = None,
     spz_version: Annotated[
         int | None, typer.Option(min=2, max=4, help="Version of .spz files; 3 by default, 4 is smaller.")
@@ -66,13 +78,14 @@ def convert(
         Literal["spz"] | None, typer.Option(help="Write an SPZ inside of a .glb, for CesiumJS.")
     ] = None,
 ) -> None:
-    """Convert scenes to another format, and merge, crop or move them."""
+    """Convert scenes to another format or other axes, and merge, crop or move them."""
     from dataclasses import replace
 
     import numpy as np
 
     from g2ard import io
     from g2ard.io.scene_formats import check_options
+    from g2ard.scene.axes import with_axes
     from g2ard.scene.transform import in_box, in_sphere, join, moving
     from g2ard.scene.transform import transform as moved
 
@@ -89,6 +102,7 @@ def convert(
             np.eye(4) if matrix is None else matrix
         )
     check_options(output, options)
+    change = None if to_axes is None else _change_of_axes(output, to_axes, options)
     io.check_scene_output(output, run.overwrite)
     splats = join([run.load(path) for path in scenes])
     read = len(splats)
@@ -103,6 +117,8 @@ def convert(
         splats = replace(splats, offset=np.zeros(3))
     if sh_degree is not None:
         splats = splats.with_sh_degree(sh_degree)
+    if change is not None:
+        splats = with_axes(splats, change)
     run.write(output, splats, **options)
     size = _size(output)
     kept = f"{len(splats):,}" if len(splats) == read else f"{len(splats):,} of {read:,}"
@@ -120,6 +136,28 @@ def _parted(run: Run, paths: list[Path], output: Path | None) -> tuple[list[Path
         raise typer.BadParameter("give an input and an output: SCENE… OUT, or SCENE… -o OUT")
     run.reads(scenes, output)
     return scenes, output
+
+
+def _change_of_axes(output: Path, axes: Axes, options: dict[str, Any]) -> NDArray[np.float64] | None:
+    """Return the change of axes before writing, None if the format's writer makes it."""
+    from g2ard.errors import InputError
+    from g2ard.io.scene_formats import scene_format
+    from g2ard.scene.axes import change_of_axes
+
+    found = scene_format(output)
+    if found.axes is None:
+        return change_of_axes("RDF", axes)
+    if axes == found.axes:
+        return None
+    if "axes" not in found.options:
+        raise InputError(
+            f"{found.suffix} has {found.axes} axes by definition",
+            path=output,
+            hint="write .spz (version 4), which can name others, or .ply, .sog or .splat, which name none",
+        )
+    options["axes"] = axes
+    options.setdefault("spz_version", 4)
+    return None
 
 
 def _check_left(splats: Splats, read: int) -> None:
