@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,7 +22,7 @@ _FEW = 0.005
 
 def write_table(run: Run, report: dict[str, Any]) -> None:
     """Print the scores by kind of view, under counts, sizes and times."""
-    from g2ard.report.kinds import KindScore
+    from g2ard.report.kinds import COLUMNS, KindScore, cells
 
     size = report["bytes"]
     seconds = {name: value for name, value in report["seconds"].items() if name != "resumed"}
@@ -34,25 +33,7 @@ def write_table(run: Run, report: dict[str, Any]) -> None:
         f"{size['input'] / 1e6:.2f} → {size['output'] / 1e6:.2f} MB as .ply; {times}"
     )
     title = f"held-out views against {report['against']}, simplified → recovered:"
-    write_kinds(run, title, [KindScore.of(kind) for kind in report["kinds"]])
-
-
-def write_kinds(run: Run, title: str, kinds: Sequence[KindScore]) -> None:
-    """Print a row for each kind of view."""
-    run.console.table(
-        title,
-        ["kind of view", "views", "PSNR, dB", "SSIM", "worst view"],
-        [
-            [
-                kind.kind,
-                str(kind.views),
-                f"{kind.psnr.before:.2f} → {kind.psnr.after:.2f}",
-                f"{kind.ssim.before:.4f} → {kind.ssim.after:.4f}",
-                f"{kind.worst} {kind.worst_psnr.after:.2f}",
-            ]
-            for kind in kinds
-        ],
-    )
+    run.console.table(title, list(COLUMNS), cells(map(KindScore.of, report["kinds"])))
 
 
 def told(report: dict[str, Any], *, verbose: bool = False) -> list[str]:

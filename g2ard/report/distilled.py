@@ -14,7 +14,7 @@ from g2ard.config.choices import BLACK, Colour
 from g2ard.progress import plural
 from g2ard.rendering.metrics import psnr
 from g2ard.rendering.renderer import Renderer
-from g2ard.report.kinds import KindScore
+from g2ard.report.kinds import COLUMNS, KindScore, cells
 from g2ard.report.page import Comparison, Page, Shown
 from g2ard.scene.images import contact_sheet, to_bytes, write_png
 from g2ard.scene.splats import Splats
@@ -48,21 +48,8 @@ def distill_report(
         told: summary lines that the command prints.
     """
     page = Page(title, verdict(report))
-    page.table(
-        ["kind of view", "views", "PSNR simplified, dB", "recovered, dB", "SSIM", "worst view", "dB"],
-        [
-            [
-                kind.kind,
-                str(kind.views),
-                f"{kind.psnr.before:.2f}",
-                f"{kind.psnr.after:.2f}",
-                f"{kind.ssim.after:.4f}",
-                kind.worst,
-                f"{kind.worst_psnr.after:.2f}",
-            ]
-            for kind in map(KindScore.of, report["kinds"])
-        ],
-    )
+    page.table(COLUMNS, cells(map(KindScore.of, report["kinds"])))
+    page.paragraph("PSNR and SSIM: simplified → recovered.")
     for line in told:
         page.paragraph(line)
     page.heading("Worst views")

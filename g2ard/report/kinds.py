@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from statistics import fmean
 from typing import Any
@@ -90,3 +90,20 @@ def by_kind(
             )
         )
     return tuple(scores)
+
+
+COLUMNS = ("kind of view", "views", "PSNR, dB", "worst view", "SSIM")
+
+
+def cells(kinds: Iterable[KindScore]) -> list[list[str]]:
+    """Return the rows of a table with `COLUMNS`."""
+    return [
+        [
+            kind.kind,
+            str(kind.views),
+            f"{kind.psnr.before:.2f} → {kind.psnr.after:.2f}",
+            f"{kind.worst} {kind.worst_psnr.after:.2f}",
+            f"{kind.ssim.before:.4f} → {kind.ssim.after:.4f}",
+        ]
+        for kind in kinds
+    ]

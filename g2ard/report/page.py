@@ -238,7 +238,7 @@ box-shadow:0 0 3px #000;pointer-events:none}
 select{font:inherit;max-width:100%}
 .r0{--roi:#2563eb}.r1{--roi:#d97706}
 .roi{position:absolute;box-sizing:border-box;border:2px solid var(--roi);pointer-events:none}
-.crops{display:flex;flex-wrap:wrap;gap:10px;margin-top:10px}.crop{margin:0;width:190px}
+.crops{display:flex;flex-wrap:wrap;gap:10px;margin-top:10px}.crop{margin:0;flex:1 1 90px;max-width:300px}
 .wide{margin:8px 0}.wide img{display:block;max-width:100%}
 .crop img{display:block;width:100%;box-sizing:border-box;border:2px solid var(--roi)}
 """

@@ -137,8 +137,8 @@ def test_the_table_has_a_row_per_kind_of_view() -> None:
     assert said[1].startswith("9,000 points → 90 Gaussians")
     _, _, rows = tables[0]
     assert rows == [
-        ["given", "1", "31.00 → 32.00", "0.9000 → 0.9000", "a 32.00"],
-        ["near", "2", "31.00 → 32.00", "0.9000 → 0.9000", "near_0 31.00"],
+        ["given", "1", "31.00 → 32.00", "a 32.00", "0.9000 → 0.9000"],
+        ["near", "2", "31.00 → 32.00", "near_0 31.00", "0.9000 → 0.9000"],
     ]
 
 

@@ -78,7 +78,7 @@ def recover(
 ) -> None:
     """Optimise a fixed set of Gaussians against photos or a teacher's renders."""
     from g2ard.cli.resume import check_stopped, left_at, stoppable
-    from g2ard.cli.run_result import loss, write_kinds
+    from g2ard.cli.run_result import loss
     from g2ard.config.paths import listed
     from g2ard.config.presets import PRESETS, configured
     from g2ard.io import check_scene_output
@@ -86,6 +86,7 @@ def recover(
     from g2ard.jobs.inputs import load_split_views, load_trained, make_targets
     from g2ard.jobs.score import scores_by_kind
     from g2ard.jobs.view_checks import propose_background, warn_of_sight
+    from g2ard.report.kinds import COLUMNS, cells
     from g2ard.scene.targets import kinds_of
     from g2ard.stages.recover import RecoverConfig
     from g2ard.stages.recover import recover as optimize
@@ -160,7 +161,8 @@ def recover(
             pool.cameras.take(tested).resized(size), dense, config.background, photos=photos, lazy=True
         )
         kinds = scores_by_kind(splats, result.splats, held_out, config.background, run.progress)
-        write_kinds(run, f"held-out views against {kinds_of(held_out)}, before → after:", kinds)
+        title = f"held-out views against {kinds_of(held_out)}, before → after:"
+        run.console.table(title, list(COLUMNS), cells(kinds))
         lines = [loss(kind, "the student is better there") for kind in kinds]
         scored = sum(kind.views * kind.psnr.after for kind in kinds) / len(tested)
         lines += likely_causes(
