@@ -27,7 +27,8 @@ def write_table(run: Run, report: dict[str, Any]) -> None:
     size = report["bytes"]
     seconds = {name: value for name, value in report["seconds"].items() if name != "resumed"}
     times = ", ".join(f"{name} {value:.1f} s" for name, value in seconds.items())
-    before = plural(report["input_count"], "point" if report["lifted"] else "Gaussian")
+    count = report["input_count"]
+    before = plural(count, "point") if report["lifted"] else f"{count:,}"
     run.say(
         f"{before} → {plural(report['output_count'], 'Gaussian')}, "
         f"{size['input'] / 1e6:.2f} → {size['output'] / 1e6:.2f} MB as .ply; {times}"

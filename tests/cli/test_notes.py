@@ -133,7 +133,7 @@ def test_the_table_has_a_row_per_kind_of_view() -> None:
     run = cast("Run", SimpleNamespace(console=console, say=said.append))
     for lifted in (False, True):
         write_table(run, report | {"lifted": lifted})
-    assert said[0] == "9,000 Gaussians → 90 Gaussians, 9.00 → 1.00 MB as .ply; total 2.0 s"
+    assert said[0] == "9,000 → 90 Gaussians, 9.00 → 1.00 MB as .ply; total 2.0 s"
     assert said[1].startswith("9,000 points → 90 Gaussians")
     _, _, rows = tables[0]
     assert rows == [
