@@ -58,10 +58,11 @@ def loss(
 ) -> str | None:
     """Describe what recovery lost in the views of a kind, if anything; `hint` ends a warning."""
     what = f"{kind.kind} views"
-    if kind.ssim.gain < -_SSIM_LOSS and kind.psnr.gain > 0:  # neither scene is better
-        return f"recovery lost {-kind.ssim.gain:.3f} SSIM and gained {kind.psnr.gain:.2f} dB in {what}"
-    if kind.psnr.gain < -_LOSS or kind.ssim.gain < -_SSIM_LOSS:
-        how = f"{-kind.psnr.gain:.2f} dB" if kind.psnr.gain < -_LOSS else f"{-kind.ssim.gain:.3f} SSIM"
+    ssim = kind.ssim.gain if kind.ssim else 0.0
+    if ssim < -_SSIM_LOSS and kind.psnr.gain > 0:  # neither scene is better
+        return f"recovery lost {-ssim:.3f} SSIM and gained {kind.psnr.gain:.2f} dB in {what}"
+    if kind.psnr.gain < -_LOSS or ssim < -_SSIM_LOSS:
+        how = f"{-kind.psnr.gain:.2f} dB" if kind.psnr.gain < -_LOSS else f"{-ssim:.3f} SSIM"
         worst = f"{kind.worst}: {kind.worst_psnr.before:.2f} → {kind.worst_psnr.after:.2f} dB"
         return f"warning: recovery lost {how} in {what} (worst view {worst}); {hint}"
     return f"{kind.lost} of {kind.views} {what} lost PSNR; their mean gained" if kind.lost else None

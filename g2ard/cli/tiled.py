@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from g2ard.cli.frame import Run
 from g2ard.cli.outputs import Outputs
 from g2ard.cli.run_folder import is_done, tell_finished, write_report
+from g2ard.cli.run_result import loss
 from g2ard.progress import plural
 
 if TYPE_CHECKING:
@@ -19,6 +20,9 @@ if TYPE_CHECKING:
     from g2ard.stages.simplify import SimplifyConfig
     from g2ard.tiles.merging import TiledScene
     from g2ard.tiles.store import TileStore
+
+
+_HINT = "the simplified scene is better there (`g2ard simplify` writes it)"
 
 
 class TiledCommand:
@@ -82,6 +86,7 @@ class TiledCommand:
         from g2ard.jobs.tiled import distill_in_tiles, working
         from g2ard.jobs.tiling import refuse_whole, whole_budgets, whole_options
         from g2ard.report.distilled import tiled_report
+        from g2ard.report.kinds import COLUMNS, cells
 
         run, began = self.run, time.perf_counter()
         with working(self.tiling, options.views, options.held_out):
@@ -117,8 +122,12 @@ class TiledCommand:
                 title = f"{self.scene.name}: {store.count:,} → {len(small):,}"
                 tiled_report(folder / "report.html", title, report)
                 write_report(folder, report)
+                title = "held-out views against teacher renders, simplified → recovered:"
+                run.console.table(title, list(COLUMNS), cells(scores.kinds))
+                for line in filter(None, (loss(kind, _HINT) for kind in scores.kinds)):
+                    run.say(line)
                 run.say(
-                    f"{folder}: {len(small):,} of {store.count:,} Gaussians; held-out views "
+                    f"{folder}: {len(small):,} of {store.count:,} Gaussians; over all pixels "
                     f"{scores.simplified:.2f} → {scores.recovered:.2f} dB; "
                     f"{plural(scores.steps, 'step')} in all tiles together"
                 )

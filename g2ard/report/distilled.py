@@ -96,9 +96,9 @@ def verdict(report: dict[str, Any]) -> str:
     if len(kinds) > 1:
         last = f"{weakest.kind} views are weakest ({weakest.psnr.after:.1f} dB)"
     count = f"{report['output_count']:,} of {plural(report['input_count'], 'Gaussian')}"
-    if report["lifted"]:
+    if report.get("lifted"):
         count = f"{plural(report['output_count'], 'Gaussian')} from {plural(report['input_count'], 'point')}"
-    what = "photos" if "photo" in report["against"] else "scene"
+    what = "photos" if "photo" in report.get("against", "") else "scene"
     mean = fmean(kind.psnr.after for kind in kinds)
     return f"{count} reproduce the {what} at {mean:.1f} dB on average; {last}."
 
@@ -121,11 +121,10 @@ def tiled_report(path: Path, title: str, report: dict[str, Any]) -> None:
     """
     scores, views = report["scores"], report["views"]
     shown = sorted((t for t in scores["tiles"] if t["pixels"]), key=lambda t: (t["recovered"], t["tile"]))
-    count = f"{report['output_count']:,} of {plural(report['input_count'], 'Gaussian')}"
-    weakest = f"; tile {shown[0]['tile']} is weakest ({shown[0]['recovered']:.1f} dB)" if shown else ""
-    page = Page(title, f"{count} reproduce the scene at {scores['recovered']:.1f} dB on average{weakest}.")
+    page = Page(title, verdict(report | {"kinds": scores["kinds"]}))
+    page.table(COLUMNS, cells(map(KindScore.of, scores["kinds"])))
     page.paragraph(
-        f"Simplified {scores['simplified']:.2f} dB, recovered {scores['recovered']:.2f} dB, over the "
+        f"Simplified {scores['simplified']:.2f} dB, recovered {scores['recovered']:.2f} dB over the "
         f"{scores['pixels']:,} pixels that tiles own in {plural(views['test'], 'held-out view')}; "
         f"{plural(views['train'], 'training view')}, {scores['steps']:,} recovery steps of all tiles "
         f"together, {report['seconds']['total']:,.0f} s."

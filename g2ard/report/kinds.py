@@ -36,7 +36,7 @@ class KindScore(Report):
             user's.
         views: number of views.
         psnr: mean PSNR, dB.
-        ssim: mean SSIM.
+        ssim: mean SSIM; None for a scene in tiles.
         worst: name of the view with the lowest PSNR after recovery.
         worst_psnr: PSNR of that view, dB.
         lost: number of views that lost over 0.05 dB.
@@ -45,7 +45,7 @@ class KindScore(Report):
     kind: str
     views: int
     psnr: Change
-    ssim: Change
+    ssim: Change | None
     worst: str
     worst_psnr: Change
     lost: int
@@ -57,7 +57,8 @@ def by_kind(
     """Summarise scores by kind of view.
 
     Args:
-        before: `name`, `psnr` and `ssim` of each view with the simplified scene.
+        before: `name`, `psnr` and, unless the scene is in tiles, `ssim` of each view with the simplified
+            scene.
         after: the same with the recovered scene.
         usual: name of the kind of views whose name states none.
 
@@ -83,7 +84,7 @@ def by_kind(
                 usual if kind == USUAL else kind,
                 len(rows),
                 mean(psnr),
-                mean(changes("ssim", rows)),
+                mean(changes("ssim", rows)) if "ssim" in after[rows[0]] else None,
                 names[rows[worst]],
                 psnr[worst],
                 sum(change.gain < -_LOST for change in psnr),
@@ -103,7 +104,7 @@ def cells(kinds: Iterable[KindScore]) -> list[list[str]]:
             str(kind.views),
             f"{kind.psnr.before:.2f} → {kind.psnr.after:.2f}",
             f"{kind.worst} {kind.worst_psnr.after:.2f}",
-            f"{kind.ssim.before:.4f} → {kind.ssim.after:.4f}",
+            f"{kind.ssim.before:.4f} → {kind.ssim.after:.4f}" if kind.ssim else "–",
         ]
         for kind in kinds
     ]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -12,9 +13,11 @@ from numpy.typing import NDArray
 
 from g2ard.config.paths import changed, values_of
 from g2ard.rendering.renderer import RasterSettings, Renderer, settings_for
+from g2ard.report.kinds import KindScore, by_kind
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.prepared import PreparedScene
 from g2ard.scene.splats import SH_C0, Splats
+from g2ard.scene.splits import USUAL
 from g2ard.scene.targets import TeacherRenders
 from g2ard.scene.transform import join
 from g2ard.stages.recover import RecoverConfig
@@ -77,6 +80,7 @@ class TiledScores:
         simplified: PSNR before recovery, dB.
         recovered: PSNR after recovery, dB.
         pixels: number of pixels scored.
+        kinds: scores by kind of view.
         steps: steps of all tiles together.
         tiles: scores per tile.
     """
@@ -84,6 +88,7 @@ class TiledScores:
     simplified: float
     recovered: float
     pixels: int
+    kinds: tuple[KindScore, ...]
     steps: int
     tiles: tuple[TileScore, ...]
 
@@ -124,8 +129,8 @@ def recover_tile(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays
         places: `store`, the folder of the dense tiles; `student`, of the tiles to recover, in the same boxes.
 
     Returns:
-        `scene` (`scene_of`), the tile's Gaussians; `errors`, (2, 2) before and after: squared error in the
-        held-out views and number of values summed; `steps` taken.
+        `scene` (`scene_of`), the tile's Gaussians; `errors`, (2, C, 2) before and after, per held-out view:
+        squared error and number of values summed; `steps` taken.
     """
     from g2ard.stages.recover import recover
 
@@ -146,7 +151,8 @@ def recover_tile(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays
         return found if len(found.cameras) else None
 
     held_out, idle = targets("test"), not len(small) or not arguments["steps"]
-    before = _errors(student, held_out, background)
+    names = cameras_of(inputs["test"]).names
+    before = _errors(student, held_out, names, background)
     train, apart = (None, None) if idle else (targets("train"), targets("apart"))
     if train is None:
         return {**arrays_of(small, "scene"), "errors": np.array([before, before]), "steps": np.array(0)}
@@ -159,7 +165,7 @@ def recover_tile(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays
         frozen=frozen,
     )
     result = done.splats.take(slice(len(small)))
-    after = _errors(join([result, student.take(frozen)]), held_out, background)
+    after = _errors(join([result, student.take(frozen)]), held_out, names, background)
     return {
         **arrays_of(result, "scene"),
         "errors": np.array([before, after]),
@@ -175,18 +181,22 @@ def _cropped(cameras: Cameras, core: PreparedScene, offset: NDArray[np.float64])
 
 
 def _errors(
-    scene: Splats, targets: TileTargets | None, background: tuple[float, float, float]
-) -> tuple[float, int]:
-    """Return the squared error summed over masked pixels and channels, and the number of values."""
+    scene: Splats,
+    targets: TileTargets | None,
+    names: Sequence[str],
+    background: tuple[float, float, float],
+) -> NDArray[np.float64]:
+    """Return the (C, 2) squared error summed over masked pixels and channels, and the number of values, of
+    the views called `names`; zeros for those not among the targets."""
+    found = np.zeros((len(names), 2))
     if targets is None:
-        return 0.0, 0
-    total, count, renderer = 0.0, 0, Renderer(scene, background=background)
+        return found
+    renderer = Renderer(scene, background=background)
     for view, camera in enumerate(targets.cameras):
         mask = targets.mask(view)
         lost = renderer.clipped(camera)[mask] - targets[view][mask]
-        total += float(np.sum(np.square(lost, dtype=np.float64)))
-        count += lost.size
-    return total, count
+        found[names.index(camera.name)] = np.sum(np.square(lost, dtype=np.float64)), lost.size
+    return found
 
 
 def recover_tiles(
@@ -238,11 +248,18 @@ def recover_tiles(
     errors = [load(path, "errors")[0] for path in paths]
     taken = [int(load(path, "steps")[0]) for path in paths]
     parts = tuple(
-        TileScore(tile.index, tile.rows, *_psnr(lost), int(lost[0][1]) // 3, steps)
+        TileScore(tile.index, tile.rows, *_psnr(lost.sum(axis=1)), int(lost[0, :, 1].sum()) // 3, steps)
         for tile, lost, steps in zip(student.tiles, errors, taken, strict=True)
     )
     lost = np.sum(errors, axis=0)
-    scores = TiledScores(*_psnr(lost), int(lost[0][1]) // 3, sum(taken), parts)
+    shown = [(name, *_psnr(lost[:, i])) for i, name in enumerate(views.test.names) if lost[0, i, 1]]
+    kinds = by_kind(
+        [{"name": name, "psnr": before} for name, before, _ in shown],
+        [{"name": name, "psnr": after} for name, _, after in shown],
+        USUAL if views.pool is not None else "given",
+    )
+    pixels = int(lost[0, :, 1].sum()) // 3
+    scores = TiledScores(*_psnr(lost.sum(axis=1)), pixels, kinds, sum(taken), parts)
     degree = student.sh_degree if config.sh_degree is None else config.sh_degree
     scene = TiledScene(
         tuple(tile.rows for tile in student.tiles),

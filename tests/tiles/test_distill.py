@@ -217,7 +217,11 @@ def test_distill_in_tiles_recovers(command_line: CommandLine, folder: Path, tmp_
     tiles = report["scores"]["tiles"]
     assert [tile["count"] for tile in tiles] == report["tiles"]
     assert sum(tile["pixels"] for tile in tiles) == report["scores"]["pixels"]
+    (kind,) = report["scores"]["kinds"]
+    assert (kind["kind"], kind["views"], kind["ssim"]) == ("given", 2, None)
+    assert kind["worst_psnr"]["after"] <= report["scores"]["recovered"] <= kind["psnr"]["after"] + 0.2
     page = (tmp_path / "run" / "report.html").read_text()
+    assert f"the worst view is {kind['worst']}" in page
     assert "town.ply: 9,000 → 900" in page
     assert f"{sum(tile['steps'] for tile in tiles):,} recovery steps of all tiles together" in page
     assert all(f"{tile['recovered']:.2f}" in page for tile in tiles)
