@@ -155,18 +155,8 @@ def distill(
     names = ("method", "keep_region", "schedule", "steps", "recovery_time", "background", "seed")
     settings = run.settings(DistillConfig(), *names, preset=preset)
     budgets = budgets_of(count, ratio, fit, min_psnr, min_ssim)
-    if is_made(str(held_out)):
-        raise typer.BadParameter(
-            "--held-out must be a file of views; generated views already hold out every 8th"
-        )
     given = views is not None and not is_made(views)
-    if scene is None and not given:
-        raise typer.BadParameter("give a SCENE, or photos with their poses as --views")
-    if photos and is_made(views):
-        raise typer.BadParameter("--photos: generated views have no photos; give --views VIEWS")
-    if scene is None and photos is False:
-        raise typer.BadParameter("--renders needs a SCENE to render; give one or remove --renders")
-    from g2ard.io import kind
+    _check_options(scene, views, held_out, photos)
     from g2ard.jobs.distill import prepare
     from g2ard.jobs.distill_options import DistillOptions
     from g2ard.jobs.estimate import check_memory
@@ -186,12 +176,8 @@ def distill(
     if early and not dry_run and all(is_done(run, place, resume) for place in early):
         _tell_all(run, [tell_finished(run, place) for place in early])
         return
-    if scene is not None and kind(scene) == "views":
-        raise typer.BadParameter(
-            f"{scene} holds views, not a scene; to start from photos, pass it as --views with -n COUNT"
-        )
-    if scene is not None and kind(scene) != "splats" and not given:
-        raise typer.BadParameter("a point cloud cannot render training images; give photos with --views")
+    if scene is not None:
+        _check_kind(scene, given)
     options = DistillOptions(
         views=with_images(views, images, alpha),
         photos=photos,
@@ -239,6 +225,35 @@ def distill(
     _tell_all(run, reports)
     if len(finished) < len(places):
         tell_quality(run, aim, result.splats)
+
+
+def _check_options(
+    scene: Path | None, views: Path | None, held_out: Path | None, photos: bool | None
+) -> None:
+    """Reject inputs that leave nothing to distil, to train on or to score on."""
+    if is_made(str(held_out)):
+        raise typer.BadParameter(
+            "--held-out must be a file of views; generated views already hold out every 8th"
+        )
+    if scene is None and (views is None or is_made(views)):
+        raise typer.BadParameter("give a SCENE, or photos with their poses as --views")
+    if photos and is_made(views):
+        raise typer.BadParameter("--photos: generated views have no photos; give --views VIEWS")
+    if scene is None and photos is False:
+        raise typer.BadParameter("--renders needs a SCENE to render; give one or remove --renders")
+
+
+def _check_kind(scene: Path, given: bool) -> None:
+    """Reject a file of views as the scene, and a point cloud without `given` views."""
+    from g2ard.io import kind
+
+    found = kind(scene)
+    if found == "views":
+        raise typer.BadParameter(
+            f"{scene} holds views, not a scene; to start from photos, pass it as --views with -n COUNT"
+        )
+    if found != "splats" and not given:
+        raise typer.BadParameter("a point cloud cannot render training images; give photos with --views")
 
 
 def _tell_all(run: Run, reports: list[dict[str, Any]]) -> None:
