@@ -65,6 +65,7 @@ if TYPE_CHECKING:
     from g2ard.stages.lift import lift
     from g2ard.stages.recover import RecoverConfig, Recovered, recover
     from g2ard.stages.recover.anchors import Regularizers
+    from g2ard.stages.recover.config import FitConfig
     from g2ard.stages.register import RegisterConfig, Registered, register
     from g2ard.stages.select import CoverageOptions, Selection, select
     from g2ard.stages.simplify import Simplified, SimplifyConfig
@@ -81,6 +82,7 @@ __all__ = [
     "DistillOptions",
     "Distilled",
     "Evaluation",
+    "FitConfig",
     "G2ardError",
     "Georeference",
     "InputError",
@@ -146,6 +148,7 @@ _HOMES = {
     "stages.evaluate": ("Evaluation", "evaluate"),
     "stages.lift": ("lift",),
     "stages.recover": ("RecoverConfig", "Recovered", "recover"),
+    "stages.recover.config": ("FitConfig",),
     "stages.recover.anchors": ("Regularizers",),
     "stages.register": ("RegisterConfig", "Registered", "register"),
     "rendering.renderer": ("RasterSettings", "Rendered", "Renderer", "render"),
