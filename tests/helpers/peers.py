@@ -1,7 +1,7 @@
 """Other people's readers, for tests that hold our files against them.
 
 Looked for in $G2ARD_NODE_MODULES, where `npm i node@22 @playcanvas/splat-transform@3.7 @adobe/spz@0.2.3
-gltf-validator` has been run; tests that need one skip where it is absent.
+gltf-validator cesium` has been run; tests that need one skip where it is absent.
 """
 
 import json
@@ -32,7 +32,8 @@ console.log(JSON.stringify(report));
 """
 
 
-def _package(*parts: str) -> Path:
+def package(*parts: str) -> Path:
+    """Return a path in the node modules; skip the test if it is absent."""
     root = Path(os.environ.get("G2ARD_NODE_MODULES", "node_modules")).absolute()
     if not root.joinpath(*parts).exists():
         pytest.skip(f"no {'/'.join(parts)} (set G2ARD_NODE_MODULES)")
@@ -52,17 +53,17 @@ def _run(*arguments: str | Path) -> str:
 
 def splat_transform(*arguments: str | Path) -> None:
     """Run splat-transform; fail with its output."""
-    _run(_package("@playcanvas", "splat-transform", "bin", "cli.mjs"), "-q", "-w", *arguments)
+    _run(package("@playcanvas", "splat-transform", "bin", "cli.mjs"), "-q", "-w", *arguments)
 
 
 def adobe_spz(path: Path) -> dict[str, np.ndarray]:
     """Read an .spz with Adobe's library: flat arrays in the axes of a .ply, rotations x y z w."""
-    module = _package("@adobe", "spz", "dist", "spz.js")
+    module = package("@adobe", "spz", "dist", "spz.js")
     out = _run("--input-type=module", "-e", _ADOBE, "-", module, path)
     return {key: np.array(values) for key, values in json.loads(out.splitlines()[-1]).items()}
 
 
 def gltf_report(path: Path) -> dict[str, Any]:
     """Return the report of Khronos' glTF validator."""
-    modules = _package("gltf-validator").parent
+    modules = package("gltf-validator").parent
     return json.loads(_run("--input-type=module", "-e", _VALIDATOR, "-", modules, path))

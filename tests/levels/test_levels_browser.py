@@ -3,21 +3,26 @@
 import json
 import re
 import threading
+import time
 from collections.abc import Iterator
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from g2ard.jobs.levels import lod
 from g2ard.jobs.viewer_frame import frame_with
-from g2ard.levels import Cut, save_levels
+from g2ard.levels import Cut, Georeference, save_levels, save_tileset
+from g2ard.rendering.metrics import psnr
+from g2ard.rendering.renderer import Renderer
 from g2ard.scene.cameras import Camera, Cameras
 from g2ard.scene.splats import Splats
 from g2ard.viewer import write_page
 from helpers.browser import Browser
 from helpers.pages import FRONT, GREY, HEIGHT, WIDTH, assert_shows, rendered, show
+from helpers.peers import package
 from helpers.scenes import checkered_ball
 
 RATIOS = (1.0, 4.0, 16.0)
@@ -80,3 +85,66 @@ def test_each_level(
     fetched = {url.removeprefix(f"{address}/{name}/") for url in browser.requests if f"/{name}/" in url}
     assert "lod-meta.json" in fetched
     assert any(re.match(r"0_\d+/", file) for file in fetched)
+
+
+GLOBE = """<!doctype html><style>body { margin: 0; overflow: hidden }
+#show, canvas { width: 100vw; height: 100vh }
+.cesium-widget-credits { display: none !important }</style><div id="show"></div>
+<script>CESIUM_BASE_URL = "cesium/"</script><script src="cesium/Cesium.js"></script><script>
+async function start(url, pixels, camera) {
+  const off = { globe: false, skyBox: false, skyAtmosphere: false, baseLayer: false, msaaSamples: 1 };
+  const widget = new Cesium.CesiumWidget("show", off), scene = widget.scene;
+  scene.sun = scene.moon = undefined;
+  scene.backgroundColor = Cesium.Color.BLACK;
+  const vector = name => new Cesium.Cartesian3(...camera[name]);
+  Object.assign(scene.camera.frustum, { fov: camera.fov, near: 0.01, far: 1e5 });
+  const orientation = { direction: vector("direction"), up: vector("up") };
+  scene.camera.setView({ destination: vector("position"), orientation });
+  const tiles = await Cesium.Cesium3DTileset.fromUrl(url, { maximumScreenSpaceError: pixels });
+  scene.primitives.add(tiles);
+  window.shown = () => tiles.tilesLoaded && tiles.gaussianSplatPrimitive ? tiles._selectedTiles.map(
+    tile => tile.content.url.split("/").pop()).sort().join() : "";
+}</script>"""
+
+
+@pytest.mark.parametrize("level", [0, 1, 2])
+def test_cesium_shows_each_level_on_the_globe(
+    browser: Browser, served: tuple[Path, str], levels: tuple[Splats, ...], level: int
+) -> None:
+    """CesiumJS widens Gaussians by 0.3 / 16 square pixels, not by 0.3, so a larger render is taken, and of
+    4 × 4 pixels the middle four."""
+    folder, address = served
+    place = Georeference(24.75, 59.43, 30, 40)
+    if not (folder / "cesium").exists():
+        (folder / "cesium").symlink_to(package("cesium", "Build", "Cesium"))
+        (folder / "globe.html").write_text(GLOBE)
+        save_tileset(folder / "globe", levels, up=(0, 0, 1), place=place, cut=Cut(4096, 1.0, 512))
+    turn, origin = place.matrix()[:3, :3], place.matrix()[:3, 3]
+    eye = np.array([18, -16, 9.0])  # far, so that a level's tiles have about the same error on the screen
+    large = Camera.facing(eye, [0, 0, 0], width=4 * WIDTH, height=4 * HEIGHT, fov=6)
+    picture = np.clip(Renderer(levels[level]).image(large), 0, 1).reshape(HEIGHT, 4, WIDTH, 4, 3)
+    expected = picture[:, 1:3, :, 1:3].mean(axis=(1, 3))
+    camera = {
+        "position": (turn @ eye + origin).tolist(),
+        "direction": (turn @ -eye / np.linalg.norm(eye)).tolist(),
+        "up": (turn @ [0, 0, 1]).tolist(),
+        "fov": float(np.radians(6)),
+    }
+    tiles = [json.loads((folder / "globe" / "tileset.json").read_text())["root"]]
+    errors: dict[str, list[float]] = {"1": [], "2": []}
+    for tile in tiles:
+        tiles += tile.get("children", [])
+        errors.setdefault(tile["content"]["uri"][0], []).append(tile["geometricError"])
+    error = [0.0, np.sqrt(max(errors["1"]) * min(errors["2"])), 1.5 * max(errors["2"])][level]
+    pixels = max(0.01, float(error * large.K[0, 0] / 4 / np.linalg.norm(eye)))
+    browser.open(f"{address}/globe.html")
+    browser.run(
+        "new Promise(done => { const look = () => window.start ? done() : setTimeout(look, 50); look(); })"
+    )
+    browser.run(f"start('globe/tileset.json', {pixels}, {json.dumps(camera)})")
+    until, found = time.monotonic() + 60, 0.0
+    while found < 35 and time.monotonic() < until:
+        browser.run("new Promise(done => setTimeout(done, 500))")
+        found = psnr(browser.picture() / np.float32(255), expected)
+    assert found > 35, browser.run("shown()")
+    assert {name[0] for name in browser.run("shown()").split(",")} == {str(level)}
