@@ -10,7 +10,7 @@ import contextlib
 import inspect
 import os
 import traceback
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from itertools import combinations
 from pathlib import Path
@@ -25,12 +25,13 @@ from g2ard.cli.config import load_config, printed
 from g2ard.cli.console import Console
 from g2ard.cli.panels import COMMON, GROUPED, into_panels
 from g2ard.cli.usage import flags_of, in_flags, typed
-from g2ard.config.choices import RenderModel
+from g2ard.config.choices import RenderModel, ViewFormat
 from g2ard.errors import G2ardError
 from g2ard.progress import plural
 from g2ard.system import interrupt
 
 if TYPE_CHECKING:
+    from g2ard.scene.cameras import Cameras
     from g2ard.scene.splats import Splats
 
 __all__ = ["Run", "app", "command", "group", "one_line"]
@@ -214,6 +215,25 @@ class Run:
         write_splats(path, splats, overwrite=self.overwrite or overwrite, **options)
         for note in lost_in(path, splats, **options):
             self.say(f"note: {path}: {note}")
+
+    def write_views(
+        self,
+        path: Path,
+        cameras: Cameras,
+        format: ViewFormat | None = None,
+        splits: Sequence[str | None] = (),
+        weights: Any = None,
+        *,
+        overwrite: bool = False,
+    ) -> None:
+        """Write views, and report what their format cannot hold."""
+        from g2ard.io import write_views
+        from g2ard.io.camera_files import lost_views, view_format
+
+        overwrite = self.overwrite or overwrite
+        write_views(path, cameras, splits=splits, weights=weights, format=format, overwrite=overwrite)
+        if lost := lost_views(cameras, view_format(path, format), splits, weights is not None):
+            self.say(f"note: {path}: without {', '.join(lost)}")
 
     def spare_inputs(self, *outputs: Path) -> None:
         """Raise a usage error if an output is also an input, even with --overwrite."""

@@ -21,6 +21,7 @@ from g2ard.config.choices import (
     Policy,
     PresetName,
     ScheduleName,
+    ViewFormat,
 )
 
 if TYPE_CHECKING:
@@ -208,6 +209,23 @@ ShDegreeOption = Annotated[
 FormatOption = Annotated[
     FormatName,
     typer.Option("--format", case_sensitive=False, help="Format of the scene in RUN."),
+]
+ViewFormatOption = Annotated[
+    ViewFormat | None,
+    typer.Option(
+        "--format",
+        case_sensitive=False,
+        help="Format of OUT; by default that of its name: cameras.json is INRIA's, transforms.json "
+        "nerfstudio's, another .json g2ard's, a folder COLMAP text.",
+    ),
+]
+ViewsFormatOption = Annotated[
+    ViewFormat,
+    typer.Option(
+        "--views-format",
+        case_sensitive=False,
+        help="Also write generated views as cameras.json (inria), transforms.json (nerfstudio) or colmap/.",
+    ),
 ]
 ResumeOption = Annotated[bool, typer.Option("--resume", help="Continue an interrupted run.")]
 SizeOption = Annotated[

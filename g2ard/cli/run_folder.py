@@ -12,8 +12,10 @@ from typing import TYPE_CHECKING, Any
 
 from g2ard.cli.frame import Run
 from g2ard.cli.resume import OPTIONS, check_stopped, left_at
+from g2ard.config.choices import ViewFormat
 
 if TYPE_CHECKING:
+    from g2ard.io import ViewSet
     from g2ard.jobs.budget import Budget
 
 WORK = ".unfinished"
@@ -23,13 +25,30 @@ KEPT = Path("simplified", "scene.ply")
 REPORT = "report.json"
 """The run's numbers, written last."""
 
+_VIEWS: dict[ViewFormat, str] = {
+    "inria": "cameras.json",
+    "nerfstudio": "transforms.json",
+    "colmap": "colmap",
+}
+"""Names of generated views for other programs, beside views.json."""
+
 _OF_THE_CALL = (
     *("output", "resume", "keep", "view", "dry_run", "threads", "device"),
-    *("memory", "workers", "scheduler", "work"),
+    *("memory", "workers", "scheduler", "work", "views_format"),
 )
 """Options that may change when a run is resumed. `device` may change except to or from CUDA."""
 _OF_THE_BUDGET = ("count", "ratio")
 """Budget options; each folder has one budget."""
+
+
+def write_pool(run: Run, folder: Path, pool: ViewSet) -> None:
+    """Write generated views, also in the format of --views-format."""
+    from g2ard.io import write_views
+
+    write_views(folder / "views.json", pool.cameras, splits=pool.splits, overwrite=True)
+    also: ViewFormat = run.config["views_format"]
+    if also in _VIEWS:
+        run.write_views(folder / _VIEWS[also], pool.cameras, also, pool.splits, overwrite=True)
 
 
 def write_report(folder: Path, report: dict[str, Any]) -> None:

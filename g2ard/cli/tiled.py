@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from g2ard.cli.frame import Run
 from g2ard.cli.outputs import Outputs
-from g2ard.cli.run_folder import is_done, tell_finished, write_report
+from g2ard.cli.run_folder import is_done, tell_finished, write_pool, write_report
 from g2ard.cli.run_result import loss
 from g2ard.progress import plural
 
@@ -82,7 +82,6 @@ class TiledCommand:
         """
         from dataclasses import asdict
 
-        from g2ard import io
         from g2ard.jobs.tiled import distill_in_tiles, working
         from g2ard.jobs.tiling import refuse_whole, whole_budgets, whole_options
         from g2ard.report.distilled import tiled_report
@@ -117,7 +116,7 @@ class TiledCommand:
                     "config": run.config,
                 }
                 if (pool := views.pool) is not None:
-                    io.write_views(folder / "views.json", pool.cameras, splits=pool.splits, overwrite=True)
+                    write_pool(run, folder, pool)
                 self._write(folder / name, store, small)
                 title = f"{self.scene.name}: {store.count:,} → {len(small):,}"
                 tiled_report(folder / "report.html", title, report)

@@ -75,5 +75,8 @@ LpipsInput = Literal["scaled", "unscaled"]
 """Value range of the images passed to LPIPS's networks (`g2ard.rendering.lpips`)."""
 LPIPS_INPUTS: tuple[LpipsInput, ...] = get_args(LpipsInput)
 
+ViewFormat = Literal["g2ard", "inria", "nerfstudio", "colmap"]
+"""Formats that views can be written to (`g2ard.io.camera_files`)."""
+
 FormatName = Literal["ply", "sog", "spz", "glb", "compressed.ply", "splat", "usda", "usdc"]
 """Formats that scenes can be written to (`g2ard.io.scene_formats`)."""

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import ArrayLike
 
-    from g2ard.config.choices import Alpha, RenderModel
+    from g2ard.config.choices import Alpha, RenderModel, ViewFormat
     from g2ard.io.point_stream import PointStream
     from g2ard.io.stream import SceneStream
     from g2ard.io.types import Cloud, Note, Points, Scene, ViewFiles, ViewSet
@@ -156,15 +156,6 @@ def check_scene(path: str | Path) -> tuple[Path, str]:
     return path, found
 
 
-def _named(path: str | Path, suffixes: tuple[str, ...], rule: str) -> Path:
-    from g2ard.errors import OutputError
-
-    path = Path(path)
-    if path.suffix.lower() not in suffixes:
-        raise OutputError(rule, path=path)
-    return path
-
-
 def check_scene_output(path: str | Path, overwrite: bool = False) -> Path:
     """Raise the `OutputError` that `write_splats` would raise, before any work."""
     from g2ard.io.scene_formats import scene_format
@@ -175,9 +166,11 @@ def check_scene_output(path: str | Path, overwrite: bool = False) -> Path:
     return check_output(path, overwrite)
 
 
-def check_views_output(path: str | Path, overwrite: bool = False) -> Path:
+def check_views_output(path: str | Path, overwrite: bool = False, format: ViewFormat | None = None) -> Path:
     """Raise the `OutputError` that `write_views` would raise, before any work."""
-    return check_output(_named(path, (".json",), "views are written as .json"), overwrite)
+    from g2ard.io.camera_files import view_format
+
+    return check_output(path, overwrite, folder=view_format(Path(path), format) == "colmap")
 
 
 def write_splats(path: str | Path, splats: Splats, *, overwrite: bool = False, **options: Any) -> None:
@@ -363,23 +356,47 @@ def write_views(
     *,
     splits: Sequence[str | None] = (),
     weights: ArrayLike | None = None,
+    format: ViewFormat | None = None,
     overwrite: bool = False,
 ) -> None:
-    """Write views as g2ard's .json, which `read_views` restores to the same bits.
+    """Write views as g2ard's .json, which `read_views` restores to the same bits, or for other programs.
 
     Args:
-        path: the .json to write; photo paths are stored relative to it.
+        path: the .json to write, or a folder for COLMAP; photo paths are stored relative to it.
         cameras: C views.
         splits: "train", "test" or None per view, or ().
         weights: (C,) sampling weights, NaN for views without one, or None.
+        format: "g2ard", "inria", "nerfstudio" or "colmap" (text). None decides by name: cameras.json is
+            INRIA's, transforms*.json nerfstudio's, a name without suffix a COLMAP project.
         overwrite: whether to replace an existing file.
+
+    Warns:
+        UserWarning: the format cannot hold something of the views.
 
     Raises:
         OutputError: the file exists, cannot be written, or is not a .json.
         InputError: there are no views, or `splits` or `weights` have another length.
     """
-    from g2ard.io import views
+    import warnings
+
+    from g2ard.errors import InputError
+    from g2ard.io import camera_files, views
 
     path = Path(path)
-    _named(path, (".json",), "views are written as .json")
-    views.write(path, cameras, splits=splits, weights=weights, overwrite=overwrite)
+    kind = camera_files.view_format(path, format)
+    if kind == "g2ard":
+        views.write(path, cameras, splits=splits, weights=weights, overwrite=overwrite)
+        return
+    if not len(cameras):
+        raise InputError("not written: there are no views", path=path)
+    if kind == "colmap":
+        with atomic_folder(path, overwrite) as temporary:
+            camera_files.write_colmap(temporary, cameras)
+    else:
+        with atomic_output(path, overwrite) as temporary:
+            if kind == "inria":
+                camera_files.write_inria(temporary, cameras)
+            else:
+                camera_files.write_nerfstudio(temporary, cameras, path, splits)
+    if lost := camera_files.lost_views(cameras, kind, splits, weights is not None):
+        warnings.warn(f"{path}: without {', '.join(lost)}", stacklevel=2)

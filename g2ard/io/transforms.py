@@ -22,7 +22,7 @@ _LEAST_ANGLE = 1e-6
 
 _TRAIN, _TEST = "transforms_train.json", "transforms_test.json"
 
-_FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
+FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 """OpenGL camera axes (y up, looking along −z) to OpenCV's (y down, looking along z)."""
 
 
@@ -124,7 +124,7 @@ def _there(frame: Fields, mask: Path) -> Path:
 
 def opencv_view(world_from_camera: NDArray[np.float64]) -> NDArray[np.float64]:
     """Convert a rigid world_from_camera in OpenGL axes to a (4, 4) camera_from_world in OpenCV axes."""
-    return inverse(world_from_camera @ _FLIP)
+    return inverse(world_from_camera @ FLIP)
 
 
 def _intrinsics(path: Path, values: Fields, photo: Path) -> dict[str, Any]:

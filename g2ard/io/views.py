@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -13,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from g2ard.errors import InputError
 from g2ard.io.atomic import atomic_output
+from g2ard.io.camera_files import beside
 from g2ard.io.jsonfile import (
     Fields,
     fields_of,
@@ -25,7 +25,6 @@ from g2ard.io.jsonfile import (
     text,
     whole,
 )
-from g2ard.io.paths import real_path
 from g2ard.io.photos import Frame, rigid, view_set
 from g2ard.io.types import ViewSet
 from g2ard.progress import plural
@@ -101,8 +100,8 @@ def write(
             "K": cameras.Ks[i].tolist(),
             "camera_from_world": cameras.viewmats[i].tolist(),
             "distortion": cameras.distortions[i].tolist() if cameras.distortions[i].any() else None,
-            "image": _relative(cameras.image_paths[i], path),
-            "mask": _relative(cameras.mask_paths[i], path),
+            "image": beside(cameras.image_paths[i], path),
+            "mask": beside(cameras.mask_paths[i], path),
             "split": parts[i],
             "weight": drawn[i],
         }
@@ -110,12 +109,3 @@ def write(
     head = f'{{"format": "{_FORMAT}", "version": {_VERSION}, "views": [\n'
     with atomic_output(path, overwrite) as temporary:
         temporary.write_text(head + ",\n".join(lines) + "\n]}\n", encoding="utf-8")
-
-
-def _relative(photo: Path | None, path: Path) -> str | None:
-    if photo is None:
-        return None
-    try:
-        return Path(os.path.relpath(real_path(photo), real_path(path.parent))).as_posix()
-    except ValueError:  # another drive on Windows
-        return real_path(photo).as_posix()

@@ -44,7 +44,7 @@ def transform(splats: Splats, matrix: ArrayLike) -> Splats:
         offset = offset + shift
     else:
         means, offset = means + shift, np.zeros(3)
-    turn = _quaternion(rotation)
+    turn = quaternion_of(rotation)
     return replace(
         splats,
         means=means.astype(splats.means.dtype),
@@ -104,7 +104,7 @@ def similarity(matrix: ArrayLike) -> tuple[float, NDArray[np.float64], NDArray[n
     return scale, u @ v, m[:3, 3]
 
 
-def _quaternion(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
+def quaternion_of(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return (4,) wxyz: the eigenvector of the largest eigenvalue of Bar-Itzhack's matrix."""
     r = rotation
     k = np.array(

@@ -32,6 +32,7 @@ from g2ard.cli.options import (
     SizeOption,
     StepsOption,
     UpOption,
+    ViewsFormatOption,
     ViewsOrMadeOption,
     is_made,
     recovery_engine,
@@ -47,6 +48,7 @@ from g2ard.cli.run_folder import (
     tell_anew,
     tell_finished,
     work_folder,
+    write_pool,
     write_report,
 )
 from g2ard.cli.run_result import say_views, say_weight, tell_quality, told, write_table
@@ -122,6 +124,7 @@ def distill(
         typer.Option("-o", "--output", metavar="RUN", help="Output folder."),
     ],
     format: FormatOption = "ply",
+    views_format: ViewsFormatOption = "g2ard",
     clean: Annotated[
         bool,
         typer.Option("--clean", help="First remove invisible and stray Gaussians, as `g2ard clean` does."),
@@ -322,9 +325,7 @@ def _distil(
         _write(run, place, result, job.held_out, colour, report)
         _keep(output / KEPT, result.simplified if keep else None)
     if (pool := job.views.pool) is not None:
-        from g2ard.io import write_views
-
-        write_views(output / "views.json", pool.cameras, splits=pool.splits, overwrite=True)
+        write_pool(run, output, pool)
     shutil.rmtree(output / WORK)
     write_table(run, report)
     for line in told(report, verbose=run.verbose):

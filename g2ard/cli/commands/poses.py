@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from g2ard.cli.frame import Run, command
-from g2ard.cli.options import OutputOption, SceneArgument, UpOption
+from g2ard.cli.options import OutputOption, SceneArgument, UpOption, ViewFormatOption
 from g2ard.config.choices import PoolKind
 from g2ard.progress import plural
 
@@ -37,6 +37,7 @@ def poses(
     run: Run,
     scene: SceneArgument,
     output: OutputOption,
+    format: ViewFormatOption = None,
     kind: Annotated[
         PoolKind,
         typer.Option(
@@ -57,11 +58,11 @@ def poses(
     up: UpOption = None,
 ) -> None:
     """Generate views for a scene: poses in free space that see it well."""
-    from g2ard.io import check_views_output, write_views
+    from g2ard.io import check_views_output
     from g2ard.poses import plan_pool
     from g2ard.scene.splits import splits_of
 
-    check_views_output(output, run.overwrite)
+    check_views_output(output, run.overwrite, format)
     splats = run.load(scene)
     pool = plan_pool(
         splats,
@@ -74,7 +75,7 @@ def poses(
         progress=run.progress,
     )
     splits = splits_of(None, pool.cameras.names)
-    write_views(output, pool.cameras, splits=splits, overwrite=run.overwrite)
+    run.write_views(output, pool.cameras, format, splits)
     direction = ", ".join(f"{v:.2f}" for v in pool.up)
     run.say(f"{output}: {plural(count, 'pose')}, {pool.kind} ({pool.why}; up is {direction})")
     shares = (("is in no view", pool.unseen), ("is smaller than a pixel in all views", pool.coarse))

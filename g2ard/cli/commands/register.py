@@ -8,7 +8,13 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from g2ard.cli.frame import Run, command
-from g2ard.cli.options import AlphaOption, BackgroundOption, OutputOption, SceneArgument
+from g2ard.cli.options import (
+    AlphaOption,
+    BackgroundOption,
+    OutputOption,
+    SceneArgument,
+    ViewFormatOption,
+)
 from g2ard.config.choices import BLACK, Keep, Refinement
 from g2ard.progress import plural
 
@@ -34,6 +40,7 @@ def register(
         ),
     ],
     output: OutputOption,
+    format: ViewFormatOption = None,
     poses: Annotated[
         Path | None,
         typer.Option(metavar="FILE", help="Initial poses: views in any format, or ACE text."),
@@ -109,7 +116,7 @@ def register(
     from g2ard.config.paths import changed, listed
     from g2ard.config.presets import GS_CPR
     from g2ard.errors import InputError
-    from g2ard.io import check_views_output, write_views
+    from g2ard.io import check_views_output
     from g2ard.jobs.register import photos_of, pool_of, poses_for
     from g2ard.stages.register import RegisterConfig
     from g2ard.stages.register import register as find
@@ -126,7 +133,7 @@ def register(
         raise typer.BadParameter("--metres-per-unit goes with --truth")
     if intrinsics is not None and focal is not None:
         raise typer.BadParameter("--intrinsics and --focal exclude each other; give one")
-    check_views_output(output, run.overwrite)
+    check_views_output(output, run.overwrite, format)
     if report is not None:
         _check_report(run, report, (output, scene, poses, truth, intrinsics, photos))
     taken = photos_of(photos, split=split, intrinsics=intrinsics, focal=focal, alpha=alpha, say=run.say)
@@ -173,7 +180,7 @@ def register(
             background=background or BLACK,
         )
     if len(found.cameras):
-        write_views(output, found.cameras, overwrite=run.overwrite)
+        run.write_views(output, found.cameras, format)
     written = str(output) if len(found.cameras) else None
     run.result(
         {

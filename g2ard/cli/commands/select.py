@@ -16,6 +16,7 @@ from g2ard.cli.options import (
     PolicyOption,
     SceneArgument,
     SplitOption,
+    ViewFormatOption,
     ViewsOption,
     views_count,
     with_images,
@@ -23,6 +24,7 @@ from g2ard.cli.options import (
 from g2ard.progress import plural
 
 if TYPE_CHECKING:
+    from g2ard.config.choices import ViewFormat
     from g2ard.io import ViewSet
 
 
@@ -36,6 +38,7 @@ def select(
     run: Run,
     scene: SceneArgument,
     output: OutputOption,
+    format: ViewFormatOption = None,
     k: Annotated[
         Count | None,
         typer.Option(
@@ -75,7 +78,7 @@ def select(
         raise typer.BadParameter(str(error)) from None
     if config.views_count is None:
         raise typer.BadParameter("give the number of views with -k K")
-    check_views_output(output, run.overwrite)
+    check_views_output(output, run.overwrite, format)
     splats = run.load(scene)
     pool, candidates = load_split_views(with_images(views, images), split, run.say)
     cameras = pool.cameras.take(candidates)
@@ -90,7 +93,7 @@ def select(
         progress=run.progress,
     )
     kept = cameras.take(chosen.order)
-    _write(run, output, pool, candidates.nonzero()[0][chosen.order], chosen.weights)
+    _write(run, output, format, pool, candidates.nonzero()[0][chosen.order], chosen.weights)
     if len(chosen.refused):
         count = plural(len(chosen.refused), "view")
         run.say(f"{count} not used: the scene is not in sight, or the camera is inside it")
@@ -117,21 +120,21 @@ def select(
     )
 
 
-def _write(run: Run, output: Path, pool: ViewSet, chosen: Any, weights: Any) -> None:
+def _write(
+    run: Run, output: Path, format: ViewFormat | None, pool: ViewSet, chosen: Any, weights: Any
+) -> None:
     """Write the chosen views, best first, then the other views outside the training split."""
     import numpy as np
-
-    from g2ard.io import write_views
 
     kept = np.isin(np.arange(len(pool.splits)), chosen)
     held_out = [i for i, word in enumerate(pool.splits) if word not in ("train", None) and not kept[i]]
     rows = np.array([*chosen, *held_out], int)
-    write_views(
+    run.write_views(
         output,
         pool.cameras.take(rows),
+        format,
         splits=[pool.splits[i] for i in rows],
         weights=[*weights, *[np.nan] * len(held_out)],
-        overwrite=run.overwrite,
     )
     tests = sum(pool.splits[i] not in ("train", None) for i in chosen)
     if tests:
