@@ -8,14 +8,14 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from g2ard.errors import InputError, require
+from g2ard.errors import InputError, missing, require
 from g2ard.levels.tree import Cut, Leaf, Node
 from g2ard.levels.tree import cut as cut_tree
 from g2ard.progress import Progress, silent
@@ -59,6 +59,23 @@ class Georeference:
         for name in ("height", "heading"):
             require(name, getattr(self, name), bool(np.isfinite(getattr(self, name))), "a finite number")
 
+    @classmethod
+    def of_map(cls, system: Any, offset: ArrayLike) -> Georeference:
+        """Return the place of an offset in map coordinates, with the direction of grid north as heading.
+
+        Args:
+            system: a coordinate system of `map_system`.
+            offset: (3,) easting, northing, height in metres.
+        """
+        import pyproj
+
+        east, north, height = np.asarray(offset, np.float64).tolist()
+        to_globe = pyproj.Transformer.from_crs(system, "EPSG:4979", always_xy=True)
+        lon, lat, up = to_globe.transform(east, north, height)
+        ahead = to_globe.transform(east, north + 100, height)
+        place = cls(lon, lat, up)
+        return replace(place, heading=pyproj.Geod(ellps="WGS84").inv(lon, lat, *ahead[:2])[0])
+
     def matrix(self) -> Float:
         """Return the (4, 4) matrix from x, y (along the heading), z up to earth-centred coordinates."""
         lon, lat, turn = np.radians((self.longitude, self.latitude, self.heading))
@@ -73,6 +90,32 @@ class Georeference:
         matrix[:3, 2] = up
         matrix[:3, 3] = (normal + self.height) * up - (0, 0, squared * normal * np.sin(lat))
         return matrix
+
+
+def map_system(name: str) -> Any:
+    """Return pyproj's coordinate system of a name such as EPSG:32635.
+
+    Raises:
+        InputError: an unknown name, or a system without eastings and northings in metres.
+        MissingDependencyError: pyproj is not installed.
+    """
+    try:
+        import pyproj
+    except ImportError as error:
+        raise missing("a coordinate system by name", "g2ard[globe]", parameter="place") from error
+    try:
+        system = pyproj.CRS.from_user_input(name)
+    except pyproj.exceptions.CRSError:
+        raise InputError(
+            f"unknown coordinate system {name!r}; expected EPSG:CODE", parameter="place"
+        ) from None
+    if not system.is_projected or any(axis.unit_conversion_factor != 1 for axis in system.axis_info):
+        raise InputError(
+            f"{system.name} is not a projected system in metres",
+            parameter="place",
+            hint="scale the scene to metres with `g2ard convert --transform`, or give LON,LAT,HEIGHT",
+        )
+    return system
 
 
 def save_tileset(
@@ -191,8 +234,6 @@ class _Tiles:
 
     def content(self, name: str) -> list[bytes]:
         """Return the .glb of a tile, whose node is moved to the middle of its box."""
-        from dataclasses import replace
-
         from g2ard.io.glb import spz_glb
         from g2ard.io.packing import writable
 

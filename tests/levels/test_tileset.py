@@ -10,6 +10,7 @@ import pytest
 from g2ard.errors import InputError
 from g2ard.io import read_splats, write_splats
 from g2ard.levels import Cut, Georeference, save_tileset
+from g2ard.levels.tileset import map_system
 from g2ard.scene.splats import Splats
 from helpers.commands import CommandLine, refused, succeeds
 from helpers.glb_files import glb_parts
@@ -113,6 +114,25 @@ def test_an_impossible_place_is_refused() -> None:
         Georeference(0, 91, 0)
     with pytest.raises(InputError, match="heading: expected"):
         Georeference(0, 0, 0, float("nan"))
+
+
+def test_a_map_system_gives_the_place_and_grid_north(tmp_path: Path) -> None:
+    pytest.importorskip("pyproj")
+    middle = Georeference.of_map(map_system("EPSG:32635"), (500_000, 6_590_000, 12))
+    assert (middle.longitude, middle.height) == (pytest.approx(27, abs=1e-9), 12)
+    assert middle.heading == pytest.approx(0, abs=1e-6)
+    east = Georeference.of_map(map_system("EPSG:32635"), (620_000, 6_590_000, 0))
+    turned = np.degrees(
+        np.arctan(np.tan(np.radians(east.longitude - 27)) * np.sin(np.radians(east.latitude)))
+    )
+    assert east.heading == pytest.approx(turned, abs=2e-3)
+    for name, message in (
+        ("EPSG:4326", "not a projected"),
+        ("EPSG:2994", "not a projected"),
+        ("X", "unknown"),
+    ):
+        with pytest.raises(InputError, match=message):
+            map_system(name)
 
 
 def test_the_command_writes_3d_tiles(tmp_path: Path, command_line: CommandLine) -> None:

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from g2ard.jobs.levels import Levels
     from g2ard.jobs.tiled import TiledLevels
     from g2ard.jobs.tiling import Tiling
-    from g2ard.levels import Cut, Georeference
+    from g2ard.levels import Cut
     from g2ard.levels.tree import Level
 
 
@@ -109,9 +109,9 @@ def lod(
         str | None,
         typer.Option(
             "--georeference",
-            metavar="LON,LAT,HEIGHT[,HEADING]",
+            metavar="LON,LAT,HEIGHT[,HEADING]|EPSG:CODE",
             help="Place 3D Tiles on the globe: degrees and metres of the scene's offset, and the direction "
-            "of its y axis (z if -y is up), clockwise from north.",
+            "of its y axis (z if -y is up), clockwise from north; or the map system of its coordinates.",
         ),
     ] = None,
     views: ViewsOrMadeOption = None,
@@ -216,7 +216,7 @@ def _in_tiles(
     rule: Cut,
     errors: bool,
     kind: str,
-    spot: Georeference | None,
+    spot: Any,
 ) -> None:
     """Write levels tile by tile; finished steps stay in the tiling's folder until the command succeeds."""
     from g2ard.jobs.tiled import lod_in_tiles
@@ -238,13 +238,13 @@ def _save(
     rule: Cut,
     errors: bool,
     kind: str,
-    spot: Georeference | None,
+    spot: Any,
     up: Sequence[float] | None,
     work: Path | None = None,
 ) -> int:
     """Write the output folder and return its bytes."""
     from g2ard.jobs.levels import tileset_up
-    from g2ard.levels import save_levels, save_tileset
+    from g2ard.levels import Georeference, save_levels, save_tileset
 
     common: dict[str, Any] = {
         "cut": rule,
@@ -254,6 +254,9 @@ def _save(
     }
     if kind == "sog":
         return save_levels(output, levels, errors=errors, **common)
+    if spot is not None and not isinstance(spot, Georeference):
+        spot = Georeference.of_map(spot, levels[0].offset)
+        run.say(f"longitude {spot.longitude:.6f}, latitude {spot.latitude:.6f}, heading {spot.heading:.3f}")
     axis = tileset_up(levels, up)
     run.say(
         f"up is {', '.join(f'{value:.3g}' for value in axis)}" + ("" if up else "; --up X,Y,Z changes it")
@@ -261,10 +264,14 @@ def _save(
     return save_tileset(output, levels, up=axis, place=spot, **common)
 
 
-def _georeference(text: str) -> Georeference:
+def _georeference(text: str) -> Any:
+    """Return the place, or the map system in which the scene's offset is the place."""
     from g2ard.cli.options import numbers
     from g2ard.levels import Georeference
+    from g2ard.levels.tileset import map_system
 
+    if text[:1].isalpha():
+        return map_system(text)
     return Georeference(*numbers("--georeference", text, 4 if text.count(",") == 3 else 3))
 
 
