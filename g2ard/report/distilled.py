@@ -91,6 +91,8 @@ def verdict(report: dict[str, Any]) -> str:
     '500 of 5,000 Gaussians reproduce the scene at 36.6 dB on average; the worst view is near_0003 (36.6 dB).'
     """
     kinds = [KindScore.of(kind) for kind in report["kinds"]]
+    if not kinds:
+        return f"{plural(report['output_count'], 'Gaussian')}; no held-out view shows the scene."
     weakest = min(kinds, key=lambda kind: kind.psnr.after)
     last = f"the worst view is {weakest.worst} ({weakest.worst_psnr.after:.1f} dB)"
     if len(kinds) > 1:

@@ -71,5 +71,6 @@ def test_the_verdict_names_the_weakest_kind_of_view() -> None:
     }
     told = "9 of 90 Gaussians reproduce the scene at 30.5 dB on average; near views are weakest (27.0 dB)."
     assert verdict(report) == told
+    assert verdict(report | {"kinds": []}) == "9 Gaussians; no held-out view shows the scene."
     of_photos = verdict(report | {"lifted": True, "against": "photos"})
     assert of_photos.startswith("9 Gaussians from 90 points reproduce the photos at")
