@@ -24,10 +24,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from g2ard import _core
 from g2ard.rendering.renderer import RasterSettings, view_of
 from g2ard.rendering.visibility import CONVERGED, NEAR, ROUND, spread
+from g2ard.scene.cameras import Cameras
 from g2ard.scene.prepared import PreparedScene, as_prepared, finite_rows_of
 from g2ard.scene.splats import Splats
 from g2ard.scene.transform import join
@@ -145,22 +147,13 @@ def look(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
     settings = RasterSettings(antialiased=own.antialiased, near=NEAR * float(distance) or None)
     here = cropped(here, own, settings)
     sums = _core.VisibilityAccumulator(with_surroundings(own, arguments, inputs, places).core)
-    stride = max(1, math.ceil(len(here) / ROUND))
-    light, used, seen = np.asarray(arguments["light"]), [], 0
-    for first in spread(stride):
-        some = range(first, len(here), stride)
-        sums.add([view_of(here, i, settings) for i in some], settings, None)
-        used += list(some)
-        before, seen = seen, int(np.count_nonzero(sums.by_row()[0][: len(own)]))
-        if len(used) > ROUND and seen - before < CONVERGED * len(own):
-            break
-    share = light[used].sum() / arguments["all_light"] if used else 1.0
+    used = _add_until_converged(sums, here, settings, len(own))
+    share = np.asarray(arguments["light"])[used].sum() / arguments["all_light"] if used else 1.0
     weight, pixel_size = (values[: len(own)] for values in sums.by_row())
     weight = weight / np.float32(share or 1.0)
     pixel_size = pixel_size * np.float32(arguments["shrunk"])  # in pixels of the full image
-    finite = pixel_size[np.isfinite(pixel_size) & (pixel_size > 0)]
-    pixel = float(np.partition(finite, len(finite) // 2)[len(finite) // 2]) if len(finite) else math.nan
-    frame = _with_pixel_size(arguments["frame"], pixel if finite.size else 1.0)
+    pixel = _median(pixel_size[np.isfinite(pixel_size) & (pixel_size > 0)])
+    frame = _with_pixel_size(arguments["frame"], 1.0 if math.isnan(pixel) else pixel)
     tile = _merging(own, _config(arguments), frame, RowVisibility(weight, pixel_size))
     return {
         "weight": weight,
@@ -171,6 +164,29 @@ def look(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
         "share": np.array(share or 1.0),
         "near": np.array(settings.near_of(0)),
     }
+
+
+def _add_until_converged(
+    sums: _core.VisibilityAccumulator, cameras: Cameras, settings: RasterSettings, rows: int
+) -> list[int]:
+    """Add rounds of views until one finds few new of the first `rows` Gaussians; return the views."""
+    stride = max(1, math.ceil(len(cameras) / ROUND))
+    used: list[int] = []
+    seen = 0
+    for first in spread(stride):
+        views = range(first, len(cameras), stride)
+        sums.add([view_of(cameras, i, settings) for i in views], settings, None)
+        used += views
+        before, seen = seen, int(np.count_nonzero(sums.by_row()[0][:rows]))
+        if len(used) > ROUND and seen - before < CONVERGED * rows:
+            break
+    return used
+
+
+def _median(values: NDArray[np.float32]) -> float:
+    """Return the upper median, NaN without values."""
+    middle = len(values) // 2
+    return float(np.partition(values, middle)[middle]) if len(values) else math.nan
 
 
 def run_costs(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:

@@ -283,17 +283,6 @@ def test_a_signalling_nan_in_a_glb_drops_its_row(tmp_path: Path) -> None:
         assert len(found.splats) == 9 - dropped
 
 
-@pytest.mark.parametrize("what", ["ply of 2**63 rows", "nested", "angle 0", "png bomb"])
-def test_the_command_line_reports_claims(what: str, command_line: CommandLine, tmp_path: Path) -> None:
-    make, words = CLAIMS[what]
-    path = make(tmp_path)
-    status, _, told = command_line("info", path, cwd=tmp_path)
-    assert status == 1
-    assert path.name in told
-    assert words in told
-    assert len(told.strip().splitlines()) == 1
-
-
 def test_nothing_is_written_after_such_a_claim(command_line: CommandLine, tmp_path: Path) -> None:
     path = CLAIMS["gzip bomb"][0](tmp_path)
     before = sorted(tmp_path.rglob("*"))

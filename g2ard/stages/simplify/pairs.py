@@ -140,7 +140,7 @@ def fit_opacities(
 
     α is multiplied by ratio^¼, with the ratio limited to 0.5–2, because neighbours share a deficit and other
     views need less. Excess over α = 0.99 goes to the area of the two longer axes. A floor of 5 % of the mean
-    keeps hardly visible rows unchanged.
+    keeps hardly visible rows unchanged. Rows that did not merge, or that would no longer be drawn, are kept.
 
     Args:
         scene: M merged Gaussians.
@@ -150,15 +150,17 @@ def fit_opacities(
         mean: mean of `wanted`, for tiles over all of them.
     """
     floor = _FLOOR * mean
-    factor = np.clip((wanted + floor) / np.maximum(now + floor, np.finfo(float).tiny), *_RATIO) ** _FIT
-    alone = (members < 2) | ~np.isfinite(factor)
+    ratio = (wanted + floor) / np.maximum(now + floor, np.finfo(float).tiny)
+    factor = np.clip(ratio, *_RATIO) ** _FIT
     alpha = scene.opacities.astype(np.float64)
-    held = np.minimum(alpha * factor, np.maximum(alpha, MAX_OPACITY))
-    faint = (held < DRAWN_OPACITY) & (alpha >= DRAWN_OPACITY)  # visible rows stay visible
-    held = np.where(faint | (alpha <= 0) | alone, alpha, held)
-    growth = np.where(alone | faint | (held <= 0), 1.0, alpha * factor / np.maximum(held, 1e-30))
-    changed = held != alpha
-    logits = np.log(np.maximum(held, 1e-30)) - np.log1p(-np.minimum(held, 1 - 1e-9))
+    aimed = alpha * factor
+    limited = np.minimum(aimed, np.maximum(alpha, MAX_OPACITY))
+    vanishes = (limited < DRAWN_OPACITY) & (alpha >= DRAWN_OPACITY)
+    kept = (members < 2) | ~np.isfinite(factor) | vanishes | (alpha <= 0)
+    fitted = np.where(kept, alpha, limited)
+    growth = np.where(kept | (fitted <= 0), 1.0, aimed / np.maximum(fitted, 1e-30))
+    changed = fitted != alpha
+    logits = np.log(np.maximum(fitted, 1e-30)) - np.log1p(-np.minimum(fitted, 1 - 1e-9))
     shortest = np.arange(3) == np.argmin(scene.scales, axis=1)[:, None]
     grown = (growth > 1)[:, None] & ~shortest
     return replace(
