@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 Float = NDArray[np.float64]
 
 _TILE_OF_SCENE = np.array([[-1.0, 0, 0], [0, 0, -1], [0, -1, 0]])
-"""From the scene's axes to a tile's: glTF's (half a turn about z), then z up instead of y."""
+"""Rotation from the scene's axes to a tile's: glTF's (half a turn about z), then z up instead of y."""
 
 _MOST_ERROR = 16.0
 """Error on the screen in pixels at which viewers refine a tile by default (maximumScreenSpaceError)."""

@@ -18,7 +18,7 @@ from helpers.peers import adobe_spz
 from reference.raster import rotations, sh_basis
 
 WORLD = {"R": [1, 0, 0], "L": [-1, 0, 0], "U": [0, 1, 0], "D": [0, -1, 0], "B": [0, 0, 1], "F": [0, 0, -1]}
-"""What the letters mean, written out: directions in the world right, up, back."""
+"""Directions of the letters, written out, in the world right, up, back."""
 
 
 def scene(count: int = 40) -> Splats:
