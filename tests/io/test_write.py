@@ -487,3 +487,35 @@ def node_file(path: Path, document: dict, binary: bytes) -> None:
     text += b" " * (-len(text) % 4)
     head = struct.pack("<4sIIII", b"glTF", 2, 28 + len(text) + len(binary), len(text), 0x4E4F534A)
     path.write_bytes(head + text + struct.pack("<II", len(binary), 0x004E4942) + binary)
+
+
+STORED = {"ROTATION": "quats", "SCALE": "scales", "OPACITY": "opacities"}
+
+
+@pytest.mark.parametrize(
+    ("name", "dtype"),
+    [
+        *(("ROTATION", dtype) for dtype in ("i1", "<i2")),
+        *(("SCALE", dtype) for dtype in ("i1", "u1", "<i2", "<u2")),
+        *(("OPACITY", dtype) for dtype in ("u1", "<u2")),
+    ],
+)
+def test_attributes_of_a_glb_may_be_normalised_integers(tmp_path: Path, name: str, dtype: str) -> None:
+    path = saved(tmp_path, "glb", replace(scene(90, 1), scales=np.full((90, 3), 0.3, np.float32)))
+    plain = read_splats(path)
+    document, binary = glb_parts(path)
+    attributes = document["meshes"][0]["primitives"][0]["attributes"]
+    accessor = document["accessors"][attributes[f"{EXTENSION}:{name}"]]
+    view = document["bufferViews"][accessor["bufferView"]]
+    floats = np.frombuffer(binary, "<f4", view["byteLength"] // 4, view["byteOffset"]).reshape(90, -1)
+    codes = np.rint(floats * np.iinfo(dtype).max).astype(dtype)
+    rows = np.zeros((90, 12), "u1")
+    rows[:, : codes.itemsize * codes.shape[1]] = codes.view("u1").reshape(90, -1)
+    view |= {"byteOffset": len(binary), "byteLength": rows.size, "byteStride": 12}
+    kind = {"i1": 5120, "u1": 5121, "i2": 5122, "u2": 5123}[dtype[-2:]]
+    accessor |= {"componentType": kind, "normalized": True}
+    node_file(path, document, binary + rows.tobytes())
+    found = read_splats(path)
+    for attribute, field in STORED.items():
+        step = 0.51 / np.iinfo(dtype).max if attribute == name else 1e-7
+        np.testing.assert_allclose(getattr(found, field), getattr(plain, field), atol=step)

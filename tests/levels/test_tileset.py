@@ -145,6 +145,10 @@ def test_the_command_writes_3d_tiles(tmp_path: Path, command_line: CommandLine) 
     origin = np.array(tileset["root"]["transform"][12:15])
     np.testing.assert_allclose(origin, geocentric(24.75, 59.43, 31.5), atol=1e-6)
     succeeds(command_line, tmp_path, *words, "out", *there, "--resume")
+    succeeds(command_line, tmp_path, *words, "tiled", *there, "--tile-rows", "300")
+    tiled = json.loads((tmp_path / "tiled" / "tileset.json").read_text())
+    assert tiled["root"]["transform"] == tileset["root"]["transform"]
+    assert tiled["extras"] == tileset["extras"]
     message = refused(command_line, tmp_path, "lod", "a.ply", "-o", "b", "--georeference", "0,0,0")
     assert "--format 3dtiles" in message
     assert "latitude" in refused(command_line, tmp_path, *words, "c", "--georeference", "0,99,0")
