@@ -132,9 +132,11 @@ def prepare(
     """
     began = time.monotonic()
     recover = options.config.recover  # rejects invalid settings before anything is read
+    alone = scene is None
     if scene is None:
         scene = _points(budgets, options, progress, say)
     read = _read(scene, budgets, options, progress, say)
+    read = replace(read, from_photos=read.from_photos or alone)
     prior, cleaned = read.prior, None
     if options.clean:
         prior, cleaned = _cleaned(prior, options, progress, say)
@@ -156,7 +158,7 @@ def prepare(
         say=say,
     )
     sources = _sources(views, options.photos, read.lifted)
-    regularizers, why, measured = _regularizers(prior, views, options, sources, read.lifted)
+    regularizers, why, measured = _regularizers(prior, views, options, sources, read)
     if sources.photos:
         given = options.named("recover.background") is not None
         propose_background(views.train.cameras, recover.background, given, say)
@@ -165,6 +167,7 @@ def prepare(
     say(_task(prior, aims, views, sources))
     say(f"regularisers: {why}")
     config = options.configured(regularizers, lift_degree)
+    config = replace(config, recover=replace(config.recover, from_points=read.from_photos))
     say_regions(prior, config.simplify, read.name, say)
     return DistillJob(
         prior=prior,
@@ -215,17 +218,26 @@ def _sources(views: RunViews, photos: bool | None, lifted: bool) -> _Sources:
 
 
 def _regularizers(
-    prior: Splats, views: RunViews, options: DistillOptions, sources: _Sources, lifted: bool
+    prior: Splats, views: RunViews, options: DistillOptions, sources: _Sources, read: _Read
 ) -> tuple[Regularizers, str, PriorMeasures]:
-    """Choose regularisers with `preset_for`; view consistency is measured only for photos."""
-    from g2ard.stages.recover.presets import preset_for
+    """Choose regularisers with `preset_for`, or none for points of photos.
 
-    kind = options.named("recover.regularizers") or "auto"
+    View consistency is measured only for photos.
+    """
+    from g2ard.stages.recover.anchors import FREE
+    from g2ard.stages.recover.presets import measure_prior, preset_for
+
+    kind, paper = (
+        options.named("recover.regularizers") or "auto",
+        options.named("recover.schedule") == "paper",
+    )
+    if read.from_photos and kind == "auto" and not paper:
+        return FREE, "none (points found in photos are not a surface to hold to)", measure_prior(prior)
     return preset_for(
-        "paper-lift" if lifted and kind == "paper" else kind,
+        "paper-lift" if read.lifted and kind == "paper" else kind,
         prior,
         views.train.cameras if sources.photos else None,
-        paper=options.named("recover.schedule") == "paper",
+        paper=paper,
     )
 
 
@@ -303,12 +315,14 @@ class _Read:
         lifted: whether it was lifted from a point cloud.
         beside: path beside which to look for cameras.
         name: its name in errors.
+        from_photos: whether the points, or some of them, were found in the photos.
     """
 
     prior: Splats
     lifted: bool
     beside: str | Path | None
     name: str
+    from_photos: bool = False
 
 
 def _read(
@@ -339,7 +353,8 @@ def _read(
             "a point cloud cannot render training images", path=name, hint="give its photos with {views}"
         )
     wanted = _wanted(budgets) or 0
-    if len(scene) < wanted:
+    few = len(scene) < wanted
+    if few:
         from g2ard.jobs.photos import topped_up
 
         scene = topped_up(
@@ -353,7 +368,7 @@ def _read(
             say=say,
         )
     lifted = lift(scene.positions, scene.colors, **vars(options.config.lift), progress=progress)
-    return _Read(lifted, True, options.beside, name)
+    return _Read(lifted, True, options.beside, name, from_photos=few)
 
 
 def _cleaned(

@@ -1,12 +1,13 @@
 """Starting points from photos with poses: COLMAP's sparse points, and as a fallback points along camera rays.
 
 A point along a camera ray lies on the ray of a random pixel, at the depth where photos of nearby views agree
-best on its colour (a plane sweep, one ray at a time). The points are a start for distillation, not a
-reconstruction.
+best on its colour (a plane sweep, one ray at a time), and within the visual hull of photos with alpha. The
+points are a start for distillation, not a reconstruction.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,10 +17,11 @@ from numpy.typing import NDArray
 from g2ard.config.choices import BLACK, Colour
 from g2ard.errors import InputError
 from g2ard.io.types import Points
+from g2ard.jobs.hull import VisualHull, visual_hull
 from g2ard.jobs.inputs import load_for_training, load_view_sets
 from g2ard.progress import Progress, Say, plural, silent, unsaid
 from g2ard.scene.cameras import Cameras
-from g2ard.scene.images import load_image
+from g2ard.scene.images import composited, load_premultiplied
 
 if TYPE_CHECKING:
     from g2ard.jobs.inputs import Views
@@ -27,14 +29,25 @@ if TYPE_CHECKING:
 _SIDE = 240
 """Longer side in pixels of the photos used to place points."""
 _DEPTHS = 48
+_HULL_DEPTHS = 96
+"""Trial depths across a visual hull."""
 _NEAREST, _FARTHEST = 0.3, 4.0
 """Range of trial depths, evenly spaced in 1/z, as multiples of the view's distance from the common centre."""
 _NOTHING = 2 / 255
 """A pixel this close to the background colour is empty."""
-_ALIKE = 1e-4
-"""Variance of colour, summed over channels, within which depths count as equal."""
-_OTHERS = 6
-"""Number of nearby views compared; at least two must contain a point."""
+_ALIKE = 0.01
+"""Difference of costs within which depths in a hull count as equal."""
+_OTHERS, _AGREEING = 6, 2
+"""Number of nearby views compared, and of those that agree best, whose mean counts."""
+_PATCH = np.array([(0, 0), (-1, -1), (-1, 0), (-1, 1), (0, -1), (0, 1), (1, -1), (1, 0), (1, 1)])
+_SPACED = 120
+"""Rows and columns of the compared pixels, from a ray's own, in units of this part of the photo's side."""
+_HYPOTHESES, _FINER = 3, 5
+"""Depths of a ray that are refined, and finer trials around each."""
+_SUPPORTED, _DISTINCT = 0.05, 0.25
+"""Largest cost of a point, absolute and as a share of the usual cost on its ray."""
+_PATIENCE = 8
+"""Rays per point after which both limits are doubled."""
 _RAYS = 2048
 """Rays at a time."""
 
@@ -153,8 +166,9 @@ def points_within_sight(
 ) -> Points:
     """Place points on the rays of random pixels, where nearby photos agree best on the colour.
 
-    z* = argmin_z Var_v[c_v(x(z))] over the nearest views v that contain x(z), at least two besides the ray's
-    own.
+    z* = argmin_z of the mean difference of a patch around the pixel from those of the two nearby views that
+    agree best. Points on which no photo agrees, or on whose ray many depths agree, are dropped. If photos
+    have alpha, only pixels that show the object count, and points lie in its visual hull.
 
     Args:
         cameras: C ≥ 3 views with photos, in world coordinates.
@@ -174,18 +188,30 @@ def points_within_sight(
     bare = [name for name, path in zip(cameras.names, cameras.image_paths, strict=True) if path is None]
     if bare:
         raise InputError(f"photos: view {bare[0]} has no photo; pass views with photos, or a scene")
-    photos = [load_image(cameras, i, background) for i in range(len(cameras))]
+    photos, outlines = [], []
+    for view in range(len(cameras)):
+        image = load_premultiplied(cameras, view)
+        photos.append(composited(image, background))
+        outlines.append(image[..., 3] > 0.5 if image.shape[2] == 4 else None)
+        progress("photos", view + 1, len(cameras))
     rng = np.random.default_rng([seed, 11])
     middle = _looked_at(cameras)
     reach = np.linalg.norm(cameras.positions - middle, axis=1)
     near = [_neighbours(cameras, i) for i in range(len(cameras))]
+    hull = visual_hull(cameras, outlines, middle)
     positions, colors, tried = np.zeros((0, 3)), np.zeros((0, 3), np.float32), 0
     while len(positions) < count:
         if tried > 64 * max(count, _RAYS):
             raise InputError("photos: no point was found that three views see; pass a point cloud")
         view = int(rng.integers(len(cameras)))
         rays = min(_RAYS, max(64, -(-count // len(cameras))))
-        xyz, rgb = _swept(cameras, photos, view, near[view], float(reach[view]), rays, background, rng)
+        pixels = _pixels(photos[view], outlines[view], rays, background, rng)
+        if hull is None:
+            depths = reach[view] / np.linspace(1 / _NEAREST, 1 / _FARTHEST, _DEPTHS)
+        else:
+            depths = hull.depths(cameras, view, _HULL_DEPTHS)
+        slack = 2.0 ** (tried // (_PATIENCE * max(count, _RAYS)))
+        xyz, rgb = _swept(cameras, photos, view, near[view], pixels, depths, hull, slack)
         tried += rays
         positions, colors = np.concatenate([positions, xyz]), np.concatenate([colors, rgb])
         progress("points", min(len(positions), count), count)
@@ -214,38 +240,131 @@ def _neighbours(cameras: Cameras, view: int) -> NDArray[np.int64]:
     return order[order != view][:_OTHERS]
 
 
+def _pixels(
+    photo: NDArray[np.float32],
+    outline: NDArray[np.bool_] | None,
+    count: int,
+    background: Colour,
+    rng: np.random.Generator,
+) -> NDArray[np.int64]:
+    """Return rows and columns, (2, N ≤ count), of random pixels that show anything."""
+    rows, columns = rng.integers(photo.shape[0], size=count), rng.integers(photo.shape[1], size=count)
+    if outline is None:
+        kept = np.abs(photo[rows, columns] - background).max(1) > _NOTHING
+    else:
+        kept = outline[rows, columns]
+    return np.stack([rows, columns])[:, kept]
+
+
 def _swept(
     cameras: Cameras,
     photos: list[NDArray[np.float32]],
     view: int,
     others: NDArray[np.int64],
-    reach: float,
-    rays: int,
-    background: tuple[float, float, float],
-    rng: np.random.Generator,
+    pixels: NDArray[np.int64],
+    depths: Float,
+    hull: VisualHull | None,
+    slack: float,
 ) -> tuple[Float, NDArray[np.float32]]:
-    """Return points and colours on random rays of one view that at least two others contain."""
-    photo, K, pose = photos[view], cameras.Ks[view], cameras.viewmats[view]
-    columns, rows = rng.integers(photo.shape[1], size=rays), rng.integers(photo.shape[0], size=rays)
-    own = photo[rows, columns]
-    pixels = np.stack([columns + 0.5, rows + 0.5, np.ones(rays)])
-    depths = reach / np.linspace(1 / _NEAREST, 1 / _FARTHEST, _DEPTHS)
-    local = (np.linalg.inv(K) @ pixels).T[:, None, :] * depths[None, :, None]
-    world = (local - pose[:3, 3]) @ pose[:3, :3]
-    total, squares = own[:, None, :].astype(np.float64), (own[:, None, :] ** 2).astype(np.float64)
-    total, squares = (np.repeat(a, _DEPTHS, axis=1) for a in (total, squares))
-    seen = np.ones((rays, _DEPTHS))
-    for other in others:
-        color, held = _sampled(cameras, photos, int(other), world)
-        total += color
-        squares += color**2
-        seen += held
-    spread = (squares / seen[..., None] - (total / seen[..., None]) ** 2).sum(-1)
-    spread[seen < 3] = np.inf
-    alike = spread <= spread.min(1, keepdims=True) + _ALIKE
-    best = _DEPTHS - 1 - alike[:, ::-1].argmax(1)  # among equals the farthest, because it occludes nothing
-    kept = np.isfinite(spread.min(1)) & (np.abs(own - background).max(1) > _NOTHING)
-    return world[np.arange(rays), best][kept], own[kept].astype(np.float32)
+    """Return points on the rays of some pixels of a view, with colours.
+
+    Points lie within the hull if there is one. Without one, a point must agree with other photos, and
+    clearly better than most depths of its ray; `slack` multiplies both limits.
+    """
+    ray = _Rays.of(cameras, photos, view, pixels)
+    trial = np.broadcast_to(depths, (len(ray.colors), len(depths)))
+    cost = ray.costs(cameras, photos, others, trial)
+    rows = np.arange(len(cost))
+    if hull is not None:
+        cost[~hull.holds(ray.at(trial))] = np.inf
+        best = (cost <= cost.min(1, keepdims=True) + _ALIKE).argmax(1)  # the nearest is on the hull
+        depth, least = trial[rows, best], cost[rows, best]
+        kept = np.isfinite(least)
+    else:
+        finite = np.isfinite(cost)
+        middle = np.maximum(finite.sum(1) // 2, 1) - 1
+        usual = np.sort(cost, axis=1)[rows, middle]  # the median, since infinities are sorted last
+        depth, least = _refined(cameras, photos, others, ray, trial, cost)
+        kept = finite.any(1) & (least <= slack * np.minimum(_SUPPORTED, _DISTINCT * usual))
+    return ray.at(depth[:, None])[kept, 0], ray.colors[kept]
+
+
+def _refined(
+    cameras: Cameras,
+    photos: list[NDArray[np.float32]],
+    others: NDArray[np.int64],
+    ray: _Rays,
+    trial: Float,
+    cost: Float,
+) -> tuple[Float, Float]:
+    """Return the best depth and its cost, from finer trials around the best depths of each ray."""
+    padded = np.pad(cost, ((0, 0), (1, 1)), constant_values=np.inf)
+    valley = (cost <= padded[:, :-2]) & (cost <= padded[:, 2:])
+    order = np.argsort(np.where(valley, cost, np.inf), axis=1, kind="stable")[:, :_HYPOTHESES]
+    rows = np.arange(len(cost))[:, None]
+    inverse, step = 1 / trial[rows, order], np.abs(1 / trial[:, :1] - 1 / trial[:, 1:2])
+    offsets = np.linspace(-0.75, 0.75, _FINER)
+    finer = 1 / np.maximum(inverse[:, :, None] + offsets * step[:, :, None], 1e-3 * inverse[:, :, None])
+    finer = finer.reshape(len(cost), -1)
+    found = ray.costs(cameras, photos, others, finer)
+    best = found.argmin(1)
+    return finer[rows[:, 0], best], found[rows[:, 0], best]
+
+
+@dataclass(frozen=True, eq=False)
+class _Rays:
+    """Rays of some pixels of a view, each with the rays of its neighbours.
+
+    Args:
+        origin: (3,) the camera's centre.
+        aims: (N, P, 3) world directions at depth 1; the pixel's own first.
+        patches: (N, P, 3) colours.
+    """
+
+    origin: Float
+    aims: Float
+    patches: Float
+
+    @classmethod
+    def of(
+        cls, cameras: Cameras, photos: list[NDArray[np.float32]], view: int, pixels: NDArray[np.int64]
+    ) -> _Rays:
+        photo, pose = photos[view], cameras.viewmats[view]
+        patch = _PATCH * max(1, round(max(photo.shape) / _SPACED))
+        rows = np.clip(pixels[0][:, None] + patch[:, 0], 0, photo.shape[0] - 1)
+        columns = np.clip(pixels[1][:, None] + patch[:, 1], 0, photo.shape[1] - 1)
+        seen = np.stack([columns + 0.5, rows + 0.5, np.ones(rows.shape)], -1)
+        aims = seen @ np.linalg.inv(cameras.Ks[view]).T @ pose[:3, :3]
+        return cls(cameras.positions[view], aims, photo[rows, columns].astype(np.float64))
+
+    @property
+    def colors(self) -> NDArray[np.float32]:
+        """Colours of the pixels, (N, 3)."""
+        return self.patches[:, 0].astype(np.float32)
+
+    def at(self, depths: Float) -> Float:
+        """Return the (N, D, 3) world points of the pixels at (N, D) depths."""
+        return self.origin + self.aims[:, :1] * depths[..., None]
+
+    def costs(
+        self,
+        cameras: Cameras,
+        photos: list[NDArray[np.float32]],
+        others: NDArray[np.int64],
+        depths: Float,
+    ) -> Float:
+        """Return (N, D) differences of the patches to the views that agree best; ∞ if too few see them."""
+        found = np.full((len(others), *depths.shape), np.inf)
+        for k, other in enumerate(others):
+            total, inside = np.zeros(depths.shape), np.ones(depths.shape, bool)
+            for p in range(self.aims.shape[1]):
+                world = self.origin + self.aims[:, p : p + 1] * depths[..., None]
+                color, held = _sampled(cameras, photos, int(other), world)
+                total += np.abs(color - self.patches[:, p : p + 1]).mean(-1)
+                inside &= held
+            found[k][inside] = total[inside] / self.aims.shape[1]
+        found.sort(axis=0)
+        return found[:_AGREEING].mean(0)
 
 
 def _sampled(

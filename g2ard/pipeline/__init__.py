@@ -101,7 +101,9 @@ def distill(
 
 
 def final_steps(config: DistillConfig, scene: Splats, cameras: Cameras, *, photos: bool) -> int:
-    """Return the steps of the last recovery: as set, the schedule's, or by need if targets are renders.
+    """Return the steps of the last recovery: as set, the schedule's, or more by need.
+
+    More are needed for points of photos, and for renders of which each shows little of the scene.
 
     Args:
         config: configuration of the pipeline.
@@ -109,11 +111,13 @@ def final_steps(config: DistillConfig, scene: Splats, cameras: Cameras, *, photo
         cameras: training views.
         photos: whether targets are photos.
     """
-    from g2ard.stages.recover.schedule import steps_for
+    from g2ard.stages.recover.schedule import steps_for, steps_from_points
 
     schedule = config.recover.schedule
     if config.recover.steps is not None:
         return config.recover.steps
+    if schedule.means_in_scales and config.recover.from_points:
+        return steps_from_points(len(scene), schedule.steps)
     if not schedule.means_in_scales or photos:
         return schedule.steps
     return steps_for(scene, cameras, schedule.steps)

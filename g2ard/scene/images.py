@@ -48,27 +48,25 @@ def load_image(cameras: Cameras, index: int, background: Sequence[float] = BLACK
     Raises:
         InputError: the view has no photo, or the photo is missing, broken, or of another aspect ratio.
     """
-    image = _fitted(cameras, index)
+    return composited(load_premultiplied(cameras, index), background)
+
+
+def composited(image: NDArray[np.float32], background: Sequence[float]) -> NDArray[np.float32]:
+    """Composite premultiplied RGBA over a background; RGB is unchanged."""
     if image.shape[2] == 4:
         image = image[..., :3] + (1 - image[..., 3:]) * np.asarray(background, np.float32)
     return np.ascontiguousarray(image)
 
 
-def load_alpha(cameras: Cameras, index: int) -> NDArray[np.float32] | None:
-    """Read the opacity of a view's photo, in the pixels of `load_image`.
+def load_premultiplied(cameras: Cameras, index: int) -> NDArray[np.float32]:
+    """Read a photo as `load_image` does, but keep its alpha.
 
     Returns:
-        (H, W) float32 in [0, 1]; None if the photo has no alpha.
+        (H, W, 3) float32 RGB, or (H, W, 4) RGBA with RGB premultiplied.
 
     Raises:
         InputError: as for `load_image`.
     """
-    image = _fitted(cameras, index)
-    return np.ascontiguousarray(image[..., 3]) if image.shape[2] == 4 else None
-
-
-def _fitted(cameras: Cameras, index: int) -> NDArray[np.float32]:
-    """Read a photo undistorted and at its view's size, as RGB or as RGBA with RGB premultiplied."""
     path, name = cameras.image_paths[index], cameras.names[index]
     if path is None:
         raise InputError(f"({name}) has no photo", index=index, item="view", hint="pass views with photos")
@@ -161,8 +159,8 @@ def load_mask(cameras: Cameras, index: int) -> NDArray[np.bool_] | None:
     if path is None:
         return None
     if path == cameras.image_paths[index]:
-        alpha = load_alpha(cameras, index)
-        return None if alpha is None else alpha > 0.5
+        own = load_premultiplied(cameras, index)
+        return own[..., 3] > 0.5 if own.shape[2] == 4 else None
     image = load_image(replace(cameras, image_paths=cameras.mask_paths), index)
     return np.ascontiguousarray(image.mean(2) > 0.5)
 

@@ -48,12 +48,12 @@ def photos_of(folder: Path, points: bool = False, scene: g2ard.Splats = BALL, co
         edit(folder / "transforms.json", lambda content: content.update(ply_file_path="sparse.ply"))
 
 
-def rgba_photos_of(folder: Path, scene: g2ard.Splats = BALL, count: int = 24) -> g2ard.Cameras:
-    """Write RGBA photos of a scene as NeRF's synthetic scenes have them, a third of them for testing."""
-    views = around(count)
+def rgba_photos_of(folder: Path, count: int = 24, distance: float = 3.0) -> g2ard.Cameras:
+    """Write RGBA photos of the ball as NeRF's synthetic scenes have them, a third of them for testing."""
+    views = around(count, distance=distance)
     names = []
     for i in range(count):
-        found = g2ard.render(scene, views[i])
+        found = g2ard.render(BALL, views[i])
         alpha = found.alpha[..., None]
         straight = np.clip(found.image / np.maximum(alpha, 1e-3), 0, 1)
         names.append(f"{'test' if i % 3 == 0 else 'train'}/r_{i}")

@@ -7,9 +7,11 @@ import numpy as np
 import pytest
 
 import g2ard
+from g2ard.jobs.hull import visual_hull
 from g2ard.jobs.photos import points_within_sight
+from g2ard.scene.images import load_premultiplied, write_png
 from helpers.commands import CommandLine, refused, succeeds
-from helpers.photos import photos_of
+from helpers.photos import photos_of, rgba_photos_of
 
 
 @pytest.mark.parametrize("points", [False, True])
@@ -22,6 +24,7 @@ def test_photos_alone_are_enough(points: bool, command_line: CommandLine, tmp_pa
     assert found["scores"]["recovered"]["psnr"] > max(17, found["scores"]["simplified"]["psnr"] + 1)
     said = "starting from 1,200 sparse points\n" if points else "starting from 500 points along camera rays\n"
     assert said in error
+    assert "regularisers: none (points found in photos" in error
     ours = g2ard.distill(None, views=tmp_path / "photos", count=500, steps=150).splats
     g2ard.save(tmp_path / "ours.ply", ours)
     assert (tmp_path / "ours.ply").read_bytes() == (tmp_path / "run" / "scene.ply").read_bytes()
@@ -49,3 +52,49 @@ def test_points_within_sight_lie_on_the_surface(tmp_path: Path) -> None:
     away = np.abs(np.linalg.norm(found.positions[bright], axis=1) - 1)
     assert np.median(away) < 0.15
     np.testing.assert_array_equal(found.positions, points_within_sight(cameras, 600).positions)
+
+
+def test_alpha_carves_the_start(tmp_path: Path) -> None:
+    cameras = rgba_photos_of(tmp_path, distance=5)
+    found = g2ard.load_views(tmp_path, split="train")
+    for background in ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0)):
+        points = points_within_sight(found, 600, background=background)
+        away = np.linalg.norm(points.positions, axis=1)
+        assert np.quantile(np.abs(away - 1), 0.9) < 0.25, background
+    outlines = [np.ones((48, 64), bool)] * len(cameras)
+    assert visual_hull(cameras, outlines, np.zeros(3)) is None  # nothing is empty
+
+
+def test_a_hull_encloses_the_object_closely(tmp_path: Path) -> None:
+    cameras = rgba_photos_of(tmp_path, distance=5)
+    outlines = [load_premultiplied(g2ard.load_views(tmp_path), i)[..., 3] > 0.5 for i in range(24)]
+    hull = visual_hull(g2ard.load_views(tmp_path), outlines, np.zeros(3))
+    assert hull is not None
+    directions = np.random.default_rng(0).normal(size=(500, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    assert hull.holds(0.9 * directions).all()
+    assert hull.holds(1.6 * directions).mean() < 0.1
+    assert not hull.holds(cameras.positions).any()
+
+
+def test_more_gaussians_of_photos_take_more_steps(tmp_path: Path, command_line: CommandLine) -> None:
+    photos_of(tmp_path / "photos")
+    ask = ("distill", "--views", "photos", "--dry-run", "-o", "run", "--json", "-", "--schedule", "fast")
+
+    def steps(*budget: object) -> int:
+        return int(json.loads(succeeds(command_line, tmp_path, *ask, *budget).out)["runs"][0]["steps"])
+
+    assert [steps("-n", count) for count in (500, 5_000)] == [300, 600]
+    assert steps("-n", 5_000, "--steps", 50) == 50
+
+
+def test_points_that_no_second_photo_supports_are_dropped(tmp_path: Path) -> None:
+    photos_of(tmp_path / "photos", count=48)
+    cameras = g2ard.load_views(tmp_path / "photos")
+    noise = np.random.default_rng(0)
+    for path in cameras.image_paths[::4]:
+        assert path is not None
+        write_png(path, noise.uniform(0.2, 1, (48, 64, 3)), overwrite=True)  # a quarter shows nothing of it
+    found = points_within_sight(cameras, 600)
+    away = np.abs(np.linalg.norm(found.positions, axis=1) - 1)
+    assert np.mean(away < 0.25) > 0.8

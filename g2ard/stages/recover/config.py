@@ -43,6 +43,7 @@ class RecoverConfig(FitConfig):
         steps: number of steps; overrides the schedule's.
         recovery_time: time limit in seconds instead of steps; the result then depends on the machine's speed.
         regularizers: weights of L_anchor and L_shape (`tab:s_recovery`).
+        from_points: whether the start is points found in photos, so that steps grow with their count.
         final: whether this is the recovery at the target count; the paper's rounds have another decay.
         engine: "fused" runs whole steps in Rust; "torch" uses autograd and `SelectiveAdam`, with equal
             results up to rounding; "gsplat" is the same on an NVIDIA GPU.
@@ -55,6 +56,7 @@ class RecoverConfig(FitConfig):
     steps: int | None = None
     recovery_time: float | None = None
     regularizers: Regularizers = PRESETS["trained"]
+    from_points: bool = field(default=False, metadata={"setting": False})
     final: bool = field(default=True, metadata={"setting": False})
     engine: Engine = "fused"
 

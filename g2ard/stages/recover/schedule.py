@@ -21,6 +21,9 @@ _UNTRAINED_RMSE = 0.1
 _POINTS = 4096
 """Gaussians that `steps_for` measures views with."""
 
+_FEW_POINTS = 1250
+"""Points of photos up to which the schedule's steps suffice."""
+
 _MOST_TIMES = 2.25
 """Limit of the factor on the schedule's steps."""
 
@@ -215,6 +218,18 @@ def reach_for(start_rmse: float, typical: float) -> float:
     (0.01, 0.04, inf)
     """
     return max(_REACH, typical) if start_rmse < _UNTRAINED_RMSE else math.inf
+
+
+def steps_from_points(count: int, steps: int) -> int:
+    """Return `steps` times √(count / 1,250), or `steps` if that is more, for a start from points of photos.
+
+    Such points are misplaced by a length that does not depend on their count. A mean moves by a share of its
+    radius per step, and radii shrink with the root of the count, so that the way takes as many more steps.
+
+    >>> steps_from_points(1_000, 1000), steps_from_points(20_000, 1000), steps_from_points(20_000, 300)
+    (1000, 4000, 1200)
+    """
+    return round(steps * math.sqrt(max(1.0, count / _FEW_POINTS)))
 
 
 def steps_for(scene: Splats, cameras: Cameras, steps: int) -> int:
