@@ -45,6 +45,16 @@ def rows_by_kind(names: Sequence[str]) -> dict[str, list[int]]:
     return {kind: found for kind, found in rows.items() if found}
 
 
+def usual_rows(names: Sequence[str]) -> list[int]:
+    """Return the indices of all views except those from anywhere; of all if there are no others.
+
+    >>> usual_rows(["pose_0", "anywhere_0"]), usual_rows(["anywhere_0"])
+    ([0], [0])
+    """
+    rows = [i for i, name in enumerate(names) if kind_of(name) != "anywhere"]
+    return rows or list(range(len(names)))
+
+
 def split_mask(
     views: str | Path | None, names: Sequence[str], which: str, *, stated: Sequence[str | None] = ()
 ) -> NDArray[np.bool_]:

@@ -208,6 +208,15 @@ def test_untouched_gaussians_do_not_move() -> None:
     assert not np.array_equal(trainer.arrays()[0][50:], p["means"][50:])
 
 
+def test_relative_steps_descend_the_logarithm_of_the_loss() -> None:
+    p, (view, *_), (target, *_) = problem()
+    plain, relative = trainer_of(p), trainer_of(p)
+    loss, _ = plain.step(view_of(view, 0, SETTINGS), target, Rates(**RATES))
+    assert relative.step(view_of(view, 0, SETTINGS), target, Rates(**RATES), relative=0.02)[0] == loss
+    want = plain.state()["first"] * np.float32(0.02 / loss)
+    np.testing.assert_allclose(relative.state()["first"], want, rtol=1e-3, atol=1e-3 * np.abs(want).max())
+
+
 def test_resume_is_bitwise() -> None:
     p, cameras, targets = problem()
     straight = trainer_of(p, np.full(200, 0.5, np.float32))

@@ -14,6 +14,10 @@ from g2ard.scene.splats import Splats
 from g2ard.stages.recover.anchors import Anchors, Regularizers
 from g2ard.stages.recover.schedule import Rates
 
+TYPICAL_LOSS, LEAST_LOSS = 0.02, 0.005
+"""Loss to which the gradients of views are scaled if they count alike, and the loss below which errors are
+invisible, about 40 dB."""
+
 
 @dataclass(frozen=True, eq=False)
 class Photometric:
@@ -41,6 +45,8 @@ class Objective(Photometric):
         regularizers: weights of the regularisers.
         means_in_scales: optimise means in multiples of each Gaussian's initial radius.
         frozen: (N,) bool, Gaussians that stay unchanged; None freezes none.
+        relative: whether to descend log(loss) times `TYPICAL_LOSS`, so that views count alike whatever their
+            loss; losses below `LEAST_LOSS` count as that.
     """
 
     start: Splats
@@ -49,6 +55,7 @@ class Objective(Photometric):
     regularizers: Regularizers
     means_in_scales: bool
     frozen: NDArray[np.bool_] | None = None
+    relative: bool = False
 
 
 class Engine(Protocol):

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from g2ard import _core
 from g2ard.rendering.renderer import arrays_of, view_of
 from g2ard.scene.splats import Splats
-from g2ard.stages.recover.engine import Objective
+from g2ard.stages.recover.engine import TYPICAL_LOSS, Objective
 from g2ard.stages.recover.schedule import Rates
 from g2ard.stages.recover.sizes import radii
 
@@ -50,6 +50,7 @@ class FusedEngine:
             rates,
             objective.regularizers if regularize else None,
             mask,
+            TYPICAL_LOSS if objective.relative else None,
         )
         return loss
 

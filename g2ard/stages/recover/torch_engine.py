@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from g2ard.scene.splats import Splats
-from g2ard.stages.recover.engine import Objective
+from g2ard.stages.recover.engine import LEAST_LOSS, TYPICAL_LOSS, Objective
 from g2ard.stages.recover.extent import extents, share_of_rate
 from g2ard.stages.recover.losses import TorchAnchors, l1_ssim, regularization
 from g2ard.stages.recover.rasterize import rasterize
@@ -73,9 +73,11 @@ class TorchEngine:
             share = mask.size / max(1, int(mask.sum()))
         loss = share * self._loss(image, wanted)
         total = loss
+        if self._objective.relative:
+            total = total * (TYPICAL_LOSS / max(float(loss.detach()), LEAST_LOSS))
         weights = self._objective.regularizers
         if regularize and weights.active:
-            total = loss + regularization(means, p["quats"], p["log_scales"], self._anchors, weights)
+            total = total + regularization(means, p["quats"], p["log_scales"], self._anchors, weights)
         self._adam.zero_grad(set_to_none=True)
         torch.autograd.backward(total)
         shares = self._shares(means.detach(), view, rates.reach)

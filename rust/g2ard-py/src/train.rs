@@ -79,6 +79,7 @@ impl PyTrainer {
             target,
             mask: None,
             ssim_weight: self.ssim_weight,
+            relative: None,
             rates: Rates::default(),
             reach: None,
             regularizers: None,
@@ -135,7 +136,7 @@ impl PyTrainer {
     }
 
     /// Take one step; return (photometric loss before it, Gaussians moved). `mask`: where the loss counts.
-    #[pyo3(signature = (view, target, rates, regularizers = None, mask = None))]
+    #[pyo3(signature = (view, target, rates, regularizers = None, mask = None, relative = None))]
     fn step(
         &mut self,
         py: Python<'_>,
@@ -144,11 +145,13 @@ impl PyTrainer {
         rates: PyRates,
         regularizers: Option<Config<Regularizers>>,
         mask: Option<PyReadonlyArray2<'_, bool>>,
+        relative: Option<f32>,
     ) -> PyResult<(f64, usize)> {
         let camera = view.camera();
         let target = flat("target", &target)?;
         let input = StepInput {
             mask: mask.as_ref().map(|m| flat("mask", m)).transpose()?,
+            relative,
             reach: rates.reach_in(&camera),
             rates: rates.into(),
             regularizers: regularizers.map(|r| r.0),

@@ -17,6 +17,8 @@ pub use store::{Exported, Store};
 
 use std::time::Instant;
 
+use rayon::prelude::*;
+
 use crate::raster::gradients::Discard;
 use crate::raster::memory::bytes;
 use crate::raster::rasterizer::ChunkSums;
@@ -28,6 +30,9 @@ use crate::ssim::{Loss, Shape};
 use crate::{Error, Result};
 use adam::{Biases, Update};
 use mask::Mask;
+
+/// Smaller losses, about 40 dB, are hardly visible.
+const LEAST_LOSS: f32 = 0.005;
 
 /// Adam's learning rate of each attribute.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
@@ -53,6 +58,9 @@ pub struct StepInput<'a> {
     pub mask: Option<&'a [bool]>,
     /// λ of (1 − λ)·L1 + λ·(1 − SSIM).
     pub ssim_weight: f32,
+    /// Times the gradient of the loss's logarithm: all views then count alike, whatever their loss. `None` takes the
+    /// gradient of the loss.
+    pub relative: Option<f32>,
     pub rates: Rates,
     /// c, a size in pixels: rates of Gaussians that are larger in this view are multiplied by 1/(1 + (σ/c)¹⁶). For
     /// means and rotations σ is the Gaussian's longer side, for each scale its own axis. `None` leaves all rates
@@ -263,6 +271,10 @@ impl Trainer {
         if let Some(mask) = &mask {
             mask.clear(&mut self.gradient);
             loss *= f64::from(mask.share);
+        }
+        if let Some(typical) = input.relative {
+            let factor = typical / (loss as f32).max(LEAST_LOSS);
+            self.gradient.par_iter_mut().for_each(|g| *g *= factor);
         }
         Ok((loss, clock.elapsed().as_secs_f64()))
     }

@@ -14,6 +14,7 @@ fn steps_give_the_same_bits_on_any_number_of_threads_and_learn() {
             target: &target,
             mask: None,
             ssim_weight: 0.2,
+            relative: None,
             rates: Rates {
                 means: 1e-3,
                 quats: 1e-3,
