@@ -154,6 +154,7 @@ def prepare(
         up=options.up,
         seed=recover.seed,
         teach=not read.lifted and options.photos is not True,
+        anywhere=options.anywhere,
         progress=progress,
         say=say,
     )

@@ -57,6 +57,13 @@ class DistillOptions:
         """
         return self.configured()
 
+    @property
+    def anywhere(self) -> float | None:
+        """Share of training views from anywhere, see `SelectConfig`; 0 for the paper's methods."""
+        config = self.config
+        papers = config.select.views_count is not None or not config.recover.schedule.means_in_scales
+        return 0.0 if papers else config.select.anywhere
+
     def configured(
         self, regularizers: Regularizers | None = None, sh_degree: int | None = None
     ) -> DistillConfig:

@@ -449,6 +449,7 @@ def _job(
             size=options.size,
             up=options.up,
             seed=options.config.recover.seed,
+            anywhere=options.anywhere,
             represents=store.count / len(sample),
             progress=progress,
             say=say,

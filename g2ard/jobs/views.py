@@ -1,4 +1,4 @@
-"""Views of a run: given, found beside the scene, or generated; and views of another kind."""
+"""Views of a run: given, found beside the scene, or generated; and views of other kinds."""
 
 from __future__ import annotations
 
@@ -7,15 +7,17 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from g2ard.jobs.inputs import drop_held_out, load_for_training, load_held_out, load_view_sets, load_views
 from g2ard.jobs.view_checks import as_pool, check_sight, found_views, warn_of_sight
 from g2ard.progress import Progress, Say, silent, unsaid
+from g2ard.scene.cameras import Cameras
 
 if TYPE_CHECKING:
     from g2ard.io import ViewSet
     from g2ard.jobs.inputs import Views
     from g2ard.poses import Pool
-    from g2ard.scene.cameras import Cameras
     from g2ard.scene.splats import Splats
 
     Up = Sequence[float] | None
@@ -24,8 +26,12 @@ _POOL, _GROW, _NEAR = 160, 2.0, 0.25
 """Generated pool: number of poses, growth factor if views show little of the scene, and share of nearer
 poses. Every 8th pose is held out for scoring.
 """
-_APART = 24
-"""Number of views of another kind: one half validates recovery, the other is scored."""
+_ANYWHERE, _FEW = 0.4, 0.05
+"""Share of the training views that look from anywhere, if other views hold nothing of the scene; if they hold
+a share h, 1−h times that, and none below the second share.
+"""
+_APART = 16
+"""Number of near views and of views from anywhere: one half validates recovery, the other is scored."""
 _POOL_GAUSSIANS = 4_000_000
 """Size of a tiled scene from which the pool grows in proportion."""
 _ROWS = 200_000
@@ -42,9 +48,9 @@ class RunViews:
     """Views of a run.
 
     Args:
-        train: views for training.
-        test: views of the same kind, for scoring.
-        apart: views of another kind, nearer to the scene; None if there are none.
+        train: views for training, including views from anywhere.
+        test: usual views for scoring.
+        apart: views of other kinds, near and from anywhere; None if there are none.
         pool: the whole generated pool, written beside the result.
         unseen: share of the sampled matter that no view of the pool sees.
     """
@@ -76,6 +82,7 @@ def views_of(
     up: Up = None,
     seed: int = 0,
     teach: bool = True,
+    anywhere: float | None = 0.0,
     represents: float = 1.0,
     progress: Progress = silent,
     say: Say = unsaid,
@@ -93,6 +100,8 @@ def views_of(
         seed: seed of generated views.
         teach: whether the scene can render targets; otherwise views without a photo are skipped and no views
             are generated.
+        anywhere: share of the training views that look from anywhere, added to those that are given without
+            photos or generated; None decides by how much of the scene a view holds.
         represents: Gaussians per row if `prior` is a sample of a larger scene; the pool grows with it.
         progress: called during planning.
         say: called with log messages.
@@ -103,7 +112,7 @@ def views_of(
     """
     from g2ard.errors import InputError
     from g2ard.io import ViewSet
-    from g2ard.scene.splits import split_mask, splits_of
+    from g2ard.scene.splits import split_mask
 
     found = None
     if views is None and beside is not None:
@@ -120,7 +129,14 @@ def views_of(
             check_sight(prior, train.cameras, say)
         if found and not size:
             train, test = (replace(part, cameras=as_pool(part.cameras)) for part in (train, test))
-        apart = _near(prior, size, up, seed, progress, represents) if teach else None
+        if not teach:
+            return RunViews(train, test.cameras)
+        try:
+            planned = _planned(prior, _APART, up, seed, progress, represents=represents)
+        except InputError:  # the scene has no room for poses
+            return RunViews(train, test.cameras)
+        share = 0.0 if any(train.cameras.image_paths) else anywhere
+        train, apart = _mixed(train, planned, share, size)
         return RunViews(train, test.cameras, apart)
     if not teach:
         raise InputError(
@@ -128,17 +144,52 @@ def views_of(
         )
     held = None if held_out is None else load_held_out(held_out, size, say, unpictured=teach)
     planned = _planned(prior, _POOL, up, seed, progress, _GROW, represents)
-    apart = planned.apart and planned.apart.resized(size)
     names = planned.cameras.names
-    say(f"poses: {_of(planned)}")
+    held_back = split_mask(None, names, "test") if held is None else np.zeros(len(names), bool)
+    usual = ViewSet(planned.cameras, splits=tuple(np.where(held_back, "test", "train").tolist()))
+    train, apart = _mixed(usual.take(~held_back), planned, anywhere, None)
+    pool = ViewSet(
+        Cameras.of([*train.cameras, *usual.cameras.take(held_back)]),
+        splits=("train",) * len(train.cameras) + ("test",) * int(held_back.sum()),
+    )
+    say(f"poses: {_of(planned, len(pool.cameras))}")
+    train = train.resized(size)
     if held is not None:
-        pool = ViewSet(planned.cameras, splits=("train",) * len(names))
-        train = drop_held_out(pool.resized(size), held.cameras, say)
-        return RunViews(train, held.cameras, apart, pool, planned.unseen)
-    pool = ViewSet(planned.cameras, splits=splits_of(None, names))
-    mask = split_mask(None, names, "test")
-    train = pool.take(~mask).resized(size)
-    return RunViews(train, pool.take(mask).resized(size).cameras, apart, pool, planned.unseen)
+        train = drop_held_out(train, held.cameras, say)
+    scored = usual.cameras.take(held_back).resized(size) if held is None else held.cameras
+    return RunViews(train, scored, apart and apart.resized(size), pool, planned.unseen)
+
+
+def _mixed(
+    train: ViewSet, planned: Pool, share: float | None, size: int | None
+) -> tuple[ViewSet, Cameras | None]:
+    """Add views from anywhere to training views, and return them with views of other kinds.
+
+    Args:
+        train: the usual views.
+        planned: a pool of the scene.
+        share: share of the views from anywhere among all; None is 40 % times 1 − `Pool.held`.
+        size: longer side of the views, pixels.
+    """
+    from g2ard.io import ViewSet
+
+    if share is None:
+        share = _ANYWHERE * (1 - planned.held)
+        share = share if share > _FEW else 0.0
+    count = round(len(train.cameras) * share / (1 - share))
+    more = planned.anywhere(count + _APART)
+    count = min(count, max(len(more) - _APART, len(more) // 2))
+    apart = [*(planned.apart or []), *more[count:]]
+    others = Cameras.of(apart).resized(size) if apart else None
+    if not count:
+        return train, others
+    usual = np.ones(len(train.cameras)) if train.weights is None else train.weights / train.weights.mean()
+    return ViewSet(
+        Cameras.of([*train.cameras, *more[:count]]).resized(size),
+        train.notes,
+        train.splits and train.splits + ("train",) * count,
+        np.append(usual, np.ones(count)),  # drawn equally often
+    ), others
 
 
 def views_or_pool(
@@ -175,14 +226,15 @@ def views_or_pool(
         planned = _planned(scene, _POOL, up, seed, progress, _GROW)
     else:
         planned = plan_pool(scene, count, up=up, seed=seed, rows=_ROWS, progress=progress)
-    say(f"poses: {_of(planned)}")
+    say(f"poses: {_of(planned, len(planned.cameras))}")
     return ViewSet(planned.cameras, splits=splits_of(None, planned.cameras.names))
 
 
-def _of(pool: Pool) -> str:
+def _of(pool: Pool, count: int) -> str:
     """Describe a pool briefly."""
     guess = "; the up direction is a guess" if "guess" in pool.why else ""
-    return f"{len(pool.cameras)}, {pool.kind}{guess}"
+    more = " + anywhere" if count > len(pool.cameras) else ""
+    return f"{count}, {pool.kind}{more}{guess}"
 
 
 def cameras_for_looks(
@@ -269,16 +321,3 @@ def _planned(
 def pool_times(count: float) -> float:
     """Return the growth factor of the pool for a tiled scene of `count` Gaussians."""
     return max(1.0, count / _POOL_GAUSSIANS)
-
-
-def _near(
-    prior: Splats, size: int | None, up: Up, seed: int, progress: Progress, represents: float
-) -> Cameras | None:
-    """Plan views of another kind beside given ones, or return None if the scene has no room."""
-    from g2ard.errors import InputError
-
-    try:
-        apart = _planned(prior, _APART, up, seed, progress, represents=represents).apart
-    except InputError:
-        return None
-    return apart and apart.resized(size)

@@ -25,17 +25,22 @@ class SelectConfig(CoverageOptions):
         weighted: draw views by weight, so that crowded poses do not dominate. On a crowded pool this beats
             uniform draws, and any selection of a tenth of the views.
         reselect: select again from every round's scene instead of once from the prior.
+        anywhere: share of the training views that look from anywhere, in addition to generated views or to
+            given ones without photos; None means 40 % of the share of the scene that a usual view misses.
     """
 
     views_count: int | float | Literal["auto"] | None = None
     policy: Policy = "auto"
     weighted: bool = True
     reselect: bool = False
+    anywhere: float | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
         share = not isinstance(self.views_count, float) or 0 < self.views_count <= 1
         require("views_count", self.views_count, share, "a count, auto, none, or a share in (0, 1]")
+        some = self.anywhere is None or 0 <= self.anywhere < 1
+        require("anywhere", self.anywhere, some, "a share in [0, 1), or none")
         if self.views_count == "auto" and self.policy in UNMEASURED:
             raise InputError(
                 f"policy {self.policy} does not measure gains; pass a count instead of auto",

@@ -19,14 +19,18 @@ from g2ard.scene.splats import Splats
 
 Floats = NDArray[np.float64]
 
-_ROWS = 12_000
-"""Gaussians rendered per glance."""
+_ROWS, SIGHT_ROWS = 12_000, 24_000
+"""Gaussians rendered per glance, and where lines of sight matter."""
 
 _LONGEST = 96
 """Longer side of a glance's image, in pixels."""
 
 _MOST_WIDENED = 4.0
-"""Largest factor by which a sample's Gaussians grow along their two longer axes, to cover for the rest."""
+"""Largest factor by which a sample of 12,000 Gaussians grows along the two longer axes, to cover for the
+rest; a larger sample may grow more."""
+
+_SOLID = 0.3
+"""Least opacity of Gaussians that a view may aim at."""
 
 _TRIED = 8
 """Candidates tried per requested pose, at most."""
@@ -40,6 +44,9 @@ come first; the later pairs fill up if those are too few."""
 
 _COARSEST = 0.9
 """Quantile of the angular sizes seen that `Focus.coarse` reports: one tenth may be fog."""
+
+_NEAR = 0.05
+"""Near plane as a share of the distance within which matter is close."""
 
 _PITCHES = (-35.0, 20.0)
 """Range of gaze pitches, in degrees above the horizon."""
@@ -66,20 +73,28 @@ class Focus:
 
 
 class Glance:
-    """Small renders of a sample of a scene, sky and floaters included, that measure focus."""
+    """Small renders of a sample of a scene, sky and floaters included, that measure focus and sight.
 
-    def __init__(self, splats: Splats, represents: float = 1.0) -> None:
+    Args:
+        splats: the scene, or a fair sample of it.
+        represents: Gaussians of the scene per row of `splats`.
+        limit: largest number of Gaussians to render.
+    """
+
+    def __init__(self, splats: Splats, represents: float = 1.0, limit: int = _ROWS) -> None:
         rows = np.flatnonzero(splats.opacities > 1 / 255)
-        some = rows[canonical_order(splats, rows)[:_ROWS]]
+        some = rows[canonical_order(splats, rows)[:limit]]
         sample = splats.take(some[splats.take(some).finite_rows()])
         scales = np.sort(sample.scales.astype(np.float64), axis=1)
         self._sigma = np.sqrt(scales[:, 1] * scales[:, 2])
         self._middle = sample.offset + np.median(sample.means.astype(np.float64), axis=0)
         means = sample.means.astype(np.float64) + sample.offset - self._middle
-        widen = min(_MOST_WIDENED, np.sqrt(represents * len(rows) / max(1, len(some))))
+        most = _MOST_WIDENED * limit / _ROWS
+        widen = min(most, np.sqrt(represents * len(rows) / max(1, len(some))))
         shortest = np.arange(3) == np.argmin(sample.scales, axis=1)[:, None]
         logs = np.log(np.maximum(sample.scales, np.finfo(np.float32).tiny))
         self._means, self._antialiased = means, sample.antialiased
+        self.points, self.solid = means + self._middle, sample.opacities > _SOLID
         self._arrays: tuple[NDArray[np.float32], ...] = (
             np.ascontiguousarray(means, np.float32),
             np.ascontiguousarray(sample.quats, np.float32),
@@ -114,6 +129,31 @@ class Glance:
                 figures[1:, i] = fine, quantile(angle, weight[seen], _COARSEST)
             tell(i + 1, len(here))
         return Focus(*figures)
+
+    def sight(self, cameras: Cameras, aims: NDArray[np.int64], close: float) -> tuple[Floats, Floats]:
+        """Return the light from close matter, and how clear the lines of sight are.
+
+        Args:
+            cameras: C views.
+            aims: (C,) rows of `points` that they look at.
+            close: distance within which matter is close, scene units.
+
+        Returns:
+            (C,) share of the image that shows close matter, and (C,) mean transmittance in front of the aim.
+        """
+        from g2ard.rendering.renderer import RasterSettings, view_of
+
+        here = cameras.resized(_LONGEST).recentred(self._middle)
+        settings = RasterSettings(antialiased=self._antialiased, near=_NEAR * close)
+        murk, clear = np.ones(len(here)), np.zeros(len(here))
+        for i, aim in enumerate(aims):
+            sums: dict[str, Any] = _core.accumulate(
+                self._arrays, [view_of(here, i, settings)], settings, None
+            )
+            beside = norms(self._means - here.positions[i]) < close
+            murk[i] = sums["weight"][beside].sum() / (here.widths[i] * here.heights[i])
+            clear[i] = sums["transmittance"][aim] / max(1, sums["hits"][aim])
+        return murk, clear
 
 
 def plan_focus(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -12,8 +12,9 @@ from numpy.typing import ArrayLike, NDArray
 from g2ard.config.choices import POOL_KINDS
 from g2ard.errors import InputError
 from g2ard.poses.aerial import plan_aerial
+from g2ard.poses.anywhere import ANYWHERE_FOV, plan_anywhere
 from g2ard.poses.auto import plan_auto
-from g2ard.poses.focus import Glance, plan_focus
+from g2ard.poses.focus import SIGHT_ROWS, Glance, plan_focus
 from g2ard.poses.inside import find_inside, plan_inside
 from g2ard.poses.lattice import strata
 from g2ard.poses.near import Reach, plan_near, reach_of
@@ -23,7 +24,7 @@ from g2ard.poses.sight import Lens, Poses
 from g2ard.poses.site import Site
 from g2ard.poses.walk import plan_walk
 from g2ard.progress import Progress, counter, silent
-from g2ard.scene.cameras import Cameras
+from g2ard.scene.cameras import Camera, Cameras
 from g2ard.scene.splats import Splats
 from g2ard.scene.splits import HOLD_OUT
 
@@ -55,7 +56,9 @@ class Pool:
         up: (3,) unit vector in world coordinates.
         unseen: share of a sample of the matter that no pose sees.
         coarse: share that is seen, but nowhere with a standard deviation of a pixel.
+        held: share of the matter that a typical pose has in its frame.
         apart: additional views nearer to what `cameras` see; None unless requested.
+        anywhere: plans additional views from anywhere, at most as many as requested.
     """
 
     cameras: Cameras
@@ -64,7 +67,9 @@ class Pool:
     up: NDArray[np.float64]
     unseen: float = 0.0
     coarse: float = 0.0
+    held: float = 1.0
     apart: Cameras | None = None
+    anywhere: Callable[[int], list[Camera]] = field(default=lambda count: [])
 
 
 def plan_pool(
@@ -154,7 +159,11 @@ def plan_pool(
         site.up.axis,
         unseen=reach.unseen(),
         coarse=float(reach.coarse(lens).mean()),
+        held=held,
         apart=apart_views,
+        anywhere=lambda count: _anywhere(
+            site, Glance(splats, represents, SIGHT_ROWS), count, size, seed, tell
+        ),
     )
 
 
@@ -173,6 +182,15 @@ def _apart(site: Site, poses: Poses, reach: Reach, count: int, lens: Lens, seed:
         return None
     cameras = nearer.cameras(site, lens)
     return replace(cameras, names=tuple(name.replace("pose", "near") for name in cameras.names))
+
+
+def _anywhere(
+    site: Site, glance: Glance, count: int, size: tuple[int, int], seed: int, tell: Callable[[int, int], None]
+) -> list[Camera]:
+    """Return at most `count` views from anywhere, half as large as others because they see little."""
+    lens = _lens((max(1, size[0] // 2), max(1, size[1] // 2)), ANYWHERE_FOV)
+    cameras = plan_anywhere(site, glance, count, lens, seed, tell).cameras(site, lens)
+    return [replace(view, name=view.name.replace("pose", "anywhere")) for view in cameras]
 
 
 def _planned(

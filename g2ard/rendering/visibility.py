@@ -16,6 +16,7 @@ from g2ard.rendering.renderer import RasterSettings, arrays_of, centred, setting
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.prepared import as_prepared
 from g2ard.scene.splats import Splats
+from g2ard.scene.splits import usual_rows
 
 MOST_LOOKS, LONGEST = 96, 300
 """Largest number of views per scene or tile, and the longer side of their renders in pixels."""
@@ -109,7 +110,8 @@ def visibility_source(
     views for later ones, so that sums are comparable. Results do not depend on the order of the scene's rows.
 
     Args:
-        cameras: the views; at most `views` of them are used, evenly spaced.
+        cameras: the views; at most `views` of them are used, evenly spaced, and none from anywhere if there
+            are others: near views would outweigh all others in Σ αT.
         views: upper limit of the number of views.
         longest: longer side of the renders, pixels; `pixel_size` refers to the full image.
         progress: called after each view.
@@ -118,7 +120,7 @@ def visibility_source(
         scene → `SampledVisibility`. The scene's arrays are C-contiguous and float32, except its means. A
         `g2ard.scene.prepared.PreparedScene` is not sorted again.
     """
-    return _Sampler(cameras, views, longest, progress)
+    return _Sampler(cameras.take(usual_rows(cameras.names)), views, longest, progress)
 
 
 class _Sampler:

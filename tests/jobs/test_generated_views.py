@@ -3,9 +3,18 @@
 import json
 from pathlib import Path
 
+import numpy as np
+import pytest
 from PIL import Image
 
+from g2ard.io import write_views
+from g2ard.jobs.views import views_of
+from g2ard.poses import plan_pool
+from g2ard.rendering.visibility import visibility_source
+from g2ard.scene.cameras import Cameras
+from g2ard.scene.splits import rows_by_kind
 from helpers.commands import CommandLine, refused, succeeds
+from reference import poses as naive
 
 
 def test_views_are_made_where_none_are_given(command_line: CommandLine, folder: Path) -> None:
@@ -32,3 +41,38 @@ def test_views_are_made_where_none_are_given(command_line: CommandLine, folder: 
     assert after["psnr"] > before["psnr"] + 1
     for command in (("evaluate", "small.ply"), ("recover", "small.ply", "-o", "x.ply")):
         assert "--views, or a --teacher" in refused(command_line, folder, *command)
+
+
+@pytest.mark.parametrize(("make", "share"), [(naive.room, None), (naive.statue, None), (naive.statue, 0.5)])
+def test_views_from_anywhere_join_where_a_view_holds_little(make, share: float | None) -> None:
+    views = views_of(make(), "made", anywhere=share)
+    rows = rows_by_kind(views.train.cameras.names)
+    found = len(rows.get("anywhere", [])) / len(views.train.cameras)
+    if share is not None:
+        assert found == pytest.approx(share, abs=0.02)
+    else:
+        assert 0.2 < found < 0.4 if make is naive.room else found < 0.1
+    assert set(rows_by_kind(views.test.names)) == {"usual"}
+    assert views.apart is not None
+    assert set(rows_by_kind(views.apart.names)) == {"near", "anywhere"}
+    assert not set(views.apart.names) & set(views.train.cameras.names)
+    assert views.pool is not None
+    assert len(views.pool.cameras) == len(views.train.cameras) + len(views.test)
+
+
+def test_simplification_does_not_look_from_anywhere() -> None:
+    statue = naive.statue()
+    pool = plan_pool(statue, 16)
+    usual, mixed = pool.cameras, Cameras.of([*pool.cameras, *pool.anywhere(8)])
+    seen, same = visibility_source(usual)(statue), visibility_source(mixed)(statue)
+    np.testing.assert_array_equal(same.weight, seen.weight)
+
+
+def test_given_views_stay_first(tmp_path: Path) -> None:
+    statue = naive.statue()
+    write_views(tmp_path / "views.json", plan_pool(statue, 16).cameras)
+    plain = views_of(statue, tmp_path / "views.json").train.cameras
+    mixed = views_of(statue, tmp_path / "views.json", anywhere=0.25).train.cameras
+    assert mixed.names[: len(plain)] == plain.names
+    assert set(rows_by_kind(mixed.names[len(plain) :])) == {"anywhere"}
+    assert len(mixed) - len(plain) == round(len(plain) / 3)

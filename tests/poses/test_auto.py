@@ -16,6 +16,7 @@ from g2ard.poses.sight import Lens, Poses
 from g2ard.poses.site import Site
 from g2ard.poses.up import estimate_up
 from g2ard.poses.volume import OccupiedVolume
+from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
 from helpers.realdata import real
 from reference import poses as naive
@@ -148,6 +149,25 @@ def test_views_apart_are_nearer_and_free(make) -> None:
     again = plan_pool(splats, 32, apart=12).apart
     assert again is not None
     np.testing.assert_array_equal(again.viewmats, pool.apart.viewmats)
+
+
+@pytest.mark.parametrize("make", [naive.statue, naive.room])
+def test_views_from_anywhere_are_free_and_see_their_aim(make) -> None:
+    splats = make()
+    pool = plan_pool(splats, 16)
+    views = Cameras.of(pool.anywhere(12))
+    assert views.names == tuple(f"anywhere_{i:04d}" for i in range(12))
+    assert (views.widths == 400).all()
+    gaps = [np.linalg.norm(splats.means - eye, axis=1) for eye in views.positions]
+    assert min(gap.min() for gap in gaps) > 0.05
+    site = Site.of(splats)
+    eyes = (views.positions - site.origin) @ site.axes.T / site.size
+    aims = site.grid.cast(eyes, views.forwards @ site.axes.T)
+    diagonal = np.linalg.norm(site.box[1] - site.box[0])
+    assert (aims > 0.03 * diagonal).all()
+    assert (aims < 0.45 * diagonal).all()
+    np.testing.assert_array_equal(Cameras.of(pool.anywhere(12)).viewmats, views.viewmats)
+    np.testing.assert_array_equal(Cameras.of(pool.anywhere(6)).viewmats, views.viewmats[:6])
 
 
 @pytest.mark.parametrize(("make", "grown"), [(naive.statue, False), (naive.room, True)])

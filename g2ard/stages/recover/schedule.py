@@ -233,18 +233,19 @@ def steps_from_points(count: int, steps: int) -> int:
 
 
 def steps_for(scene: Splats, cameras: Cameras, steps: int) -> int:
-    """Return `steps` times 1/√share for views that show a share of the scene.
+    """Return `steps` times 1/√share for views of a share of the scene, and more with some from anywhere.
 
     A view of an orbit shows the whole object, but a view in a room a tenth of it. At equal steps, a room's
-    Gaussians would be trained a tenth as often; the square root is a compromise with time.
+    Gaussians would be trained a tenth as often; the square root is a compromise with time. Views from
+    anywhere add steps, so that the others are visited as often as without them.
 
     Args:
         scene: the scene to recover.
-        cameras: the training views, in world coordinates.
+        cameras: the training views, in world coordinates; those from anywhere have no part in the share.
         steps: the schedule's steps.
 
     Returns:
-        A number from `steps` to 2.25 × `steps`.
+        A number from `steps` to 2.25 × `steps`, times the ratio of all views to those not from anywhere.
 
     >>> import numpy as np
     >>> from g2ard.scene.cameras import Cameras, look_at
@@ -257,6 +258,10 @@ def steps_for(scene: Splats, cameras: Cameras, steps: int) -> int:
     """
     import numpy as np
 
+    from g2ard.scene.splits import usual_rows
+
+    usual = cameras.take(usual_rows(cameras.names))
     some = np.unique(np.linspace(0, len(scene) - 1, min(len(scene), _POINTS)).round().astype(int))
     points = scene.means[some].astype(np.float64) + scene.offset
-    return round(steps / math.sqrt(max(cameras.usual_share(points), 1 / _MOST_TIMES**2)))
+    share = max(usual.usual_share(points), 1 / _MOST_TIMES**2)
+    return round(steps / math.sqrt(share) * (len(cameras) / len(usual)))
