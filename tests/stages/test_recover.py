@@ -262,7 +262,7 @@ def test_progress_figures(student: Splats, targets: TeacherRenders, monkeypatch:
     )
     assert [a[1] for a in seen] == list(range(1, 61))
     assert set(seen[-1][3]) == {"loss", "PSNR", "steps/s"}
-    shown = {tuple(figures["PSNR"].split(" @")) for *_, figures in seen}
+    shown = {tuple(figures["PSNR"].split(" dB at step ")) for *_, figures in seen}
     assert len(shown) > 2
     for value, step in shown:  # each is of the step it names
         want = probe.Probe(targets, (0.0, 0.0, 0.0)).all_of(scenes[int(step)])
