@@ -92,7 +92,7 @@ class SampledVisibility:
     """Visibility sampled from a few small renders, for the weights of simplification.
 
     Args:
-        weight: (N,) float32, Σ αT.
+        weight: (N,) float32, Σ αT²: behind transmittance T, a change adds to a squared error with T².
         pixel_size: (N,) float32, as in `Visibility`, for the full-size image.
     """
 

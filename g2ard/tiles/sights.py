@@ -141,7 +141,7 @@ def written(work: Path, cameras: Cameras) -> Path:
 
 
 def light_of(store: TileStore, coarse: list[Path], cameras: Cameras, workers: Workers) -> NDArray[np.float64]:
-    """Return (V, T) Σ αT of each tile's coarse Gaussians in small renders of each view."""
+    """Return (V, T) Σ αT² of each tile's coarse Gaussians in small renders of each view."""
     level = "near" if store.count // COARSE[0] <= _GLANCED else "far"
     small = cameras.resized(LONGEST)
     views = written(workers.folder, small)

@@ -105,7 +105,7 @@ def glance(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
         places: none.
 
     Returns:
-        `weights`, (V, T) float64 Σ αT.
+        `weights`, (V, T) float64 Σ αT².
     """
     parts = [scene_of(path, arguments["level"]) for path in inputs["coarse"]]
     tiles = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
@@ -128,13 +128,13 @@ def look(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
 
     Args:
         arguments: `tile`, `config`, `frame`, `levels`; `views`, numbers of the V views that see the tile;
-            `light`, (V,) Σ αT that each gets from it (`glance`); `all_light`, its sum over all views;
+            `light`, (V,) Σ αT² that each gets from it (`glance`); `all_light`, its sum over all views;
             `shrunk`, the ratio of these images' width to the full width.
         inputs: `coarse`, `views`.
         places: `store`.
 
     Returns:
-        `weight`, (N,) float32 Σ αT over all views; `pixel_size`, (N,) float32 size of a full-image pixel,
+        `weight`, (N,) float32 Σ αT² over all views; `pixel_size`, (N,) float32 size of a full-image pixel,
         scene units, infinite if no view shows the row; `pixel`, the median of the finite ones, NaN if there
         are none; `sums`, (2,) `emphasised` weight and mass of the kept rows, for the frame's floor; `used`,
         numbers of the rendered views; `share`, their part of `all_light`, by which `weight` was divided;
@@ -238,7 +238,7 @@ def merge(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
 
     Returns:
         `scene`, n = runs − merges Gaussians (`scene_of`) with unfitted opacities; `members`, (n,) rows merged
-        into each; `clamped`, the number of clamped opacities; with views also `wanted`, (n,) Σ αT of the
+        into each; `clamped`, the number of clamped opacities; with views also `wanted`, (n,) Σ αT² of the
         members, and `unseen`, the number of rows that no view sees.
     """
     scene = tile_of(arguments, inputs, places)
@@ -272,7 +272,7 @@ def look_again(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
         places: `store`.
 
     Returns:
-        `weight`, (n,) float32 Σ αT, scaled like those of `look`.
+        `weight`, (n,) float32 Σ αT², scaled like those of `look`.
     """
     core = as_prepared(scene_of(inputs["merged"], "scene").with_sh_degree(0))
     used, share, near = load(inputs["look"], "used", "share", "near")

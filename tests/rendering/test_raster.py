@@ -10,7 +10,7 @@ import torch
 from g2ard import _core
 from g2ard.errors import InputError
 from g2ard.rendering.renderer import RasterSettings, render
-from g2ard.rendering.visibility import visibility
+from g2ard.rendering.visibility import visibility, visibility_source
 from g2ard.scene.cameras import Cameras, look_at
 from g2ard.stages.recover.rasterize import rasterize
 from helpers.raster_cases import NAMES, VARIANTS, Params, camera, oracle, scene, splats_of, tensors_of
@@ -248,6 +248,9 @@ def test_visibility_equals_the_oracles() -> None:
     assert np.allclose(got.transmittance, want.before.sum(1).numpy(), rtol=1e-3, atol=2)
     dominant = np.bincount(weight.argmax(0)[weight.max(0) > 0], minlength=150)
     assert np.abs(got.dominant.astype(int) - dominant).sum() <= 4
+    sampled = visibility_source(cameras, longest=48)(splats_of(p))
+    squared = (want.weight * want.before).sum(1).numpy()
+    assert np.allclose(sampled.weight, squared, rtol=1e-4, atol=2e-2)
     camera_z = p["means"] @ cameras.viewmats[0, 2, :3] + cameras.viewmats[0, 2, 3]
     inside = np.isfinite(got.pixel_size)
     assert 0 < inside.sum() < 150

@@ -149,7 +149,7 @@ def test_real_scenes_are_nearly_the_same(
 
 
 def test_looks_of_the_default_method_run_on_the_gpu(gpu: None) -> None:
-    """Σ αT within 10⁻⁴ of its sum; the budget exactly, and renders as good."""
+    """Σ αT² within 10⁻⁴ of its sum; the budget exactly, and renders as good."""
     ball, views = checkered_ball(3000), around(20, (160, 120))
     there = visibility_source(views)(ball)
     assert served() == 2  # two rounds of views

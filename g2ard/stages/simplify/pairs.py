@@ -38,7 +38,7 @@ class Visibility(Protocol):
 
     @property
     def weight(self) -> NDArray[Any]:
-        """(N,) Σ αT over the pixels of the views."""
+        """(N,) Σ αT² over the pixels of the views."""
 
     @property
     def pixel_size(self) -> NDArray[Any]:
@@ -145,8 +145,8 @@ def fit_opacities(
     Args:
         scene: M merged Gaussians.
         members: (M,) number of Gaussians merged into each.
-        wanted: (M,) Σ αT of those Gaussians.
-        now: (M,) Σ αT of the merged Gaussians.
+        wanted: (M,) Σ αT² of those Gaussians.
+        now: (M,) Σ αT² of the merged Gaussians.
         mean: mean of `wanted`, for tiles over all of them.
     """
     floor = _FLOOR * mean

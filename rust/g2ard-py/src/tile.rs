@@ -104,7 +104,7 @@ impl PyTileMerging {
         }
     }
 
-    /// Return Σ αT of the views, and mass, of the kept rows.
+    /// Return Σ αT² of the views, and mass, of the kept rows.
     fn sums(&self, py: Python<'_>) -> PyResult<(f64, f64)> {
         self.with(py, |tile| long(py, None, |_| tile.sums()))
     }

@@ -47,7 +47,7 @@ impl PyVisibilityAccumulator {
         })
     }
 
-    /// Return (N,) Σ αT and (N,) the smallest size of a pixel, ∞ if no view contains the mean.
+    /// Return (N,) Σ αT² and (N,) the smallest size of a pixel, ∞ if no view contains the mean.
     fn by_row<'py>(
         &self,
         py: Python<'py>,

@@ -78,8 +78,8 @@ impl SharedSums {
     }
 }
 
-/// Number of sums per pair: the weight alone, or also transmittance, hits, dominant and peak.
-pub const WEIGHT: usize = 1;
+/// Number of sums per pair: only Σ αT², as its weight, or Σ αT with transmittance, hits, dominant and peak.
+pub const SQUARED: usize = 1;
 pub const ALL: usize = 5;
 
 /// A row of lanes' state from front to back; values of one pair are adjacent.
@@ -152,9 +152,11 @@ impl<const KINDS: usize> Kernel for Accumulate<'_, KINDS> {
                     }
                     let go = hit.and(going);
                     let w = (a * t).only(go);
-                    weight = weight + w;
                     hits += go.bits().count_ones();
-                    if KINDS == ALL {
+                    if KINDS == SQUARED {
+                        weight = w.fma(t, weight);
+                    } else {
+                        weight = weight + w;
                         let most = F::Block::load_part(&row.most, part);
                         let winner = F::Block::load_part(&row.winner, part);
                         F::Block::select(w.gt(most), number, winner)

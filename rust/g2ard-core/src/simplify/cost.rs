@@ -39,7 +39,7 @@ pub struct Node<T = f32> {
     pub alpha: T,
     /// Σ α·A, A with the dilation: light stopped, as rendered.
     pub mass: T,
-    /// Σ αT over the views, or its estimate.
+    /// Σ αT² over the views, or its estimate.
     pub visibility: T,
     /// A_d.
     pub areas: [T; PLACES],

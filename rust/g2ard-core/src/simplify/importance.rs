@@ -1,4 +1,4 @@
-//! The weight of a row without views: an estimate of Σ αT.
+//! The weight of a row without views: an estimate of Σ αT².
 
 use super::cost::Node;
 

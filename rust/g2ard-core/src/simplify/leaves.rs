@@ -29,9 +29,9 @@ pub struct Leaves<'a> {
     visibility: Option<Visibility<'a>>,
     /// Unit of the scene's lengths.
     unit: f64,
-    /// Σ αT that a unit of mass counts for though no view sees it.
+    /// Σ αT² that a unit of mass counts for though no view sees it.
     floor: f32,
-    /// Estimates Σ αT without views.
+    /// Estimates Σ αT² without views.
     importance: Importance,
 }
 
@@ -71,7 +71,7 @@ impl<'a> Leaves<'a> {
         leaves
     }
 
-    /// Σ αT over the views, and mass, of all rows.
+    /// Σ αT² over the views, and mass, of all rows.
     pub fn sums(&self) -> (f64, f64) {
         let masses: Vec<f32> = (0..self.len())
             .into_par_iter()
@@ -160,7 +160,7 @@ impl Rows for Leaves<'_> {
     }
 }
 
-/// Σ αT that a unit of mass counts for though no view sees it.
+/// Σ αT² that a unit of mass counts for though no view sees it.
 pub fn floor(weight: f64, mass: f64) -> f32 {
     UNSEEN
         * if weight > 0.0 {

@@ -45,7 +45,7 @@ constants! {
 /// Visibility of each input row.
 #[derive(Debug, Clone, Copy)]
 pub struct Visibility<'a> {
-    /// Σ αT over the pixels of the views.
+    /// Σ αT² over the pixels of the views.
     pub weight: &'a [f32],
     /// Size of a pixel at the row, scene units; infinite where no view shows it.
     pub pixel_size: &'a [f32],

@@ -23,9 +23,9 @@ pub struct Frame {
     pub unit: f64,
     /// Pixel size of rows that no view sees.
     pub pixel_size: f32,
-    /// Σ αT that a unit of mass counts for though no view sees it.
+    /// Σ αT² that a unit of mass counts for though no view sees it.
     pub floor: f32,
-    /// Estimates Σ αT without views.
+    /// Estimates Σ αT² without views.
     pub importance: Importance,
 }
 
@@ -75,7 +75,7 @@ pub struct Tile<'a> {
 }
 
 impl Tile<'_> {
-    /// Σ αT of the views, and mass, of the rows that are kept; the frame's floor is not read.
+    /// Σ αT² of the views, and mass, of the rows that are kept; the frame's floor is not read.
     pub fn sums(&self) -> Result<(f64, f64)> {
         self.policy.check(self.scene, self.visibility, None)?;
         let (blur, kept) = (self.blurs(), self.kept());

@@ -10,7 +10,7 @@ use std::sync::Arc;
 use rayon::prelude::*;
 
 use crate::Result;
-use crate::raster::accumulate::{Total, WEIGHT};
+use crate::raster::accumulate::{SQUARED, Total};
 use crate::raster::disjoint::DisjointSlice;
 use crate::raster::params::check_count;
 use crate::raster::simd::LANES;
@@ -19,7 +19,7 @@ use crate::scene::{Means, Ordered, SceneRef};
 use groups::{Bounds, CulledGroups, Group, LiveGroup};
 pub use kernels::VisibilityKernels;
 
-/// Σ αT and the smallest pixel of each of N Gaussians over the views added so far. The result depends neither on the
+/// Σ αT² and the smallest pixel of each of N Gaussians over the views added so far. The result depends neither on the
 /// order of the rows nor on the number of threads: equal depths are drawn in the order of the scene's content.
 pub struct VisibilityAccumulator {
     groups: Vec<Group>,
@@ -87,7 +87,7 @@ impl VisibilityAccumulator {
         camera
     }
 
-    /// Adds views whose Σ αT of each Gaussian was found elsewhere.
+    /// Adds views whose Σ αT² of each Gaussian was found elsewhere.
     pub fn add_sums(&mut self, cameras: &[Camera], weights: &[f32]) {
         for (sum, &weight) in self.weight.iter_mut().zip(weights) {
             *sum += f64::from(weight);
@@ -151,7 +151,7 @@ impl VisibilityAccumulator {
             unsafe { *weight.at(row) += total.weight };
         };
         self.rasterizer
-            .accumulate_from::<WEIGHT, _>(source, camera, settings, grid, add);
+            .accumulate_from::<SQUARED, _>(source, camera, settings, grid, add);
     }
 
     /// Rows that some view saw.
@@ -159,7 +159,7 @@ impl VisibilityAccumulator {
         self.weight.par_iter().filter(|w| **w > 0.0).count()
     }
 
-    /// Σ αT and the size of a pixel, scene units, ∞ where no view has the mean in its image; by input row.
+    /// Σ αT² and the size of a pixel, scene units, ∞ where no view has the mean in its image; by input row.
     pub fn by_row(&self) -> (Vec<f32>, Vec<f32>) {
         let mut weight = vec![0.0; self.weight.len()];
         let mut pixel_size = vec![0.0; self.weight.len()];
@@ -302,12 +302,20 @@ mod tests {
         let scene = made(Means::F32(means), scales, &rows);
         let (mut views, mut whole) = (accumulator(&scene), Accumulated::new(means.len()));
         let (mut rasterizer, mut met) = (Rasterizer::default(), 0);
+        let mut squared = vec![0.0; means.len()];
         for camera in cameras() {
             let settings = Settings::default();
             views.add(&camera, &settings).unwrap();
             rasterizer
                 .accumulate(&params, &camera, &settings, &mut whole)
                 .unwrap();
+            let sums = DisjointSlice::new(&mut squared);
+            let add = |row: usize, total: Total| {
+                // SAFETY: the call comes once for every row.
+                unsafe { *sums.at(row) += total.weight };
+            };
+            let grid = TileGrid::of(&camera);
+            rasterizer.accumulate_from::<SQUARED, _>(params, &camera, &settings, grid, add);
             let frustum = Frustum::of(&camera);
             let alone = views.bounds.iter().map(|b| b.tile_rows(&frustum).is_some());
             let live: Vec<usize> = (0..).zip(alone).filter(|g| g.1).map(|g| g.0).collect();
@@ -317,7 +325,7 @@ mod tests {
         }
         let (weight, pixel_size) = views.by_row();
         assert_eq!(pixel_size, whole.pixel_size);
-        for (i, (&got, &want)) in weight.iter().zip(&whole.weight).enumerate() {
+        for (i, (&got, &want)) in weight.iter().zip(&squared).enumerate() {
             let want = want as f32; // of log scales, which round
             assert!(
                 (got - want).abs() <= 1e-3 + 1e-4 * want,

@@ -1,6 +1,6 @@
 // A tile's splats, nearest first: a workgroup takes a tile, a thread a pixel. A dispatch draws view.pairs of each tile's
 // from the view.first-th on. `depths`: the depth at which less than half the light is left; pixels that nobody asks for
-// start without any. `weigh`: what each pair adds to Σ αT.
+// start without any. `weigh`: what each pair adds to Σ αT².
 
 @group(0) @binding(1) var<storage, read> splats: array<Splat>;
 @group(0) @binding(2) var<storage, read> numbers: array<u32>;
@@ -88,7 +88,7 @@ fn weigh(
             if left > 0.0 && first + k < span.y {
                 let alpha = alpha_of(splats[drawn[numbers[first + k]]], pixel);
                 let next = left * (1.0 - alpha);
-                weight = alpha * left;
+                weight = alpha * left * left;
                 left = next;
                 if next <= view.light_min {
                     weight = 0.0;

@@ -1,4 +1,4 @@
-//! GPU kernels for visibility: the median depths and cells of `g2ard_core::select`, and each Gaussian's Σ αT of
+//! GPU kernels for visibility: the median depths and cells of `g2ard_core::select`, and each Gaussian's Σ αT² of
 //! `g2ard_core::visibility`.
 //!
 //! A view takes two submissions. The first projects all rows, marks those that the image may show and counts the tiles
@@ -57,7 +57,7 @@ pub fn serves(settings: &Settings) -> bool {
     settings.convention == Convention::Gsplat && !settings.antialiased
 }
 
-/// Σ αT of every row over these views, in the order of `sums`. The device keeps the scene between calls.
+/// Σ αT² of every row over these views, in the order of `sums`. The device keeps the scene between calls.
 pub fn weights(
     gpu: &Gpu,
     sums: &mut VisibilityAccumulator,

@@ -51,7 +51,7 @@ const WEIGH_ROUNDS: usize = 7;
 pub enum Goal<'a> {
     /// The median depth of each pixel.
     Depths(&'a Buffer),
-    /// Σ αT, added to each row's.
+    /// Σ αT², added to each row's.
     Weights(&'a Buffer),
 }
 

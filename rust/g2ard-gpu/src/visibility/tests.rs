@@ -41,7 +41,7 @@ fn cameras(center: [f64; 3], radius: f64) -> Vec<Camera> {
         .collect()
 }
 
-/// Largest difference of Σ αT summed over all Gaussians, as a share of that sum; and the share of Gaussians that may
+/// Largest difference of Σ αT² summed over all Gaussians, as a share of that sum; and the share of Gaussians that may
 /// differ by over a thousandth, because their order by depth is within rounding.
 const TOLERANCE: f64 = 1e-5;
 
@@ -76,7 +76,7 @@ fn compare_weights(gpu: &Gpu, what: &str, splats: &Splats, cameras: &[Camera]) {
     let apart = apart.sum::<f64>() / total.max(1.0);
     let off = pairs.filter(|(a, b)| (*a - *b).abs() > 1e-3 * **a + 1e-3);
     let off = off.count() as f64 / splats.len() as f64;
-    eprintln!("{what}: Σ αT {apart:.1e} apart, {off:.5} of the rows by more than 0.001");
+    eprintln!("{what}: Σ αT² {apart:.1e} apart, {off:.5} of the rows by more than 0.001");
     assert!(apart <= TOLERANCE && off <= 1e-3, "{what}");
 }
 
