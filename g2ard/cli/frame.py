@@ -207,14 +207,21 @@ class Run:
 
         return load_scene(path, self.say, self.render_model)
 
-    def write(self, path: Path, splats: Splats, *, overwrite: bool = False, **options: Any) -> None:
-        """Write a scene, and report what its format cannot hold."""
+    def write(
+        self, path: Path, splats: Splats, *, overwrite: bool = False, compare: bool = False, **options: Any
+    ) -> None:
+        """Write a scene, and report what its format cannot hold and, with `compare`, a large loss."""
         from g2ard.io import write_splats
         from g2ard.io.scene_formats import lost_in
 
         write_splats(path, splats, overwrite=self.overwrite or overwrite, **options)
         for note in lost_in(path, splats, **options):
             self.say(f"note: {path}: {note}")
+        if compare:
+            from g2ard.jobs.packing import loss_warning
+
+            if warning := loss_warning(path, splats, options):
+                self.say(warning)
 
     def write_views(
         self,

@@ -38,8 +38,9 @@ def write_table(run: Run, report: dict[str, Any]) -> None:
 
 
 def told(report: dict[str, Any], *, verbose: bool = False) -> list[str]:
-    """Return lines on recovery's outcome, losses, likely causes and unseen parts; `verbose` adds idle
+    """Return lines on recovery, losses, likely causes, unseen parts and packing; `verbose` adds idle
     regularisers."""
+    from g2ard.jobs.packing import score_lines
     from g2ard.report.kinds import KindScore
     from g2ard.stages.recover.report import RecoverReport, outcome, unregularized_rounds
 
@@ -50,6 +51,8 @@ def told(report: dict[str, Any], *, verbose: bool = False) -> list[str]:
     lines += report["causes"]
     if report["unseen"] and report["unseen"] > _FEW:
         lines.append(f"{report['unseen']:.0%} of the scene is in no view: simplified but not recovered")
+    if packed := report.get("packed"):
+        lines += score_lines(packed, report["bytes"]["file"], report["scores"]["recovered"]["psnr"])
     return [line for line in lines if line is not None]
 
 

@@ -143,7 +143,7 @@ class TiledCommand:
             model = small.render_model
             write_parts(place, *parts, render_model=model, overwrite=self.run.overwrite)
         else:
-            self.run.write(place, small.whole())
+            self.run.write(place, small.whole(), compare=True)
 
 
 def _report(store: TileStore, small: TiledScene, began: float) -> dict[str, Any]:

@@ -23,6 +23,7 @@ class SceneFormat(NamedTuple):
         options: names of its options.
         models: whether it can state the render model.
         axes: of its coordinates, by definition or unless it states others; None if scenes bring their own.
+        lossy: whether it rounds values to fewer bits than float32.
     """
 
     suffix: str
@@ -31,21 +32,22 @@ class SceneFormat(NamedTuple):
     options: tuple[str, ...] = ()
     models: bool = True
     axes: str | None = None
+    lossy: bool = False
 
 
 FORMATS: dict[FormatName, SceneFormat] = {
-    "compressed.ply": SceneFormat(".compressed.ply", "compressed_ply"),
+    "compressed.ply": SceneFormat(".compressed.ply", "compressed_ply", lossy=True),
     "ply": SceneFormat(".ply", "ply", options=("normals",)),
-    "sog": SceneFormat(".sog", "sog_write"),
-    "spz": SceneFormat(".spz", "spz", options=("spz_version", "axes"), axes="RUB"),
+    "sog": SceneFormat(".sog", "sog_write", lossy=True),
+    "spz": SceneFormat(".spz", "spz", options=("spz_version", "axes"), axes="RUB", lossy=True),
     "glb": SceneFormat(".glb", "glb", options=("compress",), models=False, axes="LUF"),
-    "splat": SceneFormat(".splat", "splat", models=False),
+    "splat": SceneFormat(".splat", "splat", models=False, lossy=True),
     "usda": SceneFormat(".usda", "usd", models=False, axes="RUB"),
     "usdc": SceneFormat(".usdc", "usd", models=False, axes="RUB"),
 }
 """Formats by name, longer suffixes first."""
 
-_FOLDER = SceneFormat("meta.json", "sog_write", "write_folder")
+_FOLDER = SceneFormat("meta.json", "sog_write", "write_folder", lossy=True)
 
 
 def scene_format(path: str | Path) -> SceneFormat:

@@ -119,7 +119,7 @@ def convert(
         splats = splats.with_sh_degree(sh_degree)
     if change is not None:
         splats = with_axes(splats, change)
-    run.write(output, splats, **options)
+    run.write(output, splats, compare=True, **options)
     size = _size(output)
     kept = f"{len(splats):,}" if len(splats) == read else f"{len(splats):,} of {read:,}"
     what = "Gaussian" if kept == "1" else "Gaussians"

@@ -342,7 +342,8 @@ def _distil(
 def _write(
     run: Run, place: Path, result: Distilled, unseen: Targets, colour: Colour, report: dict[str, Any]
 ) -> None:
-    """Write the picture, the scene and, last, the report."""
+    """Write the picture, the scene, which is read back and scored if packed, and, last, the report."""
+    from g2ard.jobs.packing import score_file
     from g2ard.report.distilled import preview
 
     scenes = [("simplified", result.simplified), ("recovered", result.splats)]
@@ -350,6 +351,8 @@ def _write(
     run.write(place, result.splats, overwrite=True)
     drop_older(place)
     report["bytes"]["file"] = place.stat().st_size
+    if place.name != "scene.ply":
+        report["packed"] = score_file(place, unseen, colour, run.progress)
     write_report(place.parent, {**report, "config": run.config})
 
 

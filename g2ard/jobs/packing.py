@@ -1,0 +1,88 @@
+"""Quality that a packed format costs, measured by reading the file back."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from g2ard.config.choices import Colour
+from g2ard.errors import InputError
+from g2ard.progress import Progress
+
+if TYPE_CHECKING:
+    from g2ard.scene.splats import Splats
+    from g2ard.scene.targets import Targets
+
+_LOSS = 1.0
+"""Loss that is worth a warning, dB."""
+_USUAL = 35.0
+"""PSNR of a good scene, to which the difference between two scenes is related, dB."""
+_VIEWS, _SIZE, _ROWS = 4, (400, 300), 100_000
+"""Generated views to compare in: their number, pixels, and the Gaussians they are planned by."""
+_LARGEST = 2_000_000
+"""Gaussians above which scenes are not compared."""
+
+
+def score_file(path: Path, targets: Targets, background: Colour, progress: Progress) -> dict[str, Any]:
+    """Read a scene file back and return its mean scores in the views of `targets`."""
+    from g2ard.io import read_splats
+    from g2ard.stages.evaluate import evaluate
+
+    found = evaluate(read_splats(path), targets, background=background, progress=progress, stage="score file")
+    return {"file": path.name, "psnr": found.psnr, "ssim": found.ssim}
+
+
+def score_lines(packed: dict[str, Any], size: int, unpacked: float) -> list[str]:
+    """Return a packed file's size in bytes and score beside that of the unpacked scene, and a warning if the
+    loss is large.
+
+    >>> score_lines({"file": "scene.sog", "psnr": 37.86}, 1_310_000, 37.94)
+    ['scene.sog: 1.3 MB, 37.9 dB in held-out views (37.9 as .ply)']
+    """
+    name, psnr = packed["file"], packed["psnr"]
+    lines = [f"{name}: {size / 1e6:.1f} MB, {psnr:.1f} dB in held-out views ({unpacked:.1f} as .ply)"]
+    if unpacked - psnr > _LOSS:
+        lines.append(f"warning: {name}: the format costs {unpacked - psnr:.1f} dB; {_better(name)}")
+    return lines
+
+
+def loss_warning(path: Path, splats: Splats, options: dict[str, Any]) -> str | None:
+    """Compare a written file with its scene in a few small generated views.
+
+    Args:
+        path: the file.
+        splats: the scene as given to the writer.
+        options: the writer's options.
+
+    Returns:
+        A warning if a scene of 35 dB would lose more than 1 dB. None otherwise, and without a comparison if
+        the format is exact, the scene is large or no view shows it.
+    """
+    from g2ard.io import read_splats
+    from g2ard.io.scene_formats import scene_format
+    from g2ard.poses import plan_pool
+    from g2ard.scene.targets import TeacherRenders
+    from g2ard.stages.evaluate import evaluate
+
+    if not (scene_format(path).lossy or options.get("compress")) or len(splats) > _LARGEST:
+        return None
+    try:
+        pool = plan_pool(splats, _VIEWS, size=_SIZE, rows=_ROWS)
+    except InputError:
+        return None
+    away = evaluate(read_splats(path), TeacherRenders(splats, pool.cameras)).psnr
+    psnr = -10 * float(np.log10(10 ** (-_USUAL / 10) + 10 ** (-away / 10)))
+    if _USUAL - psnr <= _LOSS:
+        return None
+    return (
+        f"warning: {path}: renders are {away:.1f} dB PSNR from the original's, which lowers a score of "
+        f"{_USUAL:.0f} dB to {psnr:.1f}; {_better(path.name)}"
+    )
+
+
+def _better(name: str) -> str:
+    """Name formats that lose less than that of a file."""
+    close = name.lower().endswith((".sog", "meta.json", ".compressed.ply"))
+    return ".ply loses nothing" if close else ".sog loses less, .ply nothing"

@@ -1,0 +1,42 @@
+"""The quality that packed formats cost, as `distill` and `convert` report it."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+import g2ard
+from g2ard.jobs.packing import score_lines
+from helpers.commands import CommandLine, succeeds
+from helpers.scenes import checkered_ball
+
+
+def test_distill_scores_the_packed_file(command_line: CommandLine, folder: Path) -> None:
+    ask = ("distill", "ball.ply", "-r", 4, "--steps", 20, "--size", 48, "--no-view", "--format", "splat")
+    error = succeeds(command_line, folder, *ask, "-o", "run").err
+    report = json.loads((folder / "run" / "report.json").read_text())
+    packed, unpacked = report["packed"]["psnr"], report["scores"]["recovered"]["psnr"]
+    assert f"scene.splat: 0.0 MB, {packed:.1f} dB in held-out views ({unpacked:.1f} as .ply)" in error
+    assert 10 < packed < unpacked
+    assert "dB in held-out views (" not in succeeds(command_line, folder, *ask[:-1], "ply", "-o", "plain").err
+
+
+def test_a_costly_format_names_a_better_one() -> None:
+    packed = {"file": "scene.spz", "psnr": 39.74}
+    assert score_lines(packed, 1_000_000, 40.0)[1:] == []
+    (warning,) = score_lines(packed, 1_000_000, 48.05)[1:]
+    assert warning == "warning: scene.spz: the format costs 8.3 dB; .sog loses less, .ply nothing"
+    assert ".sog" not in score_lines({"file": "scene.SOG", "psnr": 30}, 1, 48)[1].partition(";")[2]
+
+
+def test_convert_warns_only_of_a_visible_loss(command_line: CommandLine, tmp_path: Path) -> None:
+    ball = checkered_ball(400)
+    g2ard.save(tmp_path / "ball.ply", ball)
+    for name in ("a.sog", "a.spz", "a.glb", "a.compressed.ply"):
+        assert "warning" not in succeeds(command_line, tmp_path, "convert", "ball.ply", name).err, name
+    shiny = replace(ball, shN=np.random.default_rng(0).normal(size=(400, 15, 3)).astype(np.float32))
+    g2ard.save(tmp_path / "shiny.ply", shiny)
+    error = succeeds(command_line, tmp_path, "convert", "shiny.ply", "b.splat").err  # .splat drops SH
+    assert "warning: b.splat: renders are " in error
+    assert "; .sog loses less, .ply nothing\n" in error
