@@ -30,8 +30,9 @@ _ANYWHERE, _FEW = 0.4, 0.05
 """Share of the training views that look from anywhere, if other views hold nothing of the scene; if they hold
 a share h, 1−h times that, and none below the second share.
 """
-_APART = 16
-"""Number of near views and of views from anywhere: one half validates recovery, the other is scored."""
+_APART = 24
+"""Number of near views, and of views from anywhere if some train: one half validates recovery, the other is
+scored."""
 _POOL_GAUSSIANS = 4_000_000
 """Size of a tiled scene from which the pool grows in proportion."""
 _ROWS = 200_000
@@ -177,7 +178,7 @@ def _mixed(
         share = _ANYWHERE * (1 - planned.held)
         share = share if share > _FEW else 0.0
     count = round(len(train.cameras) * share / (1 - share))
-    more = planned.anywhere(count + _APART)
+    more = planned.anywhere(count + _APART) if count else []
     count = min(count, max(len(more) - _APART, len(more) // 2))
     apart = [*(planned.apart or []), *more[count:]]
     others = Cameras.of(apart).resized(size) if apart else None

@@ -33,7 +33,7 @@ class SelectConfig(CoverageOptions):
     policy: Policy = "auto"
     weighted: bool = True
     reselect: bool = False
-    anywhere: float | None = None
+    anywhere: float | None = 0.0
 
     def __post_init__(self) -> None:
         super().__post_init__()

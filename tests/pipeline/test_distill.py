@@ -85,12 +85,12 @@ def test_command_on_a_trained_scene(command_line: CommandLine, tmp_path: Path) -
     assert report["scores"]["recovered"]["psnr"] > report["scores"]["simplified"]["psnr"]
     assert report["against"] == "teacher renders"
     apart = report["apart"]
-    assert {kind_of(view["name"]) for view in apart["recovered"]["views"]} == {"near", "anywhere"}
+    assert {kind_of(view["name"]) for view in apart["recovered"]["views"]} == {"near"}
     assert not {view["name"] for view in report["scores"]["recovered"]["views"]} & {
         view["name"] for view in apart["recovered"]["views"]
     }
     assert 0 <= report["unseen"] < 0.5
-    assert [row["kind"] for row in report["kinds"]] == ["usual", "near", "anywhere"]
+    assert [row["kind"] for row in report["kinds"]] == ["usual", "near"]
     near = [view for view in apart["recovered"]["views"] if kind_of(view["name"]) == "near"]
     worst = min(near, key=lambda view: view["psnr"])
     assert (report["kinds"][1]["worst"], report["kinds"][1]["worst_psnr"]["after"]) == (
