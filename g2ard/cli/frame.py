@@ -21,7 +21,7 @@ import typer
 
 from g2ard.cli.app import app
 from g2ard.cli.budget_options import Counts, Ratios
-from g2ard.cli.config import load_config, printed
+from g2ard.cli.config_file import load_config, printed
 from g2ard.cli.console import Console
 from g2ard.cli.panels import COMMON, GROUPED, into_panels
 from g2ard.cli.usage import flags_of, in_flags, typed
@@ -131,13 +131,13 @@ class Run:
             names: options named like a field or like the end of its path.
             preset: preset to check the values of --set with.
         """
-        from g2ard.config.paths import full_paths, parsed
+        from g2ard.config.paths import full_paths, parse_settings
         from g2ard.config.presets import configured
         from g2ard.errors import InputError
 
         given = {name: self.config[name] for name in names if self.config[name] not in (None, [], ())}
         try:
-            typed = parsed(self.config["set"] or [], config)
+            typed = parse_settings(self.config["set"] or [], config)
             configured(config, preset or "auto", typed)
         except InputError as e:
             raise typer.BadParameter(f"--set: {e}") from None
@@ -309,34 +309,38 @@ def command(
             shared_options["set"] = (list[str] | None, None, _SET)
         if scenes:
             shared_options["render_model"] = (RenderModel | None, None, _RENDER_MODEL)
-        common = [
+        shared_parameters = [
             inspect.Parameter(
                 key, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=Annotated[kind, option]
             )
             for key, (kind, default, option) in shared_options.items()
         ]
-        for p in common:
+        for p in shared_parameters:
             into_panels(p.name, p.annotation, COMMON)
         for p in own if name in GROUPED else ():
             into_panels(p.name, p.annotation)
 
         def call(ctx: typer.Context, **values: Any) -> None:
             _flags_win(ctx, values, {p.name: p.default for p in own})
-            shared = {key: values.pop(key) for key in shared_options}
+            shared_values = {key: values.pop(key) for key in shared_options}
             if typed(ctx, "set"):  # after the config file's, since the last value wins
-                shared["set"] = [*(ctx.default_map or {}).get("set", []), *shared["set"]]
-            printing = shared.pop("print_config")
-            run = Run(name, shared, dict(values), flags_of(ctx.command))
+                typed_last = [*(ctx.default_map or {}).get("set", []), *shared_values["set"]]
+                shared_values["set"] = typed_last
+            printing = shared_values.pop("print_config")
+            run = Run(name, shared_values, dict(values), flags_of(ctx.command))
             if printing:
-                if shared.get("set"):
+                if shared_values.get("set"):
                     _check_settings(run, fn, values)
-                typer.echo(printed(ctx, {**values, **shared}), nl=False)
+                typer.echo(printed(ctx, {**values, **shared_values}), nl=False)
                 return
             with interrupt.RaisesInterrupt():
                 _execute(run, fn, values, cuda)
 
+        # Typer reads options from the signature: the context, the command's own, and the shared ones.
         context = inspect.Parameter("ctx", inspect.Parameter.KEYWORD_ONLY, annotation=typer.Context)
-        parameters = [p.replace(kind=inspect.Parameter.KEYWORD_ONLY) for p in (context, *own, *common)]
+        parameters = [
+            p.replace(kind=inspect.Parameter.KEYWORD_ONLY) for p in (context, *own, *shared_parameters)
+        ]
         call.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
         call.__annotations__ = {p.name: p.annotation for p in parameters}
         call.__doc__ = fn.__doc__

@@ -9,7 +9,7 @@ from g2ard.cli.frame import Run
 from g2ard.progress import plural
 
 if TYPE_CHECKING:
-    from g2ard.jobs.fit import Aim
+    from g2ard.jobs.measured_budget import Aim
     from g2ard.report.kinds import KindScore
     from g2ard.scene.splats import Splats
 

@@ -24,7 +24,7 @@ Config = TypeVar("Config")
 _UNIONS = (Union, types.UnionType)
 
 
-def parsed(texts: Iterable[str], config: Any) -> dict[str, Any]:
+def parse_settings(texts: Iterable[str], config: Any) -> dict[str, Any]:
     """Parse `PATH=VALUE` texts for a config; the last value of a repeated path wins.
 
     Values are checked against the field's type: numbers (`1e-3`, `inf`), `true` or `false`, names, `0.36,0.1`
@@ -37,7 +37,7 @@ def parsed(texts: Iterable[str], config: Any) -> dict[str, Any]:
         InputError: no `=`, an unknown or ambiguous path, or a value of another type.
 
     >>> from g2ard.stages.recover.config import RecoverConfig
-    >>> parsed(["regularizers.anchor=1e-3", "period=50", "schedule=fast"], RecoverConfig())
+    >>> parse_settings(["regularizers.anchor=1e-3", "period=50", "schedule=fast"], RecoverConfig())
     {'recover.regularizers.anchor': 0.001, 'recover.regularizers.period': 50, 'recover.schedule': 'fast'}
     """
     known = {leaf.path: leaf for leaf in _leaves(config)}

@@ -316,11 +316,12 @@ def fraction_bits(path: Path, means: NDArray[np.float64], splats: Splats) -> int
         InputError: steps exceed both 2^−12 and the median middle scale.
     """
     farthest = float(np.abs(means).max())
+    # 23 bits beside the sign; the margin keeps what is just below a power of two from rounding up to 2^23
     room = 23 - math.ceil(math.log2(max(farthest, 2.0**-20) * (1 + 2**-20)))
     middle = np.sort(splats.scales, axis=1)[:, 1].astype(np.float64)
-    fine = max(float(np.percentile(middle, 1)), 1e-12)
-    wanted = math.ceil(-math.log2(fine / 4))
-    bits = min(max(_USUAL_BITS, wanted), _MOST_BITS, room)
+    fine_scale = max(float(np.percentile(middle, 1)), 1e-12)
+    bits_for_fine_scale = math.ceil(-math.log2(fine_scale / 4))
+    bits = min(max(_USUAL_BITS, bits_for_fine_scale), _MOST_BITS, room)
     if bits < 0 or 2.0**-bits > max(float(np.median(middle)), 2.0**-_USUAL_BITS):
         raise InputError(
             f".spz is too coarse at {farthest:g} from the origin (steps of {2.0**-bits:g})",

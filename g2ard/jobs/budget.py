@@ -94,7 +94,7 @@ class Budget:
 
     @property
     def is_measured(self) -> bool:
-        """Return whether the count depends on the scene, not only on its size (`g2ard.jobs.fit`)."""
+        """Return whether the count depends on the scene, not only on its size: `measured_budget`."""
         return self.bytes is not None or self.min_psnr is not None or self.min_ssim is not None
 
     def of(self, total: int, name: str = "scene") -> int:

@@ -21,8 +21,8 @@ from g2ard.scene.splats import Splats
 if TYPE_CHECKING:
     from g2ard.config.choices import RenderModel
     from g2ard.io.types import Points
-    from g2ard.jobs.fit import Aim
     from g2ard.jobs.inputs import Views
+    from g2ard.jobs.measured_budget import Aim
     from g2ard.pipeline import Distilled
     from g2ard.stages.recover.anchors import Regularizers
     from g2ard.stages.recover.presets import PriorMeasures
@@ -132,18 +132,18 @@ def prepare(
     """
     began = time.monotonic()
     recover = options.config.recover  # rejects invalid settings before anything is read
-    alone = scene is None
+    from_photos_only = scene is None
     if scene is None:
         scene = _points(budgets, options, progress, say)
     read = _read(scene, budgets, options, progress, say)
-    read = replace(read, from_photos=read.from_photos or alone)
+    read = replace(read, from_photos=read.from_photos or from_photos_only)
     prior, cleaned = read.prior, None
     if options.clean:
         prior, cleaned = _cleaned(prior, options, progress, say)
     if counted is not None:
         counted(len(prior))
-    lift_degree = 3 if read.lifted else None
-    degree = options.configured(sh_degree=lift_degree).recover.sh_degree
+    default_degree = 3 if read.lifted else None  # points have one colour each, photos show more
+    degree = options.configured(sh_degree=default_degree).recover.sh_degree
     aims = _aims(prior, budgets, options, degree, read.name, progress, say)
     views = views_of(
         prior,
@@ -159,15 +159,15 @@ def prepare(
         say=say,
     )
     sources = _sources(views, options.photos, read.lifted)
-    regularizers, why, measured = _regularizers(prior, views, options, sources, read)
+    regularizers, preset_label, measured = _regularizers(prior, views, options, sources, read)
     if sources.photos:
         given = options.named("recover.background") is not None
         propose_background(views.train.cameras, recover.background, given, say)
     if sources.photos and not read.lifted:
         warn_of_photos(prior, views.train.cameras, recover.background, say)
     say(_task(prior, aims, views, sources))
-    say(f"regularisers: {why}")
-    config = options.configured(regularizers, lift_degree)
+    say(f"regularisers: {preset_label}")
+    config = options.configured(regularizers, default_degree)
     config = replace(config, recover=replace(config.recover, from_points=read.from_photos))
     say_regions(prior, config.simplify, read.name, say)
     return DistillJob(
@@ -179,7 +179,7 @@ def prepare(
         config=config,
         weights=views.train.weights if config.select.weighted else None,
         lifted=read.lifted,
-        preset=why,
+        preset=preset_label,
         measured=measured,
         seconds=time.monotonic() - began,
         cleaned=cleaned,
@@ -263,7 +263,7 @@ def _aims(
     say: Say,
 ) -> tuple[Aim, ...]:
     """Resolve the budgets; bytes are measured at the result's SH degree."""
-    from g2ard.jobs.fit import aim_of
+    from g2ard.jobs.measured_budget import aim_of
     from g2ard.jobs.simplify import Reduction
 
     seed = options.config.recover.seed

@@ -14,7 +14,7 @@ from g2ard.scene.splats import Splats
 from g2ard.scene.targets import kinds_of
 
 if TYPE_CHECKING:
-    from g2ard.jobs.fit import Aim
+    from g2ard.jobs.measured_budget import Aim
     from g2ard.pipeline import DistillConfig, Distilled
     from g2ard.rendering.renderer import Renderer
     from g2ard.scene.cameras import Cameras

@@ -85,7 +85,7 @@ def simplify(
     (90, (900,), 90)
     """
     from g2ard.config.presets import configured
-    from g2ard.jobs.fit import aim_of
+    from g2ard.jobs.measured_budget import aim_of
     from g2ard.stages.simplify import SimplifyConfig
 
     fields = {"method": method, "keep_region": keep_region}

@@ -105,9 +105,10 @@ def visibility_source(
 ) -> Callable[[Splats], SampledVisibility]:
     """Return a function that samples a scene's visibility from a few small renders, for `simplify`.
 
-    Views are rendered in rounds of sixteen until a round finds under 1 % more of the Gaussians: 32 views for
-    an object of half a million, 80 for a small one, all for a room (decision 0007). The first scene fixes the
-    views for later ones, so that sums are comparable. Results do not depend on the order of the scene's rows.
+    Views are rendered in rounds of sixteen until a round finds under 1 % more of the Gaussians, and at least
+    while Gaussians × views are few: 32 views for an object of half a million, 80 for a small one, all for a
+    room (decision 0007). The first scene fixes the views for later ones, so that sums are comparable.
+    Results do not depend on the order of the scene's rows.
 
     Args:
         cameras: the views; at most `views` of them are used, evenly spaced, and none from anywhere if there

@@ -130,10 +130,10 @@ def simplify_tiles(
         )
     run = TiledRun(store, workers, config or SimplifyConfig())
     coarse = run.begin()
-    frame = run.sampled_frame()
+    frame = run.sampled_frame()  # units that tiles share, so that their costs compare
     unchanged = budget == store.count
     sights: Sights | None = None
-    if not blind and (views is not None or not unchanged):
+    if not blind and (views is not None or not unchanged):  # recovery of an unchanged scene needs them too
         sample = join([scene_of(path, "sample") for path in coarse])
         _check_regions(sample, run.config["keep_region"])
         cameras = views or beside(sample) or _planned(run, sample, up, seed, say)

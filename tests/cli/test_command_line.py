@@ -49,7 +49,7 @@ def test_usage_errors(arguments: list[str], words: str, command_line: CommandLin
 def test_config_files_are_utf_8(tmp_path: Path, mark: bytes) -> None:
     """Any locale works, also with the byte order mark that editors on Windows write."""
     (tmp_path / "c.toml").write_bytes(mark + 'output = "größe/×.ply"\n'.encode())
-    code = "import sys; from pathlib import Path; from g2ard.cli.config import _read;"
+    code = "import sys; from pathlib import Path; from g2ard.cli.config_file import _read;"
     code += "print(ascii(_read(Path(sys.argv[1]))))"
     plain = {**os.environ, "LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
     done = subprocess.run(

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import g2ard
-from g2ard.config.paths import changed, listed, parsed
+from g2ard.config.paths import changed, listed, parse_settings
 from g2ard.config.presets import preset
 from g2ard.errors import InputError
 from g2ard.io import read_splats, write_splats, write_views
@@ -39,22 +39,22 @@ class Outer:
 
 def test_a_field_of_any_dataclass_is_a_setting_at_once() -> None:
     texts = ["outer.cells=7", "edges=0.5,4", "exact=true", "mode=hard", "inner.brand_new=1e-3", "cells=none"]
-    values = parsed(texts, Outer())
+    values = parse_settings(texts, Outer())
     assert changed(Outer(cells=3), values) == Outer(None, "hard", True, Inner(1e-3, (0.5, 4.0)))
     assert changed(Inner(), values) == Inner()
     assert changed(Outer(), {}) == Outer()
 
 
 def test_the_path_nearest_the_root_is_meant() -> None:
-    assert parsed(["brand_new=2"], Outer()) == {"outer.brand_new": 2.0}
-    assert parsed(["steps=3"], DistillConfig()) == {"recover.steps": 3}
+    assert parse_settings(["brand_new=2"], Outer()) == {"outer.brand_new": 2.0}
+    assert parse_settings(["steps=3"], DistillConfig()) == {"recover.steps": 3}
     with pytest.raises(InputError, match=r"use simplify\.neighbors or lift\.neighbors"):
-        parsed(["neighbors=3"], DistillConfig())
+        parse_settings(["neighbors=3"], DistillConfig())
 
 
 def test_a_config_is_set_as_a_whole_by_its_name_and_its_fields_after_it() -> None:
     texts = ["schedule.rates.sh0=1", "recover.schedule=paper", "regularizers=lift"]
-    found = changed(DistillConfig(), parsed(texts, DistillConfig())).recover
+    found = changed(DistillConfig(), parse_settings(texts, DistillConfig())).recover
     assert found.schedule == replace(PAPER, rates=replace(PAPER.rates, sh0=1.0))
     assert found.regularizers == PRESETS["lift"]
     with pytest.raises(InputError, match="schedule: expected one of fast"):
@@ -62,7 +62,7 @@ def test_a_config_is_set_as_a_whole_by_its_name_and_its_fields_after_it() -> Non
 
 
 def test_regions_are_read_as_text() -> None:
-    values = parsed(["keep_region=0,0,0,1;0,0,0,1,1,2"], DistillConfig())
+    values = parse_settings(["keep_region=0,0,0,1;0,0,0,1,1,2"], DistillConfig())
     assert values == {"simplify.keep_region": ((0, 0, 0, 1), (0, 0, 0, 1, 1, 2))}
     with pytest.raises(InputError, match="expected X,Y,Z,R"):
         changed(DistillConfig(), {"simplify.keep_region": ((0, 0, 0),)})
@@ -86,7 +86,7 @@ def test_regions_are_read_as_text() -> None:
 )
 def test_invalid_settings_are_named(text: str, words: str) -> None:
     with pytest.raises(InputError, match=r"^[^\n]*$") as error:
-        parsed([text], Outer())
+        parse_settings([text], Outer())
     assert words in str(error.value)
 
 
@@ -97,7 +97,7 @@ def test_a_report_s_settings_can_be_typed_again() -> None:
         for path, value in listed(paper).items()
     ]
     assert len(lines) > 60
-    assert changed(DistillConfig(), parsed(lines, DistillConfig())) == paper
+    assert changed(DistillConfig(), parse_settings(lines, DistillConfig())) == paper
     json.dumps(listed(paper), allow_nan=False)
 
 

@@ -11,7 +11,7 @@ import g2ard
 from g2ard.errors import InputError
 from g2ard.io import read_splats, write_splats
 from g2ard.jobs.budget import DEVICES
-from g2ard.jobs.fit import Aim, Quality, count_for_bytes, count_for_quality, file_bytes
+from g2ard.jobs.measured_budget import Aim, Quality, count_for_bytes, count_for_quality, file_bytes
 from g2ard.scene.splats import Splats
 from g2ard.stages.simplify import Simplified, simplify
 from helpers.commands import CommandLine, succeeds

@@ -370,11 +370,11 @@ def test_a_change_that_ends_too_low_is_cut_back() -> None:
         return -abs(float(scene.means.mean()) - float(ball.means.mean()) - 4 / 3)
 
     guard = Guard(score, ball, score(ball))
-    part, value, way = guard.judge(end)
+    part, value, way = guard.choose_by_training(end)
     assert way == 0.5
     np.testing.assert_array_equal(part.means, half.means)
     assert value > guard.before
-    assert Guard(score, ball, 0.0).judge(end)[0] is ball
+    assert Guard(score, ball, 0.0).choose_by_training(end)[0] is ball
 
 
 def test_validation_views_scale_back_harmful_changes() -> None:
@@ -394,21 +394,21 @@ def test_validation_views_scale_back_harmful_changes() -> None:
     def doubtful(scene: Splats) -> float:  # what one view has seen costs, what many have pays
         return float(way(scene) @ [-3, 0.5, 1, 1])
 
-    part, k = guard(10.0, doubtful).settle(end, views, 9)
+    part, k = guard(10.0, doubtful).choose_by_validation(end, views, 9)
     assert k == 5
     np.testing.assert_allclose(way(part), views / (views + 5), atol=1e-5)
     gaining = guard(10.0, lambda scene: float(way(scene).mean()))
-    assert gaining.settle(end, views, 9) == (end, 0.0)
+    assert gaining.choose_by_validation(end, views, 9) == (end, 0.0)
     harm = guard(10.0, lambda scene: -float(way(scene).mean()))
-    assert harm.settle(end, views, 9) == (start, math.inf)
+    assert harm.choose_by_validation(end, views, 9) == (start, math.inf)
     half = guard(10.0, lambda scene: -abs(float(way(scene)[0]) - 0.25) - abs(float(way(scene)[3]) - 0.25))
-    part, k = half.settle(end, views, 9)
+    part, k = half.choose_by_validation(end, views, 9)
     assert k is None
     np.testing.assert_allclose(way(part), 0.25, atol=1e-5)
     looks = [found["psnr"]["near"] for found in half.validation]
     assert looks == pytest.approx([-0.5, -1.5, 0.0], abs=1e-5)
     alone = Guard(lambda scene: 0.0, start, 0.0)
-    assert alone.settle(end, views, 9) == (end, 0.0)
+    assert alone.choose_by_validation(end, views, 9) == (end, 0.0)
 
 
 def test_a_recovery_that_only_harms_validation_views_stops_at_half(targets: TeacherRenders) -> None:
@@ -467,9 +467,11 @@ def test_the_guard_goes_by_the_kind_of_view_that_loses_most() -> None:
         return Guard(lambda scene: way(scene), start, 0.0, others)
 
     seen = np.full(4, 2.0)
-    part, k = guard(5, 16).settle(end, seen, 9)  # anywhere loses 8 dB at the end and gains up to a quarter
+    part, k = guard(5, 16).choose_by_validation(
+        end, seen, 9
+    )  # anywhere loses 8 dB at the end and gains up to a quarter
     assert (k, way(part)) == (None, pytest.approx(0.25, abs=1e-5))
-    assert guard(5, 0).settle(end, seen, 9) == (end, 0.0)
+    assert guard(5, 0).choose_by_validation(end, seen, 9) == (end, 0.0)
     losing = guard(5, 16)
     assert losing.look(end, 0.5, 50) == "stop"
     assert losing.lost == pytest.approx(8)

@@ -89,8 +89,8 @@ def simplify(
         raise typer.BadParameter("--keep-region needs views; remove --no-views or --method paper")
     tiling = tiling_of(run, scene, output, tile_rows, memory, workers, scheduler, work)
     from g2ard import io
-    from g2ard.jobs.fit import aim_of
     from g2ard.jobs.inputs import say_notes
+    from g2ard.jobs.measured_budget import aim_of
     from g2ard.jobs.simplify import Reduction
     from g2ard.jobs.tiling import (
         WHOLE_TIMES,

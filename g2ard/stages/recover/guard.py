@@ -46,7 +46,7 @@ class Guard:
         before: score of the start.
         others: returns the score of a scene by kind of validation view; None without such views. The kind
             that loses most decides.
-        active: whether to look for losses; otherwise `due` is never true and `judge` keeps the result.
+        active: whether to look for losses; without it the result is always kept.
     """
 
     score: Callable[[Splats], float]
@@ -99,7 +99,9 @@ class Guard:
         before = self.validation[0]["psnr"]
         return min(scores[kind] - before[kind] for kind in before)
 
-    def settle(self, result: Splats, views: NDArray[np.float64], step: int) -> tuple[Splats, float | None]:
+    def choose_by_validation(
+        self, result: Splats, views: NDArray[np.float64], step: int
+    ) -> tuple[Splats, float | None]:
         """Decide how much of a result's changes to keep, by the validation views.
 
         Everything is kept without such views, or if every kind of them loses at most 0.1 dB against the
@@ -124,7 +126,6 @@ class Guard:
         best, scores, most = self.start, self.validation[0]["psnr"], 0.0
         chosen: float | None = math.inf
         shares: list[tuple[float | None, NDArray[np.float64] | float]] = [
-            (0.0, 1.0),
             *((k, views / (views + k)) for k in _PRIOR_VIEWS),
             *((None, share) for share in _BLENDS),
         ]
@@ -136,7 +137,7 @@ class Guard:
         self.validation.append({"step": step, "psnr": scores})
         return best, chosen
 
-    def judge(self, result: Splats) -> tuple[Splats, float, float]:
+    def choose_by_training(self, result: Splats) -> tuple[Splats, float, float]:
         """Choose between the result, the best earlier scene, and blends of start and result.
 
         A result that is at least as good as all earlier scenes is kept. Otherwise the best earlier scene is

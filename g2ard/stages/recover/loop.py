@@ -215,7 +215,8 @@ class Loop:
         self.done += 1
 
     def _look(self) -> None:
-        """After too large a loss, continue from the best scene with a third of the rates."""
+        """After too large a loss, continue from the best scene with a third of the rates; `run` ends when
+        `guard.stopped` is set."""
         share = self._share()
         short = self.config.recovery_time is None and self.config.horizon < _SHORT
         if short or not self.guard.due(share):

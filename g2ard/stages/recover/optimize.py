@@ -128,10 +128,10 @@ def recover(
         loop.choose_rates(before)
     loop.run(checkpoint, progress, stage, watch)
     end = loop.engine.splats()
-    result, after, blend = guard.judge(end)
+    result, after, blend = guard.choose_by_training(end)
     prior_views: float | None = 0.0
     if result is end and validation is not None:
-        result, prior_views = guard.settle(end, loop.views_seen, loop.done)
+        result, prior_views = guard.choose_by_validation(end, loop.views_seen, loop.done)
         if result is not end:
             after, blend = probe.all_of(result), float(result is not student)
     return Recovered(

@@ -149,6 +149,8 @@ def fit_opacities(
         now: (M,) Σ αT² of the merged Gaussians.
         mean: mean of `wanted`, for tiles over all of them.
     """
+    if mean <= 0:  # no view sees anything
+        return scene
     floor = _FLOOR * mean
     ratio = (wanted + floor) / np.maximum(now + floor, np.finfo(float).tiny)
     factor = np.clip(ratio, *_RATIO) ** _FIT

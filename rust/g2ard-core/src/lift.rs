@@ -83,7 +83,8 @@ pub fn lift(points: &[[f64; 3]], config: &LiftConfig, control: &Control) -> Resu
     Ok(discs(&tree, &chunks.concat(), config))
 }
 
-/// PCA of the point and its neighbours about their mean.
+/// PCA of the point and its neighbours about their mean. `quat_from_rotation` flips a left-handed normal; `discs` handles
+/// an extent of zero.
 fn patch(points: &[[f64; 3]], row: u32, near: &[Neighbor<f64>], config: &LiftConfig) -> Patch {
     let here = points[row as usize];
     let share = 1.0 / (near.len() + 1) as f64;

@@ -1,4 +1,4 @@
-//! The exact budget: which rows stay when there are too many.
+//! The rows of highest score: the paper's trim, and the dropping of transparent rows.
 
 /// The `keep` rows of highest score, ascending. Which of equals stay is as good as random, but always the same: rows
 /// are in Morton order, and the first of them would be one corner of the scene.
