@@ -120,7 +120,8 @@ def test_the_command(tmp_path: Path, command_line: CommandLine) -> None:
     assert "are clutter" in told
     assert (tmp_path / "p.png").stat().st_size > 1000
     assert not (tmp_path / "b.ply").exists()
-    assert command_line("clean", "a.ply", "--only", "giant", "-o", "b.sog", cwd=tmp_path)[0] == 0
+    error = succeeds(command_line, tmp_path, "clean", "a.ply", "--only", "giant", "-o", "b.sog").err
+    assert f"b.sog: keeps {len(splats) - 1:,} of {len(splats):,} Gaussians" in error
     assert len(read_splats(tmp_path / "b.sog")) == len(splats) - 1
     for words, code in ((["a.ply"], 2), (["a.ply", "--only", "dust", "--dry-run"], 2)):
         assert command_line("clean", *words, cwd=tmp_path)[0] == code

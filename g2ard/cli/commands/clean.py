@@ -83,7 +83,7 @@ def clean(
                 "every Gaussian would be removed; inspect it with --dry-run --preview", path=scene
             )
         run.write(output, splats.take(found.keep))
-        run.say(f"{output}: {plural(kept, 'Gaussian')}")
+        run.say(f"{output}: keeps {kept:,} of {plural(len(splats), 'Gaussian')}")
     run.result({"input_count": len(splats), "output_count": kept, "found": found.counts})
 
 
@@ -94,13 +94,14 @@ def _paint(path: Path, splats: Splats, found: Cleaning, cameras: Cameras, overwr
     from g2ard.rendering.renderer import Renderer
     from g2ard.report.paint import painted
     from g2ard.scene.images import contact_sheet, write_png
-    from g2ard.stages.clean import KINDS
 
     colors = np.array([*_COLORS.values(), (0.45, 0.48, 0.52)])[found.kind]
     scenes = [splats, painted(splats, colors), splats.take(found.keep)]
     chosen = np.unique(np.linspace(0, len(cameras) - 1, min(3, len(cameras))).astype(int))
     renderers = [Renderer(scene) for scene in scenes]
     rows = [[r.clipped(cameras[int(view)]) for r in renderers] for view in chosen]
-    legend = ", ".join(f"{name} {word}" for name, word in zip(KINDS, _WORDS, strict=True))
-    labels = [f"{plural(len(splats), 'Gaussian')}", legend, f"{len(scenes[2]):,} stay"]
-    write_png(path, contact_sheet(rows, labels), overwrite=overwrite)
+    counts = zip(_WORDS, found.counts.items(), strict=True)
+    legend = ", ".join(f"{word}: {count:,} {name}" for word, (name, count) in counts)
+    labels = [f"before: {len(splats):,}", "removed, in colour", f"after: {len(scenes[2]):,}"]
+    sheet = contact_sheet(rows, labels, row_labels=[legend] * len(rows))
+    write_png(path, sheet, overwrite=overwrite)
