@@ -224,7 +224,7 @@ class Workspace:
         No method sees the others (`benchmarks.standing.standing_views`, `benchmarks.views.anywhere_views`).
         """
         found = {"pool": self.targets(next(iter(self.scored.values())))}
-        wanted = kinds_for(getattr(self.study, "protocol", "pool"), self.scene)
+        wanted = kinds_for(getattr(self.study, "protocol", "all"), self.scene)
         source, seed = self.place / self.scene.prior, self.study.pool_seed
         size, background = self.study.size, self.scene.background
         if "standing" in wanted:

@@ -20,4 +20,4 @@ def test_formats_lose_as_much_as_their_quanta(tmp_path: Path) -> None:
     assert pool[5, "ply"]["lost"] == 0
     assert abs(pool[5, "sog"]["lost"]) < 0.1
     assert pool[1, "splat"]["psnr"] < pool[1, "sog"]["psnr"]  # no harmonics, coarse rotations
-    assert {r["views_kind"] for r in rows} == {"pool", "near", "standing"}
+    assert {r["views_kind"] for r in rows} >= {"pool", "near", "standing"}

@@ -134,9 +134,9 @@ def test_no_command_trains_on_what_a_selection_holds_out(folder: Path, g2ard: Pr
     g2ard("distill", "ball.ply", "-n", 200, "--views", "chosen.json", "--steps", 4, "-o", "run")
     assert watch.trained == [chosen] * 3
     assert watch.looked == [chosen] * 2
-    assert watch.scored == [TEST] * 2  # of distill: simplified and recovered
+    assert watch.scored == [TEST] * 4  # of recover and distill, before and after
     g2ard("evaluate", "small.ply", "--views", "chosen.json")
-    assert watch.scored[2:] == [TEST]
+    assert watch.scored[4:] == [TEST]
     g2ard("render", "small.ply", "--views", "chosen.json", "--split", "test", "-o", "renders")
     assert {p.name for p in (folder / "renders").iterdir()} == TEST
 
@@ -299,7 +299,7 @@ def test_caliterra_s_photos_stay_apart(folder: Path, g2ard: Program, watch: Watc
     g2ard("distill", "prior.ply", "-n", 500, "--views", "chosen.json", *small, "-o", "run")
     assert watch.trained == [train] * 2
     assert watch.looked == [train]
-    assert watch.scored == [split["test"]] * 2
+    assert watch.scored == [split["test"]] * 4
 
 
 def test_the_study_of_policies_never_offers_test_photos(tmp_path: Path) -> None:

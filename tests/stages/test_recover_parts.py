@@ -195,7 +195,7 @@ def test_views_that_see_through_each_other_s_surfaces_make_a_prior_noisy() -> No
     assert preset_for("auto", ball, views)[0] == PRESETS["trained"]
     weights, why, _ = preset_for("auto", foggy, views)
     assert weights == PRESETS["noisy"]
-    assert "see through" in why
+    assert "of the surface agrees between neighbouring views" in why
     far = np.array([447_000.0, 5_411_000.0, 130.0])
     moved = view_consistency(replace(ball, offset=ball.offset + far), views.recentred(-far))
     assert moved == pytest.approx(sound, abs=0.01)

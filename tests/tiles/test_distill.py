@@ -232,7 +232,7 @@ def test_recovery_in_tiles_takes_its_options(command_line: CommandLine, folder: 
     write_splats(tmp_path / "town.ply", town(1500))
 
     def distilled(name: str, *options: object) -> Splats:
-        args = ("distill", tmp_path / "town.ply", "-r", 10, "-o", tmp_path / name, "--steps", 12)
+        args = ("distill", tmp_path / "town.ply", "-r", 10, "-o", tmp_path / name, "--steps", 60)
         tiled = ("--views", folder / "views.json", "--tile-rows", 800, "--workers", 1)
         succeeds(command_line, tmp_path, *args, *tiled, *options)
         return read_splats(tmp_path / name / "scene.ply")

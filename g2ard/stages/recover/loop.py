@@ -149,7 +149,7 @@ class Loop:
                 self.reach = tight  # better trained than its error suggested
                 self.multiplier = trials.search(guess)
             if trials.worsens(self.multiplier):  # on nearly fitted photos a few steps say nothing
-                self.multiplier = trials.calm() if nearly_fitted else guess
+                self.multiplier = trials.calm() if nearly_fitted else min(guess, self.multiplier)
         except TimeoutError:  # take the best multiplier tried, or a calmer one
             best = trials.best(guess)
             if trials.scores.get(best, -math.inf) >= trials.start:

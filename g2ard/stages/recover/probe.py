@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING
@@ -18,6 +19,8 @@ if TYPE_CHECKING:
 
 _VIEWS = 8
 """Views that are scored, of training and of each kind of validation views."""
+_VISIBLE = 40.0
+"""PSNR in dB above which differences are invisible, so that no validation view counts for more."""
 _SHARE = 0.01
 """Share of the time that scoring the views may take while progress is shown."""
 _FIRST_SHARE = 0.1
@@ -25,13 +28,15 @@ _FIRST_SHARE = 0.1
 
 
 class Probe:
-    """PSNR of a few evenly spaced views."""
+    """PSNR of a few evenly spaced views, each at most `most`."""
 
-    def __init__(self, targets: Targets, background: tuple[float, float, float]) -> None:
+    def __init__(
+        self, targets: Targets, background: tuple[float, float, float], most: float = math.inf
+    ) -> None:
         count = len(targets.cameras)
         sample = np.linspace(0, count - 1, min(count, _VIEWS)).round().astype(int)
         self._views = [int(view) for view in np.unique(sample)]
-        self._targets, self._background = targets, background
+        self._targets, self._background, self._most = targets, background, most
         self._next = 0.0
         self._latest = (float("nan"), 0)
 
@@ -59,13 +64,14 @@ class Probe:
 
     def _score(self, renderer: Renderer, view: int) -> float:
         image = renderer.clipped(self._targets.cameras[view])
-        return psnr(image, self._targets[view], mask_of(self._targets, view))
+        return min(self._most, psnr(image, self._targets[view], mask_of(self._targets, view)))
 
 
 def score_by_kind(
     targets: Targets, background: tuple[float, float, float]
 ) -> Callable[[Splats], dict[str, float]]:
-    """Return a function that scores a scene: kind of view → mean PSNR of up to eight views of that kind."""
+    """Return a function that scores a scene: kind of view → mean PSNR of up to eight views of that kind, each
+    at most 40 dB."""
     rows = rows_by_kind(targets.cameras.names)
-    probes = {kind: Probe(Subset(targets, found), background) for kind, found in rows.items()}
+    probes = {kind: Probe(Subset(targets, found), background, _VISIBLE) for kind, found in rows.items()}
     return lambda splats: {kind: probe.all_of(splats) for kind, probe in probes.items()}
