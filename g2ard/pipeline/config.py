@@ -33,7 +33,7 @@ class SelectConfig(CoverageOptions):
     policy: Policy = "auto"
     weighted: bool = True
     reselect: bool = False
-    anywhere: float | None = 0.0
+    anywhere: float | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -137,6 +137,7 @@ impl PyTrainer {
 
     /// Take one step; return (photometric loss before it, Gaussians moved). `mask`: where the loss counts.
     #[pyo3(signature = (view, target, rates, regularizers = None, mask = None, relative = None))]
+    #[expect(clippy::too_many_arguments, reason = "Python's signature")]
     fn step(
         &mut self,
         py: Python<'_>,
