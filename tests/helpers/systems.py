@@ -12,19 +12,19 @@ import pytest
 __all__ = ["is_worker", "needs_links", "needs_modes", "needs_proc", "needs_processes", "needs_signals"]
 
 needs_signals = pytest.mark.skipif(
-    os.name == "nt", reason="on Windows a program is sent no signal: it is ended at once"
+    os.name == "nt", reason="Windows ends a program at once instead of sending a signal"
 )
 """Mark of tests that send SIGINT or SIGTERM to another process."""
 
 needs_processes = pytest.mark.skipif(
-    not hasattr(os, "posix_spawnp"), reason="what a process took is measured by POSIX's calls"
+    not hasattr(os, "posix_spawnp"), reason="the cost of a process is measured by POSIX calls"
 )
 """Mark of tests of benchmarks that run commands as processes."""
 
 needs_modes = pytest.mark.skipif(os.name == "nt", reason="on Windows a folder's mode keeps nobody out")
 
 needs_proc = pytest.mark.skipif(
-    not Path(f"/proc/self/task/{os.getpid()}/children").exists(), reason="no /proc tells of children"
+    not Path(f"/proc/self/task/{os.getpid()}/children").exists(), reason="needs /proc to list child processes"
 )
 """Mark of tests that look for worker processes."""
 

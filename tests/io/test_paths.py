@@ -25,7 +25,7 @@ def scene(tmp_path: Path) -> Path:
     return path
 
 
-@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="pipes with names are of POSIX")
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="named pipes need POSIX")
 def test_a_pipe_is_rejected_as_a_file(tmp_path: Path, scene: Path, command_line: CommandLine) -> None:
     for name in ("a.ply", "a.spz", "a.las", "a.json"):
         os.mkfifo(tmp_path / name)

@@ -76,7 +76,7 @@ def test_a_dry_run_says_which_file_it_writes(tmp_path: Path, command_line: Comma
     assert {path.name for path in tmp_path.iterdir()} == {"ball.ply", "told.json"}
 
 
-@pytest.mark.skipif(peak_rss() is None, reason="the system tells no memory")
+@pytest.mark.skipif(peak_rss() is None, reason="peak memory cannot be read on this system")
 @pytest.mark.parametrize("source", ["scene", "photos"])
 def test_the_estimate_of_memory_is_close(source: str, tmp_path: Path) -> None:
     """The estimate includes the program itself, which dominates for a small scene."""

@@ -16,7 +16,7 @@ pub struct Pair {
     pub cost: f32,
 }
 
-/// The cluster of each ordered row ([`GONE`] if it has none).
+/// The cluster of each ordered row, or [`GONE`].
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Partition {
     pub of: Vec<u32>,
