@@ -15,7 +15,7 @@ from g2ard.io import Points
 from g2ard.report.base import Report
 from g2ard.scene.splats import Splats
 from helpers.commands import CommandLine, succeeds
-from helpers.scenes import ARRAYS, checkered_ball
+from helpers.scenes import ARRAYS, around, checkered_ball
 
 BALL = checkered_ball(1500)
 
@@ -44,6 +44,24 @@ def test_every_public_name_exists_and_no_function_is_a_module() -> None:
     assert set(dir(g2ard)) == set(g2ard.__all__)
     with pytest.raises(AttributeError, match="no attribute 'simplfy'"):
         g2ard.simplfy  # type: ignore[attr-defined]
+
+
+def test_results_print_as_one_short_line() -> None:
+    views = around(6)
+    done = g2ard.distill(BALL, count=150, views=views, steps=2, size=64)
+    recovered = g2ard.recover(BALL, done.held_out, g2ard.RecoverConfig(steps=2))
+    for result, expected in (
+        (BALL, "Splats(1,500 Gaussians, SH degree 1)"),
+        (views, "Cameras(6 views)"),
+        (g2ard.simplify(BALL, count=1, blind=True), "Simplified(1,500 → 1 Gaussian)"),
+        (g2ard.select(BALL, views, 2), "Selection(2 views, policy="),
+        (done, "Distilled(150 Gaussians, PSNR "),
+        (recovered, "Recovered(1,500 Gaussians, PSNR "),
+        (g2ard.evaluate(BALL, done.held_out), "Evaluation(1,500 Gaussians, 1 view: PSNR "),
+        (g2ard.render(BALL, views[0]), "Rendered(64 × 48)"),
+    ):
+        assert repr(result).startswith(expected)
+        assert len(repr(result)) < 80
 
 
 @pytest.mark.parametrize(

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard.errors import InputError
+from g2ard.progress import plural
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -58,6 +59,9 @@ class Points:
             raise InputError(
                 f"expected shape {self.positions.shape}, got {self.colors.shape}", parameter="colors"
             )
+
+    def __repr__(self) -> str:
+        return f"Points({plural(len(self), 'point')})"
 
     def __len__(self) -> int:
         return len(self.positions)

@@ -65,6 +65,9 @@ class Levels:
     splats: tuple[Splats, ...]
     reports: tuple[LevelReport, ...]
 
+    def __repr__(self) -> str:
+        return f"Levels({', '.join(f'{len(level):,}' for level in self.splats)} Gaussians)"
+
 
 def lod(
     scene: Splats | str | Path,

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from g2ard.pipeline.config import DistillConfig, SelectConfig
 from g2ard.pipeline.report import DistillReport, RoundReport, StageSeconds, ViewsReport
-from g2ard.progress import Progress, silent
+from g2ard.progress import Progress, plural, silent
 from g2ard.scene.splats import Splats
 from g2ard.scene.targets import Photos, PhotosOrRenders, Subset, Targets, fingerprint_of
 from g2ard.stages.recover import checkpoint as checkpoints
@@ -46,6 +46,11 @@ class Distilled:
     simplified: Splats
     report: DistillReport
     held_out: Targets | None = None
+
+    def __repr__(self) -> str:
+        gain = self.report.rounds[-1].recover[-1:]
+        scores = f", {gain[0].psnr}" if gain else ""
+        return f"Distilled({plural(len(self.splats), 'Gaussian')}{scores})"
 
 
 def distill(

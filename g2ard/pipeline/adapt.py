@@ -11,7 +11,7 @@ import numpy as np
 
 from g2ard.config.choices import ADAPT_SCHEDULES, AdaptSchedule
 from g2ard.errors import InputError, require
-from g2ard.progress import Progress, silent
+from g2ard.progress import Progress, plural, silent
 from g2ard.report.base import Report
 from g2ard.scene.appearance import blended, colour_change, recoloured, views_seeing
 from g2ard.scene.splats import Splats
@@ -146,6 +146,9 @@ class Adapted:
 
     splats: Splats
     report: AdaptReport
+
+    def __repr__(self) -> str:
+        return f"Adapted({plural(len(self.splats), 'Gaussian')}, {self.report.psnr})"
 
 
 @dataclass

@@ -151,6 +151,10 @@ class Rendered:
     depth: _Floats
     median: _Floats | None = None
 
+    def __repr__(self) -> str:
+        height, width = self.alpha.shape
+        return f"Rendered({width} × {height})"
+
 
 class Renderer:
     """Renderer for many views of one scene; prepares the scene once and reuses buffers.

@@ -156,6 +156,9 @@ class Cameras:
     def _error(self, index: int, message: str) -> InputError:
         return InputError(f"({self.names[index]}) {message}", index=index, item="view")
 
+    def __repr__(self) -> str:
+        return f"Cameras({plural(len(self), 'view')})"
+
     def __len__(self) -> int:
         return len(self.viewmats)
 

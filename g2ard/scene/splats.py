@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from g2ard.config.choices import RENDER_MODELS, RenderModel
 from g2ard.errors import InputError
+from g2ard.progress import plural
 
 SH_C0 = 0.28209479177387814
 """Band-0 spherical harmonic: colour = 0.5 + SH_C0 · sh0."""
@@ -117,6 +118,9 @@ class Splats:
 
     def __len__(self) -> int:
         return len(self.means)
+
+    def __repr__(self) -> str:
+        return f"Splats({plural(len(self), 'Gaussian')}, SH degree {self.sh_degree})"
 
     @property
     def sh_degree(self) -> int:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from g2ard.config.choices import BLACK, Colour
-from g2ard.progress import Progress, silent
+from g2ard.progress import Progress, plural, silent
 from g2ard.rendering.lpips import Lpips
 from g2ard.rendering.metrics import psnr, ssim
 from g2ard.scene.images import as_saved
@@ -47,6 +47,10 @@ class Evaluation:
     count: int
     bytes: int
     views: tuple[ViewScore, ...]
+
+    def __repr__(self) -> str:
+        scores = f"PSNR {self.psnr:.2f} dB, SSIM {self.ssim:.4f}"
+        return f"Evaluation({plural(self.count, 'Gaussian')}, {plural(len(self.views), 'view')}: {scores})"
 
     @property
     def psnr(self) -> float:

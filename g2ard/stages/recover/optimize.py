@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from g2ard.errors import InputError
-from g2ard.progress import Progress, silent
+from g2ard.progress import Progress, plural, silent
 from g2ard.scene.cameras import unseeing
 from g2ard.scene.splats import Splats
 from g2ard.scene.targets import Targets, fingerprint_of
@@ -44,6 +44,10 @@ class Recovered:
 
     splats: Splats
     report: RecoverReport
+
+    def __repr__(self) -> str:
+        done = self.report
+        return f"Recovered({plural(len(self.splats), 'Gaussian')}, {done.psnr}, {plural(done.steps, 'step')})"
 
 
 def recover(

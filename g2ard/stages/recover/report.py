@@ -16,6 +16,9 @@ class Gain(Report):
     before: float
     after: float
 
+    def __str__(self) -> str:
+        return f"PSNR {self.before:.2f} → {self.after:.2f} dB"
+
 
 @dataclass(frozen=True)
 class Trial(Report):

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from g2ard.config.choices import Keep
 from g2ard.errors import require
+from g2ard.progress import plural
 from g2ard.report.base import Report
 from g2ard.scene.cameras import Cameras
 
@@ -110,6 +111,9 @@ class Registered:
     cameras: Cameras
     report: RegisterReport
     matches: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        return f"Registered({len(self.cameras)} of {plural(len(self.report.photos), 'photo')})"
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from g2ard.config.choices import POLICIES, UNMEASURED
 from g2ard.errors import InputError
-from g2ard.progress import Progress, silent
+from g2ard.progress import Progress, plural, silent
 from g2ard.scene.cameras import Cameras, unseeing
 from g2ard.scene.splats import Splats
 from g2ard.stages.select import poses
@@ -56,6 +56,9 @@ class Selection:
     refused: Order
     evaluations: int = 0
     seconds: dict[str, float] = field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        return f"Selection({plural(len(self.order), 'view')}, policy={self.policy!r})"
 
 
 def select(

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from g2ard import _core
 from g2ard.errors import InputError
-from g2ard.progress import Progress, counter, silent
+from g2ard.progress import Progress, counter, plural, silent
 from g2ard.scene.prepared import PreparedScene, finite_rows_of, with_some_opacity
 from g2ard.scene.splats import DRAWN_LOGIT, Splats, unit_quats
 from g2ard.stages.simplify.config import METHODS, SimplifyConfig, round_counts
@@ -56,6 +56,9 @@ class Simplified:
     parents: NDArray[np.int64]
     protected: NDArray[np.bool_]
     report: SimplifyReport
+
+    def __repr__(self) -> str:
+        return f"Simplified({len(self.parents):,} → {plural(len(self.splats), 'Gaussian')})"
 
 
 def flag(
