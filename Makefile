@@ -8,7 +8,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK = 1
 
 RUST := $(shell find rust -name '*.rs' -o -name '*.wgsl' -o -name Cargo.toml) Cargo.toml Cargo.lock
 
-.PHONY: demo test lint docs stress fuzz fuzz-guided miri bench bench-kernels wheel wheel-linux release-check setup clean
+.PHONY: demo test lint docs stress fuzz fuzz-guided miri bench wheel wheel-linux release-check setup clean
 
 setup: $(VENV)/.built
 
@@ -77,10 +77,6 @@ SCENE ?= $(G2ARD_DATA)/playbot/0_0
 bench: setup
 	$(BIN)/python -m benchmarks run raster simplify $(SCENE) --ratios 10,30 -o bench/scene
 	$(BIN)/python -m benchmarks run $(STUDIES) -o bench $(QUICK)
-
-# The core's kernels alone, on synthetic scenes: no Python, no data, under a minute once built.
-bench-kernels:
-	cargo bench --quiet -p g2ard-core
 
 # A wheel for this system; nothing but maturin is installed for it.
 wheel: $(VENV)/.maturin
