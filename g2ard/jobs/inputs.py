@@ -246,6 +246,7 @@ def clutter_seen(
     splats: Splats,
     kinds: tuple[str, ...] | None = None,
     *,
+    strength: float = 0.0,
     seed: int = 0,
     progress: Progress = silent,
     say: Say = unsaid,
@@ -255,6 +256,7 @@ def clutter_seen(
     Args:
         splats: the scene.
         kinds: looked for; None for all of `g2ard.stages.clean.KINDS`.
+        strength: of removing haze and streaks, see `g2ard.stages.clean.find_clutter`; 0 removes none.
         seed: of the generated views.
         progress: receives planning and renders.
         say: receives log lines.
@@ -267,9 +269,9 @@ def clutter_seen(
     """
     from g2ard.poses import plan_pool
     from g2ard.rendering.visibility import visibility
-    from g2ard.stages.clean import KINDS, find_clutter, within_reach
+    from g2ard.stages.clean import FLOATING, KINDS, find_clutter, find_floating, within_reach
 
-    kinds = kinds or KINDS
+    kinds = tuple(kind for kind in kinds or KINDS if strength or kind not in FLOATING)
     pool = plan_pool(
         splats,
         _CLUTTER_VIEWS,
@@ -282,8 +284,11 @@ def clutter_seen(
     cameras = pool.cameras.resized(_CLUTTER_SIDE)
     seen = visibility(splats, cameras, progress)
     pixels = int((cameras.widths.astype(int) * cameras.heights).sum())
-    found = find_clutter(splats, seen, within_reach(splats, cameras, progress), pixels, kinds)
+    reached = within_reach(splats, cameras, progress)
+    floating = find_floating(splats, cameras, progress) if set(kinds) & set(FLOATING) else None
+    found = find_clutter(splats, seen, reached, pixels, kinds, floating=floating, strength=strength)
     parts = [f"{count:,} {name}" for name, count in found.counts.items() if name in kinds]
     gone = len(splats) - int(found.keep.sum())
-    say(f"{gone:,} of {plural(len(splats), 'Gaussian')} are clutter: {', '.join(parts)}")
+    light = f"{seen.weight[~found.keep].sum() / max(seen.weight.sum(), 1e-30):.1%} of the light"
+    say(f"{gone:,} of {plural(len(splats), 'Gaussian')} are clutter, with {light}: {', '.join(parts)}")
     return found, cameras

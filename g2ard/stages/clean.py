@@ -6,10 +6,13 @@
 | giant | larger than the scene, with the scene's centre within 3σ: fog over everything |
 | needle | ten times as long as wide, with both ends beyond the 3σ of every neighbour |
 | floater | in a connected group below a thousandth of the scene, by number and by light |
+| haze | on request: in front of the visible surface in most views |
+| streak | on request: ten times as long as wide, with an end in front of the surface in most views |
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,10 +23,12 @@ from g2ard import _core
 from g2ard.errors import InputError
 from g2ard.progress import Progress, silent
 from g2ard.rendering.renderer import Renderer
-from g2ard.scene.cameras import Cameras
+from g2ard.scene.cameras import Camera, Cameras
 from g2ard.scene.splats import DRAWN_LOGIT, Splats
 
-KINDS = ("invisible", "giant", "needle", "floater")
+KINDS = ("invisible", "giant", "needle", "floater", "haze", "streak")
+FLOATING = ("haze", "streak")
+"""Kinds that are found only with a strength."""
 
 _HALF_STEP = 0.5 / 255
 _REACH = 3.0
@@ -33,7 +38,7 @@ _SMALL = 1e-3
 """Share of the scene's Gaussians and of its light below which a separate group is a floater."""
 _NEIGHBORS = 16
 _BEHIND = 0.01
-"""Share of the depth by which a Gaussian may lie behind the visible surface and still be within reach."""
+"""Share of the depth within which a Gaussian belongs to the visible surface, behind or in front of it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +63,14 @@ class Cleaning:
 
 
 def find_clutter(
-    splats: Splats, seen: Any, looked: NDArray[np.bool_], pixels: int, kinds: tuple[str, ...] = KINDS
+    splats: Splats,
+    seen: Any,
+    looked: NDArray[np.bool_],
+    pixels: int,
+    kinds: tuple[str, ...] = KINDS,
+    *,
+    floating: Floating | None = None,
+    strength: float = 0.0,
 ) -> Cleaning:
     """Find Gaussians to remove; one of several kinds gets the first in the order of `KINDS`.
 
@@ -68,6 +80,8 @@ def find_clutter(
         looked: (N,) mask from `within_reach`: only these can be invisible, apart from α below 1/255.
         pixels: number of pixels of all views together.
         kinds: kinds to find.
+        floating: from `find_floating`; None finds neither haze nor streaks.
+        strength: 0 to 1: haze and streaks float in more than 1 − `strength` of the views.
 
     Raises:
         InputError: an unknown kind, or `seen` or `looked` of another length.
@@ -85,8 +99,11 @@ def find_clutter(
         "needle": lambda rest: _needles(splats, rest),
         "floater": lambda rest: _floaters(splats, rest, seen.weight, looked),
     }
+    if floating is not None:
+        finders["haze"] = lambda rest: floating.middle > 1 - strength
+        finders["streak"] = lambda rest: floating.ends > 1 - strength
     for number, name in enumerate(KINDS):
-        if name in kinds:
+        if name in kinds and name in finders:
             rest = (kind < 0) & ~hidden  # invisible Gaussians support nothing either
             found = finders[name](rest)
             kind[found & (kind < 0)] = number
@@ -114,22 +131,78 @@ def within_reach(splats: Splats, cameras: Cameras, progress: Progress = silent) 
     The surface is where half of a pixel's light is blocked. Gaussians deeper in all views, behind a wall or
     in an unseen corner, may be visible from elsewhere.
     """
-    renderer = Renderer(splats)
     means = splats.means.astype(np.float64) + splats.offset
     out = np.zeros(len(splats), bool)
+    for camera, depths in _surfaces(splats, cameras, progress):
+        rows, z, surface = _framed(means, camera, depths)
+        out[rows[(surface == 0) | (z < (1 + _BEHIND) * surface)]] = True
+    return out
+
+
+@dataclass(frozen=True, eq=False)
+class Floating:
+    """Share of the views in which each Gaussian floats.
+
+    Args:
+        middle: (N,) float64, share for its mean.
+        ends: (N,) float64, the larger share of its two ends (2σ); 0 unless it is ten times as long as wide.
+    """
+
+    middle: NDArray[np.float64]
+    ends: NDArray[np.float64]
+
+
+def find_floating(splats: Splats, cameras: Cameras, progress: Progress = silent) -> Floating:
+    """Return in which share of the views Gaussians float in front of the visible surface.
+
+    A point floats in a view if the surface behind it is further away than its Gaussian's standard deviation
+    along the ray and 1 % of the depth. Views that do not show the point, or show no surface behind it, do
+    not count. One more view counts as not floating, so that few views are weak evidence.
+    """
+    means = splats.means.astype(np.float64)
+    long, tips = _long(splats, np.arange(len(splats)))
+    points = np.concatenate([means, means[long] - tips, means[long] + tips]) + splats.offset
+    owners = np.concatenate([np.arange(len(splats)), long, long])
+    axes = _axes(splats.quats)
+    views, floats = np.ones(len(points)), np.zeros(len(points))
+    for camera, depths in _surfaces(splats, cameras, progress):
+        rows, z, surface = _framed(points, camera, depths)
+        shown = (surface > 0) & (z < (1 + _BEHIND) * surface)
+        rows, z, surface = rows[shown], z[shown], surface[shown]
+        rays = points[rows] - camera.position
+        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+        owner = owners[rows]
+        along = np.einsum("nji,nj->ni", axes[owner], rays) * splats.scales[owner]
+        views[rows] += 1
+        floats[rows] += z + np.linalg.norm(along, axis=1) < (1 - _BEHIND) * surface
+    shares = floats / views
+    ends = np.zeros(len(splats))
+    ends[long] = shares[len(splats) :].reshape(2, -1).max(axis=0)
+    return Floating(shares[: len(splats)], ends)
+
+
+def _surfaces(
+    splats: Splats, cameras: Cameras, progress: Progress
+) -> Iterator[tuple[Camera, NDArray[np.float32]]]:
+    """Yield each view with the (H, W) depths of the visible surface; 0 means no surface."""
+    renderer = Renderer(splats)
     for done, camera in enumerate(cameras, 1):
         depths = renderer.render(camera, median=True).median
         assert depths is not None
-        x, y, z = camera.viewmat[:3, :3] @ means.T + camera.viewmat[:3, 3:]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            u = np.floor(camera.K[0, 0] * x / z + camera.K[0, 2])
-            v = np.floor(camera.K[1, 1] * y / z + camera.K[1, 2])
-        framed = (z > 0) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
-        rows = np.flatnonzero(framed)
-        there = depths[v[rows].astype(int), u[rows].astype(int)]
-        out[rows[(there == 0) | (z[rows] < (1 + _BEHIND) * there)]] = True
+        yield camera, depths
         progress("depths", done, len(cameras), {})
-    return out
+
+
+def _framed(
+    points: NDArray[np.float64], camera: Camera, depths: NDArray[np.float32]
+) -> tuple[NDArray[np.intp], NDArray[np.float64], NDArray[np.float32]]:
+    """Return the rows of points in the frame, their depths, and the surface's depths at their pixels."""
+    x, y, z = camera.viewmat[:3, :3] @ points.T + camera.viewmat[:3, 3:]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        u = np.floor(camera.K[0, 0] * x / z + camera.K[0, 2])
+        v = np.floor(camera.K[1, 1] * y / z + camera.K[1, 2])
+    rows = np.flatnonzero((z > 0) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height))
+    return rows, z[rows], depths[v[rows].astype(int), u[rows].astype(int)]
 
 
 def _giants(splats: Splats) -> NDArray[np.bool_]:
@@ -159,13 +232,9 @@ def _needles(splats: Splats, rest: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """
     out = np.zeros(len(splats), bool)
     rows = np.flatnonzero(rest)
-    order = np.sort(splats.scales[rows], axis=1).astype(np.float64)
-    long = rows[order[:, 2] > _LONG * np.maximum(order[:, 1], 1e-30)]
+    long, reach = _long(splats, rows)
     if not len(long) or len(rows) <= 2 * _NEIGHBORS:
         return out
-    axis = np.argmax(splats.scales[long], axis=1)
-    along = np.take_along_axis(_axes(splats.quats[long]), axis[:, None, None], axis=2)[:, :, 0]
-    reach = 2 * splats.scales[long, axis].astype(np.float64)[:, None] * along
     means = splats.means.astype(np.float64)
     ends = np.concatenate([means[long] - reach, means[long] + reach])
     points = np.concatenate([means[rows], ends])
@@ -177,6 +246,15 @@ def _needles(splats: Splats, rest: NDArray[np.bool_]) -> NDArray[np.bool_]:
     covered &= away <= _REACH * splats.scales[other].max(axis=2)
     out[long[~covered.any(axis=1).reshape(2, -1).any(axis=0)]] = True
     return out
+
+
+def _long(splats: Splats, rows: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
+    """Return those of `rows` that are ten times as long as wide, and (n, 3) vectors from mean to end (2σ)."""
+    order = np.sort(splats.scales[rows], axis=1).astype(np.float64)
+    long = rows[order[:, 2] > _LONG * np.maximum(order[:, 1], 1e-30)]
+    axis = np.argmax(splats.scales[long], axis=1)
+    along = np.take_along_axis(_axes(splats.quats[long]), axis[:, None, None], axis=2)[:, :, 0]
+    return long, 2 * splats.scales[long, axis].astype(np.float64)[:, None] * along
 
 
 def _floaters(

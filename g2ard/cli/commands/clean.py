@@ -16,12 +16,14 @@ if TYPE_CHECKING:
     from g2ard.scene.splats import Splats
     from g2ard.stages.clean import Cleaning
 
-_WORDS = ("blue", "yellow", "pink", "red")
+_WORDS = ("blue", "yellow", "pink", "red", "cyan", "green")
 _COLORS = {
     "invisible": (0.20, 0.45, 0.95),
     "giant": (0.95, 0.85, 0.10),
     "needle": (0.90, 0.15, 0.75),
     "floater": (0.95, 0.25, 0.10),
+    "haze": (0.10, 0.80, 0.85),
+    "streak": (0.25, 0.80, 0.20),
 }
 
 
@@ -35,9 +37,19 @@ def clean(
     only: Annotated[
         str | None,
         typer.Option(
-            metavar="KIND,…", help="Kinds to remove: invisible, giant, needle, floater; all by default."
+            metavar="KIND,…",
+            help="Kinds to remove: invisible, giant, needle, floater, haze, streak; all by default.",
         ),
     ] = None,
+    strength: Annotated[
+        float,
+        typer.Option(
+            min=0,
+            max=1,
+            help="Also remove haze and streaks that float in front of the surface in more than 1 − STRENGTH "
+            "of the views: 0 none, 0.5 most, 1 all.",
+        ),
+    ] = 0,
     preview: Annotated[
         Path | None,
         typer.Option(
@@ -48,18 +60,20 @@ def clean(
         bool, typer.Option("--dry-run", help="Report what would be removed, write no scene.")
     ] = False,
 ) -> None:
-    """Remove clutter: invisible Gaussians, giants, needles and floaters.
+    """Remove clutter: invisible Gaussians, giants, needles and floaters; haze and streaks on request.
 
     Visibility is measured from generated views.
     """
     from g2ard import io
     from g2ard.errors import InputError
     from g2ard.jobs.inputs import clutter_seen
-    from g2ard.stages.clean import KINDS
+    from g2ard.stages.clean import FLOATING, KINDS
 
     kinds = KINDS if only is None else tuple(word.strip() for word in only.split(","))
     if wrong := [word for word in kinds if word not in KINDS]:
         raise typer.BadParameter(f"--only: expected {', '.join(KINDS)}, got {wrong[0]!r}")
+    if only is not None and not strength and (idle := [kind for kind in kinds if kind in FLOATING]):
+        raise typer.BadParameter(f"--only {idle[0]} needs --strength, such as 0.5")
     if output is None and not dry_run:
         raise typer.BadParameter("give an output with -o, or --dry-run")
     if output is not None and not dry_run:
@@ -71,7 +85,9 @@ def clean(
             raise typer.BadParameter(f"--preview: {preview} is also the input or output; name another file")
         io.check_output(preview, run.overwrite)
     splats = run.load(scene)
-    found, cameras = clutter_seen(splats, kinds, seed=run.seed, progress=run.progress, say=run.say)
+    found, cameras = clutter_seen(
+        splats, kinds, strength=strength, seed=run.seed, progress=run.progress, say=run.say
+    )
     if preview is not None:
         _paint(preview, splats, found, cameras, run.overwrite)
         run.kept.append(f"{preview} is written")
@@ -101,7 +117,7 @@ def _paint(path: Path, splats: Splats, found: Cleaning, cameras: Cameras, overwr
     renderers = [Renderer(scene) for scene in scenes]
     rows = [[r.clipped(cameras[int(view)]) for r in renderers] for view in chosen]
     counts = zip(_WORDS, found.counts.items(), strict=True)
-    legend = ", ".join(f"{word}: {count:,} {name}" for word, (name, count) in counts)
+    legend = ", ".join(f"{word}: {count:,} {name}" for word, (name, count) in counts if count)
     labels = [f"before: {len(splats):,}", "removed, in colour", f"after: {len(scenes[2]):,}"]
     sheet = contact_sheet(rows, labels, row_labels=[legend] * len(rows))
     write_png(path, sheet, overwrite=overwrite)
