@@ -37,7 +37,7 @@ PROTOCOLS: dict[str, tuple[str, ...]] = {
     "standing": ("near", "standing"),
     "anywhere": ("anywhere",),
 }
-"""Protocol → kinds of views to score; photos exist for the pool alone."""
+"""Protocol → kinds of views to score; photos exist for the pool, and for a scene's further score views."""
 
 _POOL = 128
 _MAX_LOGIT = 20.0
@@ -54,7 +54,7 @@ def kinds_for(protocol: str, scene: SceneSpec) -> tuple[str, ...]:
         return PROTOCOLS[protocol]
     if protocol not in ("all", "pool"):
         raise InputError("protocol: expected 'pool' for photos; other views need a trained scene")
-    return ("pool",)
+    return ("pool", *list(scene.score)[1:])
 
 
 def budget_of(count: int, ratio: float) -> int:
@@ -219,12 +219,13 @@ class Workspace:
 
     @cached_property
     def kinds_of_views(self) -> dict[str, Targets]:
-        """Kind of views → targets: "pool" (the scored views), and the protocol's others if there is room.
+        """Kind of views → targets: "pool" (those scored first), and the protocol's others if there is room.
 
         No method sees the others (`benchmarks.standing.standing_views`, `benchmarks.views.anywhere_views`).
         """
         found = {"pool": self.targets(next(iter(self.scored.values())))}
         wanted = kinds_for(getattr(self.study, "protocol", "all"), self.scene)
+        found |= {name: self.targets(cameras) for name, cameras in self.scored.items() if name in wanted}
         source, seed = self.place / self.scene.prior, self.study.pool_seed
         size, background = self.study.size, self.scene.background
         if "standing" in wanted:

@@ -16,6 +16,7 @@ from benchmarks.runner import Cell
 from benchmarks.score import score
 from benchmarks.study import SceneSpec, Study, checked, key
 from benchmarks.workspace import PROTOCOLS, Workspace, budget_of, kinds_for
+from g2ard.config.presets import PRESETS, configured
 from g2ard.errors import InputError
 from g2ard.pipeline import DistillConfig, distill
 from g2ard.rendering.visibility import visibility_source
@@ -26,7 +27,7 @@ from g2ard.stages.recover.anchors import PAPER_PRESETS, Anchors, Regularizers, d
 from g2ard.stages.recover.presets import preset_for
 from g2ard.stages.recover.report import RecoverReport
 from g2ard.stages.recover.schedule import PAPER, TUNED, Schedule
-from g2ard.stages.simplify import simplify
+from g2ard.stages.simplify import round_counts, simplify
 
 __all__ = ["Recover", "Variant"]
 
@@ -45,9 +46,10 @@ class Variant:
         horizon: steps to scale the paper's schedule to; by default its own.
         decay: whether the paper's schedule uses the default's decay.
         multiplier: multiplier of the rates; None chooses it.
-        round_share: steps per round relative to the last recovery; 0 recovers once.
         anchor: factor of the weight of L_anchor.
         shape: factor of the weight of L_shape.
+        preset: preset of a whole distillation, from selection on, that takes the place of all the above.
+        settings: its settings by full path.
     """
 
     name: str
@@ -56,9 +58,10 @@ class Variant:
     horizon: int | None = key(None, least=1)
     decay: bool = key(False)
     multiplier: float | None = key(None, least=0)
-    round_share: float = key(0.0, least=0)
     anchor: float = key(1.0, least=0)
     shape: float = key(1.0, least=0)
+    preset: str | None = key(None, choices=tuple(PRESETS))
+    settings: Mapping[str, Any] = key({})
 
     @property
     def plan(self) -> Schedule:
@@ -66,23 +69,24 @@ class Variant:
         if self.schedule == "paper":
             found = PAPER if self.horizon is None else PAPER.scaled(self.horizon)
             return replace(found, cosine_floor=TUNED.cosine_floor) if self.decay else found
-        rounds = round(self.round_share * TUNED.steps)
-        return replace(TUNED, round_steps=rounds, multiplier=self.multiplier or TUNED.multiplier)
+        return replace(TUNED, multiplier=self.multiplier or TUNED.multiplier)
 
 
 @dataclass(frozen=True)
 class Recover(Study):
-    """A study of recovery. All runs start from the same simplification; scoring does not count as time.
+    """A study of recovery. Scoring does not count as time.
+
+    All runs start from the same simplification, except those of variants with a preset: these distil anew,
+    and their CPU seconds include it.
 
     Args:
         methods: tables of `Variant`.
-        steps: steps of variants with the default schedule; only the last unless a variant runs each.
-        seconds: seconds of recovery over all rounds, instead of steps.
+        steps: steps of variants with the default schedule or a preset, over all rounds; only the last unless
+            a variant runs each.
         protocol: kinds of views to score: "pool", "standing" (near and standing views), "anywhere", or "all".
     """
 
     steps: tuple[int, ...] = key((1000,), least=1, axis=True)
-    seconds: float | None = key(None, least=1e-6)
     protocol: str = key("all", choices=tuple(PROTOCOLS), axis=True)
 
     @classmethod
@@ -102,7 +106,7 @@ class Recover(Study):
             for variant in self.methods:
                 for steps in self.steps if variant.each else self.steps[-1:]:
                     name = f"{variant.name}@{steps}" if variant.each else variant.name
-                    horizon = None if variant.schedule == "paper" or self.seconds else steps
+                    horizon = None if variant.schedule == "paper" else steps
                     for seed in self.seeds:
                         names = {"scene": label, "ratio": ratio, "variant": name, "seed": seed}
                         run = partial(self._run, place, ratio, variant, horizon, seed, kinds)
@@ -185,9 +189,37 @@ class _Workspace(Workspace):
         own = PAPER_PRESETS[why.split()[0]] if variant.schedule == "paper" else preset
         return replace(own, anchor=own.anchor * variant.anchor, shape=own.shape * variant.shape)
 
+    def distillation(self, variant: Variant, budget: int, steps: int, seed: int) -> DistillConfig:
+        """Return the configuration of a variant with a preset, with the regularisers of this scene's kind.
+
+        Its recoveries take `steps` together, in its schedule's proportion, unless `recover.steps` is set.
+        """
+        assert variant.preset is not None
+        given = {**PRESETS[variant.preset], **variant.settings}
+        views = self.train_cameras if self.scene.targets == "photos" else None
+        weights, _, _ = preset_for(given.get("recover.regularizers", "auto"), self.splats, views)
+        values = {
+            **variant.settings,
+            "recover.regularizers": weights,
+            "recover.sh_degree": self.sh_degree,
+            "recover.background": self.scene.background,
+            "recover.seed": seed,
+        }
+        config = configured(DistillConfig(), variant.preset, values)
+        if config.recover.steps is not None:
+            return config
+        schedule, simplification = config.recover.schedule, config.simplify
+        kept = simplification.retention_of("paper")
+        rounds = round_counts(len(self.splats), budget, kept, simplification.fold)
+        early = len(rounds) if schedule.round_steps else 0
+        share = schedule.steps / (schedule.steps + early * schedule.round_steps)
+        schedule = schedule.scaled(round(share * steps))
+        last = steps - early * schedule.round_steps
+        return replace(config, recover=replace(config.recover, schedule=schedule, steps=last))
+
 
 class _Run:
-    """A recovery, or a chain of recoveries, with scores along the way."""
+    """A recovery, or a chain of recoveries, with scores along the way; or a whole distillation."""
 
     def __init__(
         self,
@@ -203,11 +235,13 @@ class _Run:
         self.options: dict[str, Any] = {
             "schedule": self.plan,
             "steps": steps,
-            "recovery_time": place.study.seconds,
             "regularizers": place.weights(variant),
             "background": place.scene.background,
             "seed": seed,
         }
+        self.config: DistillConfig | None = None
+        if variant.preset is not None and steps is not None:
+            self.config = place.distillation(variant, self.budget, steps, seed)
         self.found: list[Row] = []
         self.simplify_s = 0.0
         self.before = self.now = 0.0  # seconds of finished recoveries and of the current one
@@ -215,10 +249,10 @@ class _Run:
 
     def rows(self) -> list[Row]:
         """Run, and return a row per score and kind of views."""
-        done, started, reports = (self._chain if self.plan.round_steps else self._once)()
+        done, started, reports = (self._chain if self.config or self.plan.round_steps else self._once)()
         self._count_cpu()
         _check_finite(done, [loss for report in reports for loss in report.loss])
-        spent = sum(report.seconds for report in reports)
+        spent, steps = sum(r.seconds for r in reports), sum(r.steps for r in reports)
         extra = sum(report.seconds * report.regularizers.share for report in reports)
         end = {
             "simplify_s": self.simplify_s,
@@ -226,7 +260,7 @@ class _Run:
             "reg_share": extra / max(spent, 1e-9),
             "skipped": sum(report.skipped["non_finite"] for report in reports),
         }
-        return [*self.found, *({**row, **end} for row in self._looks(done, reports[-1].steps, spent, 1))]
+        return [*self.found, *({**row, **end} for row in self._looks(done, steps, spent, 1))]
 
     def _once(self) -> tuple[Splats, Splats, list[RecoverReport]]:
         targets = self.place.train_targets
@@ -236,9 +270,13 @@ class _Run:
         return done.splats, start, [done.report]
 
     def _chain(self) -> tuple[Splats, Splats, list[RecoverReport]]:
-        place = self.place
-        config = DistillConfig(recover=RecoverConfig(**self.options, sh_degree=place.sh_degree))
-        done = distill(place.splats, self.budget, place.train_targets, config, watch=self._watch)
+        place, targets = self.place, self.place.train_targets
+        watch = self._watch if self.config is None else None
+        config = self.config or DistillConfig(
+            recover=RecoverConfig(**self.options, sh_degree=place.sh_degree)
+        )
+        self.cpu_began = time.process_time()
+        done = distill(place.splats, self.budget, targets, config, watch=watch)
         self.simplify_s = done.report.seconds.simplify
         reports = [report for entry in done.report.rounds for report in entry.recover]
         return done.splats, done.simplified, reports

@@ -60,14 +60,12 @@ def test_curves_compare_schedules(scene: SceneSpec, tmp_path: Path) -> None:
     assert never[2][0][-2:] == ["never", "–"]
 
 
-def test_rounds_take_the_time_they_are_given(scene: SceneSpec, tmp_path: Path) -> None:
-    found = ask(scene, tmp_path, "rounds", ratios="3", seconds="2.0")
-    ends = [row for row in found if row["final"]]
-    assert [row["variant"] for row in ends] == ["one-shot", "rounds", "light-rounds"]
-    assert {row["count"] for row in ends} == {500}
-    for row in ends:
-        assert 1.5 <= row["seconds"] < 2.8  # a round that only loses ends at three quarters of its time
-    assert any(row["count"] > 500 for row in found)  # looks within rounds
+def test_a_preset_distils_anew_in_as_many_steps(scene: SceneSpec, tmp_path: Path) -> None:
+    found = ask(scene, tmp_path, "rounds", ratios="3", steps="60", seeds="0")
+    assert [row["variant"] for row in found] == ["one-shot", "rounds", "one-shot, twice the steps"]
+    assert [row["step"] for row in found] == [60, 60, 800]
+    assert {row["count"] for row in found} == {500}
+    assert found[0]["psnr"] != found[1]["psnr"]
 
 
 def test_every_kind_of_view_is_scored(scene: SceneSpec, tmp_path: Path) -> None:
