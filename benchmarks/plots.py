@@ -81,9 +81,7 @@ def plots() -> dict[str, str]:
     return {
         "simplify-pool.svg": lead("pool"),
         "simplify-standing.svg": lead("standing"),
-        "recover-guitar.svg": curve(
-            "guitar 400px", ("default@300", "default@1000", "default@2000", "paper/10")
-        ),
+        "recover-guitar.svg": curve("guitar 400px", ("default@300", "default@1000", "default@2000")),
         "recover-playbot.svg": curve("playbot/0_0 800px", ("default@300", "default@1000", "default@3000")),
     }
 

@@ -121,7 +121,7 @@ def simplify(
     `paper` works in rounds that keep 75 %. Each drops α < 0.01, merges cell × colour-bin groups by moment
     matching if the affine-energy and surface-coverage guards pass, down to the round's count, and trims the
     rest by π = −log(1 − α)·A·(1 + λ_h·p) (eq. `importance`). Every round has about one cell per Gaussian of
-    the final budget (see `docs/paper.md` for our reading of the paper).
+    the final budget (`docs/g2ard-and-the-paper.md` has our reading).
 
     Rows below the method's least α are dropped first, unless the budget needs them. The result does not
     depend on the order of the rows, the unit, or the number of threads.

@@ -28,7 +28,7 @@ _OF_METHOD = ("min_opacity", "morton_premerge_ratio", "morton_premerge_steps")
 @dataclass(frozen=True)
 class SimplifyConfig:
     """Constants of simplification: the paper's (`tab:s_config`) if it states them, otherwise measured ones
-    (`docs/paper.md`, `docs/methods`).
+    (`docs/g2ard-and-the-paper.md`, `docs/methods`).
 
     Args:
         method: "default", "fast" or "paper", see `g2ard.stages.simplify.simplify`.
