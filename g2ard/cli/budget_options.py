@@ -157,7 +157,7 @@ LooksOption = Annotated[
         "--count",
         parser=Count.parse,
         metavar="COUNT",
-        help="Number of views to generate; with --color flags, cells or parents the Gaussians to keep.",
+        help="Views to generate. With --color flags, cells or parents: Gaussians to keep.",
     ),
 ]
 RatioOption = Annotated[

@@ -81,9 +81,9 @@ def preset(name: str = "paper", config: Any = None) -> Any:
 
     `paper` follows the paper (`tab:s_config`, `tab:s_avs`, `tab:s_recovery`): simplification in rounds that
     keep 75 %; half of the views, selected directionally once from the raw prior and drawn uniformly; 8,000
-    steps after every round and 30,000 at the end, without going back; anchors from each round's construction;
-    SH degree 3; 7,000 steps of adaptation. `docs/g2ard-and-the-paper.md` lists the readings of what
-    the paper leaves open.
+    steps after every round and 30,000 at the end, none of them undone; anchors from each round's
+    construction; SH degree 3; 7,000 steps of adaptation. `docs/g2ard-and-the-paper.md` lists the readings of
+    what the paper leaves open.
 
     Args:
         name: auto, trained, lift, noisy, paper, paper-trained, paper-lift or paper-noisy. `auto` and `paper`

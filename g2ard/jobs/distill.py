@@ -68,7 +68,7 @@ def distill(
         ratio: reduction factor, at least 1.
         fit: largest file, such as "5MB", or a device (see `Budget`).
         min_psnr: PSNR (dB) that simplification alone must keep against the scene, in generated views.
-        min_ssim: SSIM to keep likewise; with `min_psnr` both hold. `say` receives the result's quality.
+        min_ssim: SSIM that it must keep; with `min_psnr` both hold. `say` receives the result's quality.
         views, photos, held_out, beside, up, size, clean, render_model, format, preset: see
             `g2ard.DistillOptions`.
         settings: values of `g2ard.DistillConfig` by path, such as {"recover.schedule.rates.means": 1e-3};

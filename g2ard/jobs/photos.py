@@ -70,7 +70,7 @@ def points_of_photos(
     Args:
         views: cameras with photos, or their path; only training views are used.
         held_out: separate views for scoring; all of `views` are then for training.
-        count: least number of points; None means only the sparse points.
+        count: minimum number of points; None means only the sparse points.
         asked: the kind of budget if it is not a count: ratio, share, fit, min_psnr or min_ssim.
         background: RGB of empty pixels.
         seed: seed of the rays.

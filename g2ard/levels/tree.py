@@ -35,7 +35,7 @@ class Cut:
     and holds more than `least`. The defaults are those of PlayCanvas' writer.
 
     Args:
-        most: most Gaussians of a leaf, and roughly of a file.
+        most: maximum Gaussians of a leaf, and roughly of a file.
         extent: longest side of the box of a leaf's means, scene units.
         least: a wide node with at most this many Gaussians stays whole; otherwise sky and floaters would
             become thousands of leaves.

@@ -32,15 +32,15 @@ class AdaptConfig(FitConfig):
     """Options of adaptation, in addition to `FitConfig`.
 
     Args:
-        steps: most steps; 7,000 as in the paper.
-        tolerance: fitting stops after a stretch that gains less than this on the training views, dB; 0 takes
-            all steps.
+        steps: maximum number of steps; 7,000 as in the paper.
+        tolerance: gain on the training views, dB, below which fitting stops after a stretch; 0 takes all
+            steps.
         schedule: "default" takes stretches of 500, 1,000, 2,000 … steps with cosine decay; "paper" takes all
             steps at once, with rates that decay to a tenth, without colour change or blending.
         prior_views: weight of the appearance before the fit, in views. A Gaussian seen by v views moves v/(v
             + prior_views) of the way to its fit. 0 keeps the fit.
         first_stretch: steps of the first stretch.
-        colour_worth: least gain (dB) on the images for changing all colours at once.
+        colour_worth: smallest gain on the images, dB, for which all colours are changed at once.
         recovery: rates and decay of a stretch with frozen geometry, see `appearance_only`; None means those
             of `schedule`.
 

@@ -25,8 +25,8 @@ class SelectConfig(CoverageOptions):
         weighted: draw views by weight, so that crowded poses do not dominate. On a crowded pool this beats
             uniform draws, and any selection of a tenth of the views.
         reselect: select again from every round's scene instead of once from the prior.
-        anywhere: share of the training views that look from anywhere, in addition to generated views or to
-            given ones without photos; None means 40 % of the share of the scene that a usual view misses.
+        anywhere: share of training views from anywhere in free space. They are added to generated views, and
+            to given ones without photos. None means 40 % of the share of the scene that a usual view misses.
     """
 
     views_count: int | float | Literal["auto"] | None = None

@@ -38,9 +38,9 @@ def make_pool(
         kind: "orbit" (around an object, elevations −5° to 50°), "walk" (at eye height in free space, through
             rooms and streets), "aerial" (straight down and oblique), "inside" (surrounded by matter), "focus"
             (free places whose image is full and sharp), or "auto". "auto" places poses within rooms in
-            proportion to their share of the scene. Outside rooms, poses orbit an object, or view a landscape
-            from the air (three quarters) and from the ground (one quarter), where that is in focus. The
-            remaining poses walk, or stand where the scene is in focus.
+            proportion to their share of the scene. An object is orbited. A landscape is seen from the air by
+            three quarters of the poses and from the ground by one, where that is in focus. The remaining
+            poses walk, or stand where the scene is in focus.
         size: width and height in pixels.
         fov: horizontal field of view, degrees; None means 50, and 70 for a pool within rooms.
         up: (3,) direction away from the ground; None to estimate it.

@@ -133,8 +133,8 @@ class _Cached(ABC):
 class Photos(_Cached):
     """Photos of `cameras`, undistorted and at each camera's size; cached as 8-bit.
 
-    Alpha is composited over the background. A photo with a mask is black outside of it. For a photo with an
-    exposure, the affine colour transform C that trainers fit (photo = C·render), C is inverted.
+    Alpha is composited over the background. A photo with a mask is black outside of it. An exposure is the
+    affine colour transform C that trainers fit (photo = C·render); a photo that has one is mapped by C⁻¹.
 
     Args:
         cameras: views, all with a photo.

@@ -62,7 +62,7 @@ def ingest(
         source: one or more scenes as accepted by `g2ard.io.open_stream`, one or more coloured point clouds as
             accepted by `g2ard.io.open_point_stream`, or a scene stream.
         folder: output folder: absent, empty, or with these tiles, complete or partial.
-        tile_rows: most Gaussians per tile; exceeded only if more of them share one position.
+        tile_rows: maximum Gaussians per tile; exceeded only if more of them share one position.
         block_rows: rows in memory at a time; None means 16 MiB of rows.
         lift: constants for lifting points; None means `LiftConfig()`.
         like: reuse the tree and margin of these tiles, ignoring `tile_rows`.
@@ -72,7 +72,7 @@ def ingest(
         say: called with messages.
 
     Raises:
-        InputError: the source cannot be read, or `tile_rows` is less than 1 or a 10,000th of its rows.
+        InputError: the source cannot be read, or `tile_rows` is less than 1 or than a 10,000th of the rows.
         OutputError: the folder holds something else, another process writes there, or the disk has too
             little room.
 

@@ -118,7 +118,7 @@ def cut_tree(points: Points, rows_each: float, most: int) -> KdTree:
     Args:
         points: (N, 3) float32, finite: all rows or a sample.
         rows_each: rows per point; 1 for all rows.
-        most: most rows of a leaf.
+        most: maximum rows of a leaf.
 
     Returns:
         A tree; a leaf whose points all coincide may hold more.

@@ -123,7 +123,7 @@ def pour(
         folder: an existing folder: empty, or with a journal of the same key.
         key: hash of everything that determines the content.
         feed: the rows.
-        tile_rows: most rows per tile.
+        tile_rows: maximum rows per tile.
         rows: rows in memory at a time.
         progress: called with the number of rows read.
         say: called with messages.

@@ -110,8 +110,8 @@ def lod(
         typer.Option(
             "--georeference",
             metavar="LON,LAT,HEIGHT[,HEADING]|EPSG:CODE",
-            help="Place 3D Tiles on the globe: degrees and metres of the scene's offset, and the direction "
-            "of its y axis (z if -y is up), clockwise from north; or the map system of its coordinates.",
+            help="Place 3D Tiles on the globe: longitude, latitude and height of the scene's offset, and the "
+            "heading of its y axis (z if -y is up), degrees from north; or its coordinates' map system.",
         ),
     ] = None,
     views: ViewsOrMadeOption = None,

@@ -68,8 +68,8 @@ def recover(
 
     L = (1−λ)·L1 + λ·(1−SSIM), plus λ_a·L_anchor + λ_s·L_shape every `period` steps. No Gaussian is added or
     removed. If PSNR on a sample of training views falls below the student's, recovery returns to the best
-    scene and continues with a third of the rates. A student that only gets worse is returned unchanged. A
-    schedule that is not `guarded`, such as the paper's, always takes all its steps.
+    scene and continues at a third of the learning rates. A student that only gets worse is returned
+    unchanged. A schedule that is not `guarded`, such as the paper's, always takes all its steps.
 
     Args:
         student: the scene to recover; cameras are in world coordinates, including its offset.

@@ -22,27 +22,27 @@ class RegisterConfig:
         refine: refinement after features: "none" keeps their pose, "photometric" aligns from it, "auto"
             combines both, "exact" polishes the result (or alignment's) by the exact gradient of renders
             (`g2ard.stages.register.polish`).
-        passes: most passes of rendering, matching and solving.
+        passes: maximum number of passes of rendering, matching and solving.
         coarsest: approximate longer side in pixels of the coarsest alignment level; each level doubles it.
-        iterations: most iterations per level.
+        iterations: maximum iterations per level.
         still: the finest level ends when a step moves the image by fewer pixels (root mean square), coarser
             ones at ten times this.
-        accept: least median local ZNCC for status "registered".
-        doubt: least median local ZNCC for status "uncertain"; below, a photo is "refused".
+        accept: lowest median local ZNCC for status "registered".
+        doubt: lowest median local ZNCC for status "uncertain"; below, a photo is "refused".
         max_angle_sigma: largest σ of the rotation for "registered", degrees.
         max_position_sigma: largest σ of the position for "registered", as a share of the median depth.
         min_alpha: render pixels with less alpha are ignored.
         max_edge: pixels next to a relative depth jump above this are ignored.
-        min_overlap: least share of valid pixels.
+        min_overlap: smallest share of valid pixels.
         window: side of ZNCC's windows in pixels.
         candidates: number of pool poses tried, ranked by renders of `pool_size` pixels.
         pool_size: longer side of those renders in pixels.
         correlated: factor on variances, because neighbouring residuals are correlated; calibrated at 500
             pixels on photos of caliterra and of the city.
-        features: most SIFT features per image.
+        features: maximum SIFT features per image.
         ratio: SIFT's ratio test: largest ratio of the nearest to the second nearest distance.
         max_reprojection: largest reprojection error of an inlier, pixels.
-        min_inliers: least inliers of a pose from features.
+        min_inliers: minimum inliers of a pose from features.
         fallback: try alignment if features fail.
         alike: factor on the variances of poses from features, like `correlated`.
 

@@ -39,7 +39,7 @@ def matcher_named(name: str, ratio: float, most: int) -> Matcher | None:
     Args:
         name: "auto" (SIFT if the extra `register` is installed), "sift", "direct" or "MODULE:FUNCTION".
         ratio: SIFT's ratio test, see `mutual`.
-        most: most SIFT features per image.
+        most: maximum SIFT features per image.
 
     Raises:
         InputError: an unknown name, module or function.
@@ -146,7 +146,7 @@ class Sift:
 
     Args:
         ratio: see `mutual`.
-        most: most features per image; the strongest are kept.
+        most: maximum features per image; the strongest are kept.
     """
 
     def __init__(self, ratio: float, most: int) -> None:

@@ -80,7 +80,7 @@ def solve(
         mask: (H, W) valid pixels.
         match: see `g2ard.stages.register.matchers`.
         config: see `RegisterConfig`.
-        passes: most renders.
+        passes: maximum number of renders.
 
     Returns:
         The last pass that gave a pose; None if the first did not.

@@ -48,7 +48,7 @@ class Simplified:
         splats: exactly `budget` Gaussians, in an order that depends only on the scene's content. Their
             geometry serves as recovery's anchors.
         parents: (N,) int64, output row of each input row; −1 if it was dropped or trimmed.
-        protected: (M,) bool, flags, the OR of all rows merged into each.
+        protected: (M,) bool, whether any of the rows merged into a Gaussian is protected.
         report: figures of the simplification.
     """
 
