@@ -9,14 +9,18 @@ import json
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+import numpy as np
 
 from g2ard.config.choices import ViewFormat
 from g2ard.errors import OutputError
+from g2ard.io.paths import real_path
+from g2ard.io.photos import inverse
+from g2ard.io.transforms import FLIP
 from g2ard.progress import plural
-
-if TYPE_CHECKING:
-    from g2ard.scene.cameras import Cameras
+from g2ard.scene.cameras import Cameras
+from g2ard.scene.transform import quaternion_of
 
 _OFF_CENTRE = 0.5
 """Distance in pixels of a principal point from the middle that is worth a note."""
@@ -90,11 +94,6 @@ def write_nerfstudio(path: Path, cameras: Cameras, place: Path, splits: Sequence
         place: the final path, which photos are relative to.
         splits: "train", "test" or another word per view, or ().
     """
-    import numpy as np
-
-    from g2ard.io.photos import inverse
-    from g2ard.io.transforms import FLIP
-
     lenses = [_lens(cameras, i) for i in range(len(cameras))]
     shared = lenses[0] if all(lens == lenses[0] for lens in lenses) else {}
     frames: list[dict[str, Any]] = []
@@ -115,8 +114,6 @@ def write_nerfstudio(path: Path, cameras: Cameras, place: Path, splits: Sequence
 
 def write_colmap(folder: Path, cameras: Cameras) -> None:
     """Write sparse/0 with cameras.txt, images.txt and an empty points3D.txt; a camera per lens."""
-    from g2ard.scene.transform import quaternion_of
-
     lenses: dict[str, int] = {}
     images = []
     for i, viewmat in enumerate(cameras.viewmats):
@@ -160,8 +157,6 @@ def _lines(rows: list[dict[str, Any]]) -> str:
 
 def beside(photo: Path | None, place: Path) -> str | None:
     """Return a photo's path relative to the folder of `place`."""
-    from g2ard.io.paths import real_path
-
     if photo is None:
         return None
     try:

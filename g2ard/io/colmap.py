@@ -6,17 +6,15 @@ import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
 
 from g2ard.errors import DAMAGED, InputError
+from g2ard.io.photos import Frame, photo_size, rotation, view_set
 from g2ard.io.records import Record
-
-if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
-    from g2ard.io.photos import Frame
-    from g2ard.io.types import ViewSet
+from g2ard.io.types import ViewSet
 
 _MODELS = (
     *("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV"),
@@ -94,15 +92,11 @@ def read(path: Path, images: Path | None = None) -> ViewSet:
         images: folder of the photos; by default `images` beside or above the model. Cameras are scaled to
             resized photos (Mip-NeRF 360's images_2, images_4).
     """
-    from g2ard.io.photos import view_set
-
     return view_set(*frames(path, images))
 
 
 def frames(path: Path, images: Path | None = None) -> tuple[Path, list[Frame]]:
     """Return the model's folder and its frames, with or without photos."""
-    from g2ard.io.photos import Frame, photo_size
-
     if images is None and (beside := photos_beside(path)):
         path, images = beside
     folder = model_folder(path)
@@ -140,10 +134,6 @@ def _photo_folder(path: Path, model: Path) -> Path | None:
 
 
 def _viewmat(path: Path, image: _Image) -> NDArray[np.float64]:
-    import numpy as np
-
-    from g2ard.io.photos import rotation
-
     if not any(image.quat):
         raise InputError(f"{image.name!r}: its quaternion is zero", path=path)
     view = np.eye(4)
@@ -153,8 +143,6 @@ def _viewmat(path: Path, image: _Image) -> NDArray[np.float64]:
 
 
 def _camera(path: Path, model: str, size: tuple[int, int], p: tuple[float, ...]) -> _Camera:
-    import numpy as np
-
     if model not in _PARAMETERS:
         known = ", ".join(_PARAMETERS)
         raise InputError(

@@ -8,13 +8,12 @@ import sys
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from g2ard.errors import InputError
-
-if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
 
 _LARGEST = sys.float_info.max
 _SHOWN = 40
@@ -184,8 +183,6 @@ def number(holder: Fields, key: str, default: float | None = None) -> float:
 
 def matrix(holder: Fields, key: str) -> NDArray[np.float64]:
     """Return a matrix of 3×4 or 4×4 numbers."""
-    import numpy as np
-
     rows = 3 if len(listed(holder, key)) == 3 else 4
     return np.array(numbers(holder, key, rows, 4))
 

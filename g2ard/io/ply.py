@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.lib.recfunctions import structured_to_unstructured
 from numpy.typing import NDArray
 
 from g2ard.config.choices import RenderModel
@@ -154,8 +155,6 @@ def _recentre(sample: NDArray[Any]) -> NDArray[np.float64]:
 
 
 def _read_block(block: NDArray[Any], raw: Raw, at: slice, layout: _Layout) -> None:
-    from numpy.lib.recfunctions import structured_to_unstructured
-
     rest, stored = layout.rest, layout.stored
     raw.means[at] = _means(block, layout.shift)
     raw.sh0[at, 0] = structured_to_unstructured(block[_DC])
@@ -173,8 +172,6 @@ def _read_block(block: NDArray[Any], raw: Raw, at: slice, layout: _Layout) -> No
 
 
 def _means(block: NDArray[Any], shift: NDArray[np.float64]) -> NDArray[np.float32]:
-    from numpy.lib.recfunctions import structured_to_unstructured
-
     means = structured_to_unstructured(block[_MEANS])
     return np.asarray(means - shift if shift.any() else means, np.float32)
 

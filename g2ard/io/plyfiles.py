@@ -6,14 +6,13 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
 
 from g2ard.config.choices import RenderModel
 from g2ard.errors import DAMAGED, InputError
-
-if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
 
 _OFFSET = re.compile(r"g2ard offset (\S+) (\S+) (\S+)$")
 _RENDER_MODES: dict[str, RenderModel | Literal["2dgs"]] = {
@@ -89,8 +88,6 @@ def _header_line(header: PlyHeader, words: list[str]) -> None:
 
 def offset_of(path: Path, header: PlyHeader) -> NDArray[np.float64]:
     """Return the (3,) offset of a comment `g2ard offset X Y Z`; zeros without one."""
-    import numpy as np
-
     for comment in header.comments:
         if match := _OFFSET.match(comment):
             try:
@@ -157,8 +154,6 @@ def row_blocks(
 
     Mapped rows are read with file reads, since mapped pages count as memory of the process.
     """
-    import numpy as np
-
     for first in range(start, len(every), rows):
         count = min(rows, len(every) - first)
         if not isinstance(every, np.memmap):
@@ -172,8 +167,6 @@ def row_blocks(
 
 def spread_rows(rows: NDArray[Any]) -> NDArray[Any]:
     """Return about 100,000 evenly spaced rows, without loading the pages between them."""
-    import numpy as np
-
     step = max(1, len(rows) // 100_000)
     if not isinstance(rows, np.memmap) or step == 1:
         return np.asarray(rows[::step])

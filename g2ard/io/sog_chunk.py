@@ -7,18 +7,17 @@ import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL.Image import Image
 
 from g2ard.config.choices import RenderModel
 from g2ard.errors import InputError
 from g2ard.io.jsonfile import Fields, listed, names_of, numbers, object_of, whole
-
-if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-    from PIL.Image import Image
-
-    from g2ard.io.sanitize import Raw
+from g2ard.io.limits import opened_image
+from g2ard.io.sanitize import BLOCK, Raw
 
 _COEFFICIENTS = {0: 0, 1: 3, 2: 8, 3: 15}
 _LARGEST = float.fromhex("0x1.fffffep+127")
@@ -83,8 +82,6 @@ def _opened_image(chunk: Chunk, name: str) -> Iterator[Image]:
         WebPImagePlugin,  # noqa: F401  (Pillow would load all its formats to find this one)
     )
 
-    from g2ard.io.limits import opened_image
-
     try:
         data = chunk.load(name)
     except (KeyError, FileNotFoundError) as error:
@@ -97,8 +94,6 @@ def _opened_image(chunk: Chunk, name: str) -> Iterator[Image]:
 
 def _image(chunk: Chunk, name: str) -> NDArray[np.uint8]:
     """Return (height, width, 4) bytes."""
-    import numpy as np
-
     with _opened_image(chunk, name) as image:
         return np.asarray(image.convert("RGBA"))
 
@@ -131,8 +126,6 @@ class Decoder:
 
     def fill(self, rows: slice, raw: Raw) -> None:
         """Decode the Gaussians `rows` into `raw` in blocks that fit into the cache."""
-        from g2ard.io.sanitize import BLOCK
-
         for start in range(rows.start, rows.stop, BLOCK):
             stop = min(start + BLOCK, rows.stop)
             self._fill(slice(start, stop), raw.take(slice(start - rows.start, stop - rows.start)))
@@ -149,8 +142,6 @@ class Decoder:
 
     def _fill_rest(self, rows: slice, out: NDArray[np.float32]) -> None:
         """Look up palette entries by label."""
-        import numpy as np
-
         index = self._labels[rows, 0] + (self._labels[rows, 1].astype(np.intp) << 8)
         if index.max() >= len(self._palette):
             row = int(np.argmax(index >= len(self._palette)))
@@ -165,8 +156,6 @@ class Decoder:
 
 def means_of(chunk: Chunk, count: int) -> NDArray[np.float32]:
     """Decode only the (count, 3) means."""
-    import numpy as np
-
     part = object_of(chunk.meta, "means")
     low, high = (_rows(chunk, name, count) for name in names_of(part, "files", 2))
     means = np.empty((count, 3), np.float32)
@@ -184,8 +173,6 @@ def _fill_means(
 
 def _positions(part: Fields) -> NDArray[Any]:
     """Return the (3, 65536) values of codes per axis, which are stored as sign(x)·ln(|x| + 1)."""
-    import numpy as np
-
     low, high = (_bound(part, end, slice(3), _LARGEST_LOG) for end in ("mins", "maxs"))
     logs = low + (high - low) * (np.arange(65536)[:, None] / 65535)
     return (np.sign(logs) * np.expm1(np.abs(logs))).T.astype(np.float32)
@@ -193,8 +180,6 @@ def _positions(part: Fields) -> NDArray[Any]:
 
 def _logits(part: Fields) -> NDArray[Any]:
     """Return the (256,) logits of opacity bytes, which are α in version 2 and logits in version 1."""
-    import numpy as np
-
     alpha = np.arange(256) / 255
     if "codebook" not in part:
         low, high = (_bound(part, end, 3) for end in ("mins", "maxs"))
@@ -207,8 +192,6 @@ class _Values:
     """Values of bytes: from a codebook (version 2), or between mins and maxs (version 1)."""
 
     def __init__(self, part: Fields) -> None:
-        import numpy as np
-
         self._place = part.place.to("codebook")
         self._book: NDArray[Any] | None = None
         if "codebook" in part:
@@ -229,8 +212,6 @@ class _Values:
 
 def _bound(part: Fields, key: str, channels: slice | int, most: float = _LARGEST) -> NDArray[Any]:
     """Return a bound: one number for all channels, or a list per channel with opacity as the fourth."""
-    import numpy as np
-
     if not isinstance(value := part[key], list):
         return np.asarray(numbers(part, key, most=most))
     wanted = 4 if channels == 3 or len(value) == 4 else 3
@@ -243,8 +224,6 @@ def _quats(codes: NDArray[np.uint8]) -> NDArray[Any]:
 
     Other fourth bytes give a zero quaternion, which later becomes the identity, with a note.
     """
-    import numpy as np
-
     parts = np.zeros((len(codes), 5))  # three components, the largest, zero
     parts[:, :3] = (codes[:, :3] / 255 - 0.5) * np.sqrt(2)
     parts[:, 3] = np.sqrt(np.maximum(0, 1 - (parts[:, :3] ** 2).sum(1)))
@@ -256,8 +235,6 @@ def _quats(codes: NDArray[np.uint8]) -> NDArray[Any]:
 
 def _palette(chunk: Chunk, rest: int, count: int) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
     """Return the (entries, K−1, 3) coefficients of the palette, and the labels."""
-    import numpy as np
-
     centroids, labels = _sh_files(chunk)
     image = _image(chunk, centroids)
     if image.shape[1] != _PALETTE_COLUMNS * rest:

@@ -16,15 +16,16 @@ import json
 import math
 import zipfile
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
+from g2ard import __version__, _core
 from g2ard.errors import InputError
-
-if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
-    from g2ard.scene.splats import Splats
+from g2ard.io.atomic import atomic_folder, atomic_output
+from g2ard.io.packing import coded, log_scales, morton_order, smallest_three, unit_quats, writable
+from g2ard.scene.splats import Splats
 
 _COLUMNS = 64
 """Entries of the palette per row of its image."""
@@ -38,8 +39,6 @@ _STEPS = 6
 
 def write(path: Path, splats: Splats, *, overwrite: bool = False) -> None:
     """Write a .sog: the files of `sog_files`, zipped without compression; equal scenes give equal bytes."""
-    from g2ard.io.atomic import atomic_output
-
     with atomic_output(path, overwrite) as temporary:
         temporary.write_bytes(sog_bytes(path, splats))
 
@@ -55,8 +54,6 @@ def sog_bytes(path: Path, splats: Splats) -> bytes:
 
 def write_folder(path: Path, splats: Splats, *, overwrite: bool = False) -> None:
     """Write `path`, a meta.json, and its images beside it."""
-    from g2ard.io.atomic import atomic_folder
-
     with atomic_folder(path.parent, overwrite) as temporary:
         for name, content in sog_files(path, splats).items():
             (temporary / name).write_bytes(content)
@@ -76,11 +73,6 @@ def sog_files(path: Path, splats: Splats, *, ordered: bool = False) -> dict[str,
 
     An `offset` is stored under "g2ard" in meta.json; other programs show the recentred scene.
     """
-    import numpy as np
-
-    from g2ard import __version__
-    from g2ard.io.packing import coded, log_scales, morton_order, smallest_three, unit_quats, writable
-
     splats = writable(path, splats)
     if not ordered:
         splats = splats.take(morton_order(splats.means))
@@ -147,10 +139,6 @@ def _webp(pixels: NDArray[np.uint8]) -> bytes:
 
 def _means(splats: Splats) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
     """Return the bounds of the logarithms per axis, and (N, 3) 16-bit codes between them."""
-    import numpy as np
-
-    from g2ard.io.packing import coded
-
     means = splats.means.astype(np.float64)
     logs = np.sign(means) * np.log1p(np.abs(means))
     low, high = logs.min(axis=0), logs.max(axis=0)
@@ -159,10 +147,6 @@ def _means(splats: Splats) -> tuple[NDArray[np.float64], NDArray[np.float64], ND
 
 def _numbers(values: NDArray[Any]) -> tuple[NDArray[np.float32], NDArray[np.intp]]:
     """Return a codebook of 256 entries, and the nearest entry of every value."""
-    import numpy as np
-
-    from g2ard import _core
-
     values = np.ascontiguousarray(values, np.float32)
     book = _core.codebook(values.ravel(), 256)
     return book, nearest(book, values)
@@ -170,8 +154,6 @@ def _numbers(values: NDArray[Any]) -> tuple[NDArray[np.float32], NDArray[np.intp
 
 def nearest(book: NDArray[np.float32], values: NDArray[np.float32]) -> NDArray[np.intp]:
     """Return the entry of an ascending codebook nearest to each value."""
-    import numpy as np
-
     wide = book.astype(np.float64)
     return np.searchsorted((wide[1:] + wide[:-1]) / 2, values)
 
@@ -181,8 +163,6 @@ def _weights(splats: Splats) -> NDArray[np.float32]:
 
     The root gains 0.35 dB over equal weights on a scene at 10×; α·A itself gains nothing.
     """
-    import numpy as np
-
     longer = np.sort(splats.scales.astype(np.float64), axis=1)[:, 1:].prod(axis=1)
     shown = np.sqrt(splats.opacities * np.minimum(longer, 1e30))
     mean = shown.mean()
@@ -191,10 +171,6 @@ def _weights(splats: Splats) -> NDArray[np.float32]:
 
 def _rest(splats: Splats) -> tuple[int, NDArray[np.float32], NDArray[np.uint8], NDArray[np.uint32]]:
     """Return the palette's size, codebook and image, and the (N,) entries of Gaussians."""
-    import numpy as np
-
-    from g2ard import _core
-
     rest = splats.shN.shape[1]
     points = np.ascontiguousarray(splats.shN.reshape(len(splats), 3 * rest))
     entries, labels = _core.palette(points, palette_size(len(splats)), _STEPS, _weights(splats))

@@ -3,20 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from g2ard.config.choices import Alpha
 from g2ard.errors import InputError
 from g2ard.progress import plural
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from g2ard.config.choices import Alpha
-    from g2ard.scene.cameras import Cameras
-    from g2ard.scene.splats import Splats
+from g2ard.scene.cameras import Cameras
+from g2ard.scene.splats import Splats
 
 
 @dataclass(frozen=True)

@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
+from numpy.typing import NDArray
 
+from g2ard.config.choices import Colour
 from g2ard.progress import plural
+from g2ard.rendering.metrics import psnr
+from g2ard.rendering.renderer import Renderer
+from g2ard.scene.cameras import Cameras
+from g2ard.scene.images import colour_text
+from g2ard.scene.splats import Splats
 from g2ard.scene.targets import Targets, against_of, mask_of
+from g2ard.stages.recover.report import RecoverReport
+from g2ard.stages.recover.sizes import typical_share
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from g2ard.config.choices import Colour
-    from g2ard.scene.cameras import Cameras
-    from g2ard.scene.splats import Splats
-    from g2ard.stages.recover.report import RecoverReport
-
-    Floats = NDArray[np.floating]
+Floats = NDArray[np.floating]
 
 _LOW, _GAP = 20.0, 3.0
 """PSNR in held-out views below which a result is poor, and by which it may lie below the training views', dB.
@@ -82,10 +81,6 @@ def likely_causes(
 
 def _of_photos(splats: Splats, held_out: Targets, background: Colour) -> list[str]:
     """Check poses, exposure and background in a few held-out photos."""
-    from g2ard.rendering.metrics import psnr
-    from g2ard.rendering.renderer import Renderer
-    from g2ard.scene.images import colour_text
-
     views = [v for v in range(len(held_out.cameras)) if against_of(held_out, v) == "photo"]
     renderer = Renderer(splats, background=background)
     alike, gains, colours, errors = [], [], [], []
@@ -141,8 +136,6 @@ def _exposed(image: Floats, photo: Floats) -> Floats:
 
 def _of_budget(splats: Splats, trained: Cameras, recovery: RecoverReport) -> list[str]:
     """Check whether there were enough steps and Gaussians."""
-    from g2ard.stages.recover.sizes import typical_share
-
     causes, fifths = [], [part.mean() for part in np.array_split(recovery.loss, 5) if len(part)]
     if recovery.steps < 2 * len(trained):
         views = plural(len(trained), "view")

@@ -6,28 +6,29 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from g2ard.config.choices import RenderModel
 from g2ard.errors import InputError
+from g2ard.io.types import Points
 from g2ard.jobs.budget import Budget
 from g2ard.jobs.distill_options import DistillOptions
-from g2ard.jobs.inputs import load_scene, say_regions
+from g2ard.jobs.inputs import Views, clutter_seen, load_scene, say_regions
 from g2ard.jobs.job import DistillJob
+from g2ard.jobs.measured_budget import Aim, aim_of
+from g2ard.jobs.photos import points_of_photos, topped_up
+from g2ard.jobs.simplify import Reduction
 from g2ard.jobs.view_checks import propose_background, warn_of_photos
 from g2ard.jobs.views import RunViews, is_made, views_of
+from g2ard.pipeline import Distilled
 from g2ard.progress import Progress, Say, plural, silent, unsaid
 from g2ard.scene.splats import Splats
+from g2ard.scene.targets import kinds_told
+from g2ard.stages.lift import lift
+from g2ard.stages.recover.anchors import FREE, Regularizers
+from g2ard.stages.recover.presets import PriorMeasures, measure_prior, preset_for
 
-if TYPE_CHECKING:
-    from g2ard.config.choices import RenderModel
-    from g2ard.io.types import Points
-    from g2ard.jobs.inputs import Views
-    from g2ard.jobs.measured_budget import Aim
-    from g2ard.pipeline import Distilled
-    from g2ard.stages.recover.anchors import Regularizers
-    from g2ard.stages.recover.presets import PriorMeasures
-
-    Scene = Splats | Points | str | Path | None
+Scene = Splats | Points | str | Path | None
 
 
 def distill(
@@ -225,9 +226,6 @@ def _regularizers(
 
     View consistency is measured only for photos.
     """
-    from g2ard.stages.recover.anchors import FREE
-    from g2ard.stages.recover.presets import measure_prior, preset_for
-
     kind, paper = (
         options.named("recover.regularizers") or "auto",
         options.named("recover.schedule") == "paper",
@@ -244,8 +242,6 @@ def _regularizers(
 
 def _task(prior: Splats, aims: Sequence[Aim], views: RunViews, sources: _Sources) -> str:
     """Describe the task in one line."""
-    from g2ard.scene.targets import kinds_told
-
     paths = views.train.cameras.image_paths
     photos = sum(path is not None for path in paths) if sources.photos else 0
     counts = ", ".join([*(f"{aim.count:,}" for aim in aims[:-1]), plural(aims[-1].count, "Gaussian")])
@@ -263,9 +259,6 @@ def _aims(
     say: Say,
 ) -> tuple[Aim, ...]:
     """Resolve the budgets; bytes are measured at the result's SH degree."""
-    from g2ard.jobs.measured_budget import aim_of
-    from g2ard.jobs.simplify import Reduction
-
     seed = options.config.recover.seed
     written = prior if degree is None else prior.with_sh_degree(degree)
     return tuple(
@@ -288,7 +281,6 @@ def _points(budgets: Sequence[Budget], options: DistillOptions, progress: Progre
     """Create starting points from photos alone."""
     if options.views is None or is_made(options.views):
         raise InputError("missing; without a scene, pass photos with poses as views", parameter="scene")
-    from g2ard.jobs.photos import points_of_photos
 
     return points_of_photos(
         options.views,
@@ -335,7 +327,6 @@ def _read(
 ) -> _Read:
     """Read the dense scene, or lift a point cloud, which needs views with photos and at least the budget."""
     from g2ard.io import kind, read_cloud
-    from g2ard.stages.lift import lift
 
     if isinstance(scene, Splats):
         return _Read(scene, False, options.beside, "scene")
@@ -356,8 +347,6 @@ def _read(
     wanted = _wanted(budgets) or 0
     few = len(scene) < wanted
     if few:
-        from g2ard.jobs.photos import topped_up
-
         scene = topped_up(
             scene,
             options.views,
@@ -376,7 +365,5 @@ def _cleaned(
     prior: Splats, options: DistillOptions, progress: Progress, say: Say
 ) -> tuple[Splats, dict[str, int]]:
     """Remove clutter; return the rest and the number of Gaussians removed by kind."""
-    from g2ard.jobs.inputs import clutter_seen
-
     found, _ = clutter_seen(prior, seed=options.config.recover.seed, progress=progress, say=say)
     return prior.take(found.keep), found.counts

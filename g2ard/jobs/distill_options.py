@@ -6,13 +6,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-if TYPE_CHECKING:
-    from g2ard.config.choices import RenderModel
-    from g2ard.jobs.inputs import Views
-    from g2ard.pipeline import DistillConfig
-    from g2ard.stages.recover.anchors import Regularizers
+from g2ard.config.choices import RenderModel
+from g2ard.config.paths import full_paths
+from g2ard.config.presets import PRESETS, configured
+from g2ard.jobs.inputs import Views
+from g2ard.pipeline import DistillConfig
+from g2ard.stages.recover.anchors import Regularizers
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -68,9 +69,6 @@ class DistillOptions:
         self, regularizers: Regularizers | None = None, sh_degree: int | None = None
     ) -> DistillConfig:
         """Return the configuration with measured regularisers and a default SH degree."""
-        from g2ard.config.presets import configured
-        from g2ard.pipeline import DistillConfig
-
         settings = dict(self._full)
         if sh_degree is not None:
             settings.setdefault("recover.sh_degree", sh_degree)
@@ -80,13 +78,8 @@ class DistillOptions:
 
     def named(self, path: str) -> Any:
         """Return the value of a path in the settings or the preset, or None."""
-        from g2ard.config.presets import PRESETS
-
         return self._full.get(path, PRESETS.get(self.preset, {}).get(path))
 
     @cached_property
     def _full(self) -> Mapping[str, Any]:
-        from g2ard.config.paths import full_paths
-        from g2ard.pipeline import DistillConfig
-
         return full_paths(self.settings, DistillConfig())

@@ -5,23 +5,22 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from g2ard.errors import InputError
+from g2ard.jobs.job import DistillJob
 from g2ard.jobs.tiling import RECOVERY_TIMES, TileMemory, amount
+from g2ard.pipeline import final_steps
 from g2ard.progress import plural
-from g2ard.scene.targets import CACHE_BYTES
+from g2ard.scene.cameras import Cameras
+from g2ard.scene.splats import Splats
+from g2ard.scene.targets import CACHE_BYTES, Targets
+from g2ard.stages.recover import recover
+from g2ard.stages.simplify import round_counts, simplify
 from g2ard.system.memory import peak_rss
 from g2ard.tiles.pour import foretold
 from g2ard.tiles.store import row_width
-
-if TYPE_CHECKING:
-    from g2ard.jobs.job import DistillJob
-    from g2ard.scene.cameras import Cameras
-    from g2ard.scene.splats import Splats
-    from g2ard.scene.targets import Targets
 
 _TRIED, _STEPS = 4, 8
 """Number of views rendered and of steps taken for the estimate."""
@@ -152,8 +151,6 @@ def _page_bytes(job: DistillJob, merged: Splats) -> int:
 
 def _merged(job: DistillJob, budget: int) -> tuple[Splats, float]:
     """Merge the scene by `fast`; return it and the expected time of the requested method."""
-    from g2ard.stages.simplify import simplify
-
     began = time.monotonic()
     merged = simplify(job.prior, budget, method="fast").splats
     seconds = time.monotonic() - began
@@ -163,8 +160,6 @@ def _merged(job: DistillJob, budget: int) -> tuple[Splats, float]:
 
 
 def _step_seconds(job: DistillJob, student: Splats, targets: Targets) -> float:
-    from g2ard.stages.recover import recover
-
     config = job.config.recover
     schedule = replace(config.schedule, multiplier=1.0, reach=1.0)
     tried = replace(config, schedule=schedule, steps=_STEPS, recovery_time=None)
@@ -172,8 +167,6 @@ def _step_seconds(job: DistillJob, student: Splats, targets: Targets) -> float:
 
 
 def _steps(job: DistillJob, student: Splats) -> int:
-    from g2ard.pipeline import final_steps
-
     config = job.config
     photos = job.photos_over_renders or job.teacher is None
     last = final_steps(config, student, job.views.train.cameras, photos=photos)
@@ -182,8 +175,6 @@ def _steps(job: DistillJob, student: Splats) -> int:
 
 def _rounds(job: DistillJob, student: Splats) -> int:
     """Return the number of recoveries before the last; 0 if the schedule has no rounds."""
-    from g2ard.stages.simplify import round_counts
-
     config = job.config
     if not config.recover.schedule.round_steps:
         return 0

@@ -7,22 +7,26 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+from numpy.typing import NDArray
+
+from g2ard.config.choices import RenderModel
+from g2ard.errors import InputError
+from g2ard.io import Note, ViewFiles, ViewSet, read_scene, read_view_set
+from g2ard.io.exposures import find_exposures
 from g2ard.progress import Progress, Say, plural, silent, unsaid
+from g2ard.rendering.renderer import RasterSettings, Renderer
+from g2ard.rendering.visibility import visibility
+from g2ard.scene.cameras import Cameras
+from g2ard.scene.regions import in_any
+from g2ard.scene.splats import Splats
+from g2ard.scene.splits import for_scores, for_training, not_held_out, split_mask, splits_of
+from g2ard.scene.targets import Photos, PhotosOrRenders, Targets, TeacherRenders
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
-    from g2ard.config.choices import RenderModel
-    from g2ard.io import Note, ViewFiles, ViewSet
-    from g2ard.rendering.renderer import RasterSettings, Renderer
-    from g2ard.scene.cameras import Cameras
-    from g2ard.scene.splats import Splats
-    from g2ard.scene.targets import Targets
     from g2ard.stages.clean import Cleaning
     from g2ard.stages.simplify import SimplifyConfig
-
-    Views = Cameras | ViewSet | ViewFiles | str | Path  # cameras, or the path of views
+Views = Cameras | ViewSet | ViewFiles | str | Path  # cameras, or the path of views
 
 _CLUTTER_VIEWS, _CLUTTER_SIDE = 96, 400
 """Number of generated views for finding clutter, and their longer side in pixels."""
@@ -34,8 +38,6 @@ _CLUTTER_NEAR = 0.25
 
 def load_scene(path: str | Path, say: Say = unsaid, render_model: RenderModel | None = None) -> Splats:
     """Read a scene and report its notes."""
-    from g2ard.io import read_scene
-
     scene = read_scene(path, render_model=render_model)
     say_notes(path, scene.notes, say)
     return scene.splats
@@ -57,9 +59,6 @@ def say_regions(splats: Splats, config: SimplifyConfig, name: str, say: Say) -> 
     Raises:
         InputError: no Gaussian lies there.
     """
-    from g2ard.errors import InputError
-    from g2ard.scene.regions import in_any
-
     if config.keep_region:
         inside = int(in_any(splats, config.keep_region).sum())
         if not inside:
@@ -95,8 +94,6 @@ def load_view_sets(
     Raises:
         InputError: as `load_views`.
     """
-    from g2ard.scene.splits import split_mask
-
     found, path = _read(views, say, unpictured=unpictured)
     masks = [split_mask(path, found.cameras.names, split, stated=found.splits) for split in splits]
     return [found.take(mask).resized(size) for mask in masks]
@@ -111,8 +108,6 @@ def load_for_training(
     Raises:
         InputError: as `load_views`, and as `g2ard.scene.splits.for_training`.
     """
-    from g2ard.scene.splits import for_training
-
     found, path = _read(views, say, unpictured=unpictured)
     return found.take(for_training(path, found.cameras.names, found.splits)).resized(size)
 
@@ -123,8 +118,6 @@ def load_held_out(views: Views, size: int | None, say: Say = unsaid, *, unpictur
     Raises:
         InputError: as `load_views`, and as `g2ard.scene.splits.for_scores`.
     """
-    from g2ard.scene.splits import for_scores
-
     found, path = _read(views, say, unpictured=unpictured)
     return found.take(for_scores(path, found.cameras.names, found.splits)).resized(size)
 
@@ -135,9 +128,6 @@ def drop_held_out(train: ViewSet, held_out: Cameras, say: Say = unsaid) -> ViewS
     Raises:
         InputError: no views are left.
     """
-    from g2ard.errors import InputError
-    from g2ard.scene.splits import not_held_out
-
     keep = not_held_out(train.cameras, held_out)
     if not keep.any():
         raise InputError(
@@ -173,8 +163,6 @@ def load_split_views(
     Raises:
         InputError: as `load_views`.
     """
-    from g2ard.scene.splits import split_mask, splits_of
-
     found, path = _read(views, say, unpictured=unpictured)
     names = found.cameras.names
     mask = split_mask(path, names, split, stated=found.splits)
@@ -183,8 +171,6 @@ def load_split_views(
 
 def _read(views: Views, say: Say, *, unpictured: bool = False) -> tuple[ViewSet, Path | None]:
     """Return the views, and their path if they were read."""
-    from g2ard.io import ViewFiles, ViewSet, read_view_set
-
     if isinstance(views, ViewSet):
         return views, None
     if not isinstance(views, str | Path | ViewFiles):
@@ -212,9 +198,6 @@ def make_targets(
     With `photos` and a teacher, each view's photo is used, or a render if it has none. `lazy` renders on
     first access.
     """
-    from g2ard.io.exposures import find_exposures
-    from g2ard.scene.targets import Photos, PhotosOrRenders, TeacherRenders
-
     if teacher is not None and not photos:
         return TeacherRenders(
             teacher,
@@ -268,7 +251,6 @@ def clutter_seen(
         InputError: an unknown kind, or a scene with no room for poses.
     """
     from g2ard.poses import plan_pool
-    from g2ard.rendering.visibility import visibility
     from g2ard.stages.clean import FLOATING, KINDS, find_clutter, find_floating, within_reach
 
     kinds = tuple(kind for kind in kinds or KINDS if strength or kind not in FLOATING)

@@ -5,21 +5,19 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from g2ard.jobs.inputs import make_targets
+from g2ard.jobs.measured_budget import Aim
 from g2ard.jobs.views import RunViews
+from g2ard.pipeline import DistillConfig, Distilled
+from g2ard.pipeline import distill as pipeline
 from g2ard.progress import Progress, Say, silent, unsaid
+from g2ard.rendering.renderer import Renderer
+from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
-from g2ard.scene.targets import kinds_of
-
-if TYPE_CHECKING:
-    from g2ard.jobs.measured_budget import Aim
-    from g2ard.pipeline import DistillConfig, Distilled
-    from g2ard.rendering.renderer import Renderer
-    from g2ard.scene.cameras import Cameras
-    from g2ard.scene.targets import Targets
-    from g2ard.stages.recover.presets import PriorMeasures
+from g2ard.scene.targets import Targets, kinds_of
+from g2ard.stages.recover.presets import PriorMeasures
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,8 +97,6 @@ class DistillJob:
     @cached_property
     def _renderer(self) -> Renderer | None:
         """Renderer of the teacher, shared by all targets."""
-        from g2ard.rendering.renderer import Renderer
-
         background = self.config.recover.background
         return None if self.teacher is None else Renderer(self.teacher, background=background)
 
@@ -130,8 +126,6 @@ class DistillJob:
         Returns:
             The result of `g2ard.distill`.
         """
-        from g2ard.pipeline import distill as pipeline
-
         aim = next(aim for aim in self.aims if budget in (None, aim.count))
         self.render_targets()
         done = pipeline(

@@ -8,25 +8,29 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from g2ard.config.choices import BLACK, Colour, RenderModel
+from g2ard.errors import InputError
 from g2ard.jobs.budget import Budget
-from g2ard.jobs.inputs import make_targets
+from g2ard.jobs.distill import prepare
+from g2ard.jobs.distill_options import DistillOptions
+from g2ard.jobs.inputs import Views, make_targets
+from g2ard.jobs.job import DistillJob
+from g2ard.jobs.viewer_frame import up_of
+from g2ard.levels.tree import Level
+from g2ard.pipeline import distill as pipeline
 from g2ard.progress import Progress, Say, plural, silent, unsaid
+from g2ard.rendering.visibility import visibility_source
 from g2ard.report.base import Report
+from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from g2ard.jobs.inputs import Views
-    from g2ard.jobs.job import DistillJob
-    from g2ard.levels.tree import Level
-    from g2ard.scene.cameras import Cameras
-    from g2ard.scene.targets import Targets
+from g2ard.scene.targets import Targets
+from g2ard.stages.evaluate import evaluate
+from g2ard.stages.simplify import simplify
 
 RATIOS = (1.0, 2.0, 4.0, 8.0, 16.0)
 """Reduction factors; each level has half the Gaussians of the previous one, as in viewers' own tools."""
@@ -124,9 +128,6 @@ def lod(
     >>> [len(level) for level in lod(ball, ratios=(1, 4, 8), steps=3, size=48).splats]
     [800, 200, 100]
     """
-    from g2ard.jobs.distill import prepare
-    from g2ard.jobs.distill_options import DistillOptions
-
     check_ratios(ratios)
     job = prepare(
         scene,
@@ -167,8 +168,6 @@ def recovery_settings(steps: int | None, background: Colour, seed: int) -> dict[
 
 def check_ratios(ratios: Sequence[float]) -> None:
     """Reject ratios that do not rise from 1 or more."""
-    from g2ard.errors import InputError
-
     rising = all(a < b for a, b in pairwise(ratios))
     if not ratios or not rising or not all(1 <= ratio < math.inf for ratio in ratios):
         given = ", ".join(f"{ratio:g}" for ratio in ratios)
@@ -179,9 +178,6 @@ def _level(
     job: DistillJob, finer: Splats, count: int, ratio: float, recover: bool, work: Path | None
 ) -> tuple[Splats, Splats, LevelReport]:
     """Return the level, its unrecovered version, and its report."""
-    from g2ard.pipeline import distill as pipeline
-    from g2ard.stages.evaluate import evaluate
-
     began = time.perf_counter()
     longest = level_size(job.views.train.cameras, ratio)
     held_out = _targets(job, job.views.test, longest)
@@ -216,9 +212,6 @@ def _level(
 
 def _merged(job: DistillJob, finer: Splats, count: int) -> Splats:
     """Merge to the next level, weighted by visibility in the training views."""
-    from g2ard.rendering.visibility import visibility_source
-    from g2ard.stages.simplify import simplify
-
     look = visibility_source(job.views.train.cameras, progress=job.progress)
     return simplify(finer, count, visibility=look, progress=job.progress).splats
 
@@ -235,8 +228,6 @@ def _targets(job: DistillJob, cameras: Cameras, longest: int) -> Targets:
 
 def tileset_up(levels: Sequence[Level], up: Sequence[float] | None = None) -> NDArray[np.float64]:
     """Return the (3,) up direction for 3D Tiles: `up`, z in map coordinates, or an estimate."""
-    from g2ard.jobs.viewer_frame import up_of
-
     coarse = levels[-1]
     if up is None and coarse.offset.any():
         return np.array([0.0, 0, 1])

@@ -15,12 +15,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard.errors import InputError
+from g2ard.io import read_splats, write_splats
+from g2ard.io.scene_formats import scene_format
 from g2ard.jobs.budget import Budget
 from g2ard.progress import Progress, Say, plural, silent, unsaid
 from g2ard.rendering.metrics import psnr, ssim
 from g2ard.rendering.renderer import Renderer
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
+from g2ard.stages.simplify import simplify
 
 if TYPE_CHECKING:
     from g2ard.stages.simplify import Simplified
@@ -73,9 +76,6 @@ def file_bytes(splats: Splats, name: str, **options: Any) -> int:
 
 def as_file(splats: Splats, name: str) -> Splats:
     """Return the scene as read back from the format of `name`: quantised and without unsupported fields."""
-    from g2ard.io import read_splats
-    from g2ard.io.scene_formats import scene_format
-
     if scene_format(name).suffix in (".ply", ".usda", ".usdc"):
         return splats
     with _written(splats, name) as path:
@@ -85,9 +85,6 @@ def as_file(splats: Splats, name: str) -> Splats:
 @contextmanager
 def _written(splats: Splats, name: str, **options: Any) -> Iterator[Path]:
     """Yield a temporary file of the scene in the format of `name`."""
-    from g2ard.io import write_splats
-    from g2ard.io.scene_formats import scene_format
-
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "scene" / "meta.json"
         if scene_format(name).function == "write":
@@ -227,8 +224,6 @@ class Aim:
         Returns:
             The scene, and (N,) the new row of each row, −1 if dropped.
         """
-        from g2ard.stages.simplify import simplify
-
         rows = np.arange(len(splats))
         while self.bytes is not None and (size := file_bytes(splats, self.file)) > self.bytes:
             fewer = max(1, int(len(splats) * self.bytes / size * 0.99))
@@ -261,7 +256,6 @@ class Aim:
         """Return whether a result keeps the quality, with a message; None if no quality is required."""
         if self.wanted is None:
             return None
-        from g2ard.io.scene_formats import scene_format
 
         assert self.dense is not None
         assert self.cameras is not None
@@ -347,8 +341,6 @@ def _by_quality(
 
 
 def _fast(splats: Splats, count: int) -> Splats:
-    from g2ard.stages.simplify import simplify
-
     return simplify(splats, count, method="fast").splats
 
 

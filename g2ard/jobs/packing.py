@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from g2ard.config.choices import Colour
 from g2ard.errors import InputError
+from g2ard.io import read_splats
+from g2ard.io.scene_formats import scene_format
+from g2ard.poses import plan_pool
 from g2ard.progress import Progress
-
-if TYPE_CHECKING:
-    from g2ard.scene.splats import Splats
-    from g2ard.scene.targets import Targets
+from g2ard.scene.splats import Splats
+from g2ard.scene.targets import Targets, TeacherRenders
+from g2ard.stages.evaluate import evaluate
 
 _LOSS = 1.0
 """Loss that is worth a warning, dB."""
@@ -27,9 +29,6 @@ _LARGEST = 2_000_000
 
 def score_file(path: Path, targets: Targets, background: Colour, progress: Progress) -> dict[str, Any]:
     """Read a scene file back and return its mean scores in the views of `targets`."""
-    from g2ard.io import read_splats
-    from g2ard.stages.evaluate import evaluate
-
     found = evaluate(read_splats(path), targets, background=background, progress=progress, stage="score file")
     return {"file": path.name, "psnr": found.psnr, "ssim": found.ssim}
 
@@ -60,12 +59,6 @@ def loss_warning(path: Path, splats: Splats, options: dict[str, Any]) -> str | N
         A warning if a scene of 35 dB would lose more than 1 dB. None otherwise, and without a comparison if
         the format is exact, the scene is large or no view shows it.
     """
-    from g2ard.io import read_splats
-    from g2ard.io.scene_formats import scene_format
-    from g2ard.poses import plan_pool
-    from g2ard.scene.targets import TeacherRenders
-    from g2ard.stages.evaluate import evaluate
-
     if not (scene_format(path).lossy or options.get("compress")) or len(splats) > _LARGEST:
         return None
     try:

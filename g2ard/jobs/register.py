@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from g2ard.config.choices import Alpha
 from g2ard.errors import InputError
-from g2ard.io import read_view_set
+from g2ard.io import ace, read_view_set
+from g2ard.io.detect import file_format, is_photo
 from g2ard.io.photos import has_alpha, photo_size
 from g2ard.progress import Progress, Say, silent, unsaid
 from g2ard.scene.cameras import Camera, Cameras
@@ -97,8 +98,6 @@ def photos_of(
 
 def _photos_in(path: Path) -> list[Path]:
     """Return the photos of a folder without views, or [] for anything else."""
-    from g2ard.io.detect import file_format, is_photo
-
     if not path.is_dir():
         return []
     try:
@@ -174,8 +173,6 @@ def read_poses(path: Path) -> Poses:
         InputError: it cannot be read, or names a view twice.
     """
     if path.suffix.lower() == ".txt" and path.is_file():
-        from g2ard.io import ace
-
         return ace.read(path)
     cameras = read_view_set(path, unpictured=True).cameras
     return dict(zip(cameras.names, cameras.viewmats, strict=True))

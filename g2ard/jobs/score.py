@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from g2ard.config.choices import Colour
+from g2ard.config.paths import listed
+from g2ard.jobs.causes import likely_causes
+from g2ard.jobs.job import DistillJob
+from g2ard.pipeline import Distilled
 from g2ard.progress import Progress
-
-if TYPE_CHECKING:
-    from g2ard.jobs.job import DistillJob
-    from g2ard.pipeline import Distilled
-    from g2ard.report.kinds import KindScore
-    from g2ard.scene.splats import Splats
-    from g2ard.scene.targets import Targets
+from g2ard.report.kinds import KindScore, by_kind
+from g2ard.scene.splats import Splats
+from g2ard.scene.splits import USUAL
+from g2ard.scene.targets import Targets
+from g2ard.stages.evaluate import evaluate
 
 
 def report_of(job: DistillJob, done: Distilled) -> dict[str, Any]:
@@ -28,11 +30,6 @@ def report_of(job: DistillJob, done: Distilled) -> dict[str, Any]:
         their summary by kind (`kinds`), likely causes of a poor result (`causes`), rounds, seconds by stage,
         and every setting by path.
     """
-    from g2ard.config.paths import listed
-    from g2ard.jobs.causes import likely_causes
-    from g2ard.report.kinds import by_kind
-    from g2ard.scene.splits import USUAL
-
     scores = _scores(job, done, job.held_out, job.progress)
     apart = None if job.apart[1] is None else _scores(job, done, job.apart[1], job.progress)
     before, after = (
@@ -73,8 +70,6 @@ def report_of(job: DistillJob, done: Distilled) -> dict[str, Any]:
 
 def _scores(job: DistillJob, done: Distilled, targets: Targets, progress: Progress) -> dict[str, Any]:
     """Score both scenes in some views."""
-    from g2ard.stages.evaluate import evaluate
-
     scenes: dict[str, Splats] = {"simplified": done.simplified, "recovered": done.splats}
     return {
         name: evaluate(
@@ -92,9 +87,6 @@ def scores_by_kind(
     before: Splats, after: Splats, targets: Targets, background: Colour, progress: Progress
 ) -> tuple[KindScore, ...]:
     """Score a scene before and after recovery in held-out views, by kind of view."""
-    from g2ard.report.kinds import by_kind
-    from g2ard.stages.evaluate import evaluate
-
     first, second = (
         evaluate(splats, targets, background=background, progress=progress, stage="score").as_dict()["views"]
         for splats in (before, after)

@@ -5,18 +5,19 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from functools import cached_property, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from g2ard.config.choices import RenderModel
+from g2ard.config.presets import configured
+from g2ard.errors import InputError
 from g2ard.jobs.budget import Budget
-from g2ard.jobs.inputs import load_scene, say_regions
+from g2ard.jobs.inputs import Views, load_scene, say_regions
+from g2ard.jobs.measured_budget import aim_of
 from g2ard.jobs.views import cameras_for_looks
 from g2ard.progress import Progress, Say, silent, unsaid
+from g2ard.rendering.visibility import visibility_source
 from g2ard.scene.splats import Splats
-
-if TYPE_CHECKING:
-    from g2ard.config.choices import RenderModel
-    from g2ard.jobs.inputs import Views
-    from g2ard.stages.simplify import Simplified, SimplifyConfig, Visibility, VisibilitySource
+from g2ard.stages.simplify import Simplified, SimplifyConfig, Visibility, VisibilitySource
 
 
 def simplify(
@@ -84,10 +85,6 @@ def simplify(
     >>> len(small.splats), small.parents.shape, small.report.output_count
     (90, (900,), 90)
     """
-    from g2ard.config.presets import configured
-    from g2ard.jobs.measured_budget import aim_of
-    from g2ard.stages.simplify import SimplifyConfig
-
     fields = {"method": method, "keep_region": keep_region}
     given = {name: value for name, value in fields.items() if value is not None}
     config = configured(config or SimplifyConfig(), settings=given | dict(settings or {}))
@@ -132,9 +129,6 @@ class Reduction:
         progress: Progress = silent,
         say: Say = unsaid,
     ) -> None:
-        from g2ard.errors import InputError
-        from g2ard.stages.simplify import SimplifyConfig
-
         if views is not None and blind:
             raise InputError("views and blind exclude each other")
         self.splats, self.blind = splats, blind
@@ -170,8 +164,6 @@ class Reduction:
 
     @cached_property
     def _look(self) -> VisibilitySource | None:
-        from g2ard.rendering.visibility import visibility_source
-
         cameras = None if self.blind else self._plan()
         return None if cameras is None else _remembering(visibility_source(cameras, progress=self.progress))
 

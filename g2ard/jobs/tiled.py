@@ -9,29 +9,33 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+from g2ard.config.choices import RenderModel
 from g2ard.errors import G2ardError, InputError, OutputError
+from g2ard.io.atomic import drop_empty, parents_made
+from g2ard.io.lock import locked
 from g2ard.jobs.budget import Budget
+from g2ard.jobs.distill_options import DistillOptions
+from g2ard.jobs.inputs import Views, load_view_sets, load_views
 from g2ard.jobs.levels import LevelReport, check_ratios, level_size
 from g2ard.jobs.tiling import RECOVERY_TIMES, Tiling, refuse_whole, whole_options, workers_for
+from g2ard.jobs.view_checks import as_pool, found_views
+from g2ard.jobs.views import RunViews, is_made, pool_times, views_of
+from g2ard.levels import Cut
+from g2ard.pipeline import DistillConfig
 from g2ard.progress import Progress, Say, plural, silent, unsaid
-
-if TYPE_CHECKING:
-    from g2ard.config.choices import RenderModel
-    from g2ard.jobs.distill_options import DistillOptions
-    from g2ard.jobs.inputs import Views
-    from g2ard.jobs.views import RunViews
-    from g2ard.levels import Cut
-    from g2ard.pipeline import DistillConfig
-    from g2ard.scene.cameras import Cameras
-    from g2ard.scene.splats import Splats
-    from g2ard.stages.simplify import SimplifyConfig
-    from g2ard.tiles.executor import Workers
-    from g2ard.tiles.merging import TiledScene
-    from g2ard.tiles.recover import TiledScores
-    from g2ard.tiles.sights import Surroundings
-    from g2ard.tiles.store import StoredScene, TileStore
+from g2ard.scene.cameras import Cameras
+from g2ard.scene.splats import Splats
+from g2ard.stages.recover.presets import preset_for
+from g2ard.stages.recover.schedule import steps_for
+from g2ard.stages.simplify import SimplifyConfig
+from g2ard.tiles.executor import DaskExecutor, Workers, executor
+from g2ard.tiles.ingest import ingest
+from g2ard.tiles.journal import is_ours
+from g2ard.tiles.merging import TiledScene, key_of, sample_of, simplify_tiles
+from g2ard.tiles.recover import TiledScores, recover_tiles
+from g2ard.tiles.sights import Surroundings
+from g2ard.tiles.store import MANIFEST, StoredScene, TileStore
 
 _OURS = re.compile(r"tiles|steps|(student|merged|level|written)-[0-9a-f]{16}")
 """Names that commands create in the work folder."""
@@ -53,9 +57,6 @@ def working(tiling: Tiling, *views: Views | None) -> Iterator[None]:
         InputError: the views cannot be read, or the scheduler does not answer.
         OutputError: the folder is a file, holds something else, or another process works there.
     """
-    from g2ard.io.atomic import drop_empty, parents_made
-    from g2ard.io.lock import locked
-
     folder = _folder(tiling)
     _check_folder(folder)
     _check_given(tiling, views)
@@ -87,8 +88,6 @@ def _folder(tiling: Tiling) -> Path:
 
 def _check_folder(folder: Path) -> None:
     """Reject a folder that holds anything but tiled work."""
-    from g2ard.tiles.journal import is_ours
-
     try:
         names = sorted(path.name for path in folder.iterdir()) if folder.exists() else []
     except OSError as error:
@@ -102,15 +101,10 @@ def _check_folder(folder: Path) -> None:
 
 
 def _check_given(tiling: Tiling, views: tuple[Views | None, ...]) -> None:
-    from g2ard.jobs.inputs import load_view_sets
-    from g2ard.jobs.views import is_made
-
     for given in views:
         if given is not None and not is_made(given):
             load_view_sets(given, [], None, unpictured=True)
     if tiling.scheduler not in (None, "local"):
-        from g2ard.tiles.executor import DaskExecutor
-
         with DaskExecutor(tiling.scheduler, 1, 1):
             pass
 
@@ -144,10 +138,6 @@ def _tiles_and_workers(
     Raises:
         InputError: the scene cannot be read, or a tile takes too much memory.
     """
-    from g2ard.tiles.executor import Workers, executor
-    from g2ard.tiles.ingest import ingest
-    from g2ard.tiles.store import MANIFEST, TileStore
-
     if (scene / MANIFEST).is_file():
         store = TileStore.open(scene)
         if render_model not in (None, store.render_model):
@@ -207,8 +197,6 @@ def simplify_in_tiles(
     Raises:
         InputError: too little memory for a tile, or as `g2ard.tiles.merging.simplify_tiles`.
     """
-    from g2ard.tiles.merging import simplify_tiles
-
     with _tiles_and_workers(scene, tiling, 1.0, render_model, progress, say) as (store, workers):
         for budget in budgets:
             yield (
@@ -229,17 +217,11 @@ def simplify_in_tiles(
 
 
 def _given(views: Views | None, say: Say) -> Cameras | None:
-    from g2ard.jobs.inputs import load_views
-    from g2ard.jobs.views import is_made
-
     return None if views is None or is_made(views) else load_views(views, "train", None, say)
 
 
 def _found(scene: Path, sample: Splats, say: Say) -> Cameras | None:
     """Return the cameras beside the scene that see the sample of it."""
-    from g2ard.jobs.inputs import load_views
-    from g2ard.jobs.view_checks import as_pool, found_views
-
     found = found_views(scene, sample, ["train"], say)
     return as_pool(load_views(found, "train", None, say)) if found else None
 
@@ -286,8 +268,6 @@ class TiledLevels:
 
     def key(self, rule: Cut, errors: bool) -> str:
         """Return 16 hexadecimal digits that identify the files they are written to."""
-        from g2ard.tiles.merging import key_of
-
         return key_of([[scene.store.key for scene in self.scenes], asdict(rule), errors])
 
 
@@ -321,8 +301,6 @@ def lod_in_tiles(
     Raises:
         InputError: ratios that do not rise, options that need the whole scene, or as `distill_in_tiles`.
     """
-    from g2ard.tiles.store import StoredScene
-
     check_ratios(ratios)
     refuse_whole(scene, whole_options(options))
     levels: list[StoredScene] = []
@@ -389,8 +367,6 @@ class _Job:
 
     def simplified(self, store: TileStore, count: int, cameras: Cameras) -> TiledScene:
         """Simplify a scene in tiles: the dense one, or one derived from it."""
-        from g2ard.tiles.merging import simplify_tiles
-
         return simplify_tiles(
             store,
             count,
@@ -405,10 +381,6 @@ class _Job:
         self, small: TiledScene, around: Surroundings, views: RunViews
     ) -> tuple[TiledScene, TiledScores]:
         """Recover a simplified scene, unless nothing is to be learned, and score it."""
-        from g2ard.jobs.views import pool_times
-        from g2ard.stages.recover.schedule import steps_for
-        from g2ard.tiles.recover import recover_tiles
-
         needed = steps_for(self.sample, views.train.cameras, self.config.recover.schedule.steps)
         steps = self.config.recover.steps or round(needed * pool_times(self.store.count))
         return recover_tiles(
@@ -423,8 +395,6 @@ class _Job:
 
     def stored(self, scene: TiledScene, name: str, like: TileStore | None = None) -> TileStore:
         """Write a derived scene in tiles of its own, or in those of another."""
-        from g2ard.tiles.ingest import ingest
-
         folder = _folder(self.tiling) / f"{name}-{scene.key}"
         return ingest(scene.stream(), folder, tile_rows=self.tiling.most_rows, like=like)
 
@@ -434,10 +404,6 @@ def _job(
     scene: Path, tiling: Tiling, options: DistillOptions, learn: bool, progress: Progress, say: Say
 ) -> Iterator[_Job]:
     """Open the tiles, start workers, and decide views and constants of a distillation."""
-    from g2ard.jobs.views import views_of
-    from g2ard.stages.recover.presets import preset_for
-    from g2ard.tiles.merging import sample_of
-
     model = options.render_model
     with _tiles_and_workers(scene, tiling, RECOVERY_TIMES, model, progress, say) as (store, workers):
         sample = sample_of(store, workers)

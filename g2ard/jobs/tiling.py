@@ -11,11 +11,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from g2ard.errors import InputError
+from g2ard.io import open_stream
+from g2ard.io.detect import kind
+from g2ard.tiles.store import MANIFEST, TileStore, row_width
 
 if TYPE_CHECKING:
     from g2ard.jobs.budget import Budget
     from g2ard.jobs.distill_options import DistillOptions
-    from g2ard.tiles.store import TileStore
 
 _SMALLEST_ROW = 4
 """Least bytes per Gaussian in a file: a smaller file is known to be small without opening it."""
@@ -193,8 +195,6 @@ def is_tiled(scene: Path, tiling: Tiling) -> bool:
     Raises:
         InputError: a scene that cannot be read.
     """
-    from g2ard.tiles.store import MANIFEST, TileStore
-
     if (scene / MANIFEST).is_file():
         return len(TileStore.open(scene).tiles) > 1
     if (
@@ -203,8 +203,6 @@ def is_tiled(scene: Path, tiling: Tiling) -> bool:
         and scene.stat().st_size < _SMALLEST_ROW * tiling.most_rows
     ):
         return False
-    from g2ard.io import open_stream
-    from g2ard.io.detect import kind
 
     return kind(scene) == "splats" and open_stream(scene).count > tiling.most_rows
 
@@ -221,9 +219,6 @@ def check_memory(scene: Path, tiling: Tiling, times: float, tile_times: float = 
     Raises:
         InputError: too little memory, with what would do; or the scene cannot be read.
     """
-    from g2ard.io import open_stream
-    from g2ard.tiles.store import row_width
-
     if tiling.memory is None:
         return
     stream = open_stream(scene)
@@ -274,14 +269,11 @@ def workers_for(store: TileStore, tiling: Tiling, times: float = 1.0) -> int:
 
 
 def _folder_of_tiles(scene: Path) -> Path | None:
-    from g2ard.tiles.store import MANIFEST
-
     return scene if (scene / MANIFEST).is_file() else None
 
 
 def _foretold(scene: Path) -> Callable[[int], int]:
     """Return a function from `--tile-rows` to the rows of the largest tile, halo included."""
-    from g2ard.io import open_stream
     from g2ard.tiles.pour import foretold
 
     stream = open_stream(scene)
@@ -300,7 +292,6 @@ def refuse_whole(scene: Path, options: Sequence[str]) -> None:
     """
     if not options:
         return
-    from g2ard.io import open_stream
 
     one = cut_into(_folder_of_tiles(scene), open_stream(scene).count)
     takes = "needs" if len(options) == 1 else "need"

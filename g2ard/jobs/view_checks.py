@@ -4,17 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+import numpy as np
+from numpy.typing import NDArray
+
+from g2ard.config.choices import Colour
+from g2ard.errors import InputError
+from g2ard.io import find_views, read_view_set
 from g2ard.progress import Say, plural, unsaid
-
-if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
-    from g2ard.config.choices import Colour
-    from g2ard.scene.cameras import Cameras
-    from g2ard.scene.splats import Splats
+from g2ard.rendering.renderer import Renderer
+from g2ard.scene.cameras import Cameras, unseeing
+from g2ard.scene.splats import Splats
+from g2ard.scene.splits import split_mask
+from g2ard.scene.targets import Photos, mask_of
 
 _SIDE = 800
 """Longer side in pixels, as in a generated pool."""
@@ -46,10 +48,6 @@ def found_views(scene: str | Path, splats: Splats, splits: Sequence[str], say: S
     Returns:
         A path for `load_views`, or None.
     """
-    from g2ard.errors import InputError
-    from g2ard.io import find_views, read_view_set
-    from g2ard.scene.splits import split_mask
-
     path = find_views(scene)
     if path is None:
         return None
@@ -86,9 +84,6 @@ def check_sight(splats: Splats, cameras: Cameras, say: Say = unsaid) -> None:
     Raises:
         InputError: no view sees the scene.
     """
-    from g2ard.errors import InputError
-    from g2ard.scene.cameras import unseeing
-
     if not cameras.facing(splats.means + splats.offset).any():
         raise InputError(unseeing(cameras, "the scene"))
     warn_of_sight(splats, cameras, say)
@@ -99,11 +94,7 @@ def warn_of_photos(splats: Splats, cameras: Cameras, background: Colour, say: Sa
 
     The measure is the correlation of pixel brightness, as the median over a few small photos.
     """
-    import numpy as np
-
     from g2ard.jobs.causes import correlation
-    from g2ard.rendering.renderer import Renderer
-    from g2ard.scene.targets import Photos, mask_of
 
     pictured = np.flatnonzero([path is not None for path in cameras.image_paths])
     tried = np.unique(np.linspace(0, len(pictured) - 1, min(_LOOKED_AT, len(pictured))).astype(int))
@@ -161,8 +152,6 @@ def as_pool(cameras: Cameras) -> Cameras:
 
 def opaque_points(splats: Splats) -> NDArray[np.float64]:
     """Return (K, 3) world means of a sample of the Gaussians of opacity 0.5 or more, otherwise of all."""
-    import numpy as np
-
     opaque = np.flatnonzero(splats.opacities >= 0.5)
     rows = opaque if len(opaque) else np.arange(len(splats))
     sample = rows[np.linspace(0, len(rows) - 1, min(_SAMPLE, len(rows))).astype(int)]

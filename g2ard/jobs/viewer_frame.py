@@ -5,22 +5,20 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from g2ard.errors import InputError
-from g2ard.jobs.inputs import load_views
+from g2ard.jobs.inputs import Views, load_views
 from g2ard.jobs.view_checks import opaque_points
 from g2ard.jobs.views import is_made, views_or_pool
+from g2ard.poses.site import Site
 from g2ard.progress import Progress, Say, silent, unsaid
+from g2ard.scene.cameras import Camera, Cameras
+from g2ard.scene.splats import Splats
+from g2ard.scene.transform import transform
 from g2ard.viewer import Start
-
-if TYPE_CHECKING:
-    from g2ard.jobs.inputs import Views
-    from g2ard.scene.cameras import Camera, Cameras
-    from g2ard.scene.splats import Splats
 
 _POOL = 32
 """Number of generated poses from which the initial camera is chosen."""
@@ -58,8 +56,6 @@ class ViewerFrame:
 
     def of(self, splats: Splats) -> Splats:
         """Transform a scene to this frame, without offset."""
-        from g2ard.scene.transform import transform
-
         turn = np.eye(4)
         turn[:3, :3] = self.rotation
         return transform(replace(splats.recentred(self.origin), offset=np.zeros(3)), turn)
@@ -132,8 +128,6 @@ def _level(cameras: Cameras) -> NDArray[np.float64] | None:
 
 def up_of(scene: Splats, up: Sequence[float] | None = None) -> NDArray[np.float64]:
     """Return `up` if given, otherwise estimate it from the scene, with −y as a fallback."""
-    from g2ard.poses.site import Site
-
     if up is not None:
         axis = np.asarray(up, np.float64)
         if axis.shape != (3,) or not np.isfinite(axis).all() or not axis.any():

@@ -9,18 +9,25 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from g2ard.jobs.inputs import drop_held_out, load_for_training, load_held_out, load_view_sets, load_views
+from g2ard.errors import InputError
+from g2ard.io import ViewSet
+from g2ard.jobs.inputs import (
+    Views,
+    drop_held_out,
+    load_for_training,
+    load_held_out,
+    load_view_sets,
+    load_views,
+)
 from g2ard.jobs.view_checks import as_pool, check_sight, found_views, warn_of_sight
 from g2ard.progress import Progress, Say, silent, unsaid
 from g2ard.scene.cameras import Cameras
+from g2ard.scene.splats import Splats
+from g2ard.scene.splits import split_mask, splits_of
 
 if TYPE_CHECKING:
-    from g2ard.io import ViewSet
-    from g2ard.jobs.inputs import Views
     from g2ard.poses import Pool
-    from g2ard.scene.splats import Splats
-
-    Up = Sequence[float] | None
+Up = Sequence[float] | None
 
 _POOL, _GROW, _NEAR = 160, 2.0, 0.25
 """Generated pool: number of poses, growth factor if views show little of the scene, and share of nearer
@@ -111,10 +118,6 @@ def views_of(
         InputError: a file without views, an empty split, views that see nothing of the scene, a scene with no
             room for poses, or a generated pool when targets must be photos.
     """
-    from g2ard.errors import InputError
-    from g2ard.io import ViewSet
-    from g2ard.scene.splits import split_mask
-
     found = None
     if views is None and beside is not None:
         wanted = ["train"] if held_out is not None else ["train", "test"]
@@ -172,8 +175,6 @@ def _mixed(
         share: share of the views from anywhere among all; None is 40 % times 1 − `Pool.held`.
         size: longer side of the views, pixels.
     """
-    from g2ard.io import ViewSet
-
     if share is None:
         share = _ANYWHERE * (1 - planned.held)
         share = share if share > _FEW else 0.0
@@ -215,9 +216,7 @@ def views_or_pool(
     Raises:
         InputError: a scene with no room for poses.
     """
-    from g2ard.io import ViewSet
     from g2ard.poses import plan_pool
-    from g2ard.scene.splits import splits_of
 
     if views is not None and not is_made(views):
         return views
@@ -264,7 +263,6 @@ def cameras_for_looks(
     Raises:
         InputError: a file without views, or an empty split.
     """
-    from g2ard.errors import InputError
     from g2ard.poses import plan_pool
 
     made = is_made(views)

@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from g2ard.levels.tree import Leaf
+from g2ard.levels.tree import Leaf, Level
+from g2ard.rendering.renderer import Renderer
 from g2ard.scene.cameras import Camera
 from g2ard.scene.splats import Splats
-
-if TYPE_CHECKING:
-    from g2ard.levels.tree import Level
 
 Float = NDArray[np.float64]
 
@@ -93,8 +90,6 @@ def _axes() -> Float:
 
 def _images(splats: Splats, cameras: Sequence[Camera]) -> NDArray[np.float32]:
     """Render (6, S, S, 4) colours over black with alpha."""
-    from g2ard.rendering.renderer import Renderer
-
     renderer = Renderer(splats)
     drawn = [renderer.render(camera) for camera in cameras]
     return np.stack([np.dstack([np.clip(image.image, 0, 1), image.alpha]) for image in drawn])

@@ -10,18 +10,19 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from g2ard import __version__
 from g2ard.errors import InputError, missing, require
-from g2ard.levels.tree import Cut, Leaf, Node
+from g2ard.io.atomic import atomic_folder
+from g2ard.io.glb import EXTENSION, SPZ_EXTENSION, spz_glb
+from g2ard.io.packing import writable
+from g2ard.levels.tree import Cut, Leaf, Level, Node
 from g2ard.levels.tree import cut as cut_tree
 from g2ard.progress import Progress, silent
-
-if TYPE_CHECKING:
-    from g2ard.levels.tree import Level
 
 Float = NDArray[np.float64]
 
@@ -151,10 +152,6 @@ def save_tileset(
         InputError: no levels, a level that is empty or not finite, or different offsets.
         OutputError: see `atomic_folder`.
     """
-    from g2ard import __version__
-    from g2ard.io.atomic import atomic_folder
-    from g2ard.io.glb import EXTENSION, SPZ_EXTENSION
-
     path, rule = Path(path), cut or Cut()
     tree = cut_tree(levels, rule, work)
     tiles = _Tiles(levels, rule.most, path)
@@ -234,9 +231,6 @@ class _Tiles:
 
     def content(self, name: str) -> list[bytes]:
         """Return the .glb of a tile, whose node is moved to the middle of its box."""
-        from g2ard.io.glb import spz_glb
-        from g2ard.io.packing import writable
-
         level, rows, middle = self.files[name]
         splats = replace(self.levels[level].take(np.concatenate(rows)), offset=np.zeros(3))
         return spz_glb(self.path / name, writable(self.path / name, splats), np.rint(middle))

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryFile
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,12 +15,10 @@ from numpy.typing import NDArray
 from g2ard.errors import InputError, require
 from g2ard.scene.splats import Splats
 from g2ard.stages.recover.anchors import rotation_matrices
+from g2ard.tiles.store import StoredScene
 
-if TYPE_CHECKING:
-    from g2ard.tiles.store import StoredScene
-
-    Level = Splats | StoredScene
-    """A level of detail: a scene in memory, or rows on disk."""
+Level = Splats | StoredScene
+"""A level of detail: a scene in memory, or rows on disk."""
 
 Float = NDArray[np.float64]
 Rows = NDArray[np.int64]

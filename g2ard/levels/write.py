@@ -15,19 +15,20 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
+from g2ard import __version__
+from g2ard.io.atomic import atomic_folder
+from g2ard.io.packing import morton_order
+from g2ard.io.sog_write import sog_files
 from g2ard.levels.error import leaf_errors
-from g2ard.levels.tree import Cut, Leaf, Node
+from g2ard.levels.tree import Cut, Leaf, Level, Node
 from g2ard.levels.tree import cut as cut_tree
 from g2ard.progress import Progress, silent
-
-if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
-    from g2ard.levels.tree import Level
-    from g2ard.scene.splats import Splats
+from g2ard.scene.splats import Splats
 
 _ERRORS = "errors.jsonl"
 """File in the work folder: one line of errors per leaf, in a fixed order of leaves."""
@@ -70,9 +71,6 @@ def save_levels(
         InputError: no levels, a level that is empty or not finite, or different offsets.
         OutputError: see `atomic_folder`.
     """
-    from g2ard import __version__
-    from g2ard.io.atomic import atomic_folder
-
     rule = cut or Cut()
     tree = cut_tree(levels, rule, work)
     files = _Files(levels, rule.most, {})
@@ -160,9 +158,6 @@ class _Files:
 
     def write(self, folder: Path, path: Path, progress: Progress) -> None:
         """Write all missing files, each atomically; `path` names them in messages."""
-        from g2ard.io.atomic import atomic_folder
-        from g2ard.io.sog_write import sog_files
-
         for number, name in enumerate(self.parts, start=1):
             if not (folder / name).exists():
                 with atomic_folder((folder / name).parent) as begun:
@@ -172,10 +167,6 @@ class _Files:
 
     def _rows(self, name: str) -> Splats:
         """Return the rows of a file, each leaf's in Morton order."""
-        import numpy as np
-
-        from g2ard.io.packing import morton_order
-
         leaves = self.parts[name]
         splats = self.levels[self.level_of[name]].take(np.concatenate(leaves))
         starts = np.cumsum([0, *map(len, leaves)])

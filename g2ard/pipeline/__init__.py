@@ -7,7 +7,7 @@ import time
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -15,15 +15,18 @@ from numpy.typing import ArrayLike
 from g2ard.pipeline.config import DistillConfig, SelectConfig
 from g2ard.pipeline.report import DistillReport, RoundReport, StageSeconds, ViewsReport
 from g2ard.progress import Progress, plural, silent
+from g2ard.rendering.visibility import visibility_source
+from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
 from g2ard.scene.targets import Photos, PhotosOrRenders, Subset, Targets, fingerprint_of
 from g2ard.stages.recover import checkpoint as checkpoints
+from g2ard.stages.recover import recover
 from g2ard.stages.recover.anchors import Anchors
 from g2ard.stages.recover.draw import checked_weights
-
-if TYPE_CHECKING:
-    from g2ard.scene.cameras import Cameras
-    from g2ard.stages.recover.optimize import Watch
+from g2ard.stages.recover.optimize import Watch
+from g2ard.stages.recover.schedule import steps_for, steps_from_points
+from g2ard.stages.select import select
+from g2ard.stages.simplify import round_counts, simplify
 
 __all__ = ["DistillConfig", "Distilled", "SelectConfig", "distill", "final_steps"]
 
@@ -90,8 +93,6 @@ def distill(
         InputError: the budget does not fit, no view sees the prior, or `work` belongs to another run.
         KeyboardInterrupt: after Ctrl-C; the same call resumes from `work`.
     """
-    from g2ard.stages.simplify import round_counts
-
     config = config or DistillConfig()
     many = config.recover.schedule.round_steps > 0
     kept, fold = config.simplify.retention_of("paper"), config.simplify.fold
@@ -116,8 +117,6 @@ def final_steps(config: DistillConfig, scene: Splats, cameras: Cameras, *, photo
         cameras: training views.
         photos: whether targets are photos.
     """
-    from g2ard.stages.recover.schedule import steps_for, steps_from_points
-
     schedule = config.recover.schedule
     if config.recover.steps is not None:
         return config.recover.steps
@@ -141,8 +140,6 @@ class _Supervision:
         cls, scene: Splats, targets: Targets, config: DistillConfig, weights: Any, progress: Progress
     ) -> _Supervision:
         """Select the views that see `scene`; given `weights` override those of the selection."""
-        from g2ard.stages.select import select
-
         cameras = targets.cameras
         how = config.select
         if how.views_count is None and (weights is not None or not how.weighted):
@@ -232,9 +229,6 @@ class _Rounds:
             self.supervision.fill(self.progress)
 
     def _simplify(self, number: int, count: int, entry: dict[str, Any]) -> None:
-        from g2ard.rendering.visibility import visibility_source
-        from g2ard.stages.simplify import simplify
-
         name = f"simplified-{number}"
         if self._restore(name, entry):
             self._resumed(entry["simplify"]["seconds"])
@@ -260,8 +254,6 @@ class _Rounds:
         self.simplified = self.state
 
     def _recover(self, name: str, entry: dict[str, Any], *, final: bool) -> None:
-        from g2ard.stages.recover import recover
-
         if self._restore(name, entry):
             self._resumed(entry["recover"][-1]["seconds"])
         else:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,9 +12,7 @@ from numpy.typing import NDArray
 from g2ard.errors import InputError
 from g2ard.io.jsonfile import read_json
 from g2ard.io.paths import real_path
-
-if TYPE_CHECKING:
-    from g2ard.scene.cameras import Cameras
+from g2ard.scene.cameras import Cameras
 
 HOLD_OUT = 8
 """Without a split file every 8th name is in the test split, as in Mip-NeRF 360's and INRIA's evaluations."""

@@ -14,6 +14,7 @@ from multiprocessing import get_context, parent_process
 from pathlib import Path
 from typing import Any, Protocol
 
+from g2ard import _core
 from g2ard.errors import InputError
 from g2ard.progress import Progress, silent
 from g2ard.system.memory import forget_workers, note_worker, peak_rss
@@ -167,8 +168,6 @@ def _run_noted(task: Task) -> tuple[int, int | None]:
 
 def _begin(threads: int) -> None:
     """Initialise a worker: leave Ctrl-C to the parent, and exit when the parent dies."""
-    from g2ard import _core
-
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
     _core.set_num_threads(threads)
@@ -270,7 +269,5 @@ class DaskExecutor:
 
 
 def _work(task: Task, threads: int) -> str:
-    from g2ard import _core
-
     _core.set_num_threads(threads)
     return str(run_task(task))

@@ -7,7 +7,7 @@ import json
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +15,9 @@ from numpy.typing import NDArray
 from g2ard.config.choices import RenderModel
 from g2ard.errors import InputError
 from g2ard.io.stream import PartsStream
+from g2ard.poses import plan_pool
 from g2ard.progress import Say, unsaid
+from g2ard.scene.cameras import Cameras
 from g2ard.scene.regions import Region, in_any
 from g2ard.scene.splats import Splats, unit_quats
 from g2ard.scene.transform import join
@@ -25,9 +27,6 @@ from g2ard.tiles.sights import Sights, Surroundings
 from g2ard.tiles.steps import TiledRun
 from g2ard.tiles.store import TileStore
 from g2ard.tiles.tasks import load, scene_of, small_scene
-
-if TYPE_CHECKING:
-    from g2ard.scene.cameras import Cameras
 
 _POOL, _POOL_ROWS = 96, 4_000_000
 """Number of poses per number of Gaussians; larger scenes get proportionally more."""
@@ -240,8 +239,6 @@ def _check_regions(sample: Splats, regions: Sequence[Region]) -> None:
 
 def _planned(run: TiledRun, sample: Splats, up: Any, seed: int, say: Say) -> Cameras | None:
     """Plan a view pool that grows with the scene."""
-    from g2ard.poses import plan_pool
-
     times = max(1.0, run.store.count / _POOL_ROWS)
     try:
         pool = plan_pool(

@@ -6,12 +6,12 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from g2ard.config.paths import changed, values_of
+from g2ard.jobs.views import RunViews
 from g2ard.rendering.renderer import RasterSettings, Renderer, settings_for
 from g2ard.report.kinds import KindScore, by_kind
 from g2ard.scene.cameras import Cameras
@@ -20,7 +20,7 @@ from g2ard.scene.splats import SH_C0, Splats
 from g2ard.scene.splits import USUAL
 from g2ard.scene.targets import TeacherRenders
 from g2ard.scene.transform import join
-from g2ard.stages.recover import RecoverConfig
+from g2ard.stages.recover import RecoverConfig, recover
 from g2ard.stages.recover.anchors import Anchors
 from g2ard.tiles.executor import Workers
 from g2ard.tiles.merging import TiledScene, finished, key_of
@@ -40,9 +40,6 @@ from g2ard.tiles.tasks import (
     scene_of,
     tile_of,
 )
-
-if TYPE_CHECKING:
-    from g2ard.jobs.views import RunViews
 
 _MARGIN = 16
 """Margin in pixels around a tile in its images, because SSIM's windows reach over its edge."""
@@ -132,8 +129,6 @@ def recover_tile(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays
         `scene` (`scene_of`), the tile's Gaussians; `errors`, (2, C, 2) before and after, per held-out view:
         squared error and number of values summed; `steps` taken.
     """
-    from g2ard.stages.recover import recover
-
     store = TileStore.open(places["store"])
     core, far = tile_of(arguments, inputs, places), far_around(store, arguments, inputs)
     # The tile's own Gaussians come first in teacher and student: masks and `frozen` rely on it.

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard.errors import InputError
+from g2ard.io.atomic import atomic_output
 from g2ard.rendering.renderer import RasterSettings
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.prepared import PreparedScene, as_prepared, finite_rows_of
@@ -99,8 +100,6 @@ def run_task(task: Task) -> Path:
         InputError: raised by the function.
         OutputError: the file cannot be written.
     """
-    from g2ard.io.atomic import atomic_output
-
     if task.done:
         return task.output
     module, name = task.function.split(":")

@@ -5,16 +5,18 @@ from __future__ import annotations
 import base64
 import json
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+import numpy as np
+
+from g2ard import __version__
 from g2ard.config.choices import BLACK
 from g2ard.errors import InputError, OutputError
-
-if TYPE_CHECKING:
-    from g2ard.scene.splats import Splats
+from g2ard.io.atomic import atomic_output, check_output
+from g2ard.io.sog_write import sog_bytes
+from g2ard.scene.splats import Splats
 
 _HERE = Path(__file__).parent
 _NOTICE = "The viewer on this page is SuperSplat Viewer 1.36.2 with PlayCanvas Engine 2.22.6.\n\n"
@@ -53,8 +55,6 @@ class Written:
 
 def check_page_output(path: str | Path, overwrite: bool = False) -> Path:
     """Check that a page can be written here, like `g2ard.io.check_output`."""
-    from g2ard.io.atomic import check_output
-
     if Path(path).suffix.lower() not in (".html", ".htm"):
         raise OutputError("expected a file name that ends in .html", path=path)
     return check_output(path, overwrite)
@@ -86,8 +86,6 @@ def write_page(
         OutputError: the file exists, cannot be written, or is not .html.
         InputError: a scene is empty, not finite, or too large for a page.
     """
-    from g2ard.io.atomic import atomic_output
-
     path = check_page_output(path, overwrite)
     packed = [_sog(path, label, splats) for label, splats in scenes]
     shown = {
@@ -104,12 +102,6 @@ def write_page(
 
 
 def _sog(path: Path, label: str, splats: Splats) -> bytes:
-    from dataclasses import replace
-
-    import numpy as np
-
-    from g2ard.io.sog_write import sog_bytes
-
     packed = sog_bytes(path, replace(splats, offset=np.zeros(3)))
     if len(packed) > _LARGEST:
         raise InputError(
@@ -121,8 +113,6 @@ def _sog(path: Path, label: str, splats: Splats) -> bytes:
 
 
 def _page(labels: Sequence[str], shown: object, packed: Sequence[bytes]) -> str:
-    from g2ard import __version__
-
     def part(name: str) -> str:
         return (_HERE / name).read_text(encoding="utf-8")
 
