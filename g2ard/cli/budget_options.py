@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -130,26 +130,51 @@ class Ratios(tuple[float, ...]):
         return cls(parse_ratio(part) for part in text.split(","))
 
 
-CountsOption = Annotated[
-    list[Counts] | None,
-    typer.Option(
-        "-n",
-        "--count",
-        parser=Counts.parse,
-        metavar="COUNT",
-        help="Gaussians to keep: 250000, 250k, 1.5M or 25%. Several (10k,20k) need {count} in --output.",
+BUDGETS: dict[str, tuple[Any, Any, Any]] = {
+    "count": (
+        list[Counts] | None,
+        None,
+        typer.Option(
+            "-n",
+            "--count",
+            parser=Counts.parse,
+            metavar="COUNT",
+            help="Gaussians to keep: 250000, 250k, 1.5M or 25%. Several (10k,20k) need {count} in --output.",
+        ),
     ),
-]
-RatiosOption = Annotated[
-    list[Ratios] | None,
-    typer.Option(
-        "-r",
-        "--ratio",
-        parser=Ratios.parse,
-        metavar="RATIO",
-        help="Reduction ratio: 10 keeps a tenth. Several (5,10,20) need {ratio} in --output.",
+    "ratio": (
+        list[Ratios] | None,
+        None,
+        typer.Option(
+            "-r",
+            "--ratio",
+            parser=Ratios.parse,
+            metavar="RATIO",
+            help="Reduction ratio: 10 keeps a tenth. Several (5,10,20) need {ratio} in --output.",
+        ),
     ),
-]
+    "fit": (
+        str | None,
+        None,
+        typer.Option(
+            metavar="5MB|DEVICE",
+            help="Largest scene that fits a file size or a device: "
+            "quest3, visionpro, android, ios, mobile, web, desktop.",
+        ),
+    ),
+    "min_psnr": (
+        float | None,
+        None,
+        typer.Option(min=1, help="Smallest scene with at least this PSNR against the original, dB."),
+    ),
+    "min_ssim": (
+        float | None,
+        None,
+        typer.Option(min=0.01, max=0.9999, help="Smallest scene with at least this SSIM."),
+    ),
+}
+"""Options of commands with budgets, see `g2ard.cli.frame.command`: name → type, default and option."""
+
 LooksOption = Annotated[
     Count | None,
     typer.Option(
@@ -165,23 +190,6 @@ RatioOption = Annotated[
     typer.Option(
         "-r", "--ratio", parser=parse_ratio, metavar="RATIO", help="Reduction ratio: 10 keeps a tenth."
     ),
-]
-FitOption = Annotated[
-    str | None,
-    typer.Option(
-        "--fit",
-        metavar="5MB|DEVICE",
-        help="Largest scene that fits a file size or a device: "
-        "quest3, visionpro, android, ios, mobile, web, desktop.",
-    ),
-]
-MinPsnrOption = Annotated[
-    float | None,
-    typer.Option(min=1, help="Smallest scene with at least this PSNR against the original, dB."),
-]
-MinSsimOption = Annotated[
-    float | None,
-    typer.Option(min=0.01, max=0.9999, help="Smallest scene with at least this SSIM."),
 ]
 
 

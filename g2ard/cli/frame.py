@@ -20,10 +20,11 @@ from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 import typer
 
 from g2ard.cli.app import app
-from g2ard.cli.budget_options import Counts, Ratios
+from g2ard.cli.budget_options import BUDGETS, Counts, Ratios
 from g2ard.cli.config_file import load_config, printed
 from g2ard.cli.console import Console
 from g2ard.cli.panels import COMMON, GROUPED, into_panels
+from g2ard.cli.tile_options import TILES
 from g2ard.cli.usage import flags_of, in_flags, typed
 from g2ard.config.choices import RenderModel, ViewFormat
 from g2ard.errors import G2ardError
@@ -79,16 +80,24 @@ _COMMON: dict[str, tuple[Any, Any, Any]] = {
 }
 """Name → type, default and option."""
 
-_SET = typer.Option(
-    "--set",
-    metavar="PATH=VALUE",
-    help="Change a setting, such as recover.schedule.steps=300; repeatable. See docs/options.md.",
-)
-
-
-_RENDER_MODEL = typer.Option(
-    "--render-model", help="How the scenes are drawn, if their files do not say it or say it wrongly."
-)
+_SETTINGS: dict[str, tuple[Any, Any, Any]] = {
+    "set": (
+        list[str] | None,
+        None,
+        typer.Option(
+            "--set",
+            metavar="PATH=VALUE",
+            help="Change a setting, such as recover.schedule.steps=300; repeatable. See docs/options.md.",
+        ),
+    )
+}
+_SCENES: dict[str, tuple[Any, Any, Any]] = {
+    "render_model": (
+        RenderModel | None,
+        None,
+        typer.Option(help="How the scenes are drawn, if their files do not say it or say it wrongly."),
+    )
+}
 
 
 class Run:
@@ -103,6 +112,7 @@ class Run:
     ) -> None:
         self.name = name
         self.flags = flags  # parameter → flag
+        self.shared = common
         self.overwrite: bool = common["overwrite"]
         self.seed: int = common["seed"]
         self.threads: int = common["threads"]
@@ -117,11 +127,11 @@ class Run:
         self.kept: list[str] = []  # what remains after Ctrl-C, for its message
         given = (*options.values(), common["config"])
         paths = [p for value in given for p in (value if isinstance(value, list) else [value])]
-        written = (options.get("output"), options.get("work"))
+        written = (options.get("output"), common.get("work"))
         self._inputs = [p for p in paths if isinstance(p, Path) and all(p is not w for w in written)]
-        own = {name: _flat(value) for name, value in options.items()}
-        self.config = {**own, "seed": self.seed, "threads": self.threads, "device": self.device}
-        self.config |= {name: common[name] for name in ("set", "render_model") if name in common}
+        unrecorded = _COMMON.keys() - {"seed", "threads", "device"}
+        told = {**options, **{name: value for name, value in common.items() if name not in unrecorded}}
+        self.config = {name: _flat(value) for name, value in told.items()}
 
     def settings(self, config: Any, *names: str, preset: str | None = None) -> dict[str, Any]:
         """Collect config values by path from options and --set, which wins.
@@ -290,6 +300,8 @@ def command(
     cuda: bool = False,
     settings: bool = False,
     scenes: bool = False,
+    budgets: bool = False,
+    tiles: bool = False,
 ) -> Callable[[Any], Any]:
     """Register `fn(run, **options)` as a command.
 
@@ -300,28 +312,28 @@ def command(
         cuda: whether it supports --device cuda.
         settings: whether it takes --set, see `Run.settings`.
         scenes: whether it reads scenes and takes --render-model, see `Run.load`.
+        budgets: whether it takes budgets, see `g2ard.cli.outputs.budgets_of`.
+        tiles: whether it works on scenes in tiles, see `g2ard.cli.tile_options.tiling_of`.
     """
 
     def register(fn: Callable[..., None]) -> Callable[..., None]:
         own = list(inspect.signature(fn, eval_str=True).parameters.values())[1:]
-        shared_options = dict(_COMMON)
-        if settings:
-            shared_options["set"] = (list[str] | None, None, _SET)
-        if scenes:
-            shared_options["render_model"] = (RenderModel | None, None, _RENDER_MODEL)
-        shared_parameters = [
-            inspect.Parameter(
-                key, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=Annotated[kind, option]
-            )
-            for key, (kind, default, option) in shared_options.items()
-        ]
-        for p in shared_parameters:
-            into_panels(p.name, p.annotation, COMMON)
-        for p in own if name in GROUPED else ():
-            into_panels(p.name, p.annotation)
+        given = BUDGETS if budgets else {}
+        taken = {**(TILES if tiles else {}), **_COMMON}
+        taken |= {**(_SETTINGS if settings else {}), **(_SCENES if scenes else {})}
+        shared_options = {**given, **taken}
+        first, last = (
+            [_parameter(key, *options) for key, options in part.items()] for part in (given, taken)
+        )
+        all_parameters = [*first, *own, *last]
+        for p in all_parameters:
+            if p.name in (*_COMMON, *_SETTINGS, *_SCENES):
+                into_panels(p.name, p.annotation, COMMON)
+            elif name in GROUPED:
+                into_panels(p.name, p.annotation)
 
         def call(ctx: typer.Context, **values: Any) -> None:
-            _flags_win(ctx, values, {p.name: p.default for p in own})
+            _flags_win(ctx, values, {p.name: p.default for p in all_parameters})
             shared_values = {key: values.pop(key) for key in shared_options}
             if typed(ctx, "set"):  # after the config file's, since the last value wins
                 typed_last = [*(ctx.default_map or {}).get("set", []), *shared_values["set"]]
@@ -338,9 +350,7 @@ def command(
 
         # Typer reads options from the signature: the context, the command's own, and the shared ones.
         context = inspect.Parameter("ctx", inspect.Parameter.KEYWORD_ONLY, annotation=typer.Context)
-        parameters = [
-            p.replace(kind=inspect.Parameter.KEYWORD_ONLY) for p in (context, *own, *shared_parameters)
-        ]
+        parameters = [p.replace(kind=inspect.Parameter.KEYWORD_ONLY) for p in (context, *all_parameters)]
         call.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
         call.__annotations__ = {p.name: p.annotation for p in parameters}
         call.__doc__ = fn.__doc__
@@ -348,6 +358,11 @@ def command(
         return fn
 
     return register
+
+
+def _parameter(name: str, kind: Any, default: Any, option: Any) -> inspect.Parameter:
+    annotation = Annotated[kind, option]
+    return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
 
 
 class _Checked(Exception):
@@ -369,7 +384,7 @@ def _execute(run: Run, fn: Callable[..., None], options: dict[str, Any], cuda: b
     outputs = [Path(o) for o in (options.get("output"), run.json) if o not in (None, "-")]
     if len({real_path(output) for output in outputs}) < len(outputs):
         raise typer.BadParameter(f"--json and --output are the same file {run.json}; name another one")
-    work = options.get("work")
+    work = run.shared.get("work")
     if work is not None and real_path(work) in {real_path(output) for output in outputs}:
         raise typer.BadParameter(f"--work: {work} is an output; name another folder")
     run.spare_inputs(*outputs)

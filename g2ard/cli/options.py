@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -32,13 +32,6 @@ SceneArgument = Annotated[
     Path,
     typer.Argument(
         metavar="SCENE", help="Scene: .ply (3DGS), SOG, .spz, .glb, .splat, .compressed.ply or OpenUSD."
-    ),
-]
-Protocol = Literal["pool", "standing", "both"]
-ProtocolOption = Annotated[
-    Protocol,
-    typer.Option(
-        help="Views to score: held out of the pool, near and at eye level (standing), or both.",
     ),
 ]
 ViewsOption = Annotated[
@@ -236,12 +229,6 @@ BackgroundOption = Annotated[
     Triple | None,
     typer.Option(
         parser=_colour, metavar="COLOUR", help="Background: black (default), white or R,G,B in [0, 1]."
-    ),
-]
-SkyOption = Annotated[
-    Triple | None,
-    typer.Option(
-        parser=_colour, metavar="COLOUR", help="Sky: black, white or R,G,B in [0, 1]; 0.6,0.8,1 by default."
     ),
 ]
 TeacherOption = Annotated[

@@ -9,25 +9,20 @@ from typing import TYPE_CHECKING
 
 import typer
 
+from g2ard.cli.budget_options import BUDGETS
 from g2ard.cli.frame import Run
 from g2ard.cli.usage import in_flags
 
 if TYPE_CHECKING:
-    from g2ard.cli.budget_options import Counts, Ratios
     from g2ard.jobs.budget import Budget
 
 
-def budgets_of(
-    counts: list[Counts] | None,
-    ratios: list[Ratios] | None,
-    fit: str | None = None,
-    min_psnr: float | None = None,
-    min_ssim: float | None = None,
-) -> list[Budget]:
+def budgets_of(run: Run) -> list[Budget]:
     """Return the budgets of the options, and check that exactly one kind is given."""
     from g2ard.errors import InputError
     from g2ard.jobs.budget import Budget
 
+    counts, ratios, fit, min_psnr, min_ssim = (run.shared[name] for name in BUDGETS)
     quality = min_psnr is not None or min_ssim is not None
     if [bool(counts), bool(ratios), fit is not None, quality].count(True) != 1:
         raise typer.BadParameter(
@@ -37,9 +32,7 @@ def budgets_of(
         try:
             return [Budget(fit=fit, min_psnr=min_psnr, min_ssim=min_ssim)]
         except InputError as error:
-            raise typer.BadParameter(
-                in_flags(error, {"fit": "--fit", "min_psnr": "--min-psnr", "min_ssim": "--min-ssim"})
-            ) from None
+            raise typer.BadParameter(in_flags(error, run.flags)) from None
     if counts:
         return [count.budget() for several in counts for count in several]
     return [Budget(ratio=ratio) for several in ratios or [] for ratio in several]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Any
 
 import typer
 
@@ -14,70 +14,64 @@ if TYPE_CHECKING:
     from g2ard.cli.frame import Run
     from g2ard.jobs.tiling import Tiling
 
-TileRowsOption = Annotated[
-    Count | None,
-    typer.Option(
-        parser=Count.parse_absolute,
-        metavar="COUNT",
-        help="Maximum Gaussians per tile; larger scenes are processed in tiles. 5M by default.",
+TILES: dict[str, tuple[Any, Any, Any]] = {
+    "tile_rows": (
+        Count | None,
+        None,
+        typer.Option(
+            parser=Count.parse_absolute,
+            metavar="COUNT",
+            help="Maximum Gaussians per tile; larger scenes are processed in tiles. 5M by default.",
+        ),
     ),
-]
-MemoryOption = Annotated[
-    str | None,
-    typer.Option(metavar="SIZE", help="Memory limit for all workers together, such as 4GB."),
-]
-WorkersOption = Annotated[
-    int | None,
-    typer.Option(min=1, help="Processes for tiles; by default as many as cores and memory allow."),
-]
-SchedulerOption = Annotated[
-    str | None,
-    typer.Option(
-        metavar="ADDRESS",
-        help="Dask scheduler for tiles: tcp://HOST:PORT or local (needs the extra `distributed`).",
+    "memory": (
+        str | None,
+        None,
+        typer.Option(metavar="SIZE", help="Memory limit for all workers together, such as 4GB."),
     ),
-]
-WorkOption = Annotated[
-    Path | None,
-    typer.Option(
-        metavar="DIR",
-        help="Keep tiles and finished steps here, for other budgets; by default in .NAME.tiles beside the "
-        "output, until the command succeeds.",
+    "workers": (
+        int | None,
+        None,
+        typer.Option(min=1, help="Processes for tiles; by default as many as cores and memory allow."),
     ),
-]
+    "scheduler": (
+        str | None,
+        None,
+        typer.Option(
+            metavar="ADDRESS",
+            help="Dask scheduler for tiles: tcp://HOST:PORT or local (needs the extra `distributed`).",
+        ),
+    ),
+    "work": (
+        Path | None,
+        None,
+        typer.Option(
+            metavar="DIR",
+            help="Keep tiles and finished steps here, for other budgets; by default in .NAME.tiles beside "
+            "the output, until the command succeeds.",
+        ),
+    ),
+}
+"""Options of commands that work in tiles, see `g2ard.cli.frame.command`: name → type, default and option."""
 
 
-def tiling_of(
-    run: Run,
-    scene: Path | None,
-    output: Path,
-    tile_rows: Count | None,
-    memory: str | None,
-    workers: int | None,
-    scheduler: str | None,
-    work: Path | None,
-) -> Tiling:
+def tiling_of(run: Run, scene: Path | None, output: Path) -> Tiling:
     """Check the options and return them as a `Tiling`."""
     from g2ard.errors import InputError
     from g2ard.jobs.tiling import Tiling, bytes_of
 
-    if tile_rows is not None and scene is not None:
-        _check_rows(scene, tile_rows.of(0))
+    tile_rows, memory, workers, scheduler, work = (run.shared[name] for name in TILES)
+    rows = None if tile_rows is None else tile_rows.of(0)
+    if rows is not None and scene is not None:
+        _check_rows(scene, rows)
     try:
         size = None if memory is None else bytes_of(memory)
     except InputError as error:
         raise typer.BadParameter(in_flags(error, run.flags)) from None
     if scheduler is not None and scheduler != "local" and "://" not in scheduler:
         raise typer.BadParameter(f"--scheduler: expected tcp://HOST:PORT or local, got {scheduler!r}")
-    return Tiling(
-        None if tile_rows is None else tile_rows.of(0),
-        size,
-        workers,
-        run.threads or None,
-        scheduler,
-        work or _beside(output),
-        keep=work is not None,
-    )
+    folder = work or _beside(output)
+    return Tiling(rows, size, workers, run.threads or None, scheduler, folder, keep=work is not None)
 
 
 def _beside(output: Path) -> Path:

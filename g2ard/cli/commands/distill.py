@@ -10,13 +10,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from g2ard.cli.budget_options import (
-    CountsOption,
-    FitOption,
-    MinPsnrOption,
-    MinSsimOption,
-    RatiosOption,
-)
 from g2ard.cli.frame import Run, command
 from g2ard.cli.options import (
     AlphaOption,
@@ -52,14 +45,7 @@ from g2ard.cli.run_folder import (
     write_report,
 )
 from g2ard.cli.run_result import say_views, say_weight, tell_quality, told, write_table
-from g2ard.cli.tile_options import (
-    MemoryOption,
-    SchedulerOption,
-    TileRowsOption,
-    WorkersOption,
-    WorkOption,
-    tiling_of,
-)
+from g2ard.cli.tile_options import tiling_of
 from g2ard.cli.tiled import TiledCommand
 from g2ard.progress import plural
 
@@ -73,7 +59,15 @@ if TYPE_CHECKING:
     Colour = tuple[float, float, float]
 
 
-@command("distill", example="g2ard distill scene.ply -r 10 -o run/", cuda=True, settings=True, scenes=True)
+@command(
+    "distill",
+    example="g2ard distill scene.ply -r 10 -o run/",
+    cuda=True,
+    settings=True,
+    scenes=True,
+    budgets=True,
+    tiles=True,
+)
 def distill(
     run: Run,
     *,
@@ -84,11 +78,6 @@ def distill(
             help="A trained scene or coloured point cloud. Omit it to start from the photos of --views.",
         ),
     ] = None,
-    count: CountsOption = None,
-    ratio: RatiosOption = None,
-    fit: FitOption = None,
-    min_psnr: MinPsnrOption = None,
-    min_ssim: MinSsimOption = None,
     views: ViewsOrMadeOption = None,
     images: ImagesOption = None,
     alpha: AlphaOption = "composite",
@@ -141,11 +130,6 @@ def distill(
         bool,
         typer.Option("--dry-run", help="Estimate time and memory, then exit."),
     ] = False,
-    tile_rows: TileRowsOption = None,
-    memory: MemoryOption = None,
-    workers: WorkersOption = None,
-    scheduler: SchedulerOption = None,
-    work: WorkOption = None,
 ) -> None:
     """Distil a dense scene, or a point cloud with photos, into a compact scene.
 
@@ -157,7 +141,7 @@ def distill(
 
     names = ("method", "keep_region", "schedule", "steps", "recovery_time", "background", "seed")
     settings = run.settings(DistillConfig(), *names, preset=preset)
-    budgets = budgets_of(count, ratio, fit, min_psnr, min_ssim)
+    budgets = budgets_of(run)
     given = views is not None and not is_made(views)
     _check_options(scene, views, held_out, photos)
     from g2ard.jobs.distill import prepare
@@ -193,7 +177,7 @@ def distill(
         preset=preset,
         settings=settings,
     )
-    tiling = tiling_of(run, scene, output, tile_rows, memory, workers, scheduler, work)
+    tiling = tiling_of(run, scene, output)
     if scene is not None and is_tiled(scene, tiling):
         TiledCommand(run, scene, outputs, tiling, budgets).distill(options, name, resume)
         return

@@ -19,14 +19,7 @@ from g2ard.cli.options import (
     ViewsOrMadeOption,
     with_images,
 )
-from g2ard.cli.tile_options import (
-    MemoryOption,
-    SchedulerOption,
-    TileRowsOption,
-    WorkersOption,
-    WorkOption,
-    tiling_of,
-)
+from g2ard.cli.tile_options import tiling_of
 from g2ard.cli.usage import in_flags
 from g2ard.config.choices import BLACK
 from g2ard.progress import plural
@@ -40,7 +33,7 @@ if TYPE_CHECKING:
     from g2ard.levels.tree import Level
 
 
-@command("lod", example="g2ard lod scene.ply -r 1,2,4,8,16 -o streamed/", scenes=True)
+@command("lod", example="g2ard lod scene.ply -r 1,2,4,8,16 -o streamed/", scenes=True, tiles=True)
 def lod(
     run: Run,
     scene: Annotated[
@@ -123,11 +116,6 @@ def lod(
     background: BackgroundOption = None,
     up: UpOption = None,
     resume: ResumeOption = False,
-    tile_rows: TileRowsOption = None,
-    memory: MemoryOption = None,
-    workers: WorkersOption = None,
-    scheduler: SchedulerOption = None,
-    work: WorkOption = None,
 ) -> None:
     """Write levels of detail as streamed SOG or 3D Tiles.
 
@@ -162,7 +150,7 @@ def lod(
     meta = output / ("lod-meta.json" if kind == "sog" else "tileset.json")
     stopped = output.with_name(f".{output.name}.unfinished")
     run.spare_inputs(meta)
-    tiling = tiling_of(run, scene, output, tile_rows, memory, workers, scheduler, work)
+    tiling = tiling_of(run, scene, output)
     tiled = is_tiled(scene, tiling)
     finished = resume and meta.exists() and not run.overwrite and (tiled or not left_at(stopped))
     if finished:

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from g2ard.cli.budget_options import CountsOption, FitOption, MinPsnrOption, MinSsimOption, RatiosOption
 from g2ard.cli.frame import Run, command
 from g2ard.cli.options import (
     ImagesOption,
@@ -24,14 +23,7 @@ from g2ard.cli.options import (
 )
 from g2ard.cli.outputs import Outputs, budgets_of
 from g2ard.cli.run_result import say_weight, tell_quality
-from g2ard.cli.tile_options import (
-    MemoryOption,
-    SchedulerOption,
-    TileRowsOption,
-    WorkersOption,
-    WorkOption,
-    tiling_of,
-)
+from g2ard.cli.tile_options import tiling_of
 from g2ard.cli.tiled import TiledCommand
 from g2ard.progress import plural
 
@@ -40,16 +32,18 @@ if TYPE_CHECKING:
     from g2ard.stages.simplify import Simplified, SimplifyConfig
 
 
-@command("simplify", example="g2ard simplify garden.ply -r 10 -o garden_10x.ply", settings=True, scenes=True)
+@command(
+    "simplify",
+    example="g2ard simplify garden.ply -r 10 -o garden_10x.ply",
+    settings=True,
+    scenes=True,
+    budgets=True,
+    tiles=True,
+)
 def simplify(
     run: Run,
     *,
     scene: SceneArgument,
-    count: CountsOption = None,
-    ratio: RatiosOption = None,
-    fit: FitOption = None,
-    min_psnr: MinPsnrOption = None,
-    min_ssim: MinSsimOption = None,
     views: ViewsOrMadeOption = None,
     images: ImagesOption = None,
     no_views: Annotated[
@@ -65,11 +59,6 @@ def simplify(
         Path | None,
         typer.Option(metavar="FILE.npy", help="Also write each Gaussian's row in the result, or -1."),
     ] = None,
-    tile_rows: TileRowsOption = None,
-    memory: MemoryOption = None,
-    workers: WorkersOption = None,
-    scheduler: SchedulerOption = None,
-    work: WorkOption = None,
 ) -> None:
     """Reduce a scene to an exact number of Gaussians; no images needed.
 
@@ -82,12 +71,12 @@ def simplify(
 
     settings = run.settings(SimplifyConfig(), "method", "keep_region", preset=preset)
     config = configured(SimplifyConfig(), preset or "auto", settings)
-    budgets = budgets_of(count, ratio, fit, min_psnr, min_ssim)
+    budgets = budgets_of(run)
     if views is not None and no_views:
         raise typer.BadParameter("--views and --no-views exclude each other; give one")
     if keep_region and (no_views or config.method == "paper"):
         raise typer.BadParameter("--keep-region needs views; remove --no-views or --method paper")
-    tiling = tiling_of(run, scene, output, tile_rows, memory, workers, scheduler, work)
+    tiling = tiling_of(run, scene, output)
     from g2ard import io
     from g2ard.jobs.inputs import say_notes
     from g2ard.jobs.measured_budget import aim_of
