@@ -17,12 +17,7 @@ OPTIONS = "options.json"
 
 
 def check_stopped(run: Run, place: Path, resume: bool, output: Path) -> bool:
-    """Return whether to resume from `place`, a checkpoint or a folder of checkpoints.
-
-    Raises:
-        OutputError: checkpoints exist, and neither --resume nor --overwrite is given.
-        Exit: `output` is finished, and there is nothing to resume.
-    """
+    """Return whether to resume from `place`, checkpoints; end the command if `output` is finished already."""
     left = left_at(place)
     if resume and not left and not run.overwrite and output.exists():
         run.say(f"{output}: already finished; -w without --resume starts over")

@@ -26,11 +26,7 @@ def writable(path: Path, splats: Splats) -> Splats:
 
 
 def world_means(path: Path, splats: Splats, what: str) -> NDArray[np.float64]:
-    """Return (N, 3) means + offset for a float32 format `what` without an offset.
-
-    Raises:
-        InputError: steps of float32 exceed the median smallest scale.
-    """
+    """Return (N, 3) means + offset for a float32 format `what` without an offset."""
     means = splats.means.astype(np.float64) + splats.offset
     if splats.offset.any():
         step = float(np.spacing(np.abs(means).max().astype(np.float32)))

@@ -40,9 +40,6 @@ class Budget:
         min_psnr: approximately the fewest that keep this PSNR (dB) against renders of the scene.
         min_ssim: approximately the fewest that keep this SSIM; with `min_psnr` both hold.
 
-    Raises:
-        InputError: no budget or several, or a value out of range.
-
     >>> Budget(ratio=3).of(1000), Budget(count=10).of(1000), Budget(share=0.25).of(10)
     (333, 10, 3)
     >>> Budget(fit="1.5MB").bytes, Budget(fit="quest3").of(2_000_000)
@@ -98,11 +95,7 @@ class Budget:
         return self.bytes is not None or self.min_psnr is not None or self.min_ssim is not None
 
     def of(self, total: int, name: str = "scene") -> int:
-        """Return the exact count for a scene of `total` Gaussians, called `name` in errors.
-
-        Raises:
-            InputError: it is above `total`, or depends on the scene.
-        """
+        """Return the exact count for a scene of `total` Gaussians, called `name` in errors."""
         if self.is_measured:
             raise InputError("fit, min_psnr, min_ssim: the count depends on the scene")
         if self.ratio is not None:

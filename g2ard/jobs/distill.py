@@ -205,9 +205,6 @@ def _sources(views: RunViews, photos: bool | None, lifted: bool) -> _Sources:
         views: views for training and scoring.
         photos: the option: True allows only photos, False only renders, None both.
         lifted: whether the scene is a lifted point cloud, which cannot be rendered for targets.
-
-    Raises:
-        InputError: a view without a photo, if targets must be photos.
     """
     train = views.train.cameras
     pictured = [path is not None for path in (*train.image_paths, *views.test.image_paths)]

@@ -105,11 +105,7 @@ def estimate(job: DistillJob, budget: int, *, page: bool = True) -> Estimate:
 
 
 def check_memory(job: DistillJob, most: int | None, *, page: bool = True) -> None:
-    """Reject a job whose estimated memory exceeds `most` bytes at any budget; None means no limit.
-
-    Raises:
-        InputError: the estimate exceeds `most`.
-    """
+    """Reject a job whose estimated memory exceeds `most` bytes at any budget; None means no limit."""
     if most is None:
         return
     need = max(estimate(job, budget, page=page).bytes for budget in job.budgets)

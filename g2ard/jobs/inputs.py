@@ -54,11 +54,7 @@ def say_notes(path: str | Path, notes: Sequence[Note], say: Say) -> None:
 
 
 def say_regions(splats: Splats, config: SimplifyConfig, name: str, say: Say) -> None:
-    """Say how many Gaussians lie in the regions to keep.
-
-    Raises:
-        InputError: no Gaussian lies there.
-    """
+    """Say how many Gaussians lie in the regions to keep."""
     if config.keep_region:
         inside = int(in_any(splats, config.keep_region).sum())
         if not inside:
@@ -78,22 +74,14 @@ _HARMLESS = ("clamped_logits",)
 def load_views(
     views: Views, split: str, size: int | None, say: Say = unsaid, *, unpictured: bool = False
 ) -> Cameras:
-    """Read the views of a split, shrunk to `size`; `unpictured` keeps views without a photo among others.
-
-    Raises:
-        InputError: the file has no views, or the split is empty.
-    """
+    """Read the views of a split, shrunk to `size`; `unpictured` keeps views without a photo among others."""
     return load_view_sets(views, [split], size, say, unpictured=unpictured)[0].cameras
 
 
 def load_view_sets(
     views: Views, splits: list[str], size: int | None, say: Say = unsaid, *, unpictured: bool = False
 ) -> list[ViewSet]:
-    """Read views once and return several splits, shrunk to `size`, with their weights.
-
-    Raises:
-        InputError: as `load_views`.
-    """
+    """Read views once and return several splits, shrunk to `size`, with their weights."""
     found, path = _read(views, say, unpictured=unpictured)
     masks = [split_mask(path, found.cameras.names, split, stated=found.splits) for split in splits]
     return [found.take(mask).resized(size) for mask in masks]
@@ -104,30 +92,19 @@ def load_for_training(
 ) -> ViewSet:
     """Read training views when views for scoring are given separately: the train split if splits are stated,
     otherwise all.
-
-    Raises:
-        InputError: as `load_views`, and as `g2ard.scene.splits.for_training`.
     """
     found, path = _read(views, say, unpictured=unpictured)
     return found.take(for_training(path, found.cameras.names, found.splits)).resized(size)
 
 
 def load_held_out(views: Views, size: int | None, say: Say = unsaid, *, unpictured: bool = False) -> ViewSet:
-    """Read views that were given for scoring.
-
-    Raises:
-        InputError: as `load_views`, and as `g2ard.scene.splits.for_scores`.
-    """
+    """Read views that were given for scoring."""
     found, path = _read(views, say, unpictured=unpictured)
     return found.take(for_scores(path, found.cameras.names, found.splits)).resized(size)
 
 
 def drop_held_out(train: ViewSet, held_out: Cameras, say: Say = unsaid) -> ViewSet:
-    """Remove held-out views from training views, and report how many were removed.
-
-    Raises:
-        InputError: no views are left.
-    """
+    """Remove held-out views from training views, and report how many were removed."""
     keep = not_held_out(train.cameras, held_out)
     if not keep.any():
         raise InputError(
@@ -142,11 +119,7 @@ def drop_held_out(train: ViewSet, held_out: Cameras, say: Say = unsaid) -> ViewS
 def load_trained(
     views: Views, split: str, size: int | None, say: Say = unsaid, *, unpictured: bool = False
 ) -> ViewSet:
-    """Read the training views of a split, shrunk to `size`; report test views among them.
-
-    Raises:
-        InputError: as `load_views`.
-    """
+    """Read the training views of a split, shrunk to `size`; report test views among them."""
     pool, mask = load_split_views(views, split, say, unpictured=unpictured)
     chosen = pool.take(mask)
     held_out = chosen.splits.count("test")
@@ -158,11 +131,7 @@ def load_trained(
 def load_split_views(
     views: Views, split: str, say: Say = unsaid, *, unpictured: bool = False
 ) -> tuple[ViewSet, NDArray[np.bool_]]:
-    """Read all views with their splits, stated or by the rule, and the mask of the views in `split`.
-
-    Raises:
-        InputError: as `load_views`.
-    """
+    """Read all views with their splits, stated or by the rule, and the mask of the views in `split`."""
     found, path = _read(views, say, unpictured=unpictured)
     names = found.cameras.names
     mask = split_mask(path, names, split, stated=found.splits)
@@ -241,14 +210,9 @@ def clutter_seen(
         kinds: looked for; None for all of `g2ard.stages.clean.KINDS`.
         strength: of removing haze and streaks, see `g2ard.stages.clean.find_clutter`; 0 removes none.
         seed: of the generated views.
-        progress: receives planning and renders.
-        say: receives log lines.
 
     Returns:
         The clutter, and the views it was found by.
-
-    Raises:
-        InputError: an unknown kind, or a scene with no room for poses.
     """
     from g2ard.poses import plan_pool
     from g2ard.stages.clean import FLOATING, KINDS, find_clutter, find_floating, within_reach

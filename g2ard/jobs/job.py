@@ -38,8 +38,6 @@ class DistillJob:
         measured: the measures that decided it.
         seconds: time of preparation, including reading.
         cleaned: number of Gaussians removed by kind of clutter; None without cleaning.
-        progress: called by all stages.
-        say: called with log messages.
     """
 
     prior: Splats

@@ -104,9 +104,6 @@ def count_for_bytes(splats: Splats, wanted: int, name: str, reduce: Callable[[in
         wanted: bytes.
         name: a file name; its suffix is the format.
         reduce: count → scene.
-
-    Raises:
-        InputError: too few bytes for any useful scene.
     """
     fewest, most = min(_FEWEST, len(splats)), len(splats)
     sample = splats.take(np.unique(np.linspace(0, most - 1, min(most, _SAMPLE)).astype(int)))
@@ -292,12 +289,6 @@ def aim_of(
         reduce: count → scene, by the method that makes the result.
         recovered: whether recovery follows. Bytes are then searched with the method `fast` and a margin.
         seed: seed of the views for measuring quality.
-        progress: called during planning.
-        say: called with the count found.
-
-    Raises:
-        InputError: the budget is above the scene's count, or no file of its format has so few bytes.
-        OutputError: `file` has no known scene format.
     """
     if budget.min_psnr is not None or budget.min_ssim is not None:
         wanted = Quality(budget.min_psnr or 0.0, budget.min_ssim or 0.0)

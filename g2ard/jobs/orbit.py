@@ -37,10 +37,6 @@ def orbit(
         size: width and height, pixels.
         up: (3,) axis of the circle; estimated by default.
         seed: seed of the generated views.
-        progress: called during planning.
-
-    Raises:
-        InputError: nothing visible to look at, or an invalid `up`.
     """
     pool = plan_pool(scene, _POOL, size=size, up=up, seed=seed, progress=progress)
     points, axis = opaque_points(scene), np.asarray(pool.up, np.float64)

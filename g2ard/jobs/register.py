@@ -44,14 +44,9 @@ def photos_of(
         focal: for a folder: focal length in pixels of the stored photo; centred principal point, no
             distortion.
         alpha: "mask" ignores transparent pixels instead of showing them over the background.
-        say: called with notes.
 
     Returns:
         C cameras; photos from a folder have the identity as pose.
-
-    Raises:
-        InputError: no photos, no intrinsics or both kinds, ambiguous intrinsics, or no photo with the
-            intrinsics' aspect ratio.
     """
     files = _photos_in(path)
     if not files:
@@ -167,11 +162,7 @@ def _check_aspects(files: list[Path], sizes: list[tuple[int, int]], views: list[
 
 
 def read_poses(path: Path) -> Poses:
-    """Read name → (4, 4) camera_from_world from views in any format, or from ACE's text (`g2ard.io.ace`).
-
-    Raises:
-        InputError: it cannot be read, or names a view twice.
-    """
+    """Read name → (4, 4) camera_from_world from views in any format, or from ACE's text (`g2ard.io.ace`)."""
     if path.suffix.lower() == ".txt" and path.is_file():
         return ace.read(path)
     cameras = read_view_set(path, unpictured=True).cameras
@@ -179,11 +170,7 @@ def read_poses(path: Path) -> Poses:
 
 
 def poses_for(path: Path, names: Sequence[str]) -> Poses:
-    """Read the poses of the named photos, see `read_poses` and `matched`.
-
-    Raises:
-        InputError: as `read_poses`, or no pose belongs to a photo.
-    """
+    """Read the poses of the named photos, see `read_poses` and `matched`."""
     found = matched(read_poses(path), names)
     if not found:
         raise InputError(f"no pose has the name of a photo (the first photo is {names[0]})", path=path)
@@ -209,11 +196,7 @@ def matched(found: Mapping[str, Found], names: Sequence[str]) -> dict[str, Found
 
 
 def pool_of(scene: Splats, pool: str, seed: int, progress: Progress = silent, say: Say = unsaid) -> Cameras:
-    """Return poses from a file of views, or plan as many as a number says; `say` receives their kind.
-
-    Raises:
-        InputError: an unreadable file, or a scene with no room for poses.
-    """
+    """Return poses from a file of views, or plan as many as a number says; `say` receives their kind."""
     if not pool.strip().isdigit():
         return read_view_set(Path(pool), unpictured=True).cameras
     from g2ard.poses import plan_pool

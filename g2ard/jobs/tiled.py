@@ -52,10 +52,6 @@ def working(tiling: Tiling, *views: Views | None) -> Iterator[None]:
         tiling: of the command.
         views: given to the command; they are read now, and the scheduler is tried, because writing tiles
             takes long.
-
-    Raises:
-        InputError: the views cannot be read, or the scheduler does not answer.
-        OutputError: the folder is a file, holds something else, or another process works there.
     """
     folder = _folder(tiling)
     _check_folder(folder)
@@ -132,11 +128,6 @@ def _tiles_and_workers(
         tiling: how. Tiles of another size are replaced unless the user named the folder.
         times: memory of a tile relative to merging it.
         render_model: overrides what a file says.
-        progress: receives rows written.
-        say: receives log lines.
-
-    Raises:
-        InputError: the scene cannot be read, or a tile takes too much memory.
     """
     if (scene / MANIFEST).is_file():
         store = TileStore.open(scene)
@@ -191,11 +182,6 @@ def simplify_in_tiles(
         up: (3,) away from the ground, for generated views.
         seed: of generated views.
         render_model: overrides what a file says.
-        progress: receives the number of finished tasks.
-        say: receives log lines.
-
-    Raises:
-        InputError: too little memory for a tile, or as `g2ard.tiles.merging.simplify_tiles`.
     """
     with _tiles_and_workers(scene, tiling, 1.0, render_model, progress, say) as (store, workers):
         for budget in budgets:
@@ -244,11 +230,6 @@ def distill_in_tiles(
         budgets: counts, ratios or shares.
         tiling: how; `folder` keeps finished steps, so that the same call resumes.
         options: as for `g2ard.distill`, without those that `whole_options` returns.
-        progress: receives the number of finished tasks.
-        say: receives log lines.
-
-    Raises:
-        InputError: as `simplify_in_tiles`.
     """
     with _job(scene, tiling, options, True, progress, say) as job:
         for budget in budgets:
@@ -292,14 +273,9 @@ def lod_in_tiles(
         tiling: how; `folder` keeps finished steps, so that the same call resumes.
         options: as for `g2ard.distill`.
         recover: optimise each level; otherwise levels are only merged.
-        progress: receives the number of finished tasks.
-        say: receives log lines.
 
     Returns:
         The levels, of exactly round(N/r) Gaussians each.
-
-    Raises:
-        InputError: ratios that do not rise, options that need the whole scene, or as `distill_in_tiles`.
     """
     check_ratios(ratios)
     refuse_whole(scene, whole_options(options))
@@ -353,7 +329,6 @@ class _Job:
         workers: run the tasks.
         tiling: how; `folder` keeps finished steps.
         options: as they were given.
-        say: receives log lines.
     """
 
     store: TileStore

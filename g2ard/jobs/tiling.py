@@ -171,9 +171,6 @@ def _rounded_down(value: float) -> int:
 def bytes_of(text: str) -> int:
     """Parse a size such as 4GB, 500MB or 2GiB; units are powers of 1000, with an i of 1024.
 
-    Raises:
-        InputError: another text, or less than a megabyte.
-
     >>> bytes_of("4GB"), bytes_of("1.5 gib")
     (4000000000, 1610612736)
     """
@@ -191,9 +188,6 @@ def is_tiled(scene: Path, tiling: Tiling) -> bool:
     """Return whether a scene is a folder of several tiles or has too many Gaussians for one piece.
 
     Point clouds are never processed in tiles.
-
-    Raises:
-        InputError: a scene that cannot be read.
     """
     if (scene / MANIFEST).is_file():
         return len(TileStore.open(scene).tiles) > 1
@@ -215,9 +209,6 @@ def check_memory(scene: Path, tiling: Tiling, times: float, tile_times: float = 
         tiling: with the limit; nothing is checked without one.
         times: memory in one piece relative to the scene's arrays.
         tile_times: memory of a tile relative to merging it.
-
-    Raises:
-        InputError: too little memory, with what would do; or the scene cannot be read.
     """
     if tiling.memory is None:
         return
@@ -241,9 +232,6 @@ def workers_for(store: TileStore, tiling: Tiling, times: float = 1.0) -> int:
         store: the tiles.
         tiling: the limits.
         times: memory of a tile relative to merging it.
-
-    Raises:
-        InputError: a single tile takes too much memory, or `--workers` are too many.
     """
     memory = tiling.usable_memory
     largest = max(store.tiles, key=lambda tile: tile.rows + tile.halo)
@@ -286,9 +274,6 @@ def refuse_whole(scene: Path, options: Sequence[str]) -> None:
     Args:
         scene: its file, or a folder of tiles.
         options: those that were given, as they are typed.
-
-    Raises:
-        InputError: there are some.
     """
     if not options:
         return

@@ -43,7 +43,6 @@ def found_views(scene: str | Path, splats: Splats, splits: Sequence[str], say: S
         scene: the scene's path.
         splats: the scene.
         splits: splits that must not be empty.
-        say: called with the views used, or why those found are not used.
 
     Returns:
         A path for `load_views`, or None.
@@ -79,11 +78,7 @@ def warn_of_sight(splats: Splats, cameras: Cameras, say: Say) -> None:
 
 
 def check_sight(splats: Splats, cameras: Cameras, say: Say = unsaid) -> None:
-    """Reject views that contain no Gaussian's centre; otherwise warn like `warn_of_sight`.
-
-    Raises:
-        InputError: no view sees the scene.
-    """
+    """Reject views that contain no Gaussian's centre; otherwise warn like `warn_of_sight`."""
     if not cameras.facing(splats.means + splats.offset).any():
         raise InputError(unseeing(cameras, "the scene"))
     warn_of_sight(splats, cameras, say)
@@ -120,7 +115,6 @@ def propose_background(cameras: Cameras, background: Colour, given: bool, say: S
         cameras: views, some with photos.
         background: RGB in use.
         given: whether it was chosen rather than the default.
-        say: called with a note that states the flag.
     """
     from g2ard.scene.images import colour_text, photo_traits
 

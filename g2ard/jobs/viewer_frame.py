@@ -81,11 +81,6 @@ def frame_of(
         beside: path beside which to look for cameras.
         up: (3,) direction away from the ground; None takes it from the views, or estimates it.
         seed: seed of generated views.
-        progress: called during planning.
-        say: called with log messages.
-
-    Raises:
-        InputError: a file without views, no view of that name, or an invalid `up`.
     """
     try:
         found = views_or_pool(
@@ -103,11 +98,7 @@ def frame_of(
 def frame_with(
     scene: Splats, cameras: Cameras, *, start: str | None = None, up: Sequence[float] | None = None
 ) -> ViewerFrame:
-    """Choose a frame and an initial camera from given cameras, like `frame_of`.
-
-    Raises:
-        InputError: no view of that name, or an invalid `up`.
-    """
+    """Choose a frame and an initial camera from given cameras, like `frame_of`."""
     axis = _level(cameras) if up is None else None
     stand = ViewerFrame(_turn(up_of(scene, up) if axis is None else axis), _middle(scene))
     points = opaque_points(scene)

@@ -111,12 +111,6 @@ def views_of(
         anywhere: share of the training views that look from anywhere, added to those that are given without
             photos or generated; None decides by how much of the scene a view holds.
         represents: Gaussians per row if `prior` is a sample of a larger scene; the pool grows with it.
-        progress: called during planning.
-        say: called with log messages.
-
-    Raises:
-        InputError: a file without views, an empty split, views that see nothing of the scene, a scene with no
-            room for poses, or a generated pool when targets must be photos.
     """
     found = None
     if views is None and beside is not None:
@@ -212,9 +206,6 @@ def views_or_pool(
         count: size of a generated pool; None chooses like `distill`.
 
     Other arguments are those of `views_of`.
-
-    Raises:
-        InputError: a scene with no room for poses.
     """
     from g2ard.poses import plan_pool
 
@@ -259,9 +250,6 @@ def cameras_for_looks(
 
     Returns:
         The cameras, or None for no views.
-
-    Raises:
-        InputError: a file without views, or an empty split.
     """
     from g2ard.poses import plan_pool
 

@@ -37,9 +37,6 @@ class Cut:
         extent: longest side of the box of a leaf's means, scene units.
         least: a wide node with at most this many Gaussians stays whole; otherwise sky and floaters would
             become thousands of leaves.
-
-    Raises:
-        InputError: a value out of range.
     """
 
     most: int = 512 * 1024
@@ -94,9 +91,6 @@ def cut(levels: Sequence[Level], rule: Cut | None = None, scratch: Path | None =
 
     Returns:
         The root of the tree, a leaf if nothing is split.
-
-    Raises:
-        InputError: no levels, an empty level, different offsets, or a mean that is not finite.
 
     >>> fine = Splats.create([[0, 0, 0], [9, 0, 0]], scales=[[1, 1, 2]] * 2)
     >>> tree = cut([fine, fine.take([0])], Cut(most=2))

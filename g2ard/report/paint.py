@@ -33,9 +33,6 @@ def painted(splats: Splats, colors: ArrayLike) -> Splats:
     Returns:
         The same geometry and opacities, SH degree 0.
 
-    Raises:
-        InputError: another number of colours.
-
     >>> scene = Splats.create(np.zeros((2, 3)), scales=np.ones((2, 3)), sh0=np.full((2, 1, 3), 9.0))
     >>> painted(scene, [[1, 0, 0], [0, 0, 1]]).colors.round(3).tolist() == [[1, 0, 0], [0, 0, 1]]
     True
@@ -83,9 +80,6 @@ def cell_labels(splats: Splats, count: int) -> NDArray[np.int64]:
 
     Returns:
         (N,) cell numbers from 0, in arbitrary order.
-
-    Raises:
-        InputError: no Gaussian, or a count below 1.
     """
     if count < 1 or not len(splats):
         raise InputError(

@@ -20,11 +20,7 @@ SUFFIXES = (".gif", ".webp", ".mp4")
 
 
 def check_animation(path: Path) -> None:
-    """Check that an animation of this suffix can be written.
-
-    Raises:
-        MissingDependencyError: an .mp4 without ffmpeg.
-    """
+    """Check that an animation of this suffix can be written."""
     if path.suffix.lower() == ".mp4" and shutil.which("ffmpeg") is None:
         raise MissingDependencyError(
             "an .mp4 needs the program ffmpeg", path=path, hint="install it, or write .webp or .gif"
@@ -41,10 +37,6 @@ def write_animation(
         images: (H, W, 3) uint8.
         fps: images a second; .gif rounds to hundredths of a second.
         overwrite: replace an existing file.
-
-    Raises:
-        InputError: images of several sizes.
-        MissingDependencyError: an .mp4 without ffmpeg.
     """
     check_animation(path)
     frames = _one_size(path, iter(images))

@@ -25,9 +25,6 @@ def change_of_axes(source: str, target: str) -> NDArray[np.float64]:
 
     >>> change_of_axes("RUB", "RFU") @ [1, 2, 3]
     array([ 1., -3.,  2.])
-
-    Raises:
-        InputError: an unknown name.
     """
     for name in (source, target):
         if name not in AXES:

@@ -44,9 +44,6 @@ def load_image(cameras: Cameras, index: int, background: Sequence[float] = BLACK
 
     Returns:
         (H, W, 3) float32 in [0, 1].
-
-    Raises:
-        InputError: the view has no photo, or the photo is missing, broken, or of another aspect ratio.
     """
     return composited(load_premultiplied(cameras, index), background)
 
@@ -63,9 +60,6 @@ def load_premultiplied(cameras: Cameras, index: int) -> NDArray[np.float32]:
 
     Returns:
         (H, W, 3) float32 RGB, or (H, W, 4) RGBA with RGB premultiplied.
-
-    Raises:
-        InputError: as for `load_image`.
     """
     path, name = cameras.image_paths[index], cameras.names[index]
     if path is None:
@@ -151,9 +145,6 @@ def load_mask(cameras: Cameras, index: int) -> NDArray[np.bool_] | None:
     Returns:
         (H, W), True if the mask is brighter than half, or, for a photo that is its own mask, if its alpha is
         above half; None if the view has no mask.
-
-    Raises:
-        InputError: as for `load_image`.
     """
     path = cameras.mask_paths[index]
     if path is None:
@@ -281,10 +272,6 @@ def write_png(path: str | Path, image: ArrayLike, *, overwrite: bool = False) ->
         path: the file.
         image: (H, W, 3), (H, W, 4) or (H, W), floats in [0, 1] or bytes.
         overwrite: replace an existing file.
-
-    Raises:
-        InputError: the shape is not an image's.
-        OutputError: see `atomic_output`.
     """
     values = to_bytes(image)
     if values.ndim == 3 and values.shape[2] == 1:
@@ -312,9 +299,6 @@ def contact_sheet(
 
     Returns:
         (H, W, 3) bytes, on a dark background.
-
-    Raises:
-        InputError: no images.
     """
     grid = [[_cell(image, cell_width) for image in row] for row in rows]
     if not any(grid):

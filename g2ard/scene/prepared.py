@@ -43,11 +43,7 @@ class PreparedScene(Splats):
         return _core.Scene(self)
 
     def restore(self, order: NDArray[np.uint32], bounds: NDArray[np.float64]) -> None:
-        """Restore `core.order` and `core.bounds` of the same scene.
-
-        Raises:
-            InputError: `order` is not a permutation.
-        """
+        """Restore `core.order` and `core.bounds` of the same scene."""
         vars(self)["core"] = _core.Scene(self, (order, bounds.tolist()))
 
 
@@ -59,11 +55,7 @@ def as_prepared(splats: Splats) -> PreparedScene:
 
 
 def finite_rows_of(splats: Splats) -> tuple[PreparedScene, NDArray[np.bool_] | slice]:
-    """Return the finite rows of a scene, prepared, and their mask.
-
-    Raises:
-        InputError: no row is finite.
-    """
+    """Return the finite rows of a scene, prepared, and their mask."""
     arrays = (splats.means, splats.quats, splats.scales, splats.sh0, splats.shN)
     everything = all(_all_finite(a) for a in arrays) and not np.isnan(splats.logit_opacities).any()
     finite = np.ones(len(splats), bool) if everything else splats.finite_rows()

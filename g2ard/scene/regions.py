@@ -20,9 +20,6 @@ Region = tuple[float, ...]
 def check_region(region: Sequence[float]) -> Region:
     """Validate a region and return it as plain numbers.
 
-    Raises:
-        InputError: neither 4 nor 6 finite numbers, a radius that is not positive, or an empty box.
-
     >>> check_region([0, 0, 0, 2])
     (0.0, 0.0, 0.0, 2.0)
     """
@@ -40,9 +37,6 @@ def check_region(region: Sequence[float]) -> Region:
 
 def as_regions(given: Sequence[Any]) -> tuple[Region, ...]:
     """Validate one or several regions and return them as plain numbers.
-
-    Raises:
-        InputError: as for `check_region`, or not numbers.
 
     >>> as_regions((0, 0, 0, 2)), as_regions([[0, 0, 0, 2]])
     (((0.0, 0.0, 0.0, 2.0),), ((0.0, 0.0, 0.0, 2.0),))

@@ -284,10 +284,6 @@ class PhotosOrRenders:
         limit: bytes cached in memory per kind.
         lazy: render on first access.
         renderer: see `TeacherRenders`.
-        progress: called after every render.
-
-    Raises:
-        InputError: an exposure that is not invertible.
     """
 
     def __init__(

@@ -59,9 +59,6 @@ def executor(
         threads: threads per worker; None divides the cores among workers.
         scheduler: `tcp://HOST:PORT` of a Dask scheduler whose workers see the same files, or `local` for a
             Dask cluster of `workers` processes on this machine.
-
-    Raises:
-        InputError: Dask is not installed, or the scheduler does not answer.
     """
     forget_workers()
     threads = threads or max(1, (os.cpu_count() or 1) // workers)
@@ -185,9 +182,6 @@ class DaskExecutor:
     """Executor on the workers of a Dask scheduler, which must see the same files under the same paths.
 
     Results are paths, because Dask cannot spill what workers hold in Rust's memory.
-
-    Raises:
-        InputError: Dask is not installed, or the scheduler does not answer.
     """
 
     def __init__(self, scheduler: str, workers: int, threads: int):

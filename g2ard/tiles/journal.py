@@ -91,11 +91,7 @@ class Journal:
 
     @classmethod
     def open(cls, folder: Path, row_bytes: int, tally: type) -> Journal | None:
-        """Read the journal of a folder, or return None without one.
-
-        Raises:
-            InputError: it is malformed.
-        """
+        """Read the journal of a folder, or return None without one."""
         path = folder / JOURNAL
         if not path.is_file():
             return None

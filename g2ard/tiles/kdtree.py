@@ -96,11 +96,7 @@ class KdTree:
 
     @classmethod
     def from_json(cls, content: Any) -> KdTree:
-        """Parse the output of `to_json`.
-
-        Raises:
-            ValueError, TypeError: malformed content.
-        """
+        """Parse the output of `to_json`."""
         if content is None:
             return cls()
         axis, at, below, above = content

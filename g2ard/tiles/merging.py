@@ -118,10 +118,6 @@ def simplify_tiles(
         blind: use no cameras at all.
         up: (3,) direction away from the ground for generated views; None estimates it.
         seed: seed of the generated views.
-        say: called with messages.
-
-    Raises:
-        InputError: a budget below 1 or above the number of visible Gaussians.
     """
     if not 1 <= budget <= store.count:
         raise InputError(

@@ -125,13 +125,7 @@ def pour(
         feed: the rows.
         tile_rows: maximum rows per tile.
         rows: rows in memory at a time.
-        progress: called with the number of rows read.
-        say: called with messages.
         like: reuse the tree and margin of these tiles, ignoring `tile_rows`.
-
-    Raises:
-        InputError: the source is broken, or has no row to keep.
-        OutputError: the disk has too little room.
     """
     stream: Any = feed.stream
     journal = Journal.open(folder, feed.row_bytes, type(feed.stream.tally))
@@ -218,10 +212,6 @@ def lift_tiles(
     """Write points to tiles in a subfolder, then lift each tile with its halo and write the result.
 
     Arguments are those of `pour`.
-
-    Raises:
-        InputError: the source is broken, or has no point to keep.
-        OutputError: the disk has too little room.
     """
     within, row_bytes = folder / POINTS, 4 * row_width(0)
     within.mkdir(exist_ok=True)

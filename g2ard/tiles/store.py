@@ -293,11 +293,7 @@ class StoredScene:
         return self.store.count
 
     def positions(self) -> Iterator[NDArray[np.float32]]:
-        """Yield the (n, 3) means of each tile in order, memory-mapped, after verifying its contents.
-
-        Raises:
-            InputError: a file's contents changed.
-        """
+        """Yield the (n, 3) means of each tile in order, memory-mapped, after verifying its contents."""
         for tile in self.store.tiles:
             self.store.check(tile.index)
             yield self.store.rows(tile.index)[:, :3]

@@ -94,12 +94,7 @@ class Task:
 
 
 def run_task(task: Task) -> Path:
-    """Run a task unless it is done; the file is written atomically.
-
-    Raises:
-        InputError: raised by the function.
-        OutputError: the file cannot be written.
-    """
+    """Run a task unless it is done; the file is written atomically."""
     if task.done:
         return task.output
     module, name = task.function.split(":")
@@ -121,11 +116,7 @@ def is_whole(path: Path) -> bool:
 
 
 def load(path: Path, *names: str) -> list[NDArray[Any]]:
-    """Read arrays of a task's file.
-
-    Raises:
-        InputError: the file is corrupt.
-    """
+    """Read arrays of a task's file."""
     try:
         with np.load(path, allow_pickle=False) as arrays:
             return [arrays[name] for name in names]

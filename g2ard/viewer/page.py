@@ -81,10 +81,6 @@ def write_page(
 
     Returns:
         The sizes of the page and its scenes.
-
-    Raises:
-        OutputError: the file exists, cannot be written, or is not .html.
-        InputError: a scene is empty, not finite, or too large for a page.
     """
     path = check_page_output(path, overwrite)
     packed = [_sog(path, label, splats) for label, splats in scenes]
