@@ -13,13 +13,11 @@ from g2ard.jobs.job import DistillJob
 from g2ard.jobs.tiling import RECOVERY_TIMES, TileMemory, amount
 from g2ard.pipeline import final_steps
 from g2ard.progress import plural
-from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
 from g2ard.scene.targets import CACHE_BYTES, Targets
 from g2ard.stages.recover import recover
 from g2ard.stages.simplify import round_counts, simplify
 from g2ard.system.memory import peak_rss
-from g2ard.tiles.pour import foretold
 from g2ard.tiles.store import row_width
 
 _TRIED, _STEPS = 4, 8
@@ -36,8 +34,6 @@ which it stops growing. Measured on playbot: 113 MB for 25,000 Gaussians, 511 fo
 """
 _TRAINER_BYTES = 983
 """Bytes per Gaussian in recovery: parameters, Adam's moments, buffers (`docs/benchmarks.md`)."""
-_RASTER_BYTES = 192
-"""Bytes per Gaussian of the dense scene while it is rendered, at most; 123 if most lie outside the views."""
 _PROGRAM_BYTES = 150_000_000
 """Bytes of the interpreter and loaded libraries."""
 
@@ -77,7 +73,8 @@ def estimate(job: DistillJob, budget: int, *, page: bool = True) -> Estimate:
     """
     train, test, apart = job.views.train.cameras, job.views.test, job.views.apart
     near = 0 if apart is None or job.teacher is None else len(apart)
-    targets = job.tried(_evenly(train, _TRIED))
+    some = np.unique(np.linspace(0, len(train) - 1, min(_TRIED, len(train))).round().astype(int))
+    targets = job.tried(train.take(some))
     began = time.monotonic()
     for view in range(len(targets.cameras)):
         targets[view]
@@ -98,7 +95,7 @@ def estimate(job: DistillJob, budget: int, *, page: bool = True) -> Estimate:
             "recover": _WATCHING * steps * _step_seconds(job, merged, targets) if limit is None else limit,
             "score": per_view * (2 * len(test) + near),
         },
-        bytes=max(_trial_bytes(job, budget), _page_bytes(job, merged) if page else 0)
+        bytes=_peak_bytes(job, merged, page)
         + 2 * merged.nbytes  # the recovered scene, and its rows during writing
         + min(CACHE_BYTES, views * pixels * (12 if job.teacher is not None else 3)),
     )
@@ -115,7 +112,7 @@ def check_memory(job: DistillJob, most: int | None, *, page: bool = True) -> Non
         told += f"more than {amount(most)}; smaller views, --size, take less"
         if job.teacher is not None and not job.lifted:  # tiles support this job
             tiles = TileMemory(count, 4 * row_width(job.prior.sh_degree), RECOVERY_TIMES)
-            told += f"; in tiles {tiles.advice(most, max(1, count // 2), foretold([job.prior.means], count))}"
+            told += f"; in tiles {tiles.advice(most, max(1, count // 2))}"
         raise InputError(told)
 
 
@@ -126,23 +123,14 @@ def total(estimates: Sequence[Estimate]) -> tuple[float, int]:
     return once + apart, max(found.bytes for found in estimates)
 
 
-def _evenly(cameras: Cameras, count: int) -> Cameras:
-    chosen = np.linspace(0, len(cameras) - 1, min(count, len(cameras))).round().astype(int)
-    return cameras.take(np.unique(chosen))
-
-
-def _trial_bytes(job: DistillJob, budget: int) -> int:
-    """Return this process's peak memory, or its expected peak if the system does not report it."""
-    if (peak := peak_rss()) is not None:
-        return peak
-    rendering = _RASTER_BYTES * len(job.prior) if job.teacher is not None else 0
-    return _PROGRAM_BYTES + job.prior.nbytes + max(rendering, _TRAINER_BYTES * budget)
-
-
-def _page_bytes(job: DistillJob, merged: Splats) -> int:
-    """Return the memory while the page is written, including the scene and the program."""
-    packing = _PAGE_BYTES * 3 * ((merged.sh_degree + 1) ** 2 - 1) * min(len(merged), _PAGE_FULL)
-    return min(_PROGRAM_BYTES, peak_rss() or _PROGRAM_BYTES) + 2 * job.prior.nbytes + packing
+def _peak_bytes(job: DistillJob, merged: Splats, page: bool) -> int:
+    """Return the peak memory without targets: the trial's, or that of writing the page if it is more."""
+    scene = job.prior.nbytes
+    trial = peak_rss() or _PROGRAM_BYTES + scene + _TRAINER_BYTES * len(merged)
+    if not page:
+        return trial
+    packing = _PAGE_BYTES * 3 * merged.shN.shape[1] * min(len(merged), _PAGE_FULL)
+    return max(trial, min(trial, _PROGRAM_BYTES) + 2 * scene + packing)
 
 
 def _merged(job: DistillJob, budget: int) -> tuple[Splats, float]:
@@ -163,16 +151,11 @@ def _step_seconds(job: DistillJob, student: Splats, targets: Targets) -> float:
 
 
 def _steps(job: DistillJob, student: Splats) -> int:
-    config = job.config
-    photos = job.photos_over_renders or job.teacher is None
+    """Return the steps of all recoveries: after each round, if the schedule has rounds, and of the last."""
+    config, photos = job.config, job.photos_over_renders or job.teacher is None
     last = final_steps(config, student, job.views.train.cameras, photos=photos)
-    return last + config.recover.schedule.round_steps * _rounds(job, student)
-
-
-def _rounds(job: DistillJob, student: Splats) -> int:
-    """Return the number of recoveries before the last; 0 if the schedule has no rounds."""
-    config = job.config
     if not config.recover.schedule.round_steps:
-        return 0
+        return last
     kept, fold = config.simplify.retention_of("paper"), config.simplify.fold
-    return len(round_counts(len(job.prior), len(student), kept, fold))
+    rounds = len(round_counts(len(job.prior), len(student), kept, fold))
+    return last + rounds * config.recover.schedule.round_steps

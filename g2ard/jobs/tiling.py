@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -36,8 +36,8 @@ RECOVERY_TIMES = 1.5
 _LEAST_ROWS = 1000
 """Rows of the smallest tiles that messages advise."""
 
-_READ_ROWS = 1 << 18
-"""Positions that are read at a time."""
+_HALO_TIMES = 1.5
+"""Rows of the largest tile, halo included, relative to `--tile-rows`, at most."""
 
 _SIZE = re.compile(r"(\d+(?:\.\d+)?)\s*([kKmMgGtT]?)(?:i?[bB])?")
 
@@ -117,29 +117,22 @@ class TileMemory:
         """Return the bytes of a task on this many rows, halo included."""
         return _TASK_BYTES + int(self.times * rows * (_ROW_BYTES + _ROW_TIMES * self.row_bytes))
 
-    def advice(self, memory: int, most: int, largest: Callable[[int], int]) -> str:
-        """Return the tile size that fits into `memory` bytes, or the least memory that tiles take.
+    def advice(self, memory: int, most: int) -> str:
+        """Return a tile size, at most `most`, that fits into `memory` bytes, or the least that tiles take.
 
-        Args:
-            memory: bytes.
-            most: rows of the largest tiles that would be another answer.
-            largest: of `--tile-rows`: rows of the largest tile, halo included (`g2ard.tiles.pour.foretold`).
-
-        >>> TileMemory(60_000, 56).advice(210_000_000, 30_000, lambda rows: round(1.3 * rows))
-        '--tile-rows 22,000 takes less'
-        >>> TileMemory(60_000, 56).advice(100_000_000, 30_000, lambda rows: round(1.3 * rows))
+        >>> TileMemory(60_000, 56).advice(210_000_000, 30_000)
+        '--tile-rows 19,000 takes less'
+        >>> TileMemory(60_000, 56).advice(100_000_000, 30_000)
         'the least that tiles take is about 201 MB, with --tile-rows 1,000'
         """
         from g2ard.tiles.ingest import MOST_TILES
 
-        a_row = self.of(1) - _TASK_BYTES
+        a_row = _HALO_TIMES * (self.of(1) - _TASK_BYTES)
         least = min(max(_LEAST_ROWS, -(-self.count // MOST_TILES)), most)
         rows = _rounded_down(min((memory - _TASK_BYTES) / a_row, most))
-        while rows >= least:
-            if self.of(held := largest(rows)) <= memory:
-                return f"{cut_into(self.folder, rows)} takes less"
-            rows = _rounded_down(min(rows * (memory - _TASK_BYTES) / a_row / held, rows - 1))
-        need = amount(self.of(largest(least)), up=True)
+        if rows >= least:
+            return f"{cut_into(self.folder, rows)} takes less"
+        need = amount(self.of(round(_HALO_TIMES * least)), up=True)
         return f"the least that tiles take is about {need}, with {cut_into(self.folder, least)}"
 
 
@@ -220,7 +213,7 @@ def check_memory(scene: Path, tiling: Tiling, times: float, tile_times: float = 
         raise InputError(
             f"{stream.count:,} Gaussians in one piece take about {amount(need, up=True)}, "
             f"{amount(_TASK_BYTES)} of it the program, more than {tiling.memory_limit}; "
-            f"{tiles.advice(tiling.memory, max(1, stream.count // 2), _foretold(scene))}",
+            f"{tiles.advice(tiling.memory, max(1, stream.count // 2))}",
             path=scene,
         )
 
@@ -246,7 +239,7 @@ def workers_for(store: TileStore, tiling: Tiling, times: float = 1.0) -> int:
         raise InputError(
             f"a tile of {largest.rows:,} Gaussians and {largest.halo:,} around it takes about "
             f"{amount(need, up=True)}, {amount(_TASK_BYTES)} of it the program, more than "
-            f"{tiling.memory_limit}; {tiles.advice(memory, most, _foretold(store.folder))}"
+            f"{tiling.memory_limit}; {tiles.advice(memory, most)}"
         )
     if tiling.workers is not None and tiling.scheduler is None and tiling.workers > fit:
         raise InputError(
@@ -258,14 +251,6 @@ def workers_for(store: TileStore, tiling: Tiling, times: float = 1.0) -> int:
 
 def _folder_of_tiles(scene: Path) -> Path | None:
     return scene if (scene / MANIFEST).is_file() else None
-
-
-def _foretold(scene: Path) -> Callable[[int], int]:
-    """Return a function from `--tile-rows` to the rows of the largest tile, halo included."""
-    from g2ard.tiles.pour import foretold
-
-    stream = open_stream(scene)
-    return foretold(stream.positions(_READ_ROWS), stream.count)
 
 
 def refuse_whole(scene: Path, options: Sequence[str]) -> None:

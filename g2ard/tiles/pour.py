@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import math
 import shutil
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -26,9 +25,6 @@ from g2ard.tiles.store import TileStore, halo_name, packed, row_width, tile_name
 
 _SAMPLE = 1 << 20
 """Size of the sample of positions that determines the tiles (12 MB)."""
-
-_SIGMAS = 4.0
-"""Standard deviations by which a tile and its halo may exceed the count estimated from the sample."""
 
 _POINT = np.dtype([("near", "<f4", 3), ("rgb", "<f4", 3), ("far", "<f8", 3)])
 """A point: float32 position relative to the offset (determines the tile), stored colour, world position."""
@@ -251,28 +247,3 @@ def _lifted(points: Journal, index: int, feed: PointFeed) -> Splats:
 
 def _read(path: Path, count: int) -> NDArray[Any]:
     return np.fromfile(path, _POINT, count)
-
-
-def foretold(positions: Iterable[Points], count: int) -> Callable[[int], int]:
-    """Return a function `tile_rows` → estimated rows of the largest tile, including its halo.
-
-    Args:
-        positions: all positions, in blocks.
-        count: number of positions.
-
-    >>> line = np.stack([np.arange(100.0, dtype=np.float32)] * 3, 1)
-    >>> rows = foretold([line], 100)
-    >>> rows(100), rows(50), rows(25)
-    (100, 52, 26)
-    """
-    sampler = Sampler(count, _SAMPLE)
-    for points in positions:
-        sampler.add(points)
-    sample, each = sampler.result()
-
-    def largest(tile_rows: int) -> int:
-        tree = cut_tree(sample, each, tile_rows) if count > tile_rows else KdTree()
-        most = max(len(core) + len(halo) for core, halo in tree.route(sample, margin_of(tree, sample)))
-        return math.ceil((most + (_SIGMAS * math.sqrt(most) if each > 1 else 0)) * each)
-
-    return largest
