@@ -13,15 +13,20 @@ from typing import TYPE_CHECKING, Any
 from g2ard.cli.frame import Run
 from g2ard.cli.resume import OPTIONS, check_stopped, left_at
 from g2ard.config.choices import ViewFormat
+from g2ard.progress import plural
 
 if TYPE_CHECKING:
     from g2ard.io import ViewSet
     from g2ard.jobs.budget import Budget
+    from g2ard.scene.cameras import Cameras
+    from g2ard.scene.splats import Splats
 
 WORK = ".unfinished"
 """Folder in a run's folder for finished rounds and checkpoints."""
 KEPT = Path("simplified", "scene.ply")
 """The simplified scene, with --keep, for `evaluate --anchors`."""
+VIEW = "view.html"
+"""The run's viewer page."""
 REPORT = "report.json"
 """The run's numbers, written last."""
 
@@ -56,6 +61,28 @@ def write_report(folder: Path, report: dict[str, Any]) -> None:
 
     with atomic_output(folder / REPORT, overwrite=True) as temporary:
         temporary.write_text(json.dumps(report, indent=2, default=str) + "\n", encoding="utf-8", newline="\n")
+
+
+def write_view(
+    place: Path, splats: Splats, cameras: Cameras, background: tuple[float, float, float]
+) -> tuple[int | None, str]:
+    """Write view.html beside `place`, the scene's file, unless browsers would not draw it smoothly.
+
+    Returns:
+        Size of the page in bytes, None if it was not written, and a line to print.
+    """
+    from g2ard.jobs.budget import DEVICES
+    from g2ard.jobs.viewer_frame import frame_with
+    from g2ard.viewer import write_page
+
+    path, count, most = place.with_name(VIEW), len(splats), DEVICES["web"]
+    if count > most:
+        path.unlink(missing_ok=True)
+        return None, f"{path} skipped: over {most:,} Gaussians (`g2ard view` writes it anyway)"
+    stand = frame_with(splats, cameras)
+    shown = [(f"{place.name}: {plural(count, 'Gaussian')}", stand.of(splats))]
+    written = write_page(path, shown, start=stand.start, background=background, overwrite=True)
+    return written.bytes, f"view: {path} ({written.bytes / 1e6:.2f} MB)"
 
 
 def check_place(run: Run, place: Path, budget: Budget, given: bool, resume: bool) -> None:

@@ -144,15 +144,10 @@ def check_scene(path: str | Path) -> tuple[Path, str]:
     path = run_scene(path)
     found = file_format(path)
     if KINDS[found] != "splats":
-        words = {
-            "cloud_ply": "a point cloud (no f_dc, scale, rot)",
-            "las": "a point cloud",
-            "views": "views",
-        }
-        what = words.get(found, found)
+        words = {"cloud_ply": "a point cloud (no f_dc, scale, rot)", "las": "a point cloud"}
         is_cloud = KINDS[found] == "points"
         hint = "`g2ard lift` turns it into a scene" if is_cloud else "give the scene's file"
-        raise InputError(f"expected a Gaussian scene, found {what}", path=path, hint=hint)
+        raise InputError(f"expected a Gaussian scene, found {words.get(found, found)}", path=path, hint=hint)
     return path, found
 
 
@@ -327,12 +322,9 @@ def read_view_set(
     from g2ard.io.types import ViewFiles
     from g2ard.scene.splits import split_mask
 
-    files = (
-        path
-        if isinstance(path, ViewFiles)
-        else ViewFiles(Path(path), Path(images) if images else None, alpha)
-    )
-    path, images = run_views(files.path), files.images
+    if not isinstance(path, ViewFiles):
+        path = ViewFiles(Path(path), Path(images) if images else None, alpha)
+    images, alpha, path = path.images, path.alpha, run_views(path.path)
     found = file_format(path)
     if KINDS[found] != "views":
         what = "a Gaussian scene" if KINDS[found] == "splats" else "a point cloud"
@@ -346,7 +338,7 @@ def read_view_set(
     except OSError as error:  # invalid photo name, unreadable folder
         raise InputError(error.strerror or str(error), path=path) from error
     views = views if unpictured else pictured(views)
-    views = alpha_as_masks(views) if files.alpha == "mask" else views
+    views = alpha_as_masks(views) if alpha == "mask" else views
     return views.take(split_mask(path, views.cameras.names, split, stated=views.splits))
 
 

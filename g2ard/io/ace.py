@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard.errors import InputError
+from g2ard.io.paths import read_text
 from g2ard.io.photos import rotation
 
 
@@ -16,14 +17,8 @@ def read(path: Path) -> dict[str, NDArray[np.float64]]:
 
     Empty lines and lines that begin with # are skipped.
     """
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except OSError as error:
-        raise InputError(f"{error.strerror}", path=path) from error
-    except UnicodeDecodeError as error:
-        raise InputError("not a text file", path=path) from error
     out: dict[str, NDArray[np.float64]] = {}
-    for number, line in enumerate(lines, 1):
+    for number, line in enumerate(read_text(path).splitlines(), 1):
         words = line.split()
         if not words or words[0].startswith("#"):
             continue

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+import struct
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from g2ard.errors import DAMAGED, InputError
-from g2ard.io.photos import Frame, photo_size, rotation, view_set
-from g2ard.io.records import Record
+from g2ard.io.photos import Frame, Lens, photo_size, rotation, view_set
 from g2ard.io.types import ViewSet
 
 _MODELS = (
@@ -21,23 +21,6 @@ _MODELS = (
     *("FOV", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "THIN_PRISM_FISHEYE"),
 )
 _PARAMETERS = {"SIMPLE_PINHOLE": 3, "PINHOLE": 4, "SIMPLE_RADIAL": 4, "RADIAL": 5, "OPENCV": 8}
-
-
-class _Camera(NamedTuple):
-    """A camera's size, pinhole matrix and OpenCV distortion k1 k2 p1 p2 k3."""
-
-    size: tuple[int, int]
-    K: NDArray[np.float64]
-    distortion: tuple[float, ...]
-
-    def at(self, size: tuple[int, int]) -> _Camera:
-        """Return the camera for resized photos."""
-        if size == self.size:
-            return self
-        K = self.K.copy()
-        K[0] *= size[0] / self.size[0]
-        K[1] *= size[1] / self.size[1]
-        return self._replace(size=size, K=K)
 
 
 class _Image(NamedTuple):
@@ -142,7 +125,44 @@ def _viewmat(path: Path, image: _Image) -> NDArray[np.float64]:
     return view
 
 
-def _camera(path: Path, model: str, size: tuple[int, int], p: tuple[float, ...]) -> _Camera:
+class Record:
+    """Layout of little-endian columns without padding.
+
+    Args:
+        names: names of the columns in file order.
+        letters: struct format of each.
+
+    >>> Record(("ID", "X", "Y"), "Qdd").size
+    24
+    """
+
+    def __init__(self, names: Sequence[str], letters: str) -> None:
+        self._names = tuple(names)
+        self._layout = struct.Struct(f"<{letters}")
+        self._ends = [struct.calcsize(f"<{letters[: i + 1]}") for i in range(len(letters))]
+        self.size = self._layout.size
+
+    def read(self, path: Path, entry: str, i: int, data: bytes, at: int) -> tuple[Any, ...]:
+        """Return the values at byte `at`; `entry` and `i`, such as "camera" and 3, are for errors."""
+        try:
+            return self._layout.unpack_from(data, at)
+        except struct.error:
+            ends = zip(self._names, self._ends, strict=True)
+            name = next(name for name, end in ends if at + end > len(data))
+            raise InputError(
+                "is cut off", path=path, property=name, index=i, item=entry, hint=DAMAGED
+            ) from None
+
+    def read_finite(self, path: Path, entry: str, i: int, data: bytes, at: int) -> tuple[Any, ...]:
+        """Return the values as `read` does, or raise an `InputError` if one is not finite."""
+        values = self.read(path, entry, i, data, at)
+        for name, value in zip(self._names, values, strict=True):
+            if not math.isfinite(value):
+                raise InputError(f"is {value}", path=path, property=name, index=i, item=entry)
+        return values
+
+
+def _camera(path: Path, model: str, size: tuple[int, int], p: tuple[float, ...]) -> Lens:
     if model not in _PARAMETERS:
         known = ", ".join(_PARAMETERS)
         raise InputError(
@@ -157,7 +177,7 @@ def _camera(path: Path, model: str, size: tuple[int, int], p: tuple[float, ...])
             f"invalid camera of {size[0]:,}×{size[1]:,} pixels and focal lengths {fx}, {fy}", path=path
         )
     k1, k2, p1, p2 = (*k, 0.0, 0.0, 0.0, 0.0)[:4]
-    return _Camera(size, np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]]), (k1, k2, p1, p2, 0.0))
+    return Lens(size, np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]]), (k1, k2, p1, p2, 0.0))
 
 
 _POSE = ("QW", "QX", "QY", "QZ", "TX", "TY", "TZ")
@@ -171,7 +191,7 @@ def _parameters(count: int) -> Record:
     return Record([f"PARAMS[{k}]" for k in range(count)], count * "d")
 
 
-def _cameras_bin(path: Path) -> dict[int, _Camera]:
+def _cameras_bin(path: Path) -> dict[int, Lens]:
     data = path.read_bytes()
     (count,) = _COUNT.read(path, "table", 0, data, 0)
     cameras, at = {}, _COUNT.size
@@ -219,7 +239,7 @@ def text_lines(path: Path) -> list[str]:
     return [line for line in path.read_text(encoding="utf-8").splitlines() if not line.startswith("#")]
 
 
-def _cameras_txt(path: Path) -> dict[int, _Camera]:
+def _cameras_txt(path: Path) -> dict[int, Lens]:
     cameras = {}
     rows = [words for line in text_lines(path) if (words := line.split())]
     for i, words in enumerate(rows):

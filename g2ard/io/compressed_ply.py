@@ -27,7 +27,7 @@ from g2ard.io.plyfiles import (
     row_blocks,
 )
 from g2ard.io.sanitize import Raw, cleaned
-from g2ard.io.stream import SceneStream, file_identity
+from g2ard.io.stream import SceneStream
 from g2ard.io.types import Scene
 from g2ard.progress import plural
 from g2ard.scene.splats import SH_C0, Splats
@@ -54,9 +54,6 @@ class _PackedStream(SceneStream):
         layout = self._layout = _layout(path)
         model = layout.render_model
         super().__init__(path, len(layout.vertex), layout.rest, layout.offset, render_model=model)
-
-    def identity(self) -> list[Any]:
-        return file_identity([self.path])
 
     def raw(self, rows: int, start: int) -> Iterator[Raw]:
         layout = self._layout

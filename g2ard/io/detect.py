@@ -6,39 +6,29 @@ from contextlib import suppress
 from difflib import get_close_matches
 from itertools import islice
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 from g2ard.errors import InputError
 from g2ard.io.paths import check_regular
 
-Format = Literal[
-    "ply",
-    "compressed_ply",
-    "sog",
-    "spz",
-    "glb",
-    "splat",
-    "usd",
-    "tiles",
-    "cloud_ply",
-    "las",
-    "points3d",
-    "colmap",
-    "transforms",
-    "cambridge",
-    "inria",
-    "nerfstudio",
-    "nerfstudio_export",
-    "gsplat_run",
-    "views",
+SceneFile = Literal["ply", "compressed_ply", "sog", "spz", "glb", "splat", "usd", "tiles"]
+CloudFile = Literal["cloud_ply", "las", "points3d"]
+ViewsFile = Literal[
+    "colmap", "transforms", "cambridge", "inria", "nerfstudio", "nerfstudio_export", "gsplat_run", "views"
 ]
+Format = SceneFile | CloudFile | ViewsFile
 Kind = Literal["splats", "points", "views"]
 
 KINDS: dict[str, Kind] = {
-    **dict.fromkeys(("ply", "compressed_ply", "sog", "spz", "glb", "splat", "usd", "tiles"), "splats"),
-    **dict.fromkeys(("cloud_ply", "las", "points3d"), "points"),
-    **dict.fromkeys(("colmap", "transforms", "cambridge", "views"), "views"),
-    **dict.fromkeys(("inria", "nerfstudio", "nerfstudio_export", "gsplat_run"), "views"),
+    **dict.fromkeys(get_args(SceneFile), "splats"),
+    **dict.fromkeys(get_args(CloudFile), "points"),
+    **dict.fromkeys(get_args(ViewsFile), "views"),
+}
+"""Format, which is the name of the module that reads it, → its kind."""
+
+_BY_SUFFIX: dict[str, Format] = {
+    **{".sog": "sog", ".spz": "spz", ".glb": "glb", ".splat": "splat", ".las": "las", ".laz": "las"},
+    **dict.fromkeys((".usda", ".usdc", ".usd", ".usdz"), "usd"),
 }
 
 MANIFEST, JOURNAL, POINTS = "tiles.json", "journal.json", ".points"
@@ -76,17 +66,8 @@ def file_format(path: str | Path) -> Format:
         return "colmap"
     if name in ("config.yml", "cfg.yml"):
         return "nerfstudio" if name == "config.yml" else "gsplat_run"
-    by_suffix: dict[str, Format] = {
-        ".sog": "sog",
-        ".spz": "spz",
-        ".glb": "glb",
-        ".splat": "splat",
-        **dict.fromkeys((".usda", ".usdc", ".usd", ".usdz"), "usd"),
-        ".las": "las",
-        ".laz": "las",
-    }
-    if suffix in by_suffix:
-        return by_suffix[suffix]
+    if suffix in _BY_SUFFIX:
+        return _BY_SUFFIX[suffix]
     if suffix == ".ply":
         return _ply_format(path)
     if suffix == ".json":

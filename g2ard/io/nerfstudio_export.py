@@ -3,27 +3,17 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, NamedTuple
-
-import numpy as np
+from typing import Any
 
 from g2ard.errors import InputError
 from g2ard.io import colmap, transforms
 from g2ard.io.jsonfile import Fields, fields_of, matrix, read_any_json, read_json_list, text
-from g2ard.io.photos import Frame, photo_size, rigid, view_set
+from g2ard.io.photos import Frame, Lens, photo_size, rigid, view_set
 from g2ard.io.settings import below
 from g2ard.io.types import ViewSet
 
 LISTS = {"transforms_train.json": "train", "transforms_eval.json": "test"}
 """File → its split."""
-
-
-class _Lens(NamedTuple):
-    """Intrinsics of a photo, which the export does not store."""
-
-    K: Any
-    size: tuple[int, int]
-    distortion: tuple[float, ...]
 
 
 def is_export(content: Any) -> bool:
@@ -48,7 +38,7 @@ def read(path: Path, images: Path | None = None) -> ViewSet:
         images: folder to search for photos by file name; None uses `file_path`.
     """
     files = exported(path) if path.is_dir() else [path]
-    lenses: dict[Path, dict[str, _Lens]] = {}
+    lenses: dict[Path, dict[str, Lens]] = {}
     frames = []
     for file in files:
         for i, entry in enumerate(read_json_list(file)):
@@ -57,7 +47,7 @@ def read(path: Path, images: Path | None = None) -> ViewSet:
 
 
 def _frame(
-    path: Path, index: int, entry: Any, images: Path | None, lenses: dict[Path, dict[str, _Lens]]
+    path: Path, index: int, entry: Any, images: Path | None, lenses: dict[Path, dict[str, Lens]]
 ) -> Frame:
     camera = fields_of(path, entry, index, "camera")
     file_path = Path(text(camera, "file_path"))
@@ -66,9 +56,8 @@ def _frame(
     ups = (below(path, up) for up in file_path.parents[:3] if up.parts)
     lens = _lens(camera, file_path, there or next(filter(None, ups), None), lenses)
     photo = images / file_path.name if images else there
-    if photo is not None and photo.is_file() and (size := photo_size(photo, path)) != lens.size:
-        zoom = np.diag([size[0] / lens.size[0], size[1] / lens.size[1], 1.0])
-        lens = lens._replace(K=zoom @ lens.K, size=size)
+    if photo is not None and photo.is_file():
+        lens = lens.at(photo_size(photo, path))
     return Frame(
         name=file_path.name,
         viewmat=transforms.opencv_view(world_from_camera),
@@ -80,7 +69,7 @@ def _frame(
     )
 
 
-def _lens(camera: Fields, named: Path, place: Path | None, known: dict[Path, dict[str, _Lens]]) -> _Lens:
+def _lens(camera: Fields, named: Path, place: Path | None, known: dict[Path, dict[str, Lens]]) -> Lens:
     """Return a photo's intrinsics by file name, from the nearest folder above it that has them."""
     for folder in () if place is None else (place, *place.parents[:3]):
         if folder not in known:
@@ -94,7 +83,7 @@ def _lens(camera: Fields, named: Path, place: Path | None, known: dict[Path, dic
     raise error.at(hint="give the run's folder with its dataparser_transforms.json")
 
 
-def _lenses(folder: Path) -> dict[str, _Lens]:
+def _lenses(folder: Path) -> dict[str, Lens]:
     if (folder / "transforms.json").is_file():
         frames = transforms.frames(folder / "transforms.json")
     elif folder.is_dir() and colmap.model_folder(folder) is not None:
@@ -104,4 +93,4 @@ def _lenses(folder: Path) -> dict[str, _Lens]:
     names = [Path(frame.photo.name if frame.photo else frame.name).name for frame in frames]
     if len(set(names)) < len(names):
         raise InputError("several photos have the same name, so their intrinsics are ambiguous", path=folder)
-    return {name: _Lens(f.K, f.size, f.distortion) for name, f in zip(names, frames, strict=True)}
+    return {name: Lens(f.size, f.K, f.distortion) for name, f in zip(names, frames, strict=True)}

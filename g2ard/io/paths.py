@@ -24,6 +24,16 @@ def check_regular(path: Path) -> None:
         raise InputError("not a regular file", path=path)
 
 
+def read_text(path: Path) -> str:
+    """Return the content of a text file."""
+    try:
+        return path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise InputError(f"{error.strerror}", path=path) from error
+    except UnicodeDecodeError as error:
+        raise InputError("not a text file", path=path) from error
+
+
 def output_names(path: str | Path, names: Sequence[str]) -> list[str]:
     """Return file names for views, without suffix, that stay inside one folder.
 

@@ -38,6 +38,23 @@ class Frame(NamedTuple):
     mask: Path | None = None
 
 
+class Lens(NamedTuple):
+    """Size, pinhole matrix and OpenCV distortion k1 k2 p1 p2 k3 of a camera."""
+
+    size: tuple[int, int]
+    K: NDArray[np.float64]
+    distortion: tuple[float, ...]
+
+    def at(self, size: tuple[int, int]) -> Lens:
+        """Return the lens for resized photos."""
+        if size == self.size:
+            return self
+        K = self.K.copy()
+        K[0] *= size[0] / self.size[0]
+        K[1] *= size[1] / self.size[1]
+        return self._replace(size=size, K=K)
+
+
 def find_photo(path: Path) -> Path:
     """Return `path`, or an existing photo with a suffix added, as for NeRF's synthetic scenes."""
     if path.is_file() or path.suffix in _SUFFIXES:

@@ -26,7 +26,7 @@ from g2ard.io.plyfiles import (
     spread_rows,
 )
 from g2ard.io.sanitize import BLOCK, LOG_SCALE_LIMIT, Raw, cleaned
-from g2ard.io.stream import SceneStream, file_identity
+from g2ard.io.stream import SceneStream
 from g2ard.io.types import Note, Scene
 from g2ard.progress import plural
 from g2ard.scene.splats import Splats, unit_quats
@@ -104,9 +104,6 @@ class _PlyStream(SceneStream):
         layout = self._layout = _Layout.of(path)
         notes, model = tuple(layout.notes), layout.render_model
         super().__init__(path, len(layout.rows), layout.kept, layout.offset, notes, model)
-
-    def identity(self) -> list[Any]:
-        return file_identity([self.path])
 
     def positions(self, rows: int) -> Iterator[NDArray[np.float32]]:
         for _, block in row_blocks(self.path, self._layout.rows, rows):

@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 
 from g2ard.errors import DAMAGED, InputError
 from g2ard.io.cloud_ply import finite_cloud
-from g2ard.io.colmap import model_folder, number, parsing, text_lines
-from g2ard.io.records import Record
+from g2ard.io.colmap import Record, model_folder, number, parsing, text_lines
 from g2ard.io.types import Cloud
 
 _COUNT = Record(["COUNT"], "Q")

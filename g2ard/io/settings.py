@@ -9,8 +9,7 @@ from __future__ import annotations
 import re
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
-from g2ard.errors import InputError
-from g2ard.io.paths import real_path
+from g2ard.io.paths import read_text, real_path
 
 _PATH = re.compile(r"(?:&(?P<anchor>\w+)\s+)?!!python/object/apply:pathlib\.(?P<kind>\w*)Path\s*(?:\[\])?$")
 
@@ -89,12 +88,7 @@ class Settings:
 
 def read_settings(path: Path) -> Settings:
     """Read a file of settings."""
-    try:
-        return Settings(path.read_text(encoding="utf-8").splitlines())
-    except OSError as error:
-        raise InputError(f"{error.strerror}", path=path) from error
-    except UnicodeDecodeError as error:
-        raise InputError("not a text file", path=path) from error
+    return Settings(read_text(path).splitlines())
 
 
 def below(start: Path, path: Path) -> Path | None:

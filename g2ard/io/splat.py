@@ -13,7 +13,7 @@ from g2ard.errors import DAMAGED, InputError
 from g2ard.io.atomic import atomic_output
 from g2ard.io.packing import world_means, writable
 from g2ard.io.sanitize import Raw, cleaned
-from g2ard.io.stream import SceneStream, file_identity
+from g2ard.io.stream import SceneStream
 from g2ard.io.types import Scene
 from g2ard.scene.splats import SH_C0, Splats, unit_quats
 
@@ -33,9 +33,6 @@ def stream(path: Path) -> SceneStream:
 class _SplatStream(SceneStream):
     def __init__(self, path: Path) -> None:
         super().__init__(path, _count(path))
-
-    def identity(self) -> list[Any]:
-        return file_identity([self.path])
 
     def raw(self, rows: int, start: int) -> Iterator[Raw]:
         for first in range(start, self.count, rows):

@@ -56,9 +56,9 @@ class SceneStream(ABC):
     def raw(self, rows: int, start: int) -> Iterator[Raw]:
         """Yield the source's rows from `start`, at most `rows` at a time; callers may change the arrays."""
 
-    @abstractmethod
     def identity(self) -> list[Any]:
         """Return JSON that identifies this source, see `file_identity`."""
+        return file_identity([self.path])
 
     def positions(self, rows: int) -> Iterator[NDArray[np.float32]]:
         """Yield the (n, 3) means of all rows in blocks, without cleaning."""

@@ -34,6 +34,7 @@ from g2ard.cli.options import (
 from g2ard.cli.outputs import Outputs, budgets_of
 from g2ard.cli.run_folder import (
     KEPT,
+    VIEW,
     WORK,
     check_place,
     drop_older,
@@ -43,6 +44,7 @@ from g2ard.cli.run_folder import (
     work_folder,
     write_pool,
     write_report,
+    write_view,
 )
 from g2ard.cli.run_result import say_views, say_weight, tell_quality, told, write_table
 from g2ard.cli.tile_options import tiling_of
@@ -305,7 +307,11 @@ def _distil(
             colour,
             told=told(report),
         )
-        page = _view(place, result.splats if view else None, job, report)
+        page = ""
+        if view:
+            report["bytes"]["view"], page = write_view(place, result.splats, job.views.train.cameras, colour)
+        else:
+            (output / VIEW).unlink(missing_ok=True)
         _write(run, place, result, job.held_out, colour, report)
         _keep(output / KEPT, result.simplified if keep else None)
     if (pool := job.views.pool) is not None:
@@ -338,19 +344,6 @@ def _write(
     if place.name != "scene.ply":
         report["packed"] = score_file(place, unseen, colour, run.progress)
     write_report(place.parent, {**report, "config": run.config})
-
-
-def _view(place: Path, scene: Splats | None, job: DistillJob, report: dict[str, Any]) -> str | None:
-    """Write view.html and return a line about it; without a scene, remove an earlier run's page."""
-    from g2ard.cli.run_view import run_view
-
-    page = place.parent / "view.html"
-    if scene is None:
-        page.unlink(missing_ok=True)
-        return None
-    seen = job.views.train.cameras
-    report["bytes"]["view"], line = run_view(page, place, scene, seen, job.config.recover.background)
-    return line
 
 
 def _keep(path: Path, scene: Splats | None) -> None:
