@@ -42,9 +42,7 @@ class Outputs:
     """Outputs of a command, one per budget; `{ratio}` and `{count}` in the pattern are the budget's.
 
     Args:
-        run: the command.
         pattern: path as given.
-        budgets: requested budgets.
         name: flag of the pattern, for messages.
     """
 
@@ -69,11 +67,7 @@ class Outputs:
             )
 
     def paths(self, total: int | None = None) -> list[Path]:
-        """Return the paths in the order of the budgets, or [] if they depend on an unknown `total`.
-
-        Args:
-            total: Gaussians of the input scene.
-        """
+        """Return the paths in the order of the budgets, or [] if they depend on an unknown `total`."""
         if total is None and self._unknown():
             return []
         found = [Path(self._named(budget, total)) for budget in self._budgets]

@@ -89,11 +89,7 @@ def check_place(run: Run, place: Path, budget: Budget, given: bool, resume: bool
     """Raise an `OutputError` unless the run may write to the folder of `place`, its scene file.
 
     Args:
-        run: the command.
-        place: the scene's file.
-        budget: budget of this folder.
         given: whether views are given; otherwise views.json is written too.
-        resume: --resume.
     """
     from g2ard.io.atomic import check_output
 
@@ -135,9 +131,6 @@ def work_folder(run: Run, output: Path, resume: bool, counts: tuple[int, int] = 
     """Create the folder for checkpoints; after an error or Ctrl-C, keep it only if it can be resumed.
 
     Args:
-        run: the command.
-        output: the folder of the run.
-        resume: --resume.
         counts: Gaussians of the dense scene and of the result.
     """
     from g2ard.errors import InputError

@@ -56,12 +56,8 @@ def likely_causes(
     A result is poor if it scores below 20 dB in held-out views, or more than 3 dB below the training views.
 
     Args:
-        splats: the recovered scene.
         held_out: the held-out views of the training views' kind.
-        trained: the training views.
-        recovery: report of the last recovery.
         scored: mean PSNR in the held-out views, dB.
-        background: RGB behind the scene.
     """
     gap = recovery.psnr.after - scored
     if scored >= _LOW and gap <= _GAP:

@@ -202,7 +202,6 @@ def _sources(views: RunViews, photos: bool | None, lifted: bool) -> _Sources:
     """Decide the sources of the targets.
 
     Args:
-        views: views for training and scoring.
         photos: the option: True allows only photos, False only renders, None both.
         lifted: whether the scene is a lifted point cloud, which cannot be rendered for targets.
     """

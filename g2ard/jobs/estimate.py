@@ -44,8 +44,6 @@ class Estimate:
 
     Args:
         views: number of views that need a target, including those for scoring.
-        pixels: pixels per view.
-        steps: recovery steps of all rounds together.
         seconds: by stage: prepare (measured), targets, simplify, recover, score.
         bytes: peak memory: the peak of this process so far, including the trial, plus what the run adds,
             mainly the targets.
@@ -64,13 +62,7 @@ class Estimate:
 
 
 def estimate(job: DistillJob, budget: int, *, page: bool = True) -> Estimate:
-    """Estimate a job at one budget from a few renders and steps and one fast merge.
-
-    Args:
-        job: a job from `g2ard.jobs.distill.prepare`.
-        budget: Gaussians of the result.
-        page: whether a viewer page is written too.
-    """
+    """Estimate a job at one budget from a few renders and steps and one fast merge."""
     train, test, apart = job.views.train.cameras, job.views.test, job.views.apart
     near = 0 if apart is None or job.teacher is None else len(apart)
     some = np.unique(np.linspace(0, len(train) - 1, min(_TRIED, len(train))).round().astype(int))

@@ -206,13 +206,8 @@ def clutter_seen(
     """Find clutter from generated views, and say how much there is of each kind.
 
     Args:
-        splats: the scene.
         kinds: looked for; None for all of `g2ard.stages.clean.KINDS`.
         strength: of removing haze and streaks, see `g2ard.stages.clean.find_clutter`; 0 removes none.
-        seed: of the generated views.
-
-    Returns:
-        The clutter, and the views it was found by.
     """
     from g2ard.poses import plan_pool
     from g2ard.stages.clean import FLOATING, KINDS, find_clutter, find_floating, within_reach

@@ -27,11 +27,9 @@ class DistillJob:
     Args:
         prior: the dense scene, or a lifted point cloud.
         aims: one or more resolved budgets; shared work is done once.
-        views: views for training and scoring.
         teacher: the scene rendered for targets; None if all targets are photos.
         photos_over_renders: use photos where views have them and renders for the rest; always False without a
             teacher.
-        config: configuration of the pipeline.
         weights: (C,) sampling weight per view, if the views state them.
         lifted: whether `prior` is a lifted point cloud.
         preset: the regularisers chosen, and why.

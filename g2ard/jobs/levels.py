@@ -47,10 +47,8 @@ class LevelReport(Report):
     """Figures of one level.
 
     Args:
-        count: number of Gaussians.
         ratio: reduction factor relative to the scene.
         size: longer side in pixels of the views for recovery and scoring.
-        seconds: time for the whole level.
         simplified, recovered: PSNR, dB, in held-out views of that size; None for the scene itself.
     """
 

@@ -100,10 +100,7 @@ def count_for_bytes(splats: Splats, wanted: int, name: str, reduce: Callable[[in
     bracket the result, until one fills 98 % of the bytes.
 
     Args:
-        splats: the dense scene.
-        wanted: bytes.
         name: a file name; its suffix is the format.
-        reduce: count → scene.
     """
     fewest, most = min(_FEWEST, len(splats)), len(splats)
     sample = splats.take(np.unique(np.linspace(0, most - 1, min(most, _SAMPLE)).astype(int)))
@@ -155,9 +152,7 @@ def count_for_quality(
     excess is at most 0.25 dB.
 
     Args:
-        splats: the dense scene, N Gaussians.
         wanted: mean PSNR and SSIM; 0 means no requirement.
-        cameras: views to measure in.
         reduce: count → scene, by the method that makes the result.
 
     Returns:
@@ -282,13 +277,9 @@ def aim_of(
     """Resolve a budget for a scene.
 
     Args:
-        budget: a budget of any kind.
-        splats: the scene.
-        name: name of the scene in errors.
         file: a file name; its suffix is the format for `Budget.fit`.
         reduce: count → scene, by the method that makes the result.
         recovered: whether recovery follows. Bytes are then searched with the method `fast` and a margin.
-        seed: seed of the views for measuring quality.
     """
     if budget.min_psnr is not None or budget.min_ssim is not None:
         wanted = Quality(budget.min_psnr or 0.0, budget.min_ssim or 0.0)

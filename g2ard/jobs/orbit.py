@@ -32,11 +32,8 @@ def orbit(
     median depth in its direction.
 
     Args:
-        scene: the scene.
         count: number of views; the one after the last would be the first again.
-        size: width and height, pixels.
         up: (3,) axis of the circle; estimated by default.
-        seed: seed of the generated views.
     """
     pool = plan_pool(scene, _POOL, size=size, up=up, seed=seed, progress=progress)
     points, axis = opaque_points(scene), np.asarray(pool.up, np.float64)

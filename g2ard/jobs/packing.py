@@ -50,11 +50,6 @@ def score_lines(packed: dict[str, Any], size: int, unpacked: float) -> list[str]
 def loss_warning(path: Path, splats: Splats, options: dict[str, Any]) -> str | None:
     """Compare a written file with its scene in a few small generated views.
 
-    Args:
-        path: the file.
-        splats: the scene as given to the writer.
-        options: the writer's options.
-
     Returns:
         A warning if a scene of 35 dB would lose more than 1 dB. None otherwise, and without a comparison if
         the format is exact, the scene is large or no view shows it.

@@ -21,10 +21,6 @@ from g2ard.stages.evaluate import evaluate
 def report_of(job: DistillJob, done: Distilled) -> dict[str, Any]:
     """Score the simplified and the recovered scene in held-out views, and describe the run.
 
-    Args:
-        job: the job.
-        done: its result.
-
     Returns:
         Counts, bytes, scores in held-out views (`scores`) and in views of other kinds (`apart`, or None),
         their summary by kind (`kinds`), likely causes of a poor result (`causes`), rounds, seconds by stage,

@@ -49,7 +49,6 @@ def working(tiling: Tiling, *views: Views | None) -> Iterator[None]:
     resumed run would find nothing in it: no finished task and, after errors of the output, no tiles either.
 
     Args:
-        tiling: of the command.
         views: given to the command; they are read now, and the scheduler is tried, because writing tiles
             takes long.
     """
@@ -124,10 +123,7 @@ def _tiles_and_workers(
     """Open the tiles of a scene, streamed into `tiling.folder` if it is a file, and start workers.
 
     Args:
-        scene: its file, or a folder of tiles.
         tiling: how. Tiles of another size are replaced unless the user named the folder.
-        times: memory of a tile relative to merging it.
-        render_model: overrides what a file says.
     """
     if (scene / MANIFEST).is_file():
         store = TileStore.open(scene)
@@ -173,15 +169,8 @@ def simplify_in_tiles(
     """Simplify a scene larger than memory to several budgets, each computed when it is requested.
 
     Args:
-        scene: its file, or a folder of tiles.
-        budgets: counts, ratios or shares.
         tiling: how; `folder` keeps finished steps, so that the same call resumes.
         views: as for `g2ard.simplify`.
-        blind: use no cameras at all.
-        config: constants.
-        up: (3,) away from the ground, for generated views.
-        seed: of generated views.
-        render_model: overrides what a file says.
     """
     with _tiles_and_workers(scene, tiling, 1.0, render_model, progress, say) as (store, workers):
         for budget in budgets:
@@ -226,8 +215,6 @@ def distill_in_tiles(
     Targets are the dense scene's own renders, in views that are given, found beside it or generated.
 
     Args:
-        scene: its file, or a folder of tiles.
-        budgets: counts, ratios or shares.
         tiling: how; `folder` keeps finished steps, so that the same call resumes.
         options: as for `g2ard.distill`, without those that `whole_options` returns.
     """
@@ -268,10 +255,7 @@ def lod_in_tiles(
     against the dense scene's renders in views shrunk by √√r.
 
     Args:
-        scene: its file, or a folder of tiles.
-        ratios: how many times fewer Gaussians each level has, rising; 1 is the scene as it is.
         tiling: how; `folder` keeps finished steps, so that the same call resumes.
-        options: as for `g2ard.distill`.
         recover: optimise each level; otherwise levels are only merged.
 
     Returns:
@@ -320,15 +304,9 @@ class _Job:
     """A distillation in tiles with everything decided.
 
     Args:
-        store: the dense scene in tiles.
         sample: a fair sample of it.
-        views: for training and scoring.
         config: of recovery.
-        merging: of simplification.
         learn: whether anything is recovered, or only scored.
-        workers: run the tasks.
-        tiling: how; `folder` keeps finished steps.
-        options: as they were given.
     """
 
     store: TileStore

@@ -102,8 +102,6 @@ class TileMemory:
     """Estimate of the memory that tiles of a scene take.
 
     Args:
-        count: Gaussians of the scene.
-        row_bytes: bytes of a Gaussian's arrays.
         times: memory relative to merging a tile.
         folder: folder of existing tiles, which `--tile-rows` cannot change; None if it can.
     """
@@ -198,7 +196,6 @@ def check_memory(scene: Path, tiling: Tiling, times: float, tile_times: float = 
     """Reject a scene that takes more than `--memory` in one piece.
 
     Args:
-        scene: its file, or a folder of tiles.
         tiling: with the limit; nothing is checked without one.
         times: memory in one piece relative to the scene's arrays.
         tile_times: memory of a tile relative to merging it.
@@ -222,8 +219,6 @@ def workers_for(store: TileStore, tiling: Tiling, times: float = 1.0) -> int:
     """Return the number of workers that memory and cores allow.
 
     Args:
-        store: the tiles.
-        tiling: the limits.
         times: memory of a tile relative to merging it.
     """
     memory = tiling.usable_memory
@@ -254,12 +249,7 @@ def _folder_of_tiles(scene: Path) -> Path | None:
 
 
 def refuse_whole(scene: Path, options: Sequence[str]) -> None:
-    """Reject options that need the whole scene in memory.
-
-    Args:
-        scene: its file, or a folder of tiles.
-        options: those that were given, as they are typed.
-    """
+    """Reject options that need the whole scene in memory."""
     if not options:
         return
 

@@ -40,8 +40,6 @@ def found_views(scene: str | Path, splats: Splats, splits: Sequence[str], say: S
     """Find views beside a scene (`g2ard.io.find_views`) that see it.
 
     Args:
-        scene: the scene's path.
-        splats: the scene.
         splits: splits that must not be empty.
 
     Returns:
@@ -112,8 +110,6 @@ def propose_background(cameras: Cameras, background: Colour, given: bool, say: S
     """Say which background fits the photos if they have alpha, or a border of another colour.
 
     Args:
-        cameras: views, some with photos.
-        background: RGB in use.
         given: whether it was chosen rather than the default.
     """
     from g2ard.scene.images import colour_text, photo_traits

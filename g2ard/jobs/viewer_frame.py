@@ -78,9 +78,7 @@ def frame_of(
         scene: the scene, or the left one of two.
         views: cameras, or their path; "made" generates a pool.
         start: name of the initial view; None takes the one that contains most of the scene.
-        beside: path beside which to look for cameras.
         up: (3,) direction away from the ground; None takes it from the views, or estimates it.
-        seed: seed of generated views.
     """
     try:
         found = views_or_pool(

@@ -98,14 +98,9 @@ def views_of(
     """Choose views for recovery and for scoring.
 
     Args:
-        prior: the dense scene.
         views: cameras, or their path. None uses cameras found beside the scene, or generates a pool; "made"
             always generates one.
         held_out: views to score on; None holds out the test split, or every 8th view of a pool.
-        beside: path beside which to look for cameras.
-        size: longer side in pixels, if views are larger.
-        up: (3,) direction away from the ground for generated views; None estimates it.
-        seed: seed of generated views.
         teach: whether the scene can render targets; otherwise views without a photo are skipped and no views
             are generated.
         anywhere: share of the training views that look from anywhere, added to those that are given without
@@ -164,10 +159,7 @@ def _mixed(
     """Add views from anywhere to training views, and return them with views of other kinds.
 
     Args:
-        train: the usual views.
-        planned: a pool of the scene.
         share: share of the views from anywhere among all; None is 40 % times 1 − `Pool.held`.
-        size: longer side of the views, pixels.
     """
     if share is None:
         share = _ANYWHERE * (1 - planned.held)
@@ -202,7 +194,6 @@ def views_or_pool(
     """Return given views, views found beside the scene, or a generated pool with every 8th view held out.
 
     Args:
-        scene: the dense scene.
         count: size of a generated pool; None chooses like `distill`.
 
     Other arguments are those of `views_of`.
@@ -242,7 +233,6 @@ def cameras_for_looks(
     """Choose views for simplification's visibility: given, found beside the scene, or generated.
 
     Args:
-        scene: the dense scene.
         views: as for `views_of`; the training split is used.
         method: `fast` uses only given or requested views, `paper` none.
 

@@ -30,13 +30,6 @@ def leaf_errors(leaf: Leaf, levels: Sequence[Level]) -> list[float]:
 
     f is the finest level with Gaussians in the leaf. Errors never decrease from a level to the next coarser
     one, because viewers rank loads by the error removed. f and levels without Gaussians here have error 0.
-
-    Args:
-        leaf: a leaf of the tree.
-        levels: the levels that the tree was cut from.
-
-    Returns:
-        One error per level.
     """
     there = [level for level, rows in enumerate(leaf.rows) if len(rows)]
     errors = [0.0] * len(levels)

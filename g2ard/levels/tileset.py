@@ -44,6 +44,9 @@ class Georeference:
         longitude, latitude: degrees.
         height: metres above the ellipsoid.
         heading: direction of the scene's y axis if z is up, of z if −y is up, degrees clockwise from north.
+
+    Raises:
+        InputError: a value out of range.
     """
 
     longitude: float
@@ -91,7 +94,12 @@ class Georeference:
 
 
 def map_system(name: str) -> Any:
-    """Return pyproj's coordinate system of a name such as EPSG:32635."""
+    """Return pyproj's coordinate system of a name such as EPSG:32635.
+
+    Raises:
+        InputError: an unknown name, or a system without eastings and northings in metres.
+        MissingDependencyError: pyproj is not installed.
+    """
     try:
         import pyproj
     except ImportError as error:
@@ -135,9 +143,14 @@ def save_tileset(
         cut: splitting rule of the tree, and the most Gaussians of a tile; None means `Cut()`.
         overwrite: replace files in the folder, and remove files of its previous `tileset.json`.
         work: folder for temporary files, which saves memory.
+        progress: called for files written.
 
     Returns:
         Bytes written.
+
+    Raises:
+        InputError: no levels, a level that is empty or not finite, or different offsets.
+        OutputError: see `atomic_folder`.
     """
     path, rule = Path(path), cut or Cut()
     tree = cut_tree(levels, rule, work)

@@ -85,7 +85,6 @@ def cut(levels: Sequence[Level], rule: Cut | None = None, scratch: Path | None =
 
     Args:
         levels: the same scene at several levels, finest first, with equal offsets.
-        rule: when to split; None means `Cut()`.
         scratch: folder for unnamed temporary files of positions and row numbers. Memory then holds 4 bytes
             per row plus the rows of one leaf. None keeps everything in memory.
 

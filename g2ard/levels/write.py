@@ -62,9 +62,14 @@ def save_levels(
         overwrite: replace files in the folder, and remove files of its previous `lod-meta.json`.
         work: folder for intermediate results; the same call on the same levels resumes from it and uses less
             memory.
+        progress: called for leaves measured and files written.
 
     Returns:
         Bytes written.
+
+    Raises:
+        InputError: no levels, a level that is empty or not finite, or different offsets.
+        OutputError: see `atomic_folder`.
     """
     rule = cut or Cut()
     tree = cut_tree(levels, rule, work)

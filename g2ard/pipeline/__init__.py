@@ -110,12 +110,6 @@ def final_steps(config: DistillConfig, scene: Splats, cameras: Cameras, *, photo
     """Return the steps of the last recovery: as set, the schedule's, or more by need.
 
     More are needed for points of photos, and for renders of which each shows little of the scene.
-
-    Args:
-        config: configuration of the pipeline.
-        scene: the scene to recover.
-        cameras: training views.
-        photos: whether targets are photos.
     """
     schedule = config.recover.schedule
     if config.recover.steps is not None:

@@ -117,7 +117,6 @@ class AdaptReport(Report):
     """Figures of an adaptation.
 
     Args:
-        steps: steps taken.
         seconds: time for these steps.
         converged: whether the last stretch gained less than the tolerance.
         psnr: PSNR before and after, on a sample of the training views.

@@ -14,10 +14,7 @@ class ViewsReport(Report):
     """Report of the view selection.
 
     Args:
-        policy: selection policy.
-        candidates: number of candidates.
         chosen: names of the chosen views, best first.
-        weighted: whether views are drawn by weight.
         refused: names of views that see nothing of the scene or lie inside geometry.
         left_out: share of the whole pool's objective that the remaining views would add.
     """
@@ -44,9 +41,6 @@ class StageSeconds(Report):
     """Wall seconds of each stage.
 
     Args:
-        select: selecting or weighting views.
-        simplify: simplification in all rounds.
-        recover: recovery in all rounds.
         resumed: part of these spent by earlier, interrupted calls; None if there were none.
     """
 

@@ -39,12 +39,9 @@ def distill_report(
     """Write the HTML page of one run: a verdict, scores by kind of view, and pictures of the worst views.
 
     Args:
-        path: output file.
-        title: title of the page.
         scenes: (name, scene) of `simplified` and `recovered`, as `report["scores"]` names them.
         targets: photos or teacher renders of the held-out views, and of the views of other kinds, if any.
         report: what `g2ard distill` writes as report.json.
-        background: RGB behind the scenes.
         told: summary lines that the command prints.
     """
     page = Page(title, verdict(report))
@@ -117,8 +114,6 @@ def tiled_report(path: Path, title: str, report: dict[str, Any]) -> None:
     """Write the HTML page of a run in tiles.
 
     Args:
-        path: output file.
-        title: title of the page.
         report: content of report.json from `g2ard distill` in tiles.
     """
     scores, views = report["scores"], report["views"]
@@ -159,10 +154,7 @@ def preview(
     """Write a PNG with a row for each of three evenly spaced views: target, then each scene with its PSNR.
 
     Args:
-        path: output file.
-        targets: photos or teacher renders with their cameras.
         scenes: (label, scene), left to right after the target.
-        background: RGB behind the scenes.
     """
     count = len(targets.cameras)
     chosen = np.unique(np.linspace(0, count - 1, min(count, _SHOWN)).round().astype(int))

@@ -71,10 +71,6 @@ def _span(start: float, extent: float, size: int) -> slice:
 def worst_windows(image: NDArray[np.uint8], target: NDArray[np.uint8]) -> list[Window]:
     """Return the windows with the largest error, worst first, without overlaps.
 
-    Args:
-        image: (H, W, 3).
-        target: of the same shape.
-
     >>> target = np.zeros((100, 100, 3), np.uint8)
     >>> image = target.copy()
     >>> image[70:80, 20:30] = 255

@@ -27,7 +27,6 @@ def painted(splats: Splats, colors: ArrayLike) -> Splats:
     """Recolour a scene, view-independently, shaded by the luma of its own colours.
 
     Args:
-        splats: N Gaussians.
         colors: (N, 3) in [0, 1].
 
     Returns:
@@ -75,7 +74,6 @@ def cell_labels(splats: Splats, count: int) -> NDArray[np.int64]:
     of its own.
 
     Args:
-        splats: N Gaussians, all of them finite.
         count: number of cells, N_S in the paper.
 
     Returns:

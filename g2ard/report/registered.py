@@ -42,16 +42,10 @@ def registration_report(
     """Write the HTML page of a registration, least similar photos first.
 
     Args:
-        path: output file.
-        title: title of the page.
-        scene: the scene that the photos were registered against.
-        photos: C views with photos.
         rows: C `PhotoReport`s, in the same order.
         starts: name → (4, 4) camera_from_world, shown beside the result.
         matches: name → (M, 4) of `Registered`, drawn between photo and render.
         side: longer side in pixels of the images that `matches` refer to.
-        told: summary lines that the command prints.
-        background: RGB behind the scene.
     """
     page = Page(title, f"{plural(len(photos), 'photo')} against {plural(len(scene), 'Gaussian')}")
     for line in told:
@@ -89,8 +83,6 @@ def matches_drawn(
     """Draw photo and render side by side, (H, 2 W, 3), with a line for each match.
 
     Args:
-        photo: (H, W, 3).
-        render: likewise.
         matches: (M, 4) matching pixels (u, v) of photo and render.
     """
     from PIL import Image, ImageDraw

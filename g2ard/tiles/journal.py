@@ -62,11 +62,7 @@ class Journal:
     the excess after an interruption.
 
     Args:
-        folder: folder of the tiles.
         key: hash of everything that determines their content.
-        tree: the kd-tree.
-        margin: reach of halos, scene units.
-        row_bytes: bytes per row.
         tally: a dataclass of counts gathered while reading the source.
         settings: settings behind `key`, for error messages.
         next_row: first row of the source that is not in its tile yet.
@@ -136,12 +132,7 @@ class Journal:
         return np.ascontiguousarray(rows[:, :12]).view("<f4")
 
     def add(self, rows: NDArray[Any], means: Points) -> None:
-        """Append rows to their tiles and to the halos of tiles nearby.
-
-        Args:
-            rows: (N, …) rows of `row_bytes`, contiguous.
-            means: (N, 3) their positions.
-        """
+        """Append rows to their tiles and to the halos of tiles nearby."""
         if not len(rows):
             return
         self.low = np.minimum(self.low, means.min(axis=0).astype(np.float64)).tolist()

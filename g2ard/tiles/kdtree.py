@@ -50,10 +50,6 @@ class KdTree:
         """Yield per leaf, in order, the rows in its box and the rows of other boxes within `margin`.
 
         A point is within the margin if it lies in the box after all sides move outwards by `margin`.
-
-        Args:
-            points: (N, 3) float32, finite.
-            margin: reach of the halo; 0 makes no halo.
         """
         core, halo = np.arange(len(points)), np.empty(0, np.intp)
         columns = tuple(np.ascontiguousarray(points.T))

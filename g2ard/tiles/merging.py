@@ -44,8 +44,6 @@ class TiledScene:
     Args:
         counts: Gaussians per tile.
         tiles: reads the Gaussians of a tile, with fitted opacities.
-        sh_degree: SH degree of all tiles.
-        offset: (3,) float64.
         key: hash of the names of its files.
         views: number of views used; 0 without views.
         unseen: Gaussians of the dense scene that no view sees; None without views.
@@ -109,15 +107,9 @@ def simplify_tiles(
     only on the scene, the tiles and the seed, not on where, in which order or how often tasks ran.
 
     Args:
-        store: the scene.
-        budget: Gaussians to keep.
-        workers: runs the tasks, stage by stage.
-        config: constants; None means the method's defaults.
         views: cameras to render from; None uses `beside`, or as a fallback a generated pool.
         beside: returns cameras found beside the scene for a sample of it, or None.
         blind: use no cameras at all.
-        up: (3,) direction away from the ground for generated views; None estimates it.
-        seed: seed of the generated views.
     """
     if not 1 <= budget <= store.count:
         raise InputError(
@@ -294,7 +286,6 @@ def cheapest(costs: Sequence[Callable[[], NDArray[np.float32]]], count: int) -> 
 
     Args:
         costs: functions that return arrays of float32 ≥ 0, called three times each.
-        count: at most the total number of costs.
 
     >>> few = [np.array([3, 1, 1], np.float32), np.array([1, 0, 2], np.float32)]
     >>> cheapest([lambda a=a: a for a in few], 3)

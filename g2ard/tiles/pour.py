@@ -118,8 +118,6 @@ def pour(
     Args:
         folder: an existing folder: empty, or with a journal of the same key.
         key: hash of everything that determines the content.
-        feed: the rows.
-        tile_rows: maximum rows per tile.
         rows: rows in memory at a time.
         like: reuse the tree and margin of these tiles, ignoring `tile_rows`.
     """

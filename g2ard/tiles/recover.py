@@ -56,8 +56,6 @@ class TileScore:
     """Score of one tile.
 
     Args:
-        tile: its number.
-        count: its Gaussians.
         simplified, recovered, pixels, steps: as in `TiledScores`; PSNR is meaningless without pixels.
     """
 
@@ -74,12 +72,7 @@ class TiledScores:
     """Scores on held-out views, over all pixels owned by tiles.
 
     Args:
-        simplified: PSNR before recovery, dB.
-        recovered: PSNR after recovery, dB.
         pixels: number of pixels scored.
-        kinds: scores by kind of view.
-        steps: steps of all tiles together.
-        tiles: scores per tile.
     """
 
     simplified: float
@@ -210,13 +203,11 @@ def recover_tiles(
     pixels it owns in the dense scene. A tile's share of `steps` is the share of views that see it.
 
     Args:
-        store: the dense scene.
         student: the scene to recover, in the same boxes (`ingest(…, like=store)`).
         around: placement of the dense tiles, from `simplify_tiles` with views.
         views: views for training, for scoring, and of another kind for validation.
         config: constants of recovery; its steps are ignored.
         steps: steps of a recovery of the whole scene; 0 only scores.
-        workers: runs the tasks.
     """
     sight = {
         name: (written(workers.folder, cameras), _seen(store, around, cameras, workers))

@@ -115,12 +115,7 @@ def boxes_of(coarse: Sequence[Path]) -> NDArray[np.float64]:
 
 
 def in_sight(light: NDArray[np.float64], tile: int) -> NDArray[np.intp]:
-    """Return the views that see a tile; if they are few, include the best of the others.
-
-    Args:
-        light: (V, T) from `light_of`.
-        tile: tile number.
-    """
+    """Return the views that see a tile; if they are few, include the best of the others."""
     own = light[:, tile]
     sight = np.flatnonzero(own > _IN_SIGHT * light.sum(axis=1))
     if len(sight) < MOST_LOOKS:

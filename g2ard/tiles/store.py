@@ -86,7 +86,6 @@ class Tile:
     """Manifest entry of a tile.
 
     Args:
-        index: position in the order of the kd-tree.
         rows: number of Gaussians whose mean lies in its box.
         halo: number of Gaussians of other tiles within the margin around the box.
         low, high: corners of the box, clipped to the bounds of the scene's means, relative to the offset.

@@ -55,8 +55,6 @@ class Task:
 
     Args:
         function: "module:name" of a function (arguments, inputs, places) → arrays.
-        label: prefix of the file's name.
-        folder: folder of the file.
         arguments: JSON values.
         inputs: output files of other tasks, by name.
         places: files and folders whose content `arguments` determine; they may be moved.

@@ -30,7 +30,6 @@ class Start:
     """Initial camera of a page, in the viewer's axes: x right, y up, z towards the viewer.
 
     Args:
-        position: scene units.
         target: centre of rotation, scene units.
         fov: degrees, along the window's longer side.
     """
@@ -45,7 +44,6 @@ class Written:
     """Sizes of a written page.
 
     Args:
-        bytes: size of the file.
         scenes: SOG bytes per scene.
     """
 
@@ -73,14 +71,8 @@ def write_page(
     Scenes are embedded, and quantised, as .sog; their `offset` is dropped. Equal scenes give equal bytes.
 
     Args:
-        path: the .html file.
         scenes: (label, scene), one or two, left to right, in the same frame: x right, y down, z ahead.
         start: initial camera; None lets the viewer frame the whole scene.
-        background: RGB in [0, 1].
-        overwrite: whether an existing file may be replaced.
-
-    Returns:
-        The sizes of the page and its scenes.
     """
     path = check_page_output(path, overwrite)
     packed = [_sog(path, label, splats) for label, splats in scenes]
