@@ -262,6 +262,16 @@ class Run:
             if real_path(output) in taken:
                 raise typer.BadParameter(f"{output} is both an input and the output; name another output")
 
+    def check_extra(self, flag: str, path: Path, given: Path | None = None) -> None:
+        """Check a further output, whose option is `given`: it must be no other path of the command."""
+        from g2ard.io.atomic import check_output
+        from g2ard.io.paths import real_path
+
+        others = [p for p in (*self._inputs, self.config.get("output")) if p and p is not (given or path)]
+        if real_path(path) in map(real_path, others):
+            raise typer.BadParameter(f"{flag}: {path} is also an input or output; name another file")
+        check_output(path, self.overwrite)
+
     def reads(self, scenes: list[Path], output: Path) -> None:
         """Record that the last positional path is the output, and check it with `spare_inputs`."""
         self.config |= {"scenes": scenes, "output": output}

@@ -66,6 +66,12 @@ def scene_format(path: str | Path) -> SceneFormat:
     raise OutputError(f"scenes are written as {known}, or as a SOG folder (NAME/meta.json)", path=path)
 
 
+def written_bytes(path: Path) -> int:
+    """Return the size of a written scene: of its file, or of all files beside a meta.json."""
+    files = path.parent.iterdir() if path.name == "meta.json" else [path]
+    return sum(file.stat().st_size for file in files)
+
+
 def lost_in(path: str | Path, splats: Splats, **options: object) -> list[Note]:
     """Return notes on what the format of an output path cannot hold."""
     found = scene_format(path)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -20,13 +21,14 @@ from g2ard.rendering.visibility import visibility
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.regions import in_any
 from g2ard.scene.splats import Splats
-from g2ard.scene.splits import for_scores, for_training, not_held_out, split_mask, splits_of
+from g2ard.scene.splits import not_held_out, split_mask, splits_of
 from g2ard.scene.targets import Photos, PhotosOrRenders, Targets, TeacherRenders
 
 if TYPE_CHECKING:
     from g2ard.stages.clean import Cleaning
     from g2ard.stages.simplify import SimplifyConfig
 Views = Cameras | ViewSet | ViewFiles | str | Path  # cameras, or the path of views
+Split = str | Callable[..., "NDArray[np.bool_]"]  # of `split_mask`, or a function like `for_training`
 
 _CLUTTER_VIEWS, _CLUTTER_SIDE = 96, 400
 """Number of generated views for finding clutter, and their longer side in pixels."""
@@ -79,28 +81,15 @@ def load_views(
 
 
 def load_view_sets(
-    views: Views, splits: list[str], size: int | None, say: Say = unsaid, *, unpictured: bool = False
+    views: Views, splits: Sequence[Split], size: int | None, say: Say = unsaid, *, unpictured: bool = False
 ) -> list[ViewSet]:
     """Read views once and return several splits, shrunk to `size`, with their weights."""
     found, path = _read(views, say, unpictured=unpictured)
-    masks = [split_mask(path, found.cameras.names, split, stated=found.splits) for split in splits]
-    return [found.take(mask).resized(size) for mask in masks]
-
-
-def load_for_training(
-    views: Views, size: int | None, say: Say = unsaid, *, unpictured: bool = False
-) -> ViewSet:
-    """Read training views when views for scoring are given separately: the train split if splits are stated,
-    otherwise all.
-    """
-    found, path = _read(views, say, unpictured=unpictured)
-    return found.take(for_training(path, found.cameras.names, found.splits)).resized(size)
-
-
-def load_held_out(views: Views, size: int | None, say: Say = unsaid, *, unpictured: bool = False) -> ViewSet:
-    """Read views that were given for scoring."""
-    found, path = _read(views, say, unpictured=unpictured)
-    return found.take(for_scores(path, found.cameras.names, found.splits)).resized(size)
+    parts = []
+    for split in splits:
+        chosen = partial(split_mask, which=split) if isinstance(split, str) else split
+        parts.append(found.take(chosen(path, found.cameras.names, stated=found.splits)).resized(size))
+    return parts
 
 
 def drop_held_out(train: ViewSet, held_out: Cameras, say: Say = unsaid) -> ViewSet:

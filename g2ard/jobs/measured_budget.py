@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from g2ard.errors import InputError
 from g2ard.io import read_splats, write_splats
-from g2ard.io.scene_formats import scene_format
+from g2ard.io.scene_formats import scene_format, written_bytes
 from g2ard.jobs.budget import Budget
 from g2ard.progress import Progress, Say, plural, silent, unsaid
 from g2ard.rendering.metrics import psnr, ssim
@@ -69,9 +69,7 @@ class Quality:
 def file_bytes(splats: Splats, name: str, **options: Any) -> int:
     """Return the bytes of the scene as `write_splats` writes it under `name`."""
     with _written(splats, name, **options) as path:
-        folder = path.parent if path.name == "meta.json" else path
-        files = folder.iterdir() if folder.is_dir() else [folder]
-        return sum(file.stat().st_size for file in files)
+        return written_bytes(path)
 
 
 def as_file(splats: Splats, name: str) -> Splats:

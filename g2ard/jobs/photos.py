@@ -18,10 +18,11 @@ from g2ard.config.choices import BLACK, Colour
 from g2ard.errors import InputError
 from g2ard.io.types import Points
 from g2ard.jobs.hull import VisualHull, visual_hull
-from g2ard.jobs.inputs import load_for_training, load_view_sets
+from g2ard.jobs.inputs import load_view_sets
 from g2ard.progress import Progress, Say, plural, silent, unsaid
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.images import composited, load_premultiplied
+from g2ard.scene.splits import for_training
 
 if TYPE_CHECKING:
     from g2ard.jobs.inputs import Views
@@ -112,11 +113,7 @@ def topped_up(
     wanting = max(0, count - found)
     parts = [] if points is None else [points]
     if wanting:
-        train = (
-            load_view_sets(views, ["train"], _SIDE)[0]
-            if held_out is None
-            else load_for_training(views, _SIDE)
-        )
+        (train,) = load_view_sets(views, ["train" if held_out is None else for_training], _SIDE)
         parts.append(
             points_within_sight(train.cameras, wanting, background=background, seed=seed, progress=progress)
         )

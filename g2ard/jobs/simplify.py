@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from functools import cached_property, partial
+from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from g2ard.progress import Progress, Say, silent, unsaid
 from g2ard.rendering.visibility import visibility_source
 from g2ard.scene.splats import Splats
 from g2ard.stages.simplify import Simplified, SimplifyConfig, Visibility, VisibilitySource
+from g2ard.stages.simplify import simplify as merge
 
 
 def simplify(
@@ -109,6 +111,7 @@ def simplify(
     return small
 
 
+@dataclass(eq=False)
 class Reduction:
     """Reductions of one scene to any budget: count → `Simplified`, as `simplify` returns it.
 
@@ -116,43 +119,26 @@ class Reduction:
     those of `simplify`.
     """
 
-    def __init__(
-        self,
-        splats: Splats,
-        *,
-        views: Views | None = None,
-        blind: bool = False,
-        config: SimplifyConfig | None = None,
-        beside: str | Path | None = None,
-        up: Sequence[float] | None = None,
-        seed: int = 0,
-        progress: Progress = silent,
-        say: Say = unsaid,
-    ) -> None:
-        if views is not None and blind:
+    splats: Splats
+    views: Views | None = None
+    blind: bool = False
+    config: SimplifyConfig = field(default_factory=SimplifyConfig)
+    beside: str | Path | None = None
+    up: Sequence[float] | None = None
+    seed: int = 0
+    progress: Progress = silent
+    say: Say = unsaid
+    _made: dict[int, Simplified] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if self.views is not None and self.blind:
             raise InputError("views and blind exclude each other")
-        self.splats, self.blind = splats, blind
-        self.config, self.progress = config or SimplifyConfig(), progress
-        say_regions(splats, self.config, "the scene", say)
-        self._plan = partial(
-            cameras_for_looks,
-            splats,
-            views,
-            self.config.method,
-            beside=beside,
-            up=up,
-            seed=seed,
-            progress=progress,
-            say=say,
-        )
-        self._made: dict[int, Simplified] = {}
+        say_regions(self.splats, self.config, "the scene", self.say)
 
     def __call__(self, count: int) -> Simplified:
         """Return the scene at a budget."""
-        from g2ard.stages.simplify import simplify as reduce
-
         if count not in self._made:
-            made = reduce(
+            made = merge(
                 self.splats,
                 count,
                 visibility=self._look if count < len(self.splats) else None,
@@ -164,7 +150,18 @@ class Reduction:
 
     @cached_property
     def _look(self) -> VisibilitySource | None:
-        cameras = None if self.blind else self._plan()
+        if self.blind:
+            return None
+        cameras = cameras_for_looks(
+            self.splats,
+            self.views,
+            self.config.method,
+            beside=self.beside,
+            up=self.up,
+            seed=self.seed,
+            progress=self.progress,
+            say=self.say,
+        )
         return None if cameras is None else _remembering(visibility_source(cameras, progress=self.progress))
 
 

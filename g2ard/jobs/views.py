@@ -14,8 +14,6 @@ from g2ard.io import ViewSet
 from g2ard.jobs.inputs import (
     Views,
     drop_held_out,
-    load_for_training,
-    load_held_out,
     load_view_sets,
     load_views,
 )
@@ -23,7 +21,7 @@ from g2ard.jobs.view_checks import as_pool, check_sight, found_views, warn_of_si
 from g2ard.progress import Progress, Say, silent, unsaid
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
-from g2ard.scene.splits import split_mask, splits_of
+from g2ard.scene.splits import for_scores, for_training, split_mask, splits_of
 
 if TYPE_CHECKING:
     from g2ard.poses import Pool
@@ -115,8 +113,8 @@ def views_of(
         if held_out is None:
             train, test = load_view_sets(views, ["train", "test"], size, say, unpictured=teach)
         else:
-            train = load_for_training(views, size, say, unpictured=teach)
-            test = load_held_out(held_out, size, say, unpictured=teach)
+            (train,) = load_view_sets(views, [for_training], size, say, unpictured=teach)
+            (test,) = load_view_sets(held_out, [for_scores], size, say, unpictured=teach)
             train = drop_held_out(train, test.cameras, say)
         if not found:
             check_sight(prior, train.cameras, say)
@@ -135,7 +133,9 @@ def views_of(
         raise InputError(
             "generated views have no photos", parameter="photos", hint="give {views} that have them"
         )
-    held = None if held_out is None else load_held_out(held_out, size, say, unpictured=teach)
+    held = None
+    if held_out is not None:
+        (held,) = load_view_sets(held_out, [for_scores], size, say, unpictured=teach)
     planned = _planned(prior, _POOL, up, seed, progress, _GROW, represents)
     names = planned.cameras.names
     held_back = split_mask(None, names, "test") if held is None else np.zeros(len(names), bool)

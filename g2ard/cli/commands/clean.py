@@ -79,11 +79,7 @@ def clean(
     if output is not None and not dry_run:
         io.check_scene_output(output, run.overwrite)
     if preview is not None:
-        from g2ard.io.paths import real_path
-
-        if real_path(preview) in {real_path(path) for path in (scene, output) if path}:
-            raise typer.BadParameter(f"--preview: {preview} is also the input or output; name another file")
-        io.check_output(preview, run.overwrite)
+        run.check_extra("--preview", preview)
     splats = run.load(scene)
     found, cameras = clutter_seen(
         splats, kinds, strength=strength, seed=run.seed, progress=run.progress, say=run.say

@@ -84,7 +84,7 @@ def convert(
     import numpy as np
 
     from g2ard import io
-    from g2ard.io.scene_formats import check_options
+    from g2ard.io.scene_formats import check_options, written_bytes
     from g2ard.scene.axes import with_axes
     from g2ard.scene.transform import in_box, in_sphere, join, moving
     from g2ard.scene.transform import transform as moved
@@ -120,7 +120,7 @@ def convert(
     if change is not None:
         splats = with_axes(splats, change)
     run.write(output, splats, compare=True, **options)
-    size = _size(output)
+    size = written_bytes(output)
     kept = f"{len(splats):,}" if len(splats) == read else f"{len(splats):,} of {read:,}"
     what = "Gaussian" if kept == "1" else "Gaussians"
     run.say(f"{output}: {kept} {what}, {size / 1e6:.2f} MB, {size / len(splats):.1f} bytes each")
@@ -167,15 +167,6 @@ def _check_left(splats: Splats, read: int) -> None:
         raise InputError(
             f"none of {read:,} Gaussians are within --box and --sphere; `g2ard info` shows the scene's extent"
         )
-
-
-def _size(output: Path) -> int:
-    """Return the size of a file, or of the folder of a meta.json."""
-    from g2ard.io.scene_formats import scene_format
-
-    if scene_format(output).function == "write_folder":
-        return sum(file.stat().st_size for file in output.parent.iterdir() if file.is_file())
-    return output.stat().st_size
 
 
 def _matrix(given: str) -> list[list[float]]:

@@ -121,6 +121,7 @@ def register(
     from g2ard.stages.register import RegisterConfig
     from g2ard.stages.register import register as find
     from g2ard.stages.register.report import summarize
+    from g2ard.viewer import check_page_output
 
     names = ("size", "matcher", "refine", "passes", "accept")
     settings = run.settings(RegisterConfig(), *names)
@@ -135,7 +136,8 @@ def register(
         raise typer.BadParameter("--intrinsics and --focal exclude each other; give one")
     check_views_output(output, run.overwrite, format)
     if report is not None:
-        _check_report(run, report, (output, scene, poses, truth, intrinsics, photos))
+        run.check_extra("--report", report)
+        check_page_output(report, run.overwrite)
     taken = photos_of(photos, split=split, intrinsics=intrinsics, focal=focal, alpha=alpha, say=run.say)
     folder = photos.is_dir() and (intrinsics is not None or focal is not None)
     if poses is None and pool is None and folder:
@@ -208,18 +210,6 @@ def _refuse_contradictions(
     }
     if found := next((name for name, given in contradicts.items() if given), None):
         raise typer.BadParameter(f"--protocol gs-cpr sets {found}; remove {found}")
-
-
-def _check_report(run: Run, report: Path, others: tuple[Path | None, ...]) -> None:
-    """Reject a report that is no .html file, cannot be written, or is one of the `others`."""
-    from g2ard.io.atomic import check_output
-    from g2ard.io.paths import real_path
-
-    if real_path(report) in {real_path(path) for path in others if path}:
-        raise typer.BadParameter(f"--report {report} is also an input or the output; name another file")
-    if report.suffix.lower() not in (".html", ".htm"):
-        raise typer.BadParameter(f"--report {report}: expected a name that ends in .html")
-    check_output(report, run.overwrite)
 
 
 def _told(summary: Summary) -> list[str]:

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -81,7 +80,7 @@ def render(
     """Render views of a scene as PNG, or show how it would be simplified."""
     import numpy as np
 
-    from g2ard.io.atomic import check_output
+    from g2ard.io.atomic import atomic_folder, check_output
     from g2ard.io.paths import output_names
     from g2ard.jobs.inputs import load_views
     from g2ard.jobs.orbit import orbit
@@ -131,7 +130,7 @@ def render(
     shown: list[NDArray[np.uint8]] = []
     wanted = sheet is not None or animation is not None
     renderer = Renderer(splats, background=background or BLACK, settings=settings)
-    with _folder(output, run.overwrite) as folder:
+    with nullcontext() if output is None else atomic_folder(output, run.overwrite) as folder:
         for view in range(len(cameras)):
             rendered = renderer.render(cameras[view])
             if wanted:
@@ -150,17 +149,6 @@ def render(
     written = [str(path) for path in (output, animation, sheet) if path]
     run.say(f"{plural(len(cameras), 'image')} in {' and '.join(written)}")
     run.result({"images": len(cameras), "output": written[0]})
-
-
-@contextmanager
-def _folder(path: Path | None, overwrite: bool) -> Iterator[Path | None]:
-    from g2ard.io.atomic import atomic_folder
-
-    if path is None:
-        yield None
-        return
-    with atomic_folder(path, overwrite=overwrite) as folder:
-        yield folder
 
 
 def _write_sheet(

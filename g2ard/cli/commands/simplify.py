@@ -18,7 +18,6 @@ from g2ard.cli.options import (
     SceneArgument,
     UpOption,
     ViewsOrMadeOption,
-    is_made,
     with_images,
 )
 from g2ard.cli.outputs import Outputs, budgets_of
@@ -78,6 +77,7 @@ def simplify(
         raise typer.BadParameter("--keep-region needs views; remove --no-views or --method paper")
     tiling = tiling_of(run, scene, output)
     from g2ard import io
+    from g2ard.io.scene_formats import written_bytes
     from g2ard.jobs.inputs import say_notes
     from g2ard.jobs.measured_budget import aim_of
     from g2ard.jobs.simplify import Reduction
@@ -105,7 +105,7 @@ def simplify(
     check_memory(scene, tiling, WHOLE_TIMES)
     maps = None if parents is None else Outputs(run, parents, budgets, name="--parents")
     if maps is not None:
-        maps.check(lambda path, _: _check_parents(run, path, scene, views))
+        maps.check(lambda path, _: run.check_extra("--parents", path, parents))
     clock = [time.perf_counter()]
     found = io.read_scene(scene, render_model=run.render_model)
     say_notes(scene, found.notes, run.say)
@@ -148,17 +148,11 @@ def simplify(
         reports.append(_report(found, small, config.resolved(antialiased=small.splats.antialiased), clock))
         _tell(run, scene, small, place, total, clock[-1] - clock[0])
         if aim.bytes is not None:
-            run.say(f"{place}: {_bytes_of(place):,} of {aim.bytes:,} bytes")
+            run.say(f"{place}: {written_bytes(place):,} of {aim.bytes:,} bytes")
         run.kept.append(f"{place} is written")
         clock = [clock[-1] - (clock[1] - clock[0]), clock[-1]]  # reading is shared
     run.result(reports[0] if len(reports) == 1 else {"runs": reports})
     tell_quality(run, aims[0], small.splats)
-
-
-def _bytes_of(place: Path) -> int:
-    """Return the size of a file, or of all files of a SOG folder."""
-    files = place.parent.iterdir() if place.name == "meta.json" else [place]
-    return sum(file.stat().st_size for file in files)
 
 
 def _report(found: Scene, small: Simplified, config: SimplifyConfig, clock: list[float]) -> dict[str, Any]:
@@ -179,15 +173,6 @@ def _report(found: Scene, small: Simplified, config: SimplifyConfig, clock: list
         },
         "peak_rss_bytes": peak_rss(),
     }
-
-
-def _check_parents(run: Run, parents: Path, scene: Path, views: Path | None) -> None:
-    from g2ard.io.atomic import check_output
-    from g2ard.io.paths import real_path
-
-    if real_path(parents) in {real_path(path) for path in (scene, views) if path and not is_made(path)}:
-        raise typer.BadParameter(f"--parents: {parents} is an input; name another output")
-    check_output(parents, run.overwrite)
 
 
 def _write_parents(run: Run, path: Path, small: Simplified) -> None:
