@@ -71,7 +71,6 @@ def changed(config: Config, values: Mapping[str, Any]) -> Config:
     A nested config given as a whole (by name or as an object) is replaced before its fields.
 
     Args:
-        config: a dataclass.
         values: by full path; paths that the config does not have are ignored.
 
     Raises:

@@ -89,7 +89,6 @@ def write_nerfstudio(path: Path, cameras: Cameras, place: Path, splits: Sequence
     """Write a transforms.json: world_from_camera in OpenGL axes, and lists of file names per split.
 
     Args:
-        path: the file.
         cameras: the views; those without a photo are named `images/NAME`.
         place: the final path, which photos are relative to.
         splits: "train", "test" or another word per view, or ().

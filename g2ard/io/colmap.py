@@ -128,10 +128,6 @@ def _viewmat(path: Path, image: _Image) -> NDArray[np.float64]:
 class Record:
     """Layout of little-endian columns without padding.
 
-    Args:
-        names: names of the columns in file order.
-        letters: struct format of each.
-
     >>> Record(("ID", "X", "Y"), "Qdd").size
     24
     """

@@ -102,7 +102,6 @@ def spz_glb(path: Path, splats: Splats, centre: NDArray[np.float64] | None = Non
     """Return the parts of a .glb that holds an SPZ; `path` names it in messages.
 
     Args:
-        path: the file.
         splats: the scene, whose `offset` is the node's translation.
         centre: (3,) moved from the means to the node's translation, so that coordinates are fine.
     """

@@ -135,8 +135,6 @@ def fields_of(path: str | Path, entry: Any, index: int | None = None, item: str 
     """Return `entry` as `Fields`, or raise an error if it is not an object.
 
     Args:
-        path: the file.
-        entry: the object.
         index: index of the entry in the file; None for the whole document.
         item: unit of `index`.
     """
@@ -150,8 +148,6 @@ def numbers(holder: Fields, key: str, *shape: int, most: float = _LARGEST, gaps:
     """Return a number, or nested lists of numbers, as floats.
 
     Args:
-        holder: the object.
-        key: the property.
         shape: lengths of the lists, outermost first; empty for one number.
         most: largest magnitude.
         gaps: whether null (which becomes NaN), NaN and infinities are allowed.

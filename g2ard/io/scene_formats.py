@@ -17,8 +17,6 @@ class SceneFormat(NamedTuple):
     """A format to write scenes in.
 
     Args:
-        suffix: suffix of its files.
-        module: its module in `g2ard.io`.
         function: the writer in the module, `fn(path, splats, *, overwrite, **options)`.
         options: names of its options.
         models: whether it can state the render model.

@@ -138,18 +138,7 @@ def _left_out(path: Path, read_count: int) -> list[Note]:
 
 
 class _SogStream(SceneStream):
-    """Scene of one or more chunks; blocks do not cross chunks.
-
-    Args:
-        path: path for messages.
-        counts: Gaussians per chunk.
-        rest: largest number of coefficients past band 0.
-        offset: (3,) float64.
-        notes: notes so far.
-        render_model: see `Splats`.
-        files: files of the scene.
-        opened: function that opens the chunks.
-    """
+    """Scene of one or more chunks; blocks do not cross chunks."""
 
     def __init__(
         self,

@@ -83,14 +83,9 @@ class PartsStream(SceneStream):
     """Scene of clean parts that are loaded one at a time.
 
     Args:
-        path: path for messages.
         counts: Gaussians per part.
         part: function that loads a part by index.
-        sh_degree: SH degree of all parts.
-        offset: (3,) float64 offset of all parts.
         identity: JSON that identifies the scene.
-        notes: notes on the scene.
-        render_model: see `Splats`.
     """
 
     def __init__(

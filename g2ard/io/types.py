@@ -22,7 +22,6 @@ class Note:
     Args:
         code: stable identifier: `dropped_rows`, `clamped_logits`, `missing_photos`, …
         count: number of affected rows, properties or files.
-        text: message.
     """
 
     code: str
@@ -102,8 +101,6 @@ class ViewSet:
     """Views of a file, with splits, weights and notes.
 
     Args:
-        cameras: C views.
-        notes: notes of the reader.
         splits: "train", "test" or None per view; () if the file has no splits.
         weights: (C,) float64 sampling weights; None if the file has none.
     """

@@ -34,9 +34,7 @@ def write_animation(
 
     Args:
         path: the file; its suffix decides the format.
-        images: (H, W, 3) uint8.
         fps: images a second; .gif rounds to hundredths of a second.
-        overwrite: replace an existing file.
     """
     check_animation(path)
     frames = _one_size(path, iter(images))

@@ -30,8 +30,6 @@ class ColourChange:
     """Affine change of all colours of a scene: c → matrix·c + shift.
 
     Args:
-        matrix: (3, 3) float64.
-        shift: (3,) float64.
         gain: gain in dB on the pixels it was fitted to.
     """
 
@@ -47,7 +45,6 @@ def colour_change(splats: Splats, targets: Targets, background: tuple[float, flo
     after the map: linear least squares with twelve unknowns and a small weight on no change.
 
     Args:
-        splats: the scene.
         targets: images; masked pixels are ignored.
         background: RGB behind the scene, which stays unchanged.
     """

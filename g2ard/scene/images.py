@@ -38,8 +38,6 @@ def load_image(cameras: Cameras, index: int, background: Sequence[float] = BLACK
     equal channels; alpha is composited over the background.
 
     Args:
-        cameras: C views.
-        index: index of the view.
         background: RGB in [0, 1] behind transparent pixels.
 
     Returns:
@@ -137,10 +135,6 @@ def colour_text(colour: Colour) -> str:
 
 def load_mask(cameras: Cameras, index: int) -> NDArray[np.bool_] | None:
     """Read the mask of a view's photo, in the pixels of `load_image`.
-
-    Args:
-        cameras: C views.
-        index: index of the view.
 
     Returns:
         (H, W), True if the mask is brighter than half, or, for a photo that is its own mask, if its alpha is
@@ -269,9 +263,7 @@ def write_png(path: str | Path, image: ArrayLike, *, overwrite: bool = False) ->
     """Write an image as an 8-bit PNG, atomically.
 
     Args:
-        path: the file.
         image: (H, W, 3), (H, W, 4) or (H, W), floats in [0, 1] or bytes.
-        overwrite: replace an existing file.
     """
     values = to_bytes(image)
     if values.ndim == 3 and values.shape[2] == 1:
@@ -293,7 +285,6 @@ def contact_sheet(
 
     Args:
         rows: rows of images (H, W, 3), floats in [0, 1] or bytes, of any sizes; rows may be short.
-        labels: a caption above each column.
         row_labels: a caption under each row; () for none.
         cell_width: resize every image to this width; None keeps sizes.
 

@@ -102,11 +102,6 @@ def splits_of(
 ) -> tuple[str | None, ...]:
     """Return the split of each view by the rules of `split_mask`, for writing it with the views.
 
-    Args:
-        views: as for `split_mask`.
-        names: C view names.
-        stated: as for `split_mask`.
-
     Returns:
         C split names, or None for a view in no split. For a view in several splits, "test" comes before
         "train", and both before others by name.

@@ -71,12 +71,7 @@ def fingerprint_of(targets: Targets) -> str:
 
 
 class Subset:
-    """Subset of other targets.
-
-    Args:
-        targets: all of them.
-        rows: indices of the views, in order.
-    """
+    """Subset of other targets."""
 
     def __init__(self, targets: Targets, rows: ArrayLike) -> None:
         self._targets, self._rows = targets, np.asarray(rows, np.int64)
@@ -276,14 +271,8 @@ class PhotosOrRenders:
     As in sec. 3.1: "real images are used when available, otherwise teacher renders".
 
     Args:
-        cameras: views with or without photos.
-        teacher: the dense scene.
-        background: RGB behind it, and behind transparent pixels of photos.
         exposures: exposures of the photos, see `Photos`.
-        settings: the renderer's conventions; None means gsplat's.
         limit: bytes cached in memory per kind.
-        lazy: render on first access.
-        renderer: see `TeacherRenders`.
     """
 
     def __init__(

@@ -14,14 +14,11 @@ class Adapter:
     """A device that a graphics driver offers.
 
     Args:
-        name: the driver's name for it.
         kind: discrete, integrated, virtual, cpu (software) or other.
         backend: vulkan, metal or dx12.
-        driver: its name and version.
         max_buffer: bytes of its largest buffer.
         max_binding: bytes of a buffer that one kernel can address; larger scenes are processed in pieces.
         max_workgroup_memory: bytes shared by the threads of a workgroup.
-        timestamps: whether it can time kernels.
     """
 
     name: str
