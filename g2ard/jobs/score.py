@@ -11,6 +11,7 @@ from g2ard.jobs.causes import likely_causes
 from g2ard.jobs.job import DistillJob
 from g2ard.pipeline import Distilled
 from g2ard.progress import Progress
+from g2ard.rendering.visibility import overdraw
 from g2ard.report.kinds import KindScore, by_kind
 from g2ard.scene.splats import Splats
 from g2ard.scene.splits import USUAL
@@ -23,8 +24,8 @@ def report_of(job: DistillJob, done: Distilled) -> dict[str, Any]:
 
     Returns:
         Counts, bytes, scores in held-out views (`scores`) and in views of other kinds (`apart`, or None),
-        their summary by kind (`kinds`), likely causes of a poor result (`causes`), rounds, seconds by stage,
-        and every setting by path.
+        their summary by kind (`kinds`), likely causes of a poor result (`causes`), Gaussians per pixel
+        (`overdraw`), rounds, seconds by stage, and every setting by path.
     """
     scores = _scores(job, done, job.held_out, job.progress)
     apart = None if job.apart[1] is None else _scores(job, done, job.apart[1], job.progress)
@@ -54,6 +55,7 @@ def report_of(job: DistillJob, done: Distilled) -> dict[str, Any]:
             config.recover.background,
         ),
         "unseen": _unseen(job, done),
+        "overdraw": overdraw(done.splats, job.held_out.cameras),
         "against": job.against,
         "preset": job.preset,
         "prior": job.measured.as_dict(),

@@ -69,7 +69,8 @@ def distill_report(
     size, seconds = report["bytes"], report["seconds"]
     page.paragraph(
         f"{size['input'] / 1e6:.2f} → {size['output'] / 1e6:.2f} MB as .ply, in {seconds['total']:,.0f} s. "
-        f"Scored against {report['against']} in views that were not trained on."
+        f"Scored against {report['against']} in views that were not trained on, "
+        f"which blend {report['overdraw']:.1f} Gaussians per pixel."
     )
     page.write(path)
 

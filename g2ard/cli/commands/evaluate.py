@@ -60,7 +60,7 @@ def evaluate(
     size: SizeOption = None,
     background: BackgroundOption = None,
 ) -> None:
-    """Score scenes against photos or a teacher's renders: PSNR, SSIM, size, needles.
+    """Score scenes against photos or a teacher's renders: PSNR, SSIM, size, needles, Gaussians per pixel.
 
     For the evaluation of the original 3DGS, use --convention inria --8bit --lpips-input unscaled.
     """
@@ -71,6 +71,7 @@ def evaluate(
     from g2ard.jobs.view_checks import check_sight, propose_background
     from g2ard.rendering.lpips import load_lpips
     from g2ard.rendering.renderer import RasterSettings
+    from g2ard.rendering.visibility import overdraw
     from g2ard.stages.evaluate import evaluate as score
     from g2ard.stages.recover.anchors import Anchors, drift95, needle
 
@@ -109,6 +110,7 @@ def evaluate(
         )
         row = {"scene": str(path), **scored.as_dict(), "drift95": None, "needle": needle(splats.scales)}
         row["file_bytes"] = bytes_of(path)
+        row["overdraw"] = overdraw(splats, cameras, run.progress)
         if frozen is not None:
             if len(frozen) != len(splats):
                 raise InputError(f"has {len(frozen):,} Gaussians, {path} has {len(splats):,}", path=anchors)
@@ -156,6 +158,7 @@ def _table(run: Run, title: str, rows: list[dict[str, Any]]) -> None:
             "SSIM",
             "LPIPS",
             "needle",
+            "per pixel",
             *(["Drift95"] if drifts else []),
         ],
         [
@@ -167,6 +170,7 @@ def _table(run: Run, title: str, rows: list[dict[str, Any]]) -> None:
                 f"{r['ssim']:.4f}",
                 " ".join(f"{net} {value:.4f}" for net, value in (r["lpips"] or {}).items()) or "–",
                 f"{r['needle']:.1%}",
+                f"{r['overdraw']:.1f}",
                 *([f"{r['drift95']:.3g}"] if drifts else []),
             ]
             for r in rows

@@ -69,6 +69,9 @@ def _described(path: Path) -> tuple[dict[str, Any], list[list[str]]]:
     against, scores = _scores(report)
     figures["run"] = {"input_count": report["input_count"], "against": against, "scores": scores}
     rows = [["made from", plural(report["input_count"], "Gaussian")]]
+    if "overdraw" in report:  # not of runs in tiles
+        figures["run"]["overdraw"] = report["overdraw"]
+        rows.append(["Gaussians per pixel", f"{report['overdraw']:.1f}"])
     for name, found in scores.items():
         ssim = f", SSIM {found['ssim']:.4f}" if "ssim" in found else ""
         rows.append([name, f"{found['psnr']:.2f} dB{ssim} against {against}"])
