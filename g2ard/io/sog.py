@@ -29,6 +29,7 @@ from g2ard.io.jsonfile import (
     numbers,
     object_of,
     objects,
+    optional_text,
     parse_json,
     read_json,
 )
@@ -64,9 +65,10 @@ def chunks_of(path: Path) -> list[Path]:
 
 
 def _listed(index: Path) -> list[Path]:
-    """Return the chunks that lod-meta.json's tree uses at level 0, in the order of its list."""
+    """Return the chunks that lod-meta.json's tree uses at level 0, in the order of its list, and the sky."""
     content = fields_of(index, read_json(index))
     names = names_of(content, "filenames", len(listed(content, "filenames")))
+    sky = optional_text(content, "environment")
     files = [index.parent / Path(name).parent for name in names]
     used: set[int] = set()
     nodes = [object_of(content, "tree")]
@@ -82,7 +84,10 @@ def _listed(index: Path) -> list[Path]:
             raise content.place.to("filenames").to(i).error(f"cannot be found ({error.strerror})") from error
         if not there:
             raise content.place.to("filenames").to(i).error(f"is {names[i]}, which does not exist")
-    return [files[i] for i in sorted(used)]
+    chunks = [files[i] for i in sorted(used)]
+    if sky and (index.parent / sky).is_file():
+        chunks.append((index.parent / sky).parent)
+    return chunks
 
 
 def read(path: Path) -> Scene:
@@ -128,12 +133,12 @@ def _render_model(chunks: list[Chunk]) -> RenderModel:
 
 
 def _left_out(path: Path, read_count: int) -> list[Note]:
-    """Note coarser levels or an environment beside the chunks."""
+    """Note coarser levels, or other folders beside the chunks."""
     folder = path if path.is_dir() else path.parent
     if path.suffix.lower() == ".sog" or (folder / "meta.json").is_file():
         return []
     others = len(list(folder.glob("*/meta.json"))) - read_count
-    text = f"{plural(others, 'other SOG folder')} ignored (coarser levels of detail, environment)"
+    text = f"{plural(others, 'other SOG folder')} ignored (coarser levels of detail)"
     return [Note("ignored_chunks", others, text)] if others > 0 else []
 
 

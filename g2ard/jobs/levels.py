@@ -18,7 +18,7 @@ from g2ard.errors import InputError
 from g2ard.jobs.budget import Budget
 from g2ard.jobs.distill import prepare
 from g2ard.jobs.distill_options import DistillOptions
-from g2ard.jobs.inputs import Views, make_targets
+from g2ard.jobs.inputs import Views, load_scene, make_targets
 from g2ard.jobs.job import DistillJob
 from g2ard.jobs.viewer_frame import up_of
 from g2ard.levels.tree import Level
@@ -27,6 +27,7 @@ from g2ard.progress import Progress, Say, plural, silent, unsaid
 from g2ard.rendering.visibility import visibility_source
 from g2ard.report.base import Report
 from g2ard.scene.cameras import Cameras
+from g2ard.scene.sky import sky_mask
 from g2ard.scene.splats import Splats
 from g2ard.scene.targets import Targets
 from g2ard.stages.evaluate import evaluate
@@ -62,10 +63,11 @@ class LevelReport(Report):
 
 @dataclass(frozen=True, eq=False)
 class Levels:
-    """Levels of detail of a scene, finest first, with a report on each."""
+    """Levels of detail of a scene, finest first, with a report on each, and the sky if it is apart."""
 
     splats: tuple[Splats, ...]
     reports: tuple[LevelReport, ...]
+    sky: Splats | None = None
 
     def __repr__(self) -> str:
         return f"Levels({', '.join(f'{len(level):,}' for level in self.splats)} Gaussians)"
@@ -84,6 +86,7 @@ def lod(
     beside: str | Path | None = None,
     up: Sequence[float] | None = None,
     render_model: RenderModel | None = None,
+    split_sky: bool = False,
     seed: int = 0,
     work: Path | None = None,
     progress: Progress = silent,
@@ -107,6 +110,7 @@ def lod(
         beside: where to look for cameras, if `scene` is not a path.
         up: (3,) direction away from the ground for generated views; None estimates it.
         render_model: overrides what the scene's file says.
+        split_sky: keep sky and far background apart, whole; ratios then count the rest.
         seed: random seed.
         work: folder for finished levels and checkpoints; the same call resumes from it after Ctrl-C.
         progress: called by all stages.
@@ -127,6 +131,14 @@ def lod(
     [800, 200, 100]
     """
     check_ratios(ratios)
+    sky = None
+    if split_sky:
+        if not isinstance(scene, Splats):
+            beside = beside or scene
+            scene = load_scene(scene, say, render_model)
+        if (far := sky_mask(scene)).any():
+            say(f"sky: {plural(int(far.sum()), 'Gaussian')}, kept whole")
+            scene, sky = scene.take(~far), scene.take(far)
     job = prepare(
         scene,
         [Budget(ratio=ratio) for ratio in ratios],
@@ -155,7 +167,7 @@ def lod(
         level, finer, report = _level(job, finer, aim.count, ratio, recover, place)
         splats.append(level)
         reports.append(report)
-    return Levels(tuple(splats), tuple(reports))
+    return Levels(tuple(splats), tuple(reports), sky)
 
 
 def recovery_settings(steps: int | None, background: Colour, seed: int) -> dict[str, Any]:

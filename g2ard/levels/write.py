@@ -36,7 +36,9 @@ _ERRORS = "errors.jsonl"
 _BESIDE = "beside.txt"
 """File in the work folder that names the hidden folder of an unfinished output."""
 
-_PART, _IMAGE = re.compile(r"\d+_\d+/meta\.json"), re.compile(r"\w+\.webp")
+_ENVIRONMENT = "env/meta.json"
+
+_PART, _IMAGE = re.compile(r"(\d+_\d+|env)/meta\.json"), re.compile(r"\w+\.webp")
 """Names of a level's files, and of the images in them."""
 
 
@@ -45,6 +47,7 @@ def save_levels(
     levels: Sequence[Level],
     *,
     cut: Cut | None = None,
+    environment: Splats | None = None,
     errors: bool = True,
     overwrite: bool = False,
     work: Path | None = None,
@@ -57,6 +60,7 @@ def save_levels(
         levels: the same scene at several levels, finest first, with equal offsets. A `StoredScene` is read
             one leaf or file at a time.
         cut: splitting rule of the tree; None means `Cut()`.
+        environment: sky and far background, which viewers always show; written to `env/meta.json`.
         errors: measure the error of each leaf's levels (`g2ard.levels.leaf_errors`), from which viewers
             decide what to load; without errors they use counts.
         overwrite: replace files in the folder, and remove files of its previous `lod-meta.json`.
@@ -90,6 +94,7 @@ def save_levels(
         "counts": counts,
         "lodLevels": len(levels),
         "lodErrors": errors,
+        **({} if environment is None else {"environment": _ENVIRONMENT}),
         "filenames": list(files.parts),
         "tree": root,
     }
@@ -104,6 +109,10 @@ def save_levels(
             (work / _BESIDE).write_text(str(folder), encoding="utf-8", newline="\n")
             for name in files.parts:  # linked, not moved: an interrupted call resumes from them
                 shutil.copytree((work / name).parent, (folder / name).parent, copy_function=_linked)
+        if environment is not None:
+            (folder / _ENVIRONMENT).parent.mkdir()
+            for name, content in sog_files(Path(path) / _ENVIRONMENT, environment).items():
+                (folder / _ENVIRONMENT).with_name(name).write_bytes(content)
         (folder / "lod-meta.json").write_text(
             json.dumps(meta, separators=(",", ":")), encoding="utf-8", newline="\n"
         )
@@ -232,7 +241,8 @@ def _rounded(values: Sequence[float] | NDArray[np.float64]) -> list[float]:
 def _named_in(path: Path) -> set[Path]:
     """Return the relative paths of all level files that the folder's `lod-meta.json` names."""
     named: set[Path] = set()
-    for part in map(Path, _names(_json(path / "lod-meta.json"), "filenames", _PART)):
+    meta = _json(path / "lod-meta.json")
+    for part in map(Path, [*_names(meta, "filenames", _PART), *_names(meta, "environment", _PART)]):
         entries = [entry for entry in _json(path / part).values() if isinstance(entry, dict)]
         images = [image for entry in entries for image in _names(entry, "files", _IMAGE)]
         named |= {part, *map(part.with_name, images)}
@@ -250,7 +260,8 @@ def _remove(path: Path, files: Collection[Path]) -> None:
 
 def _names(content: dict[str, Any], key: str, pattern: re.Pattern[str]) -> list[str]:
     found = content.get(key)
-    return [name for name in map(str, found) if pattern.fullmatch(name)] if isinstance(found, list) else []
+    names = found if isinstance(found, list) else [found]
+    return [name for name in map(str, names) if pattern.fullmatch(name)]
 
 
 def _json(file: Path) -> dict[str, Any]:

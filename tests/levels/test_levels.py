@@ -12,6 +12,7 @@ from g2ard.io import sog
 from g2ard.jobs.levels import lod
 from g2ard.levels import Cut, Leaf, Node, cut, leaf_errors, save_levels
 from g2ard.scene.splats import Splats
+from g2ard.scene.transform import join
 from g2ard.stages.recover.anchors import rotation_matrices
 from helpers.commands import refused, succeeds
 from helpers.level_files import files_of, leaves_of, scattered
@@ -195,3 +196,21 @@ def test_a_stopped_run_with_other_options(
     assert not (tmp_path / "out").exists()
     succeeds(command_line, tmp_path, *given, "--resume", "--no-errors")
     assert {path.name for path in tmp_path.iterdir()} == {"ball.ply", "out"}
+
+
+def test_the_sky_is_the_environment(tmp_path: Path, command_line) -> None:
+    ball = checkered_ball(800)
+    rays = np.random.default_rng(1).normal(size=(100, 3))
+    sky = Splats.create(60 * rays / np.linalg.norm(rays, axis=1)[:, None], scales=np.full((100, 3), 8.0))
+    io.write_splats(tmp_path / "a.ply", join([ball, sky]))
+    words = ("lod", "a.ply", "-o", "out", "-r", "1,8", "--merge-only", "--size", "48")
+    assert "sky: 100 Gaussians" in succeeds(command_line, tmp_path, *words).err
+    meta = json.loads((tmp_path / "out" / "lod-meta.json").read_text())
+    assert (meta["environment"], meta["counts"]) == ("env/meta.json", [800, 100])
+    np.testing.assert_array_less(meta["tree"]["bound"]["max"], 2)
+    assert len(io.read_splats(tmp_path / "out" / "env")) == 100
+    assert len(io.read_splats(tmp_path / "out")) == 900
+    succeeds(command_line, tmp_path, *words, "--no-environment", "-w")
+    meta = json.loads((tmp_path / "out" / "lod-meta.json").read_text())
+    assert ("environment" in meta, meta["counts"]) == (False, [900, 113])
+    assert not (tmp_path / "out" / "env").exists()

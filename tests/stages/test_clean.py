@@ -15,7 +15,7 @@ from g2ard.scene.cameras import Cameras, look_at
 from g2ard.scene.splats import Splats
 from g2ard.scene.transform import join
 from g2ard.stages.clean import FLOATING, KINDS, find_clutter, find_floating, within_reach
-from helpers.commands import CommandLine, succeeds
+from helpers.commands import CommandLine, refused, succeeds
 from helpers.scenes import around, checkered_ball
 
 
@@ -155,3 +155,22 @@ def test_the_command(tmp_path: Path, command_line: CommandLine) -> None:
     assert len(read_splats(tmp_path / "b.sog")) == len(splats) - 1
     for words in ([], ["--only", "dust", "--dry-run"], ["--only", "haze", "--dry-run"]):
         assert command_line("clean", "a.ply", *words, cwd=tmp_path)[0] == 2
+
+
+def test_the_sky_is_kept_apart_and_joined_again(tmp_path: Path, command_line: CommandLine) -> None:
+    splats, _ = junk()
+    rays = np.random.default_rng(1).normal(size=(400, 3))
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    dome = Splats.create(60 * rays, scales=np.full((400, 3), 5.0), logit_opacities=np.full(400, 3.0))
+    write_splats(tmp_path / "a.ply", join([splats, dome]))
+    words = ["clean", "a.ply", "--split-sky", "sky.ply", "-o", "near.ply", "--only", "none"]
+    told = succeeds(command_line, tmp_path, *words).err
+    assert "sky: 400 Gaussians" in told
+    assert (read_splats(tmp_path / "sky.ply").means == dome.means.astype(np.float32)).all()
+    succeeds(command_line, tmp_path, "convert", "near.ply", "sky.ply", "both.ply")
+    assert (tmp_path / "both.ply").read_bytes() == (tmp_path / "a.ply").read_bytes()
+    words[1:4] = ["near.ply", "--split-sky", "none.ply"]
+    words[5] = "same.ply"
+    assert "has no sky" in succeeds(command_line, tmp_path, *words).err
+    assert not (tmp_path / "none.ply").exists()
+    refused(command_line, tmp_path, "clean", "a.ply", "--split-sky", "a.ply", "-o", "b.ply")

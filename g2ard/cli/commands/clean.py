@@ -38,7 +38,13 @@ def clean(
         str | None,
         typer.Option(
             metavar="KIND,…",
-            help="Kinds to remove: invisible, giant, needle, floater, haze, streak; all by default.",
+            help="Kinds to remove: invisible, giant, needle, floater, haze, streak; all by default; or none.",
+        ),
+    ] = None,
+    split_sky: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE", help="Write sky and far background to this scene, whole, and the rest to OUT."
         ),
     ] = None,
     strength: Annotated[
@@ -64,27 +70,43 @@ def clean(
 
     Visibility is measured from generated views.
     """
+    import numpy as np
+
     from g2ard import io
     from g2ard.errors import InputError
     from g2ard.jobs.inputs import clutter_seen
-    from g2ard.stages.clean import FLOATING, KINDS
+    from g2ard.scene.sky import sky_mask
+    from g2ard.stages.clean import FLOATING, KINDS, Cleaning
 
-    kinds = KINDS if only is None else tuple(word.strip() for word in only.split(","))
+    kinds = KINDS if only is None else tuple(word.strip() for word in only.split(",") if only != "none")
     if wrong := [word for word in kinds if word not in KINDS]:
         raise typer.BadParameter(f"--only: expected {', '.join(KINDS)}, got {wrong[0]!r}")
     if only is not None and not strength and (idle := [kind for kind in kinds if kind in FLOATING]):
         raise typer.BadParameter(f"--only {idle[0]} needs --strength, such as 0.5")
+    if preview is not None and not kinds:
+        raise typer.BadParameter("--preview shows clutter, so that it does not go with --only none")
     if output is None and not dry_run:
         raise typer.BadParameter("give an output with -o, or --dry-run")
     if output is not None and not dry_run:
         io.check_scene_output(output, run.overwrite)
     if preview is not None:
         run.check_extra("--preview", preview)
-    splats = run.load(scene)
-    found, cameras = clutter_seen(
-        splats, kinds, strength=strength, seed=run.seed, progress=run.progress, say=run.say
-    )
-    if preview is not None:
+    if split_sky is not None:
+        run.check_extra("--split-sky", split_sky)
+        if not dry_run:
+            io.check_scene_output(split_sky, run.overwrite)
+    whole = splats = run.load(scene)
+    sky = np.zeros(len(whole), bool)
+    if split_sky is not None:
+        sky = sky_mask(whole)
+        splats = whole.take(~sky)
+        run.say(f"sky: {plural(int(sky.sum()), 'Gaussian')}" if sky.any() else "the scene has no sky")
+    found, cameras = Cleaning(np.full(len(splats), -1, np.int8)), None
+    if kinds:
+        found, cameras = clutter_seen(
+            splats, kinds, strength=strength, seed=run.seed, progress=run.progress, say=run.say
+        )
+    if preview is not None and cameras is not None:
         _paint(preview, splats, found, cameras, run.overwrite)
         run.kept.append(f"{preview} is written")
         run.say(f"picture: {preview}")
@@ -96,7 +118,10 @@ def clean(
             )
         run.write(output, splats.take(found.keep))
         run.say(f"{output}: keeps {kept:,} of {plural(len(splats), 'Gaussian')}")
-    run.result({"input_count": len(splats), "output_count": kept, "found": found.counts})
+        if split_sky is not None and sky.any():
+            run.write(split_sky, whole.take(sky))
+    counts = {"input_count": len(whole), "output_count": kept, "found": found.counts}
+    run.result(counts if split_sky is None else {**counts, "sky_count": int(sky.sum())})
 
 
 def _paint(path: Path, splats: Splats, found: Cleaning, cameras: Cameras, overwrite: bool) -> None:

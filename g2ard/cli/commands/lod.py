@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from g2ard.jobs.tiling import Tiling
     from g2ard.levels import Cut
     from g2ard.levels.tree import Level
+    from g2ard.scene.splats import Splats
 
 
 @command("lod", example="g2ard lod scene.ply -r 1,2,4,8,16 -o streamed/", scenes=True, tiles=True)
@@ -69,6 +70,13 @@ def lod(
         typer.Option(
             "--errors/--no-errors",
             help="Measure the error of each chunk at each level, which viewers use to choose levels.",
+        ),
+    ] = True,
+    environment: Annotated[
+        bool,
+        typer.Option(
+            "--environment/--no-environment",
+            help="Keep sky and far background apart: whole, and always shown (streamed SOG, not in tiles).",
         ),
     ] = True,
     most: Annotated[
@@ -184,12 +192,13 @@ def lod(
             background=background or BLACK,
             up=up,
             render_model=run.render_model,
+            split_sky=environment and kind == "sog",
             seed=run.seed,
             work=stopped,
             progress=run.progress,
             say=run.say,
         )
-        size_of_all = _save(run, output, levels.splats, rule, errors, kind, spot, up)
+        size_of_all = _save(run, output, levels.splats, rule, errors, kind, spot, up, sky=levels.sky)
     _tell(run, output, levels, size_of_all)
 
 
@@ -229,6 +238,7 @@ def _save(
     spot: Any,
     up: Sequence[float] | None,
     work: Path | None = None,
+    sky: Splats | None = None,
 ) -> int:
     """Write the output folder and return its bytes."""
     from g2ard.jobs.levels import tileset_up
@@ -241,14 +251,13 @@ def _save(
         "progress": run.progress,
     }
     if kind == "sog":
-        return save_levels(output, levels, errors=errors, **common)
+        return save_levels(output, levels, environment=sky, errors=errors, **common)
     if spot is not None and not isinstance(spot, Georeference):
         spot = Georeference.of_map(spot, levels[0].offset)
         run.say(f"longitude {spot.longitude:.6f}, latitude {spot.latitude:.6f}, heading {spot.heading:.3f}")
     axis = tileset_up(levels, up)
-    run.say(
-        f"up is {', '.join(f'{value:.3g}' for value in axis)}" + ("" if up else "; --up X,Y,Z changes it")
-    )
+    rounded = ", ".join(f"{round(value, 3) + 0.0:g}" for value in axis)
+    run.say(f"up is {rounded}" + ("" if up else "; --up X,Y,Z changes it"))
     return save_tileset(output, levels, up=axis, place=spot, **common)
 
 
