@@ -304,7 +304,7 @@ class _Read:
         lifted: whether it was lifted from a point cloud.
         beside: path beside which to look for cameras.
         name: its name in errors.
-        from_photos: whether the points, or some of them, were found in the photos.
+        from_photos: whether the points, or some of them, were found in the photos, by COLMAP or here.
     """
 
     prior: Splats
@@ -326,7 +326,7 @@ def _read(
 
     if isinstance(scene, Splats):
         return _Read(scene, False, options.beside, "scene")
-    name = "cloud"
+    name, sparse = "cloud", False
     if isinstance(scene, str | Path):
         if kind(scene) == "splats":
             return _Read(
@@ -335,6 +335,7 @@ def _read(
         name, cloud = str(scene), read_cloud(scene)
         for note in cloud.notes:
             say(f"{scene}: {note}")
+        sparse = options.views is not None and _is_sparse(Path(scene), options.views)
         scene = cloud.points
     if options.views is None or is_made(options.views):
         raise InputError(
@@ -354,7 +355,20 @@ def _read(
             say=say,
         )
     lifted = lift(scene.positions, scene.colors, **vars(options.config.lift), progress=progress)
-    return _Read(lifted, True, options.beside, name, from_photos=few)
+    return _Read(lifted, True, options.beside, name, from_photos=few or sparse)
+
+
+def _is_sparse(cloud: Path, views: Views) -> bool:
+    """Return whether a cloud is the sparse points that belong to the views."""
+    from g2ard.io import ViewFiles
+    from g2ard.io.paths import real_path
+    from g2ard.jobs.photos import sparse_file
+
+    path = views.path if isinstance(views, ViewFiles) else views
+    if not isinstance(path, str | Path) or is_made(path):
+        return False
+    file = sparse_file(Path(path))
+    return file is not None and real_path(file) == real_path(cloud)
 
 
 def _cleaned(

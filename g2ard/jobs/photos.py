@@ -132,25 +132,30 @@ def topped_up(
 
 
 def sparse_points(views: Path) -> Points | None:
-    """Return the points of a COLMAP model, of a transforms.json's `ply_file_path`, or of the input.ply beside
-    INRIA's cameras.json; None if there are none."""
+    """Return the points of `sparse_file`; None if there are none or they cannot be read."""
     from g2ard.io import read_points
+
+    file = sparse_file(views)
+    try:
+        return None if file is None else read_points(file)
+    except InputError:
+        return None
+
+
+def sparse_file(views: Path) -> Path | None:
+    """Return the path of a COLMAP model, of a transforms.json's `ply_file_path`, or of the input.ply beside
+    INRIA's cameras.json, which may not exist; None for other views."""
     from g2ard.io.detect import file_format
     from g2ard.io.jsonfile import read_json
 
-    found = file_format(views)
-    try:
-        if found == "colmap":
-            return read_points(views if views.is_dir() else views.parent)
-        if found == "transforms":
-            file = views / "transforms.json" if views.is_dir() else views
-            listed = read_json(file).get("ply_file_path") if file.is_file() else None
-            return read_points(file.parent / str(listed)) if listed else None
-        if found == "inria":
-            return read_points((views if views.is_dir() else views.parent) / "input.ply")
-    except InputError:
-        return None
-    return None
+    found, folder = file_format(views), views if views.is_dir() else views.parent
+    if found == "colmap":
+        return folder
+    if found == "inria":
+        return folder / "input.ply"
+    file = views / "transforms.json" if views.is_dir() else views
+    listed = read_json(file).get("ply_file_path") if found == "transforms" and file.is_file() else None
+    return file.parent / str(listed) if listed else None
 
 
 def points_within_sight(

@@ -34,13 +34,18 @@ def test_photos_alone_are_enough(points: bool, command_line: CommandLine, tmp_pa
     assert "give a SCENE, or photos" in refused(command_line, tmp_path, "distill", "-n", 500, "-o", "run")
 
 
-def test_a_result_larger_than_its_points_is_noted(command_line: CommandLine, tmp_path: Path) -> None:
+def test_sparse_points_given_as_a_cloud_are_known_and_other_clouds_are_surfaces(
+    command_line: CommandLine, tmp_path: Path
+) -> None:
     photos_of(tmp_path / "photos", points=True)
-    ask = ("distill", "--views", "photos", "-n", 900, "--steps", 3)
-    error = command_line(*ask, "-o", "run", cwd=tmp_path)[2]
-    assert "MB, the lifted points have 0." in error, error
-    light = command_line(*ask, "--set", "sh_degree=0", "-n", 300, "-o", "light", cwd=tmp_path)[2]
-    assert "lifted as they are" not in light, light
+    (tmp_path / "scan.ply").write_bytes((tmp_path / "photos" / "sparse.ply").read_bytes())
+    ask = ("--views", "photos", "-n", 900, "--steps", 3)
+    sparse = succeeds(command_line, tmp_path, "distill", "photos/sparse.ply", *ask, "-o", "run").err
+    assert "regularisers: none (points found in photos" in sparse
+    assert "sparse.ply has" not in sparse, sparse
+    scan = succeeds(command_line, tmp_path, "distill", "scan.ply", *ask, "-o", "scan").err
+    assert "regularisers: none (points found in photos" not in scan
+    assert "MB, scan.ply has 0." in scan, scan
 
 
 def test_points_within_sight_lie_on_the_surface(tmp_path: Path) -> None:

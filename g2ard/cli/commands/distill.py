@@ -321,7 +321,8 @@ def _distil(
     for line in told(report, verbose=run.verbose):
         run.say(line)
     say_views(run, report["views"], job.config.select.views_count is not None)
-    say_weight(run, source, place, result.splats, lifted=job.prior if job.lifted else None)
+    if not job.config.recover.from_points:  # such points are no scene to compare with
+        say_weight(run, source, place, result.splats, lifted=job.prior if job.lifted else None)
     run.say(
         f"scene: {place} ({place.stat().st_size / 1e6:.2f} MB)\npicture: {output / 'preview.png'}\n"
         f"report: {output / 'report.html'}, {output / 'report.json'}" + (f"\n{page}" if page else "")
