@@ -25,8 +25,9 @@ _WORTH = 0.25
 _GRID = 48, 36
 _BEHIND = 1.15
 """A point farther than this multiple of the nearest depth in its grid cell is hidden."""
-_ROWS = 200_000
-"""Largest sample of Gaussians for detecting poses inside geometry; sampled ones are enlarged."""
+_ROWS = 50_000
+"""Largest sample of Gaussians for detecting poses inside geometry, about thirty a pixel; sampled ones are
+enlarged."""
 _SIDE = 48
 """Longer side in pixels of the renders for that."""
 _INSIDE = 0.02
