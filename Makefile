@@ -21,12 +21,13 @@ $(VENV)/.maturin:
 	test -x $(BIN)/maturin || { $(PYTHON) -m venv $(VENV) && $(BIN)/pip install --quiet "maturin>=1.9,<2"; }
 	touch $@
 
-# The package with its plain dependencies: neither torch nor what the tests need.
+# The package as the demo needs it: without torch, the tests' dependencies and the GPU kernels, which take half of the build.
 $(VENV)/.plain: pyproject.toml $(RUST) | $(VENV)/.maturin
-	$(BIN)/maturin develop --release --quiet
+	$(BIN)/maturin develop --release --no-default-features --quiet
 	touch $@
 
-demo: $(VENV)/.plain
+# A development build that exists is kept up to date instead of replaced.
+demo: $(if $(wildcard $(VENV)/.built),setup,$(VENV)/.plain)
 	$(BIN)/python examples/01_distill_a_scene.py
 
 # Python's tests run in TEST_PROCESSES processes (0: in one), each with two threads for the kernels. Tests of determinism set
