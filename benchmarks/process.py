@@ -103,10 +103,10 @@ def splat_transform(*arguments: str, program: str | None = None) -> list[str]:
     return [found, "-q", "-w", "-g", "cpu", *arguments]
 
 
-def version_of(program: str) -> str:
+def version_of(*program: str) -> str:
     """Return the first line that a program prints for --version."""
     told = subprocess.run(
-        [program, "--version"], capture_output=True, encoding="utf-8", errors="replace", check=False
+        [*program, "--version"], capture_output=True, encoding="utf-8", errors="replace", check=False
     )
     lines = (told.stdout or told.stderr).splitlines()
     return lines[0].strip() if lines else ""

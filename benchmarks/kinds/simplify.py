@@ -23,6 +23,8 @@ from g2ard.scene.splats import Splats
 
 __all__ = ["Simplify"]
 
+_SPARK = ["node", str(Path(baselines.__file__).with_name("spark.mjs"))]
+
 
 @dataclass(frozen=True)
 class Simplify(Study):
@@ -37,7 +39,7 @@ class Simplify(Study):
         splat_transform: path of splat-transform; None uses PATH.
     """
 
-    METHODS: ClassVar[Mapping[str, Any]] = {name: name for name in REDUCERS}
+    METHODS: ClassVar[Mapping[str, Any]] = {name: name for name in (*REDUCERS, "spark")}
     PROCESSES: ClassVar[bool] = True
 
     protocol: str = key("all", choices=tuple(PROTOCOLS), axis=True)
@@ -58,6 +60,8 @@ class Simplify(Study):
             row = {"views_kind": kind, "input_count": len(place.splats), "budget": budget}
             if method.startswith("splat-transform"):
                 row["version"] = version_of(splat_transform(program=self.splat_transform)[0])
+            if method == "spark":
+                row["version"] = version_of(*_SPARK)
             if kind not in place.kinds_of_views:
                 yield {**row, "error": f"no place for {kind} views"}
                 continue
@@ -80,6 +84,8 @@ class Simplify(Study):
         if method.startswith("splat-transform"):
             mode = "--decimate-adaptive" if method.endswith("adaptive") else "--decimate"
             return splat_transform(source, mode, str(budget), str(output), program=self.splat_transform)
+        if method == "spark":
+            return [*_SPARK, source, str(budget), str(output)]
         if method in baselines.METHODS:
             views = ["--views", str(place.train)] if method in baselines.NEED_VIEWS else []
             return [*python, "benchmarks.baselines", method, source, str(budget), str(output), *views]

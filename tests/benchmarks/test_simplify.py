@@ -28,7 +28,7 @@ def ask(scene: SceneSpec, out: Path, methods: str, **options: str) -> list[Row]:
 
 
 @needs_processes
-def test_measures_writes_and_resumes(tmp_path: Path) -> None:
+def test_measures_writes_and_resumes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     io.write_splats(tmp_path / "ball.ply", checkered_ball(2000))
     io.write_views(tmp_path / "views.json", around(16))
     scene = SceneSpec("ball", str(tmp_path / "ball.ply"), str(tmp_path / "views.json"))
@@ -49,6 +49,9 @@ def test_measures_writes_and_resumes(tmp_path: Path) -> None:
     (failed,) = ask(scene, tmp_path / "out", "splat-transform", splat_transform=str(program))
     assert failed["error"] == "exit status 7: it broke 1.2"
     assert len(read_rows(tmp_path / "out" / "rows.csv")) == 6  # in the old failure's place
+    monkeypatch.delenv("NODE_PATH", raising=False)
+    (absent,) = ask(scene, tmp_path / "out", "spark")
+    assert "NODE_PATH" in absent["error"] or "node" in absent["error"]
 
 
 @needs_processes
