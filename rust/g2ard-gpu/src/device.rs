@@ -15,7 +15,7 @@ use crate::runtime::{Adapter, Error, Gpu, Options, guarded};
 use crate::two::Frame;
 use crate::{groups, probe, visibility, voxels};
 
-/// Which device to use.
+/// The device to use.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Choice {
     #[default]

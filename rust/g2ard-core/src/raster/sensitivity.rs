@@ -1,7 +1,7 @@
-//! How much each Gaussian's rect and size matter to a view: F = Σ over pixels and channels of g gᵀ, g = ∂C/∂(mean,
+//! Sensitivity of a view to each Gaussian's mean and size: F = Σ over pixels and channels of g gᵀ, g = ∂C/∂(mean,
 //! log scale), 6×6 a Gaussian. Pruning by sensitivity (PUP 3D-GS) ranks by it.
 //!
-//! Of a pixel, g is linear in φ = (u, v, u², uv, v²): g = L·(h φ) + w·d, with h = ∂C/∂(ln α), w = αT, and L (6×5) and d
+//! At a pixel, g is linear in φ = (u, v, u², uv, v²): g = L·(h φ) + w·d, with h = ∂C/∂(ln α), w = αT, and L (6×5) and d
 //! (by the viewing direction in SH) the same for every pixel of a view. So a pixel adds to moments of u and v only.
 
 use super::blocks::{BlockMasks, blocks, row_and_part};

@@ -1,4 +1,4 @@
-//! What merging two Gaussians costs in the image: the squared error of their projections, averaged over
+//! Cost of merging two Gaussians in the image: the squared error of their projections, averaged over
 //! directions, for one pair or for sixteen.
 //!
 //! Six axes of an icosahedron stand for all directions. Along a unit axis d a Gaussian of covariance S
