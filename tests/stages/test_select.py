@@ -123,14 +123,6 @@ def test_visibility_is_the_oracles(tolerance: float) -> None:
     assert agree / kept >= 0.995
 
 
-def test_a_wider_tolerance_sees_more():
-    scene, cameras = ball(2500), around(3)
-    cells = surface(scene, 1200)
-    counts = [len(visible_cells(scene, cells, cameras, depth_tolerance=t).cells) for t in (0, 0.01, 0.2, 1)]
-    assert counts == sorted(counts)
-    assert counts[-1] > 1.1 * counts[1]
-
-
 @pytest.mark.parametrize(
     ("parts", "every", "cells"),
     [(("playbot", "0_0"), 40, 100), (("taebak_park", "0_4"), 50, 100), ((), 1, 300)],
@@ -169,10 +161,10 @@ def random_problem(rng, count=12, cells=60):
     return made, seen, rng.standard_normal((count, 3)) * 4
 
 
-def run_greedy(made, seen, positions, k, lazy, directional=True, **options):
+def run_greedy(made, seen, positions, k, directional=True, **options):
     starts = np.concatenate([[0], np.cumsum([len(s) for s in seen])]).astype(np.uint64)
     views = starts, np.concatenate(seen).astype(np.uint32), positions
-    return _core.select_greedy(made.parts, views, k, directional, CoverageOptions(lazy=lazy, **options))
+    return _core.select_greedy(made.parts, views, k, directional, CoverageOptions(**options))
 
 
 @pytest.mark.parametrize("directional", [True, False])
@@ -181,40 +173,25 @@ def test_greedy_is_the_naive_greedy(directional, alpha):
     rng = np.random.default_rng(1)
     for _ in range(3):
         made, seen, positions = random_problem(rng)
-        order, gains, _ = run_greedy(made, seen, positions, 6, False, directional=directional, alpha=alpha)
+        seen[-1], positions[-1] = seen[0], positions[0]  # twins: ties go to the first
+        order, gains, evaluations = run_greedy(made, seen, positions, 6, directional, alpha=alpha)
         want, value = naive.greedy(6, made, seen, positions, directional=directional, alpha=alpha)
         assert order.tolist() == want
         np.testing.assert_allclose(gains, value, rtol=1e-6, atol=1e-12)
+        assert np.all(np.diff(gains) <= 1e-12)  # submodular: gains never rise
+        assert evaluations < 12 + 11 + 10 + 9 + 8 + 7  # those of a search that evaluates every view again
 
 
 def test_directions_and_epsilon_are_options():
     made, seen, positions = random_problem(np.random.default_rng(5))
-    order, gains, _ = run_greedy(made, seen, positions, 6, False, anchors=48, epsilon=0.1)
+    order, gains, _ = run_greedy(made, seen, positions, 6, anchors=48, epsilon=0.1)
     want, value = naive.greedy(6, made, seen, positions, directional=True, directions=48, epsilon=0.1)
     assert order.tolist() == want
     np.testing.assert_allclose(gains, value, rtol=1e-6, atol=1e-12)
-    _, usual, _ = run_greedy(made, seen, positions, 6, False)
+    _, usual, _ = run_greedy(made, seen, positions, 6)
     assert abs(usual[0] - gains[0]) > 1e-3 * abs(usual[0])
     with pytest.raises(InputError, match="anchors: expected 1 to 64"):
-        run_greedy(made, seen, positions, 6, False, anchors=65)
-
-
-def test_lazy_is_plain_greedy_on_fifty_pools():
-    rng = np.random.default_rng(2)
-    saved = 0.0
-    for trial in range(50):
-        made, seen, positions = random_problem(rng, count=int(rng.integers(2, 40)), cells=200)
-        if trial % 5 == 0:  # twins: ties go to the first
-            seen[-1], positions[-1] = seen[0], positions[0]
-        k = int(rng.integers(1, len(seen) + 1))
-        lazy = run_greedy(made, seen, positions, k, True, directional=trial % 2 == 0)
-        plain = run_greedy(made, seen, positions, k, False, directional=trial % 2 == 0)
-        np.testing.assert_array_equal(lazy[0], plain[0])
-        np.testing.assert_array_equal(lazy[1], plain[1])
-        assert np.all(np.diff(lazy[1]) <= 1e-12)  # submodular: gains never rise
-        assert lazy[2] <= plain[2]
-        saved += 1 - lazy[2] / plain[2]
-    assert saved > 10
+        run_greedy(made, seen, positions, 6, anchors=65)
 
 
 @pytest.mark.parametrize("count", [30, 9])
@@ -231,27 +208,6 @@ def test_auto_reaches_every_pose_and_then_represents(count):
     assert gains.sum() == pytest.approx(1.0)
     assert gains.min() >= 0
     np.testing.assert_allclose(poses.gains_of(order, alike, wanted), gains, atol=1e-15)
-
-
-def test_auto_reaches_first():
-    """Two poses far from a crowd are chosen before a second one of the crowd."""
-    rng = np.random.default_rng(8)
-    crowd = np.array([4.0, 0, 0]) + 0.3 * rng.standard_normal((30, 3))
-    far = np.array([[-4.0, 0, 0], [0, 0, 4.0]])
-    chosen = select(ball(), views(np.concatenate([crowd, far])), 3)
-    assert set(chosen.order.tolist()) >= {30, 31}
-    unreached = poses.facility_location(
-        np.eye(5), np.full(5, 0.2), np.array([1, 1, 0, 1, 1], bool), np.ones(5)
-    )
-    assert unreached[0].tolist() == [0, 1, 3, 4]  # nothing like anything: usable ones in the order given
-
-
-def test_among_similar_views_the_one_that_sees_more_wins():
-    """Five pairs of twins; the second of each sees more."""
-    alike = np.kron(np.eye(5), np.ones((2, 2)))
-    shares = np.tile([0.2, 0.3], 5)
-    order, _ = poses.facility_location(alike, np.full(10, 0.1), np.ones(10, bool), shares)
-    assert set(order[:5].tolist()) == {1, 3, 5, 7, 9}
 
 
 def test_outlooks_count_surface_in_front():

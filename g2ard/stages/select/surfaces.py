@@ -36,7 +36,6 @@ class CoverageOptions:
         epsilon: ε of the coverage ratio C_jk / (P_jk + ε).
         depth_tolerance: a cell is visible if its depth differs from the pixel's by at most this share, or by
             a cell's size.
-        lazy: lazy evaluation (CELF): the same views with fewer evaluations.
 
     Raises:
         InputError: a value out of range.
@@ -49,7 +48,6 @@ class CoverageOptions:
     anchors: int = _CORE["anchors"]
     epsilon: float = _CORE["epsilon"]
     depth_tolerance: float = 0.01
-    lazy: bool = _CORE["lazy"]
 
     def __post_init__(self) -> None:
         require("cells", self.cells, self.cells >= 1, "at least 1")

@@ -9,29 +9,17 @@ pub enum Slot<'a> {
     Flag(&'a mut bool),
 }
 
-impl<'a> From<&'a mut f64> for Slot<'a> {
-    fn from(value: &'a mut f64) -> Self {
-        Self::F64(value)
-    }
+macro_rules! slots {
+    ($($kind:ty => $slot:ident),*) => {$(
+        impl<'a> From<&'a mut $kind> for Slot<'a> {
+            fn from(value: &'a mut $kind) -> Self {
+                Self::$slot(value)
+            }
+        }
+    )*};
 }
 
-impl<'a> From<&'a mut f32> for Slot<'a> {
-    fn from(value: &'a mut f32) -> Self {
-        Self::F32(value)
-    }
-}
-
-impl<'a> From<&'a mut usize> for Slot<'a> {
-    fn from(value: &'a mut usize) -> Self {
-        Self::Count(value)
-    }
-}
-
-impl<'a> From<&'a mut bool> for Slot<'a> {
-    fn from(value: &'a mut bool) -> Self {
-        Self::Flag(value)
-    }
-}
+slots!(f64 => F64, f32 => F32, usize => Count, bool => Flag);
 
 /// A struct declared by `constants!`.
 pub trait Constants: Default {

@@ -32,6 +32,19 @@ impl Error {
             got: got.to_string(),
         }
     }
+
+    /// Check that `name` has as many `what` (rows or values) as expected.
+    pub(crate) fn unless_equal(
+        name: &'static str,
+        got: usize,
+        expected: usize,
+        what: &str,
+    ) -> Result<()> {
+        if got == expected {
+            return Ok(());
+        }
+        Err(Self::invalid(name, format!("{expected} {what}"), got))
+    }
 }
 
 pub type Result<T> = std::result::Result<T, Error>;

@@ -48,9 +48,7 @@ impl Splats {
             ("logit_opacities", self.logit_opacities.len()),
             ("sh", self.sh.len() / self.sh_coeffs),
         ] {
-            if rows != n {
-                return Err(Error::invalid(name, format!("{n} rows"), rows));
-            }
+            Error::unless_equal(name, rows, n, "rows")?;
         }
         finite("means", &self.means, |m| m.iter().all(|v| v.is_finite()))?;
         finite("quats", &self.quats, |q| q.iter().all(|v| v.is_finite()))?;

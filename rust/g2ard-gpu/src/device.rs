@@ -336,6 +336,15 @@ mod tests {
     use super::*;
     use crate::testing::no_adapter;
 
+    fn open() -> Option<Device> {
+        let device = Device::new(Choice::Gpu, Options::default());
+        if device.ready(1).is_none() {
+            no_adapter("failures");
+            return None;
+        }
+        Some(device)
+    }
+
     #[test]
     fn whatever_a_twin_ends_in_the_cpu_answers_and_one_line_says_why() {
         let name = || "a device".to_owned();
@@ -353,10 +362,7 @@ mod tests {
             Error::Wrong(name()),
         ];
         for failure in failures {
-            let device = Device::new(Choice::Gpu, Options::default());
-            if device.ready(1).is_none() {
-                return no_adapter("failures");
-            }
+            let Some(device) = open() else { return };
             let why = failure.to_string();
             let twin = |_: &Gpu| -> crate::runtime::Result<u8> { Err(failure) };
             assert_eq!(device.either(1, twin, || Ok(7)).unwrap(), 7);
@@ -364,17 +370,6 @@ mod tests {
             assert!(device.gpu().is_none(), "left for good");
             assert_eq!(device.served(), 0);
         }
-    }
-
-    #[test]
-    fn a_panic_of_a_driver_s_stays_within() {
-        let device = Device::new(Choice::Gpu, Options::default());
-        if device.ready(1).is_none() {
-            return no_adapter("failures");
-        }
-        let twin = |_: &Gpu| -> crate::runtime::Result<u8> { panic!("a driver's") };
-        assert_eq!(device.either(1, twin, || Ok(7)).unwrap(), 7);
-        assert!(device.notes()[0].contains("the driver panicked (a driver's)"));
     }
 
     #[test]
@@ -393,10 +388,7 @@ mod tests {
         let told = "4 rows are too many for the device, which takes 3 at most";
         assert_eq!(many.to_string(), told);
         for failure in [large, many] {
-            let device = Device::new(Choice::Gpu, Options::default());
-            if device.ready(1).is_none() {
-                return no_adapter("failures");
-            }
+            let Some(device) = open() else { return };
             let twin = |_: &Gpu| -> crate::runtime::Result<u8> { Err(failure) };
             assert_eq!(device.either(1, twin, || Ok(7)).unwrap(), 7);
             assert_eq!(device.notes().len(), 1);
@@ -406,10 +398,7 @@ mod tests {
 
     #[test]
     fn a_stop_is_no_failure() {
-        let device = Device::new(Choice::Gpu, Options::default());
-        if device.ready(1).is_none() {
-            return no_adapter("failures");
-        }
+        let Some(device) = open() else { return };
         let twin = |_: &Gpu| -> crate::runtime::Result<u8> { Err(Error::Interrupted) };
         let found = device.either(1, twin, || Ok(7));
         assert_eq!(found.unwrap_err(), g2ard_core::Error::Interrupted);

@@ -19,7 +19,19 @@ pub fn gpu(what: &str) -> Option<Gpu> {
     gpu_with(what, Options::default())
 }
 
-pub fn gpu_with(what: &str, options: Options) -> Option<Gpu> {
+/// A device that binds `bytes` at most, so that work goes in pieces.
+pub fn gpu_in_pieces(what: &str, bytes: u64) -> Option<Gpu> {
+    let max_binding = Some(bytes);
+    gpu_with(
+        what,
+        Options {
+            max_binding,
+            ..Options::default()
+        },
+    )
+}
+
+fn gpu_with(what: &str, options: Options) -> Option<Gpu> {
     match Gpu::open(true, options) {
         Ok(gpu) => Some(gpu),
         Err(Error::NoAdapter) => {

@@ -1,11 +1,10 @@
 //! numpy ↔ slices of fixed-size rows, without copying.
 
-use g2ard_core::Error;
 use numpy::ndarray::Dimension;
 use numpy::{Element, PyArray1, PyArray2, PyArrayMethods, PyReadonlyArray, PyUntypedArrayMethods};
 use pyo3::prelude::*;
 
-use crate::error::to_py;
+use crate::error::invalid;
 
 /// A C-contiguous array whose last axes hold `C` values, as rows of `C`.
 pub fn rows<'a, T: Element, const C: usize>(
@@ -17,11 +16,8 @@ pub fn rows<'a, T: Element, const C: usize>(
     if left.is_empty() {
         Ok(rows)
     } else {
-        Err(to_py(Error::invalid(
-            name,
-            format!("rows of {C}"),
-            format!("{:?}", array.shape()),
-        )))
+        let got = format!("{:?}", array.shape());
+        Err(invalid(name, format!("rows of {C}"), got))
     }
 }
 
@@ -30,9 +26,16 @@ pub fn flat<'a, T: Element>(
     name: &'static str,
     array: &'a PyReadonlyArray<'_, T, impl Dimension>,
 ) -> PyResult<&'a [T]> {
-    array
-        .as_slice()
-        .map_err(|_| to_py(Error::invalid(name, "a C-contiguous array", "strides")))
+    let strided = |_| invalid(name, "a C-contiguous array", "strides");
+    array.as_slice().map_err(strided)
+}
+
+/// An array that may be absent, as one slice.
+pub fn optional<'a, T: Element>(
+    name: &'static str,
+    array: &'a Option<PyReadonlyArray<'_, T, impl Dimension>>,
+) -> PyResult<Option<&'a [T]>> {
+    array.as_ref().map(|array| flat(name, array)).transpose()
 }
 
 /// Rows as an (N, C) array; the memory moves, nothing is copied.

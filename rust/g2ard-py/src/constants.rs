@@ -44,7 +44,7 @@ fn as_dict<'py>(py: Python<'py>, mut config: impl Constants) -> PyResult<Bound<'
 
 /// Return the core's constants by config: "lift", "coverage", "limits" and the methods of simplification.
 #[pyfunction]
-fn defaults(py: Python<'_>) -> PyResult<Bound<'_, PyDict>> {
+pub fn defaults(py: Python<'_>) -> PyResult<Bound<'_, PyDict>> {
     let cuts = PyDict::new(py);
     cuts.set_item("logit_of_opaque", limits::LOGIT_OF_OPAQUE)?;
     cuts.set_item("max_opacity", limits::MAX_OPACITY)?;
@@ -58,8 +58,4 @@ fn defaults(py: Python<'_>) -> PyResult<Bound<'_, PyDict>> {
     out.set_item("fast", as_dict(py, Pairwise::fast())?)?;
     out.set_item("paper", as_dict(py, Paper::default())?)?;
     Ok(out)
-}
-
-pub fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
-    m.add_function(wrap_pyfunction!(defaults, m)?)
 }

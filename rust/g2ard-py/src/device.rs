@@ -37,7 +37,7 @@ pub fn backend(kernels: &Arc<Kernels>) -> &dyn Backend {
 #[cfg(feature = "gpu")]
 #[pyfunction]
 #[pyo3(signature = (name, max_binding=None, timed=false))]
-fn set_device(name: &str, max_binding: Option<u64>, timed: bool) -> PyResult<()> {
+pub fn set_device(name: &str, max_binding: Option<u64>, timed: bool) -> PyResult<()> {
     let choice = match name {
         "cpu" => Choice::Cpu,
         "gpu" => Choice::Gpu,
@@ -53,7 +53,7 @@ fn set_device(name: &str, max_binding: Option<u64>, timed: bool) -> PyResult<()>
 #[cfg(not(feature = "gpu"))]
 #[pyfunction]
 #[pyo3(signature = (name, max_binding=None, timed=false))]
-fn set_device(name: &str, max_binding: Option<u64>, timed: bool) -> PyResult<()> {
+pub fn set_device(name: &str, max_binding: Option<u64>, timed: bool) -> PyResult<()> {
     let _ = (max_binding, timed);
     if ["cpu", "gpu", "auto"].contains(&name) {
         Ok(())
@@ -69,7 +69,7 @@ fn unknown(name: &str) -> PyErr {
 /// Return {adapter, served, uploaded_bytes, seconds}: the device in use, the number of kernels that it ran, bytes sent,
 /// and seconds per kernel.
 #[pyfunction]
-fn device_state(py: Python<'_>) -> PyResult<Bound<'_, PyDict>> {
+pub fn device_state(py: Python<'_>) -> PyResult<Bound<'_, PyDict>> {
     let out = PyDict::new(py);
     #[cfg(feature = "gpu")]
     {
@@ -92,7 +92,7 @@ fn device_state(py: Python<'_>) -> PyResult<Bound<'_, PyDict>> {
 
 /// Return messages for the user since the last call.
 #[pyfunction]
-fn device_notes() -> Vec<String> {
+pub fn device_notes() -> Vec<String> {
     #[cfg(feature = "gpu")]
     return kernels().notes();
     #[cfg(not(feature = "gpu"))]
@@ -101,7 +101,7 @@ fn device_notes() -> Vec<String> {
 
 /// Return every adapter, the preferred one first; None if this build has no GPU kernels.
 #[pyfunction]
-fn adapters(py: Python<'_>) -> PyResult<Option<Vec<Bound<'_, PyDict>>>> {
+pub fn adapters(py: Python<'_>) -> PyResult<Option<Vec<Bound<'_, PyDict>>>> {
     #[cfg(feature = "gpu")]
     {
         let found = quick(py, || Ok(runtime::list()))?;
@@ -124,11 +124,4 @@ fn adapters(py: Python<'_>) -> PyResult<Option<Vec<Bound<'_, PyDict>>>> {
         let _ = py;
         Ok(None)
     }
-}
-
-pub fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
-    m.add_function(wrap_pyfunction!(set_device, m)?)?;
-    m.add_function(wrap_pyfunction!(device_state, m)?)?;
-    m.add_function(wrap_pyfunction!(device_notes, m)?)?;
-    m.add_function(wrap_pyfunction!(adapters, m)?)
 }

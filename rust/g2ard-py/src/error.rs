@@ -15,6 +15,15 @@ pub fn to_py(error: Error) -> PyErr {
     })
 }
 
+/// An `InputError` about one argument.
+pub fn invalid(
+    name: &'static str,
+    expected: impl Into<String>,
+    got: impl std::fmt::Display,
+) -> PyErr {
+    to_py(Error::invalid(name, expected, got))
+}
+
 /// An `InputError` whose `parameter` is the field at fault, and whose `index` its first row that is not finite.
 fn input_error(py: Python<'_>, error: &Error) -> PyResult<PyErr> {
     let fields = PyDict::new(py);

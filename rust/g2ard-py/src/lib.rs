@@ -1,6 +1,4 @@
-//! `g2ard._core`: registration only; one file per stage.
-
-use pyo3::prelude::*;
+//! `g2ard._core`: one file per stage.
 
 mod arrays;
 mod constants;
@@ -21,23 +19,42 @@ mod views;
 mod visibility;
 mod work;
 
-#[pymodule]
-fn _core(m: &Bound<'_, PyModule>) -> PyResult<()> {
-    m.add("__version__", env!("CARGO_PKG_VERSION"))?;
-    work::register(m)?;
-    constants::register(m)?;
-    device::register(m)?;
-    scene::register(m)?;
-    visibility::register(m)?;
-    lift::register(m)?;
-    simplify::register(m)?;
-    spatial::register(m)?;
-    quantize::register(m)?;
-    raster::register(m)?;
-    register::register(m)?;
-    select::register(m)?;
-    ssim::register(m)?;
-    tile::register(m)?;
-    train::register(m)?;
-    Ok(())
+/// The module of Python.
+#[pyo3::pymodule]
+mod _core {
+    #[pymodule_export]
+    #[allow(non_upper_case_globals)] // Python's name
+    const __version__: &str = env!("CARGO_PKG_VERSION");
+    #[pymodule_export]
+    use crate::constants::defaults;
+    #[pymodule_export]
+    use crate::device::{adapters, device_notes, device_state, set_device};
+    #[pymodule_export]
+    use crate::lift::lift_points;
+    #[pymodule_export]
+    use crate::quantize::{codebook, palette};
+    #[pymodule_export]
+    use crate::raster::{PyRasterizer, accumulate, instruction_sets, machine_limits, sensitivity};
+    #[pymodule_export]
+    use crate::register::{flow, local_zncc, normal_equations, shot};
+    #[pymodule_export]
+    use crate::scene::PyScene;
+    #[pymodule_export]
+    use crate::select::{
+        select_depth, select_greedy, select_surface, select_view_statistics, select_visible,
+    };
+    #[pymodule_export]
+    use crate::simplify::{simplify_flags, simplify_pairwise, simplify_paper};
+    #[pymodule_export]
+    use crate::spatial::{cast_rays, knn};
+    #[pymodule_export]
+    use crate::ssim::{l1_ssim, psnr, ssim_metric};
+    #[pymodule_export]
+    use crate::tile::{PyFrame, PyTileMerging};
+    #[pymodule_export]
+    use crate::train::PyTrainer;
+    #[pymodule_export]
+    use crate::visibility::PyVisibilityAccumulator;
+    #[pymodule_export]
+    use crate::work::{num_threads, set_num_threads};
 }

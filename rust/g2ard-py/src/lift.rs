@@ -13,7 +13,7 @@ type Discs<'py> = (Bound<'py, PyArray2<f32>>, Bound<'py, PyArray2<f32>>);
 /// Return (quats, scales) of the discs of centred (N, 3) points.
 #[pyfunction]
 #[pyo3(signature = (points, config, progress=None))]
-fn lift_points<'py>(
+pub fn lift_points<'py>(
     py: Python<'py>,
     points: PyReadonlyArray2<'py, f64>,
     config: Config<LiftConfig>,
@@ -25,8 +25,4 @@ fn lift_points<'py>(
         arrays::matrix(py, discs.quats)?,
         arrays::matrix(py, discs.scales)?,
     ))
-}
-
-pub fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
-    m.add_function(wrap_pyfunction!(lift_points, m)?)
 }

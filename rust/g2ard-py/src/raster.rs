@@ -10,21 +10,12 @@ use numpy::{IntoPyArray, PyArray1, PyArrayMethods, PyReadonlyArrayDyn, PyUntyped
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 
-use crate::error::to_py;
+use crate::arrays::{flat, optional};
+use crate::error::{invalid, to_py};
 use crate::views::{RasterOptions, View};
 use crate::work;
 
 pub type Floats<'py> = PyReadonlyArrayDyn<'py, f32>;
-
-pub fn slice<'a>(name: &'static str, array: &'a Floats<'_>) -> PyResult<&'a [f32]> {
-    array.as_slice().map_err(|_| {
-        to_py(g2ard_core::Error::invalid(
-            name,
-            "a C-contiguous array",
-            "another layout",
-        ))
-    })
-}
 
 /// The six parameter arrays, in the order that every method takes them.
 #[derive(FromPyObject)]
@@ -42,12 +33,12 @@ impl Arrays<'_> {
         let shape = self.5.shape();
         let rest = if shape.len() == 3 { shape[1] } else { 0 };
         let params = Params {
-            means: slice("means", &self.0)?,
-            quats: slice("quats", &self.1)?,
-            log_scales: slice("log_scales", &self.2)?,
-            logit_opacities: slice("logit_opacities", &self.3)?,
-            sh0: slice("sh0", &self.4)?,
-            sh_n: slice("shN", &self.5)?,
+            means: flat("means", &self.0)?,
+            quats: flat("quats", &self.1)?,
+            log_scales: flat("log_scales", &self.2)?,
+            logit_opacities: flat("logit_opacities", &self.3)?,
+            sh0: flat("sh0", &self.4)?,
+            sh_n: flat("shN", &self.5)?,
             sh_coeffs: rest + 1,
         };
         params.validate().map_err(to_py)?;
@@ -56,39 +47,32 @@ impl Arrays<'_> {
 }
 
 pub fn isa_named(name: Option<&str>) -> PyResult<Isa> {
-    let best = Isa::detect();
-    match name {
-        None => Ok(best),
-        Some(name) => Isa::available()
-            .into_iter()
-            .find(|isa| isa.name() == name)
-            .ok_or_else(|| {
-                to_py(g2ard_core::Error::invalid(
-                    "isa",
-                    "one this machine has",
-                    name,
-                ))
-            }),
-    }
+    let Some(name) = name else {
+        return Ok(Isa::detect());
+    };
+    let mut known = Isa::available().into_iter();
+    known
+        .find(|isa| isa.name() == name)
+        .ok_or_else(|| invalid("isa", "one this machine has", name))
 }
 
 /// Return the names of the instruction sets that this machine can run, fastest first.
 #[pyfunction]
-fn instruction_sets() -> Vec<&'static str> {
+pub fn instruction_sets() -> Vec<&'static str> {
     Isa::available().into_iter().map(Isa::name).collect()
 }
 
 /// Measure and return (FMA 10⁹ flops/s, read 10⁹ bytes/s) of all threads.
 #[pyfunction]
 #[pyo3(signature = (isa = None))]
-fn machine_limits(py: Python<'_>, isa: Option<&str>) -> PyResult<(f64, f64)> {
+pub fn machine_limits(py: Python<'_>, isa: Option<&str>) -> PyResult<(f64, f64)> {
     let isa = isa_named(isa)?;
     let limits = work::quick(py, || Ok(measure(isa)))?;
     Ok((limits.fma_gflops, limits.read_gb_s))
 }
 
 #[pyclass(name = "Rasterizer", module = "g2ard._core")]
-struct PyRasterizer {
+pub struct PyRasterizer {
     inner: Rasterizer,
     /// Height and width of the last forward pass.
     shape: [usize; 2],
@@ -174,15 +158,9 @@ impl PyRasterizer {
     ) -> PyResult<Vec<Bound<'py, numpy::PyArrayDyn<f32>>>> {
         let params = arrays.params()?;
         let gradients = ImageGradients {
-            rgb: slice("image gradient", &image)?,
-            alpha: alpha
-                .as_ref()
-                .map(|a| slice("alpha gradient", a))
-                .transpose()?,
-            depth: depth
-                .as_ref()
-                .map(|a| slice("depth gradient", a))
-                .transpose()?,
+            rgb: flat("image gradient", &image)?,
+            alpha: optional("alpha gradient", &alpha)?,
+            depth: optional("depth gradient", &depth)?,
         };
         let inner = &mut self.inner;
         let out = work::quick(py, || {
@@ -225,7 +203,7 @@ impl PyRasterizer {
     ) -> PyResult<PoseGradient> {
         let params = arrays.params()?;
         let gradients = ImageGradients {
-            rgb: slice("image gradient", &image)?,
+            rgb: flat("image gradient", &image)?,
             alpha: None,
             depth: None,
         };
@@ -267,7 +245,7 @@ pub fn passes<'py>(py: Python<'py>, passes: &Passes) -> PyResult<Bound<'py, PyDi
 /// Return sums per Gaussian over all `views`: a dict of (N,) arrays.
 #[pyfunction]
 #[pyo3(signature = (arrays, views, options, progress = None))]
-fn accumulate<'py>(
+pub fn accumulate<'py>(
     py: Python<'py>,
     arrays: Arrays<'py>,
     views: Vec<View>,
@@ -300,7 +278,7 @@ fn accumulate<'py>(
 /// Return (N, 21) upper triangles of Σ g gᵀ over all pixels, channels and `views`, g = ∂C/∂(mean, log scale).
 #[pyfunction]
 #[pyo3(signature = (arrays, views, options, progress = None))]
-fn sensitivity<'py>(
+pub fn sensitivity<'py>(
     py: Python<'py>,
     arrays: Arrays<'py>,
     views: Vec<View>,
@@ -321,12 +299,4 @@ fn sensitivity<'py>(
         Ok(sums)
     })?;
     PyArray1::from_vec(py, sums).reshape([params.len(), SENSITIVITY_TRIANGLE])
-}
-
-pub fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
-    m.add_class::<PyRasterizer>()?;
-    m.add_function(wrap_pyfunction!(instruction_sets, m)?)?;
-    m.add_function(wrap_pyfunction!(machine_limits, m)?)?;
-    m.add_function(wrap_pyfunction!(accumulate, m)?)?;
-    m.add_function(wrap_pyfunction!(sensitivity, m)?)
 }

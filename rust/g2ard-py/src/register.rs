@@ -1,6 +1,5 @@
 //! `_core.shot`, `_core.normal_equations`, `_core.flow`, `_core.local_zncc`: images for registration.
 
-use g2ard_core::Error;
 use g2ard_core::register::{self, Lens, Light, Photo, Render, Size};
 use numpy::ndarray::Ix2;
 use numpy::{
@@ -10,7 +9,7 @@ use numpy::{
 use pyo3::prelude::*;
 
 use crate::arrays::flat;
-use crate::error::to_py;
+use crate::error::invalid;
 use crate::work;
 
 type Grey<'py> = PyReadonlyArray2<'py, f64>;
@@ -32,7 +31,7 @@ fn plane<'a, T: Element>(
     if image.shape() != [size.height, size.width] {
         let expected = format!("({}, {})", size.height, size.width);
         let got = format!("{:?}", image.shape());
-        return Err(to_py(Error::invalid(name, expected, got)));
+        return Err(invalid(name, expected, got));
     }
     flat(name, image)
 }
@@ -49,7 +48,7 @@ type Planes<'py> = (
 
 /// Return (grey, depth, mask) of a render; see `g2ard_core::register::shot`.
 #[pyfunction]
-fn shot<'py>(
+pub fn shot<'py>(
     py: Python<'py>,
     image: PyReadonlyArray3<'py, f32>,
     alpha: PyReadonlyArray2<'py, f32>,
@@ -80,7 +79,7 @@ type Normal = ([[f64; 8]; 8], [f64; 8], f64, f64, f64);
 /// `shot`, `lens` (fx, fy, cx, cy) and `light` (gain, bias).
 #[pyfunction]
 #[pyo3(signature = (photo, shot, lens, light, scale = None))]
-fn normal_equations<'py>(
+pub fn normal_equations<'py>(
     py: Python<'py>,
     photo: (Grey<'py>, Grey<'py>, Grey<'py>, Mask<'py>),
     shot: (Grey<'py>, Grey<'py>, Mask<'py>),
@@ -117,7 +116,7 @@ fn render<'a>(shot: &'a (Grey<'_>, Grey<'_>, Mask<'_>), size: Size) -> PyResult<
 
 /// Return the root mean square, in pixels, by which ξ moves the unmasked pixels.
 #[pyfunction]
-fn flow<'py>(
+pub fn flow<'py>(
     py: Python<'py>,
     shot: (Grey<'py>, Grey<'py>, Mask<'py>),
     lens: [f64; 4],
@@ -131,7 +130,7 @@ fn flow<'py>(
 
 /// Return the median ZNCC over windows; see `g2ard_core::register::local_zncc`.
 #[pyfunction]
-fn local_zncc(
+pub fn local_zncc(
     py: Python<'_>,
     a: Grey<'_>,
     b: Grey<'_>,
@@ -142,11 +141,4 @@ fn local_zncc(
     let (a, b) = (plane("a", &a, size)?, plane("b", &b, size)?);
     let mask = plane("mask", &mask, size)?;
     work::quick(py, || register::local_zncc(a, b, mask, size, side))
-}
-
-pub fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
-    m.add_function(wrap_pyfunction!(shot, m)?)?;
-    m.add_function(wrap_pyfunction!(normal_equations, m)?)?;
-    m.add_function(wrap_pyfunction!(flow, m)?)?;
-    m.add_function(wrap_pyfunction!(local_zncc, m)?)
 }

@@ -119,7 +119,3 @@ impl PyScene {
         PyArray1::from_slice(py, &self.ordered.rows)
     }
 }
-
-pub fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
-    m.add_class::<PyScene>()
-}

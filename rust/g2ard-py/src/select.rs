@@ -9,13 +9,13 @@ use pyo3::types::PyDict;
 use crate::arrays;
 use crate::constants::Config;
 use crate::device::{backend, kernels};
-use crate::error::to_py;
+use crate::error::{invalid, to_py};
 use crate::views::View;
 use crate::work::{long, quick};
 
 /// Centred means, quats, linear scales, opacities.
 #[derive(FromPyObject)]
-struct Scene<'py>(
+pub struct Scene<'py>(
     PyReadonlyArray2<'py, f64>,
     PyReadonlyArray2<'py, f32>,
     PyReadonlyArray2<'py, f32>,
@@ -37,7 +37,7 @@ impl Scene<'_> {
 
 /// Return surface cells: centers, normals, confidence, weights, size.
 #[pyfunction]
-fn select_surface<'py>(
+pub fn select_surface<'py>(
     py: Python<'py>,
     scene: Scene<'py>,
     cells: usize,
@@ -56,7 +56,7 @@ fn select_surface<'py>(
 
 /// Return the median depth of every pixel of a view.
 #[pyfunction]
-fn select_depth<'py>(
+pub fn select_depth<'py>(
     py: Python<'py>,
     scene: Scene<'py>,
     view: View,
@@ -69,7 +69,7 @@ fn select_depth<'py>(
 /// Return (C, 2): the share of each view's pixels that show the scene, and the median of their depths.
 #[pyfunction]
 #[pyo3(signature = (scene, views, progress=None))]
-fn select_view_statistics<'py>(
+pub fn select_view_statistics<'py>(
     py: Python<'py>,
     scene: Scene<'py>,
     views: Vec<View>,
@@ -107,11 +107,7 @@ fn surface_of(parts: &Surfaces<'_>) -> PyResult<Surface> {
         ("weights", surface.weights.len()),
     ] {
         if rows != m {
-            return Err(to_py(g2ard_core::Error::invalid(
-                name,
-                format!("{m} rows"),
-                rows,
-            )));
+            return Err(invalid(name, format!("{m} rows"), rows));
         }
     }
     Ok(surface)
@@ -122,7 +118,7 @@ type Lists<'py> = (Bound<'py, PyArray1<u64>>, Bound<'py, PyArray1<u32>>);
 /// Return (starts (C + 1,), cells): view v sees cells[starts[v]..starts[v + 1]].
 #[pyfunction]
 #[pyo3(signature = (scene, surface, views, *, tolerance, progress=None))]
-fn select_visible<'py>(
+pub fn select_visible<'py>(
     py: Python<'py>,
     scene: Scene<'py>,
     surface: Surfaces<'py>,
@@ -158,7 +154,7 @@ type Views<'py> = (
 /// Return (views, gains, evaluations) of greedy maximisation.
 #[pyfunction]
 #[pyo3(signature = (surface, views, k, directional, config, progress=None))]
-fn select_greedy<'py>(
+pub fn select_greedy<'py>(
     py: Python<'py>,
     surface: Surfaces<'py>,
     views: Views<'py>,
@@ -174,10 +170,10 @@ fn select_greedy<'py>(
         .windows(2)
         .map(|w| cells.get(w[0] as usize..w[1] as usize).map(<[u32]>::to_vec))
         .collect::<Option<Vec<_>>>();
-    let offsets = || g2ard_core::Error::invalid("starts", "ascending offsets into cells", "others");
+    let offsets = || invalid("starts", "ascending offsets into cells", "others");
     let problem = Problem {
         surface: &surface,
-        visible: &visible.ok_or_else(offsets).map_err(to_py)?,
+        visible: &visible.ok_or_else(offsets)?,
         positions: arrays::rows("positions", &views.2)?,
         directional,
     };
@@ -189,12 +185,4 @@ fn select_greedy<'py>(
         PyArray1::from_vec(py, chosen.gains),
         chosen.evaluations,
     ))
-}
-
-pub fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
-    m.add_function(wrap_pyfunction!(select_surface, m)?)?;
-    m.add_function(wrap_pyfunction!(select_depth, m)?)?;
-    m.add_function(wrap_pyfunction!(select_view_statistics, m)?)?;
-    m.add_function(wrap_pyfunction!(select_visible, m)?)?;
-    m.add_function(wrap_pyfunction!(select_greedy, m)?)
 }

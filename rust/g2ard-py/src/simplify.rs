@@ -32,7 +32,7 @@ impl PyVisibility<'_> {
 /// Return `protected` (N,) bool of the raw prior over about `cells` cells.
 #[pyfunction]
 #[pyo3(signature = (scene, cells, config, progress=None))]
-fn simplify_flags<'py>(
+pub fn simplify_flags<'py>(
     py: Python<'py>,
     scene: &PyScene,
     cells: usize,
@@ -58,7 +58,7 @@ fn simplify_flags<'py>(
 /// Run the paper's rounds, down to each count of `schedule`, over about `cells` cells each.
 #[pyfunction]
 #[pyo3(signature = (scene, schedule, cells, config, protected=None, progress=None))]
-fn simplify_paper<'py>(
+pub fn simplify_paper<'py>(
     py: Python<'py>,
     scene: &PyScene,
     schedule: Vec<usize>,
@@ -69,8 +69,7 @@ fn simplify_paper<'py>(
 ) -> PyResult<Bound<'py, PyDict>> {
     let (splats, ordered) = (scene.splats(py)?, &scene.ordered);
     let scene = splats.borrow()?;
-    let protected = protected.as_ref().map(|p| arrays::flat("protected", p));
-    let (policy, protected) = (config.0, protected.transpose()?);
+    let (policy, protected) = (config.0, arrays::optional("protected", &protected)?);
     let kernels = kernels();
     let outcome = long(py, progress, |control| {
         let run = backend(&kernels).group_kernels();
@@ -88,7 +87,7 @@ fn simplify_paper<'py>(
 /// Run the methods `default` and `fast`: runs of Morton order, then pairs of neighbours, cheapest first.
 #[pyfunction]
 #[pyo3(signature = (scene, schedule, config, protected=None, visibility=None, progress=None))]
-fn simplify_pairwise<'py>(
+pub fn simplify_pairwise<'py>(
     py: Python<'py>,
     scene: &PyScene,
     schedule: Vec<usize>,
@@ -99,9 +98,8 @@ fn simplify_pairwise<'py>(
 ) -> PyResult<Bound<'py, PyDict>> {
     let (splats, ordered) = (scene.splats(py)?, &scene.ordered);
     let scene = splats.borrow()?;
-    let protected = protected.as_ref().map(|p| arrays::flat("protected", p));
-    let visibility = visibility.as_ref().map(PyVisibility::borrow);
-    let (protected, visibility) = (protected.transpose()?, visibility.transpose()?);
+    let protected = arrays::optional("protected", &protected)?;
+    let visibility = visibility.as_ref().map(PyVisibility::borrow).transpose()?;
     let outcome = long(py, progress, |control| {
         (config.0).run(&scene, ordered, visibility, protected, &schedule, control)
     })?;
@@ -166,10 +164,4 @@ pub fn outcome_dict<'py, R>(
     out.set_item("infinite_logits", outcome.infinite_logits)?;
     out.set_item("rounds", rounds)?;
     Ok(out)
-}
-
-pub fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
-    m.add_function(wrap_pyfunction!(simplify_flags, m)?)?;
-    m.add_function(wrap_pyfunction!(simplify_paper, m)?)?;
-    m.add_function(wrap_pyfunction!(simplify_pairwise, m)?)
 }

@@ -1,6 +1,5 @@
 //! Exact nearest neighbours; rays through cells.
 
-use g2ard_core::Error;
 use g2ard_core::spatial::{Steps, Tree};
 use numpy::ndarray::Array2;
 use numpy::{IntoPyArray, PyArray1, PyArray2, PyReadonlyArray1, PyReadonlyArray2};
@@ -8,12 +7,12 @@ use pyo3::prelude::*;
 use rayon::prelude::*;
 
 use crate::arrays;
-use crate::error::to_py;
+use crate::error::invalid;
 use crate::work::quick;
 
 /// Return (N, k) rows of the points nearest to each of (N, 3) finite points, without itself, by (distance, row).
 #[pyfunction]
-fn knn<'py>(
+pub fn knn<'py>(
     py: Python<'py>,
     points: PyReadonlyArray2<'py, f64>,
     k: usize,
@@ -21,11 +20,11 @@ fn knn<'py>(
     let points = arrays::rows::<f64, 3>("points", &points)?;
     if k == 0 || k >= points.len() {
         let wanted = format!("1 to {}", points.len().saturating_sub(1));
-        return Err(to_py(Error::invalid("k", wanted, k)));
+        return Err(invalid("k", wanted, k));
     }
     if let Some(row) = points.iter().position(|p| p.iter().any(|v| !v.is_finite())) {
         let got = format!("{:?} in row {row}", points[row]);
-        return Err(to_py(Error::invalid("points", "finite coordinates", got)));
+        return Err(invalid("points", "finite coordinates", got));
     }
     let near = quick(py, || Ok(neighbors(points, k)))?;
     Ok(near.into_pyarray(py))
@@ -54,7 +53,7 @@ fn neighbors(points: &[[f64; 3]], k: usize) -> Array2<u32> {
 
 /// Return (M,) distances at which unit rays first meet a cell of 0 steps; infinite if they meet none.
 #[pyfunction]
-fn cast_rays<'py>(
+pub fn cast_rays<'py>(
     py: Python<'py>,
     steps: PyReadonlyArray1<'py, i8>,
     shape: [usize; 3],
@@ -73,9 +72,4 @@ fn cast_rays<'py>(
     let directions = arrays::rows::<f64, 3>("directions", &directions)?;
     let found = quick(py, || steps.cast(eyes, directions))?;
     Ok(PyArray1::from_vec(py, found))
-}
-
-pub fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
-    m.add_function(wrap_pyfunction!(cast_rays, m)?)?;
-    m.add_function(wrap_pyfunction!(knn, m)?)
 }

@@ -1,11 +1,11 @@
 //! `_core.l1_ssim`, `_core.ssim`, `_core.psnr`.
 
 use g2ard_core::ssim::{self, Loss, Shape};
-use g2ard_core::{Error, Result};
 use numpy::{PyArray1, PyArray3, PyArrayMethods, PyReadonlyArray3, PyUntypedArrayMethods};
 use pyo3::prelude::*;
 
-use crate::error::to_py;
+use crate::arrays::flat;
+use crate::error::invalid;
 use crate::work;
 
 type Image<'py> = PyReadonlyArray3<'py, f32>;
@@ -15,34 +15,22 @@ fn pair<'a>(
     image: &'a Image<'_>,
     target: &'a Image<'_>,
 ) -> PyResult<(&'a [f32], &'a [f32], Shape)> {
-    let inner = || -> Result<_> {
-        if image.shape() != target.shape() {
-            let expected = format!("the image's shape {:?}", image.shape());
-            return Err(Error::invalid(
-                "target",
-                expected,
-                format!("{:?}", target.shape()),
-            ));
-        }
-        let layout = |_| Error::invalid("image", "C-contiguous arrays", "another layout");
-        let [height, width, channels] = [0, 1, 2].map(|i| image.shape()[i]);
-        let shape = Shape {
-            height,
-            width,
-            channels,
-        };
-        Ok((
-            image.as_slice().map_err(layout)?,
-            target.as_slice().map_err(layout)?,
-            shape,
-        ))
+    let [height, width, channels] = [0, 1, 2].map(|i| image.shape()[i]);
+    if image.shape() != target.shape() {
+        let expected = format!("the image's shape {:?}", image.shape());
+        return Err(invalid("target", expected, format!("{:?}", target.shape())));
+    }
+    let shape = Shape {
+        height,
+        width,
+        channels,
     };
-    inner().map_err(to_py)
+    Ok((flat("image", image)?, flat("target", target)?, shape))
 }
 
 /// Return (loss, dloss/dimage) of (1 − λ)·L1 + λ·(1 − SSIM).
 #[pyfunction]
-fn l1_ssim<'py>(
+pub fn l1_ssim<'py>(
     py: Python<'py>,
     image: Image<'py>,
     target: Image<'py>,
@@ -62,20 +50,14 @@ fn l1_ssim<'py>(
 /// Return the mean SSIM of two (H, W, C) images in 0–1.
 #[pyfunction]
 #[pyo3(name = "ssim")]
-fn ssim_metric(py: Python<'_>, image: Image<'_>, target: Image<'_>) -> PyResult<f64> {
+pub fn ssim_metric(py: Python<'_>, image: Image<'_>, target: Image<'_>) -> PyResult<f64> {
     let (a, b, shape) = pair(&image, &target)?;
     work::quick(py, || ssim::ssim(a, b, shape))
 }
 
 /// Return the PSNR in dB of two (H, W, C) images in 0–1.
 #[pyfunction]
-fn psnr(py: Python<'_>, image: Image<'_>, target: Image<'_>) -> PyResult<f64> {
+pub fn psnr(py: Python<'_>, image: Image<'_>, target: Image<'_>) -> PyResult<f64> {
     let (a, b, shape) = pair(&image, &target)?;
     work::quick(py, || ssim::psnr(a, b, shape))
-}
-
-pub fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
-    m.add_function(wrap_pyfunction!(l1_ssim, m)?)?;
-    m.add_function(wrap_pyfunction!(ssim_metric, m)?)?;
-    m.add_function(wrap_pyfunction!(psnr, m)?)
 }

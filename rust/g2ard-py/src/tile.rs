@@ -17,7 +17,7 @@ type Rows<'py> = Bound<'py, PyArray1<u32>>;
 /// Units of measure of all tiles of a scene.
 #[pyclass(name = "TileFrame", module = "g2ard._core", frozen, from_py_object)]
 #[derive(Clone, Copy)]
-struct PyFrame(Frame);
+pub struct PyFrame(Frame);
 
 #[pymethods]
 impl PyFrame {
@@ -61,7 +61,7 @@ impl PyFrame {
 }
 
 #[pyclass(name = "TileMerging", module = "g2ard._core", frozen)]
-struct PyTileMerging {
+pub struct PyTileMerging {
     scene: Py<PyScene>,
     visibility: Option<Py<PyAny>>,
     policy: Pairwise,
@@ -158,9 +158,4 @@ impl PyTileMerging {
         })?;
         outcome_dict(py, outcome, Vec::new())
     }
-}
-
-pub fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
-    m.add_class::<PyFrame>()?;
-    m.add_class::<PyTileMerging>()
 }

@@ -9,9 +9,10 @@ use numpy::{
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 
-use crate::arrays::flat;
+use crate::arrays::{flat, optional};
 use crate::constants::Config;
-use crate::raster::{Arrays, Floats, isa_named, slice};
+use crate::error::{invalid, to_py};
+use crate::raster::{Arrays, Floats, isa_named};
 use crate::views::{RasterOptions, View};
 use crate::work;
 
@@ -59,7 +60,7 @@ struct PyObjective {
 }
 
 #[pyclass(name = "Trainer", module = "g2ard._core")]
-struct PyTrainer {
+pub struct PyTrainer {
     inner: Trainer,
     settings: Settings,
     background: [f32; 3],
@@ -98,8 +99,8 @@ impl PyTrainer {
         isa: Option<&str>,
     ) -> PyResult<Self> {
         let isa = isa_named(isa)?;
-        let units = units.as_ref().map(|u| slice("units", u)).transpose()?;
-        let inner = Trainer::new(&arrays.params()?, units, isa).map_err(crate::error::to_py)?;
+        let units = optional("units", &units)?;
+        let inner = Trainer::new(&arrays.params()?, units, isa).map_err(to_py)?;
         Ok(Self {
             inner,
             settings: objective.settings.settings()?,
@@ -120,19 +121,19 @@ impl PyTrainer {
         r_perp: Floats<'_>,
     ) -> PyResult<()> {
         let (means, frames) = (
-            slice("anchor means", &means)?,
-            slice("anchor frames", &frames)?,
+            flat("anchor means", &means)?,
+            flat("anchor frames", &frames)?,
         );
-        let (r_parallel, r_perp) = (slice("r_parallel", &r_parallel)?, slice("r_perp", &r_perp)?);
+        let (r_parallel, r_perp) = (flat("r_parallel", &r_parallel)?, flat("r_perp", &r_perp)?);
         self.inner
             .anchor(means, frames, r_parallel, r_perp)
-            .map_err(crate::error::to_py)
+            .map_err(to_py)
     }
 
     /// Freeze rows, given as an (N,) mask: no step changes them.
     fn freeze(&mut self, frozen: PyReadonlyArray1<'_, bool>) -> PyResult<()> {
-        let frozen = crate::arrays::flat("frozen", &frozen)?;
-        self.inner.freeze(frozen).map_err(crate::error::to_py)
+        let frozen = flat("frozen", &frozen)?;
+        self.inner.freeze(frozen).map_err(to_py)
     }
 
     /// Take one step; return (photometric loss before it, Gaussians moved). `mask`: where the loss counts.
@@ -151,7 +152,7 @@ impl PyTrainer {
         let camera = view.camera();
         let target = flat("target", &target)?;
         let input = StepInput {
-            mask: mask.as_ref().map(|m| flat("mask", m)).transpose()?,
+            mask: optional("mask", &mask)?,
             relative,
             reach: rates.reach_in(&camera),
             rates: rates.into(),
@@ -227,7 +228,7 @@ impl PyTrainer {
             steps: vector(state, "steps")?,
             order: vector(state, "order")?,
         };
-        self.inner.import(&state).map_err(crate::error::to_py)
+        self.inner.import(&state).map_err(to_py)
     }
 
     /// Number of Gaussian steps skipped since the start because a gradient was not finite.
@@ -262,18 +263,8 @@ fn vector<T: numpy::Element + Clone>(
     state: &Bound<'_, PyDict>,
     name: &'static str,
 ) -> PyResult<Vec<T>> {
-    let missing = || {
-        crate::error::to_py(g2ard_core::Error::invalid(
-            name,
-            "an array in the state",
-            "none",
-        ))
-    };
+    let missing = || invalid(name, "an array in the state", "none");
     let value = state.get_item(name)?.ok_or_else(missing)?;
     let array: PyReadonlyArray1<'_, T> = value.extract()?;
     Ok(array.as_array().to_vec())
-}
-
-pub fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
-    m.add_class::<PyTrainer>()
 }

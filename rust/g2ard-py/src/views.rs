@@ -1,10 +1,9 @@
 //! Cameras and the rasteriser's options, as Python holds them.
 
-use g2ard_core::Error;
 use g2ard_core::raster::{Camera, Convention, Settings};
 use pyo3::prelude::*;
 
-use crate::error::to_py;
+use crate::error::invalid;
 
 /// `(viewmat 4×4, (fx, fy, cx, cy), (width, height), near)`.
 #[derive(FromPyObject)]
@@ -40,13 +39,7 @@ impl RasterOptions {
         let convention = match self.convention.as_str() {
             "gsplat" => Convention::Gsplat,
             "inria" => Convention::Inria,
-            other => {
-                return Err(to_py(Error::invalid(
-                    "convention",
-                    "gsplat or inria",
-                    other,
-                )));
-            }
+            other => return Err(invalid("convention", "gsplat or inria", other)),
         };
         Ok(Settings {
             convention,

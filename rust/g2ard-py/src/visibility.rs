@@ -12,7 +12,7 @@ use crate::views::{RasterOptions, View};
 use crate::work::long;
 
 #[pyclass(name = "VisibilityAccumulator", module = "g2ard._core")]
-struct PyVisibilityAccumulator {
+pub struct PyVisibilityAccumulator {
     sums: VisibilityAccumulator,
     /// The kernels chosen when it was created.
     kernels: Arc<Kernels>,
@@ -58,8 +58,4 @@ impl PyVisibilityAccumulator {
             PyArray1::from_vec(py, pixel_size),
         )
     }
-}
-
-pub fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
-    m.add_class::<PyVisibilityAccumulator>()
 }

@@ -35,7 +35,7 @@ fn panicked() -> PyErr {
 
 /// Set the number of threads of every kernel from now on; 0 means all cores.
 #[pyfunction]
-fn set_num_threads(threads: usize) -> PyResult<()> {
+pub fn set_num_threads(threads: usize) -> PyResult<()> {
     let built = ThreadPoolBuilder::new()
         .num_threads(threads)
         .build()
@@ -45,7 +45,7 @@ fn set_num_threads(threads: usize) -> PyResult<()> {
 }
 
 #[pyfunction]
-fn num_threads() -> PyResult<usize> {
+pub fn num_threads() -> PyResult<usize> {
     Ok(pool()?.current_num_threads())
 }
 
@@ -98,9 +98,4 @@ pub fn long<R: Send>(
         (None, Some(result)) => result.map_err(to_py),
         (None, None) => Err(panicked()),
     }
-}
-
-pub fn register(m: &Bound<'_, PyModule>) -> PyResult<()> {
-    m.add_function(wrap_pyfunction!(set_num_threads, m)?)?;
-    m.add_function(wrap_pyfunction!(num_threads, m)?)
 }

@@ -38,13 +38,7 @@ impl Gradients<'_> {
             ("sh0", self.sh0.len(), params.sh0.len()),
             ("shN", self.sh_n.len(), params.sh_n.len()),
         ] {
-            if got != expected {
-                return Err(Error::invalid(
-                    name,
-                    format!("gradients of {expected} values"),
-                    got,
-                ));
-            }
+            Error::unless_equal(name, got, expected, "gradients")?;
         }
         Ok(())
     }

@@ -56,6 +56,7 @@ struct ForwardState {
 }
 
 /// Renders one view and keeps what its backward pass needs; the next view reuses every buffer.
+#[derive(Default)]
 pub struct Rasterizer {
     isa: Isa,
     state: Option<ForwardState>,
@@ -79,32 +80,11 @@ pub struct Rasterizer {
     passes: Passes,
 }
 
-impl Default for Rasterizer {
-    fn default() -> Self {
-        Self::new(Isa::detect())
-    }
-}
-
 impl Rasterizer {
     pub fn new(isa: Isa) -> Self {
         Self {
             isa,
-            state: None,
-            splats: Vec::new(),
-            tile_lists: Vec::new(),
-            intersectors: Vec::new(),
-            chunks: Vec::new(),
-            order: Vec::new(),
-            spare: Vec::new(),
-            bins: Bins::default(),
-            batches: Vec::new(),
-            block_masks: Vec::new(),
-            transmittance: Vec::new(),
-            last: Vec::new(),
-            slots: Vec::new(),
-            shares: Vec::new(),
-            written: Vec::new(),
-            passes: Passes::default(),
+            ..Self::default()
         }
     }
 
@@ -155,17 +135,7 @@ impl Rasterizer {
         image: &ImageGradients,
         sink: K,
     ) -> Result<()> {
-        let Some(state) = &self.state else {
-            return Err(Error::invalid(
-                "backward",
-                "a forward pass before it",
-                "none",
-            ));
-        };
-        if source.len() != state.rows {
-            return Err(Error::invalid("rows", state.rows.to_string(), source.len()));
-        }
-        image.validate(&state.camera)?;
+        self.check_rendered("backward", source.len(), image)?;
         let mut clock = Instant::now();
         if image.depth.is_some() {
             self.backward_tiles::<true>(image);
@@ -189,6 +159,20 @@ impl Rasterizer {
         });
         self.passes.gather = lap(&mut clock);
         Ok(())
+    }
+
+    /// Check that the last forward pass rendered as many rows, in an image of this size.
+    fn check_rendered(
+        &self,
+        name: &'static str,
+        rows: usize,
+        image: &ImageGradients,
+    ) -> Result<()> {
+        let Some(state) = &self.state else {
+            return Err(Error::invalid(name, "a forward pass before it", "none"));
+        };
+        Error::unless_equal("rows", rows, state.rows, "rows")?;
+        image.validate(&state.camera)
     }
 
     /// Renders any source, image only.

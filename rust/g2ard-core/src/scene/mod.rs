@@ -84,18 +84,9 @@ impl SceneRef<'_> {
             ("logit_opacities", self.logit_opacities.len()),
             ("sh0", self.sh0.len()),
         ] {
-            if rows != n {
-                return Err(Error::invalid(name, format!("{n} rows"), rows));
-            }
+            Error::unless_equal(name, rows, n, "rows")?;
         }
-        if self.sh_rest.len() != n * self.rest {
-            return Err(Error::invalid(
-                "shN",
-                format!("{} triples", n * self.rest),
-                self.sh_rest.len(),
-            ));
-        }
-        Ok(())
+        Error::unless_equal("shN", self.sh_rest.len(), n * self.rest, "triples")
     }
 
     /// All attributes of two rows, bit by bit: equal only where the rows are interchangeable.

@@ -28,8 +28,6 @@ constants! {
         pub anchors: usize = 32,
         /// ε of C_jk / (P_jk + ε): keeps the ratio finite where a target is almost zero.
         pub epsilon: f64 = 1e-9,
-        /// Evaluate again only the view that leads by its bound (CELF), not all of them each time.
-        pub lazy: bool = true,
     }
 }
 
@@ -89,18 +87,12 @@ pub struct Chosen {
 impl Problem<'_> {
     /// The `k` views that greedy maximisation of F picks.
     ///
-    /// F is monotone and submodular, so a gain once computed bounds all later ones: a lazy search
-    /// evaluates only the view that leads by its bound.
+    /// F is monotone and submodular, so a gain once computed bounds all later ones: only the view that
+    /// leads by its bound is evaluated again (CELF).
     pub fn greedy(&self, k: usize, coverage: &Coverage, control: &Control) -> Result<Chosen> {
         coverage.validate()?;
         let n = self.visible.len();
-        if self.positions.len() != n {
-            return Err(Error::invalid(
-                "positions",
-                format!("{n} rows"),
-                self.positions.len(),
-            ));
-        }
+        Error::unless_equal("positions", self.positions.len(), n, "rows")?;
         let cells = self.surface.len() as u32;
         if self.visible.iter().flatten().any(|&c| c >= cells) {
             return Err(Error::invalid(
@@ -112,11 +104,7 @@ impl Problem<'_> {
         let state = State::new(*self, *coverage);
         let k = k.min(n);
         control.begin(k as u64);
-        if coverage.lazy {
-            state.lazy(k, control)
-        } else {
-            state.plain(k, control)
-        }
+        state.choose(k, control)
     }
 }
 
@@ -252,7 +240,7 @@ impl<'a> State<'a> {
         views.par_iter().map(|&v| self.gain(v as usize)).collect()
     }
 
-    fn lazy(mut self, k: usize, control: &Control) -> Result<Chosen> {
+    fn choose(mut self, k: usize, control: &Control) -> Result<Chosen> {
         let all: Vec<u32> = (0..self.problem.visible.len() as u32).collect();
         let gains = self.gains(&all);
         let mut heap: BinaryHeap<Bound> = all
@@ -282,32 +270,6 @@ impl<'a> State<'a> {
             self.add(view as usize);
             chosen.views.push(view);
             chosen.gains.push(top.gain);
-            control.advance(1);
-        }
-        chosen.evaluations = self.evaluations;
-        Ok(chosen)
-    }
-
-    fn plain(mut self, k: usize, control: &Control) -> Result<Chosen> {
-        let mut left: Vec<u32> = (0..self.problem.visible.len() as u32).collect();
-        let mut chosen = Chosen {
-            views: Vec::new(),
-            gains: Vec::new(),
-            evaluations: 0,
-        };
-        while chosen.views.len() < k {
-            control.check()?;
-            let gains = self.gains(&left);
-            let mut best = 0;
-            for i in 1..left.len() {
-                if gains[i].total_cmp(&gains[best]) == Ordering::Greater {
-                    best = i;
-                }
-            }
-            let view = left.remove(best);
-            self.add(view as usize);
-            chosen.views.push(view);
-            chosen.gains.push(gains[best]);
             control.advance(1);
         }
         chosen.evaluations = self.evaluations;

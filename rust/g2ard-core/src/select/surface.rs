@@ -26,9 +26,7 @@ impl Gaussians<'_> {
             ("scales", self.scales.len()),
             ("opacities", self.opacities.len()),
         ] {
-            if rows != n {
-                return Err(Error::invalid(name, format!("{n} rows"), rows));
-            }
+            Error::unless_equal(name, rows, n, "rows")?;
         }
         if n == 0 {
             return Err(Error::invalid("means", "at least one Gaussian", 0));

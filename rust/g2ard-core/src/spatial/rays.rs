@@ -29,13 +29,7 @@ impl Steps<'_> {
                 self.steps.len(),
             ));
         }
-        if eyes.len() != directions.len() {
-            return Err(Error::invalid(
-                "directions",
-                format!("{} rows", eyes.len()),
-                directions.len(),
-            ));
-        }
+        Error::unless_equal("directions", directions.len(), eyes.len(), "rows")?;
         let rays = eyes.par_iter().zip(directions);
         Ok(rays
             .map(|(eye, direction)| self.first(eye, direction))
@@ -71,74 +65,5 @@ impl Steps<'_> {
             flat * self.shape[k] + (place.max(0.0) as usize).min(self.shape[k] - 1)
         });
         self.steps[index]
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    /// One full cell in the middle of 5 × 5 × 5, at [2, 3)³.
-    fn middle() -> Vec<i8> {
-        let away = |i: usize| (i as i8 - 2).abs();
-        (0..125)
-            .map(|i| away(i / 25).max(away(i / 5 % 5)).max(away(i % 5)))
-            .collect()
-    }
-
-    #[test]
-    fn rays_stop_at_the_full_cell_or_leave() {
-        let steps = middle();
-        let box_ = Steps {
-            low: [0.0; 3],
-            cell: 1.0,
-            shape: [5; 3],
-            steps: &steps,
-        };
-        let eyes = [
-            [-3.0, 2.5, 2.5],
-            [2.5, 2.5, 9.0],
-            [-1.0, 0.5, 0.5],
-            [2.5, 2.5, 2.5],
-            [0.5, 0.5, 0.5],
-            [0.0, 7.0, 0.0],
-        ];
-        let oblique = 1.0 / 3f64.sqrt();
-        let rays = [
-            [1.0, 0.0, 0.0],
-            [0.0, 0.0, -1.0],
-            [1.0, 0.0, 0.0],
-            [0.0, 1.0, 0.0],
-            [oblique; 3],
-            [1.0, 0.0, 0.0],
-        ];
-        let found = box_.cast(&eyes, &rays).unwrap();
-        let near = |got: f64, want: f64| assert!((got - want).abs() <= 0.61, "{got} {want}");
-        near(found[0], 5.0);
-        near(found[1], 6.0);
-        assert_eq!(found[2], f64::INFINITY);
-        near(found[3], 0.0);
-        near(found[4], 1.5 * 3f64.sqrt());
-        assert_eq!(found[5], f64::INFINITY);
-    }
-
-    #[test]
-    fn wrong_lengths_are_refused() {
-        let box_ = Steps {
-            low: [0.0; 3],
-            cell: 1.0,
-            shape: [5; 3],
-            steps: &[0; 3],
-        };
-        assert!(box_.cast(&[], &[]).is_err());
-        let steps = middle();
-        assert!(
-            Steps {
-                steps: &steps,
-                ..box_
-            }
-            .cast(&[[0.0; 3]], &[])
-            .is_err()
-        );
     }
 }

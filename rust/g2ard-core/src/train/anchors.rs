@@ -49,9 +49,7 @@ impl Anchors {
             ("r_parallel", r_parallel.len(), n),
             ("r_perp", r_perp.len(), n),
         ] {
-            if got != expected {
-                return Err(Error::invalid(name, format!("{expected} values"), got));
-            }
+            Error::unless_equal(name, got, expected, "values")?;
         }
         let mut blocks = vec![Lanes16::default(); n.div_ceil(LANES) * ROWS];
         for (row, from) in order.iter().enumerate() {

@@ -12,10 +12,7 @@ pub struct Mask<'a> {
 
 impl<'a> Mask<'a> {
     pub fn new(counts: &'a [bool], pixels: usize) -> Result<Self> {
-        if counts.len() != pixels {
-            let expected = format!("{pixels} values");
-            return Err(Error::invalid("mask", expected, counts.len()));
-        }
+        Error::unless_equal("mask", counts.len(), pixels, "values")?;
         let count = counts.iter().filter(|counts| **counts).count();
         let share = pixels as f32 / count.max(1) as f32;
         Ok(Self { counts, share })

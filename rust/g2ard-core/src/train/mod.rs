@@ -130,10 +130,7 @@ impl Trainer {
 
     /// Rows that no step changes, as the caller numbers them.
     pub fn freeze(&mut self, frozen: &[bool]) -> Result<()> {
-        if frozen.len() != self.store.len() {
-            let expected = format!("{} rows", self.store.len());
-            return Err(Error::invalid("frozen", expected, frozen.len()));
-        }
+        Error::unless_equal("frozen", frozen.len(), self.store.len(), "rows")?;
         self.frozen = frozen.to_vec();
         self.mark_free();
         Ok(())
@@ -226,13 +223,7 @@ impl Trainer {
             width: camera.width,
             channels: 3,
         };
-        if input.target.len() != shape.values() {
-            return Err(Error::invalid(
-                "target",
-                format!("{} values", shape.values()),
-                input.target.len(),
-            ));
-        }
+        Error::unless_equal("target", input.target.len(), shape.values(), "values")?;
         if let Some(reach) = input.reach
             && !(reach > 0.0 && reach.is_finite())
         {

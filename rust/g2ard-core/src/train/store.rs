@@ -48,15 +48,7 @@ impl Store {
     pub fn new(params: &Params, units: Option<&[f32]>) -> Result<Self> {
         params.validate()?;
         let rows = params.len();
-        if let Some(units) = units
-            && units.len() != rows
-        {
-            return Err(Error::invalid(
-                "units",
-                format!("{rows} values"),
-                units.len(),
-            ));
-        }
+        Error::unless_equal("units", units.map_or(rows, <[f32]>::len), rows, "values")?;
         let attributes = SH + 3 * params.sh_coeffs;
         let blocks = rows.div_ceil(LANES);
         let zeros = vec![Lanes16::default(); blocks * attributes];
@@ -180,9 +172,7 @@ impl Store {
             ("steps", state.steps.len(), n),
             ("order", state.order.len(), n),
         ] {
-            if got != expected {
-                return Err(Error::invalid(name, format!("{expected} values"), got));
-            }
+            Error::unless_equal(name, got, expected, "values")?;
         }
         let mut seen = vec![false; n];
         for row in &state.order {

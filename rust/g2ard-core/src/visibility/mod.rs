@@ -249,12 +249,11 @@ mod tests {
         (means, quats, scales, logits)
     }
 
-    /// A scene of these arrays with other means and scales.
-    fn made<'a>(means: Means<'a>, scales: &'a [[f32; 3]], rows: &'a Arrays) -> SceneRef<'a> {
+    fn made(rows: &Arrays) -> SceneRef<'_> {
         SceneRef {
-            means,
+            means: Means::F32(&rows.0),
             quats: &rows.1,
-            scales,
+            scales: &rows.2,
             logit_opacities: &rows.3,
             sh0: &rows.0,
             sh_rest: &[],
@@ -299,7 +298,7 @@ mod tests {
             sh_n: &[],
             sh_coeffs: 1,
         };
-        let scene = made(Means::F32(means), scales, &rows);
+        let scene = made(&rows);
         let (mut views, mut whole) = (accumulator(&scene), Accumulated::new(means.len()));
         let (mut rasterizer, mut met) = (Rasterizer::default(), 0);
         let mut squared = vec![0.0; means.len()];
@@ -374,7 +373,7 @@ mod tests {
     #[test]
     fn bands_show_what_the_whole_image_does() {
         let rows = scene();
-        let scene = made(Means::F32(&rows.0), &rows.2, &rows);
+        let scene = made(&rows);
         let (mut whole, mut split) = (accumulator(&scene), accumulator(&scene));
         split.band = 10;
         for camera in cameras() {
@@ -382,56 +381,5 @@ mod tests {
             split.add(&camera, &Settings::default()).unwrap();
         }
         assert_eq!(whole.by_row(), split.by_row());
-    }
-
-    #[test]
-    fn a_unit_that_is_a_power_of_two_changes_no_bit() {
-        let rows = scene();
-        let by_row = |unit: f32| {
-            let times = |rows: &[[f32; 3]]| rows.iter().map(|r| r.map(|x| unit * x)).collect();
-            let (means, scales): (Vec<_>, Vec<_>) = (times(&rows.0), times(&rows.2));
-            let mut views = accumulator(&made(Means::F32(&means), &scales, &rows));
-            for mut camera in cameras() {
-                for r in &mut camera.viewmat {
-                    r[3] *= f64::from(unit);
-                }
-                camera.near *= unit;
-                views.add(&camera, &Settings::default()).unwrap();
-            }
-            let (weight, pixel_size) = views.by_row();
-            (
-                weight,
-                pixel_size.into_iter().map(|p| p / unit).collect::<Vec<_>>(),
-            )
-        };
-        let here = by_row(1.0);
-        for exponent in [-10, -1, 1, 3, 10] {
-            assert_eq!(by_row(2f32.powi(exponent)), here, "2^{exponent}");
-        }
-    }
-
-    #[test]
-    fn map_coordinates_are_as_good_as_any() {
-        let rows = scene();
-        let offset = [400_000.0, 4_000_000.0, 100.0];
-        let here: Vec<[f64; 3]> = rows.0.iter().map(|m| m.map(f64::from)).collect();
-        let moved: Vec<[f64; 3]> = here
-            .iter()
-            .map(|m| [0, 1, 2].map(|k| m[k] + offset[k]))
-            .collect();
-        let by_row = |means: &[[f64; 3]], shift: [f64; 3]| {
-            let mut views = accumulator(&made(Means::F64(means), &rows.2, &rows));
-            for mut camera in cameras() {
-                for r in &mut camera.viewmat {
-                    r[3] -= r[0] * shift[0] + r[1] * shift[1] + r[2] * shift[2];
-                }
-                views.add(&camera, &Settings::default()).unwrap();
-            }
-            views.by_row().0
-        };
-        let (a, b) = (by_row(&here, [0.0; 3]), by_row(&moved, offset));
-        let total: f32 = a.iter().sum();
-        let apart: f32 = a.iter().zip(&b).map(|(a, b)| (a - b).abs()).sum();
-        assert!(apart < 1e-3 * total, "{apart} of {total}");
     }
 }

@@ -15,21 +15,21 @@ use batch::{Source, Twin, run};
 const MEMBERS: &str = include_str!("members.wgsl");
 
 const ENERGY: Twin = Twin {
-    kernel: Kernel {
-        name: "groups.energy",
-        sources: &[TWO, include_str!("energy.wgsl"), MEMBERS],
-        entry: "energy",
-    },
+    kernel: Kernel::new(
+        "groups.energy",
+        &[TWO, include_str!("energy.wgsl"), MEMBERS],
+        "energy",
+    ),
     part: COLORED,
     answer: 2,
 };
 
 const MERGE: Twin = Twin {
-    kernel: Kernel {
-        name: "groups.merge",
-        sources: &[TWO, include_str!("merge.wgsl"), MEMBERS],
-        entry: "merge",
-    },
+    kernel: Kernel::new(
+        "groups.merge",
+        &[TWO, include_str!("merge.wgsl"), MEMBERS],
+        "merge",
+    ),
     part: WEIGHED,
     answer: 32,
 };
@@ -123,8 +123,7 @@ fn gaussian(answer: &[u32], first: [f64; 3]) -> Gaussian {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::runtime::Options;
-    use crate::testing::{gpu, gpu_with, scenes};
+    use crate::testing::{gpu, gpu_in_pieces, scenes};
     use g2ard_core::Splats;
     use g2ard_core::spatial::{Cells, RobustBounds};
 
@@ -212,14 +211,7 @@ mod tests {
 
     #[test]
     fn energies_and_merges_are_close_to_the_cpus_in_pieces() {
-        let max_binding = Some(1 << 14);
-        let Some(gpu) = gpu_with(
-            "groups in pieces",
-            Options {
-                max_binding,
-                ..Options::default()
-            },
-        ) else {
+        let Some(gpu) = gpu_in_pieces("groups in pieces", 1 << 14) else {
             return;
         };
         compare(&gpu, "groups in pieces");

@@ -9,11 +9,7 @@ use rayon::prelude::*;
 use crate::runtime::{Buffer, Gpu, Kernel, Result, Work};
 use crate::two::Frame;
 
-const GATHER: Kernel = Kernel {
-    name: "rows.gather",
-    sources: &[include_str!("gather.wgsl")],
-    entry: "gather",
-};
+const GATHER: Kernel = Kernel::new("rows.gather", &[include_str!("gather.wgsl")], "gather");
 
 /// Words per row: SH of band 0 (3), mean (6), optical mass (2), scales (3), quaternion (4).
 const ROW: usize = 18;
@@ -185,8 +181,7 @@ mod tests {
         numbers.replace(&[2, GONE]);
         assert_eq!(numbers.of(2), [5, 6]);
     }
-    use crate::runtime::Options;
-    use crate::testing::{gpu_with, scenes};
+    use crate::testing::{gpu_in_pieces, scenes};
 
     /// Some rows of a scene, in any order, under new numbers.
     fn some(splats: &Splats, rows: &[usize]) -> Splats {
@@ -207,12 +202,8 @@ mod tests {
     #[test]
     fn only_new_rows_are_sent_and_all_are_found() {
         let (_, scene) = scenes(900).swap_remove(0);
-        for max_binding in [None, Some(1 << 10)] {
-            let options = Options {
-                max_binding,
-                ..Options::default()
-            };
-            let Some(gpu) = gpu_with("rows", options) else {
+        for bytes in [u64::MAX, 1 << 10] {
+            let Some(gpu) = gpu_in_pieces("rows", bytes) else {
                 return;
             };
             let mut held = Rows::default();

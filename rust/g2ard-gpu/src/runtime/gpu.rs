@@ -30,6 +30,20 @@ pub struct Kernel {
     pub entry: &'static str,
 }
 
+impl Kernel {
+    pub const fn new(
+        name: &'static str,
+        sources: &'static [&'static str],
+        entry: &'static str,
+    ) -> Self {
+        Self {
+            name,
+            sources,
+            entry,
+        }
+    }
+}
+
 /// A buffer of words on the device.
 #[derive(Debug, Clone)]
 pub struct Buffer {

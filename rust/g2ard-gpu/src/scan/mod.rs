@@ -3,16 +3,8 @@
 use crate::runtime::{Buffer, Gpu, Kernel, Result, Work};
 
 const SOURCES: &[&str] = &[include_str!("scan.wgsl")];
-const SCAN: Kernel = Kernel {
-    name: "scan",
-    sources: SOURCES,
-    entry: "scan",
-};
-const ADD: Kernel = Kernel {
-    name: "scan.add",
-    sources: SOURCES,
-    entry: "add_totals",
-};
+const SCAN: Kernel = Kernel::new("scan", SOURCES, "scan");
+const ADD: Kernel = Kernel::new("scan.add", SOURCES, "add_totals");
 const BLOCK: usize = 1024;
 
 /// Replace the first `count` words by the sums of the words before them; the returned word is the total.

@@ -4,16 +4,8 @@ use crate::runtime::{Buffer, Gpu, Kernel, Result, Work};
 use crate::scan;
 
 const SOURCES: &[&str] = &[include_str!("sort.wgsl")];
-const COUNT: Kernel = Kernel {
-    name: "sort.count",
-    sources: SOURCES,
-    entry: "count_digits",
-};
-const SCATTER: Kernel = Kernel {
-    name: "sort.scatter",
-    sources: SOURCES,
-    entry: "scatter",
-};
+const COUNT: Kernel = Kernel::new("sort.count", SOURCES, "count_digits");
+const SCATTER: Kernel = Kernel::new("sort.scatter", SOURCES, "scatter");
 const BLOCK: usize = 1024;
 const DIGIT: usize = 4;
 

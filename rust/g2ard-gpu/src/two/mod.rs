@@ -123,11 +123,7 @@ mod tests {
         input: &[T],
         [rows, out]: [usize; 2],
     ) -> Vec<f64> {
-        let kernel = Kernel {
-            name,
-            sources: Vec::leak(vec![TWO, source]),
-            entry: "each",
-        };
+        let kernel = Kernel::new(name, Vec::leak(vec![TWO, source]), "each");
         let input = gpu.upload("input", input).unwrap();
         let found = gpu.buffer("found", 2 * out * rows).unwrap();
         let mut work = Work::new(gpu);

@@ -7,16 +7,8 @@ use super::view::{Constants, View};
 use crate::runtime::{Buffer, Gpu, Kernel, Result, Work};
 
 const CELLS: &[&str] = &[include_str!("pinhole.wgsl"), include_str!("cells.wgsl")];
-const WANT: Kernel = Kernel {
-    name: "visibility.want",
-    sources: CELLS,
-    entry: "want",
-};
-const SEEN: Kernel = Kernel {
-    name: "visibility.seen",
-    sources: CELLS,
-    entry: "seen",
-};
+const WANT: Kernel = Kernel::new("visibility.want", CELLS, "want");
+const SEEN: Kernel = Kernel::new("visibility.seen", CELLS, "seen");
 
 /// Centres of cells on the device.
 pub struct Cells {

@@ -11,26 +11,14 @@ const PROJECTION: &[&str] = &[PINHOLE, include_str!("mark.wgsl")];
 const TILES: &[&str] = &[PINHOLE, include_str!("tiles.wgsl")];
 const DRAW: &[&str] = &[PINHOLE, include_str!("draw.wgsl")];
 
-const fn kernel(
-    name: &'static str,
-    sources: &'static [&'static str],
-    entry: &'static str,
-) -> Kernel {
-    Kernel {
-        name,
-        sources,
-        entry,
-    }
-}
-
-const MARK: Kernel = kernel("visibility.mark", PROJECTION, "mark");
-const GATHER: Kernel = kernel("visibility.gather", PROJECTION, "gather");
-const COUNT: Kernel = kernel("visibility.count", TILES, "count");
-const EXPAND: Kernel = kernel("visibility.expand", TILES, "expand");
-const RANGES: Kernel = kernel("visibility.ranges", TILES, "ranges");
-const COLLECT: Kernel = kernel("visibility.collect", TILES, "collect");
-const DEPTHS: Kernel = kernel("visibility.depths", DRAW, "depths");
-const WEIGH: Kernel = kernel("visibility.weigh", DRAW, "weigh");
+const MARK: Kernel = Kernel::new("visibility.mark", PROJECTION, "mark");
+const GATHER: Kernel = Kernel::new("visibility.gather", PROJECTION, "gather");
+const COUNT: Kernel = Kernel::new("visibility.count", TILES, "count");
+const EXPAND: Kernel = Kernel::new("visibility.expand", TILES, "expand");
+const RANGES: Kernel = Kernel::new("visibility.ranges", TILES, "ranges");
+const COLLECT: Kernel = Kernel::new("visibility.collect", TILES, "collect");
+const DEPTHS: Kernel = Kernel::new("visibility.depths", DRAW, "depths");
+const WEIGH: Kernel = Kernel::new("visibility.weigh", DRAW, "weigh");
 
 /// Rows per workgroup of the projection, and threads per workgroup of all other kernels.
 const BLOCK: usize = 256;

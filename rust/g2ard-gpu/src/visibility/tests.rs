@@ -1,8 +1,7 @@
 use std::sync::Arc;
 
 use super::*;
-use crate::runtime::Options;
-use crate::testing::{gpu, gpu_with, scenes};
+use crate::testing::{gpu, gpu_in_pieces, scenes};
 use g2ard_core::scene::{Means, Ordered, SceneRef};
 use g2ard_core::select::ViewKernels;
 use g2ard_core::visibility::VisibilityKernels;
@@ -142,14 +141,7 @@ fn views_see_the_cells_they_see_on_the_cpu() {
 
 #[test]
 fn views_see_the_same_when_pairs_are_drawn_in_turns() {
-    let max_binding = Some(1 << 19);
-    let Some(gpu) = gpu_with(
-        "visibility in turns",
-        Options {
-            max_binding,
-            ..Options::default()
-        },
-    ) else {
+    let Some(gpu) = gpu_in_pieces("visibility in turns", 1 << 19) else {
         return;
     };
     compare(&gpu, "visibility in turns");

@@ -11,27 +11,11 @@ use crate::scan;
 use crate::sort::{Keyed, sort};
 use crate::two::Frame;
 
-const KEYS: Kernel = Kernel {
-    name: "voxels.keys",
-    sources: &[include_str!("voxels.wgsl")],
-    entry: "find_keys",
-};
+const KEYS: Kernel = Kernel::new("voxels.keys", &[include_str!("voxels.wgsl")], "find_keys");
 const NEIGHBOURS: &[&str] = &[include_str!("edges.wgsl")];
-const APART: Kernel = Kernel {
-    name: "voxels.octaves",
-    sources: NEIGHBOURS,
-    entry: "octaves",
-};
-const EDGES: Kernel = Kernel {
-    name: "voxels.edges",
-    sources: NEIGHBOURS,
-    entry: "edges",
-};
-const COMPACT: Kernel = Kernel {
-    name: "voxels.compact",
-    sources: NEIGHBOURS,
-    entry: "compact",
-};
+const APART: Kernel = Kernel::new("voxels.octaves", NEIGHBOURS, "octaves");
+const EDGES: Kernel = Kernel::new("voxels.edges", NEIGHBOURS, "edges");
+const COMPACT: Kernel = Kernel::new("voxels.compact", NEIGHBOURS, "compact");
 
 /// Rows per workgroup: 64 threads with one row each, or 256 with four.
 const THREADS: usize = 64;
@@ -226,8 +210,7 @@ impl<'a> Lattice<'a> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::runtime::Options;
-    use crate::testing::{gpu_with, scenes};
+    use crate::testing::{gpu, gpu_in_pieces, scenes};
     use std::collections::HashMap;
 
     /// Points nearer to a border than this share of a cell may fall into the next cell.
@@ -282,7 +265,7 @@ mod tests {
 
     #[test]
     fn cells_are_the_cpus_but_on_borders() {
-        let Some(gpu) = gpu_with("voxels", Options::default()) else {
+        let Some(gpu) = gpu("voxels") else {
             return;
         };
         compare(&gpu, "voxels");
@@ -290,14 +273,7 @@ mod tests {
 
     #[test]
     fn cells_are_the_cpus_but_on_borders_in_pieces() {
-        let max_binding = Some(1 << 17);
-        let Some(gpu) = gpu_with(
-            "voxels in pieces",
-            Options {
-                max_binding,
-                ..Options::default()
-            },
-        ) else {
+        let Some(gpu) = gpu_in_pieces("voxels in pieces", 1 << 17) else {
             return;
         };
         compare(&gpu, "voxels in pieces");

@@ -16,17 +16,7 @@ impl Rasterizer {
         image: &ImageGradients,
     ) -> Result<PoseGradient> {
         params.validate()?;
-        let Some(state) = &self.state else {
-            return Err(Error::invalid(
-                "pose gradient",
-                "a forward pass before it",
-                "none",
-            ));
-        };
-        if params.len() != state.rows {
-            return Err(Error::invalid("rows", state.rows.to_string(), params.len()));
-        }
-        image.validate(&state.camera)?;
+        self.check_rendered("pose gradient", params.len(), image)?;
         if image.depth.is_some() {
             return Err(Error::invalid(
                 "pose gradient",

@@ -63,10 +63,7 @@ pub struct Memory {
 }
 
 fn check(name: &'static str, got: usize, expected: usize) -> Result<()> {
-    if got == expected {
-        return Ok(());
-    }
-    Err(Error::invalid(name, format!("{expected} values"), got))
+    Error::unless_equal(name, got, expected, "values")
 }
 
 impl Image<'_> {

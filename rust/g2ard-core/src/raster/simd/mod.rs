@@ -222,6 +222,12 @@ pub enum Isa {
     Portable,
 }
 
+impl Default for Isa {
+    fn default() -> Self {
+        Self::detect()
+    }
+}
+
 impl Isa {
     /// The instruction sets that this machine can run, fastest first.
     pub fn available() -> Vec<Self> {
