@@ -56,10 +56,6 @@ def city(
         Count | None,
         typer.Option(parser=Count.parse, metavar="COUNT", help="Points of the cloud; 500k by default."),
     ] = None,
-    million: Annotated[
-        float | None,
-        typer.Option(min=0.001, max=1000, metavar="N", help="Million points, with a city of matching size."),
-    ] = None,
     views: Annotated[int, typer.Option(min=8, help="Photos in all four splits.")] = 120,
     size: Annotated[
         _Size | None,
@@ -67,7 +63,7 @@ def city(
     ] = None,
     blocks: Annotated[
         int | None,
-        typer.Option(min=1, max=40, help="City blocks per side; by default 3, or as --million needs."),
+        typer.Option(min=1, max=40, help="City blocks per side; 3 by default."),
     ] = None,
     offset: Annotated[
         Triple | None,
@@ -79,14 +75,9 @@ def city(
 
     if points is not None and points.is_share:
         raise typer.BadParameter("--points: expected a count, got a share")
-    if points is not None and million is not None:
-        raise typer.BadParameter("give --points or --million, not both")
     began = time.monotonic()
     default = CityConfig()
     count = default.points if points is None else points.of(0)
-    if million is not None:
-        count = round(million * 1e6)
-        blocks = blocks or min(40, max(1, round(million**0.5)))
     config = CityConfig(
         points=count,
         views=views,

@@ -1,4 +1,4 @@
-"""A city as a folder: cloud, photos, depth, the splits' views, and what made it."""
+"""A city as a folder: cloud, photos, the views of each split, and the options that made it."""
 
 from __future__ import annotations
 
@@ -22,26 +22,11 @@ from g2ard.scene.cameras import Cameras
 
 __all__ = ["write_city"]
 
-_README = """A procedural city by `benchmarks synth city` (g2ard {version}); equal options, equal bits.
-
-cloud.ply      {points} points: x y z (double, metres, z up) and red green blue; laser range noise {noise} m
-images/        photos, 8-bit RGB; where there is sky the colour is {sky} (give it as --background)
-{depth}{views}
-manifest.json  every option, the seed, and the counts
-"""
-_ROLES = {
-    "train": "candidate pool: drives along every second street, flights over the roofs",
-    "val": "held out evenly from the train trajectories",
-    "adapt": "trajectories of their own: drives along the other streets, crossing flights",
-    "ood": "trajectories of their own: low drone flights, a wide orbit",
-}
-
 
 def write_city(
     folder: str | Path,
     config: CityConfig | None = None,
     *,
-    depth: bool = False,
     overwrite: bool = False,
     threads: int = 0,
     progress: Progress = silent,
@@ -50,9 +35,8 @@ def write_city(
 
     Args:
         folder: where to; holds cloud.ply, images/, train.json, val.json, adapt.json, ood.json,
-            manifest.json, README.txt and, if asked for, depth/.
+            manifest.json.
         config: see `CityConfig`; None is the default city.
-        depth: also write depth/NAME.npy, (H, W) float32 metres along the optical axis, inf for sky.
         overwrite: whether a folder that is not empty may be written into.
         threads: photos taken side by side; 0 means every core. The result does not depend on it.
         progress: told of points and photos.
@@ -72,12 +56,11 @@ def write_city(
         for name, cameras in town.views.items():
             paths = tuple(place / "images" / f"{view}.png" for view in cameras.names)
             write_views(place / f"{name}.json", replace(cameras, image_paths=paths))
-        _photograph(town, place, depth, threads, progress)
-        manifest = _manifest(town, depth)
+        _photograph(town, place, threads, progress)
+        manifest = _manifest(town)
         (place / "manifest.json").write_text(
             json.dumps(manifest, indent=2) + "\n", encoding="utf-8", newline="\n"
         )
-        (place / "README.txt").write_text(_readme(config, manifest), encoding="utf-8", newline="\n")
     return manifest
 
 
@@ -95,19 +78,13 @@ def _scan(town: City, path: Path, progress: Progress) -> None:
     write_blocks(path, count, blocks())
 
 
-def _photograph(town: City, place: Path, depth: bool, threads: int, progress: Progress) -> None:
+def _photograph(town: City, place: Path, threads: int, progress: Progress) -> None:
     (place / "images").mkdir()
-    if depth:
-        (place / "depth").mkdir()
     jobs = [(cameras, i) for cameras in town.views.values() for i in range(len(cameras))]
 
     def shoot(cameras: Cameras, index: int) -> None:
         pixels = np.rint(town.photo(cameras, index) * 255).astype(np.uint8)
         Image.fromarray(pixels).save(place / "images" / f"{cameras.names[index]}.png")
-        if depth:
-            np.save(
-                place / "depth" / f"{cameras.names[index]}.npy", town.depth(cameras, index).astype(np.float32)
-            )
 
     _side_by_side(shoot, jobs, threads, lambda done: progress("photos", done, len(jobs)))
 
@@ -127,7 +104,7 @@ def _side_by_side(
         pool.shutdown(cancel_futures=True)
 
 
-def _manifest(town: City, depth: bool) -> dict[str, Any]:
+def _manifest(town: City) -> dict[str, Any]:
     return {
         "generator": f"python -m benchmarks synth city {__version__}",
         "options": asdict(town.config),
@@ -135,20 +112,4 @@ def _manifest(town: City, depth: bool) -> dict[str, Any]:
         "primitives": len(town.layout.shapes),
         "points": town.config.points,
         "views": {name: len(cameras) for name, cameras in town.views.items()},
-        "depth": "depth/NAME.npy: float32 metres along the optical axis, inf is sky" if depth else None,
     }
-
-
-def _readme(config: CityConfig, manifest: dict[str, Any]) -> str:
-    views = "\n".join(
-        f"{name + '.json':<15}{count} views; {_ROLES[name]}" for name, count in manifest["views"].items()
-    )
-    depth = f"depth/         {manifest['depth']}\n" if manifest["depth"] else ""
-    return _README.format(
-        version=__version__,
-        points=config.points,
-        noise=config.noise,
-        sky=",".join(f"{c:g}" for c in config.sky),
-        depth=depth,
-        views=views,
-    )

@@ -14,14 +14,13 @@ from benchmarks.runner import run as run_studies
 from benchmarks.score import Scored, ViewFigures, luma, score
 from benchmarks.study import Study, read_study
 from g2ard import io
-from g2ard.rendering.renderer import RasterSettings
 from g2ard.scene.splats import Splats
 from g2ard.scene.targets import TeacherRenders
 from g2ard.stages.evaluate import evaluate
-from g2ard.stages.recover.anchors import PAPER_PRESETS, PRESETS, Anchors, drift95
+from g2ard.stages.recover.anchors import PAPER_PRESETS
 from g2ard.stages.simplify import round_counts
 from helpers.scenes import around, checkered_ball
-from helpers.studies import STUDY, check_page, pictured, study
+from helpers.studies import STUDY, check_page, study
 from helpers.systems import needs_processes
 
 HEAD = 'title = "Balls"\nratios = [4]\nsteps = [12]\n'
@@ -142,29 +141,6 @@ def test_released_schedules_run_beside_the_matched_ones(tmp_path: Path) -> None:
     assert METHODS["g2ard-paper"].released_schedule == "paper"
 
 
-@needs_processes
-def test_the_last_round_recovers_twice_and_stays_anchored_where_it_was_built(tmp_path: Path) -> None:
-    text = HEAD.replace("[12]", "[60]") + 'methods = ["g2ard-paper", "shot"]\n'
-    text += '[method.shot]\nbase = "g2ard-paper"\nrounds = "one"\n'
-    _, (row, shot), out = run(tmp_path, text + SCENE)
-    counts = round_counts(1200, 300)
-    recoveries = {job["output"]: job for job in jobs(out, "recover") if job["steps"] != 60}
-    assert len(recoveries) == len(counts) + 1
-    share = 8_000 / (8_000 * len(counts) + 30_000)
-    (final,) = (job for job in recoveries.values() if job["final"])
-    early = [job for job in recoveries.values() if not job["final"]]
-    assert {job["steps"] for job in early} == {int(60 * share)}
-    assert final["steps"] == 60 - len(counts) * int(60 * share)
-    assert (row["steps"], shot["steps"]) == (60, 60)
-    assert row["psnr"] != shot["psnr"]
-    before = recoveries[final["scene"]]  # the last round's own recovery
-    assert final["anchors"] == before["scene"]
-    assert not any("anchors" in job for job in early)
-    anchors = Anchors.of(io.read_splats(final["anchors"]))
-    moved = drift95(anchors, io.read_splats(final["output"]).means)
-    assert row["drift95"] == pytest.approx(moved, rel=1e-4)
-
-
 def test_legs_are_those_of_the_releases() -> None:
     paper = METHODS["g2ard-paper"].legs(12)
     assert [leg.final for leg in paper] == [False] * 12 + [True]
@@ -176,26 +152,6 @@ def test_legs_are_those_of_the_releases() -> None:
     shared = replace(METHODS["g2ard-paper"], shared_start=True).legs(3)
     assert [(leg.round, leg.final) for leg in shared] == [(0, False), (1, False), (2, True)]
     assert shared[-1].share == 1
-
-
-@needs_processes
-def test_the_papers_method_has_the_papers_weights_of_each_prior(tmp_path: Path) -> None:
-    text = HEAD.replace("12", "6") + 'methods = ["a", "b", "c", "d"]\n'
-    for name, prior in {"a": "trained", "b": "lift"}.items():
-        text += f'[method.{name}]\nbase = "g2ard-paper"\nrounds = "one"\nprior = "{prior}"\n'
-    text += '[method.c]\nprior = "lift"\npreset = "lift"\n'
-    text += '[method.d]\nbase = "g2ard-paper"\nrounds = "one"\npreset = "noisy"\neffective_rank = false\n'
-    _, rows, out = run(tmp_path, text + CITY)
-    assert {(row["method"], row["prior"]) for row in rows} >= {("a", "trained"), ("b", "lift")}
-    found = [job["regularizers"] for job in jobs(out, "recover") if job["steps"] == 6]
-    as_dicts = [
-        vars(PAPER_PRESETS["trained"]),
-        vars(PAPER_PRESETS["lift"]),
-        vars(PRESETS["lift"]),
-        vars(PAPER_PRESETS["noisy"]) | {"effective_rank": False},
-    ]
-    assert len(found) == 4
-    assert all(weights in found for weights in as_dicts)
 
 
 def test_a_given_prior_has_the_weights_of_the_kind_that_its_scene_states(tmp_path: Path) -> None:
@@ -284,17 +240,6 @@ def test_scored_views_are_not_trained_on(tmp_path: Path) -> None:
 
 
 @needs_processes
-def test_adaptation_takes_all_views_in_the_papers_schedule(tmp_path: Path) -> None:
-    text = HEAD.replace("12", "4") + 'adapt_steps = 7\nadapt_schedule = "paper"\nadapt_on = "all"\n'
-    _, rows, out = run(tmp_path, text + 'methods = ["random"]\n' + CITY)
-    assert [row["split"] for row in rows] == ["val", "ood"]
-    (job,) = jobs(out, "adapt")
-    assert (job["schedule"], job["steps"]) == ("paper", 7)
-    (city,) = out.glob("work/*/city/adapt.json")
-    assert len(io.read_views(job["views"])) == len(io.read_views(city))
-
-
-@needs_processes
 def test_the_last_training_views_may_be_the_new_trajectory(tmp_path: Path) -> None:
     text = HEAD.replace("12", "4") + 'adapt_steps = 3\nmethods = ["random"]\n'
     _, (row,), out = run(tmp_path, text + SCENE + "adapt_last = 5\n")
@@ -306,27 +251,3 @@ def test_the_last_training_views_may_be_the_new_trajectory(tmp_path: Path) -> No
     none_left = study(tmp_path / "more", text + SCENE + "adapt_last = 14\n")
     (failed,) = run_studies([read_study(none_left)], tmp_path / "none")
     assert "adapt_last: 14 of 14 views leave none to train on" in failed["error"]
-
-
-@needs_processes
-def test_a_study_may_score_by_inrias_conventions_in_8_bit(tmp_path: Path) -> None:
-    text = HEAD.replace("12", "4") + 'methods = ["random"]\n' + SCENE
-    _, (plain,), out = run(tmp_path, text)
-    (tmp_path / "balls.toml").write_text('convention = "inria"\neight_bit = true\n' + text)
-    (row,) = run_studies([read_study(tmp_path / "balls.toml")], out, keep=True)
-    assert row["psnr"] != plain["psnr"]
-    (stored,), (prior,) = out.glob("work/*/targets-test-inria"), out.glob("work/*/prior.ply")
-    cameras = around(16, size=(48, 36)).take([0])
-    again = TeacherRenders(io.read_splats(prior), cameras, settings=RasterSettings(convention="inria"))
-    np.testing.assert_allclose(np.load(stored / "0.npy"), again[0], atol=1e-5)
-
-
-@needs_processes
-def test_either_target_is_the_photo_or_the_priors_render(tmp_path: Path) -> None:
-    io.write_views(tmp_path / "some.json", pictured(tmp_path), splits=["train", "train", "test", "test"])
-    text = HEAD.replace("12", "4") + 'methods = ["random"]\n' + SCENE.replace("views.json", "some.json")
-    _, (row,), out = run(tmp_path, text + 'targets = "either"\n')
-    assert (row["views"], row["against"]) == (2, "either")
-    kinds = {np.load(path).dtype for path in out.glob("work/*/targets-t*/?.npy")}
-    assert kinds == {np.dtype(np.uint8), np.dtype(np.float32)}
-    assert len(list(out.glob("work/*/targets-train/?.npy"))) == 2

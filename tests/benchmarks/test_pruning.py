@@ -8,7 +8,6 @@ from benchmarks.baselines import METHODS, reduce
 from benchmarks.baselines.lightgaussian import global_significance
 from benchmarks.baselines.mini_splatting import importance, sample
 from benchmarks.baselines.pup import _log_det, _quarter, fisher, pup, rounds
-from benchmarks.baselines.simple import optical_mass
 from g2ard.errors import InputError
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
@@ -127,12 +126,6 @@ def test_sampling_follows_the_weights() -> None:
     # Second draws follow the weights of those left: P(both of 0, 1) = 1/8·2/7 + 2/8·1/6.
     pairs = [tuple(sample(weights, 2, seed=seed)) for seed in range(4000)]
     assert pairs.count((0, 1)) / 4000 == pytest.approx(1 / 28 + 1 / 24, abs=0.015)
-
-
-def test_optical_mass_is_the_papers_formula() -> None:
-    s = scene()
-    two = np.sort(s.scales.astype(float), 1)[:, 1:].prod(1)
-    np.testing.assert_allclose(optical_mass(s), -np.log1p(-s.opacities.astype(float)) * two, rtol=1e-4)
 
 
 @pytest.mark.parametrize("method", METHODS)

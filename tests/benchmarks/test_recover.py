@@ -3,15 +3,13 @@
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 
-from benchmarks.rows import Row, read_rows
+from benchmarks.rows import Row
 from benchmarks.runner import run
 from benchmarks.study import DEFINITIONS, SceneSpec, read_study
 from g2ard import io
 from g2ard.errors import InputError
-from helpers.commands import CommandLine, succeeds
 from helpers.scenes import around, checkered_ball
 
 
@@ -84,12 +82,3 @@ def test_every_kind_of_view_is_scored(scene: SceneSpec, tmp_path: Path) -> None:
     assert (tmp_path / "rows.csv").read_text() == before  # nothing was run again
     with pytest.raises(InputError, match="need a trained scene"):
         ask(replace(scene, targets="photos"), tmp_path, "curves", protocol="standing")
-
-
-def test_command(scene: SceneSpec, tmp_path: Path, command_line: CommandLine) -> None:
-    asked = ("--methods", "×1,chosen", "--steps", "30", "--ratios", "5", "--set", "protocol=pool")
-    place = ("benchmarks", "run", "recover-multiplier", scene.prior, "--views", scene.train)
-    told = succeeds(command_line, tmp_path, *place, *asked).err
-    assert "×1" in told
-    assert "chosen" in told
-    assert np.isfinite([row["psnr"] for row in read_rows(tmp_path / "figures" / "rows.csv")]).all()

@@ -11,7 +11,6 @@ from benchmarks.rows import Row
 from benchmarks.runner import run
 from benchmarks.study import DEFINITIONS, SceneSpec, read_study
 from g2ard.io import write_splats
-from helpers.commands import CommandLine, succeeds
 from helpers.scenes import checkered_ball
 
 FEW = {"percents": "25", "seeds": "0", "draws": "2", "steps": "4"}
@@ -91,11 +90,3 @@ def test_gains_are_over_random_on_the_same_pool() -> None:
     assert found["random"][0] == f"{(21 + 30) / 2:.2f}"
     assert found["auto"] == ["1.00", f"{np.std([1.5, 0.5], ddof=1):.2f}", "0.50", "0.71"]
     assert found["pool"][0] == "3.00"
-
-
-def test_the_command_prints_gains(scene: SceneSpec, tmp_path: Path, command_line: CommandLine) -> None:
-    small = ["--set", "count=100", "--set", "candidates=12", "--size", 32, "--set", "pools=even"]
-    few = ["--methods", "random,auto", "--set", "percents=25", "--seeds", 0, "--set", "draws=2"]
-    ask = ("benchmarks", "run", "select", scene.prior, *small, *few, "--steps", 3)
-    error = succeeds(command_line, tmp_path, *ask).err
-    assert "dB over mean random" in error
