@@ -10,7 +10,7 @@ from g2ard.io import Points, write_points, write_splats, write_views
 from g2ard.io.describe import describe
 from g2ard.scene.cameras import Cameras, look_at
 from g2ard.scene.splats import Splats
-from helpers.commands import CommandLine, refused, succeeds
+from helpers.commands import CommandLine, succeeds
 from helpers.realdata import real
 
 
@@ -72,12 +72,6 @@ def test_command(tmp_path: Path, command_line: CommandLine) -> None:
     assert "SH degree" in out
     assert json.loads(succeeds(command_line, tmp_path, "info", "a.ply", "--json", "-").out)["count"] == 400
     assert succeeds(command_line, tmp_path, "info", "a.ply", "-q").out == ""
-
-
-def test_unwritable_json(tmp_path: Path, command_line: CommandLine) -> None:
-    scene(tmp_path / "a.ply")
-    assert "a.ply" in refused(command_line, tmp_path, "info", "a.ply", "--json", "a.ply/x.json", status=1)
-    assert [p.name for p in tmp_path.iterdir()] == ["a.ply"]
 
 
 def test_playbot_matches_its_readme() -> None:

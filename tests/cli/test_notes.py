@@ -3,17 +3,12 @@
 import re
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any, cast
 
 import numpy as np
 import pytest
 
 import g2ard
-from g2ard.cli.frame import Run
-from g2ard.cli.run_result import told, write_table
 from g2ard.io import write_views
-from g2ard.report.kinds import by_kind
 from helpers.commands import CommandLine, succeeds
 from helpers.photos import BALL, cloud_of, photos_of
 from helpers.scenes import around, checkered_ball
@@ -109,36 +104,3 @@ def test_photos_of_another_world_are_noted(command_line: CommandLine, folder: Pa
     for scene, warned in (("other.ply", True), ("own.ply", False)):
         error = succeeds(command_line, folder, "distill", scene, *ask, "-o", "run").err
         assert ("warning: the scene does not look like the photos (correlation" in error) == warned, error
-
-
-def test_the_table_has_a_row_per_kind_of_view() -> None:
-    names = ("near_0", "a", "near_1")
-    views = [{"name": name, "psnr": 30.0 + i, "ssim": 0.9} for i, name in enumerate(names)]
-    kinds = by_kind(views, [view | {"psnr": view["psnr"] + 1} for view in views], "given")
-    report: dict[str, Any] = {
-        "kinds": [kind.as_dict() for kind in kinds],
-        "bytes": {"input": 9e6, "output": 1e6},
-        "seconds": {"total": 2.0},
-        "input_count": 9000,
-        "output_count": 90,
-        "against": "photos",
-    }
-    tables: list[Any] = []
-    said: list[str] = []
-    console = SimpleNamespace(table=lambda *parts: tables.append(parts))
-    run = cast("Run", SimpleNamespace(console=console, say=said.append))
-    for lifted in (False, True):
-        write_table(run, report | {"lifted": lifted})
-    assert said[0] == "9,000 → 90 Gaussians, 9.00 → 1.00 MB as .ply; total 2.0 s"
-    assert said[1].startswith("9,000 points → 90 Gaussians")
-    _, _, rows = tables[0]
-    assert rows == [
-        ["given", "1", "31.00 → 32.00", "a 32.00", "0.9000 → 0.9000"],
-        ["near", "2", "31.00 → 32.00", "near_0 31.00", "0.9000 → 0.9000"],
-    ]
-
-
-@pytest.mark.parametrize(("unseen", "lines"), [(0.004, 0), (0.005, 0), (0.02, 1)])
-def test_a_share_of_unseen_gaussians_is_noted(unseen: float, lines: int) -> None:
-    found = told({"rounds": [], "kinds": [], "causes": [], "unseen": unseen})
-    assert (len(found), any("0%" in line for line in found)) == (lines, False)

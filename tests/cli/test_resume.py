@@ -12,7 +12,6 @@ import pytest
 
 from g2ard.cli.frame import Run
 from g2ard.cli.resume import stoppable
-from g2ard.cli.run_folder import work_folder
 from g2ard.errors import InputError
 from g2ard.io import write_splats, write_views
 from g2ard.jobs.job import DistillJob
@@ -108,25 +107,6 @@ def test_a_file_that_is_not_a_checkpoint_is_named(tmp_path: Path, content: bytes
     with pytest.raises(InputError) as caught:
         checkpoint.load(path, "key")
     assert str(caught.value).startswith(f"{path}: not a checkpoint of g2ard, or a damaged one; ")
-
-
-def test_distill_stopped_before_a_checkpoint(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    common = ("overwrite", "seed", "threads", "device", "verbose", "json", "quiet", "config")
-    run, output = Run("distill", dict.fromkeys(common), {}), tmp_path / "run"
-    with pytest.raises(KeyboardInterrupt), work_folder(run, output, resume=False):
-        raise KeyboardInterrupt
-    assert capsys.readouterr().err == ""
-    assert not output.exists()
-    saved = output / ".unfinished" / "simplified-1.npz"
-
-    def stopped_later() -> None:
-        saved.touch()
-        raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt), work_folder(run, output, resume=False):
-        stopped_later()
-    assert run.kept == [f"run the same command with --resume to continue in {output}"]
-    assert saved.exists()
 
 
 def test_the_total_of_a_resumed_run_holds_what_was_done_before(

@@ -12,7 +12,7 @@ import g2ard
 from g2ard.config.paths import changed, listed, parse_settings
 from g2ard.config.presets import preset
 from g2ard.errors import InputError
-from g2ard.io import read_splats, write_splats, write_views
+from g2ard.io import write_splats, write_views
 from g2ard.pipeline import DistillConfig
 from g2ard.stages.recover.anchors import PRESETS
 from g2ard.stages.recover.schedule import PAPER
@@ -165,37 +165,7 @@ def test_settings_in_a_config_file_and_over_it(folder: Path, command_line: Comma
         assert words in error
 
 
-def test_settings_reach_their_stage(folder: Path, command_line: CommandLine) -> None:
-    for growth in (1, 2):
-        ask = ("simplify", "a.ply", "-r", 10, "-o", f"{growth}.ply", "--set", f"max_growth={growth}")
-        succeeds(command_line, folder, *ask, "--no-views")
-    small, large = (read_splats(folder / f"{growth}.ply") for growth in (1, 2))
-    assert large.scales.mean() > small.scales.mean()
-
-
 PRIOR = checkered_ball()
-
-
-@pytest.mark.parametrize(
-    ("arguments", "told"),
-    [
-        (("simplify", "a.ply", "-r", 3, "-o", "o.ply", "--set", "simplify.cells=3"), "simplify.cells"),
-        (("distill", "a.ply", "-o", "o", "--set", "rates.mean=1"), "rates.means"),
-        (("select", "a.ply", "-k", 3, "-o", "o.json", "--set", "kappa=soft"), "kappa"),
-        (("recover", "a.ply", "-o", "o.ply", "--set", "nothing=1"), "nothing"),
-    ],
-)
-def test_a_printed_config_has_only_known_settings(
-    folder: Path, command_line: CommandLine, arguments: tuple[object, ...], told: str
-) -> None:
-    status, out, error = command_line(*arguments, "--print-config", cwd=folder)
-    assert (status, out) == (2, "")
-    assert told in error
-    right = (*arguments[:-1], "max_energy=0.02")
-    if arguments[0] in ("simplify", "distill"):
-        out = succeeds(command_line, folder, *right, "--print-config").out
-        assert "max_energy" in out
-        assert not (folder / "o").exists()
 
 
 def test_simplify_takes_settings_in_python() -> None:

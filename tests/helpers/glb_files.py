@@ -4,8 +4,6 @@ import json
 import struct
 from pathlib import Path
 
-# ── glTF's rules ─────────────────────────────────────────────────────────────────────────────────────
-
 
 def glb_parts(path: Path) -> tuple[dict, bytes]:
     data = path.read_bytes()
@@ -18,3 +16,11 @@ def glb_parts(path: Path) -> tuple[dict, bytes]:
     assert kind == b"BIN\0"
     assert len(data) == 28 + size + rest
     return json.loads(data[20 : 20 + size]), data[28 + size :]
+
+
+def write_glb(path: Path, document: dict, binary: bytes) -> Path:
+    text = json.dumps(document).encode()
+    text += b" " * (-len(text) % 4)
+    head = struct.pack("<4sIIII", b"glTF", 2, 28 + len(text) + len(binary), len(text), 0x4E4F534A)
+    path.write_bytes(head + text + struct.pack("<II", len(binary), 0x004E4942) + binary)
+    return path

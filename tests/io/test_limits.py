@@ -22,7 +22,7 @@ from g2ard.scene.splats import Splats, unit_quats
 from g2ard.stages.simplify import simplify
 from helpers.commands import CommandLine
 from helpers.faults import Fault, faulty
-from helpers.glb_files import glb_parts
+from helpers.glb_files import glb_parts, write_glb
 from helpers.packed_files import save_spz, truth
 from helpers.sog_files import parts
 from helpers.trainer_files import inria
@@ -131,10 +131,7 @@ def node_tree(path: Path, nodes: list[dict], changed: dict[str, Any] | None = No
     """A .glb with these nodes, and other parts of its document changed."""
     write_splats(path, truth(9, 0), overwrite=True)
     document, binary = glb_parts(path)
-    text = json.dumps({**document, "nodes": nodes, **(changed or {})}).encode()
-    text += b" " * (-len(text) % 4)
-    head = struct.pack("<4sIIII", b"glTF", 2, 28 + len(text) + len(binary), len(text), 0x4E4F534A)
-    return written(path, head + text + struct.pack("<II", len(binary), 0x004E4942) + binary)
+    return write_glb(path, {**document, "nodes": nodes, **(changed or {})}, binary)
 
 
 def png(width: int, height: int) -> bytes:

@@ -115,12 +115,6 @@ def test_spz_equals_compressed_ply_of_the_same_scene() -> None:
     assert np.abs((a.splats.quats * b.splats.quats).sum(1)).min() > 0.9999
 
 
-def test_guitar_counts() -> None:
-    found = read_scene(real("format_samples", "guitar.compressed.ply"))
-    assert len(found.splats) == 90_854
-    assert {n.code: n.count for n in found.notes} == {"clamped_logits": 667}
-
-
 # ── .splat ───────────────────────────────────────────────────────────────────────────────────────────
 
 

@@ -148,22 +148,6 @@ def test_every_stage_keeps_it(tmp_path: Path, truth: np.ndarray) -> None:
     assert all(level.antialiased for level in levels.splats)
 
 
-def test_engines_agree_on_it() -> None:
-    from g2ard.scene.targets import TeacherRenders
-    from g2ard.stages.recover import RecoverConfig, recover
-
-    ball = mip_ball()
-    small = g2ard.simplify(ball, ratio=8, blind=True).splats
-    targets = TeacherRenders(ball, FAR)
-    fused, torch = (
-        recover(small, targets, RecoverConfig(steps=20, engine=engine)).splats
-        for engine in ("fused", "torch")  # type: ignore[arg-type]
-    )
-    assert fused.antialiased
-    assert torch.antialiased
-    np.testing.assert_allclose(fused.sh0, torch.sh0, atol=2e-3)
-
-
 def test_tiles_carry_it(command_line: CommandLine, tmp_path: Path) -> None:
     path = saved(tmp_path, "ply", mip_ball())
     store = ingest(path, tmp_path / "tiles", tile_rows=1000)

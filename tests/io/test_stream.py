@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 
 from g2ard.errors import InputError
-from g2ard.io import open_point_stream, open_stream, read_cloud, read_scene, write_splats
+from g2ard.io import open_stream, read_scene, write_splats
 from g2ard.levels import Cut, save_levels
 from g2ard.scene.splats import Splats
 from helpers.ply_files import columns, save, scene
-from helpers.realdata import real
 from helpers.scenes import ARRAYS
 from helpers.sog_files import folder, parts
 
@@ -130,26 +129,3 @@ def test_another_time_is_another_source(tmp_path: Path) -> None:
     content = path.read_bytes()
     path.write_bytes(content[:-1] + bytes([content[-1] ^ 1]))
     assert open_stream(path).identity() != first
-
-
-def test_a_park_in_eight_chunks() -> None:
-    path = real("taebak_park")
-    whole, start = read_scene(path).splats, 0
-    for block in open_stream(path).blocks(300_000):
-        part = whole.take(slice(start, start + len(block)))
-        assert block.fingerprint() == part.fingerprint()
-        start += len(block)
-    assert start == len(whole) == 4_249_286
-
-
-def test_a_stadium_in_blocks() -> None:
-    path = real("autzen_lidar", "autzen_stadium.laz")
-    points, start = read_cloud(path).points, 0
-    stream = open_point_stream(path)
-    list(stream.blocks(1_000_000))
-    for positions, colors in stream.raw(70_000, 0):  # no multiple of a chunk's 50,000 points
-        rows = slice(start, start + len(positions))
-        np.testing.assert_array_equal(positions, points.positions[rows])
-        np.testing.assert_array_equal(colors / np.float32(stream.divisor), points.colors[rows])
-        start = rows.stop
-    assert start == len(points)

@@ -14,7 +14,7 @@ from g2ard.rendering.renderer import Renderer
 from g2ard.scene.cameras import Camera
 from g2ard.scene.splats import Splats
 from g2ard.scene.transform import transform
-from g2ard.stages.recover.anchors import rotation_matrices
+from reference.rotations import covariances
 
 
 def scene(degree: int = 3, offset: tuple[float, float, float] = (0, 0, 0)) -> Splats:
@@ -36,12 +36,6 @@ def attributes(path: Path) -> dict[str, np.ndarray]:
     return {name: np.array(ast.literal_eval(v), float) for kind, name, v in lines if "token" not in kind}
 
 
-def spreads(quats: np.ndarray, scales: np.ndarray) -> np.ndarray:
-    """Covariances of quaternions w x y z and standard deviations."""
-    frames = rotation_matrices(quats) * scales[:, None].astype(float)
-    return frames @ frames.swapaxes(1, 2)
-
-
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_usda_holds_the_scene_with_y_up(tmp_path: Path, degree: int) -> None:
     truth = scene(degree, (443_000.0, 5_411_000.5, 120.25))
@@ -54,8 +48,8 @@ def test_usda_holds_the_scene_with_y_up(tmp_path: Path, degree: int) -> None:
     np.testing.assert_array_equal(found["opacities"].astype(np.float32), truth.opacities)
     np.testing.assert_array_equal(found["xformOp:translate"], [443_000.0, -5_411_000.5, -120.25])
     np.testing.assert_allclose(np.linalg.norm(found["orientations"], axis=1), 1, atol=1e-6)
-    spread = spreads(found["orientations"], found["scales"])
-    np.testing.assert_allclose(spread, spreads(turned.quats, turned.scales), atol=1e-7)
+    spread = covariances(found["orientations"], found["scales"])
+    np.testing.assert_allclose(spread, covariances(turned.quats, turned.scales), atol=1e-7)
     harmonics = found["radiance:sphericalHarmonicsCoefficients"].reshape(40, -1, 3)
     assert found["radiance:sphericalHarmonicsDegree"] == degree
     np.testing.assert_allclose(harmonics[:, 1:], turned.shN, atol=1e-6)

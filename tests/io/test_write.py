@@ -2,7 +2,6 @@
 
 import json
 import math
-import struct
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,12 +17,12 @@ from g2ard.io.sog_write import nearest, palette_size, sog_files
 from g2ard.io.spz import fraction_bits
 from g2ard.scene.splats import Splats
 from g2ard.scene.transform import transform
-from g2ard.stages.recover.anchors import rotation_matrices
-from helpers.glb_files import glb_parts
+from helpers.glb_files import glb_parts, write_glb
 from helpers.peers import adobe_spz, gltf_report, splat_transform
 from helpers.realdata import real
 from helpers.scenes import assert_same_bits
 from helpers.threads import on_threads
+from reference.rotations import covariances
 
 FORMATS = ("sog", "spz", "glb", "compressed.ply", "splat", "ply", "folder/meta.json")
 
@@ -347,17 +346,6 @@ def test_broken_glb_is_one_line(tmp_path: Path) -> None:
 # ── other people's readers ───────────────────────────────────────────────────────────────────────────
 
 
-def covariances(splats: Splats) -> np.ndarray:
-    w, x, y, z = unit_quats(splats.quats).T
-    columns = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)],
-        [2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)],
-        [2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    axes = np.stack([np.stack(c, 1) for c in columns], 1) * splats.scales[..., None].astype(float)
-    return np.einsum("nka,nkb->nab", axes, axes)
-
-
 def about_x(splats: Splats) -> Splats:
     """Turn by 180° about x: splat-transform 3.7 reads .spz in the axes that it is stored in."""
     return transform(splats, np.diag([1.0, -1, -1, 1]))
@@ -369,7 +357,7 @@ def agree(ours: Splats, theirs: Splats, *, shape: float = 2e-3) -> None:
     np.testing.assert_allclose(theirs.opacities, ours.opacities, atol=1e-6)
     np.testing.assert_allclose(theirs.sh0, ours.sh0, atol=2e-5)
     np.testing.assert_allclose(theirs.shN, ours.shN, atol=2e-5)
-    a, b = covariances(theirs), covariances(ours)
+    a, b = (covariances(s.quats, s.scales) for s in (theirs, ours))
     assert (np.abs(a - b).max((1, 2)) <= shape * ours.scales.max(1).astype(float) ** 2).all()
 
 
@@ -453,13 +441,8 @@ def test_glb_with_spz_holds_gltf_coordinates(tmp_path: Path, degree: int) -> Non
     np.testing.assert_array_equal(found.offset, truth.offset)
     np.testing.assert_allclose(found.means, truth.means, atol=2.0**-13)
     np.testing.assert_allclose(found.shN, truth.shN, atol=0.07)
-    np.testing.assert_allclose(spreads(found), spreads(truth), rtol=0.1, atol=0.02 * truth.scales.max() ** 2)
-
-
-def spreads(splats: Splats) -> np.ndarray:
-    """Covariances."""
-    frames = rotation_matrices(splats.quats) * splats.scales[:, None].astype(float)
-    return frames @ frames.swapaxes(1, 2)
+    got, want = (covariances(s.quats, s.scales) for s in (found, truth))
+    np.testing.assert_allclose(got, want, rtol=0.1, atol=0.02 * truth.scales.max() ** 2)
 
 
 @pytest.mark.parametrize("compress", [None, "spz"])
@@ -470,23 +453,17 @@ def test_nodes_of_a_glb_turn_scale_and_move(tmp_path: Path, compress: str | None
     third = [0.5, 0.5, 0.5, 0.5]  # x → y → z → x
     above = {"children": [0], "rotation": third, "scale": [2, 2, 2], "translation": [1, 2, 3]}
     document, binary = glb_parts(path)
-    node_file(path, {**document, "nodes": [document["nodes"][0], above]}, binary)
+    write_glb(path, {**document, "nodes": [document["nodes"][0], above]}, binary)
     cycle, turn = np.eye(4), np.diag([-1.0, -1, 1, 1])
     cycle[:3] = [[0, 0, 2, 1], [2, 0, 0, 2], [0, 2, 0, 3]]
     wanted, found = transform(plain, turn @ cycle @ turn), read_splats(path)
     np.testing.assert_allclose(found.means + found.offset, wanted.means + wanted.offset, atol=1e-5)
-    np.testing.assert_allclose(spreads(found), spreads(wanted), rtol=1e-4, atol=1e-6)
+    got, want = (covariances(s.quats, s.scales) for s in (found, wanted))
+    np.testing.assert_allclose(got, want, rtol=1e-4, atol=1e-6)
     np.testing.assert_allclose(found.shN, wanted.shN, atol=1e-5)
-    node_file(path, {**document, "nodes": [document["nodes"][0], above | {"scale": [1, 2, 1]}]}, binary)
+    write_glb(path, {**document, "nodes": [document["nodes"][0], above | {"scale": [1, 2, 1]}]}, binary)
     with pytest.raises(InputError, match="a node shears, or scales differently"):
         read_splats(path)
-
-
-def node_file(path: Path, document: dict, binary: bytes) -> None:
-    text = json.dumps(document).encode()
-    text += b" " * (-len(text) % 4)
-    head = struct.pack("<4sIIII", b"glTF", 2, 28 + len(text) + len(binary), len(text), 0x4E4F534A)
-    path.write_bytes(head + text + struct.pack("<II", len(binary), 0x004E4942) + binary)
 
 
 STORED = {"ROTATION": "quats", "SCALE": "scales", "OPACITY": "opacities"}
@@ -514,7 +491,7 @@ def test_attributes_of_a_glb_may_be_normalised_integers(tmp_path: Path, name: st
     view |= {"byteOffset": len(binary), "byteLength": rows.size, "byteStride": 12}
     kind = {"i1": 5120, "u1": 5121, "i2": 5122, "u2": 5123}[dtype[-2:]]
     accessor |= {"componentType": kind, "normalized": True}
-    node_file(path, document, binary + rows.tobytes())
+    write_glb(path, document, binary + rows.tobytes())
     found = read_splats(path)
     for attribute, field in STORED.items():
         step = 0.51 / np.iinfo(dtype).max if attribute == name else 1e-7

@@ -10,7 +10,7 @@ from g2ard import io
 from g2ard.errors import InputError
 from g2ard.io import sog
 from g2ard.jobs.levels import lod
-from g2ard.levels import Cut, Leaf, Node, cut, leaf_errors, save_levels
+from g2ard.levels import Cut, cut, leaf_errors, save_levels
 from g2ard.scene.splats import Splats
 from g2ard.scene.transform import join
 from g2ard.stages.recover.anchors import rotation_matrices
@@ -38,14 +38,6 @@ def test_every_row_of_every_level_lies_in_one_leaf_and_its_box(rule: Cut) -> Non
                 assert (level.means[row] + corners <= leaf.high + 1e-6).all()
 
 
-def test_a_node_is_split_by_count_and_by_extent_alone() -> None:
-    wide = [scattered(500)]
-    assert isinstance(cut(wide, Cut(most=500, extent=100)), Leaf)
-    assert isinstance(cut(wide, Cut(most=499, extent=100)), Node)
-    assert isinstance(cut(wide, Cut(most=500, extent=1, least=500)), Leaf)
-    assert isinstance(cut(wide, Cut(most=500, extent=1, least=499)), Node)
-
-
 def test_levels_that_do_not_fit_together_are_refused() -> None:
     with pytest.raises(InputError, match="different offsets"):
         cut([scattered(9), scattered(9, offset=5)])
@@ -66,14 +58,6 @@ def test_errors_range_from_zero_to_one_and_never_fall() -> None:
     assert 0.001 < errors[2] < 0.9
     assert errors[3] == errors[2]  # no coarser level may promise less
     assert errors[4] == pytest.approx(1, abs=1e-3)
-
-
-def test_a_level_that_is_absent_from_a_leaf_has_no_error() -> None:
-    fine = scattered(50)
-    leaf = Leaf(
-        fine.means.min(0).astype(float), fine.means.max(0).astype(float), (np.arange(0), np.arange(50))
-    )
-    assert leaf_errors(leaf, [fine, fine]) == [0.0, 0.0]
 
 
 @pytest.mark.parametrize("offset", [0.0, 500_000.0])
@@ -122,13 +106,6 @@ def test_files_of_an_earlier_call_go_and_others_stay(tmp_path: Path) -> None:
     assert {folder.name for folder in (tmp_path / "out").iterdir()} == {
         *("lod-meta.json", "notes.txt", "0_0", "0_1", "0_9")
     }
-
-
-def test_equal_levels_give_equal_bytes(tmp_path: Path) -> None:
-    levels = [scattered(300), scattered(90, 1)]
-    for name in ("a", "b"):
-        save_levels(tmp_path / name, levels, cut=Cut(most=100))
-    assert files_of(tmp_path / "a") == files_of(tmp_path / "b")
 
 
 def test_an_interrupted_lod_resumes_to_the_same_bits(tmp_path: Path) -> None:

@@ -16,7 +16,6 @@ from g2ard.pipeline import DistillConfig, SelectConfig, distill
 from g2ard.progress import silent
 from g2ard.scene.splits import kind_of
 from g2ard.scene.targets import Targets, TeacherRenders
-from g2ard.stages.evaluate import evaluate
 from g2ard.stages.recover import RecoverConfig
 from g2ard.stages.recover.schedule import PAPER, TUNED
 from g2ard.stages.simplify import SimplifyConfig
@@ -43,19 +42,6 @@ def test_views_of_another_kind_are_handed_on(targets: TeacherRenders, tmp_path: 
     assert done.report.rounds[0].recover[0].validation.looks
     with pytest.raises(InputError, match="other options"):
         distill(PRIOR, 300, targets, config, work=tmp_path)
-
-
-def test_one_shot_reaches_the_budget_and_recovers(targets: TeacherRenders) -> None:
-    result = distill(PRIOR, 300, targets, DistillConfig(recover=RecoverConfig(steps=120)))
-    assert len(result.splats) == len(result.simplified) == 300
-    assert [entry.count for entry in result.report.rounds] == [300]
-    assert evaluate(result.splats, targets).psnr > evaluate(result.simplified, targets).psnr + 3
-
-
-def test_rounds_follow_the_paper_s_counts(targets: TeacherRenders) -> None:
-    result = distill(PRIOR, 1000, targets, PAPER_ROUNDS)
-    assert [entry.count for entry in result.report.rounds] == [2250, 1688, 1266, 1000]
-    assert [len(entry.recover) for entry in result.report.rounds] == [1, 1, 1, 2]
 
 
 def test_an_interrupted_run_resumes_to_the_same_bits(targets: TeacherRenders, tmp_path: Path) -> None:
@@ -201,27 +187,6 @@ def test_bad_input_is_one_line_and_leaves_nothing(
     assert len(lines) == 1, error
     assert words in lines[0]
     assert sorted(tmp_path.iterdir()) == before
-
-
-def test_every_stage_writes_the_same_bytes_for_any_threads(command_line: CommandLine, tmp_path: Path) -> None:
-    cloud_with_photos(tmp_path, PRIOR)
-    write_splats(tmp_path / "ball.ply", PRIOR)
-    commands = [
-        ("lift", "cloud.ply", "-o", "lift.ply"),
-        ("simplify", "ball.ply", "-r", 8, "-o", "small.ply"),
-        ("recover", "small.ply", "--views", "views.json", "--steps", 30, "-o", "better.ply"),
-        ("distill", "ball.ply", "-r", 10, "-o", "run", "--steps", 30, "--size", 80),
-        ("render", "better.ply", "--views", "views.json", "-o", "renders"),
-    ]
-    written = []
-    for threads in (1, 2):
-        for command in commands:
-            succeeds(command_line, tmp_path, *command, "-w", "--threads", threads)
-        files = [tmp_path / name for name in ("lift.ply", "small.ply", "better.ply", "run/scene.ply")]
-        files += sorted((tmp_path / "renders").iterdir())
-        written.append([file.read_bytes() for file in files])
-    assert len(written[0]) == 4 + 12
-    assert written[0] == written[1]
 
 
 def test_a_scanned_cloud_and_photos_are_distilled(command_line: CommandLine, tmp_path: Path) -> None:

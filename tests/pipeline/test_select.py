@@ -70,15 +70,6 @@ def test_only_chosen_views_are_looked_at_and_the_rest_is_accounted_for() -> None
     assert report.seconds.select > 0
 
 
-def test_auto_chooses_the_count_from_the_curve() -> None:
-    targets = TeacherRenders(PRIOR, crowded())
-    report = distill(
-        PRIOR, 200, targets, changed(SHORT, {"select.views_count": "auto", "select.policy": "coverage"})
-    ).report
-    assert 1 < len(report.views.chosen) < 20
-    assert report.views.policy == "coverage"
-
-
 def test_given_weights_stand() -> None:
     cameras = around(12)
     targets, weights = Watched(cameras), np.r_[np.zeros(11), 1.0]

@@ -9,17 +9,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from benchmarks.kinds.matched import MatchedWorkspace
-from benchmarks.kinds.select import Universe, pool_of
 from benchmarks.study import DEFINITIONS, SceneSpec, read_study
 from benchmarks.workspace import Workspace
 from g2ard.errors import InputError
-from g2ard.io import read_points, read_view_set, write_splats, write_views
+from g2ard.io import read_view_set, write_splats, write_views
 from g2ard.scene.splits import for_scores, for_training, not_held_out, split_mask, splits_of
-from g2ard.stages.lift import lift
 from helpers.commands import CommandLine, refused, succeeds
 from helpers.photos import cloud_of, photos_of
-from helpers.realdata import real
 from helpers.scenes import around, checkered_ball
 
 Program = Callable[..., None]
@@ -242,21 +238,6 @@ def test_a_name_in_both_splits_is_refused(tmp_path: Path) -> None:
     assert splits_of(tmp_path, ["a", "b", "c", "d"]) == ("train", "test", "ood", None)
 
 
-STUDY = """
-title = "Balls"
-ratios = [4]
-steps = [9]
-methods = ["g2ard"]
-adapt_steps = 5
-
-[[scene]]
-name = "ball"
-prior = "ball.ply"
-train = "photos"
-adapt = "photos"
-"""
-
-
 def test_simplifiers_are_given_training_views_alone(folder: Path) -> None:
     names = [f"{i:03d}.png" for i in range(16)]
     (folder / "photos" / "split.json").write_text(
@@ -271,44 +252,3 @@ def test_simplifiers_are_given_training_views_alone(folder: Path) -> None:
     found = read_view_set(place.folder / "pool.json") if place.train else None
     assert found.splits == splits_of(None, found.cameras.names)
     assert set(place.train_cameras.names).isdisjoint(place.scored["test"].names)
-
-
-def test_studies_read_the_stated_splits(folder: Path) -> None:
-    for score in ("", 'score = { unseen = "photos" }\n'):
-        (folder / "study.toml").write_text(STUDY + score)
-        study = read_study(folder / "study.toml")
-        made = MatchedWorkspace(folder / f"work{len(score)}", study, study.scenes[0])
-        for path in (made.train, made.adapted):
-            found = read_view_set(path)
-            assert (set(found.cameras.names), set(found.splits)) == (TRAIN, {"train"})
-        for targets in made.test.values():
-            assert set(targets.cameras.names) == TEST
-
-
-def test_caliterra_s_photos_stay_apart(folder: Path, g2ard: Program, watch: Watch) -> None:
-    data = real("caliterra")
-    split = {word: set(names) for word, names in json.loads((data / "split.json").read_text()).items()}
-    points = read_points(data)
-    write_splats(folder / "prior.ply", lift(points.positions[::8], points.colors[::8]))
-    g2ard("select", "prior.ply", "--views", data, "-k", 10, "-o", "chosen.json")
-    train = set(read_view_set(folder / "chosen.json", split="train").cameras.names)
-    assert len(train) == 10
-    assert train <= split["train"]
-    small = ("--size", 64, "--steps", 4)
-    g2ard("recover", "prior.ply", "--views", "chosen.json", *small, "-o", "recovered.ply")
-    g2ard("distill", "prior.ply", "-n", 500, "--views", "chosen.json", *small, "-o", "run")
-    assert watch.trained == [train] * 2
-    assert watch.looked == [train]
-    assert watch.scored == [split["test"]] * 4
-
-
-def test_the_study_of_policies_never_offers_test_photos(tmp_path: Path) -> None:
-    data = real("caliterra")
-    test = set(json.loads((data / "split.json").read_text())["test"])
-    study = read_study(DEFINITIONS / "select.toml").narrowed({"count": 500, "size": 64})
-    made = Universe(tmp_path, study, SceneSpec("caliterra", str(data), targets="photos"))
-    names = np.array(made.shown.cameras.names)
-    assert set(names[made.held]) <= test
-    for kind in ("biased", "even"):
-        pool = pool_of(made, kind, 0)
-        assert not set(names[np.concatenate([pool.rows, pool.crowd])]) & test

@@ -247,12 +247,6 @@ def test_invisible_scenes_are_refused() -> None:
         make_pool(Splats.create([[np.nan, 0, 0]], scales=[[1, 1, 1]]))
 
 
-def test_progress_is_reported(scenes) -> None:
-    seen = []
-    make_pool(scenes["statue"], 8, progress=lambda *a: seen.append(a))
-    assert seen[-1][1:3] == (8, 8)
-
-
 def test_command(scenes, command_line: CommandLine, tmp_path: Path) -> None:
     write_splats(tmp_path / "scene.ply", scenes["statue"])
     arguments = ("poses", "scene.ply", "--count", 12, "--size", "320x200", "--fov", 60, "-o", "p.json")
@@ -301,7 +295,6 @@ def test_threads_do_not_matter(scenes, tmp_path: Path) -> None:
         ("playbot/0_0", "orbit", (0, -1, 0)),
         ("taebak_park/0_4", "walk + aerial", (0, -1, 0)),
         ("format_samples/guitar.compressed.ply", "orbit", (0, -1, 0)),
-        ("format_samples/biker.compressed.ply", "orbit", (0, -1, 0)),
     ],
 )
 def test_real_scenes(name, kind, up) -> None:

@@ -2,6 +2,8 @@
 
 import numpy as np
 
+from reference.rotations import rotations
+
 
 def median_depths(splats, viewmat, K, size, pixels):
     """(n,) depth at which less than half the light is left through pixel centres (n, 2); 0 where it never is.
@@ -33,17 +35,6 @@ def median_depths(splats, viewmat, K, size, pixels):
         past = np.searchsorted(-light, np.log(2), side="right")
         out[i] = z[past] if past < len(z) else 0.0
     return out
-
-
-def rotations(quats):
-    """(n, 3, 3) of (n, 4) wxyz quaternions."""
-    w, x, y, z = (quats / np.linalg.norm(quats, axis=1, keepdims=True)).T
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.stack([np.stack(row, -1) for row in rows], -2)
 
 
 def agreement(splats, surface, cameras, seen, cells):

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from reference.simplify import rotation
+from reference.rotations import rotations
 
 
 def median_depth(splats, viewmat, K, pixels):
@@ -24,7 +24,7 @@ def median_depth(splats, viewmat, K, pixels):
             np.array([[K[0, 0] / z, 0, -K[0, 0] * u / z], [0, K[1, 1] / z, -K[1, 1] * v / z]])
             @ viewmat[:3, :3]
         )
-        R = rotation(splats.quats[i].astype(np.float64))
+        R = rotations(splats.quats[i].astype(np.float64))
         cov = J @ R @ np.diag(splats.scales[i].astype(np.float64) ** 2) @ R.T @ J.T + 0.3 * np.eye(2)
         d = pixels - [K[0, 0] * x / z + K[0, 2], K[1, 1] * y / z + K[1, 2]]
         power = 0.5 * np.einsum("ni,ij,nj->n", d, np.linalg.inv(cov), d)

@@ -2,22 +2,13 @@
 
 import numpy as np
 
+from reference.rotations import rotations
+
 C0 = 0.28209479177387814
 
 
-def rotation(q):
-    w, x, y, z = np.asarray(q, np.float64) / np.linalg.norm(np.asarray(q, np.float64))
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
-
-
 def covariance(splats, i):
-    R, s = rotation(splats.quats[i]), splats.scales[i].astype(np.float64)
+    R, s = rotations(splats.quats[i]), splats.scales[i].astype(np.float64)
     return R @ np.diag(s * s) @ R.T
 
 

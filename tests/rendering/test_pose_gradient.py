@@ -11,8 +11,7 @@ from g2ard.errors import InputError
 from g2ard.rendering.renderer import Renderer, arrays_of, view_of
 from g2ard.stages.register.pose import moved
 from helpers.raster_cases import VARIANTS, camera, oracle, scene, splats_of
-from helpers.scenes import around, checkered_ball
-from helpers.threads import on_threads
+from helpers.scenes import checkered_ball
 
 BACKGROUND = [0.2, 0.5, 0.9]
 
@@ -64,17 +63,6 @@ def test_gradient_is_how_renders_change(seed: int) -> None:
 
     measured = [(loss(step * unit) - loss(-step * unit)) / (2 * step) for unit in np.eye(6)]
     np.testing.assert_allclose(got, measured, atol=0.03 * np.abs(measured).max())
-
-
-def test_its_bits_do_not_depend_on_threads() -> None:
-    renderer, at = Renderer(checkered_ball(2500)), around(5, (160, 120), 2.2)[1]
-    weight = np.random.default_rng(0).normal(size=(120, 160, 3)).astype(np.float32)
-
-    def gradient() -> bytes:
-        renderer.image(at)
-        return renderer.pose_gradient(weight).tobytes()
-
-    assert len(set(on_threads(gradient))) == 1
 
 
 def test_a_pose_gradient_needs_a_forward_pass() -> None:

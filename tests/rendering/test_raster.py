@@ -14,7 +14,6 @@ from g2ard.rendering.visibility import visibility, visibility_source
 from g2ard.scene.cameras import Cameras, look_at
 from g2ard.stages.recover.rasterize import rasterize
 from helpers.raster_cases import NAMES, VARIANTS, Params, camera, oracle, scene, splats_of, tensors_of
-from helpers.threads import on_threads
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
@@ -179,25 +178,6 @@ def test_finite_differences_agree_with_the_oracle() -> None:
             if abs(slope - got) < 1e-5 * max(1, abs(got)):
                 checked += 1
     assert checked >= 34  # a pair of pixels may cross 1/255 between ±h
-
-
-def everything(p: Params, cameras: Cameras) -> list[bytes]:
-    arrays = tuple(p[k] for k in NAMES)
-    view = (cameras.viewmats[0].tolist(), [200.0, 200, 100, 75], (200, 150), 0.01)
-    r = _core.Rasterizer()
-    settings = RasterSettings(antialiased=False)
-    image, alpha, depth, median = r.forward(arrays, view, settings, [0.1, 0.2, 0.3], 2)
-    g = np.random.default_rng(0).normal(size=(150, 200, 3)).astype(np.float32)
-    sums = _core.accumulate(arrays, [view], settings)
-    found = [image, alpha, depth, median, *r.backward(arrays, g, alpha, depth), *sums.values()]
-    return [a.tobytes() for a in found]
-
-
-def test_bits_do_not_depend_on_threads_or_runs() -> None:
-    p = scene(0, 20_000, 3, size=0.05)
-    cameras = camera(200, 150)
-    first, *others = on_threads(lambda: everything(p, cameras), (1, 2, 8, 8))
-    assert others == [first] * 3
 
 
 @pytest.mark.parametrize("isa", _core.instruction_sets())

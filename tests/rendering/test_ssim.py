@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 from g2ard import _core
 from g2ard.errors import InputError
 from g2ard.stages.recover.losses import l1_ssim
-from helpers.threads import on_threads
 from reference import ssim as reference
 
 Image = NDArray[np.float32]
@@ -53,16 +52,6 @@ def test_metrics_are_the_twin_s(shape: tuple[int, int, int]) -> None:
     assert abs(_core.psnr(a, b) - -10 * np.log10(np.mean((a64 - b64) ** 2))) < 1e-9
     assert abs(_core.ssim(a, a) - 1) < 1e-12
     assert _core.psnr(a, a) == np.inf
-
-
-def test_bits_do_not_depend_on_threads() -> None:
-    a, b = images((200, 150, 3), "noise")
-
-    def results() -> tuple[object, ...]:
-        loss, gradient = _core.l1_ssim(a, b, 0.2)
-        return loss, gradient.tobytes(), _core.ssim(a, b), _core.psnr(a, b)
-
-    assert len(set(on_threads(results))) == 1
 
 
 def test_shapes_must_fit() -> None:

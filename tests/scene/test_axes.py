@@ -15,7 +15,8 @@ from g2ard.scene.axes import change_of_axes, with_axes
 from g2ard.scene.splats import Splats
 from helpers.commands import CommandLine, refused, succeeds
 from helpers.peers import adobe_spz
-from reference.raster import rotations, sh_basis
+from reference.raster import sh_basis
+from reference.rotations import covariances
 
 WORLD = {"R": [1, 0, 0], "L": [-1, 0, 0], "U": [0, 1, 0], "D": [0, -1, 0], "B": [0, 0, 1], "F": [0, 0, -1]}
 """Directions of the letters, written out, in the world right, up, back."""
@@ -32,11 +33,6 @@ def scene(count: int = 40) -> Splats:
     )
 
 
-def covariances(splats: Splats) -> np.ndarray:
-    frames = rotations(torch.from_numpy(splats.quats).double()).numpy() * splats.scales[:, None]
-    return frames @ frames.transpose(0, 2, 1)
-
-
 def world(splats: Splats, axes: str) -> list[np.ndarray]:
     """Means, covariances and colours from fixed directions, in the world right, up, back: the naive twin."""
     to_world = np.array([WORLD[letter] for letter in axes], float).T
@@ -45,7 +41,11 @@ def world(splats: Splats, axes: str) -> list[np.ndarray]:
     basis = sh_basis(torch.from_numpy(directions @ to_world), 16).numpy()
     coefficients = np.concatenate([splats.sh0, splats.shN], axis=1)
     colors = np.einsum("dk,nkc->ndc", basis, coefficients)
-    return [splats.means @ to_world.T, to_world @ covariances(splats) @ to_world.T, colors]
+    return [
+        splats.means @ to_world.T,
+        to_world @ covariances(splats.quats, splats.scales) @ to_world.T,
+        colors,
+    ]
 
 
 @pytest.mark.parametrize("name", AXES)

@@ -120,15 +120,6 @@ def test_masked_photos_teach_like_whole_ones(student: Splats, tmp_path: Path) ->
     assert scores[0] > scores[1] + 3
 
 
-def test_both_engines_agree_under_a_mask(student: Splats, tmp_path: Path) -> None:
-    targets = Photos(photographed(tmp_path, spoil=1.0))
-    losses = [
-        recover(student, targets, RecoverConfig(steps=3, engine=engine, regularizers=BARE)).report.loss
-        for engine in ("fused", "torch")
-    ]
-    assert losses[0] == pytest.approx(losses[1], abs=2e-4)
-
-
 def test_metrics_use_unmasked_pixels_only() -> None:
     rng = np.random.default_rng(0)
     a = rng.random((40, 50, 3)).astype(np.float32)

@@ -9,7 +9,6 @@ from g2ard.rendering.renderer import RasterSettings, render, settings_for
 from g2ard.rendering.visibility import visibility, visibility_source
 from g2ard.scene.cameras import Cameras, look_at
 from g2ard.scene.splats import Splats
-from g2ard.stages.select import select
 from g2ard.stages.simplify import simplify
 from helpers.scenes import assert_same_bits, in_units
 
@@ -67,13 +66,6 @@ def test_the_near_plane_is_the_conventions_in_ordinary_scenes():
     assert settings_for(points / 1000, inria).near_of(0) == pytest.approx(0.0004, rel=0.02)
     assert settings_for(points / 1000, RasterSettings(near=0.5)).near_of(0) == 0.5
     assert settings_for(points[:1]).near_of(0) == 0.01
-
-
-@pytest.mark.parametrize("policy", ["auto", "coverage", "directional"])
-def test_views_are_chosen_in_any_unit(policy):
-    small, near = in_units(ball(), around(), 1e-3)
-    here = select(ball(), around(), 4, policy=policy)
-    np.testing.assert_array_equal(select(small, near, 4, policy=policy).order, here.order)
 
 
 def test_recovery_works_in_any_unit():

@@ -100,9 +100,3 @@ def test_few_images_also_change_unseen_gaussians() -> None:
     assert psnr[1.0] > evaluate(compact, others).psnr + 2
     assert psnr[1.0] > psnr[0.0] + 0.3
     assert 0.3 < done.report.prior_share < 0.95
-
-
-def test_the_papers_schedule_blends_nothing() -> None:
-    ball, lit = evening(300)
-    done = adapt(ball, TeacherRenders(lit, VIEWS), AdaptConfig(steps=20, schedule="paper"))
-    assert (done.report.colour_change, done.report.prior_share) == (None, 0.0)

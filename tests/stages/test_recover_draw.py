@@ -64,13 +64,6 @@ def test_equal_weights_draw_like_no_weights(value: float) -> None:
         np.testing.assert_array_equal(drawn(5, epoch, 23, weights), drawn(5, epoch, 23))
 
 
-def test_unequal_weights_change_recovery(student: Splats, targets: TeacherRenders) -> None:
-    config, equal = RecoverConfig(steps=25), np.full(len(VIEWS), 4.0)
-    even = recover(student, targets, config).splats
-    assert not same(even, recover(student, targets, config, weights=WEIGHTS).splats)
-    assert same(even, recover(student, targets, config, weights=equal).splats)
-
-
 @pytest.mark.parametrize("engine", ["fused", "torch"])
 def test_a_resumed_run_continues_its_draws(
     student: Splats, targets: TeacherRenders, engine: Any, tmp_path: Path

@@ -24,6 +24,7 @@ from g2ard.stages.recover.losses import TorchAnchors, anchor_loss, regularizatio
 from g2ard.stages.recover.presets import preset_for, view_consistency
 from g2ard.stages.recover.schedule import PAPER, TUNED, Schedule
 from helpers.scenes import around, checkered_ball
+from reference.rotations import rotations
 
 
 def random_splats(n: int = 40, seed: int = 0) -> Splats:
@@ -35,18 +36,6 @@ def random_splats(n: int = 40, seed: int = 0) -> Splats:
         logit_opacities=rng.normal(size=n),
         sh0=rng.normal(size=(n, 1, 3)),
     )
-
-
-def naive_rotation(q: np.ndarray) -> np.ndarray:
-    """R v = q v q⁻¹, column by column."""
-
-    def product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-        w = a[0] * b[0] - a[1:] @ b[1:]
-        return np.concatenate([[w], a[0] * b[1:] + b[0] * a[1:] + np.cross(a[1:], b[1:])])
-
-    q = q.astype(np.float64) / np.linalg.norm(q.astype(np.float64))
-    conjugate = q * [1, -1, -1, -1]
-    return np.stack([product(product(q, np.r_[0.0, e]), conjugate)[1:] for e in np.eye(3)], axis=1)
 
 
 def test_tuned_rates_follow_a_cosine_to_one_percent() -> None:
@@ -69,7 +58,7 @@ def test_anchor_frames_put_the_thinnest_axis_last() -> None:
     splats = random_splats()
     anchors = Anchors.of(splats)
     for i in range(len(splats)):
-        R, order = naive_rotation(splats.quats[i]), np.argsort(-splats.scales[i])
+        R, order = rotations(splats.quats[i]), np.argsort(-splats.scales[i])
         np.testing.assert_allclose(anchors.frames[i], R[:, order], atol=1e-6)
         s = splats.scales[i][order]
         assert anchors.r_perp[i] == s[2]
@@ -98,13 +87,13 @@ def naive_losses(
     """`eq:anchor` and `eq:shape`, one Gaussian at a time in float64."""
     anchor = shape = 0.0
     for i in range(len(splats)):
-        frame, s0 = naive_rotation(splats.quats[i]), splats.scales[i].astype(np.float64)
+        frame, s0 = rotations(splats.quats[i]), splats.scales[i].astype(np.float64)
         t1, t2, n = np.argsort(-s0)
         d = frame.T @ (means[i] - splats.means[i].astype(np.float64))
         parallel, perp = 3 * (s0[t1] + s0[t2]) / 2, s0[n]
         excess = (d[t1] ** 2 + d[t2] ** 2) / parallel**2 + d[n] ** 2 / perp**2 - 1
         anchor += math.log1p(max(0.0, excess))
-        s, R = np.exp(log_scales[i]), naive_rotation(quats[i])
+        s, R = np.exp(log_scales[i]), rotations(quats[i])
         thick = math.sqrt(frame[:, n] @ R @ np.diag(s**2) @ R.T @ frame[:, n])
         q = s / s.sum()
         rank = math.exp(-(q * np.log(q)).sum())

@@ -20,7 +20,6 @@ from g2ard.stages.recover.losses import TorchAnchors, l1_ssim, regularization
 from g2ard.stages.recover.rasterize import rasterize
 from g2ard.stages.recover.schedule import Rates
 from helpers.raster_cases import NAMES, Params, camera, scene, splats_of, tensors_of
-from helpers.threads import on_threads
 
 RATES = {"means": 2e-3, "quats": 1e-2, "log_scales": 2e-2, "logit_opacities": 5e-2, "sh0": 2e-2, "shN": 2e-3}
 BACKGROUND = (0.1, 0.2, 0.3)
@@ -233,18 +232,6 @@ def test_resume_is_bitwise() -> None:
         assert value.tobytes() == resumed.state()[key].tobytes(), key
 
 
-def test_bits_do_not_depend_on_threads() -> None:
-    p, cameras, targets = problem(n=5000)
-
-    def trained() -> tuple[list[float], dict[str, bytes]]:
-        trainer = trainer_of(p)
-        losses = [step(trainer, cameras[i], targets[i])[0] for i in range(3)]
-        return losses, {k: v.tobytes() for k, v in trainer.state().items()}
-
-    first, *others = on_threads(trained)
-    assert others == [first] * 2
-
-
 @pytest.mark.parametrize(
     "weights",
     [
@@ -291,15 +278,6 @@ def test_gradients_that_are_not_finite_are_skipped_and_counted() -> None:
     _, updated = step(trainer, cameras[0], target)
     assert trainer.skipped > 0
     assert updated + trainer.skipped <= 50
-    assert all(np.isfinite(a).all() for a in trainer.arrays())
-
-
-def test_hundreds_of_steps_stay_finite_and_learn() -> None:
-    p, cameras, targets = problem(n=300)
-    flat = [np.full_like(t, 0.4) for t in targets]
-    trainer = trainer_of(p)
-    losses = [step(trainer, cameras[i % 3], flat[i % 3])[0] for i in range(300)]
-    assert losses[-1] < 0.25 * losses[0]
     assert all(np.isfinite(a).all() for a in trainer.arrays())
 
 

@@ -267,26 +267,3 @@ def test_broken_photos_are_refused_rows(site: Path, command_line: CommandLine, t
         assert "none of 1 photo was registered; view_000.png" in err
         assert json.loads(out)["photos"][0]["status"] == "refused"
         assert (tmp_path / "page.html").is_file()
-
-
-def test_photos_that_keep_their_start_are_in_the_report(
-    site: Path, command_line: CommandLine, tmp_path: Path
-) -> None:
-    (tmp_path / "wild.py").write_text(
-        "import numpy as np\n"
-        "def match(photo, render):\n"
-        "    a = np.random.default_rng(0).random((40, 2)) * photo.shape[1::-1]\n"
-        "    return a, a[::-1], np.ones(40)\n"
-    )
-    pytest.importorskip("pycolmap")
-    out = succeeds(
-        command_line,
-        tmp_path,
-        *("register", site / "scene.ply", "--photos", site / "views.json", "--poses", site / "coarse.txt"),
-        *("--protocol", "gs-cpr", "--matcher", "wild:match", "--size", "128"),
-        *("-o", "poses.json", "--report", "page.html", "--json", "-"),
-    ).out
-    result = json.loads(out)
-    assert any(row["zncc"] is None for row in result["photos"])
-    assert (result["settings"]["register.passes"], result["config"]["keep"]) == (1, "all")
-    assert "kept at its start" in (tmp_path / "page.html").read_text()

@@ -1,7 +1,5 @@
 """Direct alignment: against a naive twin, against rendered differences, and on poses that are known."""
 
-import subprocess
-import sys
 from dataclasses import replace
 
 import numpy as np
@@ -14,7 +12,6 @@ from g2ard.rendering.renderer import Renderer
 from g2ard.stages.register.align import Shot, align, level_of, normal_equations, shoot
 from g2ard.stages.register.grey import grey_of, local_zncc, zncc
 from g2ard.stages.register.pose import moved, pose_error
-from helpers.project import ROOT
 from helpers.registration import BALL, CONFIG, off, pyramid_of
 from helpers.scenes import around
 from reference import register as twin
@@ -159,27 +156,3 @@ def test_a_scene_out_of_sight_gives_nothing() -> None:
     away = camera.viewmat.copy()
     away[:3, 3] = [0, 0, -20]
     assert align(Renderer(BALL), away, pyramid_of(camera, photo, CONFIG), CONFIG) is None
-
-
-def test_results_do_not_depend_on_threads() -> None:
-    code = """
-import sys; sys.path[:0] = ["tests"]
-from g2ard import _core; _core.set_num_threads(int(sys.argv[1]))
-import numpy as np
-from g2ard.rendering.renderer import Renderer
-from g2ard.stages.register.align import align
-from helpers import registration as t
-from helpers.scenes import around
-camera = around(5, (160, 120), 2.5)[3]; renderer = Renderer(t.BALL)
-photo = np.clip(renderer.image(camera), 0, 1)
-found = align(renderer, t.off(camera.viewmat, .1, 2, 5), t.pyramid_of(camera, photo, t.CONFIG), t.CONFIG)
-print(found.viewmat.tobytes().hex(), found.covariance.tobytes().hex())
-"""
-    bits = [
-        subprocess.run(
-            [sys.executable, "-c", code, threads], capture_output=True, text=True, check=True, cwd=ROOT
-        ).stdout
-        for threads in ("1", "2")
-    ]
-    assert bits[0] == bits[1]
-    assert len(bits[0]) > 500

@@ -131,14 +131,3 @@ def test_the_command_on_pools_of_all_shapes(command_line: CommandLine, folder: P
     status, _, error = ask(command_line, folder, 1, "-w", "--split", "all")
     assert status == 1
     assert "none of 1 view sees the scene" in error
-
-
-def test_the_command_reads_k_off_the_curve(command_line: CommandLine, folder: Path) -> None:
-    rng = np.random.default_rng(0)
-    eyes = np.repeat(around(5).positions, 8, axis=0) + 0.02 * rng.standard_normal((40, 3))
-    write_views(folder / "pool.json", cameras([look_at(eye, [0, 0, 0]) for eye in eyes]))
-    status, out, error = ask(command_line, folder, "auto")
-    assert status == 0, error
-    said = json.loads(out)
-    assert len({int(view["name"][1:]) // 8 for view in said["views"]}) == len(said["views"]) == 5
-    assert said["left_out"] < 0.1

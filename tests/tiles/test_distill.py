@@ -139,7 +139,7 @@ def test_a_killed_command_leaves_no_workers_and_resumes(folder: Path, tmp_path: 
 
 
 @needs_proc
-@pytest.mark.parametrize("seconds", [0.0, 0.2, 0.5])
+@pytest.mark.parametrize("seconds", [0.0, 0.3])
 def test_new_workers_end_with_a_killed_command(folder: Path, tmp_path: Path, seconds: float) -> None:
     words = ["simplify", folder / "town.ply", "-r", "10", "-o", tmp_path / "x.ply", "--tile-rows", "700"]
     command = [sys.executable, "-m", "g2ard", *map(str, words), "--workers", "2", "--no-views"]
@@ -241,8 +241,6 @@ def test_recovery_in_tiles_takes_its_options(command_line: CommandLine, folder: 
     others = (
         ("--background", "1,1,1"),
         ("--set", "rates.means=0.01"),
-        ("--set", "regularizers.shape=1", "--set", "regularizers.period=1"),
-        ("--seed", 3),
     )
     for number, options in enumerate(others):
         changed = distilled(f"other{number}", *options)

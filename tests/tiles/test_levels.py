@@ -18,7 +18,6 @@ from g2ard.system.memory import peak_rss
 from g2ard.tiles.ingest import ingest
 from g2ard.tiles.store import StoredScene
 from helpers.commands import refused, succeeds
-from helpers.interruptions import interrupt_at
 from helpers.level_files import files_of, leaves_of, scattered
 from helpers.tiled_scenes import ring, town
 
@@ -80,30 +79,6 @@ def test_levels_on_disk_give_the_files_of_levels_in_memory(tmp_path: Path, degre
     save_levels(tmp_path / "a", held, cut=Cut(most=300))
     save_levels(tmp_path / "b", stored, cut=Cut(most=300), work=tmp_path / "work")
     assert files_of(tmp_path / "a") == files_of(tmp_path / "b")
-
-
-def test_measured_and_written_levels_are_not_repeated(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    levels, work = [scattered(2000), scattered(300, 1)], tmp_path / "work"
-    work.mkdir()
-    save_levels(tmp_path / "whole", levels, cut=Cut(most=200))
-    stop = interrupt_at("write", 3)
-
-    with pytest.raises(KeyboardInterrupt):
-        save_levels(tmp_path / "out", levels, cut=Cut(most=200), work=work, progress=stop)
-    assert not (tmp_path / "out").exists()
-    before = {path: path.stat().st_mtime_ns for path in work.rglob("*") if path.is_file()}
-    assert sum(path.name == "meta.json" for path in before) == 3
-    with (work / "errors.jsonl").open("a") as table:
-        table.write("[0.0, 0.")  # killed within a line
-    from g2ard.levels import write
-
-    monkeypatch.setattr(write, "leaf_errors", lambda *_: pytest.fail("measured again"))
-    save_levels(tmp_path / "out", levels, cut=Cut(most=200), work=work)
-    assert files_of(tmp_path / "out") == files_of(tmp_path / "whole")
-    moved = {path.stat().st_mtime_ns for path in (tmp_path / "out").rglob("*") if path.is_file()}
-    assert {time for path, time in before.items() if path.name != "errors.jsonl"} <= moved
 
 
 def levels_in_tiles(place: Path, folder: Path, **more: object) -> TiledLevels:
