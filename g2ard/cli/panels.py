@@ -25,7 +25,7 @@ _PANELS = {
     ),
     "Output": (
         *("output", "format", "keep", "view", "parents", "resume", "dry_run", "report", "truth"),
-        *("metres_per_unit", "errors", "most", "extent", "least"),
+        *("metres_per_unit", "environment", "most", "extent", "least"),
     ),
     "Large scenes": ("memory", "workers", "tile_rows", "scheduler", "work"),
 }

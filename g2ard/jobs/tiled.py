@@ -234,9 +234,9 @@ class TiledLevels:
     scenes: tuple[StoredScene, ...]
     reports: tuple[LevelReport, ...]
 
-    def key(self, rule: Cut, errors: bool) -> str:
+    def key(self, rule: Cut) -> str:
         """Return 16 hexadecimal digits that identify the files they are written to."""
-        return key_of([[scene.store.key for scene in self.scenes], asdict(rule), errors])
+        return key_of([[scene.store.key for scene in self.scenes], asdict(rule)])
 
 
 def lod_in_tiles(

@@ -1,6 +1,5 @@
-"""Levels of detail: one kd-tree over all levels, and the error of each level in each leaf."""
+"""Levels of detail: one kd-tree over all levels, written as streamed SOG or 3D Tiles."""
 
-from g2ard.levels.error import leaf_errors
 from g2ard.levels.tileset import Georeference, save_tileset
 from g2ard.levels.tree import Cut, Leaf, Node, cut
 from g2ard.levels.write import save_levels
@@ -11,7 +10,6 @@ __all__ = [
     "Leaf",
     "Node",
     "cut",
-    "leaf_errors",
     "save_levels",
     "save_tileset",
 ]

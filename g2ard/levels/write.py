@@ -1,7 +1,7 @@
 """Writer for streamed SOG (PlayCanvas): levels of detail as SOG files of consecutive leaves.
 
 `lod-meta.json`, version 1: a node has a `bound` and two `children`. A leaf has `lods` instead: for each level
-with Gaussians there, the file, the offset of its first row and the count; and `errors` of all levels.
+with Gaussians there, the file, the offset of its first row and the count.
 """
 
 from __future__ import annotations
@@ -24,14 +24,10 @@ from g2ard import __version__
 from g2ard.io.atomic import atomic_folder
 from g2ard.io.packing import morton_order
 from g2ard.io.sog_write import sog_files
-from g2ard.levels.error import leaf_errors
 from g2ard.levels.tree import Cut, Leaf, Level, Node
 from g2ard.levels.tree import cut as cut_tree
 from g2ard.progress import Progress, silent
 from g2ard.scene.splats import Splats
-
-_ERRORS = "errors.jsonl"
-"""File in the work folder: one line of errors per leaf, in a fixed order of leaves."""
 
 _BESIDE = "beside.txt"
 """File in the work folder that names the hidden folder of an unfinished output."""
@@ -48,7 +44,6 @@ def save_levels(
     *,
     cut: Cut | None = None,
     environment: Splats | None = None,
-    errors: bool = True,
     overwrite: bool = False,
     work: Path | None = None,
     progress: Progress = silent,
@@ -61,8 +56,6 @@ def save_levels(
             one leaf or file at a time.
         cut: splitting rule of the tree; None means `Cut()`.
         environment: sky and far background, which viewers always show; written to `env/meta.json`.
-        errors: measure the error of each leaf's levels (`g2ard.levels.leaf_errors`), from which viewers
-            decide what to load; without errors they use counts.
         overwrite: replace files in the folder, and remove files of its previous `lod-meta.json`.
         work: folder for intermediate results; the same call on the same levels resumes from it and uses less
             memory.
@@ -79,8 +72,6 @@ def save_levels(
     tree = cut_tree(levels, rule, work)
     files = _Files(levels, rule.most, {})
     root = _node(tree, files)
-    if errors:
-        _measure(tree, root, levels, work, progress)
     counts = [len(level) for level in levels]
     meta: dict[str, Any] = {
         "version": 1,
@@ -93,7 +84,6 @@ def save_levels(
         "count": sum(counts),
         "counts": counts,
         "lodLevels": len(levels),
-        "lodErrors": errors,
         **({} if environment is None else {"environment": _ENVIRONMENT}),
         "filenames": list(files.parts),
         "tree": root,
@@ -189,48 +179,6 @@ def _node(tree: Node | Leaf, files: _Files) -> dict[str, Any]:
         placed = {str(level): files.place(level, rows) for level, rows in enumerate(tree.rows) if len(rows)}
         return {**node, "lods": placed}
     return {**node, "children": [_node(child, files) for child in tree.children]}
-
-
-def _measure(
-    tree: Node | Leaf, root: dict[str, Any], levels: Sequence[Level], work: Path | None, progress: Progress
-) -> None:
-    """Add `errors` to the leaves of the JSON tree."""
-    pairs = [(tree, root)]
-    leaves: list[tuple[Leaf, dict[str, Any]]] = []
-    while pairs:
-        part, node = pairs.pop()
-        if isinstance(part, Leaf):
-            leaves.append((part, node))
-        else:
-            pairs.extend(zip(part.children, node["children"], strict=True))
-    table = None if work is None else work / _ERRORS
-    known = [] if table is None or not table.exists() else _lines(table)
-    for number, (leaf, node) in enumerate(leaves, start=1):
-        if number <= len(known):
-            node["errors"] = known[number - 1]
-        else:
-            node["errors"] = _rounded(leaf_errors(leaf, levels))
-            if table is not None:
-                with table.open("a", encoding="utf-8", newline="\n") as file:
-                    file.write(json.dumps(node["errors"]) + "\n")
-        progress("measure", number, len(leaves))
-
-
-def _lines(table: Path) -> list[list[float]]:
-    """Read all complete lines and truncate the file after them."""
-    text, whole, found = table.read_bytes(), 0, []
-    for line in text.splitlines(keepends=True):
-        try:
-            values = [float(value) for value in json.loads(line)]
-        except (ValueError, TypeError):
-            break
-        if not line.endswith(b"\n"):
-            break
-        found.append(values)
-        whole += len(line)
-    if whole < len(text):
-        table.write_bytes(text[:whole])
-    return found
 
 
 def _rounded(values: Sequence[float] | NDArray[np.float64]) -> list[float]:

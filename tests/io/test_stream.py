@@ -51,7 +51,7 @@ def chunks(to: Path) -> Path:
 
 def levels(to: Path) -> Path:
     fine = scene(900, 2)
-    save_levels(to / "lod", [fine, fine.take(slice(0, 100))], cut=Cut(most=250, least=50), errors=False)
+    save_levels(to / "lod", [fine, fine.take(slice(0, 100))], cut=Cut(most=250, least=50))
     return to / "lod"
 
 

@@ -10,7 +10,7 @@ from g2ard import io
 from g2ard.errors import InputError
 from g2ard.io import sog
 from g2ard.jobs.levels import lod
-from g2ard.levels import Cut, cut, leaf_errors, save_levels
+from g2ard.levels import Cut, cut, save_levels
 from g2ard.scene.splats import Splats
 from g2ard.scene.transform import join
 from g2ard.stages.recover.anchors import rotation_matrices
@@ -47,19 +47,6 @@ def test_levels_that_do_not_fit_together_are_refused() -> None:
         Cut(extent=0)
 
 
-def test_errors_range_from_zero_to_one_and_never_fall() -> None:
-    fine = checkered_ball(1500)
-    gone = Splats.create(fine.means[:1], scales=[[1e-4] * 3], logit_opacities=[-20])
-    half = fine.take(np.arange(0, 1500, 2))
-    levels = [fine, fine, half, fine, gone]
-    (leaf,) = leaves_of(cut(levels))
-    errors = leaf_errors(leaf, levels)
-    assert errors[:2] == [0.0, 0.0]
-    assert 0.001 < errors[2] < 0.9
-    assert errors[3] == errors[2]  # no coarser level may promise less
-    assert errors[4] == pytest.approx(1, abs=1e-3)
-
-
 @pytest.mark.parametrize("offset", [0.0, 500_000.0])
 def test_streamed_sog_holds_the_leaves_where_the_tree_says(tmp_path: Path, offset: float) -> None:
     levels = [scattered(900, offset=offset), scattered(200, 1, offset)]
@@ -81,8 +68,6 @@ def test_streamed_sog_holds_the_leaves_where_the_tree_says(tmp_path: Path, offse
             assert (rows < high + 1e-3).all()
             seen[int(level)] += part["count"], 1
             assert meta["filenames"][part["file"]].startswith(f"{level}_")
-        if "lods" in node:
-            assert len(node["errors"]) == 2
     assert seen[:, 0].tolist() == [900, 200]
     back = io.read_splats(tmp_path / "out" / "lod-meta.json")
     assert len(back) == 900
@@ -171,7 +156,7 @@ def test_a_stopped_run_with_other_options(
         command_line, tmp_path, *given[:-1], "64", "--resume", status=1
     )
     assert not (tmp_path / "out").exists()
-    succeeds(command_line, tmp_path, *given, "--resume", "--no-errors")
+    succeeds(command_line, tmp_path, *given, "--resume")
     assert {path.name for path in tmp_path.iterdir()} == {"ball.ply", "out"}
 
 
@@ -181,13 +166,13 @@ def test_the_sky_is_the_environment(tmp_path: Path, command_line) -> None:
     sky = Splats.create(60 * rays / np.linalg.norm(rays, axis=1)[:, None], scales=np.full((100, 3), 8.0))
     io.write_splats(tmp_path / "a.ply", join([ball, sky]))
     words = ("lod", "a.ply", "-o", "out", "-r", "1,8", "--merge-only", "--size", "48")
-    assert "sky: 100 Gaussians" in succeeds(command_line, tmp_path, *words).err
+    assert "sky: 100 Gaussians" in succeeds(command_line, tmp_path, *words, "--environment").err
     meta = json.loads((tmp_path / "out" / "lod-meta.json").read_text())
     assert (meta["environment"], meta["counts"]) == ("env/meta.json", [800, 100])
     np.testing.assert_array_less(meta["tree"]["bound"]["max"], 2)
     assert len(io.read_splats(tmp_path / "out" / "env")) == 100
     assert len(io.read_splats(tmp_path / "out")) == 900
-    succeeds(command_line, tmp_path, *words, "--no-environment", "-w")
+    succeeds(command_line, tmp_path, *words, "-w")
     meta = json.loads((tmp_path / "out" / "lod-meta.json").read_text())
     assert ("environment" in meta, meta["counts"]) == (False, [900, 113])
     assert not (tmp_path / "out" / "env").exists()

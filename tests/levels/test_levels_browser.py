@@ -19,6 +19,7 @@ from g2ard.rendering.metrics import psnr
 from g2ard.rendering.renderer import Renderer
 from g2ard.scene.cameras import Camera, Cameras
 from g2ard.scene.splats import Splats
+from g2ard.scene.transform import join
 from g2ard.viewer import write_page
 from helpers.browser import Browser
 from helpers.pages import FRONT, GREY, HEIGHT, WIDTH, assert_shows, rendered, show
@@ -55,10 +56,18 @@ def browser() -> Iterator[Browser]:
         yield page
 
 
-def streaming(folder: Path, name: str, levels: tuple[Splats, ...], camera: Camera) -> None:
+def streaming(
+    folder: Path, name: str, levels: tuple[Splats, ...], camera: Camera, sky: Splats | None = None
+) -> None:
     """A page beside streamed levels, which it loads as they are needed."""
     stand = frame_with(levels[0], Cameras.of([camera]), up=(0, 0, 1))
-    save_levels(folder / name, [stand.of(level) for level in levels], cut=Cut(4096, 1.0, 512), overwrite=True)
+    save_levels(
+        folder / name,
+        [stand.of(level) for level in levels],
+        cut=Cut(4096, 1.0, 512),
+        environment=None if sky is None else stand.of(sky),
+        overwrite=True,
+    )
     page = folder / f"{name}.html"
     write_page(page, [("scene", stand.of(levels[0]))], start=stand.start, background=GREY, overwrite=True)
     text, count = re.subn(
@@ -85,6 +94,20 @@ def test_each_level(
     fetched = {url.removeprefix(f"{address}/{name}/") for url in browser.requests if f"/{name}/" in url}
     assert "lod-meta.json" in fetched
     assert any(re.match(r"0_\d+/", file) for file in fetched)
+
+
+def test_the_environment(browser: Browser, served: tuple[Path, str], levels: tuple[Splats, ...]) -> None:
+    """Show a sky outside of the tree's box, by which the viewer sets the far plane."""
+    folder, address = served
+    rng = np.random.default_rng(0)
+    rays = rng.normal(size=(400, 3))
+    rays *= 12 / np.linalg.norm(rays, axis=1, keepdims=True)
+    sky = Splats.create(
+        rays, scales=np.full((400, 3), 0.5), logit_opacities=np.ones(400), sh0=rng.normal(size=(400, 1, 3))
+    )
+    streaming(folder, "sky", levels, FRONT, sky)
+    show(browser, f"{address}/sky.html")
+    assert_shows(browser, rendered(join([levels[0], sky])), 35)
 
 
 GLOBE = """<!doctype html><style>body { margin: 0; overflow: hidden }

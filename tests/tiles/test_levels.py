@@ -110,7 +110,7 @@ def test_levels_have_exact_counts_and_a_stopped_chain_goes_on(place: Path, tmp_p
     rows = np.arange(500)
     one, other = (levels.scenes[2].take(rows).fingerprint() for levels in (whole, again))
     assert one == other
-    assert whole.key(Cut(), True) == again.key(Cut(), True) != whole.key(Cut(most=9), True)
+    assert whole.key(Cut()) == again.key(Cut()) != whole.key(Cut(most=9))
 
 
 def test_the_command_in_tiles(place: Path, tmp_path: Path, command_line) -> None:

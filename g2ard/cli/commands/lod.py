@@ -65,20 +65,13 @@ def lod(
     recover: Annotated[
         bool, typer.Option("--recover/--merge-only", help="Recover each level after merging, or only merge.")
     ] = True,
-    errors: Annotated[
-        bool,
-        typer.Option(
-            "--errors/--no-errors",
-            help="Measure the error of each chunk at each level, which viewers use to choose levels.",
-        ),
-    ] = True,
     environment: Annotated[
         bool,
         typer.Option(
-            "--environment/--no-environment",
+            "--environment",
             help="Keep sky and far background apart: whole, and always shown (streamed SOG, not in tiles).",
         ),
-    ] = True,
+    ] = False,
     most: Annotated[
         int,
         typer.Option(
@@ -155,11 +148,15 @@ def lod(
     views = with_images(views, images)
     if spot is not None and kind == "sog":
         raise typer.BadParameter("--georeference needs --format 3dtiles")
+    if environment and kind != "sog":
+        raise typer.BadParameter("--environment needs --format sog")
     meta = output / ("lod-meta.json" if kind == "sog" else "tileset.json")
     stopped = output.with_name(f".{output.name}.unfinished")
     run.spare_inputs(meta)
     tiling = tiling_of(run, scene, output)
     tiled = is_tiled(scene, tiling)
+    if environment and tiled:
+        raise typer.BadParameter("--environment needs a scene that fits into memory")
     finished = resume and meta.exists() and not run.overwrite and (tiled or not left_at(stopped))
     if finished:
         _check_same(meta, ratios)
@@ -175,11 +172,11 @@ def lod(
             settings=recovery_settings(steps, background or BLACK, run.seed),
         )
         with working(tiling, views):
-            _in_tiles(run, scene, output, ratios, tiling, options, recover, rule, errors, kind, spot)
+            _in_tiles(run, scene, output, ratios, tiling, options, recover, rule, kind, spot)
         return
     check_memory(scene, tiling, LEVELS_TIMES, RECOVERY_TIMES)
     if going_on:
-        check_same_options(run, stopped, besides=("errors", "most", "extent", "least", "kind", "place"))
+        check_same_options(run, stopped, besides=("most", "extent", "least", "kind", "place"))
     with stoppable(run, stopped, resume):
         note_options(run, stopped)
         levels = levels_of(
@@ -192,13 +189,13 @@ def lod(
             background=background or BLACK,
             up=up,
             render_model=run.render_model,
-            split_sky=environment and kind == "sog",
+            split_sky=environment,
             seed=run.seed,
             work=stopped,
             progress=run.progress,
             say=run.say,
         )
-        size_of_all = _save(run, output, levels.splats, rule, errors, kind, spot, up, sky=levels.sky)
+        size_of_all = _save(run, output, levels.splats, rule, kind, spot, up, sky=levels.sky)
     _tell(run, output, levels, size_of_all)
 
 
@@ -211,7 +208,6 @@ def _in_tiles(
     options: DistillOptions,
     recover: bool,
     rule: Cut,
-    errors: bool,
     kind: str,
     spot: Any,
 ) -> None:
@@ -222,9 +218,9 @@ def _in_tiles(
     assert tiling.folder is not None
     run.kept = [f"finished steps are in {tiling.folder}; run the same command to continue"]
     levels = lod_in_tiles(scene, ratios, tiling, options, recover=recover, progress=run.progress, say=run.say)
-    begun = tiling.folder / f"written-{levels.key(rule, errors)}"
+    begun = tiling.folder / f"written-{levels.key(rule)}"
     begun.mkdir(exist_ok=True)
-    size = _save(run, output, levels.scenes, rule, errors, kind, spot, options.up, begun)
+    size = _save(run, output, levels.scenes, rule, kind, spot, options.up, begun)
     _tell(run, output, levels, size, peak_rss_bytes=peak_rss_of_all())
 
 
@@ -233,7 +229,6 @@ def _save(
     output: Path,
     levels: Sequence[Level],
     rule: Cut,
-    errors: bool,
     kind: str,
     spot: Any,
     up: Sequence[float] | None,
@@ -251,7 +246,7 @@ def _save(
         "progress": run.progress,
     }
     if kind == "sog":
-        return save_levels(output, levels, environment=sky, errors=errors, **common)
+        return save_levels(output, levels, environment=sky, **common)
     if spot is not None and not isinstance(spot, Georeference):
         spot = Georeference.of_map(spot, levels[0].offset)
         run.say(f"longitude {spot.longitude:.6f}, latitude {spot.latitude:.6f}, heading {spot.heading:.3f}")
