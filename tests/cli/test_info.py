@@ -89,6 +89,7 @@ def test_info_of_several_files_and_of_a_run(command_line: CommandLine, folder: P
     assert (scene["kind"], views["kind"], made["count"]) == ("splats", "views", 40)
     assert made["run"]["input_count"] == 400
     assert made["run"]["scores"]["recovered"]["psnr"] > 10
+    assert made["run"]["overdraw"] > 1
     assert "made from" in command_line("info", "run", cwd=folder)[1]
 
 

@@ -87,6 +87,7 @@ def test_command(command_line: CommandLine, tmp_path: Path) -> None:
     out = succeeds(command_line, tmp_path, "evaluate", *common, *options).out
     found = json.loads(out)
     assert found["against"] == {"photo": 2, "teacher": 2}
+    assert found["scenes"][0]["overdraw"] > 1
     assert found["protocol"] == {"convention": "inria", "8bit": True, "lpips_input": None}
     assert [v["against"] for v in found["scenes"][0]["views"]] == ["photo", "teacher"] * 2
     plain = json.loads(command_line("evaluate", *common, "--teacher", "ball.ply", cwd=tmp_path)[1])
