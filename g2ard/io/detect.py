@@ -174,13 +174,16 @@ def _instead(path: Path) -> str:
 
 
 def _poses_above(path: Path) -> Path | None:
-    """Return the transforms.json, or the folder of a COLMAP model, beside a folder of photos."""
+    """Return the transforms.json, or the folder of another file of poses, beside a folder of photos."""
+    from g2ard.io import inria
     from g2ard.io.colmap import model_folder
     from g2ard.io.transforms import files_of
 
     above = path.parent
     files = files_of(above)
-    return (next(iter(files)) if len(files) == 1 else above) if files or model_folder(above) else None
+    if len(files) == 1:
+        return next(iter(files))
+    return above if files or model_folder(above) or (above / inria.NAME).is_file() else None
 
 
 def _ply_format(path: Path) -> Format:

@@ -91,7 +91,10 @@ def test_errors_point_to_the_poses_of_photos(folder: Path) -> None:
     (folder / "scan" / "transforms.json").write_text("{}")
     with pytest.raises(InputError, match=r"give .*scan/transforms\.json, which has the poses of its photos$"):
         g2ard.load_views(shots)
-    (folder / "scan" / "transforms.json").unlink()
+    (folder / "scan" / "transforms.json").rename(folder / "scan" / "cameras.json")
+    with pytest.raises(InputError, match=r"give .*scan, which has the poses of its photos$"):
+        g2ard.load_views(shots)
+    (folder / "scan" / "cameras.json").unlink()
     (folder / "scan" / "sparse" / "0").mkdir(parents=True)
     for name in ("cameras.bin", "images.bin"):
         (folder / "scan" / "sparse" / "0" / name).touch()
