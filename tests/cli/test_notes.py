@@ -15,10 +15,11 @@ from helpers.scenes import around, checkered_ball
 
 
 def test_a_result_larger_than_its_input_is_noted(command_line: CommandLine, tmp_path: Path) -> None:
-    photos_of(tmp_path / "photos", points=True)
-    ask = ("distill", "photos/sparse.ply", "--views", "photos", "-n", 1000, "--steps", 3)
+    photos_of(tmp_path / "photos")
+    cloud_of(tmp_path / "scan.ply", BALL)
+    ask = ("distill", "scan.ply", "--views", "photos", "-n", 1000, "--steps", 3)
     error = command_line(*ask, "-o", "run", cwd=tmp_path)[2]
-    assert "run/scene.ply: 0.24 MB, sparse.ply has 0.03 MB: 76% of it is SH above degree 0 (" in error
+    assert "run/scene.ply: 0.24 MB, scan.ply has 0.03 MB: 76% of it is SH above degree 0 (" in error
     g2ard.save(tmp_path / "ball.ply", BALL)
     assert "MB" not in command_line("simplify", "ball.ply", "-r", 2, "-o", "s.ply", cwd=tmp_path)[2]
 
