@@ -52,8 +52,8 @@ def clean(
         typer.Option(
             min=0,
             max=1,
-            help="Also remove haze and streaks that float in front of the surface in more than 1 − STRENGTH "
-            "of the views: 0 none, 0.5 most, 1 all.",
+            help="Also remove haze and streaks: 0 none, 1 all, otherwise those that float in front of the "
+            "surface in more than 1 - STRENGTH of the views that see them.",
         ),
     ] = 0,
     preview: Annotated[
