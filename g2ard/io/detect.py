@@ -8,6 +8,7 @@ from itertools import islice
 from pathlib import Path
 from typing import Literal, get_args
 
+from g2ard.config.choices import BLACK, Colour
 from g2ard.errors import InputError
 from g2ard.io.paths import check_regular
 
@@ -95,6 +96,17 @@ def run_views(path: str | Path) -> Path:
     path = Path(path)
     made = path / "views.json"
     return made if run_scene(path) != path and made.is_file() else path
+
+
+def run_background(path: str | Path) -> Colour | None:
+    """Return the background that a `distill` run in a folder was made with, or None."""
+    from g2ard.io.jsonfile import read_json
+
+    if run_scene(path) == Path(path):
+        return None
+    settings = read_json(Path(path) / "report.json").get("settings", {})
+    red, green, blue = settings.get("recover.background", BLACK)
+    return red, green, blue
 
 
 def is_photo(path: Path) -> bool:

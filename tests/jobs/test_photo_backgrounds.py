@@ -45,6 +45,17 @@ def test_alpha_is_composited_over_the_background(command_line: CommandLine, rgba
     assert "8 photos with alpha, composited over black, the default; most" in error
 
 
+def test_a_run_is_evaluated_on_its_own_background(command_line: CommandLine, rgba: Path) -> None:
+    made = ("distill", "--views", "ball", "-n", 300, "--steps", 5, "--background", "white", "--no-view")
+    succeeds(command_line, rgba, *made, "-o", "run")
+    told = succeeds(command_line, rgba, "evaluate", "run", "--views", "ball")
+    assert "background: white, as run was made with" in told.err
+    assert (
+        told.out
+        == succeeds(command_line, rgba, "evaluate", "run", "--views", "ball", "--background", "white").out
+    )
+
+
 def test_alpha_masks_if_requested(command_line: CommandLine, rgba: Path) -> None:
     cameras = read_view_set(ViewFiles(rgba / "ball", alpha="mask"), split="test").cameras
     targets = Photos(cameras, background=WHITE)

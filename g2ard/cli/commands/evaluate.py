@@ -21,7 +21,7 @@ from g2ard.cli.options import (
     views_or_teacher,
     with_images,
 )
-from g2ard.config.choices import BLACK, LpipsInput
+from g2ard.config.choices import BLACK, Colour, LpipsInput
 from g2ard.progress import plural
 
 
@@ -83,13 +83,14 @@ def evaluate(
     views = with_images(views, images, alpha)
     for path in scenes:
         check_scene(path)
-    colour, settings = background or BLACK, RasterSettings(convention=convention)
+    chosen, settings = background or _of_run(run, scenes), RasterSettings(convention=convention)
+    colour = chosen or BLACK
     dense = run.load(teacher) if teacher else None
     frozen = run.load(anchors) if anchors else None
     views = views_or_teacher(run, views, teacher, dense)
     cameras = load_views(views, split, size, run.say, unpictured=dense is not None)
     if dense is None or photos:
-        propose_background(cameras, colour, background is not None, run.say)
+        propose_background(cameras, colour, chosen is not None, run.say)
     targets = make_targets(
         cameras, dense, colour, photos=photos, settings=settings, progress=run.progress, say=run.say
     )
@@ -121,6 +122,18 @@ def evaluate(
     _table(run, said, rows)
     protocol = {"convention": convention, "8bit": eight_bit, "lpips_input": lpips_input if lpips else None}
     run.result({"against": _kind(against), "protocol": protocol, "scenes": rows})
+
+
+def _of_run(run: Run, scenes: list[Path]) -> Colour | None:
+    """Return the background of the first scene that is a run's folder, and say it unless it is black."""
+    from g2ard.io.detect import run_background
+    from g2ard.scene.images import colour_text
+
+    found = next(((path, colour) for path in scenes if (colour := run_background(path))), None)
+    if found is None or found[1] == BLACK:
+        return None
+    run.say(f"background: {colour_text(found[1])}, as {found[0]} was made with")
+    return found[1]
 
 
 def _against(views: list[dict[str, Any]]) -> dict[str, int]:
