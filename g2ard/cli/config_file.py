@@ -34,7 +34,8 @@ def load_config(ctx: typer.Context, path: Path | None) -> Path | None:
     found: dict[str, Any] = {}
     for key, value in table.items():
         many = getattr(params[key], "multiple", False) or params[key].nargs == -1
-        found[str(params[key].name)] = _several(value) if many else _as_typed(value)
+        several = value if isinstance(value, list) else [value]
+        found[str(params[key].name)] = [_as_typed(one) for one in several] if many else _as_typed(value)
     if constants:
         found["set"] = [f"{name}={_as_typed(value)}" for name, value in constants.items()]
         if "set" not in params:
@@ -137,10 +138,6 @@ def _as_typed(value: Any) -> Any:
     if isinstance(value, list):
         return ",".join(str(item) for item in value)
     return str(value).lower() if isinstance(value, bool) else str(value)
-
-
-def _several(value: Any) -> list[str]:
-    return [_as_typed(item) for item in value] if isinstance(value, list) else [_as_typed(value)]
 
 
 def printed(ctx: typer.Context, values: dict[str, Any]) -> str:

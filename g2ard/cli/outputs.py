@@ -60,9 +60,10 @@ class Outputs:
             raise typer.BadParameter(f"{name}: {{ratio}} and {{count}} need a budget by -r or -n")
         by_count = budgets[0].ratio is None
         if len(budgets) > 1 and not named:
+            word = "{count}" if by_count else "{ratio}x"
             raise typer.BadParameter(
                 f"{name}: {len(budgets)} budgets need {{ratio}} or {{count}} in its name, such as "
-                f"{_suggested(pattern, by_count=by_count)}"
+                f"{pattern.with_name(f'{pattern.stem}_{word}{pattern.suffix}')}"
                 + ("; commas separate counts, so write a single one as 10_000" if by_count else "")
             )
 
@@ -100,8 +101,3 @@ class Outputs:
             count = budget.count if budget.count is not None else budget.of(total or 0)
             name = name.replace("{count}", str(count))
         return name
-
-
-def _suggested(pattern: Path, *, by_count: bool) -> str:
-    word = "{count}" if by_count else "{ratio}x"
-    return str(pattern.with_name(f"{pattern.stem}_{word}{pattern.suffix}"))

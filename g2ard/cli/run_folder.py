@@ -97,7 +97,8 @@ def check_place(run: Run, place: Path, budget: Budget, given: bool, resume: bool
     views = [] if given else [folder / "views.json"]
     run.spare_inputs(place, *_other_scenes(place), folder / KEPT, *views)
     left = left_at(folder / WORK)
-    if not left and not (resume and _is_finished(place)) and not _is_bare(folder):
+    killed = folder.is_dir() and [path.name for path in folder.iterdir()] == [WORK]
+    if not left and not (resume and _is_finished(place)) and not killed:
         check_output(folder, run.overwrite, folder=True)
     if left or not resume:
         check_stopped(run, folder / WORK, resume, place)
@@ -193,11 +194,6 @@ def _other_scenes(place: Path) -> list[Path]:
 
 def _is_finished(place: Path) -> bool:
     return place.exists() and (place.parent / REPORT).exists() and not left_at(place.parent / WORK)
-
-
-def _is_bare(folder: Path) -> bool:
-    """Return whether a folder only holds an empty checkpoint folder, as a killed run leaves it."""
-    return folder.is_dir() and [path.name for path in folder.iterdir()] == [WORK]
 
 
 def _check_same(

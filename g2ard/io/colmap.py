@@ -183,10 +183,6 @@ _IMAGE = Record(["IMAGE_ID", *_POSE, "CAMERA_ID"], "IdddddddI")
 _POINTS = Record(["POINTS2D"], "Q")
 
 
-def _parameters(count: int) -> Record:
-    return Record([f"PARAMS[{k}]" for k in range(count)], count * "d")
-
-
 def _cameras_bin(path: Path) -> dict[int, Lens]:
     data = path.read_bytes()
     (count,) = _COUNT.read(path, "table", 0, data, 0)
@@ -194,7 +190,8 @@ def _cameras_bin(path: Path) -> dict[int, Lens]:
     for i in range(count):
         key, model, width, height = _CAMERA.read(path, "camera", i, data, at)
         name = _MODELS[model] if 0 <= model < len(_MODELS) else f"number {model}"
-        layout = _parameters(_PARAMETERS.get(name, 0))
+        many = _PARAMETERS.get(name, 0)
+        layout = Record([f"PARAMS[{k}]" for k in range(many)], many * "d")
         values = layout.read_finite(path, "camera", i, data, at + _CAMERA.size)
         cameras[key] = _camera(path, name, (width, height), values)
         at += _CAMERA.size + layout.size

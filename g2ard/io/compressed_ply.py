@@ -181,7 +181,9 @@ def write(path: Path, splats: Splats, *, overwrite: bool = False) -> None:
         len(splats), [(f"packed_{n}", "<u4") for n in ("position", "rotation", "scale", "color")]
     )
     words["packed_position"] = _packed(_within(bounds, "", "xyz", splats.means), (11, 10, 11))
-    words["packed_rotation"] = _rotations(splats)
+    largest, others = smallest_three(unit_quats(splats.quats))
+    rotations = _packed(others / math.sqrt(2) + 0.5, (10, 10, 10))
+    words["packed_rotation"] = largest.astype(np.uint32) << np.uint32(30) | rotations
     logs = np.clip(log_scales(splats), -_SCALE_LIMIT, _SCALE_LIMIT)
     words["packed_scale"] = _packed(_within(bounds, "scale_", "xyz", logs), (11, 10, 11))
     color = _within(bounds, "", "rgb", splats.colors)
@@ -218,11 +220,6 @@ def _packed(values: NDArray[np.float64], bits: tuple[int, ...]) -> NDArray[np.ui
     for k, width in enumerate(bits):
         word = word << np.uint32(width) | coded(values[:, k], (1 << width) - 1).astype(np.uint32)
     return word
-
-
-def _rotations(splats: Splats) -> NDArray[np.uint32]:
-    largest, others = smallest_three(unit_quats(splats.quats))
-    return largest.astype(np.uint32) << np.uint32(30) | _packed(others / math.sqrt(2) + 0.5, (10, 10, 10))
 
 
 def _harmonics(splats: Splats) -> NDArray[Any]:

@@ -116,7 +116,7 @@ def _views(views: ViewSet) -> dict[str, Any]:
         "count": len(cameras),
         "photos": sum(path is not None for path in cameras.image_paths),
         "sizes": dict(sizes.most_common()),
-        "fov_degrees": _quantiles(_fov(cameras)),
+        "fov_degrees": _quantiles(np.degrees(2 * np.arctan(cameras.widths / (2 * cameras.Ks[:, 0, 0])))),
         "distorted": int(cameras.distortions.any(1).sum()),
         "splits": dict(Counter(s for s in views.splits if s)),
         "extent": _extent(cameras.positions),
@@ -140,8 +140,3 @@ def _photo_notes(cameras: Cameras) -> list[Note]:
         text = f"{plural(most, 'photo')} of {width}×{height} pixels, {others} of other sizes"
         notes.append(Note("mixed_sizes", others, text))
     return notes
-
-
-def _fov(cameras: Cameras) -> NDArray[np.float64]:
-    """Return the (C,) horizontal fields of view, degrees."""
-    return np.degrees(2 * np.arctan(cameras.widths / (2 * cameras.Ks[:, 0, 0])))

@@ -51,16 +51,12 @@ def read(path: Path, images: Path | None = None) -> ViewSet:
         model, frames = colmap.frames(data, photos)
     except InputError as error:
         raise InputError(f"data_dir: {error}", path=file) from error
-    every = _whole(file, "test_every", settings.word("test_every") or "8")
-    words = ["train" if i % every else "test" for i in range(len(frames))]
+    every = settings.word("test_every") or "8"
+    if not every.isdigit() or int(every) < 1:
+        raise InputError(f"is {every!r}, expected a whole number ≥ 1", path=file, property="test_every")
+    words = ["train" if i % int(every) else "test" for i in range(len(frames))]
     found = view_set(model, [f._replace(split=word) for f, word in zip(frames, words, strict=True)])
     if settings.word("pose_opt") != "true":
         return found
     text = "the run optimised its poses; these are the poses before training"
     return replace(found, notes=(*found.notes, Note("optimised_poses", len(found.cameras), text)))
-
-
-def _whole(path: Path, key: str, text: str) -> int:
-    if not text.isdigit() or int(text) < 1:
-        raise InputError(f"is {text!r}, expected a whole number ≥ 1", path=path, property=key)
-    return int(text)

@@ -342,8 +342,9 @@ def _streams(splats: Splats, means: NDArray[np.float64], bits: int, version: int
         _bytes((log_scales(splats) + 10) * 16),
         _xyz(quats) if version == 2 else _packed(quats),
     ]
-    if splats.sh_degree:
-        streams.append(_harmonics(splats))
+    if splats.sh_degree:  # in all 8 bits: rounding to fewer is where other writers lose most
+        flips = FLIPS[: splats.shN.shape[1], None]
+        streams.append(_bytes(splats.shN.astype(np.float64) * flips * 128 + 128))
     return streams
 
 
@@ -366,9 +367,3 @@ def _packed(quats: NDArray[np.float64]) -> bytes:
         ).astype(np.uint32)
         words = (words << np.uint32(10) | part).astype(np.uint32)
     return words.astype("<u4").tobytes()
-
-
-def _harmonics(splats: Splats) -> bytes:
-    """Pack harmonics as 128x + 128, in all 8 bits: rounding to fewer is where other writers lose most."""
-    rest = splats.shN.shape[1]
-    return _bytes(splats.shN.astype(np.float64) * FLIPS[:rest, None] * 128 + 128)

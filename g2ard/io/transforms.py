@@ -94,14 +94,17 @@ def _frame(path: Path, index: int, content: dict[str, Any], entry: Any, images: 
     frame = fields_of(path, {**content, **entry} if isinstance(entry, dict) else entry, index, "frame")
     if "rot_mat" in frame:
         frame.update(_from_matrix_city(path, frame))
-    file_path, mask = text(frame, "file_path"), optional_text(frame, "mask_path")
+    file_path, named = text(frame, "file_path"), optional_text(frame, "mask_path")
+    mask = None if named is None else path.parent / named
+    if mask is not None and not mask.is_file():
+        raise frame.place.to("mask_path").error(f"is {mask}, which does not exist")
     world_from_camera = rigid(matrix(frame, "transform_matrix"), frame.place.to("transform_matrix"))
     photo = find_photo(images / Path(file_path).name if images else path.parent / file_path)
     return Frame(
         name=file_path.removeprefix("./").removeprefix("images/"),
         viewmat=opencv_view(world_from_camera),
         photo=photo,
-        mask=None if mask is None else _there(frame, path.parent / mask),
+        mask=mask,
         **_intrinsics(path, frame, photo),
     )
 
@@ -114,12 +117,6 @@ def _from_matrix_city(path: Path, frame: Fields) -> dict[str, Any]:
     name = f"{whole(frame, 'frame_index'):04d}.png"
     places = [folder for folder in ("", "rgb/", "input/") if (path.parent / folder / name).is_file()]
     return {"file_path": (places or [""])[0] + name, "transform_matrix": frame["rot_mat"]}
-
-
-def _there(frame: Fields, mask: Path) -> Path:
-    if not mask.is_file():
-        raise frame.place.to("mask_path").error(f"is {mask}, which does not exist")
-    return mask
 
 
 def opencv_view(world_from_camera: NDArray[np.float64]) -> NDArray[np.float64]:

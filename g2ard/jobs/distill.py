@@ -140,7 +140,8 @@ def prepare(
     read = replace(read, from_photos=read.from_photos or from_photos_only)
     prior, cleaned = read.prior, None
     if options.clean:
-        prior, cleaned = _cleaned(prior, options, progress, say)
+        clutter, _ = clutter_seen(prior, seed=recover.seed, progress=progress, say=say)
+        prior, cleaned = prior.take(clutter.keep), clutter.counts
     if counted is not None:
         counted(len(prior))
     default_degree = 3 if read.lifted else None  # points have one colour each, photos show more
@@ -369,11 +370,3 @@ def _is_sparse(cloud: Path, views: Views) -> bool:
         return False
     file = sparse_file(Path(path))
     return file is not None and real_path(file) == real_path(cloud)
-
-
-def _cleaned(
-    prior: Splats, options: DistillOptions, progress: Progress, say: Say
-) -> tuple[Splats, dict[str, int]]:
-    """Remove clutter; return the rest and the number of Gaussians removed by kind."""
-    found, _ = clutter_seen(prior, seed=options.config.recover.seed, progress=progress, say=say)
-    return prior.take(found.keep), found.counts

@@ -283,10 +283,9 @@ def aim_of(
         wanted = Quality(budget.min_psnr or 0.0, budget.min_ssim or 0.0)
         return _by_quality(splats, wanted, file, reduce, seed, progress, say)
     if budget.bytes is not None:
-        if recovered:
-            found = count_for_bytes(splats, int(budget.bytes * _MARGIN), file, partial(_fast, splats))
-        else:
-            found = count_for_bytes(splats, budget.bytes, file, lambda count: reduce(count).splats)
+        most = int(budget.bytes * _MARGIN) if recovered else budget.bytes
+        made = partial(simplify, splats, method="fast") if recovered else reduce
+        found = count_for_bytes(splats, most, file, lambda count: made(count).splats)
         say(f"{budget.fit}: about {plural(found, 'Gaussian')}")
         return Aim(found, bytes=budget.bytes, file=file)
     found = budget.of(len(splats), name)
@@ -318,10 +317,6 @@ def _by_quality(
     else:
         say(f"{plural(found, 'Gaussian')} should keep {near.psnr:.2f} dB, SSIM {near.ssim:.4f}")
     return Aim(found, file=file, wanted=wanted, dense=splats, cameras=cameras)
-
-
-def _fast(splats: Splats, count: int) -> Splats:
-    return simplify(splats, count, method="fast").splats
 
 
 def _onward(first: NDArray[np.int64], second: NDArray[np.int64]) -> NDArray[np.int64]:

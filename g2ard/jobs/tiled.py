@@ -181,7 +181,7 @@ def simplify_in_tiles(
                     budget.of(store.count, str(scene)),
                     workers=workers,
                     config=config,
-                    views=_given(views, say),
+                    views=None if views in (None, "made") else load_views(views, "train", None, say),
                     beside=lambda sample: _found(scene, sample, say) if views is None else None,
                     blind=blind,
                     up=up,
@@ -189,10 +189,6 @@ def simplify_in_tiles(
                     say=say,
                 ),
             )
-
-
-def _given(views: Views | None, say: Say) -> Cameras | None:
-    return None if views is None or is_made(views) else load_views(views, "train", None, say)
 
 
 def _found(scene: Path, sample: Splats, say: Say) -> Cameras | None:

@@ -27,8 +27,8 @@ class Report:
 
     def as_dict(self) -> dict[str, Any]:
         """Return the report as JSON values: fields by name, nested reports as dicts."""
-        found = ((f, getattr(self, f.name)) for f in fields(self))
-        return {f.name: _plain(value) for f, value in found if value is not None or not _left_out(f)}
+        values = ((f, getattr(self, f.name)) for f in fields(self))
+        return {f.name: _plain(v) for f, v in values if v is not None or "left_out" not in f.metadata}
 
     @classmethod
     def of(cls, data: Mapping[str, Any]) -> Self:
@@ -36,10 +36,6 @@ class Report:
         kinds = get_type_hints(cls)
         names = [f.name for f in fields(cls) if f.name in data or f.default is MISSING]
         return cls(**{name: _read(kinds[name], data[name]) for name in names})
-
-
-def _left_out(f: Any) -> bool:
-    return bool(f.metadata.get("left_out"))
 
 
 def _plain(value: Any) -> Any:

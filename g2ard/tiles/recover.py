@@ -217,19 +217,31 @@ def recover_tiles(
             ("apart", views.apart or views.test.take([])),
         )
     }
-    tasks = [
-        _task(
-            store,
-            student,
-            around,
-            tile,
-            sight,
-            steps / max(1, len(views.train.cameras)),
-            config,
-            workers.folder,
+    steps_a_view = steps / max(1, len(views.train.cameras))
+    tasks = []
+    for tile in range(len(store.tiles)):
+        seen = {name: by_tile[tile] for name, (_, by_tile) in sight.items()}
+        arguments = {
+            "store": store.key,
+            "student": student.key,
+            "tile": tile,
+            "levels": around.levels[tile],
+            "steps": round(steps_a_view * len(seen["train"])),
+            "config": values_of(config),
+            **seen,
+        }
+        inputs: dict[str, Path | list[Path]] = {"own": around.coarse[tile], "coarse": around.coarse}
+        tasks.append(
+            Task(
+                "g2ard.tiles.recover:recover_tile",
+                f"recover-{tile:05}",
+                workers.folder,
+                arguments,
+                inputs | {name: path for name, (path, _) in sight.items()},
+                {"store": store.folder, "student": student.folder},
+                store.tiles[tile].rows,
+            )
         )
-        for tile in range(len(store.tiles))
-    ]
     paths = workers.run(tasks, "recover" if steps else "score")
     errors = [load(path, "errors")[0] for path in paths]
     taken = [int(load(path, "steps")[0]) for path in paths]
@@ -271,37 +283,3 @@ def _seen(store: TileStore, around: Surroundings, cameras: Cameras, workers: Wor
         return [[] for _ in store.tiles]
     light = light_of(store, around.coarse, cameras, workers)
     return [in_sight(light, tile).tolist() for tile in range(len(store.tiles))]
-
-
-def _task(
-    store: TileStore,
-    student: TileStore,
-    around: Surroundings,
-    tile: int,
-    sight: dict[str, tuple[Path, list[list[int]]]],
-    steps_a_view: float,
-    config: RecoverConfig,
-    work: Path,
-) -> Task:
-    views = {name: seen[tile] for name, (_, seen) in sight.items()}
-    return Task(
-        "g2ard.tiles.recover:recover_tile",
-        f"recover-{tile:05}",
-        work,
-        {
-            "store": store.key,
-            "student": student.key,
-            "tile": tile,
-            "levels": around.levels[tile],
-            "steps": round(steps_a_view * len(views["train"])),
-            "config": values_of(config),
-            **views,
-        },
-        {
-            "own": around.coarse[tile],
-            "coarse": around.coarse,
-            **{name: path for name, (path, _) in sight.items()},
-        },
-        {"store": store.folder, "student": student.folder},
-        store.tiles[tile].rows,
-    )

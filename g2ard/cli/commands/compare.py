@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
@@ -11,9 +11,6 @@ from g2ard.cli.frame import Run, command
 from g2ard.cli.options import BackgroundOption, ImagesOption, SizeOption, ViewsOrMadeOption, with_images
 from g2ard.config.choices import BLACK
 from g2ard.progress import plural
-
-if TYPE_CHECKING:
-    from g2ard.stages.evaluate import ViewScore
 
 _WORST = 3
 """Views that the table names."""
@@ -72,7 +69,7 @@ def compare(
         ["", "Gaussians", "PSNR, dB", "SSIM"],
         [
             ["mean", f"{len(other):,} of {len(reference):,}", f"{scores.psnr:.2f}", f"{scores.ssim:.4f}"],
-            *(_row(view) for view in worst),
+            *([f"worst: {v.name}", "", f"{v.psnr:.2f}", f"{v.ssim:.4f}"] for v in worst),
         ],
         stdout=run.json != "-",
     )
@@ -84,7 +81,3 @@ def compare(
         write_page(output, scenes, start=stand.start, background=colour, overwrite=run.overwrite)
         run.say(f"{output}: opens at {worst[0].name}")
     run.result({**scores.as_dict(), "output": None if output is None else str(output)})
-
-
-def _row(view: ViewScore) -> list[str]:
-    return [f"worst: {view.name}", "", f"{view.psnr:.2f}", f"{view.ssim:.4f}"]

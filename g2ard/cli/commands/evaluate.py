@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -72,6 +73,7 @@ def evaluate(
     from g2ard.rendering.lpips import load_lpips
     from g2ard.rendering.renderer import RasterSettings
     from g2ard.rendering.visibility import overdraw
+    from g2ard.scene.targets import kinds_of
     from g2ard.stages.evaluate import evaluate as score
     from g2ard.stages.recover.anchors import Anchors, drift95, needle
 
@@ -117,11 +119,13 @@ def evaluate(
                 raise InputError(f"has {len(frozen):,} Gaussians, {path} has {len(splats):,}", path=anchors)
             row["drift95"] = drift95(Anchors.of(frozen), splats.means)
         rows.append(row)
-    against = _against(rows[0]["views"])
-    said = f"{plural(len(cameras), 'view')}, against {_named(against)}; {_protocol(convention, eight_bit)}"
-    _table(run, said, rows)
-    protocol = {"convention": convention, "8bit": eight_bit, "lpips_input": lpips_input if lpips else None}
-    run.result({"against": _kind(against), "protocol": protocol, "scenes": rows})
+    protocol = f"{convention}'s conventions, {'8-bit' if eight_bit else 'float'} renders"
+    _table(run, f"{plural(len(cameras), 'view')}, against {kinds_of(targets)}; {protocol}", rows)
+    counts = Counter(view["against"] for view in rows[0]["views"])
+    single = {"photo": "photos", "teacher": "teacher"}
+    against = counts if len(counts) > 1 else single[next(iter(counts))]
+    followed = {"convention": convention, "8bit": eight_bit, "lpips_input": lpips_input if lpips else None}
+    run.result({"against": against, "protocol": followed, "scenes": rows})
 
 
 def _of_run(run: Run, scenes: list[Path]) -> Colour | None:
@@ -134,29 +138,6 @@ def _of_run(run: Run, scenes: list[Path]) -> Colour | None:
         return None
     run.say(f"background: {colour_text(found[1])}, as {found[0]} was made with")
     return found[1]
-
-
-def _against(views: list[dict[str, Any]]) -> dict[str, int]:
-    """Count the targets that are photos and those that are a teacher's renders."""
-    counts: dict[str, int] = {}
-    for view in views:
-        counts[view["against"]] = counts.get(view["against"], 0) + 1
-    return counts
-
-
-def _kind(against: dict[str, int]) -> str | dict[str, int]:
-    single = {"photo": "photos", "teacher": "teacher"}
-    return single[next(iter(against))] if len(against) == 1 else against
-
-
-def _named(against: dict[str, int]) -> str:
-    if len(against) == 1:
-        return "photos" if "photo" in against else "the teacher"
-    return f"{plural(against['photo'], 'photo')} and {plural(against['teacher'], 'render')} of the teacher"
-
-
-def _protocol(convention: str, eight_bit: bool) -> str:
-    return f"{convention}'s conventions, {'8-bit' if eight_bit else 'float'} renders"
 
 
 def _table(run: Run, title: str, rows: list[dict[str, Any]]) -> None:
