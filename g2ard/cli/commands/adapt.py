@@ -7,22 +7,8 @@ from typing import Annotated
 
 import typer
 
+from g2ard.cli import options as opt
 from g2ard.cli.frame import Run, command
-from g2ard.cli.options import (
-    AlphaOption,
-    BackgroundOption,
-    ImagesOption,
-    LookOption,
-    OutputOption,
-    PaperOption,
-    ResumeOption,
-    ShDegreeOption,
-    SizeOption,
-    SplitOption,
-    TeacherOption,
-    trained_on,
-    with_images,
-)
 from g2ard.config.choices import AdaptSchedule
 from g2ard.progress import plural
 
@@ -31,11 +17,11 @@ from g2ard.progress import plural
 def adapt(
     run: Run,
     compact: Annotated[Path, typer.Argument(metavar="COMPACT", help="Scene to adapt.")],
-    views: LookOption,
-    output: OutputOption,
-    images: ImagesOption = None,
-    alpha: AlphaOption = "composite",
-    teacher: TeacherOption = None,
+    views: opt.LookOption,
+    output: opt.OutputOption,
+    images: opt.ImagesOption = None,
+    alpha: opt.AlphaOption = "composite",
+    teacher: opt.TeacherOption = None,
     steps: Annotated[int | None, typer.Option(min=1, help="Maximum steps; 7,000 by default.")] = None,
     tolerance: Annotated[
         float | None,
@@ -53,12 +39,12 @@ def adapt(
             min=0, help="Weight of the old appearance, as a number of views; 1 by default, 0 in the paper."
         ),
     ] = None,
-    sh_degree: ShDegreeOption = None,
-    resume: ResumeOption = False,
-    split: SplitOption = "train",
-    size: SizeOption = None,
-    background: BackgroundOption = None,
-    preset: PaperOption = None,
+    sh_degree: opt.ShDegreeOption = None,
+    resume: opt.ResumeOption = False,
+    split: opt.SplitOption = "train",
+    size: opt.SizeOption = None,
+    background: opt.BackgroundOption = None,
+    preset: opt.PaperOption = None,
 ) -> None:
     """Refit colours and opacities to new images; means, rotations and scales stay fixed."""
     from g2ard.cli.resume import check_stopped, left_at, stoppable
@@ -83,7 +69,7 @@ def adapt(
     splats = run.load(compact)
     dense = run.load(teacher) if teacher else None
     cameras = load_trained(
-        with_images(views, images, alpha), split, size, run.say, unpictured=dense is not None
+        opt.with_images(views, images, alpha), split, size, run.say, unpictured=dense is not None
     ).cameras
     warn_of_sight(splats, cameras, run.say)
     if dense is None:
@@ -96,6 +82,6 @@ def adapt(
     gain, end = result.report.psnr, "converged" if result.report.converged else "all steps taken"
     run.say(
         f"{output}: {plural(len(splats), 'Gaussian')}, {plural(result.report.steps, 'step')} ({end}), "
-        f"{trained_on(split)} {gain.before:.2f} → {gain.after:.2f} dB"
+        f"{opt.trained_on(split)} {gain.before:.2f} → {gain.after:.2f} dB"
     )
     run.result({**result.report.as_dict(), "output": str(output), "settings": listed(config)})

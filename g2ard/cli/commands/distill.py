@@ -10,27 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from g2ard.cli import options as opt
 from g2ard.cli.frame import Run, command
-from g2ard.cli.options import (
-    AlphaOption,
-    BackgroundOption,
-    FormatOption,
-    ImagesOption,
-    KeepRegionOption,
-    MethodOption,
-    PresetOption,
-    RecoveryTimeOption,
-    ResumeOption,
-    ScheduleOption,
-    SizeOption,
-    StepsOption,
-    UpOption,
-    ViewsFormatOption,
-    ViewsOrMadeOption,
-    is_made,
-    recovery_engine,
-    with_images,
-)
 from g2ard.cli.outputs import Outputs, budgets_of
 from g2ard.cli.run_folder import (
     KEPT,
@@ -80,9 +61,9 @@ def distill(
             help="A trained scene or coloured point cloud. Omit it to start from the photos of --views.",
         ),
     ] = None,
-    views: ViewsOrMadeOption = None,
-    images: ImagesOption = None,
-    alpha: AlphaOption = "composite",
+    views: opt.ViewsOrMadeOption = None,
+    images: opt.ImagesOption = None,
+    alpha: opt.AlphaOption = "composite",
     photos: Annotated[
         bool | None,
         typer.Option(
@@ -97,12 +78,12 @@ def distill(
             help="Views to score on. --views is then used for training only.",
         ),
     ] = None,
-    method: MethodOption = None,
-    keep_region: KeepRegionOption = None,
-    preset: PresetOption = "auto",
-    schedule: ScheduleOption = None,
-    steps: StepsOption = None,
-    recovery_time: RecoveryTimeOption = None,
+    method: opt.MethodOption = None,
+    keep_region: opt.KeepRegionOption = None,
+    preset: opt.PresetOption = "auto",
+    schedule: opt.ScheduleOption = None,
+    steps: opt.StepsOption = None,
+    recovery_time: opt.RecoveryTimeOption = None,
     keep: Annotated[
         bool,
         typer.Option(
@@ -114,8 +95,8 @@ def distill(
         Path,
         typer.Option("-o", "--output", metavar="RUN", help="Output folder."),
     ],
-    format: FormatOption = "ply",
-    views_format: ViewsFormatOption = "g2ard",
+    format: opt.FormatOption = "ply",
+    views_format: opt.ViewsFormatOption = "g2ard",
     clean: Annotated[
         bool,
         typer.Option("--clean", help="First remove invisible and stray Gaussians, as `g2ard clean` does."),
@@ -124,10 +105,10 @@ def distill(
         bool,
         typer.Option("--view/--no-view", help="Write view.html, a viewer page with the scene."),
     ] = True,
-    resume: ResumeOption = False,
-    size: SizeOption = None,
-    background: BackgroundOption = None,
-    up: UpOption = None,
+    resume: opt.ResumeOption = False,
+    size: opt.SizeOption = None,
+    background: opt.BackgroundOption = None,
+    up: opt.UpOption = None,
     dry_run: Annotated[
         bool,
         typer.Option("--dry-run", help="Estimate time and memory, then exit."),
@@ -144,7 +125,7 @@ def distill(
     names = ("method", "keep_region", "schedule", "steps", "recovery_time", "background", "seed")
     settings = run.settings(DistillConfig(), *names, preset=preset)
     budgets = budgets_of(run)
-    given = views is not None and not is_made(views)
+    given = views is not None and not opt.is_made(views)
     _check_options(scene, views, held_out, photos)
     from g2ard.jobs.distill import prepare
     from g2ard.jobs.distill_options import DistillOptions
@@ -152,7 +133,7 @@ def distill(
     from g2ard.jobs.tiling import is_tiled
 
     began = time.monotonic()
-    settings.setdefault("recover.engine", recovery_engine(run))
+    settings.setdefault("recover.engine", opt.recovery_engine(run))
     name = f"scene.{format}"
     outputs = Outputs(run, output, budgets)
 
@@ -168,9 +149,9 @@ def distill(
     if scene is not None:
         _check_kind(scene, given)
     options = DistillOptions(
-        views=with_images(views, images, alpha),
+        views=opt.with_images(views, images, alpha),
         photos=photos,
-        held_out=None if held_out is None else with_images(held_out, images, alpha),
+        held_out=None if held_out is None else opt.with_images(held_out, images, alpha),
         up=up,
         size=size,
         clean=clean,
@@ -220,13 +201,13 @@ def _check_options(
     scene: Path | None, views: Path | None, held_out: Path | None, photos: bool | None
 ) -> None:
     """Reject inputs that leave nothing to distil, to train on or to score on."""
-    if is_made(str(held_out)):
+    if opt.is_made(str(held_out)):
         raise typer.BadParameter(
             "--held-out must be a file of views; generated views already hold out every 8th"
         )
-    if scene is None and (views is None or is_made(views)):
+    if scene is None and (views is None or opt.is_made(views)):
         raise typer.BadParameter("give a SCENE, or photos with their poses as --views")
-    if photos and is_made(views):
+    if photos and opt.is_made(views):
         raise typer.BadParameter("--photos: generated views have no photos; give --views VIEWS")
     if scene is None and photos is False:
         raise typer.BadParameter("--renders needs a SCENE to render; give one or remove --renders")

@@ -8,20 +8,8 @@ from typing import Annotated, Any
 
 import typer
 
+from g2ard.cli import options as opt
 from g2ard.cli.frame import Run, command
-from g2ard.cli.options import (
-    AlphaOption,
-    BackgroundOption,
-    ConventionOption,
-    ImagesOption,
-    SizeOption,
-    SplitOption,
-    TeacherOption,
-    ViewsOrMadeOption,
-    can_be_made,
-    views_or_teacher,
-    with_images,
-)
 from g2ard.config.choices import BLACK, Colour, LpipsInput
 from g2ard.progress import plural
 
@@ -34,10 +22,10 @@ from g2ard.progress import plural
 def evaluate(
     run: Run,
     scenes: Annotated[list[Path], typer.Argument(metavar="SCENE...", help="Scenes to score.")],
-    views: ViewsOrMadeOption = None,
-    images: ImagesOption = None,
-    alpha: AlphaOption = "composite",
-    teacher: TeacherOption = None,
+    views: opt.ViewsOrMadeOption = None,
+    images: opt.ImagesOption = None,
+    alpha: opt.AlphaOption = "composite",
+    teacher: opt.TeacherOption = None,
     photos: Annotated[
         bool,
         typer.Option("--photos", help="With --teacher: use photos where views have them, renders otherwise."),
@@ -53,13 +41,13 @@ def evaluate(
         LpipsInput,
         typer.Option(help="Scale images to [-1, 1], as LPIPS expects, or feed [0, 1] as 3DGS does."),
     ] = "scaled",
-    convention: ConventionOption = "gsplat",
+    convention: opt.ConventionOption = "gsplat",
     eight_bit: Annotated[
         bool, typer.Option("--8bit", help="Round renders and targets to 8 bits, as in saved PNGs.")
     ] = False,
-    split: SplitOption = "test",
-    size: SizeOption = None,
-    background: BackgroundOption = None,
+    split: opt.SplitOption = "test",
+    size: opt.SizeOption = None,
+    background: opt.BackgroundOption = None,
 ) -> None:
     """Score scenes against photos or a teacher's renders: PSNR, SSIM, size, needles, Gaussians per pixel.
 
@@ -81,15 +69,15 @@ def evaluate(
         raise typer.BadParameter("--photos goes with --teacher; without a teacher, all targets are photos")
     if lpips_input != "scaled" and lpips is None:
         raise typer.BadParameter("--lpips-input goes with --lpips; give --lpips DIR")
-    can_be_made(views, teacher)
-    views = with_images(views, images, alpha)
+    opt.can_be_made(views, teacher)
+    views = opt.with_images(views, images, alpha)
     for path in scenes:
         check_scene(path)
     chosen, settings = background or _of_run(run, scenes), RasterSettings(convention=convention)
     colour = chosen or BLACK
     dense = run.load(teacher) if teacher else None
     frozen = run.load(anchors) if anchors else None
-    views = views_or_teacher(run, views, teacher, dense)
+    views = opt.views_or_teacher(run, views, teacher, dense)
     cameras = load_views(views, split, size, run.say, unpictured=dense is not None)
     if dense is None or photos:
         propose_background(cameras, colour, chosen is not None, run.say)

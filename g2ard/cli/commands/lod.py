@@ -8,17 +8,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
+from g2ard.cli import options as opt
 from g2ard.cli.budget_options import Ratios
 from g2ard.cli.frame import Run, command
-from g2ard.cli.options import (
-    BackgroundOption,
-    ImagesOption,
-    ResumeOption,
-    SizeOption,
-    UpOption,
-    ViewsOrMadeOption,
-    with_images,
-)
 from g2ard.cli.tile_options import tiling_of
 from g2ard.cli.usage import in_flags
 from g2ard.config.choices import BLACK
@@ -108,15 +100,15 @@ def lod(
             "heading of its y axis (z if -y is up), degrees from north; or its coordinates' map system.",
         ),
     ] = None,
-    views: ViewsOrMadeOption = None,
-    images: ImagesOption = None,
+    views: opt.ViewsOrMadeOption = None,
+    images: opt.ImagesOption = None,
     steps: Annotated[
         int | None, typer.Option(min=1, help="Steps per level; by default until it converges.")
     ] = None,
-    size: SizeOption = None,
-    background: BackgroundOption = None,
-    up: UpOption = None,
-    resume: ResumeOption = False,
+    size: opt.SizeOption = None,
+    background: opt.BackgroundOption = None,
+    up: opt.UpOption = None,
+    resume: opt.ResumeOption = False,
 ) -> None:
     """Write levels of detail as streamed SOG or 3D Tiles.
 
@@ -145,7 +137,7 @@ def lod(
         spot = None if place is None else _georeference(place)
     except InputError as error:
         raise typer.BadParameter(in_flags(error, run.flags)) from None
-    views = with_images(views, images)
+    views = opt.with_images(views, images)
     if spot is not None and kind == "sog":
         raise typer.BadParameter("--georeference needs --format 3dtiles")
     if environment and kind != "sog":

@@ -7,28 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from g2ard.cli import options as opt
 from g2ard.cli.frame import Run, command
-from g2ard.cli.options import (
-    AlphaOption,
-    BackgroundOption,
-    ImagesOption,
-    OutputOption,
-    PresetOption,
-    RecoveryTimeOption,
-    ResumeOption,
-    ScheduleOption,
-    ShDegreeOption,
-    SizeOption,
-    SplitOption,
-    StepsOption,
-    TeacherOption,
-    ViewsOrMadeOption,
-    can_be_made,
-    recovery_engine,
-    trained_on,
-    views_or_teacher,
-    with_images,
-)
 from g2ard.progress import plural
 
 if TYPE_CHECKING:
@@ -46,11 +26,11 @@ if TYPE_CHECKING:
 def recover(
     run: Run,
     student: Annotated[Path, typer.Argument(metavar="STUDENT", help="Simplified scene to recover.")],
-    output: OutputOption,
-    views: ViewsOrMadeOption = None,
-    images: ImagesOption = None,
-    alpha: AlphaOption = "composite",
-    teacher: TeacherOption = None,
+    output: opt.OutputOption,
+    views: opt.ViewsOrMadeOption = None,
+    images: opt.ImagesOption = None,
+    alpha: opt.AlphaOption = "composite",
+    teacher: opt.TeacherOption = None,
     photos: Annotated[
         bool,
         typer.Option("--photos", help="With --teacher: use photos where views have them, renders otherwise."),
@@ -62,19 +42,19 @@ def recover(
             help="The student before any recovery, if it was recovered before.",
         ),
     ] = None,
-    preset: PresetOption = "auto",
-    schedule: ScheduleOption = None,
-    steps: StepsOption = None,
-    recovery_time: RecoveryTimeOption = None,
-    sh_degree: ShDegreeOption = None,
-    resume: ResumeOption = False,
-    split: SplitOption = "train",
+    preset: opt.PresetOption = "auto",
+    schedule: opt.ScheduleOption = None,
+    steps: opt.StepsOption = None,
+    recovery_time: opt.RecoveryTimeOption = None,
+    sh_degree: opt.ShDegreeOption = None,
+    resume: opt.ResumeOption = False,
+    split: opt.SplitOption = "train",
     weighted: Annotated[
         bool | None,
         typer.Option("--weights/--no-weights", help="Sample views by their weights, if they have any."),
     ] = None,
-    size: SizeOption = None,
-    background: BackgroundOption = None,
+    size: opt.SizeOption = None,
+    background: opt.BackgroundOption = None,
 ) -> None:
     """Optimise a fixed set of Gaussians against photos or a teacher's renders."""
     from g2ard.cli.resume import check_stopped, left_at, stoppable
@@ -101,16 +81,16 @@ def recover(
         weighted = named.get("select.weighted", True)
     if photos and teacher is None:
         raise typer.BadParameter("--photos goes with --teacher; without a teacher, all targets are photos")
-    can_be_made(views, teacher)
-    views = with_images(views, images, alpha)
+    opt.can_be_made(views, teacher)
+    views = opt.with_images(views, images, alpha)
     checkpoint = output.parent / f".{output.name}.checkpoint.npz"
     if left_at(checkpoint) or not (resume and output.exists()):
         check_scene_output(output, run.overwrite)
     check_stopped(run, checkpoint, resume, output)
-    settings.setdefault("recover.engine", recovery_engine(run))
+    settings.setdefault("recover.engine", opt.recovery_engine(run))
     splats = run.load(student)
     dense = run.load(teacher) if teacher else None
-    views = views_or_teacher(run, views, teacher, dense)
+    views = opt.views_or_teacher(run, views, teacher, dense)
     chosen = load_trained(views, split, size, run.say, unpictured=dense is not None)
     warn_of_sight(splats, chosen.cameras, run.say)
     if dense is None or photos:
@@ -171,7 +151,7 @@ def recover(
         for line in filter(None, lines):
             run.say(line)
     gain, count = result.report.psnr, plural(len(splats), "Gaussian")
-    run.say(f"{output}: {count}, {trained_on(split)} {gain.before:.2f} → {gain.after:.2f} dB")
+    run.say(f"{output}: {count}, {opt.trained_on(split)} {gain.before:.2f} → {gain.after:.2f} dB")
     report = {**result.report.as_dict(), "preset": why, "prior": measured.as_dict()}
     report |= {"kinds": [kind.as_dict() for kind in kinds], "settings": listed(config)}
     run.result({**report, "output": str(output)})

@@ -7,14 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
+from g2ard.cli import options as opt
 from g2ard.cli.frame import Run, command
-from g2ard.cli.options import (
-    AlphaOption,
-    BackgroundOption,
-    OutputOption,
-    SceneArgument,
-    ViewFormatOption,
-)
 from g2ard.config.choices import BLACK, Keep, Refinement
 from g2ard.progress import plural
 
@@ -30,7 +24,7 @@ if TYPE_CHECKING:
 )
 def register(
     run: Run,
-    scene: SceneArgument,
+    scene: opt.SceneArgument,
     photos: Annotated[
         Path,
         typer.Option(
@@ -39,8 +33,8 @@ def register(
             "poses are the start.",
         ),
     ],
-    output: OutputOption,
-    format: ViewFormatOption = None,
+    output: opt.OutputOption,
+    format: opt.ViewFormatOption = None,
     poses: Annotated[
         Path | None,
         typer.Option(metavar="FILE", help="Initial poses: views in any format, or ACE text."),
@@ -106,8 +100,8 @@ def register(
         Path | None,
         typer.Option(metavar="FILE.html", help="Also write a page of renders overlaid on photos."),
     ] = None,
-    alpha: AlphaOption = "composite",
-    background: BackgroundOption = None,
+    alpha: opt.AlphaOption = "composite",
+    background: opt.BackgroundOption = None,
 ) -> None:
     """Estimate camera poses of photos by matching them with renders of a scene.
 

@@ -8,20 +8,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
+from g2ard.cli import options as opt
 from g2ard.cli.budget_options import Count, LooksOption, RatioOption, one_budget
 from g2ard.cli.frame import Run, command
-from g2ard.cli.options import (
-    BackgroundOption,
-    ConventionOption,
-    ImagesOption,
-    SceneArgument,
-    SizeOption,
-    SplitOption,
-    ViewsOrMadeOption,
-    is_made,
-    picture,
-    with_images,
-)
 from g2ard.config.choices import BLACK, Method
 from g2ard.progress import plural
 
@@ -37,7 +26,7 @@ Color = Literal["scene", "flags", "cells", "parents"]
 @command("render", example="g2ard render scene.ply -n 4 --sheet look.png", scenes=True)
 def render(
     run: Run,
-    scene: SceneArgument,
+    scene: opt.SceneArgument,
     output: Annotated[
         Path | None,
         typer.Option(
@@ -47,8 +36,8 @@ def render(
             help="Folder for PNGs, or an animation of the views in order: .gif, .webp, .mp4 (needs ffmpeg).",
         ),
     ] = None,
-    views: ViewsOrMadeOption = None,
-    images: ImagesOption = None,
+    views: opt.ViewsOrMadeOption = None,
+    images: opt.ImagesOption = None,
     turn: Annotated[
         int | None,
         typer.Option("--orbit", min=1, metavar="N", help="Render N views on a circle around the scene."),
@@ -56,7 +45,7 @@ def render(
     fps: Annotated[float, typer.Option(min=0.1, help="Images a second of an animation.")] = 25.0,
     sheet: Annotated[
         Path | None,
-        typer.Option(parser=picture, metavar="FILE.png", help="Write all views as one contact sheet."),
+        typer.Option(parser=opt.picture, metavar="FILE.png", help="Write all views as one contact sheet."),
     ] = None,
     depth: Annotated[
         bool, typer.Option("--depth", help="Also write NAME.depth.npy, in scene units.")
@@ -72,10 +61,10 @@ def render(
         Path | None,
         typer.Option(metavar="FILE.npy", help="With --color parents: file from `simplify --parents`."),
     ] = None,
-    convention: ConventionOption = "gsplat",
-    split: SplitOption = "all",
-    size: SizeOption = None,
-    background: BackgroundOption = None,
+    convention: opt.ConventionOption = "gsplat",
+    split: opt.SplitOption = "all",
+    size: opt.SizeOption = None,
+    background: opt.BackgroundOption = None,
 ) -> None:
     """Render views of a scene as PNG, or show how it would be simplified."""
     import numpy as np
@@ -102,7 +91,7 @@ def render(
         check_animation(animation)
         output = None
     looks = _looks(color, count, ratio, parents, views)
-    views = with_images(views, images)
+    views = opt.with_images(views, images)
     if output is not None:
         check_output(output, run.overwrite, folder=True)
     if sheet is not None:
@@ -172,7 +161,7 @@ def _looks(
     if color != "scene" or ratio is not None or count is None:
         _check(color, count, ratio, parents)
         return None
-    if views is not None and not is_made(views):
+    if views is not None and not opt.is_made(views):
         raise typer.BadParameter("-n generates views, so it excludes --views; give one")
     if parents is not None or count.is_share:
         raise typer.BadParameter(

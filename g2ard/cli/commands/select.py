@@ -7,20 +7,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from g2ard.cli import options as opt
 from g2ard.cli.budget_options import Count
 from g2ard.cli.frame import Run, command
-from g2ard.cli.options import (
-    ImagesOption,
-    OutputOption,
-    PaperOption,
-    PolicyOption,
-    SceneArgument,
-    SplitOption,
-    ViewFormatOption,
-    ViewsOption,
-    views_count,
-    with_images,
-)
 from g2ard.progress import plural
 
 if TYPE_CHECKING:
@@ -36,23 +25,23 @@ if TYPE_CHECKING:
 )
 def select(
     run: Run,
-    scene: SceneArgument,
-    output: OutputOption,
-    format: ViewFormatOption = None,
+    scene: opt.SceneArgument,
+    output: opt.OutputOption,
+    format: opt.ViewFormatOption = None,
     k: Annotated[
         Count | None,
         typer.Option(
             "-k",
-            parser=views_count,
+            parser=opt.views_count,
             metavar="K",
             help="Views to select: 100, 25%, or auto (the knee of the curve).",
         ),
     ] = None,
-    views: ViewsOption = None,
-    images: ImagesOption = None,
-    policy: PolicyOption = None,
-    split: SplitOption = "train",
-    preset: PaperOption = None,
+    views: opt.ViewsOption = None,
+    images: opt.ImagesOption = None,
+    policy: opt.PolicyOption = None,
+    split: opt.SplitOption = "train",
+    preset: opt.PaperOption = None,
 ) -> None:
     """Select the most useful views, best first, each with a sampling weight.
 
@@ -80,7 +69,7 @@ def select(
         raise typer.BadParameter("give the number of views with -k K")
     check_views_output(output, run.overwrite, format)
     splats = run.load(scene)
-    pool, candidates = load_split_views(with_images(views, images), split, run.say)
+    pool, candidates = load_split_views(opt.with_images(views, images), split, run.say)
     cameras = pool.cameras.take(candidates)
     warn_of_sight(splats, cameras, run.say)
     chosen = choose(

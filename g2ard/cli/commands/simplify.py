@@ -8,18 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from g2ard.cli import options as opt
 from g2ard.cli.frame import Run, command
-from g2ard.cli.options import (
-    ImagesOption,
-    KeepRegionOption,
-    MethodOption,
-    OutputOption,
-    PaperOption,
-    SceneArgument,
-    UpOption,
-    ViewsOrMadeOption,
-    with_images,
-)
 from g2ard.cli.outputs import Outputs, budgets_of
 from g2ard.cli.run_result import say_weight, tell_quality
 from g2ard.cli.tile_options import tiling_of
@@ -42,18 +32,18 @@ if TYPE_CHECKING:
 def simplify(
     run: Run,
     *,
-    scene: SceneArgument,
-    views: ViewsOrMadeOption = None,
-    images: ImagesOption = None,
+    scene: opt.SceneArgument,
+    views: opt.ViewsOrMadeOption = None,
+    images: opt.ImagesOption = None,
     no_views: Annotated[
         bool,
         typer.Option("--no-views", help="Use no cameras, neither found nor generated."),
     ] = False,
-    preset: PaperOption = None,
-    method: MethodOption = None,
-    keep_region: KeepRegionOption = None,
-    up: UpOption = None,
-    output: OutputOption,
+    preset: opt.PaperOption = None,
+    method: opt.MethodOption = None,
+    keep_region: opt.KeepRegionOption = None,
+    up: opt.UpOption = None,
+    output: opt.OutputOption,
     parents: Annotated[
         Path | None,
         typer.Option(metavar="FILE.npy", help="Also write each Gaussian's row in the result, or -1."),
@@ -100,7 +90,7 @@ def simplify(
         ]
         refuse_whole(scene, given)
         tiled = TiledCommand(run, scene, outputs, tiling, budgets)
-        tiled.simplify(config, with_images(views, images), no_views, up)
+        tiled.simplify(config, opt.with_images(views, images), no_views, up)
         return
     check_memory(scene, tiling, WHOLE_TIMES)
     maps = None if parents is None else Outputs(run, parents, budgets, name="--parents")
@@ -114,7 +104,7 @@ def simplify(
     clock.append(time.perf_counter())
     reduce = Reduction(
         found.splats,
-        views=with_images(views, images),
+        views=opt.with_images(views, images),
         blind=no_views,
         config=config,
         beside=scene,

@@ -7,15 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from g2ard.cli import options as opt
 from g2ard.cli.frame import Run, command
-from g2ard.cli.options import (
-    BackgroundOption,
-    ImagesOption,
-    OutputOption,
-    UpOption,
-    ViewsOrMadeOption,
-    with_images,
-)
 from g2ard.config.choices import BLACK
 from g2ard.progress import plural
 
@@ -29,26 +22,26 @@ def view(
     scene: Annotated[
         Path, typer.Argument(metavar="SCENE|RUN", help="A scene, or the folder of a `distill` run.")
     ],
-    output: OutputOption,
+    output: opt.OutputOption,
     other: Annotated[
         Path | None,
         typer.Argument(metavar="[SCENE|RUN]", help="Second scene to compare with, right of a divider."),
     ] = None,
-    views: ViewsOrMadeOption = None,
-    images: ImagesOption = None,
+    views: opt.ViewsOrMadeOption = None,
+    images: opt.ImagesOption = None,
     start: Annotated[
         str | None,
         typer.Option(metavar="NAME", help="View to open with; by default the one that shows most."),
     ] = None,
-    background: BackgroundOption = None,
-    up: UpOption = None,
+    background: opt.BackgroundOption = None,
+    up: opt.UpOption = None,
 ) -> None:
     """Write an HTML page that shows one scene, or compares two, in any browser."""
     from g2ard.io.detect import run_scene
     from g2ard.jobs.viewer_frame import frame_of
     from g2ard.viewer import check_page_output, write_page
 
-    views = with_images(views, images)
+    views = opt.with_images(views, images)
     check_page_output(output, run.overwrite)
     paths = [run_scene(path) for path in (scene, other) if path is not None]
     run.spare_inputs(output)
