@@ -15,17 +15,9 @@ from numpy.typing import NDArray
 
 from g2ard.config.choices import RenderModel
 from g2ard.errors import InputError
+from g2ard.io import plyfiles
 from g2ard.io.atomic import atomic_output
 from g2ard.io.packing import coded, log_scales, morton_order, smallest_three, unit_quats, writable
-from g2ard.io.plyfiles import (
-    comments_of,
-    offset_of,
-    read_element,
-    read_header,
-    render_model_of,
-    require,
-    row_blocks,
-)
 from g2ard.io.sanitize import Raw, cleaned
 from g2ard.io.stream import SceneStream
 from g2ard.io.types import Scene
@@ -59,8 +51,8 @@ class _PackedStream(SceneStream):
         layout = self._layout
         bands: Iterator[Any] = repeat((0, None))
         if layout.sh is not None:
-            bands = row_blocks(self.path, layout.sh, rows, start)
-        vertices = row_blocks(self.path, layout.vertex, rows, start)
+            bands = plyfiles.row_blocks(self.path, layout.sh, rows, start)
+        vertices = plyfiles.row_blocks(self.path, layout.vertex, rows, start)
         for (first, vertex), (_, sh) in zip(vertices, bands, strict=False):
             yield _raw(layout, first, vertex, sh)
 
@@ -79,8 +71,8 @@ class _Layout:
 
 
 def _layout(path: Path) -> _Layout:
-    header = read_header(path)
-    require(path, header.properties.get("vertex", []), _PACKED, "a compressed scene")
+    header = plyfiles.read_header(path)
+    plyfiles.require(path, header.properties.get("vertex", []), _PACKED, "a compressed scene")
     chunk_properties = header.properties.get("chunk", [])
     bounds = [f"{end}_{axis}" for end in ("min", "max") for axis in ("x", "y", "z")]
     bounds += [f"{end}_scale_{axis}" for end in ("min", "max") for axis in ("x", "y", "z")]
@@ -94,14 +86,14 @@ def _layout(path: Path) -> _Layout:
         raise InputError(f"element 'sh' has {len(rest)} coefficients; expected 9, 24 or 45", path=path)
 
     names = ("vertex", "chunk", "sh") if rest else ("vertex", "chunk")
-    vertex, chunk, *sh = read_element(path, header, *names)
+    vertex, chunk, *sh = plyfiles.read_element(path, header, *names)
     if len(chunk) * _CHUNK < len(vertex) or (sh and len(sh[0]) != len(vertex)):
         raise InputError(f"{len(chunk)} chunks and {plural(len(vertex), 'Gaussian')} do not fit", path=path)
     for name in _PACKED:
         if vertex.dtype[name] != np.uint32:
             raise InputError(f"has type {vertex.dtype[name]}, expected uint", path=path, property=name)
     bands, colored = sh[0] if sh else None, "min_r" in chunk_properties
-    offset, mode = offset_of(path, header), render_model_of(header)
+    offset, mode = plyfiles.offset_of(path, header), plyfiles.render_model_of(header)
     model: RenderModel = "antialiased" if mode == "antialiased" else "classic"
     return _Layout(vertex, np.array(chunk), bands, len(rest) // 3, colored, offset, model)
 
@@ -194,7 +186,7 @@ def write(path: Path, splats: Splats, *, overwrite: bool = False) -> None:
     elements = [PlyElement.describe(chunk, "chunk"), PlyElement.describe(words, "vertex")]
     if splats.sh_degree:
         elements.append(PlyElement.describe(_harmonics(splats), "sh"))
-    comments = comments_of(splats.offset, splats.render_model)
+    comments = plyfiles.comments_of(splats.offset, splats.render_model)
     with atomic_output(path, overwrite) as temporary, temporary.open("wb") as file:
         PlyData(elements, byte_order="<", comments=comments).write(file)
 

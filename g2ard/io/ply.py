@@ -14,17 +14,8 @@ from numpy.typing import NDArray
 
 from g2ard.config.choices import RenderModel
 from g2ard.errors import InputError
+from g2ard.io import plyfiles
 from g2ard.io.atomic import atomic_output
-from g2ard.io.plyfiles import (
-    comments_of,
-    offset_of,
-    read_element,
-    read_header,
-    render_model_of,
-    require,
-    row_blocks,
-    spread_rows,
-)
 from g2ard.io.sanitize import BLOCK, LOG_SCALE_LIMIT, Raw, cleaned
 from g2ard.io.stream import SceneStream
 from g2ard.io.types import Note, Scene
@@ -57,17 +48,17 @@ class _Layout:
 
     @classmethod
     def of(cls, path: Path) -> _Layout:
-        header = read_header(path)
+        header = plyfiles.read_header(path)
         properties = header.properties.get("vertex", [])
-        mode = render_model_of(header)
+        mode = plyfiles.render_model_of(header)
         flat = mode == "2dgs" or ("scale_1" in properties and "scale_2" not in properties)
         needed = [name for name in _NEEDED if not flat or name != "scale_2"]
-        require(path, properties, needed, "a 3DGS scene")
+        plyfiles.require(path, properties, needed, "a 3DGS scene")
         rest = sorted((p for p in properties if re.fullmatch(r"f_rest_\d{1,3}", p)), key=lambda p: int(p[7:]))
         stored, kept = _bands(path, rest)
-        (rows,) = read_element(path, header, "vertex")
-        shift = _recentre(spread_rows(rows)) if rows.dtype["x"].itemsize == 8 else np.zeros(3)
-        offset = offset_of(path, header) + shift
+        (rows,) = plyfiles.read_element(path, header, "vertex")
+        shift = _recentre(plyfiles.spread_rows(rows)) if rows.dtype["x"].itemsize == 8 else np.zeros(3)
+        offset = plyfiles.offset_of(path, header) + shift
         notes = _ignored(properties, rest, stored, kept)
         if flat:
             text = "2DGS scene read as flat Gaussians; renders differ where surfaces are seen at a slant"
@@ -106,13 +97,16 @@ class _PlyStream(SceneStream):
         super().__init__(path, len(layout.rows), layout.kept, layout.offset, notes, model)
 
     def positions(self, rows: int) -> Iterator[NDArray[np.float32]]:
-        for _, block in row_blocks(self.path, self._layout.rows, rows):
+        for _, block in plyfiles.row_blocks(self.path, self._layout.rows, rows):
             with np.errstate(over="ignore", invalid="ignore"):
                 means = _means(block, self._layout.shift)
             yield means
 
     def raw(self, rows: int, start: int) -> Iterator[Raw]:
-        return (self._layout.raw(block) for _, block in row_blocks(self.path, self._layout.rows, rows, start))
+        return (
+            self._layout.raw(block)
+            for _, block in plyfiles.row_blocks(self.path, self._layout.rows, rows, start)
+        )
 
 
 def _bands(path: Path, rest: list[str]) -> tuple[int, int]:
@@ -212,7 +206,7 @@ def write_parts(
     names += [f"f_rest_{k}" for k in range(rest)] + ["opacity", *_SCALES, *_QUATS]
     one_row = np.zeros(1, [(name, "<f4") for name in names])
     rows = PlyElement.describe(np.broadcast_to(one_row, count), "vertex")  # costs no memory
-    comments = comments_of(offset, render_model)
+    comments = plyfiles.comments_of(offset, render_model)
     header = PlyData([rows], byte_order="<", comments=comments).header
     with atomic_output(path, overwrite) as temporary, temporary.open("wb") as file:
         file.write(header.encode("ascii") + b"\n")

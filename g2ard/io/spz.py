@@ -22,17 +22,9 @@ from numpy.typing import NDArray
 
 from g2ard.config.choices import Axes
 from g2ard.errors import DAMAGED, InputError, missing
+from g2ard.io import packing
 from g2ard.io.atomic import atomic_output
 from g2ard.io.limits import check_unpacked
-from g2ard.io.packing import (
-    coded,
-    log_scales,
-    morton_order,
-    smallest_three,
-    unit_quats,
-    world_means,
-    writable,
-)
 from g2ard.io.sanitize import Raw, cleaned
 from g2ard.io.types import Note, Scene
 from g2ard.scene.axes import change_of_axes, with_axes
@@ -273,9 +265,9 @@ def write(
                 hint="{spz_version=4} can name others",
             )
         splats = with_axes(splats, change_of_axes("RUB", "RDF") @ change_of_axes("RDF", axes))
-    splats = writable(path, splats)
-    splats = splats.take(morton_order(splats.means))
-    means = world_means(path, splats, ".spz")
+    splats = packing.writable(path, splats)
+    splats = splats.take(packing.morton_order(splats.means))
+    means = packing.world_means(path, splats, ".spz")
     content = encoded(path, splats, means, fraction_bits(path, means, splats), spz_version, axes)
     with atomic_output(path, overwrite) as temporary:
         temporary.write_bytes(content)
@@ -334,12 +326,12 @@ def fraction_bits(path: Path, means: NDArray[np.float64], splats: Splats) -> int
 def _streams(splats: Splats, means: NDArray[np.float64], bits: int, version: int) -> list[bytes]:
     """Pack positions, alphas, colours, scales, rotations and, if any, harmonics."""
     fixed = np.rint(means * (1, -1, -1) * (1 << bits)).astype("<i4")
-    quats = unit_quats(splats.quats) * (1, 1, -1, -1)
+    quats = packing.unit_quats(splats.quats) * (1, 1, -1, -1)
     streams = [
         fixed.reshape(-1, 1).view(np.uint8)[:, :3].tobytes(),
         _bytes(splats.opacities.astype(np.float64) * 255),
         _bytes((splats.sh0[:, 0].astype(np.float64) * _COLOR_SCALE + 0.5) * 255),
-        _bytes((log_scales(splats) + 10) * 16),
+        _bytes((packing.log_scales(splats) + 10) * 16),
         _xyz(quats) if version == 2 else _packed(quats),
     ]
     if splats.sh_degree:  # in all 8 bits: rounding to fewer is where other writers lose most
@@ -359,10 +351,10 @@ def _xyz(quats: NDArray[np.float64]) -> bytes:
 
 def _packed(quats: NDArray[np.float64]) -> bytes:
     """Pack quaternions for versions 3 and 4, see `_quats_packed`."""
-    largest, others = smallest_three(quats[:, [1, 2, 3, 0]])
+    largest, others = packing.smallest_three(quats[:, [1, 2, 3, 0]])
     words = largest.astype(np.uint32)
     for k in range(3):
-        part = (others[:, k] < 0).astype(np.uint32) << 9 | coded(
+        part = (others[:, k] < 0).astype(np.uint32) << 9 | packing.coded(
             np.abs(others[:, k]) * math.sqrt(2), 511
         ).astype(np.uint32)
         words = (words << np.uint32(10) | part).astype(np.uint32)

@@ -11,20 +11,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from g2ard.errors import InputError
+from g2ard.io import jsonfile
 from g2ard.io.atomic import atomic_output
 from g2ard.io.camera_files import beside
-from g2ard.io.jsonfile import (
-    Fields,
-    fields_of,
-    listed,
-    matrix,
-    number,
-    numbers,
-    optional_text,
-    read_json,
-    text,
-    whole,
-)
 from g2ard.io.photos import Frame, rigid, view_set
 from g2ard.io.types import ViewSet
 from g2ard.progress import plural
@@ -36,7 +25,7 @@ _VERSION = 1
 
 def read(path: Path, images: Path | None = None) -> ViewSet:
     """Read views; photo paths are relative to the file unless `images`, a folder of photos, is given."""
-    content = read_json(path)
+    content = jsonfile.read_json(path)
     if content.get("format") != _FORMAT:
         raise InputError(f"is {content.get('format')!r}, expected {_FORMAT!r}", path=path, property="format")
     if content.get("version") != _VERSION:
@@ -48,28 +37,28 @@ def read(path: Path, images: Path | None = None) -> ViewSet:
 
 
 def _frame(path: Path, index: int, entry: Any, images: Path | None) -> Frame:
-    view = fields_of(path, entry, index, "view")
-    photo, mask = optional_text(view, "image"), optional_text(view, "mask")
-    weight = None if view.get("weight") is None else number(view, "weight")
+    view = jsonfile.fields_of(path, entry, index, "view")
+    photo, mask = jsonfile.optional_text(view, "image"), jsonfile.optional_text(view, "mask")
+    weight = None if view.get("weight") is None else jsonfile.number(view, "weight")
     if weight is not None and weight < 0:
         raise view.place.to("weight").unexpected(weight, "a number ≥ 0")
-    lens = listed(view, "distortion")
+    lens = jsonfile.listed(view, "distortion")
     return Frame(
-        name=text(view, "name"),
+        name=jsonfile.text(view, "name"),
         viewmat=_exact(view),
-        K=np.array(numbers(view, "K", 3, 3)),
-        size=(whole(view, "width"), whole(view, "height")),
+        K=np.array(jsonfile.numbers(view, "K", 3, 3)),
+        size=(jsonfile.whole(view, "width"), jsonfile.whole(view, "height")),
         photo=None if photo is None else images / Path(photo).name if images else path.parent / photo,
         mask=None if mask is None else path.parent / mask,
-        distortion=(*(numbers(view, "distortion", len(lens)) if lens else ()), *[0.0] * 5)[:5],
-        split=optional_text(view, "split"),
+        distortion=(*(jsonfile.numbers(view, "distortion", len(lens)) if lens else ()), *[0.0] * 5)[:5],
+        split=jsonfile.optional_text(view, "split"),
         weight=weight,
     )
 
 
-def _exact(view: Fields) -> NDArray[np.float64]:
+def _exact(view: jsonfile.Fields) -> NDArray[np.float64]:
     """Return the pose as stored if it is rigid to rounding, so that writing and reading change no bit."""
-    stored = matrix(view, "camera_from_world")
+    stored = jsonfile.matrix(view, "camera_from_world")
     nearest = rigid(stored, view.place.to("camera_from_world"))
     return stored if len(stored) == 4 and np.allclose(nearest, stored, rtol=0, atol=1e-9) else nearest
 

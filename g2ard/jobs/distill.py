@@ -149,14 +149,9 @@ def prepare(
     aims = _aims(prior, budgets, options, degree, read.name, progress, say)
     views = views_of(
         prior,
-        options.views,
-        options.held_out,
+        options,
         beside=read.beside,
-        size=options.size,
-        up=options.up,
-        seed=recover.seed,
         teach=not read.lifted and options.photos is not True,
-        anywhere=options.anywhere,
         progress=progress,
         say=say,
     )

@@ -358,13 +358,8 @@ def _job(
         sample = sample_of(store, workers)
         views = views_of(
             sample,
-            options.views,
-            options.held_out,
+            options,
             beside=options.beside or scene,
-            size=options.size,
-            up=options.up,
-            seed=options.config.recover.seed,
-            anywhere=options.anywhere,
             represents=store.count / len(sample),
             progress=progress,
             say=say,

@@ -24,6 +24,7 @@ from g2ard.scene.splats import Splats
 from g2ard.scene.splits import for_scores, for_training, split_mask, splits_of
 
 if TYPE_CHECKING:
+    from g2ard.jobs.distill_options import DistillOptions
     from g2ard.poses import Pool
 Up = Sequence[float] | None
 
@@ -80,15 +81,10 @@ def is_made(views: object) -> bool:
 
 def views_of(
     prior: Splats,
-    views: Views | None,
-    held_out: Views | None = None,
+    options: DistillOptions,
     *,
     beside: str | Path | None = None,
-    size: int | None = None,
-    up: Up = None,
-    seed: int = 0,
     teach: bool = True,
-    anywhere: float | None = 0.0,
     represents: float = 1.0,
     progress: Progress = silent,
     say: Say = unsaid,
@@ -96,15 +92,16 @@ def views_of(
     """Choose views for recovery and for scoring.
 
     Args:
-        views: cameras, or their path. None uses cameras found beside the scene, or generates a pool; "made"
-            always generates one.
-        held_out: views to score on; None holds out the test split, or every 8th view of a pool.
+        prior: the dense scene.
+        options: the views, or None for those found beside the scene or generated; `anywhere`, the share of
+            views from anywhere, which are added to views that are given without photos or generated.
+        beside: path beside which to look for cameras.
         teach: whether the scene can render targets; otherwise views without a photo are skipped and no views
             are generated.
-        anywhere: share of the training views that look from anywhere, added to those that are given without
-            photos or generated; None decides by how much of the scene a view holds.
         represents: Gaussians per row if `prior` is a sample of a larger scene; the pool grows with it.
     """
+    views, held_out, size, up = options.views, options.held_out, options.size, options.up
+    seed, anywhere = options.config.recover.seed, options.anywhere
     found = None
     if views is None and beside is not None:
         wanted = ["train"] if held_out is not None else ["train", "test"]

@@ -8,6 +8,7 @@ import pytest
 from PIL import Image
 
 from g2ard.io import write_views
+from g2ard.jobs.distill_options import DistillOptions
 from g2ard.jobs.views import views_of
 from g2ard.poses import plan_pool
 from g2ard.rendering.visibility import visibility_source
@@ -45,7 +46,7 @@ def test_views_are_made_where_none_are_given(command_line: CommandLine, folder: 
 
 @pytest.mark.parametrize(("make", "share"), [(naive.room, None), (naive.statue, None), (naive.statue, 0.5)])
 def test_views_from_anywhere_join_where_a_view_holds_little(make, share: float | None) -> None:
-    views = views_of(make(), "made", anywhere=share)
+    views = views_of(make(), DistillOptions(views="made", settings={"anywhere": share}))
     rows = rows_by_kind(views.train.cameras.names)
     found = len(rows.get("anywhere", [])) / len(views.train.cameras)
     if share is not None:
@@ -71,8 +72,11 @@ def test_simplification_does_not_look_from_anywhere() -> None:
 def test_given_views_stay_first(tmp_path: Path) -> None:
     statue = naive.statue()
     write_views(tmp_path / "views.json", plan_pool(statue, 16).cameras)
-    plain = views_of(statue, tmp_path / "views.json").train.cameras
-    mixed = views_of(statue, tmp_path / "views.json", anywhere=0.25).train.cameras
+    views = [
+        views_of(statue, DistillOptions(views=tmp_path / "views.json", settings={"anywhere": share}))
+        for share in (0.0, 0.25)
+    ]
+    plain, mixed = (found.train.cameras for found in views)
     assert mixed.names[: len(plain)] == plain.names
     assert set(rows_by_kind(mixed.names[len(plain) :])) == {"anywhere"}
     assert len(mixed) - len(plain) == round(len(plain) / 3)

@@ -11,22 +11,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from g2ard.cli import options as opt
+from g2ard.cli import run_folder
 from g2ard.cli.frame import Run, command
 from g2ard.cli.outputs import Outputs, budgets_of
-from g2ard.cli.run_folder import (
-    KEPT,
-    VIEW,
-    WORK,
-    check_place,
-    drop_older,
-    is_done,
-    tell_anew,
-    tell_finished,
-    work_folder,
-    write_pool,
-    write_report,
-    write_view,
-)
 from g2ard.cli.run_result import say_views, say_weight, tell_quality, told, write_table
 from g2ard.cli.tile_options import tiling_of
 from g2ard.cli.tiled import TiledCommand
@@ -139,12 +126,12 @@ def distill(
 
     def check(folder: Path, budget: Budget) -> None:
         if not dry_run:
-            check_place(run, folder / name, budget, given, resume)
+            run_folder.check_place(run, folder / name, budget, given, resume)
 
     outputs.check(check)
     early = [folder / name for folder in outputs.paths()]
-    if early and not dry_run and all(is_done(run, place, resume) for place in early):
-        _tell_all(run, [tell_finished(run, place) for place in early])
+    if early and not dry_run and all(run_folder.is_done(run, place, resume) for place in early):
+        _tell_all(run, [run_folder.tell_finished(run, place) for place in early])
         return
     if scene is not None:
         _check_kind(scene, given)
@@ -176,7 +163,8 @@ def distill(
     if dry_run:
         _tell_estimates(run, job, [place.parent for place in places], page=view)
         return
-    finished = {place: tell_finished(run, place) for place in places if is_done(run, place, resume)}
+    done = [place for place in places if run_folder.is_done(run, place, resume)]
+    finished = {place: run_folder.tell_finished(run, place) for place in done}
     if len(finished) < len(places):
         check_memory(job, tiling.memory, page=view)
         job.render_targets()
@@ -185,7 +173,7 @@ def distill(
         if place in finished:
             reports.append(finished[place])
             continue
-        tell_anew(run, place.parent, resume)
+        run_folder.tell_anew(run, place.parent, resume)
         result, report = _distil(
             run, scene or Path(str(views)), job, aim.count, place, resume, keep, view, began
         )
@@ -275,7 +263,7 @@ def _distil(
     from g2ard.report.distilled import distill_report
 
     output, colour = place.parent, job.config.recover.background
-    with work_folder(run, output, resume, (len(job.prior), budget)) as work:
+    with run_folder.work_folder(run, output, resume, (len(job.prior), budget)) as work:
         result = job.run(budget, work=work)
         report = report_of(job, result)
         report["seconds"]["total"] = time.monotonic() - began + report["seconds"].get("resumed", 0.0)
@@ -290,14 +278,15 @@ def _distil(
         )
         page = ""
         if view:
-            report["bytes"]["view"], page = write_view(place, result.splats, job.views.train.cameras, colour)
+            seen = job.views.train.cameras
+            report["bytes"]["view"], page = run_folder.write_view(place, result.splats, seen, colour)
         else:
-            (output / VIEW).unlink(missing_ok=True)
+            (output / run_folder.VIEW).unlink(missing_ok=True)
         _write(run, place, result, job.held_out, colour, report)
-        _keep(output / KEPT, result.simplified if keep else None)
+        _keep(output / run_folder.KEPT, result.simplified if keep else None)
     if (pool := job.views.pool) is not None:
-        write_pool(run, output, pool)
-    shutil.rmtree(output / WORK)
+        run_folder.write_pool(run, output, pool)
+    shutil.rmtree(output / run_folder.WORK)
     write_table(run, report)
     for line in told(report, verbose=run.verbose):
         run.say(line)
@@ -321,11 +310,11 @@ def _write(
     scenes = [("simplified", result.simplified), ("recovered", result.splats)]
     preview(place.parent / "preview.png", unseen, scenes, colour)
     run.write(place, result.splats, overwrite=True)
-    drop_older(place)
+    run_folder.drop_older(place)
     report["bytes"]["file"] = place.stat().st_size
     if place.name != "scene.ply":
         report["packed"] = score_file(place, unseen, colour, run.progress)
-    write_report(place.parent, {**report, "config": run.config})
+    run_folder.write_report(place.parent, {**report, "config": run.config})
 
 
 def _keep(path: Path, scene: Splats | None) -> None:
