@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 from g2ard.errors import InputError
 from g2ard.io.atomic import atomic_output
 from g2ard.io.plyfiles import read_element, read_header, require, row_blocks, spread_rows
-from g2ard.io.point_stream import PointStream, RawPoints, cloud_middle
-from g2ard.io.types import Cloud, Note, Points
-from g2ard.progress import plural
+from g2ard.io.point_stream import PointStream, RawPoints, cloud_middle, finite_cloud
+from g2ard.io.types import Cloud, Points
 
 _POSITION = ["x", "y", "z"]
 _COLOR_NAMES = (["red", "green", "blue"], ["r", "g", "b"], ["diffuse_red", "diffuse_green", "diffuse_blue"])
@@ -76,23 +75,6 @@ def _unit(path: Path, values: NDArray[Any], name: str) -> NDArray[np.float32]:
         raise InputError(f"has a value of {beyond:g}, expected floats in [0, 1]", path=path, property=name)
     with np.errstate(invalid="ignore"):  # a signalling NaN
         return values.astype(np.float32)
-
-
-def finite_cloud(
-    path: Path, positions: NDArray[np.float64], colors: NDArray[np.float32], notes: tuple[Note, ...] = ()
-) -> Cloud:
-    """Drop non-finite points with a note, and clip colours to [0, 1]."""
-    if not len(positions):
-        raise InputError("has no points", path=path)
-    good = np.all(np.isfinite(positions), axis=1) & np.all(np.isfinite(colors), axis=1)
-    dropped = len(good) - int(np.count_nonzero(good))
-    if dropped == len(good):
-        raise InputError(f"none of its {plural(dropped, 'point')} is finite", path=path)
-    if dropped:
-        text = f"{plural(dropped, 'non-finite point')} dropped (the first is row {int(np.argmin(good))})"
-        notes = (*notes, Note("dropped_rows", dropped, text))
-        positions, colors = positions[good], colors[good]
-    return Cloud(Points(positions, np.clip(colors, 0, 1)), notes)
 
 
 def write(path: Path, points: Points, *, overwrite: bool = False) -> None:

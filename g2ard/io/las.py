@@ -11,9 +11,8 @@ from typing import Any
 import numpy as np
 
 from g2ard.errors import DAMAGED, InputError, missing
-from g2ard.io.cloud_ply import finite_cloud
 from g2ard.io.limits import check_unpacked
-from g2ard.io.point_stream import PointStream, RawPoints, cloud_middle
+from g2ard.io.point_stream import PointStream, RawPoints, cloud_middle, finite_cloud
 from g2ard.io.types import Cloud, Note
 
 _LARGEST_CHUNK = 1 << 30

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from g2ard.errors import InputError
 from g2ard.io.stream import file_identity
-from g2ard.io.types import Cloud, Note
+from g2ard.io.types import Cloud, Note, Points
 from g2ard.progress import plural
 
 RawPoints = tuple[NDArray[np.float64], NDArray[np.float32]]
@@ -39,6 +39,29 @@ class PointTally:
         self.rows += len(good)
         self.brightest = max(self.brightest, float(np.max(points[1], where=good[:, None], initial=0.0)))
         return good
+
+    def notes(self, path: Path, notes: tuple[Note, ...]) -> tuple[Note, ...]:
+        """Add a note on non-finite points to `notes`; raise an `InputError` if no point is finite."""
+        if not self.rows:
+            raise InputError("has no points", path=path)
+        if self.dropped == self.rows:
+            raise InputError(f"none of its {plural(self.rows, 'point')} is finite", path=path)
+        if not self.dropped:
+            return notes
+        text = f"{plural(self.dropped, 'non-finite point')} dropped (the first is row {self.first})"
+        return (*notes, Note("dropped_rows", self.dropped, text))
+
+
+def finite_cloud(
+    path: Path, positions: NDArray[np.float64], colors: NDArray[np.float32], notes: tuple[Note, ...] = ()
+) -> Cloud:
+    """Drop non-finite points with a note, and clip colours to [0, 1]."""
+    tally = PointTally()
+    good = tally.finite((positions, colors))
+    notes = tally.notes(path, notes)
+    if tally.dropped:
+        positions, colors = positions[good], colors[good]
+    return Cloud(Points(positions, np.clip(colors, 0, 1)), notes)
 
 
 class PointStream(ABC):
@@ -79,15 +102,7 @@ class PointStream(ABC):
 
     def all_notes(self) -> tuple[Note, ...]:
         """Return all notes once `blocks` has finished; raise an `InputError` if no point is finite."""
-        tally = self.tally
-        if not tally.rows:
-            raise InputError("has no points", path=self.path)
-        if tally.dropped == tally.rows:
-            raise InputError(f"none of its {plural(tally.rows, 'point')} is finite", path=self.path)
-        if not tally.dropped:
-            return self.notes()
-        text = f"{plural(tally.dropped, 'non-finite point')} dropped (the first is row {tally.first})"
-        return (*self.notes(), Note("dropped_rows", tally.dropped, text))
+        return self.tally.notes(self.path, self.notes())
 
 
 def cloud_middle(low: NDArray[np.float64], high: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard.errors import DAMAGED, InputError
-from g2ard.io.cloud_ply import finite_cloud
 from g2ard.io.colmap import Record, model_folder, number, parsing, text_lines
+from g2ard.io.point_stream import finite_cloud
 from g2ard.io.types import Cloud
 
 _COUNT = Record(["COUNT"], "Q")
