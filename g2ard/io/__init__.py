@@ -21,7 +21,6 @@ from g2ard.io.find import find_views
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
-    from types import ModuleType
 
     from numpy.typing import ArrayLike
 
@@ -224,26 +223,7 @@ def read_points(path: str | Path) -> Points:
 
 def read_cloud(path: str | Path) -> Cloud:
     """Read a coloured point cloud with notes on the file."""
-    path, module = _cloud_reader(path)
-    cloud: Cloud = module.read(path)
-    return cloud
-
-
-def _cloud_reader(path: str | Path) -> tuple[Path, ModuleType]:
-    """Return the path of a point cloud and the module that reads it."""
-    from importlib import import_module
-
-    from g2ard.errors import InputError
-    from g2ard.io.detect import file_format
-
-    path, found = Path(path), file_format(path)
-    modules = {"cloud_ply": "cloud_ply", "las": "las", "points3d": "points3d", "colmap": "points3d"}
-    if found not in modules:
-        scene = kind(path) == "splats"
-        what = "a Gaussian scene" if scene else found
-        hint = "run `simplify` or `distill` on it" if scene else "give the point cloud's file"
-        raise InputError(f"expected a coloured point cloud, found {what}", path=path, hint=hint)
-    return path, import_module(f"g2ard.io.{modules[found]}")
+    return open_point_stream(path).whole()
 
 
 def open_point_stream(path: str | Path | Sequence[str | Path]) -> PointStream:
@@ -252,19 +232,26 @@ def open_point_stream(path: str | Path | Sequence[str | Path]) -> PointStream:
     Memory holds one block of a .ply, .las or .laz, or the whole file of other formats. Several clouds get
     the offset of the first.
     """
+    from importlib import import_module
+
     from g2ard.errors import InputError
-    from g2ard.io.point_stream import JoinedClouds, WholeCloud
+    from g2ard.io.detect import file_format
+    from g2ard.io.point_stream import JoinedClouds
 
     if not isinstance(path, str | Path):
         streams = [open_point_stream(part) for part in path]
         if not streams:
             raise InputError("no point cloud given")
         return streams[0] if len(streams) == 1 else JoinedClouds(streams)
-    path, module = _cloud_reader(path)
-    if hasattr(module, "stream"):
-        stream: PointStream = module.stream(path)
-        return stream
-    return WholeCloud(path, module.read(path))
+    path, found = Path(path), file_format(path)
+    modules = {"cloud_ply": "cloud_ply", "las": "las", "points3d": "points3d", "colmap": "points3d"}
+    if found not in modules:
+        scene = kind(path) == "splats"
+        what = "a Gaussian scene" if scene else found
+        hint = "run `simplify` or `distill` on it" if scene else "give the point cloud's file"
+        raise InputError(f"expected a coloured point cloud, found {what}", path=path, hint=hint)
+    stream: PointStream = import_module(f"g2ard.io.{modules[found]}").stream(path)
+    return stream
 
 
 def write_points(path: str | Path, points: Points, *, overwrite: bool = False) -> None:

@@ -12,21 +12,18 @@ from numpy.typing import NDArray
 from g2ard.errors import InputError
 from g2ard.io.atomic import atomic_output
 from g2ard.io.plyfiles import read_element, read_header, require, row_blocks, spread_rows
-from g2ard.io.point_stream import PointStream, RawPoints, cloud_middle, finite_cloud
-from g2ard.io.types import Cloud, Points
+from g2ard.io.point_stream import PointStream, RawPoints, cloud_middle
+from g2ard.io.types import Points
 
 _POSITION = ["x", "y", "z"]
 _COLOR_NAMES = (["red", "green", "blue"], ["r", "g", "b"], ["diffuse_red", "diffuse_green", "diffuse_blue"])
 
 
-def read(path: Path) -> Cloud:
-    """Read x y z and red green blue: integers, scaled by their range, or floats in [0, 1]."""
-    rows, names = _vertices(path)
-    return finite_cloud(path, *_points(path, np.asarray(rows), names))
-
-
 def stream(path: Path) -> PointStream:
-    """Open a cloud for reading in blocks; text files and those with leading lists are read whole."""
+    """Open x y z and red green blue: integers, scaled by their range, or floats in [0, 1].
+
+    Text files and those with leading lists are read whole.
+    """
     return _PlyPoints(path)
 
 

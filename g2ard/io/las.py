@@ -12,26 +12,18 @@ import numpy as np
 
 from g2ard.errors import DAMAGED, InputError, missing
 from g2ard.io.limits import check_unpacked
-from g2ard.io.point_stream import PointStream, RawPoints, cloud_middle, finite_cloud
-from g2ard.io.types import Cloud, Note
+from g2ard.io.point_stream import PointStream, RawPoints, cloud_middle
+from g2ard.io.types import Note
 
 _LARGEST_CHUNK = 1 << 30
 """Largest chunk, in bytes of unpacked points, of a file with fewer points than a chunk holds."""
 
 
-def read(path: Path) -> Cloud:
-    """Read positions and colours; colours up to 255 are treated as 8-bit, with a note."""
-    with _opened(path) as reader:
-        las, promised = reader.read(), reader.header.point_count
-    if len(las.points) < promised:
-        raise InputError(f"truncated: {len(las.points):,} of {promised:,} points", path=path, hint=DAMAGED)
-    positions, rgb = _points(las)
-    notes, divisor = _depth(len(rgb), float(rgb.max(initial=0)))
-    return finite_cloud(path, positions, rgb / np.float32(divisor), notes)
-
-
 def stream(path: Path) -> PointStream:
-    """Open a cloud for reading in blocks; one chunk of a .laz is unpacked at a time."""
+    """Open positions and colours; colours up to 255 are treated as 8-bit, with a note.
+
+    One chunk of a .laz is unpacked at a time.
+    """
     return _LasPoints(path)
 
 
@@ -44,10 +36,12 @@ class _LasPoints(PointStream):
 
     @property
     def divisor(self) -> float:
-        return _depth(self.tally.rows, self.tally.brightest)[1]
+        return 65535.0 if self.tally.brightest > 255 else 255.0
 
     def notes(self) -> tuple[Note, ...]:
-        return _depth(self.tally.rows, self.tally.brightest)[0]
+        if self.divisor > 255:
+            return ()
+        return (Note("eight_bit_colors", self.tally.rows, "8-bit colours in 16-bit fields"),)
 
     def raw(self, rows: int, start: int) -> Iterator[RawPoints]:
         with _opened(self.path) as reader:
@@ -67,13 +61,6 @@ def _points(las: Any) -> RawPoints:
     positions = np.stack([np.asarray(las[name], np.float64) for name in ("x", "y", "z")], axis=1)
     rgb = np.stack([np.asarray(las[name], np.float32) for name in ("red", "green", "blue")], axis=1)
     return positions, rgb
-
-
-def _depth(count: int, brightest: float) -> tuple[tuple[Note, ...], float]:
-    """Return a note if colours are 8-bit, and the divisor of colours."""
-    if brightest > 255:
-        return (), 65535.0
-    return (Note("eight_bit_colors", count, "8-bit colours in 16-bit fields"),), 255.0
 
 
 @contextmanager

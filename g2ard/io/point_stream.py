@@ -16,6 +16,8 @@ from g2ard.io.stream import file_identity
 from g2ard.io.types import Cloud, Note, Points
 from g2ard.progress import plural
 
+_ROWS = 1 << 20
+
 RawPoints = tuple[NDArray[np.float64], NDArray[np.float32]]
 """(n, 3) positions, world units, and (n, 3) colours; colours / `divisor` are in [0, 1]."""
 
@@ -50,18 +52,6 @@ class PointTally:
             return notes
         text = f"{plural(self.dropped, 'non-finite point')} dropped (the first is row {self.first})"
         return (*notes, Note("dropped_rows", self.dropped, text))
-
-
-def finite_cloud(
-    path: Path, positions: NDArray[np.float64], colors: NDArray[np.float32], notes: tuple[Note, ...] = ()
-) -> Cloud:
-    """Drop non-finite points with a note, and clip colours to [0, 1]."""
-    tally = PointTally()
-    good = tally.finite((positions, colors))
-    notes = tally.notes(path, notes)
-    if tally.dropped:
-        positions, colors = positions[good], colors[good]
-    return Cloud(Points(positions, np.clip(colors, 0, 1)), notes)
 
 
 class PointStream(ABC):
@@ -104,6 +94,15 @@ class PointStream(ABC):
         """Return all notes once `blocks` has finished; raise an `InputError` if no point is finite."""
         return self.tally.notes(self.path, self.notes())
 
+    def whole(self) -> Cloud:
+        """Read all points, with colours in [0, 1]."""
+        positions, colors, kept = np.empty((self.count, 3)), np.empty((self.count, 3), np.float32), 0
+        for block in self.blocks(_ROWS):
+            rows = slice(kept, kept := kept + len(block[0]))
+            positions[rows], colors[rows] = block
+        notes = self.all_notes()
+        return Cloud(Points(positions[:kept], np.clip(colors[:kept] / np.float32(self.divisor), 0, 1)), notes)
+
 
 def cloud_middle(low: NDArray[np.float64], high: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the centre of a cloud's bounds in whole units, or zero for a cloud around the origin."""
@@ -115,22 +114,15 @@ def cloud_middle(low: NDArray[np.float64], high: NDArray[np.float64]) -> NDArray
 class WholeCloud(PointStream):
     """Point cloud in memory."""
 
-    def __init__(self, path: Path, cloud: Cloud) -> None:
-        self._cloud, at = cloud, cloud.points.positions
-        super().__init__(path, len(at), cloud_middle(at.min(axis=0), at.max(axis=0)))
-
-    def identity(self) -> list[Any]:
-        files = sorted(self.path.iterdir()) if self.path.is_dir() else [self.path]
-        return file_identity([file for file in files if file.is_file()])
+    def __init__(self, path: Path, positions: NDArray[np.float64], colors: NDArray[np.float32]) -> None:
+        self._positions, self._colors = positions, colors
+        at = positions[np.isfinite(positions).all(axis=1)]
+        bounds = (at.min(axis=0), at.max(axis=0)) if len(at) else np.zeros((2, 3))
+        super().__init__(path, len(positions), cloud_middle(*bounds))
 
     def raw(self, rows: int, start: int) -> Iterator[RawPoints]:
-        points = self._cloud.points
         for first in range(start, self.count, rows):
-            at = slice(first, first + rows)
-            yield points.positions[at], points.colors[at]
-
-    def notes(self) -> tuple[Note, ...]:
-        return self._cloud.notes
+            yield self._positions[first : first + rows], self._colors[first : first + rows]
 
 
 class JoinedClouds(PointStream):

@@ -9,15 +9,14 @@ from numpy.typing import NDArray
 
 from g2ard.errors import DAMAGED, InputError
 from g2ard.io.colmap import Record, model_folder, number, parsing, text_lines
-from g2ard.io.point_stream import finite_cloud
-from g2ard.io.types import Cloud
+from g2ard.io.point_stream import PointStream, WholeCloud
 
 _COUNT = Record(["COUNT"], "Q")
 _COLUMNS = ("X", "Y", "Z", "R", "G", "B")
 _POINT = Record(["POINT3D_ID", *"XYZRGB", "ERROR", "TRACK"], "QdddBBBdQ")
 
 
-def read(path: Path) -> Cloud:
+def stream(path: Path) -> PointStream:
     """Read points3D.bin or .txt, or that of the model in a COLMAP folder."""
     if path.is_dir() or path.stem.lower() != "points3d":
         folder = model_folder(path) or path
@@ -27,7 +26,7 @@ def read(path: Path) -> Cloud:
         path = found
     with parsing(path):
         positions, rgb = (_binary if path.suffix == ".bin" else _text)(path)
-    return finite_cloud(path, positions, (rgb / 255).astype(np.float32))
+    return WholeCloud(path, positions, (rgb / 255).astype(np.float32))
 
 
 def _binary(path: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:

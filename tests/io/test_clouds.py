@@ -206,10 +206,10 @@ def test_a_panic_in_lazrs_is_one_line(tmp_path: Path, monkeypatch: pytest.Monkey
     def fall(*_: object) -> None:
         raise type("PanicException", (BaseException,), {})("divisor of zero")
 
-    monkeypatch.setattr(laspy.LasReader, "read", fall)
+    monkeypatch.setattr(laspy.LasReader, "read_points", fall)
     with pytest.raises(InputError, match=r"a\.laz: cannot be read as LAS: divisor of zero"):
         read_points(path)
-    monkeypatch.setattr(laspy.LasReader, "read", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+    monkeypatch.setattr(laspy.LasReader, "read_points", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
     with pytest.raises(KeyboardInterrupt):
         read_points(path)
 
