@@ -5,12 +5,11 @@ from __future__ import annotations
 import math
 import re
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
-if TYPE_CHECKING:
-    from g2ard.jobs.budget import Budget
+from g2ard.jobs.budget import Budget
 
 _COUNT = re.compile(r"(\d+(?:\.\d+)?)\s*([kKmM%]?)")
 _GROUPED = re.compile(r"\d{1,3}(?:,\d{3})+|\d{1,3}(?:_\d{3})+")
@@ -85,8 +84,6 @@ class Count:
         return float(self.value) if self.is_share else int(self.value)
 
     def budget(self) -> Budget:
-        from g2ard.jobs.budget import Budget
-
         return Budget(share=self.value) if self.is_share else Budget(count=int(self.value))
 
     def __str__(self) -> str:
@@ -195,8 +192,6 @@ RatioOption = Annotated[
 
 def one_budget(count: Count | None, ratio: float | None) -> Budget:
     """Return the budget of -n or -r, and check that exactly one is given."""
-    from g2ard.jobs.budget import Budget
-
     if (count is None) == (ratio is None):
         raise typer.BadParameter("give the budget as either -n COUNT or -r RATIO")
     if count is None:

@@ -27,9 +27,16 @@ from g2ard.cli.panels import COMMON, GROUPED, into_panels
 from g2ard.cli.tile_options import TILES
 from g2ard.cli.usage import flags_of, in_flags, typed
 from g2ard.config.choices import RenderModel, ViewFormat
-from g2ard.errors import G2ardError
+from g2ard.config.paths import full_paths, parse_settings
+from g2ard.config.presets import configured
+from g2ard.errors import G2ardError, InputError
+from g2ard.io import write_splats, write_views
+from g2ard.io.atomic import atomic_output, check_output
+from g2ard.io.detect import run_scene
+from g2ard.io.paths import real_path
+from g2ard.io.scene_formats import lost_in
 from g2ard.progress import plural
-from g2ard.system import interrupt
+from g2ard.system import devices, interrupt
 
 if TYPE_CHECKING:
     from g2ard.scene.cameras import Cameras
@@ -141,10 +148,6 @@ class Run:
             names: options named like a field or like the end of its path.
             preset: preset to check the values of --set with.
         """
-        from g2ard.config.paths import full_paths, parse_settings
-        from g2ard.config.presets import configured
-        from g2ard.errors import InputError
-
         given = {name: self.config[name] for name in names if self.config[name] not in (None, [], ())}
         try:
             typed = parse_settings(self.config["set"] or [], config)
@@ -168,8 +171,6 @@ class Run:
     def tell_notes(self) -> None:
         """Report GPU fallbacks since the last call, and warn once if the adapter is a software renderer."""
         if self.device in ("auto", "gpu"):
-            from g2ard.system import devices
-
             for note in devices.notes():
                 self.noted = True
                 self.console.say(note)
@@ -194,7 +195,6 @@ class Run:
         if self.json == "-":
             print(text, flush=True)
             return
-        from g2ard.io.atomic import atomic_output
 
         with atomic_output(Path(self.json), overwrite=self.overwrite) as temporary:
             temporary.write_text(text + "\n", encoding="utf-8", newline="\n")
@@ -203,7 +203,6 @@ class Run:
         """Describe GPU use, if any."""
         if self.device not in ("auto", "gpu"):
             return {}
-        from g2ard.system import devices
 
         state = devices.state()
         if not state.served:
@@ -221,9 +220,6 @@ class Run:
         self, path: Path, splats: Splats, *, overwrite: bool = False, compare: bool = False, **options: Any
     ) -> None:
         """Write a scene, and report what its format cannot hold and, with `compare`, a large loss."""
-        from g2ard.io import write_splats
-        from g2ard.io.scene_formats import lost_in
-
         write_splats(path, splats, overwrite=self.overwrite or overwrite, **options)
         for note in lost_in(path, splats, **options):
             self.say(f"note: {path}: {note}")
@@ -244,7 +240,6 @@ class Run:
         overwrite: bool = False,
     ) -> None:
         """Write views, and report what their format cannot hold."""
-        from g2ard.io import write_views
         from g2ard.io.camera_files import lost_views, view_format
 
         overwrite = self.overwrite or overwrite
@@ -254,9 +249,6 @@ class Run:
 
     def spare_inputs(self, *outputs: Path) -> None:
         """Raise a usage error if an output is also an input, even with --overwrite."""
-        from g2ard.io.detect import run_scene
-        from g2ard.io.paths import real_path
-
         taken = {real_path(place) for path in self._inputs for place in (path, run_scene(path))}
         for output in outputs:
             if real_path(output) in taken:
@@ -264,9 +256,6 @@ class Run:
 
     def check_extra(self, flag: str, path: Path, given: Path | None = None) -> None:
         """Check a further output, whose option is `given`: it must be no other path of the command."""
-        from g2ard.io.atomic import check_output
-        from g2ard.io.paths import real_path
-
         others = [p for p in (*self._inputs, self.config.get("output")) if p and p is not (given or path)]
         if real_path(path) in map(real_path, others):
             raise typer.BadParameter(f"{flag}: {path} is also an input or output; name another file")
@@ -389,7 +378,6 @@ def _check_settings(run: Run, fn: Callable[..., None], options: dict[str, Any]) 
 def _execute(run: Run, fn: Callable[..., None], options: dict[str, Any], cuda: bool) -> None:
     if run.device not in ("auto", "cpu", "gpu", "cuda"):
         raise typer.BadParameter(f"--device: expected auto, cpu, gpu or cuda, got {run.device!r}")
-    from g2ard.io.paths import real_path
 
     outputs = [Path(o) for o in (options.get("output"), run.json) if o not in (None, "-")]
     if len({real_path(output) for output in outputs}) < len(outputs):
@@ -435,7 +423,6 @@ def _device(run: Run) -> Iterator[None]:
     if run.device not in ("auto", "gpu"):
         yield
         return
-    from g2ard.system import devices
 
     devices.use(run.device, timed=run.verbose)
     ended = False

@@ -23,6 +23,7 @@ from g2ard.config.choices import (
     ScheduleName,
     ViewFormat,
 )
+from g2ard.errors import InputError
 
 if TYPE_CHECKING:
     from g2ard.cli.frame import Run
@@ -170,7 +171,6 @@ class Spot(tuple[float, ...]):
 
 
 def _spot(text: str) -> Spot:
-    from g2ard.errors import InputError
     from g2ard.scene.regions import check_region
 
     try:

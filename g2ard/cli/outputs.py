@@ -5,23 +5,18 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import typer
 
 from g2ard.cli.budget_options import BUDGETS
 from g2ard.cli.frame import Run
 from g2ard.cli.usage import in_flags
-
-if TYPE_CHECKING:
-    from g2ard.jobs.budget import Budget
+from g2ard.errors import InputError
+from g2ard.jobs.budget import Budget
 
 
 def budgets_of(run: Run) -> list[Budget]:
     """Return the budgets of the options, and check that exactly one kind is given."""
-    from g2ard.errors import InputError
-    from g2ard.jobs.budget import Budget
-
     counts, ratios, fit, min_psnr, min_ssim = (run.shared[name] for name in BUDGETS)
     quality = min_psnr is not None or min_ssim is not None
     if [bool(counts), bool(ratios), fit is not None, quality].count(True) != 1:

@@ -13,6 +13,11 @@ from typing import TYPE_CHECKING, Any
 from g2ard.cli.frame import Run
 from g2ard.cli.resume import OPTIONS, check_stopped, left_at
 from g2ard.config.choices import ViewFormat
+from g2ard.errors import InputError, OutputError
+from g2ard.io import write_views
+from g2ard.io.atomic import atomic_output, check_output
+from g2ard.io.scene_formats import FORMATS
+from g2ard.jobs.budget import DEVICES
 from g2ard.progress import plural
 
 if TYPE_CHECKING:
@@ -48,8 +53,6 @@ _OF_THE_BUDGET = ("count", "ratio")
 
 def write_pool(run: Run, folder: Path, pool: ViewSet) -> None:
     """Write generated views, also in the format of --views-format."""
-    from g2ard.io import write_views
-
     write_views(folder / "views.json", pool.cameras, splits=pool.splits, overwrite=True)
     also: ViewFormat = run.config["views_format"]
     if also in _VIEWS:
@@ -57,8 +60,6 @@ def write_pool(run: Run, folder: Path, pool: ViewSet) -> None:
 
 
 def write_report(folder: Path, report: dict[str, Any]) -> None:
-    from g2ard.io.atomic import atomic_output
-
     with atomic_output(folder / REPORT, overwrite=True) as temporary:
         temporary.write_text(json.dumps(report, indent=2, default=str) + "\n", encoding="utf-8", newline="\n")
 
@@ -71,7 +72,6 @@ def write_view(
     Returns:
         Size of the page in bytes, None if it was not written, and a line to print.
     """
-    from g2ard.jobs.budget import DEVICES
     from g2ard.jobs.viewer_frame import frame_with
     from g2ard.viewer import write_page
 
@@ -91,8 +91,6 @@ def check_place(run: Run, place: Path, budget: Budget, given: bool, resume: bool
     Args:
         given: whether views are given; otherwise views.json is written too.
     """
-    from g2ard.io.atomic import check_output
-
     folder = place.parent
     views = [] if given else [folder / "views.json"]
     run.spare_inputs(place, *_other_scenes(place), folder / KEPT, *views)
@@ -134,8 +132,6 @@ def work_folder(run: Run, output: Path, resume: bool, counts: tuple[int, int] = 
     Args:
         counts: Gaussians of the dense scene and of the result.
     """
-    from g2ard.errors import InputError
-
     work, made = output / WORK, not output.exists()
     if not resume:
         shutil.rmtree(work, ignore_errors=True)
@@ -187,8 +183,6 @@ def drop_older(place: Path) -> None:
 
 def _other_scenes(place: Path) -> list[Path]:
     """Return the scene's file names in other formats."""
-    from g2ard.io.scene_formats import FORMATS
-
     return [path for name in FORMATS if (path := place.with_name(f"scene.{name}")) != place]
 
 
@@ -200,7 +194,6 @@ def _check_same(
     run: Run, folder: Path, told: Path, budget: Budget | None, how: str, besides: Sequence[str] = ()
 ) -> None:
     """Raise an `OutputError` if a run's recorded options differ."""
-    from g2ard.errors import OutputError
     from g2ard.io.jsonfile import read_json
 
     if not told.exists():
@@ -227,8 +220,6 @@ def _others(run: Run, before: Mapping[str, Any], budget: Budget | None) -> list[
 
 def _is_budget(budget: Budget, before: Mapping[str, Any]) -> bool:
     """Return whether a run's count is that of the budget; measured budgets are compared by their options."""
-    from g2ard.errors import InputError
-
     if budget.is_measured or "output_count" not in before:
         return True
     try:

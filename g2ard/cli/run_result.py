@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from g2ard.cli.frame import Run
+from g2ard.io.scene_formats import written_bytes
 from g2ard.progress import plural
 
 if TYPE_CHECKING:
@@ -87,8 +88,6 @@ def say_views(run: Run, views: dict[str, Any] | None, chosen: bool) -> None:
 
 def say_weight(run: Run, source: Path, output: Path, splats: Splats, *, lifted: Splats | None = None) -> None:
     """Print a hint if the output is larger than its source file, or than the `lifted` points."""
-    from g2ard.io.scene_formats import written_bytes
-
     inputs = [] if lifted is None else [(lifted.nbytes, "the lifted points have")]
     if source.is_file() and source.suffix.lower() != ".json":
         inputs.append((source.stat().st_size, f"{source.name} has"))

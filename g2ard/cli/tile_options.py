@@ -9,6 +9,7 @@ import typer
 
 from g2ard.cli.budget_options import Count
 from g2ard.cli.usage import in_flags
+from g2ard.errors import InputError
 
 if TYPE_CHECKING:
     from g2ard.cli.frame import Run
@@ -57,7 +58,6 @@ TILES: dict[str, tuple[Any, Any, Any]] = {
 
 def tiling_of(run: Run, scene: Path | None, output: Path) -> Tiling:
     """Check the options and return them as a `Tiling`."""
-    from g2ard.errors import InputError
     from g2ard.jobs.tiling import Tiling, bytes_of
 
     tile_rows, memory, workers, scheduler, work = (run.shared[name] for name in TILES)

@@ -11,7 +11,10 @@ from g2ard.cli.frame import Run
 from g2ard.cli.outputs import Outputs
 from g2ard.cli.run_folder import is_done, tell_finished, write_pool, write_report
 from g2ard.cli.run_result import loss
+from g2ard.config.paths import listed
+from g2ard.io.scene_formats import scene_format
 from g2ard.progress import plural
+from g2ard.system.memory import peak_rss_of_all
 
 if TYPE_CHECKING:
     from g2ard.jobs.budget import Budget
@@ -39,7 +42,6 @@ class TiledCommand:
 
     def simplify(self, config: SimplifyConfig, views: Any, blind: bool, up: Sequence[float] | None) -> None:
         """Run `g2ard simplify`."""
-        from g2ard.config.paths import listed
         from g2ard.jobs.tiled import simplify_in_tiles, working
 
         run, began, reports = self.run, time.perf_counter(), []
@@ -136,7 +138,6 @@ class TiledCommand:
 
     def _write(self, place: Path, store: TileStore, small: TiledScene) -> None:
         from g2ard.io.ply import write_parts
-        from g2ard.io.scene_formats import scene_format
 
         if scene_format(place).suffix == ".ply":
             parts = small, len(small), small.sh_degree, small.offset
@@ -148,8 +149,6 @@ class TiledCommand:
 
 def _report(store: TileStore, small: TiledScene, began: float) -> dict[str, Any]:
     """Return the numbers that both commands report."""
-    from g2ard.system.memory import peak_rss_of_all
-
     return {
         "input_count": store.count,
         "output_count": len(small),

@@ -12,12 +12,17 @@ The first function of each row returns data; the second also returns notes about
 
 from __future__ import annotations
 
+import warnings
+from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from g2ard.errors import InputError, OutputError
 from g2ard.io.atomic import atomic_folder, atomic_output, check_output
-from g2ard.io.detect import kind
+from g2ard.io.detect import KINDS, file_format, kind, run_scene, run_views
 from g2ard.io.find import find_views
+from g2ard.io.scene_formats import check_options, lost_in, scene_format
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -93,9 +98,6 @@ def read_splats(path: str | Path, *, render_model: RenderModel | None = None) ->
 
 def read_scene(path: str | Path, *, render_model: RenderModel | None = None) -> Scene:
     """Read a Gaussian scene with notes on dropped rows, clamped values and ignored properties."""
-    from dataclasses import replace
-    from importlib import import_module
-
     path, found = check_scene(path)
     scene: Scene = import_module(f"g2ard.io.{found}").read(path)
     if render_model is None:
@@ -112,9 +114,6 @@ def open_stream(
     file of other formats. Several scenes get the offset of the first and the highest of their SH degrees;
     their render models must agree. `render_model` overrides what files say.
     """
-    from importlib import import_module
-
-    from g2ard.errors import InputError
     from g2ard.io.stream import JoinedScenes, PartsStream, file_identity
 
     if not isinstance(path, str | Path):
@@ -137,9 +136,6 @@ def open_stream(
 
 def check_scene(path: str | Path) -> tuple[Path, str]:
     """Return a scene's file or folder and its format; raise an `InputError` if it is not a scene."""
-    from g2ard.errors import InputError
-    from g2ard.io.detect import KINDS, file_format, run_scene
-
     path = run_scene(path)
     found = file_format(path)
     if KINDS[found] != "splats":
@@ -152,8 +148,6 @@ def check_scene(path: str | Path) -> tuple[Path, str]:
 
 def check_scene_output(path: str | Path, overwrite: bool = False) -> Path:
     """Raise the `OutputError` that `write_splats` would raise, before any work."""
-    from g2ard.io.scene_formats import scene_format
-
     if scene_format(path).function == "write_folder":
         check_output(Path(path).parent, overwrite, folder=True)
         return Path(path)
@@ -193,11 +187,6 @@ def write_splats(path: str | Path, splats: Splats, *, overwrite: bool = False, *
     >>> len(g2ard.load(path))
     1
     """
-    import warnings
-    from importlib import import_module
-
-    from g2ard.io.scene_formats import check_options, lost_in
-
     found = check_options(path, options)
     writer = getattr(import_module(f"g2ard.io.{found.module}"), found.function)
     writer(Path(path), splats, overwrite=overwrite, **options)
@@ -232,10 +221,6 @@ def open_point_stream(path: str | Path | Sequence[str | Path]) -> PointStream:
     Memory holds one block of a .ply, .las or .laz, or the whole file of other formats. Several clouds get
     the offset of the first.
     """
-    from importlib import import_module
-
-    from g2ard.errors import InputError
-    from g2ard.io.detect import file_format
     from g2ard.io.point_stream import JoinedClouds
 
     if not isinstance(path, str | Path):
@@ -256,7 +241,6 @@ def open_point_stream(path: str | Path | Sequence[str | Path]) -> PointStream:
 
 def write_points(path: str | Path, points: Points, *, overwrite: bool = False) -> None:
     """Write a coloured point cloud as .ply (float64 positions, 8-bit colours) atomically."""
-    from g2ard.errors import OutputError
     from g2ard.io import cloud_ply
 
     path = Path(path)
@@ -301,10 +285,6 @@ def read_view_set(
         unpictured: whether to keep views without photos among others.
         alpha: "mask" makes a photo with alpha and without a mask its own mask.
     """
-    from importlib import import_module
-
-    from g2ard.errors import InputError
-    from g2ard.io.detect import KINDS, file_format, run_views
     from g2ard.io.photos import alpha_as_masks, pictured
     from g2ard.io.types import ViewFiles
     from g2ard.scene.splits import split_mask
@@ -356,9 +336,6 @@ def write_views(
         OutputError: the file exists, cannot be written, or is not a .json.
         InputError: there are no views, or `splits` or `weights` have another length.
     """
-    import warnings
-
-    from g2ard.errors import InputError
     from g2ard.io import camera_files, views
 
     path = Path(path)

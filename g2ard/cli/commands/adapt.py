@@ -9,7 +9,11 @@ import typer
 
 from g2ard.cli import options as opt
 from g2ard.cli.frame import Run, command
+from g2ard.cli.resume import check_stopped, left_at, stoppable
 from g2ard.config.choices import AdaptSchedule
+from g2ard.config.paths import listed
+from g2ard.config.presets import PRESETS, configured
+from g2ard.io import check_scene_output
 from g2ard.progress import plural
 
 
@@ -47,10 +51,6 @@ def adapt(
     preset: opt.PaperOption = None,
 ) -> None:
     """Refit colours and opacities to new images; means, rotations and scales stay fixed."""
-    from g2ard.cli.resume import check_stopped, left_at, stoppable
-    from g2ard.config.paths import listed
-    from g2ard.config.presets import PRESETS, configured
-    from g2ard.io import check_scene_output
     from g2ard.jobs.inputs import load_trained, make_targets
     from g2ard.jobs.view_checks import propose_background, warn_of_sight
     from g2ard.pipeline.adapt import AdaptConfig

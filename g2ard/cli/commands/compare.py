@@ -10,6 +10,7 @@ import typer
 from g2ard.cli.frame import Run, command
 from g2ard.cli.options import BackgroundOption, ImagesOption, SizeOption, ViewsOrMadeOption, with_images
 from g2ard.config.choices import BLACK
+from g2ard.io.detect import run_scene
 from g2ard.progress import plural
 
 _WORST = 3
@@ -36,7 +37,6 @@ def compare(
     background: BackgroundOption = None,
 ) -> None:
     """Compare renders of two scenes: PSNR, SSIM, the worst views, and a page to look at."""
-    from g2ard.io.detect import run_scene
     from g2ard.jobs.inputs import load_views
     from g2ard.jobs.view_checks import check_sight
     from g2ard.jobs.viewer_frame import frame_with

@@ -7,9 +7,12 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
+from g2ard import io
 from g2ard.cli.frame import Run, command
 from g2ard.cli.options import ShDegreeOption, numbers
 from g2ard.config.choices import Axes
+from g2ard.errors import InputError
+from g2ard.io.scene_formats import check_options, scene_format, written_bytes
 
 if TYPE_CHECKING:
     import numpy as np
@@ -83,8 +86,6 @@ def convert(
 
     import numpy as np
 
-    from g2ard import io
-    from g2ard.io.scene_formats import check_options, written_bytes
     from g2ard.scene.axes import with_axes
     from g2ard.scene.transform import in_box, in_sphere, join, moving
     from g2ard.scene.transform import transform as moved
@@ -140,8 +141,6 @@ def _parted(run: Run, paths: list[Path], output: Path | None) -> tuple[list[Path
 
 def _change_of_axes(output: Path, axes: Axes, options: dict[str, Any]) -> NDArray[np.float64] | None:
     """Return the change of axes before writing, None if the format's writer makes it."""
-    from g2ard.errors import InputError
-    from g2ard.io.scene_formats import scene_format
     from g2ard.scene.axes import change_of_axes
 
     found = scene_format(output)
@@ -161,8 +160,6 @@ def _change_of_axes(output: Path, axes: Axes, options: dict[str, Any]) -> NDArra
 
 
 def _check_left(splats: Splats, read: int) -> None:
-    from g2ard.errors import InputError
-
     if not len(splats):
         raise InputError(
             f"none of {read:,} Gaussians are within --box and --sphere; `g2ard info` shows the scene's extent"
@@ -175,7 +172,6 @@ def _matrix(given: str) -> list[list[float]]:
     if path.suffix.lower() != ".json":
         flat = numbers("--transform", given, 16)
         return [flat[row : row + 4] for row in (0, 4, 8, 12)]
-    from g2ard.errors import InputError
     from g2ard.io.jsonfile import read_any_json
 
     content = read_any_json(path)

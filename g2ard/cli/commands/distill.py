@@ -17,6 +17,7 @@ from g2ard.cli.outputs import Outputs, budgets_of
 from g2ard.cli.run_result import say_views, say_weight, tell_quality, told, write_table
 from g2ard.cli.tile_options import tiling_of
 from g2ard.cli.tiled import TiledCommand
+from g2ard.io import kind, write_splats
 from g2ard.progress import plural
 
 if TYPE_CHECKING:
@@ -203,8 +204,6 @@ def _check_options(
 
 def _check_kind(scene: Path, given: bool) -> None:
     """Reject a file of views as the scene, and a point cloud without `given` views."""
-    from g2ard.io import kind
-
     found = kind(scene)
     if found == "views":
         raise typer.BadParameter(
@@ -319,8 +318,6 @@ def _write(
 
 def _keep(path: Path, scene: Splats | None) -> None:
     """Write the simplified scene; without one, remove an earlier run's."""
-    from g2ard.io import write_splats
-
     if scene is None:
         path.unlink(missing_ok=True)
         return

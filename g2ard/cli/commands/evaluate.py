@@ -11,6 +11,8 @@ import typer
 from g2ard.cli import options as opt
 from g2ard.cli.frame import Run, command
 from g2ard.config.choices import BLACK, Colour, LpipsInput
+from g2ard.errors import InputError
+from g2ard.io import check_scene
 from g2ard.progress import plural
 
 
@@ -53,8 +55,6 @@ def evaluate(
 
     For the evaluation of the original 3DGS, use --convention inria --8bit --lpips-input unscaled.
     """
-    from g2ard.errors import InputError
-    from g2ard.io import check_scene
     from g2ard.io.describe import bytes_of
     from g2ard.jobs.inputs import load_views, make_targets
     from g2ard.jobs.view_checks import check_sight, propose_background

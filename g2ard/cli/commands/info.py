@@ -9,6 +9,7 @@ import typer
 
 from g2ard.cli.frame import Run, command, one_line
 from g2ard.errors import InputError
+from g2ard.io.detect import run_scene
 from g2ard.progress import plural
 
 
@@ -56,7 +57,6 @@ def _described(path: Path) -> tuple[dict[str, Any], list[list[str]]]:
     """Return a file's figures, with scores for a run, and the table rows that show them."""
     from g2ard.cli.run_folder import stopped_run
     from g2ard.io.describe import describe
-    from g2ard.io.detect import run_scene
     from g2ard.io.jsonfile import read_json
 
     if (stopped := stopped_run(path)) is not None:

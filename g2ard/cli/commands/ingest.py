@@ -10,7 +10,9 @@ import typer
 from g2ard.cli.budget_options import Count
 from g2ard.cli.frame import Run, command
 from g2ard.cli.options import ResumeOption
+from g2ard.config.paths import changed
 from g2ard.progress import plural
+from g2ard.system.memory import peak_rss
 
 
 @command("ingest", example="g2ard ingest city.ply -o tiles/ --tile-rows 2M", settings=True, scenes=True)
@@ -39,9 +41,7 @@ def ingest(
     """
     import time
 
-    from g2ard.config.paths import changed
     from g2ard.stages.lift import LiftConfig
-    from g2ard.system.memory import peak_rss
     from g2ard.tiles.ingest import TILE_ROWS
     from g2ard.tiles.ingest import ingest as into_tiles
 

@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from g2ard import io
 from g2ard.cli.frame import Run, command
 from g2ard.cli.options import OutputOption
 from g2ard.cli.run_result import say_weight
@@ -31,7 +32,6 @@ def lift(
     """Turn a coloured point cloud into surface-aligned Gaussian discs, without training."""
     import time
 
-    from g2ard import io
     from g2ard.stages.lift import lift as lift_points
 
     io.check_scene_output(output, run.overwrite)

@@ -10,6 +10,7 @@ import typer
 from g2ard.cli.frame import Run, command
 from g2ard.cli.options import OutputOption, SceneArgument, UpOption, ViewFormatOption
 from g2ard.config.choices import PoolKind
+from g2ard.io import check_views_output
 from g2ard.progress import plural
 
 _FEW = 0.005
@@ -58,7 +59,6 @@ def poses(
     up: UpOption = None,
 ) -> None:
     """Generate views for a scene: poses in free space that see it well."""
-    from g2ard.io import check_views_output
     from g2ard.poses import plan_pool
     from g2ard.scene.splits import splits_of
 

@@ -9,6 +9,12 @@ import typer
 
 from g2ard.cli import options as opt
 from g2ard.cli.frame import Run, command
+from g2ard.cli.resume import check_stopped, left_at, stoppable
+from g2ard.cli.run_result import loss
+from g2ard.config.paths import listed
+from g2ard.config.presets import PRESETS, configured
+from g2ard.errors import InputError
+from g2ard.io import check_scene_output
 from g2ard.progress import plural
 
 if TYPE_CHECKING:
@@ -57,11 +63,6 @@ def recover(
     background: opt.BackgroundOption = None,
 ) -> None:
     """Optimise a fixed set of Gaussians against photos or a teacher's renders."""
-    from g2ard.cli.resume import check_stopped, left_at, stoppable
-    from g2ard.cli.run_result import loss
-    from g2ard.config.paths import listed
-    from g2ard.config.presets import PRESETS, configured
-    from g2ard.io import check_scene_output
     from g2ard.jobs.causes import likely_causes
     from g2ard.jobs.inputs import load_split_views, load_trained, make_targets
     from g2ard.jobs.score import scores_by_kind
@@ -159,8 +160,6 @@ def recover(
 
 def _built(run: Run, path: Path, student: Splats) -> Splats:
     """Read the student as it was built, in its present coordinates."""
-    from g2ard.errors import InputError
-
     scene = run.load(path)
     if len(scene) != len(student):
         raise InputError(

@@ -10,6 +10,10 @@ import typer
 from g2ard.cli import options as opt
 from g2ard.cli.frame import Run, command
 from g2ard.config.choices import BLACK, Keep, Refinement
+from g2ard.config.paths import changed, listed
+from g2ard.config.presets import GS_CPR
+from g2ard.errors import InputError
+from g2ard.io import check_views_output
 from g2ard.progress import plural
 
 if TYPE_CHECKING:
@@ -107,10 +111,6 @@ def register(
 
     Each photo is registered, uncertain or refused; OUT gets the registered ones as views.
     """
-    from g2ard.config.paths import changed, listed
-    from g2ard.config.presets import GS_CPR
-    from g2ard.errors import InputError
-    from g2ard.io import check_views_output
     from g2ard.jobs.register import photos_of, pool_of, poses_for
     from g2ard.stages.register import RegisterConfig
     from g2ard.stages.register import register as find

@@ -12,6 +12,9 @@ from g2ard.cli import options as opt
 from g2ard.cli.budget_options import Count, LooksOption, RatioOption, one_budget
 from g2ard.cli.frame import Run, command
 from g2ard.config.choices import BLACK, Method
+from g2ard.errors import InputError
+from g2ard.io.atomic import atomic_folder, check_output
+from g2ard.io.paths import output_names
 from g2ard.progress import plural
 
 if TYPE_CHECKING:
@@ -69,8 +72,6 @@ def render(
     """Render views of a scene as PNG, or show how it would be simplified."""
     import numpy as np
 
-    from g2ard.io.atomic import atomic_folder, check_output
-    from g2ard.io.paths import output_names
     from g2ard.jobs.inputs import load_views
     from g2ard.jobs.orbit import orbit
     from g2ard.jobs.view_checks import warn_of_sight
@@ -211,8 +212,6 @@ def _painted(
 
 def _read_parents(path: Path, count: int) -> NDArray[np.int64]:
     import numpy as np
-
-    from g2ard.errors import InputError
 
     try:
         labels = np.load(path, allow_pickle=False)

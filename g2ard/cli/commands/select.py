@@ -10,6 +10,10 @@ import typer
 from g2ard.cli import options as opt
 from g2ard.cli.budget_options import Count
 from g2ard.cli.frame import Run, command
+from g2ard.config.paths import listed
+from g2ard.config.presets import configured
+from g2ard.errors import InputError
+from g2ard.io import check_views_output
 from g2ard.progress import plural
 
 if TYPE_CHECKING:
@@ -47,10 +51,6 @@ def select(
 
     Views outside the training split are appended without a weight, for scoring.
     """
-    from g2ard.config.paths import listed
-    from g2ard.config.presets import configured
-    from g2ard.errors import InputError
-    from g2ard.io import check_views_output
     from g2ard.jobs.inputs import load_split_views
     from g2ard.jobs.view_checks import warn_of_sight
     from g2ard.pipeline import SelectConfig

@@ -8,13 +8,19 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from g2ard import io
 from g2ard.cli import options as opt
 from g2ard.cli.frame import Run, command
 from g2ard.cli.outputs import Outputs, budgets_of
 from g2ard.cli.run_result import say_weight, tell_quality
 from g2ard.cli.tile_options import tiling_of
 from g2ard.cli.tiled import TiledCommand
+from g2ard.config.paths import listed
+from g2ard.config.presets import configured
+from g2ard.io.atomic import atomic_output
+from g2ard.io.scene_formats import written_bytes
 from g2ard.progress import plural
+from g2ard.system.memory import peak_rss
 
 if TYPE_CHECKING:
     from g2ard.io import Scene
@@ -55,7 +61,6 @@ def simplify(
     generated views. The fast method uses views only if --views is given; the paper's method uses none.
     Scenes larger than memory and folders of tiles are simplified tile by tile to the same exact budget.
     """
-    from g2ard.config.presets import configured
     from g2ard.stages.simplify import SimplifyConfig
 
     settings = run.settings(SimplifyConfig(), "method", "keep_region", preset=preset)
@@ -66,8 +71,6 @@ def simplify(
     if keep_region and (no_views or config.method == "paper"):
         raise typer.BadParameter("--keep-region needs views; remove --no-views or --method paper")
     tiling = tiling_of(run, scene, output)
-    from g2ard import io
-    from g2ard.io.scene_formats import written_bytes
     from g2ard.jobs.inputs import say_notes
     from g2ard.jobs.measured_budget import aim_of
     from g2ard.jobs.simplify import Reduction
@@ -146,9 +149,6 @@ def simplify(
 
 
 def _report(found: Scene, small: Simplified, config: SimplifyConfig, clock: list[float]) -> dict[str, Any]:
-    from g2ard.config.paths import listed
-    from g2ard.system.memory import peak_rss
-
     began, read, simplified, written = clock
     return {
         **small.report.as_dict(),
@@ -168,8 +168,6 @@ def _report(found: Scene, small: Simplified, config: SimplifyConfig, clock: list
 def _write_parents(run: Run, path: Path, small: Simplified) -> None:
     """Write the parents, (N,) int64 in the scene's row order, for `render --color parents`."""
     import numpy as np
-
-    from g2ard.io.atomic import atomic_output
 
     with atomic_output(path, overwrite=run.overwrite) as temporary, temporary.open("wb") as file:
         np.save(file, small.parents)

@@ -10,6 +10,7 @@ import typer
 from g2ard.cli import options as opt
 from g2ard.cli.frame import Run, command
 from g2ard.config.choices import BLACK
+from g2ard.io.detect import run_scene
 from g2ard.progress import plural
 
 if TYPE_CHECKING:
@@ -37,7 +38,6 @@ def view(
     up: opt.UpOption = None,
 ) -> None:
     """Write an HTML page that shows one scene, or compares two, in any browser."""
-    from g2ard.io.detect import run_scene
     from g2ard.jobs.viewer_frame import frame_of
     from g2ard.viewer import check_page_output, write_page
 
