@@ -129,19 +129,6 @@ def test_regularisers_equal_their_naive_twins() -> None:
     assert both.item() == pytest.approx(0.5 * anchor + 0.25 * shape, rel=1e-4)
 
 
-def test_regulariser_gradients_equal_finite_differences() -> None:
-    splats = random_splats(6)
-    means, log_scales, quats = moved(splats)
-    anchors = double_anchors(splats)
-    weights = Regularizers(1.0, 1.0, effective_rank=True)
-    assert torch.autograd.gradcheck(
-        lambda m, q, s: regularization(m, q, s, anchors, weights),
-        (means, quats, log_scales),
-        eps=1e-7,
-        atol=1e-5,
-    )
-
-
 def test_inside_the_trust_region_nothing_pulls() -> None:
     splats = random_splats()
     anchors = double_anchors(splats)

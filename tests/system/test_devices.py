@@ -116,22 +116,15 @@ def test_views_see_the_same_cells(gpu: None) -> None:
     assert min(every, seen) >= SEEN_ALIKE
 
 
-@pytest.mark.parametrize("parts", [("playbot", "0_0"), ("taebak_park", "0_4")])
-def test_real_scenes_are_nearly_the_same(
-    parts: tuple[str, str], gpu: None, capsys: pytest.CaptureFixture
-) -> None:
-    prior = read_splats(real(*parts))
+def test_a_real_scene_is_nearly_the_same(gpu: None) -> None:
+    prior = read_splats(real("taebak_park", "0_4"))
     prior = prior.take(np.argsort(prior.means[:, 0], kind="stable")[:40_000])
     there = simplify(prior, 4000, method="paper")
     assert served() > 10
     devices.use("cpu")
     views = make_pool(prior, 6).resized(192)
     assert_close(simplify(prior, 4000, method="paper"), there, prior, views)
-    every, seen = seen_alike(prior, views, 10_000)
-    with capsys.disabled():
-        print(f"\n{'/'.join(parts)}: cells seen {100 * every:.4f} % alike, ", end="")
-        print(f"{100 * seen:.4f} % of those that either sees")
-    assert min(every, seen) >= SEEN_ALIKE
+    assert min(seen_alike(prior, views, 10_000)) >= SEEN_ALIKE
 
 
 def test_looks_of_the_default_method_run_on_the_gpu(gpu: None) -> None:
@@ -217,7 +210,7 @@ def test_failures_are_reported_at_once(capsys: pytest.CaptureFixture, gpu: None)
     assert "GPU" not in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("kilobytes", [600_000, 1_400_000, 3_000_000])
+@pytest.mark.parametrize("kilobytes", [600_000, 3_000_000])
 def test_little_address_space_ends_on_the_cpu(kilobytes: int, tmp_path: Path, gpu: None) -> None:
     """Drivers that run out of it end the process, so they are not asked."""
     if sys.platform != "linux":
