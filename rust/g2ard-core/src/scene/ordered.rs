@@ -169,21 +169,4 @@ mod tests {
         assert_eq!(power_of_two_below(5.3), 4.0);
         assert_eq!(power_of_two_below(0.3), 0.25);
     }
-
-    #[test]
-    fn names_the_short_array() {
-        let scene = SceneRef {
-            means: Means::F64(&[[0.0; 3]; 2]),
-            quats: &[[1.0, 0.0, 0.0, 0.0]],
-            scales: &[[0.1; 3]; 2],
-            logit_opacities: &[0.0; 2],
-            sh0: &[[0.0; 3]; 2],
-            sh_rest: &[],
-            rest: 0,
-        };
-        assert_eq!(
-            Ordered::new(&scene).unwrap_err(),
-            Error::invalid("quats", "2 rows", 1)
-        );
-    }
 }

@@ -339,38 +339,6 @@ mod tests {
     }
 
     #[test]
-    fn bands_cover_every_row_of_tiles_once_and_meet_few_groups() {
-        let mut random = Lcg(3);
-        let live: Vec<LiveGroup> = (0..1000)
-            .map(|number| {
-                let first = random.integer() as u16 % 30;
-                let last = (first + random.integer() as u16 % 3).min(29);
-                LiveGroup {
-                    number,
-                    tile_rows: [first, last],
-                }
-            })
-            .collect();
-        for most in [1, 80, 150, 400, 5000] {
-            let bands = bands(&live, 30, most);
-            let ends = bands.iter().map(|b| b.end);
-            assert!(
-                bands
-                    .iter()
-                    .map(|b| b.start)
-                    .eq([0].into_iter().chain(ends).take(bands.len()))
-            );
-            assert_eq!(bands.last().unwrap().end, 30);
-            for band in &bands {
-                let [first, last] = [band.start as u16, band.end as u16 - 1];
-                let meets = |g: &&LiveGroup| g.tile_rows[0] <= last && g.tile_rows[1] >= first;
-                let met = live.iter().filter(meets).count();
-                assert!(met <= most || band.len() == 1, "{met} in {band:?}");
-            }
-        }
-    }
-
-    #[test]
     fn bands_show_what_the_whole_image_does() {
         let rows = scene();
         let scene = made(&rows);

@@ -186,20 +186,3 @@ fn a_crowded_tile_is_drawn_to_its_end() {
         want
     );
 }
-
-#[test]
-fn the_same_twice() {
-    let Some(gpu) = gpu("visibility, twice") else {
-        return;
-    };
-    let (_, splats) = scenes(3000).swap_remove(0);
-    let scene = Gaussians {
-        means: &splats.means,
-        quats: &splats.quats,
-        scales: &splats.scales,
-        opacities: &vec![0.4; splats.len()],
-    };
-    let cameras = cameras([0.0; 3], 5.0);
-    let look = || view_statistics(&gpu, &scene, &cameras, &Control::default()).unwrap();
-    assert_eq!(look(), look());
-}
