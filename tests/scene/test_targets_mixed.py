@@ -36,10 +36,9 @@ def run(command_line: CommandLine, folder: Path, *arguments: object) -> tuple[di
     return json.loads(out), error
 
 
-@pytest.mark.parametrize("preset", ["auto", "paper"])
-def test_distill_learns_from_photos_and_renders(folder: Path, command_line: CommandLine, preset: str) -> None:
+def test_distill_learns_from_photos_and_renders(folder: Path, command_line: CommandLine) -> None:
     ask = ("distill", "ball.ply", "-r", 3, "--views", "v.json", "-o", "run", "--steps", 4)
-    report, told = run(command_line, folder, *ask, "--preset", preset)
+    report, told = run(command_line, folder, *ask)
     assert "8 views against 4 photos and 4 teacher renders" in told
     assert "skipped" not in told
     assert report["against"] == "2 photos and 2 teacher renders"
