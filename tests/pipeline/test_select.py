@@ -82,7 +82,7 @@ def test_given_weights_stand() -> None:
 
 
 def test_views_are_selected_once_by_default(monkeypatch: pytest.MonkeyPatch) -> None:
-    import g2ard.stages.select as stage
+    import g2ard.pipeline as stage
 
     counts: list[int] = []
     whole = stage.select

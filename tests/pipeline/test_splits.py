@@ -64,8 +64,9 @@ class Watch:
 
 @pytest.fixture
 def watch(monkeypatch: pytest.MonkeyPatch) -> Watch:
+    import g2ard.jobs.score
+    import g2ard.jobs.simplify
     import g2ard.pipeline.adapt
-    import g2ard.rendering.visibility
     import g2ard.stages.evaluate
     import g2ard.stages.recover
 
@@ -81,10 +82,13 @@ def watch(monkeypatch: pytest.MonkeyPatch) -> Watch:
 
         monkeypatch.setattr(module, name, told)
 
-    watched(g2ard.stages.recover, "recover", 1, seen.trained)
     watched(g2ard.pipeline.adapt, "adapt", 1, seen.trained)
-    watched(g2ard.rendering.visibility, "visibility_source", 0, seen.looked)
-    watched(g2ard.stages.evaluate, "evaluate", 1, seen.scored)
+    for module in (g2ard.stages.recover, g2ard.pipeline):
+        watched(module, "recover", 1, seen.trained)
+    for module in (g2ard.jobs.simplify, g2ard.pipeline):
+        watched(module, "visibility_source", 0, seen.looked)
+    for module in (g2ard.stages.evaluate, g2ard.jobs.score):
+        watched(module, "evaluate", 1, seen.scored)
     return seen
 
 

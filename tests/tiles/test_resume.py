@@ -30,7 +30,7 @@ def test_a_stopped_distill_resumes(
 
     call = "distill", "town.ply", "-r", "10", "--views", "views.json", "-o", "run", *QUICK
     with monkeypatch.context() as patch:
-        patch.setattr("g2ard.tiles.recover.recover_tiles", stopped)
+        patch.setattr("g2ard.jobs.tiled.recover_tiles", stopped)
         status, _, said = command_line(*call, cwd=folder)
     assert status == 130
     assert "run the same command with --resume to continue" in " ".join(said.split())
