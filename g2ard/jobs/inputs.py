@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -156,31 +156,15 @@ def make_targets(
     With `photos` and a teacher, each view's photo is used, or a render if it has none. `lazy` renders on
     first access.
     """
+    renders: Any = {"settings": settings, "lazy": lazy, "renderer": renderer, "progress": progress}
     if teacher is not None and not photos:
-        return TeacherRenders(
-            teacher,
-            cameras,
-            background=background,
-            settings=settings,
-            lazy=lazy,
-            renderer=renderer,
-            progress=progress,
-        )
+        return TeacherRenders(teacher, cameras, background=background, **renders)
     exposures = find_exposures(cameras)
     if exposures:
         say(f"exposure.json: corrected the exposure of {plural(len(exposures), 'photo')}")
     if teacher is None:
         return Photos(cameras, background=background, exposures=exposures)
-    return PhotosOrRenders(
-        cameras,
-        teacher,
-        background=background,
-        exposures=exposures,
-        settings=settings,
-        lazy=lazy,
-        renderer=renderer,
-        progress=progress,
-    )
+    return PhotosOrRenders(cameras, teacher, background=background, exposures=exposures, **renders)
 
 
 def clutter_seen(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
@@ -63,35 +63,51 @@ def kinds_told(photos: int, renders: int) -> str:
 def fingerprint_of(targets: Targets) -> str:
     """Return a hash of the views, their names and the source of their images, for checkpoints."""
     cameras = targets.cameras
-    source = getattr(targets, "source", type(targets).__name__)
-    digest = hashlib.sha256(f"{source} {cameras.names}".encode())
+    digest = hashlib.sha256(f"{_source(targets)} {cameras.names}".encode())
     for array in (cameras.viewmats, cameras.Ks, cameras.widths, cameras.heights):
         digest.update(np.ascontiguousarray(array).tobytes())
     return digest.hexdigest()
 
 
-class Subset:
-    """Subset of other targets."""
+def _source(targets: Targets) -> str:
+    return str(getattr(targets, "source", type(targets).__name__))
 
-    def __init__(self, targets: Targets, rows: ArrayLike) -> None:
-        self._targets, self._rows = targets, np.asarray(rows, np.int64)
-        self.cameras = targets.cameras.take(self._rows)
+
+class _Chosen:
+    """Views of other targets.
+
+    Args:
+        places: the targets and the row in them of each view of `cameras`.
+    """
+
+    def __init__(self, cameras: Cameras, places: Sequence[tuple[Targets, int]]) -> None:
+        self.cameras, self._places = cameras, places
 
     @property
     def source(self) -> str:
-        """Source of the other targets."""
-        return str(getattr(self._targets, "source", type(self._targets).__name__))
+        """Sources of the other targets."""
+        parts = {id(targets): targets for targets, _ in self._places}
+        return " | ".join(map(_source, parts.values()))
 
     def __getitem__(self, view: int) -> NDArray[np.float32]:
-        return self._targets[int(self._rows[view])]
+        targets, row = self._places[view]
+        return targets[row]
 
     def mask(self, view: int) -> NDArray[np.bool_] | None:
         """Return the mask, see `mask_of`."""
-        return mask_of(self._targets, int(self._rows[view]))
+        return mask_of(*self._places[view])
 
     def against(self, view: int) -> str | None:
         """Return the kind, see `against_of`."""
-        return against_of(self._targets, int(self._rows[view]))
+        return against_of(*self._places[view])
+
+
+class Subset(_Chosen):
+    """Subset of other targets."""
+
+    def __init__(self, targets: Targets, rows: ArrayLike) -> None:
+        rows = np.asarray(rows, np.int64)
+        super().__init__(targets.cameras.take(rows), [(targets, int(row)) for row in rows])
 
 
 class _Cached(ABC):
@@ -265,7 +281,7 @@ class TeacherRenders(_Cached):
         return self._stored(view)
 
 
-class PhotosOrRenders:
+class PhotosOrRenders(_Chosen):
     """Photo of each view, or a render of the dense scene for views without a photo.
 
     As in sec. 3.1: "real images are used when available, otherwise teacher renders".
@@ -273,6 +289,7 @@ class PhotosOrRenders:
     Args:
         exposures: exposures of the photos, see `Photos`.
         limit: bytes cached in memory per kind.
+        renders: further arguments of `TeacherRenders`.
     """
 
     def __init__(
@@ -282,47 +299,13 @@ class PhotosOrRenders:
         *,
         background: Colour = BLACK,
         exposures: Mapping[str, NDArray[np.float64]] | None = None,
-        settings: RasterSettings | None = None,
         limit: int = CACHE_BYTES,
-        lazy: bool = False,
-        renderer: Renderer | None = None,
-        progress: Progress = silent,
+        **renders: Any,
     ) -> None:
-        self.cameras = cameras
         pictured = np.array([path is not None for path in cameras.image_paths], bool)
-        photos = Photos(
-            cameras.take(np.flatnonzero(pictured)), background=background, exposures=exposures, limit=limit
-        )
-        renders = TeacherRenders(
-            teacher,
-            cameras.take(np.flatnonzero(~pictured)),
-            background=background,
-            settings=settings,
-            limit=limit,
-            lazy=lazy,
-            renderer=renderer,
-            progress=progress,
-        )
+        parts = [cameras.take(np.flatnonzero(mask)) for mask in (pictured, ~pictured)]
+        photos = Photos(parts[0], background=background, exposures=exposures, limit=limit)
+        others = TeacherRenders(teacher, parts[1], background=background, limit=limit, **renders)
         rows = np.where(pictured, np.cumsum(pictured), np.cumsum(~pictured)) - 1
-        self._places: list[tuple[Photos | TeacherRenders, int]] = [
-            (photos if photo else renders, int(row)) for photo, row in zip(pictured, rows, strict=True)
-        ]
-        self._parts = photos, renders
-
-    @property
-    def source(self) -> str:
-        """Identity of photos and renders."""
-        return " | ".join(part.source for part in self._parts)
-
-    def __getitem__(self, view: int) -> NDArray[np.float32]:
-        targets, row = self._places[view]
-        return targets[row]
-
-    def mask(self, view: int) -> NDArray[np.bool_] | None:
-        """Return the mask, see `mask_of`."""
-        targets, row = self._places[view]
-        return mask_of(targets, row)
-
-    def against(self, view: int) -> str:
-        """Return the kind, see `against_of`."""
-        return self._places[view][0].against(view)
+        places = [(photos if photo else others, int(row)) for photo, row in zip(pictured, rows, strict=True)]
+        super().__init__(cameras, places)
