@@ -127,10 +127,9 @@ class Ratios(tuple[float, ...]):
         return cls(parse_ratio(part) for part in text.split(","))
 
 
-BUDGETS: dict[str, tuple[Any, Any, Any]] = {
+BUDGETS: dict[str, tuple[Any, ...]] = {
     "count": (
         list[Counts] | None,
-        None,
         typer.Option(
             "-n",
             "--count",
@@ -141,7 +140,6 @@ BUDGETS: dict[str, tuple[Any, Any, Any]] = {
     ),
     "ratio": (
         list[Ratios] | None,
-        None,
         typer.Option(
             "-r",
             "--ratio",
@@ -152,7 +150,6 @@ BUDGETS: dict[str, tuple[Any, Any, Any]] = {
     ),
     "fit": (
         str | None,
-        None,
         typer.Option(
             metavar="5MB|DEVICE",
             help="Largest scene that fits a file size or a device: "
@@ -161,16 +158,14 @@ BUDGETS: dict[str, tuple[Any, Any, Any]] = {
     ),
     "min_psnr": (
         float | None,
-        None,
         typer.Option(min=1, help="Smallest scene with at least this PSNR against the original, dB."),
     ),
     "min_ssim": (
         float | None,
-        None,
         typer.Option(min=0.01, max=0.9999, help="Smallest scene with at least this SSIM."),
     ),
 }
-"""Options of commands with budgets, see `g2ard.cli.frame.command`: name → type, default and option."""
+"""Options of commands with budgets, see `g2ard.cli.frame.command`: name → type and option."""
 
 LooksOption = Annotated[
     Count | None,

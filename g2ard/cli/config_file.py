@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import json
+import math
 from collections.abc import Iterable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +16,8 @@ from g2ard.cli.usage import meant
 
 _NOT_KEPT = ("config", "print_config", "overwrite", "resume")
 """Options that are not written to config files."""
+_toml = partial(json.dumps, ensure_ascii=False)
+"""Format a value; for text, finite numbers and lists of them, TOML is JSON."""
 
 
 def load_config(ctx: typer.Context, path: Path | None) -> Path | None:
@@ -170,17 +175,7 @@ def _plain(value: Any) -> Any:
         return [_plain(item) for item in value]
     if isinstance(value, float) and value.is_integer() and abs(value) < 1e15:
         return int(value)
-    if isinstance(value, bool | int | float):
+    if isinstance(value, bool | int | float) and math.isfinite(value):
         return value
     text = str(value)
     return int(text) if isinstance(value, Count) and text.isdecimal() else text
-
-
-def _toml(value: Any) -> str:
-    if isinstance(value, bool):
-        return str(value).lower()
-    if isinstance(value, int | float):
-        return str(value)
-    if isinstance(value, list):
-        return f"[{', '.join(_toml(item) for item in value)}]"
-    return '"' + value.replace("\\", "\\\\").replace('"', '\\"') + '"'

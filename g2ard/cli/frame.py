@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import inspect
+import json
 import os
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -62,35 +63,32 @@ def _flags_win(ctx: typer.Context, values: dict[str, Any], defaults: dict[str, A
                 values[other] = defaults[other]
 
 
-_COMMON: dict[str, tuple[Any, Any, Any]] = {
-    "quiet": (bool, False, typer.Option("-q", "--quiet", help="Print errors only.")),
-    "verbose": (bool, False, typer.Option("-v", "--verbose", help="Print more details.")),
-    "overwrite": (bool, False, typer.Option("-w", "--overwrite", help="Replace existing outputs.")),
+_COMMON: dict[str, tuple[Any, ...]] = {
+    "quiet": (bool, typer.Option("-q", "--quiet", help="Print errors only."), False),
+    "verbose": (bool, typer.Option("-v", "--verbose", help="Print more details."), False),
+    "overwrite": (bool, typer.Option("-w", "--overwrite", help="Replace existing outputs."), False),
     "json": (
         str | None,
-        None,
         typer.Option("--json", metavar="FILE|-", help="Write the result as JSON; - is stdout."),
     ),
-    "seed": (int, 0, typer.Option(min=0, help="Random seed.")),
-    "threads": (int, 0, typer.Option(min=0, max=256, help="CPU threads; 0 uses all cores.")),
-    "device": (str, "auto", typer.Option(metavar="auto|cpu|gpu|cuda", help="Where to compute.")),
+    "seed": (int, typer.Option(min=0, help="Random seed."), 0),
+    "threads": (int, typer.Option(min=0, max=256, help="CPU threads; 0 uses all cores."), 0),
+    "device": (str, typer.Option(metavar="auto|cpu|gpu|cuda", help="Where to compute."), "auto"),
     "print_config": (
         bool,
-        False,
         typer.Option("--print-config", help="Print the options as a --config file, then exit."),
+        False,
     ),
     "config": (
         Path | None,
-        None,
         typer.Option(metavar="FILE.toml", callback=load_config, is_eager=True, help="Read default options."),
     ),
 }
-"""Name → type, default and option."""
+"""Name → type, option and default, None if left out."""
 
-_SETTINGS: dict[str, tuple[Any, Any, Any]] = {
+_SETTINGS: dict[str, tuple[Any, ...]] = {
     "set": (
         list[str] | None,
-        None,
         typer.Option(
             "--set",
             metavar="PATH=VALUE",
@@ -98,10 +96,9 @@ _SETTINGS: dict[str, tuple[Any, Any, Any]] = {
         ),
     )
 }
-_SCENES: dict[str, tuple[Any, Any, Any]] = {
+_SCENES: dict[str, tuple[Any, ...]] = {
     "render_model": (
         RenderModel | None,
-        None,
         typer.Option(help="How the scenes are drawn, if their files do not say it or say it wrongly."),
     )
 }
@@ -189,8 +186,6 @@ class Run:
         """Write the result and the resolved options to --json."""
         if self.json is None:
             return
-        import json
-
         text = json.dumps({**data, **self._used(), "config": self.config}, indent=2, default=_plain)
         if self.json == "-":
             print(text, flush=True)
@@ -359,7 +354,7 @@ def command(
     return register
 
 
-def _parameter(name: str, kind: Any, default: Any, option: Any) -> inspect.Parameter:
+def _parameter(name: str, kind: Any, option: Any, default: Any = None) -> inspect.Parameter:
     annotation = Annotated[kind, option]
     return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
 
@@ -390,8 +385,6 @@ def _execute(run: Run, fn: Callable[..., None], options: dict[str, Any], cuda: b
         run.say("--device cuda: this command does not use CUDA; it runs on the CPU")
     try:
         if run.json not in (None, "-"):
-            from g2ard.io.atomic import check_output
-
             check_output(str(run.json), run.overwrite)
         if run.threads:
             from g2ard import _core

@@ -15,10 +15,9 @@ if TYPE_CHECKING:
     from g2ard.cli.frame import Run
     from g2ard.jobs.tiling import Tiling
 
-TILES: dict[str, tuple[Any, Any, Any]] = {
+TILES: dict[str, tuple[Any, ...]] = {
     "tile_rows": (
         Count | None,
-        None,
         typer.Option(
             parser=Count.parse_absolute,
             metavar="COUNT",
@@ -27,17 +26,14 @@ TILES: dict[str, tuple[Any, Any, Any]] = {
     ),
     "memory": (
         str | None,
-        None,
         typer.Option(metavar="SIZE", help="Memory limit for all workers together, such as 4GB."),
     ),
     "workers": (
         int | None,
-        None,
         typer.Option(min=1, help="Processes for tiles; by default as many as cores and memory allow."),
     ),
     "scheduler": (
         str | None,
-        None,
         typer.Option(
             metavar="ADDRESS",
             help="Dask scheduler for tiles: tcp://HOST:PORT or local (needs the extra `distributed`).",
@@ -45,7 +41,6 @@ TILES: dict[str, tuple[Any, Any, Any]] = {
     ),
     "work": (
         Path | None,
-        None,
         typer.Option(
             metavar="DIR",
             help="Keep tiles and finished steps here, for other budgets; by default in .NAME.tiles beside "
@@ -53,7 +48,7 @@ TILES: dict[str, tuple[Any, Any, Any]] = {
         ),
     ),
 }
-"""Options of commands that work in tiles, see `g2ard.cli.frame.command`: name → type, default and option."""
+"""Options of commands that work in tiles, see `g2ard.cli.frame.command`: name → type and option."""
 
 
 def tiling_of(run: Run, scene: Path | None, output: Path) -> Tiling:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -82,8 +83,6 @@ class TiledCommand:
 
         With `resume`, finished budgets are skipped.
         """
-        from dataclasses import asdict
-
         from g2ard.jobs.tiled import distill_in_tiles, working
         from g2ard.jobs.tiling import refuse_whole, whole_budgets, whole_options
         from g2ard.report.distilled import tiled_report

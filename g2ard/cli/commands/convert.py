@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -82,8 +83,6 @@ def convert(
     ] = None,
 ) -> None:
     """Convert scenes to another format or other axes, and merge, crop or move them."""
-    from dataclasses import replace
-
     import numpy as np
 
     from g2ard.scene.axes import with_axes

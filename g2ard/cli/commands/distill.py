@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 import time
 from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -219,8 +220,6 @@ def _tell_all(run: Run, reports: list[dict[str, Any]]) -> None:
 
 def _tell_estimates(run: Run, job: DistillJob, folders: Sequence[Path], *, page: bool) -> None:
     """Print the estimated time and memory of each budget, and the total of several."""
-    from dataclasses import asdict
-
     from g2ard.jobs.estimate import estimate, total
 
     found, told = [], []

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -99,8 +100,6 @@ def _rows_of_stopped(path: Path, stopped: dict[str, Any]) -> list[list[str]]:
 
 
 def _devices(run: Run) -> None:
-    from dataclasses import asdict
-
     from g2ard.system import devices
 
     found = devices.adapters()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 from typing import Annotated
 
@@ -39,8 +40,6 @@ def ingest(
 
     Run the same command again to continue after an interruption.
     """
-    import time
-
     from g2ard.stages.lift import LiftConfig
     from g2ard.tiles.ingest import TILE_ROWS
     from g2ard.tiles.ingest import ingest as into_tiles

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 from typing import Annotated
 
@@ -30,8 +31,6 @@ def lift(
     opacity: Annotated[float, typer.Option(help="Opacity of every disc, between 0 and 1.")] = 0.5,
 ) -> None:
     """Turn a coloured point cloud into surface-aligned Gaussian discs, without training."""
-    import time
-
     from g2ard.stages.lift import lift as lift_points
 
     io.check_scene_output(output, run.overwrite)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -261,8 +262,6 @@ def _georeference(text: str) -> Any:
 
 def _check_same(meta: Path, ratios: Sequence[float]) -> None:
     """Raise an error if a finished folder holds levels of other ratios."""
-    import json
-
     from g2ard.errors import OutputError
 
     content = json.loads(meta.read_text(encoding="utf-8"))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -145,8 +146,6 @@ def _write_sheet(
     path: Path, images: list[NDArray[np.uint8]], names: tuple[str, ...], overwrite: bool
 ) -> None:
     """Write a roughly square grid of all images, captioned by row."""
-    import math
-
     from g2ard.scene.images import contact_sheet, write_png
 
     columns = math.ceil(math.sqrt(len(images)))
