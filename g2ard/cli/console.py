@@ -5,7 +5,6 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Mapping
-from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -29,7 +28,7 @@ def duration(seconds: float) -> str:
 
 
 class Console:
-    """Progress callback (see `g2ard.progress`) that draws bars, as a context that ends them."""
+    """Progress callback (see `g2ard.progress`) that draws bars."""
 
     def __init__(self, *, quiet: bool = False) -> None:
         self.quiet = quiet
@@ -37,14 +36,6 @@ class Console:
         self._tasks: dict[str, TaskID] = {}
         self._plain: dict[str, tuple[float, float]] = {}  # stage → (began, last line)
         self._done: dict[str, int] = {}
-
-    def __enter__(self) -> Console:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._end_bars()
 
     def say(self, text: str) -> None:
         if self.quiet:
@@ -55,14 +46,14 @@ class Console:
             print(text, file=sys.stderr, flush=True)
 
     def error(self, text: str) -> None:
-        self._end_bars()
+        self.close()
         print(f"g2ard: {text}", file=sys.stderr, flush=True)
 
     def table(self, title: str, columns: list[str], rows: list[list[str]], *, stdout: bool = False) -> None:
         """Print a table; all columns but the first are right-aligned, and empty names show no header."""
         if self.quiet:
             return
-        self._end_bars()
+        self.close()
         from rich.console import Console as Rich
         from rich.table import Table
 
@@ -133,7 +124,8 @@ class Console:
         else:
             self._plain[stage] = (began, now)
 
-    def _end_bars(self) -> None:
+    def close(self) -> None:
+        """End all bars."""
         if self._bars is not None:
             self._bars.stop()
             self._bars = None

@@ -391,7 +391,7 @@ def _execute(run: Run, fn: Callable[..., None], options: dict[str, Any], cuda: b
 
             _core.set_num_threads(run.threads)
             os.environ["RAYON_NUM_THREADS"] = str(run.threads)  # for child processes
-        with run.console, _device(run):
+        with contextlib.closing(run.console), _device(run):
             fn(run, **options)
     except KeyboardInterrupt:
         run.console.error(f"interrupted; {'; '.join(run.kept) or 'nothing was written'}")

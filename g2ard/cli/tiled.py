@@ -62,7 +62,7 @@ class TiledCommand:
             )
             for at, (store, small) in enumerate(made):
                 place = self.outputs.paths(store.count)[at]
-                self._write(place, store, small)
+                self._write(place, small)
                 report = {
                     **_report(store, small, began),
                     "views": small.views,
@@ -118,7 +118,7 @@ class TiledCommand:
                 }
                 if (pool := views.pool) is not None:
                     write_pool(run, folder, pool)
-                self._write(folder / name, store, small)
+                self._write(folder / name, small)
                 title = f"{self.scene.name}: {store.count:,} → {len(small):,}"
                 tiled_report(folder / "report.html", title, report)
                 write_report(folder, report)
@@ -135,7 +135,7 @@ class TiledCommand:
                 reports[at] = report
         run.result(reports[0] if len(reports) == 1 else {"runs": [reports[at] for at in sorted(reports)]})
 
-    def _write(self, place: Path, store: TileStore, small: TiledScene) -> None:
+    def _write(self, place: Path, small: TiledScene) -> None:
         from g2ard.io.ply import write_parts
 
         if scene_format(place).suffix == ".ply":
