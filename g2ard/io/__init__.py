@@ -99,7 +99,8 @@ def read_splats(path: str | Path, *, render_model: RenderModel | None = None) ->
 def read_scene(path: str | Path, *, render_model: RenderModel | None = None) -> Scene:
     """Read a Gaussian scene with notes on dropped rows, clamped values and ignored properties."""
     path, found = check_scene(path)
-    scene: Scene = import_module(f"g2ard.io.{found}").read(path)
+    module = import_module(f"g2ard.io.{found}")
+    scene: Scene = module.stream(path).whole() if hasattr(module, "stream") else module.read(path)
     if render_model is None:
         return scene
     return replace(scene, splats=replace(scene.splats, render_model=render_model))

@@ -18,9 +18,8 @@ from g2ard.errors import InputError
 from g2ard.io import plyfiles
 from g2ard.io.atomic import atomic_output
 from g2ard.io.packing import coded, log_scales, morton_order, smallest_three, unit_quats, writable
-from g2ard.io.sanitize import Raw, cleaned
+from g2ard.io.sanitize import Raw
 from g2ard.io.stream import SceneStream
-from g2ard.io.types import Scene
 from g2ard.progress import plural
 from g2ard.scene.splats import SH_C0, Splats
 
@@ -29,11 +28,6 @@ _SCALE_LIMIT = 20.0
 """Log-scales are clamped to ±20, as in SuperSplat, since an outlier would coarsen its chunk."""
 
 _PACKED = ["packed_position", "packed_rotation", "packed_scale", "packed_color"]
-
-
-def read(path: Path) -> Scene:
-    layout = _layout(path)
-    return cleaned(path, _raw(layout, 0, layout.vertex, layout.sh), render_model=layout.render_model)
 
 
 def stream(path: Path) -> SceneStream:

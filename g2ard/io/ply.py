@@ -16,9 +16,9 @@ from g2ard.config.choices import RenderModel
 from g2ard.errors import InputError
 from g2ard.io import plyfiles
 from g2ard.io.atomic import atomic_output
-from g2ard.io.sanitize import BLOCK, LOG_SCALE_LIMIT, Raw, cleaned
+from g2ard.io.sanitize import BLOCK, LOG_SCALE_LIMIT, Raw
 from g2ard.io.stream import SceneStream
-from g2ard.io.types import Note, Scene
+from g2ard.io.types import Note
 from g2ard.progress import plural
 from g2ard.scene.splats import Splats, unit_quats
 
@@ -76,17 +76,12 @@ class _Layout:
         return raw
 
 
-def read(path: Path) -> Scene:
-    """Read a 3DGS .ply of any SH degree, property order, scalar type and byte order, or ascii.
-
-    float64 positions that float32 cannot represent are recentred; the shift is stored in `offset`.
-    """
-    layout = _Layout.of(path)
-    return cleaned(path, layout.raw(np.asarray(layout.rows)), layout.notes, layout.render_model)
-
-
 def stream(path: Path) -> SceneStream:
-    """Open a scene for reading in blocks; text files and those with leading lists are read whole."""
+    """Open a 3DGS .ply of any SH degree, property order, scalar type and byte order, or ascii.
+
+    float64 positions that float32 cannot represent are recentred; the shift is stored in `offset`. Text files
+    and those with leading lists are read whole.
+    """
     return _PlyStream(path)
 
 

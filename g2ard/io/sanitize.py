@@ -59,6 +59,11 @@ class Raw:
             self.offset,
         )
 
+    def fill(self, scene: Splats, scales: NDArray[np.float32]) -> None:
+        """Copy a scene, with these numbers as `log_scales`."""
+        self.means[:], self.quats[:], self.log_scales[:] = scene.means, scene.quats, scales
+        self.logit_opacities[:], self.sh0[:], self.shN[:] = scene.logit_opacities, scene.sh0, scene.shN
+
     def activated(self, render_model: RenderModel = "classic") -> Splats:
         """Return the scene, after `Tally.clean` has exponentiated `log_scales` in place."""
         return Splats(

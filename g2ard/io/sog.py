@@ -35,10 +35,10 @@ from g2ard.io.jsonfile import (
 )
 from g2ard.io.limits import check_unpacked
 from g2ard.io.paths import check_regular
-from g2ard.io.sanitize import Raw, cleaned
+from g2ard.io.sanitize import Raw
 from g2ard.io.sog_chunk import Chunk, Decoder, count_of, means_of, render_model_of, rest_of
 from g2ard.io.stream import SceneStream, file_identity
-from g2ard.io.types import Note, Scene
+from g2ard.io.types import Note
 from g2ard.progress import plural
 from g2ard.scene.transform import one_model
 
@@ -90,24 +90,12 @@ def _listed(index: Path) -> list[Path]:
     return chunks
 
 
-def read(path: Path) -> Scene:
-    """Read a SOG scene, version 1 or 2: a .sog, a meta.json or its folder, or a folder of chunks.
-
-    Chunks are padded with zeros to the highest SH degree.
-    """
-    with _opened(path) as chunks:
-        counts = [count_of(chunk) for chunk in chunks]
-        raw = Raw.empty(sum(counts), max(map(rest_of, chunks), default=0))
-        start = 0
-        for chunk, count in zip(chunks, counts, strict=True):
-            Decoder(chunk, count).fill(slice(0, count), raw.take(slice(start, start + count)))
-            start += count
-        raw.offset, model = _offset(chunks), _render_model(chunks)
-    return cleaned(path, raw, _left_out(path, len(chunks)), model)
-
-
 def stream(path: Path) -> SceneStream:
-    """Open a scene for reading by chunk; memory holds a chunk's images, 20 to 28 bytes per Gaussian."""
+    """Open a SOG scene, version 1 or 2: a .sog, a meta.json or its folder, or a folder of chunks.
+
+    Chunks are padded with zeros to the highest SH degree. Memory holds a chunk's images, 20 to 28 bytes per
+    Gaussian.
+    """
     with _opened(path) as chunks:
         counts = [count_of(chunk) for chunk in chunks]
         rest = max(map(rest_of, chunks), default=0)

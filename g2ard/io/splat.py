@@ -12,21 +12,15 @@ from numpy.typing import NDArray
 from g2ard.errors import DAMAGED, InputError
 from g2ard.io.atomic import atomic_output
 from g2ard.io.packing import world_means, writable
-from g2ard.io.sanitize import Raw, cleaned
+from g2ard.io.sanitize import Raw
 from g2ard.io.stream import SceneStream
-from g2ard.io.types import Scene
 from g2ard.scene.splats import SH_C0, Splats, unit_quats
 
 _ROW = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
 
 
-def read(path: Path) -> Scene:
-    """Read a .splat: linear scales, 8-bit colour and opacity, quaternions as bytes around 128."""
-    return cleaned(path, _raw(np.fromfile(path, _ROW, _count(path))))
-
-
 def stream(path: Path) -> SceneStream:
-    """Open a scene for reading in blocks."""
+    """Open a .splat: linear scales, 8-bit colour and opacity, quaternions as bytes around 128."""
     return _SplatStream(path)
 
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from g2ard.config.choices import RenderModel
 from g2ard.errors import InputError
 from g2ard.io.sanitize import BLOCK, Raw, Tally
-from g2ard.io.types import Note
+from g2ard.io.types import Note, Scene
 from g2ard.scene.splats import Splats
 from g2ard.scene.transform import one_model
 
@@ -78,6 +78,15 @@ class SceneStream(ABC):
         """Return all notes once `blocks` has finished; raise an `InputError` if no row is finite."""
         return (*self.notes, *self.tally.notes(self.path))
 
+    def whole(self) -> Scene:
+        """Read all rows into memory."""
+        raw, kept = Raw.empty(self.count, (self.sh_degree + 1) ** 2 - 1), 0
+        raw.offset = self.offset
+        for block in self.blocks(BLOCK):
+            raw.take(slice(kept, kept := kept + len(block))).fill(block, block.scales)
+        notes = self.all_notes()
+        return Scene(raw.take(slice(kept)).activated(self.render_model), notes)
+
 
 class PartsStream(SceneStream):
     """Scene of clean parts that are loaded one at a time.
@@ -111,8 +120,7 @@ class PartsStream(SceneStream):
     def raw(self, rows: int, start: int) -> Iterator[Raw]:
         for part in self._pieces(rows, start):
             raw = Raw.empty(len(part), part.shN.shape[1])
-            raw.means[:], raw.quats[:], raw.log_scales[:] = part.means, part.quats, np.log(part.scales)
-            raw.logit_opacities[:], raw.sh0[:], raw.shN[:] = part.logit_opacities, part.sh0, part.shN
+            raw.fill(part, np.log(part.scales))
             raw.offset = self.offset
             yield raw
 

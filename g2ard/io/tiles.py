@@ -5,16 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 
 from g2ard.io.stream import PartsStream
-from g2ard.io.types import Scene
-
-
-def read(path: Path) -> Scene:
-    """Read all tiles as one scene, in order."""
-    from g2ard.scene.transform import join
-    from g2ard.tiles.store import TileStore
-
-    store = TileStore.open(path)
-    return Scene(join([store.read(tile.index) for tile in store.tiles]), store.notes)
 
 
 def stream(path: Path) -> PartsStream:
