@@ -60,7 +60,7 @@ def test_curves_compare_schedules(scene: SceneSpec, tmp_path: Path) -> None:
 
 def test_a_preset_distils_anew_in_as_many_steps(scene: SceneSpec, tmp_path: Path) -> None:
     found = ask(scene, tmp_path, "rounds", ratios="3", steps="60", seeds="0")
-    assert [row["variant"] for row in found] == ["one-shot", "rounds", "one-shot, twice the steps"]
+    assert [row["variant"] for row in found] == ["one-shot", "rounds", "one-shot twice as long"]
     assert [row["step"] for row in found] == [60, 60, 800]
     assert {row["count"] for row in found} == {500}
     assert found[0]["psnr"] != found[1]["psnr"]
