@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass
 from itertools import product, repeat
 from pathlib import Path
 from typing import Any
@@ -37,80 +36,62 @@ def stream(path: Path) -> SceneStream:
 
 class _PackedStream(SceneStream):
     def __init__(self, path: Path) -> None:
-        layout = self._layout = _layout(path)
-        model = layout.render_model
-        super().__init__(path, len(layout.vertex), layout.rest, layout.offset, render_model=model)
+        header = plyfiles.read_header(path)
+        plyfiles.require(path, header.properties.get("vertex", []), _PACKED, "a compressed scene")
+        chunk_properties = header.properties.get("chunk", [])
+        bounds = [f"{end}_{axis}" for end in ("min", "max") for axis in ("x", "y", "z")]
+        bounds += [f"{end}_scale_{axis}" for end in ("min", "max") for axis in ("x", "y", "z")]
+        if "min_r" in chunk_properties:
+            bounds += [f"{end}_{channel}" for end in ("min", "max") for channel in "rgb"]
+        missing = [name for name in bounds if name not in chunk_properties]
+        if missing:
+            raise InputError(f"element 'chunk' lacks {', '.join(map(repr, missing))}", path=path)
+        rest = [p for p in header.properties.get("sh", []) if re.fullmatch(r"f_rest_\d+", p)]
+        if len(rest) not in (0, 9, 24, 45) or set(rest) != {f"f_rest_{k}" for k in range(len(rest))}:
+            raise InputError(f"element 'sh' has {len(rest)} coefficients; expected 9, 24 or 45", path=path)
+
+        names = ("vertex", "chunk", "sh") if rest else ("vertex", "chunk")
+        vertex, chunk, *sh = plyfiles.read_element(path, header, *names)
+        if len(chunk) * _CHUNK < len(vertex) or (sh and len(sh[0]) != len(vertex)):
+            raise InputError(
+                f"{len(chunk)} chunks and {plural(len(vertex), 'Gaussian')} do not fit", path=path
+            )
+        for name in _PACKED:
+            if vertex.dtype[name] != np.uint32:
+                raise InputError(f"has type {vertex.dtype[name]}, expected uint", path=path, property=name)
+        offset, mode = plyfiles.offset_of(path, header), plyfiles.render_model_of(header)
+        model: RenderModel = "antialiased" if mode == "antialiased" else "classic"
+        super().__init__(path, len(vertex), len(rest) // 3, offset, render_model=model)
+        self._vertex, self._sh, self._rest = vertex, sh[0] if sh else None, len(rest) // 3
+        self._chunk, self._colored = np.array(chunk), "min_r" in chunk_properties
 
     def raw(self, rows: int, start: int) -> Iterator[Raw]:
-        layout = self._layout
         bands: Iterator[Any] = repeat((0, None))
-        if layout.sh is not None:
-            bands = plyfiles.row_blocks(self.path, layout.sh, rows, start)
-        vertices = plyfiles.row_blocks(self.path, layout.vertex, rows, start)
+        if self._sh is not None:
+            bands = plyfiles.row_blocks(self.path, self._sh, rows, start)
+        vertices = plyfiles.row_blocks(self.path, self._vertex, rows, start)
         for (first, vertex), (_, sh) in zip(vertices, bands, strict=False):
-            yield _raw(layout, first, vertex, sh)
+            yield self._decode(first, vertex, sh)
 
-
-@dataclass(frozen=True)
-class _Layout:
-    """Elements of a file: `chunk` in memory, the others mapped."""
-
-    vertex: NDArray[Any]
-    chunk: NDArray[Any]
-    sh: NDArray[Any] | None
-    rest: int
-    colored: bool
-    offset: NDArray[np.float64]
-    render_model: RenderModel
-
-
-def _layout(path: Path) -> _Layout:
-    header = plyfiles.read_header(path)
-    plyfiles.require(path, header.properties.get("vertex", []), _PACKED, "a compressed scene")
-    chunk_properties = header.properties.get("chunk", [])
-    bounds = [f"{end}_{axis}" for end in ("min", "max") for axis in ("x", "y", "z")]
-    bounds += [f"{end}_scale_{axis}" for end in ("min", "max") for axis in ("x", "y", "z")]
-    if "min_r" in chunk_properties:
-        bounds += [f"{end}_{channel}" for end in ("min", "max") for channel in "rgb"]
-    missing = [name for name in bounds if name not in chunk_properties]
-    if missing:
-        raise InputError(f"element 'chunk' lacks {', '.join(map(repr, missing))}", path=path)
-    rest = [p for p in header.properties.get("sh", []) if re.fullmatch(r"f_rest_\d+", p)]
-    if len(rest) not in (0, 9, 24, 45) or set(rest) != {f"f_rest_{k}" for k in range(len(rest))}:
-        raise InputError(f"element 'sh' has {len(rest)} coefficients; expected 9, 24 or 45", path=path)
-
-    names = ("vertex", "chunk", "sh") if rest else ("vertex", "chunk")
-    vertex, chunk, *sh = plyfiles.read_element(path, header, *names)
-    if len(chunk) * _CHUNK < len(vertex) or (sh and len(sh[0]) != len(vertex)):
-        raise InputError(f"{len(chunk)} chunks and {plural(len(vertex), 'Gaussian')} do not fit", path=path)
-    for name in _PACKED:
-        if vertex.dtype[name] != np.uint32:
-            raise InputError(f"has type {vertex.dtype[name]}, expected uint", path=path, property=name)
-    bands, colored = sh[0] if sh else None, "min_r" in chunk_properties
-    offset, mode = plyfiles.offset_of(path, header), plyfiles.render_model_of(header)
-    model: RenderModel = "antialiased" if mode == "antialiased" else "classic"
-    return _Layout(vertex, np.array(chunk), bands, len(rest) // 3, colored, offset, model)
-
-
-def _raw(layout: _Layout, first: int, vertex: NDArray[Any], sh: NDArray[Any] | None) -> Raw:
-    """Decode rows, the first of which is row `first` of the file."""
-    raw, chunk, rest = Raw.empty(len(vertex), layout.rest), layout.chunk, layout.rest
-    raw.offset = layout.offset
-    of = np.arange(first, first + len(vertex)) // _CHUNK
-    raw.means[:] = _between(chunk, of, "{}_{}", "xyz", _three(vertex["packed_position"]))
-    raw.log_scales[:] = _between(chunk, of, "{}_scale_{}", "xyz", _three(vertex["packed_scale"]))
-    raw.quats[:] = _quats(vertex["packed_rotation"])
-    color = np.stack([_unit(vertex["packed_color"], shift, 8) for shift in (24, 16, 8, 0)], axis=1)
-    rgb = color[:, :3]
-    if layout.colored:  # older files quantise colour over [0, 1] instead
-        rgb = _between(chunk, of, "{}_{}", "rgb", rgb)
-    raw.sh0[:, 0] = (rgb - 0.5) / SH_C0
-    with np.errstate(divide="ignore"):
-        raw.logit_opacities[:] = np.log(color[:, 3]) - np.log1p(-color[:, 3])
-    if sh is not None:
-        for k, channel in product(range(rest), range(3)):
-            raw.shN[:, k, channel] = _coefficient(sh[f"f_rest_{channel * rest + k}"])
-    return raw
+    def _decode(self, first: int, vertex: NDArray[Any], sh: NDArray[Any] | None) -> Raw:
+        """Decode rows, the first of which is row `first` of the file."""
+        raw, chunk, rest = Raw.empty(len(vertex), self._rest), self._chunk, self._rest
+        raw.offset = self.offset
+        of = np.arange(first, first + len(vertex)) // _CHUNK
+        raw.means[:] = _between(chunk, of, "{}_{}", "xyz", _three(vertex["packed_position"]))
+        raw.log_scales[:] = _between(chunk, of, "{}_scale_{}", "xyz", _three(vertex["packed_scale"]))
+        raw.quats[:] = _quats(vertex["packed_rotation"])
+        color = np.stack([_unit(vertex["packed_color"], shift, 8) for shift in (24, 16, 8, 0)], axis=1)
+        rgb = color[:, :3]
+        if self._colored:  # older files quantise colour over [0, 1] instead
+            rgb = _between(chunk, of, "{}_{}", "rgb", rgb)
+        raw.sh0[:, 0] = (rgb - 0.5) / SH_C0
+        with np.errstate(divide="ignore"):
+            raw.logit_opacities[:] = np.log(color[:, 3]) - np.log1p(-color[:, 3])
+        if sh is not None:
+            for k, channel in product(range(rest), range(3)):
+                raw.shN[:, k, channel] = _coefficient(sh[f"f_rest_{channel * rest + k}"])
+        return raw
 
 
 def _unit(packed: NDArray[Any], shift: int, bits: int) -> NDArray[np.float64]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -32,22 +31,17 @@ _FLAT = np.log(np.float32(1e-3))
 """Logarithm of the thickness of 2D Gaussians over their shorter scale."""
 
 
-@dataclass(frozen=True)
-class _Layout:
-    """Rows of a file and their layout."""
+def stream(path: Path) -> SceneStream:
+    """Open a 3DGS .ply of any SH degree, property order, scalar type and byte order, or ascii.
 
-    rows: NDArray[Any]
-    rest: list[str]
-    stored: int
-    kept: int
-    offset: NDArray[np.float64]
-    shift: NDArray[np.float64]
-    notes: list[Note]
-    render_model: RenderModel
-    flat: bool
+    float64 positions that float32 cannot represent are recentred; the shift is stored in `offset`. Text files
+    and those with leading lists are read whole.
+    """
+    return _PlyStream(path)
 
-    @classmethod
-    def of(cls, path: Path) -> _Layout:
+
+class _PlyStream(SceneStream):
+    def __init__(self, path: Path) -> None:
         header = plyfiles.read_header(path)
         properties = header.properties.get("vertex", [])
         mode = plyfiles.render_model_of(header)
@@ -64,44 +58,40 @@ class _Layout:
             text = "2DGS scene read as flat Gaussians; renders differ where surfaces are seen at a slant"
             notes.append(Note("flat_gaussians", len(rows), text))
         model: RenderModel = "antialiased" if mode == "antialiased" and not flat else "classic"
-        return cls(rows, rest, stored, kept, offset, shift, notes, model, flat)
-
-    def raw(self, rows: NDArray[Any]) -> Raw:
-        raw = Raw.empty(len(rows), self.kept)
-        raw.offset = self.offset
-        with np.errstate(over="ignore", invalid="ignore"):  # rows beyond float32 become inf and are dropped
-            for start in range(0, len(rows), BLOCK):
-                at = slice(start, start + BLOCK)
-                _read_block(rows[at], raw, at, self)
-        return raw
-
-
-def stream(path: Path) -> SceneStream:
-    """Open a 3DGS .ply of any SH degree, property order, scalar type and byte order, or ascii.
-
-    float64 positions that float32 cannot represent are recentred; the shift is stored in `offset`. Text files
-    and those with leading lists are read whole.
-    """
-    return _PlyStream(path)
-
-
-class _PlyStream(SceneStream):
-    def __init__(self, path: Path) -> None:
-        layout = self._layout = _Layout.of(path)
-        notes, model = tuple(layout.notes), layout.render_model
-        super().__init__(path, len(layout.rows), layout.kept, layout.offset, notes, model)
+        super().__init__(path, len(rows), kept, offset, tuple(notes), model)
+        self._rows, self._shift, self._flat = rows, shift, flat
+        self._rest, self._stored, self._kept = rest, stored, kept
 
     def positions(self, rows: int) -> Iterator[NDArray[np.float32]]:
-        for _, block in plyfiles.row_blocks(self.path, self._layout.rows, rows):
+        for _, block in plyfiles.row_blocks(self.path, self._rows, rows):
             with np.errstate(over="ignore", invalid="ignore"):
-                means = _means(block, self._layout.shift)
+                means = _means(block, self._shift)
             yield means
 
     def raw(self, rows: int, start: int) -> Iterator[Raw]:
-        return (
-            self._layout.raw(block)
-            for _, block in plyfiles.row_blocks(self.path, self._layout.rows, rows, start)
-        )
+        for _, block in plyfiles.row_blocks(self.path, self._rows, rows, start):
+            raw = Raw.empty(len(block), self._kept)
+            raw.offset = self.offset
+            with np.errstate(over="ignore", invalid="ignore"):  # beyond float32: inf, and dropped
+                for first in range(0, len(block), BLOCK):
+                    part = slice(first, first + BLOCK)
+                    self._decode(block[part], raw.take(part))
+            yield raw
+
+    def _decode(self, block: NDArray[Any], raw: Raw) -> None:
+        raw.means[:] = _means(block, self._shift)
+        raw.sh0[:, 0] = structured_to_unstructured(block[_DC])
+        if self._flat:
+            raw.log_scales[:, :2] = structured_to_unstructured(block[_SCALES[:2]])
+            raw.log_scales[:, 2] = raw.log_scales[:, :2].min(axis=1) + _FLAT
+        else:
+            raw.log_scales[:] = structured_to_unstructured(block[_SCALES])
+        raw.quats[:] = structured_to_unstructured(block[_QUATS])
+        raw.logit_opacities[:] = block["opacity"]
+        if self._rest:  # channel-major: all of red's coefficients, then green's, then blue's
+            bands = structured_to_unstructured(block[self._rest]).reshape(-1, 3, self._stored)
+            for channel in range(3):  # three times as fast as a transposed copy
+                raw.shN[:, :, channel] = bands[:, channel, : self._kept]
 
 
 def _bands(path: Path, rest: list[str]) -> tuple[int, int]:
@@ -137,23 +127,6 @@ def _recentre(sample: NDArray[Any]) -> NDArray[np.float64]:
     low, middle, high = np.percentile(positions, (1, 50, 99), axis=0)
     far = np.abs(middle) > 16 * np.linalg.norm(high - low)
     return np.where(far.any(), np.rint(middle), 0.0)
-
-
-def _read_block(block: NDArray[Any], raw: Raw, at: slice, layout: _Layout) -> None:
-    rest, stored = layout.rest, layout.stored
-    raw.means[at] = _means(block, layout.shift)
-    raw.sh0[at, 0] = structured_to_unstructured(block[_DC])
-    if layout.flat:
-        raw.log_scales[at, :2] = structured_to_unstructured(block[_SCALES[:2]])
-        raw.log_scales[at, 2] = raw.log_scales[at, :2].min(axis=1) + _FLAT
-    else:
-        raw.log_scales[at] = structured_to_unstructured(block[_SCALES])
-    raw.quats[at] = structured_to_unstructured(block[_QUATS])
-    raw.logit_opacities[at] = block["opacity"]
-    if rest:  # channel-major: all of red's coefficients, then green's, then blue's
-        bands = structured_to_unstructured(block[rest]).reshape(-1, 3, stored)
-        for channel in range(3):  # three times as fast as a transposed copy
-            raw.shN[at, :, channel] = bands[:, channel, : raw.shN.shape[1]]
 
 
 def _means(block: NDArray[Any], shift: NDArray[np.float64]) -> NDArray[np.float32]:
