@@ -11,14 +11,13 @@ import struct
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from g2ard.config.choices import RenderModel
 from g2ard.errors import DAMAGED, InputError
 from g2ard.io.jsonfile import (
     Fields,
@@ -96,15 +95,7 @@ def stream(path: Path) -> SceneStream:
     Chunks are padded with zeros to the highest SH degree. Memory holds a chunk's images, 20 to 28 bytes per
     Gaussian.
     """
-    with _opened(path) as chunks:
-        counts = [count_of(chunk) for chunk in chunks]
-        rest = max(map(rest_of, chunks), default=0)
-        offset, notes = _offset(chunks), tuple(_left_out(path, len(chunks)))
-        model = _render_model(chunks)
-    files = [path]
-    if path.suffix.lower() != ".sog":
-        files = sorted(file for folder in chunks_of(path) for file in folder.iterdir() if file.is_file())
-    return _SogStream(path, counts, rest, offset, notes, model, files, lambda: _opened(path))
+    return _SogStream(path)
 
 
 def _offset(chunks: list[Chunk]) -> NDArray[np.float64]:
@@ -114,10 +105,6 @@ def _offset(chunks: list[Chunk]) -> NDArray[np.float64]:
         own = object_of(chunk.meta, "g2ard") if "g2ard" in chunk.meta else Fields({})
         found.add(tuple(numbers(own, "offset", 3)) if "offset" in own else (0.0, 0.0, 0.0))
     return np.array(found.pop() if len(found) == 1 else (0, 0, 0), np.float64)
-
-
-def _render_model(chunks: list[Chunk]) -> RenderModel:
-    return one_model([render_model_of(chunk) for chunk in chunks] or ["classic"])
 
 
 def _left_out(path: Path, read_count: int) -> list[Note]:
@@ -133,30 +120,27 @@ def _left_out(path: Path, read_count: int) -> list[Note]:
 class _SogStream(SceneStream):
     """Scene of one or more chunks; blocks do not cross chunks."""
 
-    def __init__(
-        self,
-        path: Path,
-        counts: list[int],
-        rest: int,
-        offset: NDArray[np.float64],
-        notes: tuple[Note, ...],
-        render_model: RenderModel,
-        files: list[Path],
-        opened: Callable[[], AbstractContextManager[list[Chunk]]],
-    ) -> None:
-        super().__init__(path, sum(counts), rest, offset, notes, render_model)
-        self._counts, self._rest, self._files, self._opened = counts, rest, files, opened
+    def __init__(self, path: Path) -> None:
+        with _opened(path) as chunks:
+            self._counts = [count_of(chunk) for chunk in chunks]
+            self._rest = max(map(rest_of, chunks), default=0)
+            offset, model = _offset(chunks), one_model([*map(render_model_of, chunks)] or ["classic"])
+        notes = tuple(_left_out(path, len(chunks)))
+        super().__init__(path, sum(self._counts), self._rest, offset, notes, model)
 
     def identity(self) -> list[Any]:
-        return file_identity(self._files)
+        if self.path.suffix.lower() == ".sog":
+            return file_identity([self.path])
+        files = (file for folder in chunks_of(self.path) for file in folder.iterdir() if file.is_file())
+        return file_identity(sorted(files))
 
     def positions(self, rows: int) -> Iterator[NDArray[np.float32]]:
-        with self._opened() as chunks:
+        with _opened(self.path) as chunks:
             for chunk, count in zip(chunks, self._counts, strict=True):
                 yield means_of(chunk, count)
 
     def raw(self, rows: int, start: int) -> Iterator[Raw]:
-        with self._opened() as chunks:
+        with _opened(self.path) as chunks:
             for chunk, count in zip(chunks, self._counts, strict=True):
                 if start >= count:
                     start -= count
