@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from g2ard import _core
 from g2ard.errors import InputError
 from g2ard.scene.splats import Splats
-from g2ard.stages.recover.anchors import rotation_matrices
+from g2ard.scene.transform import rotation_matrices
 
 __all__ = ["nanogs"]
 

@@ -10,8 +10,9 @@ import numpy as np
 
 from g2ard.errors import DAMAGED, InputError
 from g2ard.io.colmap import parsing
-from g2ard.io.photos import Frame, photo_size, rotation, view_set
+from g2ard.io.photos import Frame, photo_size, view_set
 from g2ard.io.types import Note, ViewSet
+from g2ard.scene.transform import rotation_matrices
 
 _SIZE = (1920, 1080)
 """Size of the original photos, for which focal lengths are given."""
@@ -58,7 +59,7 @@ def read(path: Path, images: Path | None = None) -> ViewSet:
 def _frame(where: Path, name: str, pose: list[float], lens: _Lens, photo: Path, split: str) -> Frame:
     width, height = photo_size(photo, where) if photo.is_file() else _SIZE
     view = np.eye(4)
-    view[:3, :3] = rotation(pose[3:])
+    view[:3, :3] = rotation_matrices(np.array([pose[3:]]))[0]
     view[:3, 3] = -view[:3, :3] @ np.array(pose[:3])
     focal = lens.focal * width / _SIZE[0]
     K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])

@@ -13,8 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard.errors import DAMAGED, InputError
-from g2ard.io.photos import Frame, Lens, photo_size, rotation, view_set
+from g2ard.io.photos import Frame, Lens, photo_size, view_set
 from g2ard.io.types import ViewSet
+from g2ard.scene.transform import rotation_matrices
 
 _MODELS = (
     *("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV"),
@@ -120,7 +121,7 @@ def _viewmat(path: Path, image: _Image) -> NDArray[np.float64]:
     if not any(image.quat):
         raise InputError(f"{image.name!r}: its quaternion is zero", path=path)
     view = np.eye(4)
-    view[:3, :3] = rotation(image.quat)
+    view[:3, :3] = rotation_matrices(np.array([image.quat]))[0]
     view[:3, 3] = image.translation
     return view
 

@@ -39,7 +39,7 @@ from g2ard.io.sanitize import Raw, cleaned
 from g2ard.io.types import Note, Scene
 from g2ard.progress import plural
 from g2ard.scene.splats import Splats
-from g2ard.scene.transform import placed
+from g2ard.scene.transform import placed, rotation_matrices
 
 EXTENSION = "KHR_gaussian_splatting"
 SPZ_EXTENSION = f"{EXTENSION}_compression_spz_2"
@@ -368,10 +368,8 @@ def _local(node: Fields) -> NDArray[np.float64]:
     matrix = np.eye(4)
     matrix[:3, 3] = _numbers(node, "translation", (0, 0, 0))
     if "rotation" in node or "scale" in node:
-        w, x, y, z = unit_quats(_numbers(node, "rotation", (0, 0, 0, 1))[[3, 0, 1, 2]][None])[0]
-        cross = np.cross(np.eye(3), (x, y, z))
-        rotation = np.eye(3) + 2 * w * cross + 2 * cross @ cross
-        matrix[:3, :3] = rotation * _numbers(node, "scale", (1, 1, 1))
+        quat = _numbers(node, "rotation", (0, 0, 0, 1))[[3, 0, 1, 2]]
+        matrix[:3, :3] = rotation_matrices(quat[None])[0] * _numbers(node, "scale", (1, 1, 1))
     return matrix
 
 

@@ -72,19 +72,6 @@ def photo_size(path: Path, listed_in: Path | None = None) -> tuple[int, int]:
         raise error if listed_in is None else error.at(hint=f"it is listed in {listed_in}") from None
 
 
-def rotation(quat: Sequence[float]) -> NDArray[np.float64]:
-    """Return the (3, 3) rotation of a wxyz quaternion of any length except 0."""
-    q = np.asarray(quat, np.float64) / np.abs(quat).max()  # avoids an infinite norm
-    w, x, y, z = q / np.linalg.norm(q)
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
-
-
 def rigid(matrix: NDArray[np.float64], place: Place) -> NDArray[np.float64]:
     """Return the rigid transform nearest to a (4, 4) or (3, 4) pose with rounding errors or a uniform scale.
 

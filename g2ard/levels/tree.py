@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from g2ard.errors import InputError, require
 from g2ard.scene.splats import Splats
-from g2ard.stages.recover.anchors import rotation_matrices
+from g2ard.scene.transform import rotation_matrices
 from g2ard.tiles.store import StoredScene
 
 Level = Splats | StoredScene

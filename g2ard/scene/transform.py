@@ -119,6 +119,20 @@ def quaternion_of(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
     return q if q[0] >= 0 else -q
 
 
+def rotation_matrices(quats: NDArray[np.floating]) -> NDArray[np.float64]:
+    """Return (N, 3, 3) matrices of (N, 4) wxyz quaternions of any length; zero is the identity."""
+    q = quats.astype(np.float64)
+    largest = np.abs(q).max(1, keepdims=True)
+    q = np.where(largest > 0, q / np.where(largest > 0, largest, 1), [1.0, 0.0, 0.0, 0.0])
+    w, x, y, z = (q / np.linalg.norm(q, axis=1, keepdims=True)).T
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.stack([np.stack(row, -1) for row in rows], -2)
+
+
 def _product(p: NDArray[np.float64], q: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return (N, 4) p·q: rotation q followed by p."""
     w, x, y, z = p

@@ -25,6 +25,7 @@ from g2ard.progress import Progress, silent
 from g2ard.rendering.renderer import Renderer
 from g2ard.scene.cameras import Camera, Cameras
 from g2ard.scene.splats import DRAWN_LOGIT, Splats
+from g2ard.scene.transform import rotation_matrices
 
 KINDS = ("invisible", "giant", "needle", "floater", "haze", "streak")
 FLOATING = ("haze", "streak")
@@ -163,7 +164,7 @@ def find_floating(splats: Splats, cameras: Cameras, progress: Progress = silent)
     long, tips = _long(splats, np.arange(len(splats)))
     points = np.concatenate([means, means[long] - tips, means[long] + tips]) + splats.offset
     owners = np.concatenate([np.arange(len(splats)), long, long])
-    axes = _axes(splats.quats)
+    axes = rotation_matrices(splats.quats)
     views, floats = np.ones(len(points)), np.zeros(len(points))
     for camera, depths in _surfaces(splats, cameras, progress):
         rows, z, surface = _framed(points, camera, depths)
@@ -219,7 +220,9 @@ def _giants(splats: Splats) -> NDArray[np.bool_]:
 
 def _away(splats: Splats, rows: NDArray[np.intp], points: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the (n,) Mahalanobis distances √((p − μ)ᵀ Σ⁻¹ (p − μ)) of the given rows."""
-    local = np.einsum("nji,nj->ni", _axes(splats.quats[rows]), points - splats.means[rows].astype(np.float64))
+    local = np.einsum(
+        "nji,nj->ni", rotation_matrices(splats.quats[rows]), points - splats.means[rows].astype(np.float64)
+    )
     local /= np.maximum(splats.scales[rows].astype(np.float64), 1e-30)
     return np.sqrt((local * local).sum(axis=1))
 
@@ -253,7 +256,7 @@ def _long(splats: Splats, rows: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDA
     order = np.sort(splats.scales[rows], axis=1).astype(np.float64)
     long = rows[order[:, 2] > _LONG * np.maximum(order[:, 1], 1e-30)]
     axis = np.argmax(splats.scales[long], axis=1)
-    along = np.take_along_axis(_axes(splats.quats[long]), axis[:, None, None], axis=2)[:, :, 0]
+    along = np.take_along_axis(rotation_matrices(splats.quats[long]), axis[:, None, None], axis=2)[:, :, 0]
     return long, 2 * splats.scales[long, axis].astype(np.float64)[:, None] * along
 
 
@@ -294,16 +297,3 @@ def _groups(count: int, a: NDArray[Any], b: NDArray[Any]) -> NDArray[np.int64]:
         root = root[root]
         if (root == before).all():
             return root
-
-
-def _axes(quats: NDArray[Any]) -> NDArray[np.float64]:
-    """Return (N, 3, 3) rotation matrices whose columns are the axes of the scales."""
-    from g2ard.io.packing import unit_quats
-
-    w, x, y, z = unit_quats(quats).T
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.stack([np.stack(row, axis=1) for row in rows], axis=1)

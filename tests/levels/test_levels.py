@@ -12,8 +12,7 @@ from g2ard.io import sog
 from g2ard.jobs.levels import lod
 from g2ard.levels import Cut, cut, save_levels
 from g2ard.scene.splats import Splats
-from g2ard.scene.transform import join
-from g2ard.stages.recover.anchors import rotation_matrices
+from g2ard.scene.transform import join, rotation_matrices
 from helpers.commands import refused, succeeds
 from helpers.level_files import files_of, leaves_of, scattered
 from helpers.scenes import checkered_ball

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from g2ard.errors import require
 from g2ard.scene.splats import Splats
+from g2ard.scene.transform import rotation_matrices
 
 NEEDLE_RANK = 1.1
 """Effective rank below which a Gaussian is a needle."""
@@ -143,20 +144,6 @@ class Anchors:
         """Return (N, 3) δ̃ = R̄ᵀ(μ − μ̄): two tangential components, then the normal one."""
         delta = means.astype(np.float64) - self.means
         return np.einsum("nji,nj->ni", self.frames.astype(np.float64), delta)
-
-
-def rotation_matrices(quats: NDArray[np.float32]) -> NDArray[np.float64]:
-    """Return (N, 3, 3) matrices of (N, 4) wxyz quaternions of any length; zero is the identity."""
-    q = quats.astype(np.float64)
-    largest = np.abs(q).max(1, keepdims=True)
-    q = np.where(largest > 0, q / np.where(largest > 0, largest, 1), [1.0, 0.0, 0.0, 0.0])
-    w, x, y, z = (q / np.linalg.norm(q, axis=1, keepdims=True)).T
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.stack([np.stack(row, -1) for row in rows], -2)
 
 
 def effective_rank(scales: NDArray[np.float32]) -> NDArray[np.float64]:
