@@ -17,7 +17,7 @@ from g2ard.poses.site import Site
 from g2ard.progress import Progress, Say, silent, unsaid
 from g2ard.scene.cameras import Camera, Cameras
 from g2ard.scene.splats import Splats
-from g2ard.scene.transform import transform
+from g2ard.scene.transform import transform, unit_up
 from g2ard.viewer import Start
 
 _POOL = 32
@@ -118,10 +118,7 @@ def _level(cameras: Cameras) -> NDArray[np.float64] | None:
 def up_of(scene: Splats, up: Sequence[float] | None = None) -> NDArray[np.float64]:
     """Return `up` if given, otherwise estimate it from the scene, with −y as a fallback."""
     if up is not None:
-        axis = np.asarray(up, np.float64)
-        if axis.shape != (3,) or not np.isfinite(axis).all() or not axis.any():
-            raise InputError(f"expected three finite numbers, not all zero, got {up!r}", parameter="up")
-        return axis / np.linalg.norm(axis)
+        return unit_up(up)
     try:
         return Site.of(scene, None, _ROWS).up.axis
     except InputError:  # nothing visible

@@ -23,6 +23,7 @@ from g2ard.io.packing import writable
 from g2ard.levels.tree import Cut, Leaf, Level, Node
 from g2ard.levels.tree import cut as cut_tree
 from g2ard.progress import Progress, silent
+from g2ard.scene.transform import unit_up
 
 Float = NDArray[np.float64]
 
@@ -190,10 +191,7 @@ def save_tileset(
 
 def _upright(up: ArrayLike) -> Float:
     """Return the (3, 3) rotation of `up` to z, which keeps x in the plane of x and z."""
-    axis = np.asarray(up, np.float64)
-    if axis.shape != (3,) or not np.isfinite(axis).all() or not axis.any():
-        raise InputError(f"expected three finite numbers, not all zero, got {up!r}", parameter="up")
-    axis = axis / np.linalg.norm(axis)
+    axis = unit_up(up)
     east = np.eye(3)[0 if abs(axis[0]) < 0.9 else 1]
     east = east - (east @ axis) * axis
     east /= np.linalg.norm(east)

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from g2ard.errors import InputError
 from g2ard.poses.lattice import fibonacci
 from g2ard.poses.numbers import along, moments, quantile
 from g2ard.poses.volume import Sample
+from g2ard.scene.transform import unit_up
 
 Floats = NDArray[np.float64]
 
@@ -58,10 +58,7 @@ def given_up(sample: Sample, up: ArrayLike) -> Up:
     Raises:
         InputError: not three finite numbers, or all zero.
     """
-    axis = np.asarray(up, np.float64)
-    if axis.shape != (3,) or not np.isfinite(axis).all() or not axis.any():
-        raise InputError(f"expected three finite numbers, not all zero, got {up!r}", parameter="up")
-    axis = axis / np.linalg.norm(axis)
+    axis = unit_up(up)
     layer, _ = _layer(sample, axis)
     return Up(axis, _is_flat(sample)[0] or layer > _GROUND_GIVEN, "up as given")
 

@@ -104,6 +104,14 @@ def similarity(matrix: ArrayLike) -> tuple[float, NDArray[np.float64], NDArray[n
     return scale, u @ v, m[:3, 3]
 
 
+def unit_up(up: ArrayLike) -> NDArray[np.float64]:
+    """Return the (3,) unit vector of an up direction, after checking it."""
+    axis = np.asarray(up, np.float64)
+    if axis.shape != (3,) or not np.isfinite(axis).all() or not axis.any():
+        raise InputError(f"expected three finite numbers, not all zero, got {up!r}", parameter="up")
+    return np.asarray(axis / np.linalg.norm(axis))
+
+
 def quaternion_of(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return (4,) wxyz: the eigenvector of the largest eigenvalue of Bar-Itzhack's matrix."""
     r = rotation
