@@ -140,15 +140,28 @@ def test_python_examples_parse_and_their_names_exist(name: str) -> None:
                 assert node.attr in g2ard.__all__, f"{name}: g2ard.{node.attr}"
 
 
-def test_the_python_guide_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
+def run_guide(name: str) -> dict[str, Any]:
+    """Run the Python of a how-to page, which finds a scene.ply, and return its names."""
     g2ard.save("scene.ply", BALL)
-    text = (ROOT / "docs/how-to/from-python.md").read_text(encoding="utf-8")
+    text = (ROOT / "docs/how-to" / name).read_text(encoding="utf-8")
     names: dict[str, Any] = {}
     for block in re.findall(r"(?ms)^```python\n(.*?)^```", text):
-        exec(compile(block, "from-python.md", "exec"), names)
+        exec(compile(block, name, "exec"), names)
+    return names
+
+
+def test_the_python_guide_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    names = run_guide("from-python.md")
     assert len(names["better"].splats) == len(names["small"].splats) == len(BALL) // 10
     assert g2ard.load("better.sog").means.shape == (len(BALL) // 10, 3)
+
+
+def test_the_rasteriser_guide_trains_a_scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    names = run_guide("rasteriser.md")
+    before, after = (g2ard.evaluate(names[scene], names["targets"]).psnr for scene in ("small", "trained"))
+    assert after > before
 
 
 def test_the_notebook_runs_and_holds_its_output(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
