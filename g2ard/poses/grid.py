@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard import _core
+from g2ard.poses.matter import Matter
 from g2ard.poses.numbers import norms, turned
-from g2ard.poses.volume import OccupiedVolume
 
 Floats = NDArray[np.float64]
 
@@ -34,9 +34,6 @@ _HALF_WIDTH = 1.6
 
 _PARTS = 9
 """Most sample points along an axis for a Gaussian wider than a cell."""
-
-_BATCH = 2_000_000
-"""Points counted at once."""
 
 _REACH = 12
 """Largest distance stored, in cells: enough for rays to stride through free space."""
@@ -62,35 +59,30 @@ class Grid:
     scale: NDArray[np.float32]
 
     @classmethod
-    def of(cls, low: Floats, high: Floats, volume: OccupiedVolume, axes: Floats, *, cells: int = 0) -> Grid:
+    def of(cls, low: Floats, high: Floats, matter: Matter, axes: Floats, *, cells: int = 0) -> Grid:
         """Fill the box from `low` to `high`, along the rows of `axes`; `cells` of 0 follows the rows."""
-        if volume.represents > 1:
-            cells = cells or _CELLS_A_ROW * len(volume.points)
-        cells = cells or int(np.clip(len(volume.points), *_CELLS))
+        if matter.represents > 1:
+            cells = cells or _CELLS_A_ROW * len(matter.points)
+        cells = cells or int(np.clip(len(matter.points), *_CELLS))
         sides = np.maximum(high - low, np.max(high - low) * _LEAST_SIDE)
         cell = float(np.cbrt(np.prod(sides) / cells))
         shape = np.maximum(1, np.ceil(sides / cell)).astype(int)
-        points = turned(volume.points, axes)
+        points = turned(matter.points, axes)
         filled, logs = np.zeros(int(np.prod(shape))), np.zeros(int(np.prod(shape)))
-        sizes = 0.5 * np.log(np.maximum(volume.scales[:, 1] * volume.scales[:, 2], np.finfo(float).tiny))
-        faces = 2 * np.pi * volume.scales[:, 1] * volume.scales[:, 2] / cell**2
-        optical = volume.represents * volume.opacities * faces
-        parts = np.clip(np.ceil(_HALF_WIDTH * volume.scales[:, 2] / cell), 1, _PARTS).astype(np.int8)
+        sizes = 0.5 * np.log(np.maximum(matter.scales[:, 1] * matter.scales[:, 2], np.finfo(float).tiny))
+        faces = 2 * np.pi * matter.scales[:, 1] * matter.scales[:, 2] / cell**2
+        optical = matter.represents * matter.opacities * faces
+        parts = np.clip(np.ceil(_HALF_WIDTH * matter.scales[:, 2] / cell), 1, _PARTS).astype(np.int8)
         for count in np.unique(parts):
-            rows, offsets = np.flatnonzero(parts == count), _lattice(int(count))
-            spans = turned(volume.spans(rows).reshape(-1, 3), axes).reshape(-1, 2, 3) if count > 1 else None
-            parts_of = min(len(offsets), -(-len(offsets) * len(rows) // _BATCH))
-            for some in np.array_split(offsets, parts_of):
-                at = points[rows]
-                if spans is not None:
-                    a, b = some.T[:, :, None, None]
-                    at = (at + a * spans[:, 0] + b * spans[:, 1]).reshape(-1, 3)
-                index, inside = _index(at, low, cell, shape)
-                share, size = (
-                    np.tile(part, len(some))[inside] for part in (optical[rows] / count**2, sizes[rows])
-                )
-                filled += np.bincount(index[inside], share, filled.size)
-                logs += np.bincount(index[inside], share * size, filled.size)
+            rows, spans = np.flatnonzero(parts == count), np.zeros((1, 2, 3))
+            if count > 1:
+                spans = matter.axes(rows)[:, 1:] * matter.scales[rows, 1:, None]
+                spans = turned(spans.reshape(-1, 3), axes).reshape(-1, 2, 3)
+            for a, b in _lattice(int(count)):
+                index, inside = _index(points[rows] + a * spans[:, 0] + b * spans[:, 1], low, cell, shape)
+                share, size = optical[rows[inside]] / count**2, sizes[rows[inside]]
+                np.add.at(filled, index[inside], share)
+                np.add.at(logs, index[inside], share * size)
         scale = np.where(filled > 0, np.exp(logs / np.where(filled > 0, filled, 1)), 0).astype(np.float32)
         opaque, murky = (_steps((filled > limit).reshape(shape)) for limit in (_OPAQUE, _MURKY))
         return cls(low, cell, opaque, murky, scale.reshape(shape))
@@ -140,23 +132,15 @@ def _index(points: Floats, low: Floats, cell: float, shape: NDArray[Any]) -> tup
     return flat, inside
 
 
-def _steps(opaque: NDArray[np.bool_]) -> NDArray[np.int8]:
-    steps = np.where(opaque, 0, _REACH).astype(np.int8)
-    grown = opaque
+def _steps(filled: NDArray[np.bool_]) -> NDArray[np.int8]:
+    """Return king's moves to the nearest filled cell, at most `_REACH`."""
+    steps = np.where(filled, 0, _REACH).astype(np.int8)
     for reach in range(1, _REACH):
-        wider = _grown(grown)
-        steps[wider & ~grown] = reach
-        grown = wider
+        for axis in range(3):
+            wider = filled.copy()
+            after, before = (np.moveaxis(cells, axis, 0) for cells in (wider, filled))
+            after[1:] |= before[:-1]
+            after[:-1] |= before[1:]
+            filled = wider
+        steps[filled & (steps == _REACH)] = reach
     return steps
-
-
-def _grown(cells: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return the cells and their 26 neighbours."""
-    for axis in range(3):
-        wider = cells.copy()
-        ahead, behind = [slice(None)] * 3, [slice(None)] * 3
-        ahead[axis], behind[axis] = slice(1, None), slice(None, -1)
-        wider[tuple(ahead)] |= cells[tuple(behind)]
-        wider[tuple(behind)] |= cells[tuple(ahead)]
-        cells = wider
-    return cells

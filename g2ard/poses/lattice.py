@@ -12,17 +12,17 @@ Floats = NDArray[np.float64]
 _GOLDEN = (np.sqrt(5) - 1) / 2
 
 
-def fibonacci(count: int, turn: float = 0.0, low: float = -1.0, high: float = 1.0) -> Floats:
+def fibonacci(count: int, low: float = -1.0, high: float = 1.0) -> Floats:
     """Return (count, 3) unit vectors, each representing the same area of the sphere.
 
-    They cover the heights z from `high` down to `low`; the spiral begins at `turn` of a full circle.
+    They cover the heights z from `high` down to `low`.
 
     >>> bool(np.abs(fibonacci(1000).mean(axis=0)).max() < 0.01)
     True
     """
     steps = np.arange(count)
     z = high - (high - low) * (steps + 0.5) / count
-    around = 2 * np.pi * ((steps * _GOLDEN + turn) % 1)
+    around = 2 * np.pi * (steps * _GOLDEN % 1)
     across = np.sqrt(1 - z * z)
     return np.stack([across * np.cos(around), across * np.sin(around), z], axis=1)
 

@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from g2ard.poses.grid import Grid
+from g2ard.poses.matter import Matter, Sample
 from g2ard.poses.numbers import along, middle, moments, quantile, turned
 from g2ard.poses.terrain import Terrain
-from g2ard.poses.up import Up, estimate_up, given_up
-from g2ard.poses.volume import OccupiedVolume, Sample
+from g2ard.poses.up import Up, estimate_up, facing, given_up
 from g2ard.scene.splats import Splats
 
 Floats = NDArray[np.float64]
@@ -25,9 +25,6 @@ _BODY = 1.5
 
 _ROOM = (0.1, 0.02)
 """Margin of the grid around the box: a share of its sides, plus a length in scene sizes."""
-
-_FACING = np.cos(np.radians(35))
-"""Least cosine between the vertical and the normals of possible ground."""
 
 _TALL = 0.98
 """Quantile of the heights above the ground that is the height of what stands there."""
@@ -71,20 +68,20 @@ class Site:
         Raises:
             InputError: nothing is visible, or `up` is not a direction.
         """
-        volume = OccupiedVolume.of(splats, rows, represents)
-        some = volume.sample()
+        matter = Matter.of(splats, rows, represents)
+        some = matter.sample()
         found = estimate_up(some) if up is None else given_up(some, up)
         axes = _axes(some, found.axis)
         points = turned(some.points, axes)
         box = np.array([quantile(points[:, a], some.weights, _EXTENT) for a in range(3)]).T
-        body = _BODY * middle(volume.scales[:, 2])  # for a scene no larger than its Gaussians
+        body = _BODY * middle(matter.scales[:, 2])  # for a scene no larger than its Gaussians
         box += np.maximum(0, body - (box[1] - box[0]) / 2) * np.array([[-1.0], [1.0]])
         room = _ROOM[0] * (box[1] - box[0]) + _ROOM[1]
-        grid = Grid.of(box[0] - room, box[1] + room, volume, axes)
-        facing = np.abs(along(some.normals, found.axis)) > _FACING
-        terrain = Terrain.of(points[facing], some.weights[facing], box) if found.grounded else None
-        origin = splats.offset + volume.origin
-        return cls(points, some.weights, box, terrain, grid, axes, origin, volume.size, found)
+        grid = Grid.of(box[0] - room, box[1] + room, matter, axes)
+        ground = facing(some, found.axis)
+        terrain = Terrain.of(points[ground], some.weights[ground], box) if found.grounded else None
+        origin = splats.offset + matter.origin
+        return cls(points, some.weights, box, terrain, grid, axes, origin, matter.size, found)
 
     def ground(self, points: Floats) -> Floats:
         """Return (M,) heights of the ground under points, or of the box's bottom without a ground."""

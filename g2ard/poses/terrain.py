@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
+
+from g2ard.poses.numbers import quantile
 
 Floats = NDArray[np.float64]
 
@@ -38,39 +41,30 @@ class Terrain:
         shape = np.maximum(1, np.ceil(sides / block - 1e-9)).astype(int)
         place = np.floor((points[:, :2] - box[0, :2]) / block).astype(int)
         inside = ((place >= 0) & (place < shape)).all(axis=1)
-        cell = place[inside, 0] * shape[1] + place[inside, 1]
-        heights = _low(cell, points[inside, 2], weights[inside], int(np.prod(shape))).reshape(shape)
-        return cls(box[0, :2], block, _opened(_filled(heights, box[0, 2])))
+        cell = np.where(inside, place[:, 0] * shape[1] + place[:, 1], -1)
+        rows = np.argsort(cell, kind="stable")
+        starts = np.searchsorted(cell[rows], np.arange(np.prod(shape) + 1))
+        heights = np.full(int(np.prod(shape)), np.nan)
+        for k, (start, stop) in enumerate(pairwise(starts)):
+            if stop > start:
+                some = rows[start:stop]
+                heights[k] = quantile(points[some, 2], weights[some], _LOW)
+        heights = _filled(heights.reshape(shape), box[0, 2])
+        lowest = _around(heights, np.inf).min(axis=0)
+        opened = _around(lowest, -np.inf).max(axis=0)  # without bumps narrower than three blocks
+        padded = np.pad(opened, 1, mode="edge")
+        return cls(box[0, :2], block, _around(padded, 0.0).mean(axis=0)[1:-1, 1:-1])
 
     def height(self, points: Floats) -> Floats:
         """Return (M,) ground heights under points: bilinear within the map, constant beyond its edge."""
         top = np.array(self.heights.shape) - 1
         place = np.clip((points[:, :2] - self.low) / self.block - 0.5, 0, top)
-        base = np.minimum(np.floor(place).astype(int), np.maximum(top - 1, 0))
-        share = place - base
-        after = np.minimum(base + 1, top)
-        near = self._row(base[:, 0], base[:, 1], after[:, 1], share[:, 1])
-        far = self._row(after[:, 0], base[:, 1], after[:, 1], share[:, 1])
-        return near + share[:, 0] * (far - near)
-
-    def _row(
-        self, x: NDArray[np.int64], y0: NDArray[np.int64], y1: NDArray[np.int64], share: Floats
-    ) -> Floats:
-        first = self.heights[x, y0]
-        return first + share * (self.heights[x, y1] - first)
-
-
-def _low(cell: NDArray[np.int64], heights: Floats, weights: Floats, count: int) -> Floats:
-    """Return (count,) heights below which a quarter of each cell's weight lies; NaN in empty cells."""
-    order = np.lexsort((heights, cell))
-    cell, heights, weights = cell[order], heights[order], weights[order]
-    total = np.bincount(cell, weights, count)
-    passed = np.cumsum(weights)
-    before = np.concatenate([[0.0], np.cumsum(total)[:-1]])
-    found = np.full(count, np.nan)
-    at = np.flatnonzero(passed - before[cell] >= _LOW * total[cell])
-    found[cell[at[::-1]]] = heights[at[::-1]]  # the first of each cell is written last
-    return found
+        base = np.floor(place).astype(int)
+        share, total = place - base, np.zeros(len(points))
+        for step in ((0, 0), (0, 1), (1, 0), (1, 1)):
+            x, y = np.minimum(base + step, top).T
+            total += np.where(step, share, 1 - share).prod(axis=1) * self.heights[x, y]
+        return total
 
 
 def _filled(heights: Floats, default: float) -> Floats:
@@ -79,25 +73,13 @@ def _filled(heights: Floats, default: float) -> Floats:
         return np.full_like(heights, default)
     while (gaps := np.isnan(heights)).any():
         around = _around(heights, np.nan)
-        known = ~np.isnan(around)
-        count = known.sum(axis=0)
-        mean = np.where(known, around, 0).sum(axis=0) / np.maximum(count, 1)
-        heights = np.where(gaps & (count > 0), mean, heights)
+        count = (~np.isnan(around)).sum(axis=0)
+        heights = np.where(gaps & (count > 0), np.nansum(around, axis=0) / np.maximum(count, 1), heights)
     return heights
 
 
-def _opened(heights: Floats) -> Floats:
-    """Cut off bumps narrower than three blocks, then smooth."""
-    lowest = _around(heights, np.inf).min(axis=0)
-    opened = _around(lowest, -np.inf).max(axis=0)
-    return _around(opened, None).mean(axis=0)
-
-
-def _around(heights: Floats, outside: float | None) -> Floats:
-    """Return (9, X, Y), each cell's neighbourhood, padded with `outside`; None repeats the edge."""
-    if outside is None:
-        wide = np.pad(heights, 1, mode="edge")
-    else:
-        wide = np.pad(heights, 1, constant_values=outside)
+def _around(heights: Floats, outside: float) -> Floats:
+    """Return (9, X, Y), the neighbourhood of each cell, padded with `outside`."""
+    wide = np.pad(heights, 1, constant_values=outside)
     x, y = heights.shape
     return np.stack([wide[a : a + x, b : b + y] for a in range(3) for b in range(3)])

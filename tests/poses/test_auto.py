@@ -12,10 +12,10 @@ from g2ard.poses import plan_pool
 from g2ard.poses.focus import Glance, plan_focus
 from g2ard.poses.inside import find_inside, plan_inside
 from g2ard.poses.lattice import fibonacci
+from g2ard.poses.matter import Matter
 from g2ard.poses.sight import Lens, Poses
 from g2ard.poses.site import Site
 from g2ard.poses.up import estimate_up
-from g2ard.poses.volume import OccupiedVolume
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
 from helpers.realdata import real
@@ -219,7 +219,7 @@ def test_up_is_found_by_layers_when_noise_lies_behind_floor_and_ceiling() -> Non
     )
     table = naive.box((3, 2, 0), (5, 4, 0.7), 0.1, floor=False)
     scene = naive.joined(naive.box((0, 0, 0), (9, 7, 2.5), 0.1), table, noise)
-    found = estimate_up(OccupiedVolume.of(scene).sample())
+    found = estimate_up(Matter.of(scene).sample())
     assert "layers" in found.why
     assert found.grounded
     assert abs(found.axis[2]) > np.cos(np.radians(5))

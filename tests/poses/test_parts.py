@@ -12,9 +12,9 @@ import pytest
 
 from g2ard.poses.grid import Grid
 from g2ard.poses.lattice import halton, strata
+from g2ard.poses.matter import Matter
 from g2ard.poses.site import Site
 from g2ard.poses.terrain import Terrain
-from g2ard.poses.volume import OccupiedVolume
 from reference import poses as naive
 
 
@@ -31,8 +31,8 @@ def test_halton_goes_on_where_it_stopped() -> None:
 
 
 def test_grid_equals_its_naive_twin() -> None:
-    volume = OccupiedVolume.of(naive.statue())
-    grid = Grid.of(np.full(3, -0.5), np.full(3, 0.5), volume, np.eye(3), cells=2000)
+    matter = Matter.of(naive.statue())
+    grid = Grid.of(np.full(3, -0.5), np.full(3, 0.5), matter, np.eye(3), cells=2000)
     opaque = grid.opaque == 0
     assert 0.02 < opaque.mean() < 0.9
     np.testing.assert_array_equal(grid.opaque, naive.king_steps(opaque, 12))
@@ -50,16 +50,6 @@ def test_grid_equals_its_naive_twin() -> None:
     assert (np.isfinite(want) != np.isfinite(got)).sum() <= 2  # corners cut between two steps
     assert (np.abs(got[hit] - want[hit]) < 0.7 * grid.cell).mean() > 0.9
     assert (got[hit] > want[hit] - 0.02 * grid.cell).all()
-
-
-@pytest.mark.parametrize("batch", [1, 500, 10**6])
-def test_a_grid_does_not_depend_on_how_many_points_are_counted_at_once(batch, monkeypatch) -> None:
-    volume = OccupiedVolume.of(naive.statue())
-    whole = Grid.of(np.full(3, -0.5), np.full(3, 0.5), volume, np.eye(3), cells=2000)
-    monkeypatch.setattr("g2ard.poses.grid._BATCH", batch)
-    parts = Grid.of(np.full(3, -0.5), np.full(3, 0.5), volume, np.eye(3), cells=2000)
-    np.testing.assert_array_equal(parts.opaque, whole.opaque)
-    np.testing.assert_allclose(parts.scale, whole.scale, rtol=1e-6)
 
 
 _CAST = """

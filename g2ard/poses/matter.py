@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from g2ard.errors import InputError
 from g2ard.poses.numbers import canonical_order, middle, norms, quantile
 from g2ard.scene.splats import Splats
+from g2ard.scene.transform import rotation_matrices
 
 Floats = NDArray[np.float64]
 
@@ -32,24 +33,21 @@ class Sample:
         points: (K, 3) means.
         weights: (K,) mass.
         normals: (K, 3) unit axes of the smallest scales, sign arbitrary.
-        flatness: (K,) 1 − smallest / middle scale.
+        faces: (K,) mass × flatness, where flatness is 1 − smallest / middle scale.
     """
 
     points: Floats
     weights: Floats
     normals: Floats
-    flatness: Floats
-
-    def __len__(self) -> int:
-        return len(self.points)
+    faces: Floats
 
     def take(self, rows: Any) -> Sample:
         """Return the rows that a mask, a slice or indices select."""
-        return Sample(self.points[rows], self.weights[rows], self.normals[rows], self.flatness[rows])
+        return Sample(self.points[rows], self.weights[rows], self.normals[rows], self.faces[rows])
 
 
 @dataclass(frozen=True, eq=False)
-class OccupiedVolume:
+class Matter:
     """Opaque Gaussians of a scene: scene = origin + size·points.
 
     The order of the rows depends on their values alone, and each prefix is a fair sample.
@@ -77,7 +75,7 @@ class OccupiedVolume:
     represents: float = 1.0
 
     @classmethod
-    def of(cls, splats: Splats, limit: int | None = None, represents: float = 1.0) -> OccupiedVolume:
+    def of(cls, splats: Splats, limit: int | None = None, represents: float = 1.0) -> Matter:
         """Weigh a scene's rows, drop invisible and distant ones, and normalise the rest.
 
         Args:
@@ -88,14 +86,13 @@ class OccupiedVolume:
         Raises:
             InputError: nothing is visible.
         """
-        opacities = splats.opacities.astype(np.float64)
-        rows = np.flatnonzero(opacities > 1 / 255)
+        rows = np.flatnonzero(splats.opacities > 1 / 255)
         visible = len(rows)
         rows = rows[canonical_order(splats, rows)[:limit]]
         represents *= visible / max(1, len(rows))
         if len(rows):
             rows = rows[splats.take(rows).finite_rows()]
-        opacities = opacities[rows]
+        opacities = splats.opacities[rows].astype(np.float64)
         means = splats.means[rows].astype(np.float64)
         scales = np.abs(splats.scales[rows])
         order = np.argsort(scales, axis=1, kind="stable")
@@ -107,7 +104,11 @@ class OccupiedVolume:
             )
         weights = opacities * np.minimum(areas / middle(areas[areas > 0]), _WIDEST)
         near = _near(means, opacities)
-        origin, size = _frame(means[near][:_SAMPLE], weights[near][:_SAMPLE], scales[near][:_SAMPLE])
+        some = np.flatnonzero(near)[:_SAMPLE]
+        box = np.array([quantile(means[some, a], weights[some], [0.01, 0.99]) for a in range(3)])
+        size = float(norms((box[:, 1] - box[:, 0])[None])[0]) / 2
+        size = max(size, 2 * middle(scales[some, 2]))  # a single Gaussian also needs a size
+        origin = box.mean(axis=1)
         return cls(
             points=(means[near] - origin) / size,
             weights=weights[near],
@@ -124,30 +125,13 @@ class OccupiedVolume:
         """Return the first rows with their normals."""
         some = slice(_SAMPLE)
         thick = np.maximum(self.scales[some, 1], np.finfo(float).tiny)
-        normals = self._axis(some, 0)
-        return Sample(self.points[some], self.weights[some], normals, 1 - self.scales[some, 0] / thick)
+        faces = self.weights[some] * (1 - self.scales[some, 0] / thick)
+        return Sample(self.points[some], self.weights[some], self.axes(some)[:, 0], faces)
 
-    def spans(self, rows: Any) -> Floats:
-        """Return (m, 2, 3) the two longest axes of some rows, times their scales."""
-        return np.stack([self._axis(rows, k) * self.scales[rows, k, None] for k in (1, 2)], axis=1)
-
-    def _axis(self, rows: Any, rank: int) -> Floats:
-        """Return the unit axes of the `rank`-th smallest scales: columns of the rotations."""
-        q, column = self.quats[rows].astype(np.float64), self.order[rows, rank]
-        length = norms(q)
-        q[length == 0] = (1, 0, 0, 0)
-        w, x, y, z = (q / np.where(length == 0, 1, length)[:, None]).T
-        axes = np.empty((len(q), 3))
-        for k, (a, b, c) in enumerate(
-            [
-                (1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)),
-                (2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)),
-                (2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)),
-            ]
-        ):
-            mine = column == k
-            axes[mine] = np.stack([a[mine], b[mine], c[mine]], axis=1)
-        return axes
+    def axes(self, rows: Any) -> Floats:
+        """Return (m, 3, 3) the unit axes of some rows, by ascending scale."""
+        axes = rotation_matrices(self.quats[rows]).swapaxes(1, 2)
+        return np.take_along_axis(axes, self.order[rows][:, :, None], axis=1)
 
 
 def _near(means: Floats, weights: Floats) -> NDArray[np.bool_]:
@@ -165,9 +149,3 @@ def _near(means: Floats, weights: Floats) -> NDArray[np.bool_]:
             break
         near = within
     return near
-
-
-def _frame(means: Floats, weights: Floats, scales: Floats) -> tuple[Floats, float]:
-    box = np.array([quantile(means[:, a], weights, [0.01, 0.99]) for a in range(3)])
-    size = float(norms((box[:, 1] - box[:, 0])[None])[0]) / 2
-    return box.mean(axis=1), max(size, 2 * middle(scales[:, 2]))  # a single Gaussian also needs a size
