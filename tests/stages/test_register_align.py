@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from g2ard import _core
 from g2ard.rendering.renderer import Renderer
-from g2ard.stages.register.align import Shot, align, level_of, normal_equations, shoot
+from g2ard.stages.register.align import Shot, align, level_of, normal_equations, shot_of
 from g2ard.stages.register.grey import grey_of, local_zncc, zncc
 from g2ard.stages.register.pose import moved, pose_error
 from helpers.registration import BALL, CONFIG, off, pyramid_of
@@ -103,7 +103,7 @@ def test_predicts_how_renders_change() -> None:
     order of splats by depth, at which renders jump: such differences need longer steps, and stay noisier."""
     camera = around(5, (160, 120), 2.2)[1]
     renderer = Renderer(BALL.with_sh_degree(0))
-    shot = shoot(renderer, camera, CONFIG)
+    shot = shot_of(renderer.render(camera), CONFIG)
     down, right = np.gradient(shot.grey)
     predicted = -twin.image_rows(shot.depth, camera.K, (right, down))
     inner = shot.mask.copy()
@@ -112,8 +112,8 @@ def test_predicts_how_renders_change() -> None:
             inner &= np.roll(shot.mask, shift, axis)
     for axis, step in enumerate([0.006] * 6):
         ahead, behind = (
-            shoot(renderer, replace(camera, viewmat=moved(camera.viewmat, s * np.eye(6)[axis])), CONFIG).grey
-            for s in (step, -step)
+            shot_of(renderer.render(replace(camera, viewmat=moved(camera.viewmat, xi))), CONFIG).grey
+            for xi in (step * np.eye(6)[axis], -step * np.eye(6)[axis])
         )
         measured = ((ahead - behind) / (2 * step))[inner]
         expected = predicted[axis][inner]

@@ -16,15 +16,8 @@ def extents(
 ) -> tuple[Tensor, Tensor]:
     """Return squared sizes on the screen before dilation, px²; 0 behind the near plane.
 
-    Σ₂ = MMᵀ with M = J·W·R·S, and J clamped like in the rasteriser.
-
-    Args:
-        means: (N, 3) in the coordinates of `cameras`.
-        quats: (N, 4) wxyz, any length.
-        log_scales: (N, 3).
-        cameras: the views' cameras.
-        view: index of the view.
-        near: its near plane.
+    Σ₂ = MMᵀ with M = J·W·R·S, and J clamped like in the rasteriser. Means are in the coordinates of
+    `cameras`; quaternions may have any length.
 
     Returns:
         (N,) the larger eigenvalue of Σ₂, and (N, 3) the squared lengths of M's columns, one per axis.

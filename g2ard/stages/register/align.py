@@ -108,10 +108,6 @@ def level_of(grey: Float, mask: Mask | None = None) -> Level:
     return Level(soft, *gradient(soft), np.ones(grey.shape, bool) if mask is None else mask)
 
 
-def shoot(renderer: Renderer, camera: Camera, config: RegisterConfig) -> Shot:
-    return shot_of(renderer.render(camera), config)
-
-
 def shot_of(out: Rendered, config: RegisterConfig) -> Shot:
     """Convert a render to a `Shot`."""
     return Shot(*_core.shot(out.image, out.alpha, out.depth, config.min_alpha, config.max_edge))
@@ -148,16 +144,9 @@ def align(
     pyramid: list[tuple[Camera, Level]],
     config: RegisterConfig,
 ) -> Aligned | None:
-    """Align a photo, coarse to fine, from a starting pose.
+    """Align a photo, coarse to fine, from a pose; return None if too few pixels are valid there.
 
-    Args:
-        renderer: of the scene.
-        start: (4, 4) camera_from_world.
-        pyramid: the photo at each level: a camera with that size and K (its pose is ignored), and the level.
-        config: see `RegisterConfig`.
-
-    Returns:
-        The aligned pose; None if too few pixels are valid at the start.
+    The pyramid's cameras state size and K of each level; their poses are ignored.
     """
     state = Aligned(np.asarray(start, np.float64), 1.0, 0.0, None, 0.0, 0, 0.0)
     for number, (camera, photo) in enumerate(pyramid):
@@ -187,7 +176,7 @@ def _level(
     """
 
     def shot_at(viewmat: Float) -> Shot:
-        return shoot(renderer, replace(camera, viewmat=viewmat), config)
+        return shot_of(renderer.render(replace(camera, viewmat=viewmat)), config)
 
     def counts(shot: Shot) -> bool:
         return (photo.mask & shot.mask).mean() >= config.min_overlap
@@ -223,12 +212,13 @@ def _level(
         if still:
             break
     final = normal_equations(photo, shot, camera.K, gain, bias)
+    covariance = inverse(final.matrix)
     counted = photo.mask & shot.mask
     return Aligned(
         pose,
         gain,
         bias,
-        _covariance(final, config.correlated),
+        None if covariance is None else covariance[:6, :6] * (final.scale**2 * config.correlated),
         float(counted.mean()),
         taken,
         float(np.median(shot.depth[counted])),
@@ -252,11 +242,6 @@ def _solved(normal: Normal) -> Float | None:
     unit = 1 / np.sqrt(diagonal)
     scaled = normal.matrix * unit[:, None] * unit[None, :] + _DAMPING * np.eye(8)
     return unit * np.linalg.solve(scaled, unit * normal.right)
-
-
-def _covariance(normal: Normal, correlated: float) -> Float | None:
-    found = inverse(normal.matrix)
-    return None if found is None else found[:6, :6] * (normal.scale**2 * correlated)
 
 
 def inverse(matrix: Float) -> Float | None:

@@ -20,7 +20,6 @@ from g2ard.scene.cameras import Camera
 from g2ard.stages.register.align import (
     Aligned,
     Level,
-    Normal,
     Shot,
     inverse,
     moves,
@@ -98,7 +97,8 @@ class Energy:
         grey = blurred_back(-gain * pull)
         inside = (out.image > 0) & (out.image < 1)
         by_colour = np.where(inside, grey[..., None] * LUMA, 0.0).astype(np.float32)
-        slope = np.concatenate([self._renderer.pose_gradient(by_colour), self._by_light(normal)])
+        by_light = -normal.right[6:] / (normal.scale**2 * config.correlated)
+        slope = np.concatenate([self._renderer.pose_gradient(by_colour), by_light])
         hessian = normal.matrix / (normal.scale**2 * config.correlated)
         energy = normal.cost * self._pixels * _TUKEY**2 / 6 / config.correlated
         if self._prior is not None:
@@ -115,9 +115,6 @@ class Energy:
         weight = np.maximum(0.0, 1 - (share / _TUKEY) ** 2) ** 2
         return np.where(counted, weight * share, 0.0) / (self._scale * self._config.correlated)
 
-    def _by_light(self, normal: Normal) -> Float:
-        return -normal.right[6:] / (normal.scale**2 * self._config.correlated)
-
 
 def polish(
     renderer: Renderer,
@@ -127,18 +124,9 @@ def polish(
     prior: Prior | None,
     config: RegisterConfig,
 ) -> Aligned | None:
-    """Minimise E from a pose and its light.
+    """Minimise E from a pose and its light; return None if too few pixels are valid.
 
-    Args:
-        renderer: of the scene.
-        start: pose and light from alignment or features.
-        camera: the photo's size and K; its pose is ignored.
-        photo: the photo at that size.
-        prior: pose from features; None without.
-        config: see `RegisterConfig`; `iterations` and `still` end the search.
-
-    Returns:
-        The pose, with its renders as `steps`; None if too few pixels are valid.
+    `camera` states the size and K of `photo`; `iterations` and `still` of the config end the search.
     """
     energy = Energy(renderer, camera, photo, prior, config)
     here = energy.at(start.viewmat, start.gain, start.bias)

@@ -39,13 +39,8 @@ def small_render(renderer: Renderer, camera: Camera, config: RegisterConfig) -> 
 
 
 def turned(viewmat: Float, render: Float, photo: Float, K: Float) -> Turned:
-    """Rotate a pose by the shift s of its render onto the photo: ω = (−s_v/f_y, s_u/f_x, 0).
-
-    Args:
-        viewmat: (4, 4) pose of the render.
-        render: (H, W) from `small_render`.
-        photo: (H, W) band-passed grey.
-        K: (3, 3) intrinsics of both.
+    """Rotate a pose by the shift s of its `small_render` onto the photo's band-passed grey, with K of both:
+    ω = (−s_v/f_y, s_u/f_x, 0).
     """
     right, down, likeness = shift_between(render, photo)
     turn = np.eye(4)
@@ -54,13 +49,7 @@ def turned(viewmat: Float, render: Float, photo: Float, K: Float) -> Turned:
 
 
 class PoolRenders:
-    """Renders of a pool's poses with a photo's intrinsics, cached per intrinsics.
-
-    Args:
-        renderer: of the scene.
-        pool: C poses; their K and size are ignored.
-        config: `min_alpha` of `RegisterConfig`.
-    """
+    """Renders of a pool's poses with a photo's intrinsics, cached per intrinsics."""
 
     def __init__(self, renderer: Renderer, pool: Cameras, config: RegisterConfig) -> None:
         self._renderer, self.pool, self._config = renderer, pool, config
@@ -69,11 +58,7 @@ class PoolRenders:
     def ranked(self, camera: Camera, grey: Float) -> tuple[list[tuple[int, Turned]], int]:
         """Return poses by decreasing similarity, each rotated onto the photo, and the number of renders.
 
-        Args:
-            camera: the photo's camera at `pool_size`.
-            grey: (H, W) grey photo at that size.
-
-        Ties go by index.
+        `camera` and `grey` are the photo at `pool_size`. Ties go by index.
         """
         key = camera.K.tobytes() + bytes(str((camera.width, camera.height)), "ascii")
         renders = 0

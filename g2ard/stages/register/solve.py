@@ -70,20 +70,9 @@ def solve(
     config: RegisterConfig,
     passes: int,
 ) -> Solved | None:
-    """Match, lift and solve from a starting pose, then repeat from the result.
+    """Match, lift and solve from a starting pose, then repeat from the result, in at most `passes` renders.
 
-    Args:
-        renderer: of the scene.
-        start: (4, 4) camera_from_world.
-        camera: the photo's size and K; its pose is ignored.
-        photo: (H, W, 3) in [0, 1].
-        mask: (H, W) valid pixels.
-        match: see `g2ard.stages.register.matchers`.
-        config: see `RegisterConfig`.
-        passes: maximum number of renders.
-
-    Returns:
-        The last pass that gave a pose; None if the first did not.
+    `camera` states the photo's size and K. Returns the last pass that gave a pose, or None.
     """
     found = None
     for number in range(passes):
@@ -118,16 +107,7 @@ def lifted(
 
     The median depth is interpolated between the four pixels around (u, v). It is known if all four have a
     depth, enough alpha (`min_alpha`), and differ by at most `max_edge`. The expected depth would lie between
-    foreground and background.
-
-    Args:
-        out: a render with its median depth.
-        camera: of the render.
-        uv: (M, 2) pixels.
-        config: see `RegisterConfig`.
-
-    Returns:
-        (M, 3) world coordinates, and the (M,) mask of known ones.
+    foreground and background. Returns (M, 3) world coordinates, and the (M,) mask of known ones.
     """
     assert out.median is not None
     height, width = out.alpha.shape
@@ -151,14 +131,7 @@ def lifted(
 def solved(
     camera: Camera, uv: Float, points: Float, config: RegisterConfig
 ) -> tuple[Float, NDArray[np.bool_]] | None:
-    """Solve PnP; return the pose and the inlier mask, or None with too few inliers.
-
-    Args:
-        camera: size and K.
-        uv: (M, 2) pixels.
-        points: (M, 3) world coordinates.
-        config: see `RegisterConfig`.
-    """
+    """Solve PnP for (M, 2) pixels of (M, 3) points; return pose and inlier mask, or None with too few."""
     import pycolmap
 
     if len(uv) < _LEAST:
@@ -218,12 +191,6 @@ def information(T: Float, K: Float, uv: Float, points: Float) -> Float:
     """Return the (6, 6) JᵀWJ/σ² of the reprojections π(exp(ξ) T X) − u, with J = ∂π/∂X·[I | −[X]ₓ].
 
     W is Cauchy's weight 1/(1 + r²/σ²), with σ from the median absolute deviation of the residuals.
-
-    Args:
-        T: (4, 4) camera_from_world.
-        K: (3, 3).
-        uv: (M, 2) pixels.
-        points: (M, 3) world.
     """
     X = points @ T[:3, :3].T + T[:3, 3]
     x, y, depth = X[:, 0] / X[:, 2], X[:, 1] / X[:, 2], X[:, 2]
