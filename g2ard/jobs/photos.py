@@ -299,15 +299,20 @@ def _refined(
     trial: Float,
     cost: Float,
 ) -> tuple[Float, Float]:
-    """Return the best depth and its cost, from finer trials around the best depths of each ray."""
+    """Return the (N,) best depths and their costs, from finer trials around the best minima of each ray.
+
+    `trial` and `cost` are (N, D); depths are evenly spaced in 1/depth. The finer trials reach three quarters
+    of a spacing to both sides, past the middle between two trials.
+    """
     padded = np.pad(cost, ((0, 0), (1, 1)), constant_values=np.inf)
-    valley = (cost <= padded[:, :-2]) & (cost <= padded[:, 2:])
-    order = np.argsort(np.where(valley, cost, np.inf), axis=1, kind="stable")[:, :_HYPOTHESES]
+    is_minimum = (cost <= padded[:, :-2]) & (cost <= padded[:, 2:])
+    order = np.argsort(np.where(is_minimum, cost, np.inf), axis=1, kind="stable")[:, :_HYPOTHESES]
     rows = np.arange(len(cost))[:, None]
-    inverse, step = 1 / trial[rows, order], np.abs(1 / trial[:, :1] - 1 / trial[:, 1:2])
+    inverse_depth = 1 / trial[rows, order]
+    spacing = np.abs(1 / trial[:, :1] - 1 / trial[:, 1:2])
     offsets = np.linspace(-0.75, 0.75, _FINER)
-    finer = 1 / np.maximum(inverse[:, :, None] + offsets * step[:, :, None], 1e-3 * inverse[:, :, None])
-    finer = finer.reshape(len(cost), -1)
+    tried = inverse_depth[:, :, None] + offsets * spacing[:, :, None]
+    finer = (1 / np.maximum(tried, 1e-3 * inverse_depth[:, :, None])).reshape(len(cost), -1)
     found = ray.costs(cameras, photos, others, finer)
     best = found.argmin(1)
     return finer[rows[:, 0], best], found[rows[:, 0], best]

@@ -94,7 +94,7 @@ def states_splits(views: str | Path | None, stated: Sequence[str | None] = ()) -
     Raises:
         InputError: a broken split file.
     """
-    return any(stated) or (views is not None and _split_file(Path(views)) is not None)
+    return any(stated) or (views is not None and _read_split(Path(views)) is not None)
 
 
 def splits_of(
@@ -158,7 +158,7 @@ def _masks(
     """Return split → (C,) mask: as stated, as listed in split.json, or by the rule."""
     if any(stated):
         return {word: np.array([s == word for s in stated], bool) for word in {s for s in stated if s}}
-    listed = None if views is None else _split_file(Path(views))
+    listed = None if views is None else _read_split(Path(views))
     if listed is None:
         test = np.zeros(len(names), bool)
         test[sorted(range(len(names)), key=lambda i: names[i])[::HOLD_OUT]] = True
@@ -172,10 +172,12 @@ def _masks(
     return masks
 
 
-def _split_file(views: Path) -> dict[str, list[str]] | None:
-    """Read split.json from the views' folder; for a COLMAP model also from above sparse/0."""
+def _read_split(views: Path) -> dict[str, list[str]] | None:
+    """Read split.json from the views' folder; for a COLMAP model in sparse/ or sparse/0 also from the folders
+    above it, up to that of sparse/."""
     folder = views if views.is_dir() else views.parent
-    places = [folder, *(folder.parents[:2] if folder.name == "0" or folder.name == "sparse" else ())]
+    above = {"sparse": 1, "0": 2}.get(folder.name, 0)
+    places = [folder, *folder.parents[:above]]
     path = next((p for place in places if (p := place / "split.json").is_file()), None)
     if path is None:
         return None

@@ -126,7 +126,7 @@ impl PyTrainer {
         );
         let (r_parallel, r_perp) = (flat("r_parallel", &r_parallel)?, flat("r_perp", &r_perp)?);
         self.inner
-            .anchor(means, frames, r_parallel, r_perp)
+            .set_anchors(means, frames, r_parallel, r_perp)
             .map_err(to_py)
     }
 

@@ -57,6 +57,7 @@ impl Incoming {
             let line = &image[first..first + rect.columns * channels];
             for_stretches(y, rect.columns, |x, row, lane, count| {
                 let given = &mut self.0[row].given[from..from + channels];
+                // The usual stretch, four pixels of three channels, without inner loops.
                 if let (Some(values), [r, g, b]) =
                     (line[x * channels..].first_chunk::<12>(), &mut *given)
                     && count == 4

@@ -138,18 +138,19 @@ impl Pairwise {
     pub(super) fn merge_rounds(
         &self,
         nodes: &mut Nodes,
-        geometric: f32,
+        geometric_weight: f32,
         schedule: &[usize],
         control: &Control,
         mut on_pairs: impl FnMut(&[Pair], &[u32]),
     ) -> Result<()> {
         for &target in schedule {
+            // The cheapest candidate of all always matches, so each turn merges at least one pair.
             while nodes.len() > target {
-                let lists = candidates(nodes, self.neighbors, geometric, control)?;
+                let lists = candidates(nodes, self.neighbors, geometric_weight, control)?;
                 let pairs = matched(&lists, self.neighbors, nodes.len() - target);
                 drop(lists);
-                let map = merge(nodes, &pairs);
-                on_pairs(&pairs, &map);
+                let new_index = merge(nodes, &pairs);
+                on_pairs(&pairs, &new_index);
                 control.advance(pairs.len() as u64);
             }
         }

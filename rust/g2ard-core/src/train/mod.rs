@@ -150,8 +150,9 @@ impl Trainer {
         };
     }
 
-    /// Freezes the surface that [`StepInput::regularizers`] hold the Gaussians to; rows as the caller numbers them.
-    pub fn anchor(
+    /// Sets the surface that [`StepInput::regularizers`] pull the Gaussians to. Rows as the caller numbers them: means 3 values
+    /// each, frames 9, radii 1.
+    pub fn set_anchors(
         &mut self,
         means: &[f32],
         frames: &[f32],
