@@ -21,7 +21,7 @@ $(VENV)/.maturin:
 	test -x $(BIN)/maturin || { $(PYTHON) -m venv $(VENV) && $(BIN)/pip install --quiet "maturin>=1.9,<2"; }
 	touch $@
 
-# The package as the demo needs it: without torch, the tests' dependencies and the GPU kernels, which take half of the build.
+# The package as the demo needs it: without torch, what the tests need, and the GPU kernels.
 $(VENV)/.plain: pyproject.toml $(RUST) | $(VENV)/.maturin
 	$(BIN)/maturin develop --release --no-default-features --quiet
 	touch $@
