@@ -6,6 +6,7 @@ import math
 import os
 import re
 import tomllib
+from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import MISSING, Field, dataclass, field, fields, replace
 from importlib import import_module
@@ -103,7 +104,7 @@ class SceneSpec:
 
 
 @dataclass(frozen=True)
-class Study:
+class Study(ABC):
     """Base class of studies, with the keys that all kinds have.
 
     Args:
@@ -135,9 +136,9 @@ class Study:
     differs: tuple[str, ...] = key((), axis=True)
     folder: Path = field(default=Path(), metadata={"axis": True})
 
+    @abstractmethod
     def cells(self, scene: SceneSpec, work: Path) -> Iterator[Cell]:
         """Yield the cells of a scene, without loading it."""
-        raise NotImplementedError
 
     def derived(self, rows: list[Row]) -> list[Row]:
         """Return the rows with columns that depend on several rows."""

@@ -100,12 +100,15 @@ def run_views(path: str | Path) -> Path:
 
 def run_background(path: str | Path) -> Colour | None:
     """Return the background that a `distill` run in a folder was made with, or None."""
-    from g2ard.io.jsonfile import read_json
+    from g2ard.io.jsonfile import fields_of, numbers, object_of, read_json
 
     if run_scene(path) == Path(path):
         return None
-    settings = read_json(Path(path) / "report.json").get("settings", {})
-    red, green, blue = settings.get("recover.background", BLACK)
+    report = Path(path) / "report.json"
+    settings = object_of(fields_of(report, {"settings": {}, **read_json(report)}), "settings")
+    if "recover.background" not in settings:
+        return BLACK
+    red, green, blue = numbers(settings, "recover.background", 3, most=1)
     return red, green, blue
 
 

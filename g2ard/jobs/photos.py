@@ -132,7 +132,7 @@ def topped_up(
 
 
 def sparse_points(views: Path) -> Points | None:
-    """Return the points of `sparse_file`; None if there are none or they cannot be read."""
+    """Read the points of `sparse_file`; return None if no file exists or it cannot be read."""
     from g2ard.io import read_points
 
     file = sparse_file(views)

@@ -52,7 +52,7 @@ class StageSeconds(Report):
 
 @dataclass(frozen=True)
 class DistillReport(Report):
-    """Report of a distillation; `views` is None if nothing was selected."""
+    """Report of a distillation; without a selection, `views` is None."""
 
     rounds: tuple[RoundReport, ...]
     seconds: StageSeconds

@@ -56,6 +56,31 @@ def test_a_run_is_evaluated_on_its_own_background(command_line: CommandLine, rgb
     )
 
 
+@pytest.mark.parametrize(
+    ("report", "said"),
+    [
+        ({"settings": 3}, "property 'settings' is 3, expected an object"),
+        (
+            {"settings": {"recover.background": "white"}},
+            "property 'settings.recover.background' is the string 'white'",
+        ),
+        (
+            {"settings": {"recover.background": [0, 2, 0]}},
+            "property 'settings.recover.background[1]' is 2, expected a number within ±1",
+        ),
+    ],
+)
+def test_a_damaged_report_of_a_run_is_named(
+    command_line: CommandLine, rgba: Path, report: dict[str, Any], said: str
+) -> None:
+    (rgba / "run").mkdir()
+    shutil.copy(rgba / "ball.ply", rgba / "run" / "scene.ply")
+    (rgba / "run" / "report.json").write_text(json.dumps(report), encoding="utf-8")
+    error = refused(command_line, rgba, "evaluate", "run", "--views", "ball", status=1)
+    assert "report.json" in error
+    assert said in error
+
+
 def test_alpha_masks_if_requested(command_line: CommandLine, rgba: Path) -> None:
     cameras = read_view_set(ViewFiles(rgba / "ball", alpha="mask"), split="test").cameras
     targets = Photos(cameras, background=WHITE)
