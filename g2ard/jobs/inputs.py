@@ -179,11 +179,11 @@ def clutter_seen(
     """Find clutter from generated views, and say how much there is of each kind.
 
     Args:
-        kinds: looked for; None for all of `g2ard.stages.clean.KINDS`.
-        strength: of removing haze and streaks, see `g2ard.stages.clean.find_clutter`; 0 removes none.
+        kinds: kinds to find; None for all of `g2ard.stages.clean.KINDS`.
+        strength: see `g2ard.stages.clean.find_clutter`; 0 finds neither haze nor streaks.
     """
     from g2ard.poses import plan_pool
-    from g2ard.stages.clean import FLOATING, KINDS, find_clutter, find_floating, within_reach
+    from g2ard.stages.clean import FLOATING, KINDS, find_clutter, find_floating, unoccluded_means
 
     kinds = tuple(kind for kind in kinds or KINDS if strength or kind not in FLOATING)
     pool = plan_pool(
@@ -198,9 +198,9 @@ def clutter_seen(
     cameras = pool.cameras.resized(_CLUTTER_SIDE)
     seen = visibility(splats, cameras, progress)
     pixels = int((cameras.widths.astype(int) * cameras.heights).sum())
-    reached = within_reach(splats, cameras, progress)
+    unoccluded = unoccluded_means(splats, cameras, progress)
     floating = find_floating(splats, cameras, progress) if set(kinds) & set(FLOATING) else None
-    found = find_clutter(splats, seen, reached, pixels, kinds, floating=floating, strength=strength)
+    found = find_clutter(splats, seen, unoccluded, pixels, kinds, floating=floating, strength=strength)
     parts = [f"{count:,} {name}" for name, count in found.counts.items() if name in kinds]
     gone = len(splats) - int(found.keep.sum())
     light = f"{seen.weight[~found.keep].sum() / max(seen.weight.sum(), 1e-30):.1%} of the light"

@@ -32,13 +32,15 @@ FLOATING = ("haze", "streak")
 """Kinds that are found only with a strength."""
 
 _HALF_STEP = 0.5 / 255
+"""Half an 8-bit step."""
 _REACH = 3.0
 """Standard deviations at which renderers cut off a footprint."""
-_LONG = 10.0
-_SMALL = 1e-3
+_ELONGATED = 10.0
+"""Ratio of length to width above which a Gaussian is a needle or a streak."""
+_SMALL_GROUP = 1e-3
 """Share of the scene's Gaussians and of its light below which a separate group is a floater."""
 _NEIGHBORS = 16
-_BEHIND = 0.01
+_SURFACE_SLACK = 0.01
 """Share of the depth within which a Gaussian belongs to the visible surface, behind or in front of it."""
 
 
@@ -66,7 +68,7 @@ class Cleaning:
 def find_clutter(
     splats: Splats,
     seen: Any,
-    looked: NDArray[np.bool_],
+    unoccluded: NDArray[np.bool_],
     pixels: int,
     kinds: tuple[str, ...] = KINDS,
     *,
@@ -78,27 +80,27 @@ def find_clutter(
     Args:
         splats: N Gaussians, finite.
         seen: their visibility (`g2ard.rendering.visibility.visibility`); uses `weight` and `peak`.
-        looked: (N,) mask from `within_reach`: only these can be invisible, apart from α below 1/255.
+        unoccluded: (N,) mask from `unoccluded_means`: only these can be invisible, apart from α below 1/255.
         pixels: number of pixels of all views together.
         kinds: kinds to find.
         floating: from `find_floating`; None finds neither haze nor streaks.
         strength: 0 to 1: haze and streaks float in more than 1 − `strength` of the views.
 
     Raises:
-        InputError: an unknown kind, or `seen` or `looked` of another length.
+        InputError: an unknown kind, or `seen` or `unoccluded` of another length.
     """
     if unknown := sorted(set(kinds) - set(KINDS)):
         raise InputError(f"expected some of {', '.join(KINDS)}, got {unknown[0]!r}", parameter="kinds")
-    for name, rows in (("seen", seen.weight), ("looked", looked)):
+    for name, rows in (("seen", seen.weight), ("unoccluded", unoccluded)):
         if len(rows) != len(splats):
             raise InputError(f"expected {len(splats)} rows, got {len(rows)}", parameter=name)
     kind = np.full(len(splats), -1, np.int8)
-    hidden = _invisible(splats, seen, looked, pixels)
+    hidden = _invisible(splats, seen, unoccluded, pixels)
     finders = {
         "invisible": lambda rest: hidden,
         "giant": lambda rest: _giants(splats),
         "needle": lambda rest: _needles(splats, rest),
-        "floater": lambda rest: _floaters(splats, rest, seen.weight, looked),
+        "floater": lambda rest: _floaters(splats, rest, seen.weight, unoccluded),
     }
     if floating is not None:
         finders["haze"] = lambda rest: floating.middle > 1 - strength
@@ -111,13 +113,13 @@ def find_clutter(
     return Cleaning(kind)
 
 
-def _invisible(splats: Splats, seen: Any, looked: NDArray[np.bool_], pixels: int) -> NDArray[np.bool_]:
+def _invisible(splats: Splats, seen: Any, unoccluded: NDArray[np.bool_], pixels: int) -> NDArray[np.bool_]:
     """Mark Gaussians that no renderer draws, and the weakest ones that change no pixel by half an 8-bit step.
 
     The latter are taken in order of light until together they would change the mean pixel by half a step.
     """
     faint = splats.logit_opacities < DRAWN_LOGIT
-    small = np.flatnonzero(looked & ~faint & (seen.peak < _HALF_STEP))
+    small = np.flatnonzero(unoccluded & ~faint & (seen.peak < _HALF_STEP))
     order = small[np.argsort(seen.weight[small], kind="stable")]
     total = np.cumsum(seen.weight[order], dtype=np.float64)
     out: NDArray[np.bool_] = faint.copy()
@@ -125,9 +127,8 @@ def _invisible(splats: Splats, seen: Any, looked: NDArray[np.bool_], pixels: int
     return out
 
 
-def within_reach(splats: Splats, cameras: Cameras, progress: Progress = silent) -> NDArray[np.bool_]:
-    """Return an (N,) mask of means in front of the visible surface of some view, or up to 1 % of its depth
-    behind it.
+def unoccluded_means(splats: Splats, cameras: Cameras, progress: Progress = silent) -> NDArray[np.bool_]:
+    """Return the (N,) mask of means in the frame of a view and at most 1 % of the depth behind its surface.
 
     The surface is where half of a pixel's light is blocked. Gaussians deeper in all views, behind a wall or
     in an unseen corner, may be visible from elsewhere.
@@ -135,8 +136,8 @@ def within_reach(splats: Splats, cameras: Cameras, progress: Progress = silent) 
     means = splats.means.astype(np.float64) + splats.offset
     out = np.zeros(len(splats), bool)
     for camera, depths in _surfaces(splats, cameras, progress):
-        rows, z, surface = _framed(means, camera, depths)
-        out[rows[(surface == 0) | (z < (1 + _BEHIND) * surface)]] = True
+        rows, z, surface = _in_frame(means, camera, depths)
+        out[rows[(surface == 0) | (z < (1 + _SURFACE_SLACK) * surface)]] = True
     return out
 
 
@@ -154,28 +155,29 @@ class Floating:
 
 
 def find_floating(splats: Splats, cameras: Cameras, progress: Progress = silent) -> Floating:
-    """Return in which share of the views Gaussians float in front of the visible surface.
+    """Return the share of the views in which each Gaussian floats in front of the visible surface.
 
-    A point floats in a view if the surface behind it is further away than its Gaussian's standard deviation
-    along the ray and 1 % of the depth. Views that do not show the point, or show no surface behind it, do
-    not count. One more view counts as not floating, so that few views are weak evidence.
+    Means are tested, and both ends of Gaussians ten times as long as wide. A point floats in a view if it is
+    nearer than the surface by more than its Gaussian's standard deviation along the ray plus 1 % of the
+    depth. Views that do not show the point, or show no surface behind it, do not count. One more view counts
+    as not floating, so that few views are weak evidence.
     """
     means = splats.means.astype(np.float64)
-    long, tips = _long(splats, np.arange(len(splats)))
-    points = np.concatenate([means, means[long] - tips, means[long] + tips]) + splats.offset
+    long, mean_to_end = _elongated(splats, np.arange(len(splats)))
+    points = np.concatenate([means, means[long] - mean_to_end, means[long] + mean_to_end]) + splats.offset
     owners = np.concatenate([np.arange(len(splats)), long, long])
     axes = rotation_matrices(splats.quats)
     views, floats = np.ones(len(points)), np.zeros(len(points))
     for camera, depths in _surfaces(splats, cameras, progress):
-        rows, z, surface = _framed(points, camera, depths)
-        shown = (surface > 0) & (z < (1 + _BEHIND) * surface)
+        rows, z, surface = _in_frame(points, camera, depths)
+        shown = (surface > 0) & (z < (1 + _SURFACE_SLACK) * surface)
         rows, z, surface = rows[shown], z[shown], surface[shown]
         rays = points[rows] - camera.position
         rays /= np.linalg.norm(rays, axis=1, keepdims=True)
         owner = owners[rows]
         along = np.einsum("nji,nj->ni", axes[owner], rays) * splats.scales[owner]
         views[rows] += 1
-        floats[rows] += z + np.linalg.norm(along, axis=1) < (1 - _BEHIND) * surface
+        floats[rows] += z + np.linalg.norm(along, axis=1) < (1 - _SURFACE_SLACK) * surface
     shares = floats / views
     ends = np.zeros(len(splats))
     ends[long] = shares[len(splats) :].reshape(2, -1).max(axis=0)
@@ -194,7 +196,7 @@ def _surfaces(
         progress("depths", done, len(cameras), {})
 
 
-def _framed(
+def _in_frame(
     points: NDArray[np.float64], camera: Camera, depths: NDArray[np.float32]
 ) -> tuple[NDArray[np.intp], NDArray[np.float64], NDArray[np.float32]]:
     """Return the rows of points in the frame, their depths, and the surface's depths at their pixels."""
@@ -214,11 +216,11 @@ def _giants(splats: Splats) -> NDArray[np.bool_]:
     large = np.flatnonzero(splats.scales.max(axis=1) > radius)
     out = np.zeros(len(splats), bool)
     if len(large):
-        out[large[_away(splats, large, middle) <= _REACH]] = True
+        out[large[_mahalanobis(splats, large, middle) <= _REACH]] = True
     return out
 
 
-def _away(splats: Splats, rows: NDArray[np.intp], points: NDArray[np.float64]) -> NDArray[np.float64]:
+def _mahalanobis(splats: Splats, rows: NDArray[np.intp], points: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the (n,) Mahalanobis distances √((p − μ)ᵀ Σ⁻¹ (p − μ)) of the given rows."""
     local = np.einsum(
         "nji,nj->ni", rotation_matrices(splats.quats[rows]), points - splats.means[rows].astype(np.float64)
@@ -235,11 +237,11 @@ def _needles(splats: Splats, rest: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """
     out = np.zeros(len(splats), bool)
     rows = np.flatnonzero(rest)
-    long, reach = _long(splats, rows)
+    long, mean_to_end = _elongated(splats, rows)
     if not len(long) or len(rows) <= 2 * _NEIGHBORS:
         return out
     means = splats.means.astype(np.float64)
-    ends = np.concatenate([means[long] - reach, means[long] + reach])
+    ends = np.concatenate([means[long] - mean_to_end, means[long] + mean_to_end])
     points = np.concatenate([means[rows], ends])
     near = _core.knn(np.ascontiguousarray(points), _NEIGHBORS)[len(rows) :].astype(np.int64)
     real = near < len(rows)
@@ -251,19 +253,19 @@ def _needles(splats: Splats, rest: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return out
 
 
-def _long(splats: Splats, rows: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
+def _elongated(splats: Splats, rows: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
     """Return those of `rows` that are ten times as long as wide, and (n, 3) vectors from mean to end (2σ)."""
     order = np.sort(splats.scales[rows], axis=1).astype(np.float64)
-    long = rows[order[:, 2] > _LONG * np.maximum(order[:, 1], 1e-30)]
+    long = rows[order[:, 2] > _ELONGATED * np.maximum(order[:, 1], 1e-30)]
     axis = np.argmax(splats.scales[long], axis=1)
     along = np.take_along_axis(rotation_matrices(splats.quats[long]), axis[:, None, None], axis=2)[:, :, 0]
     return long, 2 * splats.scales[long, axis].astype(np.float64)[:, None] * along
 
 
 def _floaters(
-    splats: Splats, rest: NDArray[np.bool_], weight: NDArray[Any], looked: NDArray[np.bool_]
+    splats: Splats, rest: NDArray[np.bool_], weight: NDArray[Any], unoccluded: NDArray[np.bool_]
 ) -> NDArray[np.bool_]:
-    """Mark small groups of touching Gaussians of `rest` (3σ spheres meet), partly within reach of a view."""
+    """Mark small groups of touching Gaussians of `rest` (3σ spheres meet), some of them unoccluded."""
     out = np.zeros(len(splats), bool)
     rows = np.flatnonzero(rest)
     if len(rows) <= _NEIGHBORS:
@@ -276,8 +278,8 @@ def _floaters(
     group = _groups(len(rows), a, near[a, b])
     count = np.bincount(group, minlength=len(rows))
     light = np.bincount(group, weight[rows], minlength=len(rows))
-    small = (count <= _SMALL * len(rows)) & (light <= _SMALL * light.sum())
-    small &= np.bincount(group, looked[rows], minlength=len(rows)) > 0
+    small = (count <= _SMALL_GROUP * len(rows)) & (light <= _SMALL_GROUP * light.sum())
+    small &= np.bincount(group, unoccluded[rows], minlength=len(rows)) > 0
     out[rows[small[group]]] = True
     return out
 

@@ -50,7 +50,7 @@ class State:
 
 def adapters() -> list[Adapter] | None:
     """Return all adapters, best first, or None if this build has no GPU kernels."""
-    _hush()
+    _silence_mesa()
     found = _core.adapters()
     return None if found is None else [Adapter(**row) for row in found]
 
@@ -76,12 +76,12 @@ def use(device: str, *, timed: bool = False) -> None:
     """
     if device not in ("cpu", "gpu", "auto"):
         raise InputError(f"expected cpu, gpu or auto, got {device!r}", parameter="device")
-    _hush()
+    _silence_mesa()
     _core.set_device(device, timed=timed)
 
 
-def _hush() -> None:
-    """Silence a Mesa layer that complains on stderr when there is no desktop session."""
+def _silence_mesa() -> None:
+    """Silence a layer of the Mesa drivers that complains on stderr without a desktop session."""
     if "XDG_RUNTIME_DIR" not in os.environ:
         os.environ.setdefault("NODEVICE_SELECT", "1")
 

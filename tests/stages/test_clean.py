@@ -14,7 +14,7 @@ from g2ard.rendering.visibility import visibility
 from g2ard.scene.cameras import Cameras, look_at
 from g2ard.scene.splats import Splats
 from g2ard.scene.transform import join
-from g2ard.stages.clean import FLOATING, KINDS, find_clutter, find_floating, within_reach
+from g2ard.stages.clean import FLOATING, KINDS, find_clutter, find_floating, unoccluded_means
 from helpers.commands import CommandLine, refused, succeeds
 from helpers.scenes import around, checkered_ball
 
@@ -72,9 +72,9 @@ def test_gaussians_outside_all_views_stay() -> None:
     splats, _ = junk()
     view = around(24).take([0])
     behind = replace(splats, means=splats.means + (100 * view.positions[0]).astype(np.float32))
-    reached = within_reach(behind, view)
-    assert not reached.any()
-    found = find_clutter(behind, visibility(behind, view), reached, 64 * 48, ("invisible",))
+    unoccluded = unoccluded_means(behind, view)
+    assert not unoccluded.any()
+    found = find_clutter(behind, visibility(behind, view), unoccluded, 64 * 48, ("invisible",))
     np.testing.assert_array_equal(found.kind >= 0, splats.logit_opacities < -5.54)
 
 
@@ -89,12 +89,12 @@ def test_gaussians_behind_a_wall_stay() -> None:
     scene = join([wall, beyond, before])
     K = [[60, 0, 32], [0, 60, 24], [0, 0, 1]]
     view = Cameras.from_lists([look_at([0, -4, 0], [0, 0, 0])], [K], [(64, 48)], ["front"])
-    reached = within_reach(scene, view)
-    assert not reached[x.size : -1].any()
-    assert reached[-1]
+    unoccluded = unoccluded_means(scene, view)
+    assert not unoccluded[x.size : -1].any()
+    assert unoccluded[-1]
     hidden = visibility(scene, view).weight[x.size : -1]
     assert hidden.max() < 1e-3  # it would be called invisible by what shows alone
-    kinds = find_clutter(scene, visibility(scene, view), reached, 64 * 48, ("invisible",)).kind
+    kinds = find_clutter(scene, visibility(scene, view), unoccluded, 64 * 48, ("invisible",)).kind
     assert (kinds[x.size : -1] < 0).all()
 
 

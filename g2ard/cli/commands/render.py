@@ -74,7 +74,7 @@ def render(
     import numpy as np
 
     from g2ard.jobs.inputs import load_views
-    from g2ard.jobs.orbit import orbit
+    from g2ard.jobs.turntable import turntable
     from g2ard.jobs.view_checks import warn_of_sight
     from g2ard.jobs.views import views_or_pool
     from g2ard.rendering.renderer import RasterSettings, Renderer
@@ -104,7 +104,7 @@ def render(
         splats = _painted(run, splats, color, budget, method, parents)
     found: Any
     if turn is not None:
-        found = orbit(splats, turn, seed=run.seed, progress=run.progress)
+        found = turntable(splats, turn, seed=run.seed, progress=run.progress)
     else:
         found = views_or_pool(
             splats,

@@ -41,7 +41,7 @@ __all__ = [
 ]
 
 Float = NDArray[np.float64]
-_FEATURES_COUNT = 0.05
+_FEATURES_BONUS = 0.05
 """Bonus in likeness for a pose confirmed by features.
 
 Likeness detects poses that are wrong by metres, features those that are wrong by decimetres.
@@ -115,7 +115,7 @@ def register(
     for i, name in enumerate(photos.names):
         began = time.perf_counter()
         start = Start(given[name], name) if name in given else None
-        row, best = _one(search, photos, i, start, renders, true.get(name))
+        row, best = _register_photo(search, photos, i, start, renders, true.get(name))
         if best is not None and best.solved is not None:
             matches[name] = np.concatenate([best.solved.pixels, best.solved.seen], 1)
         if best is None and keep == "all" and start is not None:
@@ -148,7 +148,7 @@ def _poses(what: str, poses: Mapping[str, ArrayLike] | None, photos: Cameras) ->
     return out
 
 
-def _one(
+def _register_photo(
     search: Search,
     photos: Cameras,
     index: int,
@@ -156,7 +156,11 @@ def _one(
     pool: PoolRenders | None,
     true: Float | None,
 ) -> tuple[PhotoReport, Candidate | None]:
-    """Register one photo from its pose or the pool."""
+    """Register one photo from the pose `given`, otherwise from the pool.
+
+    Returns:
+        The photo's report, with errors against the pose `true` if given, and its best candidate, if any.
+    """
     name = photos.names[index]
     start_error = None if given is None or true is None else PoseError(*pose_error(given.pose, true))
     refused = PhotoReport(name, "refused", start=given.name if given else None, start_error=start_error)
@@ -178,7 +182,7 @@ def _one(
         if not search.config.fallback:
             why = f"fewer than {search.config.min_inliers} matches confirm a pose"
         return replace(refused, reason=why, renders=renders), None
-    best = max(candidates, key=lambda c: c.zncc + (_FEATURES_COUNT if c.solved else 0))
+    best = max(candidates, key=lambda c: c.zncc + (_FEATURES_BONUS if c.solved else 0))
     row = _reported(name, best, search.config, renders)
     if true is not None:
         start_error = PoseError(*pose_error(best.start.pose, true))

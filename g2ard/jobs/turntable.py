@@ -1,4 +1,4 @@
-"""Turntables: ordered views around a scene."""
+"""Turntables: ordered views on a circle around a scene."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _POOL = 32
 """Generated poses, of which the one that shows most of the scene begins the turn."""
 
 
-def orbit(
+def turntable(
     scene: Splats,
     count: int,
     *,
