@@ -91,12 +91,16 @@ fn patch(points: &[[f64; 3]], row: u32, near: &[Neighbor<f64>], config: &LiftCon
     let offsets = || near.iter().map(|n| sub(points[n.1 as usize], here));
     let mut mean = [0.0; 3];
     for d in offsets() {
-        (0..3).for_each(|k| mean[k] += d[k] * share);
+        for k in 0..3 {
+            mean[k] += d[k] * share;
+        }
     }
     let mut cov: Sym3 = [0.0; 6];
     for d in offsets().chain([[0.0; 3]]) {
         let o = outer(sub(d, mean));
-        (0..6).for_each(|k| cov[k] += o[k] * share);
+        for k in 0..6 {
+            cov[k] += o[k] * share;
+        }
     }
     let e = symmetric_eigen(&cov);
     let [t1, t2, n] = e.vectors;

@@ -1,7 +1,7 @@
 //! `g2ard.stages.simplify`.
 
 use g2ard_core::simplify::{
-    Outcome, Pairwise, PairwiseRound, Paper, PaperPlan, PaperRound, Visibility, flags,
+    Outcome, Pairwise, PairwiseRound, Paper, PaperPlan, PaperRound, Visibility, protection_flags,
 };
 use numpy::{PyArray1, PyArrayMethods, PyReadonlyArray1};
 use pyo3::prelude::*;
@@ -45,7 +45,7 @@ pub fn simplify_flags<'py>(
     let found = long(py, progress, |control| {
         let splats = ordered.splats(&scene);
         let run = backend(&kernels).group_kernels();
-        let found = flags(&splats, cells, &config.0, &*run, control)?;
+        let found = protection_flags(&splats, cells, &config.0, &*run, control)?;
         let mut by_row = vec![false; found.len()];
         for (&row, &flag) in ordered.rows.iter().zip(&found) {
             by_row[row as usize] = flag;
@@ -159,7 +159,7 @@ pub fn outcome_dict<'py, R>(
     let sh = PyArray1::from_vec(py, s.sh.into_flattened()).reshape([n, coeffs, 3])?;
     out.set_item("sh", sh)?;
     out.set_item("parents", PyArray1::from_vec(py, outcome.parents))?;
-    out.set_item("protected", PyArray1::from_vec(py, outcome.flags))?;
+    out.set_item("protected", PyArray1::from_vec(py, outcome.protected))?;
     out.set_item("clamped_opacities", outcome.clamped_opacities)?;
     out.set_item("infinite_logits", outcome.infinite_logits)?;
     out.set_item("rounds", rounds)?;

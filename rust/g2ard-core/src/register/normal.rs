@@ -87,7 +87,7 @@ fn motion(x: f64, y: f64, depth: f64, p: f64, q: f64) -> [f64; MOTION] {
     ]
 }
 
-/// The normal equations at a pose, and their cost; without `scale` it is found from the residuals.
+/// The normal equations at a pose, and their cost. `scale` is σ of the residuals, estimated from them by default.
 pub fn normal_equations(
     photo: &Photo,
     shot: &Render,
@@ -111,7 +111,7 @@ pub fn normal_equations(
     let residual = |i: usize| photo.grey[i] - light.gain * shot.grey[i] - light.bias;
     let counted = |y: usize| (y * size.width..(y + 1) * size.width).filter(|&i| counts(i));
     let rows = 0..size.height;
-    let number: usize = (0..size.pixels()).filter(|&i| counts(i)).count();
+    let pixels = (0..size.pixels()).filter(|&i| counts(i)).count();
     let scale = scale.unwrap_or_else(|| {
         let residuals: Vec<f64> = rows
             .clone()
@@ -150,7 +150,7 @@ pub fn normal_equations(
         .into_par_iter()
         .map_init(|| std::array::from_fn(|_| Vec::new()), row)
         .collect();
-    Ok(added(&rows, scale, number))
+    Ok(total(&rows, scale, pixels))
 }
 
 impl Sums {
@@ -177,7 +177,8 @@ impl Sums {
     }
 }
 
-fn added(rows: &[Sums], scale: f64, number: usize) -> Normal {
+/// Adds up rows in order, completes the symmetric matrix, and divides the cost by the number of `pixels`.
+fn total(rows: &[Sums], scale: f64, pixels: usize) -> Normal {
     let mut out = Normal {
         matrix: [[0.0; UNKNOWNS]; UNKNOWNS],
         right: [0.0; UNKNOWNS],
@@ -200,7 +201,7 @@ fn added(rows: &[Sums], scale: f64, number: usize) -> Normal {
             out.matrix[a][b] = out.matrix[b][a];
         }
     }
-    out.cost /= number as f64;
+    out.cost /= pixels as f64;
     out
 }
 

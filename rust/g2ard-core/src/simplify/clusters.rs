@@ -46,12 +46,13 @@ impl Partition {
     ///
     /// Mass is α·A as rendered, A with the row's dilation `blur` (a variance), and is conserved: α of a
     /// cluster is Σm / A. Where that passes 0.99, the cluster grows instead along its two longer axes, to at
-    /// most `growth` times the area. Returns also how many clusters reached α = 0.99.
+    /// most `growth` times the area. Returns also how many clusters reached α = 0.99. A cluster with a `protected`
+    /// member is protected.
     pub fn assemble(
         &self,
         scene: &SceneRef,
         ordered: &Ordered,
-        flags: &[bool],
+        protected: &[bool],
         growth: f64,
         blur: impl Fn(usize) -> f64 + Sync,
         control: &Control,
@@ -80,7 +81,8 @@ impl Partition {
         let mut clamped = 0;
         for (c, made) in chunks.into_iter().flatten().enumerate() {
             let members = &rows[starts[c] as usize..starts[c + 1] as usize];
-            step.flags.push(members.iter().any(|&i| flags[i as usize]));
+            step.protected
+                .push(members.iter().any(|&i| protected[i as usize]));
             step.copied
                 .push(if members.len() == 1 { members[0] } else { GONE });
             clamped += usize::from(made.clamped);
@@ -178,7 +180,9 @@ fn average_sh(
     for (&i, w) in members.iter().zip(weights) {
         let (dc, rest) = of(i);
         for (sum, sh) in sums.iter_mut().zip(std::iter::once(&dc).chain(rest)) {
-            (0..3).for_each(|k| sum[k] += w * f64::from(sh[k]));
+            for k in 0..3 {
+                sum[k] += w * f64::from(sh[k]);
+            }
         }
     }
     out.extend(sums[..=scene.rest].iter().map(|s| s.map(|v| v as f32)));

@@ -1,4 +1,4 @@
-//! Whether a merged Gaussian may replace its members.
+//! The guard of coverage: how much of its members' footprints a merged Gaussian covers.
 
 use std::f64::consts::PI;
 use std::sync::OnceLock;
@@ -60,7 +60,7 @@ impl Shadow {
     }
 }
 
-/// Share of the members' footprint area ΣA_i that the merged Gaussian covers. Footprints end `support` standard
+/// Share of the members' footprint area ΣA_i, A_i the product of the two longer scales, that the merged Gaussian covers. Footprints end `support` standard
 /// deviations from the mean, as far as a renderer draws them.
 ///
 /// Each member casts its footprint on the merged tangent plane, foreshortened by how far it leans; the part
@@ -74,7 +74,9 @@ pub fn coverage(members: &[Gaussian], merged: &Gaussian, support: f64) -> f64 {
     for g in members {
         let (area, cov) = (footprint(g.scales), g.covariance());
         total += area;
-        (0..6).for_each(|k| within[k] += area * cov[k]);
+        for k in 0..6 {
+            within[k] += area * cov[k];
+        }
     }
     if total <= 0.0 {
         return 1.0;

@@ -28,7 +28,7 @@ pub use moments::{Merged, merge, optical_mass, pool, weights};
 pub use outcome::Outcome;
 pub use pairwise::{Pairwise, PairwiseRound, Visibility};
 pub use paper::{Paper, PaperPlan, PaperRound};
-pub use residual::{color, flags};
+pub use residual::{color, protection_flags};
 pub use tile::{Frame, Tile, TilePlan};
 
 use crate::Splats;
@@ -42,7 +42,8 @@ pub struct Step {
     pub splats: Splats,
     /// Output row of each input row, or [`GONE`].
     pub parents: Vec<u32>,
-    pub flags: Vec<bool>,
+    /// Whether a row, or a member of it, is protected: in a cell of uneven colour (`residual.rs`).
+    pub protected: Vec<bool>,
     /// The input row that an output row is a copy of, or [`GONE`] where it was made by merging.
     pub copied: Vec<u32>,
 }

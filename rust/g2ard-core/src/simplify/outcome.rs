@@ -10,7 +10,8 @@ pub struct Outcome<R> {
     pub splats: Splats,
     /// Output row of each input row; −1 where it was dropped or trimmed.
     pub parents: Vec<i64>,
-    pub flags: Vec<bool>,
+    /// Per output row, see [`Step::protected`].
+    pub protected: Vec<bool>,
     pub rounds: Vec<R>,
     /// Merged rows whose α was clipped, so that some of their mass is lost.
     pub clamped_opacities: usize,
@@ -24,7 +25,7 @@ impl Step {
         let rows: Vec<u32> = (0..splats.len() as u32).collect();
         Self {
             parents: rows.clone(),
-            flags: vec![false; rows.len()],
+            protected: vec![false; rows.len()],
             copied: rows,
             splats,
         }
@@ -49,7 +50,7 @@ impl Step {
         let Self {
             mut splats,
             parents,
-            flags,
+            protected,
             copied,
         } = self;
         for (mean, &source) in splats.means.iter_mut().zip(&copied) {
@@ -70,7 +71,7 @@ impl Step {
         Outcome {
             splats,
             parents: by_row,
-            flags,
+            protected,
             rounds,
             clamped_opacities: 0,
             infinite_logits: ordered.infinite_logits,
@@ -89,7 +90,7 @@ mod tests {
                 means: vec![[0.0; 3]; copied.len()],
                 ..Splats::default()
             },
-            flags: vec![false; copied.len()],
+            protected: vec![false; copied.len()],
             parents,
             copied,
         };

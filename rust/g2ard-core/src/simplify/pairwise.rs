@@ -84,18 +84,18 @@ impl Pairwise {
         }
     }
 
-    /// Rounds down to each count of `schedule`. `visibility` and `flags` have a row for each of the input's.
+    /// Rounds down to each count of `schedule`. `visibility` and `protected` have a row for each of the input's.
     pub fn run(
         &self,
         scene: &SceneRef,
         ordered: &Ordered,
         visibility: Option<Visibility>,
-        flags: Option<&[bool]>,
+        protected: Option<&[bool]>,
         schedule: &[usize],
         control: &Control,
     ) -> Result<Outcome<PairwiseRound>> {
-        self.check(scene, visibility, flags)?;
-        let flags = flags.map_or_else(|| vec![false; scene.len()], |f| ordered.sorted(f));
+        self.check(scene, visibility, protected)?;
+        let protected = protected.map_or_else(|| vec![false; scene.len()], |f| ordered.sorted(f));
         let blur = self.blurs(scene, ordered, visibility, None);
         let budget = schedule.last().copied().unwrap_or(scene.len());
         control.begin(scene.len().saturating_sub(budget) as u64);
@@ -123,7 +123,7 @@ impl Pairwise {
         let (step, clamped) = partition.assemble(
             scene,
             ordered,
-            &flags,
+            &protected,
             self.max_growth,
             |i| blur[i].into(),
             control,
@@ -201,7 +201,7 @@ impl Pairwise {
         &self,
         scene: &SceneRef,
         visibility: Option<Visibility>,
-        flags: Option<&[bool]>,
+        protected: Option<&[bool]>,
     ) -> Result<()> {
         let lengths = [
             ("visibility.weight", visibility.map(|v| v.weight.len())),
@@ -209,7 +209,7 @@ impl Pairwise {
                 "visibility.pixel_size",
                 visibility.map(|v| v.pixel_size.len()),
             ),
-            ("protected", flags.map(<[bool]>::len)),
+            ("protected", protected.map(<[bool]>::len)),
         ];
         for (name, rows) in lengths {
             if let Some(rows) = rows.filter(|&rows| rows != scene.len()) {

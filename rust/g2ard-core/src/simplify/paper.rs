@@ -77,27 +77,27 @@ struct Candidate {
 }
 
 impl Paper {
-    /// Run the rounds of a plan. Without `flags` they are computed first, on the raw scene over its cells.
+    /// Run the rounds of a plan. Without `protected` they are computed first, on the raw scene over its cells.
     pub fn run(
         &self,
         scene: &SceneRef,
         ordered: &Ordered,
-        flags: Option<&[bool]>,
+        protected: Option<&[bool]>,
         plan: PaperPlan,
         kernels: &dyn GroupKernels,
         control: &Control,
     ) -> Result<Outcome<PaperRound>> {
         let mut step = Step::start(ordered.splats(scene));
-        step.flags = match flags {
-            Some(flags) if flags.len() == ordered.rows.len() => ordered.sorted(flags),
-            Some(flags) => {
+        step.protected = match protected {
+            Some(protected) if protected.len() == ordered.rows.len() => ordered.sorted(protected),
+            Some(protected) => {
                 return Err(Error::invalid(
                     "protected",
                     format!("{} rows", ordered.rows.len()),
-                    flags.len(),
+                    protected.len(),
                 ));
             }
-            None => super::flags(&step.splats, plan.cells, self, kernels, control)?,
+            None => super::protection_flags(&step.splats, plan.cells, self, kernels, control)?,
         };
         let mut rounds = Vec::new();
         let shed = |budget: usize| ordered.rows.len().saturating_sub(budget) as u64;
@@ -108,7 +108,8 @@ impl Paper {
                 cells: plan.cells,
                 grid: ordered.grid,
             };
-            let (next, report) = self.round(&step.splats, &step.flags, target, kernels, control)?;
+            let (next, report) =
+                self.round(&step.splats, &step.protected, target, kernels, control)?;
             control.advance((report.before - report.after) as u64);
             kernels.rows_replaced(&next.copied);
             step = step.then(next);
@@ -127,7 +128,7 @@ impl Paper {
     fn round(
         &self,
         splats: &Splats,
-        flags: &[bool],
+        protected: &[bool],
         target: Target,
         kernels: &dyn GroupKernels,
         control: &Control,
@@ -138,7 +139,7 @@ impl Paper {
             after: splats.len().min(budget),
             ..PaperRound::default()
         };
-        let kept = self.drop_transparent(splats, flags, budget);
+        let kept = self.drop_transparent(splats, protected, budget);
         report.dropped = splats.len() - kept.len();
         let groups = if kept.len() > budget {
             self.groups(splats, &kept, target.cells, kernels, &mut report)?
@@ -147,28 +148,28 @@ impl Paper {
         };
         let mut merges = self.judge(splats, &groups, kernels, &mut report, control)?;
         undo_costliest(&groups, &mut merges, budget, &mut report);
-        let built = build(splats, flags, &groups, merges, target.grid, &mut report);
+        let built = build(splats, protected, &groups, merges, target.grid, &mut report);
         Ok((self.trim(built, budget, &mut report), report))
     }
 
-    fn priority(&self, splats: &Splats, flags: &[bool]) -> Vec<f64> {
+    fn priority(&self, splats: &Splats, protected: &[bool]) -> Vec<f64> {
         let score = |i: usize| {
             let logit = f64::from(splats.logit_opacities[i]);
             let mass = optical_mass(logit, splats.scales[i].map(f64::from));
-            mass * (1.0 + self.protection * f64::from(u8::from(flags[i])))
+            mass * (1.0 + self.protection * f64::from(u8::from(protected[i])))
         };
         (0..splats.len()).into_par_iter().map(score).collect()
     }
 
     /// Rows with α ≥ α_min; if they are fewer than the budget, the best of the others too.
-    fn drop_transparent(&self, splats: &Splats, flags: &[bool], budget: usize) -> Vec<u32> {
+    fn drop_transparent(&self, splats: &Splats, protected: &[bool], budget: usize) -> Vec<u32> {
         let visible =
             |i: u32| sigmoid(f64::from(splats.logit_opacities[i as usize])) >= self.min_opacity;
         let kept: Vec<u32> = (0..splats.len() as u32).filter(|&i| visible(i)).collect();
         if kept.len() >= budget.min(splats.len()) {
             return kept;
         }
-        let mut scores = self.priority(splats, flags);
+        let mut scores = self.priority(splats, protected);
         kept.iter()
             .for_each(|&i| scores[i as usize] = f64::INFINITY);
         best(&scores, budget)
@@ -258,7 +259,7 @@ impl Paper {
             return built;
         }
         report.trimmed = n - budget;
-        let stay = best(&self.priority(&built.splats, &built.flags), budget);
+        let stay = best(&self.priority(&built.splats, &built.protected), budget);
         let mut to = vec![GONE; n];
         stay.iter()
             .enumerate()
@@ -267,7 +268,7 @@ impl Paper {
         Step {
             splats: take(&built.splats, &stay),
             parents: built.parents.into_iter().map(follow).collect(),
-            flags: stay.iter().map(|&i| built.flags[i as usize]).collect(),
+            protected: stay.iter().map(|&i| built.protected[i as usize]).collect(),
             copied: stay.iter().map(|&i| built.copied[i as usize]).collect(),
         }
     }
@@ -307,7 +308,7 @@ fn undo_costliest(
 /// The groups' rows in order: one for a merged group, else its members.
 fn build(
     splats: &Splats,
-    flags: &[bool],
+    protected: &[bool],
     groups: &[Vec<u32>],
     merges: Vec<Option<Box<Candidate>>>,
     grid: f64,
@@ -326,14 +327,15 @@ fn build(
             let to = out.splats.len() as u32;
             rows.iter().for_each(|&i| out.parents[i as usize] = to);
             push_merged(&mut out.splats, candidate.merged, grid);
-            out.flags.push(rows.iter().any(|&i| flags[i as usize]));
+            out.protected
+                .push(rows.iter().any(|&i| protected[i as usize]));
             out.copied.push(GONE);
             continue;
         }
         for &i in rows {
             out.parents[i as usize] = out.splats.len() as u32;
             push_copy(&mut out.splats, splats, i as usize);
-            out.flags.push(flags[i as usize]);
+            out.protected.push(protected[i as usize]);
             out.copied.push(i);
         }
     }

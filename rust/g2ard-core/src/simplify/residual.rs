@@ -12,7 +12,7 @@ pub fn color(splats: &Splats, i: usize) -> [f64; 3] {
 }
 
 /// p_i = 1[E_c(i) > ε_h] (eq. `frequency`), over about `cells` cells.
-pub fn flags(
+pub fn protection_flags(
     splats: &Splats,
     cells: usize,
     constants: &Paper,

@@ -173,11 +173,11 @@ impl Tile<'_> {
             ));
         }
         let blur = self.blurs();
-        let flags = vec![false; of.len()];
+        let protected = vec![false; of.len()];
         let (step, clamped) = Partition { of, count }.assemble(
             self.scene,
             self.ordered,
-            &flags,
+            &protected,
             self.policy.max_growth,
             |i| blur[i].into(),
             control,

@@ -1,4 +1,4 @@
-//! (1 − λ)·L1 + λ·(1 − SSIM) and its gradient in two passes over bands of rows.
+//! (1 − λ)·L1 + λ·(1 − SSIM) and its gradient in two passes over bands of rows: `Forward` and `Backward` in `bands.rs`.
 //!
 //! With e = x − y the textbook fraction reads SSIM = l·c, l = 1 − d²/P, c = 1 − E/Q, where d = ⟨e⟩, E = ⟨e²⟩ − d²,
 //! P = μx² + μy² + C₁, Q = σx² + σy² + C₂: nothing cancels where the images agree, and SSIM(x, x) is 1 exactly.

@@ -100,7 +100,7 @@ impl Group {
 
 /// A group that a view can see.
 #[derive(Debug, Clone, Copy)]
-pub struct LiveGroup {
+pub struct VisibleGroup {
     pub number: u32,
     /// The first and the last row of the image's tiles that its rows can touch.
     pub tile_rows: [u16; 2],
@@ -108,21 +108,21 @@ pub struct LiveGroup {
 
 /// The groups a view can see, one after another.
 #[derive(Clone, Copy)]
-pub struct CulledGroups<'a> {
+pub struct VisibleGroups<'a> {
     pub groups: &'a [Group],
     /// Numbers of the groups that the view can see, ascending.
-    pub live: &'a [u32],
+    pub visible: &'a [u32],
     pub rows: usize,
 }
 
-impl CulledGroups<'_> {
+impl VisibleGroups<'_> {
     #[inline(always)]
     fn value<F: Lanes>(&self, group: usize, value: usize) -> F {
-        F::load(&self.groups[self.live[group] as usize].values[value])
+        F::load(&self.groups[self.visible[group] as usize].values[value])
     }
 }
 
-impl Source for CulledGroups<'_> {
+impl Source for VisibleGroups<'_> {
     const COLOURED: bool = false;
 
     #[inline(always)]

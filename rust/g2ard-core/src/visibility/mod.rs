@@ -16,7 +16,7 @@ use crate::raster::params::check_count;
 use crate::raster::simd::LANES;
 use crate::raster::{Camera, Frustum, Rasterizer, Settings, TileGrid};
 use crate::scene::{Means, Ordered, SceneRef};
-use groups::{Bounds, CulledGroups, Group, LiveGroup};
+use groups::{Bounds, Group, VisibleGroup, VisibleGroups};
 pub use kernels::VisibilityKernels;
 
 /// Σ αT² and the smallest pixel of each of N Gaussians over the views added so far. The result depends neither on the
@@ -34,8 +34,8 @@ pub struct VisibilityAccumulator {
     /// The largest pixel size of each group: a view from farther away lowers none.
     largest: Vec<f32>,
     rasterizer: Rasterizer,
-    /// Groups that a band of the image may meet.
-    band: usize,
+    /// Most groups that a band of the image may meet, unless one row of tiles meets more.
+    groups_per_band: usize,
     /// Data that a device keeps of the scene between calls.
     pub held: Option<Box<dyn Any + Send + Sync>>,
 }
@@ -59,7 +59,7 @@ impl VisibilityAccumulator {
             ordered,
             shift,
             rasterizer: Rasterizer::default(),
-            band: BAND,
+            groups_per_band: GROUPS_PER_BAND,
             held: None,
         })
     }
@@ -87,7 +87,7 @@ impl VisibilityAccumulator {
         camera
     }
 
-    /// Adds views whose Σ αT² of each Gaussian was found elsewhere.
+    /// Adds views whose Σ αT² per Gaussian, `weights`, another device computed.
     pub fn add_sums(&mut self, cameras: &[Camera], weights: &[f32]) {
         for (sum, &weight) in self.weight.iter_mut().zip(weights) {
             *sum += f64::from(weight);
@@ -95,32 +95,36 @@ impl VisibilityAccumulator {
         for camera in cameras {
             let camera = self.relative(camera);
             let frustum = Frustum::of(&camera);
-            let live = self.live(&frustum);
-            self.find_pixels(&camera, &frustum, &live);
+            let visible = self.visible_groups(&frustum);
+            self.lower_pixel_sizes(&camera, &frustum, &visible);
         }
     }
 
-    /// Adds a view in the scene's coordinates.
+    /// Adds the Σ αT² of a view, in the scene's coordinates, to each Gaussian's, and lowers their pixel sizes.
+    ///
+    /// The image is drawn in bands of rows, each from the groups that it meets.
     pub fn add(&mut self, camera: &Camera, settings: &Settings) -> Result<()> {
         camera.validate()?;
         settings.validate()?;
         let camera = self.relative(camera);
         let frustum = Frustum::of(&camera);
-        let live = self.live(&frustum);
-        self.find_pixels(&camera, &frustum, &live);
+        let visible = self.visible_groups(&frustum);
+        self.lower_pixel_sizes(&camera, &frustum, &visible);
         let grid = TileGrid::of(&camera);
-        for rows in bands(&live, grid.rows, self.band) {
+        for rows in bands(&visible, grid.rows, self.groups_per_band) {
             let [first, last] = [rows.start as u16, rows.end as u16 - 1];
-            let here = live.iter();
-            let here = here.filter(|g| g.tile_rows[0] <= last && g.tile_rows[1] >= first);
-            let here: Vec<u32> = here.map(|g| g.number).collect();
-            self.add_band(&camera, settings, grid.with_rows(rows), &here);
+            let in_band: Vec<u32> = visible
+                .iter()
+                .filter(|group| group.tile_rows[0] <= last && group.tile_rows[1] >= first)
+                .map(|group| group.number)
+                .collect();
+            self.add_band(&camera, settings, grid.with_rows(rows), &in_band);
         }
         Ok(())
     }
 
     /// The groups that a view can see, ascending.
-    fn live(&self, frustum: &Frustum) -> Vec<LiveGroup> {
+    fn visible_groups(&self, frustum: &Frustum) -> Vec<VisibleGroup> {
         let blocks = self.blocks.par_iter().zip(self.bounds.par_chunks(BLOCK));
         blocks
             .enumerate()
@@ -129,24 +133,24 @@ impl VisibilityAccumulator {
                 groups.iter().enumerate().filter_map(move |(at, group)| {
                     let tile_rows = group.tile_rows(frustum)?;
                     let number = (block * BLOCK + at) as u32;
-                    Some(LiveGroup { number, tile_rows })
+                    Some(VisibleGroup { number, tile_rows })
                 })
             })
             .collect()
     }
 
-    /// Adds what some rows of the image's tiles show of the groups `live`, ascending.
-    fn add_band(&mut self, camera: &Camera, settings: &Settings, grid: TileGrid, live: &[u32]) {
-        let Some(&last) = live.last() else { return };
+    /// Adds what the rows of tiles in `grid` show of the groups `in_band`, ascending.
+    fn add_band(&mut self, camera: &Camera, settings: &Settings, grid: TileGrid, in_band: &[u32]) {
+        let Some(&last) = in_band.last() else { return };
         let past_end = (LANES * (last as usize + 1)).saturating_sub(self.weight.len());
-        let source = CulledGroups {
+        let source = VisibleGroups {
             groups: &self.groups,
-            live,
-            rows: live.len() * LANES - past_end,
+            visible: in_band,
+            rows: in_band.len() * LANES - past_end,
         };
         let weight = DisjointSlice::new(&mut self.weight);
         let add = |row: usize, total: Total| {
-            let row = live[row / LANES] as usize * LANES + row % LANES;
+            let row = in_band[row / LANES] as usize * LANES + row % LANES;
             // SAFETY: the call comes once for every row.
             unsafe { *weight.at(row) += total.weight };
         };
@@ -170,12 +174,12 @@ impl VisibilityAccumulator {
         (weight, pixel_size)
     }
 
-    /// Lowers each live row's pixel size to that of this view.
-    fn find_pixels(&mut self, camera: &Camera, frustum: &Frustum, live: &[LiveGroup]) {
+    /// Lowers each visible row's pixel size to that of this view.
+    fn lower_pixel_sizes(&mut self, camera: &Camera, frustum: &Frustum, visible: &[VisibleGroup]) {
         let count = self.pixel_size.len();
         let pixel_size = DisjointSlice::new(&mut self.pixel_size);
         let largest = DisjointSlice::new(&mut self.largest);
-        live.par_iter().for_each(|g| {
+        visible.par_iter().for_each(|g| {
             let (number, first) = (g.number as usize, g.number as usize * LANES);
             // SAFETY: no two groups share rows, and each is there once.
             let (sizes, largest) = unsafe {
@@ -200,15 +204,14 @@ impl VisibilityAccumulator {
 /// Groups that are tested together before each is.
 const BLOCK: usize = 16;
 
-/// Groups that are drawn together where a row of tiles does not meet more: projections, lists of tiles and keys take
-/// about 130 bytes a row while they are.
-const BAND: usize = 1 << 14;
+/// A band's projections, lists of tiles and keys take about 130 bytes per Gaussian.
+const GROUPS_PER_BAND: usize = 1 << 14;
 
-/// The image's rows of tiles in bands, each as high as it can be and meet no more than `most` groups, but one row at
-/// least. A group that meets two bands is projected for both.
-fn bands(live: &[LiveGroup], rows: usize, most: usize) -> Vec<Range<usize>> {
+/// Splits the image's rows of tiles into bands that meet at most `most` groups each, or have a single row. A group that
+/// meets two bands is projected for both.
+fn bands(visible: &[VisibleGroup], rows: usize, most: usize) -> Vec<Range<usize>> {
     let (mut starts, mut ends) = (vec![0; rows], vec![0; rows]);
-    for group in live {
+    for group in visible {
         starts[usize::from(group.tile_rows[0])] += 1;
         ends[usize::from(group.tile_rows[1])] += 1;
     }
@@ -317,9 +320,9 @@ mod tests {
             rasterizer.accumulate_from::<SQUARED, _>(params, &camera, &settings, grid, add);
             let frustum = Frustum::of(&camera);
             let alone = views.bounds.iter().map(|b| b.tile_rows(&frustum).is_some());
-            let live: Vec<usize> = (0..).zip(alone).filter(|g| g.1).map(|g| g.0).collect();
-            let found = views.live(&frustum);
-            assert!(found.iter().map(|g| g.number as usize).eq(live));
+            let visible: Vec<usize> = (0..).zip(alone).filter(|g| g.1).map(|g| g.0).collect();
+            let found = views.visible_groups(&frustum);
+            assert!(found.iter().map(|g| g.number as usize).eq(visible));
             met += found.len();
         }
         let (weight, pixel_size) = views.by_row();
@@ -343,7 +346,7 @@ mod tests {
         let rows = scene();
         let scene = made(&rows);
         let (mut whole, mut split) = (accumulator(&scene), accumulator(&scene));
-        split.band = 10;
+        split.groups_per_band = 10;
         for camera in cameras() {
             whole.add(&camera, &Settings::default()).unwrap();
             split.add(&camera, &Settings::default()).unwrap();

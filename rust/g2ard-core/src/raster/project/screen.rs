@@ -1,4 +1,4 @@
-//! A chunk of Gaussians' splats, written out.
+//! Projection of a chunk of Gaussians: visible splats and the tiles that they touch.
 
 use super::{Projected, Splat, View, colour, direction, on_image, project};
 use crate::raster::grid::TileGrid;
@@ -7,8 +7,8 @@ use crate::raster::simd::{Kernel, LANES, Lanes, Lanes16, Mask, Wide};
 use crate::raster::tile_lists::{Ellipses, TileIntersector, TileList};
 use crate::raster::{ALPHA_MIN, Convention, TILE, sh};
 
-/// Projects the groups `first..last`; visible splats go to the front of `out` in row order, each with
-/// its tile_list. Returns how many.
+/// Projects the groups of sixteen rows `first..last`. Visible splats go to the front of `out` in row order, and
+/// their lists of tiles to the same places of `tile_lists`. Returns their count.
 pub struct Project<'a, S: Source> {
     pub view: &'a View,
     pub source: S,
@@ -29,14 +29,14 @@ impl<S: Source> Kernel for Project<'_, S> {
         self.intersector.clear();
         for group in self.first..self.last {
             let p = project::<F, S>(self.view, &self.source, group);
-            let rows = (self.source.len() - group * LANES).min(LANES);
+            let real_lanes = (self.source.len() - group * LANES).min(LANES);
             let visible = p.visible.and(p.on_rows(&self.grid));
-            let bits = u32::from(visible.bits()) & ((1u32 << rows) - 1);
+            let bits = u32::from(visible.bits()) & ((1u32 << real_lanes) - 1);
             if bits == 0 {
                 continue;
             }
-            let some = count + bits.count_ones() as usize;
-            let tile_lists = &mut self.tile_lists[count..some];
+            let end = count + bits.count_ones() as usize;
+            let tile_lists = &mut self.tile_lists[count..end];
             p.ellipses(self.view)
                 .tile_lists(bits, self.grid, self.intersector, tile_lists);
             let mut rgb = [F::zero(); 3];
@@ -49,7 +49,7 @@ impl<S: Source> Kernel for Project<'_, S> {
             let (mut x, mut y) = ([0.0; LANES], [0.0; LANES]);
             p.x.store(&mut x);
             p.y.store(&mut y);
-            let mut rows = [Lanes16::default(); 8];
+            let mut stored = [Lanes16::default(); 8];
             let values = [
                 p.a,
                 p.b,
@@ -61,34 +61,34 @@ impl<S: Source> Kernel for Project<'_, S> {
                 p.depth,
             ];
             for k in 0..8 {
-                values[k].store(&mut rows[k]);
+                values[k].store(&mut stored[k]);
             }
             let mut todo = bits;
-            for (splat, tile_list) in self.out[count..some].iter_mut().zip(tile_lists) {
+            for (splat, tile_list) in self.out[count..end].iter_mut().zip(tile_lists) {
                 let l = todo.trailing_zeros() as usize;
                 todo &= todo - 1;
                 *splat = Splat {
                     x: x[l],
                     y: y[l],
-                    a: rows[0].0[l],
-                    b: rows[1].0[l],
-                    c: rows[2].0[l],
-                    log2_opacity: rows[3].0[l],
-                    rgb: [rows[4].0[l], rows[5].0[l], rows[6].0[l]],
-                    depth: rows[7].0[l],
+                    a: stored[0].0[l],
+                    b: stored[1].0[l],
+                    c: stored[2].0[l],
+                    log2_opacity: stored[3].0[l],
+                    rgb: [stored[4].0[l], stored[5].0[l], stored[6].0[l]],
+                    depth: stored[7].0[l],
                     row: (group * LANES + l) as u32,
                     tiles: tile_list.tiles,
                     slot: tile_list.slot,
                 };
             }
-            count = some;
+            count = end;
         }
         count
     }
 }
 
 impl<F: Lanes> Projected<F> {
-    /// Whether they may touch the grid's rows of tiles.
+    /// Lanes that may touch the grid's rows of tiles.
     #[inline(always)]
     fn on_rows(&self, grid: &TileGrid) -> F::Mask {
         let first = (grid.first_row * TILE) as f32;
@@ -96,6 +96,7 @@ impl<F: Lanes> Projected<F> {
         on_image(y, self.half[1], (grid.rows * TILE) as f32)
     }
 
+    /// The outlines at α = 1/255, slightly enlarged against rounding (see [`Ellipses::level`]).
     #[inline(always)]
     fn ellipses(&self, view: &View) -> Ellipses<F> {
         let reach = (self.log2_opacity - F::splat(ALPHA_MIN.log2())).max(F::zero());
