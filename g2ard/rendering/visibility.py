@@ -116,7 +116,7 @@ class SampledVisibility:
 
 
 def visibility_source(
-    cameras: Cameras, *, views: int = MOST_LOOKS, longest: int = LONGEST, progress: Progress = silent
+    cameras: Cameras, *, longest: int = LONGEST, progress: Progress = silent
 ) -> Callable[[Splats], SampledVisibility]:
     """Return a function that samples a scene's visibility from a few small renders, for `simplify`.
 
@@ -126,9 +126,8 @@ def visibility_source(
     Results do not depend on the order of the scene's rows.
 
     Args:
-        cameras: the views; at most `views` of them are used, evenly spaced, and none from anywhere if there
-            are others: near views would outweigh all others in Σ αT.
-        views: upper limit of the number of views.
+        cameras: the views; at most 96 of them are used, evenly spaced, and none from anywhere if there are
+            others: near views would outweigh all others in Σ αT².
         longest: longer side of the renders, pixels; `pixel_size` refers to the full image.
         progress: called after each view.
 
@@ -136,14 +135,15 @@ def visibility_source(
         scene → `SampledVisibility`. The scene's arrays are C-contiguous and float32, except its means. A
         `g2ard.scene.prepared.PreparedScene` is not sorted again.
     """
-    return _Sampler(cameras.take(usual_rows(cameras.names)), views, longest, progress)
+    return _Sampler(cameras.take(usual_rows(cameras.names)), longest, progress)
 
 
 class _Sampler:
     """Function of `visibility_source`: `rounds` of views, of which the first `used` are rendered."""
 
-    def __init__(self, cameras: Cameras, views: int, longest: int, progress: Progress) -> None:
-        sample = np.unique(np.linspace(0, len(cameras) - 1, min(views, len(cameras))).round().astype(int))
+    def __init__(self, cameras: Cameras, longest: int, progress: Progress) -> None:
+        count = min(MOST_LOOKS, len(cameras))
+        sample = np.unique(np.linspace(0, len(cameras) - 1, count).round().astype(int))
         full = cameras.take(sample)
         self.cameras = full.resized(longest)
         self.shrunk = np.float32((self.cameras.widths / full.widths).mean())

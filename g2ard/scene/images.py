@@ -279,19 +279,20 @@ def contact_sheet(
     labels: Sequence[str],
     *,
     row_labels: Sequence[str] = (),
-    cell_width: int | None = None,
 ) -> NDArray[np.uint8]:
     """Arrange images in a grid: one row per view, one column per kind (photo, simplified, recovered…).
 
     Args:
         rows: rows of images (H, W, 3), floats in [0, 1] or bytes, of any sizes; rows may be short.
         row_labels: a caption under each row; () for none.
-        cell_width: resize every image to this width; None keeps sizes.
 
     Returns:
         (H, W, 3) bytes, on a dark background.
     """
-    grid = [[_cell(image, cell_width) for image in row] for row in rows]
+    grid = [
+        [Image.fromarray(np.ascontiguousarray(to_bytes(image))).convert("RGB") for image in row]
+        for row in rows
+    ]
     if not any(grid):
         raise InputError("a contact sheet needs images")
     columns = max(map(len, grid))
@@ -314,11 +315,3 @@ def contact_sheet(
             draw.text((_GAP, top + height), row_labels[r], fill=(200, 200, 200), font=font)
         top += height + foot + _GAP
     return np.asarray(sheet)
-
-
-def _cell(image: ArrayLike, width: int | None) -> Image.Image:
-    cell = Image.fromarray(np.ascontiguousarray(to_bytes(image))).convert("RGB")
-    if width is None or cell.width == width:
-        return cell
-    height = max(1, round(cell.height * width / cell.width))
-    return cell.resize((width, height), Image.Resampling.LANCZOS)
