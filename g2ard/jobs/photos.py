@@ -47,8 +47,8 @@ _HYPOTHESES, _FINER = 3, 5
 """Depths of a ray that are refined, and finer trials around each."""
 _SUPPORTED, _DISTINCT = 0.05, 0.25
 """Largest cost of a point, absolute and as a share of the usual cost on its ray."""
-_PATIENCE = 8
-"""Rays per point after which both limits are doubled."""
+_RAYS_PER_DOUBLING = 8
+"""Rays per requested point after which both limits of cost are doubled."""
 _RAYS = 2048
 """Rays at a time."""
 
@@ -115,7 +115,7 @@ def topped_up(
     if wanting:
         (train,) = load_view_sets(views, ["train" if held_out is None else for_training], _SIDE)
         parts.append(
-            points_within_sight(train.cameras, wanting, background=background, seed=seed, progress=progress)
+            points_along_rays(train.cameras, wanting, background=background, seed=seed, progress=progress)
         )
     starts = [
         words
@@ -158,7 +158,7 @@ def sparse_file(views: Path) -> Path | None:
     return file.parent / str(listed) if listed else None
 
 
-def points_within_sight(
+def points_along_rays(
     cameras: Cameras,
     count: int,
     *,
@@ -169,8 +169,9 @@ def points_within_sight(
     """Place points on the rays of random pixels, where nearby photos agree best on the colour.
 
     z* = argmin_z of the mean difference of a patch around the pixel from those of the two nearby views that
-    agree best. Points on which no photo agrees, or on whose ray many depths agree, are dropped. If photos
-    have alpha, only pixels that show the object count, and points lie in its visual hull.
+    agree best. Points on which no photo agrees, or on whose ray many depths agree, are dropped; these limits
+    are relaxed if too few points remain. If photos have alpha, only pixels that show the object count, and
+    points lie in its visual hull.
 
     Args:
         cameras: C ≥ 3 views with photos, in world coordinates.
@@ -197,10 +198,10 @@ def points_within_sight(
         outlines.append(image[..., 3] > 0.5 if image.shape[2] == 4 else None)
         progress("photos", view + 1, len(cameras))
     rng = np.random.default_rng([seed, 11])
-    middle = _looked_at(cameras)
-    reach = np.linalg.norm(cameras.positions - middle, axis=1)
+    centre = _common_centre(cameras)
+    distances = np.linalg.norm(cameras.positions - centre, axis=1)
     near = [_neighbours(cameras, i) for i in range(len(cameras))]
-    hull = visual_hull(cameras, outlines, middle)
+    hull = visual_hull(cameras, outlines, centre)
     positions, colors, tried = np.zeros((0, 3)), np.zeros((0, 3), np.float32), 0
     while len(positions) < count:
         if tried > 64 * max(count, _RAYS):
@@ -209,10 +210,10 @@ def points_within_sight(
         rays = min(_RAYS, max(64, -(-count // len(cameras))))
         pixels = _pixels(photos[view], outlines[view], rays, background, rng)
         if hull is None:
-            depths = reach[view] / np.linspace(1 / _NEAREST, 1 / _FARTHEST, _DEPTHS)
+            depths = distances[view] / np.linspace(1 / _NEAREST, 1 / _FARTHEST, _DEPTHS)
         else:
             depths = hull.depths(cameras, view, _HULL_DEPTHS)
-        slack = 2.0 ** (tried // (_PATIENCE * max(count, _RAYS)))
+        slack = 2.0 ** (tried // (_RAYS_PER_DOUBLING * max(count, _RAYS)))
         xyz, rgb = _swept(cameras, photos, view, near[view], pixels, depths, hull, slack)
         tried += rays
         positions, colors = np.concatenate([positions, xyz]), np.concatenate([colors, rgb])
@@ -220,7 +221,7 @@ def points_within_sight(
     return Points(positions[:count], np.ascontiguousarray(colors[:count]))
 
 
-def _looked_at(cameras: Cameras) -> Float:
+def _common_centre(cameras: Cameras) -> Float:
     """Return the (3,) point nearest to all optical axes, or a point ahead of the mean camera if they hardly
     cross."""
     across = np.eye(3) - cameras.forwards[:, :, None] * cameras.forwards[:, None, :]

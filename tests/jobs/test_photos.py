@@ -8,7 +8,7 @@ import pytest
 
 import g2ard
 from g2ard.jobs.hull import visual_hull
-from g2ard.jobs.photos import points_within_sight
+from g2ard.jobs.photos import points_along_rays
 from g2ard.scene.images import load_premultiplied, write_png
 from helpers.commands import CommandLine, refused, succeeds
 from helpers.photos import photos_of, rgba_photos_of
@@ -48,22 +48,22 @@ def test_sparse_points_given_as_a_cloud_are_known_and_other_clouds_are_surfaces(
     assert "MB, scan.ply has 0." in scan, scan
 
 
-def test_points_within_sight_lie_on_the_surface(tmp_path: Path) -> None:
+def test_points_along_rays_lie_on_the_surface(tmp_path: Path) -> None:
     photos_of(tmp_path / "photos")
     cameras = g2ard.load_views(tmp_path / "photos")
-    found = points_within_sight(cameras, 600)
+    found = points_along_rays(cameras, 600)
     assert found.positions.shape == (600, 3)
     bright = found.colors.max(1) > 0.1  # the background is black everywhere, and everywhere agrees
     away = np.abs(np.linalg.norm(found.positions[bright], axis=1) - 1)
     assert np.median(away) < 0.15
-    np.testing.assert_array_equal(found.positions, points_within_sight(cameras, 600).positions)
+    np.testing.assert_array_equal(found.positions, points_along_rays(cameras, 600).positions)
 
 
 def test_alpha_carves_the_start(tmp_path: Path) -> None:
     cameras = rgba_photos_of(tmp_path, distance=5)
     found = g2ard.load_views(tmp_path, split="train")
     for background in ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0)):
-        points = points_within_sight(found, 600, background=background)
+        points = points_along_rays(found, 600, background=background)
         away = np.linalg.norm(points.positions, axis=1)
         assert np.quantile(np.abs(away - 1), 0.9) < 0.25, background
     outlines = [np.ones((48, 64), bool)] * len(cameras)
@@ -100,6 +100,6 @@ def test_points_that_no_second_photo_supports_are_dropped(tmp_path: Path) -> Non
     for path in cameras.image_paths[::4]:
         assert path is not None
         write_png(path, noise.uniform(0.2, 1, (48, 64, 3)), overwrite=True)  # a quarter shows nothing of it
-    found = points_within_sight(cameras, 600)
+    found = points_along_rays(cameras, 600)
     away = np.abs(np.linalg.norm(found.positions, axis=1) - 1)
     assert np.mean(away < 0.25) > 0.8

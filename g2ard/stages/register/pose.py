@@ -14,8 +14,8 @@ def rotation_of(omega: ArrayLike) -> Float:
     >>> np.round(rotation_of([0, 0, np.pi / 2]) @ [1, 0, 0], 12).tolist()
     [0.0, 1.0, 0.0]
     """
-    cross, sine, cosine = _parts(omega)
-    return np.eye(3) + sine * cross + cosine * (cross @ cross)
+    cross, first, second = _rodrigues(omega)
+    return np.eye(3) + first * cross + second * (cross @ cross)
 
 
 def moved(viewmat: Float, xi: ArrayLike) -> Float:
@@ -25,15 +25,16 @@ def moved(viewmat: Float, xi: ArrayLike) -> Float:
     re-orthogonalised, so that rounding does not accumulate.
     """
     v, omega = np.asarray(xi, np.float64)[:3], np.asarray(xi, np.float64)[3:]
-    cross, sine, cosine = _parts(omega)
+    cross, first, second = _rodrigues(omega)
     angle2 = float(omega @ omega)
-    third = (1 - sine) / angle2 if angle2 > 1e-8 else 1 / 6
+    third = (1 - first) / angle2 if angle2 > 1e-8 else 1 / 6
     square = cross @ cross
-    turn = np.eye(3) + sine * cross + cosine * square
+    R = np.eye(3) + first * cross + second * square
+    V = np.eye(3) + second * cross + third * square
     out = np.eye(4)
-    U, _, Vt = np.linalg.svd(turn @ viewmat[:3, :3])
+    U, _, Vt = np.linalg.svd(R @ viewmat[:3, :3])
     out[:3, :3] = U @ Vt
-    out[:3, 3] = turn @ viewmat[:3, 3] + (np.eye(3) + cosine * cross + third * square) @ v
+    out[:3, 3] = R @ viewmat[:3, 3] + V @ v
     return out
 
 
@@ -73,8 +74,8 @@ def pose_error(found: Float, true: Float) -> tuple[float, float]:
     return float(np.linalg.norm(centres[0] - centres[1])), float(angle)
 
 
-def _parts(omega: ArrayLike) -> tuple[Float, float, float]:
-    """Return [ω]ₓ, sin θ/θ and (1 − cos θ)/θ², by series for small θ."""
+def _rodrigues(omega: ArrayLike) -> tuple[Float, float, float]:
+    """Return [ω]ₓ and Rodrigues' coefficients sin θ/θ and (1 − cos θ)/θ², by series for small θ."""
     x, y, z = np.asarray(omega, np.float64)
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     angle2 = x * x + y * y + z * z
