@@ -13,7 +13,7 @@ import pytest
 
 import g2ard
 from g2ard.errors import InputError
-from g2ard.stages.recover.anchors import PAPER_PRESETS, PRESETS
+from g2ard.stages.recover.anchors import PAPER_REGULARIZERS, REGULARIZERS
 from helpers.project import ROOT
 from helpers.scenes import around, checkered_ball
 
@@ -238,8 +238,8 @@ def test_scripts_need_no_deep_imports() -> None:
         if re.match(r"\s*(from g2ard\.(?!synth import)|import g2ard\.)", line)
     ]
     assert deep == []
-    assert g2ard.Regularizers.of("lift") == PRESETS["lift"]
-    assert g2ard.Regularizers.of("noisy", paper=True) == PAPER_PRESETS["noisy"]
+    assert g2ard.Regularizers.of("lift") == REGULARIZERS["lift"]
+    assert g2ard.Regularizers.of("noisy", paper=True) == PAPER_REGULARIZERS["noisy"]
     with pytest.raises(InputError, match="one of trained, lift, noisy, got 'lifted'"):
         g2ard.Regularizers.of("lifted")
     targets = g2ard.TeacherRenders(BALL, around(4, (32, 24)))

@@ -38,8 +38,8 @@ from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
 from g2ard.scene.splits import states_splits
 from g2ard.scene.targets import Targets
-from g2ard.stages.recover.anchors import PRESETS, needle
-from g2ard.stages.recover.presets import preset_for
+from g2ard.stages.recover.anchors import REGULARIZERS, needle
+from g2ard.stages.recover.prior import regularizers_for
 from g2ard.stages.simplify import METHODS as SIMPLIFIERS
 from g2ard.stages.simplify import round_counts
 
@@ -243,7 +243,7 @@ class MatchedWorkspace(Workspace):
             "schedule": "default",
             "steps": self.scene.train_prior,
             "seconds": None,
-            "regularizers": asdict(PRESETS["lift"]),
+            "regularizers": asdict(REGULARIZERS["lift"]),
             "sh_degree": 3,
             "final": True,
             "seed": 0,
@@ -437,7 +437,9 @@ class _Pipeline:
         method = self.method
         papers = method.lambdas == "paper"
         known = {"given": self.place.scene.regularizers}.get(self.prior, self.prior) if papers else "auto"
-        chosen, _, _ = preset_for(known if method.preset == "auto" else method.preset, prior, paper=papers)
+        chosen, _, _ = regularizers_for(
+            known if method.preset == "auto" else method.preset, prior, paper=papers
+        )
         if method.anchor is not None:
             chosen = replace(chosen, anchor=method.anchor)
         if method.shape is not None:

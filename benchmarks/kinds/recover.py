@@ -23,8 +23,15 @@ from g2ard.rendering.visibility import visibility_source
 from g2ard.scene.splats import Splats
 from g2ard.scene.targets import Targets
 from g2ard.stages.recover import RecoverConfig, recover
-from g2ard.stages.recover.anchors import PAPER_PRESETS, Anchors, Regularizers, drift95, effective_rank, needle
-from g2ard.stages.recover.presets import preset_for
+from g2ard.stages.recover.anchors import (
+    PAPER_REGULARIZERS,
+    Anchors,
+    Regularizers,
+    drift95,
+    effective_rank,
+    needle,
+)
+from g2ard.stages.recover.prior import regularizers_for
 from g2ard.stages.recover.report import RecoverReport
 from g2ard.stages.recover.schedule import PAPER, TUNED, Schedule
 from g2ard.stages.simplify import round_counts, simplify
@@ -185,8 +192,8 @@ class _Workspace(Workspace):
     def weights(self, variant: Variant) -> Regularizers:
         """Return the regularisers: the paper's for its schedule, with the variant's factors."""
         views = self.train_cameras if self.scene.targets == "photos" else None
-        preset, why, _ = preset_for("auto", self.splats, views)
-        own = PAPER_PRESETS[why.split()[0]] if variant.schedule == "paper" else preset
+        preset, why, _ = regularizers_for("auto", self.splats, views)
+        own = PAPER_REGULARIZERS[why.split()[0]] if variant.schedule == "paper" else preset
         return replace(own, anchor=own.anchor * variant.anchor, shape=own.shape * variant.shape)
 
     def distillation(self, variant: Variant, budget: int, steps: int, seed: int) -> DistillConfig:
@@ -197,7 +204,7 @@ class _Workspace(Workspace):
         assert variant.preset is not None
         given = {**PRESETS[variant.preset], **variant.settings}
         views = self.train_cameras if self.scene.targets == "photos" else None
-        weights, _, _ = preset_for(given.get("recover.regularizers", "auto"), self.splats, views)
+        weights, _, _ = regularizers_for(given.get("recover.regularizers", "auto"), self.splats, views)
         values = {
             **variant.settings,
             "recover.regularizers": weights,

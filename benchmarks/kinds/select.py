@@ -28,7 +28,7 @@ from g2ard.scene.targets import Subset, Targets
 from g2ard.stages.evaluate import evaluate
 from g2ard.stages.lift import lift
 from g2ard.stages.recover import RecoverConfig, recover
-from g2ard.stages.recover.anchors import PRESETS
+from g2ard.stages.recover.anchors import REGULARIZERS
 from g2ard.stages.select import CoverageOptions, Selection, select
 from g2ard.stages.simplify import simplify
 
@@ -114,7 +114,7 @@ class Select(Study):
         background = universe.scene.background
         config = RecoverConfig(
             steps=self.steps[-1],
-            regularizers=PRESETS["lift" if universe.lifted else "trained"],
+            regularizers=REGULARIZERS["lift" if universe.lifted else "trained"],
             sh_degree=3 if universe.lifted else None,
             background=background,
             seed=seed,

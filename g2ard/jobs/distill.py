@@ -26,7 +26,7 @@ from g2ard.scene.splats import Splats
 from g2ard.scene.targets import kinds_told
 from g2ard.stages.lift import lift
 from g2ard.stages.recover.anchors import FREE, Regularizers
-from g2ard.stages.recover.presets import PriorMeasures, measure_prior, preset_for
+from g2ard.stages.recover.prior import PriorMeasures, measure_prior, regularizers_for
 
 Scene = Splats | Points | str | Path | None
 
@@ -214,7 +214,7 @@ def _sources(views: RunViews, photos: bool | None, lifted: bool) -> _Sources:
 def _regularizers(
     prior: Splats, views: RunViews, options: DistillOptions, sources: _Sources, read: _Read
 ) -> tuple[Regularizers, str, PriorMeasures]:
-    """Choose regularisers with `preset_for`, or none for points of photos.
+    """Choose regularisers with `regularizers_for`, or none for points of photos.
 
     View consistency is measured only for photos.
     """
@@ -224,7 +224,7 @@ def _regularizers(
     )
     if read.from_photos and kind == "auto" and not paper:
         return FREE, "none (points found in photos are not a surface to hold to)", measure_prior(prior)
-    return preset_for(
+    return regularizers_for(
         "paper-lift" if read.lifted and kind == "paper" else kind,
         prior,
         views.train.cameras if sources.photos else None,

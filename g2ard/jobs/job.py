@@ -17,7 +17,7 @@ from g2ard.rendering.renderer import Renderer
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
 from g2ard.scene.targets import Targets, kinds_of
-from g2ard.stages.recover.presets import PriorMeasures
+from g2ard.stages.recover.prior import PriorMeasures
 
 
 @dataclass(frozen=True, eq=False)

@@ -26,7 +26,7 @@ from g2ard.pipeline import DistillConfig
 from g2ard.progress import Progress, Say, plural, silent, unsaid
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
-from g2ard.stages.recover.presets import preset_for
+from g2ard.stages.recover.prior import regularizers_for
 from g2ard.stages.recover.schedule import steps_for
 from g2ard.stages.simplify import SimplifyConfig
 from g2ard.tiles.executor import DaskExecutor, Workers, executor
@@ -364,7 +364,7 @@ def _job(
             progress=progress,
             say=say,
         )
-        regularizers, why, _ = preset_for(options.named("recover.regularizers") or "auto", sample)
+        regularizers, why, _ = regularizers_for(options.named("recover.regularizers") or "auto", sample)
         if learn:
             say(f"regularisers: {why}")
         config = options.configured(regularizers)

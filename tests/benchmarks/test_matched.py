@@ -17,7 +17,7 @@ from g2ard import io
 from g2ard.scene.splats import Splats
 from g2ard.scene.targets import TeacherRenders
 from g2ard.stages.evaluate import evaluate
-from g2ard.stages.recover.anchors import PAPER_PRESETS
+from g2ard.stages.recover.anchors import PAPER_REGULARIZERS
 from g2ard.stages.simplify import round_counts
 from helpers.scenes import around, checkered_ball
 from helpers.studies import STUDY, check_page, study
@@ -160,7 +160,7 @@ def test_a_given_prior_has_the_weights_of_the_kind_that_its_scene_states(tmp_pat
         (folder := tmp_path / kind).mkdir()
         _, _, out = run(folder, f'{text}{SCENE}regularizers = "{kind}"\n')
         weights = [job["regularizers"] for job in jobs(out, "recover")]
-        assert vars(PAPER_PRESETS[kind]) in weights
+        assert vars(PAPER_REGULARIZERS[kind]) in weights
 
 
 @needs_processes

@@ -9,7 +9,7 @@ from g2ard.errors import InputError
 from g2ard.io.scene_formats import FORMATS
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
-from g2ard.stages.recover.anchors import PAPER_PRESETS, PRESETS
+from g2ard.stages.recover.anchors import PAPER_REGULARIZERS, REGULARIZERS
 from g2ard.stages.recover.loop import engine_class
 from g2ard.stages.recover.schedule import SCHEDULES
 from g2ard.stages.select import select
@@ -19,7 +19,7 @@ from g2ard.stages.simplify import SimplifyConfig
 def test_every_list_of_names_matches_its_table() -> None:
     assert tuple(SCHEDULES) == choices.SCHEDULE_NAMES
     assert set(FORMATS) == set(get_args(choices.FormatName))
-    presets = {"auto", *PRESETS, "paper", *(f"paper-{name}" for name in PAPER_PRESETS)}
+    presets = {"auto", *REGULARIZERS, "paper", *(f"paper-{name}" for name in PAPER_REGULARIZERS)}
     assert set(get_args(choices.PresetName)) == presets
     for method in choices.METHODS:
         assert 0 < SimplifyConfig().retention_of(method) < 1

@@ -17,7 +17,7 @@ from g2ard.io import read_splats, write_splats, write_views
 from g2ard.pipeline import SelectConfig, distill
 from g2ard.scene.targets import TeacherRenders
 from g2ard.stages.recover import RecoverConfig, recover
-from g2ard.stages.recover.anchors import PAPER_PRESETS, Anchors, Regularizers, drift95
+from g2ard.stages.recover.anchors import PAPER_REGULARIZERS, Anchors, Regularizers, drift95
 from g2ard.stages.recover.schedule import PAPER, Schedule
 from g2ard.stages.simplify import simplify
 from helpers.commands import CommandLine, refused, succeeds
@@ -128,7 +128,7 @@ def test_the_other_commands_know_it(folder: Path, command_line: CommandLine) -> 
 
 def test_in_python() -> None:
     noisy = g2ard.preset("paper-noisy")
-    assert noisy.recover.regularizers == PAPER_PRESETS["noisy"]
+    assert noisy.recover.regularizers == PAPER_REGULARIZERS["noisy"]
     assert g2ard.preset("paper", g2ard.AdaptConfig()).stretches() == [7000]
     with pytest.raises(InputError, match="expected"):
         preset("peer")

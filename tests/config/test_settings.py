@@ -14,7 +14,7 @@ from g2ard.config.presets import preset
 from g2ard.errors import InputError
 from g2ard.io import write_splats, write_views
 from g2ard.pipeline import DistillConfig
-from g2ard.stages.recover.anchors import PRESETS
+from g2ard.stages.recover.anchors import REGULARIZERS
 from g2ard.stages.recover.schedule import PAPER
 from g2ard.stages.simplify import SimplifyConfig
 from helpers.commands import CommandLine, succeeds
@@ -56,7 +56,7 @@ def test_a_config_is_set_as_a_whole_by_its_name_and_its_fields_after_it() -> Non
     texts = ["schedule.rates.sh0=1", "recover.schedule=paper", "regularizers=lift"]
     found = changed(DistillConfig(), parse_settings(texts, DistillConfig())).recover
     assert found.schedule == replace(PAPER, rates=replace(PAPER.rates, sh0=1.0))
-    assert found.regularizers == PRESETS["lift"]
+    assert found.regularizers == REGULARIZERS["lift"]
     with pytest.raises(InputError, match="schedule: expected one of fast"):
         changed(DistillConfig(), {"recover.schedule": "slow"})
 

@@ -20,7 +20,7 @@ from g2ard.scene.targets import TeacherRenders
 from g2ard.stages.evaluate import evaluate
 from g2ard.stages.recover import RecoverConfig, loop, probe, recover, trials
 from g2ard.stages.recover import checkpoint as checkpoint_module
-from g2ard.stages.recover.anchors import PRESETS, Anchors
+from g2ard.stages.recover.anchors import REGULARIZERS, Anchors
 from g2ard.stages.recover.guard import Guard, blended
 from g2ard.stages.recover.report import outcome
 from g2ard.stages.recover.schedule import TUNED
@@ -66,7 +66,7 @@ def test_both_engines_take_the_same_steps(student: Splats, targets: TeacherRende
 
 
 def test_same_bits_from_run_to_run_and_for_any_threads(student: Splats, targets: TeacherRenders) -> None:
-    config = RecoverConfig(steps=25, regularizers=replace(PRESETS["noisy"], period=10))
+    config = RecoverConfig(steps=25, regularizers=replace(REGULARIZERS["noisy"], period=10))
     first, *others = on_threads(lambda: recover(student, targets, config).splats)
     for other in others:
         assert_same_bits(first, other)
@@ -76,7 +76,7 @@ def test_same_bits_from_run_to_run_and_for_any_threads(student: Splats, targets:
 def test_an_interrupted_run_resumes_to_the_same_bits(
     student: Splats, targets: TeacherRenders, engine: Any, steps: int, tmp_path: Path
 ) -> None:
-    config = RecoverConfig(steps=steps, engine=engine, regularizers=replace(PRESETS["lift"], period=10))
+    config = RecoverConfig(steps=steps, engine=engine, regularizers=replace(REGULARIZERS["lift"], period=10))
     whole = recover(student, targets, config)
     checkpoint = tmp_path / "c.npz"
     with pytest.raises(KeyboardInterrupt):
@@ -97,7 +97,7 @@ def test_an_interrupted_run_resumes_to_the_same_bits(
 def test_a_killed_run_resumes_from_the_last_checkpoint(
     student: Splats, targets: TeacherRenders, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    config = RecoverConfig(steps=30, regularizers=replace(PRESETS["lift"], period=10))
+    config = RecoverConfig(steps=30, regularizers=replace(REGULARIZERS["lift"], period=10))
     whole = recover(student, targets, config)
     monkeypatch.setattr(checkpoint_module, "PERIOD", 0.0)  # a minute has always passed
 

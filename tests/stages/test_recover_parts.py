@@ -12,8 +12,8 @@ from g2ard.errors import InputError
 from g2ard.scene.splats import Splats
 from g2ard.stages.recover import checkpoint
 from g2ard.stages.recover.anchors import (
-    PAPER_PRESETS,
-    PRESETS,
+    PAPER_REGULARIZERS,
+    REGULARIZERS,
     Anchors,
     Regularizers,
     drift95,
@@ -21,7 +21,7 @@ from g2ard.stages.recover.anchors import (
     needle,
 )
 from g2ard.stages.recover.losses import TorchAnchors, anchor_loss, regularization, shape_loss
-from g2ard.stages.recover.presets import preset_for, view_consistency
+from g2ard.stages.recover.prior import regularizers_for, view_consistency
 from g2ard.stages.recover.schedule import PAPER, TUNED, Schedule
 from helpers.scenes import around, checkered_ball
 from reference.rotations import rotations
@@ -146,17 +146,21 @@ def test_auto_preset_tells_lift_trained_and_noisy_apart() -> None:
         trained.means, scales=np.tile([1.0, 1e-3, 1e-3], (40, 1)), logit_opacities=trained.logit_opacities
     )
     round_ = Splats.create(trained.means, scales=np.ones((40, 3)), logit_opacities=trained.logit_opacities)
-    assert preset_for("auto", lift)[0] == PRESETS["lift"]
-    assert preset_for("auto", noisy)[0] == PRESETS["noisy"]
-    assert preset_for("auto", round_)[0] == PRESETS["trained"]
-    weights, why, measured = preset_for("lift", noisy)
-    assert weights == PRESETS["lift"]
+    assert regularizers_for("auto", lift)[0] == REGULARIZERS["lift"]
+    assert regularizers_for("auto", noisy)[0] == REGULARIZERS["noisy"]
+    assert regularizers_for("auto", round_)[0] == REGULARIZERS["trained"]
+    weights, why, measured = regularizers_for("lift", noisy)
+    assert weights == REGULARIZERS["lift"]
     assert why == "lift (as requested)"
-    assert preset_for("auto", lift, paper=True)[0] == PAPER_PRESETS["lift"] == Regularizers(1e-3, 1e-4, True)
+    assert (
+        regularizers_for("auto", lift, paper=True)[0]
+        == PAPER_REGULARIZERS["lift"]
+        == Regularizers(1e-3, 1e-4, True)
+    )
     assert measured.needle == 1
     assert measured.consistency is None
     with pytest.raises(InputError, match="preset"):
-        preset_for("gentle", trained)
+        regularizers_for("gentle", trained)
 
 
 def test_views_that_see_through_each_other_s_surfaces_make_a_prior_noisy() -> None:
@@ -168,9 +172,9 @@ def test_views_that_see_through_each_other_s_surfaces_make_a_prior_noisy() -> No
     foggy = replace(ball, means=strewn, logit_opacities=np.full(len(ball), 3, np.float32))
     sound, loose = view_consistency(ball, views), view_consistency(foggy, views)
     assert loose < 0.92 < 0.97 < sound
-    assert preset_for("auto", ball, views)[0] == PRESETS["trained"]
-    weights, why, _ = preset_for("auto", foggy, views)
-    assert weights == PRESETS["noisy"]
+    assert regularizers_for("auto", ball, views)[0] == REGULARIZERS["trained"]
+    weights, why, _ = regularizers_for("auto", foggy, views)
+    assert weights == REGULARIZERS["noisy"]
     assert "of the surface agrees between neighbouring views" in why
     far = np.array([447_000.0, 5_411_000.0, 130.0])
     moved = view_consistency(replace(ball, offset=ball.offset + far), views.recentred(-far))

@@ -29,7 +29,7 @@ from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
 from g2ard.scene.targets import TeacherRenders
 from g2ard.stages.recover import RecoverConfig, recover
-from g2ard.stages.recover.anchors import PRESETS
+from g2ard.stages.recover.anchors import REGULARIZERS
 from g2ard.stages.select import CoverageOptions, select
 from g2ard.stages.simplify import METHODS, flag, simplify
 from helpers.scenes import around, checkered_ball
@@ -120,7 +120,7 @@ def _selected(scene: Splats, views: Cameras) -> Arrays:
 def _recovered(scene: Splats, views: Cameras) -> Arrays:
     small = simplify(scene, len(scene) // 5).splats
     targets = TeacherRenders(scene, views)
-    regularizers = replace(PRESETS["noisy"], period=2)
+    regularizers = replace(REGULARIZERS["noisy"], period=2)
     for engine in ("fused", "torch"):
         config = RecoverConfig(steps=8, regularizers=regularizers, engine=engine)  # type: ignore[arg-type]
         yield from _named(engine, recover(small, targets, config).splats)

@@ -72,7 +72,7 @@ def recover(
     from g2ard.stages.recover import RecoverConfig
     from g2ard.stages.recover import recover as optimize
     from g2ard.stages.recover.anchors import Anchors
-    from g2ard.stages.recover.presets import preset_for
+    from g2ard.stages.recover.prior import regularizers_for
     from g2ard.stages.recover.report import outcome, unregularized
 
     names = ("schedule", "steps", "recovery_time", "sh_degree", "background", "seed")
@@ -110,7 +110,7 @@ def recover(
     if weights is not None:
         run.say(f"sampling {plural(len(weights), 'view')} by weight")
     built = _built(run, anchors, splats) if anchors else None
-    settings["recover.regularizers"], why, measured = preset_for(
+    settings["recover.regularizers"], why, measured = regularizers_for(
         named.get("recover.regularizers", "auto"),
         dense or built or splats,
         None if dense else chosen.cameras,

@@ -63,7 +63,7 @@ class Regularizers:
         >>> Regularizers.of("lift").anchor, Regularizers.of("lift", paper=True).anchor
         (0.1, 0.001)
         """
-        rows = PAPER_PRESETS if paper else PRESETS
+        rows = PAPER_REGULARIZERS if paper else REGULARIZERS
         require("prior", repr(prior), prior in rows, f"one of {', '.join(rows)}")
         return rows[prior]
 
@@ -85,7 +85,7 @@ class Regularizers:
         return self.anchor > 0 or self.shape > 0
 
 
-PAPER_PRESETS = {
+PAPER_REGULARIZERS = {
     "trained": Regularizers(anchor=5e-2, shape=0.0, effective_rank=False),
     "lift": Regularizers(anchor=1e-3, shape=1e-4, effective_rank=True),
     "noisy": Regularizers(anchor=5e-2, shape=1e-3, effective_rank=True),
@@ -93,8 +93,8 @@ PAPER_PRESETS = {
 """Rows of `tab:s_recovery` (faithful trained prior, lift, less regularised trained prior) for the paper's
 schedule."""
 
-PRESETS = {
-    "trained": PAPER_PRESETS["trained"],
+REGULARIZERS = {
+    "trained": PAPER_REGULARIZERS["trained"],
     "lift": Regularizers(anchor=1e-1, shape=1.0, effective_rank=True),
     "noisy": Regularizers(anchor=5e-2, shape=1.0, effective_rank=True),
 }

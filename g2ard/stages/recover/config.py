@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 from g2ard.config.choices import BLACK, Colour, Engine
 from g2ard.errors import InputError
-from g2ard.stages.recover.anchors import PRESETS, Regularizers
+from g2ard.stages.recover.anchors import REGULARIZERS, Regularizers
 from g2ard.stages.recover.schedule import TUNED, Schedule
 
 
@@ -55,7 +55,7 @@ class RecoverConfig(FitConfig):
     schedule: Schedule = TUNED
     steps: int | None = None
     recovery_time: float | None = None
-    regularizers: Regularizers = PRESETS["trained"]
+    regularizers: Regularizers = REGULARIZERS["trained"]
     from_points: bool = field(default=False, metadata={"setting": False})
     final: bool = field(default=True, metadata={"setting": False})
     engine: Engine = "fused"

@@ -1,4 +1,4 @@
-"""Choice of regularisers for a prior: by name, or by measuring it."""
+"""Measures of a prior (the dense scene), and the regularisers that they suggest."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from g2ard.errors import InputError
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
-from g2ard.stages.recover.anchors import PAPER_PRESETS, PRESETS, Regularizers, needle
+from g2ard.stages.recover.anchors import PAPER_REGULARIZERS, REGULARIZERS, Regularizers, needle
 
 _LIFT_THICKNESS = 0.2
 _LIFT_SPREAD = 2.5
@@ -94,7 +94,7 @@ def view_consistency(scene: Splats, cameras: Cameras) -> float | None:
     scene, small = centred(scene, cameras.resized(_SAMPLE_PIXELS))
     arrays, settings = arrays_of(scene), settings_for(scene.means)
     sample = np.unique(np.linspace(0, len(small) - 1, min(len(small), _SAMPLE_VIEWS)).round().astype(int))
-    agree = float_ = 0
+    agreeing = floating = 0
     for a in sample:
         distance = np.linalg.norm(small.positions - small.positions[a], axis=1)
         distance[a] = np.inf
@@ -107,9 +107,9 @@ def view_consistency(scene: Splats, cameras: Cameras) -> float | None:
             depths.append(median)
         expected, seen = _carried(depths[0], depths[1], small, int(a), b)
         ratio = np.where(seen > 0, seen, np.inf) / expected
-        agree += int((np.abs(ratio - 1) <= _SAME_DEPTH).sum())
-        float_ += int((ratio > 1 + _SAME_DEPTH).sum())
-    return agree / (agree + float_) if agree + float_ else None
+        agreeing += int((np.abs(ratio - 1) <= _SAME_DEPTH).sum())
+        floating += int((ratio > 1 + _SAME_DEPTH).sum())
+    return agreeing / (agreeing + floating) if agreeing + floating else None
 
 
 def _carried(
@@ -128,7 +128,7 @@ def _carried(
     return points[2, inside], other[v[inside].astype(int), u[inside].astype(int)]
 
 
-def preset_for(
+def regularizers_for(
     name: str, prior: Splats, cameras: Cameras | None = None, *, paper: bool = False
 ) -> tuple[Regularizers, str, PriorMeasures]:
     """Choose regularisers by name or by measuring the prior.
@@ -151,13 +151,13 @@ def preset_for(
         InputError: an unknown preset.
     """
     kind = {"paper": "auto"}.get(name, name.removeprefix("paper-"))
-    if kind != "auto" and kind not in PRESETS:
-        raise InputError(f"expected auto, paper, {', '.join(PRESETS)}, got {name!r}", parameter="preset")
+    if kind != "auto" and kind not in REGULARIZERS:
+        raise InputError(f"expected auto, paper, {', '.join(REGULARIZERS)}, got {name!r}", parameter="preset")
     paper = paper or name.startswith("paper")
     found = measure_prior(prior, cameras)
     kind, why = (kind, "as requested") if kind != "auto" else _judged(found)
     said = f"the paper's for {kind}" if paper else kind
-    return (PAPER_PRESETS if paper else PRESETS)[kind], f"{said} ({why})", found
+    return (PAPER_REGULARIZERS if paper else REGULARIZERS)[kind], f"{said} ({why})", found
 
 
 def _judged(m: PriorMeasures) -> tuple[str, str]:
