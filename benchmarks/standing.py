@@ -58,8 +58,9 @@ def standing_views(splats: Splats, scene: Path, seed: int = 0) -> dict[str, Came
     Raises:
         InputError: nothing is visible in the scene, or a standing.json is invalid.
     """
-    pool = plan_pool(splats, _POOL, seed=seed + _SEED, apart=_NEAR)
-    found = {} if pool.apart is None else {"near": pool.apart}
+    pool = plan_pool(splats, _POOL, seed=seed + _SEED)
+    near = pool.more("near", _NEAR)
+    found = {"near": Cameras.of(near)} if near else {}
     given = given_views(scene)
     standing = given if given is not None else _standing(splats, pool.kind, seed + 2 * _SEED)
     return found if standing is None or not len(standing) else {**found, "standing": standing}

@@ -13,7 +13,7 @@ _PANELS = {
     "Budget": ("count", "ratio", "ratios", "fit", "min_psnr", "min_ssim"),
     "Views": (
         *("views", "images", "alpha", "teacher", "photos", "held_out", "split", "size", "background"),
-        *("up", "no_views", "poses", "pool", "intrinsics", "focal"),
+        *("up", "focus", "no_views", "poses", "pool", "intrinsics", "focal"),
     ),
     "Method": (
         *("method", "preset", "keep_region", "clean", "anchors"),

@@ -23,9 +23,12 @@ POLICIES: tuple[Policy, ...] = get_args(Policy)
 UNMEASURED: tuple[Policy, ...] = ("random", "uniform")
 """Policies that measure nothing and so cannot tell how many views are enough."""
 
-PoolKind = Literal["auto", "orbit", "walk", "aerial", "inside", "focus"]
+PoolKind = Literal["auto", "orbit", "walk", "aerial", "inside", "sharp"]
 """Kinds of generated view pools (`g2ard.poses.make_pool`)."""
 POOL_KINDS: tuple[PoolKind, ...] = get_args(PoolKind)
+
+Focus = Literal["far", "near", "standing", "anywhere"]
+"""Kinds of training views that `distill --focus` adds; `far` adds none (`g2ard.SelectConfig`)."""
 
 ScheduleName = Literal["fast", "default", "best", "paper"]
 """Schedules of recovery (`g2ard.stages.recover.schedule`)."""

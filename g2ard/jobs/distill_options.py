@@ -8,7 +8,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from g2ard.config.choices import RenderModel
+from g2ard.config.choices import Focus, RenderModel
 from g2ard.config.paths import full_paths
 from g2ard.config.presets import PRESETS, configured
 from g2ard.jobs.inputs import Views
@@ -59,11 +59,11 @@ class DistillOptions:
         return self.configured()
 
     @property
-    def anywhere(self) -> float | None:
-        """Share of training views from anywhere, see `SelectConfig`; 0 for the paper's methods."""
+    def focus(self) -> Focus | None:
+        """Kind of training views to add, see `SelectConfig`; `far` for the paper's methods unless named."""
         config = self.config
         papers = config.select.views_count is not None or not config.recover.schedule.means_in_scales
-        return 0.0 if papers else config.select.anywhere
+        return config.select.focus or ("far" if papers else None)
 
     def configured(
         self, regularizers: Regularizers | None = None, sh_degree: int | None = None

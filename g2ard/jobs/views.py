@@ -21,10 +21,11 @@ from g2ard.jobs.view_checks import as_pool, check_sight, found_views, warn_of_si
 from g2ard.progress import Progress, Say, silent, unsaid
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
-from g2ard.scene.splits import for_scores, for_training, split_mask, splits_of
+from g2ard.scene.splits import USUAL, for_scores, for_training, rows_by_kind, split_mask, splits_of
 
 if TYPE_CHECKING:
     from g2ard.jobs.distill_options import DistillOptions
+    from g2ard.pipeline.config import SelectConfig
     from g2ard.poses import Pool
 Up = Sequence[float] | None
 
@@ -37,7 +38,7 @@ _ANYWHERE, _FEW = 0.4, 0.05
 a share h, 1−h times that, and none below the second share.
 """
 _APART = 24
-"""Number of near views, and of views from anywhere if some train: one half validates recovery, the other is
+"""Number of near views, and of each further kind that trains: one half validates recovery, the other is
 scored."""
 _POOL_GAUSSIANS = 4_000_000
 """Size of a tiled scene from which the pool grows in proportion."""
@@ -55,9 +56,9 @@ class RunViews:
     """Views of a run.
 
     Args:
-        train: views for training, including views from anywhere.
+        train: views for training, of the usual and other kinds.
         test: usual views for scoring.
-        apart: views of other kinds, near and from anywhere; None if there are none.
+        apart: views of other kinds; None if there are none.
         pool: the whole generated pool, written beside the result.
         unseen: share of the sampled matter that no view of the pool sees.
     """
@@ -93,15 +94,16 @@ def views_of(
 
     Args:
         prior: the dense scene.
-        options: the views, or None for those found beside the scene or generated; `anywhere`, the share of
-            views from anywhere, which are added to views that are given without photos or generated.
+        options: the views, or None for those found beside the scene or generated; `focus`, the kind of views
+            added to views that are given without photos or generated.
         beside: path beside which to look for cameras.
         teach: whether the scene can render targets; otherwise views without a photo are skipped and no views
             are generated.
         represents: Gaussians per row if `prior` is a sample of a larger scene; the pool grows with it.
     """
     views, held_out, size, up = options.views, options.held_out, options.size, options.up
-    seed, anywhere = options.config.recover.seed, options.anywhere
+    seed, select = options.config.recover.seed, replace(options.config.select, focus=options.focus)
+    spare = round(_APART * _times(prior, represents))
     found = None
     if views is None and beside is not None:
         wanted = ["train"] if held_out is not None else ["train", "test"]
@@ -117,14 +119,17 @@ def views_of(
             check_sight(prior, train.cameras, say)
         if found and not size:
             train, test = (replace(part, cameras=as_pool(part.cameras)) for part in (train, test))
+        if not teach or any(train.cameras.image_paths):
+            if options.config.select.focus:
+                say("warning: --focus has no effect on views with photos")
+            select = replace(select, focus="far")
         if not teach:
             return RunViews(train, test.cameras)
         try:
             planned = _planned(prior, _APART, up, seed, progress, represents=represents)
         except InputError:  # the scene has no room for poses
             return RunViews(train, test.cameras)
-        share = 0.0 if any(train.cameras.image_paths) else anywhere
-        train, apart = _mixed(train, planned, share, size)
+        train, apart = _mixed(train, planned, select, spare, size, say)
         return RunViews(train, test.cameras, apart)
     if not teach:
         raise InputError(
@@ -137,12 +142,12 @@ def views_of(
     names = planned.cameras.names
     held_back = split_mask(None, names, "test") if held is None else np.zeros(len(names), bool)
     usual = ViewSet(planned.cameras, splits=tuple(np.where(held_back, "test", "train").tolist()))
-    train, apart = _mixed(usual.take(~held_back), planned, anywhere, None)
+    train, apart = _mixed(usual.take(~held_back), planned, select, spare, None, say)
     pool = ViewSet(
         Cameras.of([*train.cameras, *usual.cameras.take(held_back)]),
         splits=("train",) * len(train.cameras) + ("test",) * int(held_back.sum()),
     )
-    say(f"poses: {_of(planned, len(pool.cameras))}")
+    say(f"poses: {_of(planned, pool.cameras.names)}")
     train = train.resized(size)
     if held is not None:
         train = drop_held_out(train, held.cameras, say)
@@ -151,29 +156,37 @@ def views_of(
 
 
 def _mixed(
-    train: ViewSet, planned: Pool, share: float | None, size: int | None
+    train: ViewSet, planned: Pool, select: SelectConfig, spare: int, size: int | None, say: Say
 ) -> tuple[ViewSet, Cameras | None]:
-    """Add views from anywhere to training views, and return them with views of other kinds.
+    """Add views of other kinds to training views, and return them with `spare` further views of each kind.
 
-    Args:
-        share: share of the views from anywhere among all; None is 40 % times 1 − `Pool.held`.
+    There are also as many near views if none train.
     """
-    if share is None:
-        share = _ANYWHERE * (1 - planned.held)
-        share = share if share > _FEW else 0.0
-    count = round(len(train.cameras) * share / (1 - share))
-    more = planned.anywhere(count + _APART) if count else []
-    count = min(count, max(len(more) - _APART, len(more) // 2))
-    apart = [*(planned.apart or []), *more[count:]]
+    usual = len(train.cameras)
+    share = _ANYWHERE * (1 - planned.held)
+    if select.focus in ("far", "anywhere") or share <= _FEW:
+        share = 0.0
+    counts = {"near": 0, "anywhere": round(usual * share / (1 - share))}
+    if select.focus not in (None, "far"):
+        times = select.focus_share / (1 - select.focus_share)
+        counts[select.focus] = round((usual + counts["anywhere"]) * times)
+    more, apart = [], []
+    for kind, count in counts.items():
+        found = planned.more(kind, count + spare) if count or kind == "near" else []
+        taken = min(count, max(len(found) - spare, len(found) // 2))
+        if kind == select.focus and taken < 0.9 * count:
+            say(f"warning: --focus {kind}: the scene has room for {taken} such views, {count} are wanted")
+        more += found[:taken]
+        apart += found[taken:]
     others = Cameras.of(apart).resized(size) if apart else None
-    if not count:
+    if not more:
         return train, others
-    usual = np.ones(len(train.cameras)) if train.weights is None else train.weights / train.weights.mean()
+    weights = np.ones(usual) if train.weights is None else train.weights / train.weights.mean()
     return ViewSet(
-        Cameras.of([*train.cameras, *more[:count]]).resized(size),
+        Cameras.of([*train.cameras, *more]).resized(size),
         train.notes,
-        train.splits and train.splits + ("train",) * count,
-        np.append(usual, np.ones(count)),  # drawn equally often
+        train.splits and train.splits + ("train",) * len(more),
+        np.append(weights, np.ones(len(more))),  # drawn equally often
     ), others
 
 
@@ -205,15 +218,15 @@ def views_or_pool(
         planned = _planned(scene, _POOL, up, seed, progress, _GROW)
     else:
         planned = plan_pool(scene, count, up=up, seed=seed, rows=_ROWS, progress=progress)
-    say(f"poses: {_of(planned, len(planned.cameras))}")
+    say(f"poses: {_of(planned, planned.cameras.names)}")
     return ViewSet(planned.cameras, splits=splits_of(None, planned.cameras.names))
 
 
-def _of(pool: Pool, count: int) -> str:
-    """Describe a pool briefly."""
+def _of(pool: Pool, names: Sequence[str]) -> str:
+    """Describe a pool, and views of further kinds, briefly."""
+    kinds = [pool.kind, *(kind for kind in rows_by_kind(names) if kind != USUAL)]
     guess = "; the up direction is a guess" if "guess" in pool.why else ""
-    more = " + anywhere" if count > len(pool.cameras) else ""
-    return f"{count}, {pool.kind}{more}{guess}"
+    return f"{len(names)}, {' + '.join(kinds)}{guess}"
 
 
 def cameras_for_looks(
@@ -274,22 +287,25 @@ def _planned(
     grow: float = 1.0,
     represents: float = 1.0,
 ) -> Pool:
-    """Plan a pool of `count` to `grow` × `count` views, and views of another kind."""
+    """Plan a pool of `count` to `grow` × `count` views."""
     from g2ard.poses import plan_pool
 
-    times = pool_times(len(prior) * represents) if represents > 1 else 1.0
+    times = _times(prior, represents)
     return plan_pool(
         prior,
         round(count * times),
         up=up,
         seed=seed,
         rows=round(_ROWS * times),
-        apart=round(_APART * times),
         grow=grow,
         near=_NEAR,
         represents=represents,
         progress=progress,
     )
+
+
+def _times(prior: Splats, represents: float) -> float:
+    return pool_times(len(prior) * represents) if represents > 1 else 1.0
 
 
 def pool_times(count: float) -> float:

@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass, field
 from typing import Literal
 
-from g2ard.config.choices import UNMEASURED, Policy
+from g2ard.config.choices import UNMEASURED, Focus, Policy
 from g2ard.errors import InputError, require
 from g2ard.stages.lift import LiftConfig
 from g2ard.stages.recover.config import RecoverConfig
@@ -25,22 +25,24 @@ class SelectConfig(CoverageOptions):
         weighted: draw views by weight, so that crowded poses do not dominate. On a crowded pool this beats
             uniform draws, and any selection of a tenth of the views.
         reselect: select again from every round's scene instead of once from the prior.
-        anywhere: share of training views from anywhere in free space. They are added to generated views, and
-            to given ones without photos. None means 40 % of the share of the scene that a usual view misses.
+        focus: kind of views to add to generated views, and to given ones without photos: near, at eye level
+            (standing) or from anywhere in free space; "far" adds none. None adds views from anywhere: 40 % of
+            the share of the scene that a usual view misses. Near and standing views are added to these.
+        focus_share: their share of the training views.
     """
 
     views_count: int | float | Literal["auto"] | None = None
     policy: Policy = "auto"
     weighted: bool = True
     reselect: bool = False
-    anywhere: float | None = None
+    focus: Focus | None = None
+    focus_share: float = 0.5
 
     def __post_init__(self) -> None:
         super().__post_init__()
         share = not isinstance(self.views_count, float) or 0 < self.views_count <= 1
         require("views_count", self.views_count, share, "a count, auto, none, or a share in (0, 1]")
-        some = self.anywhere is None or 0 <= self.anywhere < 1
-        require("anywhere", self.anywhere, some, "a share in [0, 1), or none")
+        require("focus_share", self.focus_share, 0 <= self.focus_share < 1, "a share in [0, 1)")
         if self.views_count == "auto" and self.policy in UNMEASURED:
             raise InputError(
                 f"policy {self.policy} does not measure gains; pass a count instead of auto",

@@ -1,7 +1,7 @@
 """Cameras for a scene without views: around objects, through rooms and streets, from the air.
 
 A scene is turned upright (`up`), freed of floaters and sky (`matter`), its free space mapped (`grid`, `site`)
-and its kind classified (`shape`). Planners (`orbit`, `walk`, `aerial`, `inside`, `focus`) propose poses from
+and its kind classified (`shape`). Planners (`orbit`, `walk`, `aerial`, `inside`, `sharp`) propose poses from
 endless even sequences. They keep poses that stand in free space and see enough (`sight`, `gather`). `auto`
 combines the planners; `near` steps nearer to what a pool sees and measures what it misses.
 """
@@ -36,11 +36,11 @@ def make_pool(
         splats: the scene, in any unit, origin and orientation.
         count: number of poses.
         kind: "orbit" (around an object, elevations −5° to 50°), "walk" (at eye height in free space, through
-            rooms and streets), "aerial" (straight down and oblique), "inside" (surrounded by matter), "focus"
+            rooms and streets), "aerial" (straight down and oblique), "inside" (surrounded by matter), "sharp"
             (free places whose image is full and sharp), or "auto". "auto" places poses within rooms in
             proportion to their share of the scene. An object is orbited. A landscape is seen from the air by
-            three quarters of the poses and from the ground by one, where that is in focus. The remaining
-            poses walk, or stand where the scene is in focus.
+            three quarters of the poses and from the ground by one, where that is sharp. The remaining
+            poses walk, or stand where the scene looks sharp.
         size: width and height in pixels.
         fov: horizontal field of view, degrees; None means 50, and 70 for a pool within rooms.
         up: (3,) direction away from the ground; None to estimate it.

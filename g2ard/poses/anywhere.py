@@ -7,18 +7,13 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from g2ard.poses.focus import Glance
 from g2ard.poses.lattice import halton
 from g2ard.poses.numbers import norms
+from g2ard.poses.sharp import Glance
 from g2ard.poses.sight import Lens, Poses
 from g2ard.poses.site import Site
 
-__all__ = ["ANYWHERE_FOV", "plan_anywhere"]
-
 Floats = NDArray[np.float64]
-
-ANYWHERE_FOV = 70.0
-"""Degrees."""
 
 _DISTANCES = (0.04, 0.4)
 """Range of distances from the aim, in diagonals of the scene's box; drawn log-uniformly."""

@@ -1,4 +1,4 @@
-"""Poses for a scene of any kind: within rooms, around and above, and wherever it is in focus."""
+"""Poses for a scene of any kind: within rooms, around and above, and wherever it looks sharp."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard.poses.aerial import plan_aerial
-from g2ard.poses.focus import Glance, plan_focus
 from g2ard.poses.inside import Inside, plan_inside
 from g2ard.poses.numbers import middle, norms
 from g2ard.poses.orbit import plan_orbit
 from g2ard.poses.shape import shape_of
+from g2ard.poses.sharp import Glance, plan_sharp
 from g2ard.poses.sight import Lens, Poses
 from g2ard.poses.site import Site
 from g2ard.poses.walk import plan_walk
@@ -22,7 +22,7 @@ _STREET = 0.25
 """Share of a landscape's poses that stand on its ground, where there is room."""
 
 _SHARP = 0.04
-"""Radians: a pose from around or above is in focus if `Focus.coarse`, the 90th percentile of the angular
+"""Radians: a pose from around or above is sharp if `Sharpness.coarse`, the 90th percentile of the angular
 standard deviations it sees, is smaller. Measured: objects .007–.01, a park .012, an open scene seen through
 its own sky .1 and more."""
 
@@ -51,8 +51,8 @@ def plan_auto(
     """Plan at most `count` poses, and return them with their kinds and the reasons.
 
     No decision covers the scene as a whole. Rooms are seen from within, in proportion to their size. The
-    other poses stand around or above the scene as its shape allows, where it is in focus. The remaining poses
-    stand on the ground and wherever the scene is in focus.
+    other poses stand around or above the scene as its shape allows, where it looks sharp. The remaining poses
+    stand on the ground and wherever the scene looks sharp.
     """
     parts: dict[str, Poses] = {}
     why = [f"{inside.share:.1%} of its box lies within rooms"]
@@ -75,10 +75,10 @@ def plan_auto(
             add("walk", plan_walk(site, part, lens, seed, tell, indoors=shape == "room"))
         add(far.kind, far.poses.take(slice(missing())))
         if not far.sharp:
-            why.append(f"from around or above it is out of focus ({far.share:.0%} of the poses)")
+            why.append(f"from around or above it looks blurred ({far.share:.0%} of the poses are sharp)")
         if missing():
             ground = plan_walk(site, missing() // 2, lens, seed + 1, tell, indoors=False)
-            add("focus", plan_focus(site, glance, missing(), lens, seed, tell, also=ground))
+            add("sharp", plan_sharp(site, glance, missing(), lens, seed, tell, also=ground))
         if missing() and not far.sharp:
             add("walk", plan_walk(site, missing(), lens, seed + 2, tell, indoors=False))
     for kind, plan in (("aerial", plan_aerial), ("orbit", plan_orbit)):  # better foggy views than none
@@ -93,7 +93,7 @@ def plan_auto(
 
 @dataclass(frozen=True, eq=False)
 class _Far:
-    """Poses from around or above that are in focus, and the share of sampled poses that are."""
+    """Poses from around or above that look sharp, and the share of sampled poses that are."""
 
     kind: str
     poses: Poses
@@ -101,7 +101,7 @@ class _Far:
 
     @property
     def sharp(self) -> bool:
-        """Whether enough poses are in focus to rely on them."""
+        """Whether enough poses are sharp to rely on them."""
         return self.share >= _FEW
 
 
@@ -124,7 +124,7 @@ def _far(
 def _sharp(
     site: Site, glance: Glance, poses: Poses, lens: Lens, tell: Callable[[int, int], None]
 ) -> NDArray[np.bool_]:
-    """Return whether each pose sees the scene in focus; matter behind the scene does not count."""
+    """Return whether each pose sees the scene sharply; matter behind the scene does not count."""
     away = norms(poses.eyes - site.box.mean(axis=0))
     reach = away + norms(site.box[1:] - site.box[:1]) / 2
     usual = middle(site.grid.scale_at(site.points))  # unweighted: a sky has few rows and much area

@@ -12,14 +12,14 @@ from numpy.typing import ArrayLike, NDArray
 from g2ard.config.choices import POOL_KINDS
 from g2ard.errors import InputError
 from g2ard.poses.aerial import plan_aerial
-from g2ard.poses.anywhere import ANYWHERE_FOV, plan_anywhere
+from g2ard.poses.anywhere import plan_anywhere
 from g2ard.poses.auto import plan_auto
-from g2ard.poses.focus import SIGHT_ROWS, Glance, plan_focus
 from g2ard.poses.inside import find_inside, plan_inside
 from g2ard.poses.lattice import strata
-from g2ard.poses.near import Reach, plan_near, reach_of
+from g2ard.poses.near import plan_near, reach_of
 from g2ard.poses.orbit import plan_orbit
 from g2ard.poses.shape import shape_of
+from g2ard.poses.sharp import SIGHT_ROWS, Glance, plan_sharp
 from g2ard.poses.sight import Lens, Poses
 from g2ard.poses.site import Site
 from g2ard.poses.walk import plan_walk
@@ -38,8 +38,8 @@ objects .06–.17, whole scenes .01–.06, two chunks cut from a room, seen from
 _POINTS = 4096
 """Points of the scene's matter that are projected into the views."""
 
-_FOV, _FOV_INSIDE = 50.0, 70.0
-"""Horizontal fields of view in degrees: within rooms people use wider lenses."""
+_FOV, _FOV_WIDE = 50.0, 70.0
+"""Horizontal fields of view in degrees: within a scene people use wider lenses."""
 
 _MOSTLY_INSIDE = 0.5
 """Share of a pool within rooms above which the whole pool uses the wider lens."""
@@ -57,8 +57,7 @@ class Pool:
         unseen: share of a sample of the matter that no pose sees.
         coarse: share that is seen, but nowhere with a standard deviation of a pixel.
         held: share of the matter that a typical pose has in its frame.
-        apart: additional views nearer to what `cameras` see; None unless requested.
-        anywhere: plans additional views from anywhere, at most as many as requested.
+        more: plans additional views of a kind, near, standing or anywhere: at most as many as requested.
     """
 
     cameras: Cameras
@@ -68,8 +67,7 @@ class Pool:
     unseen: float = 0.0
     coarse: float = 0.0
     held: float = 1.0
-    apart: Cameras | None = None
-    anywhere: Callable[[int], list[Camera]] = field(default=lambda count: [])
+    more: Callable[[str, int], list[Camera]] = field(default=lambda kind, count: [])
 
 
 def plan_pool(
@@ -82,7 +80,6 @@ def plan_pool(
     up: ArrayLike | None = None,
     seed: int = 0,
     rows: int | None = None,
-    apart: int = 0,
     grow: float = 1.0,
     near: float = 0.0,
     looks: bool = False,
@@ -96,7 +93,6 @@ def plan_pool(
     Args:
         splats: the scene, or a fair sample of it (see `represents`).
         count: number of poses if a view holds the whole scene.
-        apart: largest number of nearer views to plan in addition, as a separate set.
         grow: largest factor on `count`; if a view holds a share h of the scene, the factor is 1/√h.
         near: largest share of the poses that step nearer to what the others see. The actual share is near·s,
             where s rises from 0 to 1 with the share of the matter that is only seen below a pixel. With
@@ -120,7 +116,7 @@ def plan_pool(
     tell = counter(progress, "poses")
     inside = find_inside(site, seed) if kind == "auto" else None
     if inside is not None and fov is None and inside.weight > _MOSTLY_INSIDE:
-        lens = _lens(size, _FOV_INSIDE)
+        lens = _lens(size, _FOV_WIDE)
 
     def glance() -> Glance:
         return Glance(splats, represents)
@@ -142,8 +138,7 @@ def plan_pool(
             "or give views of the scene"
         )
     reach = reach_of(site, poses, lens)
-    # Based on the pool before any pose steps nearer, and on another seed than the near poses.
-    apart_views = _apart(site, poses, reach, apart, lens, seed)
+    far = poses, reach
     coarse = float(reach.coarse(lens).mean())
     need = max(float(np.interp(coarse, _COARSE, (0, 1))), 1 - held if looks else 0.0)
     near_poses = plan_near(site, poses, reach, int(near * need * len(poses)), lens, seed + 1)
@@ -151,6 +146,17 @@ def plan_pool(
         kept = np.linspace(0, len(poses) - 1, len(poses) - len(near_poses)).round().astype(int)
         poses, used = Poses.joined([poses.take(kept), near_poses]), [*used, "near"]
         reach = reach_of(site, poses, lens)
+
+    def more(kind: str, count: int) -> list[Camera]:
+        if kind == "near":  # of the pool before any pose stepped nearer, and with another seed
+            return _named(kind, plan_near(site, *far, count, lens, seed), site, lens)
+        wide = _lens(size, _FOV_WIDE)
+        if kind == "standing":
+            return _named(kind, _planned(site, glance, "walk", count, wide, seed + 3, tell), site, wide)
+        small = _lens((max(1, size[0] // 2), max(1, size[1] // 2)), _FOV_WIDE)  # they see little
+        eyes = plan_anywhere(site, Glance(splats, represents, SIGHT_ROWS), count, small, seed, tell)
+        return _named(kind, eyes, site, small)
+
     order = strata(_features(poses), HOLD_OUT, seed)
     return Pool(
         poses.take(order).cameras(site, lens),
@@ -160,10 +166,7 @@ def plan_pool(
         unseen=reach.unseen(),
         coarse=float(reach.coarse(lens).mean()),
         held=held,
-        apart=apart_views,
-        anywhere=lambda count: _anywhere(
-            site, Glance(splats, represents, SIGHT_ROWS), count, size, seed, tell
-        ),
+        more=more,
     )
 
 
@@ -175,22 +178,9 @@ def _held(site: Site, poses: Poses, lens: Lens) -> float:
     return max(poses.cameras(site, lens).usual_share(points), 1 / _POINTS)
 
 
-def _apart(site: Site, poses: Poses, reach: Reach, count: int, lens: Lens, seed: int) -> Cameras | None:
-    """Return nearer views as a separate set, or None if none is requested or none has room."""
-    nearer = plan_near(site, poses, reach, count, lens, seed)
-    if not len(nearer):
-        return None
-    cameras = nearer.cameras(site, lens)
-    return replace(cameras, names=tuple(name.replace("pose", "near") for name in cameras.names))
-
-
-def _anywhere(
-    site: Site, glance: Glance, count: int, size: tuple[int, int], seed: int, tell: Callable[[int, int], None]
-) -> list[Camera]:
-    """Return at most `count` views from anywhere, half as large as others because they see little."""
-    lens = _lens((max(1, size[0] // 2), max(1, size[1] // 2)), ANYWHERE_FOV)
-    cameras = plan_anywhere(site, glance, count, lens, seed, tell).cameras(site, lens)
-    return [replace(view, name=view.name.replace("pose", "anywhere")) for view in cameras]
+def _named(kind: str, poses: Poses, site: Site, lens: Lens) -> list[Camera]:
+    """Return cameras whose names state their kind."""
+    return [replace(view, name=view.name.replace("pose", kind)) for view in poses.cameras(site, lens)]
 
 
 def _planned(
@@ -205,8 +195,8 @@ def _planned(
     """Plan poses of a given kind."""
     if kind == "inside":
         return plan_inside(site, find_inside(site, seed), count, lens, seed, tell)
-    if kind == "focus":
-        return plan_focus(site, glance(), count, lens, seed, tell)
+    if kind == "sharp":
+        return plan_sharp(site, glance(), count, lens, seed, tell)
     if kind == "walk":
         return plan_walk(site, count, lens, seed, tell, indoors=shape_of(site)[0] == "room")
     return {"orbit": plan_orbit, "aerial": plan_aerial}[kind](site, count, lens, seed, tell)

@@ -126,8 +126,8 @@ def visibility_source(
     Results do not depend on the order of the scene's rows.
 
     Args:
-        cameras: the views; at most 96 of them are used, evenly spaced, and none from anywhere if there are
-            others: near views would outweigh all others in Σ αT².
+        cameras: the views; at most 96 of them are used, evenly spaced, and only usual ones if there are any:
+            near views would outweigh all others in Σ αT².
         longest: longer side of the renders, pixels; `pixel_size` refers to the full image.
         progress: called after each view.
 

@@ -44,12 +44,12 @@ def rows_by_kind(names: Sequence[str]) -> dict[str, list[int]]:
 
 
 def usual_rows(names: Sequence[str]) -> list[int]:
-    """Return the indices of all views except those from anywhere; of all if there are no others.
+    """Return the indices of the views whose names state no kind; of all if there are no others.
 
     >>> usual_rows(["pose_0", "anywhere_0"]), usual_rows(["anywhere_0"])
     ([0], [0])
     """
-    rows = [i for i, name in enumerate(names) if kind_of(name) != "anywhere"]
+    rows = [i for i, name in enumerate(names) if kind_of(name) == USUAL]
     return rows or list(range(len(names)))
 
 

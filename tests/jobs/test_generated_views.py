@@ -44,27 +44,38 @@ def test_views_are_made_where_none_are_given(command_line: CommandLine, folder: 
         assert "--views, or a --teacher" in refused(command_line, folder, *command)
 
 
-@pytest.mark.parametrize(("make", "share"), [(naive.room, None), (naive.statue, None), (naive.statue, 0.5)])
-def test_views_from_anywhere_join_where_a_view_holds_little(make, share: float | None) -> None:
-    views = views_of(make(), DistillOptions(views="made", settings={"anywhere": share}))
+@pytest.mark.parametrize(
+    ("make", "focus", "kinds"),
+    [
+        (naive.room, None, {"usual", "anywhere"}),
+        (naive.room, "far", {"usual"}),
+        (naive.room, "standing", {"usual", "standing", "anywhere"}),
+        (naive.statue, None, {"usual"}),
+        (naive.statue, "near", {"usual", "near"}),
+        (naive.statue, "anywhere", {"usual", "anywhere"}),
+    ],
+)
+def test_views_of_other_kinds_join_the_usual_ones(make, focus: str | None, kinds: set[str]) -> None:
+    views = views_of(make(), DistillOptions(views="made", settings={"focus": focus}))
     rows = rows_by_kind(views.train.cameras.names)
-    found = len(rows.get("anywhere", [])) / len(views.train.cameras)
-    if share is not None:
-        assert found == pytest.approx(share, abs=0.02)
-    else:
-        assert 0.2 < found < 0.4 if make is naive.room else found < 0.1
+    assert set(rows) == kinds
+    share = {kind: len(found) / len(views.train.cameras) for kind, found in rows.items()}
+    if focus is None:
+        assert share["usual"] == 1 if make is naive.statue else 0.2 < share["anywhere"] < 0.4
+    elif focus != "far":
+        assert share[focus] == pytest.approx(0.5, abs=0.02)
     assert set(rows_by_kind(views.test.names)) == {"usual"}
     assert views.apart is not None
-    assert set(rows_by_kind(views.apart.names)) == ({"near", "anywhere"} if found else {"near"})
+    assert set(rows_by_kind(views.apart.names)) == {"near"} | kinds - {"usual"}
     assert not set(views.apart.names) & set(views.train.cameras.names)
     assert views.pool is not None
     assert len(views.pool.cameras) == len(views.train.cameras) + len(views.test)
 
 
-def test_simplification_does_not_look_from_anywhere() -> None:
+def test_simplification_looks_from_usual_views_alone() -> None:
     statue = naive.statue()
     pool = plan_pool(statue, 16)
-    usual, mixed = pool.cameras, Cameras.of([*pool.cameras, *pool.anywhere(8)])
+    usual, mixed = pool.cameras, Cameras.of([*pool.cameras, *pool.more("anywhere", 8), *pool.more("near", 4)])
     seen, same = visibility_source(usual)(statue), visibility_source(mixed)(statue)
     np.testing.assert_array_equal(same.weight, seen.weight)
 
@@ -73,8 +84,8 @@ def test_given_views_stay_first(tmp_path: Path) -> None:
     statue = naive.statue()
     write_views(tmp_path / "views.json", plan_pool(statue, 16).cameras)
     views = [
-        views_of(statue, DistillOptions(views=tmp_path / "views.json", settings={"anywhere": share}))
-        for share in (0.0, 0.25)
+        views_of(statue, DistillOptions(views=tmp_path / "views.json", settings=settings))
+        for settings in ({"focus": "far"}, {"focus": "anywhere", "focus_share": 0.25})
     ]
     plain, mixed = (found.train.cameras for found in views)
     assert mixed.names[: len(plain)] == plain.names

@@ -1,4 +1,4 @@
-"""Pools of kind `auto`: poses within rooms, near views, and places from where an open scene is in focus."""
+"""Pools of kind `auto`: poses within rooms, near views, and places from where an open scene looks sharp."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ import pytest
 
 from g2ard.io import read_splats
 from g2ard.poses import plan_pool
-from g2ard.poses.focus import Glance, plan_focus
 from g2ard.poses.inside import find_inside, plan_inside
 from g2ard.poses.lattice import fibonacci
 from g2ard.poses.matter import Matter
+from g2ard.poses.sharp import Glance, plan_sharp
 from g2ard.poses.sight import Lens, Poses
 from g2ard.poses.site import Site
 from g2ard.poses.up import estimate_up
@@ -79,12 +79,12 @@ def test_an_open_scene_is_seen_from_below_its_sky(open_scene) -> None:
     assert pool.up[2] > 0.99
     assert np.linalg.norm(pool.cameras.positions, axis=1).max() < 6
     assert (pool.cameras.positions[:, 2] > 0).all()
-    assert "focus" in pool.why
+    assert "blurred" in pool.why
 
 
-def test_poses_in_focus_are_full_fine_and_free(open_scene) -> None:
+def test_sharp_poses_are_full_fine_and_free(open_scene) -> None:
     site, glance = Site.of(open_scene), Glance(open_scene)
-    poses = plan_focus(site, glance, 12, Lens(), 0, tell)
+    poses = plan_sharp(site, glance, 12, Lens(), 0, tell)
     assert 6 <= len(poses) <= 12
     assert (site.grid.distance(poses.eyes) > 3 * site.grid.cell).all()
     found = glance.of(poses.cameras(site, Lens()), tell)
@@ -129,14 +129,14 @@ def test_a_thinned_object_is_still_seen_from_around(every) -> None:
 
 
 @pytest.mark.parametrize("make", [naive.statue, naive.room])
-def test_views_apart_are_nearer_and_free(make) -> None:
+def test_near_views_are_nearer_and_free(make) -> None:
     splats = make()
-    pool = plan_pool(splats, 32, apart=12)
-    assert pool.apart is not None
-    assert 6 <= len(pool.apart) <= 12
-    assert pool.apart.names[0] == "near_0000"
-    assert not set(pool.apart.names) & set(pool.cameras.names)
-    eyes = pool.apart.positions
+    pool = plan_pool(splats, 32)
+    near = Cameras.of(pool.more("near", 12))
+    assert 6 <= len(near) <= 12
+    assert near.names[0] == "near_0000"
+    assert not set(near.names) & set(pool.cameras.names)
+    eyes = near.positions
     gaps = [np.linalg.norm(splats.means - eye, axis=1).min() for eye in eyes]
     far = [np.linalg.norm(splats.means - eye, axis=1).min() for eye in pool.cameras.positions]
     assert min(gaps) > 0.05
@@ -146,16 +146,15 @@ def test_views_apart_are_nearer_and_free(make) -> None:
         assert (eyes[:, 2] > 0).all()
     else:
         assert ((eyes > 0.05) & (eyes < np.array([6, 4, 2.7]) - 0.05)).all()
-    again = plan_pool(splats, 32, apart=12).apart
-    assert again is not None
-    np.testing.assert_array_equal(again.viewmats, pool.apart.viewmats)
+    again = Cameras.of(plan_pool(splats, 32).more("near", 12))
+    np.testing.assert_array_equal(again.viewmats, near.viewmats)
 
 
 @pytest.mark.parametrize("make", [naive.statue, naive.room])
 def test_views_from_anywhere_are_free_and_see_their_aim(make) -> None:
     splats = make()
     pool = plan_pool(splats, 16)
-    views = Cameras.of(pool.anywhere(12))
+    views = Cameras.of(pool.more("anywhere", 12))
     assert views.names == tuple(f"anywhere_{i:04d}" for i in range(12))
     assert (views.widths == 400).all()
     gaps = [np.linalg.norm(splats.means - eye, axis=1) for eye in views.positions]
@@ -166,8 +165,8 @@ def test_views_from_anywhere_are_free_and_see_their_aim(make) -> None:
     diagonal = np.linalg.norm(site.box[1] - site.box[0])
     assert (aims > 0.03 * diagonal).all()
     assert (aims < 0.45 * diagonal).all()
-    np.testing.assert_array_equal(Cameras.of(pool.anywhere(12)).viewmats, views.viewmats)
-    np.testing.assert_array_equal(Cameras.of(pool.anywhere(6)).viewmats, views.viewmats[:6])
+    np.testing.assert_array_equal(Cameras.of(pool.more("anywhere", 12)).viewmats, views.viewmats)
+    np.testing.assert_array_equal(Cameras.of(pool.more("anywhere", 6)).viewmats, views.viewmats[:6])
 
 
 @pytest.mark.parametrize(("make", "grown"), [(naive.statue, False), (naive.room, True)])
@@ -203,7 +202,6 @@ def test_a_pool_reports_its_unseen_share(room) -> None:
     assert all_around.unseen < 0.3
     assert few.unseen > 0.6
     assert 0 <= all_around.coarse < 0.2
-    assert plan_pool(room, 8).apart is None
 
 
 def test_up_is_found_by_layers_when_noise_lies_behind_floor_and_ceiling() -> None:

@@ -18,6 +18,7 @@ from g2ard.cli.outputs import Outputs, budgets_of
 from g2ard.cli.run_result import say_views, say_weight, tell_quality, told, write_table
 from g2ard.cli.tile_options import tiling_of
 from g2ard.cli.tiled import TiledCommand
+from g2ard.config.choices import Focus
 from g2ard.io import kind, write_splats
 from g2ard.progress import plural
 
@@ -96,6 +97,10 @@ def distill(
     ] = True,
     resume: opt.ResumeOption = False,
     size: opt.SizeOption = None,
+    focus: Annotated[
+        Focus | None,
+        typer.Option(help="Make half of the training views of this kind; far: only the usual ones."),
+    ] = None,
     background: opt.BackgroundOption = None,
     up: opt.UpOption = None,
     dry_run: Annotated[
@@ -111,7 +116,7 @@ def distill(
     """
     from g2ard.pipeline import DistillConfig
 
-    names = ("method", "keep_region", "schedule", "steps", "recovery_time", "background", "seed")
+    names = ("method", "keep_region", "schedule", "steps", "recovery_time", "focus", "background", "seed")
     settings = run.settings(DistillConfig(), *names, preset=preset)
     budgets = budgets_of(run)
     given = views is not None and not opt.is_made(views)

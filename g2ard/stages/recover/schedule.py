@@ -233,19 +233,19 @@ def steps_from_points(count: int, steps: int) -> int:
 
 
 def steps_for(scene: Splats, cameras: Cameras, steps: int) -> int:
-    """Return `steps` times 1/√share for views of a share of the scene, and more with some from anywhere.
+    """Return `steps` times 1/√share for views of a share of the scene, and more with views of other kinds.
 
     A view of an orbit shows the whole object, but a view in a room a tenth of it. At equal steps, a room's
-    Gaussians would be trained a tenth as often; the square root is a compromise with time. Views from
-    anywhere add steps, so that the others are visited as often as without them.
+    Gaussians would be trained a tenth as often; the square root is a compromise with time. Views of
+    other kinds add steps, so that usual ones are visited as often as without them.
 
     Args:
         scene: the scene to recover.
-        cameras: the training views, in world coordinates; those from anywhere have no part in the share.
+        cameras: the training views, in world coordinates; only usual ones decide the share.
         steps: the schedule's steps.
 
     Returns:
-        A number from `steps` to 2.25 × `steps`, times the ratio of all views to those not from anywhere.
+        A number from `steps` to 2.25 × `steps`, times the ratio of all views to usual ones.
 
     >>> import numpy as np
     >>> from g2ard.scene.cameras import Cameras, look_at

@@ -1,4 +1,4 @@
-"""Poses where an open scene is in focus: a trained scene is sharp from where its photos were taken."""
+"""Poses from where an open scene looks sharp: a trained scene does from where its photos were taken."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ _GOOD = ((0.8, 0.3), (0.7, 0.2), (0.5, 0.1))
 come first; the later pairs fill up if those are too few."""
 
 _COARSEST = 0.9
-"""Quantile of the angular sizes seen that `Focus.coarse` reports: one tenth may be fog."""
+"""Quantile of the angular sizes seen that `Sharpness.coarse` reports: one tenth may be fog."""
 
 _NEAR = 0.05
 """Near plane as a share of the distance within which matter is close."""
@@ -53,7 +53,7 @@ _PITCHES = (-35.0, 20.0)
 
 
 @dataclass(frozen=True, eq=False)
-class Focus:
+class Sharpness:
     """Statistics of glances, per camera (C,).
 
     Args:
@@ -73,7 +73,7 @@ class Focus:
 
 
 class Glance:
-    """Small renders of a sample of a scene, sky and floaters included, that measure focus and sight.
+    """Small renders of a sample of a scene, sky and floaters included, that measure sharpness and sight.
 
     Args:
         splats: the scene, or a fair sample of it.
@@ -104,12 +104,14 @@ class Glance:
             np.zeros((len(means), 0, 3), np.float32),
         )
 
-    def of(self, cameras: Cameras, tell: Callable[[int, int], None], reach: Floats | None = None) -> Focus:
+    def of(
+        self, cameras: Cameras, tell: Callable[[int, int], None], reach: Floats | None = None
+    ) -> Sharpness:
         """Look through each camera; matter beyond `reach`, (C,), counts only towards `covered`."""
         from g2ard.rendering.renderer import RasterSettings, view_of
 
         if not len(cameras):
-            return Focus(*np.zeros((3, 0)))
+            return Sharpness(*np.zeros((3, 0)))
         here = cameras.resized(_LONGEST).recentred(self._middle)
         distance = float(np.median(norms(here.positions)))
         settings = RasterSettings(antialiased=self._antialiased, near=1e-3 * distance or None)
@@ -128,7 +130,7 @@ class Glance:
                 fine = weight[seen][angle < _FINE].sum() / pixels
                 figures[1:, i] = fine, quantile(angle, weight[seen], _COARSEST)
             tell(i + 1, len(here))
-        return Focus(*figures)
+        return Sharpness(*figures)
 
     def sight(self, cameras: Cameras, aims: NDArray[np.int64], close: float) -> tuple[Floats, Floats]:
         """Return the light from close matter, and how clear the lines of sight are.
@@ -156,7 +158,7 @@ class Glance:
         return murk, clear
 
 
-def plan_focus(
+def plan_sharp(
     site: Site,
     glance: Glance,
     count: int,
@@ -178,7 +180,7 @@ def plan_focus(
         also: poses to try before those anywhere in free space.
     """
     poses = Poses(np.zeros((0, 3)), np.zeros((0, 3))) if also is None else also
-    found = glance.of(poses.cameras(site, lens), tell) if len(poses) else Focus(*np.zeros((3, 0)))
+    found = glance.of(poses.cameras(site, lens), tell) if len(poses) else Sharpness(*np.zeros((3, 0)))
     for batch in range(_TRIED):
         if len(found.good(*_GOOD[0])) >= count:
             break
@@ -187,7 +189,7 @@ def plan_focus(
             continue
         poses = Poses.joined([poses, more])
         seen = glance.of(more.cameras(site, lens), tell)
-        found = Focus(
+        found = Sharpness(
             *(np.append(getattr(found, k), getattr(seen, k)) for k in ("covered", "fine", "coarse"))
         )
     rows: list[int] = []
