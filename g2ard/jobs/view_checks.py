@@ -26,10 +26,6 @@ _SEEING = 0.5
 """Share of cameras that must see the scene for found views to be used."""
 _LOOKED_AT, _SMALL = 15, 160
 """Number of photos compared with the scene, and their longer side in pixels."""
-_ALIKE = 0.4
-"""Correlation below which photos and renders are considered unrelated. Medians: fox and caliterra with their
-own scenes (2,000 Gaussians, 20 steps) 0.86 and 0.50, plush with its own 0.98, with turned poses 0.30.
-"""
 _DIFFERENT = 4 / 255
 """Difference of two background colours that matters."""
 _BLIND = 0.1
@@ -87,7 +83,7 @@ def warn_of_photos(splats: Splats, cameras: Cameras, background: Colour, say: Sa
 
     The measure is the correlation of pixel brightness, as the median over a few small photos.
     """
-    from g2ard.jobs.causes import correlation
+    from g2ard.jobs.causes import UNLIKE, correlation
 
     pictured = np.flatnonzero([path is not None for path in cameras.image_paths])
     tried = np.unique(np.linspace(0, len(pictured) - 1, min(_LOOKED_AT, len(pictured))).astype(int))
@@ -99,7 +95,7 @@ def warn_of_photos(splats: Splats, cameras: Cameras, background: Colour, say: Sa
         counted = np.ones(photos[view].shape[:2], bool) if mask is None else mask
         image = renderer.render(photos.cameras[view]).image
         alike.append(correlation(image[counted], photos[view][counted]))
-    if alike and np.median(alike) < _ALIKE:
+    if alike and np.median(alike) < UNLIKE:
         say(
             f"warning: the scene does not look like the photos (correlation {np.median(alike):.2f}); check "
             "the views with `g2ard render --views`, or ignore the photos with --renders"

@@ -60,17 +60,24 @@ def test_a_poor_result_without_a_usual_cause_says_so(tmp_path: Path) -> None:
     assert line.startswith("the result scores only 15.0 dB in held-out views, and no usual cause")
 
 
-def test_a_white_background_is_named(tmp_path: Path) -> None:
+@pytest.mark.parametrize("times", [1, 9])  # as large as 9 times, Gaussians fill the background
+def test_a_white_background_is_named(tmp_path: Path, times: int) -> None:
     alpha = [Renderer(BALL).render(camera).alpha for camera in VIEWS.take(range(0, 12, 3))]
-    lines = causes(photos(tmp_path, lambda image, view: image + 1 - alpha[view][..., None]))
+    held_out = photos(tmp_path, lambda image, view: image + 1 - alpha[view][..., None])
+    lines = causes(held_out, replace(BALL, scales=BALL.scales * times))
     assert lines[0] == "the result scores only 15.0 dB in held-out views; likely causes:"
-    assert lines[1].startswith("  - background: ")
-    assert "photos are white there, not black" in lines[1]
+    assert lines[1] == "  - background: the photos show white around the scene, not black (--background)"
+
+
+def test_photos_of_another_place_have_no_background(tmp_path: Path) -> None:
+    noise = np.random.default_rng(0)
+    lines = causes(photos(tmp_path, lambda image, view: noise.uniform(size=image.shape)))
+    assert lines[1].startswith("  - poses: renders look unlike the photos (correlation ")
 
 
 def test_photos_of_other_poses_are_named(tmp_path: Path) -> None:
     shifted = causes(photos(tmp_path, lambda image, view: np.roll(image, image.shape[1] // 2, axis=1)))
-    assert shifted[1].startswith("  - poses: renders do not look like the photos (correlation -")
+    assert shifted[1].startswith("  - poses: renders look unlike the photos (correlation -")
 
 
 def test_changing_exposure_is_named(tmp_path: Path) -> None:
