@@ -206,7 +206,9 @@ def _sources(views: RunViews, photos: bool | None, lifted: bool) -> _Sources:
     if (lifted or photos) and not all(pictured):
         name = (*train.names, *views.test.names)[pictured.index(False)]
         scene = "a trained scene" if lifted else "leave out {photos} to render the scene there"
-        raise InputError(f"view {name} has no photo", hint=f"give views with photos, or {scene}")
+        raise InputError(
+            f"view {name} has no photo", hint=f"give views with photos, their {{images=DIR}}, or {scene}"
+        )
     use_photos = lifted or (any(pictured) if photos is None else photos)
     return _Sources(photos=use_photos, renders=not (use_photos and all(pictured)))
 

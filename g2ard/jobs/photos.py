@@ -190,7 +190,9 @@ def points_along_rays(
         raise InputError(f"photos: expected at least 3 views, got {len(cameras)}; pass more, or a scene")
     bare = [name for name, path in zip(cameras.names, cameras.image_paths, strict=True) if path is None]
     if bare:
-        raise InputError(f"photos: view {bare[0]} has no photo; pass views with photos, or a scene")
+        raise InputError(
+            f"view {bare[0]} has no photo", hint="pass views with photos, their {images=DIR}, or a scene"
+        )
     photos, outlines = [], []
     for view in range(len(cameras)):
         image = load_premultiplied(cameras, view)

@@ -171,7 +171,7 @@ class Photos(_Cached):
         if missing is not None:
             raise InputError(
                 f"view {missing} has no photo",
-                hint="pass views with photos, or render them from {teacher=SCENE}",
+                hint="pass views with photos, their {images=DIR}, or render them from {teacher=SCENE}",
             )
         super().__init__(cameras, limit)
         self._background = background

@@ -132,8 +132,8 @@ def test_views_without_photos_name_the_substitute(command_line: CommandLine, fol
     to = ("-r", 4, "-o", "x", "--views", "views.json")
     for ask, words in (
         (("distill", "ball.ply", *to, "--photos"), "leave out --photos to render the scene there"),
-        (("distill", "cloud.ply", *to), "give views with photos, or a trained scene"),
-        (("distill", *to[2:], "-n", 50), "pass views with photos, or a scene"),
+        (("distill", "cloud.ply", *to), "give views with photos, their --images DIR, or a trained scene"),
+        (("distill", *to[2:], "-n", 50), "pass views with photos, their --images DIR, or a scene"),
         (("recover", "ball.ply", "-o", "x.ply", *to[4:]), "render them from --teacher SCENE"),
     ):
         status, _, error = command_line(*ask, cwd=folder)
