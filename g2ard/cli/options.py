@@ -13,6 +13,7 @@ from g2ard.cli.budget_options import Count
 from g2ard.config.choices import (
     BLACK,
     Alpha,
+    Colour,
     Convention,
     Engine,
     FormatName,
@@ -231,6 +232,23 @@ BackgroundOption = Annotated[
         parser=_colour, metavar="COLOUR", help="Background: black (default), white or R,G,B in [0, 1]."
     ),
 ]
+
+
+def background_of(run: Run, given: Colour | None, *scenes: Path | None) -> Colour | None:
+    """Return --background, otherwise that of the first run among the scenes; None if it is the default."""
+    from g2ard.io.detect import run_background
+    from g2ard.scene.images import colour_text
+
+    if given is not None:
+        return given
+    found = ((scene, colour) for scene in filter(None, scenes) if (colour := run_background(scene)))
+    scene, colour = next(found, (None, BLACK))
+    if colour == BLACK:
+        return None
+    run.say(f"background: {colour_text(colour)}, as {scene} was made with")
+    return colour
+
+
 TeacherOption = Annotated[
     Path | None,
     typer.Option(

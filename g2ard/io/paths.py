@@ -34,6 +34,14 @@ def read_text(path: Path) -> str:
         raise InputError("not a text file", path=path) from error
 
 
+def short_names(paths: Sequence[Path]) -> list[str]:
+    """Return file names, with their folders if names repeat."""
+    names = [path.name for path in paths]
+    if len(set(names)) < len(names):
+        return ["/".join(path.absolute().parts[-2:]) for path in paths]
+    return names
+
+
 def output_names(path: str | Path, names: Sequence[str]) -> list[str]:
     """Return file names for views, without suffix, that stay inside one folder.
 

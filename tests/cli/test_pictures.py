@@ -37,6 +37,8 @@ def test_render_writes_an_animation(tmp_path: Path, command_line: CommandLine, n
         found.load()
         assert found.info["duration"] == 100
     assert "exists" in refused(command_line, tmp_path, *ask, status=1)
+    told = refused(command_line, tmp_path, *ask[:-1], "turn.avi")
+    assert "expected a folder, .gif, .webp or .mp4, got 'turn.avi'" in told
 
 
 def test_an_mp4_without_ffmpeg_says_so(

@@ -45,7 +45,7 @@ def test_alpha_is_composited_over_the_background(command_line: CommandLine, rgba
     assert "8 photos with alpha, composited over black, the default; most" in error
 
 
-def test_a_run_is_evaluated_on_its_own_background(command_line: CommandLine, rgba: Path) -> None:
+def test_a_run_is_drawn_on_its_own_background(command_line: CommandLine, rgba: Path) -> None:
     made = ("distill", "--views", "ball", "-n", 300, "--steps", 5, "--background", "white", "--no-view")
     succeeds(command_line, rgba, *made, "-o", "run")
     told = succeeds(command_line, rgba, "evaluate", "run", "--views", "ball")
@@ -54,6 +54,16 @@ def test_a_run_is_evaluated_on_its_own_background(command_line: CommandLine, rgb
         told.out
         == succeeds(command_line, rgba, "evaluate", "run", "--views", "ball", "--background", "white").out
     )
+    for ask in (
+        ("render", "run", "--orbit", 1, "-o", "pictures"),
+        ("compare", "run", "ball.ply", "-n", 1),
+        ("view", "run", "-o", "page.html"),
+        ("register", "run", "--photos", "ball", "-o", "poses.json", "--matcher", "direct"),
+    ):
+        _, _, error = command_line(*ask, cwd=rgba)
+        assert "background: white, as run was made with" in error, error
+    _, _, error = command_line("register", "ball.ply", *ask[2:], cwd=rgba)
+    assert "24 photos with alpha, composited over black, the default; most" in error
 
 
 @pytest.mark.parametrize(

@@ -8,9 +8,17 @@ from typing import Annotated
 import typer
 
 from g2ard.cli.frame import Run, command
-from g2ard.cli.options import BackgroundOption, ImagesOption, SizeOption, ViewsOrMadeOption, with_images
+from g2ard.cli.options import (
+    BackgroundOption,
+    ImagesOption,
+    SizeOption,
+    ViewsOrMadeOption,
+    background_of,
+    with_images,
+)
 from g2ard.config.choices import BLACK
 from g2ard.io.detect import run_scene
+from g2ard.io.paths import short_names
 from g2ard.progress import plural
 
 _WORST = 3
@@ -45,11 +53,12 @@ def compare(
     from g2ard.stages.evaluate import evaluate
     from g2ard.viewer import check_page_output, write_page
 
-    colour, paths = background or BLACK, (run_scene(first), run_scene(second))
+    paths = run_scene(first), run_scene(second)
     if output is not None:
         check_page_output(output, run.overwrite)
         run.spare_inputs(output)
     reference, other = (run.load(path) for path in paths)
+    colour = background_of(run, background, first, second) or BLACK
     found = views_or_pool(
         reference,
         with_images(views, images),
@@ -76,7 +85,8 @@ def compare(
     if output is not None:
         stand = frame_with(reference, cameras, start=worst[0].name)
         scenes = [
-            (path.name, stand.of(splats)) for path, splats in zip(paths, (reference, other), strict=True)
+            (name, stand.of(splats))
+            for name, splats in zip(short_names(paths), (reference, other), strict=True)
         ]
         write_page(output, scenes, start=stand.start, background=colour, overwrite=run.overwrite)
         run.say(f"{output}: opens at {worst[0].name}")

@@ -10,9 +10,10 @@ import typer
 
 from g2ard.cli import options as opt
 from g2ard.cli.frame import Run, command
-from g2ard.config.choices import BLACK, Colour, LpipsInput
+from g2ard.config.choices import BLACK, LpipsInput
 from g2ard.errors import InputError
 from g2ard.io import check_scene
+from g2ard.io.paths import short_names
 from g2ard.progress import plural
 
 
@@ -73,7 +74,7 @@ def evaluate(
     views = opt.with_images(views, images, alpha)
     for path in scenes:
         check_scene(path)
-    chosen, settings = background or _of_run(run, scenes), RasterSettings(convention=convention)
+    chosen, settings = opt.background_of(run, background, *scenes), RasterSettings(convention=convention)
     colour = chosen or BLACK
     dense = run.load(teacher) if teacher else None
     frozen = run.load(anchors) if anchors else None
@@ -116,18 +117,6 @@ def evaluate(
     run.result({"against": against, "protocol": followed, "scenes": rows})
 
 
-def _of_run(run: Run, scenes: list[Path]) -> Colour | None:
-    """Return the background of the first scene that is a run's folder, and say it unless it is black."""
-    from g2ard.io.detect import run_background
-    from g2ard.scene.images import colour_text
-
-    found = next(((path, colour) for path in scenes if (colour := run_background(path))), None)
-    if found is None or found[1] == BLACK:
-        return None
-    run.say(f"background: {colour_text(found[1])}, as {found[0]} was made with")
-    return found[1]
-
-
 def _table(run: Run, title: str, rows: list[dict[str, Any]]) -> None:
     drifts = any(r["drift95"] is not None for r in rows)
     run.console.table(
@@ -145,7 +134,7 @@ def _table(run: Run, title: str, rows: list[dict[str, Any]]) -> None:
         ],
         [
             [
-                Path(r["scene"]).name,
+                name,
                 f"{r['count']:,}",
                 f"{r['file_bytes'] / 1e6:.2f}",
                 f"{r['psnr']:.2f}",
@@ -155,7 +144,7 @@ def _table(run: Run, title: str, rows: list[dict[str, Any]]) -> None:
                 f"{r['overdraw']:.1f}",
                 *([f"{r['drift95']:.3g}"] if drifts else []),
             ]
-            for r in rows
+            for name, r in zip(short_names([Path(r["scene"]) for r in rows]), rows, strict=True)
         ],
         stdout=run.json != "-",
     )

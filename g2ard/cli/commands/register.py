@@ -112,6 +112,7 @@ def register(
     Each photo is registered, uncertain or refused; OUT gets the registered ones as views.
     """
     from g2ard.jobs.register import photos_of, pool_of, poses_for
+    from g2ard.jobs.view_checks import propose_background
     from g2ard.stages.register import RegisterConfig
     from g2ard.stages.register import register as find
     from g2ard.stages.register.report import summarize
@@ -142,7 +143,9 @@ def register(
     elif pool is None:
         starts = dict(zip(taken.names, taken.viewmats, strict=True))
     true = {} if truth is None else poses_for(truth, taken.names)
-    splats = run.load(scene)
+    splats, chosen = run.load(scene), opt.background_of(run, background, scene)
+    colour = chosen or BLACK
+    propose_background(taken, colour, chosen is not None, run.say)
     places = pool_of(splats, pool, run.seed, run.progress, run.say) if pool is not None else None
     found = find(
         splats,
@@ -152,7 +155,7 @@ def register(
         truth=true,
         config=config,
         keep=keep,
-        background=background or BLACK,
+        background=colour,
         progress=run.progress,
     )
     rows = found.report.photos
@@ -173,7 +176,7 @@ def register(
             matches=found.matches,
             side=config.size,
             told=lines,
-            background=background or BLACK,
+            background=colour,
         )
     if len(found.cameras):
         run.write_views(output, found.cameras, format)

@@ -24,6 +24,9 @@ if TYPE_CHECKING:
 
     from g2ard.scene.splats import Splats
 
+_NO_FOLDER = (".png", ".jpg", ".jpeg", ".avi", ".mov", ".mkv", ".webm")
+"""Suffixes of files that `render` does not write as -o."""
+
 Color = Literal["scene", "flags", "cells", "parents"]
 
 
@@ -86,6 +89,8 @@ def render(
     if turn is not None and (views is not None or count is not None):
         raise typer.BadParameter("--orbit generates its views, so it excludes --views and -n")
     animation = output if output is not None and output.suffix.lower() in SUFFIXES else None
+    if output is not None and animation is None and output.suffix.lower() in _NO_FOLDER:
+        raise typer.BadParameter(f"-o: expected a folder, .gif, .webp or .mp4, got {output.name!r}")
     if animation is not None:
         if depth:
             raise typer.BadParameter("--depth needs a folder; give -o DIR")
@@ -120,7 +125,8 @@ def render(
     places = output_names(cameras.source or str(views), cameras.names) if output is not None else []
     shown: list[NDArray[np.uint8]] = []
     wanted = sheet is not None or animation is not None
-    renderer = Renderer(splats, background=background or BLACK, settings=settings)
+    colour = opt.background_of(run, background, scene) or BLACK
+    renderer = Renderer(splats, background=colour, settings=settings)
     with nullcontext() if output is None else atomic_folder(output, run.overwrite) as folder:
         for view in range(len(cameras)):
             rendered = renderer.render(cameras[view])

@@ -11,6 +11,7 @@ from g2ard.cli import options as opt
 from g2ard.cli.frame import Run, command
 from g2ard.config.choices import BLACK
 from g2ard.io.detect import run_scene
+from g2ard.io.paths import short_names
 from g2ard.progress import plural
 
 if TYPE_CHECKING:
@@ -58,13 +59,13 @@ def view(
         progress=run.progress,
         say=run.say,
     )
-    named = zip(_names(paths), loaded, strict=True)
+    named = zip(short_names(paths), loaded, strict=True)
     labels = [f"{name}: {plural(len(splats), 'Gaussian')}" for name, splats in named]
     written = write_page(
         output,
         [(label, stand.of(splats)) for label, splats in zip(labels, loaded, strict=True)],
         start=stand.start,
-        background=background or BLACK,
+        background=opt.background_of(run, background, scene, other) or BLACK,
         overwrite=run.overwrite,
     )
     sizes = " and ".join(f"{size / 1e6:.2f}" for size in written.scenes)
@@ -85,11 +86,3 @@ def _told(paths: list[Path], scenes: list[Splats], sizes: tuple[int, ...]) -> li
         {"scene": str(path), "count": len(splats), "bytes": size}
         for path, splats, size in zip(paths, scenes, sizes, strict=True)
     ]
-
-
-def _names(paths: list[Path]) -> list[str]:
-    """Return file names, with their folders if names repeat."""
-    names = [path.name for path in paths]
-    if len(set(names)) < len(names):
-        return ["/".join(path.absolute().parts[-2:]) for path in paths]
-    return names

@@ -178,7 +178,8 @@ def _register_photo(
         candidates = _from_pool(search, pool, photo)
     renders = search.renders
     if not candidates:
-        why = "the starting pose does not see the scene"
+        least = f"{search.config.min_overlap:.0%} of the photo"
+        why = f"away from edges, the scene covers less than {least} at the starting pose"
         if not search.config.fallback:
             why = f"fewer than {search.config.min_inliers} matches confirm a pose"
         return replace(refused, reason=why, renders=renders), None
