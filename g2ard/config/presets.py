@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any, TypeVar
 
 from g2ard.config.paths import changed, full_paths
-from g2ard.errors import InputError
+from g2ard.errors import require
 
 Config = TypeVar("Config")
 
@@ -64,8 +64,7 @@ def configured(config: Config, preset: str = "auto", settings: Mapping[str, Any]
     """
     from g2ard.stages.recover.schedule import Schedule
 
-    if preset not in PRESETS:
-        raise InputError(f"expected one of {', '.join(PRESETS)}, got {preset!r}", parameter="preset")
+    require("preset", repr(preset), preset in PRESETS, f"one of {', '.join(PRESETS)}")
     values = {**PRESETS[preset], **full_paths(settings or {}, config)}
     schedule, steps = values.get("recover.schedule", "default"), values.get("recover.steps")
     if isinstance(schedule, str):

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from g2ard.errors import DAMAGED, InputError
+from g2ard.errors import DAMAGED, InputError, require
 from g2ard.io import spz
 from g2ard.io.atomic import atomic_output
 from g2ard.io.jsonfile import (
@@ -60,8 +60,7 @@ def write(path: Path, splats: Splats, *, overwrite: bool = False, compress: str 
     colour clipped to [0, 1] and decoded from sRGB, and α. `offset` is the node's translation.
     `compress="spz"` writes an SPZ of version 3 instead of attributes, for CesiumJS.
     """
-    if compress not in (None, "spz"):
-        raise InputError(f"expected spz, got {compress!r}", parameter="compress")
+    require("compress", repr(compress), compress in (None, "spz"), "spz")
     splats = writable(path, splats)
     content = _plain(path, splats) if compress is None else spz_glb(path, splats)
     with atomic_output(path, overwrite) as temporary, temporary.open("wb") as file:

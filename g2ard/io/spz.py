@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard.config.choices import Axes
-from g2ard.errors import DAMAGED, InputError, missing
+from g2ard.errors import DAMAGED, InputError, missing, require
 from g2ard.io import packing
 from g2ard.io.atomic import atomic_output
 from g2ard.io.limits import check_unpacked
@@ -255,8 +255,7 @@ def write(
     Version 3 uses gzip, 4 Zstandard (smaller files), 2 gzip with coarser rotations. Version 4 can store other
     `axes`, which it names; readers that ignore extensions show such a scene turned or mirrored.
     """
-    if spz_version not in (2, 3, 4):
-        raise InputError(f"expected 2, 3 or 4, got {spz_version}", parameter="spz_version")
+    require("spz_version", spz_version, spz_version in (2, 3, 4), "2, 3 or 4")
     if axes != "RUB":
         if spz_version != 4:
             raise InputError(

@@ -7,7 +7,7 @@ import re
 from dataclasses import dataclass
 from numbers import Real
 
-from g2ard.errors import InputError
+from g2ard.errors import InputError, require
 from g2ard.progress import plural
 
 DEVICES = {
@@ -62,16 +62,12 @@ class Budget:
         quality = self.min_psnr if self.min_ssim is None else self.min_ssim
         if (self.count, self.ratio, self.share, self.fit, quality).count(None) != 4:
             raise InputError("expected exactly one kind of budget: count, ratio, fit, min_psnr or min_ssim")
-        if self.count is not None and self.count < 1:
-            raise InputError(f"expected at least 1, got {self.count}", parameter="count")
-        if self.ratio is not None and not (math.isfinite(self.ratio) and self.ratio >= 1):
-            raise InputError(f"expected at least 1, got {self.ratio}", parameter="ratio")
-        if self.share is not None and not 0 < self.share <= 1:
-            raise InputError(f"expected a number in (0, 1], got {self.share}", parameter="share")
-        if self.min_psnr is not None and not (math.isfinite(self.min_psnr) and self.min_psnr > 0):
-            raise InputError(f"expected decibels above 0, got {self.min_psnr}", parameter="min_psnr")
-        if self.min_ssim is not None and not 0 < self.min_ssim < 1:
-            raise InputError(f"expected a number in (0, 1), got {self.min_ssim}", parameter="min_ssim")
+        count, ratio, share, psnr, ssim = self.count, self.ratio, self.share, self.min_psnr, self.min_ssim
+        require("count", count, count is None or count >= 1, "at least 1")
+        require("ratio", ratio, ratio is None or 1 <= ratio < math.inf, "at least 1")
+        require("share", share, share is None or 0 < share <= 1, "a number in (0, 1]")
+        require("min_psnr", psnr, psnr is None or 0 < psnr < math.inf, "decibels above 0")
+        require("min_ssim", ssim, ssim is None or 0 < ssim < 1, "a number in (0, 1)")
         if self.fit is not None and self.fit.lower() not in DEVICES and not self.bytes:
             raise InputError(
                 f"expected bytes such as 5MB or 800kB, or {', '.join(DEVICES)}, got {self.fit!r}",

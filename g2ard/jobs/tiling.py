@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from g2ard.errors import InputError
+from g2ard.errors import InputError, require
 from g2ard.io import open_stream
 from g2ard.io.detect import kind
 from g2ard.tiles.store import MANIFEST, TileStore, row_width
@@ -170,8 +170,7 @@ def bytes_of(text: str) -> int:
     size = (
         0.0 if match is None else float(match[1]) * base ** ["", "k", "m", "g", "t"].index(match[2].lower())
     )
-    if size < 1e6:
-        raise InputError(f"expected a size such as 4GB or 800MB, got {text!r}", parameter="memory")
+    require("memory", repr(text), size >= 1e6, "a size such as 4GB or 800MB")
     return int(size)
 
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from g2ard import _core
 from g2ard.config.choices import BLACK, CONVENTIONS, Convention
-from g2ard.errors import InputError
+from g2ard.errors import InputError, require
 from g2ard.scene.cameras import Camera, Cameras
 from g2ard.scene.prepared import DRAWN_LOG_SCALES, DRAWN_LOGITS, MAX_OPACITY
 from g2ard.scene.splats import Splats
@@ -50,8 +50,7 @@ class RasterSettings:
             raise InputError(
                 f"expected {' or '.join(CONVENTIONS)}, got {self.convention!r}", parameter="convention"
             )
-        if not 1 / 255 <= self.alpha_max < 1:
-            raise InputError(f"expected a value in [1/255, 1), got {self.alpha_max}", parameter="alpha_max")
+        require("alpha_max", self.alpha_max, 1 / 255 <= self.alpha_max < 1, "a value in [1/255, 1)")
 
     def near_of(self, index: int) -> float:
         """Return the near plane of camera `index`."""
@@ -183,8 +182,7 @@ class Renderer:
         settings: RasterSettings | None = None,
     ) -> None:
         self.background = [float(c) for c in background]
-        if len(self.background) != 3:
-            raise InputError(f"expected 3 numbers, got {len(self.background)}", parameter="background")
+        require("background", len(self.background), len(self.background) == 3, "3 numbers")
         if settings is not None and not isinstance(settings.near, int | float | None):
             raise InputError("expected one distance for all views", parameter="near")
         self._offset, middle = splats.offset, middle_of(splats)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from g2ard import _core
-from g2ard.errors import InputError
+from g2ard.errors import InputError, require
 from g2ard.scene.splats import SH_C0, Splats
 
 _FLAGGED = np.array([0.93, 0.33, 0.10])
@@ -37,8 +37,7 @@ def painted(splats: Splats, colors: ArrayLike) -> Splats:
     True
     """
     paint = np.asarray(colors, np.float64)
-    if paint.shape != (len(splats), 3):
-        raise InputError(f"expected shape ({len(splats)}, 3), got {paint.shape}", parameter="colors")
+    require("colors", paint.shape, paint.shape == (len(splats), 3), f"shape ({len(splats)}, 3)")
     luma = np.clip(splats.colors.astype(np.float64) @ _LUMA, 0, 1)
     shaded = paint * (1 - _SHADE + _SHADE * luma[:, None])
     sh0 = np.ascontiguousarray(((shaded - 0.5) / SH_C0)[:, None], np.float32)

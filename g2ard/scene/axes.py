@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard.config.choices import AXES
-from g2ard.errors import InputError
+from g2ard.errors import require
 from g2ard.scene.splats import Splats
 from g2ard.scene.transform import transform
 
@@ -27,8 +27,7 @@ def change_of_axes(source: str, target: str) -> NDArray[np.float64]:
     array([ 1., -3.,  2.])
     """
     for name in (source, target):
-        if name not in AXES:
-            raise InputError(f"expected one of {', '.join(AXES)}, got {name!r}", parameter="axes")
+        require("axes", repr(name), name in AXES, f"one of {', '.join(AXES)}")
     there, here = (np.array([_DIRECTIONS[letter] for letter in name], float) for name in (target, source))
     return there @ here.T
 

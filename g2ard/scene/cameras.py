@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from g2ard.errors import InputError
+from g2ard.errors import InputError, require
 from g2ard.io.limits import check_image
 from g2ard.progress import plural
 
@@ -69,8 +69,7 @@ class Camera:
         Raises:
             InputError: position and target coincide, or the field of view is not between 0 and 180°.
         """
-        if not 0 < fov < 180:
-            raise InputError(f"expected degrees between 0 and 180, got {fov}", parameter="fov")
+        require("fov", fov, 0 < fov < 180, "degrees between 0 and 180")
         focal = width / 2 / np.tan(np.radians(fov) / 2)
         K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
         return cls(look_at(position, target, up), K, width, height, name)
@@ -136,11 +135,9 @@ class Cameras:
             ("distortions", (n, 5)),
         ):
             got = getattr(self, name).shape
-            if got != shape:
-                raise InputError(f"expected shape {shape}, got {got}", parameter=name)
+            require(name, got, got == shape, f"shape {shape}")
         for name in ("names", "image_paths", "mask_paths"):
-            if len(getattr(self, name)) != n:
-                raise InputError(f"expected {n}, got {len(getattr(self, name))}", parameter=name)
+            require(name, len(getattr(self, name)), len(getattr(self, name)) == n, str(n))
         for i in range(n):
             given = (self.viewmats[i], self.Ks[i], self.distortions[i])
             if not all(np.isfinite(values).all() for values in given):

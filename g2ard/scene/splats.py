@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from g2ard.config.choices import RENDER_MODELS, RenderModel
-from g2ard.errors import InputError
+from g2ard.errors import InputError, require
 from g2ard.progress import plural
 
 SH_C0 = 0.28209479177387814
@@ -59,8 +59,7 @@ class Splats:
     render_model: RenderModel = "classic"
 
     def __post_init__(self) -> None:
-        if self.means.ndim != 2 or self.means.shape[1] != 3:
-            raise InputError(f"expected shape (N, 3), got {self.means.shape}", parameter="means")
+        require("means", self.means.shape, self.means.ndim == 2 and self.means.shape[1] == 3, "shape (N, 3)")
         n = len(self.means)
         rest = self.shN.shape[1] if self.shN.ndim == 3 else -1
         for name, shape in (
@@ -71,10 +70,8 @@ class Splats:
             ("shN", (n, rest, 3)),
         ):
             got = getattr(self, name).shape
-            if got != shape:
-                raise InputError(f"expected shape {shape}, got {got}", parameter=name)
-        if rest not in _DEGREE_OF_REST:
-            raise InputError(f"expected 0, 3, 8 or 15 coefficients, got {rest}", parameter="shN")
+            require(name, got, got == shape, f"shape {shape}")
+        require("shN", rest, rest in _DEGREE_OF_REST, "0, 3, 8 or 15 coefficients")
         if self.render_model not in RENDER_MODELS:
             raise InputError(
                 f"expected {' or '.join(RENDER_MODELS)}, got {self.render_model!r}", parameter="render_model"

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard import _core
-from g2ard.errors import InputError
+from g2ard.errors import InputError, require
 from g2ard.progress import Progress, silent
 from g2ard.rendering.renderer import Renderer
 from g2ard.scene.cameras import Camera, Cameras
@@ -92,8 +92,7 @@ def find_clutter(
     if unknown := sorted(set(kinds) - set(KINDS)):
         raise InputError(f"expected some of {', '.join(KINDS)}, got {unknown[0]!r}", parameter="kinds")
     for name, rows in (("seen", seen.weight), ("unoccluded", unoccluded)):
-        if len(rows) != len(splats):
-            raise InputError(f"expected {len(splats)} rows, got {len(rows)}", parameter=name)
+        require(name, len(rows), len(rows) == len(splats), f"{len(splats)} rows")
     kind = np.full(len(splats), -1, np.int8)
     hidden = _invisible(splats, seen, unoccluded, pixels)
     finders = {

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from g2ard import _core
-from g2ard.errors import InputError
+from g2ard.errors import InputError, require
 from g2ard.progress import Progress, counter, silent
 from g2ard.scene.splats import SH_C0, Splats
 
@@ -73,12 +73,9 @@ def lift(
     """
     xyz = np.ascontiguousarray(points, np.float64)
     rgb = np.asarray(colors, np.float64)
-    if xyz.ndim != 2 or xyz.shape[1] != 3:
-        raise InputError(f"expected shape (N, 3), got {xyz.shape}", parameter="points")
-    if rgb.shape != xyz.shape:
-        raise InputError(f"expected shape {xyz.shape}, got {rgb.shape}", parameter="colors")
-    if not 0 < opacity < 1:
-        raise InputError(f"expected a number between 0 and 1, got {opacity}", parameter="opacity")
+    require("points", xyz.shape, xyz.ndim == 2 and xyz.shape[1] == 3, "shape (N, 3)")
+    require("colors", rgb.shape, rgb.shape == xyz.shape, f"shape {xyz.shape}")
+    require("opacity", opacity, 0 < opacity < 1, "a number between 0 and 1")
     finite = np.isfinite(xyz).all(1) & np.isfinite(rgb).all(1)
     if not finite.any():
         raise InputError(f"none of the {len(xyz)} points is finite", parameter="points")

@@ -6,7 +6,7 @@ import os
 from dataclasses import dataclass
 
 from g2ard import _core
-from g2ard.errors import InputError
+from g2ard.errors import require
 
 
 @dataclass(frozen=True)
@@ -74,8 +74,7 @@ def use(device: str, *, timed: bool = False) -> None:
     >>> state().adapter is None
     True
     """
-    if device not in ("cpu", "gpu", "auto"):
-        raise InputError(f"expected cpu, gpu or auto, got {device!r}", parameter="device")
+    require("device", repr(device), device in ("cpu", "gpu", "auto"), "cpu, gpu or auto")
     _silence_mesa()
     _core.set_device(device, timed=timed)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from g2ard.config.choices import BLACK, Colour, Engine
-from g2ard.errors import InputError
+from g2ard.errors import require
 from g2ard.stages.recover.anchors import REGULARIZERS, Regularizers
 from g2ard.stages.recover.schedule import TUNED, Schedule
 
@@ -30,8 +30,7 @@ class FitConfig:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        if not 0 <= self.ssim_weight <= 1:
-            raise InputError(f"expected a value in [0, 1], got {self.ssim_weight}", parameter="ssim_weight")
+        require("ssim_weight", self.ssim_weight, 0 <= self.ssim_weight <= 1, "a value in [0, 1]")
 
 
 @dataclass(frozen=True)
@@ -62,12 +61,9 @@ class RecoverConfig(FitConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.steps is not None and self.steps < 1:
-            raise InputError(f"expected at least 1, got {self.steps}", parameter="steps")
-        if self.recovery_time is not None and not 0 < self.recovery_time < float("inf"):
-            raise InputError(
-                f"expected more than 0 seconds, got {self.recovery_time}", parameter="recovery_time"
-            )
+        require("steps", self.steps, self.steps is None or self.steps >= 1, "at least 1")
+        limit = self.recovery_time
+        require("recovery_time", limit, limit is None or 0 < limit < float("inf"), "more than 0 seconds")
 
     @property
     def horizon(self) -> int:

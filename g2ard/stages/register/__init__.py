@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from g2ard.config.choices import BLACK, Keep
-from g2ard.errors import InputError
+from g2ard.errors import InputError, require
 from g2ard.progress import Progress, silent
 from g2ard.rendering.renderer import Renderer
 from g2ard.scene.cameras import Cameras
@@ -102,8 +102,7 @@ def register(
     config = config or RegisterConfig()
     if not len(photos):
         raise InputError("no photos to register")
-    if keep not in KEPT:
-        raise InputError(f"expected {', '.join(KEPT)}, got {keep!r}", parameter="keep")
+    require("keep", repr(keep), keep in KEPT, ", ".join(KEPT))
     given = _poses("starts", starts, photos)
     true = _poses("truth", truth, photos)
     if not given and pool is None:

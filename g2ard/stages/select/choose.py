@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard.config.choices import POLICIES, UNMEASURED
-from g2ard.errors import InputError
+from g2ard.errors import InputError, require
 from g2ard.progress import Progress, plural, silent
 from g2ard.scene.cameras import Cameras, unseeing
 from g2ard.scene.splats import Splats
@@ -144,14 +144,12 @@ def select(
 
 def _check(cameras: Cameras, k: int | Literal["auto"], policy: str) -> None:
     """Reject an invalid number of views, an unknown policy, and candidates that are missing or too large."""
-    if policy not in POLICIES:
-        raise InputError(f"expected {', '.join(POLICIES)}, got {policy!r}", parameter="policy")
+    require("policy", repr(policy), policy in POLICIES, ", ".join(POLICIES))
     if k == "auto" and policy in UNMEASURED:
         raise InputError(f"'auto' needs a policy that measures gains, got {policy!r}", parameter="k")
     if k != "auto" and not isinstance(k, int | np.integer):
         raise InputError(f"expected 'auto' or a whole number of views, got {k!r}", parameter="k")
-    if k != "auto" and k < 1:
-        raise InputError(f"expected at least 1 view, got {k}", parameter="k")
+    require("k", k, k == "auto" or k >= 1, "at least 1 view")
     if not len(cameras):
         raise InputError("no candidate views to select from")
     large = np.maximum(cameras.widths, cameras.heights) > _LARGEST

@@ -104,8 +104,7 @@ def surface(splats: Splats, cells: int = 300_000) -> Surface:
     Raises:
         InputError: the scene is empty or not finite.
     """
-    if cells < 1:
-        raise InputError(f"expected at least 1, got {cells}", parameter="cells")
+    require("cells", cells, cells >= 1, "at least 1")
     scene, origin = core_scene(splats)
     found = _core.select_surface(scene, cells)
     return Surface(

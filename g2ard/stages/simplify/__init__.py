@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard import _core
-from g2ard.errors import InputError
+from g2ard.errors import InputError, require
 from g2ard.progress import Progress, counter, plural, silent
 from g2ard.scene.prepared import PreparedScene, finite_rows_of, with_some_opacity
 from g2ard.scene.splats import DRAWN_LOGIT, Splats, unit_quats
@@ -154,8 +154,7 @@ def simplify(
     (100, (1000,), 99)
     """
     method = config.method if method is None else method
-    if method not in METHODS:
-        raise InputError(f"expected one of {', '.join(METHODS)}, got {method!r}", parameter="method")
+    require("method", repr(method), method in METHODS, f"one of {', '.join(METHODS)}")
     scene, finite = finite_rows_of(splats)
     _check_budget(budget, len(scene))
     flags = _check_flags(protected, len(splats))
@@ -210,12 +209,8 @@ def _paper(
 
 
 def _check_budget(budget: int, count: int | None) -> None:
-    if budget < 1:
-        raise InputError(f"expected at least 1, got {budget}", parameter="budget")
-    if count is not None and budget > count:
-        raise InputError(
-            f"expected at most {count} (the scene's Gaussians), got {budget}", parameter="budget"
-        )
+    require("budget", budget, budget >= 1, "at least 1")
+    require("budget", budget, count is None or budget <= count, f"at most {count} (the scene's Gaussians)")
 
 
 def _check_flags(protected: NDArray[np.bool_] | None, count: int) -> NDArray[np.bool_] | None:

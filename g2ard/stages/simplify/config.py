@@ -8,7 +8,7 @@ from typing import cast
 
 from g2ard import _core
 from g2ard.config.choices import METHODS, Method
-from g2ard.errors import InputError, require
+from g2ard.errors import require
 from g2ard.scene.regions import Region, as_regions
 
 __all__ = ["METHODS", "SimplifyConfig", "round_counts"]
@@ -95,31 +95,18 @@ class SimplifyConfig:
 
     def __post_init__(self) -> None:
         require("method", repr(self.method), self.method in METHODS, f"one of {', '.join(METHODS)}")
-        if self.retention is not None and not 0 < self.retention < 1:
-            raise InputError(
-                f"expected a number between 0 and 1, got {self.retention}", parameter="retention"
-            )
-        if not 0 <= self.fold < 1:
-            raise InputError(f"expected a number in [0, 1), got {self.fold}", parameter="fold")
-        if not self.max_growth >= 1:
-            raise InputError(f"expected at least 1, got {self.max_growth}", parameter="max_growth")
-        if self.morton_premerge_ratio is not None and not self.morton_premerge_ratio >= 1:
-            raise InputError(
-                f"expected at least 1, got {self.morton_premerge_ratio}", parameter="morton_premerge_ratio"
-            )
-        if self.morton_premerge_steps is not None and self.morton_premerge_steps < 1:
-            raise InputError(
-                f"expected at least 1, got {self.morton_premerge_steps}", parameter="morton_premerge_steps"
-            )
-        if self.neighbors < 1:
-            raise InputError(f"expected at least 1, got {self.neighbors}", parameter="neighbors")
+        retention, alpha = self.retention, self.min_opacity
+        require("retention", retention, retention is None or 0 < retention < 1, "a number between 0 and 1")
+        require("fold", self.fold, 0 <= self.fold < 1, "a number in [0, 1)")
+        require("min_opacity", alpha, alpha is None or 0 <= alpha <= 1, "a number in [0, 1]")
+        for name in ("max_growth", "morton_premerge_ratio", "morton_premerge_steps", "neighbors"):
+            value = getattr(self, name)
+            require(name, value, value is None or value >= 1, "at least 1")
         object.__setattr__(self, "keep_region", as_regions(self.keep_region))
         for name in ("color_bin", "pixel_scale", "support", "keep_times"):
             value = getattr(self, name)
-            if not (math.isfinite(value) and value > 0):
-                raise InputError(f"expected a positive number, got {value}", parameter=name)
+            require(name, value, math.isfinite(value) and value > 0, "a positive number")
         for name in (
-            "min_opacity",
             "geometric_weight",
             "dilation",
             "max_energy",
@@ -129,10 +116,7 @@ class SimplifyConfig:
             "protection",
         ):
             value = getattr(self, name)
-            if value is not None and not value >= 0:
-                raise InputError(f"expected a number ≥ 0, got {value}", parameter=name)
-        if self.min_opacity is not None and self.min_opacity > 1:
-            raise InputError(f"expected a number in [0, 1], got {self.min_opacity}", parameter="min_opacity")
+            require(name, value, value >= 0, "a number ≥ 0")
 
     def resolved(self, method: str | None = None, *, antialiased: bool = False) -> SimplifyConfig:
         """Return the config for a method (by default its own), with None replaced by the method's constants.
