@@ -74,20 +74,24 @@ class DistillJob:
         return self._targets(self.views.test)
 
     @cached_property
-    def apart(self) -> tuple[Targets | None, Targets | None]:
-        """Views of another kind: one half for validation during recovery, the other for scoring.
+    def validation(self) -> Targets | None:
+        """Every second view of another kind, for validation during recovery; None as for `apart`."""
+        return self._every_second_apart(0)
 
-        Both are None if there are no such views or no teacher to render them.
-        """
+    @cached_property
+    def apart(self) -> Targets | None:
+        """The others of these views, for scoring; None without such views or a teacher to render them."""
+        return self._every_second_apart(1)
+
+    def _every_second_apart(self, first: int) -> Targets | None:
         cameras = self.views.apart
         if cameras is None or self.teacher is None or len(cameras) < 2:
-            return None, None
-        first, second = (self._targets(cameras.take(range(i, len(cameras), 2))) for i in (0, 1))
-        return first, second
+            return None
+        return self._targets(cameras.take(range(first, len(cameras), 2)))
 
     def render_targets(self) -> None:
         """Render all targets that are not lazy; `run` calls this too."""
-        _ = self.targets, self.held_out, self.apart
+        _ = self.targets, self.held_out, self.validation, self.apart
         vars(self).pop("_renderer", None)  # its buffers are larger than the scene
 
     @cached_property
@@ -130,7 +134,7 @@ class DistillJob:
             self.targets,
             self.config,
             weights=self.weights,
-            validation=self.apart[0],
+            validation=self.validation,
             work=work,
             progress=self.progress,
         )

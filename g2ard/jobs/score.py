@@ -28,7 +28,7 @@ def report_of(job: DistillJob, done: Distilled) -> dict[str, Any]:
         (`overdraw`), rounds, seconds by stage, and every setting by path.
     """
     scores = _scores(job, done, job.held_out, job.progress)
-    apart = None if job.apart[1] is None else _scores(job, done, job.apart[1], job.progress)
+    apart = None if job.apart is None else _scores(job, done, job.apart, job.progress)
     before, after = (
         [*scores[name]["views"], *(apart[name]["views"] if apart else [])]
         for name in ("simplified", "recovered")

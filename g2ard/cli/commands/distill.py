@@ -274,7 +274,7 @@ def _distil(
             output / "report.html",
             f"{source.name}: {len(job.prior):,} → {len(result.splats):,}",
             [("simplified", result.simplified), ("recovered", result.splats)],
-            [job.held_out] if job.apart[1] is None else [job.held_out, job.apart[1]],
+            [job.held_out] if job.apart is None else [job.held_out, job.apart],
             report,
             colour,
             told=told(report),
