@@ -157,9 +157,8 @@ def simplify(
     require("method", repr(method), method in METHODS, f"one of {', '.join(METHODS)}")
     scene, finite = finite_rows_of(splats)
     _check_budget(budget, len(scene))
-    flags = _check_flags(protected, len(splats))
-    if flags is not None:
-        flags = np.ascontiguousarray(flags[finite])
+    if protected is not None:
+        protected = np.ascontiguousarray(_check_flags(protected, len(splats))[finite])
     if not (scene.opacities >= config.min_opacity_of(method)).any():
         scene, config = with_some_opacity(scene), replace(config, min_opacity=0.0)
     if config.keep_region and (method == "paper" or visibility is None):
@@ -167,33 +166,19 @@ def simplify(
             "needs views; `paper` uses none, and `fast` only given ones", parameter="keep_region"
         )
     if method == "paper":
-        out = _paper(scene, budget, flags, final_budget or budget, config, progress)
+        out = _paper(scene, budget, protected, final_budget or budget, config, progress)
+    elif callable(visibility):
+        out = merge_and_fit(scene, budget, method, visibility, protected, config, progress)
     else:
-        out = _pairs(scene, budget, method, visibility, len(splats), finite, flags, config, progress)
+        seen = None if visibility is None else rows_of(visibility, len(splats), finite)
+        out = merge(scene, budget, method, seen, protected, config, counter(progress, "simplify"))
     return _simplified(splats, finite, out)
-
-
-def _pairs(
-    scene: PreparedScene,
-    budget: int,
-    method: str,
-    visibility: Visibility | VisibilitySource | None,
-    count: int,
-    finite: NDArray[np.bool_] | slice,
-    flags: NDArray[np.bool_] | None,
-    config: SimplifyConfig,
-    progress: Progress,
-) -> dict[str, Any]:
-    if callable(visibility):
-        return merge_and_fit(scene, budget, method, visibility, flags, config, progress)
-    of_rows = None if visibility is None else rows_of(visibility, count, finite)
-    return merge(scene, budget, method, of_rows, flags, config, counter(progress, "simplify"))
 
 
 def _paper(
     scene: PreparedScene,
     budget: int,
-    flags: NDArray[np.bool_] | None,
+    protected: NDArray[np.bool_] | None,
     cells: int,
     config: SimplifyConfig,
     progress: Progress,
@@ -203,7 +188,7 @@ def _paper(
         round_counts(len(scene), budget, config.retention_of("paper"), config.fold),
         cells,
         config.resolved("paper"),
-        protected=flags,
+        protected=protected,
         progress=counter(progress, "simplify"),
     )
 
@@ -213,9 +198,7 @@ def _check_budget(budget: int, count: int | None) -> None:
     require("budget", budget, count is None or budget <= count, f"at most {count} (the scene's Gaussians)")
 
 
-def _check_flags(protected: NDArray[np.bool_] | None, count: int) -> NDArray[np.bool_] | None:
-    if protected is None:
-        return None
+def _check_flags(protected: NDArray[np.bool_], count: int) -> NDArray[np.bool_]:
     flags = np.asarray(protected)
     if flags.dtype != np.bool_ or flags.shape != (count,):
         raise InputError(

@@ -86,7 +86,7 @@ def merge(
     budget: int,
     method: str,
     visibility: Visibility | None,
-    flags: NDArray[np.bool_] | None,
+    protected: NDArray[np.bool_] | None,
     config: SimplifyConfig,
     tell: Callable[[int, int], None],
 ) -> dict[str, Any]:
@@ -96,7 +96,7 @@ def merge(
         scene.core,
         round_counts(len(scene), budget, config.retention_of(method), config.fold),
         config,
-        protected=flags,
+        protected=protected,
         visibility=None if visibility is None else emphasised(scene, visibility, config),
         progress=tell,
     )
@@ -107,14 +107,14 @@ def merge_and_fit(
     budget: int,
     method: str,
     source: VisibilitySource,
-    flags: NDArray[np.bool_] | None,
+    protected: NDArray[np.bool_] | None,
     config: SimplifyConfig,
     progress: Progress,
 ) -> dict[str, Any]:
     """Merge by visibility, then fit each merged Gaussian's opacity so that views see as much of it as of its
     members."""
     visibility = rows_of(source(scene), len(scene), slice(None))
-    out = merge(scene, budget, method, visibility, flags, config, counter(progress, "simplify"))
+    out = merge(scene, budget, method, visibility, protected, config, counter(progress, "simplify"))
     merged, parents = splats_of(scene, out), out["parents"]
     order = scene.core.order  # sums in this order do not depend on the order of the scene's rows
     row, weight = parents[order], visibility.weight[order]
