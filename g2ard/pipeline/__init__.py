@@ -94,9 +94,10 @@ def distill(
         KeyboardInterrupt: after Ctrl-C; the same call resumes from `work`.
     """
     config = config or DistillConfig()
-    many = config.recover.schedule.round_steps > 0
-    kept, fold = config.simplify.retention_of("paper"), config.simplify.fold
-    counts = round_counts(len(prior), budget, kept, fold) if many else [budget]
+    counts = [budget]
+    if config.recover.schedule.round_steps > 0:
+        kept, fold = config.simplify.retention_of("paper"), config.simplify.fold
+        counts = round_counts(len(prior), budget, kept, fold)
     rounds = _Rounds(prior, budget, targets, config, len(counts), weights, validation, work, progress, watch)
     for number, count in enumerate(counts, start=1):
         rounds.advance(number, count, final=number == len(counts))
@@ -225,7 +226,7 @@ class _Rounds:
     def _simplify(self, number: int, count: int, entry: dict[str, Any]) -> None:
         name = f"simplified-{number}"
         if self._restore(name, entry):
-            self._resumed(entry["simplify"]["seconds"])
+            self._count_resumed(entry["simplify"]["seconds"])
         else:
             began = time.monotonic()
             done = simplify(
@@ -249,12 +250,12 @@ class _Rounds:
 
     def _recover(self, name: str, entry: dict[str, Any], *, final: bool) -> None:
         if self._restore(name, entry):
-            self._resumed(entry["recover"][-1]["seconds"])
+            self._count_resumed(entry["recover"][-1]["seconds"])
         else:
             config = replace(
                 self.config.recover,
                 steps=self._steps() if final else None,
-                recovery_time=self._seconds(final),
+                recovery_time=self._time_limit(final),
                 final=final,
             )
             checkpoint = self.work / f"{name}.checkpoint.npz" if self.work else None
@@ -273,7 +274,7 @@ class _Rounds:
             self.state = done.splats
             entry.setdefault("recover", []).append(done.report.as_dict())
             if done.report.resumed is not None:
-                self._resumed(done.report.resumed)
+                self._count_resumed(done.report.resumed)
             self._save(name, entry)
             if checkpoint is not None:
                 checkpoint.unlink(missing_ok=True)
@@ -283,22 +284,23 @@ class _Rounds:
         photos = isinstance(self.targets, Photos | PhotosOrRenders)
         return final_steps(self.config, self.state, self.supervision.targets.cameras, photos=photos)
 
-    def _seconds(self, final: bool) -> float | None:
-        """Return this recovery's share of the time limit."""
+    def _time_limit(self, final: bool) -> float | None:
+        """Return this recovery's share of the time limit for all."""
         config, schedule = self.config.recover, self.config.recover.schedule
         if config.recovery_time is None:
             return None
-        last = schedule.steps if config.steps is None else config.steps
-        whole = last + self.count * schedule.round_steps
-        return config.recovery_time * (last if final else schedule.round_steps) / whole
+        final_steps = schedule.steps if config.steps is None else config.steps
+        all_steps = final_steps + self.count * schedule.round_steps
+        return config.recovery_time * (final_steps if final else schedule.round_steps) / all_steps
 
-    def _resumed(self, seconds: float) -> None:
+    def _count_resumed(self, seconds: float) -> None:
+        """Add the time of a stage, or part of one, that an earlier call took."""
         self.seconds["resumed"] = self.seconds.get("resumed", 0.0) + seconds
 
     def _save(self, name: str, entry: dict[str, Any]) -> None:
         if self.work is None:
             return
-        arrays = {name: getattr(self.state, name) for name in _ARRAYS}
+        arrays = {array: getattr(self.state, array) for array in _ARRAYS}
         arrays["protected"] = np.asarray(self.protected)
         checkpoints.save(self.work / f"{name}.npz", self.key, {"entry": entry}, arrays)
 

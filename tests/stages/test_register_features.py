@@ -19,7 +19,7 @@ from g2ard.stages.register import PhotoReport, pose_error, register
 from g2ard.stages.register import matchers as module
 from g2ard.stages.register.matchers import checked_pairs, matcher_named, mutual
 from g2ard.stages.register.pose import motion_between, moved
-from g2ard.stages.register.solve import information, lifted, solved
+from g2ard.stages.register.solve import information, lifted, solve_pnp
 from helpers.commands import CommandLine, refused, succeeds
 from helpers.feature_scenes import BALL, CONFIG, _blotched, _photographed
 from helpers.project import ROOT
@@ -117,11 +117,11 @@ def test_pnp_finds_the_pose_in_map_coordinates() -> None:
     K = camera.K
     uv = seen[:, :2] / seen[:, 2:] * [K[0, 0], K[1, 1]] + K[:2, 2]
     uv[::5] += rng.uniform(20, 60, (16, 2))
-    found = solved(camera, uv, points, CONFIG)
+    found = solve_pnp(camera, uv, points, CONFIG)
     pose, inlying = found
     assert (~inlying).tolist() == [i % 5 == 0 for i in range(80)]
     assert pose_error(pose, true)[0] < 1e-3  # of millions
-    assert solved(camera, uv[:5], points[:5], CONFIG) is None
+    assert solve_pnp(camera, uv[:5], points[:5], CONFIG) is None
 
 
 def test_features_find_the_pose(tmp_path: Path) -> None:

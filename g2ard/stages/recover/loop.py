@@ -54,7 +54,7 @@ class Loop:
         anchors: Anchors,
         probe: Probe,
         guard: Guard,
-        held: str | None,
+        validation_key: str | None,
         frozen: NDArray[np.bool_] | None,
     ) -> None:
         self.targets = targets
@@ -75,15 +75,21 @@ class Loop:
         self.resumed: float | None = None
         self.losses: list[float] = []
         self.geometry: list[dict[str, float]] = []
-        self._seconds_of = {False: [0, 0.0], True: [0, 0.0]}  # regularised → steps, seconds
-        self._held = held
+        self._tally = {False: [0, 0.0], True: [0, 0.0]}  # whether regularised → steps, seconds
+        self._validation_key = validation_key
         self._epoch: tuple[int, NDArray[np.int64]] | None = None
 
     @cached_property
     def key(self) -> str:
         """Fingerprint that a checkpoint must have; computed only with a checkpoint."""
         return _fingerprint(
-            self.student, self.targets, self.config, self.weights, self.anchors, self._held, self.frozen
+            self.student,
+            self.targets,
+            self.config,
+            self.weights,
+            self.anchors,
+            self._validation_key,
+            self.frozen,
         )
 
     @cached_property
@@ -169,6 +175,7 @@ class Loop:
     def _learn(
         self, engine: Engine, step: int, share: float, multiplier: float, *, regularize: bool = False
     ) -> float:
+        """Advance an engine by the view of this step, with the rates at this share of the horizon."""
         rates = self.schedule.at(share, final=self.config.final, multiplier=multiplier, reach=self.reach)
         view = self._view(step)
         target, mask = self.targets[view], mask_of(self.targets, view)
@@ -209,7 +216,7 @@ class Loop:
         began = time.monotonic()
         loss = self._learn(self.engine, step, self._share(), self.multiplier, regularize=regularize)
         self.losses.append(loss)
-        tally = self._seconds_of[regularize]
+        tally = self._tally[regularize]
         tally[0] += 1
         tally[1] += time.monotonic() - began
         self.done += 1
@@ -238,12 +245,12 @@ class Loop:
     def regularizers(self) -> dict[str, float]:
         """Number of regularised steps, their share of the time beyond plain steps, and their period (0 if
         inactive)."""
-        (plain, plain_s), (held, held_s) = self._seconds_of[False], self._seconds_of[True]
-        extra = held_s - held * plain_s / plain if plain and held else 0.0
+        (plain, plain_seconds), (regularized, regularized_seconds) = self._tally[False], self._tally[True]
+        extra = regularized_seconds - regularized * plain_seconds / plain if plain and regularized else 0.0
         weights = self.config.regularizers
         return {
-            "steps": held,
-            "share": max(0.0, extra) / max(plain_s + held_s, 1e-9),
+            "steps": regularized,
+            "share": max(0.0, extra) / max(plain_seconds + regularized_seconds, 1e-9),
             "period": weights.period if weights.active else 0,
         }
 
@@ -278,7 +285,7 @@ class Loop:
             "reach": finite(self.reach),
             "trials": self.trials,
             "geometry": self.geometry,
-            "seconds_of": [self._seconds_of[False], self._seconds_of[True]],
+            "seconds_of": [self._tally[False], self._tally[True]],
             "skipped": self._skipped,
             "guard": self.guard.meta(),
         }
@@ -296,7 +303,7 @@ class Loop:
         self.multiplier = float(meta["multiplier"])
         self.reach = math.inf if meta["reach"] is None else float(meta["reach"])
         self.trials, self.geometry = list(meta["trials"]), list(meta["geometry"])
-        self._seconds_of = dict(zip((False, True), meta["seconds_of"], strict=True))
+        self._tally = dict(zip((False, True), meta["seconds_of"], strict=True))
 
 
 def finite(reach: float) -> float | None:
@@ -313,12 +320,12 @@ def _fingerprint(
     validation: str | None,
     frozen: NDArray[np.bool_] | None,
 ) -> str:
-    often = [] if weights is None else [repr(weights.tolist())]
-    parts = (repr(config), student.fingerprint(), fingerprint_of(targets), *often)
+    given = [] if weights is None else [repr(weights.tolist())]
+    parts = (repr(config), student.fingerprint(), fingerprint_of(targets), *given)
     parts = parts if validation is None else (*parts, validation)
     digest = hashlib.sha256("\n".join(parts).encode())
-    for held in (anchors.means, anchors.frames, anchors.r_parallel, anchors.r_perp):
-        digest.update(np.ascontiguousarray(held).tobytes())
+    for array in (anchors.means, anchors.frames, anchors.r_parallel, anchors.r_perp):
+        digest.update(np.ascontiguousarray(array).tobytes())
     if frozen is not None:
         digest.update(frozen.tobytes())
     return digest.hexdigest()

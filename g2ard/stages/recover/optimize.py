@@ -123,11 +123,11 @@ def recover(
     validation = validation if config.schedule.guarded else None
     probe = Probe(targets, config.background)
     before = probe.all_of(student)
-    often = checked_weights(weights, len(targets.cameras))
+    view_weights = checked_weights(weights, len(targets.cameras))
     others = None if validation is None else score_by_kind(validation, config.background)
     guard = Guard(probe.all_of, student, before, others, config.schedule.guarded)
-    judged_by = None if validation is None else fingerprint_of(validation)
-    loop = Loop(student, targets, config, often, anchors, probe, guard, judged_by, frozen)
+    validation_key = None if validation is None else fingerprint_of(validation)
+    loop = Loop(student, targets, config, view_weights, anchors, probe, guard, validation_key, frozen)
     if checkpoint is None or not checkpoint.exists():
         loop.choose_rates(before)
     loop.run(checkpoint, progress, stage, watch)

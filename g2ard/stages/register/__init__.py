@@ -221,7 +221,7 @@ def _from_pool(search: Search, pool: PoolRenders, photo: Photo) -> list[Candidat
         Start(pool.pool.viewmats[at], pool.pool.names[at], rank, there.viewmat)
         for rank, (at, there) in enumerate(order[: search.config.candidates], 1)
     ]
-    first = [(s, start) for start in starts if (s := search.solved(start.begins, photo, 1))]
+    first = [(s, start) for start in starts if (s := search.by_matches(start.begins, photo, 1))]
     if first:
         solved, start = max(first, key=lambda each: each[0].inliers)
         if c := search.by_features(replace(start, turned=solved.viewmat), photo):

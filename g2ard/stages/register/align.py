@@ -152,14 +152,14 @@ def align(
     for number, (camera, photo) in enumerate(pyramid):
         last = number == len(pyramid) - 1
         still = config.still if last else _COARSER * config.still
-        found = _level(renderer, state, camera, photo, config, still, fresh=number == 0)
+        found = _align_level(renderer, state, camera, photo, config, still, fresh=number == 0)
         if found is None:
             return None
         state = found
     return state
 
 
-def _level(
+def _align_level(
     renderer: Renderer,
     state: Aligned,
     camera: Camera,
@@ -178,12 +178,12 @@ def _level(
     def shot_at(viewmat: Float) -> Shot:
         return shot_of(renderer.render(replace(camera, viewmat=viewmat)), config)
 
-    def counts(shot: Shot) -> bool:
+    def overlaps(shot: Shot) -> bool:
         return (photo.mask & shot.mask).mean() >= config.min_overlap
 
     pose, gain, bias, taken = state.viewmat, state.gain, state.bias, state.steps + 1
     shot = shot_at(pose)
-    if not counts(shot):
+    if not overlaps(shot):
         return None
     if fresh:
         gain, bias = _light(photo, shot)
@@ -198,7 +198,7 @@ def _level(
             trial = moved(pose, step[:6])
             seen = shot_at(trial)
             taken += 1
-            if counts(seen):
+            if overlaps(seen):
                 light = gain + step[6], bias + step[7]
                 after = normal_equations(photo, seen, camera.K, *light, scale)
                 if light[0] > 0 and after.cost < normal.cost:

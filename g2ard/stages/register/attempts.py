@@ -139,10 +139,10 @@ class Search:
 
     def by_features(self, start: Start, photo: Photo) -> Candidate | None:
         """Match, solve PnP and refine; return None without a matcher or with too few inliers."""
-        solved = self.solved(start.begins, photo, self.config.passes)
+        solved = self.by_matches(start.begins, photo, self.config.passes)
         return None if solved is None else self._refined(start, solved, photo)
 
-    def solved(self, pose: Float, photo: Photo, passes: int) -> Solved | None:
+    def by_matches(self, pose: Float, photo: Photo, passes: int) -> Solved | None:
         """Match and solve PnP only; return None like `by_features`."""
         if self.match is None:
             return None

@@ -82,13 +82,13 @@ def solve(
         counts = _at(mask, uv)
         uv, seen = uv[counts], seen[counts]
         points, known = lifted(out, there, seen, config)
-        after = solved(there, uv[known], points[known], config)
+        after = solve_pnp(there, uv[known], points[known], config)
         if after is None:
             break
         T, inlying = after
         of, at, X = uv[known][inlying], seen[known][inlying], points[known][inlying]
         shift = _projected(T, there.K, X) - _projected(there.viewmat, there.K, X)
-        found = _solved_of(T, camera, int(known.sum()), of, X, at, number + 1, config)
+        found = _described(T, camera, int(known.sum()), of, X, at, number + 1, config)
         if float(np.sqrt((shift**2).sum(1).mean())) < _STILL:
             break
     return found
@@ -128,7 +128,7 @@ def lifted(
     return np.einsum("mi,ij->mj", seen - T[:3, 3], T[:3, :3], optimize=False), known
 
 
-def solved(
+def solve_pnp(
     camera: Camera, uv: Float, points: Float, config: RegisterConfig
 ) -> tuple[Float, NDArray[np.bool_]] | None:
     """Solve PnP for (M, 2) pixels of (M, 3) points; return pose and inlier mask, or None with too few."""
@@ -160,7 +160,7 @@ def solved(
     return (T, np.asarray(answer["inlier_mask"], bool)) if np.isfinite(T).all() else None
 
 
-def _solved_of(
+def _described(
     T: Float,
     camera: Camera,
     matches: int,
