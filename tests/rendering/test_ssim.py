@@ -11,7 +11,9 @@ from g2ard.stages.recover.losses import l1_ssim
 from reference import ssim as reference
 
 Image = NDArray[np.float32]
-SHAPES = [(48, 64, 3), (1, 1, 3), (5, 7, 3), (33, 100, 1), (130, 17, 3), (12, 11, 4)]
+SHAPES = [(48, 64, 3), (1, 1, 3), (5, 7, 3), (33, 100, 1), (215, 190, 3), (12, 11, 4)]
+"""The largest has several tiles both ways."""
+KINDS = ("noise", "close", "flat", "dark")
 
 
 def images(shape: tuple[int, int, int], kind: str) -> tuple[Image, Image]:
@@ -27,7 +29,7 @@ def images(shape: tuple[int, int, int], kind: str) -> tuple[Image, Image]:
     return a.astype(np.float32), b.astype(np.float32)
 
 
-@pytest.mark.parametrize("kind", ["noise", "close", "flat", "dark"])
+@pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("shape", SHAPES)
 def test_loss_and_gradient_are_the_twin_s(shape: tuple[int, int, int], kind: str) -> None:
     a, b = images(shape, kind)
@@ -43,12 +45,13 @@ def test_loss_and_gradient_are_the_twin_s(shape: tuple[int, int, int], kind: str
         assert error < 3e-4
 
 
+@pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("shape", SHAPES)
-def test_metrics_are_the_twin_s(shape: tuple[int, int, int]) -> None:
-    a, b = images(shape, "noise")
+def test_metrics_are_the_twin_s(shape: tuple[int, int, int], kind: str) -> None:
+    a, b = images(shape, kind)
     a64, b64 = a.astype(np.float64), b.astype(np.float64)
     want = float(reference.ssim(torch.from_numpy(a64), torch.from_numpy(b64)))
-    assert abs(_core.ssim(a, b) - want) < 1e-12
+    assert abs(_core.ssim(a, b) - want) < 1e-5
     assert abs(_core.psnr(a, b) - -10 * np.log10(np.mean((a64 - b64) ** 2))) < 1e-9
     assert abs(_core.ssim(a, a) - 1) < 1e-12
     assert _core.psnr(a, a) == np.inf

@@ -1,30 +1,28 @@
-//! (1 − λ)·L1 + λ·(1 − SSIM) and its gradient in two passes over bands of rows: `Forward` and `Backward` in `bands.rs`.
+//! (1 − λ)·L1 + λ·(1 − SSIM) and its gradient, tile by tile: `Tile` in `tile.rs`.
 //!
 //! With e = x − y the textbook fraction reads SSIM = l·c, l = 1 − d²/P, c = 1 − E/Q, where d = ⟨e⟩, E = ⟨e²⟩ − d²,
 //! P = μx² + μy² + C₁, Q = σx² + σy² + C₂: nothing cancels where the images agree, and SSIM(x, x) is 1 exactly.
+//! A tile computes what it needs of its neighbours again, so that everything between image and gradient stays in the cache.
 
-mod bands;
+mod tile;
 
 use rayon::prelude::*;
 
-use super::{Shape, TAPS, window};
+use super::{Shape, window};
 use crate::Result;
+use crate::raster::disjoint::DisjointSlice;
 use crate::raster::memory::bytes;
-use crate::raster::simd::{Isa, LANES, dispatch};
-use bands::{Backward, Forward, span};
+use crate::raster::simd::{Isa, dispatch};
+use tile::{Tile, scratch_len};
 
-/// Rows processed together: fixed, so that sums are split equally for any number of threads.
-const BAND: usize = 32;
-/// x, e, x² + y² and e² are blurred going forward; three derivatives going back.
-const FORWARD: usize = 4;
-const BACK: usize = 3;
+/// Rows and values along a row of a tile: fixed, so that sums are split equally for any number of threads.
+const ROWS: usize = 100;
+const COLUMNS: usize = 512;
 
 /// The fused loss and its buffers, reused from call to call.
 #[derive(Default)]
 pub struct Loss {
     isa: Isa,
-    /// The three derivative maps, blurred along rows: row after row, each map padded to whole lanes.
-    maps: Vec<f32>,
     sums: Vec<[f64; 2]>,
 }
 
@@ -38,7 +36,7 @@ impl Loss {
 
     /// Bytes held between calls.
     pub(crate) fn bytes(&self) -> usize {
-        bytes(&self.maps) + bytes(&self.sums)
+        bytes(&self.sums)
     }
 
     /// The loss; `gradient` receives dloss/d(image).
@@ -54,57 +52,31 @@ impl Loss {
         shape.check("target", target)?;
         shape.check("gradient", gradient)?;
         let (isa, row) = (self.isa, shape.row());
-        let padded = row.next_multiple_of(LANES);
-        let band = BACK * padded * BAND;
-        self.maps.resize(BACK * padded * shape.height, 0.0);
-        self.sums.resize(shape.height, [0.0; 2]);
+        let across = row.div_ceil(COLUMNS);
+        self.sums
+            .resize(shape.height.div_ceil(ROWS) * across, [0.0; 2]);
         let weights = window().map(|w| w as f32);
-        let forward = self
-            .maps
-            .par_chunks_mut(band)
-            .zip(self.sums.par_chunks_mut(BAND))
-            .enumerate();
-        forward.for_each_init(
-            || vec![0f32; (FORWARD * (TAPS + 1) + BACK) * span(shape)],
-            |scratch, (index, (maps, sums))| {
-                let first = index * BAND;
-                dispatch(
-                    isa,
-                    Forward {
-                        image,
-                        target,
-                        shape,
-                        weights,
-                        first,
-                        maps,
-                        sums,
-                        scratch,
-                    },
-                );
+        let count = shape.values() as f32;
+        let scale = [(1.0 - ssim_weight) / count, -ssim_weight / count];
+        let gradient = DisjointSlice::new(gradient);
+        self.sums.par_iter_mut().enumerate().for_each_init(
+            || vec![0f32; scratch_len(shape, COLUMNS.min(row))],
+            |scratch, (index, sums)| {
+                let (y, x) = (index / across * ROWS, index % across * COLUMNS);
+                let tile = Tile {
+                    image,
+                    target,
+                    shape,
+                    weights,
+                    scale,
+                    rows: y..shape.height.min(y + ROWS),
+                    columns: x..row.min(x + COLUMNS),
+                    scratch,
+                    gradient,
+                };
+                *sums = dispatch(isa, tile);
             },
         );
-        let count = shape.values() as f32;
-        let maps = &self.maps;
-        gradient
-            .par_chunks_mut(row * BAND)
-            .enumerate()
-            .for_each(|(index, out)| {
-                let first = index * BAND;
-                let scale = [(1.0 - ssim_weight) / count, -ssim_weight / count];
-                dispatch(
-                    isa,
-                    Backward {
-                        image,
-                        target,
-                        shape,
-                        weights,
-                        first,
-                        maps,
-                        scale,
-                        out,
-                    },
-                );
-            });
         let total = self
             .sums
             .iter()

@@ -1,4 +1,4 @@
-//! L1 and SSIM: fused forward and backward for training ([`Loss`]), plain metrics in f64 for reports ([`ssim`], [`psnr`]).
+//! L1 and SSIM: fused forward and backward for training ([`Loss`]), and metrics for reports ([`ssim`], [`psnr`]).
 //!
 //! SSIM of Wang et al. (2004): 11×11 Gaussian window, σ 1.5, zero-padded as 3DGS does, values in 0–1, C₁ = 0.01²,
 //! C₂ = 0.03². Images are row-major with interleaved channels, so one channel's neighbour is `channels` values away.
