@@ -31,13 +31,13 @@ from g2ard.stages.recover.schedule import steps_for
 from g2ard.stages.simplify import SimplifyConfig
 from g2ard.tiles.executor import DaskExecutor, Workers, executor
 from g2ard.tiles.ingest import ingest
-from g2ard.tiles.journal import is_ours
+from g2ard.tiles.journal import is_tile_file
 from g2ard.tiles.merging import TiledScene, key_of, sample_of, simplify_tiles
 from g2ard.tiles.recover import TiledScores, recover_tiles
 from g2ard.tiles.sights import Surroundings
 from g2ard.tiles.store import MANIFEST, StoredScene, TileStore
 
-_OURS = re.compile(r"tiles|steps|(student|merged|level|written)-[0-9a-f]{16}")
+_WORK_NAME = re.compile(r"tiles|steps|(student|merged|level|written)-[0-9a-f]{16}")
 """Names that commands create in the work folder."""
 
 
@@ -87,9 +87,9 @@ def _check_folder(folder: Path) -> None:
         names = sorted(path.name for path in folder.iterdir()) if folder.exists() else []
     except OSError as error:
         raise OutputError(f"cannot write: {error.strerror}; choose another folder", path=folder) from error
-    of_tiles = [name for name in names if is_ours(name)]
+    of_tiles = [name for name in names if is_tile_file(name)]
     others = [name for name in names if not name.startswith(".")]
-    if of_tiles or (others and not any(map(_OURS.fullmatch, names))):
+    if of_tiles or (others and not any(map(_WORK_NAME.fullmatch, names))):
         raise OutputError(
             f"holds {(of_tiles or others)[0]} and is not a work folder; choose another folder", path=folder
         )

@@ -18,7 +18,7 @@ from g2ard.io.stream import SceneStream
 from g2ard.io.types import Note
 from g2ard.progress import Progress, Say, plural, silent, unsaid
 from g2ard.stages.lift import LiftConfig
-from g2ard.tiles.journal import JOURNAL, POINTS, Journal, clear, is_ours
+from g2ard.tiles.journal import JOURNAL, POINTS, Journal, clear, is_tile_file
 from g2ard.tiles.pour import PointFeed, SceneFeed, lift_tiles, pour
 from g2ard.tiles.store import MANIFEST, VERSION, TileStore
 
@@ -181,7 +181,7 @@ def _check_foreign(folder: Path) -> None:
         names = {path.name for path in folder.iterdir()}
     except OSError as error:
         raise OutputError(f"cannot write: {error.strerror}", path=folder) from error
-    foreign = sorted(name for name in names if not (is_ours(name) or name == LOCK))
+    foreign = sorted(name for name in names if not (is_tile_file(name) or name == LOCK))
     if foreign:
         raise OutputError(
             f"holds {foreign[0]}, which does not belong to tiles; choose another folder", path=folder

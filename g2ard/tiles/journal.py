@@ -20,14 +20,14 @@ from g2ard.io.jsonfile import read_json
 from g2ard.tiles.kdtree import KdTree, Points
 from g2ard.tiles.store import FORMAT, MANIFEST, VERSION, halo_name, tile_name
 
-__all__ = ["JOURNAL", "POINTS", "Journal", "clear", "is_ours"]
+__all__ = ["JOURNAL", "POINTS", "Journal", "clear", "is_tile_file"]
 
-_OURS = re.compile(r"(tile|halo)-\d{5,}\.f32|\.?(tiles|journal)\.json(\.new)?|\.points")
+_TILE_FILE = re.compile(r"(tile|halo)-\d{5,}\.f32|\.?(tiles|journal)\.json(\.new)?|\.points")
 
 
-def is_ours(name: str) -> bool:
+def is_tile_file(name: str) -> bool:
     """Return whether a file or folder of this name belongs to tiles, complete or partial."""
-    return _OURS.fullmatch(name) is not None
+    return _TILE_FILE.fullmatch(name) is not None
 
 
 def clear(folder: Path) -> None:
@@ -35,7 +35,7 @@ def clear(folder: Path) -> None:
     for path in sorted(folder.iterdir(), key=lambda path: path.name != MANIFEST):
         if path.is_dir() and path.name == POINTS:
             shutil.rmtree(path)
-        elif is_ours(path.name):
+        elif is_tile_file(path.name):
             path.unlink()
 
 

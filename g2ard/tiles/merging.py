@@ -138,8 +138,10 @@ def _merged(
 ) -> tuple[list[Path], tuple[int, ...]]:
     """Merge all tiles to exactly `budget` Gaussians; return the results of `merge` and their counts."""
     tiles = len(run.sizes)
-    looks: list[dict[str, Any]] = [{"look": path} for path in sights.looks] if sights else [{}] * tiles
-    costs = run.each("run_costs", "costs", frame=frame, inputs=looks)
+    visibility: list[dict[str, Any]] = (
+        [{"visibility": path} for path in sights.visibility] if sights else [{}] * tiles
+    )
+    costs = run.each("run_costs", "costs", frame=frame, inputs=visibility)
     runs_left = _runs(run, costs, budget)
     share_kept = budget / sum(runs_left)
     plans = run.each(
@@ -147,7 +149,7 @@ def _merged(
         "plans",
         frame=frame,
         per_tile=[{"runs": n, "expected": share_kept * n} for n in runs_left],
-        inputs=[{"costs": path, **seen} for path, seen in zip(costs, looks, strict=True)],
+        inputs=[{"costs": path, **seen} for path, seen in zip(costs, visibility, strict=True)],
     )
     merges = cheapest([_costs_of(path) for path in plans], sum(runs_left) - budget)
     counts = tuple(n - m for n, m in zip(runs_left, merges, strict=True))
@@ -157,16 +159,16 @@ def _merged(
         "merge",
         frame=frame,
         per_tile=[{"runs": n, "merges": m} for n, m in zip(runs_left, merges, strict=True)],
-        inputs=[{"plan": path, **seen} for path, seen in zip(plans, looks, strict=True)],
+        inputs=[{"plan": path, **seen} for path, seen in zip(plans, visibility, strict=True)],
     )
     return merged, counts
 
 
 def _fitted(store: TileStore, counts: tuple[int, ...], merged: list[Path], sights: Sights) -> TiledScene:
     """Return the scene with opacities fitted to what the views see of the merged tiles."""
-    again = sights.again(merged)
+    seen = sights.again(merged)
     mean = sum(float(load(path, "wanted")[0].sum()) for path in merged) / sum(counts)
-    files = [{"merged": one, "again": other} for one, other in zip(merged, again, strict=True)]
+    files = [{"merged": one, "visibility": other} for one, other in zip(merged, seen, strict=True)]
     return replace(
         _scene(store, counts, files, mean),
         views=len(sights.cameras),

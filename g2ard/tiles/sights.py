@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from g2ard import _core
 from g2ard.io.atomic import atomic_output
-from g2ard.rendering.visibility import LONGEST, MOST_LOOKS, NEAR
+from g2ard.rendering.visibility import LONGEST, MOST_VIEWS, NEAR
 from g2ard.scene.cameras import Cameras
 from g2ard.tiles.executor import Workers
 from g2ard.tiles.steps import COARSE, TiledRun
@@ -27,7 +27,7 @@ _GLANCED = 200_000
 """Most coarse Gaussians for which the `near` level decides which views see a tile."""
 
 _CHUNK = 64
-"""Views per `glance` task."""
+"""Views per task of `light`."""
 
 _TAILS = 1, 99
 """Percentiles of its Gaussians that bound a tile's box, to ignore floaters."""
@@ -61,9 +61,11 @@ class Sights:
             }
             for tile in range(len(coarse))
         ]
-        self.looks = run.each("look", "look", frame=frame, per_tile=self.arguments, inputs=self._inputs())
-        pixels = np.array([float(load(path, "pixel")[0]) for path in self.looks])
-        sums = np.array([load(path, "sums")[0] for path in self.looks]).sum(axis=0)
+        self.visibility = run.each(
+            "visibility", "visibility", frame=frame, per_tile=self.arguments, inputs=self._inputs()
+        )
+        pixels = np.array([float(load(path, "pixel")[0]) for path in self.visibility])
+        sums = np.array([load(path, "sums")[0] for path in self.visibility]).sum(axis=0)
         self.frame = frame
         if np.isfinite(pixels).any():
             known = np.isfinite(pixels)
@@ -78,11 +80,11 @@ class Sights:
     def again(self, merged: list[Path]) -> list[Path]:
         """Measure what the same views see of the merged tiles."""
         inputs = [
-            {**given, "merged": path, "look": look}
-            for given, path, look in zip(self._inputs(), merged, self.looks, strict=True)
+            {**given, "merged": path, "visibility": seen}
+            for given, path, seen in zip(self._inputs(), merged, self.visibility, strict=True)
         ]
         levels = [{"levels": given["levels"]} for given in self.arguments]
-        return self.run.each("look_again", "look again", per_tile=levels, inputs=inputs)
+        return self.run.each("merged_visibility", "merged visibility", per_tile=levels, inputs=inputs)
 
     def _inputs(self) -> list[dict[str, Any]]:
         return [{"coarse": self.coarse, "views": self.views} for _ in self.coarse]
@@ -91,7 +93,7 @@ class Sights:
         """Choose the views of a tile, evenly spaced among those that see it."""
         sight = in_sight(light, tile)
         some = sight[
-            np.unique(np.linspace(0, len(sight) - 1, min(MOST_LOOKS, len(sight))).round().astype(int))
+            np.unique(np.linspace(0, len(sight) - 1, min(MOST_VIEWS, len(sight))).round().astype(int))
         ]
         return {
             "views": some.tolist(),
@@ -118,8 +120,8 @@ def in_sight(light: NDArray[np.float64], tile: int) -> NDArray[np.intp]:
     """Return the views that see a tile; if they are few, include the best of the others."""
     own = light[:, tile]
     sight = np.flatnonzero(own > _IN_SIGHT * light.sum(axis=1))
-    if len(sight) < MOST_LOOKS:
-        best = np.argsort(-own, kind="stable")[:MOST_LOOKS]
+    if len(sight) < MOST_VIEWS:
+        best = np.argsort(-own, kind="stable")[:MOST_VIEWS]
         sight = np.sort(best[own[best] > 0])
     return sight
 
@@ -147,8 +149,8 @@ def light_of(store: TileStore, coarse: list[Path], cameras: Cameras, workers: Wo
     chunks = [range(i, min(i + _CHUNK, len(here))) for i in range(0, len(here), _CHUNK)]
     tasks = [
         Task(
-            "g2ard.tiles.steps:glance",
-            f"glance-{number:05}",
+            "g2ard.tiles.steps:light",
+            f"light-{number:05}",
             workers.folder,
             {"views": list(chunk), "level": level, "near": near},
             {"coarse": coarse, "views": views},
@@ -156,7 +158,7 @@ def light_of(store: TileStore, coarse: list[Path], cameras: Cameras, workers: Wo
         )
         for number, chunk in enumerate(chunks)
     ]
-    paths = workers.run(tasks, "glance")
+    paths = workers.run(tasks, "light")
     return np.concatenate([load(path, "weights")[0] for path in paths])
 
 

@@ -8,8 +8,8 @@ Between steps the tiles agree on a common frame for costs and on how many Gaussi
   `_core.TileFrame`; `levels`, per tile the coarse scene ("near", "far") that represents it around this tile,
   None for this tile.
 - inputs: `own`, the output of `coarse` for this tile (not for `coarse` itself); `coarse`, the same for every
-tile;
-  `views`, cameras in world coordinates; `look`, the output of `look` for this tile, absent without views.
+  tile; `views`, cameras in world coordinates; `visibility`, the output of `visibility` for this tile, absent
+  without views.
 - places: `store`, the folder of the tiled scene.
 
 N counts the tile's rows with finite values; "ordered rows" are these in Morton order.
@@ -95,7 +95,7 @@ def coarse(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
     }
 
 
-def glance(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
+def light(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
     """Measure the light that views get from each tile, from coarse Gaussians.
 
     Args:
@@ -120,7 +120,7 @@ def glance(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
     return {"weights": weights}
 
 
-def look(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
+def visibility(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
     """Measure what the views see of a tile's Gaussians amid the whole scene.
 
     Views are rendered in rounds of sixteen until a round finds few new Gaussians; the sums are scaled up to
@@ -128,7 +128,7 @@ def look(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
 
     Args:
         arguments: `tile`, `config`, `frame`, `levels`; `views`, numbers of the V views that see the tile;
-            `light`, (V,) Σ αT² that each gets from it (`glance`); `all_light`, its sum over all views;
+            `light`, (V,) Σ αT² that each gets from it (`light`); `all_light`, its sum over all views;
             `shrunk`, the ratio of these images' width to the full width.
         inputs: `coarse`, `views`.
         places: `store`.
@@ -194,7 +194,7 @@ def run_costs(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
 
     Args:
         arguments: `tile`, `config`, `frame`.
-        inputs: `look`.
+        inputs: `visibility`.
         places: `store`.
 
     Returns:
@@ -210,7 +210,7 @@ def pair_plan(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
     Args:
         arguments: `tile`, `config`, `frame`; `runs`, the number of runs; `expected`, the Gaussians that the
             budget is expected to leave in this tile.
-        inputs: `look`; `costs`, the output of `run_costs`.
+        inputs: `visibility`; `costs`, the output of `run_costs`.
         places: `store`.
 
     Returns:
@@ -233,7 +233,7 @@ def merge(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
 
     Args:
         arguments: `tile`, `config`, `frame`; `runs`, as for `pair_plan`; `merges`, the number to apply.
-        inputs: `plan`, the output of `pair_plan`; `look`.
+        inputs: `plan`, the output of `pair_plan`; `visibility`.
         places: `store`.
 
     Returns:
@@ -255,27 +255,27 @@ def merge(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
     small = splats_of(scene, out)
     kept, made = ~dropped, arrays_of(small, "scene")
     made["members"] = np.bincount(of[kept], minlength=len(small))
-    if "look" in inputs:
-        (weight,) = load(inputs["look"], "weight")
+    if "visibility" in inputs:
+        (weight,) = load(inputs["visibility"], "weight")
         made["wanted"] = np.bincount(of[kept], weight[scene.core.order][kept], len(small))
         made["unseen"] = np.array(np.count_nonzero(weight[scene.core.order][kept] == 0))
     made["clamped"] = np.array(out["clamped_opacities"])
     return made
 
 
-def look_again(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
+def merged_visibility(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
     """Measure what the same views see of a tile's merged Gaussians.
 
     Args:
         arguments: `tile`, `levels`.
-        inputs: `coarse`, `views`, `look`; `merged`, the output of `merge`.
+        inputs: `coarse`, `views`, `visibility`; `merged`, the output of `merge`.
         places: `store`.
 
     Returns:
-        `weight`, (n,) float32 Σ αT², scaled like those of `look`.
+        `weight`, (n,) float32 Σ αT², scaled like those of `visibility`.
     """
     core = as_prepared(scene_of(inputs["merged"], "scene").with_sh_degree(0))
-    used, share, near = load(inputs["look"], "used", "share", "near")
+    used, share, near = load(inputs["visibility"], "used", "share", "near")
     cameras = cameras_of(inputs["views"]).recentred(core.offset).take(used)
     settings = RasterSettings(antialiased=core.antialiased, near=float(near))
     cameras = cropped(cameras, core, settings)
@@ -306,7 +306,9 @@ def _with_pixel_size(frame: Sequence[float], pixel_size: float) -> _core.TileFra
 
 
 def _seen_tile(scene: PreparedScene, arguments: Arguments, inputs: Inputs) -> _core.TileMerging:
-    seen = RowVisibility(*load(inputs["look"], "weight", "pixel_size")) if "look" in inputs else None
+    seen = (
+        RowVisibility(*load(inputs["visibility"], "weight", "pixel_size")) if "visibility" in inputs else None
+    )
     return _merging(scene, _config(arguments), _core.TileFrame(*arguments["frame"]), seen)
 
 

@@ -125,17 +125,17 @@ def load(path: Path, *names: str) -> list[NDArray[Any]]:
 
 
 def small_scene(files: Mapping[str, Path], mean: float | None) -> Splats:
-    """Return a tile's merged Gaussians with opacities fitted to what the views see.
+    """Return a tile's merged Gaussians, with views with opacities fitted to what these see.
 
     Args:
-        files: "merged", and with views "again" from `look_again`.
+        files: "merged", and with views "visibility" from `merged_visibility`.
         mean: mean weight in the views over all tiles; None without views.
     """
     small = scene_of(files["merged"], "scene")
     if mean is None:
         return small
     members, wanted = load(files["merged"], "members", "wanted")
-    return fit_opacities(small, members, wanted, load(files["again"], "weight")[0], mean)
+    return fit_opacities(small, members, wanted, load(files["visibility"], "weight")[0], mean)
 
 
 def scene_of(path: Path, name: str) -> Splats:

@@ -197,9 +197,9 @@ def test_finished_work_is_not_repeated(store: TileStore, tmp_path: Path, fingerp
     again = reduced(store, tmp_path, views=ring())
     assert all(path.stat().st_mtime_ns == time for path, time in before.items())
     assert again.fingerprint() == fingerprint
-    looks = {path for path in before if path.name.startswith("look")}
-    reduced(store, tmp_path, budget=450, views=ring())  # another budget looks at the same
-    assert looks == {path for path in tmp_path.iterdir() if path.name.startswith("look-")}
+    seen = {path for path in before if path.name.startswith("visibility-")}
+    reduced(store, tmp_path, budget=450, views=ring())  # another budget needs the same
+    assert seen == {path for path in tmp_path.iterdir() if path.name.startswith("visibility-")}
 
 
 def test_all_there_are_stay_as_they_are(store: TileStore, scene: Path, tmp_path: Path) -> None:
