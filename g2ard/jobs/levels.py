@@ -222,8 +222,8 @@ def _level(
 
 def _merged(job: DistillJob, finer: Splats, count: int) -> Splats:
     """Merge to the next level, weighted by visibility in the training views."""
-    look = visibility_source(job.views.train.cameras, progress=job.progress)
-    return simplify(finer, count, visibility=look, progress=job.progress).splats
+    visibility = visibility_source(job.views.train.cameras, progress=job.progress)
+    return simplify(finer, count, visibility=visibility, progress=job.progress).splats
 
 
 def _targets(job: DistillJob, cameras: Cameras, longest: int) -> Targets:

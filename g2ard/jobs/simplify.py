@@ -141,7 +141,7 @@ class Reduction:
             made = merge(
                 self.splats,
                 count,
-                visibility=self._look if count < len(self.splats) else None,
+                visibility=self._visibility if count < len(self.splats) else None,
                 config=self.config,
                 progress=self.progress,
             )
@@ -149,7 +149,7 @@ class Reduction:
         return self._made[count]
 
     @cached_property
-    def _look(self) -> VisibilitySource | None:
+    def _visibility(self) -> VisibilitySource | None:
         if self.blind:
             return None
         cameras = cameras_for_looks(
@@ -174,14 +174,14 @@ def _scene(
     return load_scene(scene, say, render_model), beside or scene, str(scene)
 
 
-def _remembering(look: VisibilitySource) -> VisibilitySource:
+def _remembering(source: VisibilitySource) -> VisibilitySource:
     """Cache the visibility of the first scene, which every reduction starts with."""
     first: list[tuple[Splats, Visibility]] = []
 
     def remembered(scene: Splats) -> Visibility:
         if first and _same(first[0][0], scene):
             return first[0][1]
-        seen = look(scene)
+        seen = source(scene)
         if not first:
             first.append((scene, seen))
         return seen

@@ -18,7 +18,7 @@ from g2ard.scene.prepared import as_prepared
 from g2ard.scene.splats import Splats
 from g2ard.scene.splits import usual_rows
 
-MOST_LOOKS, LONGEST = 96, 300
+MOST_VIEWS, LONGEST = 96, 300
 """Largest number of views per scene or tile, and the longer side of their renders in pixels."""
 
 ROUND = 16
@@ -142,7 +142,7 @@ class _Sampler:
     """Function of `visibility_source`: `rounds` of views, of which the first `used` are rendered."""
 
     def __init__(self, cameras: Cameras, longest: int, progress: Progress) -> None:
-        count = min(MOST_LOOKS, len(cameras))
+        count = min(MOST_VIEWS, len(cameras))
         sample = np.unique(np.linspace(0, len(cameras) - 1, count).round().astype(int))
         full = cameras.take(sample)
         self.cameras = full.resized(longest)
@@ -182,16 +182,6 @@ class _Sampler:
         """Add a round of views; return the number of Gaussians seen so far."""
         made = [view_of(cameras, i, self.settings) for i in views]
         return sums.add(made, self.settings, counter(self.progress, "visibility"))
-
-
-def fewest_looks(gaussians: int) -> int:
-    """Return the least number of views that `visibility_source` renders, if it has enough.
-
-    >>> fewest_looks(90_854), fewest_looks(500_000)
-    (80, 32)
-    """
-    rounds = max(2, math.ceil(_CHEAP / (ROUND * max(1, gaussians))))
-    return min(ROUND * rounds, MOST_LOOKS)
 
 
 def spread(count: int) -> list[int]:
