@@ -63,6 +63,7 @@ def _frame(path: Path, index: int, entry: Any, images: Path | None) -> Frame:
     width, height = whole(camera, "width"), whole(camera, "height")
     fx, fy = number(camera, "fx"), number(camera, "fy")
     photo = find_photo(images / Path(name).name) if images else None
+    # The file has the size of the full photos; the trainer may have used and kept smaller ones.
     if photo is not None and photo.is_file() and width and height:
         (shown_width, shown_height), full = photo_size(photo, path), (width, height)
         if abs(shown_width * height - shown_height * width) <= ASPECT_SLACK * shown_height * width:

@@ -174,9 +174,16 @@ def count_for_quality(
 
 
 def _next_count(excesses: Mapping[int, float], met: int, missed: int, most: int) -> int:
-    """Predict the count whose excess is half the tolerance."""
+    """Predict the count whose excess is half the tolerance.
+
+    Args:
+        excesses: excess in dB of the counts measured so far.
+        met: smallest count that keeps the quality, `most` until one does.
+        missed: largest count that does not, 0 until one does not.
+        most: the scene's count.
+    """
     aim = _CLOSE_ENOUGH / 2
-    if missed and met < most:
+    if missed and met < most:  # interpolate between them; otherwise extrapolate from the only known side
         share = (aim - excesses[missed]) / max(excesses[met] - excesses[missed], 1e-12)
         return round(missed * (met / missed) ** min(max(share, 0.05), 0.95))
     near = met if met < most else missed

@@ -93,10 +93,10 @@ class Energy:
         normal = normal_equations(photo, shot, camera.K, gain, bias, self._scale)
         if self._scale is None:
             self._scale, self._pixels = normal.scale, int(counted.sum())
-        pull = self._pull(photo.grey - gain * shot.grey - bias, counted)
-        grey = blurred_back(-gain * pull)
-        inside = (out.image > 0) & (out.image < 1)
-        by_colour = np.where(inside, grey[..., None] * LUMA, 0.0).astype(np.float32)
+        by_residual = self._residual_gradient(photo.grey - gain * shot.grey - bias, counted)
+        by_grey = blurred_back(-gain * by_residual)
+        unclipped = (out.image > 0) & (out.image < 1)
+        by_colour = np.where(unclipped, by_grey[..., None] * LUMA, 0.0).astype(np.float32)
         by_light = -normal.right[6:] / (normal.scale**2 * config.correlated)
         slope = np.concatenate([self._renderer.pose_gradient(by_colour), by_light])
         hessian = normal.matrix / (normal.scale**2 * config.correlated)
@@ -108,8 +108,8 @@ class Energy:
         depth = float(np.median(shot.depth[counted]))
         return Point(viewmat, gain, bias, energy, slope, hessian, shot, float(counted.mean()), depth)
 
-    def _pull(self, residual: Float, counted: NDArray[np.bool_]) -> Float:
-        """Return (H, W) dE/dr."""
+    def _residual_gradient(self, residual: Float, counted: NDArray[np.bool_]) -> Float:
+        """Return (H, W) dE/dr of the residual r, 0 for pixels that do not count."""
         assert self._scale is not None
         share = residual / self._scale
         weight = np.maximum(0.0, 1 - (share / _TUKEY) ** 2) ** 2
