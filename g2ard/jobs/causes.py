@@ -67,22 +67,26 @@ def likely_causes(
     gap = recovery.psnr.after - scored
     if scored >= _LOW and gap <= _GAP:
         return []
-    learned = scored < _LOW and gap <= _GAP and recovery.steps >= 2 * len(trained)
-    causes = _of_photos(splats, held_out, background, _LEARNED if learned else UNLIKE)
+    what = f"held-out views score {gap:.1f} dB less than training views"
     if scored < _LOW:
-        causes += _of_budget(splats, trained, recovery)
         what = f"the result scores only {scored:.1f} dB in held-out views"
-    else:
-        what = f"held-out views score {gap:.1f} dB less than training views"
-    if gap > _GAP:
-        causes += _of_views(splats, held_out.cameras, trained)
+    alike, causes = _of_photos(splats, held_out, background)
+    if not causes:
+        learned = gap <= _GAP and recovery.steps >= 2 * len(trained)
+        causes = [_poses(alike)] if learned and alike < _LEARNED else []
+        causes += _of_budget(splats, trained, recovery, fits=gap > _GAP) if scored < _LOW else []
+        causes += _of_views(splats, held_out.cameras, trained) if gap > _GAP else []
     if not causes:
         return [f"{what}, and no usual cause was found; see troubleshooting in the documentation"]
     return [f"{what}; likely causes:", *(f"  - {cause}" for cause in causes)]
 
 
-def _of_photos(splats: Splats, held_out: Targets, background: Colour, unlike: float) -> list[str]:
-    """Check background, poses and exposure in a few held-out photos; `unlike` is the limit for poses."""
+def _of_photos(splats: Splats, held_out: Targets, background: Colour) -> tuple[float, list[str]]:
+    """Check background, poses and exposure in a few held-out photos.
+
+    Returns:
+        The median correlation of renders and photos, 1 without photos, and at most one cause.
+    """
     views = [v for v in range(len(held_out.cameras)) if against_of(held_out, v) == "photo"]
     views = [views[i] for i in np.unique(np.linspace(0, len(views) - 1, _VIEWS).astype(int)) if views]
     renderer = Renderer(splats, background=background)
@@ -97,30 +101,35 @@ def _of_photos(splats: Splats, held_out: Targets, background: Colour, unlike: fl
         errors.append(float(error[empty].sum() / max(float(error.sum()), 1e-12)))
         seen_through.append(photo[empty])
     if not alike:
-        return []
+        return 1.0, []
+    found = float(np.median(alike))
     shown = photo_traits([path for v in views if (path := held_out.cameras.image_paths[v])]).border
     if shown is None and np.median(errors) > _EMPTY_ERROR:
         shown = _one_colour(np.concatenate(seen_through))
     if shown is not None and np.abs(np.subtract(shown, background)).max() > _OTHER_COLOUR:
-        return [
+        return found, [
             f"background: the photos show {colour_text(shown)} around the scene, not "
             f"{colour_text(background)} (--background)"
         ]
-    if (found := float(np.median(alike))) < unlike:
-        return [
-            f"poses: renders look unlike the photos (correlation {found:.2f}); check the axes and order of "
-            "the poses, and that a given scene shares their coordinates (`g2ard render --views`)"
-        ]
+    if found < UNLIKE:
+        return found, [_poses(found)]
     if found > _ALIKE and np.median(gains) > _EXPOSED:
-        return [
+        return found, [
             f"exposure: fitting each photo's brightness would gain {np.median(gains):.1f} dB; give an "
             "exposure.json, or photos of equal exposure"
         ]
-    return []
+    return found, []
+
+
+def _poses(alike: float) -> str:
+    return (
+        f"poses: renders look unlike the photos (correlation {alike:.2f}); check the axes and order of the "
+        "poses, and that a given scene shares their coordinates (`g2ard render --views`)"
+    )
 
 
 def _one_colour(pixels: Floats) -> Colour | None:
-    """Return the colour that most of (N, 3) pixels have, rounded; None if there is none."""
+    """Return the colour of most of (N, 3) pixels, rounded; None if they differ."""
     colour = np.median(pixels, axis=0)
     if (np.abs(pixels - colour).max(axis=1) <= _OTHER_COLOUR).mean() < 0.5:
         return None
@@ -143,15 +152,15 @@ def _exposed(image: Floats, photo: Floats) -> Floats:
     return np.clip(gain * (image - mean) + goal, 0, 1)
 
 
-def _of_budget(splats: Splats, trained: Cameras, recovery: RecoverReport) -> list[str]:
-    """Check whether there were enough steps and Gaussians."""
+def _of_budget(splats: Splats, trained: Cameras, recovery: RecoverReport, *, fits: bool) -> list[str]:
+    """Check whether there were enough steps and, unless training views fit better, Gaussians."""
     causes, fifths = [], [part.mean() for part in np.array_split(recovery.loss, 5) if len(part)]
     if recovery.steps < 2 * len(trained):
         views = plural(len(trained), "view")
         causes.append(f"too few steps: {recovery.steps:,} for {views}; raise --steps")
     elif len(fifths) == 5 and (fall := 1 - fifths[4] / fifths[3]) > _FALLING:
         causes.append(f"too few steps: the loss still fell by {fall:.0%} in the last fifth; raise --steps")
-    if (share := typical_share(splats, trained)) > _COARSE:
+    if not fits and (share := typical_share(splats, trained)) > _COARSE:
         causes.append(
             f"too few Gaussians: the standard deviation of a typical one is {share:.1%} of the image's side; "
             "raise -n or lower -r"

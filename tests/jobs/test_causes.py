@@ -90,7 +90,7 @@ def test_changing_exposure_is_named(tmp_path: Path) -> None:
     [
         ({"steps": 20}, "too few steps: 20 for 12 views"),
         ({"loss": [1 / (1 + step) for step in range(100)]}, "too few steps: the loss still fell by 22%"),
-        ({"splats": replace(BALL, scales=BALL.scales * 9)}, "too few Gaussians: the standard deviation"),
+        ({"splats": replace(BALL, scales=BALL.scales * 2)}, "too few Gaussians: the standard deviation"),
     ],
 )
 def test_steps_and_gaussians_are_named(tmp_path: Path, changed: dict, cause: str) -> None:
