@@ -118,6 +118,7 @@ def evaluate(
 
 
 def _table(run: Run, title: str, rows: list[dict[str, Any]]) -> None:
+    lpips = any(r["lpips"] for r in rows)
     drifts = any(r["drift95"] is not None for r in rows)
     run.console.table(
         title,
@@ -127,9 +128,9 @@ def _table(run: Run, title: str, rows: list[dict[str, Any]]) -> None:
             "file MB",
             "PSNR",
             "SSIM",
-            "LPIPS",
-            "needle",
-            "per pixel",
+            *(["LPIPS"] if lpips else []),
+            "needles",
+            "Gaussians/px",
             *(["Drift95"] if drifts else []),
         ],
         [
@@ -139,7 +140,7 @@ def _table(run: Run, title: str, rows: list[dict[str, Any]]) -> None:
                 f"{r['file_bytes'] / 1e6:.2f}",
                 f"{r['psnr']:.2f}",
                 f"{r['ssim']:.4f}",
-                " ".join(f"{net} {value:.4f}" for net, value in (r["lpips"] or {}).items()) or "–",
+                *([" ".join(f"{net} {value:.4f}" for net, value in r["lpips"].items())] if lpips else []),
                 f"{r['needle']:.1%}",
                 f"{r['overdraw']:.1f}",
                 *([f"{r['drift95']:.3g}"] if drifts else []),
