@@ -98,7 +98,7 @@ def warn_of_photos(splats: Splats, cameras: Cameras, background: Colour, say: Sa
     if alike and np.median(alike) < UNLIKE:
         say(
             f"warning: the scene does not look like the photos (correlation {np.median(alike):.2f}); check "
-            "the views with `g2ard render --views`, or ignore the photos with --renders"
+            "the views with `g2ard render --views`, or replace them with --views made"
         )
 
 
