@@ -18,8 +18,12 @@ from g2ard.io import check_scene_output
 from g2ard.progress import plural
 
 if TYPE_CHECKING:
+    from g2ard.config.choices import Colour
     from g2ard.report.kinds import KindScore
+    from g2ard.scene.cameras import Cameras
     from g2ard.scene.splats import Splats
+    from g2ard.scene.targets import Targets
+    from g2ard.stages.recover import Recovered
 
 
 @command(
@@ -63,11 +67,8 @@ def recover(
     background: opt.BackgroundOption = None,
 ) -> None:
     """Optimise a fixed set of Gaussians against photos or a teacher's renders."""
-    from g2ard.jobs.causes import likely_causes
     from g2ard.jobs.inputs import load_split_views, load_trained, make_targets
-    from g2ard.jobs.score import scores_by_kind
     from g2ard.jobs.view_checks import propose_background, warn_of_sight
-    from g2ard.report.kinds import COLUMNS, cells
     from g2ard.scene.targets import kinds_of
     from g2ard.stages.recover import RecoverConfig
     from g2ard.stages.recover import recover as optimize
@@ -94,17 +95,10 @@ def recover(
     views = opt.views_or_teacher(run, views, teacher, dense)
     chosen = load_trained(views, split, size, run.say, unpictured=dense is not None)
     warn_of_sight(splats, chosen.cameras, run.say)
+    colour = configured(RecoverConfig(), preset, settings).background
     if dense is None or photos:
-        colour = configured(RecoverConfig(), preset, settings).background
         propose_background(chosen.cameras, colour, background is not None, run.say)
-    targets = make_targets(
-        chosen.cameras,
-        dense,
-        configured(RecoverConfig(), preset, settings).background,
-        photos=photos,
-        progress=run.progress,
-        say=run.say,
-    )
+    targets = make_targets(chosen.cameras, dense, colour, photos=photos, progress=run.progress, say=run.say)
     run.say(f"{plural(len(chosen.cameras), 'view')} against {kinds_of(targets)}")
     weights = chosen.weights if weighted else None
     if weights is not None:
@@ -138,24 +132,34 @@ def recover(
     pool, _ = load_split_views(views, "all", unpictured=dense is not None)
     tested = [i for i, found in enumerate(pool.splits) if found == "test" and split == "train"]
     if tested:
-        held_out = make_targets(
-            pool.cameras.take(tested).resized(size), dense, config.background, photos=photos, lazy=True
-        )
-        kinds = scores_by_kind(splats, result.splats, held_out, config.background, run.progress)
-        title = f"held-out views against {kinds_of(held_out)}, before → after:"
-        run.console.table(title, list(COLUMNS), cells(kinds))
-        lines = [loss(kind, "the student is better there") for kind in kinds]
-        scored = sum(kind.views * kind.psnr.after for kind in kinds) / len(tested)
-        lines += likely_causes(
-            result.splats, held_out, chosen.cameras, result.report, scored, config.background
-        )
-        for line in filter(None, lines):
-            run.say(line)
+        cameras = pool.cameras.take(tested).resized(size)
+        held_out = make_targets(cameras, dense, colour, photos=photos, lazy=True)
+        kinds = _score(run, splats, result, held_out, chosen.cameras, colour)
     gain, count = result.report.psnr, plural(len(splats), "Gaussian")
     run.say(f"{output}: {count}, {opt.trained_on(split)} {gain.before:.2f} → {gain.after:.2f} dB")
     report = {**result.report.as_dict(), "preset": why, "prior": measured.as_dict()}
     report |= {"kinds": [kind.as_dict() for kind in kinds], "settings": listed(config)}
     run.result({**report, "output": str(output)})
+
+
+def _score(
+    run: Run, student: Splats, result: Recovered, held_out: Targets, trained: Cameras, colour: Colour
+) -> tuple[KindScore, ...]:
+    """Score held-out views, and print the table, losses and likely causes of a poor result."""
+    from g2ard.jobs.causes import likely_causes
+    from g2ard.jobs.score import scores_by_kind
+    from g2ard.report.kinds import COLUMNS, cells
+    from g2ard.scene.targets import kinds_of
+
+    kinds = scores_by_kind(student, result.splats, held_out, colour, run.progress)
+    title = f"held-out views against {kinds_of(held_out)}, before → after:"
+    run.console.table(title, list(COLUMNS), cells(kinds))
+    lines = [loss(kind, "the student is better there") for kind in kinds]
+    mean = sum(kind.views * kind.psnr.after for kind in kinds) / len(held_out.cameras)
+    lines += likely_causes(result.splats, held_out, trained, result.report, mean, colour)
+    for line in filter(None, lines):
+        run.say(line)
+    return kinds
 
 
 def _built(run: Run, path: Path, student: Splats) -> Splats:
