@@ -202,7 +202,12 @@ class _Rounds:
     @cached_property
     def key(self) -> str:
         """Fingerprint that saved stages must have; computed only with a work folder."""
-        return _fingerprint(self.prior, self.budget, self.targets, self.config, self.weights, self.validation)
+        weights = None if self.weights is None else self.weights.tolist()
+        options = repr((self.budget, self.config, weights))
+        parts = [options, self.prior.fingerprint(), fingerprint_of(self.targets)]
+        if self.validation is not None:
+            parts.append(fingerprint_of(self.validation))
+        return hashlib.sha256("\n".join(parts).encode()).hexdigest()
 
     def advance(self, number: int, count: int, *, final: bool) -> None:
         """Run one round: simplify to `count` and recover; the final round adds the final recovery."""
@@ -314,17 +319,3 @@ class _Rounds:
         self.state = replace(self.prior, **arrays)
         entry.update(meta["entry"])
         return True
-
-
-def _fingerprint(
-    prior: Splats,
-    budget: int,
-    targets: Targets,
-    config: DistillConfig,
-    weights: Any,
-    validation: Targets | None,
-) -> str:
-    given = None if weights is None else weights.tolist()
-    held = [] if validation is None else [fingerprint_of(validation)]
-    parts = (repr((budget, config, given)), prior.fingerprint(), fingerprint_of(targets), *held)
-    return hashlib.sha256("\n".join(parts).encode()).hexdigest()

@@ -13,18 +13,15 @@ from g2ard.config.choices import ADAPT_SCHEDULES, AdaptSchedule
 from g2ard.errors import InputError, require
 from g2ard.progress import Progress, plural, silent
 from g2ard.report.base import Report
-from g2ard.scene.appearance import blended, colour_change, recoloured, views_seeing
+from g2ard.scene.appearance import blended_appearance, colour_change, recoloured, views_seeing
 from g2ard.scene.splats import Splats
 from g2ard.scene.targets import Targets, fingerprint_of
 from g2ard.stages.recover import RecoverConfig, checkpoint, recover
-from g2ard.stages.recover.anchors import Regularizers
+from g2ard.stages.recover.anchors import FREE
 from g2ard.stages.recover.config import FitConfig
 from g2ard.stages.recover.probe import Probe
 from g2ard.stages.recover.report import Gain
 from g2ard.stages.recover.schedule import PAPER, TUNED, Schedule
-
-_FREE = Regularizers(anchor=0.0, shape=0.0, effective_rank=False)
-"""No regularisers, because geometry is frozen."""
 
 
 @dataclass(frozen=True)
@@ -229,7 +226,7 @@ def adapt(
     if config.schedule == "default" and config.prior_views:
         seen = views_seeing(start, targets.cameras)
         share = seen / (seen + config.prior_views)
-    result = blended(start, state.splats, share)
+    result = blended_appearance(start, state.splats, share)
     report = AdaptReport(
         steps=sum(s["steps"] for s in state.stretches),
         seconds=state.seconds,
@@ -259,7 +256,7 @@ def _stretch(
     how = RecoverConfig(
         schedule=recovery,
         steps=steps,
-        regularizers=_FREE,
+        regularizers=FREE,  # geometry is frozen
         ssim_weight=config.ssim_weight,
         background=config.background,
         seed=config.seed + number,

@@ -94,7 +94,7 @@ def views_seeing(splats: Splats, cameras: Cameras) -> NDArray[np.float64]:
     return out
 
 
-def blended(start: Splats, fitted: Splats, share: NDArray[np.float64]) -> Splats:
+def blended_appearance(start: Splats, fitted: Splats, share: NDArray[np.float64]) -> Splats:
     """Interpolate colours and opacity logits from `start` to `fitted` by the (N,) `share`."""
     s = share.astype(np.float32)
 

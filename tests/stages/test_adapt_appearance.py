@@ -7,7 +7,7 @@ import numpy as np
 
 from g2ard.pipeline.adapt import AdaptConfig, adapt
 from g2ard.rendering.renderer import render
-from g2ard.scene.appearance import blended, colour_change, recoloured, views_seeing
+from g2ard.scene.appearance import blended_appearance, colour_change, recoloured, views_seeing
 from g2ard.scene.targets import Subset, TeacherRenders
 from g2ard.stages.evaluate import evaluate
 from g2ard.stages.simplify import simplify
@@ -77,7 +77,7 @@ def test_views_that_see_a_gaussian_are_counted() -> None:
 def test_a_blend_goes_its_share_of_the_way() -> None:
     ball, lit = evening(50)
     share = np.linspace(0, 1, 50)
-    mixed = blended(ball, lit, share)
+    mixed = blended_appearance(ball, lit, share)
     np.testing.assert_array_equal(mixed.sh0[0], ball.sh0[0])
     np.testing.assert_allclose(mixed.sh0[-1], lit.sh0[-1], atol=1e-6)
     want = ball.shN + share[:, None, None] * (lit.shN - ball.shN)

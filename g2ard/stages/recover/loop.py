@@ -82,15 +82,18 @@ class Loop:
     @cached_property
     def key(self) -> str:
         """Fingerprint that a checkpoint must have; computed only with a checkpoint."""
-        return _fingerprint(
-            self.student,
-            self.targets,
-            self.config,
-            self.weights,
-            self.anchors,
-            self._validation_key,
-            self.frozen,
-        )
+        parts = [repr(self.config), self.student.fingerprint(), fingerprint_of(self.targets)]
+        if self.weights is not None:
+            parts.append(repr(self.weights.tolist()))
+        if self._validation_key is not None:
+            parts.append(self._validation_key)
+        digest = hashlib.sha256("\n".join(parts).encode())
+        anchors = self.anchors
+        for array in (anchors.means, anchors.frames, anchors.r_parallel, anchors.r_perp):
+            digest.update(np.ascontiguousarray(array).tobytes())
+        if self.frozen is not None:
+            digest.update(self.frozen.tobytes())
+        return digest.hexdigest()
 
     @cached_property
     def engine(self) -> Engine:
@@ -309,26 +312,6 @@ class Loop:
 def finite(reach: float) -> float | None:
     """Return `reach`, or None for infinity, which JSON lacks."""
     return None if math.isinf(reach) else reach
-
-
-def _fingerprint(
-    student: Splats,
-    targets: Targets,
-    config: RecoverConfig,
-    weights: NDArray[np.float64] | None,
-    anchors: Anchors,
-    validation: str | None,
-    frozen: NDArray[np.bool_] | None,
-) -> str:
-    given = [] if weights is None else [repr(weights.tolist())]
-    parts = (repr(config), student.fingerprint(), fingerprint_of(targets), *given)
-    parts = parts if validation is None else (*parts, validation)
-    digest = hashlib.sha256("\n".join(parts).encode())
-    for array in (anchors.means, anchors.frames, anchors.r_parallel, anchors.r_perp):
-        digest.update(np.ascontiguousarray(array).tobytes())
-    if frozen is not None:
-        digest.update(frozen.tobytes())
-    return digest.hexdigest()
 
 
 def engine_class(name: str) -> Callable[[Objective], Engine]:
