@@ -13,16 +13,19 @@ from reference import ssim as reference
 Image = NDArray[np.float32]
 SHAPES = [(48, 64, 3), (1, 1, 3), (5, 7, 3), (33, 100, 1), (215, 190, 3), (12, 11, 4)]
 """The largest has several tiles both ways."""
-KINDS = ("noise", "close", "flat", "dark")
+KINDS = ("noise", "close", "flat", "dark", "equal but for two pixels")
 
 
 def images(shape: tuple[int, int, int], kind: str) -> tuple[Image, Image]:
     rng = np.random.default_rng(sum(shape))
     y, x = np.mgrid[: shape[0], : shape[1]] / 20
     smooth = (0.5 + 0.4 * np.sin(x + 2 * y))[..., None] * np.ones(shape[2])
+    two = np.zeros(shape)
+    two[shape[0] // 2, shape[1] // 2], two[-1, 0] = 1, -1
     a, b = {
         "noise": (rng.random(shape), rng.random(shape)),
         "close": (smooth, smooth + rng.normal(size=shape) * 0.01),
+        "equal but for two pixels": (smooth, smooth + 0.3 * two),
         "flat": (np.full(shape, 0.3), np.full(shape, 0.6)),
         "dark": (np.zeros(shape), rng.random(shape) * 0.01),
     }[kind]

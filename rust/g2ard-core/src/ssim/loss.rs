@@ -2,7 +2,8 @@
 //!
 //! With e = x − y the textbook fraction reads SSIM = l·c, l = 1 − d²/P, c = 1 − E/Q, where d = ⟨e⟩, E = ⟨e²⟩ − d²,
 //! P = μx² + μy² + C₁, Q = σx² + σy² + C₂: nothing cancels where the images agree, and SSIM(x, x) is 1 exactly.
-//! A tile computes what it needs of its neighbours again, so that everything between image and gradient stays in the cache.
+//! A tile computes what it needs of its neighbours again, so that everything between image and gradient stays in the
+//! cache, and skips rows where the images agree, such as the background around an object.
 
 mod tile;
 
@@ -17,7 +18,7 @@ use tile::{Tile, scratch_len};
 
 /// Rows and values along a row of a tile: fixed, so that sums are split equally for any number of threads.
 const ROWS: usize = 100;
-const COLUMNS: usize = 512;
+const COLUMNS: usize = 256;
 
 /// The fused loss and its buffers, reused from call to call.
 #[derive(Default)]

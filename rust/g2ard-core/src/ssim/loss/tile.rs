@@ -97,6 +97,11 @@ impl<const MAPS: usize> Ring<'_, MAPS> {
         &mut self.values[at..at + self.width]
     }
 
+    fn clear(&mut self, group: usize) {
+        let half = GROUP * MAPS * self.width;
+        self.values[group % 2 * half..][..half].fill(0.0);
+    }
+
     /// Blurs sixteen columns of a map down: GROUP rows, centred on those from row RADIUS of group `first`.
     #[inline(always)]
     fn blurred_down<F: Lanes>(
@@ -170,138 +175,230 @@ pub struct Tile<'a> {
     pub gradient: DisjointSlice<f32>,
 }
 
+/// What a tile's steps leave for the next, in scratch memory.
+struct Rows<'a> {
+    /// Columns of the tile, with a margin on both sides, and with two.
+    width: usize,
+    derived: usize,
+    span: usize,
+    /// One row of each map, of `span` values.
+    products: &'a mut [f32],
+    /// A group of rows of each map, of `derived` values.
+    derivatives: &'a mut [f32],
+    means: Ring<'a, FORWARD>,
+    slopes: Ring<'a, BACK>,
+}
+
 impl Kernel for Tile<'_> {
     /// Σ|e| and Σ(1 − SSIM).
     type Output = [f64; 2];
 
+    /// Group g of products begins 2·RADIUS rows above row g·GROUP of the tile, that of derivatives RADIUS rows.
     #[inline(always)]
-    fn run<F: Lanes>(self) -> [f64; 2] {
-        let (row, margin, weights) = (self.shape.row(), margin(self.shape), &self.weights);
+    fn run<F: Lanes>(mut self) -> [f64; 2] {
+        let scratch = std::mem::take(&mut self.scratch);
+        let margin = margin(self.shape);
         let width = self.columns.len().next_multiple_of(LANES);
-        let derived = width + 2 * margin;
-        let (products, rest) = self.scratch.split_at_mut(FORWARD * (derived + 2 * margin));
+        let (derived, span) = (width + 2 * margin, width + 4 * margin);
+        let (products, rest) = scratch.split_at_mut(FORWARD * span);
         let (derivatives, rest) = rest.split_at_mut(BACK * GROUP * derived);
-        let (means, rest) = rest.split_at_mut(2 * GROUP * FORWARD * derived);
-        let mut means = Ring::<FORWARD> {
-            values: means,
-            width: derived,
-        };
-        let mut slopes = Ring::<BACK> {
-            values: &mut rest[..2 * GROUP * BACK * width],
+        let (means, slopes) = rest.split_at_mut(2 * GROUP * FORWARD * derived);
+        let mut rows = Rows {
             width,
+            derived,
+            span,
+            products,
+            derivatives,
+            means: Ring {
+                values: means,
+                width: derived,
+            },
+            slopes: Ring {
+                values: slopes,
+                width,
+            },
         };
-        let left = self.columns.start as isize - margin as isize;
-        let (two, l1, ssim) = (
-            F::splat(2.0),
-            F::splat(self.scale[0]),
-            F::splat(self.scale[1]),
-        );
-        let mut total = [0.0; 2];
-        // Group g of products begins 2·RADIUS rows above row g·GROUP of the tile, that of derivatives RADIUS rows.
-        for group in 0..self.rows.len().div_ceil(GROUP) + 2 {
-            for i in 0..GROUP {
-                let y = (self.rows.start + group * GROUP + i).wrapping_sub(2 * RADIUS);
-                if y >= self.shape.height {
-                    for m in 0..FORWARD {
-                        means.row(group, i, m).fill(0.0);
-                    }
-                    continue;
-                }
-                let image = &self.image[y * row..(y + 1) * row];
-                let target = &self.target[y * row..(y + 1) * row];
-                let span = derived + 2 * margin;
-                for at in (0..span).step_by(LANES) {
-                    let x = left - margin as isize + at as isize;
-                    let (p, q) = (load::<F>(image, x), load::<F>(target, x));
-                    let e = p - q;
-                    let values = [p, e, p.fma(p, q * q), e * e];
-                    for m in 0..FORWARD {
-                        // SAFETY: whole lanes of map m's row.
-                        unsafe { values[m].store_at(products.as_mut_ptr().add(m * span + at)) };
-                    }
-                }
-                for m in 0..FORWARD {
-                    let from = &products[m * span..(m + 1) * span];
-                    blur_row::<F>(from, means.row(group, i, m), self.shape, weights);
-                }
-            }
-            let Some(group) = group.checked_sub(1) else {
-                continue;
-            };
-            let mut lost = F::zero();
-            for at in (0..derived).step_by(LANES) {
-                let mut blurred = [[F::zero(); GROUP]; FORWARD];
-                for m in 0..FORWARD {
-                    blurred[m] = means.blurred_down(group, m, at, weights);
-                }
-                let columns = inside::<F>(row, left + at as isize);
-                let mine = (margin..margin + width).contains(&at);
-                for i in 0..GROUP {
-                    let y = (self.rows.start + group * GROUP + i).wrapping_sub(RADIUS);
-                    let (mut loss, mut d) = (F::zero(), [F::zero(); BACK]);
-                    if y < self.shape.height {
-                        (loss, d) = derivatives_of(&[
-                            blurred[0][i],
-                            blurred[1][i],
-                            blurred[2][i],
-                            blurred[3][i],
-                        ]);
-                    }
-                    if mine && self.rows.contains(&y) {
-                        lost = lost + loss.only(columns);
-                    }
-                    for m in 0..BACK {
-                        let to = (i * BACK + m) * derived + at;
-                        // SAFETY: whole lanes of a row of derivatives.
-                        unsafe {
-                            d[m].only(columns)
-                                .store_at(derivatives.as_mut_ptr().add(to))
-                        };
-                    }
-                }
-            }
-            total[1] += sum(lost);
-            for i in 0..GROUP {
-                for m in 0..BACK {
-                    let from = &derivatives[(i * BACK + m) * derived..][..derived];
-                    blur_row::<F>(from, slopes.row(group, i, m), self.shape, weights);
-                }
-            }
-            let Some(group) = group.checked_sub(1) else {
-                continue;
-            };
-            let mut differences = F::zero();
-            let top = self.rows.start + group * GROUP;
-            for at in (0..width).step_by(LANES) {
-                let mut blurred = [[F::zero(); GROUP]; BACK];
-                for m in 0..BACK {
-                    blurred[m] = slopes.blurred_down(group, m, at, weights);
-                }
-                let x = self.columns.start + at;
-                let count = LANES.min(self.columns.end - x);
-                for i in 0..GROUP.min(self.rows.end - top) {
-                    let first = (top + i) * row;
-                    let p = load::<F>(&self.image[first..first + row], x as isize);
-                    let e = p - load::<F>(&self.target[first..first + row], x as isize);
-                    differences = differences + e.abs();
-                    let slope = blurred[0][i] + two * (p * blurred[1][i] + e * blurred[2][i]);
-                    let sign = l1.only(e.gt(F::zero())) - l1.only(F::zero().gt(e));
-                    let value = slope.fma(ssim, sign);
-                    // SAFETY: these values are the tile's own.
-                    let out = unsafe { self.gradient.slice(first + x, count) };
-                    if count == LANES {
-                        // SAFETY: `out` has sixteen values.
-                        unsafe { value.store_at(out.as_mut_ptr()) };
-                    } else {
-                        let mut lanes = Lanes16::default();
-                        value.store(&mut lanes);
-                        out.copy_from_slice(&lanes.0[..count]);
-                    }
-                }
-            }
-            total[0] += sum(differences);
+        let groups = self.rows.len().div_ceil(GROUP) + 2;
+        let mut differ = 0u64;
+        for group in 0..groups {
+            differ |= u64::from(self.differs::<F>(group)) << group;
         }
-        total
+        // Where the images agree as far as the windows reach, loss and gradient are 0 and nothing is blurred.
+        let differs = |group: usize, count: usize| differ >> group & ((1 << count) - 1) != 0;
+        let mut sums = [0.0; 2];
+        for group in 0..groups {
+            if differs(group.saturating_sub(1), 3) {
+                self.blur_products::<F>(group, &mut rows);
+            }
+            let Some(group) = group.checked_sub(1) else {
+                continue;
+            };
+            if differs(group, 2) {
+                sums[1] += self.blur_derivatives::<F>(group, &mut rows);
+            } else {
+                rows.slopes.clear(group);
+            }
+            let Some(group) = group.checked_sub(1) else {
+                continue;
+            };
+            if differs(group, 3) {
+                sums[0] += self.write_gradient::<F>(group, &rows);
+            } else {
+                self.clear_gradient(group);
+            }
+        }
+        sums
+    }
+}
+
+impl Tile<'_> {
+    /// Whether the images differ in a group of products.
+    #[inline(always)]
+    fn differs<F: Lanes>(&self, group: usize) -> bool {
+        let reach = 2 * margin(self.shape);
+        let last = self.shape.row().min(self.columns.end + reach);
+        let first = self.rows.start + group * GROUP;
+        for y in first.saturating_sub(GROUP)..self.shape.height.min(first) {
+            let (image, target) = self.images(y);
+            for at in (self.columns.start.saturating_sub(reach)..last).step_by(LANES) {
+                let (p, q) = (
+                    load::<F>(image, at as isize),
+                    load::<F>(target, at as isize),
+                );
+                if p.ge(q).and(q.ge(p)).bits() != u16::MAX {
+                    return true;
+                }
+            }
+        }
+        false
+    }
+
+    /// Row y of the image and of the target.
+    #[inline(always)]
+    fn images(&self, y: usize) -> (&[f32], &[f32]) {
+        let row = y * self.shape.row()..(y + 1) * self.shape.row();
+        (&self.image[row.clone()], &self.target[row])
+    }
+
+    /// Blurs a group of products along their rows.
+    #[inline(always)]
+    fn blur_products<F: Lanes>(&self, group: usize, rows: &mut Rows) {
+        let left = self.columns.start as isize - 2 * margin(self.shape) as isize;
+        for i in 0..GROUP {
+            let y = (self.rows.start + group * GROUP + i).wrapping_sub(2 * RADIUS);
+            // Rows outside the image are zero, as its columns are.
+            if y >= self.shape.height {
+                for m in 0..FORWARD {
+                    rows.means.row(group, i, m).fill(0.0);
+                }
+                continue;
+            }
+            let (image, target) = self.images(y);
+            for at in (0..rows.span).step_by(LANES) {
+                let x = left + at as isize;
+                let (p, q) = (load::<F>(image, x), load::<F>(target, x));
+                let e = p - q;
+                let values = [p, e, p.fma(p, q * q), e * e];
+                for m in 0..FORWARD {
+                    let to = m * rows.span + at;
+                    // SAFETY: whole lanes of map m's row.
+                    unsafe { values[m].store_at(rows.products.as_mut_ptr().add(to)) };
+                }
+            }
+            for m in 0..FORWARD {
+                let from = &rows.products[m * rows.span..][..rows.span];
+                let to = rows.means.row(group, i, m);
+                blur_row::<F>(from, to, self.shape, &self.weights);
+            }
+        }
+    }
+
+    /// Blurs a group of products down, and the derivatives there along their rows; returns the tile's Σ(1 − SSIM).
+    #[inline(always)]
+    fn blur_derivatives<F: Lanes>(&self, group: usize, rows: &mut Rows) -> f64 {
+        let margin = margin(self.shape);
+        let left = self.columns.start as isize - margin as isize;
+        let mut lost = F::zero();
+        for at in (0..rows.derived).step_by(LANES) {
+            let mut blurred = [[F::zero(); GROUP]; FORWARD];
+            for m in 0..FORWARD {
+                blurred[m] = rows.means.blurred_down(group, m, at, &self.weights);
+            }
+            let columns = inside::<F>(self.shape.row(), left + at as isize);
+            let mine = (margin..margin + rows.width).contains(&at);
+            for i in 0..GROUP {
+                let y = (self.rows.start + group * GROUP + i).wrapping_sub(RADIUS);
+                let (mut loss, mut d) = (F::zero(), [F::zero(); BACK]);
+                if y < self.shape.height {
+                    let means = [blurred[0][i], blurred[1][i], blurred[2][i], blurred[3][i]];
+                    (loss, d) = derivatives_of(&means);
+                }
+                if mine && self.rows.contains(&y) {
+                    lost = lost + loss.only(columns);
+                }
+                for m in 0..BACK {
+                    let to = (i * BACK + m) * rows.derived + at;
+                    let d = d[m].only(columns);
+                    // SAFETY: whole lanes of a row of derivatives.
+                    unsafe { d.store_at(rows.derivatives.as_mut_ptr().add(to)) };
+                }
+            }
+        }
+        for i in 0..GROUP {
+            for m in 0..BACK {
+                let from = &rows.derivatives[(i * BACK + m) * rows.derived..][..rows.derived];
+                let to = rows.slopes.row(group, i, m);
+                blur_row::<F>(from, to, self.shape, &self.weights);
+            }
+        }
+        sum(lost)
+    }
+
+    /// Blurs a group of derivatives down and writes the gradient there; returns its Σ|e|.
+    #[inline(always)]
+    fn write_gradient<F: Lanes>(&self, group: usize, rows: &Rows) -> f64 {
+        let (two, l1) = (F::splat(2.0), F::splat(self.scale[0]));
+        let mut differences = F::zero();
+        for at in (0..rows.width).step_by(LANES) {
+            let mut blurred = [[F::zero(); GROUP]; BACK];
+            for m in 0..BACK {
+                blurred[m] = rows.slopes.blurred_down(group, m, at, &self.weights);
+            }
+            let x = self.columns.start + at;
+            let count = LANES.min(self.columns.end - x);
+            for (i, y) in self.rows_of(group).enumerate() {
+                let (image, target) = self.images(y);
+                let p = load::<F>(image, x as isize);
+                let e = p - load::<F>(target, x as isize);
+                differences = differences + e.abs();
+                let slope = blurred[0][i] + two * (p * blurred[1][i] + e * blurred[2][i]);
+                let sign = l1.only(e.gt(F::zero())) - l1.only(F::zero().gt(e));
+                let mut lanes = Lanes16::default();
+                slope.fma(F::splat(self.scale[1]), sign).store(&mut lanes);
+                // SAFETY: these values are the tile's own.
+                let out = unsafe { self.gradient.slice(y * self.shape.row() + x, count) };
+                match out.first_chunk_mut() {
+                    Some(all) if count == LANES => *all = lanes.0,
+                    _ => out.copy_from_slice(&lanes.0[..count]),
+                }
+            }
+        }
+        sum(differences)
+    }
+
+    fn clear_gradient(&self, group: usize) {
+        for y in self.rows_of(group) {
+            let first = y * self.shape.row() + self.columns.start;
+            // SAFETY: these values are the tile's own.
+            unsafe { self.gradient.slice(first, self.columns.len()) }.fill(0.0);
+        }
+    }
+
+    /// A group of the tile's own rows.
+    #[inline(always)]
+    fn rows_of(&self, group: usize) -> Range<usize> {
+        let first = self.rows.start + group * GROUP;
+        first..self.rows.end.min(first + GROUP)
     }
 }
 
