@@ -13,7 +13,6 @@ from g2ard.cli.budget_options import Count
 from g2ard.config.choices import (
     BLACK,
     Alpha,
-    Colour,
     Convention,
     Engine,
     FormatName,
@@ -234,8 +233,11 @@ BackgroundOption = Annotated[
 ]
 
 
-def background_of(run: Run, given: Colour | None, *scenes: Path | None) -> Colour | None:
-    """Return --background, otherwise that of the first run among the scenes; None if it is the default."""
+def background_of(run: Run, given: Triple | None, *scenes: Path | None) -> Triple | None:
+    """Return --background, otherwise that of the first run among the scenes, for `run.settings` as well.
+
+    None means the default.
+    """
     from g2ard.io.detect import run_background
     from g2ard.scene.images import colour_text
 
@@ -246,7 +248,8 @@ def background_of(run: Run, given: Colour | None, *scenes: Path | None) -> Colou
     if colour == BLACK:
         return None
     run.say(f"background: {colour_text(colour)}, as {scene} was made with")
-    return colour
+    run.config["background"] = colour
+    return Triple(colour)
 
 
 TeacherOption = Annotated[

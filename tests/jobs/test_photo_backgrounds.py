@@ -58,6 +58,8 @@ def test_a_run_is_drawn_on_its_own_background(command_line: CommandLine, rgba: P
         ("render", "run", "--orbit", 1, "-o", "pictures"),
         ("compare", "run", "ball.ply", "-n", 1),
         ("view", "run", "-o", "page.html"),
+        ("adapt", "run", "--views", "ball", "--steps", 2, "-o", "adapted.ply"),
+        ("recover", "run", "--views", "ball", "--steps", 2, "-o", "recovered.ply"),
         ("register", "run", "--photos", "ball", "-o", "poses.json", "--matcher", "direct"),
     ):
         _, _, error = command_line(*ask, cwd=rgba)

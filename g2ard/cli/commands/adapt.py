@@ -60,6 +60,7 @@ def adapt(
     if schedule == "paper" and prior_views:
         raise typer.BadParameter("--prior-views and the paper's schedule exclude each other; give one")
     start = AdaptConfig.scheduled(schedule)
+    background = opt.background_of(run, background, compact)
     names = ("steps", "tolerance", "schedule", "prior_views", "sh_degree", "background", "seed")
     config = configured(start, preset or "auto", run.settings(start, *names, preset=preset))
     work = output.parent / f".{output.name}.work"

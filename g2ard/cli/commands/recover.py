@@ -76,6 +76,7 @@ def recover(
     from g2ard.stages.recover.prior import regularizers_for
     from g2ard.stages.recover.report import outcome, unregularized
 
+    background = opt.background_of(run, background, student)
     names = ("schedule", "steps", "recovery_time", "sh_degree", "background", "seed")
     settings = run.settings(RecoverConfig(), *names, preset=preset)
     named = {**PRESETS[preset], **settings}
