@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -89,15 +91,11 @@ def _of_photos(splats: Splats, held_out: Targets, background: Colour) -> tuple[f
     """
     views = [v for v in range(len(held_out.cameras)) if against_of(held_out, v) == "photo"]
     views = [views[i] for i in np.unique(np.linspace(0, len(views) - 1, _VIEWS).astype(int)) if views]
-    renderer = Renderer(splats, background=background)
     alike, gains, seen_through, errors = [], [], [], []
-    for view in views:
-        mask, drawn = mask_of(held_out, view), renderer.render(held_out.cameras[view])
-        counted = np.ones(drawn.alpha.shape, bool) if mask is None else mask
-        image, photo = np.clip(drawn.image, 0, 1)[counted], held_out[view][counted]
+    for alpha, image, photo in compared(splats, held_out, views, background):
         alike.append(correlation(image, photo))
         gains.append(psnr(_exposed(image, photo)[None], photo[None]) - psnr(image[None], photo[None]))
-        empty, error = drawn.alpha[counted] < 0.5, np.square(image - photo).sum(axis=1)
+        empty, error = alpha < 0.5, np.square(image - photo).sum(axis=1)
         errors.append(float(error[empty].sum() / max(float(error.sum()), 1e-12)))
         seen_through.append(photo[empty])
     if not alike:
@@ -119,6 +117,17 @@ def _of_photos(splats: Splats, held_out: Targets, background: Colour) -> tuple[f
             "exposure.json, or photos of equal exposure"
         ]
     return found, []
+
+
+def compared(
+    splats: Splats, targets: Targets, views: Iterable[int], background: Colour
+) -> Iterator[tuple[Floats, Floats, Floats]]:
+    """Yield alpha (N,), render and target (N, 3) of the pixels of each view that count."""
+    renderer = Renderer(splats, background=background)
+    for view in views:
+        mask, drawn = mask_of(targets, view), renderer.render(targets.cameras[view])
+        counted = np.ones(drawn.alpha.shape, bool) if mask is None else mask
+        yield drawn.alpha[counted], np.clip(drawn.image, 0, 1)[counted], targets[view][counted]
 
 
 def _poses(alike: float) -> str:

@@ -12,11 +12,10 @@ from g2ard.config.choices import Colour
 from g2ard.errors import InputError
 from g2ard.io import find_views, read_view_set
 from g2ard.progress import Say, plural, unsaid
-from g2ard.rendering.renderer import Renderer
 from g2ard.scene.cameras import Cameras, unseeing
 from g2ard.scene.splats import Splats
 from g2ard.scene.splits import split_mask
-from g2ard.scene.targets import Photos, mask_of
+from g2ard.scene.targets import Photos
 
 _SIDE = 800
 """Longer side in pixels, as in a generated pool."""
@@ -83,18 +82,13 @@ def warn_of_photos(splats: Splats, cameras: Cameras, background: Colour, say: Sa
 
     The measure is the correlation of pixel brightness, as the median over a few small photos.
     """
-    from g2ard.jobs.causes import UNLIKE, correlation
+    from g2ard.jobs.causes import UNLIKE, compared, correlation
 
     pictured = np.flatnonzero([path is not None for path in cameras.image_paths])
     tried = np.unique(np.linspace(0, len(pictured) - 1, min(_LOOKED_AT, len(pictured))).astype(int))
     photos = Photos(cameras.take(pictured[tried]).resized(_SMALL), background=background)
-    renderer = Renderer(splats, background=background)
-    alike = []
-    for view in range(len(tried)):
-        mask = mask_of(photos, view)
-        counted = np.ones(photos[view].shape[:2], bool) if mask is None else mask
-        image = renderer.render(photos.cameras[view]).image
-        alike.append(correlation(image[counted], photos[view][counted]))
+    views = compared(splats, photos, range(len(tried)), background)
+    alike = [correlation(image, photo) for _, image, photo in views]
     if alike and np.median(alike) < UNLIKE:
         say(
             f"warning: the scene does not look like the photos (correlation {np.median(alike):.2f}); check "

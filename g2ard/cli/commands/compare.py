@@ -7,15 +7,8 @@ from typing import Annotated
 
 import typer
 
+from g2ard.cli import options as opt
 from g2ard.cli.frame import Run, command
-from g2ard.cli.options import (
-    BackgroundOption,
-    ImagesOption,
-    SizeOption,
-    ViewsOrMadeOption,
-    background_of,
-    with_images,
-)
 from g2ard.config.choices import BLACK
 from g2ard.io.detect import run_scene
 from g2ard.io.paths import short_names
@@ -38,11 +31,11 @@ def compare(
             "-o", "--output", metavar="FILE.html", help="Write a page with a divider, open at the worst view."
         ),
     ] = None,
-    views: ViewsOrMadeOption = None,
-    images: ImagesOption = None,
+    views: opt.ViewsOrMadeOption = None,
+    images: opt.ImagesOption = None,
     count: Annotated[int, typer.Option("-n", "--count", min=1, help="Views to generate.")] = 24,
-    size: SizeOption = None,
-    background: BackgroundOption = None,
+    size: opt.SizeOption = None,
+    background: opt.BackgroundOption = None,
 ) -> None:
     """Compare renders of two scenes: PSNR, SSIM, the worst views, and a page to look at."""
     from g2ard.jobs.inputs import load_views
@@ -58,10 +51,10 @@ def compare(
         check_page_output(output, run.overwrite)
         run.spare_inputs(output)
     reference, other = (run.load(path) for path in paths)
-    colour = background_of(run, background, first, second) or BLACK
+    colour = opt.background_of(run, background, first, second) or BLACK
     found = views_or_pool(
         reference,
-        with_images(views, images),
+        opt.with_images(views, images),
         beside=paths[0],
         count=count,
         seed=run.seed,

@@ -118,34 +118,18 @@ def evaluate(
 
 
 def _table(run: Run, title: str, rows: list[dict[str, Any]]) -> None:
-    lpips = any(r["lpips"] for r in rows)
-    drifts = any(r["drift95"] is not None for r in rows)
-    run.console.table(
-        title,
-        [
-            "scene",
-            "Gaussians",
-            "file MB",
-            "PSNR",
-            "SSIM",
-            *(["LPIPS"] if lpips else []),
-            "needles",
-            "Gaussians/px",
-            *(["Drift95"] if drifts else []),
-        ],
-        [
-            [
-                name,
-                f"{r['count']:,}",
-                f"{r['file_bytes'] / 1e6:.2f}",
-                f"{r['psnr']:.2f}",
-                f"{r['ssim']:.4f}",
-                *([" ".join(f"{net} {value:.4f}" for net, value in r["lpips"].items())] if lpips else []),
-                f"{r['needle']:.1%}",
-                f"{r['overdraw']:.1f}",
-                *([f"{r['drift95']:.3g}"] if drifts else []),
-            ]
-            for name, r in zip(short_names([Path(r["scene"]) for r in rows]), rows, strict=True)
-        ],
-        stdout=run.json != "-",
-    )
+    columns = {
+        "scene": short_names([Path(r["scene"]) for r in rows]),
+        "Gaussians": [f"{r['count']:,}" for r in rows],
+        "file MB": [f"{r['file_bytes'] / 1e6:.2f}" for r in rows],
+        "PSNR": [f"{r['psnr']:.2f}" for r in rows],
+        "SSIM": [f"{r['ssim']:.4f}" for r in rows],
+        "needles": [f"{r['needle']:.1%}" for r in rows],
+        "Gaussians/px": [f"{r['overdraw']:.1f}" for r in rows],
+    }
+    if all(r["lpips"] for r in rows):
+        columns["LPIPS"] = [" ".join(f"{net} {value:.4f}" for net, value in r["lpips"].items()) for r in rows]
+    if all(r["drift95"] is not None for r in rows):
+        columns["Drift95"] = [f"{r['drift95']:.3g}" for r in rows]
+    cells = [list(row) for row in zip(*columns.values(), strict=True)]
+    run.console.table(title, list(columns), cells, stdout=run.json != "-")
