@@ -145,14 +145,14 @@ impl<const KINDS: usize> Kernel for Accumulate<'_, KINDS> {
                     let t = F::Block::load_part(&row.unstopped, part);
                     let next = a.fnma(t, t);
                     next.store_part(&mut row.unstopped, part);
-                    let going = next.gt(stop);
+                    let going = next.gt(stop); // pixels that the splat does not stop
                     if !going.any() {
                         lit &= !(1 << b);
                         continue;
                     }
-                    let go = hit.and(going);
-                    let w = (a * t).only(go);
-                    hits += go.bits().count_ones();
+                    let shown = hit.and(going);
+                    let w = (a * t).only(shown);
+                    hits += shown.bits().count_ones();
                     if KINDS == SQUARED {
                         weight = w.fma(t, weight);
                     } else {
@@ -162,7 +162,7 @@ impl<const KINDS: usize> Kernel for Accumulate<'_, KINDS> {
                         F::Block::select(w.gt(most), number, winner)
                             .store_part(&mut row.winner, part);
                         most.max(w).store_part(&mut row.most, part);
-                        light = light + t.only(go);
+                        light = light + t.only(shown);
                         peak = peak.max(w);
                     }
                 }

@@ -92,21 +92,22 @@ impl<const DEPTH: bool> Kernel for Forward<'_, DEPTH> {
                     let hit = log2.ge(minimum);
                     let a = alpha(log2).min(clip).only(hit);
                     let next = a.fnma(t, t);
-                    let going = next.gt(stop);
+                    let going = next.gt(stop); // pixels that the splat does not stop
                     let w = (a * t).only(going);
                     for c in 0..3 {
                         rgb[c] = F::Block::splat(splat.rgb[c]).fma(w, rgb[c]);
                     }
-                    let go = hit.and(going);
+                    let shown = hit.and(going);
                     if DEPTH {
                         let z = F::Block::splat(splat.depth);
                         depth = z.fma(w, depth);
-                        median = F::Block::select(go.and(t.ge(half)).and(half.gt(next)), z, median);
+                        median =
+                            F::Block::select(shown.and(t.ge(half)).and(half.gt(next)), z, median);
                     }
                     t = next;
                     left = F::Block::select(going, next, left);
-                    last = F::Block::select(go, F::Block::splat(splat.number), last);
-                    kept |= u64::from(go.any()) << p;
+                    last = F::Block::select(shown, F::Block::splat(splat.number), last);
+                    kept |= u64::from(shown.any()) << p;
                     light = going.any();
                 }
                 block_masks[block] = kept;

@@ -68,6 +68,7 @@ pub(crate) struct RowMajor {
     sh_coeffs: usize,
 }
 
+/// Writes the `touched` lanes of a group's value to `offset` in its rows of `stride` values.
 #[inline(always)]
 fn scatter<F: Lanes>(
     out: DisjointSlice<f32>,

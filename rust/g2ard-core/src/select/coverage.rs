@@ -204,6 +204,7 @@ impl<'a> State<'a> {
         }
     }
 
+    /// What adding a view would gain: Σ over its cells of weight · Σ p·(g(after) − g(before)).
     fn gain(&self, view: usize) -> f64 {
         let parts: Vec<f64> = self.problem.visible[view]
             .par_chunks(CHUNK)
@@ -225,6 +226,7 @@ impl<'a> State<'a> {
         parts.iter().sum()
     }
 
+    /// Adds a view's observations to the evidence.
     fn add(&mut self, view: usize) {
         let mut changes = Vec::new();
         for &cell in &self.problem.visible[view] {
@@ -235,11 +237,14 @@ impl<'a> State<'a> {
         }
     }
 
+    /// Gains of several views, counted as evaluations.
     fn gains(&mut self, views: &[u32]) -> Vec<f64> {
         self.evaluations += views.len() as u64;
         views.par_iter().map(|&v| self.gain(v as usize)).collect()
     }
 
+    /// Chooses `k` views greedily. Gains only shrink as views are added, so an old gain bounds the present one: only the top
+    /// of the heap is evaluated again (lazy greedy).
     fn choose(mut self, k: usize, control: &Control) -> Result<Chosen> {
         let all: Vec<u32> = (0..self.problem.visible.len() as u32).collect();
         let gains = self.gains(&all);

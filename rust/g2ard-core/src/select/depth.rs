@@ -62,6 +62,8 @@ impl Scratch {
     }
 }
 
+/// Blends a splat into the light left at each pixel. Where it falls below one half, the splat's `z` is the depth, and
+/// farther splats are ignored.
 fn draw(s: &Splat, z: f32, view: &Pinhole, light: &mut [f32], depth: &mut [f32]) {
     for j in s.rows[0]..s.rows[1] {
         let dy = j as f32 + 0.5 - s.y;

@@ -146,6 +146,7 @@ fn cell(scene: &Gaussians<'_>, members: &[u32]) -> ([f64; 3], [f64; 3], f64, f64
     (center, e.vectors[2], planarity.clamp(0.0, 1.0), area)
 }
 
+/// Limits weights to their 99th percentile, then scales them to sum to 1.
 fn normalise(weights: &mut [f64]) {
     let mut sorted = weights.to_vec();
     sorted.sort_by(f64::total_cmp);

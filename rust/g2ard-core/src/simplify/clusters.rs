@@ -109,6 +109,7 @@ struct Made {
     clamped: bool,
 }
 
+/// Merges a cluster's `members`; parameters are those of [`Partition::assemble`].
 fn make(
     scene: &SceneRef,
     ordered: &Ordered,
@@ -127,14 +128,14 @@ fn make(
             clamped: false,
         };
     }
-    let mut least = f64::INFINITY;
+    let mut least_blur = f64::INFINITY;
     let mut parts: Vec<_> = members
         .iter()
         .map(|&i| {
             let row = ordered.rows[i as usize] as usize;
             let g = ordered.gaussian(scene, row);
             let (cov, blur) = (g.covariance(), blur(i as usize));
-            least = least.min(blur);
+            least_blur = least_blur.min(blur);
             let alpha = sigmoid(f64::from(scene.logit(row))).min(MAX_OPACITY);
             (alpha * rendered_area(&cov, blur), g.mean, cov)
         })
@@ -144,7 +145,7 @@ fn make(
         parts.iter_mut().for_each(|p| p.0 = 1.0);
     }
     let (mean, cov) = pool(&parts);
-    let alpha = mass / rendered_area(&cov, least);
+    let alpha = mass / rendered_area(&cov, least_blur);
     let total: f64 = parts.iter().map(|p| p.0).sum();
     let mut gaussian = Gaussian::from_moments(mean, &cov);
     gaussian.widen((alpha / MAX_OPACITY).clamp(1.0, growth));
@@ -162,6 +163,7 @@ fn logit_of(alpha: f64) -> f32 {
     (alpha / (1.0 - alpha)).max(f64::MIN_POSITIVE).ln() as f32
 }
 
+/// Appends a cluster's SH to `out`: the mean by `weights`, or a copy of the only member's if there are none.
 fn average_sh(
     scene: &SceneRef,
     ordered: &Ordered,

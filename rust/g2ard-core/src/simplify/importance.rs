@@ -34,6 +34,7 @@ const FOLLOWS: (f64, f64) = (0.25, 0.45);
 const FAINT: f64 = -0.4;
 
 impl Importance {
+    /// Measures a scene: the spread of its masses, and how far sizes follow the distance from the middle.
     pub fn of_scene(nodes: &[Node]) -> Self {
         let shown = || nodes.iter().filter(|n| n.mass > 0.0 && n.alpha > 0.0);
         let radius = |n: &Node| {
@@ -59,6 +60,7 @@ impl Importance {
         }
     }
 
+    /// The estimate of a node's Σ αT².
     pub fn of(&self, node: &Node) -> f32 {
         if self.exponent == 1.0 {
             return node.mass;

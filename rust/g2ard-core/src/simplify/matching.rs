@@ -115,6 +115,7 @@ impl Kernel for PairCosts<'_> {
 }
 
 impl Node {
+    /// Writes the node to one lane of `values`, in the order of [`VALUES`].
     #[inline(always)]
     fn write_lane(&self, values: &mut [Lanes16; VALUES], lane: usize) {
         let Self {
@@ -135,6 +136,7 @@ impl Node {
 }
 
 impl<F: Lanes> Node<F> {
+    /// Reads sixteen nodes as [`Node::write_lane`] wrote them.
     #[inline(always)]
     fn read(values: &[Lanes16; VALUES]) -> Self {
         let mut node = Self {

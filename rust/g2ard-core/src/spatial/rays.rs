@@ -32,11 +32,13 @@ impl Steps<'_> {
         Error::unless_equal("directions", directions.len(), eyes.len(), "rows")?;
         let rays = eyes.par_iter().zip(directions);
         Ok(rays
-            .map(|(eye, direction)| self.first(eye, direction))
+            .map(|(eye, direction)| self.first_hit(eye, direction))
             .collect())
     }
 
-    fn first(&self, eye: &[f64; 3], direction: &[f64; 3]) -> f64 {
+    /// Distance along a ray to the first full cell, infinite without one. From a cell that is s steps from the nearest full
+    /// one, the ray can advance by s − 1 cells without missing any.
+    fn first_hit(&self, eye: &[f64; 3], direction: &[f64; 3]) -> f64 {
         let (mut near, mut far) = (f64::NEG_INFINITY, f64::INFINITY);
         for k in 0..3 {
             let high = self.low[k] + self.cell * self.shape[k] as f64;
@@ -49,17 +51,17 @@ impl Steps<'_> {
         }
         let mut reached = near.max(0.0) + INSET * self.cell;
         while reached < far {
-            let ahead = self.ahead([0, 1, 2].map(|k| eye[k] + reached * direction[k]));
-            if ahead == 0 {
+            let steps = self.steps_at([0, 1, 2].map(|k| eye[k] + reached * direction[k]));
+            if steps == 0 {
                 return reached;
             }
-            reached += self.cell * (f64::from(ahead) - 1.0).max(LEAST);
+            reached += self.cell * (f64::from(steps) - 1.0).max(LEAST);
         }
         f64::INFINITY
     }
 
     /// Steps at a point, which is taken into the box if rounding put it beside.
-    fn ahead(&self, point: [f64; 3]) -> i8 {
+    fn steps_at(&self, point: [f64; 3]) -> i8 {
         let index = (0..3).fold(0, |flat, k| {
             let place = ((point[k] - self.low[k]) / self.cell).floor();
             flat * self.shape[k] + (place.max(0.0) as usize).min(self.shape[k] - 1)

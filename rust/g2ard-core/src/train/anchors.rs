@@ -23,7 +23,11 @@ constants! {
     }
 }
 
-/// Rows of a block: 3 of the mean, 9 of the frame, 1/r∥², 1/r⊥².
+/// First rows of a block's attributes: the mean, the frame row by row, 1/r∥ and 1/r⊥; and their number.
+const MEAN: usize = 0;
+const FRAME: usize = 3;
+const PARALLEL: usize = 12;
+const PERP: usize = 13;
 const ROWS: usize = 14;
 
 /// Frozen geometry of N Gaussians in the trainer's order.
@@ -56,14 +60,14 @@ impl Anchors {
             let from = *from as usize;
             let block = &mut blocks[row / LANES * ROWS..][..ROWS];
             for k in 0..3 {
-                block[k].0[row % LANES] = means[3 * from + k];
+                block[MEAN + k].0[row % LANES] = means[3 * from + k];
             }
             for k in 0..9 {
-                block[3 + k].0[row % LANES] = frames[9 * from + k];
+                block[FRAME + k].0[row % LANES] = frames[9 * from + k];
             }
             // The reciprocal, not its square: 1/r² of a 1e-20 thin disc leaves f32.
-            block[12].0[row % LANES] = 1.0 / r_parallel[from];
-            block[13].0[row % LANES] = 1.0 / r_perp[from];
+            block[PARALLEL].0[row % LANES] = 1.0 / r_parallel[from];
+            block[PERP].0[row % LANES] = 1.0 / r_perp[from];
         }
         Ok(Self {
             blocks,
@@ -106,7 +110,8 @@ impl Anchors {
     }
 }
 
-/// log(1 + [D² − 1]₊) is 2·log D outside the trust region: its slope in D² is 1/D².
+/// Adds `weight` times the gradient of log(1 + [D² − 1]₊), D² = Σ (δ̃ᵢ/rᵢ)², and returns the lanes outside the trust
+/// region. There the term is 2·log D, whose slope in D² is 1/D².
 #[inline(always)]
 fn anchor<F: Lanes>(
     block: &[Lanes16],
@@ -117,34 +122,30 @@ fn anchor<F: Lanes>(
 ) -> u16 {
     let mut offset = [F::zero(); 3];
     for k in 0..3 {
-        offset[k] = parameters.mean::<F>(group, k) - F::load(&block[k]);
+        offset[k] = parameters.mean::<F>(group, k) - F::load(&block[MEAN + k]);
     }
-    let radius = [
-        F::load(&block[12]),
-        F::load(&block[12]),
-        F::load(&block[13]),
-    ];
+    let reciprocal_radius = [PARALLEL, PARALLEL, PERP].map(|row| F::load(&block[row]));
     let mut local = [F::zero(); 3];
     let mut d2 = F::zero();
     for i in 0..3 {
         for j in 0..3 {
-            local[i] = F::load(&block[3 + 3 * j + i]).fma(offset[j], local[i]);
+            local[i] = F::load(&block[FRAME + 3 * j + i]).fma(offset[j], local[i]);
         }
-        local[i] = local[i] * radius[i];
+        local[i] = local[i] * reciprocal_radius[i];
         d2 = local[i].fma(local[i], d2);
     }
     let outside = d2.gt(F::splat(1.0));
     let slope = (weight * F::splat(2.0) / d2).only(outside);
     for j in 0..3 {
         for i in 0..3 {
-            let pull = slope * local[i] * radius[i];
-            g.mean[j] = pull.fma(F::load(&block[3 + 3 * j + i]), g.mean[j]);
+            let pull = slope * local[i] * reciprocal_radius[i];
+            g.mean[j] = pull.fma(F::load(&block[FRAME + 3 * j + i]), g.mean[j]);
         }
     }
     outside.bits()
 }
 
-/// [log s⊥ − log s̄⊥]₊, s⊥ = |S Rᵀ n̄|.
+/// Adds `weight` times the gradient of [log s⊥ − log s̄⊥]₊, s⊥ = |S Rᵀ n̄|, and returns the lanes where it is not flat.
 #[inline(always)]
 fn thickness<F: Lanes>(
     block: &[Lanes16],
@@ -155,13 +156,13 @@ fn thickness<F: Lanes>(
 ) -> u16 {
     let (q, rq) = unit_quaternion::<F, ParameterView<'_>>(parameters, group);
     let r = rotation(&q);
-    let normal = [F::load(&block[5]), F::load(&block[8]), F::load(&block[11])];
+    let normal = [0, 1, 2].map(|axis| F::load(&block[FRAME + 3 * axis + 2]));
     let mut scale = [F::zero(); 3];
     let mut extent = [F::zero(); 3];
     let mut square = F::zero();
     for k in 0..3 {
         // In units of s̄⊥, whose square may not fit f32.
-        scale[k] = parameters.scale::<F>(group, k) * F::load(&block[13]);
+        scale[k] = parameters.scale::<F>(group, k) * F::load(&block[PERP]);
         extent[k] = (r[0][k] * normal[0] + r[1][k] * normal[1] + r[2][k] * normal[2]) * scale[k];
         square = extent[k].fma(extent[k], square);
     }
@@ -182,7 +183,8 @@ fn thickness<F: Lanes>(
     over.bits()
 }
 
-/// max(0, −log(r_eff − 1 + ε)), r_eff = exp(H), H = −Σ q log q, q = s/Σs: acts below r_eff = 2.
+/// Adds `weight` times the gradient of max(0, −log(r_eff − 1 + ε)), r_eff = exp(H), H = −Σ q log q, q = s/Σs, and returns
+/// the lanes where it is not flat: r_eff below 2 − ε.
 #[inline(always)]
 fn effective_rank<F: Lanes>(
     weight: F,

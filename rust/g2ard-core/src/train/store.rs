@@ -45,6 +45,7 @@ pub struct Exported {
 }
 
 impl Store {
+    /// Copies the parameters in Morton order, with moments of 0. `units` are factors of the means' rate, 1 by default.
     pub fn new(params: &Params, units: Option<&[f32]>) -> Result<Self> {
         params.validate()?;
         let rows = params.len();
@@ -123,6 +124,7 @@ impl Store {
         self.unblock(&self.values, from, to)
     }
 
+    /// Copies attributes `from..to` of blocks to row-major rows in the caller's order.
     fn unblock(&self, blocks: &[Lanes16], from: usize, to: usize) -> Vec<f32> {
         let mut out = vec![0.0; self.rows * (to - from)];
         for row in 0..self.rows {
@@ -134,6 +136,7 @@ impl Store {
         out
     }
 
+    /// Copies row-major `rows` in the caller's order into blocks.
     fn block(&self, rows: &[f32], into: &mut [Lanes16]) {
         let attributes = self.attributes();
         for row in 0..self.rows {
@@ -144,6 +147,7 @@ impl Store {
         }
     }
 
+    /// Everything that [`Store::import`] needs.
     pub fn export(&self) -> Exported {
         let all = self.attributes();
         let mut units = vec![0.0; self.rows];
@@ -162,6 +166,7 @@ impl Store {
         }
     }
 
+    /// Restores an exported store of as many rows and attributes, including its order.
     pub fn import(&mut self, state: &Exported) -> Result<()> {
         let (n, all) = (self.rows, self.rows * self.attributes());
         for (name, got, expected) in [
