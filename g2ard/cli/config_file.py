@@ -75,9 +75,8 @@ def _of_command(ctx: typer.Context, path: Path, values: dict[str, Any]) -> dict[
     if not isinstance(own, dict):
         raise typer.BadParameter(f"{path}: {name}: expected a table of options")
     known = _options(ctx.command)
-    if own or len(top) < len(
-        values
-    ):  # a file for several commands: top-level options may belong to another one
+    several_commands = own or len(top) < len(values)
+    if several_commands:  # then options at the top may belong to another one
         of_others = _check_others(path, {key: values[key] for key in values if key not in {*top, name}})
         strange = [key for key in top if _dashed(key) not in known | of_others and key != "set"]
         if strange:

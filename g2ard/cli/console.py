@@ -66,6 +66,7 @@ class Console:
         Rich(file=stream, width=None if stream.isatty() else 120).print(table)
 
     def __call__(self, stage: str, done: int, total: int, info: Mapping[str, Any] | None = None) -> None:
+        """Show the progress of a stage, with the figures of `info`."""
         if self.quiet:
             return
         figures = "  ".join(f"{k} {v}" for k, v in (info or {}).items())

@@ -198,7 +198,8 @@ def optional_text(holder: Fields, key: str) -> str | None:
 
 def objects(holder: Fields, key: str) -> list[Fields]:
     """Return a list of objects, empty if the property is missing."""
-    return [object_of(entries, at) for entries in [listed(holder, key)] for at in range(len(entries))]
+    entries = listed(holder, key)
+    return [object_of(entries, at) for at in range(len(entries))]
 
 
 def listed(holder: Fields, key: str) -> Items:

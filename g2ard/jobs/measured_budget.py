@@ -288,7 +288,7 @@ def aim_of(
     """
     if budget.min_psnr is not None or budget.min_ssim is not None:
         wanted = Quality(budget.min_psnr or 0.0, budget.min_ssim or 0.0)
-        return _by_quality(splats, wanted, file, reduce, seed, progress, say)
+        return _aim_for_quality(splats, wanted, file, reduce, seed, progress, say)
     if budget.bytes is not None:
         most = int(budget.bytes * _MARGIN) if recovered else budget.bytes
         made = partial(simplify, splats, method="fast") if recovered else reduce
@@ -301,7 +301,7 @@ def aim_of(
     return Aim(found)
 
 
-def _by_quality(
+def _aim_for_quality(
     splats: Splats,
     wanted: Quality,
     file: str,
@@ -310,6 +310,7 @@ def _by_quality(
     progress: Progress,
     say: Say,
 ) -> Aim:
+    """Find the count that keeps a quality in generated views, as read back from the format of `file`."""
     from g2ard.poses import plan_pool
 
     pool = plan_pool(splats, _VIEWS, seed=seed, rows=_ROWS, looks=True, progress=progress)

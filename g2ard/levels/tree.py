@@ -196,6 +196,7 @@ class _Tree:
         return below, above
 
     def _leaf(self, rows: Rows) -> Leaf:
+        """Build the leaf of these rows: its rows per level, and the box of their Gaussians' 1σ extents."""
         ends, parts = np.searchsorted(rows, self.starts), []
         low, high = np.full(3, np.inf), np.full(3, -np.inf)
         for level, start, a, b in zip(self.levels, self.starts, ends, ends[1:], strict=False):

@@ -234,13 +234,12 @@ class _Rounds:
             self._count_resumed(entry["simplify"]["seconds"])
         else:
             began = time.monotonic()
+            blind = self.config.simplify.method == "paper"
             done = simplify(
                 self.state,
                 count,
                 config=self.config.simplify,
-                visibility=None
-                if self.config.simplify.method == "paper"
-                else visibility_source(self.targets.cameras, progress=self.progress),
+                visibility=None if blind else visibility_source(self.targets.cameras, progress=self.progress),
                 protected=self.protected,
                 final_budget=self.budget,
                 progress=self.progress,

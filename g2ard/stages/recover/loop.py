@@ -112,6 +112,7 @@ class Loop:
         return self.engine.counts * (len(self.targets.cameras) / max(1, steps))
 
     def _new_engine(self, start: Splats | None = None) -> Engine:
+        """Create an engine that begins at `start`, by default at the student."""
         config, student = self.config, self.student if start is None else start
         objective = Objective(
             settings=settings_for(self.anchors.means, antialiased=student.antialiased),

@@ -170,6 +170,7 @@ def _described(
     passes: int,
     config: RegisterConfig,
 ) -> Solved:
+    """Describe a pose by its inliers: pixels `uv` of the photo, `points`, and pixels `seen` of the render."""
     cells = np.floor(4 * uv / [camera.width, camera.height]).clip(0, 3) @ [1, 4]
     distance = np.linalg.norm(_projected(T, camera.K, points) - uv, axis=1)
     return Solved(
