@@ -163,5 +163,5 @@ def _size(path: Path, values: Fields, photo: Path) -> tuple[int, int]:
         return whole(values, "w"), whole(values, "h")
     if photo.is_file():
         return photo_size(photo, path)
-    error = values.place.error("has neither w and h nor an existing photo")
+    error = values.place.error(f"has neither w and h nor a photo {photo}")
     raise error.at(hint="{images=DIR} names the folder of photos that are elsewhere")

@@ -142,6 +142,16 @@ def test_distill_proposes_the_border_colour(command_line: CommandLine, tmp_path:
     assert "give --background black" in error
 
 
+def test_missing_photos_are_named_with_the_option_for_their_folder(
+    command_line: CommandLine, rgba: Path
+) -> None:
+    (rgba / "empty").mkdir()
+    ask = ("evaluate", "ball.ply", "--views", "ball", "--images", "empty")
+    error = refused(command_line, rgba, *ask, status=1)
+    assert "neither w and h nor a photo empty" in error
+    assert "--images DIR names the folder" in error
+
+
 def model(folder: Path, images: str = "images", scale: float = 1.0) -> dict[str, Any]:
     """Write INRIA's cameras.json, photos in a folder, and points; return the cameras' intrinsics."""
     views = around(16)
