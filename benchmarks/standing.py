@@ -11,9 +11,9 @@ from g2ard import io
 from g2ard.config.choices import BLACK, Colour
 from g2ard.errors import InputError
 from g2ard.poses import plan_pool
-from g2ard.poses.lattice import halton
-from g2ard.poses.orbit import plan_orbit
-from g2ard.poses.sight import Lens, Poses, view_statistics
+from g2ard.poses.numbers import halton
+from g2ard.poses.outside import plan_orbit
+from g2ard.poses.sight import Lens, Poses, Rays, Survey
 from g2ard.poses.site import Site
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
@@ -106,16 +106,16 @@ def _standing(splats: Splats, kind: str, seed: int) -> Cameras | None:
 
 def _between(splats: Splats, seed: int) -> Cameras:
     """Return views in free space around an object, nearer than a pool and farther than near views."""
-    site, lens = Site.of(splats), Lens(fov=_FOV)
-    far = plan_orbit(site, 4 * _STANDING, lens, seed, lambda done, total: None)
+    survey = Survey(splats, 1.0, Site.of(splats), Lens(fov=_FOV), seed)
+    site, far = survey.site, plan_orbit(survey, 4 * _STANDING)
     met = site.grid.cast(far.eyes, far.gazes)
     far, met = far.take(np.isfinite(met)), met[np.isfinite(met)]
     share = _BETWEEN[0] + (_BETWEEN[1] - _BETWEEN[0]) * halton(0, len(far), 1, seed)[:, 0]
     eyes = far.eyes + ((1 - share) * met)[:, None] * far.gazes
-    free = (site.grid.distance(eyes) > 2 * site.grid.cell) & (site.above_ground(eyes) > 0.01)
+    free = site.is_free(eyes, 2, 0.01)
     poses = Poses(eyes[free], far.gazes[free])
-    poses = poses.take(view_statistics(site, poses, lens).close > 2 * site.grid.cell)
-    return _named(poses.take(slice(_STANDING)).cameras(site, lens))
+    poses = poses.take(Rays(survey, poses).close > 2 * site.grid.cell)
+    return _named(survey.cameras(poses.take(slice(_STANDING))))
 
 
 def _named(cameras: Cameras) -> Cameras:

@@ -1,9 +1,8 @@
 """Cameras for a scene without views: around objects, through rooms and streets, from the air.
 
-A scene is turned upright (`up`), freed of floaters and sky (`matter`), its free space mapped (`grid`, `site`)
-and its kind classified (`shape`). Planners (`orbit`, `walk`, `aerial`, `inside`, `sharp`) propose poses from
-endless even sequences. They keep poses that stand in free space and see enough (`sight`, `gather`). `auto`
-combines the planners; `near` steps nearer to what a pool sees and measures what it misses.
+A scene is turned upright (`up`), freed of floaters and sky (`matter`), and its free space mapped (`site`).
+Planners (`outside`, `within`) propose poses from endless even sequences, and keep those that stand in free
+space and see enough (`sight`). `pool` combines them.
 """
 
 from __future__ import annotations

@@ -1,15 +1,17 @@
-"""Sums, quantiles and an order whose bits do not depend on the file's row order or on threads."""
+"""Sums, quantiles, orders and even sequences whose bits do not depend on row order or threads."""
 
 from __future__ import annotations
 
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from g2ard.scene.splats import Splats
 
 Floats = NDArray[np.float64]
+
+_GOLDEN = (np.sqrt(5) - 1) / 2
 
 
 def quantile(values: Floats, weights: Floats, shares: Any) -> Floats:
@@ -48,6 +50,79 @@ def turned(vectors: Floats, axes: Floats) -> Floats:
 def moments(vectors: Floats, weights: Floats) -> Floats:
     """Return the (D, D) weighted sum of outer products of (M, D) rows."""
     return np.array([[(weights * a * b).sum() for b in vectors.T] for a in vectors.T])
+
+
+def between(ends: Any, share: Floats) -> Floats:
+    """Return points between two ends.
+
+    >>> float(between((10, 20), 0.3))
+    13.0
+    """
+    return ends[0] + (ends[1] - ends[0]) * share
+
+
+def directions(turn: Floats, level: Floats, height: ArrayLike) -> Floats:
+    """Return (M, 3) vectors at `turn` turns around z, of lengths `level` across it and `height` along it."""
+    around = 2 * np.pi * turn
+    return np.stack([level * np.cos(around), level * np.sin(around), height], axis=1)
+
+
+def fibonacci(count: int, low: float = -1.0, high: float = 1.0) -> Floats:
+    """Return (count, 3) unit vectors, each representing the same area of the sphere.
+
+    They cover the heights z from `high` down to `low`.
+
+    >>> bool(np.abs(fibonacci(1000).mean(axis=0)).max() < 0.01)
+    True
+    """
+    steps = np.arange(count)
+    z = high - (high - low) * (steps + 0.5) / count
+    return directions(steps * _GOLDEN % 1, np.sqrt(1 - z * z), z)
+
+
+def halton(start: int, stop: int, dimensions: int, seed: int) -> Floats:
+    """Return (stop − start, dimensions) points of Halton's endless sequence in the unit cube.
+
+    `dimensions` is at most 6. The points are shifted on the torus by `seed`.
+
+    >>> bool(np.abs(halton(0, 1000, 3, seed=0).mean(axis=0) - 0.5).max() < 0.01)
+    True
+    """
+    shift = np.random.default_rng(seed).random(dimensions)
+    columns = np.empty((stop - start, dimensions))
+    for column, base in zip(columns.T, (2, 3, 5, 7, 11, 13), strict=False):
+        index, share = np.arange(start + 1, stop + 1), 1.0
+        column[:] = 0
+        while index.any():
+            share /= base
+            column += share * (index % base)
+            index = index // base
+    return (columns + shift) % 1
+
+
+def strata(features: Floats, size: int, seed: int) -> NDArray[Any]:
+    """Return an order in which every `size`-th row is a fair sample of all.
+
+    The rows are halved along the widest feature into groups of at most `size` similar rows. In each group, a
+    random row comes first and the others follow.
+
+    >>> order = strata(np.arange(16.0)[:, None], 8, seed=0)
+    >>> sorted(order[:8].tolist()), sorted(order[8:].tolist()) == list(range(8, 16))
+    ([0, 1, 2, 3, 4, 5, 6, 7], True)
+    """
+    chance = np.random.default_rng(seed)
+    groups: list[NDArray[Any]] = []
+    todo = [np.arange(len(features))]
+    while todo:
+        rows = todo.pop()
+        if len(rows) <= size:
+            groups.append(np.roll(rows, int(chance.integers(len(rows)))))
+            continue
+        widest = int(np.argmax(np.ptp(features[rows], axis=0)))
+        rows = rows[np.argsort(features[rows, widest], kind="stable")]
+        cut = size * max(1, -(-len(rows) // size) // 2)
+        todo += [rows[cut:], rows[:cut]]
+    return np.concatenate(groups)
 
 
 def canonical_order(splats: Splats, rows: NDArray[Any]) -> NDArray[Any]:

@@ -1,48 +1,56 @@
-"""Candidate pools: the kind of poses that suits a scene, in an order that splits fairly."""
+"""Pools of views: the planners that suit a scene, their number, and an order that splits fairly."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from g2ard.config.choices import POOL_KINDS
 from g2ard.errors import InputError
-from g2ard.poses.aerial import plan_aerial
-from g2ard.poses.anywhere import plan_anywhere
-from g2ard.poses.auto import plan_auto
-from g2ard.poses.inside import find_inside, plan_inside
-from g2ard.poses.lattice import strata
-from g2ard.poses.near import plan_near, reach_of
-from g2ard.poses.orbit import plan_orbit
-from g2ard.poses.shape import shape_of
-from g2ard.poses.sharp import SIGHT_ROWS, Glance, plan_sharp
-from g2ard.poses.sight import Lens, Poses
+from g2ard.poses.numbers import middle, norms, strata
+from g2ard.poses.outside import plan_aerial, plan_orbit
+from g2ard.poses.sight import Lens, Poses, Survey
 from g2ard.poses.site import Site
-from g2ard.poses.walk import plan_walk
+from g2ard.poses.within import is_room, plan_anywhere, plan_inside, plan_near, plan_sharp, plan_walk, reach_of
 from g2ard.progress import Progress, counter, silent
 from g2ard.scene.cameras import Camera, Cameras
 from g2ard.scene.splats import Splats
 from g2ard.scene.splits import HOLD_OUT
 
-_WORTH = 1.1
-"""Factor by which the number of poses must grow before they are planned again."""
+_PLANNERS: dict[str, Callable[..., Poses]] = {
+    "orbit": plan_orbit,
+    "aerial": plan_aerial,
+    "inside": plan_inside,
+    "walk": plan_walk,
+    "sharp": plan_sharp,
+}
+
+_POINTS, _WORTH = 4096, 1.1
+"""Points of the scene's matter that are projected into the views to tell how many are needed, and the factor
+by which their number must grow before they are planned again."""
 
 _COARSE = (0.2, 0.4)
 """Shares of the matter seen only below a pixel between which more and more poses step nearer. Measured:
 objects .06–.17, whole scenes .01–.06, two chunks cut from a room, seen from outside, .44 and .55."""
 
-_POINTS = 4096
-"""Points of the scene's matter that are projected into the views."""
-
 _FOV, _FOV_WIDE = 50.0, 70.0
 """Horizontal fields of view in degrees: within a scene people use wider lenses."""
 
-_MOSTLY_INSIDE = 0.5
-"""Share of a pool within rooms above which the whole pool uses the wider lens."""
+_STREET = 0.25
+"""Share of a landscape's poses that stand on its ground, where there is room."""
+
+_SHARP, _SHARP_IN_SCALES = 0.04, 12.0
+"""Radians, and multiples of the median Gaussian's angular standard deviation: a pose from around or above is
+sharp if what it sees (`Glance.of`) is smaller than the larger of them, because a scene of few Gaussians has
+large ones. Measured: objects .007–.01, a park .012, an open scene seen through its own sky .1 and more;
+without fog 4 median Gaussians in an object, 9 and 12 in it at 12,500 and 3,000 rows."""
+
+_SAMPLED, _FEW, _MOST = 16, 0.5, 0.9
+"""Poses from around or above that are rendered first, and shares of sharp ones among them: below the first,
+no pose from there is used; above the second, all are. Between the two, each pose is rendered and judged."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,7 +111,7 @@ def plan_pool(
     Raises:
         InputError: as for `make_pool`.
     """
-    lens = _lens(size, _FOV if fov is None else fov)
+    lens = Lens(size, _FOV if fov is None else fov)
     if count < 1:
         raise InputError(f"expected at least 1 pose, got {count}", parameter="count")
     if rows is not None and rows < 1:
@@ -113,21 +121,19 @@ def plan_pool(
     progress("scene", 0, 1)
     site = Site.of(splats, up, rows, represents)
     progress("scene", 1, 1)
-    tell = counter(progress, "poses")
-    inside = find_inside(site, seed) if kind == "auto" else None
-    if inside is not None and fov is None and inside.weight > _MOSTLY_INSIDE:
-        lens = _lens(size, _FOV_WIDE)
-
-    def glance() -> Glance:
-        return Glance(splats, represents)
+    survey = Survey(splats, represents, site, lens, seed, counter(progress, "poses"))
+    if kind == "auto" and fov is None and is_room(survey):
+        survey = replace(survey, lens=Lens(size, _FOV_WIDE))
 
     def plan(count: int) -> tuple[Poses, list[str], str]:
-        if inside is not None:
-            return plan_auto(site, glance, inside, count, lens, seed, tell)
-        return _planned(site, glance, kind, count, lens, seed, tell), [kind], "as requested"
+        if kind == "auto":
+            parts, why = _auto(survey, count)
+        else:
+            parts, why = {kind: _PLANNERS[kind](survey, count)}, "as requested"
+        return Poses.joined([*parts.values()]).take(slice(count)), [*parts], why
 
     poses, used, why = plan(count)
-    held = _held(site, poses, lens)
+    held = _held(survey, poses)
     wanted = round(count * max(1.0, min(grow, 1 / np.sqrt(held))))
     if len(poses) == count and wanted > _WORTH * count:
         poses, used, why = plan(wanted)
@@ -137,80 +143,95 @@ def plan_pool(
             f"request {'fewer, or ' if len(poses) else ''}another kind (`g2ard poses --kind`), "
             "or give views of the scene"
         )
-    reach = reach_of(site, poses, lens)
+    reach = reach_of(survey, poses)
     far = poses, reach
-    coarse = float(reach.coarse(lens).mean())
-    need = max(float(np.interp(coarse, _COARSE, (0, 1))), 1 - held if looks else 0.0)
-    near_poses = plan_near(site, poses, reach, int(near * need * len(poses)), lens, seed + 1)
+    need = max(float(np.interp(reach[2].mean(), _COARSE, (0, 1))), 1 - held if looks else 0.0)
+    near_poses = plan_near(survey, *far, int(near * need * len(poses)), 1)
     if len(near_poses):
         kept = np.linspace(0, len(poses) - 1, len(poses) - len(near_poses)).round().astype(int)
         poses, used = Poses.joined([poses.take(kept), near_poses]), [*used, "near"]
-        reach = reach_of(site, poses, lens)
+        reach = reach_of(survey, poses)
 
     def more(kind: str, count: int) -> list[Camera]:
+        wide = replace(survey, lens=Lens(size, _FOV_WIDE))
         if kind == "near":  # of the pool before any pose stepped nearer, and with another seed
-            return _named(kind, plan_near(site, *far, count, lens, seed), site, lens)
-        wide = _lens(size, _FOV_WIDE)
-        if kind == "standing":
-            return _named(kind, _planned(site, glance, "walk", count, wide, seed + 3, tell), site, wide)
-        small = _lens((max(1, size[0] // 2), max(1, size[1] // 2)), _FOV_WIDE)  # they see little
-        eyes = plan_anywhere(site, Glance(splats, represents, SIGHT_ROWS), count, small, seed, tell)
-        return _named(kind, eyes, site, small)
+            views = survey.cameras(plan_near(survey, *far, count))
+        else:
+            found = plan_walk(wide, count, 3) if kind == "standing" else plan_anywhere(wide, count)
+            views = wide.cameras(found)
+        return [replace(view, name=view.name.replace("pose", kind)) for view in views]
 
-    order = strata(_features(poses), HOLD_OUT, seed)
+    spread = max(float(np.ptp(poses.eyes, axis=0).max()), np.finfo(float).tiny)
+    features = np.concatenate([poses.eyes / spread, poses.gazes / 4], axis=1)  # close for similar poses
+    order = strata(features, HOLD_OUT, seed)
     return Pool(
-        poses.take(order).cameras(site, lens),
+        survey.cameras(poses.take(order)),
         " + ".join(used),
         f"{why}; {site.up.why}",
         site.up.axis,
-        unseen=reach.unseen(),
-        coarse=float(reach.coarse(lens).mean()),
+        unseen=float((reach[0] < 0).mean()),
+        coarse=float(reach[2].mean()),
         held=held,
         more=more,
     )
 
 
-def _held(site: Site, poses: Poses, lens: Lens) -> float:
+def _auto(survey: Survey, count: int) -> tuple[dict[str, Poses], str]:
+    """Plan poses for a scene of any kind; return them by kind, and the reasons.
+
+    No decision covers the scene as a whole. Rooms are seen from within, in proportion to their size. The
+    other poses stand around or above the scene as its shape allows, where it looks sharp from there. The
+    remaining poses stand on the ground and wherever the scene looks sharp.
+    """
+    inside, landscape = survey.inside, survey.site.is_landscape
+    parts: dict[str, Poses] = {}
+    why = [f"{inside.share:.1%} of its box lies within rooms"]
+
+    def missing() -> int:
+        return count - sum(len(part) for part in parts.values())
+
+    def add(kind: str, poses: Poses) -> None:
+        if len(poses):
+            parts[kind] = Poses.joined([parts[kind], poses] if kind in parts else [poses])
+
+    add("inside", plan_inside(survey, round(inside.weight * count)))
+    if missing():
+        kind = "aerial" if landscape else "orbit"
+        why.append("a landscape" if landscape else "an object")
+        sharp = _sharp(survey, _PLANNERS[kind](survey, missing(), first=_SAMPLED))
+        share = float(sharp.mean()) if len(sharp) else 1.0
+        far = _PLANNERS[kind](survey, missing(), first=None if share >= _FEW else 0)
+        if share < _FEW:
+            why.append(f"from around or above it looks blurred ({share:.0%} of the poses are sharp)")
+        elif share < _MOST:
+            far = far.take(_sharp(survey, far))
+        if share >= _FEW and (landscape or is_room(survey)):
+            add("walk", plan_walk(survey, round((_STREET if landscape else 1.0) * missing())))
+        add(kind, far.take(slice(missing())))
+        if missing():
+            add("sharp", plan_sharp(survey, missing(), also=plan_walk(survey, missing() // 2, 1)))
+        if missing() and share < _FEW:
+            add("walk", plan_walk(survey, missing(), 2))
+    for kind in sorted(("aerial", "orbit"), key=lambda kind: kind not in parts):
+        if missing():  # rather foggy views than too few
+            add(kind, _PLANNERS[kind](survey, missing(), 1))
+    return parts, "; ".join(why)
+
+
+def _sharp(survey: Survey, poses: Poses) -> NDArray[np.bool_]:
+    """Return whether each pose sees the scene sharply; matter behind the scene does not count."""
+    site = survey.site
+    away = norms(poses.eyes - site.box.mean(axis=0))
+    reach = away + norms(site.box[1:] - site.box[:1]) / 2
+    usual = middle(site.grid.scale_at(site.points))  # unweighted: a sky has few rows and much area
+    coarse = survey.glance.of(survey.cameras(poses), site.size * reach)[2]
+    return coarse < np.maximum(_SHARP, _SHARP_IN_SCALES * usual / np.maximum(away, np.finfo(float).tiny))
+
+
+def _held(survey: Survey, poses: Poses) -> float:
     """Return the share of the scene's matter that a typical pose has in its frame."""
     if not len(poses):
         return 1.0
+    site = survey.site
     points = site.origin + site.size * (site.points[:_POINTS] @ site.axes)
-    return max(poses.cameras(site, lens).usual_share(points), 1 / _POINTS)
-
-
-def _named(kind: str, poses: Poses, site: Site, lens: Lens) -> list[Camera]:
-    """Return cameras whose names state their kind."""
-    return [replace(view, name=view.name.replace("pose", kind)) for view in poses.cameras(site, lens)]
-
-
-def _planned(
-    site: Site,
-    glance: Callable[[], Glance],
-    kind: str,
-    count: int,
-    lens: Lens,
-    seed: int,
-    tell: Callable[[int, int], None],
-) -> Poses:
-    """Plan poses of a given kind."""
-    if kind == "inside":
-        return plan_inside(site, find_inside(site, seed), count, lens, seed, tell)
-    if kind == "sharp":
-        return plan_sharp(site, glance(), count, lens, seed, tell)
-    if kind == "walk":
-        return plan_walk(site, count, lens, seed, tell, indoors=shape_of(site)[0] == "room")
-    return {"orbit": plan_orbit, "aerial": plan_aerial}[kind](site, count, lens, seed, tell)
-
-
-def _lens(size: tuple[int, int], fov: float) -> Lens:
-    if min(size) < 1:
-        raise InputError(f"expected at least 1×1 pixels, got {size[0]}×{size[1]}", parameter="size")
-    if not 0 < fov < 180:
-        raise InputError(f"expected degrees between 0 and 180, got {fov}", parameter="fov")
-    return Lens((int(size[0]), int(size[1])), float(fov))
-
-
-def _features(poses: Poses) -> Any:
-    """Return features that are close for poses with similar positions and gazes."""
-    spread = max(float(np.ptp(poses.eyes, axis=0).max()), np.finfo(float).tiny)
-    return np.concatenate([poses.eyes / spread, poses.gazes / 4], axis=1)
+    return max(survey.cameras(poses).usual_share(points), 1 / _POINTS)

@@ -1,17 +1,21 @@
-"""Cameras built from eyes and gazes, and statistics of what each sees of a site."""
+"""Poses, what each sees of a scene by rays and small renders, and the collection of good ones."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from g2ard.poses.site import Site
+from g2ard import _core
+from g2ard.errors import require
+from g2ard.poses.numbers import Floats, canonical_order, norms, quantile
+from g2ard.poses.site import Inside, Site
 from g2ard.scene.cameras import Cameras
-
-Floats = NDArray[np.float64]
+from g2ard.scene.splats import Splats
 
 _RAYS = (24, 18)
 """Columns and rows of the rays that represent a frame."""
@@ -19,8 +23,25 @@ _RAYS = (24, 18)
 _RAISED = 0.1
 """Share of `Site.tallness`: matter higher above the ground stands on it."""
 
-_BATCH = 16
-"""Poses whose rays are cast together."""
+_PATIENCE, _TOLERABLE = 12, 0.5
+"""Candidates judged per requested pose, at most, and least score of a usable one; 1 is good."""
+
+_ROWS, SIGHT_ROWS, _LONGEST = 12_000, 24_000, 96
+"""Gaussians rendered per glance, and where lines of sight matter; pixels along the longer side."""
+
+_MOST_WIDENED = 4.0
+"""Largest factor by which a sample of 12,000 Gaussians grows along the two longer axes, to cover for the
+rest; a larger sample may grow more."""
+
+_SOLID = 0.3
+"""Least opacity of Gaussians that a view may aim at."""
+
+_FINE, _COARSEST = 0.03, 0.9
+"""Radians: Gaussians with a smaller angular standard deviation are detail; the rest is fog and sky. And the
+quantile of the sizes seen that counts: one tenth may be fog."""
+
+_NEAR = 0.05
+"""Near plane as a share of the distance within which matter is close."""
 
 
 @dataclass(frozen=True)
@@ -29,6 +50,11 @@ class Lens:
 
     size: tuple[int, int] = (800, 600)
     fov: float = 50.0
+
+    def __post_init__(self) -> None:
+        wide, tall = self.size
+        require("size", f"{wide}×{tall}", min(self.size) >= 1, "at least 1×1 pixels")
+        require("fov", self.fov, 0 < self.fov < 180, "degrees between 0 and 180")
 
     @property
     def tangents(self) -> tuple[float, float]:
@@ -61,7 +87,9 @@ class Poses:
     @classmethod
     def joined(cls, parts: list[Poses]) -> Poses:
         """Concatenate the poses of all parts, in order."""
-        return cls(np.concatenate([p.eyes for p in parts]), np.concatenate([p.gazes for p in parts]))
+        none = np.zeros((0, 3))
+        eyes, gazes = [p.eyes for p in parts], [p.gazes for p in parts]
+        return cls(np.concatenate([none, *eyes]), np.concatenate([none, *gazes]))
 
     def frames(self) -> Floats:
         """Return (P, 3, 3) rotations whose rows are right, down and ahead, in the site's coordinates."""
@@ -71,81 +99,210 @@ class Poses:
         right = level / np.linalg.norm(level, axis=1, keepdims=True)
         return np.stack([right, np.cross(self.gazes, right), self.gazes], axis=1)
 
-    def cameras(self, site: Site, lens: Lens) -> Cameras:
+
+class Glance:
+    """Small renders of a sample of a scene, sky and floaters included.
+
+    Args:
+        splats: the scene, or a fair sample of it.
+        represents: Gaussians of the scene per row of `splats`.
+        limit: largest number of Gaussians to render.
+    """
+
+    def __init__(self, splats: Splats, represents: float = 1.0, limit: int = _ROWS) -> None:
+        rows = np.flatnonzero(splats.opacities > 1 / 255)
+        some = rows[canonical_order(splats, rows)[:limit]]
+        sample = splats.take(some[splats.take(some).finite_rows()])
+        scales = np.sort(sample.scales.astype(np.float64), axis=1)
+        self._sigma = np.sqrt(scales[:, 1] * scales[:, 2])
+        self._middle = sample.offset + np.median(sample.means.astype(np.float64), axis=0)
+        means = sample.means.astype(np.float64) + sample.offset - self._middle
+        most = _MOST_WIDENED * limit / _ROWS
+        widen = min(most, np.sqrt(represents * len(rows) / max(1, len(some))))
+        shortest = np.arange(3) == np.argmin(sample.scales, axis=1)[:, None]
+        logs = np.log(np.maximum(sample.scales, np.finfo(np.float32).tiny))
+        self._means, self._antialiased = means, sample.antialiased
+        self.points, self.solid = means + self._middle, sample.opacities > _SOLID
+        self._arrays: tuple[NDArray[np.float32], ...] = (
+            np.ascontiguousarray(means, np.float32),
+            np.ascontiguousarray(sample.quats, np.float32),
+            np.ascontiguousarray(np.where(shortest, logs, logs + np.log(widen)), np.float32),
+            np.ascontiguousarray(np.clip(sample.logit_opacities, -80, 80), np.float32),
+            np.zeros((len(means), 1, 3), np.float32),
+            np.zeros((len(means), 0, 3), np.float32),
+        )
+
+    def of(self, cameras: Cameras, reach: Floats | None = None) -> Floats:
+        """Look through C cameras, and measure how much matter each sees, and how sharply.
+
+        Returns:
+            (3, C): mean α of the image; the part of it from Gaussians whose angular standard deviation is
+            under 0.03 rad; and the 90th percentile of these deviations, weighted by αT. Fog, sky and matter
+            too close to the camera have large ones. Matter beyond `reach`, (C,), counts only for the first.
+        """
+        figures = np.zeros((3, len(cameras)))
+        away = norms(cameras.positions - self._middle)
+        near = 1e-3 * float(np.median(away)) if len(cameras) else None
+        for i, (sums, depth, pixels) in enumerate(self._renders(cameras, near or None)):
+            weight = sums["weight"]
+            seen = (weight > 0) & (depth <= (np.inf if reach is None else reach[i]))
+            figures[:, i] = weight.sum() / pixels, 0.0, np.inf
+            if seen.any():
+                angle = self._sigma[seen] / np.maximum(depth[seen], np.finfo(float).tiny)
+                fine = weight[seen][angle < _FINE].sum() / pixels
+                figures[1:, i] = fine, quantile(angle, weight[seen], _COARSEST)
+        return figures
+
+    def sight(self, cameras: Cameras, aims: NDArray[np.int64], close: float) -> tuple[Floats, Floats]:
+        """Return the light from close matter, and how clear the lines of sight are.
+
+        Args:
+            cameras: C views.
+            aims: (C,) rows of `points` that they look at.
+            close: distance within which matter is close, scene units.
+
+        Returns:
+            (C,) share of the image that shows close matter, and (C,) mean transmittance in front of the aim.
+        """
+        murk, clear = np.zeros((2, len(cameras)))
+        for i, (sums, depth, pixels) in enumerate(self._renders(cameras, _NEAR * close)):
+            murk[i] = sums["weight"][depth < close].sum() / pixels
+            clear[i] = sums["transmittance"][aims[i]] / max(1, sums["hits"][aims[i]])
+        return murk, clear
+
+    def _renders(self, cameras: Cameras, near: float | None) -> Iterator[tuple[dict[str, Any], Floats, int]]:
+        """Yield each camera's sums, the distances to the Gaussians, and the number of pixels."""
+        from g2ard.rendering.renderer import RasterSettings, view_of
+
+        if not len(cameras):
+            return
+        here = cameras.resized(_LONGEST).recentred(self._middle)
+        settings = RasterSettings(antialiased=self._antialiased, near=near)
+        for i in range(len(here)):
+            sums = _core.accumulate(self._arrays, [view_of(here, i, settings)], settings, None)
+            yield sums, norms(self._means - here.positions[i]), int(here.widths[i] * here.heights[i])
+
+
+@dataclass(frozen=True, eq=False)
+class Survey:
+    """A scene and the lens to show it with, as planners need them.
+
+    Args:
+        splats: the scene, or a fair sample of it.
+        represents: Gaussians of the scene per row of `splats`.
+        site: the scene, upright.
+        lens: lens of the poses.
+        seed: seed of the placement.
+        tell: called with the number of good poses so far, and of those requested.
+    """
+
+    splats: Splats
+    represents: float
+    site: Site
+    lens: Lens = Lens()
+    seed: int = 0
+    tell: Callable[[int, int], None] = lambda done, total: None
+
+    @cached_property
+    def inside(self) -> Inside:
+        """Places within rooms."""
+        return self.site.inside(self.seed)
+
+    @cached_property
+    def glance(self) -> Glance:
+        """Small renders of the scene."""
+        return Glance(self.splats, self.represents)
+
+    def cameras(self, poses: Poses) -> Cameras:
         """Return cameras in world coordinates, named in order."""
-        digits = max(4, len(str(len(self) - 1)))
-        turned = self.frames() @ site.axes
-        eyes = site.origin + site.size * (self.eyes @ site.axes)
-        viewmats = np.tile(np.eye(4), (len(self), 1, 1))
+        site, lens = self.site, self.lens
+        digits = max(4, len(str(len(poses) - 1)))
+        turned = poses.frames() @ site.axes
+        eyes = site.origin + site.size * (poses.eyes @ site.axes)
+        viewmats = np.tile(np.eye(4), (len(poses), 1, 1))
         viewmats[:, :3, :3] = turned
         viewmats[:, :3, 3] = -np.einsum("pij,pj->pi", turned, eyes)
         return Cameras.from_lists(
             list(viewmats),
-            [lens.matrix] * len(self),
-            [lens.size] * len(self),
-            [f"pose_{i:0{digits}d}" for i in range(len(self))],
+            [lens.matrix] * len(poses),
+            [lens.size] * len(poses),
+            [f"pose_{i:0{digits}d}" for i in range(len(poses))],
         )
 
 
-@dataclass(frozen=True, eq=False)
-class ViewStatistics:
-    """Share of the frame that meets matter and how far the view is open, per pose (P,).
+class Rays:
+    """A coarse frame of rays from each of P poses, and what they meet in the site's grid, as (P,) arrays."""
+
+    def __init__(self, survey: Survey, poses: Poses) -> None:
+        (wide, tall), (columns, rows) = survey.lens.tangents, _RAYS
+        x = wide * ((np.arange(columns) + 0.5) / columns * 2 - 1)
+        y = tall * ((np.arange(rows) + 0.5) / rows * 2 - 1)
+        rays = np.stack([np.tile(x, rows), np.repeat(y, columns), np.ones(columns * rows)], axis=1)
+        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+        self._site, self._shape = survey.site, (len(poses), len(rays))
+        self._eyes = np.repeat(poses.eyes, len(rays), axis=0)
+        self._directions = np.einsum("ri,pij->prj", rays, poses.frames()).reshape(-1, 3)
+
+    @cached_property
+    def _stopped(self) -> Floats:
+        return self._site.grid.cast(self._eyes, self._directions)
+
+    @cached_property
+    def _met(self) -> Floats:
+        met = self._site.grid.cast(self._eyes, self._directions, murky=True)
+        return np.sort(met.reshape(self._shape), axis=1)
+
+    @property
+    def covered(self) -> Floats:
+        """Share of the rays that opaque matter stops."""
+        return np.isfinite(self._stopped).reshape(self._shape).mean(axis=1)
+
+    @property
+    def standing(self) -> Floats:
+        """Share of the rays stopped by matter that stands on the ground; all of it without a ground."""
+        hit = np.isfinite(self._stopped)
+        points = self._eyes[hit] + self._stopped[hit, None] * self._directions[hit]
+        hit[hit] = self._site.above_ground(points) > _RAISED * self._site.tallness
+        return hit.reshape(self._shape).mean(axis=1)
+
+    @property
+    def close(self) -> Floats:
+        """Distance at which a tenth of the rays have met something, even if only leaves or haze."""
+        return self._met[:, self._shape[1] // 10]
+
+    @property
+    def median(self) -> Floats:
+        """Median distance of the rays that meet anything; inf if none does."""
+        halfway = np.isfinite(self._met).sum(axis=1) // 2
+        return self._met[np.arange(len(halfway)), halfway]
+
+
+def gather(
+    survey: Survey,
+    count: int,
+    tried: Callable[[int, int], tuple[Poses, Floats]],
+    *,
+    patience: int = _PATIENCE,
+) -> Poses:
+    """Return the first `count` good poses of an endless even sequence, topped up with usable ones.
 
     Args:
-        covered: share of the rays that opaque matter stops.
-        standing: share of the rays stopped by matter that stands on the ground; all of it without a ground.
-        close: distance at which a tenth of the rays have met something, even if only leaves or haze.
-        median: median distance of the rays that meet anything; inf if none does.
+        survey: told the number of good poses.
+        count: number of poses requested.
+        tried: returns the candidates from one index of the sequence to another, and their scores; a score of
+            at least 1 is good.
+        patience: candidates tried per requested pose, at most.
+
+    Returns:
+        At most `count` poses, in the order of the sequence.
     """
-
-    covered: Floats
-    standing: Floats
-    close: Floats
-    median: Floats
-
-
-def view_statistics(
-    site: Site, poses: Poses, lens: Lens, wanted: NDArray[np.bool_] | None = None
-) -> ViewStatistics:
-    """Cast a coarse frame of rays from each pose into the site's grid; zeros for poses not in `wanted`."""
-    covered, standing, close, median = (np.zeros(len(poses)) for _ in range(4))
-    asked = np.arange(len(poses)) if wanted is None else np.flatnonzero(wanted)
-    for some, eyes, directions in _frames_of_rays(poses, lens, asked):
-        stopped = site.grid.cast(eyes, directions)
-        hit = np.isfinite(stopped)
-        covered[some] = hit.reshape(len(some), -1).mean(axis=1)
-        hit[hit] = (
-            site.above_ground(eyes[hit] + stopped[hit, None] * directions[hit]) > _RAISED * site.tallness
-        )
-        standing[some] = hit.reshape(len(some), -1).mean(axis=1)
-        met = np.sort(site.grid.cast(eyes, directions, murky=True).reshape(len(some), -1), axis=1)
-        halfway = np.isfinite(met).sum(axis=1) // 2
-        close[some], median[some] = met[:, met.shape[1] // 10], met[np.arange(len(some)), halfway]
-    return ViewStatistics(covered, standing, close, median)
-
-
-def clearance(site: Site, poses: Poses, lens: Lens) -> Floats:
-    """Return (P,) `ViewStatistics.close` alone, casting half as many rays."""
-    close = np.zeros(len(poses))
-    for some, eyes, directions in _frames_of_rays(poses, lens, np.arange(len(poses))):
-        met = site.grid.cast(eyes, directions, murky=True).reshape(len(some), -1)
-        rank = met.shape[1] // 10
-        close[some] = np.partition(met, rank, axis=1)[:, rank]
-    return close
-
-
-def _frames_of_rays(
-    poses: Poses, lens: Lens, asked: NDArray[np.int64]
-) -> Iterator[tuple[NDArray[np.int64], Floats, Floats]]:
-    """Yield batches of poses with the origins and unit directions of their rays."""
-    if not len(asked):
-        return
-    columns, rows = _RAYS
-    x = lens.tangents[0] * ((np.arange(columns) + 0.5) / columns * 2 - 1)
-    y = lens.tangents[1] * ((np.arange(rows) + 0.5) / rows * 2 - 1)
-    rays = np.stack([np.tile(x, rows), np.repeat(y, columns), np.ones(columns * rows)], axis=1)
-    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-    frames = poses.frames()
-    for some in np.array_split(asked, -(-len(asked) // _BATCH)):
-        directions = np.einsum("ri,pij->prj", rays, frames[some]).reshape(-1, 3)
-        yield some, np.repeat(poses.eyes[some], len(rays), axis=0), directions
+    parts, asked = [(Poses.joined([]), np.zeros(0))], 0
+    while (good := sum(int((scores >= 1).sum()) for _, scores in parts)) < count and asked < patience * count:
+        more = min(max(count - good, 16), patience * count - asked)
+        parts.append(tried(asked, asked + more))
+        asked += more
+        survey.tell(min(good, count - 1), count)
+    survey.tell(count, count)
+    score = np.minimum(np.concatenate([scores for _, scores in parts]), 1.0)
+    best = np.argsort(-score, kind="stable")[:count]
+    return Poses.joined([poses for poses, _ in parts]).take(np.sort(best[score[best] >= _TOLERABLE]))

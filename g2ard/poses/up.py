@@ -7,12 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from g2ard.poses.lattice import fibonacci
 from g2ard.poses.matter import Sample
-from g2ard.poses.numbers import along, moments, quantile
+from g2ard.poses.numbers import Floats, along, fibonacci, moments, quantile
 from g2ard.scene.transform import unit_up
-
-Floats = NDArray[np.float64]
 
 _FACING, _SLOPED = np.cos(np.radians(20)), np.cos(np.radians(35))
 """Least cosine between an axis and the normals that face it; and on ground, which may have slopes."""
@@ -23,7 +20,7 @@ middle above which it is long."""
 
 _GROUND_GIVEN, _GROUND = 0.1, 0.12
 """Share of all matter in a layer above which it is the ground: along a given axis, and along an estimated
-one, where matter beyond the layer counts against it (`_edge`)."""
+one, where matter beyond the layer counts against it."""
 
 _SLAB = 0.04
 """Half the thickness of a layer that counts as a plane, in scene sizes."""
@@ -71,15 +68,13 @@ def estimate_up(sample: Sample) -> Up:
         return _signed(sample, _mean_normal(sample, thin, facing(sample, thin)), True, "the scene is flat")
     few = sample.take(slice(_SEARCHED))
     directions = np.concatenate([np.eye(3), fibonacci(600)[:300]])
-    layers = np.array([_layer(few, axis) for axis in directions])
-    edges = [_edge(few, axis, *layer) * _habit(axis) for axis, layer in zip(directions, layers, strict=True)]
-    axis = directions[int(np.argmax(edges))]
+    shares, _, edges = np.array([_layer(few, axis) for axis in directions]).T
+    axis = directions[int(np.argmax(edges * [_habit(axis) for axis in directions]))]
     for _ in range(3):
         inside = np.abs(along(sample.points, axis) - _layer(sample, axis)[1]) < 2 * _SLAB
         axis = _mean_normal(sample, axis, inside & facing(sample, axis, _FACING))
-    if _edge(sample, axis, *_layer(sample, axis)) > _GROUND:
+    if _layer(sample, axis)[2] > _GROUND:
         return _signed(sample, axis, True, "a ground plane")
-    shares = layers[:, 0]
     axis = directions[int(np.argmax(shares))]
     across = shares[np.abs(directions @ axis) < 0.5].max()
     axis = _mean_normal(sample, axis, facing(sample, axis, _FACING))
@@ -106,25 +101,25 @@ def _is_flat(sample: Sample) -> tuple[bool, Floats, Floats | None]:
     return bool(values[0] < _SHEET * values[1]), vectors[:, 0], long
 
 
-def _layer(sample: Sample, axis: Floats) -> tuple[float, float]:
-    """Return the share of all matter in the strongest layer that faces `axis`, and the layer's height."""
+def _layer(sample: Sample, axis: Floats) -> tuple[float, float, float]:
+    """Return the strongest layer that faces `axis`: its share of all matter, its height, and its edge.
+
+    The edge is the share, reduced by matter on both sides: ground and walls have it on one side.
+    """
     rows = facing(sample, axis, _FACING)
     if not rows.any():
-        return 0.0, 0.0
-    bins = np.floor(along(sample.points[rows], axis) / _SLAB).astype(int)
+        return 0.0, 0.0, 0.0
+    heights, total = along(sample.points, axis), sample.weights.sum()
+    bins = np.floor(heights[rows] / _SLAB).astype(int)
     low = bins.min()
     mass = np.bincount(bins - low, sample.faces[rows])
     pairs = mass + np.append(mass[1:], 0.0)
     best = int(np.argmax(pairs))
-    return float(pairs[best] / sample.weights.sum()), float((low + best + 1) * _SLAB)
-
-
-def _edge(sample: Sample, axis: Floats, share: float, height: float) -> float:
-    """Return the layer's share, reduced by matter on both sides: ground and walls have it on one side."""
-    beside = along(sample.points, axis) - height
-    above = sample.weights[beside > 2 * _SLAB].sum()
-    below = sample.weights[beside < -2 * _SLAB].sum()
-    return share * float(1 - 2 * min(above, below) / max(above + below, 0.05 * sample.weights.sum()))
+    share, height = pairs[best] / total, (low + best + 1) * _SLAB
+    above = sample.weights[heights - height > 2 * _SLAB].sum()
+    below = sample.weights[heights - height < -2 * _SLAB].sum()
+    edge = share * (1 - 2 * min(above, below) / max(above + below, 0.05 * total))
+    return float(share), float(height), float(edge)
 
 
 def _habit(axis: Floats) -> float:

@@ -15,8 +15,8 @@ import pytest
 from g2ard.errors import InputError
 from g2ard.io import read_splats, read_views, write_splats
 from g2ard.poses import make_pool, plan_pool
-from g2ard.poses.lattice import fibonacci
-from g2ard.poses.sight import Lens, Poses
+from g2ard.poses.numbers import fibonacci
+from g2ard.poses.sight import Poses, Survey
 from g2ard.poses.site import Site
 from g2ard.scene.splats import Splats
 from helpers.commands import CommandLine
@@ -119,7 +119,7 @@ def test_few_poses(count, scenes) -> None:
 
 
 def test_more_poses_than_places_look_elsewhere_from_the_same(scenes, monkeypatch) -> None:
-    monkeypatch.setattr("g2ard.poses.walk._TRIES", (64, 64))
+    monkeypatch.setattr("g2ard.poses.within._TRIES", (64, 64))
     cameras = make_pool(scenes["room"], 200, kind="walk")
     assert len(np.unique(cameras.positions.round(6), axis=0)) < 64
     assert len(np.unique(cameras.viewmats.reshape(200, -1), axis=0)) == 200
@@ -197,7 +197,7 @@ def test_every_eighth_is_a_fair_sample(scenes) -> None:
 
 def test_names_sort_in_pool_order_when_there_are_many(scenes) -> None:
     poses = Poses(np.zeros((10_001, 3)), np.tile([1.0, 0, 0], (10_001, 1)))
-    names = poses.cameras(Site.of(scenes["statue"]), Lens()).names
+    names = Survey(scenes["statue"], 1.0, Site.of(scenes["statue"])).cameras(poses).names
     assert list(names) == sorted(set(names))
 
 

@@ -1,0 +1,110 @@
+"""Poses outside: on a dome around an object, and above a wide scene."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from g2ard.poses.numbers import Floats, between, directions, halton, quantile, turned
+from g2ard.poses.sight import Lens, Poses, Rays, Survey, gather
+from g2ard.poses.site import Site
+
+_ELEVATIONS, _DISTANCES = (-5.0, 50.0), (0.9, 1.25)
+"""Ranges around an object: degrees above the horizon of its centre, and distances as multiples of that at
+which it just fits."""
+
+_FITTING, _OUTLINE = 0.97, 8_000
+"""Share of the matter in frame when the object just fits, and the points that represent its outline."""
+
+_OUTSIDE = 1.2
+"""Least distance from the centre: everything lies within about 1 of it."""
+
+_LOWEST, _CLEAR_CELLS = 0.02, 4
+"""Least height of a pose above the ground, in scene sizes, and least number of free cells in front of it."""
+
+_NADIR, _PITCHES = 0.4, (30.0, 65.0)
+"""Share of the poses above a scene that look straight down, and degrees below the horizon of the others."""
+
+_OVERLAP = 5.0
+"""Nadir images that show the same spot of ground, as in drone surveys."""
+
+_INSET = 0.1
+"""Margin that no pose aims at, as a share of the scene's sides: frames there would show the outside."""
+
+_HEIGHTS, _ABOVE = (0.85, 0.3), 1.3
+"""Smallest factor on the height of a pose, and the range above it, so that poses see at several scales; and
+least height, as a multiple of the height of what stands on the ground."""
+
+_CLEAR, _COVERED = 0.3, 0.75
+"""Share of the height that must be free in front of a pose, and of the frame that is covered for the full
+score."""
+
+
+def plan_orbit(survey: Survey, count: int, shift: int = 0, first: int | None = None) -> Poses:
+    """Plan at most `count` poses around the centre of the matter, spread evenly over a dome.
+
+    Each is as near as the object fits the frame. Poses below the ground, in matter or close to it are
+    dropped. The others see the object, because it fills their frame. `first` is a second limit on the number.
+    """
+    site, lens = survey.site, survey.lens
+    target = site.box.mean(axis=0)
+
+    def tried(start: int, stop: int) -> tuple[Poses, Floats]:
+        turn, rise, chance = halton(start, stop, 3, survey.seed + shift).T
+        z = between(np.sin(np.radians(_ELEVATIONS)), rise)
+        outward = directions(turn, np.sqrt(1 - z * z), z)
+        distances = _fitting(site, target, outward, lens) * between(_DISTANCES, chance)
+        poses = Poses(target + distances[:, None] * outward, -outward)
+        free = site.is_free(poses.eyes, 2, _LOWEST)
+        clear = Rays(survey, poses).close > _CLEAR_CELLS * site.grid.cell
+        return poses, (free & clear).astype(float)
+
+    return gather(survey, count if first is None else min(first, count), tried)
+
+
+def _fitting(site: Site, target: Floats, outward: Floats, lens: Lens) -> Floats:
+    """Return (P,) distances at which `_FITTING` of the matter is in frame, and all of it ahead."""
+    points, weights = site.points[:_OUTLINE] - target, site.weights[:_OUTLINE]
+    wide, tall = lens.tangents
+    distances = np.empty(len(outward))
+    for i, frame in enumerate(Poses(outward, -outward).frames()):
+        x, y, z = turned(points, frame).T
+        distances[i] = quantile(np.maximum(np.abs(x) / wide, np.abs(y) / tall) - z, weights, _FITTING)
+    return np.maximum(distances, _OUTSIDE)
+
+
+def plan_aerial(survey: Survey, count: int, shift: int = 0, first: int | None = None) -> Poses:
+    """Plan at most `count` poses above everything, their footprints spread evenly over the scene.
+
+    Some look straight down and the others obliquely to all sides. The height follows from `count`: few poses
+    see much each, many see detail. Poses in matter or close to it are dropped, and poses with at least three
+    quarters of the frame covered are preferred. `first` limits the number without changing the height.
+    """
+    site, lens = survey.site, survey.lens
+    height = _height(site, count, lens)
+
+    def tried(start: int, stop: int) -> tuple[Poses, Floats]:
+        x, y, kind, turn, pitch, chance = halton(start, stop, 6, survey.seed + shift).T
+        inset = _INSET * (site.box[1] - site.box[0])
+        spots = site.box[0] + inset + (site.box[1] - site.box[0] - 2 * inset) * np.stack([x, y, x], axis=1)
+        spots[:, 2] = site.ground(spots)
+        nadir = kind < _NADIR
+        down = np.where(nadir, np.pi / 2, np.radians(between(_PITCHES, pitch)))
+        gazes = directions(turn, np.where(nadir, 0.0, np.cos(down)), -np.sin(down))
+        away = height * (_HEIGHTS[0] + _HEIGHTS[1] * chance) / np.sqrt(np.sin(down))
+        poses = Poses(spots - away[:, None] * gazes, gazes)
+        seen, free = Rays(survey, poses), site.is_free(poses.eyes, 3, 0.0)
+        return poses, np.where(free & (seen.close > _CLEAR * height), seen.covered / _COVERED, 0.0)
+
+    return gather(survey, count if first is None else min(first, count), tried)
+
+
+def _height(site: Site, count: int, lens: Lens) -> float:
+    """Return the height above the ground at which each spot lies in `_OVERLAP` nadir frames.
+
+    It is at most the height from which one frame spans the scene, and always above what stands on the ground.
+    """
+    sides = (site.box[1] - site.box[0])[:2]
+    wide, tall = lens.tangents
+    by_count = np.sqrt(_OVERLAP * sides[0] * sides[1] / (max(1.0, _NADIR * count) * 4 * wide * tall))
+    fits = min(sides) / (2 * min(wide, tall))
+    return float(max(min(by_count, fits), _ABOVE * site.tallness))

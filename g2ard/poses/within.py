@@ -1,0 +1,251 @@
+"""Poses within a scene: in its rooms, at eye height, wherever it looks sharp, and near to anything."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from g2ard.poses.numbers import Floats, between, directions, fibonacci, halton, norms
+from g2ard.poses.sight import SIGHT_ROWS, Glance, Poses, Rays, Survey, gather
+from g2ard.poses.site import Site
+
+Reach = tuple[NDArray[np.int64], Floats, NDArray[np.bool_]]
+
+_ROOM_PITCHES, _WALK_PITCHES, _SHARP_PITCHES = (-0.3, 0.2), (-25.0, 10.0), (-35.0, 20.0)
+"""Ranges of gaze pitches above the horizon: in rooms in radians, elsewhere in degrees."""
+
+_EYES = {True: (0.35, 0.75), False: (0.2, 0.6)}
+"""Range of eye heights above the ground: indoors in heights of the room, outdoors in `Site.tallness`."""
+
+_MOSTLY_INSIDE = 0.5
+"""Share of a pool within rooms above which the scene is a room."""
+
+_WIDE = 0.25
+"""Share of the places in rooms, those with most clearance, where half of the poses stand."""
+
+_COVERED, _CLEAR_CELLS = 0.8, 4
+"""Share of the frame that is matter, and free cells in front, for the full score of a gaze in a room."""
+
+_TRIES = (512, 2048)
+"""Least and most places tried; if poses outnumber the free ones, they share them."""
+
+_WALLS, _SKY, _FLOOR = 0.7, 0.25, 0.8
+"""Least share of the directions below and around that is matter indoors; of the sky that is open outdoors,
+because with less the place is inside a hollow building; and of the ground below that is closed."""
+
+_HALLS = 0.15
+"""Least share of all places in a connected group that is kept; smaller groups are hollows. Without this test
+taebak 0_4 loses .3 dB, and .6 dB in standing views."""
+
+_FRAME, _THINGS = {True: 0.8, False: 0.5}, 0.12
+"""Share of the frame that is matter, and outdoors stands on the ground, for the full score of a walk."""
+
+_FULL = ((0.8, 0.3, 1.0), (0.7, 0.2, 0.8), (0.5, 0.1, 0.6))
+"""Shares of the image that the scene covers, and that detail covers, and the score of a pose that exceeds
+both."""
+
+_SHARP_PATIENCE, _AIMED_PATIENCE = 8, 64
+"""Candidates per requested pose, at most: of sharp poses, and of poses anywhere."""
+
+_DISTANCES, _RISES = (0.04, 0.4), (-5.0, 35.0)
+"""Ranges around an aim: log-uniform distances in diagonals of the scene's box, and degrees up to the eye."""
+
+_CLOSE = 0.5 * _DISTANCES[0]
+"""Share of the diagonal within which matter is close: half of the least distance of an aim."""
+
+_MURK, _CLEAR = 0.08, 0.35
+"""Largest share of the image that shows close matter, and least transmittance in front of the aim."""
+
+_SAMPLE = 512
+"""Points that represent the scene's matter."""
+
+_PIXELS, _STEP = 1.5, (0.25, 0.6)
+"""A near pose shows its target with this standard deviation, in pixels, within these shares of the original
+distance."""
+
+_JITTER = 0.2
+"""Scale of the random offset between a gaze and its target, as a tangent, so that not every image has the
+target in the middle."""
+
+_LOWEST = 0.01
+"""Least height of a near pose above the ground, in scene sizes."""
+
+
+def is_room(survey: Survey) -> bool:
+    """Return whether most of a pool stands within rooms."""
+    return survey.inside.weight > _MOSTLY_INSIDE
+
+
+def _gazes(turn: Floats, rise: Floats) -> Floats:
+    return directions(turn, np.cos(rise), np.sin(rise))
+
+
+def plan_inside(survey: Survey, count: int, shift: int = 0) -> Poses:
+    """Plan at most `count` poses within rooms, gazing all around and near the horizon.
+
+    Every second pose stands where there is most clearance. Gazes into a near wall, or out of the scene, are
+    dropped.
+    """
+    site, places = survey.site, survey.inside.places
+    wide = max(1, int(_WIDE * len(places)))
+
+    def tried(start: int, stop: int) -> tuple[Poses, Floats]:
+        at, turn, pitch = halton(start, stop, 3, survey.seed + shift + 1).T
+        reach = np.where(np.arange(start, stop) % 2 == 0, wide, len(places))
+        poses = Poses(places[(at * reach).astype(int)], _gazes(turn, between(_ROOM_PITCHES, pitch)))
+        seen = Rays(survey, poses)
+        return poses, np.minimum(seen.covered / _COVERED, seen.close / (_CLEAR_CELLS * site.grid.cell))
+
+    return gather(survey, count if len(places) else 0, tried)
+
+
+def plan_walk(survey: Survey, count: int, shift: int = 0) -> Poses:
+    """Plan at most `count` poses at eye height in connected free space, gazing all around.
+
+    Gazes into a near wall or leaves, or out of the scene, are dropped.
+    """
+    site, indoors = survey.site, is_room(survey)
+    sides = site.box[1] - site.box[0]
+    tall = sides[2] if indoors else site.tallness
+    far = 0.4 * min(sides[:2]) if indoors else 0.6 * tall
+    room = max(2 * site.grid.cell, 0.06 * tall)
+    at = halton(0, int(np.clip(4 * count, *_TRIES)), 3, survey.seed + shift)
+    places = between(site.box, at)
+    places[:, 2] = site.ground(places) + tall * between(_EYES[indoors], at[:, 2])
+    places = places[site.is_free(places, room / site.grid.cell)]
+    if indoors:
+        places = places[_closed(site, places, 64, -1.0, 0.5) > _WALLS]
+    else:
+        places = places[_closed(site, places, 32, 0.5, 1.0) < 1 - _SKY]
+        places = places[_closed(site, places, 16, -1.0, -0.8) > _FLOOR]
+    places = places[_together(site, places)]
+
+    def tried(start: int, stop: int) -> tuple[Poses, Floats]:
+        turn, pitch = halton(start, stop, 2, survey.seed + shift + 1).T
+        gazes = _gazes(turn, np.radians(between(_WALK_PITCHES, pitch)))
+        poses = Poses(places[np.arange(start, stop) % len(places)], gazes)
+        seen = Rays(survey, poses)
+        limits = [seen.covered / _FRAME[indoors], seen.close / (2 * room), seen.median / far]
+        return poses, np.min(limits if indoors else [*limits, seen.standing / _THINGS], axis=0)
+
+    return gather(survey, count if len(places) else 0, tried)
+
+
+def _closed(site: Site, points: Floats, rays: int, low: float, high: float) -> Floats:
+    """Return (M,) shares of the directions between two heights on the sphere that meet matter."""
+    return np.isfinite(site.met(points, fibonacci(rays, low, high))).mean(axis=1)
+
+
+def _together(site: Site, points: Floats) -> NDArray[np.bool_]:
+    """Return whether each point belongs to a large part of the graph that joins neighbours in sight."""
+    count = len(points)
+    apart = sum((column[:, None] - column) ** 2 for column in points.T)
+    near = np.argsort(apart, axis=1, kind="stable")[:, 1:13]
+    start, stop = np.repeat(np.arange(count), near.shape[1]), near.ravel()
+    ways = points[stop] - points[start]
+    lengths = np.linalg.norm(ways, axis=1)
+    seen = site.grid.cast(points[start], ways / np.where(lengths > 0, lengths, 1.0)[:, None]) >= lengths
+    start, stop = start[seen], stop[seen]
+    label, low = np.arange(count), np.full(count, -1)
+    while (low != label).any():
+        low = label.copy()
+        np.minimum.at(label, start, low[stop])
+        np.minimum.at(label, stop, low[start])
+        label = label[label]
+    return np.bincount(label, minlength=count)[label] >= max(2.0, _HALLS * count)
+
+
+def plan_sharp(survey: Survey, count: int, shift: int = 0, *, also: Poses | None = None) -> Poses:
+    """Plan at most `count` poses in free space whose image is full and shows detail.
+
+    A trained scene does so from where its photos were taken. `also` are poses to try first.
+    """
+    site = survey.site
+
+    def tried(start: int, stop: int) -> tuple[Poses, Floats]:
+        *at, turn, pitch = halton(2 * start, 2 * stop, 5, survey.seed + shift + 2).T
+        points = between(site.box, np.stack(at, axis=1))
+        free = site.is_free(points, 3)
+        poses = Poses(points[free], _gazes(turn, np.radians(between(_SHARP_PITCHES, pitch)))[free])
+        poses = poses.take(Rays(survey, poses).close > 4 * site.grid.cell)
+        if also is not None and not start:
+            poses = Poses.joined([also, poses])
+        covered, fine, _ = survey.glance.of(survey.cameras(poses))
+        return poses, np.max([((covered > c) & (fine > f)) * worth for c, f, worth in _FULL], axis=0)
+
+    return gather(survey, count, tried, patience=_SHARP_PATIENCE)
+
+
+def plan_anywhere(survey: Survey, count: int) -> Poses:
+    """Plan at most `count` poses with a clear line of sight to what they aim at, and nothing close.
+
+    Aims are spread evenly over the scene's Gaussians, distances from 4 to 40 % of its diagonal. Rays in the
+    grid reject most poses, and small renders the rest, because the grid knows neither floaters nor fog.
+    """
+    site, glance = survey.site, Glance(survey.splats, survey.represents, SIGHT_ROWS)
+    diagonal = float(norms(site.box[1:] - site.box[:1])[0])
+    points = (glance.points - site.origin) @ site.axes.T / site.size
+    within = ((points > site.box[0]) & (points < site.box[1])).all(axis=1)
+    rows = np.flatnonzero(within & glance.solid)
+
+    def tried(start: int, stop: int) -> tuple[Poses, Floats]:
+        which, far, turn, rise = halton(start, stop, 4, survey.seed + 5).T
+        aims = rows[(which * len(rows)).astype(int)]
+        gazes = -_gazes(turn, np.radians(between(_RISES, rise)))
+        distances = diagonal * _DISTANCES[0] * (_DISTANCES[1] / _DISTANCES[0]) ** far
+        poses = Poses(points[aims] - distances[:, None] * gazes, gazes)
+        free = site.grid.cast(poses.eyes, gazes) > distances - 2 * site.grid.cell
+        poses = poses.take(free)
+        murk, clear = glance.sight(survey.cameras(poses), aims[free], _CLOSE * diagonal * site.size)
+        return poses, ((murk <= _MURK) & (clear >= _CLEAR)).astype(float)
+
+    return gather(survey, count if len(rows) else 0, tried, patience=_AIMED_PATIENCE)
+
+
+def reach_of(survey: Survey, poses: Poses) -> Reach:
+    """Find the nearest pose that sees each of the first K points of the site.
+
+    Returns:
+        (K,) indices of the poses, −1 if none sees the point; (K,) distances from them, inf if none does; and
+        (K,) whether a point is seen, but with a standard deviation below a pixel.
+    """
+    site, lens = survey.site, survey.lens
+    points = site.points[:_SAMPLE]
+    best, nearest = np.full(len(points), -1), np.full(len(points), np.inf)
+    wide, tall = lens.tangents
+    for i, frame in enumerate(poses.frames()):
+        away = points - poses.eyes[i]
+        x, y, z = (away @ frame.T).T
+        length = norms(away)
+        rows = np.flatnonzero((z > 0) & (np.abs(x) < wide * z) & (np.abs(y) < tall * z) & (length < nearest))
+        directions = away[rows] / length[rows, None]
+        met = site.grid.cast(np.repeat(poses.eyes[i : i + 1], len(rows), axis=0), directions)
+        rows = rows[met > length[rows] - 2 * site.grid.cell]
+        best[rows], nearest[rows] = i, length[rows]
+    coarse = site.grid.scale_at(points) * float(lens.matrix[0, 0]) < nearest
+    return best, nearest, (best >= 0) & coarse
+
+
+def plan_near(survey: Survey, poses: Poses, reach: Reach, count: int, shift: int = 0) -> Poses:
+    """Plan at most `count` poses between the given ones and points that they see.
+
+    Each pose stands where its point has a standard deviation of 1.5 pixels, at 0.25–0.6 of the original
+    distance. Up to half of the poses look at points that the given poses show smaller than a pixel.
+    """
+    site, (best, distance, coarse) = survey.site, reach
+    chance = np.random.default_rng(survey.seed + shift)
+    small = chance.permutation(np.flatnonzero(coarse))[: count // 2]
+    others = chance.permutation(np.setdiff1d(np.flatnonzero(best >= 0), small))
+    rows = np.concatenate([small, others])
+    turn, rise = halton(0, len(rows), 2, survey.seed + shift + 3).T
+    eyes, points = poses.eyes[best[rows]], site.points[rows]
+    wanted = site.grid.scale_at(points) * float(survey.lens.matrix[0, 0]) / _PIXELS
+    share = np.clip(wanted / distance[rows], *_STEP)
+    eyes = points + share[:, None] * (eyes - points)
+    gazes = (points - eyes) / np.maximum(norms(points - eyes), np.finfo(float).tiny)[:, None]
+    gazes += _JITTER * np.stack([turn - 0.5, rise - 0.5, turn - rise], axis=1)
+    gazes /= norms(gazes)[:, None]
+    free = site.is_free(eyes, 2, _LOWEST)
+    near = Poses(eyes[free], gazes[free])
+    clear = Rays(survey, near).close > 2 * site.grid.cell
+    return near.take(clear).take(slice(count))
