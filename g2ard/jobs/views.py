@@ -173,7 +173,7 @@ def _mixed(
     more, apart = [], []
     for kind, count in counts.items():
         found = planned.more(kind, count + spare) if count or kind == "near" else []
-        if found and kind == "anywhere":  # half as wide, because they see little
+        if found and kind == "anywhere" != select.focus:  # half as wide, because they see little
             found = [*Cameras.of(found).resized(found[0].width // 2)]
         taken = min(count, max(len(found) - spare, len(found) // 2))
         if kind == select.focus and taken < 0.9 * count:

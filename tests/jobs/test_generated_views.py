@@ -64,7 +64,7 @@ def test_views_of_other_kinds_join_the_usual_ones(make, focus: str | None, kinds
         assert share["usual"] == 1 if make is naive.statue else 0.2 < share["anywhere"] < 0.4
     elif focus != "far":
         assert share[focus] == pytest.approx(0.5, abs=0.02)
-    assert all(views.train.cameras.widths[rows.get("anywhere", [])] == 400)
+    assert all(views.train.cameras.widths[rows.get("anywhere", [])] == (800 if focus == "anywhere" else 400))
     assert set(rows_by_kind(views.test.names)) == {"usual"}
     assert views.apart is not None
     assert set(rows_by_kind(views.apart.names)) == {"near"} | kinds - {"usual"}
