@@ -9,7 +9,7 @@ import numpy as np
 
 from g2ard.jobs.view_checks import opaque_points
 from g2ard.poses import plan_pool
-from g2ard.progress import Progress, silent
+from g2ard.progress import Progress, Say, silent, unsaid
 from g2ard.scene.cameras import Cameras, look_at
 from g2ard.scene.splats import Splats
 
@@ -25,6 +25,7 @@ def turntable(
     up: Sequence[float] | None = None,
     seed: int = 0,
     progress: Progress = silent,
+    say: Say = unsaid,
 ) -> Cameras:
     """Return views at equal angles on a level circle, all of which look at its middle.
 
@@ -37,6 +38,8 @@ def turntable(
     """
     pool = plan_pool(scene, _POOL, size=size, up=up, seed=seed, progress=progress)
     points, axis = opaque_points(scene), np.asarray(pool.up, np.float64)
+    if up is None:
+        say(f"up: {','.join(f'{value:.2f}' for value in axis)}, estimated; --up X,Y,Z sets it")
     first = max(pool.cameras, key=lambda view: float(view.holds(points).mean()))
     eye, ahead = first.position, first.viewmat[2, :3]
     held = points[first.holds(points)]

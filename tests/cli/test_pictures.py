@@ -30,7 +30,8 @@ def test_an_orbit_keeps_its_distance_and_turns_by_equal_angles() -> None:
 def test_render_writes_an_animation(tmp_path: Path, command_line: CommandLine, name: str) -> None:
     write_splats(tmp_path / "ball.ply", checkered_ball(800))
     ask = ("render", "ball.ply", "--orbit", 5, "--size", 64, "--fps", 10, "-o", name)
-    succeeds(command_line, tmp_path, *ask)
+    assert "estimated; --up X,Y,Z sets it" in succeeds(command_line, tmp_path, *ask).err
+    assert "estimated" not in succeeds(command_line, tmp_path, *ask[:-1], "up.gif", "--up", "0,0,1").err
     with Image.open(tmp_path / name) as found:
         assert (found.n_frames, found.size) == (5, (64, 48))
         found.seek(1)

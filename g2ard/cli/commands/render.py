@@ -72,6 +72,7 @@ def render(
     split: opt.SplitOption = "all",
     size: opt.SizeOption = None,
     background: opt.BackgroundOption = None,
+    up: opt.UpOption = None,
 ) -> None:
     """Render views of a scene as PNG, or show how it would be simplified."""
     import numpy as np
@@ -109,13 +110,14 @@ def render(
         splats = _painted(run, splats, color, budget, method, parents)
     found: Any
     if turn is not None:
-        found = turntable(splats, turn, seed=run.seed, progress=run.progress)
+        found = turntable(splats, turn, up=up, seed=run.seed, progress=run.progress, say=run.say)
     else:
         found = views_or_pool(
             splats,
             "made" if looks is not None else views,
             beside=scene,
             count=looks,
+            up=up,
             seed=run.seed,
             progress=run.progress,
             say=run.say,
