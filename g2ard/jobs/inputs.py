@@ -192,7 +192,7 @@ def clutter_seen(
         seed=seed,
         rows=_CLUTTER_ROWS,
         near=_CLUTTER_NEAR,
-        looks=True,
+        for_weights=True,
         progress=progress,
     )
     cameras = pool.cameras.resized(_CLUTTER_SIDE)

@@ -313,7 +313,7 @@ def _aim_for_quality(
     """Find the count that keeps a quality in generated views, as read back from the format of `file`."""
     from g2ard.poses import plan_pool
 
-    pool = plan_pool(splats, _VIEWS, seed=seed, rows=_ROWS, looks=True, progress=progress)
+    pool = plan_pool(splats, _VIEWS, seed=seed, rows=_ROWS, for_weights=True, progress=progress)
     cameras = pool.cameras.resized(_SIDE)
 
     def written(count: int) -> Splats:

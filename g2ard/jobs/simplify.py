@@ -14,7 +14,7 @@ from g2ard.errors import InputError
 from g2ard.jobs.budget import Budget
 from g2ard.jobs.inputs import Views, load_scene, say_regions
 from g2ard.jobs.measured_budget import aim_of
-from g2ard.jobs.views import cameras_for_looks
+from g2ard.jobs.views import cameras_for_weights
 from g2ard.progress import Progress, Say, silent, unsaid
 from g2ard.rendering.visibility import visibility_source
 from g2ard.scene.splats import Splats
@@ -152,7 +152,7 @@ class Reduction:
     def _visibility(self) -> VisibilitySource | None:
         if self.blind:
             return None
-        cameras = cameras_for_looks(
+        cameras = cameras_for_weights(
             self.splats,
             self.views,
             self.config.method,

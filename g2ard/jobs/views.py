@@ -45,7 +45,7 @@ _POOL_GAUSSIANS = 4_000_000
 _ROWS = 200_000
 """Gaussians that poses are planned on."""
 
-_LOOKS, _LOOK_ROWS = 96, 100_000
+_WEIGHT_VIEWS, _WEIGHT_ROWS = 96, 100_000
 """Size of the pool for simplification, of which as many are used as the scene needs, and the Gaussians that
 it is planned on.
 """
@@ -231,7 +231,7 @@ def _of(pool: Pool, names: Sequence[str]) -> str:
     return f"{len(names)}, {' + '.join(kinds)}{guess}"
 
 
-def cameras_for_looks(
+def cameras_for_weights(
     scene: Splats,
     views: Views | None,
     method: str,
@@ -272,7 +272,14 @@ def cameras_for_looks(
         return None
     try:
         pool = plan_pool(
-            scene, _LOOKS, up=up, seed=seed, rows=_LOOK_ROWS, near=_NEAR, looks=True, progress=progress
+            scene,
+            _WEIGHT_VIEWS,
+            up=up,
+            seed=seed,
+            rows=_WEIGHT_ROWS,
+            near=_NEAR,
+            for_weights=True,
+            progress=progress,
         )
     except InputError as e:
         say(f"continuing without views: {e}")

@@ -90,7 +90,7 @@ def plan_pool(
     rows: int | None = None,
     grow: float = 1.0,
     near: float = 0.0,
-    looks: bool = False,
+    for_weights: bool = False,
     represents: float = 1.0,
     progress: Progress = silent,
 ) -> Pool:
@@ -104,8 +104,8 @@ def plan_pool(
         grow: largest factor on `count`; if a view holds a share h of the scene, the factor is 1/√h.
         near: largest share of the poses that step nearer to what the others see. The actual share is near·s,
             where s rises from 0 to 1 with the share of the matter that is only seen below a pixel. With
-            `looks`, s is at least 1−h.
-        looks: whether the pool is for weighing Gaussians rather than for training.
+            `for_weights`, s is at least 1−h.
+        for_weights: whether the pool is for weighing Gaussians rather than for training.
         represents: Gaussians of the scene per row of `splats`.
 
     Raises:
@@ -145,7 +145,7 @@ def plan_pool(
         )
     reach = reach_of(survey, poses)
     far = poses, reach
-    need = max(float(np.interp(reach[2].mean(), _COARSE, (0, 1))), 1 - held if looks else 0.0)
+    need = max(float(np.interp(reach[2].mean(), _COARSE, (0, 1))), 1 - held if for_weights else 0.0)
     near_poses = plan_near(survey, *far, int(near * need * len(poses)), 1)
     if len(near_poses):
         kept = np.linspace(0, len(poses) - 1, len(poses) - len(near_poses)).round().astype(int)

@@ -145,7 +145,7 @@ class Site:
         return self.grid.cast(eyes, np.tile(ways, (len(points), 1))).reshape(len(points), len(ways))
 
     def inside(self, seed: int) -> Inside:
-        """Find free places around which matter covers most of the sphere and is near enough to look sharp."""
+        """Find free places around which matter covers most of the sphere and looks sharp."""
         places = between(self.box, halton(0, _TRIES, 3, seed))
         places = places[self.is_free(places, 2)]
         ways = fibonacci(_DIRECTIONS)

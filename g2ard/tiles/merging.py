@@ -238,7 +238,7 @@ def _planned(run: TiledRun, sample: Splats, up: Any, seed: int, say: Say) -> Cam
             seed=seed,
             rows=round(_PLANNED_ON * times),
             near=0.25,
-            looks=True,
+            for_weights=True,
             represents=run.store.count / len(sample),
             progress=run.workers.progress,
         )
