@@ -42,6 +42,22 @@ impl Rasterizer {
             |scratch, (tile, ((batch, transmittance), last))| {
                 let pairs = bins.pairs_of(tile);
                 let rect = grid.rect(tile, &camera);
+                if pairs.is_empty() {
+                    batch.1 = 0;
+                    for y in 0..rect.rows {
+                        let first = (rect.y + y) * camera.width + rect.x;
+                        // SAFETY: as below.
+                        unsafe {
+                            let rgb = rgb.slice(3 * first, 3 * rect.columns);
+                            rgb.as_chunks_mut().0.fill(background);
+                            alpha.slice(first, rect.columns).fill(0.0);
+                            for plane in [depth, median].into_iter().flatten() {
+                                plane.slice(first, rect.columns).fill(0.0);
+                            }
+                        }
+                    }
+                    return;
+                }
                 // SAFETY: every tile has its own batches, and the pixels written below are its own.
                 let block_masks =
                     unsafe { block_masks.slice(batch.0, pairs.len().div_ceil(BATCH)) };
