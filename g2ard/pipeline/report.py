@@ -52,7 +52,7 @@ class StageSeconds(Report):
 
 @dataclass(frozen=True)
 class DistillReport(Report):
-    """Report of a distillation; without a selection, `views` is None."""
+    """Report of a distillation. `views` holds its selection of views, or None."""
 
     rounds: tuple[RoundReport, ...]
     seconds: StageSeconds

@@ -8,7 +8,7 @@ from dataclasses import MISSING, dataclass, fields
 from typing import Any, Self, Union, get_args, get_origin, get_type_hints
 
 LEFT_OUT = {"left_out": True}
-"""Metadata of a field that JSON leaves out while its value is None."""
+"""Metadata of an optional field that JSON omits without a value."""
 
 
 @dataclass(frozen=True)

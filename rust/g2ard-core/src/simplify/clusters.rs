@@ -163,7 +163,7 @@ fn logit_of(alpha: f64) -> f32 {
     (alpha / (1.0 - alpha)).max(f64::MIN_POSITIVE).ln() as f32
 }
 
-/// Appends a cluster's SH to `out`: the mean by `weights`, or a copy of the only member's if there are none.
+/// Appends a cluster's SH to `out`: the mean by `weights`, or without weights a copy of its only member's.
 fn average_sh(
     scene: &SceneRef,
     ordered: &Ordered,

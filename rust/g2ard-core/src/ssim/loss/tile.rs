@@ -17,7 +17,7 @@ fn margin(shape: Shape) -> usize {
     (RADIUS * shape.channels).next_multiple_of(LANES)
 }
 
-/// Values of scratch that a tile of so many columns needs.
+/// Length of the scratch memory, in values, of a tile of `columns`.
 pub fn scratch_len(shape: Shape, columns: usize) -> usize {
     let (columns, margin) = (columns.next_multiple_of(LANES), margin(shape));
     let derived = columns + 2 * margin;
