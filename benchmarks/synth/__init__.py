@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from benchmarks.synth.city import City, CityConfig, Hits, Scan, city
+from benchmarks.synth.city import City, CityConfig, Scan, city
 from benchmarks.synth.write import write_city
 
-__all__ = ["City", "CityConfig", "Hits", "Scan", "city", "write_city"]
+__all__ = ["City", "CityConfig", "Scan", "city", "write_city"]

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from benchmarks.synth.layout import plan
 from benchmarks.synth.lidar import scan
@@ -16,7 +16,7 @@ from benchmarks.synth.trajectories import trajectories
 from g2ard.errors import InputError
 from g2ard.scene.cameras import Cameras
 
-__all__ = ["City", "CityConfig", "Hits", "Scan", "city"]
+__all__ = ["City", "CityConfig", "Scan", "city"]
 
 _TILE = 32
 _BEAM = 0.01, 4e-4
@@ -35,8 +35,6 @@ class CityConfig:
         blocks: city blocks per side; one is 72 m × 58 m, including streets.
         seed: random seed.
         noise: standard deviation of the laser's range, metres.
-        fov: horizontal field of view of the photos, degrees.
-        supersample: samples per pixel along each axis; 2 suffices, since textures are averaged exactly.
         sky: colour in [0, 1] of rays without a hit; the default is exact in 8 bits.
         offset: (3,) world coordinates of the city's centre, such as UTM coordinates.
 
@@ -50,8 +48,6 @@ class CityConfig:
     blocks: int = 3
     seed: int = 0
     noise: float = 0.015
-    fov: float = 65.0
-    supersample: int = 2
     sky: tuple[float, float, float] = (0.6, 0.8, 1.0)
     offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
@@ -64,8 +60,6 @@ class CityConfig:
             ("blocks", self.blocks, 1, 40),
             ("seed", self.seed, 0, 2**63),
             ("noise", self.noise, 0, 10),
-            ("fov", self.fov, 1, 170),
-            ("supersample", self.supersample, 1, 8),
         ):
             if not least <= value <= most:
                 raise InputError(f"city: {name} must lie between {least} and {most}, got {value}")
@@ -90,23 +84,6 @@ class Scan:
     primitives: NDArray[np.int64]
 
 
-@dataclass(frozen=True, eq=False)
-class Hits:
-    """First hits of n rays.
-
-    Args:
-        depth: (n,) float64, in lengths of the ray's direction; inf without a hit.
-        color: (n, 3) float32 in [0, 1]; the sky's without a hit.
-        normal: (n, 3) float64 outward unit normal; zero without a hit.
-        primitive: (n,) int64, −1 without a hit.
-    """
-
-    depth: Float
-    color: NDArray[np.float32]
-    normal: Float
-    primitive: NDArray[np.int64]
-
-
 class City:
     """Procedural city; build it with `city`."""
 
@@ -115,7 +92,7 @@ class City:
         self.layout = plan(config.blocks, config.seed)
         self._paint = Painter(self.layout, config.seed)
         self._offset = np.asarray(config.offset, np.float64)
-        local = trajectories(self.layout, config.views, config.size, config.fov)
+        local = trajectories(self.layout, config.views, config.size)
         self.views: dict[str, Cameras] = {k: v.recentred(-self._offset) for k, v in local.items()}
 
     def points(self, count: int | None = None) -> Scan:
@@ -138,71 +115,19 @@ class City:
                 noisy = o + d * (t + config.noise * rng.standard_normal(len(t)))
                 yield Scan(noisy.T + self._offset, color.T, part.primitives)
 
-    def cast(self, origins: ArrayLike, directions: ArrayLike, width: float = 0.01) -> Hits:
-        """Return the exact first hits of rays.
-
-        Args:
-            origins: (n, 3) or (3,) world coordinates.
-            directions: (n, 3), of any length except zero.
-            width: width over which textures are averaged, metres.
-        """
-        d = np.asarray(directions, np.float64)
-        o = np.atleast_2d(np.asarray(origins, np.float64)) - self._offset
-        if d.ndim != 2 or d.shape[1] != 3 or o.shape not in {(1, 3), d.shape}:
-            raise InputError(
-                f"cast: expected directions (n, 3) and origins (n, 3) or (3,), got {d.shape}, {o.shape}"
-            )
-        length = np.linalg.norm(d, axis=1)
-        if not (np.isfinite(o).all() and np.isfinite(length).all() and (length > 0).all()):
-            raise InputError("cast: origins and directions must be finite, directions not zero")
-        order = _coherent(o, d / length[:, None])
-        o = o if len(o) == 1 else o[order]
-        d = d[order]
-        t, hit = cast(self.layout.shapes, np.ascontiguousarray(o.T), np.ascontiguousarray(d.T), packet=1024)
-        depth, primitive = np.empty(len(d)), np.empty(len(d), np.int64)
-        color = np.empty((len(d), 3), np.float32)
-        normal = np.zeros((len(d), 3))
-        depth[order], primitive[order] = t, hit
-        unit = d.T / length[order]
-        found = np.flatnonzero(hit >= 0)
-        at = o.T if o.shape[0] == 1 else o.T[:, found]
-        normal[order[found]] = self.layout.shapes.normals(at + d.T[:, found] * t[found], hit[found]).T
-        color[order] = np.asarray(self.config.sky, np.float32)
-        color[order[found]] = self._shade(
-            at, unit[:, found], (t * length[order])[found], hit[found], np.full(len(found), width)
-        ).T
-        return Hits(depth, color, normal, primitive)
-
     def photo(self, cameras: Cameras, index: int) -> NDArray[np.float32]:
-        """Return the (H, W, 3) colours of a view in [0, 1], the mean of supersample² rays per pixel."""
-        view = self._local(cameras, index)
+        """Return the (H, W, 3) colours of a view in [0, 1], the mean of four rays per pixel."""
+        view = cameras.take([index]).recentred(self._offset)
         width, height = int(view.widths[0]), int(view.heights[0])
         image = np.empty((height, width, 3), np.float32)
         for row in range(0, height, _TILE):
             rows = min(_TILE, height - row)
-            order, o, d, scale = _pixel_rays(view, row, rows, self.config.supersample)
+            order, o, d, scale = _pixel_rays(view, row, rows)
             t, hit = cast(self.layout.shapes, o, d)
             flat = np.empty((rows * width, 3), np.float32)
             flat[order] = self._pixels(o, d, t, hit, scale, len(order))
             image[row : row + rows] = flat.reshape(rows, width, 3)
         return image
-
-    def depth(self, cameras: Cameras, index: int) -> Float:
-        """Return the (H, W) depth along the optical axis at pixel centres, metres; inf for sky."""
-        view = self._local(cameras, index)
-        width, height = int(view.widths[0]), int(view.heights[0])
-        image = np.empty((height, width))
-        for row in range(0, height, _TILE):
-            rows = min(_TILE, height - row)
-            order, o, d, _ = _pixel_rays(view, row, rows, 1)
-            t, _ = cast(self.layout.shapes, o, d)
-            flat = np.empty(rows * width)
-            flat[order] = t * (view.viewmats[0, 2, :3] @ d)
-            image[row : row + rows] = flat.reshape(rows, width)
-        return image
-
-    def _local(self, cameras: Cameras, index: int) -> Cameras:
-        return cameras.take([index]).recentred(self._offset)
 
     def _pixels(
         self, o: Float, d: Float, t: Float, hit: NDArray[np.int64], scale: float, count: int
@@ -266,29 +191,19 @@ def city(config: CityConfig | None = None, **options: object) -> City:
     return City(replace(config or CityConfig(), **options))  # type: ignore[arg-type]
 
 
-def _coherent(o: Float, d: Float) -> NDArray[np.int64]:
-    """Return an order of rays in which neighbours have similar origins and directions."""
-    span = np.ptp(o, axis=0).max() or 1.0
-    start = np.floor((o - o.min(0)) / span * 15.99).astype(np.int64)
-    facing = np.floor((d + 1) * 5.99).astype(np.int64)
-    key = ((start[:, 0] * 16 + start[:, 1]) * 16 + start[:, 2]) * 2048
-    return np.argsort(key + (facing[:, 0] * 12 + facing[:, 1]) * 12 + facing[:, 2], kind="stable")
-
-
-def _pixel_rays(view: Cameras, row: int, rows: int, s: int) -> tuple[NDArray[np.int64], Float, Float, float]:
-    """Return rays through s × s samples per pixel in `rows` rows from `row`, ordered by tile and pixel.
+def _pixel_rays(view: Cameras, row: int, rows: int) -> tuple[NDArray[np.int64], Float, Float, float]:
+    """Return rays through 2 × 2 samples per pixel in `rows` rows from `row`, ordered by tile and pixel.
 
     Returns:
-        (n/s²,) raster indices of pixels; (3, 1) origin; (3, n) unit directions; pixel width at distance 1.
+        (n/4,) raster indices of pixels; (3, 1) origin; (3, n) unit directions; pixel width at distance 1.
     """
     width = int(view.widths[0])
     R, K = view.viewmats[0, :3, :3], view.Ks[0]
     place = np.arange(rows * width).reshape(rows, width)
     order = np.concatenate([place[:, c : c + _TILE].ravel() for c in range(0, width, _TILE)])
     y, x = np.divmod(order, width)
-    part = (np.arange(s) + 0.5) / s
-    x = (x[:, None] + np.tile(part, s)).ravel()
-    y = (row + y[:, None] + np.repeat(part, s)).ravel()
+    x = (x[:, None] + [0.25, 0.75, 0.25, 0.75]).ravel()
+    y = (row + y[:, None] + [0.25, 0.25, 0.75, 0.75]).ravel()
     camera = np.stack([(x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1], np.ones(len(x))])
     d = R.T @ camera
     return order, view.positions.T, d / np.linalg.norm(d, axis=0), 1.0 / float(K[0, 0])

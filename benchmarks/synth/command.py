@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import re
 import time
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from g2ard.cli.budget_options import Count
 from g2ard.cli.frame import Run, command
-from g2ard.cli.options import Triple
+from g2ard.errors import InputError
 from g2ard.progress import plural
 
 __all__ = ["synth"]
@@ -24,28 +23,15 @@ def _root() -> None:
     pass
 
 
-class _Size(tuple[int, int]):
-    """Width and height in one argument."""
-
-    def __str__(self) -> str:
-        return f"{self[0]}x{self[1]}"
-
-
-def _size(text: str) -> _Size:
-    match = re.fullmatch(r"(\d+)[x×](\d+)", text.strip())
-    if match is None or not (int(match[1]) and int(match[2])):
-        raise typer.BadParameter(f"expected a size such as 800x600, got {text!r}")
-    return _Size((int(match[1]), int(match[2])))
-
-
-def _offset(text: str) -> Triple:
+def _numbers(flag: str, text: str, mark: str, count: int, kind: type) -> tuple[Any, ...]:
+    """Parse `count` numbers of a type with `mark` between them."""
     try:
-        x, y, z = (float(part) for part in text.split(","))
+        (*values,) = map(kind, text.split(mark))
     except ValueError:
-        raise typer.BadParameter(
-            f"expected three numbers such as 443000,4428000,1600, got {text!r}"
-        ) from None
-    return Triple((x, y, z))
+        values = []
+    if len(values) != count:
+        raise typer.BadParameter(f"{flag}: expected {count} numbers with {mark!r} between, got {text!r}")
+    return tuple(values)
 
 
 @command("city", parent=synth, example="python -m benchmarks synth city -o city/ --points 1M --views 120")
@@ -56,19 +42,10 @@ def city(
         Count | None,
         typer.Option(parser=Count.parse, metavar="COUNT", help="Points of the cloud; 500k by default."),
     ] = None,
-    views: Annotated[int, typer.Option(min=8, help="Photos in all four splits.")] = 120,
-    size: Annotated[
-        _Size | None,
-        typer.Option(parser=_size, metavar="WxH", help="Size of photos; 800x600 by default."),
-    ] = None,
-    blocks: Annotated[
-        int | None,
-        typer.Option(min=1, max=40, help="City blocks per side; 3 by default."),
-    ] = None,
-    offset: Annotated[
-        Triple | None,
-        typer.Option(parser=_offset, metavar="X,Y,Z", help="World coordinates of the centre."),
-    ] = None,
+    views: Annotated[int, typer.Option(help="Photos in all four splits.")] = 120,
+    size: Annotated[str, typer.Option(metavar="WxH", help="Size of photos.")] = "800x600",
+    blocks: Annotated[int, typer.Option(help="City blocks per side.")] = 3,
+    offset: Annotated[str, typer.Option(metavar="X,Y,Z", help="World coordinates of the centre.")] = "0,0,0",
 ) -> None:
     """Generate a city: coloured LiDAR point cloud, photos with exact poses, splits train/val/adapt/ood."""
     from benchmarks.synth import CityConfig, write_city
@@ -76,18 +53,20 @@ def city(
     if points is not None and points.is_share:
         raise typer.BadParameter("--points: expected a count, got a share")
     began = time.monotonic()
-    default = CityConfig()
-    count = default.points if points is None else points.of(0)
-    config = CityConfig(
-        points=count,
-        views=views,
-        size=size or default.size,
-        blocks=blocks or default.blocks,
-        seed=run.seed,
-        offset=offset or default.offset,
-    )
+    width, height = _numbers("--size", size, "x", 2, int)
+    x, y, z = _numbers("--offset", offset, ",", 3, float)
+    try:
+        config = CityConfig(
+            points=CityConfig.points if points is None else points.of(0),
+            views=views,
+            size=(width, height),
+            blocks=blocks,
+            seed=run.seed,
+            offset=(x, y, z),
+        )
+    except InputError as error:
+        raise typer.BadParameter(str(error)) from None
     manifest = write_city(output, config, overwrite=run.overwrite, threads=run.threads, progress=run.progress)
     splits = ", ".join(f"{count} {name}" for name, count in manifest["views"].items())
-    pixels = f"{config.size[0]}×{config.size[1]}"
-    run.say(f"{output}: {plural(config.points, 'point')}, {splits} views of {pixels}")
+    run.say(f"{output}: {plural(config.points, 'point')}, {splits} views of {width}×{height}")
     run.result({**manifest, "output": str(output), "seconds": time.monotonic() - began})

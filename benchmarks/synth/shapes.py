@@ -72,11 +72,6 @@ class Shapes:
         normal /= half
         return normal / np.linalg.norm(normal, axis=0)
 
-    def inside(self, points: Float, margin: float = 0.0) -> NDArray[np.bool_]:
-        """Return (n,) whether points (n, 3) are in a primitive's bounding box, grown by `margin` metres."""
-        p = points[:, None]
-        return np.all((p > self.lo - margin) & (p < self.hi + margin), axis=2).any(1)
-
 
 Spans = tuple[Float, Float]
 """Entry and exit parameters of n rays; entry > exit for misses."""

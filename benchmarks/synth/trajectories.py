@@ -15,6 +15,9 @@ SPLITS = ("train", "val", "adapt", "ood")
 _SHARES = (0.70, 0.10, 0.08, 0.12)
 """Share of all views per split; the paper's MatrixCity has 4,075 · 510 · 341 · 495."""
 
+_FOV = 65.0
+"""Horizontal field of view of the photos, degrees."""
+
 _LANE = 1.6
 """Metres from the street's centre line at which a car drives."""
 _YAWS = (0.0, 55.0, -55.0, 25.0, -90.0, 90.0)
@@ -127,14 +130,13 @@ def _circle(layout: Layout, count: int) -> list[Float]:
     ]
 
 
-def trajectories(layout: Layout, views: int, size: tuple[int, int], fov: float) -> dict[str, Cameras]:
+def trajectories(layout: Layout, views: int, size: tuple[int, int]) -> dict[str, Cameras]:
     """The four splits' cameras, in the layout's own coordinates.
 
     Args:
         layout: the city.
         views: how many in all.
         size: width and height in pixels.
-        fov: horizontal field of view, degrees.
 
     Returns:
         train (drives along every second street, flights over the roofs), val (views held out evenly from
@@ -155,7 +157,7 @@ def trajectories(layout: Layout, views: int, size: tuple[int, int], fov: float) 
         "ood": _drone(layout, counts["ood"] - counts["ood"] // 2) + _circle(layout, counts["ood"] // 2),
     }
     width, height = size
-    focal = width / 2 / np.tan(np.deg2rad(fov) / 2)
+    focal = width / 2 / np.tan(np.deg2rad(_FOV) / 2)
     K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])
     return {
         name: Cameras.from_lists(

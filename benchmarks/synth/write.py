@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -34,18 +34,16 @@ def write_city(
     """Build a city and write it as a data set, whole or not at all.
 
     Args:
-        folder: where to; holds cloud.ply, images/, train.json, val.json, adapt.json, ood.json,
-            manifest.json.
-        config: see `CityConfig`; None is the default city.
-        overwrite: whether a folder that is not empty may be written into.
-        threads: photos taken side by side; 0 means every core. The result does not depend on it.
-        progress: told of points and photos.
+        folder: output; holds cloud.ply, images/, train.json, val.json, adapt.json, ood.json, manifest.json.
+        config: its configuration; None is the default city.
+        overwrite: whether to replace an existing folder.
+        threads: photos to take in parallel; 0 means every core. The result does not depend on it.
+        progress: callback per block of points and per photo.
 
     Returns:
         The manifest.
 
     Raises:
-        InputError: a value no city can be built from.
         OutputError: the folder exists and may not be overwritten, or cannot be written.
     """
     config = config or CityConfig()
@@ -86,20 +84,11 @@ def _photograph(town: City, place: Path, threads: int, progress: Progress) -> No
         pixels = np.rint(town.photo(cameras, index) * 255).astype(np.uint8)
         Image.fromarray(pixels).save(place / "images" / f"{cameras.names[index]}.png")
 
-    _side_by_side(shoot, jobs, threads, lambda done: progress("photos", done, len(jobs)))
-
-
-def _side_by_side(
-    work: Callable[[Cameras, int], None],
-    jobs: list[tuple[Cameras, int]],
-    threads: int,
-    tell: Callable[[int], None],
-) -> None:
     pool = ThreadPoolExecutor(threads or os.cpu_count() or 1)
     try:
-        for done, future in enumerate(as_completed([pool.submit(work, *job) for job in jobs]), start=1):
+        for done, future in enumerate(as_completed([pool.submit(shoot, *job) for job in jobs]), start=1):
             future.result()
-            tell(done)
+            progress("photos", done, len(jobs))
     finally:
         pool.shutdown(cancel_futures=True)
 
