@@ -93,11 +93,9 @@ def measured(command: Sequence[str], log: Path) -> Usage:
     return Usage(cpu, wall, peak * unit / 1e6)
 
 
-def splat_transform(*arguments: str, program: str | None = None) -> list[str]:
-    """Return a call of splat-transform: the given program, otherwise the one on PATH."""
-    found = shutil.which(program or "splat-transform")
-    if found is None and program is not None:
-        raise InputError(f"{program}: no such program")
+def splat_transform(*arguments: str) -> list[str]:
+    """Return a call of splat-transform."""
+    found = shutil.which("splat-transform")
     if found is None:
         raise InputError("splat-transform: not on PATH (npm i -g @playcanvas/splat-transform)")
     return [found, "-q", "-w", "-g", "cpu", *arguments]

@@ -46,7 +46,7 @@ COLUMNS: dict[str, Column] = {
     "split": Column(str, "", "which views were scored"),
     "views_kind": Column(str, "", "what was scored on: pool, near, standing or anywhere"),
     "against": Column(str, None, "photos, teacher, or either; figures of different ones never compare"),
-    "submethod": Column(str, None, "method and budget in one word"),
+    "submethod": Column(str, None, "method and budget in one word, in recorded rows"),
     "input_count": Column(int, None, "Gaussians before"),
     "budget": Column(int, None, "Gaussians requested"),
     "count": Column(int, ",", "Gaussians of the result"),
@@ -137,7 +137,7 @@ _SURVEY = {
     "bytes": "Size [Bytes]",
     "count": "#Gaussians",
 }
-"""Column names of the 3DGS compression survey, so that its plots can read CSVs of matched rows."""
+"""Column names of the 3DGS compression survey, as some recorded rows have them."""
 
 
 def read_rows(path: Path) -> list[Row]:
@@ -163,13 +163,12 @@ def write_rows(path: Path, rows: Sequence[Row]) -> None:
     """Write rows atomically."""
     present = {name for row in rows for name in row}
     names = [name for name in COLUMNS if name in present]
-    heads = _SURVEY if "submethod" in present else {}
     with (
         atomic_output(path, overwrite=True) as temporary,
         temporary.open("w", newline="", encoding="utf-8") as file,
     ):
         writer = csv.writer(file, lineterminator="\n")
-        writer.writerow([heads.get(name, name) for name in names])
+        writer.writerow(names)
         writer.writerows([_text(row.get(name)) for name in names] for row in rows)
 
 

@@ -22,16 +22,8 @@ if TYPE_CHECKING:
 __all__ = ["DEFINITIONS", "SceneSpec", "Study", "checked", "key", "read_study", "scene_label"]
 
 DEFINITIONS = Path(__file__).parent / "definitions"
-KINDS = {
-    "matched": "Matched",
-    "simplify": "Simplify",
-    "recover": "Recover",
-    "select": "Select",
-    "ship": "Ship",
-    "register": "Register",
-    "raster": "Raster",
-}
-"""Kind of study → its subclass of `Study` in the module of `benchmarks.kinds` with the kind's name."""
+KINDS = ("matched", "simplify", "recover", "select", "ship", "register", "raster")
+"""Modules of `benchmarks.kinds`; each holds the subclass of `Study` of the same name, capitalised."""
 
 _VARIABLE = re.compile(r"\$\{?(\w+)")
 _TYPES: dict[str, tuple[Any, str]] = {
@@ -122,6 +114,8 @@ class Study(ABC):
 
     METHODS: ClassVar[Mapping[str, Any]] = {}
     """Methods by name."""
+    DEFAULT: ClassVar[Any] = None
+    """Method that a table `[method.NAME]` without a `base` changes; None if a kind takes names only."""
     PROCESSES: ClassVar[bool] = False
     """Whether cells run in separate processes."""
 
@@ -149,9 +143,9 @@ class Study(ABC):
         return None
 
     @classmethod
-    def method(cls, name: str, values: Mapping[str, Any]) -> Any:
-        """Return the method of a table `[method.NAME]`."""
-        raise InputError(f"method {name}: this kind of study takes names only")
+    def default_methods(cls) -> list[str]:
+        """Return the methods of a study that lists none."""
+        return list(cls.METHODS)
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -190,7 +184,8 @@ def read_study(path: Path) -> Study:
     """Read a study from a TOML file.
 
     `kind` is one of `KINDS` (default "matched"), tables `[[scene]]` are `SceneSpec`s, and `methods` lists
-    methods of the kind or tables `[method.NAME]`. Other keys are fields of the kind's class.
+    methods of the kind or tables `[method.NAME]`, whose keys override those of the method `base`, an earlier
+    one. Other keys are fields of the kind's class.
     """
     try:
         content = tomllib.loads(path.read_text(encoding="utf-8-sig"))
@@ -200,10 +195,12 @@ def read_study(path: Path) -> Study:
         kind = content.pop("kind", "matched")
         if kind not in KINDS:
             raise InputError(f"kind: expected one of {', '.join(KINDS)}, got {kind!r}")
-        cls: type[Study] = getattr(import_module(f"benchmarks.kinds.{kind}"), KINDS[kind])
-        tables = {name: cls.method(name, values) for name, values in content.pop("method", {}).items()}
-        known = {**cls.METHODS, **tables}
-        methods = _chosen(known, content.pop("methods", list(tables or cls.METHODS)))
+        cls: type[Study] = getattr(import_module(f"benchmarks.kinds.{kind}"), kind.capitalize())
+        tables = content.pop("method", {})
+        known = dict(cls.METHODS)
+        for name, values in tables.items():
+            known[name] = _method(cls, name, values, known)
+        methods = _chosen(known, content.pop("methods", list(tables) or cls.default_methods()))
         scenes = tuple(_scene(values) for values in content.pop("scene", []))
         twice = next((s.name for i, s in enumerate(scenes) if s.name in {o.name for o in scenes[:i]}), None)
         if twice is not None:
@@ -267,6 +264,19 @@ def _item(key_: Field[Any], kind: str, given: Any) -> Any:
     if not fits or (choices and given not in choices):
         raise InputError(f"{key_.name}: expected {words}, got {given!r}")
     return os.path.expandvars(given) if kind == "str" else float(given) if kind == "float" else given
+
+
+def _method(cls: type[Study], name: str, values: dict[str, Any], known: Mapping[str, Any]) -> Any:
+    if cls.DEFAULT is None:
+        raise InputError(f"method {name}: this kind of study takes names only")
+    base = values.pop("base", None)
+    if base is not None and base not in known:
+        raise InputError(f"method {name}: base: no {base!r}")
+    start = cls.DEFAULT if base is None else known[base]
+    try:
+        return replace(start, name=name, **checked(type(start), values, {"name"}))
+    except InputError as error:
+        raise InputError(f"method {name}: {error}") from None
 
 
 def _scene(values: dict[str, Any]) -> SceneSpec:

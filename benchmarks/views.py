@@ -1,21 +1,41 @@
-"""Hidden views from anywhere in a scene, accepted by renders alone, not by the grid that plans pools."""
+"""Views that no method sees, of other kinds than a pool's: close up, where people stand, from anywhere."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from g2ard import _core
+from g2ard import _core, io
+from g2ard.config.choices import Colour
+from g2ard.errors import InputError
+from g2ard.poses import plan_pool
+from g2ard.poses.numbers import halton
+from g2ard.poses.outside import plan_orbit
+from g2ard.poses.sight import Lens, Poses, Rays, Survey
 from g2ard.poses.site import Site
 from g2ard.rendering.renderer import RasterSettings, arrays_of, view_of
 from g2ard.scene.cameras import Cameras, look_at
 from g2ard.scene.splats import Splats
+from g2ard.scene.splits import for_scores
+from g2ard.scene.targets import TeacherRenders
 
-__all__ = ["anywhere_views"]
+__all__ = ["anywhere_views", "given_views", "hidden_targets", "standing_views"]
 
-_SIZE, _TRIED, _FOV = (800, 600), (200, 150), 70.0
-"""Pixels of a view and of the render that tests it, and degrees across."""
+_SEED = 7919
+"""Added to the seed of a pool, so that these poses differ from all poses that methods use."""
+
+_POOL, _NEAR, _STANDING, _ANYWHERE = 128, 16, 24, 24
+_FOV = 70.0
+"""Degrees; a pool's poses have 50."""
+
+_BETWEEN = (0.35, 0.8)
+"""Range of the remaining share of the way to an object's surface, for poses between near and far."""
+
+_SIZE, _TRIED = (800, 600), (200, 150)
+"""Pixels of a view from anywhere and of the render that tests it."""
 
 _DISTANCES, _RISES = (0.04, 0.4), (-5.0, 35.0)
 """Ranges of the eye's position around its aim: distance in scene diagonals (log-uniform), and degrees above
@@ -34,7 +54,97 @@ _PATIENCE = 40
 """Poses tried per view, at most."""
 
 
-def anywhere_views(splats: Splats, count: int = 24, seed: int = 0) -> Cameras:
+def hidden_targets(
+    splats: Splats, scene: Path, kinds: tuple[str, ...], *, seed: int, size: int | None, background: Colour
+) -> dict[str, TeacherRenders]:
+    """Return renders of the kinds "near", "standing" and "anywhere" that are requested and have room.
+
+    Views are shrunk to `size`; those that show nothing of the scene are dropped.
+
+    Raises:
+        InputError: as `standing_views`.
+    """
+    views: dict[str, Cameras] = {}
+    if "standing" in kinds:
+        views |= standing_views(splats, scene, seed)
+    if "anywhere" in kinds:
+        views["anywhere"] = anywhere_views(splats, seed=seed)
+    found = {}
+    for kind, cameras in views.items():
+        targets = TeacherRenders(splats, cameras.resized(size), background=background)
+        shown = [bool(np.ptp(targets[view], axis=(0, 1)).any()) for view in range(len(cameras))]
+        if not all(shown):
+            cameras = targets.cameras.take(np.array(shown))
+            targets = TeacherRenders(splats, cameras, background=background)
+        if any(shown):
+            found[kind] = targets
+    return found
+
+
+def standing_views(splats: Splats, scene: Path, seed: int = 0) -> dict[str, Cameras]:
+    """Return views by kind, "near" and "standing"; kinds without room are missing.
+
+    near: at most 16 views between poses of a pool and what those see. standing: the views of a standing.json
+    beside the scene, otherwise 24 poses 70° wide. These lie between near and far for an object, at eye level
+    for a landscape, and in a pool of their own for other scenes. All use another seed than the pools of
+    methods.
+
+    Raises:
+        InputError: nothing is visible in the scene, or a standing.json is invalid.
+    """
+    pool = plan_pool(splats, _POOL, seed=seed + _SEED)
+    near = pool.more("near", _NEAR)
+    found = {"near": Cameras.of(near)} if near else {}
+    given = given_views(scene)
+    standing = given if given is not None else _standing(splats, pool.kind, seed + 2 * _SEED)
+    return found if standing is None or not len(standing) else {**found, "standing": standing}
+
+
+def given_views(scene: Path) -> Cameras | None:
+    """Return the views of a standing.json in the scene's folder or its parent; None without one.
+
+    Raises:
+        InputError: the file is invalid.
+    """
+    folder = scene.absolute() if scene.is_dir() else scene.absolute().parent
+    path = next((p for place in (folder, folder.parent) if (p := place / "standing.json").is_file()), None)
+    if path is None:
+        return None
+    found = io.read_view_set(path)
+    return found.cameras.take(for_scores(path, found.cameras.names, found.splits))
+
+
+def _standing(splats: Splats, kind: str, seed: int) -> Cameras | None:
+    if kind == "orbit":
+        return _between(splats, seed)
+    for other in ("walk", "auto") if "aerial" in kind else ("auto",):
+        try:
+            cameras = plan_pool(splats, _STANDING, kind=other, fov=_FOV, seed=seed).cameras
+        except InputError:
+            continue
+        return _named(cameras)
+    return None
+
+
+def _between(splats: Splats, seed: int) -> Cameras:
+    """Return views in free space around an object, nearer than a pool and farther than near views."""
+    survey = Survey(splats, 1.0, Site.of(splats), Lens(fov=_FOV), seed)
+    site, far = survey.site, plan_orbit(survey, 4 * _STANDING)
+    met = site.grid.cast(far.eyes, far.gazes)
+    far, met = far.take(np.isfinite(met)), met[np.isfinite(met)]
+    share = _BETWEEN[0] + (_BETWEEN[1] - _BETWEEN[0]) * halton(0, len(far), 1, seed)[:, 0]
+    eyes = far.eyes + ((1 - share) * met)[:, None] * far.gazes
+    free = site.is_free(eyes, 2, 0.01)
+    poses = Poses(eyes[free], far.gazes[free])
+    poses = poses.take(Rays(survey, poses).close > 2 * site.grid.cell)
+    return _named(survey.cameras(poses.take(slice(_STANDING))))
+
+
+def _named(cameras: Cameras) -> Cameras:
+    return replace(cameras, names=tuple(name.replace("pose", "standing") for name in cameras.names))
+
+
+def anywhere_views(splats: Splats, count: int = _ANYWHERE, seed: int = 0) -> Cameras:
     """Return views of random visible Gaussians from free places with a clear line of sight.
 
     There are fewer than `count` where few poses pass.

@@ -13,9 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.runner import folder_of, scene_key
-from benchmarks.standing import standing_targets
 from benchmarks.study import SceneSpec, Study
-from benchmarks.views import anywhere_views
+from benchmarks.views import hidden_targets
 from g2ard import io
 from g2ard.errors import InputError
 from g2ard.poses import make_pool
@@ -221,15 +220,12 @@ class Workspace:
     def kinds_of_views(self) -> dict[str, Targets]:
         """Kind of views → targets: "pool" (those scored first), and the protocol's others if there is room.
 
-        No method sees the others (`benchmarks.standing.standing_views`, `benchmarks.views.anywhere_views`).
+        No method sees the others.
         """
         found = {"pool": self.targets(next(iter(self.scored.values())))}
         wanted = kinds_for(getattr(self.study, "protocol", "all"), self.scene)
         found |= {name: self.targets(cameras) for name, cameras in self.scored.items() if name in wanted}
-        source, seed = self.place / self.scene.prior, self.study.pool_seed
-        size, background = self.study.size, self.scene.background
-        if "standing" in wanted:
-            found |= standing_targets(self.splats, source, seed, size=size, background=background)
-        if "anywhere" in wanted and len(cameras := anywhere_views(self.splats, seed=seed).resized(size)):
-            found["anywhere"] = TeacherRenders(self.splats, cameras, background=background)
-        return found
+        source, study, background = self.place / self.scene.prior, self.study, self.scene.background
+        return found | hidden_targets(
+            self.splats, source, wanted, seed=study.pool_seed, size=study.size, background=background
+        )

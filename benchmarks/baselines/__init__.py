@@ -1,34 +1,23 @@
-"""Other simplification methods, implemented from their papers at an exact count, without recovery.
-
-`reduce(name, splats, budget, cameras)` runs a method; so does the command `python -m benchmarks.baselines
-NAME SCENE COUNT OUT.ply --views VIEWS`.
-"""
+"""Other simplification methods, implemented from their papers at an exact count, without recovery."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+import numpy as np
 
-if TYPE_CHECKING:
-    from g2ard.progress import Progress
-    from g2ard.scene.cameras import Cameras
-    from g2ard.scene.splats import Splats
+from benchmarks.baselines import pruning
+from benchmarks.baselines.nanogs import nanogs
+from benchmarks.baselines.pup import sensitivity
+from g2ard.errors import InputError
+from g2ard.scene.cameras import Cameras
+from g2ard.scene.splats import Splats
 
-__all__ = ["METHODS", "NEED_VIEWS", "reduce"]
+__all__ = ["METHODS", "reduce"]
 
 METHODS = ("random", "opacity-area", "lightgaussian", "pup", "mini-splatting", "nanogs")
-NEED_VIEWS = ("lightgaussian", "pup", "mini-splatting")
-"""Methods that score Gaussians by training views."""
 
 
 def reduce(
-    name: str,
-    splats: Splats,
-    budget: int,
-    cameras: Cameras | None = None,
-    *,
-    seed: int = 0,
-    indoor: bool = False,
-    progress: Progress | None = None,
+    name: str, splats: Splats, budget: int, cameras: Cameras, *, seed: int = 0, indoor: bool = False
 ) -> Splats:
     """Reduce a scene to exactly `budget` Gaussians by a baseline of `METHODS`, without recovery.
 
@@ -36,46 +25,29 @@ def reduce(
         name: name of the method.
         splats: the scene.
         budget: Gaussians to keep, 1 to N.
-        cameras: training views, for methods in `NEED_VIEWS`.
+        cameras: training views, by which LightGaussian, PUP and Mini-Splatting score Gaussians.
         seed: seed of random methods (random, Mini-Splatting).
         indoor: whether Mini-Splatting uses its importance for rooms.
-        progress: callback per view.
 
-    >>> import numpy as np
-    >>> from g2ard.scene.splats import Splats
-    >>> scene = Splats.create(np.eye(3), scales=[[1, 1, 1], [2, 2, 2], [3, 3, 3]])
-    >>> reduce("opacity-area", scene, 2).scales[:, 0].tolist()
-    [2.0, 3.0]
+    Raises:
+        InputError: an unknown method, or a budget out of range.
     """
-    from g2ard.errors import InputError
-    from g2ard.progress import silent
-
-    tell = progress or silent
     if name not in METHODS:
         raise InputError(f"baseline: expected one of {', '.join(METHODS)}, got {name!r}")
-    if name in NEED_VIEWS and cameras is None:
-        raise InputError(f"{name}: needs training views; give --views")
+    if not 1 <= budget <= len(splats):
+        raise InputError(f"budget: expected 1 to {len(splats)}, got {budget}")
     if name == "nanogs":
-        from benchmarks.baselines.nanogs import nanogs
-
         return nanogs(splats, budget)
     if name == "random":
-        from benchmarks.baselines.simple import random_subset
-
-        return random_subset(splats, budget, seed=seed)
+        kept = np.random.default_rng(seed).choice(len(splats), budget, replace=False)
+        return splats.take(np.sort(kept))
+    if name == "mini-splatting":
+        weights = pruning.importance(splats, cameras, indoor=indoor)
+        return splats.take(pruning.sample(weights, budget, seed=seed))
     if name == "opacity-area":
-        from benchmarks.baselines.simple import opacity_area
-
-        return opacity_area(splats, budget)
-    assert cameras is not None
-    if name == "lightgaussian":
-        from benchmarks.baselines.lightgaussian import lightgaussian
-
-        return lightgaussian(splats, budget, cameras, progress=tell)
-    if name == "pup":
-        from benchmarks.baselines.pup import pup
-
-        return pup(splats, budget, cameras, progress=tell)
-    from benchmarks.baselines.mini_splatting import mini_splatting
-
-    return mini_splatting(splats, budget, cameras, seed=seed, indoor=indoor, progress=tell)
+        scores = pruning.optical_mass(splats)
+    elif name == "lightgaussian":
+        scores = pruning.global_significance(splats, cameras)
+    else:  # pup in one round; the release has two (`pup.rounds`)
+        scores = sensitivity(splats, cameras)
+    return pruning.keep_best(splats, scores, budget)

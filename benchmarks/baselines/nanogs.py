@@ -65,8 +65,6 @@ def nanogs(splats: Splats, budget: int) -> Splats:
     >>> len(nanogs(scene, 20))
     20
     """
-    if not 1 <= budget <= len(splats):
-        raise InputError(f"budget: expected 1 to {len(splats)}, got {budget}")
     if not splats.finite_rows().all():
         raise InputError("splats: a row is not finite")
     rows = _rows(splats)
@@ -76,10 +74,7 @@ def nanogs(splats: Splats, budget: int) -> Splats:
         i, j = _pairs(rows, min(half, len(rows.means) - budget))
         alone = np.ones(len(rows.means), bool)
         alone[i] = alone[j] = False
-        kept, merged = rows.take(alone), _merged(rows.take(i), rows.take(j))
-        rows = _Rows(
-            *(np.concatenate(p) for p in zip(vars(kept).values(), vars(merged).values(), strict=True))
-        )
+        rows = rows.take(alone).followed_by(_merged(rows.take(i), rows.take(j)))
     return _splats(rows, splats)
 
 

@@ -7,14 +7,12 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.baselines.ranking import keep_best
 from g2ard import _core
-from g2ard.progress import Progress, counter, silent
 from g2ard.rendering.renderer import arrays_of, centred, settings_for, view_of
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
 
-__all__ = ["fisher", "pup", "rounds", "sensitivity"]
+__all__ = ["fisher", "rounds", "sensitivity"]
 
 _FIRST, _TOTAL = 0.2, 0.1
 """Shares kept after the release's first and second round."""
@@ -24,26 +22,21 @@ _SINGULAR = 1e-7
 """Smallest eigenvalue of F with unit diagonal above rounding errors, since pixels are summed in float32."""
 
 
-def fisher(splats: Splats, cameras: Cameras, *, progress: Progress = silent) -> NDArray[np.float64]:
+def fisher(splats: Splats, cameras: Cameras) -> NDArray[np.float64]:
     """Return (N, 6, 6) F = Σ g gᵀ over views, pixels and channels, g = ∂C/∂(mean, log scale)."""
     splats, cameras = centred(splats, cameras)
     settings = settings_for(splats.means)
     views = [view_of(cameras, i, settings) for i in range(len(cameras))]
-    upper = _core.sensitivity(arrays_of(splats), views, settings, counter(progress, "sensitivity"))
+    upper = _core.sensitivity(arrays_of(splats), views, settings)
     out = np.zeros((len(splats), 6, 6))
     rows, columns = np.triu_indices(6)
     out[:, rows, columns] = out[:, columns, rows] = upper
     return out
 
 
-def sensitivity(splats: Splats, cameras: Cameras, *, progress: Progress = silent) -> NDArray[np.float64]:
+def sensitivity(splats: Splats, cameras: Cameras) -> NDArray[np.float64]:
     """Return (N,) log det F at a quarter of the views' size; −∞ if F is singular."""
-    return _log_det(fisher(splats, _quarter(cameras), progress=progress))
-
-
-def pup(splats: Splats, budget: int, cameras: Cameras, *, progress: Progress = silent) -> Splats:
-    """Keep the `budget` Gaussians of highest `sensitivity` in one round (the release has two, `rounds`)."""
-    return keep_best(splats, sensitivity(splats, cameras, progress=progress), budget)
+    return _log_det(fisher(splats, _quarter(cameras)))
 
 
 def rounds(count: int, budget: int) -> list[int]:

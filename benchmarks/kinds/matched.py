@@ -20,14 +20,13 @@ from numpy.typing import NDArray
 
 from benchmarks import baselines
 from benchmarks.baselines.pup import rounds as pup_rounds
-from benchmarks.kinds.methods import METHODS, ROUND_STEPS, Leg, MethodSpec
-from benchmarks.kinds.methods import Matched as Budget
+from benchmarks.kinds.methods import METHODS, ROUND_STEPS, Budget, Leg, MethodSpec
 from benchmarks.kinds.worker import StoredTargets, store_targets
 from benchmarks.process import Usage, measured, splat_transform
 from benchmarks.rows import Row
 from benchmarks.runner import Cell, fingerprint
 from benchmarks.score import pictured, save_jpeg, score
-from benchmarks.study import SceneSpec, Study, checked, key
+from benchmarks.study import SceneSpec, Study, key
 from benchmarks.workspace import Workspace, budget_of
 from g2ard import __version__, io
 from g2ard.config.choices import ADAPT_SCHEDULES, CONVENTIONS, LPIPS_INPUTS, SCHEDULE_NAMES
@@ -66,6 +65,7 @@ class Matched(Study):
     """
 
     METHODS: ClassVar[Mapping[str, Any]] = METHODS
+    DEFAULT: ClassVar[MethodSpec] = METHODS["g2ard"]
     PROCESSES: ClassVar[bool] = True
 
     steps: tuple[int, ...] = key((), least=1, axis=True)
@@ -84,18 +84,6 @@ class Matched(Study):
     def __post_init__(self) -> None:
         if not (self.steps or self.seconds or self.released):
             raise InputError("nothing to measure; give steps, seconds or released")
-
-    @classmethod
-    def method(cls, name: str, values: Mapping[str, Any]) -> MethodSpec:
-        """Return the method of a table, whose keys override those of its `base`."""
-        base = values.get("base", "g2ard")
-        if base not in METHODS:
-            raise InputError(f"method {name}: base: no {base!r}")
-        own = {field: value for field, value in values.items() if field != "base"}
-        try:
-            return replace(METHODS[base], name=name, **checked(MethodSpec, own, {"name"}))
-        except InputError as error:
-            raise InputError(f"method {name}: {error}") from None
 
     def budgets(self, method: MethodSpec) -> list[Budget]:
         """Return the budgets of a method's cells."""
@@ -167,7 +155,6 @@ class Matched(Study):
         folder = place.work.parent
         shared = {
             **pipeline.figures(),
-            "submethod": f"{method.name}-{ratio:g}x-{budget.label.replace(' ', '')}",
             "against": place.scene.targets,
             "count": len(splats),
             "bytes": splats.nbytes,
@@ -440,15 +427,7 @@ class _Pipeline:
         chosen, _, _ = regularizers_for(
             known if method.preset == "auto" else method.preset, prior, paper=papers
         )
-        if method.anchor is not None:
-            chosen = replace(chosen, anchor=method.anchor)
-        if method.shape is not None:
-            chosen = replace(chosen, shape=method.shape, effective_rank=method.shape > 0)
-        if method.effective_rank is not None:
-            chosen = replace(chosen, effective_rank=method.effective_rank)
-        if method.period is not None:
-            chosen = replace(chosen, period=method.period)
-        return asdict(chosen)
+        return asdict(replace(chosen, **method.regularizers))
 
     def counts(self) -> list[int]:
         """Return the count after each round; the last is the budget."""

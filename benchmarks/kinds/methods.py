@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
 
 from benchmarks import baselines
 from benchmarks.study import key
 from g2ard.config.choices import METHODS as SIMPLIFIERS
 from g2ard.config.choices import POLICIES, SCHEDULE_NAMES
 from g2ard.errors import InputError
+from g2ard.stages.recover.anchors import REGULARIZERS
 
-__all__ = ["FINAL_STEPS", "METHODS", "REDUCERS", "ROUND_STEPS", "Leg", "Matched", "MethodSpec"]
+__all__ = ["FINAL_STEPS", "METHODS", "REDUCERS", "ROUND_STEPS", "Budget", "Leg", "MethodSpec"]
 
 REDUCERS = (*SIMPLIFIERS, "no-views", "splat-transform", "splat-transform-adaptive", *baselines.METHODS)
 """Reductions: g2ard's methods, splat-transform, baselines."""
@@ -20,17 +23,11 @@ ROUND_STEPS, FINAL_STEPS = 8_000, 30_000
 
 
 @dataclass(frozen=True)
-class Matched:
-    """The budget of a cell: `amount` steps or seconds, the steps of the method's release, or nothing."""
+class Budget:
+    """The budget of a cell: `amount` "steps" or "seconds", the steps of the method's release, or "none"."""
 
     kind: str
     amount: float = 0.0
-
-    @property
-    def label(self) -> str:
-        """The budget's name in rows and charts."""
-        named = {"steps": f"{self.amount:g} steps", "seconds": f"{self.amount:g} s", "none": "as it is"}
-        return named.get(self.kind, self.kind)
 
 
 @dataclass(frozen=True)
@@ -64,10 +61,7 @@ class MethodSpec:
             the last recovery is matched.
         preset: preset of the regularisers; auto uses the prior's kind if known, or measures it.
         lambdas: weights of the regularisers: "own" or "paper" (`tab:s_recovery`).
-        anchor: overrides the weight of L_anchor.
-        shape: overrides the weight of L_shape; 0 also disables the barrier on effective rank.
-        effective_rank: overrides whether the needle barrier of L_shape is on.
-        period: overrides the steps between applications of the regularisers.
+        regularizers: fields of `Regularizers` that override those weights.
         protection: λ_h of the `paper` policy; 0 disables flags.
         schedule: rates of matched cells; None means the study's.
         released_steps: steps per recovery in the method's release, or of the last one with the paper's
@@ -84,10 +78,7 @@ class MethodSpec:
     shared_start: bool = key(False)
     preset: str = key("auto", choices=("auto", "trained", "lift", "noisy"))
     lambdas: str = key("own", choices=("own", "paper"))
-    anchor: float | None = key(None, least=0)
-    shape: float | None = key(None, least=0)
-    effective_rank: bool | None = key(None)
-    period: int | None = key(None, least=1)
+    regularizers: Mapping[str, Any] = key({})
     protection: float | None = key(None, least=0)
     schedule: str | None = key(None, choices=SCHEDULE_NAMES)
     released_steps: int | None = key(None, least=0)
@@ -96,6 +87,7 @@ class MethodSpec:
     def __post_init__(self) -> None:
         if not 0 < self.k <= 1:
             raise InputError(f"k: expected a share in (0, 1], got {self.k}")
+        replace(REGULARIZERS["lift"], **self.regularizers)  # checks names and values
 
     @property
     def recovers(self) -> bool:
@@ -119,20 +111,19 @@ class MethodSpec:
         return [*(Leg(n, False, share) for n in range(early)), Leg(last, True, 1 - share * early)]
 
 
-_PAPER = MethodSpec(
-    "g2ard-paper",
-    "paper",
-    rounds="paper",
-    lambdas="paper",
-    released_steps=FINAL_STEPS,
-    released_schedule="paper",
-)
 METHODS: dict[str, MethodSpec] = {
     m.name: m
     for m in (
         MethodSpec("g2ard", "default"),
         MethodSpec("g2ard-fast", "fast"),
-        _PAPER,
+        MethodSpec(
+            "g2ard-paper",
+            "paper",
+            rounds="paper",
+            lambdas="paper",
+            released_steps=FINAL_STEPS,
+            released_schedule="paper",
+        ),
         MethodSpec("lightgaussian", "lightgaussian", released_steps=5_000),
         MethodSpec("pup", "pup", rounds="pup", released_steps=5_000),
         MethodSpec("mini-splatting", "mini-splatting", released_steps=15_000),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -16,17 +16,13 @@ from numpy.typing import NDArray
 from benchmarks.rows import Row
 from benchmarks.runner import Cell
 from benchmarks.study import SceneSpec, Study, key
-from benchmarks.synth import City, CityConfig, city
 from benchmarks.workspace import Workspace
 from g2ard.poses import make_pool, plan_pool
-from g2ard.rendering.renderer import Renderer
 from g2ard.scene.cameras import Cameras
-from g2ard.scene.images import load_image
 from g2ard.scene.splats import Splats
 from g2ard.scene.splits import splits_of, states_splits
-from g2ard.scene.targets import Subset, Targets
+from g2ard.scene.targets import Subset, Targets, TeacherRenders
 from g2ard.stages.evaluate import evaluate
-from g2ard.stages.lift import lift
 from g2ard.stages.recover import RecoverConfig, recover
 from g2ard.stages.recover.anchors import REGULARIZERS
 from g2ard.stages.select import CoverageOptions, Selection, select
@@ -41,14 +37,13 @@ _CROWD = 24
 """Held-out views in the crowded part of a pool."""
 
 Rows = NDArray[np.int64]
-Image = NDArray[np.float32]
 
 
 @dataclass(frozen=True)
 class Select(Study):
     """A study of selection policies. Each seed draws a pool; each arm chooses K of its views.
 
-    Scenes are trained scenes, COLMAP folders with photos, or `city`.
+    Scenes are trained scenes, or point clouds with photos.
 
     Args:
         methods: arms: policies, with "+weights" to sample views by the selection's weights, or "pool" for
@@ -59,7 +54,7 @@ class Select(Study):
         draws: random subsets per pool.
         steps: steps per recovery.
         count: Gaussians of the student.
-        candidates: maximum views per pool; at least 420 in the city.
+        candidates: maximum views per pool; at least 420 in a generated city.
         tests: views per scored set.
     """
 
@@ -187,19 +182,6 @@ class Pool:
     crowd: Rows
 
 
-class _Made(Targets):
-    """Images that are made on first use and kept in half precision."""
-
-    def __init__(self, cameras: Cameras, make: Callable[[Cameras, int], Image]) -> None:
-        self.cameras, self._make = cameras, make
-        self._kept: dict[int, NDArray[np.float16]] = {}
-
-    def __getitem__(self, view: int) -> Image:
-        if view not in self._kept:
-            self._kept[view] = np.clip(self._make(self.cameras, view), 0, 1).astype(np.float16)
-        return self._kept[view].astype(np.float32)
-
-
 class Universe(Workspace):
     """A scene with all views for pools and tests, `shown`, and `outside` views.
 
@@ -207,25 +189,6 @@ class Universe(Workspace):
     """
 
     study: Select
-
-    @cached_property
-    def town(self) -> City:
-        """The generated city."""
-        width = self.study.size or 256
-        return city(CityConfig(**{**(self.scene.synth or {}), "size": (width, round(width * 3 / 4))}))
-
-    @cached_property
-    def lifted(self) -> bool:
-        """Whether the prior is lifted from a point cloud."""
-        return self.scene.synth is not None or super().lifted
-
-    @cached_property
-    def splats(self) -> Splats:
-        """The scene that views are selected for."""
-        if self.scene.synth is None:
-            return super().splats
-        scan = self.town.points()
-        return lift(scan.positions, scan.colors)
 
     @cached_property
     def student(self) -> Splats:
@@ -254,11 +217,10 @@ class Universe(Workspace):
 
     @cached_property
     def _sets(self) -> tuple[Targets, Rows, Targets]:
-        if self.scene.synth:
-            return self._city()
         return self._photos() if self.lifted else self._trained()
 
     def _trained(self) -> tuple[Targets, Rows, Targets]:
+        """Return renders: outside are nearer views of an object, or an orbit around other scenes."""
         tests, size = self.study.tests, self.study.size
         planned = plan_pool(self.splats, 7 * self.candidates, seed=1)
         universe = planned.cameras.resized(size)
@@ -267,36 +229,32 @@ class Universe(Workspace):
             outside = _nearer(self.splats, universe.take(_evenly(rows[4::8], tests)))
         else:
             outside = make_pool(self.splats, tests, kind="orbit", seed=2).resized(size)
-        renderer = Renderer(self.splats)
-
-        def image(cameras: Cameras, view: int) -> Image:
-            return renderer.image(cameras[view])
-
-        shown = _Made(universe, image)
-        return shown, _evenly(rows[::8], tests), _Made(outside, image)
-
-    def _city(self) -> tuple[Targets, Rows, Targets]:
-        """Return views of the generated city, whose photos are rendered on first use."""
-        town, tests = self.town, self.study.tests
-        universe, outside = town.views["train"], town.views["ood"]
-        shown = _Made(universe, town.photo)
-        far = _Made(outside.take(_evenly(np.arange(len(outside)), tests)), town.photo)
-        return shown, _evenly(np.arange(len(universe)), tests), far
+        shown, far = (TeacherRenders(self.splats, views, lazy=True) for views in (universe, outside))
+        return shown, _evenly(rows[::8], tests), far
 
     def _photos(self) -> tuple[Targets, Rows, Targets]:
-        """Return photos: outside are the eighth at one end of the site, held out the tests or every 8th."""
-        folder = self.place / (self.scene.train or self.scene.prior)
-        found = self.read(folder)
-        stated = states_splits(folder, found.splits)
-        words = splits_of(folder, found.cameras.names, found.splits)
-        known = np.array([word in ("train", "test") for word in words])
+        """Return photos: outside are the scene's views to score, or the eighth at one end of the site.
+
+        With views to score, the held-out ones are spread evenly; otherwise they are the stated tests, or
+        every 8th.
+        """
+        path = self.place / (self.scene.train or self.scene.prior)
+        found = self.read(path)
+        stated = states_splits(path, found.splits)
+        words = np.array(splits_of(path, found.cameras.names, found.splits))
+        known = np.isin(words, ("train", "test"))
         cameras = found.cameras.take(known).resized(self.study.size)
-        tests = np.array(words)[known] == "test"
+        rows = np.arange(len(cameras))
+        if self.scene.score:
+            tests = self.study.tests
+            (outside,) = self.scored.values()
+            outside = outside.take(_evenly(np.arange(len(outside)), tests))
+            return self.targets(cameras), _evenly(rows, tests), self.targets(outside)
         centred = cameras.positions - cameras.positions.mean(0)
         along = np.argsort(centred @ np.linalg.svd(centred, full_matrices=False)[2][0])
         far, rest = along[: len(along) // 8], np.sort(along[len(along) // 8 :])
-        held = np.flatnonzero(tests[rest]) if stated else np.arange(0, len(rest), 8)
-        return _Made(cameras.take(rest), load_image), held, _Made(cameras.take(far), load_image)
+        held = np.flatnonzero(words[known][rest] == "test") if stated else np.arange(0, len(rest), 8)
+        return self.targets(cameras.take(rest)), held, self.targets(cameras.take(far))
 
 
 def pool_of(universe: Universe, kind: str, seed: int) -> Pool:

@@ -14,7 +14,7 @@ from benchmarks.process import measured, splat_transform
 from benchmarks.rows import Row
 from benchmarks.runner import Cell
 from benchmarks.score import score
-from benchmarks.study import SceneSpec, Study, key
+from benchmarks.study import SceneSpec, Study
 from benchmarks.workspace import Workspace, reduced
 from g2ard import io
 from g2ard.io.scene_formats import FORMATS
@@ -31,12 +31,9 @@ class Ship(Study):
 
     Args:
         methods: formats, or "splat-transform sog" for the SOG of that program.
-        splat_transform: path of splat-transform; None uses PATH.
     """
 
     METHODS: ClassVar[Mapping[str, Any]] = {name: name for name in (*FORMATS, PEER)}
-
-    splat_transform: str | None = key(None, axis=True)
 
     def cells(self, scene: SceneSpec, work: Path) -> Iterator[Cell]:
         """Yield a cell per ratio and format; .ply comes first, since `lost` is relative to it."""
@@ -80,5 +77,4 @@ class Ship(Study):
             return time.process_time() - began
         source = path.with_name("source.ply")
         io.write_splats(source, splats)
-        command = splat_transform(str(source), str(path), program=self.splat_transform)
-        return measured(command, path.with_name("log")).cpu_s
+        return measured(splat_transform(str(source), str(path)), path.with_name("log")).cpu_s

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import shutil
 import sys
 import tempfile
 from collections.abc import Iterator, Mapping
@@ -24,6 +26,13 @@ from g2ard.scene.splats import Splats
 __all__ = ["Simplify"]
 
 _SPARK = ["node", str(Path(baselines.__file__).with_name("spark.mjs"))]
+_FLAGS = {
+    "default": [],
+    "no-views": ["--no-views"],
+    "fast": ["--method", "fast"],
+    "paper": ["--method", "paper"],
+}
+"""Method of g2ard → its flags."""
 
 
 @dataclass(frozen=True)
@@ -36,14 +45,19 @@ class Simplify(Study):
 
     Args:
         protocol: kinds of views to score: "pool", "standing" (near and standing views), "anywhere", or "all".
-        splat_transform: path of splat-transform; None uses PATH.
     """
 
     METHODS: ClassVar[Mapping[str, Any]] = {name: name for name in (*REDUCERS, "spark")}
     PROCESSES: ClassVar[bool] = True
 
     protocol: str = key("all", choices=tuple(PROTOCOLS), axis=True)
-    splat_transform: str | None = key(None, axis=True)
+
+    @classmethod
+    def default_methods(cls) -> list[str]:
+        """Return all methods, except other programs that are not installed."""
+        missing = () if shutil.which("splat-transform") else ("splat-transform", "splat-transform-adaptive")
+        spark = bool(shutil.which("node")) and version_of(*_SPARK).startswith("Spark")
+        return [name for name in cls.METHODS if name not in missing and (spark or name != "spark")]
 
     def cells(self, scene: SceneSpec, work: Path) -> Iterator[Cell]:
         """Yield a cell per ratio and method."""
@@ -59,11 +73,11 @@ class Simplify(Study):
         for kind in kinds:
             row = {"views_kind": kind, "input_count": len(place.splats), "budget": budget}
             if method.startswith("splat-transform"):
-                row["version"] = version_of(splat_transform(program=self.splat_transform)[0])
+                row["version"] = version_of(splat_transform()[0])
             if method == "spark":
                 row["version"] = version_of(*_SPARK)
             if kind not in place.kinds_of_views:
-                yield {**row, "error": f"no place for {kind} views"}
+                yield {**row, "views": 0}  # no place for them in this scene
                 continue
             own = kind != "pool" and method == "default" and place.scene.train is None
             if own not in ran:
@@ -83,16 +97,15 @@ class Simplify(Study):
         source, python = str(place.prior_file), [sys.executable, "-m"]
         if method.startswith("splat-transform"):
             mode = "--decimate-adaptive" if method.endswith("adaptive") else "--decimate"
-            return splat_transform(source, mode, str(budget), str(output), program=self.splat_transform)
+            return splat_transform(source, mode, str(budget), str(output))
         if method == "spark":
             return [*_SPARK, source, str(budget), str(output)]
         if method in baselines.METHODS:
-            views = ["--views", str(place.train)] if method in baselines.NEED_VIEWS else []
-            return [*python, "benchmarks.baselines", method, source, str(budget), str(output), *views]
-        flags = {
-            "default": [] if own else ["--views", str(place.train)],
-            "no-views": ["--no-views"],
-            "fast": ["--method", "fast"],
-            "paper": ["--method", "paper"],
-        }[method]
-        return [*python, "g2ard", "simplify", source, "-n", str(budget), "-o", str(output), "-q", *flags]
+            job = {"kind": "reduce", "method": method, "count": budget, "seed": 0, "scene": source}
+            job |= {"views": str(place.train), "indoor": place.scene.indoor, "output": str(output)}
+            path = output.with_name("job.json")
+            path.write_text(json.dumps(job), encoding="utf-8", newline="\n")
+            return [*python, "benchmarks.kinds.worker", str(path)]
+        views = ["--views", str(place.train)] if method == "default" and not own else []
+        command = [*python, "g2ard", "simplify", source, "-n", str(budget), "-o", str(output), "-q"]
+        return [*command, *_FLAGS[method], *views]

@@ -8,9 +8,8 @@ import pytest
 
 from benchmarks.rows import Row, read_rows
 from benchmarks.runner import run
-from benchmarks.standing import given_views, standing_targets, standing_views
 from benchmarks.study import DEFINITIONS, SceneSpec, read_study
-from benchmarks.views import anywhere_views
+from benchmarks.views import anywhere_views, given_views, hidden_targets, standing_views
 from g2ard import io
 from g2ard.poses import make_pool
 from helpers.scenes import around, checkered_ball
@@ -40,18 +39,20 @@ def test_measures_writes_and_resumes(tmp_path: Path, monkeypatch: pytest.MonkeyP
         assert 8 < row["psnr"] < 60
         assert 0 < row["cpu_s"] < 60
         assert 20 < row["peak_mb"] < 2000
-    again = ask(scene, tmp_path / "out", "default,splat-transform", splat_transform=str(tmp_path / "none"))
+    monkeypatch.setenv("PATH", str(tmp_path))
+    again = ask(scene, tmp_path / "out", "default,splat-transform")
     assert again[0] == rows[0]  # nothing was measured twice
-    assert "no such program" in again[1]["error"]
-    program = tmp_path / "broken"
+    assert "not on PATH" in again[1]["error"]
+    assert "splat-transform" not in read_study(DEFINITIONS / "simplify.toml").methods
+    program = tmp_path / "splat-transform"
     program.write_text("#!/bin/sh\necho it broke 1.2 >&2\nexit 7\n")
     program.chmod(0o755)
-    (failed,) = ask(scene, tmp_path / "out", "splat-transform", splat_transform=str(program))
+    (failed,) = ask(scene, tmp_path / "out", "splat-transform")
     assert failed["error"] == "exit status 7: it broke 1.2"
     assert len(read_rows(tmp_path / "out" / "rows.csv")) == 6  # in the old failure's place
-    monkeypatch.delenv("NODE_PATH", raising=False)
-    (absent,) = ask(scene, tmp_path / "out", "spark")
-    assert "NODE_PATH" in absent["error"] or "node" in absent["error"]
+    made = read_study(DEFINITIONS / "simplify.toml").methods
+    assert "splat-transform" in made
+    assert "spark" not in made
 
 
 @needs_processes
@@ -89,7 +90,8 @@ def test_a_standing_file_beside_the_scene_takes_precedence(tmp_path: Path) -> No
     turned = away.viewmats.copy()
     turned[0] = np.diag([-1.0, 1, -1, 1]) @ cameras.viewmats[0]  # looks the other way
     io.write_views(folder / "standing.json", replace(cameras, viewmats=turned))
-    targets = standing_targets(splats, folder / "ball.ply", size=32)
+    options = {"seed": 0, "size": 32, "background": (0.0, 0.0, 0.0)}
+    targets = hidden_targets(splats, folder / "ball.ply", ("standing",), **options)
     assert len(targets["standing"].cameras) == 4  # what shows nothing is left out
     assert targets["near"].cameras.widths.max() == 32
 
