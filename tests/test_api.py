@@ -13,9 +13,9 @@ import pytest
 import g2ard
 from g2ard.io import Points
 from g2ard.report.base import Report
-from g2ard.scene.splats import Splats
+from g2ard.scene.splats import ARRAYS, Splats
 from helpers.commands import CommandLine, succeeds
-from helpers.scenes import ARRAYS, around, checkered_ball
+from helpers.scenes import around, checkered_ball
 
 BALL = checkered_ball(1500)
 

@@ -43,11 +43,11 @@ def told(report: dict[str, Any], *, verbose: bool = False) -> list[str]:
     regularisers."""
     from g2ard.jobs.packing import score_lines
     from g2ard.report.kinds import KindScore
-    from g2ard.stages.recover.report import RecoverReport, outcome, unregularized_rounds
+    from g2ard.stages.recover.report import RecoverReport, outcome, unregularized
 
     rounds = [[RecoverReport.of(done) for done in entry.get("recover", [])] for entry in report["rounds"]]
     lines = [outcome(one) for entry in rounds for one in entry]
-    lines += [unregularized_rounds(rounds)] if verbose else []
+    lines += [unregularized(rounds)] if verbose else []
     lines += [loss(KindScore.of(kind)) for kind in report["kinds"]]
     lines += report["causes"]
     if report["unseen"] and report["unseen"] > _FEW:

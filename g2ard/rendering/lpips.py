@@ -48,7 +48,7 @@ class Lpips:
         try:
             for i in _CONV[net]:
                 self._layers[i] = (backbone[f"features.{i}.weight"], backbone[f"features.{i}.bias"])
-            self._linear = [_linear(linear, i) for i in range(5)]
+            self._linear = [linear[f"lin{i}.model.1.weight"].reshape(1, -1, 1, 1) for i in range(5)]
         except KeyError as error:
             raise InputError(f"LPIPS {net}: the weights lack {error}") from None
 
@@ -60,7 +60,7 @@ class Lpips:
             total = 0.0
             for a, b, weight in zip(self._maps(image), self._maps(target), self._linear, strict=True):
                 difference = (_unit(a) - _unit(b)) ** 2
-                total += float((difference * weight.reshape(1, -1, 1, 1)).sum(1).mean())
+                total += float((difference * weight).sum(1).mean())
         return total
 
     def _maps(self, image: NDArray[np.float32]) -> list[Any]:
@@ -74,8 +74,7 @@ class Lpips:
         for i in range(_TAPS[self.net][-1] + 1):
             if i in self._layers:
                 weight, bias = self._layers[i]
-                stride = _CONV[self.net][i][0]
-                padding = _CONV[self.net][i][1]
+                stride, padding = _CONV[self.net][i]
                 x = functional.conv2d(x, weight, bias, stride=stride, padding=padding)
             elif i in _POOL[self.net]:
                 x = functional.max_pool2d(x, _POOL[self.net][i], stride=2)
@@ -119,10 +118,6 @@ def load_lpips(folder: Path, *, scaled: bool = True) -> dict[str, Lpips]:
             "no LPIPS weights (alexnet*.pth and alex.pth, or vgg16*.pth and vgg.pth)", path=folder
         )
     return out
-
-
-def _linear(weights: dict[str, Any], i: int) -> Any:
-    return weights[f"lin{i}.model.1.weight"].reshape(-1)
 
 
 def _unit(x: Any) -> Any:

@@ -20,6 +20,10 @@ _LARGEST = 1e12
 _MEDIAN_OF = 16
 """Views used for medians over all views."""
 
+_SHAPES = {"viewmats": (4, 4), "Ks": (3, 3), "widths": (), "heights": (), "distortions": (5,)}
+"""Arrays of `Cameras` and their shapes per view."""
+_TUPLES = ("names", "image_paths", "mask_paths")
+
 
 @dataclass(frozen=True, eq=False)
 class Camera:
@@ -127,16 +131,10 @@ class Cameras:
             object.__setattr__(self, "mask_paths", (None,) * n)
         if not len(self.distortions):
             object.__setattr__(self, "distortions", np.zeros((n, 5)))
-        for name, shape in (
-            ("viewmats", (n, 4, 4)),
-            ("Ks", (n, 3, 3)),
-            ("widths", (n,)),
-            ("heights", (n,)),
-            ("distortions", (n, 5)),
-        ):
+        for name, shape in _SHAPES.items():
             got = getattr(self, name).shape
-            require(name, got, got == shape, f"shape {shape}")
-        for name in ("names", "image_paths", "mask_paths"):
+            require(name, got, got == (n, *shape), f"shape {(n, *shape)}")
+        for name in _TUPLES:
             require(name, len(getattr(self, name)), len(getattr(self, name)) == n, str(n))
         for i in range(n):
             given = (self.viewmats[i], self.Ks[i], self.distortions[i])
@@ -224,17 +222,9 @@ class Cameras:
         """Return the views that `index` selects (a mask or indices), in its order."""
         index = np.asarray(index)
         rows = np.flatnonzero(index) if index.dtype == bool else index.astype(int).reshape(-1)
-        return replace(
-            self,
-            viewmats=self.viewmats[rows],
-            Ks=self.Ks[rows],
-            widths=self.widths[rows],
-            heights=self.heights[rows],
-            names=tuple(self.names[i] for i in rows),
-            image_paths=tuple(self.image_paths[i] for i in rows),
-            mask_paths=tuple(self.mask_paths[i] for i in rows),
-            distortions=self.distortions[rows],
-        )
+        arrays: dict[str, Any] = {name: getattr(self, name)[rows] for name in _SHAPES}
+        tuples: dict[str, Any] = {name: tuple(getattr(self, name)[i] for i in rows) for name in _TUPLES}
+        return replace(self, **arrays, **tuples)
 
     def resized(self, longest: int | None) -> Cameras:
         """Return the views with their longer side shrunk to at most `longest` pixels (None keeps them)."""

@@ -23,6 +23,9 @@ DRAWN_LOGIT = -5.54
 _UNIT_SLACK = 1e-6
 """Deviation of a quaternion's length from 1 that counts as rounding: a few ulps of float32."""
 
+ARRAYS = ("means", "quats", "scales", "logit_opacities", "sh0", "shN")
+"""Names of the arrays with a row per Gaussian."""
+
 _DEGREE_OF_REST = {0: 0, 3: 1, 8: 2, 15: 3}
 
 
@@ -161,7 +164,7 @@ class Splats:
     @cached_property
     def _digest(self) -> str:
         digest = hashlib.sha256()
-        for name in ("means", "quats", "scales", "logit_opacities", "sh0", "shN", "offset"):
+        for name in (*ARRAYS, "offset"):
             digest.update(np.ascontiguousarray(getattr(self, name)).tobytes())
         if self.antialiased:
             digest.update(b"antialiased")
@@ -169,15 +172,7 @@ class Splats:
 
     def take(self, index: Any) -> Splats:
         """Return the rows that `index` selects (a mask, a slice or indices), in its order."""
-        return replace(
-            self,
-            means=self.means[index],
-            quats=self.quats[index],
-            scales=self.scales[index],
-            logit_opacities=self.logit_opacities[index],
-            sh0=self.sh0[index],
-            shN=self.shN[index],
-        )
+        return replace(self, **{name: getattr(self, name)[index] for name in ARRAYS})
 
     def with_sh_degree(self, degree: int) -> Splats:
         """Return the scene with higher bands cut off or padded with zeros.

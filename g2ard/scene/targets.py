@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,11 +13,10 @@ from numpy.typing import ArrayLike, NDArray
 from g2ard.config.choices import BLACK, Colour
 from g2ard.errors import InputError
 from g2ard.progress import Progress, plural, silent
+from g2ard.rendering.renderer import RasterSettings, Renderer
 from g2ard.scene.cameras import Cameras
+from g2ard.scene.images import load_image, load_mask
 from g2ard.scene.splats import Splats
-
-if TYPE_CHECKING:
-    from g2ard.rendering.renderer import RasterSettings, Renderer
 
 CACHE_BYTES = 2_000_000_000
 """Bytes of targets cached in memory; further ones are loaded or rendered again on each access."""
@@ -194,14 +193,10 @@ class Photos(_Cached):
     def mask(self, view: int) -> NDArray[np.bool_] | None:
         """Return the mask of valid pixels, or None."""
         if view not in self._masks:
-            from g2ard.scene.images import load_mask
-
             self._masks[view] = load_mask(self.cameras, view)
         return self._masks[view]
 
     def _make(self, view: int) -> NDArray[np.uint8]:
-        from g2ard.scene.images import load_image
-
         return np.rint(load_image(self.cameras, view, self._background) * 255).astype(np.uint8)
 
     def __getitem__(self, view: int) -> NDArray[np.float32]:
@@ -268,8 +263,6 @@ class TeacherRenders(_Cached):
 
     def _make(self, view: int) -> NDArray[np.float32]:
         if self._renderer is None:
-            from g2ard.rendering.renderer import Renderer
-
             self._renderer = Renderer(self._teacher, background=self._background, settings=self._settings)
         return self._renderer.clipped(self.cameras[view])
 

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from g2ard.config.choices import RenderModel
 from g2ard.errors import InputError
-from g2ard.scene.splats import Splats
+from g2ard.scene.splats import ARRAYS, Splats
 
 _FAR = 16.0
 """Distance in extents beyond which a move goes into `offset`, so that float32 means keep their precision."""
@@ -203,8 +203,7 @@ def join(scenes: Sequence[Splats]) -> Splats:
     model = one_model([scene.render_model for scene in scenes])
     degree = max(scene.sh_degree for scene in scenes)
     parts = [scene.recentred(scenes[0].offset).with_sh_degree(degree) for scene in scenes]
-    names = ("means", "quats", "scales", "logit_opacities", "sh0", "shN")
-    together = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
+    together = {name: np.concatenate([getattr(part, name) for part in parts]) for name in ARRAYS}
     return Splats(**together, offset=scenes[0].offset, render_model=model)
 
 

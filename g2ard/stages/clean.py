@@ -213,19 +213,11 @@ def _giants(splats: Splats) -> NDArray[np.bool_]:
     middle = np.median(means, axis=0)
     radius = float(np.percentile(np.linalg.norm(means - middle, axis=1), 99))
     large = np.flatnonzero(splats.scales.max(axis=1) > radius)
+    local = np.einsum("nji,nj->ni", rotation_matrices(splats.quats[large]), middle - means[large])
+    local /= np.maximum(splats.scales[large].astype(np.float64), 1e-30)
     out = np.zeros(len(splats), bool)
-    if len(large):
-        out[large[_mahalanobis(splats, large, middle) <= _REACH]] = True
+    out[large[np.linalg.norm(local, axis=1) <= _REACH]] = True
     return out
-
-
-def _mahalanobis(splats: Splats, rows: NDArray[np.intp], points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the (n,) Mahalanobis distances √((p − μ)ᵀ Σ⁻¹ (p − μ)) of the given rows."""
-    local = np.einsum(
-        "nji,nj->ni", rotation_matrices(splats.quats[rows]), points - splats.means[rows].astype(np.float64)
-    )
-    local /= np.maximum(splats.scales[rows].astype(np.float64), 1e-30)
-    return np.sqrt((local * local).sum(axis=1))
 
 
 def _needles(splats: Splats, rest: NDArray[np.bool_]) -> NDArray[np.bool_]:

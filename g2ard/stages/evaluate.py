@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -12,12 +12,10 @@ from g2ard.config.choices import BLACK, Colour
 from g2ard.progress import Progress, plural, silent
 from g2ard.rendering.lpips import Lpips
 from g2ard.rendering.metrics import psnr, ssim
+from g2ard.rendering.renderer import RasterSettings, Renderer
 from g2ard.scene.images import as_saved
 from g2ard.scene.splats import Splats
 from g2ard.scene.targets import Targets, against_of, mask_of
-
-if TYPE_CHECKING:
-    from g2ard.rendering.renderer import RasterSettings
 
 
 @dataclass(frozen=True)
@@ -117,8 +115,6 @@ def evaluate(
     Raises:
         InputError: a photo cannot be read.
     """
-    from g2ard.rendering.renderer import Renderer
-
     cameras = targets.cameras
     renderer = Renderer(splats, background=background, settings=settings)
     scores = []

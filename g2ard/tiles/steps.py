@@ -28,13 +28,13 @@ from numpy.typing import NDArray
 
 from g2ard import _core
 from g2ard.rendering.renderer import RasterSettings, view_of
-from g2ard.rendering.visibility import CONVERGED, NEAR, ROUND, spread
+from g2ard.rendering.visibility import CONVERGED, NEAR, ROUND, SampledVisibility, spread
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.prepared import PreparedScene, as_prepared, finite_rows_of
 from g2ard.scene.splats import Splats
 from g2ard.scene.transform import join
 from g2ard.stages.simplify import SimplifyConfig, round_counts, simplify
-from g2ard.stages.simplify.pairs import RowVisibility, emphasised, splats_of
+from g2ard.stages.simplify.pairs import emphasised, splats_of
 from g2ard.tiles.executor import Workers
 from g2ard.tiles.store import TileStore
 from g2ard.tiles.tasks import (
@@ -154,7 +154,7 @@ def visibility(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
     pixel_size = pixel_size * np.float32(arguments["shrunk"])  # in pixels of the full image
     pixel = _median(pixel_size[np.isfinite(pixel_size) & (pixel_size > 0)])
     frame = _with_pixel_size(arguments["frame"], 1.0 if math.isnan(pixel) else pixel)
-    tile = _merging(own, _config(arguments), frame, RowVisibility(weight, pixel_size))
+    tile = _merging(own, _config(arguments), frame, SampledVisibility(weight, pixel_size))
     return {
         "weight": weight,
         "pixel_size": pixel_size,
@@ -292,7 +292,7 @@ def _merging(
     scene: PreparedScene,
     config: SimplifyConfig,
     frame: _core.TileFrame,
-    visibility: RowVisibility | None,
+    visibility: SampledVisibility | None,
 ) -> _core.TileMerging:
     config = config.resolved("default")
     seen = None if visibility is None else emphasised(scene, visibility, config)
@@ -307,7 +307,9 @@ def _with_pixel_size(frame: Sequence[float], pixel_size: float) -> _core.TileFra
 
 def _seen_tile(scene: PreparedScene, arguments: Arguments, inputs: Inputs) -> _core.TileMerging:
     seen = (
-        RowVisibility(*load(inputs["visibility"], "weight", "pixel_size")) if "visibility" in inputs else None
+        SampledVisibility(*load(inputs["visibility"], "weight", "pixel_size"))
+        if "visibility" in inputs
+        else None
     )
     return _merging(scene, _config(arguments), _core.TileFrame(*arguments["frame"]), seen)
 

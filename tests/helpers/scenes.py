@@ -5,10 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from g2ard.scene.cameras import Cameras, look_at
-from g2ard.scene.splats import Splats
-
-ARRAYS = ("means", "quats", "scales", "logit_opacities", "sh0", "shN")
-"""A scene's arrays."""
+from g2ard.scene.splats import ARRAYS, Splats
 
 
 def assert_same_bits(a: Splats, b: Splats) -> None:

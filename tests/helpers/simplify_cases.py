@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from g2ard.scene.splats import Splats, unit_quats
-from helpers.scenes import ARRAYS
+from g2ard.scene.splats import ARRAYS, Splats, unit_quats
 
 
 def scene(n=2000, rest=3, seed=0, dtype=np.float32):

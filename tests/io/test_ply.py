@@ -11,9 +11,8 @@ from plyfile import PlyData
 from g2ard.errors import InputError
 from g2ard.io import kind, read_scene, read_splats, write_splats
 from g2ard.io.sanitize import LOG_SCALE_LIMIT, LOGIT_LIMIT
-from g2ard.scene.splats import DRAWN_LOGIT, Splats
+from g2ard.scene.splats import ARRAYS, DRAWN_LOGIT, Splats
 from helpers.ply_files import columns, save, scene
-from helpers.scenes import ARRAYS
 
 
 def assert_same(a: Splats, b: Splats, rtol: float = 2e-6) -> None:

@@ -10,9 +10,8 @@ import pytest
 from g2ard.errors import InputError
 from g2ard.io import open_stream, read_scene, write_splats
 from g2ard.levels import Cut, save_levels
-from g2ard.scene.splats import Splats
+from g2ard.scene.splats import ARRAYS, Splats
 from helpers.ply_files import columns, save, scene
-from helpers.scenes import ARRAYS
 from helpers.sog_files import folder, parts
 
 

@@ -13,6 +13,7 @@ from g2ard.errors import InputError
 from g2ard.io import write_splats, write_views
 from g2ard.pipeline import DistillConfig, distill
 from g2ard.scene.cameras import Cameras, look_at
+from g2ard.scene.splats import ARRAYS
 from g2ard.scene.targets import TeacherRenders
 from g2ard.stages.recover import RecoverConfig
 from g2ard.stages.recover.schedule import TUNED
@@ -20,7 +21,7 @@ from g2ard.stages.select import select
 from g2ard.stages.simplify import SimplifyConfig
 from helpers.commands import CommandLine, refused, succeeds
 from helpers.interruptions import interrupt_at
-from helpers.scenes import ARRAYS, around, assert_same_bits, checkered_ball
+from helpers.scenes import around, assert_same_bits, checkered_ball
 
 PRIOR = checkered_ball(1500)
 SHORT = DistillConfig(simplify=SimplifyConfig(method="paper"), recover=RecoverConfig(steps=20))

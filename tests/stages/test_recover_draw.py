@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from g2ard.errors import InputError
 from g2ard.io import read_splats, write_splats, write_views
-from g2ard.scene.splats import Splats
+from g2ard.scene.splats import ARRAYS, Splats
 from g2ard.scene.targets import TeacherRenders
 from g2ard.stages.evaluate import evaluate
 from g2ard.stages.recover import RecoverConfig, recover
@@ -20,7 +20,7 @@ from g2ard.stages.recover.draw import checked_weights, drawn
 from g2ard.stages.simplify import simplify
 from helpers.commands import succeeds
 from helpers.interruptions import press_ctrl_c_at
-from helpers.scenes import ARRAYS, around, checkered_ball
+from helpers.scenes import around, checkered_ball
 
 VIEWS = around()
 TEACHER = checkered_ball(1500)

@@ -8,12 +8,13 @@ from typing import Any
 import numpy as np
 import pytest
 
+from g2ard.config.choices import POLICIES
 from g2ard.errors import InputError
 from g2ard.io import read_view_set, write_splats, write_views
 from g2ard.progress import plural
 from g2ard.scene.cameras import Cameras, look_at
 from g2ard.scene.splats import Splats
-from g2ard.stages.select import POLICIES, CoverageOptions, select
+from g2ard.stages.select import CoverageOptions, select
 from helpers.commands import CommandLine
 from helpers.scenes import around, checkered_ball
 

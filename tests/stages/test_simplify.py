@@ -6,10 +6,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from g2ard.config.choices import METHODS
 from g2ard.errors import InputError
-from g2ard.scene.splats import Splats
-from g2ard.stages.simplify import METHODS, SimplifyConfig, round_counts, simplify
-from helpers.scenes import ARRAYS, assert_same_bits
+from g2ard.scene.splats import ARRAYS, Splats
+from g2ard.stages.simplify import SimplifyConfig, round_counts, simplify
+from helpers.scenes import assert_same_bits
 from helpers.simplify_cases import all_alike, assert_sound, scene
 from helpers.threads import on_threads
 

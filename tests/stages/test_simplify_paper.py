@@ -3,10 +3,9 @@
 import numpy as np
 import pytest
 
-from g2ard.scene.splats import Splats
+from g2ard.scene.splats import ARRAYS, Splats
 from g2ard.scene.transform import join
 from g2ard.stages.simplify import SimplifyConfig, flag, round_counts, simplify
-from helpers.scenes import ARRAYS
 from helpers.simplify_cases import assert_kept, assert_sound, scene
 from reference import simplify as naive
 

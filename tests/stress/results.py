@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard import _core, io
+from g2ard.config.choices import METHODS
 from g2ard.rendering import visibility
 from g2ard.rendering.renderer import RasterSettings, Renderer, arrays_of, view_of
 from g2ard.scene.cameras import Cameras
@@ -31,7 +32,7 @@ from g2ard.scene.targets import TeacherRenders
 from g2ard.stages.recover import RecoverConfig, recover
 from g2ard.stages.recover.anchors import REGULARIZERS
 from g2ard.stages.select import CoverageOptions, select
-from g2ard.stages.simplify import METHODS, flag, simplify
+from g2ard.stages.simplify import flag, simplify
 from helpers.scenes import around, checkered_ball
 
 __all__ = ["lines", "random_scene"]

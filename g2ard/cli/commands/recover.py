@@ -127,7 +127,7 @@ def recover(
         run.write(output, result.splats)
     if (told := outcome(result.report)) is not None:
         run.say(told)
-    if run.verbose and (told := unregularized(result.report)) is not None:
+    if run.verbose and (told := unregularized([[result.report]])) is not None:
         run.say(told)
     kinds: tuple[KindScore, ...] = ()
     pool, _ = load_split_views(views, "all", unpictured=dense is not None)

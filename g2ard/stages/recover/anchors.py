@@ -140,11 +140,6 @@ class Anchors:
             r_perp=np.maximum(scales[:, 2], floor).astype(np.float32),
         )
 
-    def displacements(self, means: NDArray[np.float32]) -> NDArray[np.float64]:
-        """Return (N, 3) δ̃ = R̄ᵀ(μ − μ̄): two tangential components, then the normal one."""
-        delta = means.astype(np.float64) - self.means
-        return np.einsum("nji,nj->ni", self.frames.astype(np.float64), delta)
-
 
 def effective_rank(scales: NDArray[np.float32]) -> NDArray[np.float64]:
     """Return (N,) exp(−Σ q log q), q = s/Σs, in [1, 3].
@@ -163,7 +158,9 @@ def needle(scales: NDArray[np.float32]) -> float:
 
 
 def drift95(anchors: Anchors, means: NDArray[np.float32]) -> float:
-    """Return the 95th percentile of |δ̃₃| / r⊥: distances from the surface in thicknesses."""
+    """Return the 95th percentile of |δ̃₃| / r⊥, δ̃ = R̄ᵀ(μ − μ̄): distances from the surface in thicknesses."""
     if not len(means):
         return 0.0
-    return float(np.percentile(np.abs(anchors.displacements(means)[:, 2]) / anchors.r_perp, 95))
+    delta = means.astype(np.float64) - anchors.means
+    local = np.einsum("nji,nj->ni", anchors.frames.astype(np.float64), delta)
+    return float(np.percentile(np.abs(local[:, 2]) / anchors.r_perp, 95))

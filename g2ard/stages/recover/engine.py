@@ -69,16 +69,22 @@ class Engine(Protocol):
         *,
         regularize: bool,
         mask: NDArray[np.bool_] | None = None,
-    ) -> float: ...
+    ) -> float:
+        """Take one optimiser step on one view; return its photometric loss."""
 
-    def splats(self) -> Splats: ...
+    def splats(self) -> Splats:
+        """Return the current scene, with normalised quaternions."""
 
-    def state(self) -> dict[str, NDArray[Any]]: ...
+    def state(self) -> dict[str, NDArray[Any]]:
+        """Return everything that a bitwise resume needs."""
 
-    def load(self, state: dict[str, NDArray[Any]]) -> None: ...
+    def load(self, state: dict[str, NDArray[Any]]) -> None:
+        """Restore a `state`."""
 
     @property
-    def counts(self) -> NDArray[Any]: ...
+    def counts(self) -> NDArray[Any]:
+        """Number of steps that each Gaussian has taken, (N,)."""
 
     @property
-    def skipped(self) -> int: ...
+    def skipped(self) -> int:
+        """Number of single-Gaussian steps skipped because a gradient was not finite."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -42,7 +43,6 @@ class FusedEngine:
         regularize: bool,
         mask: NDArray[np.bool_] | None = None,
     ) -> float:
-        """Take one optimiser step on one view; return its photometric loss."""
         objective = self._objective
         loss, _ = self._trainer.step(
             view_of(objective.cameras, view, objective.settings),
@@ -55,36 +55,30 @@ class FusedEngine:
         return loss
 
     def splats(self) -> Splats:
-        """Return the current scene, with normalised quaternions."""
         means, quats, log_scales, logit_opacities, sh0, shN = self._trainer.arrays()
         length = np.linalg.norm(quats, axis=1, keepdims=True)
         quats = np.where(length > 0, quats / np.where(length > 0, length, 1), [1.0, 0.0, 0.0, 0.0])
-        return Splats(
+        return replace(
+            self._objective.start,
             means=means,
             quats=quats.astype(np.float32),
             scales=np.exp(log_scales.astype(np.float64)).astype(np.float32),
             logit_opacities=logit_opacities,
             sh0=sh0,
             shN=shN,
-            offset=self._objective.start.offset,
-            render_model=self._objective.start.render_model,
         )
 
     def state(self) -> dict[str, NDArray[Any]]:
-        """Return everything that a bitwise resume needs."""
         return self._trainer.state()
 
     def load(self, state: dict[str, NDArray[Any]]) -> None:
-        """Restore a `state`."""
         self._trainer.load(state)
         self._trainer.anchor(*self._anchors)
 
     @property
     def counts(self) -> NDArray[Any]:
-        """Number of steps that each Gaussian has taken, (N,)."""
         return self._trainer.state()["steps"]
 
     @property
     def skipped(self) -> int:
-        """Number of single-Gaussian steps skipped because a gradient was not finite."""
         return self._trainer.skipped

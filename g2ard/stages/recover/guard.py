@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from g2ard.rendering.renderer import arrays_of
-from g2ard.scene.splats import Splats
+from g2ard.scene.splats import ARRAYS, Splats
 
 LOOKS = (0.1, 0.3, 0.5, 0.75)
 """Shares of the horizon at which the scene is scored."""
@@ -31,8 +31,7 @@ _TIE = 0.1
 _HALF, _HOPELESS = 0.5, 0.5
 """Share of the horizon from which validation views can stop a run, and the loss in dB above which they do."""
 
-
-_ARRAYS = ("means", "quats", "scales", "logit_opacities", "sh0", "shN")
+_STATE = ("looked", "backed_off", "stopped", "best_score", "validation")
 _BEST = "best."
 
 
@@ -164,26 +163,19 @@ class Guard:
         """Return the best scene's arrays for a checkpoint; empty if it is the start."""
         if self.best is self.start:
             return {}
-        return {f"{_BEST}{name}": getattr(self.best, name) for name in _ARRAYS}
+        return {f"{_BEST}{name}": getattr(self.best, name) for name in ARRAYS}
 
     def load(self, meta: dict[str, Any], arrays: dict[str, Any]) -> None:
         """Restore the state from `meta` and `arrays`, and remove the best scene's arrays from `arrays`."""
-        self.looked, self.backed_off = int(meta["looked"]), list(meta["backed_off"])
-        self.stopped, self.best_score = meta["stopped"], float(meta["best_score"])
-        self.validation = list(meta["validation"])
-        found = {name: arrays.pop(_BEST + name) for name in _ARRAYS if _BEST + name in arrays}
+        for name in _STATE:
+            setattr(self, name, meta[name])
+        found = {name: arrays.pop(_BEST + name) for name in ARRAYS if _BEST + name in arrays}
         if found:
             self.best = replace(self.start, **found)
 
     def meta(self) -> dict[str, Any]:
         """Return the state that a checkpoint stores besides the best scene."""
-        return {
-            "looked": self.looked,
-            "backed_off": self.backed_off,
-            "stopped": self.stopped,
-            "best_score": self.best_score,
-            "validation": self.validation,
-        }
+        return {name: getattr(self, name) for name in _STATE}
 
 
 def blended(start: Splats, end: Splats, share: ArrayLike) -> Splats:

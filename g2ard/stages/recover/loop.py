@@ -6,12 +6,14 @@ import hashlib
 import math
 import time
 from collections.abc import Callable
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+import g2ard.stages.recover.checkpoint as checkpoints
 from g2ard.config.choices import ENGINES
 from g2ard.errors import InputError
 from g2ard.progress import Progress, silent
@@ -19,7 +21,6 @@ from g2ard.rendering.renderer import settings_for
 from g2ard.scene.splats import Splats
 from g2ard.scene.splits import usual_rows
 from g2ard.scene.targets import Targets, fingerprint_of, mask_of
-from g2ard.stages.recover import checkpoint as checkpoints
 from g2ard.stages.recover.anchors import Anchors, drift95, needle
 from g2ard.stages.recover.config import RecoverConfig
 from g2ard.stages.recover.draw import drawn
@@ -41,43 +42,44 @@ Watch = Callable[[int, float, Callable[[], Splats]], None]
 """Callback after every step: its number, the seconds so far, and a function that returns the current scene.
 """
 
+_STATE = ("done", "seconds", "multiplier", "reach", "trials", "geometry", "skipped_before", "tally")
+"""Attributes of `Loop` that a checkpoint stores, besides the losses, the engine and the guard."""
 
+
+@dataclass(eq=False)
 class Loop:
-    """Steps of one recovery; `engine`, `done` and `losses` hold the state for resuming."""
+    """Steps of one recovery.
 
-    def __init__(
-        self,
-        student: Splats,
-        targets: Targets,
-        config: RecoverConfig,
-        weights: NDArray[np.float64] | None,
-        anchors: Anchors,
-        probe: Probe,
-        guard: Guard,
-        validation_key: str | None,
-        frozen: NDArray[np.bool_] | None,
-    ) -> None:
-        self.targets = targets
-        self.config = config
-        self.schedule = config.schedule.within(targets.cameras.extent)
-        self.weights = weights
-        self.anchors = anchors
-        self.multiplier = 1.0
-        self.reach = math.inf
-        self.trials: list[dict[str, float]] = []
-        self.student = student
-        self.probe = probe
-        self.guard = guard
-        self.frozen = frozen
-        self._skipped = 0  # by earlier engines
-        self.done = 0
-        self.seconds = 0.0
-        self.resumed: float | None = None
-        self.losses: list[float] = []
-        self.geometry: list[dict[str, float]] = []
-        self._tally = {False: [0, 0.0], True: [0, 0.0]}  # whether regularised → steps, seconds
-        self._validation_key = validation_key
-        self._epoch: tuple[int, NDArray[np.int64]] | None = None
+    Args:
+        validation_key: fingerprint of the validation views, for `key`.
+        resumed: the part of `seconds` before this call.
+        skipped_before: steps skipped by earlier engines.
+        tally: number of steps and their seconds, without and with regularisers.
+    """
+
+    student: Splats
+    targets: Targets
+    config: RecoverConfig
+    weights: NDArray[np.float64] | None
+    anchors: Anchors
+    probe: Probe
+    guard: Guard
+    validation_key: str | None
+    frozen: NDArray[np.bool_] | None
+    multiplier: float = 1.0
+    reach: float = math.inf
+    trials: list[dict[str, float]] = field(default_factory=list)
+    done: int = 0
+    seconds: float = 0.0
+    resumed: float | None = None
+    losses: list[float] = field(default_factory=list)
+    geometry: list[dict[str, float]] = field(default_factory=list)
+    skipped_before: int = 0
+    tally: list[list[float]] = field(default_factory=lambda: [[0, 0.0], [0, 0.0]])
+    _epoch: tuple[int, NDArray[np.int64]] | None = None
+
+    def __post_init__(self) -> None:
+        self.schedule = self.config.schedule.within(self.targets.cameras.extent)
 
     @cached_property
     def key(self) -> str:
@@ -85,8 +87,8 @@ class Loop:
         parts = [repr(self.config), self.student.fingerprint(), fingerprint_of(self.targets)]
         if self.weights is not None:
             parts.append(repr(self.weights.tolist()))
-        if self._validation_key is not None:
-            parts.append(self._validation_key)
+        if self.validation_key is not None:
+            parts.append(self.validation_key)
         digest = hashlib.sha256("\n".join(parts).encode())
         anchors = self.anchors
         for array in (anchors.means, anchors.frames, anchors.r_parallel, anchors.r_perp):
@@ -103,7 +105,7 @@ class Loop:
     @property
     def skipped(self) -> int:
         """Number of single-Gaussian steps skipped because a gradient was not finite."""
-        return self._skipped + self.engine.skipped
+        return self.skipped_before + self.engine.skipped
 
     @property
     def views_seen(self) -> NDArray[np.float64]:
@@ -186,6 +188,7 @@ class Loop:
         return engine.step(view, target, rates, regularize=regularize, mask=mask)
 
     def run(self, checkpoint: Path | None, progress: Progress, stage: str, watch: Watch | None) -> None:
+        """Take all steps, after those of a checkpoint if it exists."""
         if checkpoint is not None and checkpoint.exists():
             self._resume(checkpoint)
         earlier, began, saved = self.seconds, time.monotonic(), time.monotonic()
@@ -220,7 +223,7 @@ class Loop:
         began = time.monotonic()
         loss = self._learn(self.engine, step, self._share(), self.multiplier, regularize=regularize)
         self.losses.append(loss)
-        tally = self._tally[regularize]
+        tally = self.tally[regularize]
         tally[0] += 1
         tally[1] += time.monotonic() - began
         self.done += 1
@@ -234,7 +237,7 @@ class Loop:
             return
         if self.guard.look(self.engine.splats(), share, self.done) == "back":
             self.multiplier /= 3
-            self._skipped += self.engine.skipped
+            self.skipped_before += self.engine.skipped
             del self.engine  # two engines at once would double the memory
             self.engine = self._new_engine(self.guard.best)
 
@@ -249,7 +252,7 @@ class Loop:
     def regularizers(self) -> dict[str, float]:
         """Number of regularised steps, their share of the time beyond plain steps, and their period (0 if
         inactive)."""
-        (plain, plain_seconds), (regularized, regularized_seconds) = self._tally[False], self._tally[True]
+        (plain, plain_seconds), (regularized, regularized_seconds) = self.tally
         extra = regularized_seconds - regularized * plain_seconds / plain if plain and regularized else 0.0
         weights = self.config.regularizers
         return {
@@ -273,8 +276,7 @@ class Loop:
         return [float(part.mean()) for part in np.array_split(np.array(self.losses), 100) if len(part)]
 
     def _view(self, step: int) -> int:
-        """Return the view of a step: a new random order each epoch that depends on seed, weights and step
-        only."""
+        """Return the view of a step; each epoch has a new random order, see `drawn`."""
         count = len(self.targets.cameras)
         epoch, position = divmod(step, count)
         if self._epoch is None or self._epoch[0] != epoch:
@@ -282,17 +284,7 @@ class Loop:
         return int(self._epoch[1][position])
 
     def _save(self, path: Path) -> None:
-        meta = {
-            "done": self.done,
-            "seconds": self.seconds,
-            "multiplier": self.multiplier,
-            "reach": finite(self.reach),
-            "trials": self.trials,
-            "geometry": self.geometry,
-            "seconds_of": [self._tally[False], self._tally[True]],
-            "skipped": self._skipped,
-            "guard": self.guard.meta(),
-        }
+        meta = {name: getattr(self, name) for name in _STATE} | {"guard": self.guard.meta()}
         arrays = {**self.engine.state(), "losses": np.array(self.losses), **self.guard.arrays()}
         checkpoints.save(path, self.key, meta, arrays)
 
@@ -300,14 +292,10 @@ class Loop:
         meta, arrays = checkpoints.load(path, self.key)
         self.losses = arrays.pop("losses").tolist()
         self.guard.load(meta["guard"], arrays)
-        self._skipped = int(meta["skipped"])
         self.engine.load(arrays)
-        self.done, self.seconds = int(meta["done"]), float(meta["seconds"])
+        for name in _STATE:
+            setattr(self, name, meta[name])
         self.resumed = self.seconds
-        self.multiplier = float(meta["multiplier"])
-        self.reach = math.inf if meta["reach"] is None else float(meta["reach"])
-        self.trials, self.geometry = list(meta["trials"]), list(meta["geometry"])
-        self._tally = dict(zip((False, True), meta["seconds_of"], strict=True))
 
 
 def finite(reach: float) -> float | None:

@@ -92,17 +92,11 @@ def l1_ssim_anywhere(image: Tensor, target: Tensor, ssim_weight: float = 0.2) ->
 class TorchAnchors:
     """`Anchors` as tensors."""
 
-    def __init__(self, anchors: Anchors) -> None:
-        self.means = torch.from_numpy(anchors.means)
-        self.frames = torch.from_numpy(anchors.frames)
-        self.r_parallel = torch.from_numpy(anchors.r_parallel)
-        self.r_perp = torch.from_numpy(anchors.r_perp)
-
-    def to(self, device: torch.device) -> TorchAnchors:
-        """Move all tensors to a device, in place."""
-        for name, value in vars(self).items():
-            setattr(self, name, value.to(device))
-        return self
+    def __init__(self, anchors: Anchors, device: torch.device | None = None) -> None:
+        self.means = torch.from_numpy(anchors.means).to(device)
+        self.frames = torch.from_numpy(anchors.frames).to(device)
+        self.r_parallel = torch.from_numpy(anchors.r_parallel).to(device)
+        self.r_perp = torch.from_numpy(anchors.r_perp).to(device)
 
 
 def anchor_loss(means: Tensor, anchors: TorchAnchors) -> Tensor:

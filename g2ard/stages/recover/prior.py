@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 import numpy as np
 
 from g2ard.errors import InputError
+from g2ard.rendering.renderer import RasterSettings, Renderer
+from g2ard.report.base import Report
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
-from g2ard.stages.recover.anchors import PAPER_REGULARIZERS, REGULARIZERS, Regularizers, needle
+from g2ard.stages.recover.anchors import REGULARIZERS, Regularizers, needle
 
 _LIFT_THICKNESS = 0.2
 _LIFT_SPREAD = 2.5
@@ -30,7 +32,7 @@ _SAME_DEPTH = 0.05
 
 
 @dataclass(frozen=True)
-class PriorMeasures:
+class PriorMeasures(Report):
     """Measures that distinguish a lift, a faithful and a noisy trained scene.
 
     Args:
@@ -46,10 +48,6 @@ class PriorMeasures:
     thickness_spread: float
     view_dependent: bool
     consistency: float | None
-
-    def as_dict(self) -> dict[str, float | bool | None]:
-        """Return the measures by name."""
-        return asdict(self)
 
 
 def measure_prior(prior: Splats, cameras: Cameras | None = None) -> PriorMeasures:
@@ -86,26 +84,20 @@ def view_consistency(scene: Splats, cameras: Cameras) -> float | None:
     Returns:
         Agreeing over agreeing and floating points, in [0, 1]; None if no point is in two views.
     """
-    from g2ard import _core
-    from g2ard.rendering.renderer import arrays_of, centred, settings_for, view_of
-
     if len(cameras) < 2 or not len(scene):
         return None
-    scene, small = centred(scene, cameras.resized(_SAMPLE_PIXELS))
-    arrays, settings = arrays_of(scene), settings_for(scene.means)
+    small = cameras.resized(_SAMPLE_PIXELS)
+    renderer = Renderer(scene, settings=RasterSettings(antialiased=False))
     sample = np.unique(np.linspace(0, len(small) - 1, min(len(small), _SAMPLE_VIEWS)).round().astype(int))
     agreeing = floating = 0
     for a in sample:
         distance = np.linalg.norm(small.positions - small.positions[a], axis=1)
         distance[a] = np.inf
         b = int(distance.argmin())
-        depths = []
-        for view in (view_of(small, int(a), settings), view_of(small, b, settings)):
-            rasterizer = _core.Rasterizer()
-            _, _, _, median = rasterizer.forward(arrays, view, settings, [0.0] * 3, 2)
-            assert median is not None
-            depths.append(median)
-        expected, seen = _carried(depths[0], depths[1], small, int(a), b)
+        depth, other = (renderer.render(small[int(view)], median=True).median for view in (a, b))
+        assert depth is not None
+        assert other is not None
+        expected, seen = _carried(depth, other, small, int(a), b)
         ratio = np.where(seen > 0, seen, np.inf) / expected
         agreeing += int((np.abs(ratio - 1) <= _SAME_DEPTH).sum())
         floating += int((ratio > 1 + _SAME_DEPTH).sum())
@@ -157,7 +149,7 @@ def regularizers_for(
     found = measure_prior(prior, cameras)
     kind, why = (kind, "as requested") if kind != "auto" else _judged(found)
     said = f"the paper's for {kind}" if paper else kind
-    return (PAPER_REGULARIZERS if paper else REGULARIZERS)[kind], f"{said} ({why})", found
+    return Regularizers.of(kind, paper=paper), f"{said} ({why})", found
 
 
 def _judged(m: PriorMeasures) -> tuple[str, str]:

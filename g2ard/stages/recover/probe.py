@@ -5,17 +5,14 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from g2ard.rendering.metrics import psnr
+from g2ard.rendering.renderer import Renderer
 from g2ard.scene.splats import Splats
 from g2ard.scene.splits import rows_by_kind
 from g2ard.scene.targets import Subset, Targets, mask_of
-
-if TYPE_CHECKING:
-    from g2ard.rendering.renderer import Renderer
 
 _VIEWS = 8
 """Views that are scored, of training and of each kind of validation views."""
@@ -42,8 +39,6 @@ class Probe:
 
     def all_of(self, splats: Splats) -> float:
         """Return the mean PSNR over the views."""
-        from g2ard.rendering.renderer import Renderer
-
         renderer = Renderer(splats, background=self._background)
         return float(np.mean([self._score(renderer, view) for view in self._views]))
 

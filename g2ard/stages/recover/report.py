@@ -164,20 +164,13 @@ def outcome(report: RecoverReport) -> str | None:
     return None
 
 
-def unregularized(report: RecoverReport) -> str | None:
-    """Return a message if regularisers never acted because there were too few steps, or None."""
-    if not _idle(report):
-        return None
-    return (
-        f"the regularisers never acted: they act every {report.regularizers.period} steps, and there were "
-        f"{report.steps} (--set regularizers.period=…)"
-    )
+def unregularized(rounds: Sequence[Sequence[RecoverReport]]) -> str | None:
+    """Return a message if regularisers never acted because there were too few steps, or None.
 
-
-def unregularized_rounds(rounds: Sequence[Sequence[RecoverReport]]) -> str | None:
-    """Return the message of `unregularized` for all recoveries of a run, naming the rounds."""
-    if sum(map(len, rounds)) == 1:
-        return next(unregularized(done) for entry in rounds for done in entry)
+    Args:
+        rounds: the recoveries of each round of a run; the message names rounds if there are several
+            recoveries.
+    """
     idle = {
         f"round {number}" if k == 0 else f"the last recovery of round {number}": done
         for number, entry in enumerate(rounds, 1)
@@ -189,9 +182,10 @@ def unregularized_rounds(rounds: Sequence[Sequence[RecoverReport]]) -> str | Non
     period = next(iter(idle.values())).regularizers.period
     steps = sorted({done.steps for done in idle.values()})
     least = f"{steps[0]}" if len(steps) == 1 else f"{steps[0]} to {steps[-1]}"
+    where = f" in {', '.join(idle)}" if sum(map(len, rounds)) > 1 else ""
     return (
-        f"the regularisers never acted in {', '.join(idle)}: they act every {period} steps, and there were "
-        f"{least} (--set regularizers.period=…)"
+        f"the regularisers never acted{where}: they act every {period} steps, and there were {least} "
+        "(--set regularizers.period=…)"
     )
 
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
+
+import numpy as np
 
 from g2ard.errors import require
-
-if TYPE_CHECKING:
-    from g2ard.scene.cameras import Cameras
-    from g2ard.scene.splats import Splats
+from g2ard.scene.cameras import Cameras
+from g2ard.scene.splats import Splats
+from g2ard.scene.splits import usual_rows
 
 _REACH = 0.01
 """Default `reach`: Gaussians larger than a hundredth of the image hardly move, unless that is typical."""
@@ -247,19 +247,13 @@ def steps_for(scene: Splats, cameras: Cameras, steps: int) -> int:
     Returns:
         A number from `steps` to 2.25 × `steps`, times the ratio of all views to usual ones.
 
-    >>> import numpy as np
-    >>> from g2ard.scene.cameras import Cameras, look_at
-    >>> from g2ard.scene.splats import Splats
+    >>> from g2ard.scene.cameras import look_at
     >>> line = Splats.create([[0, 0, 0], [9, 0, 0], [0, 0, 9], [-9, 0, 0]], scales=np.ones((4, 3)))
     >>> K = [[50, 0, 32], [0, 50, 32], [0, 0, 1]]
     >>> view = Cameras.from_lists([look_at([0, -3, 0], [0, 0, 0])], [K], [(64, 64)], ["a"])
     >>> steps_for(line, view, 1000)
     2000
     """
-    import numpy as np
-
-    from g2ard.scene.splits import usual_rows
-
     usual = cameras.take(usual_rows(cameras.names))
     some = np.unique(np.linspace(0, len(scene) - 1, min(len(scene), _POINTS)).round().astype(int))
     points = scene.means[some].astype(np.float64) + scene.offset

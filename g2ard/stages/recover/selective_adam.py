@@ -47,15 +47,8 @@ class SelectiveAdam(torch.optim.Optimizer):
     @torch.no_grad()
     def step(self, closure: Any = None) -> None:  # type: ignore[override]
         """Take one step for every row that has a gradient."""
-        if closure is not None:
-            raise ValueError("SelectiveAdam takes no closure")
         groups = [group for group in self.param_groups if group["params"][0].grad is not None]
-        grads = [
-            group["params"][0].grad.flatten(1)
-            if group["params"][0].ndim > 1
-            else group["params"][0].grad[:, None]
-            for group in groups
-        ]
+        grads = [group["params"][0].grad.flatten().view(len(group["params"][0]), -1) for group in groups]
         touched = torch.stack([(grad != 0).any(1) for grad in grads]).any(0)
         sound = torch.stack([(grad.abs() <= _LARGEST).all(1) for grad in grads]).all(0)
         self.skipped += int((touched & ~sound).sum())

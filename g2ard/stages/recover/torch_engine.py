@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -36,7 +37,7 @@ class TorchEngine:
     def __init__(self, objective: Objective) -> None:
         self._objective = objective
         splats, anchors = objective.start, objective.anchors
-        self._anchors = TorchAnchors(anchors).to(self.device)
+        self._anchors = TorchAnchors(anchors, self.device)
         self._settings = objective.settings
         self._base = torch.from_numpy(splats.means.astype(np.float32)).to(self.device)
         unit = radii(splats) if objective.means_in_scales else np.ones(len(splats), np.float32)
@@ -63,7 +64,6 @@ class TorchEngine:
         regularize: bool,
         mask: NDArray[np.bool_] | None = None,
     ) -> float:
-        """Take one optimiser step on one view; return its photometric loss."""
         p = self._parameters
         means = self._base + self._unit * p["means"]
         image = self._render(means, view)
@@ -117,21 +117,18 @@ class TorchEngine:
         return l1_ssim(image, target, self._objective.ssim_weight)
 
     def splats(self) -> Splats:
-        """Return the current scene, with normalised quaternions."""
         p = {name: value.detach().cpu() for name, value in self._parameters.items()}
-        return Splats(
+        return replace(
+            self._objective.start,
             means=(self._base.cpu() + self._unit.cpu() * p["means"]).numpy().copy(),
             quats=torch.nn.functional.normalize(p["quats"], dim=1).numpy().copy(),
             scales=p["log_scales"].double().exp().float().numpy(),
             logit_opacities=p["logit_opacities"].numpy().copy(),
             sh0=p["sh0"].numpy().copy(),
             shN=p["shN"].numpy().copy(),
-            offset=self._objective.start.offset,
-            render_model=self._objective.start.render_model,
         )
 
     def state(self) -> dict[str, NDArray[Any]]:
-        """Return everything that a bitwise resume needs."""
         arrays = {f"p.{name}": value.detach().cpu().numpy() for name, value in self._parameters.items()}
         arrays["base"], arrays["unit"] = self._base.cpu().numpy(), self._unit.cpu().numpy()
         arrays["skipped"] = np.array(self._adam.skipped)
@@ -140,7 +137,6 @@ class TorchEngine:
         return arrays
 
     def load(self, state: dict[str, NDArray[Any]]) -> None:
-        """Restore a `state`."""
         with torch.no_grad():
             for name, parameter in self._parameters.items():
                 parameter.copy_(torch.from_numpy(state[f"p.{name}"]))
@@ -157,10 +153,8 @@ class TorchEngine:
 
     @property
     def counts(self) -> NDArray[Any]:
-        """Number of steps that each Gaussian has taken, (N,)."""
         return self._adam.state[self._parameters["means"]]["count"].cpu().numpy()
 
     @property
     def skipped(self) -> int:
-        """Number of single-Gaussian steps skipped because a gradient was not finite."""
         return self._adam.skipped

@@ -38,13 +38,48 @@ class Trials:
         self._began = time.monotonic()
 
     def search(self, guess: float) -> float:
-        """Return the best multiplier near `guess`, see `search_multiplier`; forgets earlier trials."""
+        """Search `MULTIPLIERS` both ways from the one nearest to `guess`; forgets earlier trials.
+
+        The largest multiplier whose gain is within 4 % of the best is chosen. Trials are too short to show
+        the benefit of larger rates, and a long run decays its rates towards the end.
+
+        >>> Trials(lambda m, end: -abs(m - 1), 0, None).search(0.2)
+        1.0
+        >>> near = {1 / 3: 32.0, 3**-0.5: 31.95}
+        >>> round(Trials(lambda m, end: near.get(m, 30.0), 30, None).search(1 / 3), 3)
+        0.577
+        """
         self.scores.clear()
-        return search_multiplier(lambda m: self._score(m, _TIME), guess, self.start)
+        seen: dict[int, float] = {}
+
+        def good(i: int) -> bool:
+            best = max(seen.values())
+            return seen[i] >= best - _TIE * max(best - self.start, 0.0)
+
+        at = min(range(len(MULTIPLIERS)), key=lambda i: abs(math.log(MULTIPLIERS[i] / guess)))
+        for neighbours in (range(at, -1, -1), range(at + 1, len(MULTIPLIERS))):
+            for i in neighbours:
+                value = self._score(MULTIPLIERS[i], _TIME)
+                seen[i] = value if math.isfinite(value) else -math.inf
+                if not good(i):
+                    break
+        best = max(seen, key=lambda i: (seen[i], -i))
+        chosen = max(filter(good, seen)) if seen[best] > self.start else best
+        return MULTIPLIERS[chosen]
 
     def calm(self) -> float:
-        """Return a multiplier below all of `MULTIPLIERS`, see `calm`."""
-        return calm(lambda m: self._score(m, _CALM_TIME), min(MULTIPLIERS), self.scores, self.start)
+        """Divide the least of `MULTIPLIERS` by three for as long as it worsens the start and dividing helps.
+
+        >>> trials = Trials(lambda m, end: 50 - 9 * m, 49.5, None)
+        >>> trials.search(0.2) > 0.3 > 0.06 > trials.calm()
+        True
+        """
+        best = min(MULTIPLIERS)
+        while self.worsens(best) and best > _CALMEST:
+            if self._score(best / 3, _CALM_TIME) <= self.scores[best]:
+                break
+            best /= 3
+        return best
 
     def worsens(self, multiplier: float) -> bool:
         """Return whether the trial with this multiplier lost quality."""
@@ -76,57 +111,3 @@ def trial_steps(horizon: int, limit: float | None) -> int:
         return _LIMITED_STEPS
     fewest, most = _STEPS
     return 0 if horizon < _SHORTEST_HORIZON else min(most, max(fewest, horizon // _PART))
-
-
-def search_multiplier(score: Callable[[float], float], guess: float, start: float) -> float:
-    """Search `MULTIPLIERS` both ways from the one nearest to `guess`.
-
-    The largest multiplier whose gain is within 4 % of the best is chosen. Trials are too short to show the
-    benefit of larger rates, and a long run decays its rates towards the end.
-
-    Args:
-        score: returns the PSNR after a trial with a multiplier.
-        guess: multiplier to begin at.
-        start: PSNR before the trial.
-
-    >>> search_multiplier(lambda m: -abs(m - 1), 0.2, start=0)
-    1.0
-    >>> round(search_multiplier(lambda m: {1 / 3: 32.0, 3**-0.5: 31.95}.get(m, 30.0), 1 / 3, start=30), 3)
-    0.577
-    """
-    seen: dict[int, float] = {}
-
-    def good(i: int) -> bool:
-        best = max(seen.values())
-        return seen[i] >= best - _TIE * max(best - start, 0.0)
-
-    at = min(range(len(MULTIPLIERS)), key=lambda i: abs(math.log(MULTIPLIERS[i] / guess)))
-    for neighbours in (range(at, -1, -1), range(at + 1, len(MULTIPLIERS))):
-        for i in neighbours:
-            value = score(MULTIPLIERS[i])
-            seen[i] = value if math.isfinite(value) else -math.inf
-            if not good(i):
-                break
-    best = max(seen, key=lambda i: (seen[i], -i))
-    chosen = max(filter(good, seen)) if seen[best] > start else best
-    return MULTIPLIERS[chosen]
-
-
-def calm(score: Callable[[float], float], best: float, scores: dict[float, float], start: float) -> float:
-    """Divide the best multiplier by three for as long as it worsens the start and dividing helps.
-
-    Args:
-        score: returns the PSNR after a trial with a multiplier, and adds it to `scores`.
-        best: multiplier to begin at, already in `scores`.
-        scores: PSNR of earlier trials by multiplier.
-        start: PSNR before the trial.
-
-    >>> scores = {1 / 3: 47.0}
-    >>> calm(lambda m: scores.setdefault(m, 50 - 9 * m), 1 / 3, scores, start=49.5) < 0.06
-    True
-    """
-    while scores[best] < start and best > _CALMEST:
-        if score(best / 3) <= scores[best]:
-            break
-        best /= 3
-    return best

@@ -113,7 +113,7 @@ def register(
     rows, kept, poses, matches = [], [], [], {}
     for i, name in enumerate(photos.names):
         began = time.perf_counter()
-        start = Start(given[name], name) if name in given else None
+        start = Start(given[name], given[name], name) if name in given else None
         row, best = _register_photo(search, photos, i, start, renders, true.get(name))
         if best is not None and best.solved is not None:
             matches[name] = np.concatenate([best.solved.pixels, best.solved.seen], 1)
@@ -207,7 +207,7 @@ def _from_pose(search: Search, given: Start, photo: Photo) -> list[Candidate]:
         render = small_render(search.renderer, replace(camera, viewmat=given.pose), config)
         there = turned(given.pose, render, band_passed(grey), camera.K)
         search.renders += 1
-        again = replace(given, turned=there.viewmat)
+        again = replace(given, begins=there.viewmat)
         if there.pixels and (c := search.by_alignment(again, photo)):
             aligned.append(c)
     return out + aligned + _featured(search, aligned, photo)
@@ -218,13 +218,13 @@ def _from_pool(search: Search, pool: PoolRenders, photo: Photo) -> list[Candidat
     order, renders = pool.ranked(*photo.small)
     search.renders += renders
     starts = [
-        Start(pool.pool.viewmats[at], pool.pool.names[at], rank, there.viewmat)
+        Start(pool.pool.viewmats[at], there.viewmat, pool.pool.names[at], rank)
         for rank, (at, there) in enumerate(order[: search.config.candidates], 1)
     ]
     first = [(s, start) for start in starts if (s := search.by_matches(start.begins, photo, 1))]
     if first:
         solved, start = max(first, key=lambda each: each[0].inliers)
-        if c := search.by_features(replace(start, turned=solved.viewmat), photo):
+        if c := search.by_features(replace(start, begins=solved.viewmat), photo):
             return [c]
     if not search.config.fallback:
         return []
@@ -237,7 +237,7 @@ def _featured(search: Search, aligned: list[Candidate], photo: Photo) -> list[Ca
     best = max(aligned, key=lambda c: c.zncc, default=None)
     if best is None or best.zncc < min(search.config.doubt, search.config.accept):
         return []
-    found = search.by_features(replace(best.start, turned=best.found.viewmat), photo)
+    found = search.by_features(replace(best.start, begins=best.found.viewmat), photo)
     return [found] if found else []
 
 

@@ -236,21 +236,26 @@ def _light(photo: Level, shot: Shot) -> tuple[float, float]:
 
 def _solved(normal: Normal) -> Float | None:
     """Solve the normal equations with unit diagonal scaling; return None if an unknown is undetermined."""
-    diagonal = np.diag(normal.matrix)
-    if not (np.isfinite(normal.matrix).all() and (diagonal > 0).all()):
+    if (found := _unit_scaled(normal.matrix)) is None:
         return None
-    unit = 1 / np.sqrt(diagonal)
-    scaled = normal.matrix * unit[:, None] * unit[None, :] + _DAMPING * np.eye(8)
-    return unit * np.linalg.solve(scaled, unit * normal.right)
+    scaled, unit = found
+    return unit * np.linalg.solve(scaled + _DAMPING * np.eye(8), unit * normal.right)
 
 
 def inverse(matrix: Float) -> Float | None:
     """Invert a symmetric matrix with unit diagonal scaling; return None if it is singular."""
+    if (found := _unit_scaled(matrix)) is None:
+        return None
+    scaled, unit = found
+    if np.linalg.eigvalsh(scaled)[0] < 1e-12:
+        return None
+    return np.asarray(np.linalg.inv(scaled) * unit[:, None] * unit[None, :])
+
+
+def _unit_scaled(matrix: Float) -> tuple[Float, Float] | None:
+    """Return D·M·D with a diagonal of ones, and the diagonal of D; None if an unknown is undetermined."""
     diagonal = np.diag(matrix)
     if not (np.isfinite(matrix).all() and (diagonal > 0).all()):
         return None
     unit = 1 / np.sqrt(diagonal)
-    scaled = matrix * unit[:, None] * unit[None, :]
-    if np.linalg.eigvalsh(scaled)[0] < 1e-12:
-        return None
-    return np.asarray(np.linalg.inv(scaled) * unit[:, None] * unit[None, :])
+    return matrix * unit[:, None] * unit[None, :], unit

@@ -47,17 +47,13 @@ class Photo:
 
 @dataclass(frozen=True)
 class Start:
-    """A starting pose; `turned` replaces it as the initial estimate if it is not None."""
+    """A starting pose and the initial estimate, both (4, 4) camera_from_world, and the pose's name and rank
+    in the pool."""
 
     pose: Float
+    begins: Float
     name: str
     rank: int | None = None
-    turned: Float | None = None
-
-    @property
-    def begins(self) -> Float:
-        """The initial estimate, (4, 4) camera_from_world."""
-        return self.pose if self.turned is None else self.turned
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,33 +84,23 @@ def loaded(photos: Cameras, index: int, config: RegisterConfig, background: Sequ
     image, mask = load_image(one, 0, background), load_mask(one, 0)
     everywhere = np.ones(image.shape[:2], bool) if mask is None else mask
     planes = np.stack([grey_of(image), everywhere], 2).astype(np.float32)
-    levels: list[_Planes] = []
-    for side in reversed(sizes):  # each level from the previous one, which is fastest
-        levels.insert(0, _shrunk(one, levels[0].planes if levels else planes, side))
-    pyramid = [(level.camera, level_of(level.grey, level.mask)) for level in levels]
-    small = _shrunk(one, levels[-1].planes, config.pool_size)
-    return Photo(one[0], image, everywhere, pyramid, (small.camera, small.grey), levels[-1].grey)
+    levels = [_shrunk(one, planes, sizes[-1])]
+    for side in reversed(sizes[:-1]):  # each level from the previous one, which is fastest
+        levels.insert(0, _shrunk(one, levels[0][1], side))
+    pyramid = [(camera, level_of(_grey(planes), planes[..., 1] > 0.999)) for camera, planes in levels]
+    finest = levels[-1][1]
+    camera, small = _shrunk(one, finest, config.pool_size)
+    return Photo(one[0], image, everywhere, pyramid, (camera, _grey(small)), _grey(finest))
 
 
-@dataclass(frozen=True, eq=False)
-class _Planes:
-    """A shrunk photo: (H, W, 2) float32, grey and the valid share of each pixel."""
-
-    camera: Camera
-    planes: NDArray[np.float32]
-
-    @property
-    def grey(self) -> Float:
-        return self.planes[..., 0].astype(np.float64)
-
-    @property
-    def mask(self) -> NDArray[np.bool_]:
-        return np.ascontiguousarray(self.planes[..., 1] > 0.999)
-
-
-def _shrunk(one: Cameras, planes: NDArray[np.float32], side: int) -> _Planes:
+def _shrunk(one: Cameras, planes: NDArray[np.float32], side: int) -> tuple[Camera, NDArray[np.float32]]:
+    """Shrink (H, W, 2) planes, grey and the valid share of each pixel, to a longer side."""
     camera = one.resized(side)[0]
-    return _Planes(camera, resized(planes, (camera.width, camera.height)))
+    return camera, resized(planes, (camera.width, camera.height))
+
+
+def _grey(planes: NDArray[np.float32]) -> Float:
+    return planes[..., 0].astype(np.float64)
 
 
 class Search:

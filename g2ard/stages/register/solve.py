@@ -43,7 +43,7 @@ class Solved:
         information: (6, 6) inverse covariance of ξ = (v, ω), camera axes; see `information`.
         depth: median depth of the inliers, scene units.
         passes: number of renders.
-        pixels, points: (inliers, 2) of the photo and (inliers, 3) in world coordinates.
+        pixels: (inliers, 2) pixels of the photo.
         seen: (inliers, 2) pixels of the last render.
     """
 
@@ -56,7 +56,6 @@ class Solved:
     depth: float
     passes: int
     pixels: Float
-    points: Float
     seen: Float
 
 
@@ -183,7 +182,6 @@ def _described(
         depth=float(np.median(points @ T[2, :3] + T[2, 3])),
         passes=passes,
         pixels=uv,
-        points=points,
         seen=seen,
     )
 

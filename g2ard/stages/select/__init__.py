@@ -1,17 +1,6 @@
 """View selection."""
 
-from __future__ import annotations
+from g2ard.stages.select.choose import Selection, select
+from g2ard.stages.select.surfaces import CoverageOptions, Surface, surface, visible_cells
 
-from g2ard.stages.select.choose import POLICIES, Selection, select
-from g2ard.stages.select.surfaces import CoverageOptions, Surface, Visible, surface, visible_cells
-
-__all__ = [
-    "POLICIES",
-    "CoverageOptions",
-    "Selection",
-    "Surface",
-    "Visible",
-    "select",
-    "surface",
-    "visible_cells",
-]
+__all__ = ["CoverageOptions", "Selection", "Surface", "select", "surface", "visible_cells"]

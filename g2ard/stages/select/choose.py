@@ -17,8 +17,6 @@ from g2ard.scene.splats import Splats
 from g2ard.stages.select import poses
 from g2ard.stages.select.surfaces import CoverageOptions, greedy, surface
 
-__all__ = ["POLICIES", "Selection", "select"]
-
 Float = NDArray[np.float64]
 Order = NDArray[np.int64]
 
@@ -120,7 +118,9 @@ def select(
     elif policy == "pose-diverse":
         order, gains = poses.farthest(alike, usable)
     elif policy == "auto":
-        order, gains = poses.facility_location(alike, pose_weights, usable, shares)
+        of_usable = np.where(usable, pose_weights, 0.0)
+        order = poses.facility_location(alike, of_usable, usable, shares)
+        gains = poses.gains_of(order, alike, of_usable)
     else:
         order = _blind(policy, np.flatnonzero(usable), k, seed)
         gains = poses.gains_of(order, alike, pose_weights)

@@ -53,10 +53,8 @@ def outlooks(cells: Surface, cameras: Cameras) -> tuple[Float, Float]:
         inside = ahead & (u >= 0) & (u < local.widths[i]) & (v >= 0) & (v < local.heights[i])
         if inside.any():
             u, v, z = u[inside], v[inside], z[inside]
-            row, column = (
-                (v * rows / local.heights[i]).astype(int),
-                (u * columns / local.widths[i]).astype(int),
-            )
+            row = (v * rows / local.heights[i]).astype(int)
+            column = (u * columns / local.widths[i]).astype(int)
             place = row * columns + column
             nearest = np.full(columns * rows, np.inf)
             np.minimum.at(nearest, place, z)
@@ -109,9 +107,7 @@ def inverse_density(alike: Float) -> Float:
     return weights / weights.sum()
 
 
-def facility_location(
-    alike: Float, pose_weights: Float, usable: NDArray[np.bool_], shares: Float
-) -> tuple[Order, Float]:
+def facility_location(alike: Float, pose_weights: Float, usable: NDArray[np.bool_], shares: Float) -> Order:
     """Order views by how well they represent all candidates: reach first, then facility location.
 
     From the weighted medoid, the farthest pose comes next while any pose is more than two bandwidths from all
@@ -120,18 +116,17 @@ def facility_location(
 
     Args:
         alike: (C, C) from `pose_kernel`.
-        pose_weights: (C,) from `inverse_density`.
-        usable: (C,) mask of views that may be chosen; the others have no weight.
+        pose_weights: (C,) from `inverse_density`, 0 for unusable views.
+        usable: (C,) mask of views that may be chosen.
         shares: (C,) from `outlooks`.
 
     Returns:
-        The usable views in order, and the gain of each in Σ_u w_u max_{v∈S} alike_uv.
+        The usable views in order.
     """
-    pose_weights, away, worth = np.where(usable, pose_weights, 0.0), _bandwidths_apart(alike), shares**_WORTH
+    away, worth = _bandwidths_apart(alike), shares**_WORTH
     best, left = np.zeros(len(alike)), usable.copy()
     nearest = np.where(usable, np.inf, -np.inf)
     order: list[int] = []
-    gains: list[float] = []
     for _ in range(int(usable.sum())):
         if not order:
             view = int(np.argmax(np.where(left, worth / np.maximum(pose_weights @ away, 1e-12), -1.0)))
@@ -141,11 +136,10 @@ def facility_location(
             added = pose_weights @ np.maximum(alike - best[:, None], 0.0)
             view = int(np.argmax(np.where(left, worth * added, -1.0)))
         order.append(view)
-        gains.append(float(pose_weights @ np.maximum(alike[:, view] - best, 0.0)))
         best = np.maximum(best, alike[:, view])
         nearest = np.minimum(nearest, away[view])
         left[view] = False
-    return np.array(order, np.int64), np.array(gains)
+    return np.array(order, np.int64)
 
 
 def _bandwidths_apart(alike: Float) -> Float:
@@ -154,7 +148,7 @@ def _bandwidths_apart(alike: Float) -> Float:
 
 
 def gains_of(order: Order, alike: Float, pose_weights: Float) -> Float:
-    """Return the gain in facility location of each view of a given order."""
+    """Return the gain of each view of an order in facility location, Σ_u w_u max_{v∈S} alike_uv."""
     best, gains = np.zeros(len(alike)), []
     for view in order:
         gains.append(float(pose_weights @ np.maximum(alike[:, view] - best, 0.0)))

@@ -12,13 +12,12 @@ from numpy.typing import NDArray
 from g2ard import _core
 from g2ard.errors import InputError, require
 from g2ard.progress import Progress, counter, silent
-from g2ard.rendering.renderer import settings_for
+from g2ard.rendering.renderer import View, settings_for, view_of
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
 
 Float = NDArray[np.float64]
 Order = NDArray[np.int64]
-
 
 _CORE = _core.defaults()["coverage"]
 
@@ -156,19 +155,10 @@ def core_scene(splats: Splats) -> tuple[tuple[Any, ...], Float]:
     return tuple(np.ascontiguousarray(a) for a in arrays), middle + splats.offset
 
 
-def core_views(cameras: Cameras, origin: Float, scene: tuple[Any, ...]) -> list[tuple[Any, ...]]:
+def core_views(cameras: Cameras, origin: Float, scene: tuple[Any, ...]) -> list[View]:
     """Convert cameras to the form that `_core` takes, relative to the origin of `core_scene`."""
-    near = settings_for(scene[0]).near_of(0)
-    local = cameras.recentred(origin)
-    return [
-        (
-            local.viewmats[i].tolist(),
-            [float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])],
-            (int(local.widths[i]), int(local.heights[i])),
-            near,
-        )
-        for i, K in enumerate(local.Ks)
-    ]
+    settings, local = settings_for(scene[0]), cameras.recentred(origin)
+    return [view_of(local, i, settings) for i in range(len(local))]
 
 
 def greedy(

@@ -10,11 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard import _core
+from g2ard.config.choices import METHODS
 from g2ard.errors import InputError, require
 from g2ard.progress import Progress, counter, plural, silent
 from g2ard.scene.prepared import PreparedScene, finite_rows_of, with_some_opacity
 from g2ard.scene.splats import DRAWN_LOGIT, Splats, unit_quats
-from g2ard.stages.simplify.config import METHODS, SimplifyConfig, round_counts
+from g2ard.stages.simplify.config import SimplifyConfig, round_counts
 from g2ard.stages.simplify.pairs import (
     Visibility,
     VisibilitySource,
@@ -26,10 +27,8 @@ from g2ard.stages.simplify.pairs import (
 from g2ard.stages.simplify.report import SimplifyReport, SimplifyRound
 
 __all__ = [
-    "METHODS",
     "Simplified",
     "SimplifyConfig",
-    "SimplifyReport",
     "Visibility",
     "VisibilitySource",
     "flag",
@@ -159,7 +158,7 @@ def simplify(
     _check_budget(budget, len(scene))
     if protected is not None:
         protected = np.ascontiguousarray(_check_flags(protected, len(splats))[finite])
-    if not (scene.opacities >= config.min_opacity_of(method)).any():
+    if not (scene.opacities >= (config.resolved(method).min_opacity or 0.0)).any():
         scene, config = with_some_opacity(scene), replace(config, min_opacity=0.0)
     if config.keep_region and (method == "paper" or visibility is None):
         raise InputError(
@@ -171,7 +170,7 @@ def simplify(
         out = merge_and_fit(scene, budget, method, visibility, protected, config, progress)
     else:
         seen = None if visibility is None else rows_of(visibility, len(splats), finite)
-        out = merge(scene, budget, method, seen, protected, config, counter(progress, "simplify"))
+        out = merge(scene, budget, method, seen, protected, config, progress)
     return _simplified(splats, finite, out)
 
 

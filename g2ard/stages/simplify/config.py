@@ -11,15 +11,12 @@ from g2ard.config.choices import METHODS, Method
 from g2ard.errors import require
 from g2ard.scene.regions import Region, as_regions
 
-__all__ = ["METHODS", "SimplifyConfig", "round_counts"]
-
 _RETENTION: dict[str, float] = {"default": 0.65, "fast": 0.65, "paper": 0.75}
 
 _CORE = _core.defaults()
 """Defaults of the Rust core, by method."""
 
 _PAIRWISE, _PAPER = _CORE["default"], _CORE["paper"]
-
 
 _OF_METHOD = ("min_opacity", "morton_premerge_ratio", "morton_premerge_steps")
 """Constants whose default depends on the method."""
@@ -139,10 +136,6 @@ class SimplifyConfig:
     def retention_of(self, method: str) -> float:
         """Return the share of Gaussians that a round of `method` keeps."""
         return _RETENTION[method] if self.retention is None else self.retention
-
-    def min_opacity_of(self, method: str) -> float:
-        """Return the α below which `method` drops Gaussians."""
-        return self.resolved(method).min_opacity or 0.0
 
 
 def round_counts(

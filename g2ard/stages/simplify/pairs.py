@@ -4,7 +4,7 @@ opacities."""
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from g2ard import _core
 from g2ard.errors import InputError
 from g2ard.progress import Progress, counter
+from g2ard.rendering.visibility import SampledVisibility
 from g2ard.scene.prepared import MAX_OPACITY, PreparedScene
 from g2ard.scene.regions import in_any
 from g2ard.scene.splats import DRAWN_LOGIT, Splats
@@ -49,22 +50,14 @@ VisibilitySource = Callable[[Splats], Visibility]
 """Function scene → visibility, such as `g2ard.rendering.visibility.visibility_source` returns."""
 
 
-@dataclass(frozen=True, eq=False)
-class RowVisibility:
-    """A visibility of finite rows: float32, contiguous."""
-
-    weight: NDArray[np.float32]
-    pixel_size: NDArray[np.float32]
-
-
-def rows_of(visibility: Visibility, count: int, finite: NDArray[np.bool_] | slice) -> RowVisibility:
+def rows_of(visibility: Visibility, count: int, finite: NDArray[np.bool_] | slice) -> SampledVisibility:
     """Return the finite rows of a visibility, contiguous."""
     for name in ("weight", "pixel_size"):
         shape = getattr(visibility, name).shape
         if shape != (count,):
             raise InputError(f"visibility.{name}: expected shape ({count},), got {shape}")
     weight, pixel = (np.asarray(a, np.float32)[finite] for a in (visibility.weight, visibility.pixel_size))
-    return RowVisibility(np.ascontiguousarray(weight), np.ascontiguousarray(pixel))
+    return SampledVisibility(np.ascontiguousarray(weight), np.ascontiguousarray(pixel))
 
 
 def emphasised(scene: Splats, visibility: Visibility, config: SimplifyConfig) -> Visibility:
@@ -76,9 +69,8 @@ def emphasised(scene: Splats, visibility: Visibility, config: SimplifyConfig) ->
         return visibility
     inside = in_any(scene, config.keep_region)
     times = np.where(inside, np.float32(config.keep_times), np.float32(1))
-    return RowVisibility(
-        visibility.weight * times, (visibility.pixel_size / np.sqrt(times)).astype(np.float32)
-    )
+    pixel_size = (visibility.pixel_size / np.sqrt(times)).astype(np.float32)
+    return SampledVisibility(visibility.weight * times, pixel_size)
 
 
 def merge(
@@ -88,7 +80,7 @@ def merge(
     visibility: Visibility | None,
     protected: NDArray[np.bool_] | None,
     config: SimplifyConfig,
-    tell: Callable[[int, int], None],
+    progress: Progress,
 ) -> dict[str, Any]:
     """Merge by `default` or `fast`; `visibility` has one row per Gaussian of the scene."""
     config = config.resolved(method, antialiased=scene.antialiased)
@@ -98,7 +90,7 @@ def merge(
         config,
         protected=protected,
         visibility=None if visibility is None else emphasised(scene, visibility, config),
-        progress=tell,
+        progress=counter(progress, "simplify"),
     )
 
 
@@ -114,7 +106,7 @@ def merge_and_fit(
     """Merge by visibility, then fit each merged Gaussian's opacity so that views see as much of it as of its
     members."""
     visibility = rows_of(source(scene), len(scene), slice(None))
-    out = merge(scene, budget, method, visibility, protected, config, counter(progress, "simplify"))
+    out = merge(scene, budget, method, visibility, protected, config, progress)
     merged, parents = splats_of(scene, out), out["parents"]
     order = scene.core.order  # sums in this order do not depend on the order of the scene's rows
     row, weight = parents[order], visibility.weight[order]
