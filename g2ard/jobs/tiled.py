@@ -13,14 +13,14 @@ from pathlib import Path
 from g2ard.config.choices import RenderModel
 from g2ard.errors import G2ardError, InputError, OutputError
 from g2ard.io.atomic import drop_empty, parents_made
+from g2ard.io.detect import MANIFEST
 from g2ard.io.lock import locked
 from g2ard.jobs.budget import Budget
 from g2ard.jobs.distill_options import DistillOptions
-from g2ard.jobs.inputs import Views, load_view_sets, load_views
+from g2ard.jobs.inputs import Views, load_view_sets, say_regions
 from g2ard.jobs.levels import LevelReport, check_ratios, level_size
 from g2ard.jobs.tiling import RECOVERY_TIMES, Tiling, refuse_whole, whole_options, workers_for
-from g2ard.jobs.view_checks import as_pool, found_views
-from g2ard.jobs.views import RunViews, is_made, pool_times, views_of
+from g2ard.jobs.views import RunViews, cameras_for_weights, is_made, pool_times, views_of
 from g2ard.levels import Cut
 from g2ard.pipeline import DistillConfig
 from g2ard.progress import Progress, Say, plural, silent, unsaid
@@ -29,13 +29,14 @@ from g2ard.scene.splats import Splats
 from g2ard.stages.recover.prior import regularizers_for
 from g2ard.stages.recover.schedule import steps_for
 from g2ard.stages.simplify import SimplifyConfig
-from g2ard.tiles.executor import DaskExecutor, Workers, executor
+from g2ard.tiles.executor import Workers, executor
 from g2ard.tiles.ingest import ingest
 from g2ard.tiles.journal import is_tile_file
-from g2ard.tiles.merging import TiledScene, key_of, sample_of, simplify_tiles
+from g2ard.tiles.merging import TiledScene, key_of, simplify_tiles
 from g2ard.tiles.recover import TiledScores, recover_tiles
 from g2ard.tiles.sights import Surroundings
-from g2ard.tiles.store import MANIFEST, StoredScene, TileStore
+from g2ard.tiles.steps import TiledRun
+from g2ard.tiles.store import StoredScene, TileStore
 
 _WORK_NAME = re.compile(r"tiles|steps|(student|merged|level|written)-[0-9a-f]{16}")
 """Names that commands create in the work folder."""
@@ -100,7 +101,7 @@ def _check_given(tiling: Tiling, views: tuple[Views | None, ...]) -> None:
         if given is not None and not is_made(given):
             load_view_sets(given, [], None, unpictured=True)
     if tiling.scheduler not in (None, "local"):
-        with DaskExecutor(tiling.scheduler, 1, 1):
+        with executor(scheduler=tiling.scheduler):
             pass
 
 
@@ -172,29 +173,26 @@ def simplify_in_tiles(
         tiling: how; `folder` keeps finished steps, so that the same call resumes.
         views: as for `g2ard.simplify`.
     """
+    config = config or SimplifyConfig()
     with _tiles_and_workers(scene, tiling, 1.0, render_model, progress, say) as (store, workers):
-        for budget in budgets:
-            yield (
-                store,
-                simplify_tiles(
-                    store,
-                    budget.of(store.count, str(scene)),
-                    workers=workers,
-                    config=config,
-                    views=None if views in (None, "made") else load_views(views, "train", None, say),
-                    beside=lambda sample: _found(scene, sample, say) if views is None else None,
-                    blind=blind,
-                    up=up,
-                    seed=seed,
-                    say=say,
-                ),
+        counts = [budget.of(store.count, str(scene)) for budget in budgets]
+        run, cameras = TiledRun(store, workers, config), None
+        if not blind and min(counts) < store.count:
+            sample = run.sample()
+            say_regions(sample, config, "a sample of the scene", unsaid)
+            cameras = cameras_for_weights(
+                sample,
+                views,
+                "default",
+                beside=scene,
+                up=up,
+                seed=seed,
+                represents=store.count / len(sample),
+                progress=progress,
+                say=say,
             )
-
-
-def _found(scene: Path, sample: Splats, say: Say) -> Cameras | None:
-    """Return the cameras beside the scene that see the sample of it."""
-    found = found_views(scene, sample, ["train"], say)
-    return as_pool(load_views(found, "train", None, say)) if found else None
+        for count in counts:
+            yield store, simplify_tiles(run, count, cameras if count < store.count else None)
 
 
 def distill_in_tiles(
@@ -312,19 +310,10 @@ class _Job:
     learn: bool
     workers: Workers
     tiling: Tiling
-    say: Say
 
     def simplified(self, store: TileStore, count: int, cameras: Cameras) -> TiledScene:
         """Simplify a scene in tiles: the dense one, or one derived from it."""
-        return simplify_tiles(
-            store,
-            count,
-            workers=self.workers,
-            config=self.config.simplify,
-            views=cameras,
-            seed=self.config.recover.seed,
-            say=self.say,
-        )
+        return simplify_tiles(TiledRun(store, self.workers, self.config.simplify), count, cameras)
 
     def recovered(
         self, small: TiledScene, around: Surroundings, views: RunViews
@@ -355,7 +344,8 @@ def _job(
     """Open the tiles, start workers, and decide views and constants of a distillation."""
     model = options.render_model
     with _tiles_and_workers(scene, tiling, RECOVERY_TIMES, model, progress, say) as (store, workers):
-        sample = sample_of(store, workers)
+        sample = TiledRun(store, workers, options.config.simplify).sample()
+        say_regions(sample, options.config.simplify, "a sample of the scene", unsaid)
         views = views_of(
             sample,
             options,
@@ -368,4 +358,4 @@ def _job(
         if learn:
             say(f"regularisers: {why}")
         config = options.configured(regularizers)
-        yield _Job(store, sample, views, config, learn, workers, tiling, say)
+        yield _Job(store, sample, views, config, learn, workers, tiling)

@@ -239,6 +239,7 @@ def cameras_for_weights(
     beside: str | Path | None = None,
     up: Up = None,
     seed: int = 0,
+    represents: float = 1.0,
     progress: Progress = silent,
     say: Say = unsaid,
 ) -> Cameras | None:
@@ -271,14 +272,16 @@ def cameras_for_weights(
     if method != "default" and not made:
         return None
     try:
+        times = _times(scene, represents)
         pool = plan_pool(
             scene,
-            _WEIGHT_VIEWS,
+            round(_WEIGHT_VIEWS * times),
             up=up,
             seed=seed,
-            rows=_WEIGHT_ROWS,
+            rows=round(_WEIGHT_ROWS * times),
             near=_NEAR,
             for_weights=True,
+            represents=represents,
             progress=progress,
         )
     except InputError as e:

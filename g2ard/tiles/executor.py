@@ -5,14 +5,15 @@ from __future__ import annotations
 import os
 import signal
 import threading
-from collections.abc import Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass
+from functools import partial
 from multiprocessing import get_context, parent_process
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from g2ard import _core
 from g2ard.errors import InputError
@@ -29,23 +30,59 @@ _MANAGER = 5.0
 The thread releases semaphores; otherwise Python warns about them at exit.
 """
 
+Finished = Callable[[Task], None]
+Executor = Callable[[Sequence[Task], Finished], None]
+"""Runs tasks that do not read each other's files, and calls back after each; may raise `WorkerDiedError`."""
 
-class Executor(Protocol):
-    """Runner for tasks that do not read each other's files."""
 
-    def run(self, tasks: Sequence[Task], stage: str, progress: Progress = silent) -> list[Path]:
-        """Run the tasks that are not done; return the files of all, in order."""
+class WorkerDiedError(Exception):
+    """A worker was killed; unfinished tasks can be run again."""
 
 
 @dataclass(frozen=True)
 class Workers:
+    """An executor, and the folder of its tasks' files."""
+
     executor: Executor
     folder: Path
     progress: Progress = silent
 
     def run(self, tasks: Sequence[Task], stage: str) -> list[Path]:
-        """Run tasks; return their files in order."""
-        return self.executor.run(tasks, stage, self.progress)
+        """Run the tasks that are not done; return the files of all, in order."""
+        total, deaths = sum(task.cost for task in tasks), 0
+        while todo := [task for task in tasks if not task.done]:
+            try:
+                self._round(todo, stage, total)
+            except WorkerDiedError:
+                left = sum(not task.done for task in tasks)
+                deaths = deaths + 1 if left == len(todo) else 0
+                if deaths == _TRIES:
+                    raise InputError(
+                        f"{stage}: workers were killed before finishing a task; give them more memory, or "
+                        "lower --memory or --workers"
+                    ) from None
+            else:
+                _check_written(todo)
+        self.progress(stage, total, total)
+        return [task.output for task in tasks]
+
+    def _round(self, todo: Sequence[Task], stage: str, total: int) -> None:
+        done = total - sum(task.cost for task in todo)
+
+        def finished(task: Task) -> None:
+            nonlocal done
+            done += task.cost
+            self.progress(stage, done, total)
+
+        self.progress(stage, done, total)
+        self.executor(todo, finished)
+
+
+def _check_written(tasks: Sequence[Task]) -> None:
+    if missing := [task.output for task in tasks if not task.done]:
+        raise InputError(
+            "written by a worker but missing here; share the folder with all workers", path=missing[0]
+        )
 
 
 @contextmanager
@@ -63,90 +100,59 @@ def executor(
     forget_workers()
     threads = threads or max(1, (os.cpu_count() or 1) // workers)
     if scheduler:
-        with DaskExecutor(scheduler, workers, threads) as cluster:
-            yield cluster
+        with _dask_client(scheduler, workers) as client:
+            yield partial(_run_on_dask, client, threads)
     elif workers == 1:
-        yield _Here()
+        yield _run_here
     else:
-        with _Processes(workers, threads) as processes:
-            yield processes
+        with closing(_Processes(workers, threads)) as processes:
+            yield processes.run
 
 
-class _Here:
-    def run(self, tasks: Sequence[Task], stage: str, progress: Progress = silent) -> list[Path]:
-        todo = [task for task in tasks if not task.done]
-        done = total = sum(task.cost for task in tasks)
-        done -= sum(task.cost for task in todo)
-        for task in todo:
-            progress(stage, done, total)
-            run_task(task)
-            done += task.cost
-        progress(stage, total, total)
-        return [task.output for task in tasks]
+def _run_here(tasks: Sequence[Task], finished: Finished) -> None:
+    for task in tasks:
+        run_task(task)
+        finished(task)
 
 
 class _Processes:
-    """A pool of processes; if one is killed, the pool is recreated and unfinished tasks run again."""
+    """A pool of processes, recreated after one of them is killed."""
 
     def __init__(self, workers: int, threads: int):
         self._workers, self._threads = workers, threads
         self._pool: ProcessPoolExecutor | None = None
 
-    def __enter__(self) -> _Processes:
-        return self
-
-    def __exit__(self, kind: object, *_: object) -> None:
-        self._stop(at_once=kind is not None)
-
-    def run(self, tasks: Sequence[Task], stage: str, progress: Progress = silent) -> list[Path]:
-        total, failures = sum(task.cost for task in tasks), 0
+    def run(self, tasks: Sequence[Task], finished: Finished) -> None:
         _sweep(tasks)
-        while todo := [task for task in tasks if not task.done]:
-            before = len(todo)
-            try:
-                self._round(todo, total, stage, progress)
-            except BrokenProcessPool:
-                self._stop(at_once=True)
-                _sweep(tasks)
-                left = sum(not task.done for task in tasks)
-                failures = failures + 1 if left == before else 0
-                if failures == _TRIES:
-                    raise InputError(
-                        f"{stage}: workers were killed before finishing a task; lower --memory or "
-                        "--workers so that they need less memory"
-                    ) from None
-        progress(stage, total, total)
-        return [task.output for task in tasks]
-
-    def _round(self, todo: Sequence[Task], total: int, stage: str, progress: Progress) -> None:
         if self._pool is None:
             context = get_context("spawn")
             self._pool = ProcessPoolExecutor(self._workers, context, _begin, (self._threads,))
-        futures: dict[Future[tuple[int, int | None]], Task] = {
-            self._pool.submit(_run_noted, task): task for task in todo
-        }
-        done, pending = total - sum(task.cost for task in todo), set(futures)
-        while pending:
-            progress(stage, done, total)
-            finished, pending = wait(pending, timeout=0.2, return_when=FIRST_COMPLETED)
-            for future in finished:
-                note_worker(*future.result())
-                done += futures[future].cost
+        try:
+            futures = {self._pool.submit(_run_noted, task): task for task in tasks}
+            pending = set(futures)
+            while pending:  # wait briefly: Ctrl-C does not end a longer wait on Windows
+                done, pending = wait(pending, timeout=0.2, return_when=FIRST_COMPLETED)
+                for future in done:
+                    note_worker(*future.result())
+                    finished(futures[future])
+        except BrokenProcessPool:
+            self.close()
+            raise WorkerDiedError from None
 
-    def _stop(self, at_once: bool) -> None:
+    def close(self) -> None:
+        """Kill the workers."""
         if self._pool is None:
             return
         processes = list((self._pool._processes or {}).values())
         manager: threading.Thread | None = getattr(self._pool, "_executor_manager_thread", None)
-        self._pool.shutdown(wait=not at_once, cancel_futures=True)
-        if at_once:
-            for process in processes:
-                with suppress(OSError, ValueError):
-                    process.kill()
-            for process in processes:
-                process.join()
-            if manager is not None:
-                manager.join(timeout=_MANAGER)
+        self._pool.shutdown(wait=False, cancel_futures=True)
+        for process in processes:
+            with suppress(OSError, ValueError):
+                process.kill()
+        for process in processes:
+            process.join()
+        if manager is not None:
+            manager.join(timeout=_MANAGER)
         self._pool = None
 
 
@@ -172,94 +178,56 @@ def _begin(threads: int) -> None:
 
 def _end_with_parent() -> None:
     """Exit when the parent is gone; a killed parent cannot tell its workers, which would wait forever."""
-    parent = parent_process()
-    if parent is not None:
+    if (parent := parent_process()) is not None:
         parent.join()
     os._exit(1)
 
 
-class DaskExecutor:
-    """Executor on the workers of a Dask scheduler, which must see the same files under the same paths.
-
-    Results are paths, because Dask cannot spill what workers hold in Rust's memory.
-    """
-
-    def __init__(self, scheduler: str, workers: int, threads: int):
-        try:
-            from distributed import Client, LocalCluster
-        except ImportError:
-            raise InputError(
-                '--scheduler: Dask is not installed; run pip install "g2ard[distributed]"'
-            ) from None
-        self._threads = threads
-        self._cluster: Any = None
+@contextmanager
+def _dask_client(scheduler: str, workers: int) -> Iterator[Any]:
+    """Connect to a Dask scheduler, or start one on this machine."""
+    try:
+        from distributed import Client, LocalCluster
+    except ImportError:
+        raise InputError('--scheduler: Dask is not installed; run pip install "g2ard[distributed]"') from None
+    with ExitStack() as opened:
         if scheduler == "local":
-            self._cluster = LocalCluster(  # type: ignore[no-untyped-call]
+            cluster = LocalCluster(  # type: ignore[no-untyped-call]
                 n_workers=workers,
                 threads_per_worker=1,
                 processes=True,
                 dashboard_address=None,
                 memory_limit=0,
             )
-            scheduler = self._cluster.scheduler_address
+            scheduler = opened.enter_context(closing(cluster)).scheduler_address
         try:
-            self.client: Any = Client(  # type: ignore[no-untyped-call]
-                scheduler, timeout="10s", set_as_default=False
-            )
+            client = Client(scheduler, timeout="10s", set_as_default=False)  # type: ignore[no-untyped-call]
         except (OSError, TimeoutError, ValueError) as error:
             raise InputError(
                 f"--scheduler {scheduler}: no answer ({error}); start one with `dask scheduler`, which "
                 "prints its address"
             ) from None
+        yield opened.enter_context(closing(client))
 
-    def __enter__(self) -> DaskExecutor:
-        return self
 
-    def __exit__(self, *_: object) -> None:
-        self.client.close()
-        if self._cluster is not None:
-            self._cluster.close()
+def _run_on_dask(client: Any, threads: int, tasks: Sequence[Task], finished: Finished) -> None:
+    """Run tasks on workers that see the same files under the same paths.
 
-    def run(self, tasks: Sequence[Task], stage: str, progress: Progress = silent) -> list[Path]:
-        """Run tasks like `Executor.run`, retrying after a worker's death."""
-        from distributed import KilledWorker
+    Results are paths, because Dask cannot spill what workers hold in Rust's memory.
+    """
+    from distributed import KilledWorker, as_completed
 
-        deaths = 0
-        while todo := {task.key: task for task in tasks if not task.done}:
-            before = len(todo)
-            try:
-                self._round(todo, sum(task.cost for task in tasks), stage, progress)
-            except KilledWorker:
-                left = sum(not task.done for task in tasks)
-                deaths = deaths + 1 if left == before else 0
-                if deaths == _TRIES:
-                    raise InputError(
-                        f"{stage}: workers were killed before finishing a task; give them more memory"
-                    ) from None
-                continue
-            if missing := [task.output for task in tasks if not task.done]:
-                raise InputError(
-                    "written by a worker but missing here; share the folder with all workers", path=missing[0]
-                )
-        return [task.output for task in tasks]
-
-    def _round(self, todo: dict[str, Task], total: int, stage: str, progress: Progress) -> None:
-        from distributed import as_completed
-
-        done = total - sum(task.cost for task in todo.values())
-        futures = [
-            self.client.submit(_work, task, self._threads, key=f"g2ard-{key}", pure=True)
-            for key, task in todo.items()
-        ]
-        try:
-            progress(stage, done, total)
-            for future in as_completed(futures, loop=self.client.loop):  # type: ignore[no-untyped-call]
-                future.result()
-                done += todo[future.key.removeprefix("g2ard-")].cost
-                progress(stage, done, total)
-        except BaseException:
-            self.client.cancel(futures, force=True)
-            raise
+    by_key = {f"g2ard-{task.key}": task for task in tasks}
+    futures = [client.submit(_work, task, threads, key=key, pure=True) for key, task in by_key.items()]
+    try:
+        for future in as_completed(futures, loop=client.loop):  # type: ignore[no-untyped-call]
+            future.result()
+            finished(by_key[future.key])
+    except BaseException as error:
+        client.cancel(futures, force=True)
+        if isinstance(error, KilledWorker):
+            raise WorkerDiedError from None
+        raise
 
 
 def _work(task: Task, threads: int) -> str:

@@ -15,24 +15,13 @@ from numpy.typing import NDArray
 from g2ard.config.choices import RenderModel
 from g2ard.errors import InputError
 from g2ard.io.stream import PartsStream
-from g2ard.poses import plan_pool
-from g2ard.progress import Say, unsaid
 from g2ard.scene.cameras import Cameras
-from g2ard.scene.regions import Region, in_any
 from g2ard.scene.splats import Splats, unit_quats
 from g2ard.scene.transform import join
-from g2ard.stages.simplify import SimplifyConfig
-from g2ard.tiles.executor import Workers
 from g2ard.tiles.sights import Sights, Surroundings
 from g2ard.tiles.steps import TiledRun
 from g2ard.tiles.store import TileStore
-from g2ard.tiles.tasks import load, scene_of, small_scene
-
-_POOL, _POOL_ROWS = 96, 4_000_000
-"""Number of poses per number of Gaussians; larger scenes get proportionally more."""
-
-_PLANNED_ON = 100_000
-"""Sampled Gaussians on which each `_POOL` poses are planned."""
+from g2ard.tiles.tasks import load, small_scene
 
 _HALF = 1 << 16
 
@@ -78,59 +67,46 @@ class TiledScene:
         return join(list(self))
 
 
-def simplify_tiles(
-    store: TileStore,
-    budget: int,
-    *,
-    workers: Workers,
-    config: SimplifyConfig | None = None,
-    views: Cameras | None = None,
-    beside: Callable[[Splats], Cameras | None] = lambda sample: None,
-    blind: bool = False,
-    up: Any = None,
-    seed: int = 0,
-    say: Say = unsaid,
-) -> TiledScene:
+def simplify_tiles(run: TiledRun, budget: int, views: Cameras | None = None) -> TiledScene:
     """Reduce a tiled scene to exactly `budget` Gaussians with method `default`.
 
     If `budget` is the scene's count, the scene is returned unchanged. Otherwise:
 
-    1. Each tile is merged to a few coarse Gaussians that represent it in views of other tiles.
-    2. Poses are planned on these. Each tile is rendered from the views that see it, amid its halo and the
-       coarse Gaussians of all other tiles (`Sights`).
+    1. Each tile is merged to a few coarse Gaussians that represent it in views of other tiles (`TiledRun`).
+    2. Each tile is rendered from the views that see it, amid its halo and the coarse Gaussians of all other
+       tiles (`Sights`).
     3. Each tile computes the costs of merging along Morton order. The cheapest merges of all tiles are done,
        down to three times the budget. Then each tile plans more merges of pairs than needed, and the cheapest
        of all plans are done, down to the budget (`_merged`).
-    4. Opacities are fitted to what the same views see of the result (`_fitted`).
+    4. Opacities are fitted to what the same views see of the result.
 
-    Every step is a task with a file in the folder of `workers`, so the same call resumes. The result depends
-    only on the scene, the tiles and the seed, not on where, in which order or how often tasks ran.
-
-    Args:
-        views: cameras to render from; None uses `beside`, or as a fallback a generated pool.
-        beside: returns cameras found beside the scene for a sample of it, or None.
-        blind: use no cameras at all.
+    Every step is a task with a file in the folder of the run's workers, so the same call resumes. The result
+    depends only on the scene, the tiles and the views, not on where, in which order or how often tasks ran.
     """
+    store = run.store
     if not 1 <= budget <= store.count:
         raise InputError(
             f"expected 1 to {store.count:,} (the scene's Gaussians), got {budget:,}", parameter="budget"
         )
-    run = TiledRun(store, workers, config or SimplifyConfig())
-    coarse = run.begin()
     frame = run.sampled_frame()  # units that tiles share, so that their costs compare
-    unchanged = budget == store.count
-    sights: Sights | None = None
-    if not blind and (views is not None or not unchanged):  # recovery of an unchanged scene needs them too
-        sample = join([scene_of(path, "sample") for path in coarse])
-        _check_regions(sample, run.config["keep_region"])
-        cameras = views or beside(sample) or _planned(run, sample, up, seed, say)
-        sights = None if cameras is None else Sights(run, coarse, cameras, frame)
-    if unchanged:
-        return _as_it_is(store, sights)
+    sights = None if views is None else Sights(run, views, frame)
+    if budget == store.count:
+        return _scene(store, run.sizes, store.read, key_of(store.key), sights)
     merged, counts = _merged(run, budget, frame if sights is None else sights.frame, sights)
     if sights is None:
-        return _scene(store, counts, [{"merged": path} for path in merged], None)
-    return _fitted(store, counts, merged, sights)
+        files, mean = [{"merged": path} for path in merged], None
+    else:
+        seen = sights.again(merged)
+        files = [{"merged": one, "visibility": other} for one, other in zip(merged, seen, strict=True)]
+        mean = sum(float(load(path, "wanted")[0].sum()) for path in merged) / budget
+
+    def tile(i: int) -> Splats:
+        return finished(small_scene(files[i], mean), store.sh_degree)
+
+    scene = _scene(store, counts, tile, key_of(files), sights)
+    if sights is None:
+        return scene
+    return replace(scene, unseen=sum(int(load(path, "unseen")[0]) for path in merged))
 
 
 def _merged(
@@ -164,45 +140,16 @@ def _merged(
     return merged, counts
 
 
-def _fitted(store: TileStore, counts: tuple[int, ...], merged: list[Path], sights: Sights) -> TiledScene:
-    """Return the scene with opacities fitted to what the views see of the merged tiles."""
-    seen = sights.again(merged)
-    mean = sum(float(load(path, "wanted")[0].sum()) for path in merged) / sum(counts)
-    files = [{"merged": one, "visibility": other} for one, other in zip(merged, seen, strict=True)]
-    return replace(
-        _scene(store, counts, files, mean),
-        views=len(sights.cameras),
-        unseen=sum(int(load(path, "unseen")[0]) for path in merged),
-        surroundings=sights.surroundings,
-    )
-
-
-def sample_of(store: TileStore, workers: Workers) -> Splats:
-    """Return a representative sample of a tiled scene; `simplify_tiles` reuses its task."""
-    run = TiledRun(store, workers, SimplifyConfig())
-    return join([scene_of(path, "sample") for path in run.begin()])
-
-
 def _scene(
-    store: TileStore, counts: tuple[int, ...], files: list[dict[str, Path]], mean: float | None
+    store: TileStore, counts: Sequence[int], tiles: Callable[[int], Splats], key: str, sights: Sights | None
 ) -> TiledScene:
-    """Return the scene made of all tiles' merge results."""
-
-    def tile(i: int) -> Splats:
-        return finished(small_scene(files[i], mean), store.sh_degree)
-
-    parts = counts, tile, store.sh_degree, store.offset
-    return TiledScene(*parts, key_of(files), render_model=store.render_model)
-
-
-def _as_it_is(store: TileStore, sights: Sights | None) -> TiledScene:
     return TiledScene(
-        tuple(tile.rows for tile in store.tiles),
-        store.read,
+        tuple(counts),
+        tiles,
         store.sh_degree,
         store.offset,
-        key_of(store.key),
-        0 if sights is None else len(sights.cameras),
+        key,
+        views=0 if sights is None else len(sights.cameras),
         surroundings=None if sights is None else sights.surroundings,
         render_model=store.render_model,
     )
@@ -219,39 +166,9 @@ def finished(small: Splats, sh_degree: int) -> Splats:
     return replace(small.with_sh_degree(sh_degree), quats=unit_quats(small.quats))
 
 
-def _check_regions(sample: Splats, regions: Sequence[Region]) -> None:
-    if regions and not in_any(sample, regions).any():
-        raise InputError(
-            f"contains none of {len(sample):,} sampled Gaussians",
-            parameter="keep_region",
-        )
-
-
-def _planned(run: TiledRun, sample: Splats, up: Any, seed: int, say: Say) -> Cameras | None:
-    """Plan a view pool that grows with the scene."""
-    times = max(1.0, run.store.count / _POOL_ROWS)
-    try:
-        pool = plan_pool(
-            sample,
-            round(_POOL * times),
-            up=up,
-            seed=seed,
-            rows=round(_PLANNED_ON * times),
-            near=0.25,
-            for_weights=True,
-            represents=run.store.count / len(sample),
-            progress=run.workers.progress,
-        )
-    except InputError as e:
-        say(f"continuing without views: {e}")
-        return None
-    say(f"poses: {len(pool.cameras)}, {pool.kind}")
-    return pool.cameras
-
-
 def _runs(run: TiledRun, costs: list[Path], budget: int) -> list[int]:
     """Return the number of Morton runs that each tile keeps."""
-    kept = [_length(path) + 1 for path in costs]
+    kept = [len(load(path, "costs")[0]) + 1 for path in costs]
     if sum(kept) < budget:
         raise InputError(
             f"expected at most {sum(kept):,} (the visible Gaussians), got {budget:,}",
@@ -260,10 +177,6 @@ def _runs(run: TiledRun, costs: list[Path], budget: int) -> list[int]:
     target = min(sum(kept), int(run.config["morton_premerge_ratio"] * budget))
     closed = cheapest([_costs_of(path) for path in costs], sum(kept) - max(target, len(kept)))
     return [n - c for n, c in zip(kept, closed, strict=True)]
-
-
-def _length(path: Path) -> int:
-    return len(load(path, "costs")[0])
 
 
 def _costs_of(path: Path) -> Callable[[], NDArray[np.float32]]:

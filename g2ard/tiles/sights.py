@@ -47,19 +47,21 @@ class Surroundings:
 
 
 class Sights:
-    def __init__(self, run: TiledRun, coarse: list[Path], cameras: Cameras, frame: tuple[float, ...]):
-        self.run, self.coarse, self.cameras = run, coarse, cameras.resized(LONGEST)
+    """Visibility of a run's tiles in some views, and the frame of costs that follows from it."""
+
+    def __init__(self, run: TiledRun, cameras: Cameras, frame: tuple[float, ...]):
+        self.run, self.cameras = run, cameras.resized(LONGEST)
         self.shrunk = float((self.cameras.widths / cameras.widths).mean())
         self.views = written(run.workers.folder, self.cameras)
-        self.boxes = boxes_of(coarse)
-        light = light_of(run.store, coarse, self.cameras, run.workers)
+        self.boxes = boxes_of(run.coarse)
+        light = light_of(run.store, run.coarse, self.cameras, run.workers)
         self.arguments = [
             {
                 **self._chosen(light, tile),
                 "levels": self._levels(tile),
                 "shrunk": self.shrunk,
             }
-            for tile in range(len(coarse))
+            for tile in range(len(run.coarse))
         ]
         self.visibility = run.each(
             "visibility", "visibility", frame=frame, per_tile=self.arguments, inputs=self._inputs()
@@ -75,7 +77,7 @@ class Sights:
     @property
     def surroundings(self) -> Surroundings:
         """Placement of the tiles."""
-        return Surroundings(self.coarse, [given["levels"] for given in self.arguments])
+        return Surroundings(self.run.coarse, [given["levels"] for given in self.arguments])
 
     def again(self, merged: list[Path]) -> list[Path]:
         """Measure what the same views see of the merged tiles."""
@@ -87,7 +89,7 @@ class Sights:
         return self.run.each("merged_visibility", "merged visibility", per_tile=levels, inputs=inputs)
 
     def _inputs(self) -> list[dict[str, Any]]:
-        return [{"coarse": self.coarse, "views": self.views} for _ in self.coarse]
+        return [{"coarse": self.run.coarse, "views": self.views} for _ in self.run.coarse]
 
     def _chosen(self, light: NDArray[np.float64], tile: int) -> dict[str, Any]:
         """Choose the views of a tile, evenly spaced among those that see it."""

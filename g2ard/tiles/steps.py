@@ -322,7 +322,7 @@ def _widened(scene: Splats, times: int) -> Splats:
 
 
 class TiledRun:
-    """Shared state of the steps of a tiled simplification."""
+    """Steps of a tiled simplification, of which the first, `coarse`, runs at once."""
 
     def __init__(self, store: TileStore, workers: Workers, config: SimplifyConfig):
         self.store, self.workers = store, workers
@@ -331,6 +331,7 @@ class TiledRun:
         self.config = asdict(config.resolved("default", antialiased=model == "antialiased"))
         self.sizes = [tile.rows for tile in store.tiles]
         self.coarse: list[Path] = []
+        self.coarse = self.each("coarse", "coarse")
 
     def each(
         self,
@@ -362,14 +363,13 @@ class TiledRun:
             )
         return self.workers.run(tasks, stage)
 
-    def begin(self) -> list[Path]:
-        """Run the first step, `coarse`."""
-        self.coarse = self.each("coarse", "coarse")
-        return self.coarse
+    def sample(self) -> Splats:
+        """Return a representative sample of the scene."""
+        return join([scene_of(path, "sample") for path in self.coarse])
 
     def sampled_frame(self) -> tuple[float, ...]:
-        """Return the frame of a representative sample of the scene, without views."""
-        sample = join([scene_of(path, "sample").with_sh_degree(0) for path in self.coarse])
+        """Return the frame of a sample of the scene, without views."""
+        sample = self.sample().with_sh_degree(0)
         every = -(-len(sample) // _SAMPLED)
         scene, _ = finite_rows_of(sample.take(slice(None, None, every)))
         return _core.TileFrame.of_sample(

@@ -47,8 +47,9 @@ def test_stopped_workers_leave_one_line(folder: Path) -> None:
     g2ard.save(folder / "large.ply", checkered_ball(20_000))
     ask = ("simplify", "large.ply", "-r", 4, "--tile-rows", "3k", "--workers", 2, "-o", "s.ply")
     running = program(*ask, folder=folder, stderr=subprocess.PIPE)
-    while not (line := running.stderr.readline()).startswith(b"poses: "):  # workers begin to look
-        assert line
+    while not list(folder.glob(".s.ply.tiles/steps/light-*.npz")):  # workers are about to look
+        assert running.poll() is None
+        time.sleep(0.05)
     time.sleep(0.3)
     running.send_signal(signal.SIGTERM)
     error = running.stderr.read()

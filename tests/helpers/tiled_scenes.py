@@ -1,14 +1,17 @@
 """Scenes and views for tests of tiles."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from g2ard.progress import Progress, silent
 from g2ard.scene.cameras import Cameras, look_at
 from g2ard.scene.splats import Splats
+from g2ard.stages.simplify import SimplifyConfig
 from g2ard.tiles.executor import Workers, executor
 from g2ard.tiles.merging import simplify_tiles
+from g2ard.tiles.steps import TiledRun
 from g2ard.tiles.store import TileStore
 
 
@@ -45,8 +48,15 @@ def ring(count: int = 6) -> Cameras:
 
 
 def reduced(
-    store: TileStore, work: Path, budget: int = 900, *, progress: Progress = silent, **options: object
+    store: TileStore,
+    work: Path,
+    budget: int = 900,
+    views: Cameras | None = None,
+    *,
+    progress: Progress = silent,
+    **where: Any,
 ) -> Splats:
-    where = {key: options.pop(key) for key in ("workers", "threads", "scheduler") if key in options}
-    with executor(**where) as runs:  # type: ignore[arg-type]
-        return simplify_tiles(store, budget, workers=Workers(runs, work, progress), **options).whole()  # type: ignore[arg-type]
+    """Simplify in tiles without poses of its own; `where` are arguments of `executor`."""
+    with executor(**where) as runs:
+        run = TiledRun(store, Workers(runs, work, progress), SimplifyConfig())
+        return simplify_tiles(run, budget, views).whole()

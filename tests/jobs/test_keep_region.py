@@ -127,7 +127,7 @@ def test_the_commands(command_line: CommandLine, tmp_path: Path) -> None:
         (
             ("--keep-region", "0,0,90,1", "--tile-rows", "200", "--workers", "1"),
             1,
-            "sampled Gaussians",
+            "Gaussians of a sample of the scene",
         ),
         (("--keep-region", "0,0,1"), 2, "expected X,Y,Z,R or X,Y,Z,X,Y,Z, got 0, 0, 1"),
         (("--keep-region", "0,0,0,1", "--no-views"), 2, "--keep-region needs views"),

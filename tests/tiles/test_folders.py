@@ -94,11 +94,11 @@ def test_tiles_of_another_length_are_poured_again(place: Path, tmp_path: Path, l
 
 def test_a_step_that_was_cut_is_done_again(place: Path, tmp_path: Path) -> None:
     store = TileStore.open(place / "tiles")
-    whole = reduced(store, tmp_path, budget=300, blind=True)
+    whole = reduced(store, tmp_path, budget=300)
     steps = {path: path.read_bytes() for path in tmp_path.iterdir()}
     for path in (p for p in steps if p.name.startswith(("costs", "merge-00001"))):
         path.write_bytes(path.read_bytes()[:100])
-    again = reduced(store, tmp_path, budget=300, blind=True)
+    again = reduced(store, tmp_path, budget=300)
     assert again.fingerprint() == whole.fingerprint()
     assert {path: path.read_bytes() for path in tmp_path.iterdir()} == steps
     for path in (p for p in steps if p.name.startswith("costs")):
@@ -106,17 +106,17 @@ def test_a_step_that_was_cut_is_done_again(place: Path, tmp_path: Path) -> None:
     with pytest.raises(
         InputError, match=r"costs-00000-\w+\.npz: its contents changed after writing; remove it"
     ):
-        reduced(store, tmp_path, budget=299, blind=True)
+        reduced(store, tmp_path, budget=299)
 
 
 def test_steps_that_are_done_do_not_hide_damaged_tiles(place: Path, tmp_path: Path) -> None:
     store = ingest(place / "town.ply", tmp_path / "tiles", tile_rows=700)
-    reduced(store, tmp_path / "steps", budget=300, blind=True)
+    reduced(store, tmp_path / "steps", budget=300)
     flipped(store.folder / "tile-00001.f32")
     with pytest.raises(InputError, match=r"tile-00001\.f32: its contents changed"):
-        reduced(store, tmp_path / "steps", budget=299, blind=True)
+        reduced(store, tmp_path / "steps", budget=299)
     with pytest.raises(InputError, match=r"tile-00001\.f32: its contents changed"):
-        reduced(store, tmp_path / "steps", budget=1600, blind=True)
+        reduced(store, tmp_path / "steps", budget=1600)
 
 
 def test_levels_are_not_written_from_damaged_tiles(place: Path, tmp_path: Path) -> None:

@@ -108,7 +108,7 @@ def test_the_cheapest_of_several_arrays_are_those_of_all() -> None:
 @pytest.mark.parametrize("blind", [False, True])
 def test_exact_count_and_quality(store: TileStore, scene: Path, tmp_path: Path, blind: bool) -> None:
     views = ring(8)
-    small = reduced(store, tmp_path, blind=blind, views=views)
+    small = reduced(store, tmp_path, views=None if blind else views)
     assert len(store.tiles) >= 4
     assert len(small) == 900
     assert small.finite_rows().all()
@@ -222,12 +222,12 @@ def test_an_order_found_before_is_checked(scene: Path) -> None:
 
 def test_budgets_out_of_reach_are_refused(store: TileStore, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"expected 1 to 9,000"):
-        reduced(store, tmp_path, budget=9001, blind=True)
+        reduced(store, tmp_path, budget=9001)
     faint = town(600)
     faint.logit_opacities[::6] = -9
     write_splats(tmp_path / "faint.ply", faint)
     some = ingest(tmp_path / "faint.ply", tmp_path / "faint", tile_rows=250)
     with pytest.raises(InputError, match=r"expected at most 500 "):
-        reduced(some, tmp_path, budget=550, blind=True)
+        reduced(some, tmp_path, budget=550)
     with pytest.raises(InputError, match=r"the 4 tiles keep at least 4 Gaussians \(one per tile\), got 2"):
-        reduced(store, tmp_path, budget=2, blind=True)
+        reduced(store, tmp_path, budget=2)
