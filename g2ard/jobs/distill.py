@@ -10,13 +10,14 @@ from typing import Any
 
 from g2ard.config.choices import RenderModel
 from g2ard.errors import InputError
+from g2ard.io.paths import real_path
 from g2ard.io.types import Points
 from g2ard.jobs.budget import Budget
 from g2ard.jobs.distill_options import DistillOptions
 from g2ard.jobs.inputs import Views, clutter_seen, load_scene, say_regions
 from g2ard.jobs.job import DistillJob
 from g2ard.jobs.measured_budget import Aim, aim_of
-from g2ard.jobs.photos import points_of_photos, topped_up
+from g2ard.jobs.photos import sparse_file, sparse_points, topped_up
 from g2ard.jobs.simplify import Reduction
 from g2ard.jobs.view_checks import propose_background, warn_of_photos
 from g2ard.jobs.views import RunViews, is_made, views_of
@@ -133,11 +134,7 @@ def prepare(
     """
     began = time.monotonic()
     recover = options.config.recover  # rejects invalid settings before anything is read
-    from_photos_only = scene is None
-    if scene is None:
-        scene = _points(budgets, options, progress, say)
     read = _read(scene, budgets, options, progress, say)
-    read = replace(read, from_photos=read.from_photos or from_photos_only)
     prior, cleaned = read.prior, None
     if options.clean:
         clutter, _ = clutter_seen(prior, seed=recover.seed, progress=progress, say=say)
@@ -271,28 +268,6 @@ def _aims(
     )
 
 
-def _points(budgets: Sequence[Budget], options: DistillOptions, progress: Progress, say: Say) -> Points:
-    """Create starting points from photos alone."""
-    if options.views is None or is_made(options.views):
-        raise InputError("missing; without a scene, pass photos with poses as views", parameter="scene")
-
-    return points_of_photos(
-        options.views,
-        options.held_out,
-        _wanted(budgets),
-        asked=budgets[0].kind,
-        background=options.config.recover.background,
-        seed=options.config.recover.seed,
-        progress=progress,
-        say=say,
-    )
-
-
-def _wanted(budgets: Sequence[Budget]) -> int | None:
-    """Return the largest requested count; None if no budget is a count."""
-    return max((budget.count for budget in budgets if budget.count is not None), default=None)
-
-
 @dataclass(frozen=True, eq=False)
 class _Read:
     """The dense scene as read or lifted.
@@ -313,57 +288,60 @@ class _Read:
 
 
 def _read(
-    scene: Splats | Points | str | Path,
-    budgets: Sequence[Budget],
-    options: DistillOptions,
-    progress: Progress,
-    say: Say,
+    scene: Scene, budgets: Sequence[Budget], options: DistillOptions, progress: Progress, say: Say
 ) -> _Read:
-    """Read the dense scene, or lift a point cloud, which needs views with photos and at least the budget."""
-    from g2ard.io import kind, read_cloud
+    """Read the dense scene, or lift points, which need views with photos, and are topped up to the budget."""
+    from g2ard.io import kind
 
     if isinstance(scene, Splats):
         return _Read(scene, False, options.beside, "scene")
-    name, sparse = "cloud", False
-    if isinstance(scene, str | Path):
-        if kind(scene) == "splats":
-            return _Read(
-                load_scene(scene, say, options.render_model), False, options.beside or scene, str(scene)
-            )
-        name, cloud = str(scene), read_cloud(scene)
-        for note in cloud.notes:
-            say(f"{scene}: {note}")
-        sparse = options.views is not None and _is_sparse(Path(scene), options.views)
-        scene = cloud.points
-    if options.views is None or is_made(options.views):
+    if isinstance(scene, str | Path) and kind(scene) == "splats":
+        splats = load_scene(scene, say, options.render_model)
+        return _Read(splats, False, options.beside or scene, str(scene))
+    views, recover = options.views, options.config.recover
+    if views is None or is_made(views):
+        if scene is None:
+            raise InputError("missing; without a scene, pass photos with poses as views", parameter="scene")
+        path = "cloud" if isinstance(scene, Points) else str(scene)
         raise InputError(
-            "a point cloud cannot render training images", path=name, hint="give its photos with {views}"
+            "a point cloud cannot render training images", path=path, hint="give its photos with {views}"
         )
-    wanted = _wanted(budgets) or 0
-    few = len(scene) < wanted
-    if few:
-        scene = topped_up(
-            scene,
-            options.views,
+    points, name, of_photos = _points(scene, views, say)
+    wanted = max((budget.count for budget in budgets if budget.count is not None), default=0)
+    if points is None and not wanted:
+        raise InputError(
+            "needs sparse points, and there are none",
+            parameter=budgets[0].kind,
+            path=str(views),
+            hint="give {count=COUNT}",
+        )
+    if points is None or scene is None or len(points) < wanted:
+        of_photos = True
+        points = topped_up(
+            points,
+            views,
             options.held_out,
             wanted,
-            background=options.config.recover.background,
-            seed=options.config.recover.seed,
+            background=recover.background,
+            seed=recover.seed,
             progress=progress,
             say=say,
         )
-    lifted = lift(scene.positions, scene.colors, **vars(options.config.lift), progress=progress)
-    return _Read(lifted, True, options.beside, name, from_photos=few or sparse)
+    lifted = lift(points.positions, points.colors, **vars(options.config.lift), progress=progress)
+    return _Read(lifted, True, options.beside, name, of_photos)
 
 
-def _is_sparse(cloud: Path, views: Views) -> bool:
-    """Return whether a cloud is the sparse points that belong to the views."""
-    from g2ard.io import ViewFiles
-    from g2ard.io.paths import real_path
-    from g2ard.jobs.photos import sparse_file
+def _points(scene: Points | str | Path | None, views: Views, say: Say) -> tuple[Points | None, str, bool]:
+    """Return the points of a cloud or stored with the views, their name in errors, and whether they were
+    found in photos."""
+    from g2ard.io import read_cloud
 
-    path = views.path if isinstance(views, ViewFiles) else views
-    if not isinstance(path, str | Path) or is_made(path):
-        return False
-    file = sparse_file(Path(path))
-    return file is not None and real_path(file) == real_path(cloud)
+    if isinstance(scene, Points):
+        return scene, "cloud", False
+    sparse = sparse_file(views)
+    if scene is None:
+        return sparse_points(sparse), "cloud", True
+    cloud = read_cloud(scene)
+    for note in cloud.notes:
+        say(f"{scene}: {note}")
+    return cloud.points, str(scene), sparse is not None and real_path(sparse) == real_path(Path(scene))

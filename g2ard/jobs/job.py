@@ -138,4 +138,4 @@ class DistillJob:
             work=work,
             progress=self.progress,
         )
-        return replace(done, splats=aim.shrink(done.splats, self.say)[0], held_out=self.held_out)
+        return replace(done, splats=aim.shrink(done.splats, self.say), held_out=self.held_out)

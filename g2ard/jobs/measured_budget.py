@@ -6,7 +6,7 @@ import math
 import tempfile
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -104,26 +104,29 @@ def count_for_bytes(splats: Splats, wanted: int, name: str, reduce: Callable[[in
     sample = splats.take(np.unique(np.linspace(0, most - 1, min(most, _SAMPLE)).astype(int)))
     count = int(len(sample) * wanted / file_bytes(sample, name))
     fits, over = (0, 0), (most + 1, 0)  # (count, bytes); 0 bytes means no such file yet
-    for _ in range(_PROBES):
+    probes = 0
+    while probes < _PROBES or not fits[0]:
+        probes += 1
         count = min(max(count, fits[0] + 1, fewest), over[0] - 1, most)
         size = file_bytes(reduce(count) if count < most else splats, name)
-        if size > wanted:
-            over = (count, size)
-        else:
+        if size <= wanted:
             fits = (count, size)
-        full = size <= wanted and (size >= _FULL * wanted or count == most)
-        if full or (count == fewest and size > wanted) or over[0] - fits[0] <= 1:
+            if size >= _FULL * wanted or count == most:
+                break
+        else:
+            over = (count, size)
+            if count == fewest:
+                raise InputError(
+                    f"{wanted:,} bytes are too few; {count:,} Gaussians take {size:,}", path=name
+                )
+        if over[0] - fits[0] <= 1:
             break
         if fits[0] and over[1]:  # file sizes grow in steps, so interpolate with limits
             share = (_AIM * wanted - fits[1]) / (over[1] - fits[1])
             count = round(fits[0] + min(max(share, 0.1), 0.9) * (over[0] - fits[0]))
         else:
             count = int(count * _AIM * wanted / size)
-    if fits[0]:
-        return fits[0]
-    if over[0] <= fewest:
-        raise InputError(f"{wanted:,} bytes are too few; {over[0]:,} Gaussians take {over[1]:,}", path=name)
-    return max(fewest, int(over[0] * _AIM * wanted / over[1]))
+    return fits[0]
 
 
 def _images(splats: Splats, cameras: Cameras) -> list[NDArray[Any]]:
@@ -215,39 +218,15 @@ class Aim:
     dense: Splats | None = None
     cameras: Cameras | None = None
 
-    def shrink(self, splats: Splats, say: Say = unsaid) -> tuple[Splats, NDArray[np.int64]]:
-        """Merge the scene further while its file is too large.
-
-        Returns:
-            The scene, and (N,) the new row of each row, −1 if dropped.
-        """
-        rows = np.arange(len(splats))
+    def shrink(self, splats: Splats, say: Say = unsaid) -> Splats:
+        """Merge the scene further while its file is too large."""
         while self.bytes is not None and (size := file_bytes(splats, self.file)) > self.bytes:
             fewer = max(1, int(len(splats) * self.bytes / size * 0.99))
             if fewer == len(splats):
                 break
             say(f"{size:,} bytes are too many: merging {len(splats):,} to {plural(fewer, 'Gaussian')}")
-            made = simplify(splats, fewer, method="fast")
-            rows = _onward(rows, made.parents)
-            splats = made.splats
-        return splats, rows
-
-    def shrink_simplified(self, small: Simplified, say: Say = unsaid) -> Simplified:
-        """Shrink a simplification like `shrink`, and update its rows and report."""
-        splats, rows = self.shrink(small.splats, say)
-        if splats is small.splats:
-            return small
-        protected = np.zeros(len(splats), bool)
-        protected[rows[small.protected & (rows >= 0)]] = True
-        parents = _onward(small.parents, rows)
-        members = np.bincount(parents[parents >= 0], minlength=len(splats))
-        report = replace(
-            small.report,
-            output_count=len(splats),
-            merged_members=int(members[members > 1].sum()),
-            protected=int(protected.sum()),
-        )
-        return replace(small, splats=splats, parents=parents, protected=protected, report=report)
+            splats = simplify(splats, fewer, method="fast").splats
+        return splats
 
     def judge(self, splats: Splats) -> tuple[bool, str] | None:
         """Return whether a result keeps the quality, with a message; None if no quality is required."""
@@ -325,12 +304,3 @@ def _aim_for_quality(
     else:
         say(f"{plural(found, 'Gaussian')} should keep {near.psnr:.2f} dB, SSIM {near.ssim:.4f}")
     return Aim(found, file=file, wanted=wanted, dense=splats, cameras=cameras)
-
-
-def _onward(first: NDArray[np.int64], second: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Compose the row maps of two consecutive reductions.
-
-    >>> _onward(np.array([1, -1, 0, 2]), np.array([0, 1, -1])).tolist()
-    [1, -1, 0, -1]
-    """
-    return np.where(first >= 0, second[first], -1)

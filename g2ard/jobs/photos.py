@@ -19,7 +19,7 @@ from g2ard.errors import InputError
 from g2ard.io.types import Points
 from g2ard.jobs.hull import VisualHull, visual_hull
 from g2ard.jobs.inputs import load_view_sets
-from g2ard.progress import Progress, Say, plural, silent, unsaid
+from g2ard.progress import Progress, Say, plural, silent
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.images import composited, load_premultiplied
 from g2ard.scene.splits import for_training
@@ -55,105 +55,67 @@ _RAYS = 2048
 Float = NDArray[np.float64]
 
 
-def points_of_photos(
-    views: Views,
-    held_out: Views | None,
-    count: int | None,
-    *,
-    asked: str = "ratio",
-    background: Colour = BLACK,
-    seed: int = 0,
-    progress: Progress = silent,
-    say: Say = unsaid,
-) -> Points:
-    """Return starting points: sparse points stored with the views, topped up to `count` along camera rays.
-
-    Args:
-        views: cameras with photos, or their path; only training views are used.
-        held_out: separate views for scoring; all of `views` are then for training.
-        count: minimum number of points; None means only the sparse points.
-        asked: the kind of budget if it is not a count: ratio, share, fit, min_psnr or min_ssim.
-        background: RGB of empty pixels.
-        seed: seed of the rays.
-        progress: called with the number of points.
-        say: called with a summary.
-
-    Raises:
-        InputError: a view without a photo, or no sparse points and no `count`.
-    """
-    from g2ard.io import ViewFiles
-
-    path = views.path if isinstance(views, ViewFiles) else views
-    sparse = sparse_points(Path(path)) if isinstance(path, str | Path) else None
-    if count is None and sparse is None:
-        raise InputError(
-            "needs sparse points, and there are none",
-            parameter=asked,
-            path=str(views),
-            hint="give {count=COUNT}",
-        )
-    return topped_up(
-        sparse, views, held_out, count or 0, background=background, seed=seed, progress=progress, say=say
-    )
-
-
 def topped_up(
     points: Points | None,
     views: Views,
     held_out: Views | None,
     count: int,
     *,
-    background: Colour = BLACK,
-    seed: int = 0,
-    progress: Progress = silent,
-    say: Say = unsaid,
+    background: Colour,
+    seed: int,
+    progress: Progress,
+    say: Say,
 ) -> Points:
-    """Add points along camera rays until there are `count`; arguments as for `points_of_photos`."""
+    """Add points along the camera rays of training views until there are `count`.
+
+    Args:
+        points: the points so far; None for none.
+        views: cameras with photos, or their path.
+        held_out: separate views for scoring; all of `views` are then for training.
+        background: RGB of empty pixels.
+    """
     found = 0 if points is None else len(points)
-    wanting = max(0, count - found)
     parts = [] if points is None else [points]
-    if wanting:
+    told = [plural(found, "sparse point")] if found else []
+    if (missing := count - found) > 0:
         (train,) = load_view_sets(views, ["train" if held_out is None else for_training], _SIDE)
         parts.append(
-            points_along_rays(train.cameras, wanting, background=background, seed=seed, progress=progress)
+            points_along_rays(train.cameras, missing, background=background, seed=seed, progress=progress)
         )
-    starts = [
-        words
-        for count, words in (
-            (found, plural(found, "sparse point")),
-            (wanting, f"{plural(wanting, 'point')} along camera rays"),
-        )
-        if count
-    ]
-    say(f"starting from {' and '.join(starts)}")
+        told.append(f"{plural(missing, 'point')} along camera rays")
+    say(f"starting from {' and '.join(told)}")
     return Points(
         np.concatenate([part.positions for part in parts]), np.concatenate([part.colors for part in parts])
     )
 
 
-def sparse_points(views: Path) -> Points | None:
+def sparse_points(file: Path | None) -> Points | None:
     """Read the points of `sparse_file`; return None if no file exists or it cannot be read."""
     from g2ard.io import read_points
 
-    file = sparse_file(views)
     try:
         return None if file is None else read_points(file)
     except InputError:
         return None
 
 
-def sparse_file(views: Path) -> Path | None:
+def sparse_file(views: Views) -> Path | None:
     """Return the path of a COLMAP model, of a transforms.json's `ply_file_path`, or of the input.ply beside
     INRIA's cameras.json, which may not exist; None for other views."""
+    from g2ard.io import ViewFiles
     from g2ard.io.detect import file_format
     from g2ard.io.jsonfile import read_json
 
-    found, folder = file_format(views), views if views.is_dir() else views.parent
+    given = views.path if isinstance(views, ViewFiles) else views
+    if not isinstance(given, str | Path):
+        return None
+    path = Path(given)
+    found, folder = file_format(path), path if path.is_dir() else path.parent
     if found == "colmap":
         return folder
     if found == "inria":
         return folder / "input.ply"
-    file = views / "transforms.json" if views.is_dir() else views
+    file = path / "transforms.json" if path.is_dir() else path
     listed = read_json(file).get("ply_file_path") if found == "transforms" and file.is_file() else None
     return file.parent / str(listed) if listed else None
 

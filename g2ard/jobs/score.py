@@ -27,8 +27,9 @@ def report_of(job: DistillJob, done: Distilled) -> dict[str, Any]:
         their summary by kind (`kinds`), likely causes of a poor result (`causes`), Gaussians per pixel
         (`overdraw`), rounds, seconds by stage, and every setting by path.
     """
-    scores = _scores(job, done, job.held_out, job.progress)
-    apart = None if job.apart is None else _scores(job, done, job.apart, job.progress)
+    scenes, background = (done.simplified, done.splats), job.config.recover.background
+    scores = _scores(*scenes, job.held_out, background, job.progress)
+    apart = None if job.apart is None else _scores(*scenes, job.apart, background, job.progress)
     before, after = (
         [*scores[name]["views"], *(apart[name]["views"] if apart else [])]
         for name in ("simplified", "recovered")
@@ -52,7 +53,7 @@ def report_of(job: DistillJob, done: Distilled) -> dict[str, Any]:
             job.views.train.cameras,
             recoveries[-1],
             scores["recovered"]["psnr"],
-            config.recover.background,
+            background,
         ),
         "unseen": _unseen(job, done),
         "overdraw": overdraw(done.splats, job.held_out.cameras),
@@ -66,16 +67,14 @@ def report_of(job: DistillJob, done: Distilled) -> dict[str, Any]:
     }
 
 
-def _scores(job: DistillJob, done: Distilled, targets: Targets, progress: Progress) -> dict[str, Any]:
+def _scores(
+    simplified: Splats, recovered: Splats, targets: Targets, background: Colour, progress: Progress
+) -> dict[str, Any]:
     """Score both scenes in some views."""
-    scenes: dict[str, Splats] = {"simplified": done.simplified, "recovered": done.splats}
+    scenes = {"simplified": simplified, "recovered": recovered}
     return {
         name: evaluate(
-            splats,
-            targets,
-            background=job.config.recover.background,
-            progress=progress,
-            stage=f"score {name}",
+            splats, targets, background=background, progress=progress, stage=f"score {name}"
         ).as_dict()
         for name, splats in scenes.items()
     }
@@ -86,8 +85,7 @@ def scores_by_kind(
 ) -> tuple[KindScore, ...]:
     """Score a scene before and after recovery in held-out views, by kind of view."""
     first, second = (
-        evaluate(splats, targets, background=background, progress=progress, stage="score").as_dict()["views"]
-        for splats in (before, after)
+        found["views"] for found in _scores(before, after, targets, background, progress).values()
     )
     return by_kind(first, second, "given")
 

@@ -105,7 +105,7 @@ def simplify(
     )
     file = f"scene.{format}"
     aim = aim_of(wanted, splats, name, file=file, reduce=reduce, seed=seed, progress=progress, say=say)
-    small = aim.shrink_simplified(reduce(aim.count), say)
+    small = reduce(aim.count)
     if judgement := aim.judge(small.splats):
         say(judgement[1])
     return small

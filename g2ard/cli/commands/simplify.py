@@ -132,7 +132,7 @@ def simplify(
     reports = []
     places = zip(outputs.paths(total), maps.paths(total) if maps else [None] * len(aims), strict=True)
     for aim, (place, rows) in zip(aims, places, strict=True):
-        small = aim.shrink_simplified(reduce(aim.count), run.say)
+        small = reduce(aim.count)
         clock.append(time.perf_counter())
         run.write(place, small.splats)
         if rows is not None:
