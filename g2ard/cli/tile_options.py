@@ -85,8 +85,9 @@ def _beside(output: Path) -> Path:
 
 def _check_rows(scene: Path, rows: int) -> None:
     """Raise a usage error if a folder of tiles was written with another --tile-rows."""
+    from g2ard.io.detect import MANIFEST
     from g2ard.jobs.tiling import cut_into
-    from g2ard.tiles.store import MANIFEST, TileStore
+    from g2ard.tiles.store import TileStore
 
     if (scene / MANIFEST).is_file() and (made := TileStore.open(scene).settings.get("tile_rows")) != rows:
         held = f"already has tiles of {made:,}" if made else "already has tiles"

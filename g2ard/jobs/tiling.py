@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING
 
 from g2ard.errors import InputError, require
 from g2ard.io import open_stream
-from g2ard.io.detect import kind
-from g2ard.tiles.store import MANIFEST, TileStore, row_width
+from g2ard.io.detect import MANIFEST, kind
+from g2ard.tiles.store import TileStore, row_width
 
 if TYPE_CHECKING:
     from g2ard.jobs.budget import Budget

@@ -13,14 +13,15 @@ from typing import Any
 from g2ard.config.choices import RenderModel
 from g2ard.errors import InputError, OutputError
 from g2ard.io import kind, open_point_stream, open_stream
+from g2ard.io.detect import JOURNAL, MANIFEST, POINTS
 from g2ard.io.lock import LOCK, locked
 from g2ard.io.stream import SceneStream
 from g2ard.io.types import Note
 from g2ard.progress import Progress, Say, plural, silent, unsaid
 from g2ard.stages.lift import LiftConfig
-from g2ard.tiles.journal import JOURNAL, POINTS, Journal, clear, is_tile_file
+from g2ard.tiles.journal import Journal, clear, is_tile_file
 from g2ard.tiles.pour import PointFeed, SceneFeed, lift_tiles, pour
-from g2ard.tiles.store import MANIFEST, VERSION, TileStore
+from g2ard.tiles.store import VERSION, TileStore
 
 TILE_ROWS = 5_000_000
 """Default largest number of rows per tile."""
@@ -111,8 +112,6 @@ def ingest(
         return done
     _check_foreign(folder)
     with locked(folder):
-        if (done := _done(folder, key, overwrite)) is not None:
-            return done  # finished by another process in the meantime
         _check_tiles(folder, key, settings, overwrite, say)
         rows = block_rows or max(1, _BLOCK_BYTES // feed.row_bytes)
         try:

@@ -15,12 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard.errors import InputError, OutputError
-from g2ard.io.detect import JOURNAL, POINTS
+from g2ard.io.detect import JOURNAL, MANIFEST, POINTS
 from g2ard.io.jsonfile import read_json
 from g2ard.tiles.kdtree import KdTree, Points
-from g2ard.tiles.store import FORMAT, MANIFEST, VERSION, halo_name, tile_name
-
-__all__ = ["JOURNAL", "POINTS", "Journal", "clear", "is_tile_file"]
+from g2ard.tiles.store import FORMAT, VERSION, halo_name, tile_name
 
 _TILE_FILE = re.compile(r"(tile|halo)-\d{5,}\.f32|\.?(tiles|journal)\.json(\.new)?|\.points")
 

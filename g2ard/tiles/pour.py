@@ -14,12 +14,13 @@ from numpy.typing import NDArray
 
 from g2ard.config.choices import RenderModel
 from g2ard.errors import OutputError
+from g2ard.io.detect import POINTS
 from g2ard.io.point_stream import PointStream, PointTally
 from g2ard.io.stream import SceneStream
 from g2ard.progress import Progress, Say, plural
 from g2ard.scene.splats import Splats
 from g2ard.stages.lift import LiftConfig, lift
-from g2ard.tiles.journal import POINTS, Journal, clear
+from g2ard.tiles.journal import Journal, clear
 from g2ard.tiles.kdtree import KdTree, Points, Sampler, cut_tree, margin_of
 from g2ard.tiles.store import TileStore, halo_name, packed, row_width, tile_name
 

@@ -8,7 +8,7 @@ scales (3, linear), logit of opacity (1), sh0 (3), shN (K × 3, the channels of 
 from __future__ import annotations
 
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,17 +23,6 @@ from g2ard.io.jsonfile import read_json
 from g2ard.io.types import Note
 from g2ard.scene.splats import Splats
 from g2ard.tiles.kdtree import KdTree
-
-__all__ = [
-    "MANIFEST",
-    "StoredScene",
-    "Tile",
-    "TileStore",
-    "halo_name",
-    "packed",
-    "row_width",
-    "tile_name",
-]
 
 FORMAT, VERSION = "g2ard tiles", 1
 
@@ -64,21 +53,6 @@ def packed(splats: Splats) -> NDArray[np.float32]:
     rows[:, 11:14] = splats.sh0[:, 0]
     rows[:, 14:] = splats.shN.reshape(len(splats), rows.shape[1] - 14)
     return rows
-
-
-def _unpacked(rows: NDArray[np.float32], store: TileStore) -> Splats:
-    """Return the scene of packed rows."""
-    rest = (rows.shape[1] - 14) // 3
-    return Splats(
-        means=np.ascontiguousarray(rows[:, :3]),
-        quats=np.ascontiguousarray(rows[:, 3:7]),
-        scales=np.ascontiguousarray(rows[:, 7:10]),
-        logit_opacities=np.ascontiguousarray(rows[:, 10]),
-        sh0=np.ascontiguousarray(rows[:, None, 11:14]),
-        shN=np.ascontiguousarray(rows[:, 14:]).reshape(len(rows), rest, 3),
-        offset=store.offset.copy(),
-        render_model=store.render_model,
-    )
 
 
 @dataclass(frozen=True)
@@ -263,21 +237,33 @@ class TileStore:
 
     def _read(self, name: str, count: int, check: int, sh: bool) -> Splats:
         self._check_size(name, count)
+        crc = 0
+
+        def blocks() -> Iterator[NDArray[np.float32]]:
+            nonlocal crc
+            with (self.folder / name).open("rb") as file:
+                for start in range(0, count, _AT_ONCE):
+                    data = file.read(self.row_bytes * min(_AT_ONCE, count - start))
+                    crc = zlib.crc32(data, crc)
+                    yield np.frombuffer(data, "<f4").reshape(-1, self.row_bytes // 4)
+
+        scene = self.unpacked(count, blocks(), sh=sh)
+        self._check_contents(name, crc, check)
+        return scene
+
+    def unpacked(self, count: int, blocks: Iterable[NDArray[np.float32]], *, sh: bool = True) -> Splats:
+        """Return the scene of `count` packed rows, given in blocks; `sh` as for `read`."""
         rest = (self.sh_degree + 1) ** 2 - 1 if sh else 0
         means, quats = np.empty((count, 3), np.float32), np.empty((count, 4), np.float32)
         scales, logits = np.empty((count, 3), np.float32), np.empty(count, np.float32)
         sh0, shN = np.empty((count, 1, 3), np.float32), np.empty((count, rest, 3), np.float32)
-        crc = 0
-        with (self.folder / name).open("rb") as file:
-            for start in range(0, count, _AT_ONCE):
-                at = slice(start, min(start + _AT_ONCE, count))
-                data = file.read(self.row_bytes * (at.stop - start))
-                crc = zlib.crc32(data, crc)
-                rows = np.frombuffer(data, "<f4").reshape(at.stop - start, -1)
-                means[at], quats[at], scales[at] = rows[:, :3], rows[:, 3:7], rows[:, 7:10]
-                logits[at], sh0[at, 0] = rows[:, 10], rows[:, 11:14]
-                shN[at] = rows[:, 14 : 14 + 3 * rest].reshape(len(rows), rest, 3)
-        self._check_contents(name, crc, check)
+        start = 0
+        for rows in blocks:
+            at = slice(start, start + len(rows))
+            means[at], quats[at], scales[at] = rows[:, :3], rows[:, 3:7], rows[:, 7:10]
+            logits[at], sh0[at, 0] = rows[:, 10], rows[:, 11:14]
+            shN[at] = rows[:, 14 : 14 + 3 * rest].reshape(len(rows), rest, 3)
+            start += len(rows)
         return Splats(means, quats, scales, logits, sh0, shN, self.offset.copy(), self.render_model)
 
 
@@ -305,4 +291,4 @@ class StoredScene:
         for tile in np.unique(tiles):
             here = tiles == tile
             rows[here] = self.store.rows(tile)[index[here] - self._starts[tile]]
-        return _unpacked(rows, self.store)
+        return self.store.unpacked(len(index), [rows])
