@@ -98,7 +98,18 @@ def distill(
     if config.recover.schedule.round_steps > 0:
         kept, fold = config.simplify.retention_of("paper"), config.simplify.fold
         counts = round_counts(len(prior), budget, kept, fold)
-    rounds = _Rounds(prior, budget, targets, config, len(counts), weights, validation, work, progress, watch)
+    rounds = _Rounds(
+        prior,
+        budget,
+        targets,
+        config,
+        len(counts),
+        checked_weights(weights, len(targets.cameras)),
+        validation=validation,
+        work=work,
+        progress=progress,
+        watch=watch,
+    )
     for number, count in enumerate(counts, start=1):
         rounds.advance(number, count, final=number == len(counts))
     report = DistillReport(
@@ -165,39 +176,28 @@ class _Supervision:
         )
         return cls(subset, weights, report)
 
-    def fill(self, progress: Progress) -> None:
-        """Load every target, so that later steps take equal time."""
-        count = len(self.targets.cameras)
-        for view in range(count):
-            self.targets[view]
-            progress("targets", view + 1, count)
 
-
+@dataclass(eq=False)
 class _Rounds:
     """State of the rounds: scene, protection flags and log; each stage is saved if `work` is given."""
 
-    def __init__(
-        self,
-        prior: Splats,
-        budget: int,
-        targets: Targets,
-        config: DistillConfig,
-        count: int,
-        weights: ArrayLike | None,
-        validation: Targets | None,
-        work: Path | None,
-        progress: Progress,
-        watch: Watch | None,
-    ) -> None:
-        self.prior, self.budget, self.targets, self.config = prior, budget, targets, config
-        self.validation = validation
-        self.count, self.work, self.progress, self.watch = count, work, progress, watch
-        self.state = self.simplified = prior
+    prior: Splats
+    budget: int
+    targets: Targets
+    config: DistillConfig
+    count: int
+    weights: Any = None
+    validation: Targets | None = None
+    work: Path | None = None
+    progress: Progress = silent
+    watch: Watch | None = None
+
+    def __post_init__(self) -> None:
+        self.state = self.simplified = self.prior
         self.protected: Any = None
         self.log: list[dict[str, Any]] = []
-        self.seconds: dict[str, float] = {"select": 0.0, "simplify": 0.0, "recover": 0.0}
-        self.weights = checked_weights(weights, len(targets.cameras))
-        self._select(prior)
+        self.seconds = {"select": 0.0, "simplify": 0.0, "recover": 0.0}
+        self._select(self.prior)
 
     @cached_property
     def key(self) -> str:
@@ -225,8 +225,11 @@ class _Rounds:
         began = time.monotonic()
         self.supervision = _Supervision.of(scene, self.targets, self.config, self.weights, self.progress)
         self.seconds["select"] += time.monotonic() - began
-        if self.config.select.views_count is not None:
-            self.supervision.fill(self.progress)
+        if self.config.select.views_count is not None:  # load all now, so that later steps take equal time
+            targets, count = self.supervision.targets, len(self.supervision.targets.cameras)
+            for view in range(count):
+                targets[view]
+                self.progress("targets", view + 1, count)
 
     def _simplify(self, number: int, count: int, entry: dict[str, Any]) -> None:
         name = f"simplified-{number}"

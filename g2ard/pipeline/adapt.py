@@ -55,19 +55,11 @@ class AdaptConfig(FitConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.steps < 1 or not self.tolerance >= 0:
-            raise InputError(
-                f"expected steps ≥ 1 and tolerance ≥ 0, got {self.steps} and {self.tolerance}",
-                parameter="steps",
-            )
-        if not 0 <= self.prior_views < float("inf"):
-            raise InputError(
-                f"expected a number of views, at least 0, got {self.prior_views}", parameter="prior_views"
-            )
-        if self.schedule not in ADAPT_SCHEDULES:
-            raise InputError(
-                f"expected {' or '.join(ADAPT_SCHEDULES)}, got {self.schedule!r}", parameter="schedule"
-            )
+        views, known = self.prior_views, self.schedule in ADAPT_SCHEDULES
+        require("steps", self.steps, self.steps >= 1, "at least 1")
+        require("tolerance", self.tolerance, self.tolerance >= 0, "at least 0")
+        require("prior_views", views, 0 <= views < float("inf"), "a number of views, at least 0")
+        require("schedule", repr(self.schedule), known, " or ".join(ADAPT_SCHEDULES))
         require("first_stretch", self.first_stretch, self.first_stretch >= 1, "at least 1")
         if self.recovery is not None and self.recovery != appearance_only(self.recovery):
             raise InputError(
