@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import re
 from collections.abc import Callable
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Self
 
@@ -121,6 +122,12 @@ def missing(what: str, package: str, **fields: Any) -> MissingDependencyError:
     return MissingDependencyError(
         f"{what} needs a package that is not installed", hint=f"pip install {quoted}", **fields
     )
+
+
+def require_torch(feature: str) -> None:
+    """Check that torch can be imported, without importing it."""
+    if find_spec("torch") is None:
+        raise MissingDependencyError(f"{feature} needs torch", hint="pip install 'g2ard[torch]'")
 
 
 def require(name: str, value: object, fits: bool, expected: str) -> None:

@@ -40,7 +40,9 @@ def city(
     output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Output folder.")],
     points: Annotated[
         Count | None,
-        typer.Option(parser=Count.parse, metavar="COUNT", help="Points of the cloud; 500k by default."),
+        typer.Option(
+            parser=Count.parse_absolute, metavar="COUNT", help="Points of the cloud; 500k by default."
+        ),
     ] = None,
     views: Annotated[int, typer.Option(help="Photos in all four splits.")] = 120,
     size: Annotated[str, typer.Option(metavar="WxH", help="Size of photos.")] = "800x600",
@@ -50,14 +52,12 @@ def city(
     """Generate a city: coloured LiDAR point cloud, photos with exact poses, splits train/val/adapt/ood."""
     from benchmarks.synth import CityConfig, write_city
 
-    if points is not None and points.is_share:
-        raise typer.BadParameter("--points: expected a count, got a share")
     began = time.monotonic()
     width, height = _numbers("--size", size, "x", 2, int)
     x, y, z = _numbers("--offset", offset, ",", 3, float)
     try:
         config = CityConfig(
-            points=CityConfig.points if points is None else points.of(0),
+            points=CityConfig.points if points is None else int(points.value),
             views=views,
             size=(width, height),
             blocks=blocks,

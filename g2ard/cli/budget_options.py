@@ -25,12 +25,12 @@ class Count:
     text: str
 
     @classmethod
-    def parse(cls, text: str) -> Count:
+    def parse(cls, text: str, shares: bool = True) -> Count:
         """Read 250000, 250,000, 250_000, 250k, 1.5M or 25%.
 
-        >>> Count.parse("250k").of(10**6), Count.parse("25%").of(10), Count.parse("1.5M").of(10**7)
-        (250000, 3, 1500000)
-        >>> Count.parse("1,234,567").of(10**7), Count.parse("250_000").of(10**7)
+        >>> Count.parse("250k").number, Count.parse("25%").number, Count.parse("1.5M").number
+        (250000, 0.25, 1500000)
+        >>> Count.parse("1,234,567").number, Count.parse("250_000").number
         (1234567, 250000)
         """
         plain = text.strip()
@@ -42,10 +42,9 @@ class Count:
                 f"dots cannot separate thousands: write {bare} or {int(bare):_}, not {text!r}"
             )
         match = _COUNT.fullmatch(plain)
-        if match is None or not float(match[1]) > 0:
-            raise typer.BadParameter(
-                f"expected a positive count such as 250000, 250k, 1.5M or 25%, got {text!r}"
-            )
+        if match is None or not float(match[1]) > 0 or (match[2] == "%" and not shares):
+            such = "250000, 250k, 1.5M or 25%" if shares else "250000, 250k or 1.5M"
+            raise typer.BadParameter(f"expected a positive count such as {such}, got {text!r}")
         number, unit = float(match[1]), match[2].lower()
         if unit == "%":
             if number > 100:
@@ -62,21 +61,10 @@ class Count:
     def parse_absolute(cls, text: str) -> Count:
         """Read an absolute count, as `parse` does.
 
-        >>> Count.parse_absolute("2M").of(0)
+        >>> Count.parse_absolute("2M").number
         2000000
         """
-        expected = f"expected a positive count such as 250000, 250k or 1.5M, got {text!r}"
-        try:
-            count = cls.parse(text)
-        except typer.BadParameter as error:
-            raise typer.BadParameter(expected if "%" in error.message else error.message) from None
-        if count.is_share:
-            raise typer.BadParameter(expected)
-        return count
-
-    def of(self, total: int) -> int:
-        """Return the count for a scene of `total` Gaussians; shares are rounded up, at least 1."""
-        return max(1, math.ceil(self.value * total - 1e-9)) if self.is_share else int(self.value)
+        return cls.parse(text, shares=False)
 
     @property
     def number(self) -> int | float:
@@ -108,7 +96,7 @@ class Counts(tuple[Count, ...]):
     def parse(cls, text: str) -> Counts:
         """Read comma-separated counts; commas before a group such as 000 belong to a single number.
 
-        >>> [count.of(10**6) for count in Counts.parse("10k,20k")], len(Counts.parse("250,000"))
+        >>> [count.number for count in Counts.parse("10k,20k")], len(Counts.parse("250,000"))
         ([10000, 20000], 1)
         """
         groups = text.strip().split(",")

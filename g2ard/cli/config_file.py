@@ -23,28 +23,31 @@ _toml = partial(json.dumps, ensure_ascii=False)
 def load_config(ctx: typer.Context, path: Path | None) -> Path | None:
     """Use the values of a TOML file as defaults: those at its top, then those in the command's table.
 
-    Keys are long flag names; unknown keys raise an error. Tables of other commands are ignored.
+    Keys are long flag names. Every key must be an option of its table's command; keys at the top, of at least
+    one of the commands.
     """
     if path is None:
         return None
-    values = _read(path)
-    table = _of_command(ctx, path, values)
-    constants = _flat(table.pop("set", {}))
-    params = {flag.lstrip("-").replace("-", "_"): p for p in ctx.command.params for flag in (*p.opts, p.name)}
-    table = {_dashed(key).replace("-", "_"): value for key, value in table.items()}
-    unknown = {_dashed(key) for key in table if key not in params or len(key) == 1}
-    if unknown:
-        near = _meant(unknown, ctx.command)
-        raise typer.BadParameter(f"{path}: `{ctx.info_name}` has no option {near}")
+    values, name = _read(path), str(ctx.info_name)
+    tables = {key: value for key, value in values.items() if isinstance(value, dict) and key != "set"}
+    top = {key: value for key, value in values.items() if key not in tables}
+    commands = _parameters(ctx, path, tables)
+    for other, table in tables.items():
+        _check_keys(table, commands[other], f"{path}: `{other}` has no option")
+    anywhere = {flag: p for parameters in commands.values() for flag, p in parameters.items()}
+    missing = "none of its commands has an option" if tables else f"`{name}` has no option"
+    _check_keys(top, anywhere, f"{path}: {missing}")
+    own = tables.get(name, {})
+    settings = _flat(top.pop("set", {})) | _flat(own.pop("set", {}))
+    if settings and "set" not in commands[name]:
+        raise typer.BadParameter(f"{path}: `{name}` has no settings; remove `set`")
     found: dict[str, Any] = {}
-    for key, value in table.items():
-        many = getattr(params[key], "multiple", False) or params[key].nargs == -1
-        several = value if isinstance(value, list) else [value]
-        found[str(params[key].name)] = [_as_typed(one) for one in several] if many else _as_typed(value)
-    if constants:
-        found["set"] = [f"{name}={_as_typed(value)}" for name, value in constants.items()]
-        if "set" not in params:
-            raise typer.BadParameter(f"{path}: `{ctx.info_name}` has no settings; remove `set`")
+    for key, value in {**top, **own}.items():
+        parameter = commands[name].get(_dashed(key))
+        if parameter is not None:  # otherwise an option of another command
+            found[str(parameter.name)] = _default(parameter, value)
+    if settings:
+        found["set"] = [f"{key}={_as_typed(value)}" for key, value in settings.items()]
     ctx.default_map = {**(ctx.default_map or {}), **found}
     return path
 
@@ -62,63 +65,42 @@ def _read(path: Path) -> dict[str, Any]:
         raise typer.BadParameter(f"{path}: {e}") from None
 
 
-def _of_command(ctx: typer.Context, path: Path, values: dict[str, Any]) -> dict[str, Any]:
-    """Return the file's top-level options, overridden by those in the command's table."""
-    from g2ard.cli.commands import COMMANDS
+def _parameters(ctx: typer.Context, path: Path, tables: Iterable[str]) -> dict[str, dict[str, Any]]:
+    """Return the parameters of this command and of those with a table, by command and dashed name."""
+    from g2ard.cli.app import app
+    from g2ard.cli.commands import COMMANDS, register_commands
 
     name = str(ctx.info_name)
-    top = {key: value for key, value in values.items() if key == "set" or not isinstance(value, dict)}
-    strange = sorted(set(values) - set(top) - {*COMMANDS, name})
-    if strange:
+    others = set(tables) - {name}
+    if strange := others - {*COMMANDS}:
         raise typer.BadParameter(f"{path}: unknown command {meant(strange, {*COMMANDS, name})}")
-    own = values.get(name, {})
-    if not isinstance(own, dict):
-        raise typer.BadParameter(f"{path}: {name}: expected a table of options")
-    known = _options(ctx.command)
-    several_commands = own or len(top) < len(values)
-    if several_commands:  # then options at the top may belong to another one
-        of_others = _check_others(path, {key: values[key] for key in values if key not in {*top, name}})
-        strange = [key for key in top if _dashed(key) not in known | of_others and key != "set"]
-        if strange:
-            near = meant(strange, known | of_others)
-            raise typer.BadParameter(f"{path}: none of its commands has an option {near}")
-        top = {key: value for key, value in top.items() if _dashed(key) in known or key == "set"}
-    constants = {**_flat(top.pop("set", {})), **_flat(own.get("set", {}))}
-    return {**top, **own} | ({"set": constants} if constants else {})
+    for other in others:
+        register_commands(other)
+    commands: dict[str, Any] = getattr(typer.main.get_command(app), "commands", {}) if others else {}
+    taken = {other: commands[other] for other in others} | {name: ctx.command}
+    return {
+        command: {_dashed(flag.lstrip("-")): p for p in found.params for flag in (*p.opts, str(p.name))}
+        for command, found in taken.items()
+    }
 
 
-def _check_others(path: Path, tables: dict[str, Any]) -> set[str]:
-    """Check the tables of other commands, and return the options of those commands."""
-    from g2ard.cli.app import app
-    from g2ard.cli.commands import register_commands
-
-    for name in tables:
-        register_commands(name)
-    commands: dict[str, Any] = getattr(typer.main.get_command(app), "commands", {})
-    found: set[str] = set()
-    for name, table in tables.items():
-        command = commands.get(name)
-        if command is None or not isinstance(table, dict) or hasattr(command, "commands"):
-            continue  # a group of commands
-        options = _options(command)
-        if strange := [key for key in table if key != "set" and _dashed(key) not in options]:
-            raise typer.BadParameter(f"{path}: `{name}` has no option {meant(strange, options)}")
-        found |= options
-    return found
+def _check_keys(table: dict[str, Any], known: dict[str, Any], problem: str) -> None:
+    """Reject unknown keys, with similar names, and letters, with the long name of their flag."""
+    told, long = [], [flag for flag in known if len(flag) > 1]
+    for key in sorted(table):
+        if len(key) == 1 and key in known:
+            told.append(f"{key} (write {max(known[key].opts, key=len).lstrip('-')})")
+        elif _dashed(key) not in long and key != "set":
+            told.append(meant([key], long))
+    if told:
+        raise typer.BadParameter(f"{problem} {', '.join(told)}")
 
 
-def _options(command: Any) -> set[str]:
-    """Return the names of a command's options, with dashes."""
-    return {_dashed(flag.lstrip("-")) for p in command.params for flag in (*p.opts, str(p.name))}
-
-
-def _meant(keys: Iterable[str], command: Any) -> str:
-    """List unknown keys, each with similar long names; for a letter, with the long name of that flag."""
-    flags = ((flag, max(p.opts, key=len)) for p in command.params for flag in p.opts)
-    long = {flag[1:]: name.lstrip("-") for flag, name in flags if len(flag) == 2}
-    known = {name for name in _options(command) if len(name) > 1}
-    told = [f"{key} (write {long[key]})" if key in long else meant([key], known) for key in sorted(keys)]
-    return ", ".join(told)
+def _default(parameter: Any, value: Any) -> Any:
+    """Return a TOML value as a parameter's default: as typed, in a list if the parameter takes several."""
+    if not getattr(parameter, "multiple", False) and parameter.nargs != -1:
+        return _as_typed(value)
+    return [_as_typed(one) for one in (value if isinstance(value, list) else [value])]
 
 
 def _dashed(key: str) -> str:
@@ -168,8 +150,8 @@ def printed(ctx: typer.Context, values: dict[str, Any]) -> str:
 def _plain(value: Any) -> Any:
     """Return an option's value as a TOML type: 5,10 becomes [5, 10], 10.0 becomes 10, the rest text."""
     if isinstance(value, list):
-        items = [item for one in map(_plain, value) for item in (one if isinstance(one, list) else [one])]
-        return items if len(items) > 1 or not isinstance(value[0], tuple) else items[0]
+        items = [_plain(item) for item in value]
+        return items if len(items) > 1 else items[0]
     if isinstance(value, tuple) and type(value).__str__ is tuple.__str__:
         return [_plain(item) for item in value]
     if isinstance(value, float) and value.is_integer() and abs(value) < 1e15:

@@ -50,7 +50,7 @@ class Console:
         print(f"g2ard: {text}", file=sys.stderr, flush=True)
 
     def table(self, title: str, columns: list[str], rows: list[list[str]], *, stdout: bool = False) -> None:
-        """Print a table; all columns but the first are right-aligned, and empty names show no header."""
+        """Print a table; columns with a header are right-aligned, except the first."""
         if self.quiet:
             return
         self.close()
@@ -59,11 +59,11 @@ class Console:
 
         table = Table(title=title, title_justify="left", show_header=any(columns))
         for i, name in enumerate(columns):
-            table.add_column(name, justify="left" if i == 0 else "right")
+            table.add_column(name, justify="right" if i and name else "left")
         for row in rows:
             table.add_row(*row)
         stream = sys.stdout if stdout else sys.stderr
-        Rich(file=stream, width=None if stream.isatty() else 120).print(table)
+        Rich(file=stream, width=None if stream.isatty() else 120).print(table, markup=False, highlight=False)
 
     def __call__(self, stage: str, done: int, total: int, info: Mapping[str, Any] | None = None) -> None:
         """Show the progress of a stage, with the figures of `info`."""

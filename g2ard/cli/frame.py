@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     from g2ard.scene.cameras import Cameras
     from g2ard.scene.splats import Splats
 
-__all__ = ["Run", "app", "command", "group", "one_line"]
+__all__ = ["Run", "app", "command", "one_line"]
 
 
 _RIVALS = (
@@ -125,7 +125,6 @@ class Run:
         self.json: str | None = common["json"]
         self.console = Console(quiet=common["quiet"])
         self.render_model: RenderModel | None = common.get("render_model")
-        self.only_checks = False  # end after checking the settings
         self.noted = False  # whether a GPU failed
         self._adapter: str | None = None  # last adapter in use
         self.kept: list[str] = []  # what remains after Ctrl-C, for its message
@@ -156,9 +155,15 @@ class Run:
             if "recover.steps" in values and other in values:
                 flag = "--recovery-time" if "time" in other else f"--set {other}"
                 raise typer.BadParameter(f"--steps and {flag} exclude each other; give one")
-        if self.only_checks:
-            raise _Checked
         return values
+
+    @contextmanager
+    def usage(self) -> Iterator[None]:
+        """Turn an `InputError` about an option's value into a usage error."""
+        try:
+            yield
+        except InputError as error:
+            raise typer.BadParameter(in_flags(error, self.flags)) from None
 
     def progress(self, stage: str, done: int, total: int, info: Mapping[str, Any] | None = None) -> None:
         """Report progress, after GPU messages since the last call."""
@@ -193,6 +198,10 @@ class Run:
 
         with atomic_output(Path(self.json), overwrite=self.overwrite) as temporary:
             temporary.write_text(text + "\n", encoding="utf-8", newline="\n")
+
+    def results(self, reports: list[dict[str, Any]]) -> None:
+        """Write the result of one budget, or of several under `runs`."""
+        self.result(reports[0] if len(reports) == 1 else {"runs": reports})
 
     def _used(self) -> dict[str, Any]:
         """Describe GPU use, if any."""
@@ -279,13 +288,6 @@ def _plain(value: Any) -> Any:
     return value.tolist() if hasattr(value, "tolist") else str(value)
 
 
-def group(name: str, text: str) -> typer.Typer:
-    """Register a command with subcommands, such as `python -m benchmarks synth`."""
-    sub = typer.Typer(help=text, no_args_is_help=True)
-    app.add_typer(sub, name=name)
-    return sub
-
-
 def command(
     name: str,
     *,
@@ -335,9 +337,7 @@ def command(
             printing = shared_values.pop("print_config")
             run = Run(name, shared_values, dict(values), flags_of(ctx.command))
             if printing:
-                if shared_values.get("set"):
-                    _check_settings(run, fn, values)
-                typer.echo(printed(ctx, {**values, **shared_values}), nl=False)
+                typer.echo(printed(ctx, {**values, **shared_values, **run.config}), nl=False)
                 return
             with interrupt.RaisesInterrupt():
                 _execute(run, fn, values, cuda)
@@ -357,17 +357,6 @@ def command(
 def _parameter(name: str, kind: Any, option: Any, default: Any = None) -> inspect.Parameter:
     annotation = Annotated[kind, option]
     return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
-
-
-class _Checked(Exception):
-    """Signal that settings are valid."""
-
-
-def _check_settings(run: Run, fn: Callable[..., None], options: dict[str, Any]) -> None:
-    """Check the values of --set without running the command."""
-    run.only_checks = True
-    with contextlib.suppress(_Checked):
-        fn(run, **options)
 
 
 def _execute(run: Run, fn: Callable[..., None], options: dict[str, Any], cuda: bool) -> None:

@@ -23,11 +23,10 @@ from g2ard.config.choices import (
     ScheduleName,
     ViewFormat,
 )
-from g2ard.errors import InputError
+from g2ard.errors import InputError, require_torch
 
 if TYPE_CHECKING:
     from g2ard.cli.frame import Run
-    from g2ard.scene.splats import Splats
 
 SceneArgument = Annotated[
     Path,
@@ -117,15 +116,12 @@ def _colour(text: str) -> Triple:
     named = {"black": Triple(BLACK), "white": Triple((1.0, 1.0, 1.0))}
     if text in named:
         return named[text]
-    try:
-        values = tuple(float(part) for part in text.split(","))
-    except ValueError:
-        values = ()
-    if len(values) != 3 or not all(0 <= v <= 1 for v in values):
+    found = _floats(text)
+    if len(found) != 3 or not all(0 <= v <= 1 for v in found):
         raise typer.BadParameter(
             f"expected black, white or R,G,B in [0, 1] such as 0.2,0.3,0.4, got {text!r}"
         )
-    return Triple((values[0], values[1], values[2]))
+    return Triple(found)
 
 
 def numbers(option: str, text: str, count: int) -> list[float]:
@@ -134,23 +130,26 @@ def numbers(option: str, text: str, count: int) -> list[float]:
     >>> numbers("--box", "0, 0,0 1,1,1e1", 6)
     [0.0, 0.0, 0.0, 1.0, 1.0, 10.0]
     """
-    try:
-        found = [float(word) for word in text.replace(",", " ").split()]
-    except ValueError:
-        found = []
-    if len(found) != count or not all(map(math.isfinite, found)):
+    found = _floats(text)
+    if len(found) != count:
         raise typer.BadParameter(f"{option}: expected {count} comma-separated numbers, got {text!r}")
     return found
 
 
-def _direction(text: str) -> Triple:
+def _floats(text: str) -> list[float]:
+    """Read numbers separated by commas or spaces; return [] if a word is not a finite number."""
     try:
-        x, y, z = (float(part) for part in text.split(","))
+        found = [float(word) for word in text.replace(",", " ").split()]
     except ValueError:
-        x = y = z = math.nan
-    if not (all(abs(v) < 1e30 for v in (x, y, z)) and any((x, y, z))):
+        return []
+    return found if all(map(math.isfinite, found)) else []
+
+
+def _direction(text: str) -> Triple:
+    found = _floats(text)
+    if len(found) != 3 or not any(found) or max(map(abs, found)) > 1e30:
         raise typer.BadParameter(f"expected a direction such as 0,0,1 or 0,-1,0, got {text!r}")
-    return Triple((x, y, z))
+    return Triple(found)
 
 
 UpOption = Annotated[
@@ -260,7 +259,10 @@ TeacherOption = Annotated[
         help="Train on or score against renders of this scene instead of photos.",
     ),
 ]
-
+PhotosOption = Annotated[
+    bool,
+    typer.Option("--photos", help="With --teacher: use photos where views have them, renders otherwise."),
+]
 ConventionOption = Annotated[
     Convention,
     typer.Option(help="Renderer to follow; inria has near plane 0.2 and cuts splats at 3σ tiles."),
@@ -325,8 +327,6 @@ def recovery_engine(run: Run) -> Engine:
     """Return the recovery engine for --device; raise an error if CUDA is requested and not available."""
     if run.device != "cuda":
         return "fused"
-    from g2ard.system.extras import require_torch
-
     require_torch("--device cuda")
     from g2ard.stages.recover.gsplat_engine import check_cuda
 
@@ -337,20 +337,3 @@ def recovery_engine(run: Run) -> Engine:
 def trained_on(split: str) -> str:
     """Return the name of the views a command trains on, for messages."""
     return "training views" if split == "train" else f"{split} views"
-
-
-def can_be_made(views: Path | None, teacher: Path | None) -> None:
-    """Check that there is a teacher to generate views of, unless views are given."""
-    if teacher is None and is_made(views):
-        raise typer.BadParameter("--views made needs a --teacher: generated views have no photos")
-    if teacher is None and views is None:
-        raise typer.BadParameter("give --views, or a --teacher to generate views of")
-
-
-def views_or_teacher(run: Run, views: Path | None, teacher: Path | None, dense: Splats | None) -> Any:
-    """Return the given views, or those found beside the teacher, or generated ones."""
-    from g2ard.jobs.views import views_or_pool
-
-    if dense is None:
-        return views
-    return views_or_pool(dense, views, beside=teacher, seed=run.seed, progress=run.progress, say=run.say)

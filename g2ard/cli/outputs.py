@@ -10,8 +10,6 @@ import typer
 
 from g2ard.cli.budget_options import BUDGETS
 from g2ard.cli.frame import Run
-from g2ard.cli.usage import in_flags
-from g2ard.errors import InputError
 from g2ard.jobs.budget import Budget
 
 
@@ -24,10 +22,8 @@ def budgets_of(run: Run) -> list[Budget]:
             "give the budget as one of -n COUNT, -r RATIO, --fit, or --min-psnr and --min-ssim"
         )
     if fit is not None or quality:
-        try:
+        with run.usage():
             return [Budget(fit=fit, min_psnr=min_psnr, min_ssim=min_ssim)]
-        except InputError as error:
-            raise typer.BadParameter(in_flags(error, run.flags)) from None
     if counts:
         return [count.budget() for several in counts for count in several]
     return [Budget(ratio=ratio) for several in ratios or [] for ratio in several]

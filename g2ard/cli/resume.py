@@ -11,13 +11,21 @@ import typer
 
 from g2ard.cli.frame import Run
 from g2ard.errors import OutputError
+from g2ard.io import check_scene_output
 
 OPTIONS = "options.json"
 """File in a folder of checkpoints with the options of their run."""
 
 
-def check_stopped(run: Run, place: Path, resume: bool, output: Path) -> bool:
-    """Return whether to resume from `place`, checkpoints; end the command if `output` is finished already."""
+def check_scene_run(run: Run, place: Path, resume: bool, output: Path) -> None:
+    """Check that the command may write the scene `output`, or resume from the checkpoints at `place`."""
+    if left_at(place) or not (resume and output.exists()):
+        check_scene_output(output, run.overwrite)
+    check_stopped(run, place, resume, output)
+
+
+def check_stopped(run: Run, place: Path, resume: bool, output: Path) -> None:
+    """Check that checkpoints at `place` may be resumed or replaced; exit if `output` is finished."""
     left = left_at(place)
     if resume and not left and not run.overwrite and output.exists():
         run.say(f"{output}: already finished; -w without --resume starts over")
@@ -26,7 +34,6 @@ def check_stopped(run: Run, place: Path, resume: bool, output: Path) -> bool:
         run.say(f"{output}: nothing to resume, starting over")
     if left and not (resume or run.overwrite):
         raise OutputError("left by an interrupted run; --resume continues it, -w starts over", path=place)
-    return resume and left
 
 
 @contextmanager

@@ -4,36 +4,28 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from g2ard.cli.frame import Run
 from g2ard.cli.resume import OPTIONS, check_stopped, left_at
-from g2ard.config.choices import ViewFormat
+from g2ard.config.choices import Colour, ViewFormat
 from g2ard.errors import InputError, OutputError
-from g2ard.io import write_views
+from g2ard.io import ViewSet, write_splats, write_views
 from g2ard.io.atomic import atomic_output, check_output
+from g2ard.io.jsonfile import read_json
 from g2ard.io.scene_formats import FORMATS
-from g2ard.jobs.budget import DEVICES
+from g2ard.jobs.budget import DEVICES, Budget
+from g2ard.jobs.viewer_frame import frame_with
 from g2ard.progress import plural
+from g2ard.scene.cameras import Cameras
+from g2ard.scene.splats import Splats
+from g2ard.viewer import write_page
 
-if TYPE_CHECKING:
-    from g2ard.io import ViewSet
-    from g2ard.jobs.budget import Budget
-    from g2ard.scene.cameras import Cameras
-    from g2ard.scene.splats import Splats
-
-WORK = ".unfinished"
+_WORK = ".unfinished"
 """Folder in a run's folder for finished rounds and checkpoints."""
-KEPT = Path("simplified", "scene.ply")
-"""The simplified scene, with --keep, for `evaluate --anchors`."""
-VIEW = "view.html"
-"""The run's viewer page."""
-REPORT = "report.json"
-"""The run's numbers, written last."""
 
 _VIEWS: dict[ViewFormat, str] = {
     "inria": "cameras.json",
@@ -51,123 +43,140 @@ _OF_THE_BUDGET = ("count", "ratio")
 """Budget options; each folder has one budget."""
 
 
-def write_pool(run: Run, folder: Path, pool: ViewSet) -> None:
-    """Write generated views, also in the format of --views-format."""
-    write_views(folder / "views.json", pool.cameras, splits=pool.splits, overwrite=True)
-    also: ViewFormat = run.config["views_format"]
-    if also in _VIEWS:
-        run.write_views(folder / _VIEWS[also], pool.cameras, also, pool.splits, overwrite=True)
-
-
-def write_report(folder: Path, report: dict[str, Any]) -> None:
-    with atomic_output(folder / REPORT, overwrite=True) as temporary:
-        temporary.write_text(json.dumps(report, indent=2, default=str) + "\n", encoding="utf-8", newline="\n")
-
-
-def write_view(
-    place: Path, splats: Splats, cameras: Cameras, background: tuple[float, float, float]
-) -> tuple[int | None, str]:
-    """Write view.html beside `place`, the scene's file, unless browsers would not draw it smoothly.
-
-    Returns:
-        Size of the page in bytes, None if it was not written, and a line to print.
-    """
-    from g2ard.jobs.viewer_frame import frame_with
-    from g2ard.viewer import write_page
-
-    path, count, most = place.with_name(VIEW), len(splats), DEVICES["web"]
-    if count > most:
-        path.unlink(missing_ok=True)
-        return None, f"{path} skipped: over {most:,} Gaussians (`g2ard view` writes it anyway)"
-    stand = frame_with(splats, cameras)
-    shown = [(f"{place.name}: {plural(count, 'Gaussian')}", stand.of(splats))]
-    written = write_page(path, shown, start=stand.start, background=background, overwrite=True)
-    return written.bytes, f"view: {path} ({written.bytes / 1e6:.2f} MB)"
-
-
-def check_place(run: Run, place: Path, budget: Budget, given: bool, resume: bool) -> None:
-    """Raise an `OutputError` unless the run may write to the folder of `place`, its scene file.
+class RunFolder:
+    """Folder of a run with one budget.
 
     Args:
-        given: whether views are given; otherwise views.json is written too.
+        path: the folder.
+        name: name of the scene's file in it.
+        resume: whether to continue an interrupted run.
     """
-    folder = place.parent
-    views = [] if given else [folder / "views.json"]
-    run.spare_inputs(place, *_other_scenes(place), folder / KEPT, *views)
-    left = left_at(folder / WORK)
-    killed = folder.is_dir() and [path.name for path in folder.iterdir()] == [WORK]
-    if not left and not (resume and _is_finished(place)) and not killed:
-        check_output(folder, run.overwrite, folder=True)
-    if left or not resume:
-        check_stopped(run, folder / WORK, resume, place)
-    if resume and left:
-        _check_same(run, folder, folder / WORK / OPTIONS, budget, "begun")
-    elif is_done(run, place, resume):
-        _check_same(run, folder, folder / REPORT, budget, "finished")
 
+    def __init__(self, run: Run, path: Path, name: str, resume: bool) -> None:
+        self._run, self._resume = run, resume
+        self.path, self.scene, self.work = path, path / name, path / _WORK
+        self._report = path / "report.json"  # written last
+        self._simplified = path / "simplified" / "scene.ply"  # with --keep, for `evaluate --anchors`
+        self._view = path / "view.html"
 
-def is_done(run: Run, place: Path, resume: bool) -> bool:
-    """Return whether --resume finds a finished run."""
-    return resume and not run.overwrite and _is_finished(place)
+    @property
+    def is_done(self) -> bool:
+        """Whether --resume finds a finished run."""
+        return self._resume and not self._run.overwrite and self._is_finished
 
+    @property
+    def _is_finished(self) -> bool:
+        return self.scene.exists() and self._report.exists() and not left_at(self.work)
 
-def tell_finished(run: Run, place: Path) -> dict[str, Any]:
-    """Say that a run is finished, and return its report."""
-    from g2ard.io.jsonfile import read_json
+    def check(self, budget: Budget, views_given: bool) -> None:
+        """Raise an `OutputError` unless the run may write here; without given views it writes views.json."""
+        views = [] if views_given else [self.path / "views.json"]
+        self._run.spare_inputs(self.scene, *self._other_scenes(), self._simplified, *views)
+        left = left_at(self.work)
+        killed = self.path.is_dir() and [path.name for path in self.path.iterdir()] == [_WORK]
+        if not left and not (self._resume and self._is_finished) and not killed:
+            check_output(self.path, self._run.overwrite, folder=True)
+        if left or not self._resume:
+            check_stopped(self._run, self.work, self._resume, self.scene)
+        if self._resume and left:
+            self._check_same(self.work / OPTIONS, budget, "begun")
+        elif self.is_done:
+            self._check_same(self._report, budget, "finished")
 
-    run.say(f"{place.parent}: already finished; -w without --resume starts over")
-    return read_json(place.parent / REPORT)
+    def _check_same(self, record: Path, budget: Budget, how: str) -> None:
+        """Raise an `OutputError` if the budget or options that an earlier run recorded differ."""
+        if record.exists() and (others := _others(self._run, read_json(record), budget)):
+            raise OutputError(
+                f"{how} with other options ({', '.join(others)})",
+                path=self.path,
+                hint="-w without --resume starts over",
+            )
 
+    def tell_finished(self) -> dict[str, Any]:
+        """Say that the run is finished, and return its report."""
+        self._run.say(f"{self.path}: already finished; -w without --resume starts over")
+        return read_json(self._report)
 
-def tell_anew(run: Run, folder: Path, resume: bool) -> None:
-    """Say that --resume starts over if there is nothing to resume."""
-    if resume and not left_at(folder / WORK):
-        run.say(f"{folder}: nothing to resume, starting over")
+    @contextmanager
+    def working(self, input_count: int, output_count: int) -> Iterator[None]:
+        """Create the folder for checkpoints; after an error or Ctrl-C, keep it only if it can be resumed."""
+        run, made = self._run, not self.path.exists()
+        if self._resume and not left_at(self.work):
+            run.say(f"{self.path}: nothing to resume, starting over")
+        if not self._resume:
+            shutil.rmtree(self.work, ignore_errors=True)
+        self.work.mkdir(parents=True, exist_ok=True)
+        if not left_at(self.work):
+            told = {"input_count": input_count, "output_count": output_count, "config": run.config}
+            text = json.dumps(told, default=str)
+            (self.work / OPTIONS).write_text(text, encoding="utf-8", newline="\n")
+        try:
+            yield
+        except (Exception, KeyboardInterrupt) as error:
+            if left_at(self.work) and (self._resume or isinstance(error, KeyboardInterrupt)):
+                run.kept.append(f"run the same command with --resume to continue in {self.path}")
+                if not isinstance(error, KeyboardInterrupt | InputError):
+                    run.say(run.kept[-1])
+            else:
+                shutil.rmtree(self.path if made else self.work, ignore_errors=True)
+            raise
+        shutil.rmtree(self.work)
 
+    def write_scene(self, splats: Splats) -> None:
+        """Write the scene, and remove an earlier run's scenes in other formats."""
+        self._run.write(self.scene, splats, overwrite=True)
+        for other in self._other_scenes():
+            other.unlink(missing_ok=True)
 
-@contextmanager
-def work_folder(run: Run, output: Path, resume: bool, counts: tuple[int, int] = (0, 0)) -> Iterator[Path]:
-    """Create the folder for checkpoints; after an error or Ctrl-C, keep it only if it can be resumed.
+    def write_simplified(self, splats: Splats | None) -> None:
+        """Write the simplified scene; without one, remove an earlier run's."""
+        if splats is None:
+            self._simplified.unlink(missing_ok=True)
+            return
+        self._simplified.parent.mkdir(exist_ok=True)
+        write_splats(self._simplified, splats, overwrite=True)
 
-    Args:
-        counts: Gaussians of the dense scene and of the result.
-    """
-    work, made = output / WORK, not output.exists()
-    if not resume:
-        shutil.rmtree(work, ignore_errors=True)
-    work.mkdir(parents=True, exist_ok=True)
-    note_options(run, work, {"input_count": counts[0], "output_count": counts[1]})
-    try:
-        yield work
-    except (Exception, KeyboardInterrupt) as error:
-        if left_at(work) and (resume or isinstance(error, KeyboardInterrupt)):
-            run.kept.append(f"run the same command with --resume to continue in {output}")
-            if not isinstance(error, KeyboardInterrupt | InputError):
-                run.say(run.kept[-1])
-        else:
-            shutil.rmtree(output if made else work, ignore_errors=True)
-        raise
+    def write_pool(self, pool: ViewSet) -> None:
+        """Write generated views, also in the format of --views-format."""
+        write_views(self.path / "views.json", pool.cameras, splits=pool.splits, overwrite=True)
+        also: ViewFormat = self._run.config["views_format"]
+        if also in _VIEWS:
+            place = self.path / _VIEWS[also]
+            self._run.write_views(place, pool.cameras, also, pool.splits, overwrite=True)
 
+    def write_report(self, report: dict[str, Any]) -> None:
+        with atomic_output(self._report, overwrite=True) as temporary:
+            text = json.dumps(report, indent=2, default=str)
+            temporary.write_text(text + "\n", encoding="utf-8", newline="\n")
 
-def note_options(run: Run, work: Path, told: Mapping[str, Any] = MappingProxyType({})) -> None:
-    """Write the run's options beside its checkpoints, unless there are checkpoints already."""
-    work.mkdir(parents=True, exist_ok=True)
-    if not left_at(work):
-        (work / OPTIONS).write_text(
-            json.dumps({**told, "config": run.config}, default=str), encoding="utf-8", newline="\n"
-        )
+    def write_view(self, splats: Splats, cameras: Cameras, background: Colour) -> tuple[int | None, str]:
+        """Write view.html unless browsers would not draw the scene smoothly.
 
+        Returns:
+            Size of the page in bytes, None if it was not written, and a line to print.
+        """
+        count, most = len(splats), DEVICES["web"]
+        if count > most:
+            self.drop_view()
+            return None, f"{self._view} skipped: over {most:,} Gaussians (`g2ard view` writes it anyway)"
+        stand = frame_with(splats, cameras)
+        shown = [(f"{self.scene.name}: {plural(count, 'Gaussian')}", stand.of(splats))]
+        written = write_page(self._view, shown, start=stand.start, background=background, overwrite=True)
+        return written.bytes, f"view: {self._view} ({written.bytes / 1e6:.2f} MB)"
 
-def check_same_options(run: Run, work: Path, besides: Sequence[str] = ()) -> None:
-    """Raise an `OutputError` if the interrupted run had other options, except for those in `besides`."""
-    _check_same(run, work, work / OPTIONS, None, "begun", besides)
+    def drop_view(self) -> None:
+        """Remove an earlier run's page."""
+        self._view.unlink(missing_ok=True)
+
+    def _other_scenes(self) -> list[Path]:
+        """Return the scene's file names in other formats."""
+        names = (self.path / f"scene.{name}" for name in FORMATS)
+        return [path for path in names if path != self.scene]
 
 
 def stopped_run(folder: Path) -> dict[str, Any] | None:
     """Describe an interrupted run (checkpoints, counts, options), or return None without one."""
-    from g2ard.io.jsonfile import read_json
-
-    work = folder / WORK
+    work = folder / _WORK
     if not left_at(work):
         return None
     told = read_json(work / OPTIONS) if (work / OPTIONS).exists() else {}
@@ -175,47 +184,15 @@ def stopped_run(folder: Path) -> dict[str, Any] | None:
     return {"path": str(folder), "kind": "stopped run", "kept": kept, **told}
 
 
-def drop_older(place: Path) -> None:
-    """Remove an earlier run's scenes in other formats, since a folder holds one scene."""
-    for other in _other_scenes(place):
-        other.unlink(missing_ok=True)
-
-
-def _other_scenes(place: Path) -> list[Path]:
-    """Return the scene's file names in other formats."""
-    return [path for name in FORMATS if (path := place.with_name(f"scene.{name}")) != place]
-
-
-def _is_finished(place: Path) -> bool:
-    return place.exists() and (place.parent / REPORT).exists() and not left_at(place.parent / WORK)
-
-
-def _check_same(
-    run: Run, folder: Path, told: Path, budget: Budget | None, how: str, besides: Sequence[str] = ()
-) -> None:
-    """Raise an `OutputError` if a run's recorded options differ."""
-    from g2ard.io.jsonfile import read_json
-
-    if not told.exists():
-        return
-    before = read_json(told)
-    if other := [name for name in _others(run, before, budget) if name not in besides]:
-        raise OutputError(
-            f"{how} with other options ({', '.join(other)})",
-            path=folder,
-            hint="-w without --resume starts over",
-        )
-
-
-def _others(run: Run, before: Mapping[str, Any], budget: Budget | None) -> list[str]:
-    """Return the names of options whose values differ."""
+def _others(run: Run, before: Mapping[str, Any], budget: Budget) -> list[str]:
+    """Return the names of options whose values differ from those of an earlier run."""
     then = before.get("config", {})
     now = json.loads(json.dumps(run.config, default=str))
     names = [name for name in now if name in then and name not in (*_OF_THE_CALL, *_OF_THE_BUDGET)]
     found = [name.replace("_", "-") for name in names if now[name] != then[name]]
     if "cuda" in (now["device"], then.get("device")) and now["device"] != then.get("device"):
         found.append("device")
-    return found if budget is None or _is_budget(budget, before) else ["budget", *found]
+    return found if _is_budget(budget, before) else ["budget", *found]
 
 
 def _is_budget(budget: Budget, before: Mapping[str, Any]) -> bool:

@@ -8,8 +8,6 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from g2ard.cli.budget_options import Count
-from g2ard.cli.usage import in_flags
-from g2ard.errors import InputError
 
 if TYPE_CHECKING:
     from g2ard.cli.frame import Run
@@ -56,13 +54,11 @@ def tiling_of(run: Run, scene: Path | None, output: Path) -> Tiling:
     from g2ard.jobs.tiling import Tiling, bytes_of
 
     tile_rows, memory, workers, scheduler, work = (run.shared[name] for name in TILES)
-    rows = None if tile_rows is None else tile_rows.of(0)
+    rows = None if tile_rows is None else int(tile_rows.value)
     if rows is not None and scene is not None:
         _check_rows(scene, rows)
-    try:
+    with run.usage():
         size = None if memory is None else bytes_of(memory)
-    except InputError as error:
-        raise typer.BadParameter(in_flags(error, run.flags)) from None
     if scheduler is not None and scheduler != "local" and "://" not in scheduler:
         raise typer.BadParameter(f"--scheduler: expected tcp://HOST:PORT or local, got {scheduler!r}")
     folder = work or _beside(output)

@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from g2ard.errors import InputError
-from g2ard.system.extras import require_torch
+from g2ard.errors import InputError, require_torch
 
 _MEAN, _STD = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
 """LPIPS's normalisation of images in [−1, 1]."""

@@ -33,13 +33,10 @@ def test_several_budgets_equal_single_runs(command_line: CommandLine, folder: Pa
     [("1,000", [1000]), ("1_100", [1100]), ("300", [300]), ("0.2k,10%", [200, 120]), ("200,100", [200, 100])],
 )
 def test_counts_take_separators(text: str, counts: list[int]) -> None:
-    assert [count.of(1200) for count in Counts.parse(text)] == counts
+    assert [count.budget().of(1200) for count in Counts.parse(text)] == counts
 
 
-def test_several_counts_are_named_by_count(command_line: CommandLine, folder: Path) -> None:
-    assert "such as s_{count}.ply; commas separate counts, so write a single one as 10_000" in refused(
-        command_line, folder, "simplify", "ball.ply", "-n", "200,100", "-o", "s.ply"
-    )
+def test_a_count_may_have_commas(command_line: CommandLine, folder: Path) -> None:
     g2ard.save(folder / "larger.ply", checkered_ball(1200))
     assert (
         "1,000 of 1,200 Gaussians"
@@ -62,7 +59,7 @@ def test_counts_that_could_be_others_are_refused(text: str, words: str) -> None:
     with pytest.raises(Exception, match=r"expected|dots|commas") as refusal:
         Counts.parse(text)
     assert words in str(refusal.value)
-    assert Count.parse("1.500M").of(2_000_000) == 1_500_000
+    assert Count.parse("1.500M").number == 1_500_000
 
 
 def test_budgets_that_share_an_output_are_rejected(command_line: CommandLine, folder: Path) -> None:
@@ -71,10 +68,3 @@ def test_budgets_that_share_an_output_are_rejected(command_line: CommandLine, fo
         error = refused(command_line, folder, *ask, "-r", budgets, "-o", name)
         assert "given twice" in error or "the same output" in error
     assert "poses" not in error
-
-
-@pytest.mark.parametrize("command", ["simplify", "distill"])
-def test_a_name_has_no_unknown_words(command: str, command_line: CommandLine, folder: Path) -> None:
-    error = refused(command_line, folder, command, "ball.ply", "-r", 4, "-o", "{foo}_{ratio}.ply")
-    assert "unknown placeholder {foo}; use {ratio} or {count}" in error
-    assert sorted(path.name for path in folder.iterdir()) == ["ball.ply", "views.json"]

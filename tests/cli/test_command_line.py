@@ -9,7 +9,7 @@ import pytest
 
 from g2ard.cli.commands import COMMANDS
 from g2ard.cli.console import Console
-from helpers.commands import CommandLine, refused, succeeds
+from helpers.commands import CommandLine, succeeds
 
 
 def imported_by(statement: str, *heavy: str) -> list[str]:
@@ -29,20 +29,6 @@ def test_import_and_help_load_nothing_heavy() -> None:
 def test_every_command_has_an_example(command: str, command_line: CommandLine, tmp_path: Path) -> None:
     shown = succeeds(command_line, tmp_path, command, "--help").out
     assert "Example: g2ard " + command in shown
-
-
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (["nonsense"], "nonsense"),
-        (["render", "x.ply", "--views", "v.json", "-o", "out", "--threads", "-1"], "--threads"),
-        (["render", "x.ply", "--views", "v.json", "-o", "out", "--background", "2,0,0"], "--background"),
-        (["render", "x.ply", "--views", "v.json", "-o", "out", "--device", "abacus"], "abacus"),
-    ],
-)
-def test_usage_errors(arguments: list[str], words: str, command_line: CommandLine, tmp_path: Path) -> None:
-    assert words in refused(command_line, tmp_path, *arguments)
-    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("mark", [b"", b"\xef\xbb\xbf"])
@@ -80,26 +66,6 @@ def test_quiet_prints_errors_only(capsys: pytest.CaptureFixture[str]) -> None:
     console.table("t", ["a"], [["1"]])
     console.error("bad")
     assert capsys.readouterr().err == "g2ard: bad\n"
-
-
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (["simplify", "absent.ply", "-r", "2", "-o", "out.obj"], "out.obj: scenes are written as"),
-        (["lift", "absent.ply", "-o", "out.gltf"], "out.gltf: scenes are written as"),
-        (["recover", "absent.ply", "--views", "v.json", "-o", "out.obj"], "out.obj: scenes are written as"),
-        (["adapt", "absent.ply", "--views", "v.json", "-o", "out.obj"], "out.obj: scenes are written as"),
-        (
-            ["select", "absent.ply", "--views", "v.json", "-k", "2", "-o", "out.txt"],
-            "out.txt: views are written",
-        ),
-        (["poses", "absent.ply", "-n", "2", "-o", "out.txt"], "out.txt: views are written"),
-    ],
-)
-def test_unknown_output_formats(
-    command_line: CommandLine, tmp_path: Path, arguments: list[str], words: str
-) -> None:
-    assert words in refused(command_line, tmp_path, *arguments, status=1)
 
 
 def test_an_interrupt_while_a_string_is_executed_ends_with_130_too(tmp_path: Path) -> None:

@@ -23,65 +23,6 @@ def test_a_wrong_kind_of_input_names_the_command_that_takes_it(
         assert words in refused(command_line, folder, *ask, status=status)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "status", "words"),
-    [
-        (
-            ("distill", "--views", "views.json", "--renders", "-n", 9, "-o", "run"),
-            2,
-            "--renders needs a SCENE to render",
-        ),
-        (
-            ("distill", "ball.ply", "--photos", "-n", 9, "-o", "run"),
-            1,
-            "--photos: generated views have no photos; give --views that have them",
-        ),
-        (("distill", "--views", "views.json", "--fit", "1kB", "-o", "run"), 1, "--fit: views.json: "),
-        (
-            ("distill", "--views", "views.json", "--min-psnr", 30, "-o", "run"),
-            1,
-            "--min-psnr: views.json: needs sparse points, and there are none; give --count COUNT",
-        ),
-        (
-            ("render", "ball.ply", "-n", 4, "--views", "views.json", "--sheet", "a.png"),
-            2,
-            "-n generates views, so it excludes --views",
-        ),
-        (
-            ("recover", "ball.ply", "--views", "made", "-o", "o.ply"),
-            2,
-            "--views made needs a --teacher",
-        ),
-        (
-            ("simplify", "ball.ply", "-ratio", 5, "-o", "o.ply"),
-            2,
-            "-ratio: long options need two dashes; write ",
-        ),
-        (
-            ("distill", "ball.ply", "-n", 5, "-o", "run", "--held-out", "made"),
-            2,
-            "--held-out must be a file of views",
-        ),
-        (
-            ("distill", "ball.ply", "-n", 5, "-o", "run", "--views", "made", "--photos"),
-            2,
-            "--photos: generated views have no photos",
-        ),
-        (
-            ("distill", "ball.ply", "-n", 5, "-o", "run", "--steps", 5, "--set", "schedule.steps=9"),
-            2,
-            "--steps and --set recover.schedule.steps exclude each other",
-        ),
-        (("simplify", "ball.ply", "-n", 5, "-o", "o.ply", "--up", "0,0,0"), 2, "a direction such as 0,0,1"),
-    ],
-)
-def test_missing_and_conflicting_options_are_named_before_any_work(
-    arguments: tuple[object, ...], status: int, words: str, command_line: CommandLine, folder: Path
-) -> None:
-    assert words in refused(command_line, folder, *arguments, status=status)
-    assert sorted(path.name for path in folder.iterdir()) == ["ball.ply", "views.json"]
-
-
 def test_errors_point_to_the_poses_of_photos(folder: Path) -> None:
     (folder / "scan" / "shots").mkdir(parents=True)
     Image.new("RGB", (8, 8)).save(folder / "scan" / "shots" / "a.png")
@@ -166,23 +107,3 @@ def test_a_damaged_file_comes_with_advice(suffix: str, command_line: CommandLine
     (folder / f"b{suffix}").write_bytes((folder / f"a{suffix}").read_bytes()[:-700])
     error = refused(command_line, folder, "info", f"b{suffix}", status=1)
     assert error.endswith("; the file is damaged: copy or export it again\n")
-
-
-def test_errors_for_common_mistakes_end_with_advice(command_line: CommandLine, folder: Path) -> None:
-    """Errors for common mistakes end with advice."""
-    for name in ("bare", "d.ply"):
-        (folder / name).mkdir()
-    Image.new("RGB", (16, 16)).save(folder / "bare" / "a.png")
-    for ask, status, step in (
-        (("recover", "ball.ply", "-o", "o.ply", "--steps", 3, "--recovery-time", 9), 2, "; give one"),
-        (("simplify", "ball.ply", "-r", 2, "-o", "o.ply", "--views", "v", "--no-views"), 2, "; give one"),
-        (("simplify", "ball.ply", "-r", 2, "-o", "d.ply"), 1, "give the name of a file"),
-        (("render", "ball.ply", "-n", 1, "-o", "ball.ply"), 2, "name another output"),
-        (("render", "ball.ply", "-n", 1, "-o", "views.json"), 1, "give the name of a folder"),
-        (("simplify", "ball.ply", "-r", 2, "-o", "o.ply", "--json", "o.ply"), 2, "name another one"),
-        (("convert", "ball.ply", "o.ply", "--box", "1,1,1,0,0,0"), 1, "the lower corner comes first"),
-        (("lift", "ball.ply", "-o", "o.ply"), 1, "run `simplify` or `distill`"),
-        (("register", "ball.ply", "--photos", "bare", "-o", "o.json", "--pool", 8), 1, "--focal PIXELS"),
-        (("evaluate", "ball.ply", "--views", "views.json", "--split", "val"), 1, "there are test, train"),
-    ):
-        assert step in refused(command_line, folder, *ask, status=status)

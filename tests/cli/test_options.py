@@ -40,12 +40,6 @@ def test_invalid_values(folder: Path, command_line: CommandLine, option: str, va
     assert f"{words} (from c.toml)" in refused(command_line, folder, *simplify, "--config", "c.toml")
 
 
-def test_a_format_is_named_in_any_case(folder: Path, command_line: CommandLine) -> None:
-    said = command_line("distill", "none.ply", "-n", "9", "--format", "SOG", "-o", "run", cwd=folder)
-    assert said[0] == 1
-    assert "none.ply: no such file" in said[2]
-
-
 def test_up_changes_the_generated_views(folder: Path, command_line: CommandLine) -> None:
     for up in ("0,0,1", "1,0,0"):
         ask = ("distill", "a.ply", "-n", 20, "--views", "made", "--steps", 1, "--size", 48)
@@ -107,16 +101,6 @@ def test_inputs_are_not_overwritten(
     error = refused(command_line, folder, *arguments.split(), "-w")
     assert f"{output} is both an input and the output" in error
     assert {path.name: path.read_bytes() for path in folder.glob("*.*")} == before
-
-
-@pytest.mark.parametrize("policy", ["random", "uniform"])
-def test_auto_needs_a_policy_that_measures(folder: Path, command_line: CommandLine, policy: str) -> None:
-    for ask in (
-        ("select", "absent.ply", "--views", "v", "-k", "auto", "--policy", policy),
-        ("distill", "absent.ply", "-r", 2, "--set", "views_count=auto", "--set", f"policy={policy}"),
-    ):
-        error = refused(command_line, folder, *ask, "-o", "out")
-        assert f"policy {policy} does not measure" in error
 
 
 def test_the_folder_one_is_in_can_be_an_output(folder: Path, command_line: CommandLine) -> None:

@@ -151,8 +151,8 @@ def test_a_stopped_run_with_other_options(
         patched.setattr("g2ard.levels.save_levels", stop)
         status, _, said = command_line(*given, cwd=tmp_path)
     assert (status, "to continue from" in said) == (130, True)
-    assert "begun with other options (size); -w without --resume starts over" in refused(
-        command_line, tmp_path, *given[:-1], "64", "--resume", status=1
+    assert "belongs to a run with another scene or other options; -w (--overwrite) starts over" in refused(
+        command_line, tmp_path, *given[:-1], "64", "--resume", "-q", status=1
     )
     assert not (tmp_path / "out").exists()
     succeeds(command_line, tmp_path, *given, "--resume")

@@ -11,9 +11,8 @@ import pytest
 import g2ard
 from g2ard.config.paths import changed
 from g2ard.errors import InputError
-from g2ard.io import read_splats, write_splats, write_views
+from g2ard.io import read_splats, write_splats
 from g2ard.pipeline import DistillConfig, SelectConfig, distill
-from g2ard.progress import silent
 from g2ard.scene.splits import kind_of
 from g2ard.scene.targets import Targets, TeacherRenders
 from g2ard.stages.recover import RecoverConfig
@@ -125,7 +124,7 @@ def test_steps_by_need_are_for_teachers() -> None:
     part = replace(around(12), Ks=around(12).Ks * [[[4], [4], [1]]])  # a sixteenth of the ball in each
 
     def horizon(targets: Targets, config: DistillConfig) -> int | None:
-        return _Rounds(PRIOR, 300, targets, config, 1, None, None, None, silent, None)._steps()
+        return _Rounds(PRIOR, 300, targets, config, 1)._steps()
 
     teacher, config = (
         TeacherRenders(PRIOR, part, lazy=True),
@@ -151,42 +150,6 @@ def test_command_on_a_cloud_with_photos(command_line: CommandLine, tmp_path: Pat
     result = read_splats(tmp_path / "run" / "scene.ply")
     assert (len(result), result.sh_degree) == (400, 3)
     assert "--views" in refused(command_line, tmp_path, *ask, "-w")
-
-
-@pytest.mark.parametrize(
-    ("arguments", "status", "words"),
-    [
-        (["distill", "absent.ply", "-r", "10", "-o", "run"], 1, "absent.ply"),
-        (["distill", "s.ply", "-n", "51", "-o", "run"], 1, "51"),
-        (["distill", "s.ply", "-n", "0", "-o", "run"], 2, "'0'"),
-        (["distill", "s.ply", "-n", "many", "-o", "run"], 2, "many"),
-        (["distill", "s.ply", "-r", "0.5", "-o", "run"], 2, "0.5"),
-        (["distill", "s.ply", "-r", "2", "-o", "run", "--views", "none.json"], 1, "none.json"),
-        (["distill", "s.ply", "-r", "2", "-o", "s.ply/run"], 1, "s.ply is a file"),
-        (["distill", "s.ply", "-r", "2,5", "-o", "run"], 2, "{ratio}"),
-        (["distill", "s.ply", "-r", "2", "-o", "run", "--schedule", "hasty"], 2, "hasty"),
-        (["distill", "s.ply", "-r", "2", "-o", "run", "--preset", "gentle"], 2, "gentle"),
-        (["distill", "s.ply", "-r", "2", "-o", "run", "--json", "s.ply/where.json"], 1, "where.json"),
-        (["recover", "s.ply", "--views", "none.json", "-o", "out.ply"], 1, "none.json"),
-        (["recover", "s.ply", "--views", "v.json", "-o", "no/out.ply"], 1, "--teacher"),
-        (["recover", "s.ply", "--views", "v.json", "-o", "s.ply/out.ply"], 1, "s.ply is a file"),
-        (["render", "s.ply", "--views", "none.json", "-o", "out"], 1, "none.json"),
-        (["render", "v.json", "--views", "v.json", "-o", "out"], 1, "v.json"),
-        (["evaluate", "s.ply", "--views", "v.json", "--teacher", "absent.ply"], 1, "absent.ply"),
-    ],
-)
-def test_bad_input_is_one_line_and_leaves_nothing(
-    arguments: list[str], status: int, words: str, command_line: CommandLine, tmp_path: Path
-) -> None:
-    write_splats(tmp_path / "s.ply", checkered_ball(50))
-    write_views(tmp_path / "v.json", around(8))
-    before = sorted(tmp_path.iterdir())
-    code, _, error = command_line(*arguments, cwd=tmp_path)
-    lines = [line for line in error.splitlines() if line.startswith("g2ard")]  # others tell of progress
-    assert code == status, error
-    assert len(lines) == 1, error
-    assert words in lines[0]
-    assert sorted(tmp_path.iterdir()) == before
 
 
 def test_a_scanned_cloud_and_photos_are_distilled(command_line: CommandLine, tmp_path: Path) -> None:

@@ -91,32 +91,3 @@ def test_command(command_line: CommandLine, tmp_path: Path) -> None:
     status, _, err = call("--color", "parents", "--parents", "to.npy", out="again")
     assert status == 0, err
     assert np.array_equal(pixels(tmp_path / "again"), images["parents"])
-
-
-@pytest.mark.parametrize(
-    ("options", "status", "message"),
-    [
-        (["--color", "flags"], 2, "either -n COUNT or -r RATIO"),
-        (["-r", "10"], 2, "go with --color"),
-        (["--color", "cells", "--parents", "to.npy"], 2, "--parents goes with"),
-        (["--color", "parents", "--parents", "nowhere.npy"], 1, "nowhere.npy"),
-        (["--color", "parents", "--parents", "views.json"], 1, "not a NumPy array"),
-        (["--color", "parents", "--parents", "few.npy"], 1, "expected 90 whole numbers"),
-        (["--color", "flags", "-n", "91"], 1, "at most its 90 Gaussians, got 91"),
-    ],
-)
-def test_bad_input_is_one_line(
-    command_line: CommandLine,
-    tmp_path: Path,
-    options: list[str],
-    status: int,
-    message: str,
-) -> None:
-    io.write_splats(tmp_path / "ball.ply", checkered_ball(90))
-    io.write_views(tmp_path / "views.json", around(1))
-    np.save(tmp_path / "few.npy", np.arange(3))
-    found = command_line("render", "ball.ply", "--views", "views.json", "-o", "x", *options, cwd=tmp_path)
-    assert found[0] == status
-    assert message in found[2]
-    assert "Traceback" not in found[2]
-    assert not (tmp_path / "x").exists()

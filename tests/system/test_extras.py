@@ -5,9 +5,9 @@ from pathlib import Path
 import pytest
 
 import g2ard
+from g2ard import errors
 from g2ard.errors import MissingDependencyError
 from g2ard.rendering.lpips import load_lpips
-from g2ard.system import extras
 from helpers.commands import CommandLine, refused
 from helpers.scenes import around, checkered_ball
 
@@ -15,7 +15,7 @@ from helpers.scenes import around, checkered_ball
 def test_features_need_torch(
     command_line: CommandLine, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(extras, "find_spec", lambda name: None)
+    monkeypatch.setattr(errors, "find_spec", lambda name: None)
     ball = checkered_ball(400)
     targets = g2ard.TeacherRenders(ball, around(4, (32, 24)))
     for engine in ("torch", "gsplat"):

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from g2ard import viewer
-from g2ard.cli.run_folder import write_view
+from g2ard.cli.run_folder import RunFolder
 from g2ard.errors import InputError, OutputError
 from g2ard.io import read_splats, write_splats, write_views
 from g2ard.jobs import budget
@@ -230,12 +230,13 @@ def test_the_command_shows_a_scene_and_a_run(command_line: CommandLine, tmp_path
 
 def test_a_run_has_a_page_unless_too_large(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     ball, path = checkered_ball(300), tmp_path / "view.html"
-    size, line = write_view(tmp_path / "scene.sog", ball, around(6), (1.0, 1.0, 1.0))
+    folder = RunFolder(None, tmp_path, "scene.sog", resume=False)
+    size, line = folder.write_view(ball, around(6), (1.0, 1.0, 1.0))
     assert size == path.stat().st_size
     assert "view.html" in line
     assert Parts(path).labels == ["scene.sog: 300 Gaussians"]
     monkeypatch.setitem(budget.DEVICES, "web", 299)
-    size, line = write_view(tmp_path / "scene.sog", ball, around(6), (1.0, 1.0, 1.0))
+    size, line = folder.write_view(ball, around(6), (1.0, 1.0, 1.0))
     assert size is None
     assert "over 299 Gaussians" in line
     assert not path.exists()

@@ -9,11 +9,10 @@ import typer
 
 from g2ard.cli import options as opt
 from g2ard.cli.frame import Run, command
-from g2ard.cli.resume import check_stopped, left_at, stoppable
+from g2ard.cli.resume import check_scene_run, stoppable
 from g2ard.config.choices import AdaptSchedule
 from g2ard.config.paths import listed
 from g2ard.config.presets import PRESETS, configured
-from g2ard.io import check_scene_output
 from g2ard.progress import plural
 
 
@@ -51,8 +50,7 @@ def adapt(
     preset: opt.PaperOption = None,
 ) -> None:
     """Refit colours and opacities to new images; means, rotations and scales stay fixed."""
-    from g2ard.jobs.inputs import load_trained, make_targets
-    from g2ard.jobs.view_checks import propose_background, warn_of_sight
+    from g2ard.cli.teaching import Teaching
     from g2ard.pipeline.adapt import AdaptConfig
     from g2ard.pipeline.adapt import adapt as refit
 
@@ -64,18 +62,10 @@ def adapt(
     names = ("steps", "tolerance", "schedule", "prior_views", "sh_degree", "background", "seed")
     config = configured(start, preset or "auto", run.settings(start, *names, preset=preset))
     work = output.parent / f".{output.name}.work"
-    if left_at(work) or not (resume and output.exists()):
-        check_scene_output(output, run.overwrite)
-    check_stopped(run, work, resume, output)
+    check_scene_run(run, work, resume, output)
     splats = run.load(compact)
-    dense = run.load(teacher) if teacher else None
-    cameras = load_trained(
-        opt.with_images(views, images, alpha), split, size, run.say, unpictured=dense is not None
-    ).cameras
-    warn_of_sight(splats, cameras, run.say)
-    if dense is None:
-        propose_background(cameras, config.background, background is not None, run.say)
-    targets = make_targets(cameras, dense, config.background, progress=run.progress, say=run.say)
+    teaching = Teaching(run, teacher, config.background, chosen=background is not None)
+    _, targets = teaching.training(splats, opt.with_images(views, images, alpha), split, size)
     with stoppable(run, work, resume):
         work.mkdir(parents=True, exist_ok=True)
         result = refit(splats, targets, config, work=work, progress=run.progress)

@@ -9,6 +9,8 @@ import typer
 
 from g2ard.cli.frame import Run, command
 from g2ard.cli.options import SceneArgument, picture
+from g2ard.errors import InputError
+from g2ard.io import check_scene_output
 from g2ard.progress import plural
 
 if TYPE_CHECKING:
@@ -72,29 +74,22 @@ def clean(
     """
     import numpy as np
 
-    from g2ard import io
-    from g2ard.errors import InputError
     from g2ard.jobs.inputs import clutter_seen
     from g2ard.scene.sky import sky_mask
-    from g2ard.stages.clean import FLOATING, KINDS, Cleaning
+    from g2ard.stages.clean import Cleaning
 
-    kinds = KINDS if only is None else tuple(word.strip() for word in only.split(",") if only != "none")
-    if wrong := [word for word in kinds if word not in KINDS]:
-        raise typer.BadParameter(f"--only: expected {', '.join(KINDS)}, got {wrong[0]!r}")
-    if only is not None and not strength and (idle := [kind for kind in kinds if kind in FLOATING]):
-        raise typer.BadParameter(f"--only {idle[0]} needs --strength, such as 0.5")
+    kinds = _kinds(only, strength)
     if preview is not None and not kinds:
         raise typer.BadParameter("--preview shows clutter, so that it does not go with --only none")
     if output is None and not dry_run:
         raise typer.BadParameter("give an output with -o, or --dry-run")
-    if output is not None and not dry_run:
-        io.check_scene_output(output, run.overwrite)
     if preview is not None:
         run.check_extra("--preview", preview)
     if split_sky is not None:
         run.check_extra("--split-sky", split_sky)
-        if not dry_run:
-            io.check_scene_output(split_sky, run.overwrite)
+    if not dry_run:
+        for path in filter(None, (output, split_sky)):
+            check_scene_output(path, run.overwrite)
     whole = splats = run.load(scene)
     sky = np.zeros(len(whole), bool)
     if split_sky is not None:
@@ -122,6 +117,20 @@ def clean(
             run.write(split_sky, whole.take(sky))
     counts = {"input_count": len(whole), "output_count": kept, "found": found.counts}
     run.result(counts if split_sky is None else {**counts, "sky_count": int(sky.sum())})
+
+
+def _kinds(only: str | None, strength: float) -> tuple[str, ...]:
+    """Return the kinds of clutter to remove, after checking that they are known and have a strength."""
+    from g2ard.stages.clean import FLOATING, KINDS
+
+    if only is None:
+        return KINDS
+    kinds = tuple(word.strip() for word in only.split(",") if only != "none")
+    if wrong := [word for word in kinds if word not in KINDS]:
+        raise typer.BadParameter(f"--only: expected {', '.join(KINDS)}, got {wrong[0]!r}")
+    if not strength and (idle := [kind for kind in kinds if kind in FLOATING]):
+        raise typer.BadParameter(f"--only {idle[0]} needs --strength, such as 0.5")
+    return kinds
 
 
 def _paint(path: Path, splats: Splats, found: Cleaning, cameras: Cameras, overwrite: bool) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import time
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -12,24 +11,19 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from g2ard.cli import options as opt
-from g2ard.cli import run_folder
 from g2ard.cli.frame import Run, command
 from g2ard.cli.outputs import Outputs, budgets_of
 from g2ard.cli.run_result import say_views, say_weight, tell_quality, told, write_table
 from g2ard.cli.tile_options import tiling_of
-from g2ard.cli.tiled import TiledCommand
 from g2ard.config.choices import Focus
-from g2ard.io import kind, write_splats
+from g2ard.io import kind
 from g2ard.progress import plural
 
 if TYPE_CHECKING:
+    from g2ard.cli.run_folder import RunFolder
     from g2ard.jobs.budget import Budget
     from g2ard.jobs.job import DistillJob
     from g2ard.pipeline import Distilled
-    from g2ard.scene.splats import Splats
-    from g2ard.scene.targets import Targets
-
-    Colour = tuple[float, float, float]
 
 
 @command(
@@ -114,31 +108,33 @@ def distill(
     Views come from --views, or from cameras found beside the scene, or are generated.
     Scenes larger than memory and folders of tiles are distilled tile by tile.
     """
+    from g2ard.cli.run_folder import RunFolder
+    from g2ard.cli.tiled import TiledCommand
+    from g2ard.jobs.distill import prepare
+    from g2ard.jobs.distill_options import DistillOptions
+    from g2ard.jobs.tiling import is_tiled
     from g2ard.pipeline import DistillConfig
 
+    began = time.monotonic()
     names = ("method", "keep_region", "schedule", "steps", "recovery_time", "focus", "background", "seed")
     settings = run.settings(DistillConfig(), *names, preset=preset)
     budgets = budgets_of(run)
     given = views is not None and not opt.is_made(views)
     _check_options(scene, views, held_out, photos)
-    from g2ard.jobs.distill import prepare
-    from g2ard.jobs.distill_options import DistillOptions
-    from g2ard.jobs.estimate import check_memory
-    from g2ard.jobs.tiling import is_tiled
-
-    began = time.monotonic()
     settings.setdefault("recover.engine", opt.recovery_engine(run))
-    name = f"scene.{format}"
     outputs = Outputs(run, output, budgets)
 
-    def check(folder: Path, budget: Budget) -> None:
+    def folder_at(path: Path) -> RunFolder:
+        return RunFolder(run, path, f"scene.{format}", resume)
+
+    def check(path: Path, budget: Budget) -> None:
         if not dry_run:
-            run_folder.check_place(run, folder / name, budget, given, resume)
+            folder_at(path).check(budget, given)
 
     outputs.check(check)
-    early = [folder / name for folder in outputs.paths()]
-    if early and not dry_run and all(run_folder.is_done(run, place, resume) for place in early):
-        _tell_all(run, [run_folder.tell_finished(run, place) for place in early])
+    early = [folder_at(path) for path in outputs.paths()]
+    if early and not dry_run and all(folder.is_done for folder in early):
+        run.results([folder.tell_finished() for folder in early])
         return
     if scene is not None:
         _check_kind(scene, given)
@@ -156,7 +152,7 @@ def distill(
     )
     tiling = tiling_of(run, scene, output)
     if scene is not None and is_tiled(scene, tiling):
-        TiledCommand(run, scene, outputs, tiling, budgets).distill(options, name, resume)
+        TiledCommand(run, scene, outputs, tiling, budgets).distill(options, folder_at)
         return
     job = prepare(
         scene,
@@ -166,30 +162,11 @@ def distill(
         progress=run.progress,
         say=run.say,
     )
-    places = [folder / name for folder in outputs.paths(len(job.prior))]
+    folders = [folder_at(path) for path in outputs.paths(len(job.prior))]
     if dry_run:
-        _tell_estimates(run, job, [place.parent for place in places], page=view)
-        return
-    done = [place for place in places if run_folder.is_done(run, place, resume)]
-    finished = {place: run_folder.tell_finished(run, place) for place in done}
-    if len(finished) < len(places):
-        check_memory(job, tiling.memory, page=view)
-        job.render_targets()
-    reports, others = [], " (--resume continues with the rest)" if len(places) > 1 else ""
-    for aim, place in zip(job.aims, places, strict=True):
-        if place in finished:
-            reports.append(finished[place])
-            continue
-        run_folder.tell_anew(run, place.parent, resume)
-        result, report = _distil(
-            run, scene or Path(str(views)), job, aim.count, place, resume, keep, view, began
-        )
-        reports.append(report)
-        run.kept.append(f"{place.parent} is finished{others}")
-        began = time.monotonic()
-    _tell_all(run, reports)
-    if len(finished) < len(places):
-        tell_quality(run, aim, result.splats)
+        _tell_estimates(run, job, folders)
+    else:
+        _distil_all(run, scene or Path(str(views)), job, folders, tiling.memory, began)
 
 
 def _check_options(
@@ -219,25 +196,21 @@ def _check_kind(scene: Path, given: bool) -> None:
         raise typer.BadParameter("a point cloud cannot render training images; give photos with --views")
 
 
-def _tell_all(run: Run, reports: list[dict[str, Any]]) -> None:
-    run.result(reports[0] if len(reports) == 1 else {"runs": reports})
-
-
-def _tell_estimates(run: Run, job: DistillJob, folders: Sequence[Path], *, page: bool) -> None:
+def _tell_estimates(run: Run, job: DistillJob, folders: Sequence[RunFolder]) -> None:
     """Print the estimated time and memory of each budget, and the total of several."""
     from g2ard.jobs.estimate import estimate, total
 
     found, told = [], []
     for folder, budget in zip(folders, job.budgets, strict=True):
-        one = estimate(job, budget, page=page)
+        one = estimate(job, budget, page=run.config["view"])
         parts = ", ".join(f"{stage} {_rounded(seconds)} s" for stage, seconds in one.seconds.items())
         about = f"about {max(1, one.total):.0f} s ({parts}) and {one.bytes / 1e6:,.0f} MB"
         run.say(
-            f"{folder}: {plural(budget, 'Gaussian')}, {plural(one.views, 'view')} of {one.pixels:,} pixels, "
-            f"{plural(one.steps, 'step')}: {about}"
+            f"{folder.path}: {plural(budget, 'Gaussian')}, {plural(one.views, 'view')} "
+            f"of {one.pixels:,} pixels, {plural(one.steps, 'step')}: {about}"
         )
         found.append(one)
-        told.append({"output": str(folder), "count": budget, **asdict(one), "total_seconds": one.total})
+        told.append({"output": str(folder.path), "count": budget, **asdict(one), "total_seconds": one.total})
     seconds, size = total(found)
     if len(found) > 1:
         run.say(f"all {len(found)} with shared targets: about {seconds:.0f} s and {size / 1e6:,.0f} MB")
@@ -250,80 +223,90 @@ def _rounded(seconds: float) -> str:
     return f"{seconds:.1f}" if seconds < 10 else f"{seconds:.0f}"
 
 
-def _distil(
-    run: Run,
-    source: Path,
-    job: DistillJob,
-    budget: int,
-    place: Path,
-    resume: bool,
-    keep: bool,
-    view: bool,
-    began: float,
-) -> tuple[Distilled, dict[str, Any]]:
-    """Distil to one budget and write the run's folder; `place` is the scene's file."""
-    from g2ard.jobs.score import report_of
-    from g2ard.report.distilled import distill_report
+def _distil_all(
+    run: Run, source: Path, job: DistillJob, folders: Sequence[RunFolder], memory: int | None, began: float
+) -> None:
+    """Distil to every budget whose folder is not finished, and check the last result's quality."""
+    from g2ard.jobs.estimate import check_memory
 
-    output, colour = place.parent, job.config.recover.background
-    with run_folder.work_folder(run, output, resume, (len(job.prior), budget)) as work:
-        result = job.run(budget, work=work)
+    finished = {folder.path: folder.tell_finished() for folder in folders if folder.is_done}
+    if len(finished) == len(folders):
+        run.results(list(finished.values()))
+        return
+    check_memory(job, memory, page=run.config["view"])
+    job.render_targets()
+    reports, others = [], " (--resume continues with the rest)" if len(folders) > 1 else ""
+    for aim, folder in zip(job.aims, folders, strict=True):
+        if folder.path in finished:
+            reports.append(finished[folder.path])
+            continue
+        result, report = _distil(run, source, job, aim.count, folder, began)
+        reports.append(report)
+        run.kept.append(f"{folder.path} is finished{others}")
+        began = time.monotonic()
+    run.results(reports)
+    tell_quality(run, aim, result.splats)
+
+
+def _distil(
+    run: Run, source: Path, job: DistillJob, budget: int, folder: RunFolder, began: float
+) -> tuple[Distilled, dict[str, Any]]:
+    """Distil to one budget, write the run's folder and print a summary."""
+    from g2ard.jobs.score import report_of
+
+    page = ""
+    with folder.working(len(job.prior), budget):
+        result = job.run(budget, work=folder.work)
         report = report_of(job, result)
         report["seconds"]["total"] = time.monotonic() - began + report["seconds"].get("resumed", 0.0)
-        distill_report(
-            output / "report.html",
-            f"{source.name}: {len(job.prior):,} → {len(result.splats):,}",
-            [("simplified", result.simplified), ("recovered", result.splats)],
-            [job.held_out] if job.apart is None else [job.held_out, job.apart],
-            report,
-            colour,
-            told=told(report),
-        )
-        page = ""
-        if view:
-            seen = job.views.train.cameras
-            report["bytes"]["view"], page = run_folder.write_view(place, result.splats, seen, colour)
+        _write_pages(source, job, result, report, folder.path)
+        if run.config["view"]:
+            seen, colour = job.views.train.cameras, job.config.recover.background
+            report["bytes"]["view"], page = folder.write_view(result.splats, seen, colour)
         else:
-            (output / run_folder.VIEW).unlink(missing_ok=True)
-        _write(run, place, result, job.held_out, colour, report)
-        _keep(output / run_folder.KEPT, result.simplified if keep else None)
-    if (pool := job.views.pool) is not None:
-        run_folder.write_pool(run, output, pool)
-    shutil.rmtree(output / run_folder.WORK)
+            folder.drop_view()
+        _write_scene(run, job, result, report, folder)
+        folder.write_simplified(result.simplified if run.config["keep"] else None)
+        if (pool := job.views.pool) is not None:
+            folder.write_pool(pool)
     write_table(run, report)
     for line in told(report, verbose=run.verbose):
         run.say(line)
     say_views(run, report["views"], job.config.select.views_count is not None)
     if not job.config.recover.from_points:  # such points are no scene to compare with
-        say_weight(run, source, place, result.splats, lifted=job.prior if job.lifted else None)
+        say_weight(run, source, folder.scene, result.splats, lifted=job.prior if job.lifted else None)
     run.say(
-        f"scene: {place} ({place.stat().st_size / 1e6:.2f} MB)\npicture: {output / 'preview.png'}\n"
-        f"report: {output / 'report.html'}, {output / 'report.json'}" + (f"\n{page}" if page else "")
+        f"scene: {folder.scene} ({folder.scene.stat().st_size / 1e6:.2f} MB)\n"
+        f"picture: {folder.path / 'preview.png'}\n"
+        f"report: {folder.path / 'report.html'}, {folder.path / 'report.json'}"
+        + (f"\n{page}" if page else "")
     )
     return result, report
 
 
-def _write(
-    run: Run, place: Path, result: Distilled, unseen: Targets, colour: Colour, report: dict[str, Any]
+def _write_pages(
+    source: Path, job: DistillJob, result: Distilled, report: dict[str, Any], folder: Path
 ) -> None:
-    """Write the picture, the scene, which is read back and scored if packed, and, last, the report."""
-    from g2ard.jobs.packing import score_file
-    from g2ard.report.distilled import preview
+    """Write report.html and preview.png."""
+    from g2ard.report.distilled import distill_report, preview
 
     scenes = [("simplified", result.simplified), ("recovered", result.splats)]
-    preview(place.parent / "preview.png", unseen, scenes, colour)
-    run.write(place, result.splats, overwrite=True)
-    run_folder.drop_older(place)
-    report["bytes"]["file"] = place.stat().st_size
-    if place.name != "scene.ply":
-        report["packed"] = score_file(place, unseen, colour, run.progress)
-    run_folder.write_report(place.parent, {**report, "config": run.config})
+    title = f"{source.name}: {len(job.prior):,} → {len(result.splats):,}"
+    targets = [job.held_out] if job.apart is None else [job.held_out, job.apart]
+    colour = job.config.recover.background
+    distill_report(folder / "report.html", title, scenes, targets, report, colour, told=told(report))
+    preview(folder / "preview.png", job.held_out, scenes, colour)
 
 
-def _keep(path: Path, scene: Splats | None) -> None:
-    """Write the simplified scene; without one, remove an earlier run's."""
-    if scene is None:
-        path.unlink(missing_ok=True)
-        return
-    path.parent.mkdir(exist_ok=True)
-    write_splats(path, scene, overwrite=True)
+def _write_scene(
+    run: Run, job: DistillJob, result: Distilled, report: dict[str, Any], folder: RunFolder
+) -> None:
+    """Write the scene, read it back and score it if it is packed, and write report.json."""
+    from g2ard.jobs.packing import score_file
+
+    folder.write_scene(result.splats)
+    report["bytes"]["file"] = folder.scene.stat().st_size
+    if folder.scene.name != "scene.ply":
+        colour = job.config.recover.background
+        report["packed"] = score_file(folder.scene, job.held_out, colour, run.progress)
+    folder.write_report({**report, "config": run.config})

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -15,6 +15,9 @@ from g2ard.errors import InputError
 from g2ard.io import check_scene
 from g2ard.io.paths import short_names
 from g2ard.progress import plural
+
+if TYPE_CHECKING:
+    from g2ard.scene.splats import Splats
 
 
 @command(
@@ -29,10 +32,7 @@ def evaluate(
     images: opt.ImagesOption = None,
     alpha: opt.AlphaOption = "composite",
     teacher: opt.TeacherOption = None,
-    photos: Annotated[
-        bool,
-        typer.Option("--photos", help="With --teacher: use photos where views have them, renders otherwise."),
-    ] = False,
+    photos: opt.PhotosOption = False,
     anchors: Annotated[
         Path | None,
         typer.Option(metavar="SCENE", help="The same Gaussians before recovery; adds Drift95."),
@@ -56,35 +56,29 @@ def evaluate(
 
     For the evaluation of the original 3DGS, use --convention inria --8bit --lpips-input unscaled.
     """
+    from g2ard.cli.teaching import Teaching, check_teacher
     from g2ard.io.describe import bytes_of
-    from g2ard.jobs.inputs import load_views, make_targets
-    from g2ard.jobs.view_checks import check_sight, propose_background
+    from g2ard.jobs.inputs import load_views
+    from g2ard.jobs.view_checks import check_sight
     from g2ard.rendering.lpips import load_lpips
     from g2ard.rendering.renderer import RasterSettings
     from g2ard.rendering.visibility import overdraw
     from g2ard.scene.targets import kinds_of
     from g2ard.stages.evaluate import evaluate as score
-    from g2ard.stages.recover.anchors import Anchors, drift95, needle
+    from g2ard.stages.recover.anchors import needle
 
-    if photos and teacher is None:
-        raise typer.BadParameter("--photos goes with --teacher; without a teacher, all targets are photos")
     if lpips_input != "scaled" and lpips is None:
         raise typer.BadParameter("--lpips-input goes with --lpips; give --lpips DIR")
-    opt.can_be_made(views, teacher)
+    check_teacher(views, teacher, photos)
     views = opt.with_images(views, images, alpha)
     for path in scenes:
         check_scene(path)
     chosen, settings = opt.background_of(run, background, *scenes), RasterSettings(convention=convention)
     colour = chosen or BLACK
-    dense = run.load(teacher) if teacher else None
+    teaching = Teaching(run, teacher, colour, chosen=chosen is not None, photos=photos)
     frozen = run.load(anchors) if anchors else None
-    views = opt.views_or_teacher(run, views, teacher, dense)
-    cameras = load_views(views, split, size, run.say, unpictured=dense is not None)
-    if dense is None or photos:
-        propose_background(cameras, colour, chosen is not None, run.say)
-    targets = make_targets(
-        cameras, dense, colour, photos=photos, settings=settings, progress=run.progress, say=run.say
-    )
+    cameras = load_views(teaching.views(views), split, size, run.say, unpictured=teaching.dense is not None)
+    targets = teaching.targets(cameras, settings=settings)
     networks = load_lpips(lpips, scaled=lpips_input == "scaled") if lpips else None
     rows: list[dict[str, Any]] = []
     for path in scenes:
@@ -100,14 +94,17 @@ def evaluate(
             progress=run.progress,
             stage=path.name,
         )
-        row = {"scene": str(path), **scored.as_dict(), "drift95": None, "needle": needle(splats.scales)}
-        row["file_bytes"] = bytes_of(path)
-        row["overdraw"] = overdraw(splats, cameras, run.progress)
-        if frozen is not None:
-            if len(frozen) != len(splats):
-                raise InputError(f"has {len(frozen):,} Gaussians, {path} has {len(splats):,}", path=anchors)
-            row["drift95"] = drift95(Anchors.of(frozen), splats.means)
-        rows.append(row)
+        drift = None if frozen is None else _drift(frozen, splats, path)
+        rows.append(
+            {
+                "scene": str(path),
+                **scored.as_dict(),
+                "drift95": drift,
+                "needle": needle(splats.scales),
+                "file_bytes": bytes_of(path),
+                "overdraw": overdraw(splats, cameras, run.progress),
+            }
+        )
     protocol = f"{convention}'s conventions, {'8-bit' if eight_bit else 'float'} renders"
     _table(run, f"{plural(len(cameras), 'view')}, against {kinds_of(targets)}; {protocol}", rows)
     counts = Counter(view["against"] for view in rows[0]["views"])
@@ -115,6 +112,17 @@ def evaluate(
     against = counts if len(counts) > 1 else single[next(iter(counts))]
     followed = {"convention": convention, "8bit": eight_bit, "lpips_input": lpips_input if lpips else None}
     run.result({"against": against, "protocol": followed, "scenes": rows})
+
+
+def _drift(frozen: Splats, splats: Splats, path: Path) -> float:
+    """Return the Drift95 of a scene from the same Gaussians before recovery."""
+    from g2ard.stages.recover.anchors import Anchors, drift95
+
+    if len(frozen) != len(splats):
+        raise InputError(
+            f"expected the {len(splats):,} Gaussians of {path}, got {len(frozen):,}", parameter="anchors"
+        )
+    return drift95(Anchors.of(frozen), splats.means)
 
 
 def _table(run: Run, title: str, rows: list[dict[str, Any]]) -> None:

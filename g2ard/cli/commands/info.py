@@ -104,10 +104,7 @@ def _devices(run: Run) -> None:
 
     found = devices.adapters()
     real = next((a.name for a in found or () if a.kind != "cpu"), None)
-    used = {
-        "gpu": found[0].name if found else None,
-        "auto": real,
-    }
+    used = {"gpu": found[0].name if found else None, "auto": real}
     rows: list[list[str]] = []
     for a in found or ():
         rows += [
@@ -127,21 +124,7 @@ def _devices(run: Run) -> None:
 
 
 def _show(run: Run, title: str, rows: list[list[str]]) -> None:
-    if run.json == "-":
-        run.console.table(title, ["", ""], rows)
-    elif not run.console.quiet:
-        _print(title, rows)
-
-
-def _print(title: str, rows: list[list[str]]) -> None:
-    """Print a table to stdout, since it is this command's result."""
-    from rich.console import Console
-    from rich.table import Table
-
-    table = Table(title=title, title_justify="left", show_header=False)
-    for row in rows:
-        table.add_row(*row)
-    Console().print(table, markup=False, highlight=False)
+    run.console.table(title, ["", ""], rows, stdout=run.json != "-")
 
 
 def _rows(figures: dict[str, Any]) -> list[list[str]]:

@@ -53,7 +53,7 @@ def ingest(
     store = into_tiles(
         scenes,
         output,
-        tile_rows=TILE_ROWS if tile_rows is None else tile_rows.of(0),
+        tile_rows=TILE_ROWS if tile_rows is None else int(tile_rows.value),
         lift=config,
         render_model=run.render_model,
         overwrite=run.overwrite,

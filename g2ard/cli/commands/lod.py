@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -13,12 +14,11 @@ from g2ard.cli import options as opt
 from g2ard.cli.budget_options import Ratios
 from g2ard.cli.frame import Run, command
 from g2ard.cli.tile_options import tiling_of
-from g2ard.cli.usage import in_flags
-from g2ard.config.choices import BLACK
+from g2ard.config.choices import BLACK, Colour
+from g2ard.errors import OutputError
 from g2ard.progress import plural
 
 if TYPE_CHECKING:
-    from g2ard.jobs.distill_options import DistillOptions
     from g2ard.jobs.levels import Levels
     from g2ard.jobs.tiled import TiledLevels
     from g2ard.jobs.tiling import Tiling
@@ -117,14 +117,10 @@ def lod(
     Scenes larger than memory and folders of tiles are processed tile by tile.
     """
     from g2ard.cli.resume import check_stopped, left_at, stoppable
-    from g2ard.cli.run_folder import check_same_options, note_options
-    from g2ard.errors import InputError
     from g2ard.io import kind as kind_of
     from g2ard.io.atomic import check_output
-    from g2ard.jobs.distill_options import DistillOptions
-    from g2ard.jobs.levels import check_ratios, recovery_settings
+    from g2ard.jobs.levels import check_ratios
     from g2ard.jobs.levels import lod as levels_of
-    from g2ard.jobs.tiled import working
     from g2ard.jobs.tiling import LEVELS_TIMES, RECOVERY_TIMES, check_memory, is_tiled
     from g2ard.levels import Cut
 
@@ -132,46 +128,35 @@ def lod(
         raise typer.BadParameter(
             "a point cloud cannot render training images; distil it first, then run `lod` on the result"
         )
-    try:
+    with run.usage():
         check_ratios(ratios)
         rule = Cut(most * 1024, extent, least * 1024)
         spot = None if place is None else _georeference(place)
-    except InputError as error:
-        raise typer.BadParameter(in_flags(error, run.flags)) from None
-    views = opt.with_images(views, images)
+    tiling = tiling_of(run, scene, output)
+    tiled = is_tiled(scene, tiling)
     if spot is not None and kind == "sog":
         raise typer.BadParameter("--georeference needs --format 3dtiles")
     if environment and kind != "sog":
         raise typer.BadParameter("--environment needs --format sog")
-    meta = output / ("lod-meta.json" if kind == "sog" else "tileset.json")
-    stopped = output.with_name(f".{output.name}.unfinished")
-    run.spare_inputs(meta)
-    tiling = tiling_of(run, scene, output)
-    tiled = is_tiled(scene, tiling)
     if environment and tiled:
         raise typer.BadParameter("--environment needs a scene that fits into memory")
-    finished = resume and meta.exists() and not run.overwrite and (tiled or not left_at(stopped))
+    writer = _Writer(run, output, kind, rule, spot, up)
+    run.spare_inputs(writer.meta)
+    stopped = output.with_name(f".{output.name}.unfinished")
+    finished = resume and writer.meta.exists() and not run.overwrite and (tiled or not left_at(stopped))
     if finished:
-        _check_same(meta, ratios)
+        _check_same(writer.meta, ratios)
     else:
         check_output(output, run.overwrite, folder=True)
-    going_on = (finished or not tiled) and check_stopped(run, stopped, resume, meta)
+    if finished or not tiled:
+        check_stopped(run, stopped, resume, writer.meta)
+    views, colour = opt.with_images(views, images), background or BLACK
     if tiled:
-        options = DistillOptions(
-            views=views,
-            size=size,
-            up=up,
-            render_model=run.render_model,
-            settings=recovery_settings(steps, background or BLACK, run.seed),
-        )
-        with working(tiling, views):
-            _in_tiles(run, scene, output, ratios, tiling, options, recover, rule, kind, spot)
+        _in_tiles(writer, scene, ratios, tiling, views, steps, size, colour, recover)
         return
     check_memory(scene, tiling, LEVELS_TIMES, RECOVERY_TIMES)
-    if going_on:
-        check_same_options(run, stopped, besides=("most", "extent", "least", "kind", "place"))
     with stoppable(run, stopped, resume):
-        note_options(run, stopped)
+        stopped.mkdir(parents=True, exist_ok=True)
         levels = levels_of(
             scene,
             ratios=ratios,
@@ -179,7 +164,7 @@ def lod(
             views=views,
             steps=steps,
             size=size,
-            background=background or BLACK,
+            background=colour,
             up=up,
             render_model=run.render_model,
             split_sky=environment,
@@ -188,82 +173,96 @@ def lod(
             progress=run.progress,
             say=run.say,
         )
-        size_of_all = _save(run, output, levels.splats, rule, kind, spot, up, sky=levels.sky)
-    _tell(run, output, levels, size_of_all)
+        written = writer.save(levels.splats, sky=levels.sky)
+    _tell(run, output, levels, written)
 
 
 def _in_tiles(
-    run: Run,
+    writer: _Writer,
     scene: Path,
-    output: Path,
     ratios: Sequence[float],
     tiling: Tiling,
-    options: DistillOptions,
+    views: Any,
+    steps: int | None,
+    size: int | None,
+    background: Colour,
     recover: bool,
-    rule: Cut,
-    kind: str,
-    spot: Any,
 ) -> None:
     """Write levels tile by tile; finished steps stay in the tiling's folder until the command succeeds."""
-    from g2ard.jobs.tiled import lod_in_tiles
+    from g2ard.jobs.distill_options import DistillOptions
+    from g2ard.jobs.levels import recovery_settings
+    from g2ard.jobs.tiled import lod_in_tiles, working
     from g2ard.system.memory import peak_rss_of_all
 
-    assert tiling.folder is not None
-    run.kept = [f"finished steps are in {tiling.folder}; run the same command to continue"]
-    levels = lod_in_tiles(scene, ratios, tiling, options, recover=recover, progress=run.progress, say=run.say)
-    begun = tiling.folder / f"written-{levels.key(rule)}"
-    begun.mkdir(exist_ok=True)
-    size = _save(run, output, levels.scenes, rule, kind, spot, options.up, begun)
-    _tell(run, output, levels, size, peak_rss_bytes=peak_rss_of_all())
+    run, folder = writer.run, tiling.folder
+    assert folder is not None
+    settings = recovery_settings(steps, background, run.seed)
+    options = DistillOptions(
+        views=views, size=size, up=writer.up, render_model=run.render_model, settings=settings
+    )
+    run.kept = [f"finished steps are in {folder}; run the same command to continue"]
+    with working(tiling, views):
+        levels = lod_in_tiles(
+            scene, ratios, tiling, options, recover=recover, progress=run.progress, say=run.say
+        )
+        begun = folder / f"written-{levels.key(writer.cut)}"
+        begun.mkdir(exist_ok=True)
+        _tell(run, writer.output, levels, writer.save(levels.scenes, begun), peak_rss_bytes=peak_rss_of_all())
 
 
-def _save(
-    run: Run,
-    output: Path,
-    levels: Sequence[Level],
-    rule: Cut,
-    kind: str,
-    spot: Any,
-    up: Sequence[float] | None,
-    work: Path | None = None,
-    sky: Splats | None = None,
-) -> int:
-    """Write the output folder and return its bytes."""
-    from g2ard.jobs.levels import tileset_up
-    from g2ard.levels import Georeference, save_levels, save_tileset
+@dataclass(frozen=True)
+class _Writer:
+    """Writer of the output folder.
 
-    common: dict[str, Any] = {
-        "cut": rule,
-        "overwrite": run.overwrite,
-        "work": work,
-        "progress": run.progress,
-    }
-    if kind == "sog":
-        return save_levels(output, levels, environment=sky, **common)
-    if spot is not None and not isinstance(spot, Georeference):
-        spot = Georeference.of_map(spot, levels[0].offset)
-        run.say(f"longitude {spot.longitude:.6f}, latitude {spot.latitude:.6f}, heading {spot.heading:.3f}")
-    axis = tileset_up(levels, up)
-    rounded = ", ".join(f"{round(value, 3) + 0.0:g}" for value in axis)
-    run.say(f"up is {rounded}" + ("" if up else "; --up X,Y,Z changes it"))
-    return save_tileset(output, levels, up=axis, place=spot, **common)
+    Args:
+        spot: place on the globe, or the map system in which the scene's offset is the place.
+    """
+
+    run: Run
+    output: Path
+    kind: str
+    cut: Cut
+    spot: Any
+    up: Sequence[float] | None
+
+    @property
+    def meta(self) -> Path:
+        """File that lists the levels."""
+        return self.output / ("lod-meta.json" if self.kind == "sog" else "tileset.json")
+
+    def save(self, levels: Sequence[Level], work: Path | None = None, sky: Splats | None = None) -> int:
+        """Write the levels and return their bytes."""
+        from g2ard.jobs.levels import tileset_up
+        from g2ard.levels import Georeference, save_levels, save_tileset
+
+        run, spot = self.run, self.spot
+        common: dict[str, Any] = {"cut": self.cut, "overwrite": run.overwrite, "work": work}
+        common["progress"] = run.progress
+        if self.kind == "sog":
+            return save_levels(self.output, levels, environment=sky, **common)
+        if spot is not None and not isinstance(spot, Georeference):
+            spot = Georeference.of_map(spot, levels[0].offset)
+            run.say(
+                f"longitude {spot.longitude:.6f}, latitude {spot.latitude:.6f}, heading {spot.heading:.3f}"
+            )
+        axis = tileset_up(levels, self.up)
+        rounded = ", ".join(f"{round(value, 3) + 0.0:g}" for value in axis)
+        run.say(f"up is {rounded}" + ("" if self.up else "; --up X,Y,Z changes it"))
+        return save_tileset(self.output, levels, up=axis, place=spot, **common)
 
 
 def _georeference(text: str) -> Any:
     """Return the place, or the map system in which the scene's offset is the place."""
-    from g2ard.cli.options import numbers
     from g2ard.levels import Georeference
     from g2ard.levels.tileset import map_system
 
     if text[:1].isalpha():
         return map_system(text)
-    return Georeference(*numbers("--georeference", text, 4 if text.count(",") == 3 else 3))
+    return Georeference(*opt.numbers("--georeference", text, 4 if text.count(",") == 3 else 3))
 
 
 def _check_same(meta: Path, ratios: Sequence[float]) -> None:
     """Raise an error if a finished folder holds levels of other ratios."""
-    from g2ard.errors import OutputError
-
     content = json.loads(meta.read_text(encoding="utf-8"))
     counts = {**content.get("extras", {}), **content}.get("counts") or [0]
     wanted = [counts[0] * ratios[0] / ratio for ratio in ratios]

@@ -9,16 +9,19 @@ import typer
 
 from g2ard.cli import options as opt
 from g2ard.cli.frame import Run, command
-from g2ard.cli.resume import check_stopped, left_at, stoppable
+from g2ard.cli.resume import check_scene_run, stoppable
 from g2ard.cli.run_result import loss
 from g2ard.config.paths import listed
 from g2ard.config.presets import PRESETS, configured
 from g2ard.errors import InputError
-from g2ard.io import check_scene_output
 from g2ard.progress import plural
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
     from g2ard.config.choices import Colour
+    from g2ard.io import ViewSet
     from g2ard.report.kinds import KindScore
     from g2ard.scene.cameras import Cameras
     from g2ard.scene.splats import Splats
@@ -41,10 +44,7 @@ def recover(
     images: opt.ImagesOption = None,
     alpha: opt.AlphaOption = "composite",
     teacher: opt.TeacherOption = None,
-    photos: Annotated[
-        bool,
-        typer.Option("--photos", help="With --teacher: use photos where views have them, renders otherwise."),
-    ] = False,
+    photos: opt.PhotosOption = False,
     anchors: Annotated[
         Path | None,
         typer.Option(
@@ -67,43 +67,29 @@ def recover(
     background: opt.BackgroundOption = None,
 ) -> None:
     """Optimise a fixed set of Gaussians against photos or a teacher's renders."""
-    from g2ard.jobs.inputs import load_split_views, load_trained, make_targets
-    from g2ard.jobs.view_checks import propose_background, warn_of_sight
+    from g2ard.cli.teaching import Teaching, check_teacher
     from g2ard.scene.targets import kinds_of
     from g2ard.stages.recover import RecoverConfig
     from g2ard.stages.recover import recover as optimize
     from g2ard.stages.recover.anchors import Anchors
     from g2ard.stages.recover.prior import regularizers_for
-    from g2ard.stages.recover.report import outcome, unregularized
 
     background = opt.background_of(run, background, student)
     names = ("schedule", "steps", "recovery_time", "sh_degree", "background", "seed")
     settings = run.settings(RecoverConfig(), *names, preset=preset)
     named = {**PRESETS[preset], **settings}
-    if weighted is None:
-        weighted = named.get("select.weighted", True)
-    if photos and teacher is None:
-        raise typer.BadParameter("--photos goes with --teacher; without a teacher, all targets are photos")
-    opt.can_be_made(views, teacher)
+    check_teacher(views, teacher, photos)
     views = opt.with_images(views, images, alpha)
     checkpoint = output.parent / f".{output.name}.checkpoint.npz"
-    if left_at(checkpoint) or not (resume and output.exists()):
-        check_scene_output(output, run.overwrite)
-    check_stopped(run, checkpoint, resume, output)
+    check_scene_run(run, checkpoint, resume, output)
     settings.setdefault("recover.engine", opt.recovery_engine(run))
     splats = run.load(student)
-    dense = run.load(teacher) if teacher else None
-    views = opt.views_or_teacher(run, views, teacher, dense)
-    chosen = load_trained(views, split, size, run.say, unpictured=dense is not None)
-    warn_of_sight(splats, chosen.cameras, run.say)
     colour = configured(RecoverConfig(), preset, settings).background
-    if dense is None or photos:
-        propose_background(chosen.cameras, colour, background is not None, run.say)
-    targets = make_targets(chosen.cameras, dense, colour, photos=photos, progress=run.progress, say=run.say)
+    teaching = Teaching(run, teacher, colour, chosen=background is not None, photos=photos)
+    dense, views = teaching.dense, teaching.views(views)
+    chosen, targets = teaching.training(splats, views, split, size)
     run.say(f"{plural(len(chosen.cameras), 'view')} against {kinds_of(targets)}")
-    weights = chosen.weights if weighted else None
-    if weights is not None:
-        run.say(f"sampling {plural(len(weights), 'view')} by weight")
+    weights = _weights(run, chosen, named.get("select.weighted", True) if weighted is None else weighted)
     built = _built(run, anchors, splats) if anchors else None
     settings["recover.regularizers"], why, measured = regularizers_for(
         named.get("recover.regularizers", "auto"),
@@ -113,34 +99,54 @@ def recover(
     )
     run.say(f"regularisers: {why}" + ("" if dense else "; measured on the student, as there is no teacher"))
     config = configured(RecoverConfig(), preset, settings)
-    frozen = Anchors.of(built, config.regularizers.in_plane) if built else None
     with stoppable(run, checkpoint, resume):
         result = optimize(
             splats,
             targets,
             config,
             weights=weights,
-            anchors=frozen,
+            anchors=Anchors.of(built, config.regularizers.in_plane) if built else None,
             checkpoint=checkpoint,
             progress=run.progress,
         )
         run.write(output, result.splats)
-    if (told := outcome(result.report)) is not None:
-        run.say(told)
-    if run.verbose and (told := unregularized([[result.report]])) is not None:
-        run.say(told)
-    kinds: tuple[KindScore, ...] = ()
-    pool, _ = load_split_views(views, "all", unpictured=dense is not None)
-    tested = [i for i, found in enumerate(pool.splits) if found == "test" and split == "train"]
-    if tested:
-        cameras = pool.cameras.take(tested).resized(size)
-        held_out = make_targets(cameras, dense, colour, photos=photos, lazy=True)
-        kinds = _score(run, splats, result, held_out, chosen.cameras, colour)
+    _tell_outcome(run, result)
+    held_out = teaching.held_out(views, size) if split == "train" else None
+    kinds = _score(run, splats, result, held_out, chosen.cameras, colour) if held_out else ()
     gain, count = result.report.psnr, plural(len(splats), "Gaussian")
     run.say(f"{output}: {count}, {opt.trained_on(split)} {gain.before:.2f} → {gain.after:.2f} dB")
     report = {**result.report.as_dict(), "preset": why, "prior": measured.as_dict()}
     report |= {"kinds": [kind.as_dict() for kind in kinds], "settings": listed(config)}
     run.result({**report, "output": str(output)})
+
+
+def _weights(run: Run, views: ViewSet, weighted: bool) -> NDArray[np.float64] | None:
+    """Return the views' sampling weights if they have any and `weighted` is set."""
+    if not weighted or views.weights is None:
+        return None
+    run.say(f"sampling {plural(len(views.weights), 'view')} by weight")
+    return views.weights
+
+
+def _built(run: Run, path: Path, student: Splats) -> Splats:
+    """Read the student as it was built, in its present coordinates."""
+    scene = run.load(path)
+    if len(scene) != len(student):
+        raise InputError(
+            f"has {plural(len(scene), 'Gaussian')}, the student has {len(student):,}",
+            path=path,
+            hint="anchors are the student before any recovery",
+        )
+    return scene.recentred(student.offset)
+
+
+def _tell_outcome(run: Run, result: Recovered) -> None:
+    """Report an unusual recovery and, with --verbose, idle regularisers."""
+    from g2ard.stages.recover.report import outcome, unregularized
+
+    lines = [outcome(result.report), unregularized([[result.report]]) if run.verbose else None]
+    for line in filter(None, lines):
+        run.say(line)
 
 
 def _score(
@@ -161,15 +167,3 @@ def _score(
     for line in filter(None, lines):
         run.say(line)
     return kinds
-
-
-def _built(run: Run, path: Path, student: Splats) -> Splats:
-    """Read the student as it was built, in its present coordinates."""
-    scene = run.load(path)
-    if len(scene) != len(student):
-        raise InputError(
-            f"has {plural(len(scene), 'Gaussian')}, the student has {len(student):,}",
-            path=path,
-            hint="anchors are the student before any recovery",
-        )
-    return scene.recentred(student.offset)

@@ -113,6 +113,7 @@ def register(
     """
     from g2ard.jobs.register import photos_of, pool_of, poses_for
     from g2ard.jobs.view_checks import propose_background
+    from g2ard.report.registered import registration_report
     from g2ard.stages.register import RegisterConfig
     from g2ard.stages.register import register as find
     from g2ard.stages.register.report import summarize
@@ -134,8 +135,7 @@ def register(
         run.check_extra("--report", report)
         check_page_output(report, run.overwrite)
     taken = photos_of(photos, split=split, intrinsics=intrinsics, focal=focal, alpha=alpha, say=run.say)
-    folder = photos.is_dir() and (intrinsics is not None or focal is not None)
-    if poses is None and pool is None and folder:
+    if poses is None and pool is None and photos.is_dir() and (intrinsics is not None or focal is not None):
         raise InputError("photos have no initial pose; give --poses or --pool", path=photos)
     starts = {}
     if poses is not None:
@@ -164,8 +164,6 @@ def register(
     for line in lines:
         run.say(line)
     if report is not None:
-        from g2ard.report.registered import registration_report
-
         registration_report(
             report,
             f"Photos in {scene.name}",
@@ -181,14 +179,8 @@ def register(
     if len(found.cameras):
         run.write_views(output, found.cameras, format)
     written = str(output) if len(found.cameras) else None
-    run.result(
-        {
-            **found.report.as_dict(),
-            "summary": summary.as_dict(),
-            "output": written,
-            "settings": listed(config),
-        }
-    )
+    result = {**found.report.as_dict(), "summary": summary.as_dict(), "output": written}
+    run.result({**result, "settings": listed(config)})
     if not len(found.cameras):
         first = next(row for row in rows if row.status != "registered")
         raise InputError(f"none of {plural(len(rows), 'photo')} was registered; {first.name}: {first.reason}")

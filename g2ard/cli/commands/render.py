@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+    from g2ard.rendering.renderer import Rendered
     from g2ard.scene.splats import Splats
 
 _NO_FOLDER = (".png", ".jpg", ".jpeg", ".avi", ".mov", ".mkv", ".webm")
@@ -75,39 +76,29 @@ def render(
     up: opt.UpOption = None,
 ) -> None:
     """Render views of a scene as PNG, or show how it would be simplified."""
-    import numpy as np
-
     from g2ard.jobs.inputs import load_views
     from g2ard.jobs.turntable import turntable
     from g2ard.jobs.view_checks import warn_of_sight
     from g2ard.jobs.views import views_or_pool
     from g2ard.rendering.renderer import RasterSettings, Renderer
-    from g2ard.scene.animation import SUFFIXES, check_animation, write_animation
-    from g2ard.scene.images import to_bytes, write_png
+    from g2ard.scene.animation import write_animation
+    from g2ard.scene.images import to_bytes
 
     if output is None and sheet is None:
         raise typer.BadParameter("give -o DIR, --sheet FILE.png or both")
     if turn is not None and (views is not None or count is not None):
         raise typer.BadParameter("--orbit generates its views, so it excludes --views and -n")
-    animation = output if output is not None and output.suffix.lower() in SUFFIXES else None
-    if output is not None and animation is None and output.suffix.lower() in _NO_FOLDER:
-        raise typer.BadParameter(f"-o: expected a folder, .gif, .webp or .mp4, got {output.name!r}")
-    if animation is not None:
-        if depth:
-            raise typer.BadParameter("--depth needs a folder; give -o DIR")
-        check_output(animation, run.overwrite)
-        check_animation(animation)
-        output = None
+    output, animation = _folder_or_animation(run, output, depth)
     looks = _looks(color, count, ratio, parents, views)
     views = opt.with_images(views, images)
-    if output is not None:
-        check_output(output, run.overwrite, folder=True)
     if sheet is not None:
         check_output(sheet, run.overwrite)
-    splats, settings = run.load(scene), RasterSettings(convention=convention)
-    if color != "scene":
-        budget = None if parents else one_budget(count, ratio).of(len(splats), str(scene))
-        splats = _painted(run, splats, color, budget, method, parents)
+    splats = run.load(scene)
+    if parents is not None:
+        splats = _by_parents(run, splats, _read_parents(parents, len(splats)))
+    elif color != "scene":
+        budget = one_budget(count, ratio).of(len(splats), str(scene))
+        splats = _painted(run, splats, color, budget, method)
     found: Any
     if turn is not None:
         found = turntable(splats, turn, up=up, seed=run.seed, progress=run.progress, say=run.say)
@@ -128,18 +119,14 @@ def render(
     shown: list[NDArray[np.uint8]] = []
     wanted = sheet is not None or animation is not None
     colour = opt.background_of(run, background, scene) or BLACK
-    renderer = Renderer(splats, background=colour, settings=settings)
+    renderer = Renderer(splats, background=colour, settings=RasterSettings(convention=convention))
     with nullcontext() if output is None else atomic_folder(output, run.overwrite) as folder:
         for view in range(len(cameras)):
             rendered = renderer.render(cameras[view])
             if wanted:
                 shown.append(to_bytes(rendered.image))
             if folder is not None:
-                stem = folder / places[view]
-                stem.parent.mkdir(parents=True, exist_ok=True)
-                write_png(stem.with_name(stem.name + ".png"), rendered.image)
-                if depth:
-                    np.save(stem.with_name(stem.name + ".depth.npy"), rendered.depth)
+                _write_view(folder / places[view], rendered, depth)
             run.progress("render", view + 1, len(cameras))
     if sheet is not None:
         _write_sheet(sheet, shown, cameras.names, run.overwrite)
@@ -148,6 +135,36 @@ def render(
     written = [str(path) for path in (output, animation, sheet) if path]
     run.say(f"{plural(len(cameras), 'image')} in {' and '.join(written)}")
     run.result({"images": len(cameras), "output": written[0]})
+
+
+def _folder_or_animation(run: Run, output: Path | None, depth: bool) -> tuple[Path | None, Path | None]:
+    """Check the output, and return it as a folder or as an animation's file."""
+    from g2ard.scene.animation import SUFFIXES, check_animation
+
+    if output is None:
+        return None, None
+    if output.suffix.lower() not in SUFFIXES:
+        if output.suffix.lower() in _NO_FOLDER:
+            raise typer.BadParameter(f"-o: expected a folder, .gif, .webp or .mp4, got {output.name!r}")
+        check_output(output, run.overwrite, folder=True)
+        return output, None
+    if depth:
+        raise typer.BadParameter("--depth needs a folder; give -o DIR")
+    check_output(output, run.overwrite)
+    check_animation(output)
+    return None, output
+
+
+def _write_view(stem: Path, rendered: Rendered, depth: bool) -> None:
+    """Write one view as STEM.png and, with `depth`, STEM.depth.npy."""
+    import numpy as np
+
+    from g2ard.scene.images import write_png
+
+    stem.parent.mkdir(parents=True, exist_ok=True)
+    write_png(stem.with_name(stem.name + ".png"), rendered.image)
+    if depth:
+        np.save(stem.with_name(stem.name + ".depth.npy"), rendered.depth)
 
 
 def _write_sheet(
@@ -165,37 +182,31 @@ def _write_sheet(
 def _looks(
     color: Color, count: Count | None, ratio: float | None, parents: Path | None, views: Path | None
 ) -> int | None:
-    """Return the number of views to generate if -n gives it, None if -n is a budget or missing."""
-    if color != "scene" or ratio is not None or count is None:
-        _check(color, count, ratio, parents)
+    """Check -n and -r, and return the number of views to generate if -n gives it."""
+    if parents is not None and color != "parents":
+        raise typer.BadParameter("--parents goes with --color parents")
+    if color != "scene" and parents is None:
+        one_budget(count, ratio)
+        return None
+    if ratio is not None or (parents is not None and count is not None):
+        raise typer.BadParameter("-n and -r go with --color flags, cells or parents (without --parents)")
+    if count is None:
         return None
     if views is not None and not opt.is_made(views):
         raise typer.BadParameter("-n generates views, so it excludes --views; give one")
-    if parents is not None or count.is_share:
+    if count.is_share:
         raise typer.BadParameter(
             "-n: expected a number of views to generate; a budget needs --color flags, cells or parents"
         )
     return int(count.value)
 
 
-def _check(color: Color, count: Count | None, ratio: float | None, parents: Path | None) -> None:
-    """Check that a budget is given exactly if --color uses it."""
-    if parents is not None and color != "parents":
-        raise typer.BadParameter("--parents goes with --color parents")
-    if color != "scene" and parents is None:
-        one_budget(count, ratio)
-    elif count is not None or ratio is not None:
-        raise typer.BadParameter("-n and -r go with --color flags, cells or parents (without --parents)")
-
-
-def _painted(
-    run: Run, splats: Splats, color: Color, budget: int | None, method: Method, parents: Path | None
-) -> Splats:
+def _painted(run: Run, splats: Splats, color: Color, budget: int, method: Method) -> Splats:
+    """Colour the scene by protection flags, cells, or the rows that simplification merges."""
     from g2ard.report.paint import cell_labels, flag_colors, label_colors, painted
     from g2ard.stages.simplify import flag, simplify
 
     if color == "flags":
-        assert budget is not None  # _check has seen to it
         flags = flag(splats, budget, progress=run.progress)
         run.say(
             f"flags: {flags.mean():.1%} of {plural(len(splats), 'Gaussian')} are protected, "
@@ -203,18 +214,19 @@ def _painted(
         )
         return painted(splats, flag_colors(flags))
     if color == "cells":
-        assert budget is not None
         labels = cell_labels(splats, budget)
         run.say(f"cells: {labels.max() + 1:,}")
         return painted(splats, label_colors(labels))
-    if parents is not None:
-        labels = _read_parents(parents, len(splats))
-    else:
-        assert budget is not None
-        labels = simplify(splats, budget, method=method, progress=run.progress).parents
-    gone = int((labels < 0).sum())
-    run.say(f"parents: {plural(labels.max() + 1, 'Gaussian')} of {len(splats):,}; {gone:,} dropped (black)")
-    return painted(splats, label_colors(labels))
+    return _by_parents(run, splats, simplify(splats, budget, method=method, progress=run.progress).parents)
+
+
+def _by_parents(run: Run, splats: Splats, parents: NDArray[np.int64]) -> Splats:
+    """Colour each Gaussian by its row in the simplified scene."""
+    from g2ard.report.paint import label_colors, painted
+
+    gone = int((parents < 0).sum())
+    run.say(f"parents: {plural(parents.max() + 1, 'Gaussian')} of {len(splats):,}; {gone:,} dropped (black)")
+    return painted(splats, label_colors(parents))
 
 
 def _read_parents(path: Path, count: int) -> NDArray[np.int64]:

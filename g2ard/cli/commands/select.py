@@ -12,7 +12,6 @@ from g2ard.cli.budget_options import Count
 from g2ard.cli.frame import Run, command
 from g2ard.config.paths import listed
 from g2ard.config.presets import configured
-from g2ard.errors import InputError
 from g2ard.io import check_views_output
 from g2ard.progress import plural
 
@@ -61,10 +60,8 @@ def select(
         settings["select.views_count"] = k.number if isinstance(k, Count) else k
     if views is None:
         raise typer.BadParameter("give the candidates with --views VIEWS")
-    try:
+    with run.usage():
         config = configured(SelectConfig(), preset or "auto", settings)
-    except InputError as error:
-        raise typer.BadParameter(str(error)) from None
     if config.views_count is None:
         raise typer.BadParameter("give the number of views with -k K")
     check_views_output(output, run.overwrite, format)

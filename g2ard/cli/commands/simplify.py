@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -14,7 +15,6 @@ from g2ard.cli.frame import Run, command
 from g2ard.cli.outputs import Outputs, budgets_of
 from g2ard.cli.run_result import say_weight, tell_quality
 from g2ard.cli.tile_options import tiling_of
-from g2ard.cli.tiled import TiledCommand
 from g2ard.config.paths import listed
 from g2ard.config.presets import configured
 from g2ard.io.atomic import atomic_output
@@ -24,6 +24,7 @@ from g2ard.system.memory import peak_rss
 
 if TYPE_CHECKING:
     from g2ard.io import Scene
+    from g2ard.jobs.budget import Budget
     from g2ard.stages.simplify import Simplified, SimplifyConfig
 
 
@@ -61,6 +62,11 @@ def simplify(
     generated views. The fast method uses views only if --views is given; the paper's method uses none.
     Scenes larger than memory and folders of tiles are simplified tile by tile to the same exact budget.
     """
+    from g2ard.cli.tiled import TiledCommand
+    from g2ard.jobs.inputs import say_notes
+    from g2ard.jobs.measured_budget import aim_of
+    from g2ard.jobs.simplify import Reduction
+    from g2ard.jobs.tiling import WHOLE_TIMES, check_memory, is_tiled
     from g2ard.stages.simplify import SimplifyConfig
 
     settings = run.settings(SimplifyConfig(), "method", "keep_region", preset=preset)
@@ -71,96 +77,70 @@ def simplify(
     if keep_region and (no_views or config.method == "paper"):
         raise typer.BadParameter("--keep-region needs views; remove --no-views or --method paper")
     tiling = tiling_of(run, scene, output)
-    from g2ard.jobs.inputs import say_notes
-    from g2ard.jobs.measured_budget import aim_of
-    from g2ard.jobs.simplify import Reduction
-    from g2ard.jobs.tiling import (
-        WHOLE_TIMES,
-        check_memory,
-        is_tiled,
-        refuse_whole,
-        whole_budgets,
-        whole_method,
-    )
-
     outputs = Outputs(run, output, budgets)
     outputs.check(lambda path, _: io.check_scene_output(path, run.overwrite))
+    given = opt.with_images(views, images)
     if is_tiled(scene, tiling):
-        given = [
-            *whole_method(config.method, preset),
-            *(["--parents"] if parents else []),
-            *whole_budgets(budgets),
-        ]
-        refuse_whole(scene, given)
-        tiled = TiledCommand(run, scene, outputs, tiling, budgets)
-        tiled.simplify(config, opt.with_images(views, images), no_views, up)
+        _refuse_whole(scene, budgets, config, preset, parents)
+        TiledCommand(run, scene, outputs, tiling, budgets).simplify(config, given, no_views, up)
         return
     check_memory(scene, tiling, WHOLE_TIMES)
     maps = None if parents is None else Outputs(run, parents, budgets, name="--parents")
     if maps is not None:
         maps.check(lambda path, _: run.check_extra("--parents", path, parents))
-    clock = [time.perf_counter()]
+    began = time.perf_counter()
     found = io.read_scene(scene, render_model=run.render_model)
     say_notes(scene, found.notes, run.say)
-    total = len(found.splats)
+    splats, total = found.splats, len(found.splats)
     outputs.check(lambda path, _: io.check_scene_output(path, run.overwrite), total)
-    clock.append(time.perf_counter())
-    reduce = Reduction(
-        found.splats,
-        views=opt.with_images(views, images),
-        blind=no_views,
-        config=config,
-        beside=scene,
-        up=up,
-        seed=run.seed,
-        progress=run.progress,
-        say=run.say,
-    )
+    started = time.perf_counter()
+    reading = started - began  # shared by all budgets
+    common: dict[str, Any] = {"seed": run.seed, "progress": run.progress, "say": run.say}
+    reduce = Reduction(splats, views=given, blind=no_views, config=config, beside=scene, up=up, **common)
     aims = [
-        aim_of(
-            budget,
-            found.splats,
-            str(scene),
-            file=output.name,
-            reduce=reduce,
-            seed=run.seed,
-            progress=run.progress,
-            say=run.say,
-        )
-        for budget in budgets
+        aim_of(budget, splats, str(scene), file=output.name, reduce=reduce, **common) for budget in budgets
     ]
     reports = []
-    places = zip(outputs.paths(total), maps.paths(total) if maps else [None] * len(aims), strict=True)
-    for aim, (place, rows) in zip(aims, places, strict=True):
+    rows = maps.paths(total) if maps else [None] * len(aims)
+    for aim, place, parents in zip(aims, outputs.paths(total), rows, strict=True):
         small = reduce(aim.count)
-        clock.append(time.perf_counter())
+        simplified = time.perf_counter()
         run.write(place, small.splats)
-        if rows is not None:
-            _write_parents(run, rows, small)
-        clock.append(time.perf_counter())
-        reports.append(_report(found, small, config.resolved(antialiased=small.splats.antialiased), clock))
-        _tell(run, scene, small, place, total, clock[-1] - clock[0])
+        if parents is not None:
+            _write_parents(run, parents, small)
+        written = time.perf_counter()
+        seconds = {"read": reading, "simplify": simplified - started, "write": written - simplified}
+        seconds["total"] = sum(seconds.values())
+        started = written
+        reports.append(_report(found, small, config, seconds))
+        _tell(run, scene, small, place, seconds["total"])
         if aim.bytes is not None:
             run.say(f"{place}: {written_bytes(place):,} of {aim.bytes:,} bytes")
         run.kept.append(f"{place} is written")
-        clock = [clock[-1] - (clock[1] - clock[0]), clock[-1]]  # reading is shared
-    run.result(reports[0] if len(reports) == 1 else {"runs": reports})
+    run.results(reports)
     tell_quality(run, aims[0], small.splats)
 
 
-def _report(found: Scene, small: Simplified, config: SimplifyConfig, clock: list[float]) -> dict[str, Any]:
-    began, read, simplified, written = clock
+def _refuse_whole(
+    scene: Path, budgets: Sequence[Budget], config: SimplifyConfig, preset: str | None, parents: Path | None
+) -> None:
+    """Reject options that a scene in tiles does not support."""
+    from g2ard.jobs.tiling import refuse_whole, whole_budgets, whole_method
+
+    rows = ["--parents"] if parents else []
+    refuse_whole(scene, [*whole_method(config.method, preset), *rows, *whole_budgets(budgets)])
+
+
+def _report(
+    found: Scene, small: Simplified, config: SimplifyConfig, seconds: dict[str, float]
+) -> dict[str, Any]:
+    config = config.resolved(antialiased=small.splats.antialiased)
     return {
         **small.report.as_dict(),
         "method": config.method,
         "settings": listed(config),
         "notes": {note.code: note.count for note in found.notes},
-        "seconds": {
-            "read": read - began,
-            "simplify": simplified - read,
-            "write": written - simplified,
-            "total": written - began,
-        },
+        "seconds": seconds,
         "peak_rss_bytes": peak_rss(),
     }
 
@@ -173,9 +153,10 @@ def _write_parents(run: Run, path: Path, small: Simplified) -> None:
         np.save(file, small.parents)
 
 
-def _tell(run: Run, scene: Path, small: Simplified, output: Path, total: int, seconds: float) -> None:
+def _tell(run: Run, scene: Path, small: Simplified, output: Path, seconds: float) -> None:
     if run.verbose:
         _table(run, small)
+    total = small.report.input_count
     share = (small.report.unseen or 0) / total
     if share >= 0.02:
         run.say(f"note: no view sees {share:.0%} of the Gaussians; they are weighted by size only")
@@ -185,19 +166,9 @@ def _tell(run: Run, scene: Path, small: Simplified, output: Path, total: int, se
 
 def _table(run: Run, small: Simplified) -> None:
     columns = ["round", "before", "dropped", "merged", "refused", "trimmed", "after"]
-    rows = [
-        [str(i + 1)]
-        + [
-            f"{v:,}"
-            for v in (
-                r.before,
-                r.dropped,
-                r.merged,
-                sum((r.refused or {}).values()),
-                r.trimmed,
-                r.after,
-            )
-        ]
-        for i, r in enumerate(small.report.rounds)
-    ]
+    rows = []
+    for number, r in enumerate(small.report.rounds, start=1):
+        refused = sum((r.refused or {}).values())
+        counts = (r.before, r.dropped, r.merged, refused, r.trimmed, r.after)
+        rows.append([str(number), *(f"{count:,}" for count in counts)])
     run.console.table("Rounds", columns, rows)

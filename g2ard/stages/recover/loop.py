@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 import g2ard.stages.recover.checkpoint as checkpoints
 from g2ard.config.choices import ENGINES
-from g2ard.errors import InputError
+from g2ard.errors import InputError, require_torch
 from g2ard.progress import Progress, silent
 from g2ard.rendering.renderer import settings_for
 from g2ard.scene.splats import Splats
@@ -30,7 +30,6 @@ from g2ard.stages.recover.probe import Probe
 from g2ard.stages.recover.schedule import multiplier_for, reach_for
 from g2ard.stages.recover.sizes import typical_share
 from g2ard.stages.recover.trials import MULTIPLIERS, Trials, trial_steps
-from g2ard.system.extras import require_torch
 
 _SHORT = 20
 """Fewest steps for going back to an earlier scene; shorter recoveries have no steps left to repeat."""

@@ -1,0 +1,121 @@
+"""Calls that are refused: one line that names the cause, and nothing is written."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from helpers.commands import CommandLine, refused
+
+
+@pytest.fixture
+def folder(folder: Path) -> Path:
+    """ball.ply, views.json, an array, a folder with a photo, and a folder named like a scene."""
+    np.save(folder / "few.npy", np.arange(3))
+    (folder / "d.ply").mkdir()
+    (folder / "bare").mkdir()
+    Image.new("RGB", (16, 16)).save(folder / "bare" / "a.png")
+    return folder
+
+
+USAGE = [
+    ("nonsense", "nonsense"),
+    ("render x.ply --views v.json -o out --threads -1", "--threads"),
+    ("render x.ply --views v.json -o out --background 2,0,0", "--background"),
+    ("render x.ply --views v.json -o out --device abacus", "abacus"),
+    ("render ball.ply -n 4 --views views.json --sheet a.png", "-n generates views, so it excludes --views"),
+    ("render ball.ply --orbit 2 -n 3 -o a", "--orbit"),
+    ("render ball.ply -n 1 -o ball.ply", "name another output"),
+    ("render ball.ply -n 1 -o turn.avi", "expected a folder, .gif, .webp or .mp4, got 'turn.avi'"),
+    ("render ball.ply -o x --sheet a.jpg", "ends in .png, got 'a.jpg'"),
+    ("render ball.ply -o x --color flags", "either -n COUNT or -r RATIO"),
+    ("render ball.ply -o x -r 10", "go with --color"),
+    ("render ball.ply -o x --color cells --parents to.npy", "--parents goes with"),
+    ("clean ball.ply --dry-run --preview a.jpg", "ends in .png, got 'a.jpg'"),
+    ("simplify ball.ply -ratio 5 -o o.ply", "-ratio: long options need two dashes; write "),
+    ("simplify ball.ply -n 5 -o o.ply --up 0,0,0", "a direction such as 0,0,1"),
+    ("simplify ball.ply -r 2 -o o.ply --views v --no-views", "; give one"),
+    ("simplify ball.ply -r 2 -o o.ply --json o.ply", "name another one"),
+    ("simplify ball.ply -r 4 -o {foo}_{ratio}.ply", "unknown placeholder {foo}; use {ratio} or {count}"),
+    (
+        "simplify ball.ply -n 200,100 -o s.ply",
+        "such as s_{count}.ply; commas separate counts, so write a single one as 10_000",
+    ),
+    ("recover ball.ply --views made -o o.ply", "--views made needs a --teacher"),
+    ("recover ball.ply -o o.ply --steps 3 --recovery-time 9", "; give one"),
+    ("select absent.ply --views v -k auto -o out --policy random", "policy random does not measure"),
+    ("select absent.ply --views v -k auto -o out --policy uniform", "policy uniform does not measure"),
+    ("distill absent.ply -r 2 -o run --set views_count=auto --set policy=random", "does not measure"),
+    ("distill --views views.json --renders -n 9 -o run", "--renders needs a SCENE to render"),
+    ("distill ball.ply -n 5 -o run --held-out made", "--held-out must be a file of views"),
+    ("distill ball.ply -n 5 -o run --views made --photos", "--photos: generated views have no photos"),
+    (
+        "distill ball.ply -n 5 -o run --steps 5 --set schedule.steps=9",
+        "--steps and --set recover.schedule.steps exclude each other",
+    ),
+    ("distill ball.ply -r 4 -o {foo}_{ratio}.ply", "unknown placeholder {foo}; use {ratio} or {count}"),
+    ("distill ball.ply -r 20,20 -o {ratio}", "given twice"),
+    ("distill ball.ply -n 0 -o run", "'0'"),
+    ("distill ball.ply -n many -o run", "many"),
+    ("distill ball.ply -r 0.5 -o run", "0.5"),
+    ("distill ball.ply -r 2,5 -o run", "{ratio}"),
+    ("distill ball.ply -r 2 -o run --schedule hasty", "hasty"),
+    ("distill ball.ply -r 2 -o run --preset gentle", "gentle"),
+]
+"""Exit status 2."""
+
+INPUT = [
+    ("simplify absent.ply -r 2 -o out.obj", "out.obj: scenes are written as"),
+    ("simplify ball.ply -r 2 -o d.ply", "give the name of a file"),
+    ("lift absent.ply -o out.gltf", "out.gltf: scenes are written as"),
+    ("lift ball.ply -o o.ply", "run `simplify` or `distill`"),
+    ("convert ball.ply o.ply --box 1,1,1,0,0,0", "the lower corner comes first"),
+    ("recover absent.ply --views v.json -o out.obj", "out.obj: scenes are written as"),
+    ("recover ball.ply --views none.json -o out.ply", "none.json"),
+    ("recover ball.ply --views views.json -o no/out.ply", "--teacher"),
+    ("recover ball.ply --views views.json -o ball.ply/out.ply", "ball.ply is a file"),
+    ("adapt absent.ply --views v.json -o out.obj", "out.obj: scenes are written as"),
+    ("select absent.ply --views v.json -k 2 -o out.txt", "out.txt: views are written"),
+    ("poses absent.ply -n 2 -o out.txt", "out.txt: views are written"),
+    ("register ball.ply --photos bare -o o.json --pool 8", "--focal PIXELS"),
+    ("render ball.ply -n 1 -o views.json", "give the name of a folder"),
+    ("render ball.ply --views none.json -o out", "none.json"),
+    ("render views.json --views views.json -o out", "views.json"),
+    ("render ball.ply --views views.json -o x --color parents --parents nowhere.npy", "nowhere.npy"),
+    ("render ball.ply --views views.json -o x --color parents --parents views.json", "not a NumPy array"),
+    (
+        "render ball.ply --views views.json -o x --color parents --parents few.npy",
+        "expected 400 whole numbers",
+    ),
+    ("render ball.ply --views views.json -o x --color flags -n 401", "at most its 400 Gaussians, got 401"),
+    ("evaluate ball.ply --views views.json --split val", "there are test, train"),
+    ("evaluate ball.ply --views views.json --teacher absent.ply", "absent.ply"),
+    ("distill absent.ply -r 10 -o run", "absent.ply"),
+    ("distill absent.ply -n 9 --format SOG -o run", "absent.ply: no such file"),
+    ("distill ball.ply -n 401 -o run", "401"),
+    ("distill ball.ply -r 2 -o run --views none.json", "none.json"),
+    ("distill ball.ply -r 2 -o ball.ply/run", "ball.ply is a file"),
+    ("distill ball.ply -r 2 -o run --json ball.ply/where.json", "where.json"),
+    (
+        "distill ball.ply --photos -n 9 -o run",
+        "--photos: generated views have no photos; give --views that have them",
+    ),
+    ("distill --views views.json --fit 1kB -o run", "--fit: views.json: "),
+    (
+        "distill --views views.json --min-psnr 30 -o run",
+        "--min-psnr: views.json: needs sparse points, and there are none; give --count COUNT",
+    ),
+]
+"""Exit status 1."""
+
+
+@pytest.mark.parametrize(
+    ("command", "words", "status"), [(*case, 2) for case in USAGE] + [(*case, 1) for case in INPUT]
+)
+def test_refused_in_one_line(
+    command: str, words: str, status: int, command_line: CommandLine, folder: Path
+) -> None:
+    before = sorted(folder.rglob("*"))
+    assert words in refused(command_line, folder, *command.split(), status=status)
+    assert sorted(folder.rglob("*")) == before
