@@ -218,8 +218,14 @@ def _inverse(name: str, exposure: NDArray[np.float64]) -> NDArray[np.float32]:
     return np.hstack([inverse, -inverse @ matrix[:, 3:]]).astype(np.float32)
 
 
+_STEPS = np.float32(65_535)
+"""Largest value of a render rounded to 16 bits."""
+
+
 class TeacherRenders(_Cached):
-    """Renders of the dense scene: (H, W, 3) float32, clipped to [0, 1], not rounded to 8 bits.
+    """Renders of the dense scene: (H, W, 3) float32, clipped to [0, 1].
+
+    They are cached as float32, or rounded to 16 bits if all of them would not fit within the limit.
 
     Args:
         teacher: the dense scene.
@@ -248,6 +254,8 @@ class TeacherRenders(_Cached):
         progress: Progress = silent,
     ) -> None:
         super().__init__(cameras, limit)
+        pixels = int((cameras.widths.astype(np.int64) * cameras.heights).sum())
+        self._rounded = 3 * np.float32().nbytes * pixels > limit
         self._teacher = teacher
         self._background, self._settings = background, settings
         self._renderer = renderer
@@ -261,17 +269,22 @@ class TeacherRenders(_Cached):
         conventions = "" if self._settings is None else f" {self._settings}"
         return f"teacher {self._teacher.fingerprint()} {self._background}{conventions}"
 
-    def _make(self, view: int) -> NDArray[np.float32]:
+    def _make(self, view: int) -> NDArray[np.float32 | np.uint16]:
         if self._renderer is None:
             self._renderer = Renderer(self._teacher, background=self._background, settings=self._settings)
-        return self._renderer.clipped(self.cameras[view])
+        image = self._renderer.clipped(self.cameras[view])
+        if not self._rounded:
+            return image
+        image *= _STEPS
+        return np.rint(image, out=image).astype(np.uint16)
 
     def against(self, view: int) -> str:
         """Return the kind, see `against_of`."""
         return "teacher"
 
     def __getitem__(self, view: int) -> NDArray[np.float32]:
-        return self._stored(view)
+        image = self._stored(view)
+        return np.multiply(image, 1 / _STEPS, dtype=np.float32) if self._rounded else image
 
 
 class PhotosOrRenders(_Chosen):
