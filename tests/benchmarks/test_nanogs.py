@@ -7,19 +7,10 @@ from benchmarks.baselines.nanogs import _SAMPLES, nanogs
 from g2ard import _core
 from g2ard.errors import InputError
 from g2ard.scene.splats import Splats
+from helpers.raster_cases import scene, splats_of
 from reference.rotations import rotations
 
-
-def scene(n: int = 60) -> Splats:
-    rng = np.random.default_rng(4)
-    return Splats.create(
-        rng.uniform(-1, 1, (n, 3)),
-        quats=rng.normal(size=(n, 4)),
-        scales=np.exp(rng.uniform(-4, -1, (n, 3))),
-        logit_opacities=rng.normal(-1.5, 1.5, n),
-        sh0=rng.normal(size=(n, 1, 3)),
-        shN=rng.normal(0, 0.1, (n, 3, 3)),
-    )
+SCENE = splats_of(scene(4, 60, 1))
 
 
 def unpack(s: Splats) -> list[dict]:
@@ -84,7 +75,7 @@ def naive(s: Splats, budget: int) -> list[dict]:
 
 @pytest.mark.parametrize("budget", [33, 20, 7, 1])
 def test_nanogs_equals_a_naive_twin(budget: int) -> None:
-    found, expected = unpack(nanogs(scene(), budget)), naive(scene(), budget)
+    found, expected = unpack(nanogs(SCENE, budget)), naive(SCENE, budget)
     assert len(found) == len(expected) == budget
     for f, e in zip(found, expected, strict=True):
         np.testing.assert_allclose(f["mean"], e["mean"], atol=1e-5)
@@ -95,11 +86,10 @@ def test_nanogs_equals_a_naive_twin(budget: int) -> None:
 
 
 def test_nanogs_counts_are_exact_where_its_cut_would_leave_too_few() -> None:
-    s = scene()
-    kept = nanogs(s, 59)
+    kept = nanogs(SCENE, 59)
     assert len(kept) == 59
-    weakest = int(np.argmin(s.logit_opacities))
-    np.testing.assert_array_equal(kept.means, np.delete(s.means, weakest, 0))
+    weakest = int(np.argmin(SCENE.logit_opacities))
+    np.testing.assert_array_equal(kept.means, np.delete(SCENE.means, weakest, 0))
 
 
 def test_knn_is_brute_force() -> None:

@@ -7,51 +7,40 @@ import torch
 from benchmarks.baselines import METHODS, reduce
 from benchmarks.baselines.pruning import global_significance, importance, sample
 from benchmarks.baselines.pup import _log_det, _quarter, fisher, rounds
+from g2ard.config.choices import BLACK
 from g2ard.errors import InputError
-from g2ard.scene.cameras import Cameras
+from g2ard.rendering.renderer import RasterSettings
+from g2ard.scene.cameras import Camera
 from g2ard.scene.splats import Splats
+from helpers.raster_cases import NAMES, Params, oracle, scene, splats_of
 from helpers.scenes import around, checkered_ball
 from reference import raster as naive
 
 VIEWS = around(3, size=(14, 11))
+SETTINGS = RasterSettings(antialiased=False)
 
 
-def scene(n: int = 12, rest: int = 3) -> Splats:
-    rng = np.random.default_rng(5)
-    return Splats.create(
-        rng.uniform(-1, 1, (n, 3)),
-        quats=rng.normal(size=(n, 4)),
-        scales=np.exp(rng.uniform(-2.5, -0.7, (n, 3))),
-        logit_opacities=rng.normal(0.5, 1.5, n),
-        sh0=rng.normal(size=(n, 1, 3)),
-        shN=rng.normal(0, 0.3, (n, rest, 3)),
-    )
+def case(n: int = 12, degree: int = 1) -> tuple[Params, Splats]:
+    params = scene(5, n, degree, size=0.2)
+    return params, splats_of(params)
 
 
-def tensors(s: Splats) -> list[torch.Tensor]:
-    arrays = (s.means, s.quats, np.log(s.scales.astype(np.float64)), s.logit_opacities, s.sh0, s.shN)
-    return [torch.from_numpy(np.asarray(a, np.float64)) for a in arrays]
+def seen(params: Params) -> list[naive.Oracle]:
+    """Return the naive render of every view."""
+    return [oracle(params, VIEWS.take([i]), SETTINGS, BLACK)[0] for i in range(len(VIEWS))]
 
 
-def oracle(s: Splats, cameras: Cameras, i: int, parameters: list[torch.Tensor] | None = None) -> naive.Oracle:
-    return naive.render(
-        *(parameters or tensors(s)),
-        viewmat=torch.from_numpy(cameras.viewmats[i]),
-        K=torch.from_numpy(cameras.Ks[i]),
-        width=int(cameras.widths[i]),
-        height=int(cameras.heights[i]),
-    )
-
-
-@pytest.mark.parametrize("rest", [0, 3, 15])
-def test_pups_fisher_is_the_gram_matrix_of_autograds_jacobian(rest: int) -> None:
-    s = scene(rest=rest)
+@pytest.mark.parametrize("degree", [0, 1, 3])
+def test_pups_fisher_is_the_gram_matrix_of_autograds_jacobian(degree: int) -> None:
+    params, s = case(degree=degree)
     expected = np.zeros((len(s), 6, 6))
-    for i in range(len(VIEWS)):
-        fixed = tensors(s)
+    fixed = [torch.from_numpy(params[name].astype(np.float64)) for name in NAMES]
+    for i, view in enumerate(VIEWS):
 
-        def image(means: torch.Tensor, log_scales: torch.Tensor, i: int = i, fixed: list = fixed):
-            return oracle(s, VIEWS, i, [means, fixed[1], log_scales, *fixed[3:]]).image
+        def image(means: torch.Tensor, log_scales: torch.Tensor, i: int = i, view: Camera = view):
+            tensors = [means, fixed[1], log_scales, *fixed[3:]]
+            pose, K = (torch.from_numpy(array[i]) for array in (VIEWS.viewmats, VIEWS.Ks))
+            return naive.render(*tensors, viewmat=pose, K=K, width=view.width, height=view.height).image
 
         by_mean, by_scale = torch.autograd.functional.jacobian(image, (fixed[0], fixed[2]), vectorize=True)
         g = torch.cat([by_mean, by_scale], -1).reshape(-1, len(s), 6).numpy()
@@ -66,7 +55,7 @@ def test_pups_fisher_is_the_gram_matrix_of_autograds_jacobian(rest: int) -> None
 
 
 def test_pup_prunes_the_singular_first_and_looks_at_a_quarter() -> None:
-    s = scene(40)
+    _, s = case(40)
     hidden = Splats.create(s.means + np.float32([0, 0, 50]), scales=s.scales)  # beyond every view
     both = Splats.create(
         np.concatenate([hidden.means, s.means]),
@@ -83,22 +72,19 @@ def test_pup_prunes_the_singular_first_and_looks_at_a_quarter() -> None:
 
 
 def test_lightgaussians_significance_equals_the_twins() -> None:
-    s = scene(10)
+    params, s = case(10)
     volume = s.scales.astype(float).prod(1)
-    typical = sorted(volume, reverse=True)[9]
-    expected = np.zeros(len(s))
-    for i in range(len(VIEWS)):
-        expected += s.opacities * oracle(s, VIEWS, i).before.sum(1).numpy()
-    expected *= (volume / typical) ** 0.1
+    expected = s.opacities * sum(out.before.sum(1).numpy() for out in seen(params))
+    expected *= (volume / sorted(volume, reverse=True)[9]) ** 0.1
     np.testing.assert_allclose(global_significance(s, VIEWS), expected, rtol=1e-4)
 
 
 @pytest.mark.parametrize("indoor", [True, False])
 def test_mini_splattings_importance_equals_the_twins(indoor: bool) -> None:
-    s = scene(14)
+    params, s = case(14)
     expected, leads = np.zeros(len(s)), np.zeros(len(s))
-    for i in range(len(VIEWS)):
-        w = oracle(s, VIEWS, i).weight.numpy()
+    for out in seen(params):
+        w = out.weight.numpy()
         lead = np.bincount(w.argmax(0)[w.max(0) > 0], minlength=len(s))
         leads += lead
         area = (w > 0).sum(1)
@@ -136,4 +122,4 @@ def test_every_baseline_keeps_exactly_the_budget(method: str) -> None:
 
 def test_unknown_baselines_are_rejected() -> None:
     with pytest.raises(InputError, match="expected one of"):
-        reduce("magic", scene(), 3, VIEWS)
+        reduce("magic", case()[1], 3, VIEWS)

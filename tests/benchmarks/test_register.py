@@ -9,31 +9,16 @@ import pytest
 
 from benchmarks.kinds.register import STARTS, displaced
 from g2ard.io import write_splats, write_views
-from g2ard.rendering.renderer import Renderer
 from g2ard.scene.cameras import Cameras
-from g2ard.scene.images import write_png
-from g2ard.stages.register import pose_error
 from helpers.commands import CommandLine, refused, succeeds
+from helpers.photos import photographed
 from helpers.scenes import around, checkered_ball
 
 
 def _site(folder: Path) -> Cameras:
     ball = checkered_ball(1500)
     write_splats(folder / "ball.ply", ball)
-    views = around(9, (128, 96), 2.5)
-    names = tuple(f"{i}.png" for i in range(len(views)))
-    for name, view in zip(names, views, strict=True):
-        write_png(folder / name, np.clip(Renderer(ball).image(view), 0, 1))
-    files = tuple(folder / name for name in names)
-    return Cameras(views.viewmats, views.Ks, views.widths, views.heights, names, files)
-
-
-def test_starts_are_as_far_off_as_they_say() -> None:
-    pose = around(3)[2].viewmat
-    for seed in range(5):
-        distance, degrees = pose_error(displaced(pose, 0.3, 15, seed), pose)
-        assert distance == pytest.approx(0.3)
-        assert degrees == pytest.approx(15)
+    return photographed(folder, ball, around(9, (128, 96), 2.5))
 
 
 def test_rows_hold_starts_and_results(tmp_path: Path, command_line: CommandLine) -> None:

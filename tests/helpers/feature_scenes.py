@@ -5,17 +5,16 @@ from pathlib import Path
 
 import numpy as np
 
-from g2ard.rendering.renderer import Renderer
 from g2ard.scene.cameras import Cameras
-from g2ard.scene.images import write_png
 from g2ard.scene.splats import Splats
 from g2ard.stages.register import RegisterConfig
+from helpers.photos import photographed
 from helpers.scenes import around, checkered_ball
 
 CONFIG = RegisterConfig(size=400, align_size=200, matcher="sift")
 
 
-def _blotched(count: int = 6000, blotches: int = 200, seed: int = 5) -> Splats:
+def blotched(count: int = 6000, blotches: int = 200, seed: int = 5) -> Splats:
     """Return a ball of which no two places look alike."""
     ball = checkered_ball(count)
     rng = np.random.default_rng(seed)
@@ -25,15 +24,9 @@ def _blotched(count: int = 6000, blotches: int = 200, seed: int = 5) -> Splats:
     return replace(ball, sh0=((color - 0.5) / 0.28209479).astype(np.float32))
 
 
-BALL = _blotched()
+BALL = blotched()
 
 
 def _photographed(folder: Path, count: int = 2, size: tuple[int, int] = (400, 300)) -> Cameras:
     """Views of the ball, photographed under other light."""
-    views = around(count, size, 2.5)
-    renderer = Renderer(BALL)
-    files = []
-    for i, view in enumerate(views):
-        files.append(folder / f"photo{i}.png")
-        write_png(files[-1], np.clip(0.7 * renderer.image(view) + 0.1, 0, 1))
-    return Cameras(views.viewmats, views.Ks, views.widths, views.heights, views.names, tuple(files))
+    return photographed(folder, BALL, around(count, size, 2.5), gain=0.7, bias=0.1)

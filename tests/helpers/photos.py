@@ -18,6 +18,17 @@ BALL = checkered_ball(1200)
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
+def photographed(
+    folder: Path, scene: g2ard.Splats, views: g2ard.Cameras, gain: float = 1.0, bias: float = 0.0
+) -> g2ard.Cameras:
+    """Write a photo of every view, and return the views with their photos."""
+    paths = tuple(folder / f"{name}.png" for name in views.names)
+    renderer = g2ard.Renderer(scene)
+    for view, path in zip(views, paths, strict=True):
+        write_png(path, np.clip(gain * renderer.image(view) + bias, 0, 1))
+    return replace(views, image_paths=paths)
+
+
 def cloud_of(path: Path, scene: g2ard.Splats) -> None:
     """Write the means of a scene as a coloured cloud."""
     colors = np.clip(0.5 + SH_C0 * scene.sh0[:, 0], 0, 1).astype(np.float32)
@@ -27,22 +38,25 @@ def cloud_of(path: Path, scene: g2ard.Splats) -> None:
 def cloud_with_photos(folder: Path, scene: g2ard.Splats) -> None:
     """Write cloud.ply of a scene, and twelve photos of it that views.json lists."""
     cloud_of(folder / "cloud.ply", scene)
-    views = around(12)
-    paths = tuple(folder / f"{name}.png" for name in views.names)
-    for view, path in zip(views, paths, strict=True):
-        write_png(path, g2ard.render(scene, view).image)
-    g2ard.save_views(folder / "views.json", replace(views, image_paths=paths))
+    g2ard.save_views(folder / "views.json", photographed(folder, scene, around(12)))
 
 
-def photos_of(folder: Path, points: bool = False, scene: g2ard.Splats = BALL, count: int = 24) -> None:
+def photos_of(
+    folder: Path,
+    points: bool = False,
+    scene: g2ard.Splats = BALL,
+    count: int = 24,
+    views: g2ard.Cameras | None = None,
+) -> None:
     """Write photos of a scene with a transforms.json, and sparse points beside them if requested."""
-    views = around(count)
+    views = around(count) if views is None else views
     (folder / "images").mkdir(parents=True)
     K = views.Ks[0]
-    size = {"fl_x": K[0, 0], "fl_y": K[1, 1], "cx": K[0, 2], "cy": K[1, 2], "w": 64, "h": 48}
-    transforms(folder / "transforms.json", list(views.viewmats), **size)
-    for i in range(count):
-        write_png(folder / "images" / f"{i:03d}.png", g2ard.render(scene, views[i]).image)
+    size = {"w": int(views.widths[0]), "h": int(views.heights[0])}
+    lens = {"fl_x": K[0, 0], "fl_y": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
+    transforms(folder / "transforms.json", list(views.viewmats), **lens, **size)
+    for i, view in enumerate(views):
+        write_png(folder / "images" / f"{i:03d}.png", g2ard.render(scene, view).image)
     if points:
         cloud_of(folder / "sparse.ply", scene)
         edit(folder / "transforms.json", lambda content: content.update(ply_file_path="sparse.ply"))

@@ -12,9 +12,7 @@ from g2ard.scene.splats import Splats
 from reference import raster as reference
 
 NAMES = ("means", "quats", "log_scales", "logit_opacities", "sh0", "shN")
-
-
-Params = dict[str, NDArray[np.float32]]
+Params = dict[str, NDArray[Any]]
 
 
 def scene(seed: int, n: int, degree: int = 3, *, size: float = 0.1, spread: float = 1.0) -> Params:
@@ -73,6 +71,7 @@ def oracle(
     *,
     grad: bool = False,
     pose: torch.Tensor | None = None,
+    clip_margin: float = 1e-4,
 ) -> tuple[reference.Oracle, list[torch.Tensor]]:
     """Return the naive render of a scene from its first view, or from another pose, and the tensors."""
     tensors = [torch.from_numpy(p[k].astype(np.float64)).requires_grad_(grad) for k in NAMES]
@@ -87,5 +86,6 @@ def oracle(
         antialiased=bool(settings.antialiased),
         inria=settings.convention == "inria",
         alpha_max=settings.alpha_max,
+        clip_margin=clip_margin,
     )
     return out, tensors

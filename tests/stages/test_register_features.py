@@ -21,7 +21,7 @@ from g2ard.stages.register.matchers import checked_pairs, matcher_named, mutual
 from g2ard.stages.register.pose import motion_between, moved
 from g2ard.stages.register.solve import information, lifted, solve_pnp
 from helpers.commands import CommandLine, refused, succeeds
-from helpers.feature_scenes import BALL, CONFIG, _blotched, _photographed
+from helpers.feature_scenes import BALL, CONFIG, _photographed, blotched
 from helpers.project import ROOT
 from helpers.registration import off
 from helpers.scenes import around
@@ -320,7 +320,7 @@ def test_a_photo_of_another_scene_is_refused(tmp_path: Path) -> None:
     pytest.importorskip("pycolmap")
     for i, view in enumerate(around(3, (400, 300), 2.5)):
         write_png(
-            tmp_path / "photo.png", np.clip(Renderer(_blotched(seed=9)).image(view), 0, 1), overwrite=True
+            tmp_path / "photo.png", np.clip(Renderer(blotched(seed=9)).image(view), 0, 1), overwrite=True
         )
         assert _registered(view, tmp_path, seed=i).status != "registered"
 

@@ -6,11 +6,10 @@ from g2ard import _core
 from g2ard.rendering.renderer import view_of
 from g2ard.stages.recover.engine import Photometric
 from g2ard.stages.recover.schedule import Rates
+from helpers.threads import on_threads
 from stress.scenes import NAMES, Problem, random_problem
 
-__all__ = ["THREADS", "differing", "large_problem"]
-
-THREADS = (1, 2, 8)
+__all__ = ["differing", "large_problem"]
 
 
 def large_problem(seed: int, count: int = 12_000) -> Problem:
@@ -36,14 +35,7 @@ def large_problem(seed: int, count: int = 12_000) -> Problem:
 
 def differing(problem: Problem) -> list[str]:
     """Return the arrays that differ between thread counts; empty if none does."""
-    before = _core.num_threads()
-    try:
-        found = []
-        for threads in THREADS:
-            _core.set_num_threads(threads)
-            found.append(_everything(problem))
-    finally:
-        _core.set_num_threads(before)
+    found = on_threads(lambda: _everything(problem))
     return [name for name in found[0] if any(other[name] != found[0][name] for other in found[1:])]
 
 

@@ -1,7 +1,6 @@
 """Random small scenes, cameras and conventions: each seed is one problem for the gradient check."""
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
@@ -10,12 +9,10 @@ from numpy.typing import NDArray
 from g2ard.rendering.renderer import RasterSettings
 from g2ard.scene.cameras import Cameras, look_at
 from g2ard.stages.recover.rasterize import rasterize
-from reference import raster as reference
+from helpers.raster_cases import NAMES, Params, oracle
+from reference.raster import Oracle
 
 __all__ = ["NAMES", "Params", "Problem", "random_problem", "weighted"]
-
-NAMES = ("means", "quats", "log_scales", "logit_opacities", "sh0", "shN")
-Params = dict[str, NDArray[Any]]
 
 
 @dataclass(frozen=True)
@@ -40,23 +37,9 @@ class Problem:
     def size(self) -> tuple[int, int]:
         return int(self.cameras.widths[0]), int(self.cameras.heights[0])
 
-    def oracle(self, params: Params, *, grad: bool = False) -> tuple[reference.Oracle, list[torch.Tensor]]:
-        tensors = [torch.from_numpy(params[k].astype(np.float64)).requires_grad_(grad) for k in NAMES]
-        width, height = self.size
-        out = reference.render(
-            *tensors,
-            viewmat=torch.from_numpy(self.cameras.viewmats[0]),
-            K=torch.from_numpy(self.cameras.Ks[0]),
-            width=width,
-            height=height,
-            near=self.settings.near_of(0),
-            background=self.background,
-            antialiased=bool(self.settings.antialiased),
-            inria=self.settings.convention == "inria",
-            alpha_max=self.settings.alpha_max,
-            clip_margin=2e-6,  # a clip is continuous: on its wrong side only the slope is another
-        )
-        return out, tensors
+    def oracle(self, params: Params, *, grad: bool = False) -> tuple[Oracle, list[torch.Tensor]]:
+        # A clip is continuous: on its wrong side only the slope is another, hence the narrow margin.
+        return oracle(params, self.cameras, self.settings, self.background, grad=grad, clip_margin=2e-6)
 
     def loss(self, image: torch.Tensor, alpha: torch.Tensor, depth: torch.Tensor) -> torch.Tensor:
         w = torch.from_numpy(self.weights).to(image.dtype)
