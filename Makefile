@@ -70,14 +70,14 @@ docs: setup $(VENV)/.docs
 	$(BIN)/python -m sphinx -q -E -a -W --keep-going -c docs -b html . site
 	@echo site/docs/index.html
 
-# Needs a scene: SCENE=path, or real data. Every study runs once, small: one scene, two ratios, few steps.
+# Needs a scene: SCENE=path, or real data. Studies run small: few steps, one ratio, scenes that are there or made; about an hour.
 # What bench/ holds is not measured again; `make clean` removes it.
-STUDIES := ablations bounded compression geobase k_sweep policies protection protection_given source
-QUICK := --only city,guitar --ratios 10,30 --seeds 0 --size 240 --steps 150 --seconds 8 --adapt-steps 500
+STUDIES := ablations bounded chain compression geobase k_sweep policies protection protection_given recover-rounds source
+QUICK := --ratios 10 --seeds 0 --size 240 --steps 150
 SCENE ?= $(G2ARD_DATA)/playbot/0_0
 bench: setup
-	$(BIN)/python -m benchmarks run raster simplify $(SCENE) --ratios 10,30 -o bench/scene
-	$(BIN)/python -m benchmarks run $(STUDIES) -o bench $(QUICK)
+	$(BIN)/python -m benchmarks run raster simplify ship recover-regularizers select $(SCENE) -o bench/scene $(QUICK)
+	$(BIN)/python -m benchmarks run $(STUDIES) -o bench $(QUICK) --only city,guitar --seconds 8 --adapt-steps 500
 
 # A wheel for this system; nothing but maturin is installed for it.
 wheel: $(VENV)/.maturin

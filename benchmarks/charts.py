@@ -11,7 +11,6 @@ from itertools import pairwise
 COLORS = ("#2563eb", "#d97706", "#059669", "#db2777", "#7c3aed", "#64748b", "#0891b2", "#b91c1c", "#65a30d")
 _WIDTH, _HEIGHT = 560, 340
 _LEFT, _RIGHT, _TOP, _BOTTOM = 54, 14, 12, 44
-_MARKS = ("circle", "square", "diamond", "triangle")
 
 
 @dataclass(frozen=True)
@@ -22,7 +21,7 @@ class Point:
         x: horizontal value; positive on a logarithmic axis.
         y: vertical value.
         series: index of the colour, from 0.
-        mark: index of the shape, from 0.
+        mark: 0 for a full dot, 1 for a pale one, 2 for a ring.
         text: tooltip.
         label: text beside the dot, if there is room; "" for none.
     """
@@ -186,18 +185,10 @@ def _lines(points: Sequence[Point], x: _Axis, y: _Axis) -> list[str]:
 
 
 def _dot(point: Point, x: float, y: float) -> str:
-    title = f"<title>{escape(point.text)}</title>"
-    css = f'class="dot s{point.series}"'
-    mark = _MARKS[point.mark % len(_MARKS)]
-    if mark == "circle":
-        return f'<circle {css} cx="{x:.1f}" cy="{y:.1f}" r="5">{title}</circle>'
-    shapes: dict[str, list[tuple[float, float]]] = {
-        "square": [(-4.5, -4.5), (4.5, -4.5), (4.5, 4.5), (-4.5, 4.5)],
-        "diamond": [(0, -6), (6, 0), (0, 6), (-6, 0)],
-        "triangle": [(0, -6), (5.5, 4.5), (-5.5, 4.5)],
-    }
-    corners = " ".join(f"{x + dx:.1f},{y + dy:.1f}" for dx, dy in shapes[mark])
-    return f'<polygon {css} points="{corners}">{title}</polygon>'
+    css = f"dot s{point.series}" + (f" m{point.mark}" if point.mark else "")
+    return (
+        f'<circle class="{css}" cx="{x:.1f}" cy="{y:.1f}" r="5"><title>{escape(point.text)}</title></circle>'
+    )
 
 
 def _names(points: Sequence[Point], x: _Axis, y: _Axis) -> list[str]:
@@ -228,12 +219,11 @@ def side_by_side(charts: Sequence[tuple[str, str]]) -> str:
 
 
 def legend(series: Sequence[str], marks: Sequence[str] = ()) -> str:
-    """Return the legend of colours (methods) and shapes (budgets)."""
-    shapes = ("●", "■", "◆", "▲")
+    """Return the legend of colours (methods), and of marks with their names."""
     items = [
         f'<span><i class="s{i % len(COLORS)}"></i>{escape(name)}</span>' for i, name in enumerate(series)
     ]
-    items += [f"<span>{shapes[i % len(shapes)]} {escape(name)}</span>" for i, name in enumerate(marks)]
+    items += [f"<span>{escape(mark)}</span>" for mark in marks]
     return f'<p class="legend">{"".join(items)}</p>'
 
 
@@ -244,6 +234,7 @@ STYLE = (
 .chart{width:100%;height:auto;background:var(--card);border-radius:8px}
 .grid{stroke:var(--line)}.tick,.axis,.name{font-size:11px;fill:var(--soft)}.name{fill:var(--fg)}
 .dot{fill:var(--c);stroke:var(--bg);stroke-width:1.2}.line{fill:none;stroke:var(--c);stroke-width:2}
+.m1{fill-opacity:.4;stroke:var(--c)}.m2{fill:var(--card);stroke:var(--c);stroke-width:2.5}
 .front{fill:none;stroke:var(--soft);stroke-dasharray:5 4;stroke-width:1.3}
 .legend span{margin-right:16px;white-space:nowrap}
 .legend i{display:inline-block;width:11px;height:11px;border-radius:3px;background:var(--c);margin-right:6px}

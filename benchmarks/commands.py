@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
+from benchmarks.synth.command import synth
 from g2ard.cli.frame import Run, command
 from g2ard.errors import InputError
 from g2ard.progress import plural
@@ -20,6 +21,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
+app.add_typer(synth, name="synth")
 _BUDGETS = ("steps", "seconds", "adapt_steps")
 _List = Annotated[str | None, typer.Option(help="Comma-separated, instead of the study's.")]
 
@@ -75,40 +77,34 @@ def run_(
     files = [path for word, path in zip(study, named, strict=True) if word.endswith(".toml") or path.exists()]
     scenes = [Path(word) for word, path in zip(study, named, strict=True) if path not in files]
     if not files:
-        raise typer.BadParameter(f"no study {study[0]!r} (there are {', '.join(_names(DEFINITIONS))})")
+        there = ", ".join(sorted(path.stem for path in DEFINITIONS.glob("*.toml")))
+        raise typer.BadParameter(f"no study {study[0]!r} (there are {there})")
     if not scenes and (views or held_out or photos):
         raise typer.BadParameter("--views, --held-out and --photos go with scenes: a study names its own")
-    flags = {"methods": methods, "ratios": ratios, "seeds": seeds, "steps": steps, "seconds": seconds}
-    flags |= {
-        "size": size,
-        "adapt_steps": adapt_steps,
-        "lpips": None if lpips is None else str(lpips.absolute()),
-    }
-    options: dict[str, Any] = {name: value for name, value in flags.items() if value is not None}
-    if run.seed and seeds is None:
-        options["seeds"] = str(run.seed)
+    specs = tuple(
+        SceneSpec(
+            scene_label(scene),
+            str(scene.absolute()),
+            None if views is None else str(views.absolute()),
+            {"test": str(held_out.absolute())} if held_out else {},
+            targets="photos" if photos or kind(scene) != "splats" else "teacher",
+        )
+        for scene in scenes
+    )
+    flags = {"methods": methods, "ratios": ratios, "steps": steps, "seconds": seconds, "size": size}
+    flags |= {"adapt_steps": adapt_steps, "lpips": None if lpips is None else str(lpips.absolute())}
+    flags["seeds"] = str(run.seed) if run.seed and seeds is None else seeds
+    given = {name: value for name, value in flags.items() if value is not None}
     forced = dict(_setting(text) for text in run.config.get("set") or [])
     studies = []
     for path in files:
         one = read_study(path)
-        if scenes:
-            specs = tuple(
-                SceneSpec(
-                    scene_label(scene),
-                    str(scene.absolute()),
-                    None if views is None else str(views.absolute()),
-                    {"test": str(held_out.absolute())} if held_out else {},
-                    targets="photos" if photos or kind(scene) != "splats" else "teacher",
-                )
-                for scene in scenes
-            )
-            one = replace(one, scenes=specs)
-        left = {name for name in options if name in _BUDGETS and not getattr(one, name, None)}
-        for name in sorted(left):
-            run.say(f"{path}: has no {name}, and --{name} is ignored there")
-        shared = {name: value for name, value in options.items() if name not in left}
-        shared = {name: value for name, value in shared.items() if name != "lpips" or hasattr(one, "lpips")}
-        one = one.narrowed({**shared, **forced})
+        one = replace(one, scenes=specs) if scenes else one
+        unfit = {name for name in _BUDGETS if not getattr(one, name, None)}
+        for name in sorted(unfit & given.keys()):
+            run.say(f"{path}: has no {name}, and --{name.replace('_', '-')} is ignored there")
+        unfit |= set() if hasattr(one, "lpips") else {"lpips"}
+        one = one.narrowed({name: given[name] for name in given if name not in unfit} | forced)
         wanted = one.scenes if only is None else tuple(s for s in one.scenes if s.name in only.split(","))
         if not wanted:
             there = f"no scene {only!r} (it has {', '.join(s.name for s in one.scenes)})"
@@ -133,10 +129,6 @@ def run_(
     failed = sum("error" in row for row in rows)
     if failed:
         run.unmet(f"{plural(failed, 'row')} failed; the same command tries again")
-
-
-def _names(folder: Path) -> list[str]:
-    return sorted(path.stem for path in folder.glob("*.toml"))
 
 
 def _setting(text: str) -> tuple[str, str]:

@@ -24,7 +24,8 @@ __all__ = ["write_report"]
 _VIEWS = 3
 _METHODS = ("method", "variant", "arm", "format", "matcher", "isa")
 """Columns that name what a kind of study compares."""
-_MARKS = ("steps", "seconds", "released")
+_MARKS = {"steps": "●", "seconds": "◍", "released": "○"}
+"""How a cell is matched → the mark of its dot in legends."""
 
 
 def write_report(folder: Path, studies: Sequence[Study], rows: Sequence[Row]) -> None:
@@ -54,7 +55,8 @@ def _study(page: Page, folder: Path, study: Study, rows: list[Row]) -> None:
         page.paragraph("Differs from the paper:")
         page.html(f"<ul>{''.join(f'<li>{escape(line)}</li>' for line in study.differs)}</ul>")
     names = list(dict.fromkeys(map(_name, rows)))
-    page.html(legend(names, [kind for kind in _MARKS if any(row.get("matched") == kind for row in rows)]))
+    matched = {row.get("matched") for row in rows}
+    page.html(legend(names, [f"{mark} {kind}" for kind, mark in _MARKS.items() if kind in matched]))
     for line in dict.fromkeys(line for row in rows for line in _notes(row)):
         page.paragraph(line)
     summary = study.summary(rows)
@@ -131,7 +133,7 @@ def _charts(rows: Sequence[Row], names: Sequence[str]) -> list[tuple[str, str]]:
 def _point(row: Row, x: float, names: Sequence[str]) -> Point:
     text = f"{_label(row)}: {row['psnr']:.2f} dB, {row['ssim']:.4f}, {row['count']:,} Gaussians"
     series = names.index(_name(row)) % len(COLORS)
-    mark = _MARKS.index(row["matched"]) if row.get("matched") in _MARKS else 0
+    mark = list(_MARKS).index(row["matched"]) if row.get("matched") in _MARKS else 0
     return Point(x, row["psnr"], series, mark, text, _name(row))
 
 

@@ -62,7 +62,7 @@ COLUMNS: dict[str, Column] = {
     "ssim": Column(float, ".4f", "mean over the views"),
     "lpips_vgg": Column(float, ".4f", "mean over the views"),
     "lpips_alex": Column(float, ".4f", "mean over the views"),
-    "luma_drift": Column(float, None, "mean of |mean luma of the render − the target's|"),
+    "luma_drift": Column(float, None, "mean of |mean luma of the render − the target's|, in recorded rows"),
     "lost": Column(float, ".2f", "dB that the format alone takes: PSNR of the .ply less this"),
     "delta_psnr": Column(float, "+.2f", "PSNR less the teacher's on the same views, dB"),
     "drift95": Column(float, ".2f", "of the last recovery, in thicknesses of its anchors"),

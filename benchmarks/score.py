@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
 from benchmarks.rows import Row
+from g2ard.config.choices import BLACK, Colour
 from g2ard.rendering.lpips import Lpips
 from g2ard.rendering.metrics import psnr, ssim
 from g2ard.rendering.renderer import RasterSettings, Renderer
@@ -17,76 +18,38 @@ from g2ard.scene.images import as_saved, to_bytes
 from g2ard.scene.splats import Splats
 from g2ard.scene.targets import Targets, mask_of
 
-__all__ = ["Scored", "ViewFigures", "luma", "pictured", "save_jpeg", "score"]
+__all__ = ["View", "figures", "pictured", "save_jpeg", "score"]
 
-_LUMA = np.array([0.2126, 0.7152, 0.0722], np.float32)
 _PICTURES = 32
 _QUALITY = 88
 
-
-@dataclass(frozen=True)
-class ViewFigures:
-    """Scores of a view.
-
-    Args:
-        luma: mean luma of the render minus that of the target.
-        black: whether the render is black in 8 bits and the target is not.
-    """
-
-    name: str
-    psnr: float
-    ssim: float
-    luma: float
-    lpips_alex: float | None = None
-    lpips_vgg: float | None = None
-    black: bool = False
+View = dict[str, Any]
+"""A view's name, psnr, ssim and lpips_NET, and whether it is black: in 8 bits, though its target is not."""
 
 
-@dataclass(frozen=True)
-class Scored:
-    """Scores of all views, with means over those that are not black (`tab:geobase`, †) unless all are."""
-
-    views: tuple[ViewFigures, ...]
-
-    @property
-    def counted(self) -> tuple[ViewFigures, ...]:
-        """The views in the means."""
-        return tuple(view for view in self.views if not view.black) or self.views
-
-    def mean(self, name: str) -> float | None:
-        """Return the mean of one score, or None if it was not measured."""
-        values = [getattr(view, name) for view in self.counted]
-        return None if None in values else float(np.mean(values))
-
-    def figures(self) -> Row:
-        """Return the columns of a row."""
-        means = {name: self.mean(name) for name in ("psnr", "ssim", "lpips_vgg", "lpips_alex")}
-        worst = min(view.psnr for view in self.counted)
-        drift = float(np.mean([abs(view.luma) for view in self.counted]))
-        black = sum(view.black for view in self.views)
-        return {**means, "psnr_worst": worst, "luma_drift": drift, "views": len(self.counted), "black": black}
-
-
-def luma(image: NDArray[np.float32], mask: NDArray[np.bool_] | None = None) -> float:
-    """Return the mean Rec. 709 luma of an image in [0, 1], or of the pixels in a mask.
-
-    >>> round(luma(np.full((2, 2, 3), 0.5, np.float32)), 6)
-    0.5
-    """
-    pixels = image if mask is None else image[mask]
-    return float((pixels.astype(np.float64) @ _LUMA).mean())
+def figures(views: list[View]) -> Row:
+    """Return the columns of a row: means over views that are not black (`tab:geobase`, †), unless all are."""
+    counted = [view for view in views if not view["black"]] or views
+    means: Row = {
+        name: float(np.mean([view[name] for view in counted]))
+        for name in ("psnr", "ssim", "lpips_vgg", "lpips_alex")
+        if name in views[0]
+    }
+    worst = min(view["psnr"] for view in counted)
+    black = sum(view["black"] for view in views)
+    return {**means, "psnr_worst": worst, "views": len(counted), "black": black}
 
 
 def score(
     splats: Splats,
     targets: Targets,
-    background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    background: Colour = BLACK,
     *,
     lpips: dict[str, Lpips] | None = None,
     settings: RasterSettings | None = None,
     eight_bit: bool = False,
     pictures: Path | None = None,
-) -> Scored:
+) -> list[View]:
     """Render and score every view.
 
     Args:
@@ -101,25 +64,17 @@ def score(
     renderer = Renderer(splats, background=background, settings=settings)
     views = []
     for number, name in enumerate(targets.cameras.names):
-        image, target = np.clip(renderer.image(targets.cameras[number]), 0, 1), targets[number]
+        image, target = renderer.clipped(targets.cameras[number]), targets[number]
         if eight_bit:
             image, target = as_saved(image), as_saved(target)
         mask = mask_of(targets, number)
-        off = luma(image, mask) - luma(target, mask)
-        perceived = {f"lpips_{net}": model(image, target) for net, model in (lpips or {}).items()}
-        views.append(
-            ViewFigures(
-                name,
-                psnr(image, target, mask),
-                ssim(image, target, mask),
-                off,
-                **perceived,
-                black=not to_bytes(image).any() and bool(to_bytes(target).any()),
-            )
-        )
+        view: View = {"name": name, "psnr": psnr(image, target, mask), "ssim": ssim(image, target, mask)}
+        view |= {f"lpips_{net}": model(image, target) for net, model in (lpips or {}).items()}
+        view["black"] = not to_bytes(image).any() and bool(to_bytes(target).any())
+        views.append(view)
         if pictures is not None and number in pictured(len(targets.cameras)):
             save_jpeg(pictures / f"{number}.jpg", image)
-    return Scored(tuple(views))
+    return views
 
 
 def pictured(count: int) -> list[int]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cached_property
@@ -148,27 +147,19 @@ class Workspace:
         return self.views(whole, "train")
 
     def write_views(self, path: Path, cameras: Cameras, what: str) -> None:
-        """Write training views without those that are scored, and count the dropped ones in dropped.json."""
+        """Write views to "train" or "adapt" on, without those that are scored."""
         keep = np.ones(len(cameras), bool)
         for name, scored in self.scored.items():
             if what == "adapt" or name != "adapt-val":  # new appearance may show trained places
                 keep &= not_held_out(cameras, scored)
         if not keep.any():
             raise InputError(f"all {plural(len(keep), 'view')} to {what} on are scored; none remain")
-        counts = {**self._dropped, what: int(np.count_nonzero(~keep))}
-        (self.folder / "dropped.json").write_text(json.dumps(counts), encoding="utf-8", newline="\n")
         io.write_views(path, cameras.take(keep), splits=["train"] * int(np.count_nonzero(keep)))
 
     @property
-    def _dropped(self) -> dict[str, int]:
-        path = self.folder / "dropped.json"
-        found: dict[str, int] = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
-        return found
-
-    @property
     def dropped(self) -> int:
-        """The number of views that were dropped from training or adaptation because they are scored."""
-        return sum(self._dropped.values())
+        """The number of views that were dropped from training because they are scored."""
+        return len(self._training()) - len(self.train_cameras)
 
     def read(self, path: Path) -> io.ViewSet:
         """Read views; those without photos are kept if the scene's targets allow it."""

@@ -25,7 +25,7 @@ from benchmarks.kinds.worker import StoredTargets, store_targets
 from benchmarks.process import Usage, measured, splat_transform
 from benchmarks.rows import Row
 from benchmarks.runner import Cell, fingerprint
-from benchmarks.score import pictured, save_jpeg, score
+from benchmarks.score import figures, pictured, save_jpeg, score
 from benchmarks.study import SceneSpec, Study, key
 from benchmarks.workspace import Workspace, budget_of
 from g2ard import __version__, io
@@ -173,12 +173,12 @@ class Matched(Study):
                 eight_bit=self.eight_bit,
                 pictures=folder / pictures,
             )
-            for view in pictured(len(scored.views)):
+            for view in pictured(len(scored)):
                 if not (folder / wanted / f"{view}.jpg").exists():
                     save_jpeg(folder / wanted / f"{view}.jpg", np.clip(targets[view], 0, 1))
-            views = {"targets": wanted, "views": [asdict(view) for view in scored.views]}
+            views = {"targets": wanted, "views": scored}
             (folder / pictures / "views.json").write_text(json.dumps(views), encoding="utf-8", newline="\n")
-            rows.append({**shared, **scored.figures(), "split": split, "pictures": pictures})
+            rows.append({**shared, **figures(scored), "split": split, "pictures": pictures})
         return rows
 
 
@@ -190,21 +190,6 @@ class _Stage:
     output: Path
     usage: Usage
     report: dict[str, Any]
-
-
-@dataclass
-class _Spent:
-    """Cost of the stages of one kind together."""
-
-    cpu: float = 0.0
-    wall: float = 0.0
-    peak: float = 0.0
-
-    def add(self, usage: Usage, wall: float | None = None) -> _Spent:
-        self.cpu += usage.cpu_s
-        self.wall += usage.wall_s if wall is None else wall
-        self.peak = max(self.peak, usage.peak_mb)
-        return self
 
 
 class MatchedWorkspace(Workspace):
@@ -280,6 +265,12 @@ class MatchedWorkspace(Workspace):
             assert cameras is not None  # of a third there are two thirds left, and of none all
             self.write_views(path, cameras, "adapt")
         return path
+
+    @property
+    def dropped(self) -> int:
+        """The number of views that were dropped from training or adaptation because they are scored."""
+        adapt = self.adaptation("train") if self.study.adapt_steps else None
+        return super().dropped + (0 if adapt is None else len(adapt) - len(self.read(self.adapted).cameras))
 
     @cached_property
     def scored(self) -> dict[str, Cameras]:
@@ -396,28 +387,32 @@ class _Pipeline:
         self.sh_degree = place.study.sh_degree
         if self.sh_degree is None and place.scene.targets != "teacher":
             self.sh_degree = 3
-        self.spent = {"reduce": _Spent(), "recover": _Spent()}
+        self.spent: dict[str, list[tuple[Usage, float]]] = {"reduce": [], "recover": []}  # and wall seconds
         self.steps = 0
         self.last: dict[str, Any] = {}
 
     def figures(self) -> Row:
         """Return the columns on cost and on the last recovery."""
-        costs = {f"{name}_cpu_s": spent.cpu for name, spent in self.spent.items()}
-        peaks = {f"{name}_peak_mb": spent.peak for name, spent in self.spent.items()}
-        walls = {f"{name}_wall_s": self.spent[name].wall for name in ("reduce", "recover")}
-        before = [spent for name, spent in self.spent.items() if name != "adapt"]
+        row: Row = {}
+        for name, runs in self.spent.items():
+            row[f"{name}_cpu_s"] = sum(usage.cpu_s for usage, _ in runs)
+            row[f"{name}_peak_mb"] = max((usage.peak_mb for usage, _ in runs), default=0.0)
         return {
+            **row,
             "prior": self.prior,
             "input_count": self.count,
             "budget": self.budget,
             "drift95": self.last.get("drift95", 0.0),  # scenes without recovery have not moved
             "steps": self.steps,
-            **costs,
-            **walls,
-            **peaks,
-            "cpu_s": sum(spent.cpu for spent in before),
-            "seconds": sum(spent.wall for spent in before),
+            "reduce_wall_s": self._wall("reduce"),
+            "recover_wall_s": self._wall("recover"),
+            "cpu_s": sum(row[f"{name}_cpu_s"] for name in self.spent if name != "adapt"),
+            "seconds": self._wall("select", "reduce", "recover"),
         }
+
+    def _wall(self, *names: str) -> float:
+        """Return the seconds that stages of these kinds took."""
+        return sum(wall for name in names for _, wall in self.spent.get(name, []))
 
     def _regularizers(self, prior: Splats) -> dict[str, Any]:
         """Return the method's weights of regularisers: the paper's for this kind of prior, or ours."""
@@ -444,7 +439,7 @@ class _Pipeline:
         if method.policy is not None:
             chosen = place.select(self.source, method.policy, method.k, self.seed)
             views = chosen.output
-            self.spent["select"] = _Spent().add(chosen.usage)
+            self.spent["select"] = [(chosen.usage, chosen.usage.wall_s)]
         early = place.train if method.shared_start else views
         counts = self.counts()
         legs = method.legs(len(counts)) if counts else []
@@ -457,7 +452,7 @@ class _Pipeline:
                 state = self._recover(state, views if leg.final else early, leg, legs, built)
         if place.study.adapt_steps:
             state = place.adapt(state, self.sh_degree, self.seed)
-            self.spent["adapt"] = _Spent().add(state.usage)
+            self.spent["adapt"] = [(state.usage, state.usage.wall_s)]
         return state
 
     def _seed(self, final: bool) -> int:
@@ -470,7 +465,7 @@ class _Pipeline:
         if method.reduce not in baselines.METHODS:
             job |= {"budget": self.budget, "protection": method.protection}
         done = self.place.reduce(state, views, job, flags)
-        self.spent["reduce"].add(done.usage, done.report.get("seconds"))
+        self.spent["reduce"].append((done.usage, done.report.get("seconds", done.usage.wall_s)))
         return done
 
     def _recover(self, state: _Stage, views: Path, leg: Leg, legs: list[Leg], built: _Stage) -> _Stage:
@@ -486,7 +481,7 @@ class _Pipeline:
             "seed": self._seed(leg.final),
         }
         done = self.place.recover(state, views, job, None if state is built else built)
-        self.spent["recover"].add(done.usage, done.report["seconds"])
+        self.spent["recover"].append((done.usage, done.report["seconds"]))
         self.steps += done.report["steps"]
         self.last = done.report
         return done
@@ -508,7 +503,7 @@ class _Pipeline:
                 steps = int(matched.amount) - sum(int(b.share * matched.amount) for b in before)
             return {"schedule": schedule, "steps": steps, "seconds": None} if steps else None
         counted = ("select",) if method.shared_start else ("select", "reduce", "recover")
-        left = matched.amount - sum(self.spent[name].wall for name in counted if name in self.spent)
+        left = matched.amount - self._wall(*counted)
         if left <= 0:  # scored without recovery; the row has the seconds
             return None
         limit = left if leg.final else left * leg.share / (1 - sum(b.share for b in before))

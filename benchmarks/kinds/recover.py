@@ -13,7 +13,7 @@ import numpy as np
 
 from benchmarks.rows import Row
 from benchmarks.runner import Cell
-from benchmarks.score import score
+from benchmarks.score import figures, score
 from benchmarks.study import SceneSpec, Study, key
 from benchmarks.workspace import PROTOCOLS, Workspace, budget_of, kinds_for
 from g2ard.config.presets import PRESETS, configured
@@ -252,7 +252,7 @@ class _Run:
                 "step": step,
                 "seconds": seconds,
                 "cpu_s": self.cpu,
-                **scored.figures(),
+                **figures(scored),
                 "needle": needle(splats.scales),
                 "rank_p1": float(np.percentile(effective_rank(splats.scales), 1)),
                 "final": final,

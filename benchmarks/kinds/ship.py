@@ -13,7 +13,7 @@ from typing import Any, ClassVar
 from benchmarks.process import measured, splat_transform
 from benchmarks.rows import Row
 from benchmarks.runner import Cell
-from benchmarks.score import score
+from benchmarks.score import figures, score
 from benchmarks.study import SceneSpec, Study
 from benchmarks.workspace import Workspace, reduced
 from g2ard import io
@@ -67,7 +67,7 @@ class Ship(Study):
             size = path.stat().st_size
         for kind, targets in place.kinds_of_views.items():
             row = {"views_kind": kind, "count": len(splats), "bytes": size, "cpu_s": seconds}
-            yield {**row, **score(back, targets, place.scene.background).figures()}
+            yield {**row, **figures(score(back, targets, place.scene.background))}
 
     def _write(self, path: Path, splats: Splats, name: str) -> float:
         """Write a file and return the CPU seconds; for splat-transform they include reading the .ply."""

@@ -17,7 +17,7 @@ from benchmarks.kinds.methods import REDUCERS
 from benchmarks.process import Usage, measured, splat_transform, version_of
 from benchmarks.rows import Row
 from benchmarks.runner import Cell
-from benchmarks.score import score
+from benchmarks.score import figures, score
 from benchmarks.study import SceneSpec, Study, key
 from benchmarks.workspace import PROTOCOLS, Workspace, budget_of, kinds_for
 from g2ard import io
@@ -84,7 +84,7 @@ class Simplify(Study):
                 ran[own] = self._run(place, method, budget, own)
             usage, small = ran[own]
             scored = score(small, place.kinds_of_views[kind], place.scene.background)
-            yield {**row, **asdict(usage), "count": len(small), **scored.figures()}
+            yield {**row, **asdict(usage), "count": len(small), **figures(scored)}
 
     def _run(self, place: Workspace, method: str, budget: int, own: bool) -> tuple[Usage, Splats]:
         with tempfile.TemporaryDirectory(prefix="g2ard-bench-") as folder:
