@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -139,27 +139,66 @@ class Adapted:
         return f"Adapted({plural(len(self.splats), 'Gaussian')}, {self.report.psnr})"
 
 
-@dataclass
-class _State:
-    """State between two stretches, for resuming."""
+@dataclass(eq=False)
+class _Fit:
+    """A fit in stretches, whose state is kept in `work`, if given.
+
+    Args:
+        splats: the scene, of which appearance changes.
+        key: fingerprint that checkpoints must have.
+    """
 
     splats: Splats
+    targets: Targets
+    config: AdaptConfig
+    key: str
+    work: Path | None
+    progress: Progress
     seconds: float = 0.0
     converged: bool = False
     stretches: list[dict[str, Any]] = field(default_factory=list)
 
-    _ARRAYS: ClassVar = ("logit_opacities", "sh0", "shN")
+    def run(self) -> None:
+        """Take stretches until one gains less than the tolerance; continue from those in `work`."""
+        lengths = self.config.stretches()
+        self._restore()
+        while len(self.stretches) < len(lengths) and not self.converged:
+            self._stretch(lengths[len(self.stretches)])
+            self._save()
 
-    def save(self, path: Path, key: str) -> None:
-        meta = {"seconds": self.seconds, "converged": self.converged}
-        arrays = {name: getattr(self.splats, name) for name in self._ARRAYS}
-        checkpoint.save(path, key, {**meta, "stretches": self.stretches}, arrays)
+    def _stretch(self, steps: int) -> None:
+        config = self.config
+        how = RecoverConfig(
+            schedule=config.recovery or appearance_only(PAPER if config.schedule == "paper" else TUNED),
+            steps=steps,
+            regularizers=FREE,  # geometry is frozen
+            ssim_weight=config.ssim_weight,
+            background=config.background,
+            seed=config.seed + len(self.stretches),
+        )
+        within = self.work / "steps.npz" if self.work else None
+        found = recover(
+            self.splats, self.targets, how, checkpoint=within, progress=self.progress, stage="adapt"
+        )
+        before, after, old = found.report.psnr.before, found.report.psnr.after, self.splats
+        self.splats = replace(found.splats, means=old.means, quats=old.quats, scales=old.scales)
+        self.stretches.append({"steps": steps, "psnr": after})
+        self.seconds += found.report.seconds
+        self.converged = after - before < config.tolerance
 
-    def load(self, path: Path, key: str) -> None:
-        meta, arrays = checkpoint.load(path, key)
-        self.splats = replace(self.splats, **arrays)
-        self.seconds = meta["seconds"]
-        self.converged, self.stretches = meta["converged"], meta["stretches"]
+    def _save(self) -> None:
+        if self.work:
+            meta = {name: getattr(self, name) for name in ("seconds", "converged", "stretches")}
+            arrays = {name: getattr(self.splats, name) for name in ("logit_opacities", "sh0", "shN")}
+            checkpoint.save(self.work / "stretches.npz", self.key, meta, arrays)
+            (self.work / "steps.npz").unlink(missing_ok=True)
+
+    def _restore(self) -> None:
+        if self.work and (self.work / "stretches.npz").exists():
+            meta, arrays = checkpoint.load(self.work / "stretches.npz", self.key)
+            self.splats = replace(self.splats, **arrays)
+            self.seconds, self.converged = meta["seconds"], meta["converged"]
+            self.stretches = meta["stretches"]
 
 
 def adapt(
@@ -196,69 +235,30 @@ def adapt(
     config = config or AdaptConfig()
     given = compact if config.sh_degree is None else compact.with_sh_degree(config.sh_degree)
     probe = Probe(targets, config.background)
-    change, start = None, given
+    change, start, share = None, given, np.ones(len(given))
     if config.schedule == "default" and len(given) and len(targets.cameras):
         change = colour_change(given, targets, config.background)
         change = change if change.gain >= config.colour_worth else None
         start = given if change is None else recoloured(given, change)
-    state = _State(start)
     parts = (repr(config), compact.fingerprint(), fingerprint_of(targets))
     key = hashlib.sha256("\n".join(parts).encode()).hexdigest()
-    done, within = (work / "stretches.npz", work / "steps.npz") if work else (None, None)
-    if done and done.exists():
-        state.load(done, key)
-    lengths = config.stretches()
-    while len(state.stretches) < len(lengths) and not state.converged:
-        number = len(state.stretches)
-        _stretch(state, compact, targets, config, lengths[number], number, within, progress)
-        if done and within:
-            state.save(done, key)
-            within.unlink(missing_ok=True)
-    share = np.ones(len(given))
+    fit = _Fit(start, targets, config, key, work, progress)
+    fit.run()
     if config.schedule == "default" and config.prior_views:
         seen = views_seeing(start, targets.cameras)
         share = seen / (seen + config.prior_views)
-    result = blended_appearance(start, state.splats, share)
+    result = blended_appearance(start, fit.splats, share)
+    changed = None if change is None else {k: np.asarray(v).tolist() for k, v in vars(change).items()}
     report = AdaptReport(
-        steps=sum(s["steps"] for s in state.stretches),
-        seconds=state.seconds,
-        converged=state.converged,
+        steps=sum(s["steps"] for s in fit.stretches),
+        seconds=fit.seconds,
+        converged=fit.converged,
         psnr=Gain(probe.all_of(given), probe.all_of(result)),
-        stretches=tuple(map(Stretch.of, state.stretches)),
-        colour_change=None
-        if change is None
-        else {k: np.asarray(v).tolist() for k, v in vars(change).items()},
+        stretches=tuple(map(Stretch.of, fit.stretches)),
+        colour_change=changed,
         prior_share=float(1 - share.mean()),
     )
     return Adapted(result, report)
-
-
-def _stretch(
-    state: _State,
-    compact: Splats,
-    targets: Targets,
-    config: AdaptConfig,
-    steps: int,
-    number: int,
-    within: Path | None,
-    progress: Progress,
-) -> None:
-    """Fit one stretch of steps."""
-    recovery = config.recovery or appearance_only(PAPER if config.schedule == "paper" else TUNED)
-    how = RecoverConfig(
-        schedule=recovery,
-        steps=steps,
-        regularizers=FREE,  # geometry is frozen
-        ssim_weight=config.ssim_weight,
-        background=config.background,
-        seed=config.seed + number,
-    )
-    found = recover(state.splats, targets, how, checkpoint=within, progress=progress, stage="adapt")
-    before, after = found.report.psnr.before, found.report.psnr.after
-    state.splats = replace(found.splats, means=compact.means, quats=compact.quats, scales=compact.scales)
-    state.stretches.append({"steps": steps, "psnr": after})
-    state.seconds += found.report.seconds
-    state.converged = after - before < config.tolerance
 
 
 def appearance_only(schedule: Schedule) -> Schedule:
