@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from g2ard.config.choices import BLACK, Colour
+from g2ard.config.choices import Colour
 from g2ard.errors import InputError
 from g2ard.progress import plural
 from g2ard.rendering.renderer import Renderer
@@ -18,6 +18,9 @@ from g2ard.report.page import Comparison, Page, Shown
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.images import load_image, to_bytes
 from g2ard.scene.splats import Splats
+
+if TYPE_CHECKING:
+    from g2ard.stages.register.report import PhotoReport, Registered
 
 _VIEWS, _SIZE = 12, 640
 """Number of photos shown, and the longer side of their images in pixels."""
@@ -31,53 +34,53 @@ def registration_report(
     title: str,
     scene: Splats,
     photos: Cameras,
-    rows: Sequence[Any],
+    found: Registered,
     starts: Mapping[str, NDArray[np.float64]],
-    *,
-    matches: Mapping[str, NDArray[np.float64]] | None = None,
-    side: int = 1000,
-    told: Sequence[str] = (),
-    background: Colour = BLACK,
+    side: int,
+    told: Sequence[str],
+    background: Colour,
 ) -> None:
     """Write the HTML page of a registration, least similar photos first.
 
     Args:
-        rows: C `PhotoReport`s, in the same order.
+        found: the registration of all photos, in the same order.
         starts: name → (4, 4) camera_from_world, shown beside the result.
-        matches: name → (M, 4) of `Registered`, drawn between photo and render.
-        side: longer side in pixels of the images that `matches` refer to.
+        side: longer side in pixels of the images that its matches refer to.
+        told: summary lines that the command prints.
     """
     page = Page(title, f"{plural(len(photos), 'photo')} against {plural(len(scene), 'Gaussian')}")
     for line in told:
         page.paragraph(line)
     page.table(
         ["photo", "status", "ZNCC", "σ position", "σ rotation, °", "error", "error, °", "why"],
-        [_cells(row) for row in rows],
+        [_cells(row) for row in found.report.photos],
     )
     page.heading("Least alike first")
+    rows = found.report.photos
     seen = [i for i, row in enumerate(rows) if row.camera_from_world is not None]
     renderer = Renderer(scene, background=background)
-    for i in sorted(seen, key=lambda i: -1.0 if rows[i].zncc is None else rows[i].zncc)[:_VIEWS]:
+    for i in sorted(seen, key=lambda i: -1.0 if (zncc := rows[i].zncc) is None else zncc)[:_VIEWS]:
         row, one = rows[i], photos.take([i]).resized(_SIZE)
         try:
             photo = to_bytes(load_image(one, 0, background))
         except InputError:
             continue  # deleted since it was registered
-        found = renderer.image(replace(one[0], viewmat=np.array(row.camera_from_world)))
+        render = to_bytes(renderer.image(replace(one[0], viewmat=np.array(row.camera_from_world))))
         alike = "kept at its start" if row.zncc is None else f"ZNCC {row.zncc:.2f}"
-        shown = [Shown("found", to_bytes(found), alike)]
+        shown = [Shown("found", render, alike)]
         if row.name in starts:
             shown.append(Shown("start", to_bytes(renderer.image(replace(one[0], viewmat=starts[row.name])))))
         page.comparison(Comparison(f"{row.name}: {row.status}", photo, shown))
-        if matches and row.name in matches:
+        matches = found.matches.get(row.name)
+        if matches is not None:
             scale = photo.shape[1] / photos.take([i]).resized(side)[0].width
-            drawn = matches_drawn(photo, to_bytes(found), matches[row.name] * scale)
-            told_of = plural(len(matches[row.name]), "match", "matches")
-            page.figure(drawn, f"{told_of} explained by the pose; at most {_LINES} are drawn")
+            drawn = _matches_drawn(photo, render, matches * scale)
+            count = plural(len(matches), "match", "matches")
+            page.figure(drawn, f"{count} explained by the pose; at most {_LINES} are drawn")
     page.write(path)
 
 
-def matches_drawn(
+def _matches_drawn(
     photo: NDArray[np.uint8], render: NDArray[np.uint8], matches: NDArray[np.float64]
 ) -> NDArray[np.uint8]:
     """Draw photo and render side by side, (H, 2 W, 3), with a line for each match.
@@ -98,7 +101,7 @@ def matches_drawn(
     return np.asarray(pair)
 
 
-def _cells(row: Any) -> list[str]:
+def _cells(row: PhotoReport) -> list[str]:
     def number(value: float | None) -> str:
         return "–" if value is None else f"{value:.3g}"
 

@@ -17,6 +17,10 @@ from g2ard.io import check_views_output
 from g2ard.progress import plural
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from g2ard.scene.cameras import Cameras
     from g2ard.stages.register.report import Accuracy, Summary
 
 
@@ -137,11 +141,7 @@ def register(
     taken = photos_of(photos, split=split, intrinsics=intrinsics, focal=focal, alpha=alpha, say=run.say)
     if poses is None and pool is None and photos.is_dir() and (intrinsics is not None or focal is not None):
         raise InputError("photos have no initial pose; give --poses or --pool", path=photos)
-    starts = {}
-    if poses is not None:
-        starts = poses_for(poses, taken.names)
-    elif pool is None:
-        starts = dict(zip(taken.names, taken.viewmats, strict=True))
+    starts = _starts(poses, pool, taken)
     true = {} if truth is None else poses_for(truth, taken.names)
     splats, chosen = run.load(scene), opt.background_of(run, background, scene)
     colour = chosen or BLACK
@@ -164,18 +164,8 @@ def register(
     for line in lines:
         run.say(line)
     if report is not None:
-        registration_report(
-            report,
-            f"Photos in {scene.name}",
-            splats,
-            taken,
-            rows,
-            starts,
-            matches=found.matches,
-            side=config.size,
-            told=lines,
-            background=colour,
-        )
+        title = f"Photos in {scene.name}"
+        registration_report(report, title, splats, taken, found, starts, config.size, lines, colour)
     if len(found.cameras):
         run.write_views(output, found.cameras, format)
     written = str(output) if len(found.cameras) else None
@@ -185,6 +175,15 @@ def register(
         first = next(row for row in rows if row.status != "registered")
         raise InputError(f"none of {plural(len(rows), 'photo')} was registered; {first.name}: {first.reason}")
     run.say(f"{output}: {len(found.cameras)} of {plural(len(rows), 'photo')}")
+
+
+def _starts(poses: Path | None, pool: str | None, photos: Cameras) -> dict[str, NDArray[np.float64]]:
+    """Return the initial poses by name: those of --poses, or without --pool the photos' own."""
+    from g2ard.jobs.register import poses_for
+
+    if poses is not None:
+        return poses_for(poses, photos.names)
+    return dict(zip(photos.names, photos.viewmats, strict=True)) if pool is None else {}
 
 
 def _refuse_contradictions(
