@@ -18,19 +18,22 @@ _DOTTED = re.compile(r"[1-9]\d{0,2}(?:\.\d{3})+")
 
 @dataclass(frozen=True)
 class Count:
-    """A count as typed: absolute, or a share of the scene."""
+    """A count as typed: an absolute one (int), or a share of the scene in (0, 1] (float)."""
 
-    value: float
-    is_share: bool
+    value: int | float
     text: str
+
+    @property
+    def is_share(self) -> bool:
+        return isinstance(self.value, float)
 
     @classmethod
     def parse(cls, text: str, shares: bool = True) -> Count:
         """Read 250000, 250,000, 250_000, 250k, 1.5M or 25%.
 
-        >>> Count.parse("250k").number, Count.parse("25%").number, Count.parse("1.5M").number
+        >>> Count.parse("250k").value, Count.parse("25%").value, Count.parse("1.5M").value
         (250000, 0.25, 1500000)
-        >>> Count.parse("1,234,567").number, Count.parse("250_000").number
+        >>> Count.parse("1,234,567").value, Count.parse("250_000").value
         (1234567, 250000)
         """
         plain = text.strip()
@@ -49,27 +52,22 @@ class Count:
         if unit == "%":
             if number > 100:
                 raise typer.BadParameter(f"expected at most 100%, got {text!r}")
-            return cls(number / 100, True, text)
+            return cls(number / 100, text)
         if not unit and "." in match[1]:
             raise typer.BadParameter(f"expected a whole number, or a share such as 25%, got {text!r}")
         number *= {"": 1, "k": 1_000, "m": 1_000_000}[unit]
         if number != round(number):
             raise typer.BadParameter(f"expected a whole number, got {text!r}")
-        return cls(round(number), False, text)
+        return cls(round(number), text)
 
     @classmethod
     def parse_absolute(cls, text: str) -> Count:
         """Read an absolute count, as `parse` does.
 
-        >>> Count.parse_absolute("2M").number
+        >>> Count.parse_absolute("2M").value
         2000000
         """
         return cls.parse(text, shares=False)
-
-    @property
-    def number(self) -> int | float:
-        """The whole number, or the share in (0, 1]."""
-        return float(self.value) if self.is_share else int(self.value)
 
     def budget(self) -> Budget:
         return Budget(share=self.value) if self.is_share else Budget(count=int(self.value))
@@ -96,7 +94,7 @@ class Counts(tuple[Count, ...]):
     def parse(cls, text: str) -> Counts:
         """Read comma-separated counts; commas before a group such as 000 belong to a single number.
 
-        >>> [count.number for count in Counts.parse("10k,20k")], len(Counts.parse("250,000"))
+        >>> [count.value for count in Counts.parse("10k,20k")], len(Counts.parse("250,000"))
         ([10000, 20000], 1)
         """
         groups = text.strip().split(",")

@@ -59,7 +59,7 @@ def test_counts_that_could_be_others_are_refused(text: str, words: str) -> None:
     with pytest.raises(Exception, match=r"expected|dots|commas") as refusal:
         Counts.parse(text)
     assert words in str(refusal.value)
-    assert Count.parse("1.500M").number == 1_500_000
+    assert Count.parse("1.500M").value == 1_500_000
 
 
 def test_budgets_that_share_an_output_are_rejected(command_line: CommandLine, folder: Path) -> None:

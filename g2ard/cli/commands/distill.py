@@ -251,7 +251,7 @@ def _distil_all(
 def _distil(
     run: Run, source: Path, job: DistillJob, budget: int, folder: RunFolder, began: float
 ) -> tuple[Distilled, dict[str, Any]]:
-    """Distil to one budget, write the run's folder and print a summary."""
+    """Distil to one budget, write the run's folder and print a summary; its time counts from `began`."""
     from g2ard.jobs.score import report_of
 
     page = ""

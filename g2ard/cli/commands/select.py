@@ -57,7 +57,7 @@ def select(
 
     settings = run.settings(SelectConfig(), "policy", preset=preset)
     if k is not None:
-        settings["select.views_count"] = k.number if isinstance(k, Count) else k
+        settings["select.views_count"] = k.value if isinstance(k, Count) else k
     if views is None:
         raise typer.BadParameter("give the candidates with --views VIEWS")
     with run.usage():
