@@ -18,18 +18,8 @@ def test_resuming_a_finished_run_says_so(command_line: CommandLine, folder: Path
     assert (status, error.count("\n")) == (0, 1), error
     assert "run: already finished" in error
     assert (folder / "run" / "scene.ply").stat().st_mtime_ns == before
-    ask = (
-        "recover",
-        "ball.ply",
-        "--views",
-        "views.json",
-        "--teacher",
-        "ball.ply",
-        "-o",
-        "b.ply",
-        "--steps",
-        3,
-    )
+    teacher = ("--views", "views.json", "--teacher", "ball.ply")
+    ask = ("recover", "ball.ply", *teacher, "-o", "b.ply", "--steps", 3)
     succeeds(command_line, folder, *ask)
     assert "b.ply: already finished" in succeeds(command_line, folder, *ask, "--resume").err
 

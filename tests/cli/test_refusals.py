@@ -13,7 +13,7 @@ from helpers.commands import CommandLine, refused
 def folder(folder: Path) -> Path:
     """ball.ply, views.json, an array, a folder with a photo, and a folder named like a scene."""
     np.save(folder / "few.npy", np.arange(3))
-    (folder / "d.ply").mkdir()
+    (folder / "directory.ply").mkdir()
     (folder / "bare").mkdir()
     Image.new("RGB", (16, 16)).save(folder / "bare" / "a.png")
     return folder
@@ -33,6 +33,9 @@ USAGE = [
     ("render ball.ply -o x -r 10", "go with --color"),
     ("render ball.ply -o x --color cells --parents to.npy", "--parents goes with"),
     ("clean ball.ply --dry-run --preview a.jpg", "ends in .png, got 'a.jpg'"),
+    ("convert ball.ply", "SCENE… OUT, or SCENE… -o OUT"),
+    ("convert ball.ply b.ply --box 1,2", "expected 6 comma-separated numbers"),
+    ("convert ball.ply b.ply --transform 1,2,3", "expected 16 comma-separated numbers"),
     ("simplify ball.ply -ratio 5 -o o.ply", "-ratio: long options need two dashes; write "),
     ("simplify ball.ply -n 5 -o o.ply --up 0,0,0", "a direction such as 0,0,1"),
     ("simplify ball.ply -r 2 -o o.ply --views v --no-views", "; give one"),
@@ -67,9 +70,13 @@ USAGE = [
 
 INPUT = [
     ("simplify absent.ply -r 2 -o out.obj", "out.obj: scenes are written as"),
-    ("simplify ball.ply -r 2 -o d.ply", "give the name of a file"),
+    ("simplify ball.ply -r 2 -o directory.ply", "give the name of a file"),
+    ("simplify bal.ply -r 2 -o o.ply", "bal.ply: no such file or folder; did you mean ball.ply?\n"),
     ("lift absent.ply -o out.gltf", "out.gltf: scenes are written as"),
     ("lift ball.ply -o o.ply", "run `simplify` or `distill`"),
+    ("convert ball.ply b.ksplat", "scenes are written as"),
+    ("convert ball.ply b.ply --spz-version 3", "no option 'spz_version'"),
+    ("convert ball.ply b.ply --box 8,8,8,9,9,9", "are within --box and --sphere"),
     ("convert ball.ply o.ply --box 1,1,1,0,0,0", "the lower corner comes first"),
     ("recover absent.ply --views v.json -o out.obj", "out.obj: scenes are written as"),
     ("recover ball.ply --views none.json -o out.ply", "none.json"),

@@ -168,7 +168,7 @@ def test_refuses_other_names() -> None:
         _core.set_device("abacus")
 
 
-def test_command_line(tmp_path: Path, command_line: CommandLine, gpu: None) -> None:
+def test_commands_say_what_the_gpu_did(tmp_path: Path, command_line: CommandLine, gpu: None) -> None:
     write_splats(tmp_path / "a.ply", checkered_ball(1000))
     write_views(tmp_path / "v.json", around(6))
     paper = ("simplify", "a.ply", "-r", "10", "--method", "paper", "-w", "--json", "-")
@@ -176,8 +176,15 @@ def test_command_line(tmp_path: Path, command_line: CommandLine, gpu: None) -> N
     chosen = (*chosen, "--set", "cells=300")
     made = {}
     for device in ("cpu", "gpu"):
-        told = succeeds(command_line, tmp_path, *paper, "-o", f"{device}.ply", "--device", device, "-v").err
+        out, told = succeeds(command_line, tmp_path, *paper, "-o", f"{device}.ply", "--device", device, "-v")
         assert ("kernels on" in told) == (device == "gpu")
+        used = json.loads(out).get("device")
+        if device == "cpu":
+            assert used is None
+        else:
+            assert used["adapter"] == devices.adapters()[0].name  # type: ignore[index]
+            assert used["kernels"] > 10
+            assert used["uploaded_bytes"] > 72_000
         told = succeeds(command_line, tmp_path, *chosen, "-o", f"{device}.json", "--device", device, "-v").err
         assert ("kernels on" in told) == (device == "gpu")
         made[device] = (
@@ -185,18 +192,6 @@ def test_command_line(tmp_path: Path, command_line: CommandLine, gpu: None) -> N
             (tmp_path / f"{device}.json").read_bytes(),
         )
     assert made["cpu"] == made["gpu"]
-
-
-def test_the_report_says_what_was_sent(tmp_path: Path, command_line: CommandLine, gpu: None) -> None:
-    write_splats(tmp_path / "a.ply", checkered_ball(1000))
-    paper = ("simplify", "a.ply", "-r", "10", "--method", "paper", "-o", "b.ply", "-w", "--json", "-")
-    _, out, _ = command_line(*paper, "--device", "gpu", cwd=tmp_path)
-    used = json.loads(out)["device"]
-    assert used["adapter"] == devices.adapters()[0].name  # type: ignore[index]
-    assert used["kernels"] > 10
-    assert used["uploaded_bytes"] > 72_000
-    _, out, _ = command_line(*paper, "--device", "cpu", cwd=tmp_path)
-    assert "device" not in json.loads(out)
 
 
 def test_failures_are_reported_at_once(capsys: pytest.CaptureFixture, gpu: None) -> None:
