@@ -1,8 +1,10 @@
 """A small scene and views of it, for tests of whole stages."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from g2ard.scene.cameras import Cameras, look_at
 from g2ard.scene.splats import ARRAYS, Splats
@@ -56,14 +58,15 @@ def around(count: int = 16, size: tuple[int, int] = (64, 48), distance: float = 
     azimuth = np.pi * (1 + 5**0.5) * i
     flat = np.sqrt(1 - z * z)
     eyes = distance * np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), z], 1)
-    width, height = size
-    K = [[width, 0, width / 2], [0, width, height / 2], [0, 0, 1]]
-    return Cameras.from_lists(
-        [look_at(eye, [0, 0, 0]) for eye in eyes],
-        [K] * count,
-        [size] * count,
-        [f"view_{k:03d}" for k in range(count)],
-    )
+    return views_at([look_at(eye, [0, 0, 0]) for eye in eyes], size, size[0])
+
+
+def views_at(poses: Sequence[ArrayLike], size: tuple[int, int] = (64, 48), focal: float = 60.0) -> Cameras:
+    """Views at poses, (4, 4) camera_from_world, with one size and focal length in pixels."""
+    (width, height), count = size, len(poses)
+    K = [[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]]
+    names = [f"view_{k:03d}" for k in range(count)]
+    return Cameras.from_lists(poses, [K] * count, [size] * count, names)
 
 
 def in_units(scene: Splats, cameras: Cameras, unit: float) -> tuple[Splats, Cameras]:

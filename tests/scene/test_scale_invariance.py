@@ -10,7 +10,7 @@ from g2ard.rendering.visibility import visibility, visibility_source
 from g2ard.scene.cameras import Cameras, look_at
 from g2ard.scene.splats import Splats
 from g2ard.stages.simplify import simplify
-from helpers.scenes import assert_same_bits, in_units
+from helpers.scenes import assert_same_bits, in_units, views_at
 
 
 def ball(count: int = 3000) -> Splats:
@@ -30,8 +30,7 @@ def ball(count: int = 3000) -> Splats:
 def around(count: int = 12) -> Cameras:
     angles = np.linspace(0, 2 * np.pi, count, endpoint=False)
     poses = [look_at([3 * np.cos(a), 3 * np.sin(a), 1], [0, 0, 0]) for a in angles]
-    K = [[90, 0, 40], [0, 90, 30], [0, 0, 1]]
-    return Cameras.from_lists(poses, [K] * count, [(80, 60)] * count, [f"v{i}" for i in range(count)])
+    return views_at(poses, (80, 60), 90)
 
 
 @pytest.mark.parametrize("method", ["default", "fast"])

@@ -11,12 +11,12 @@ from g2ard.io import read_splats, write_splats
 from g2ard.rendering.metrics import psnr
 from g2ard.rendering.renderer import render
 from g2ard.rendering.visibility import visibility
-from g2ard.scene.cameras import Cameras, look_at
+from g2ard.scene.cameras import look_at
 from g2ard.scene.splats import Splats
 from g2ard.scene.transform import join
 from g2ard.stages.clean import FLOATING, KINDS, find_clutter, find_floating, unoccluded_means
 from helpers.commands import CommandLine, refused, succeeds
-from helpers.scenes import around, checkered_ball
+from helpers.scenes import around, checkered_ball, views_at
 
 
 def junk() -> tuple[Splats, np.ndarray]:
@@ -87,8 +87,7 @@ def test_gaussians_behind_a_wall_stay() -> None:
     beyond = replace(beyond, means=beyond.means + np.float32([0, 3, 0]))
     before = replace(wall.take([0]), means=np.float32([[0, -1, 0]]), logit_opacities=np.float32([-5.4]))
     scene = join([wall, beyond, before])
-    K = [[60, 0, 32], [0, 60, 24], [0, 0, 1]]
-    view = Cameras.from_lists([look_at([0, -4, 0], [0, 0, 0])], [K], [(64, 48)], ["front"])
+    view = views_at([look_at([0, -4, 0], [0, 0, 0])])
     unoccluded = unoccluded_means(scene, view)
     assert not unoccluded[x.size : -1].any()
     assert unoccluded[-1]

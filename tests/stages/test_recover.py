@@ -5,6 +5,7 @@ import json
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -31,6 +32,8 @@ from helpers.threads import on_threads
 
 VIEWS = around()
 TEACHER = checkered_ball()
+UNEVEN = np.linspace(0, 3, len(VIEWS)) ** 2
+"""Weights of views."""
 
 
 @pytest.fixture(scope="module")
@@ -72,17 +75,26 @@ def test_same_bits_from_run_to_run_and_for_any_threads(student: Splats, targets:
         assert_same_bits(first, other)
 
 
-@pytest.mark.parametrize(("engine", "steps"), [("fused", 40), ("torch", 40), ("fused", 110)])
+@pytest.mark.parametrize(
+    ("engine", "steps", "weights"),
+    [
+        ("fused", 40, None),
+        ("torch", 40, None),
+        ("fused", 110, None),
+        *((e, 40, UNEVEN) for e in ("fused", "torch")),
+    ],
+)
 def test_an_interrupted_run_resumes_to_the_same_bits(
-    student: Splats, targets: TeacherRenders, engine: Any, steps: int, tmp_path: Path
+    student: Splats, targets: TeacherRenders, engine: Any, steps: int, weights: Any, tmp_path: Path
 ) -> None:
     config = RecoverConfig(steps=steps, engine=engine, regularizers=replace(REGULARIZERS["lift"], period=10))
-    whole = recover(student, targets, config)
+    run = partial(recover, student, targets, config, weights=weights)
+    whole = run()
     checkpoint = tmp_path / "c.npz"
     with pytest.raises(KeyboardInterrupt):
-        recover(student, targets, config, checkpoint=checkpoint, progress=press_ctrl_c_at("recover", 17))
+        run(checkpoint=checkpoint, progress=press_ctrl_c_at("recover", 17))
     assert checkpoint.exists()
-    resumed = recover(student, targets, config, checkpoint=checkpoint)
+    resumed = run(checkpoint=checkpoint)
     assert_same_bits(whole.splats, resumed.splats)
     assert whole.report.loss == resumed.report.loss
     assert whole.report.resumed is None
@@ -127,6 +139,8 @@ def test_resume_refuses_other_options(student: Splats, targets: TeacherRenders, 
         recover(student, TeacherRenders(student, VIEWS), config, checkpoint=checkpoint)
     with pytest.raises(InputError, match="other options"):
         recover(student, targets, config, checkpoint=checkpoint, anchors=Anchors.of(moved))
+    with pytest.raises(InputError, match="other options"):
+        recover(student, targets, config, checkpoint=checkpoint, weights=UNEVEN)
 
 
 def test_trials_choose_rates_that_suit_the_scene(student: Splats, targets: TeacherRenders) -> None:
@@ -248,11 +262,9 @@ def test_a_far_offset_changes_nothing_but_the_offset(student: Splats, targets: T
     assert there == pytest.approx(here, abs=0.05)
 
 
-def test_an_empty_scene_and_an_unknown_engine_are_rejected(student: Splats, targets: TeacherRenders) -> None:
+def test_an_empty_scene_is_rejected(student: Splats, targets: TeacherRenders) -> None:
     with pytest.raises(InputError, match="0 Gaussians"):
         recover(student.take(slice(0, 0)), targets)
-    with pytest.raises(InputError, match="engine"):
-        recover(student, targets, RecoverConfig(engine="steam"))  # type: ignore[arg-type]
 
 
 def test_a_start_that_cannot_be_bettered_is_kept(targets: TeacherRenders) -> None:

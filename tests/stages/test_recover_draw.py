@@ -19,7 +19,6 @@ from g2ard.stages.recover import RecoverConfig, recover
 from g2ard.stages.recover.draw import checked_weights, drawn
 from g2ard.stages.simplify import simplify
 from helpers.commands import succeeds
-from helpers.interruptions import press_ctrl_c_at
 from helpers.scenes import around, checkered_ball
 
 VIEWS = around()
@@ -62,29 +61,6 @@ def test_equal_weights_draw_like_no_weights(value: float) -> None:
     weights = checked_weights(np.full(23, value), 23)
     for epoch in range(3):
         np.testing.assert_array_equal(drawn(5, epoch, 23, weights), drawn(5, epoch, 23))
-
-
-@pytest.mark.parametrize("engine", ["fused", "torch"])
-def test_a_resumed_run_continues_its_draws(
-    student: Splats, targets: TeacherRenders, engine: Any, tmp_path: Path
-) -> None:
-    config, checkpoint = RecoverConfig(steps=40, engine=engine), tmp_path / "c.npz"
-
-    whole = recover(student, targets, config, weights=WEIGHTS)
-    with pytest.raises(KeyboardInterrupt):
-        recover(
-            student,
-            targets,
-            config,
-            weights=WEIGHTS,
-            checkpoint=checkpoint,
-            progress=press_ctrl_c_at("recover", 19),
-        )
-    with pytest.raises(InputError, match="other options"):
-        recover(student, targets, config, checkpoint=checkpoint)
-    resumed = recover(student, targets, config, weights=WEIGHTS, checkpoint=checkpoint)
-    assert same(whole.splats, resumed.splats)
-    assert whole.report.loss == resumed.report.loss
 
 
 def test_a_view_of_weight_zero_is_never_looked_at(student: Splats, targets: TeacherRenders) -> None:

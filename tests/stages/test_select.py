@@ -26,7 +26,7 @@ from g2ard.stages.select import (
 )
 from helpers.commands import refused
 from helpers.realdata import real
-from helpers.scenes import in_units
+from helpers.scenes import in_units, views_at
 from helpers.threads import on_threads
 from reference import rays
 from reference import select as naive
@@ -55,13 +55,7 @@ def ball(count=1500, seed=0, offset=(0.0, 0.0, 0.0)) -> Splats:
 def views(positions, targets=None) -> Cameras:
     positions = np.asarray(positions, float)
     targets = np.zeros_like(positions) if targets is None else targets
-    n = len(positions)
-    return Cameras.from_lists(
-        [look_at(p, t) for p, t in zip(positions, targets, strict=True)],
-        [K] * n,
-        [SIZE] * n,
-        [f"v{i:03d}" for i in range(n)],
-    )
+    return views_at([look_at(p, t) for p, t in zip(positions, targets, strict=True)], SIZE, FOCAL)
 
 
 def around(count, seed=0, radius=4.0) -> Cameras:
@@ -328,7 +322,7 @@ def test_invalid_arguments_are_named(k, policy, words):
 def test_images_too_large_for_the_rasteriser_are_rejected(policy):
     pool = around(3)
     huge = replace(pool, widths=np.array([64, 60_000, 64]))
-    with pytest.raises(InputError, match=r"v001: expected at most 32768 pixels"):
+    with pytest.raises(InputError, match=r"view_001: expected at most 32768 pixels"):
         select(ball(200), huge, 2, policy=policy)
 
 

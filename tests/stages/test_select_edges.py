@@ -3,7 +3,6 @@
 import json
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -12,21 +11,15 @@ from g2ard.config.choices import POLICIES
 from g2ard.errors import InputError
 from g2ard.io import read_view_set, write_splats, write_views
 from g2ard.progress import plural
-from g2ard.scene.cameras import Cameras, look_at
+from g2ard.scene.cameras import look_at
 from g2ard.scene.splats import Splats
 from g2ard.stages.select import CoverageOptions, select
 from helpers.commands import CommandLine
-from helpers.scenes import around, checkered_ball
+from helpers.scenes import around, checkered_ball, views_at
 
 OPTIONS = CoverageOptions(cells=500)
 MEASURING = [p for p in POLICIES if p not in ("random", "uniform")]
 BALL = checkered_ball(800)
-
-
-def cameras(poses: list[Any]) -> Cameras:
-    n = len(poses)
-    K = [[60.0, 0, 32], [0, 60.0, 24], [0, 0, 1]]
-    return Cameras.from_lists(poses, [K] * n, [(64, 48)] * n, [f"v{i}" for i in range(n)])
 
 
 def balls(count: int) -> Splats:
@@ -43,7 +36,7 @@ def balls(count: int) -> Splats:
 @pytest.mark.parametrize("policy", MEASURING)
 def test_views_without_overlap_are_worth_the_same(policy: str) -> None:
     scene = balls(4)
-    pool = cameras([look_at([50 * i, -4, 0], [50 * i, 0, 0]) for i in range(4)])
+    pool = views_at([look_at([50 * i, -4, 0], [50 * i, 0, 0]) for i in range(4)])
     chosen = select(scene, pool, 4, policy=policy, options=OPTIONS)
     assert sorted(chosen.order.tolist()) == [0, 1, 2, 3]
     if policy != "pose-diverse":  # its gains are distances
@@ -56,7 +49,7 @@ def test_views_without_overlap_are_worth_the_same(policy: str) -> None:
 @pytest.mark.parametrize("policy", MEASURING)
 def test_duplicate_poses_are_chosen_last(policy: str) -> None:
     places = around(5).viewmats
-    pool = cameras([places[i] for i in (0, 0, 0, 1, 1, 2, 3, 4, 4, 4)])
+    pool = views_at([places[i] for i in (0, 0, 0, 1, 1, 2, 3, 4, 4, 4)])
     first = {0: 0, 1: 0, 2: 0, 3: 1, 4: 1, 5: 2, 6: 3, 7: 4, 8: 4, 9: 4}
     chosen = select(BALL, pool, 10, policy=policy, options=OPTIONS)
     assert len({first[i] for i in chosen.order[:5].tolist()}) == 5
@@ -68,7 +61,7 @@ def test_duplicate_poses_are_chosen_last(policy: str) -> None:
 
 
 def test_only_duplicates() -> None:
-    pool = cameras([around(3).viewmats[0]] * 6)
+    pool = views_at([around(3).viewmats[0]] * 6)
     for policy in POLICIES:
         chosen = select(BALL, pool, 3, policy=policy, options=OPTIONS)
         assert len(set(chosen.order.tolist())) == 3
@@ -120,7 +113,7 @@ def test_the_command_on_pools_of_all_shapes(command_line: CommandLine, folder: P
         "some see nothing": ([*around(4).viewmats, away], 5, 4, 1),
     }
     for name, (poses, k, count, refused) in shapes.items():
-        write_views(folder / "pool.json", cameras(poses), overwrite=True)
+        write_views(folder / "pool.json", views_at(poses), overwrite=True)
         status, out, error = ask(command_line, folder, k, "-w", "--split", "all")
         assert status == 0, (name, error)
         said = json.loads(out)
@@ -128,7 +121,7 @@ def test_the_command_on_pools_of_all_shapes(command_line: CommandLine, folder: P
         assert len(said["refused"]) == refused
         assert (f"{plural(refused, 'view')} not used" in error) == bool(refused)
         assert len(said["curve"]) == len(poses) - refused
-    write_views(folder / "pool.json", cameras([away]), overwrite=True)
+    write_views(folder / "pool.json", views_at([away]), overwrite=True)
     status, _, error = ask(command_line, folder, 1, "-w", "--split", "all")
     assert status == 1
     assert "none of 1 view sees the scene" in error

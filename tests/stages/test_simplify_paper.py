@@ -10,7 +10,7 @@ from helpers.simplify_cases import assert_kept, assert_sound, scene
 from reference import simplify as naive
 
 
-def one_round(prior, budget, flags, **options):
+def one_round(prior, budget, flags=None, **options):
     config = SimplifyConfig(retention=1e-9, **options)
     return simplify(prior, budget, method="paper", protected=flags, config=config)
 
@@ -114,8 +114,7 @@ def sheet(side, height=0.0):
 
 def one_group(points, colors, **options):
     """Reduce to one cell in one round; return the round's report."""
-    config = SimplifyConfig(retention=1e-9, **options)
-    return simplify(discs(points, colors), 1, method="paper", config=config).report.rounds[0]
+    return one_round(discs(points, colors), 1, **options).report.rounds[0]
 
 
 def shed(result, how):
@@ -168,8 +167,7 @@ def test_two_parallel_sheets_do_not_merge(gap):
         pair = np.concatenate([sheet(side), sheet(side, gap)])
         assert one_group(pair, 0.4).refused == {"energy": 0, "coverage": 1}, side
     prior = discs(np.concatenate([sheet(30), sheet(30, gap)]))
-    out = simplify(prior, 180, method="paper", config=SimplifyConfig(retention=1e-9))
-    of = out.parents
+    of = one_round(prior, 180).parents
     both = np.intersect1d(of[:900][of[:900] >= 0], of[900:][of[900:] >= 0])
     assert both.size == 0
 
@@ -184,9 +182,7 @@ def test_a_wall_does_not_merge_with_a_floor_it_stands_on():
     floor = sheet(4)
     wall = discs(sheet(4)[:, [0, 2, 1]] + [0, 1.5, 0.5], width=0.6)
     wall.quats[:] = [np.sqrt(0.5), np.sqrt(0.5), 0, 0]  # about x: the normal along y
-    ground = discs(floor)
-    config = SimplifyConfig(retention=1e-9)
-    report = simplify(join([ground, wall]), 1, method="paper", config=config).report.rounds[0]
+    report = one_round(join([discs(floor), wall]), 1).report.rounds[0]
     assert report.refused["coverage"] == 1
 
 
@@ -225,7 +221,7 @@ def test_colors_beyond_white_are_white():
 def test_bins_part_a_cell():
     points = sheet(4)
     halves = np.where(points[:, :1] < 2, 0.2, 0.3)
-    out = simplify(discs(points, halves), 2, method="paper", config=SimplifyConfig(retention=1e-9))
+    out = one_round(discs(points, halves), 2)
     for rows in (points[:, 0] < 2, points[:, 0] >= 2):
         assert np.unique(out.parents[rows]).size == 1
 
@@ -235,8 +231,7 @@ def test_bins_part_a_cell():
 
 def test_refused_groups_keep_their_originals():
     prior = discs(sheet(20), np.random.default_rng(0).uniform(0, 1, (400, 3)))
-    config = SimplifyConfig(retention=1e-9, min_coverage=2)
-    out = simplify(prior, 40, method="paper", config=config)
+    out = one_round(prior, 40, min_coverage=2)
     kept = np.flatnonzero(out.parents >= 0)
     assert shed(out, "merged") == 0
     for name in ARRAYS:
@@ -264,12 +259,8 @@ def test_coverage_parts_at_six_tenths_of_the_footprint_area(flat, passes):
     upright = np.random.default_rng(3).permutation(100) >= flat  # edge-on: no footprint on the floor
     prior = discs(points, width=0.1, thickness=0.002)
     prior.quats[upright] = [np.sqrt(0.5), np.sqrt(0.5), 0, 0]
-    out = simplify(prior, 1, method="paper", config=SimplifyConfig(retention=1e-9))
+    out = one_round(prior, 1)
     assert out.report.rounds[0].refused == {"energy": 0, "coverage": 0 if passes else 1}
-
-
-ALONE = SimplifyConfig(retention=1e-9, min_coverage=2)
-"""The trim alone decides which Gaussians stay, because nothing merges."""
 
 
 def thinned(areas, alphas, budget, flags=None):
@@ -280,8 +271,7 @@ def thinned(areas, alphas, budget, flags=None):
     scales = np.stack([np.sqrt(areas) * 1.5, np.sqrt(areas) / 1.5, np.full(len(areas), 1e-3)], 1)
     prior = Splats.create(points, scales=scales, logit_opacities=np.log(alphas / (1 - alphas)))
     flags = np.zeros(len(areas), bool) if flags is None else flags
-    out = simplify(prior, budget, method="paper", config=ALONE, protected=flags)
-    return out.parents >= 0
+    return one_round(prior, budget, flags, min_coverage=2).parents >= 0  # nothing merges, so trims decide
 
 
 @pytest.mark.parametrize("by", ["area", "opacity"])
