@@ -71,7 +71,7 @@ Axes = Literal[
     "LFD", "RFD", "LFU", "RFU", "LBD", "RBD", "LBU", "RBU",
 ]
 # fmt: on
-"""Axes by the directions of x, y and z: left or right, down or up, back or forward (`g2ard.scene.axes`)."""
+"""Axes by the directions of x, y and z: left or right, down or up, back or forward."""
 AXES: tuple[Axes, ...] = get_args(Axes)
 
 LpipsInput = Literal["scaled", "unscaled"]

@@ -27,8 +27,8 @@ from g2ard.io.atomic import atomic_output
 from g2ard.io.limits import check_unpacked
 from g2ard.io.sanitize import Raw, cleaned
 from g2ard.io.types import Note, Scene
-from g2ard.scene.axes import change_of_axes, with_axes
 from g2ard.scene.splats import Splats
+from g2ard.scene.transform import change_of_axes, with_axes
 
 _MAGIC = b"NGSP"
 _HEADER = 16

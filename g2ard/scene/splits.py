@@ -89,25 +89,16 @@ def split_mask(
 
 
 def states_splits(views: str | Path | None, stated: Sequence[str | None] = ()) -> bool:
-    """Return whether splits are stated by views or by a split.json beside them, see `split_mask`.
-
-    Raises:
-        InputError: a broken split file.
-    """
+    """Return whether splits are stated by views or by a split.json beside them, see `split_mask`."""
     return any(stated) or (views is not None and _read_split(Path(views)) is not None)
 
 
 def splits_of(
     views: str | Path | None, names: Sequence[str], stated: Sequence[str | None] = ()
 ) -> tuple[str | None, ...]:
-    """Return the split of each view by the rules of `split_mask`, for writing it with the views.
+    """Return the split of each view by the rules of `split_mask`, or None, for writing it with the views.
 
-    Returns:
-        C split names, or None for a view in no split. For a view in several splits, "test" comes before
-        "train", and both before others by name.
-
-    Raises:
-        InputError: a broken split file.
+    For a view in several splits, "test" comes before "train", and both before others by name.
 
     >>> splits_of("nowhere", ["b", "a", "c"])
     ('train', 'test', 'train')
@@ -121,12 +112,7 @@ def for_training(
     views: str | Path | None, names: Sequence[str], stated: Sequence[str | None] = ()
 ) -> NDArray[np.bool_]:
     """Return the (C,) mask of views to train on when other views are scored: "train" if splits are stated,
-    otherwise all.
-
-    Arguments are those of `split_mask`.
-
-    Raises:
-        InputError: splits are stated, but not "train".
+    otherwise all. Arguments are those of `split_mask`.
     """
     return split_mask(views, names, "train" if states_splits(views, stated) else "all", stated=stated)
 
@@ -137,9 +123,6 @@ def for_scores(
     """Return the (C,) mask of views to score on in a file for scoring: all except those stated as "train".
 
     Arguments are those of `split_mask`.
-
-    Raises:
-        InputError: all views are stated as "train".
     """
     if not states_splits(views, stated):
         return np.ones(len(names), bool)

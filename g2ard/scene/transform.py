@@ -1,4 +1,7 @@
-"""Operations of `g2ard convert`: moving, cropping and joining scenes."""
+"""Operations of `g2ard convert`: moving, cropping and joining scenes, and axes by name.
+
+Axes are three letters for the directions of x, y and z, such as RDF for right, down, forward.
+"""
 
 from __future__ import annotations
 
@@ -9,12 +12,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from g2ard.config.choices import RenderModel
-from g2ard.errors import InputError
+from g2ard.config.choices import AXES, RenderModel
+from g2ard.errors import InputError, require
 from g2ard.scene.splats import ARRAYS, Splats
 
 _FAR = 16.0
 """Distance in extents beyond which a move goes into `offset`, so that float32 means keep their precision."""
+
+_DIRECTIONS = {
+    **{"R": (1, 0, 0), "U": (0, 1, 0), "B": (0, 0, 1)},
+    **{"L": (-1, 0, 0), "D": (0, -1, 0), "F": (0, 0, -1)},
+}
+_PARITY = np.repeat(np.array([-1, 1, -1], np.float32), (3, 5, 7))
+"""Sign of each harmonic of bands 1–3 under x ↦ −x."""
 
 
 def transform(splats: Splats, matrix: ArrayLike) -> Splats:
@@ -185,6 +195,33 @@ def _basis(d: NDArray[np.float64]) -> NDArray[np.float64]:
         *(-g * x * (4 * zz - xx - yy), 0.5 * f * z * (xx - yy), -e * x * (xx - 3 * yy)),
     ]
     return np.stack(columns, axis=1)
+
+
+def change_of_axes(source: str, target: str) -> NDArray[np.float64]:
+    """Return the (3, 3) matrix from coordinates in one system to those in another; it may mirror.
+
+    >>> change_of_axes("RUB", "RFU") @ [1, 2, 3]
+    array([ 1., -3.,  2.])
+    """
+    for name in (source, target):
+        require("axes", repr(name), name in AXES, f"one of {', '.join(AXES)}")
+    there, here = (np.array([_DIRECTIONS[letter] for letter in name], float) for name in (target, source))
+    return there @ here.T
+
+
+def with_axes(splats: Splats, matrix: NDArray[np.float64]) -> Splats:
+    """Return a scene in other axes: means, rotations and harmonics by `change_of_axes`.
+
+    A mirror is a rotation followed by x ↦ −x, which leaves the shape of a Gaussian as it is.
+    """
+    sign = np.sign(np.linalg.det(matrix))
+    rotation = np.eye(4)
+    rotation[:3, :3] = sign * matrix
+    turned = transform(splats, rotation)
+    if sign > 0:
+        return turned
+    odd = _PARITY[: splats.shN.shape[1], None]
+    return replace(turned, means=-turned.means, offset=-turned.offset, shN=turned.shN * odd)
 
 
 def join(scenes: Sequence[Splats]) -> Splats:

@@ -11,8 +11,8 @@ from g2ard.config.choices import AXES
 from g2ard.errors import InputError
 from g2ard.io import read_scene, read_splats, write_splats
 from g2ard.io.spz import _SYSTEMS
-from g2ard.scene.axes import change_of_axes, with_axes
 from g2ard.scene.splats import Splats
+from g2ard.scene.transform import change_of_axes, with_axes
 from helpers.commands import CommandLine, refused, succeeds
 from helpers.peers import adobe_spz
 from reference.raster import sh_basis

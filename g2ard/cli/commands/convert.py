@@ -85,8 +85,7 @@ def convert(
     """Convert scenes to another format or other axes, and merge, crop or move them."""
     import numpy as np
 
-    from g2ard.scene.axes import with_axes
-    from g2ard.scene.transform import in_box, in_sphere, join, moving
+    from g2ard.scene.transform import in_box, in_sphere, join, moving, with_axes
     from g2ard.scene.transform import transform as moved
 
     scenes, output = _parted(run, scenes, output)
@@ -140,7 +139,7 @@ def _parted(run: Run, paths: list[Path], output: Path | None) -> tuple[list[Path
 
 def _change_of_axes(output: Path, axes: Axes, options: dict[str, Any]) -> NDArray[np.float64] | None:
     """Return the change of axes before writing, None if the format's writer makes it."""
-    from g2ard.scene.axes import change_of_axes
+    from g2ard.scene.transform import change_of_axes
 
     found = scene_format(output)
     if found.axes is None:

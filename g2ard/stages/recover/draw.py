@@ -33,18 +33,9 @@ def checked_weights(weights: ArrayLike | None, count: int) -> NDArray[np.float64
 def drawn(seed: int, epoch: int, count: int, weights: NDArray[np.float64] | None = None) -> NDArray[np.int64]:
     """Return the `count` views of an epoch, in a random order that depends only on the arguments.
 
-    Without weights, every view appears once. With weights w of mean 1, view v appears ⌊w_v⌋ or ⌈w_v⌉ times,
-    w_v on average (systematic sampling). This is far less noisy than independent draws, and equal weights
-    change no bit.
-
-    Args:
-        seed: seed of the recovery.
-        epoch: number of the epoch, from 0.
-        count: number of views, C.
-        weights: (C,) of mean 1, see `checked_weights`.
-
-    Returns:
-        (C,) views.
+    Without weights, every view appears once. With (count,) weights w from `checked_weights`, view v appears
+    ⌊w_v⌋ or ⌈w_v⌉ times, w_v on average (systematic sampling). This is far less noisy than independent draws,
+    and equal weights change no bit.
 
     >>> import numpy as np
     >>> np.bincount(drawn(0, 0, 4, np.array([2.0, 1.0, 1.0, 0.0]))).tolist()

@@ -181,10 +181,7 @@ class Guard:
 def blended(start: Splats, end: Splats, share: ArrayLike) -> Splats:
     """Blend two scenes of the same Gaussians, each attribute in the space it is optimised in.
 
-    Args:
-        start: the scene at a share of 0.
-        end: the scene at a share of 1.
-        share: weight of `end`, one for all or (N,).
+    `share` is the weight of `end`, one for all or (N,).
 
     >>> a = Splats.create([[0, 0, 0]], scales=[[1, 1, 1]])
     >>> b = Splats.create([[2, 0, 0]], scales=[[4, 1, 1]])
@@ -192,7 +189,6 @@ def blended(start: Splats, end: Splats, share: ArrayLike) -> Splats:
     >>> half.means.tolist(), half.scales.tolist()
     ([[1.0, 0.0, 0.0]], [[2.0, 1.0, 1.0]])
     """
-
     (m0, q0, l0, o0, d0, n0), (m1, q1, l1, o1, d1, n1) = (arrays_of(scene) for scene in (start, end))
     q0, q1 = (q / np.maximum(np.linalg.norm(q, axis=1, keepdims=True), 1e-30) for q in (q0, q1))
     q0 = q0 * np.where((q0 * q1).sum(1, keepdims=True) < 0, -1, 1)

@@ -75,14 +75,8 @@ def view_consistency(scene: Splats, cameras: Cameras) -> float | None:
     """Return the share of surface points of a view that its nearest neighbour does not see through.
 
     The median depth of a few small views is projected into the nearest other view. Points within 5 % of that
-    view's depth agree, points in front of it float, and points behind it are hidden and ignored.
-
-    Args:
-        scene: the prior; cameras are in world coordinates, including its offset.
-        cameras: at least two views.
-
-    Returns:
-        Agreeing over agreeing and floating points, in [0, 1]; None if no point is in two views.
+    view's depth agree, points in front of it float, and points behind it are hidden and ignored. The
+    result is agreeing over agreeing and floating points, in [0, 1]; None if no point is in two views.
     """
     if len(cameras) < 2 or not len(scene):
         return None

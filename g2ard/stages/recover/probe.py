@@ -45,10 +45,7 @@ class Probe:
     def latest(self, splats: Callable[[], Splats], step: int, seconds: float) -> tuple[float, int]:
         """Return the mean PSNR and its step; the previous ones if scoring has used its share of the time.
 
-        Args:
-            splats: returns the current scene.
-            step: number of steps taken.
-            seconds: time since recovery began.
+        `splats` returns the current scene, after `step` steps and `seconds` of recovery.
         """
         if seconds >= self._next:
             began = time.monotonic()

@@ -208,11 +208,7 @@ def multiplier_for(start_rmse: float, least: float = 1 / 3) -> float:
 
 
 def reach_for(start_rmse: float, typical: float) -> float:
-    """Return the reach for a start: .01, or the typical size if larger; infinite for an untrained start.
-
-    Args:
-        start_rmse: RMSE before recovery.
-        typical: see `g2ard.stages.recover.sizes.typical_share`.
+    """Return the reach for a start: .01, or the `typical_share` if larger; infinite for an untrained start.
 
     >>> reach_for(0.02, 0.005), reach_for(0.05, 0.04), reach_for(0.15, 0.005)
     (0.01, 0.04, inf)
@@ -237,15 +233,8 @@ def steps_for(scene: Splats, cameras: Cameras, steps: int) -> int:
 
     A view of an orbit shows the whole object, but a view in a room a tenth of it. At equal steps, a room's
     Gaussians would be trained a tenth as often; the square root is a compromise with time. Views of
-    other kinds add steps, so that usual ones are visited as often as without them.
-
-    Args:
-        scene: the scene to recover.
-        cameras: the training views, in world coordinates; only usual ones decide the share.
-        steps: the schedule's steps.
-
-    Returns:
-        A number from `steps` to 2.25 × `steps`, times the ratio of all views to usual ones.
+    other kinds add steps, so that usual ones, which alone decide the share, are visited as often as without
+    them. The result is from 1 to 2.25 × `steps`, times the ratio of all views to usual ones.
 
     >>> from g2ard.scene.cameras import look_at
     >>> line = Splats.create([[0, 0, 0], [9, 0, 0], [0, 0, 9], [-9, 0, 0]], scales=np.ones((4, 3)))

@@ -30,11 +30,9 @@ def radii(splats: Splats) -> NDArray[np.float32]:
 
 
 def typical_share(splats: Splats, cameras: Cameras) -> float:
-    """Return the median of f·s₁/z over Gaussians and a few views, as a share of the longer side, or 0.
+    """Return the median of f·s₁/z over Gaussians and a few views, as a share of the longer side.
 
-    Args:
-        splats: the scene; cameras are in world coordinates, including its offset.
-        cameras: views, of which a few evenly spaced are used; occlusion is ignored.
+    Views are evenly spaced, and occlusion is ignored. The share is 0 if no view shows a Gaussian.
 
     >>> from g2ard.scene.cameras import look_at
     >>> dot = Splats.create([[0, 0, 0]], scales=[[0.1, 0.2, 0.01]])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -248,17 +249,15 @@ def _reported(name: str, best: Candidate, config: RegisterConfig, renders: int) 
         position, rotation = (np.sqrt(np.trace(found.covariance[at, at])) for at in _HALVES)
         sigma = PoseError(float(position), float(np.degrees(rotation)))
     status, reason = _status(best.zncc, sigma, found.depth, config)
+    names = ("matches", "inliers", "spread", "reprojection", "passes")
+    of_features: dict[str, Any] = {name: getattr(best.solved, name) for name in names if best.solved}
     return PhotoReport(
         name=name,
         status=status,
         reason=reason,
         start=best.start.name,
         rank=best.start.rank,
-        matches=best.solved.matches if best.solved else 0,
-        inliers=best.solved.inliers if best.solved else 0,
-        spread=best.solved.spread if best.solved else None,
-        reprojection=best.solved.reprojection if best.solved else None,
-        passes=best.solved.passes if best.solved else 0,
+        **of_features,
         zncc=best.zncc,
         gain=found.gain,
         bias=found.bias,

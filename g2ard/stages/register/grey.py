@@ -104,18 +104,11 @@ def shift_between(a: Float, b: Float) -> tuple[int, int, float]:
 
 
 def local_zncc(a: Float, b: Float, mask: NDArray[np.bool_], side: int) -> float:
-    """Return the median ZNCC over fully valid windows in which `b` has contrast.
+    """Return the median ZNCC of a grey render and photo, (H, W), over valid windows where the photo has
+    contrast; 0 without one.
 
-    Local windows tolerate uneven lighting. A window counts as 0 if `a` is flat and `b` is not.
-
-    Args:
-        a: (H, W) render, grey.
-        b: (H, W) photo, grey.
-        mask: (H, W) valid pixels.
-        side: side of a window in pixels, odd.
-
-    Returns:
-        A value in [−1, 1]; 0 without a usable window.
+    Local windows, of an odd `side` in pixels, tolerate uneven lighting. A window counts as 0 if only the
+    render is flat there.
     """
     if min(a.shape) < side:
         return zncc(a, b, mask)

@@ -173,16 +173,9 @@ def summarize(
     true: int = 0,
     metres_per_unit: float | None = None,
 ) -> Summary:
-    """Count photos by status and, with reference poses, score starting poses and results.
+    """Count photos by status and, if `true` photos have reference poses, score starting poses and results.
 
-    Args:
-        photos: the photos of a `RegisterReport`.
-        keep: see `KEPT`.
-        true: number of photos with a reference pose.
-        metres_per_unit: scale of the scene; None if unknown.
-
-    Raises:
-        InputError: a scale that is not positive.
+    Results are those that `keep` keeps. `metres_per_unit` is the scale of the scene, None if unknown.
 
     >>> near = PhotoReport("a", "registered", start_error=PoseError(1, 3), error=PoseError(0.04, 0.1))
     >>> lost = PhotoReport("b", "refused", start_error=PoseError(2, 3))

@@ -119,20 +119,10 @@ def visible_cells(
     depth_tolerance: float = CoverageOptions.depth_tolerance,
     progress: Progress = silent,
 ) -> Visible:
-    """Compute the visibility ν_jv of cells in views from the scene's median depth.
+    """Compute the visibility ν_jv of a scene's cells in C views, world coordinates, from its median depth.
 
     A cell is visible if its centre projects into the image and lies within max(cell size, depth_tolerance ·
     depth) of the pixel's median depth (gsplat's convention).
-
-    Args:
-        splats: the scene that `cells` came from.
-        cells: see `surface`.
-        cameras: C views in world coordinates.
-        depth_tolerance: see `CoverageOptions`.
-        progress: called with the number of views done.
-
-    Returns:
-        The visible cells of each view.
     """
     scene, origin = core_scene(splats)
     starts, seen = _core.select_visible(
