@@ -70,8 +70,8 @@ docs: setup $(VENV)/.docs
 	$(BIN)/python -m sphinx -q -E -a -W --keep-going -c docs -b html . site
 	@echo site/docs/index.html
 
-# Needs a scene: SCENE=path, or real data. Studies run small: few steps, one ratio, scenes that are there or made; about an hour.
-# What bench/ holds is not measured again; `make clean` removes it.
+# Needs a scene of at least 300,000 Gaussians: SCENE=path, or real data. Studies run small: one ratio, few steps, generated or
+# small scenes; expect an hour. What bench/ holds is not measured again; `make clean` removes it.
 STUDIES := ablations bounded chain compression geobase k_sweep policies protection protection_given recover-rounds source
 QUICK := --ratios 10 --seeds 0 --size 240 --steps 150
 SCENE ?= $(G2ARD_DATA)/playbot/0_0

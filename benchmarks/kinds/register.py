@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import cache, cached_property, partial
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -16,11 +16,11 @@ from benchmarks.rows import Row
 from benchmarks.runner import Cell
 from benchmarks.study import SceneSpec, Study, key
 from benchmarks.workspace import Workspace, reduced
+from g2ard import io
 from g2ard.config.choices import Keep
 from g2ard.config.paths import changed
 from g2ard.config.presets import GS_CPR
 from g2ard.errors import InputError
-from g2ard.io import read_view_set
 from g2ard.jobs.register import photos_of, poses_for
 from g2ard.rendering.renderer import Renderer
 from g2ard.scene.cameras import Cameras
@@ -30,6 +30,8 @@ from g2ard.stages.register.pose import rotation_of
 from g2ard.stages.register.report import Accuracy, summarize
 
 __all__ = ["STARTS", "Register", "displaced"]
+
+Poses = dict[str, NDArray[np.float64]]
 
 STARTS: dict[str, tuple[float, float] | None] = {
     "A": (0.01, 0.4),
@@ -70,76 +72,83 @@ class Register(Study):
             raise InputError(f"scene {scene.name}: needs photos with true poses; give --views")
         if "given" in self.starts and scene.starts is None:
             raise InputError(f"scene {scene.name}: start `given` needs the scene's `starts`")
-        place, views = Workspace(work, self, scene), self.folder / scene.train
-        given = None if scene.starts is None else self.folder / scene.starts
-        pool = cache(lambda: read_view_set(views, split="train", unpictured=True).cameras)
-        photos = cache(lambda: photos_of(views, split="test", say=lambda text: None))
-        small = cache(lambda ratio: reduced(place.splats, ratio, pool()))
+        site = _Site(work, self, scene)
         for ratio in self.ratios:
             for matcher in self.methods:
                 for name in self.starts:
                     for seed in self.seeds if STARTS[name] else self.seeds[:1]:
                         names = {"ratio": ratio, "matcher": matcher, "start": name, "seed": seed}
-                        yield Cell(
-                            names, partial(self._measured, partial(small, ratio), photos, pool, given, names)
-                        )
+                        yield Cell(names, partial(self._measured, site, ratio, matcher, name, seed))
 
-    def _measured(
-        self,
-        small: partial[Splats],
-        photos_: Callable[[], Cameras],
-        pool: Callable[[], Cameras],
-        given: Path | None,
-        names: dict[str, object],
-    ) -> list[Row]:
-        splats, photos, off = small(), photos_(), STARTS[str(names["start"])]
-        truth = dict(zip(photos.names, photos.viewmats, strict=True))
-        starts: dict[str, NDArray[np.float64]] | None = None
-        if names["start"] == "given":
-            assert given is not None
-            starts = poses_for(given, photos.names)
-        elif off is not None:
-            seed = 1000 * int(str(names["seed"]))
-            starts = {
-                photo: displaced(pose, off[0] * depth, off[1], seed + i)
-                for i, ((photo, pose), depth) in enumerate(
-                    zip(truth.items(), _depths(splats, photos), strict=True)
-                )
-            }
-        config = RegisterConfig(size=self.size or 1000, matcher=str(names["matcher"]))
+    def _measured(self, site: _Site, ratio: float, matcher: str, start: str, seed: int) -> list[Row]:
+        splats, photos = site.maps(ratio), site.photos
+        starts = site.starts_of(start, seed, splats)
+        config = RegisterConfig(size=self.size or 1000, matcher=matcher)
         keep: Keep = "registered"
         if self.protocol == "gs-cpr":
             config, keep = changed(config, GS_CPR), "all"
+        pool = None if starts else site.pool
         began = time.perf_counter()
-        found = register(
-            splats,
-            photos,
-            starts=starts,
-            pool=None if starts else pool(),
-            truth=truth,
-            config=config,
-            keep=keep,
-        )
+        found = register(splats, photos, starts=starts, pool=pool, truth=site.truth, config=config, keep=keep)
         seconds = (time.perf_counter() - began) / len(photos)
         metres = self.metres_per_unit
-        summary = summarize(found.report.photos, keep=keep, true=len(truth), metres_per_unit=metres)
+        summary = summarize(found.report.photos, keep=keep, true=len(photos), metres_per_unit=metres)
         assert summary.start is not None
         assert summary.found is not None
         scale = 1.0 if metres is None else 100 * metres
-        start, reached = _figures(summary.start, scale), _figures(summary.found, scale)
+        before, reached = _figures(summary.start, scale), _figures(summary.found, scale)
         return [
             {
                 "count": len(splats),
-                "bytes": len(splats) * 4 * (14 + 3 * ((splats.sh_degree + 1) ** 2 - 1)),
+                "bytes": splats.nbytes,
                 "photos": len(photos),
                 "registered": summary.registered,
                 "uncertain": summary.uncertain,
-                **{f"start_{name}": value for name, value in start.items() if name != "worst"},
+                **{f"start_{name}": value for name, value in before.items() if name != "worst"},
                 **{name: reached[name] for name in ("position", "rotation", "worst")},
                 **{f"found_{name}": reached[name] for name in ("10", "5")},
                 "seconds": seconds,
             }
         ]
+
+
+class _Site(Workspace):
+    """Photos with true poses, the other views, and maps of several sizes."""
+
+    @cached_property
+    def photos(self) -> Cameras:
+        """The test split of the scene's views."""
+        return photos_of(self.place / str(self.scene.train), split="test", say=lambda text: None)
+
+    @cached_property
+    def pool(self) -> Cameras:
+        """The training split."""
+        views = self.place / str(self.scene.train)
+        return io.read_view_set(views, split="train", unpictured=True).cameras
+
+    @cached_property
+    def maps(self) -> Callable[[float], Splats]:
+        """Ratio → the map, each made once."""
+        return cache(lambda ratio: reduced(self.splats, ratio, self.pool))
+
+    @property
+    def truth(self) -> Poses:
+        """The true poses by photo."""
+        return dict(zip(self.photos.names, self.photos.viewmats, strict=True))
+
+    def starts_of(self, name: str, seed: int, splats: Splats) -> Poses | None:
+        """Return the starts of a name of `STARTS`; None if they come from the pool."""
+        if name == "given":
+            return poses_for(self.place / str(self.scene.starts), self.photos.names)
+        error = STARTS[name]
+        if error is None:
+            return None
+        share, degrees = error
+        depths = _depths(splats, self.photos)
+        return {
+            photo: displaced(pose, share * depth, degrees, 1000 * seed + i)
+            for i, ((photo, pose), depth) in enumerate(zip(self.truth.items(), depths, strict=True))
+        }
 
 
 def displaced(

@@ -72,25 +72,17 @@ class Select(Study):
     def cells(self, scene: SceneSpec, work: Path) -> Iterator[Cell]:
         """Yield a cell per pool, arm, K and draw; deterministic policies draw once."""
         universe = Universe(work, self, scene)
-        orders: dict[tuple[str, int, str], tuple[Selection, float]] = {}
         for seed in self.seeds:
             for kind in self.pools:
                 for arm in self.methods:
                     for percent in (100.0,) if arm.startswith("pool") else self.percents:
                         for draw in range(self.draws if arm == "random" else 1):
                             names = {"pool": kind, "arm": arm, "percent": percent, "seed": seed, "draw": draw}
-                            trial = partial(self._trial, universe, orders, kind, arm, percent, seed, draw)
+                            trial = partial(self._trial, universe, kind, arm, percent, seed, draw)
                             yield Cell(names, trial, more=self.steps)
 
     def _trial(
-        self,
-        universe: Universe,
-        orders: dict[tuple[str, int, str], tuple[Selection, float]],
-        kind: str,
-        arm: str,
-        percent: float,
-        seed: int,
-        draw: int,
+        self, universe: Universe, kind: str, arm: str, percent: float, seed: int, draw: int
     ) -> list[Row]:
         pool = pool_of(universe, kind, seed)
         k = max(1, math.ceil(percent / 100 * len(pool.rows) - 1e-9))
@@ -102,9 +94,10 @@ class Select(Study):
                 chosen, select_s = _selected(universe, pool, k, policy, 1000 * seed + draw)
                 weights = chosen.weights if weighted else None
             else:  # the order is the same for every K
-                if (kind, seed, policy) not in orders:
-                    orders[kind, seed, policy] = _selected(universe, pool, len(pool.rows), policy, seed)
-                chosen, select_s = orders[kind, seed, policy]
+                if (kind, seed, policy) not in universe.orders:
+                    whole = _selected(universe, pool, len(pool.rows), policy, seed)
+                    universe.orders[kind, seed, policy] = whole
+                chosen, select_s = universe.orders[kind, seed, policy]
             rows = chosen.order[:k]
         background = universe.scene.background
         config = RecoverConfig(
@@ -189,6 +182,11 @@ class Universe(Workspace):
     """
 
     study: Select
+
+    @cached_property
+    def orders(self) -> dict[tuple[str, int, str], tuple[Selection, float]]:
+        """Kind of pool, seed and policy → the selection of all candidates, and its seconds."""
+        return {}
 
     @cached_property
     def student(self) -> Splats:

@@ -1,18 +1,17 @@
 """The raster study's figures are consistent (their size depends on the machine)."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from benchmarks.kinds.raster import built_in_view, drawn
-from benchmarks.runner import run
-from benchmarks.study import DEFINITIONS, SceneSpec, read_study
+from benchmarks.study import SceneSpec
 from g2ard import _core
 from g2ard.io import write_splats
 from g2ard.rendering.renderer import render
 from g2ard.scene.splats import Splats
+from helpers.studies import measured
 
 
 def cloud(n: int = 3000) -> Splats:
@@ -25,9 +24,7 @@ def test_figures_hang_together(tmp_path: Path) -> None:
     write_splats(tmp_path / "cloud.ply", cloud())
     isas, before = _core.instruction_sets(), _core.num_threads()
     options = {"counts": "1000,9000", "image": "96,64", "threads": "1,2", "repeats": "2", "methods": "all"}
-    made = read_study(DEFINITIONS / "raster.toml").narrowed(options)
-    scenes = (SceneSpec("cloud", str(tmp_path / "cloud.ply")),)
-    rows = run([replace(made, scenes=scenes)], tmp_path / "out")
+    rows = measured("raster", SceneSpec("cloud", str(tmp_path / "cloud.ply")), tmp_path / "out", **options)
     assert _core.num_threads() == before
     assert {row["error"] for row in rows if "error" in row} == {
         "the scene has 3,000 Gaussians, expected at least 9,000"

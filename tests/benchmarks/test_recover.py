@@ -6,24 +6,18 @@ from pathlib import Path
 import pytest
 
 from benchmarks.rows import Row
-from benchmarks.runner import run
 from benchmarks.study import DEFINITIONS, SceneSpec, read_study
-from g2ard import io
 from g2ard.errors import InputError
-from helpers.scenes import around, checkered_ball
+from helpers.studies import ball_of, measured
 
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory: pytest.TempPathFactory) -> SceneSpec:
-    folder = tmp_path_factory.mktemp("bench")
-    io.write_splats(folder / "ball.ply", checkered_ball(1500))
-    io.write_views(folder / "views.json", around(16))
-    return SceneSpec("ball", str(folder / "ball.ply"), str(folder / "views.json"))
+    return ball_of(tmp_path_factory.mktemp("bench"), 1500)
 
 
 def ask(scene: SceneSpec, out: Path, name: str, **options: str) -> list[Row]:
-    made = read_study(DEFINITIONS / f"recover-{name}.toml").narrowed({"protocol": "pool", **options})
-    rows = run([replace(made, scenes=(scene,))], out)
+    rows = measured(f"recover-{name}", scene, out, **{"protocol": "pool", **options})
     assert [row["error"] for row in rows if "error" in row] == []
     return rows
 

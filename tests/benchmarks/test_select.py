@@ -10,8 +10,7 @@ from benchmarks.kinds.select import ARMS, Universe, pool_of
 from benchmarks.rows import Row
 from benchmarks.runner import run
 from benchmarks.study import DEFINITIONS, SceneSpec, read_study
-from g2ard.io import write_splats
-from helpers.scenes import checkered_ball
+from helpers.studies import ball_of
 
 FEW = {"percents": "25", "seeds": "0", "draws": "2", "steps": "4"}
 SMALL = {"count": "150", "size": "48", "candidates": "16", "tests": "4"}
@@ -20,9 +19,7 @@ STUDY = read_study(DEFINITIONS / "select.toml").narrowed({**FEW, **SMALL})
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory: pytest.TempPathFactory) -> SceneSpec:
-    path = tmp_path_factory.mktemp("study") / "ball.ply"
-    write_splats(path, checkered_ball(1200))
-    return SceneSpec("ball", str(path))
+    return ball_of(tmp_path_factory.mktemp("study"), 1200, views=False)
 
 
 @pytest.fixture(scope="module")

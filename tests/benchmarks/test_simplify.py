@@ -7,30 +7,25 @@ import numpy as np
 import pytest
 
 from benchmarks.rows import Row, read_rows
-from benchmarks.runner import run
 from benchmarks.study import DEFINITIONS, SceneSpec, read_study
 from benchmarks.views import anywhere_views, given_views, hidden_targets, standing_views
 from g2ard import io
 from g2ard.poses import make_pool
 from helpers.scenes import around, checkered_ball
+from helpers.studies import ball_of, measured
 from helpers.systems import needs_processes
 from reference import poses as naive
 
 METHODS = ("default", "fast", "paper", "nanogs", "lightgaussian")
 
 
-def ask(scene: SceneSpec, out: Path, methods: str, **options: str) -> list[Row]:
-    made = read_study(DEFINITIONS / "simplify.toml").narrowed(
-        {"ratios": "4", "methods": methods, "protocol": "pool", **options}
-    )
-    return run([replace(made, scenes=(scene,))], out)
+def ask(scene: SceneSpec, out: Path, methods: str, protocol: str = "pool") -> list[Row]:
+    return measured("simplify", scene, out, ratios="4", methods=methods, protocol=protocol)
 
 
 @needs_processes
 def test_measures_writes_and_resumes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    io.write_splats(tmp_path / "ball.ply", checkered_ball(2000))
-    io.write_views(tmp_path / "views.json", around(16))
-    scene = SceneSpec("ball", str(tmp_path / "ball.ply"), str(tmp_path / "views.json"))
+    scene = ball_of(tmp_path, 2000)
     rows = ask(scene, tmp_path / "out", ",".join(METHODS))
     assert [row["method"] for row in rows] == list(METHODS)
     for row in rows:
@@ -57,9 +52,8 @@ def test_measures_writes_and_resumes(tmp_path: Path, monkeypatch: pytest.MonkeyP
 
 @needs_processes
 def test_every_kind_of_view_is_scored(tmp_path: Path) -> None:
-    path = tmp_path / "ball.ply"
-    io.write_splats(path, checkered_ball(3000))
-    rows = ask(SceneSpec("ball", str(path)), tmp_path / "out", "default,fast", protocol="all")
+    scene, path = ball_of(tmp_path, 3000, views=False), tmp_path / "ball.ply"
+    rows = ask(scene, tmp_path / "out", "default,fast", protocol="all")
     kinds = ["pool", "near", "standing", "anywhere"]
     assert [(r["method"], r["views_kind"]) for r in rows] == [
         (method, kind) for method in ("default", "fast") for kind in kinds
@@ -70,7 +64,7 @@ def test_every_kind_of_view_is_scored(tmp_path: Path) -> None:
     assert len({r["cpu_s"] for r in rows[:4]}) == 2  # with the pool's views, and with its own
     assert len({r["cpu_s"] for r in rows[4:]}) == 1  # run alike for all, so run once
     text = (tmp_path / "out" / "rows.csv").read_text()
-    ask(SceneSpec("ball", str(path)), tmp_path / "out", "default", protocol="standing")
+    ask(scene, tmp_path / "out", "default", protocol="standing")
     assert (tmp_path / "out" / "rows.csv").read_text() == text
 
 

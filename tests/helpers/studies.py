@@ -7,6 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.rows import Row
+from benchmarks.runner import run
+from benchmarks.study import DEFINITIONS, SceneSpec, read_study
 from g2ard import io
 from g2ard.scene.images import write_png
 from helpers.scenes import around, checkered_ball
@@ -35,6 +38,22 @@ def study(folder: Path, text: str = STUDY) -> Path:
     path = folder / "balls.toml"
     path.write_text(text)
     return path
+
+
+def ball_of(folder: Path, count: int, views: bool = True) -> SceneSpec:
+    """Write a ball, and 16 views of it if requested, for a study."""
+    folder.mkdir(parents=True, exist_ok=True)
+    io.write_splats(folder / "ball.ply", checkered_ball(count))
+    if not views:
+        return SceneSpec("ball", str(folder / "ball.ply"))
+    io.write_views(folder / "views.json", around(16))
+    return SceneSpec("ball", str(folder / "ball.ply"), str(folder / "views.json"))
+
+
+def measured(name: str, scene: SceneSpec, out: Path, **options: str) -> list[Row]:
+    """Run a study of `benchmarks/definitions` on a scene; return its rows."""
+    made = read_study(DEFINITIONS / f"{name}.toml").narrowed(options)
+    return run([replace(made, scenes=(scene,))], out)
 
 
 def check_page(html: str) -> None:
