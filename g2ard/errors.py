@@ -9,9 +9,6 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Self
 
-DAMAGED = "the file is damaged: copy or export it again"
-"""Hint for damaged files."""
-
 _PARAMETER = re.compile(r"\{(\w+)(?:=([^{}]*))?\}")
 
 
@@ -105,6 +102,11 @@ class OutputError(G2ardError, OSError):
 
 class MissingDependencyError(G2ardError, ImportError):  # type: ignore[misc]  # ImportError.path is a string
     """Missing optional package; the hint is the command that installs it."""
+
+
+def damaged(message: str, **fields: Any) -> InputError:
+    """Return the error for a damaged file, with the hint to get it again."""
+    return InputError(message, hint="the file is damaged: copy or export it again", **fields)
 
 
 def missing(what: str, package: str, **fields: Any) -> MissingDependencyError:

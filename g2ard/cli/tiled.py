@@ -13,7 +13,7 @@ from g2ard.cli.outputs import Outputs
 from g2ard.cli.run_folder import RunFolder
 from g2ard.cli.run_result import loss
 from g2ard.config.paths import listed
-from g2ard.io.ply import write_parts
+from g2ard.io import ply
 from g2ard.io.scene_formats import scene_format
 from g2ard.jobs.budget import Budget
 from g2ard.jobs.distill_options import DistillOptions
@@ -137,9 +137,7 @@ class TiledCommand:
 
     def _write(self, place: Path, small: TiledScene) -> None:
         if scene_format(place).suffix == ".ply":
-            parts = small, len(small), small.sh_degree, small.offset
-            model = small.render_model
-            write_parts(place, *parts, render_model=model, overwrite=self.run.overwrite)
+            ply.write(place, small, overwrite=self.run.overwrite)
         else:
             self.run.write(place, small.whole(), compare=True)
 

@@ -20,8 +20,7 @@ from typing import TYPE_CHECKING, Any
 
 from g2ard.errors import InputError, OutputError
 from g2ard.io.atomic import atomic_folder, atomic_output, check_output
-from g2ard.io.detect import KINDS, file_format, kind, run_scene, run_views
-from g2ard.io.find import find_views
+from g2ard.io.detect import KINDS, file_format, find_views, kind, run_scene, run_views
 from g2ard.io.scene_formats import check_options, lost_in, scene_format
 
 if TYPE_CHECKING:
@@ -100,7 +99,7 @@ def read_scene(path: str | Path, *, render_model: RenderModel | None = None) -> 
     """Read a Gaussian scene with notes on dropped rows, clamped values and ignored properties."""
     path, found = check_scene(path)
     module = import_module(f"g2ard.io.{found}")
-    scene: Scene = module.stream(path).whole() if hasattr(module, "stream") else module.read(path)
+    scene: Scene = module.Stream(path).whole() if hasattr(module, "Stream") else module.read(path)
     if render_model is None:
         return scene
     return replace(scene, splats=replace(scene.splats, render_model=render_model))
@@ -124,8 +123,8 @@ def open_stream(
         return streams[0] if len(streams) == 1 else JoinedScenes(streams)
     path, found = check_scene(path)
     module = import_module(f"g2ard.io.{found}")
-    if hasattr(module, "stream"):
-        stream: SceneStream = module.stream(path)
+    if hasattr(module, "Stream"):
+        stream: SceneStream = module.Stream(path)
     else:
         scene: Scene = module.read(path)
         splats = scene.splats
@@ -236,7 +235,7 @@ def open_point_stream(path: str | Path | Sequence[str | Path]) -> PointStream:
         what = "a Gaussian scene" if scene else found
         hint = "run `simplify` or `distill` on it" if scene else "give the point cloud's file"
         raise InputError(f"expected a coloured point cloud, found {what}", path=path, hint=hint)
-    stream: PointStream = import_module(f"g2ard.io.{modules[found]}").stream(path)
+    stream: PointStream = import_module(f"g2ard.io.{modules[found]}").Stream(path)
     return stream
 
 

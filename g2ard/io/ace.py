@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from g2ard.errors import InputError
 from g2ard.io.paths import read_text
-from g2ard.scene.transform import rotation_matrices
+from g2ard.io.photos import posed
 
 
 def read(path: Path) -> dict[str, NDArray[np.float64]]:
@@ -32,8 +32,7 @@ def read(path: Path) -> dict[str, NDArray[np.float64]]:
             )
         if words[0] in out:
             raise InputError(f"repeats the name {words[0]!r}", path=path, index=number, item="line")
-        out[words[0]] = np.eye(4)
-        out[words[0]][:3, :3], out[words[0]][:3, 3] = rotation_matrices(pose[None, :4])[0], pose[4:]
+        out[words[0]] = posed(pose[:4], pose[4:])
     if not out:
         raise InputError("no poses found", path=path)
     return out

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
 from uuid import uuid4
 
@@ -56,8 +56,7 @@ def _beside(path: Path) -> Path:
     return path.with_name(f".{path.stem}.{uuid4().hex[:12]}{path.suffix}")
 
 
-@contextmanager
-def atomic_output(path: str | Path, overwrite: bool = False) -> Iterator[Path]:
+def atomic_output(path: str | Path, overwrite: bool = False) -> AbstractContextManager[Path]:
     """Yield a temporary path with the same suffix, and rename it to `path` on success.
 
     On failure or Ctrl-C, the temporary file is removed and an existing `path` is kept.
@@ -69,41 +68,38 @@ def atomic_output(path: str | Path, overwrite: bool = False) -> Iterator[Path]:
     >>> [p.name for p in folder.iterdir()]
     ['a.txt']
     """
-    path = check_output(path, overwrite)
-    temporary, made = _beside(path), parents_made(path)
-    try:
-        yield temporary
-        os.replace(temporary, path)
-    except OSError as error:
-        if isinstance(error, OutputError) or error.filename not in (None, str(temporary), temporary):
-            raise
-        raise OutputError(f"cannot write: {error.strerror or error}", path=path) from error
-    finally:
-        temporary.unlink(missing_ok=True)
-        drop_empty(made)
+    return _renamed(check_output(path, overwrite), folder=False)
 
 
-@contextmanager
-def atomic_folder(path: str | Path, overwrite: bool = False) -> Iterator[Path]:
+def atomic_folder(path: str | Path, overwrite: bool = False) -> AbstractContextManager[Path]:
     """Yield a temporary folder, and rename it to `path` on success.
 
     If `path` exists, files of the same name are replaced and other files are kept.
     """
-    path = check_output(path, overwrite, folder=True)
+    return _renamed(check_output(path, overwrite, folder=True), folder=True)
+
+
+@contextmanager
+def _renamed(path: Path, folder: bool) -> Iterator[Path]:
     temporary, made = _beside(path), parents_made(path)
     try:
-        temporary.mkdir()
+        if folder:
+            temporary.mkdir()
         yield temporary
         if path.is_dir():
             _move_into(temporary, path)
         else:
             os.replace(temporary, path)
     except OSError as error:
-        if isinstance(error, OutputError) or not str(error.filename or "").startswith(str(temporary)):
+        elsewhere = error.filename is not None and not str(error.filename).startswith(str(temporary))
+        if elsewhere or isinstance(error, OutputError):
             raise
         raise OutputError(f"cannot write: {error.strerror or error}", path=path) from error
     finally:
-        shutil.rmtree(temporary, ignore_errors=True)
+        if folder:
+            shutil.rmtree(temporary, ignore_errors=True)
+        else:
+            temporary.unlink(missing_ok=True)
         drop_empty(made)
 
 

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from g2ard.errors import DAMAGED, InputError
+from g2ard.errors import InputError, damaged
 from g2ard.io.colmap import parsing
-from g2ard.io.photos import Frame, photo_size, view_set
-from g2ard.io.types import Note, ViewSet
-from g2ard.scene.transform import rotation_matrices
+from g2ard.io.photos import Frame, Lens, photo_size, posed, view_set
+from g2ard.io.types import ViewSet
 
 _SIZE = (1920, 1080)
 """Size of the original photos, for which focal lengths are given."""
@@ -21,7 +19,7 @@ _LISTS = {"train": "dataset_train.txt", "test": "dataset_test.txt"}
 _MODEL = "reconstruction.nvm"
 
 
-class _Lens(NamedTuple):
+class _Focal(NamedTuple):
     focal: float
     radial: float
 
@@ -39,7 +37,7 @@ def read(path: Path, images: Path | None = None) -> ViewSet:
     order.
     """
     lenses = _lenses(path / _MODEL)
-    median = _Lens(float(np.median([lens.focal for lens in lenses.values()])), 0.0)
+    median = _Focal(float(np.median([lens.focal for lens in lenses.values()])), 0.0)
     frames, guessed = [], 0
     for split, name in _LISTS.items():
         if not (path / name).is_file():
@@ -53,17 +51,16 @@ def read(path: Path, images: Path | None = None) -> ViewSet:
     if not guessed:
         return found
     text = f"{guessed} views are not in {_MODEL}; they get the median focal length, {median.focal:.1f}"
-    return replace(found, notes=(*found.notes, Note("guessed_focal", guessed, text)))
+    return found.noted("guessed_focal", guessed, text)
 
 
-def _frame(where: Path, name: str, pose: list[float], lens: _Lens, photo: Path, split: str) -> Frame:
+def _frame(where: Path, name: str, pose: list[float], lens: _Focal, photo: Path, split: str) -> Frame:
     width, height = photo_size(photo, where) if photo.is_file() else _SIZE
-    view = np.eye(4)
-    view[:3, :3] = rotation_matrices(np.array([pose[3:]]))[0]
+    view = posed(pose[3:], (0, 0, 0))
     view[:3, 3] = -view[:3, :3] @ np.array(pose[:3])
     focal = lens.focal * width / _SIZE[0]
     K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
-    return Frame(name, view, K, (width, height), photo, (-lens.radial, 0.0, 0.0, 0.0, 0.0), split)
+    return Frame(name, view, Lens((width, height), K, (-lens.radial, 0.0, 0.0, 0.0, 0.0)), photo, split)
 
 
 def _stem(name: str) -> str:
@@ -71,7 +68,7 @@ def _stem(name: str) -> str:
     return name.rsplit(".", 1)[0]
 
 
-def _lenses(path: Path) -> dict[str, _Lens]:
+def _lenses(path: Path) -> dict[str, _Focal]:
     """Read the lenses of an NVM file's first model: name, focal, quaternion, centre, radial, 0 per line."""
     with parsing(path):
         lines = path.read_text(encoding="utf-8").splitlines()
@@ -79,9 +76,9 @@ def _lenses(path: Path) -> dict[str, _Lens]:
             raise InputError("not VisualSFM's NVM_V3", path=path)
         at = next((i for i, line in enumerate(lines[1:], 1) if line.strip()), None)
         if at is None:
-            raise InputError("truncated: nothing follows its first line", path=path, hint=DAMAGED)
+            raise damaged("truncated: nothing follows its first line", path=path)
         rows = [line.replace("\t", " ").split() for line in lines[at + 1 : at + 1 + int(lines[at])]]
-        lenses = {_stem(row[0]): _Lens(float(row[1]), float(row[9])) for row in rows}
+        lenses = {_stem(row[0]): _Focal(float(row[1]), float(row[9])) for row in rows}
     if not lenses:
         raise InputError("has no cameras", path=path)
     return lenses

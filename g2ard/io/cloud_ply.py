@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard.errors import InputError
-from g2ard.io.atomic import atomic_output
-from g2ard.io.plyfiles import read_element, read_header, require, row_blocks, spread_rows
+from g2ard.io.plyfiles import read_element, read_header, require, row_blocks, spread_rows, write_rows
 from g2ard.io.point_stream import PointStream, RawPoints, cloud_middle
 from g2ard.io.types import Points
 
@@ -19,15 +18,12 @@ _POSITION = ["x", "y", "z"]
 _COLOR_NAMES = (["red", "green", "blue"], ["r", "g", "b"], ["diffuse_red", "diffuse_green", "diffuse_blue"])
 
 
-def stream(path: Path) -> PointStream:
-    """Open x y z and red green blue: integers, scaled by their range, or floats in [0, 1].
+class Stream(PointStream):
+    """Rows of x y z and red green blue: integers, scaled by their range, or floats in [0, 1].
 
     Text files and those with leading lists are read whole.
     """
-    return _PlyPoints(path)
 
-
-class _PlyPoints(PointStream):
     def __init__(self, path: Path) -> None:
         self._vertices, self._names = _vertices(path)
         sample = spread_rows(self._vertices)
@@ -81,22 +77,17 @@ def write(path: Path, points: Points, *, overwrite: bool = False) -> None:
 
 def write_blocks(path: Path, count: int, blocks: Iterable[Points], *, overwrite: bool = False) -> None:
     """Write `count` points that arrive in blocks, as `write` does."""
-    from plyfile import PlyData, PlyElement
+    types = dict.fromkeys(_POSITION, "<f8") | dict.fromkeys(_COLOR_NAMES[0], "u1")
 
-    names = [(n, "<f8") for n in _POSITION] + [(n, "u1") for n in _COLOR_NAMES[0]]
-    every = np.broadcast_to(np.zeros(1, names), count)  # costs no memory
-    header = PlyData([PlyElement.describe(every, "vertex")], byte_order="<").header
-    written = 0
-    with atomic_output(path, overwrite) as temporary, temporary.open("wb") as file:
-        file.write(header.encode("ascii") + b"\n")
-        for points in blocks:
-            if not (np.isfinite(points.positions).all() and np.isfinite(points.colors).all()):
-                raise InputError("not written: a point is not finite", path=path)
-            rows = np.empty(len(points), names)
-            for axis in range(3):
-                rows[_POSITION[axis]] = points.positions[:, axis]
-                rows[_COLOR_NAMES[0][axis]] = np.rint(np.clip(points.colors[:, axis], 0, 1) * 255)
-            file.write(rows.data)
-            written += len(rows)
-        if written != count or not count:
-            raise InputError(f"not written: {written:,} points of {count:,}", path=path)
+    def rows_of(points: Points) -> NDArray[Any]:
+        if not (np.isfinite(points.positions).all() and np.isfinite(points.colors).all()):
+            raise InputError("not written: a point is not finite", path=path)
+        rows = np.empty(len(points), list(types.items()))
+        for axis in range(3):
+            rows[_POSITION[axis]] = points.positions[:, axis]
+            rows[_COLOR_NAMES[0][axis]] = np.rint(np.clip(points.colors[:, axis], 0, 1) * 255)
+        return rows
+
+    if not count:
+        raise InputError("not written: there are no points", path=path)
+    write_rows(path, types, count, map(rows_of, blocks), overwrite)

@@ -10,12 +10,10 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from g2ard.errors import DAMAGED, InputError
-from g2ard.io.photos import Frame, Lens, photo_size, view_set
+from g2ard.errors import InputError, damaged
+from g2ard.io.photos import Frame, Lens, photo_size, posed, view_set
 from g2ard.io.types import ViewSet
-from g2ard.scene.transform import rotation_matrices
 
 _MODELS = (
     *("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV"),
@@ -70,11 +68,8 @@ def parsing(path: Path) -> Iterator[None]:
 def read(path: Path, images: Path | None = None) -> ViewSet:
     """Read the registered images of a COLMAP model as views, sorted by name.
 
-    Args:
-        path: the project folder, the model's folder, one of its files, or a folder of photos beside the
-            model, such as images_4.
-        images: folder of the photos; by default `images` beside or above the model. Cameras are scaled to
-            resized photos (Mip-NeRF 360's images_2, images_4).
+    `path` is the project folder, the model's folder, one of its files, or a folder of photos beside the
+    model, such as images_4. Cameras are scaled to resized photos (Mip-NeRF 360's images_2, images_4).
     """
     return view_set(*frames(path, images))
 
@@ -106,24 +101,15 @@ def frames(path: Path, images: Path | None = None) -> tuple[Path, list[Frame]]:
             if image.camera not in sizes:  # one lens, one size
                 sizes[image.camera] = photo_size(photo, tables[1])
             camera = camera.at(sizes[image.camera])
-        listed.append(
-            Frame(image.name, _viewmat(tables[1], image), camera.K, camera.size, photo, camera.distortion)
-        )
+        if not any(image.quat):
+            raise InputError(f"{image.name!r}: its quaternion is zero", path=tables[1])
+        listed.append(Frame(image.name, posed(image.quat, image.translation), camera, photo))
     return folder, listed
 
 
 def _photo_folder(path: Path, model: Path) -> Path | None:
     roots = (path, model, model.parent, model.parent.parent, model.parent.parent.parent)
     return next((root / "images" for root in roots if (root / "images").is_dir()), None)
-
-
-def _viewmat(path: Path, image: _Image) -> NDArray[np.float64]:
-    if not any(image.quat):
-        raise InputError(f"{image.name!r}: its quaternion is zero", path=path)
-    view = np.eye(4)
-    view[:3, :3] = rotation_matrices(np.array([image.quat]))[0]
-    view[:3, 3] = image.translation
-    return view
 
 
 class Record:
@@ -146,9 +132,7 @@ class Record:
         except struct.error:
             ends = zip(self._names, self._ends, strict=True)
             name = next(name for name, end in ends if at + end > len(data))
-            raise InputError(
-                "is cut off", path=path, property=name, index=i, item=entry, hint=DAMAGED
-            ) from None
+            raise damaged("is cut off", path=path, property=name, index=i, item=entry) from None
 
     def read_finite(self, path: Path, entry: str, i: int, data: bytes, at: int) -> tuple[Any, ...]:
         """Return the values as `read` does, or raise an `InputError` if one is not finite."""
@@ -209,7 +193,7 @@ def _images_bin(path: Path) -> list[_Image]:
         start = at + _IMAGE.size
         end = data.find(b"\0", start)
         if end < 0:
-            raise InputError("is cut off", path=path, property="NAME", index=i, item="image", hint=DAMAGED)
+            raise damaged("is cut off", path=path, property="NAME", index=i, item="image")
         try:
             name = data[start:end].decode()
         except UnicodeDecodeError:
@@ -218,9 +202,7 @@ def _images_bin(path: Path) -> list[_Image]:
         images.append(_Image(name, camera, tuple(pose[:4]), tuple(pose[4:])))
         at = end + 1 + _POINTS.size + 24 * points
         if at > len(data):
-            raise InputError(
-                "is cut off", path=path, property="POINTS2D", index=i, item="image", hint=DAMAGED
-            )
+            raise damaged("is cut off", path=path, property="POINTS2D", index=i, item="image")
     return images
 
 

@@ -16,9 +16,17 @@ from g2ard.config.choices import RenderModel
 from g2ard.errors import InputError
 from g2ard.io import plyfiles
 from g2ard.io.atomic import atomic_output
-from g2ard.io.packing import coded, log_scales, morton_order, smallest_three, unit_quats, writable
-from g2ard.io.sanitize import Raw
-from g2ard.io.stream import SceneStream
+from g2ard.io.packing import (
+    coded,
+    from_smallest_three,
+    log_scales,
+    morton_order,
+    smallest_three,
+    unit_quats,
+    writable,
+)
+from g2ard.io.sanitize import Raw, logits_of
+from g2ard.io.stream import RawStream
 from g2ard.progress import plural
 from g2ard.scene.splats import SH_C0, Splats
 
@@ -26,15 +34,15 @@ _CHUNK = 256
 _SCALE_LIMIT = 20.0
 """Log-scales are clamped to ±20, as in SuperSplat, since an outlier would coarsen its chunk."""
 
+_THREE = 11, 10, 11
+"""Bits of the three components of a position or scale."""
+
 _PACKED = ["packed_position", "packed_rotation", "packed_scale", "packed_color"]
 
 
-def stream(path: Path) -> SceneStream:
-    """Open a scene for reading in blocks; memory holds all chunk bounds, 72 bytes per 256 Gaussians."""
-    return _PackedStream(path)
+class Stream(RawStream):
+    """Scene in blocks; memory holds all chunk bounds, 72 bytes per 256 Gaussians."""
 
-
-class _PackedStream(SceneStream):
     def __init__(self, path: Path) -> None:
         header = plyfiles.read_header(path)
         plyfiles.require(path, header.properties.get("vertex", []), _PACKED, "a compressed scene")
@@ -76,32 +84,22 @@ class _PackedStream(SceneStream):
     def _decode(self, first: int, vertex: NDArray[Any], sh: NDArray[Any] | None) -> Raw:
         """Decode rows, the first of which is row `first` of the file."""
         raw, chunk, rest = Raw.empty(len(vertex), self._rest), self._chunk, self._rest
-        raw.offset = self.offset
         of = np.arange(first, first + len(vertex)) // _CHUNK
-        raw.means[:] = _between(chunk, of, "{}_{}", "xyz", _three(vertex["packed_position"]))
-        raw.log_scales[:] = _between(chunk, of, "{}_scale_{}", "xyz", _three(vertex["packed_scale"]))
-        raw.quats[:] = _quats(vertex["packed_rotation"])
-        color = np.stack([_unit(vertex["packed_color"], shift, 8) for shift in (24, 16, 8, 0)], axis=1)
+        position, rotation, scale, color = (vertex[name] for name in _PACKED)
+        raw.means[:] = _between(chunk, of, "{}_{}", "xyz", _unpacked(position, _THREE))
+        raw.log_scales[:] = _between(chunk, of, "{}_scale_{}", "xyz", _unpacked(scale, _THREE))
+        others = (_unpacked(rotation, (10, 10, 10)) - 0.5) * np.sqrt(2)
+        raw.quats[:] = from_smallest_three(rotation >> np.uint32(30), others)
+        color = _unpacked(color, (8, 8, 8, 8))
         rgb = color[:, :3]
         if self._colored:  # older files quantise colour over [0, 1] instead
             rgb = _between(chunk, of, "{}_{}", "rgb", rgb)
         raw.sh0[:, 0] = (rgb - 0.5) / SH_C0
-        with np.errstate(divide="ignore"):
-            raw.logit_opacities[:] = np.log(color[:, 3]) - np.log1p(-color[:, 3])
+        raw.logit_opacities[:] = logits_of(color[:, 3])
         if sh is not None:
             for k, channel in product(range(rest), range(3)):
                 raw.shN[:, k, channel] = _coefficient(sh[f"f_rest_{channel * rest + k}"])
         return raw
-
-
-def _unit(packed: NDArray[Any], shift: int, bits: int) -> NDArray[np.float64]:
-    top = (1 << bits) - 1
-    return ((packed >> np.uint32(shift)) & np.uint32(top)) / top
-
-
-def _three(packed: NDArray[Any]) -> NDArray[np.float64]:
-    """Decode 11, 10 and 11 bits to (N, 3) in [0, 1]."""
-    return np.stack([_unit(packed, 21, 11), _unit(packed, 11, 10), _unit(packed, 0, 11)], axis=1)
 
 
 def _between(
@@ -113,18 +111,6 @@ def _between(
         for end in ("min", "max")
     )
     return low * (1 - t) + high * t
-
-
-def _quats(packed: NDArray[Any]) -> NDArray[np.float64]:
-    """Decode (N, 4) wxyz: 2 bits for the index of the largest component, 10 bits per other one in ±1/√2."""
-    three = (np.stack([_unit(packed, shift, 10) for shift in (20, 10, 0)], axis=1) - 0.5) * np.sqrt(2)
-    largest = np.sqrt(np.maximum(0, 1 - (three**2).sum(1)))
-    quats = np.empty((len(packed), 4))
-    for mode in range(4):
-        rows = packed >> np.uint32(30) == mode
-        quats[rows, mode] = largest[rows]
-        quats[np.ix_(rows, [i for i in range(4) if i != mode])] = three[rows]
-    return quats
 
 
 def _coefficient(codes: NDArray[Any]) -> NDArray[np.float64]:
@@ -144,15 +130,13 @@ def write(path: Path, splats: Splats, *, overwrite: bool = False) -> None:
     splats = writable(path, splats)
     splats = splats.take(morton_order(splats.means))
     bounds: dict[str, NDArray[np.float32]] = {}
-    words = np.empty(
-        len(splats), [(f"packed_{n}", "<u4") for n in ("position", "rotation", "scale", "color")]
-    )
-    words["packed_position"] = _packed(_within(bounds, "", "xyz", splats.means), (11, 10, 11))
+    words = np.empty(len(splats), [(name, "<u4") for name in _PACKED])
+    words["packed_position"] = _packed(_within(bounds, "", "xyz", splats.means), _THREE)
     largest, others = smallest_three(unit_quats(splats.quats))
     rotations = _packed(others / math.sqrt(2) + 0.5, (10, 10, 10))
     words["packed_rotation"] = largest.astype(np.uint32) << np.uint32(30) | rotations
     logs = np.clip(log_scales(splats), -_SCALE_LIMIT, _SCALE_LIMIT)
-    words["packed_scale"] = _packed(_within(bounds, "scale_", "xyz", logs), (11, 10, 11))
+    words["packed_scale"] = _packed(_within(bounds, "scale_", "xyz", logs), _THREE)
     color = _within(bounds, "", "rgb", splats.colors)
     words["packed_color"] = _packed(np.column_stack([color, splats.opacities]), (8, 8, 8, 8))
     chunk = np.empty(math.ceil(len(splats) / _CHUNK), [(name, "<f4") for name in bounds])
@@ -187,6 +171,16 @@ def _packed(values: NDArray[np.float64], bits: tuple[int, ...]) -> NDArray[np.ui
     for k, width in enumerate(bits):
         word = word << np.uint32(width) | coded(values[:, k], (1 << width) - 1).astype(np.uint32)
     return word
+
+
+def _unpacked(words: NDArray[Any], bits: tuple[int, ...]) -> NDArray[np.float64]:
+    """Return the (N, C) values in [0, 1] that `_packed` takes."""
+    values, shift = np.empty((len(words), len(bits))), 0
+    for k, width in reversed(list(enumerate(bits))):
+        top = (1 << width) - 1
+        values[:, k] = (words >> np.uint32(shift) & np.uint32(top)) / top
+        shift += width
+    return values
 
 
 def _harmonics(splats: Splats) -> NDArray[Any]:

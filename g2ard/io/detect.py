@@ -1,12 +1,15 @@
-"""Format detection by extension, then by content."""
+"""Format detection by extension, then by content; cameras beside a scene."""
 
 from __future__ import annotations
 
+import os
+import re
+from collections.abc import Callable
 from contextlib import suppress
 from difflib import get_close_matches
 from itertools import islice
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 from g2ard.config.choices import BLACK, Colour
 from g2ard.errors import InputError
@@ -27,6 +30,11 @@ KINDS: dict[str, Kind] = {
 }
 """Format, which is the name of the module that reads it, → its kind."""
 
+_BY_NAME: dict[str, Format] = {
+    **{"meta.json": "sog", "lod-meta.json": "sog", "config.yml": "nerfstudio", "cfg.yml": "gsplat_run"},
+    **dict.fromkeys(("points3d.bin", "points3d.txt"), "points3d"),
+    **dict.fromkeys(("cameras.bin", "cameras.txt", "images.bin", "images.txt"), "colmap"),
+}
 _BY_SUFFIX: dict[str, Format] = {
     **{".sog": "sog", ".spz": "spz", ".glb": "glb", ".splat": "splat", ".las": "las", ".laz": "las"},
     **dict.fromkeys((".usda", ".usdc", ".usd", ".usdz"), "usd"),
@@ -37,7 +45,6 @@ MANIFEST, JOURNAL, POINTS = "tiles.json", "journal.json", ".points"
 
 _LOOKED_INTO = 64
 """Maximum files of a folder to inspect for suggestions."""
-_READ = (".ply", ".sog", ".spz", ".glb", ".splat", ".usda", ".usdc", ".las", ".laz", ".json")
 
 
 def kind(path: str | Path) -> Kind:
@@ -58,17 +65,9 @@ def file_format(path: str | Path) -> Format:
             raise InputError("is a broken link", path=path)
         raise InputError(f"no such file or folder{_near(path)}", path=path)
     check_regular(path)
-    name, suffix = path.name.lower(), path.suffix.lower()
-    if name in ("meta.json", "lod-meta.json"):
-        return "sog"
-    if name in ("points3d.bin", "points3d.txt"):
-        return "points3d"
-    if name in ("cameras.bin", "cameras.txt", "images.bin", "images.txt"):
-        return "colmap"
-    if name in ("config.yml", "cfg.yml"):
-        return "nerfstudio" if name == "config.yml" else "gsplat_run"
-    if suffix in _BY_SUFFIX:
-        return _BY_SUFFIX[suffix]
+    suffix = path.suffix.lower()
+    if found := _BY_NAME.get(path.name.lower()) or _BY_SUFFIX.get(suffix):
+        return found
     if suffix == ".ply":
         return _ply_format(path)
     if suffix == ".json":
@@ -110,6 +109,51 @@ def run_background(path: str | Path) -> Colour | None:
         return BLACK
     red, green, blue = numbers(settings, "recover.background", 3, most=1)
     return red, green, blue
+
+
+def find_views(scene: str | Path) -> Path | None:
+    """Return the cameras that a scene was trained with, for `read_view_set`, or None.
+
+    Searched in this order:
+
+    - cameras.json (INRIA) in the scene's folder, or in the model's folder above point_cloud/iteration_N/;
+    - nerfstudio's dataparser_transforms.json, then the lists of `ns-export cameras`, in the scene's folder;
+    - cfg.yml (gsplat's simple_trainer) above ply/.
+
+    A transforms.json or COLMAP model beside a scene is ignored, since trainers may move the world they read.
+
+    Args:
+        scene: a scene's file or folder; it need not exist.
+    """
+    from g2ard.io import gsplat_run, inria, nerfstudio, nerfstudio_export
+
+    scene = Path(scene)
+    own = (scene if scene.is_dir() else scene.parent).absolute()
+    iteration = re.fullmatch(r"iteration_\d+", own.name) and own.parent.name == "point_cloud"
+    places = [own / inria.NAME, *([own.parent.parent / inria.NAME] if iteration else ())]
+    found = next((file for file in places if _holds(file, inria.is_inria)), None)
+    if found is None and (own / nerfstudio.NAME).is_file():
+        found = own / nerfstudio.NAME
+    if found is None and any(
+        _holds(own / name, nerfstudio_export.is_export) for name in nerfstudio_export.LISTS
+    ):
+        found = own
+    run = own.parent / gsplat_run.NAME
+    with suppress(InputError):
+        if found is None and own.name == "ply" and gsplat_run.is_run(run):
+            found = run
+    if found is None:  # a damaged file: its reader raises the error
+        found = next((file for file in places if file.is_file()), None)
+    return found if found is None or scene.is_absolute() else Path(os.path.relpath(found))
+
+
+def _holds(file: Path, test: Callable[[Any], bool]) -> bool:
+    """Return whether a JSON file exists and passes `test`."""
+    from g2ard.io.jsonfile import read_any_json
+
+    with suppress(InputError):
+        return file.is_file() and test(read_any_json(file))
+    return False
 
 
 def is_photo(path: Path) -> bool:
@@ -162,7 +206,11 @@ def _near(path: Path) -> str:
 def _instead(path: Path) -> str:
     """Suggest what to do with an unsupported folder."""
     held: dict[Kind, list[str]] = {"splats": [], "points": [], "views": []}
-    files = (file for file in sorted(path.iterdir()) if file.suffix.lower() in _READ and file.is_file())
+    files = (
+        file
+        for file in sorted(path.iterdir())
+        if file.suffix.lower() in (".ply", ".json", *_BY_SUFFIX) and file.is_file()
+    )
     for file in islice(files, _LOOKED_INTO):
         with suppress(InputError):
             held[kind(file)].append(file.name)

@@ -1,4 +1,4 @@
-"""Reader for exposure.json of 3DGS: an affine colour transform per photo."""
+"""Reader for exposure.json of 3DGS: photo → 3×4 matrix C with photo = C·(render, 1)."""
 
 from __future__ import annotations
 
@@ -13,12 +13,6 @@ from g2ard.scene.cameras import Cameras
 _NAME = "exposure.json"
 
 
-def read(path: Path) -> dict[str, NDArray[np.float64]]:
-    """Read photo → 3×4 matrix C with photo = C·(render, 1)."""
-    content = fields_of(path, read_json(path))
-    return {name: np.array(numbers(content, name, 3, 4)) for name in content}
-
-
 def find_exposures(cameras: Cameras) -> dict[str, NDArray[np.float64]]:
     """Return exposures by view name from an exposure.json beside the photos' folder, if there is one.
 
@@ -31,7 +25,8 @@ def find_exposures(cameras: Cameras) -> dict[str, NDArray[np.float64]]:
             continue
         path = photo.parent.parent / _NAME
         if path not in tables:
-            tables[path] = read(path) if path.is_file() else {}
+            content = fields_of(path, read_json(path) if path.is_file() else {})
+            tables[path] = {key: np.array(numbers(content, key, 3, 4)) for key in content}
         table = tables[path]
         for key in (name, photo.name, photo.stem):
             if key in table:

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from g2ard.errors import DAMAGED, InputError, require
+from g2ard.errors import InputError, damaged, require
 from g2ard.io import spz
 from g2ard.io.atomic import atomic_output
 from g2ard.io.jsonfile import (
@@ -227,7 +227,7 @@ def _chunks(path: Path) -> tuple[Any, bytes]:
     while at + 8 <= len(data):
         size, kind = struct.unpack_from("<II", data, at)
         if at + 8 + size > len(data):
-            raise InputError(f"truncated: a chunk of {size:,} bytes is cut off", path=path, hint=DAMAGED)
+            raise damaged(f"truncated: a chunk of {size:,} bytes is cut off", path=path)
         found.setdefault(kind, data[at + 8 : at + 8 + size])
         at += 8 + size
     if _JSON not in found:
@@ -278,12 +278,10 @@ def _attributes_of(path: Path, document: Fields, binary: bytes, primitive: Field
     degree = max(d for d in range(4) if d == 0 or f"{EXTENSION}:SH_DEGREE_{d}_COEF_0" in names)
     means = values("POSITION", 3)
     raw = Raw.empty(len(means), (degree + 1) ** 2 - 1)
-    with np.errstate(divide="ignore", invalid="ignore"):  # a negative scale becomes NaN: the row is dropped
+    raw.set_linear(values(f"{EXTENSION}:SCALE", 3), values(f"{EXTENSION}:OPACITY", 1)[:, 0])
+    with np.errstate(invalid="ignore"):  # a signalling NaN
         raw.means[:] = means * _TURN
         raw.quats[:] = values(f"{EXTENSION}:ROTATION", 4)[:, [3, 0, 1, 2]] * (1, *_TURN)
-        raw.log_scales[:] = np.log(values(f"{EXTENSION}:SCALE", 3).astype(np.float64))
-        alphas = values(f"{EXTENSION}:OPACITY", 1)[:, 0].astype(np.float64)
-        raw.logit_opacities[:] = np.log(alphas) - np.log1p(-alphas)
         raw.sh0[:, 0] = values(f"{EXTENSION}:SH_DEGREE_0_COEF_0", 3)
         for name, k in _harmonics(degree):
             raw.shN[:, k] = values(name, 3) * _FLIPS[k]
@@ -325,7 +323,7 @@ def _accessor(
             f"attribute {name!r} has a stride of {step} bytes, less than its elements", path=path
         )
     if count and start + step * (count - 1) + width * dtype.itemsize > len(binary):
-        raise InputError(f"truncated: attribute {name!r} ends past the file", path=path, hint=DAMAGED)
+        raise damaged(f"truncated: attribute {name!r} ends past the file", path=path)
     rows = np.ndarray((count, width), dtype, binary, start, (step, dtype.itemsize))
     if not accessor.get("normalized"):
         return rows.astype(np.float32)

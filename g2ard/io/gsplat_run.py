@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 from g2ard.errors import InputError
 from g2ard.io import colmap
 from g2ard.io.photos import view_set
 from g2ard.io.settings import below, read_settings
-from g2ard.io.types import Note, ViewSet
+from g2ard.io.types import ViewSet
 
 NAME = "cfg.yml"
 
@@ -23,11 +22,8 @@ def read(path: Path, images: Path | None = None) -> ViewSet:
     """Read a run's cameras with their splits: every `test_every`th in order of names is test.
 
     Only runs with `normalize_world_space: false` are supported. Others move the world by the points'
-    principal axes, whose signs depend on the linear algebra library, and do not store the transform.
-
-    Args:
-        path: cfg.yml or its folder.
-        images: folder of the photos; by default the data's `images_N` for `data_factor` N, or `images`.
+    principal axes, whose signs depend on the linear algebra library, and do not store the transform. Without
+    `images`, photos are in the data's `images_N` for `data_factor` N, or `images`.
     """
     file = path / NAME if path.is_dir() else path
     settings = read_settings(file)
@@ -59,4 +55,4 @@ def read(path: Path, images: Path | None = None) -> ViewSet:
     if settings.word("pose_opt") != "true":
         return found
     text = "the run optimised its poses; these are the poses before training"
-    return replace(found, notes=(*found.notes, Note("optimised_poses", len(found.cameras), text)))
+    return found.noted("optimised_poses", len(frames), text)

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from g2ard.io.jsonfile import fields_of, number, numbers, read_json_list, text, whole
-from g2ard.io.photos import ASPECT_SLACK, Frame, find_photo, inverse, photo_size, rigid, view_set
-from g2ard.io.types import Note, ViewSet
+from g2ard.io.photos import ASPECT_SLACK, Frame, Lens, find_photo, inverse, photo_size, rigid, view_set
+from g2ard.io.types import ViewSet
 from g2ard.progress import plural
 
 NAME = "cameras.json"
@@ -24,16 +23,11 @@ def is_inria(content: Any) -> bool:
 
 
 def read(path: Path, images: Path | None = None) -> ViewSet:
-    """Read a model's training and test cameras.
+    """Read a model's training and test cameras from its folder or its cameras.json.
 
-    Each is {id, img_name, width, height, position, rotation, fx, fy}: the camera's centre in the world, and
-    world_from_camera as rows, in OpenCV axes. The principal point is the image's centre, as in INRIA's
-    trainer. The id is appended to repeated names, such as r_0 of each split of NeRF's synthetic scenes.
-
-    Args:
-        path: the JSON, or the model's folder.
-        images: folder to search for photos by name; None takes `images` beside the JSON, if it has any of
-            them. Cameras are scaled to resized photos.
+    `rotation` holds the rows of world_from_camera, in OpenCV axes. The principal point is the image's centre,
+    as in INRIA's trainer. The id is appended to repeated names, such as r_0 of each split of NeRF's synthetic
+    scenes. Without `images`, photos are in `images` beside the file. Cameras are scaled to resized photos.
     """
     file = path / NAME if path.is_dir() else path
     listed = read_json_list(file)
@@ -48,10 +42,9 @@ def read(path: Path, images: Path | None = None) -> ViewSet:
         frame._replace(name=f"{frame.name}_{camera.get('id', i)}") if frame.name in twice else frame
         for i, (frame, camera) in enumerate(zip(frames, listed, strict=True))
     ]
-    found = view_set(file, named)
     count = sum(times[name] for name in twice)
     text = f"{plural(count, 'camera')} of {len(frames)} have repeated names; their ids are appended"
-    return replace(found, notes=(*found.notes, Note("repeated_names", count, text)))
+    return view_set(file, named).noted("repeated_names", count, text)
 
 
 def _frame(path: Path, index: int, entry: Any, images: Path | None) -> Frame:
@@ -72,7 +65,6 @@ def _frame(path: Path, index: int, entry: Any, images: Path | None) -> Frame:
     return Frame(
         name=name,
         viewmat=inverse(rigid(world_from_camera, camera.place.to("rotation"))),
-        K=np.array([[fx, 0, width / 2], [0, fy, height / 2], [0, 0, 1]]),
-        size=(width, height),
+        lens=Lens((width, height), np.array([[fx, 0, width / 2], [0, fy, height / 2], [0, 0, 1]])),
         photo=photo,
     )

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from g2ard.errors import DAMAGED, InputError, missing
+from g2ard.errors import InputError, damaged, missing
 from g2ard.io.limits import check_unpacked
 from g2ard.io.point_stream import PointStream, RawPoints, cloud_middle
 from g2ard.io.types import Note
@@ -19,15 +19,12 @@ _LARGEST_CHUNK = 1 << 30
 """Largest chunk, in bytes of unpacked points, of a file with fewer points than a chunk holds."""
 
 
-def stream(path: Path) -> PointStream:
-    """Open positions and colours; colours up to 255 are treated as 8-bit, with a note.
+class Stream(PointStream):
+    """Positions and colours; colours up to 255 are treated as 8-bit, with a note.
 
     One chunk of a .laz is unpacked at a time.
     """
-    return _LasPoints(path)
 
-
-class _LasPoints(PointStream):
     def __init__(self, path: Path) -> None:
         with _opened(path) as reader:
             header = reader.header
@@ -51,9 +48,7 @@ class _LasPoints(PointStream):
                 wanted = min(rows, self.count - first)
                 las = reader.read_points(wanted)
                 if len(las) < wanted:
-                    there = first + len(las)
-                    text = f"truncated: {there:,} of {self.count:,} points"
-                    raise InputError(text, path=self.path, hint=DAMAGED)
+                    _check_count(self.path, first + len(las), self.count)
                 yield _points(las)
 
 
@@ -86,7 +81,8 @@ def _opened(path: Path) -> Iterator[Any]:
                 _check_chunk_table(path, header.offset_to_point_data, header.point_count)
                 _check_chunks(path, header)
             else:
-                _check_size(path, header.offset_to_point_data, header.point_count, header.point_format.size)
+                room = max(0, path.stat().st_size - header.offset_to_point_data)
+                _check_count(path, room // header.point_format.size, header.point_count)
             yield reader
     except (InputError, GeneratorExit):
         raise
@@ -106,19 +102,14 @@ def _check_records(path: Path) -> None:
     (extended,) = struct.unpack_from("<I", head, 243) if head[25] >= 4 else (0,)
     size = path.stat().st_size
     if points_at > size:
-        raise InputError(
-            f"truncated: points begin at byte {points_at:,} of {size:,}", path=path, hint=DAMAGED
-        )
+        raise damaged(f"truncated: points begin at byte {points_at:,} of {size:,}", path=path)
     if records * 54 > points_at or extended * 60 > size:
-        raise InputError(
-            f"broken header: {records + extended:,} variable-length records", path=path, hint=DAMAGED
-        )
+        raise damaged(f"broken header: {records + extended:,} variable-length records", path=path)
 
 
-def _check_size(path: Path, points_at: int, promised: int, point_size: int) -> None:
-    there = max(0, path.stat().st_size - points_at) // point_size
+def _check_count(path: Path, there: int, promised: int) -> None:
     if there < promised:
-        raise InputError(f"truncated: {there:,} of {promised:,} points", path=path, hint=DAMAGED)
+        raise damaged(f"truncated: {there:,} of {promised:,} points", path=path)
 
 
 def _check_chunk_table(path: Path, points_at: int, promised: int) -> None:
@@ -131,17 +122,13 @@ def _check_chunk_table(path: Path, points_at: int, promised: int) -> None:
             file.seek(-8, 2)
             (table,) = struct.unpack("<q", file.read(8).ljust(8, b"\0"))
         if not points_at < table <= size - 8:
-            raise InputError("truncated: the chunk table is cut off", path=path, hint=DAMAGED)
+            raise damaged("truncated: the chunk table is cut off", path=path)
         file.seek(table)
         _version, chunks = struct.unpack("<II", file.read(8).ljust(8, b"\0"))
     if chunks > max(promised, 1):
-        raise InputError(
-            f"broken chunk table: {chunks:,} chunks for {promised:,} points", path=path, hint=DAMAGED
-        )
+        raise damaged(f"broken chunk table: {chunks:,} chunks for {promised:,} points", path=path)
     if chunks > table - points_at:
-        raise InputError(
-            f"broken chunk table: {chunks:,} chunks in {table - points_at:,} bytes", path=path, hint=DAMAGED
-        )
+        raise damaged(f"broken chunk table: {chunks:,} chunks in {table - points_at:,} bytes", path=path)
 
 
 def _check_chunks(path: Path, header: Any) -> None:
@@ -150,28 +137,22 @@ def _check_chunks(path: Path, header: Any) -> None:
 
     records = header.vlrs.get("LasZipVlr")
     if not records:
-        raise InputError("broken header: the LASzip record is missing", path=path, hint=DAMAGED)
+        raise damaged("broken header: the LASzip record is missing", path=path)
     layout = lazrs.LazVlr(records[0].record_data)
     size, wanted = layout.item_size(), header.point_format.size
     if size != wanted:
-        raise InputError(
-            f"broken header: compressed points of {size} bytes, not {wanted}", path=path, hint=DAMAGED
-        )
+        raise damaged(f"broken header: compressed points of {size} bytes, not {wanted}", path=path)
     if not layout.uses_variable_size_chunks():
         chunk = layout.chunk_size()
         if not 0 < chunk * size <= max(_LARGEST_CHUNK, header.point_count * size):
-            raise InputError(f"broken header: chunks of {chunk:,} points", path=path, hint=DAMAGED)
+            raise damaged(f"broken header: chunks of {chunk:,} points", path=path)
     with path.open("rb") as file:
         file.seek(header.offset_to_point_data)
         table = lazrs.read_chunk_table(file, layout)
     room, taken = (sum(column) for column in zip(*table, strict=True)) if table else (0, 0)
     there = path.stat().st_size
     if min((packed for _, packed in table), default=0) < 0 or taken > there - header.offset_to_point_data:
-        raise InputError(f"broken chunk table: chunks of {taken:,} bytes", path=path, hint=DAMAGED)
+        raise damaged(f"broken chunk table: chunks of {taken:,} bytes", path=path)
     if room < header.point_count:
-        raise InputError(
-            f"truncated: at most {room:,} of {header.point_count:,} points",
-            path=path,
-            hint=DAMAGED,
-        )
+        raise damaged(f"truncated: at most {room:,} of {header.point_count:,} points", path=path)
     check_unpacked(path, there, header.point_count * size)

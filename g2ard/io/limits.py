@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
-from g2ard.errors import DAMAGED, InputError
+from g2ard.errors import InputError, damaged
 from g2ard.io.paths import check_regular
 
 if TYPE_CHECKING:
@@ -62,6 +62,4 @@ def opened_image(path: Path, content: IO[bytes] | None = None) -> Iterator[Image
     except UnidentifiedImageError as error:
         raise InputError("is not an image", path=path) from error
     except Exception as error:  # Pillow's decoders raise any exception for damaged files
-        raise InputError(
-            f"cannot be decoded ({str(error) or type(error).__name__})", path=path, hint=DAMAGED
-        ) from error
+        raise damaged(f"cannot be decoded ({str(error) or type(error).__name__})", path=path) from error

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +14,7 @@ from g2ard.io import colmap, transforms
 from g2ard.io.jsonfile import Fields, fields_of, matrix, number, read_json
 from g2ard.io.photos import Frame, inverse, rigid, view_set
 from g2ard.io.settings import Settings, below, read_settings
-from g2ard.io.types import Note, ViewSet
+from g2ard.io.types import ViewSet
 
 NAME = "dataparser_transforms.json"
 """File beside config.yml with `transform`, 3×4, and `scale`."""
@@ -32,10 +31,8 @@ def read(path: Path, images: Path | None = None) -> ViewSet:
     start from the original data. A (`applied_transform`) and `applied_scale`, from the data's
     transforms.json, lead from the original data to its poses. For COLMAP data, A = 1.
 
-    Args:
-        path: the run's folder, its dataparser_transforms.json or its config.yml. config.yml names the data;
-            without it, the data is a transforms.json in the folder.
-        images: folder to search for photos by file name; None uses the data's photos.
+    `path` is the run's folder or one of its two files. config.yml names the data; without it, the data is a
+    transforms.json in the folder.
     """
     folder = path if path.is_dir() else path.parent
     file = folder / NAME
@@ -50,7 +47,7 @@ def read(path: Path, images: Path | None = None) -> ViewSet:
     if mode is None:
         return found
     text = f"the run optimised its poses ({mode}); these are the poses before training"
-    return replace(found, notes=(*found.notes, Note("optimised_poses", len(found.cameras), text)))
+    return found.noted("optimised_poses", len(frames), text)
 
 
 def _data(
@@ -77,8 +74,7 @@ def _data(
 
 def _parser(path: Path, settings: Settings) -> tuple[str, Settings, Path]:
     """Return the parser's name, its options and the path of the data."""
-    pipeline = settings.block("pipeline")
-    manager = pipeline and pipeline[1].block("datamanager")
+    manager = settings.block("pipeline", "datamanager")
     parser = manager and manager[1].block("dataparser")
     if not parser or not manager:
         raise InputError("is missing", path=path, property="pipeline.datamanager.dataparser")
@@ -143,9 +139,7 @@ def _split(frames: Sequence[Frame], options: Settings) -> list[Frame]:
 
 def _optimized(settings: Settings | None) -> str | None:
     """Return the mode of pose optimisation, or None if it is off or unknown."""
-    pipeline = settings and settings.block("pipeline")
-    model = pipeline and pipeline[1].block("model")
-    optimizer = model and model[1].block("camera_optimizer")
+    optimizer = settings and settings.block("pipeline", "model", "camera_optimizer")
     mode = optimizer[1].word("mode") if optimizer else None
     return None if mode in (None, "off", "false") else mode
 

@@ -31,11 +31,8 @@ def exported(folder: Path) -> list[Path]:
 def read(path: Path, images: Path | None = None) -> ViewSet:
     """Read exported poses, {file_path, transform}: world_from_camera, 3×4, OpenGL axes, in the scene's world.
 
-    Intrinsics come from a transforms.json or a COLMAP model above the photos, scaled to the photos' size.
-
-    Args:
-        path: one of the lists, or the folder of both.
-        images: folder to search for photos by file name; None uses `file_path`.
+    `path` is one of the lists, or the folder of both. Intrinsics come from a transforms.json or a COLMAP
+    model above the photos, scaled to the photos' size.
     """
     files = exported(path) if path.is_dir() else [path]
     lenses: dict[Path, dict[str, Lens]] = {}
@@ -61,10 +58,8 @@ def _frame(
     return Frame(
         name=file_path.name,
         viewmat=transforms.opencv_view(world_from_camera),
-        K=lens.K,
-        size=lens.size,
+        lens=lens,
         photo=photo or file_path,
-        distortion=lens.distortion,
         split=LISTS.get(path.name),
     )
 
@@ -93,4 +88,4 @@ def _lenses(folder: Path) -> dict[str, Lens]:
     names = [Path(frame.photo.name if frame.photo else frame.name).name for frame in frames]
     if len(set(names)) < len(names):
         raise InputError("several photos have the same name, so their intrinsics are ambiguous", path=folder)
-    return {name: Lens(f.size, f.K, f.distortion) for name, f in zip(names, frames, strict=True)}
+    return {name: frame.lens for name, frame in zip(names, frames, strict=True)}

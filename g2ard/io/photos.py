@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from g2ard.errors import InputError
 from g2ard.io.jsonfile import Place
@@ -17,6 +17,7 @@ from g2ard.io.limits import opened_image
 from g2ard.io.types import Note, ViewSet
 from g2ard.progress import plural
 from g2ard.scene.cameras import Cameras
+from g2ard.scene.transform import rotation_matrices
 
 ASPECT_SLACK = 0.02
 """Relative difference in aspect ratio that rounding may cause; more means another photo."""
@@ -24,26 +25,12 @@ ASPECT_SLACK = 0.02
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG", ".webp")
 
 
-class Frame(NamedTuple):
-    """A view as listed in a file; its `photo` may be missing."""
-
-    name: str
-    viewmat: NDArray[np.float64]
-    K: NDArray[np.float64]
-    size: tuple[int, int]
-    photo: Path | None
-    distortion: tuple[float, ...] = (0.0,) * 5
-    split: str | None = None
-    weight: float | None = None
-    mask: Path | None = None
-
-
 class Lens(NamedTuple):
     """Size, pinhole matrix and OpenCV distortion k1 k2 p1 p2 k3 of a camera."""
 
     size: tuple[int, int]
     K: NDArray[np.float64]
-    distortion: tuple[float, ...]
+    distortion: tuple[float, ...] = (0.0,) * 5
 
     def at(self, size: tuple[int, int]) -> Lens:
         """Return the lens for resized photos."""
@@ -53,6 +40,18 @@ class Lens(NamedTuple):
         K[0] *= size[0] / self.size[0]
         K[1] *= size[1] / self.size[1]
         return self._replace(size=size, K=K)
+
+
+class Frame(NamedTuple):
+    """A view as listed in a file; its `photo` may be missing."""
+
+    name: str
+    viewmat: NDArray[np.float64]
+    lens: Lens
+    photo: Path | None
+    split: str | None = None
+    weight: float | None = None
+    mask: Path | None = None
 
 
 def find_photo(path: Path) -> Path:
@@ -89,6 +88,13 @@ def rigid(matrix: NDArray[np.float64], place: Place) -> NDArray[np.float64]:
     return out
 
 
+def posed(quat: ArrayLike, translation: ArrayLike) -> NDArray[np.float64]:
+    """Return the (4, 4) rigid transform of a quaternion wxyz, of any length, and a translation."""
+    out = np.eye(4)
+    out[:3, :3], out[:3, 3] = rotation_matrices(np.array([quat]))[0], translation
+    return out
+
+
 def inverse(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
     """Invert a (4, 4) rigid transform."""
     R, t = matrix[:3, :3], matrix[:3, 3]
@@ -101,11 +107,11 @@ def _cameras(path: Path, frames: Sequence[Frame]) -> Cameras:
     try:
         return Cameras.from_lists(
             [f.viewmat for f in frames],
-            [f.K for f in frames],
-            [f.size for f in frames],
+            [f.lens.K for f in frames],
+            [f.lens.size for f in frames],
             [f.name for f in frames],
             [f.photo for f in frames],
-            [f.distortion for f in frames],
+            [f.lens.distortion for f in frames],
             [_mask(f) for f in frames],
         )
     except InputError as error:
@@ -163,8 +169,7 @@ def pictured(found: ViewSet) -> ViewSet:
         return found
     first = found.cameras.names[int(np.argmin(has))]
     text = f"{plural(missing, 'view')} of {len(has)} skipped: no photo (the first is {first!r})"
-    notes = (*found.notes, Note("missing_photos", missing, text))
-    return replace(found.take(has), notes=notes)
+    return found.take(has).noted("missing_photos", missing, text)
 
 
 def alpha_as_masks(found: ViewSet) -> ViewSet:
@@ -177,8 +182,7 @@ def alpha_as_masks(found: ViewSet) -> ViewSet:
     pairs = zip(own, cameras.image_paths, cameras.mask_paths, strict=True)
     masks = tuple(photo if use else mask for use, photo, mask in pairs)
     text = f"{plural(sum(own), 'photo')} of {len(own)} masked by alpha"
-    notes = (*found.notes, Note("alpha_masks", sum(own), text))
-    return replace(found, cameras=replace(cameras, mask_paths=masks), notes=notes)
+    return replace(found, cameras=replace(cameras, mask_paths=masks)).noted("alpha_masks", sum(own), text)
 
 
 def has_alpha(photo: Path) -> bool:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.lib.recfunctions import structured_to_unstructured
@@ -14,12 +14,14 @@ from numpy.typing import NDArray
 from g2ard.config.choices import RenderModel
 from g2ard.errors import InputError
 from g2ard.io import plyfiles
-from g2ard.io.atomic import atomic_output
 from g2ard.io.sanitize import BLOCK, LOG_SCALE_LIMIT, Raw
-from g2ard.io.stream import SceneStream
+from g2ard.io.stream import RawStream
 from g2ard.io.types import Note
 from g2ard.progress import plural
 from g2ard.scene.splats import Splats, unit_quats
+
+if TYPE_CHECKING:
+    from g2ard.tiles.merging import TiledScene
 
 _MEANS = ["x", "y", "z"]
 _DC = ["f_dc_0", "f_dc_1", "f_dc_2"]
@@ -31,16 +33,13 @@ _FLAT = np.log(np.float32(1e-3))
 """Logarithm of the thickness of 2D Gaussians over their shorter scale."""
 
 
-def stream(path: Path) -> SceneStream:
-    """Open a 3DGS .ply of any SH degree, property order, scalar type and byte order, or ascii.
+class Stream(RawStream):
+    """3DGS .ply of any SH degree, property order, scalar type and byte order, or ascii.
 
     float64 positions that float32 cannot represent are recentred; the shift is stored in `offset`. Text files
     and those with leading lists are read whole.
     """
-    return _PlyStream(path)
 
-
-class _PlyStream(SceneStream):
     def __init__(self, path: Path) -> None:
         header = plyfiles.read_header(path)
         properties = header.properties.get("vertex", [])
@@ -71,7 +70,6 @@ class _PlyStream(SceneStream):
     def raw(self, rows: int, start: int) -> Iterator[Raw]:
         for _, block in plyfiles.row_blocks(self.path, self._rows, rows, start):
             raw = Raw.empty(len(block), self._kept)
-            raw.offset = self.offset
             with np.errstate(over="ignore", invalid="ignore"):  # beyond float32: inf, and dropped
                 for first in range(0, len(block), BLOCK):
                     part = slice(first, first + BLOCK)
@@ -134,81 +132,45 @@ def _means(block: NDArray[Any], shift: NDArray[np.float64]) -> NDArray[np.float3
     return np.asarray(means - shift if shift.any() else means, np.float32)
 
 
-def write(path: Path, splats: Splats, *, overwrite: bool = False, normals: bool = False) -> None:
+def write(path: Path, scene: Splats | TiledScene, *, overwrite: bool = False, normals: bool = False) -> None:
     """Write a binary little-endian 3DGS .ply: x y z, f_dc, f_rest, opacity, scale, rot.
 
-    A non-zero `offset` and an antialiased render model are stored in comments, which `read` restores.
+    A non-zero `offset` and an antialiased render model are stored in comments, which `Stream` restores.
     `normals` adds zero nx ny nz, 12 bytes per Gaussian, for programs with a fixed layout such as INRIA's SIBR
-    viewer (which also needs SH degree 3).
+    viewer (which also needs SH degree 3). Tiles are written one at a time.
     """
-    write_parts(
-        path,
-        [splats],
-        len(splats),
-        splats.sh_degree,
-        splats.offset,
-        render_model=splats.render_model,
-        overwrite=overwrite,
-        normals=normals,
-    )
-
-
-def write_parts(
-    path: Path,
-    parts: Iterable[Splats],
-    count: int,
-    sh_degree: int,
-    offset: NDArray[np.float64],
-    *,
-    render_model: RenderModel = "classic",
-    overwrite: bool = False,
-    normals: bool = False,
-) -> None:
-    """Write parts of one SH degree and offset, `count` Gaussians in total, as `write` does."""
-    from plyfile import PlyData, PlyElement
-
-    if not count:
+    if not len(scene):
         raise InputError("not written: the scene has no Gaussians", path=path)
     names = [*_MEANS, *(_NORMALS if normals else []), *_DC]
-    rest = 3 * ((sh_degree + 1) ** 2 - 1)
-    names += [f"f_rest_{k}" for k in range(rest)] + ["opacity", *_SCALES, *_QUATS]
-    one_row = np.zeros(1, [(name, "<f4") for name in names])
-    rows = PlyElement.describe(np.broadcast_to(one_row, count), "vertex")  # costs no memory
-    comments = plyfiles.comments_of(offset, render_model)
-    header = PlyData([rows], byte_order="<", comments=comments).header
-    with atomic_output(path, overwrite) as temporary, temporary.open("wb") as file:
-        file.write(header.encode("ascii") + b"\n")
-        first = 0
-        for part in parts:
-            for block in _blocks(path, part, names, normals, first):
-                file.write(block.data)
-            first += len(part)
-        if first != count:
-            raise InputError(f"not written: got {first:,} Gaussians, expected {count:,}", path=path)
+    names += [f"f_rest_{k}" for k in range(3 * ((scene.sh_degree + 1) ** 2 - 1))]
+    names += ["opacity", *_SCALES, *_QUATS]
+    blocks = _blocks(path, [scene] if isinstance(scene, Splats) else scene, names, normals)
+    comments = plyfiles.comments_of(scene.offset, scene.render_model)
+    plyfiles.write_rows(path, dict.fromkeys(names, "<f4"), len(scene), blocks, overwrite, comments)
 
 
 def _blocks(
-    path: Path, splats: Splats, names: list[str], normals: bool, first: int
+    path: Path, parts: Iterable[Splats], names: list[str], normals: bool
 ) -> Iterator[NDArray[np.float32]]:
-    for start in range(0, len(splats), BLOCK):
-        part = splats.take(slice(start, start + BLOCK))
-        n = len(part)
+    first = 0
+    for block in (part.take(slice(at, at + BLOCK)) for part in parts for at in range(0, len(part), BLOCK)):
+        n = len(block)
         with np.errstate(divide="ignore", invalid="ignore"):
-            logs = np.clip(np.log(part.scales, dtype=np.float64), -LOG_SCALE_LIMIT, LOG_SCALE_LIMIT)
+            logs = np.clip(np.log(block.scales, dtype=np.float64), -LOG_SCALE_LIMIT, LOG_SCALE_LIMIT)
         columns = [
-            part.means,
+            block.means,
             np.zeros((n, 3 if normals else 0)),
-            part.sh0[:, 0],
-            part.shN.transpose(0, 2, 1).reshape(n, -1),
-            part.logit_opacities[:, None],
+            block.sh0[:, 0],
+            block.shN.transpose(0, 2, 1).reshape(n, -1),
+            block.logit_opacities[:, None],
             logs,
-            unit_quats(part.quats),
+            unit_quats(block.quats),
         ]
-        block = np.concatenate(columns, axis=1, dtype="<f4", casting="same_kind")
-        finite = np.isfinite(block)
+        rows = np.concatenate(columns, axis=1, dtype="<f4", casting="same_kind")
+        finite = np.isfinite(rows)
         if not finite.all():
             row, column = np.argwhere(~finite)[0]
-            raise InputError(
-                f"not written: {names[column]!r} of Gaussian {first + start + row} is not finite", path=path
-            )
-        yield block
+            text = f"not written: {names[column]!r} of Gaussian {first + row} is not finite"
+            raise InputError(text, path=path)
+        yield rows
+        first += n

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard.config.choices import RenderModel
-from g2ard.errors import DAMAGED, InputError
+from g2ard.errors import InputError, damaged
+from g2ard.io.atomic import atomic_output
 
 _OFFSET = re.compile(r"g2ard offset (\S+) (\S+) (\S+)$")
 _RENDER_MODES: dict[str, RenderModel | Literal["2dgs"]] = {
@@ -57,7 +58,7 @@ def read_header(path: Path) -> PlyHeader:
         )
     end = _END.search(head)  # on a line of its own, since comments may contain it
     if end is None:
-        raise InputError("broken PLY header: no end_header line", path=path, hint=DAMAGED)
+        raise damaged("broken PLY header: no end_header line", path=path)
     header = PlyHeader()
     for number, line in enumerate(re.split(r"\r\n|\r|\n", head[: end.start()].decode("latin-1")), 1):
         if not line.isascii():  # required by plyfile
@@ -65,9 +66,7 @@ def read_header(path: Path) -> PlyHeader:
         try:
             _header_line(header, line.split())
         except (IndexError, ValueError, KeyError) as error:
-            raise InputError(
-                f"broken PLY header, line {number}: {line.strip()[:80]!r}", path=path, hint=DAMAGED
-            ) from error
+            raise damaged(f"broken PLY header, line {number}: {line.strip()[:80]!r}", path=path) from error
     return header
 
 
@@ -92,10 +91,10 @@ def offset_of(path: Path, header: PlyHeader) -> NDArray[np.float64]:
         if match := _OFFSET.match(comment):
             try:
                 offset = np.array([float(word) for word in match.groups()])
-            except ValueError as error:
-                raise InputError(f"broken comment {comment!r}", path=path, hint=DAMAGED) from error
+            except ValueError:
+                offset = np.full(3, np.nan)
             if not np.isfinite(offset).all():
-                raise InputError(f"broken comment {comment!r}", path=path, hint=DAMAGED)
+                raise damaged(f"broken comment {comment!r}", path=path)
             return offset
     return np.zeros(3)
 
@@ -127,11 +126,7 @@ def read_element(path: Path, header: PlyHeader, *names: str) -> list[NDArray[Any
     size = path.stat().st_size
     for name, count in header.counts.items():  # before allocating memory: a row has at least a byte
         if count > size:
-            raise InputError(
-                f"truncated: {count:,} rows of {name!r} in {size:,} bytes",
-                path=path,
-                hint=DAMAGED,
-            )
+            raise damaged(f"truncated: {count:,} rows of {name!r} in {size:,} bytes", path=path)
     triangles = {name: dict.fromkeys(lists, 3) for name, lists in header.lists.items() if lists}
     try:
         try:
@@ -145,6 +140,30 @@ def read_element(path: Path, header: PlyHeader, *names: str) -> list[NDArray[Any
     except (PlyParseError, ValueError, OSError, OverflowError, MemoryError) as error:
         raise InputError(f"cannot be read as a PLY: {error}", path=path) from error
     return [ply[name].data for name in names]
+
+
+def write_rows(
+    path: Path,
+    types: dict[str, str],
+    count: int,
+    blocks: Iterable[NDArray[Any]],
+    overwrite: bool,
+    comments: Sequence[str] = (),
+) -> None:
+    """Write a binary .ply of `count` vertices, which arrive in blocks, with properties of these types."""
+    from plyfile import PlyData, PlyElement
+
+    every = np.broadcast_to(np.zeros(1, list(types.items())), count)  # costs no memory
+    elements = [PlyElement.describe(every, "vertex")]
+    header = PlyData(elements, byte_order="<", comments=comments).header
+    written = 0
+    with atomic_output(path, overwrite) as temporary, temporary.open("wb") as file:
+        file.write(header.encode("ascii") + b"\n")
+        for rows in blocks:
+            file.write(rows.data)
+            written += len(rows)
+        if written != count:
+            raise InputError(f"not written: got {written:,} vertices, expected {count:,}", path=path)
 
 
 def row_blocks(
@@ -180,13 +199,12 @@ def spread_rows(rows: NDArray[Any]) -> NDArray[Any]:
 
 def _parse_error(path: Path, header: PlyHeader, error: Any) -> InputError:
     name = error.element.name
-    return InputError(
+    return damaged(
         f"of {header.counts.get(name, 0)} cannot be read ({error.message})",
         path=path,
         property=error.prop and error.prop.name,
         index=error.row,
         item=f"{name} row",
-        hint=DAMAGED,
     )
 
 

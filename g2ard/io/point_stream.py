@@ -11,10 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from g2ard.errors import InputError
-from g2ard.io.stream import file_identity
+from g2ard.io.sanitize import RowTally
+from g2ard.io.stream import file_identity, from_row
 from g2ard.io.types import Cloud, Note, Points
-from g2ard.progress import plural
 
 _ROWS = 1 << 20
 
@@ -23,35 +22,17 @@ RawPoints = tuple[NDArray[np.float64], NDArray[np.float32]]
 
 
 @dataclass
-class PointTally:
+class PointTally(RowTally):
     """Counts over the rows read so far."""
 
-    rows: int = 0
-    dropped: int = 0
-    first: int = -1
     brightest: float = 0.0
 
     def finite(self, points: RawPoints) -> NDArray[np.bool_]:
         """Return an (n,) mask of the finite rows, and count them."""
         good = np.all(np.isfinite(points[0]), axis=1) & np.all(np.isfinite(points[1]), axis=1)
-        lost = len(good) - int(np.count_nonzero(good))
-        if lost and not self.dropped:
-            self.first = self.rows + int(np.argmin(good))
-        self.dropped += lost
-        self.rows += len(good)
+        self.count(good)
         self.brightest = max(self.brightest, float(np.max(points[1], where=good[:, None], initial=0.0)))
         return good
-
-    def notes(self, path: Path, notes: tuple[Note, ...]) -> tuple[Note, ...]:
-        """Add a note on non-finite points to `notes`; raise an `InputError` if no point is finite."""
-        if not self.rows:
-            raise InputError("has no points", path=path)
-        if self.dropped == self.rows:
-            raise InputError(f"none of its {plural(self.rows, 'point')} is finite", path=path)
-        if not self.dropped:
-            return notes
-        text = f"{plural(self.dropped, 'non-finite point')} dropped (the first is row {self.first})"
-        return (*notes, Note("dropped_rows", self.dropped, text))
 
 
 class PointStream(ABC):
@@ -92,7 +73,7 @@ class PointStream(ABC):
 
     def all_notes(self) -> tuple[Note, ...]:
         """Return all notes once `blocks` has finished; raise an `InputError` if no point is finite."""
-        return self.tally.notes(self.path, self.notes())
+        return (*self.notes(), *self.tally.dropped_notes(self.path, "point"))
 
     def whole(self) -> Cloud:
         """Read all points, with colours in [0, 1]."""
@@ -134,12 +115,10 @@ class JoinedClouds(PointStream):
         self._divisors: list[float | None] = [None] * len(streams)
 
     def raw(self, rows: int, start: int) -> Iterator[RawPoints]:
-        for number, stream in enumerate(self._streams):
-            if start < stream.count:
-                divisor = self._divisor(number, rows)
-                for positions, colors in stream.raw(rows, start):
-                    yield positions, colors / np.float32(divisor)
-            start = max(0, start - stream.count)
+        for number, begin in from_row([stream.count for stream in self._streams], start):
+            divisor = self._divisor(number, rows)
+            for positions, colors in self._streams[number].raw(rows, begin):
+                yield positions, colors / np.float32(divisor)
 
     def _divisor(self, number: int, rows: int) -> float:
         """Return a file's divisor, which takes an additional pass over its points."""

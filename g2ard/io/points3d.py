@@ -7,26 +7,28 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from g2ard.errors import DAMAGED, InputError
+from g2ard.errors import InputError, damaged
 from g2ard.io.colmap import Record, model_folder, number, parsing, text_lines
-from g2ard.io.point_stream import PointStream, WholeCloud
+from g2ard.io.point_stream import WholeCloud
 
 _COUNT = Record(["COUNT"], "Q")
-_COLUMNS = ("X", "Y", "Z", "R", "G", "B")
+_COLUMNS = tuple((name, at) for at, name in enumerate("XYZRGB", 1))
 _POINT = Record(["POINT3D_ID", *"XYZRGB", "ERROR", "TRACK"], "QdddBBBdQ")
 
 
-def stream(path: Path) -> PointStream:
-    """Read points3D.bin or .txt, or that of the model in a COLMAP folder."""
-    if path.is_dir() or path.stem.lower() != "points3d":
-        folder = model_folder(path) or path
-        found = next((p for s in (".bin", ".txt") if (p := folder / f"points3D{s}").is_file()), None)
-        if found is None:
-            raise InputError("has no points3D.bin or points3D.txt", path=folder)
-        path = found
-    with parsing(path):
-        positions, rgb = (_binary if path.suffix == ".bin" else _text)(path)
-    return WholeCloud(path, positions, (rgb / 255).astype(np.float32))
+class Stream(WholeCloud):
+    """The points3D.bin or .txt itself, or that of the model in a COLMAP folder."""
+
+    def __init__(self, path: Path) -> None:
+        if path.is_dir() or path.stem.lower() != "points3d":
+            folder = model_folder(path) or path
+            found = next((p for s in (".bin", ".txt") if (p := folder / f"points3D{s}").is_file()), None)
+            if found is None:
+                raise InputError("has no points3D.bin or points3D.txt", path=folder)
+            path = found
+        with parsing(path):
+            positions, rgb = (_binary if path.suffix == ".bin" else _text)(path)
+        super().__init__(path, positions, (rgb / 255).astype(np.float32))
 
 
 def _binary(path: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
@@ -34,39 +36,35 @@ def _binary(path: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
     data = path.read_bytes()
     (count,) = _COUNT.read(path, "table", 0, data, 0)
     if count * _POINT.size > len(data):
-        raise InputError(f"truncated: {count:,} points in {len(data):,} bytes", path=path, hint=DAMAGED)
+        raise damaged(f"truncated: {count:,} points in {len(data):,} bytes", path=path)
     positions, rgb, at = np.empty((count, 3)), np.empty((count, 3), np.uint8), _COUNT.size
     for i in range(count):
         _key, x, y, z, r, g, b, _error, track = _POINT.read(path, "point", i, data, at)
         positions[i], rgb[i] = (x, y, z), (r, g, b)
         at += _POINT.size + 8 * track
         if at > len(data):
-            raise InputError("is cut off", path=path, property="TRACK", index=i, item="point", hint=DAMAGED)
+            raise damaged("is cut off", path=path, property="TRACK", index=i, item="point")
     return positions, rgb
 
 
 def _text(path: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
     lines = [line for line in text_lines(path) if line.strip()]
     rows = [line.split(maxsplit=7) for line in lines]
-    for i, line in enumerate(lines):
-        if "_" in line or not line.isascii():  # float() accepts both
-            for name, word in zip(_COLUMNS, rows[i][1:7], strict=False):
-                if "_" in word or not word.isascii():
-                    raise InputError(f"is {word!r}", path=path, property=name, index=i, item="point")
+    plain = all(line.isascii() and "_" not in line for line in lines)  # float() accepts more
     try:
         values = np.array([words[1:7] for words in rows], np.float64).reshape(-1, 6)
     except ValueError:
-        for i, words in enumerate(rows):
-            for at, name in enumerate(_COLUMNS, 1):
-                number(path, "point", i, words, name, at, float)
-        raise
+        plain = False
+    if not plain:  # find the wrong number
+        found = [[number(path, "point", i, w, *c, float) for c in _COLUMNS] for i, w in enumerate(rows)]
+        values = np.array(found)
     inside = (values[:, 3:] >= 0) & (values[:, 3:] <= 255)
     if not inside.all():
         i, channel = (int(at) for at in np.argwhere(~inside)[0])
         raise InputError(
             f"is {rows[i][4 + channel]!r}, expected 0 to 255",
             path=path,
-            property=_COLUMNS[3 + channel],
+            property="RGB"[channel],
             index=i,
             item="point",
         )

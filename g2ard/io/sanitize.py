@@ -36,7 +36,6 @@ class Raw:
     logit_opacities: NDArray[np.float32]
     sh0: NDArray[np.float32]
     shN: NDArray[np.float32]
-    offset: NDArray[np.float64]
 
     @classmethod
     def empty(cls, count: int, rest: int) -> Raw:
@@ -45,26 +44,24 @@ class Raw:
         def room(*shape: int) -> NDArray[np.float32]:
             return np.empty((count, *shape), np.float32)
 
-        return cls(room(3), room(4), room(3), room(), room(1, 3), room(rest, 3), np.zeros(3))
+        return cls(room(3), room(4), room(3), room(), room(1, 3), room(rest, 3))
 
     def take(self, rows: slice) -> Raw:
         """Return a view of some rows."""
-        return Raw(
-            self.means[rows],
-            self.quats[rows],
-            self.log_scales[rows],
-            self.logit_opacities[rows],
-            self.sh0[rows],
-            self.shN[rows],
-            self.offset,
-        )
+        return Raw(*(array[rows] for array in vars(self).values()))
 
-    def fill(self, scene: Splats, scales: NDArray[np.float32]) -> None:
-        """Copy a scene, with these numbers as `log_scales`."""
-        self.means[:], self.quats[:], self.log_scales[:] = scene.means, scene.quats, scales
+    def fill(self, scene: Splats) -> None:
+        """Copy a scene, with its linear scales as `log_scales`."""
+        self.means[:], self.quats[:], self.log_scales[:] = scene.means, scene.quats, scene.scales
         self.logit_opacities[:], self.sh0[:], self.shN[:] = scene.logit_opacities, scene.sh0, scene.shN
 
-    def activated(self, render_model: RenderModel = "classic") -> Splats:
+    def set_linear(self, scales: NDArray[Any], alphas: NDArray[Any]) -> None:
+        """Store scales and opacities as logarithms and logits; rows of negative scales become NaN."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            self.log_scales[:] = np.log(scales.astype(np.float64))
+            self.logit_opacities[:] = logits_of(alphas.astype(np.float64))
+
+    def activated(self, render_model: RenderModel, offset: NDArray[np.float64]) -> Splats:
         """Return the scene, after `Tally.clean` has exponentiated `log_scales` in place."""
         return Splats(
             self.means,
@@ -73,7 +70,7 @@ class Raw:
             self.logit_opacities,
             self.sh0,
             self.shN,
-            self.offset,
+            offset,
             render_model,
         )
 
@@ -93,17 +90,42 @@ def cleaned(
         rows = slice(start, start + BLOCK)
         keep[rows] = tally.clean(raw.take(rows))
     notes = [*(notes or ()), *tally.notes(path)]
-    splats = raw.activated(render_model)
+    splats = raw.activated(render_model, np.zeros(3))
     return Scene(splats.take(keep) if tally.dropped else splats, tuple(notes))
 
 
 @dataclass
-class Tally:
-    """Counts of dropped, clamped and repaired values over the blocks of a scene."""
+class RowTally:
+    """Counts of rows, and of those dropped because they are not finite, over the blocks of a file."""
 
     rows: int = 0
     dropped: int = 0
     first: int = -1
+
+    def count(self, good: NDArray[np.bool_]) -> None:
+        """Count rows, given an (n,) mask of those that are kept."""
+        lost = len(good) - int(np.count_nonzero(good))
+        if lost and not self.dropped:
+            self.first = self.rows + int(np.argmin(good))
+        self.dropped += lost
+        self.rows += len(good)
+
+    def dropped_notes(self, path: Path, item: str, hint: str | None = None) -> list[Note]:
+        """Return a note on dropped rows; raise an `InputError` with `hint` if none remains."""
+        if not self.rows:
+            raise InputError(f"has no {item}s", path=path)
+        if self.dropped == self.rows:
+            raise InputError(f"none of its {plural(self.rows, item)} is finite", path=path, hint=hint)
+        if not self.dropped:
+            return []
+        text = f"{plural(self.dropped, f'non-finite {item}')} dropped (the first is row {self.first})"
+        return [Note("dropped_rows", self.dropped, text)]
+
+
+@dataclass
+class Tally(RowTally):
+    """Counts of dropped, clamped and repaired values over the blocks of a scene."""
+
     logits: int = 0
     scales: int = 0
     quats: int = 0
@@ -125,28 +147,18 @@ class Tally:
         if zero.any():
             self.quats += int(np.count_nonzero(zero))
             quats[zero] = (1, 0, 0, 0)
-        lost = len(good) - int(np.count_nonzero(good))
-        if lost and not self.dropped:
-            self.first = self.rows + int(np.argmin(good))
-        self.dropped += lost
-        self.rows += len(good)
+        self.count(good)
         self.brightest = float(np.max(logits, where=good, initial=self.brightest))
         return good
 
+    def add(self, scene: Splats) -> None:
+        """Count the Gaussians of a clean scene."""
+        self.rows += len(scene)
+        self.brightest = float(np.max(scene.logit_opacities, initial=self.brightest))
+
     def notes(self, path: Path) -> list[Note]:
         """Return notes on all rows; raise an `InputError` if none remains."""
-        if not self.rows:
-            raise InputError("has no Gaussians", path=path)
-        if self.dropped == self.rows:
-            raise InputError(
-                f"none of its {plural(self.rows, 'Gaussian')} is finite",
-                path=path,
-                hint="use an earlier checkpoint of the training",
-            )
-        notes = []
-        if self.dropped:
-            text = f"{plural(self.dropped, 'non-finite Gaussian')} dropped (the first is row {self.first})"
-            notes.append(Note("dropped_rows", self.dropped, text))
+        notes = self.dropped_notes(path, "Gaussian", "use an earlier checkpoint of the training")
         for count, code, what, then in (
             (self.logits, "clamped_logits", "opacity logit", f"beyond ±{LOGIT_LIMIT:g} clamped"),
             (self.scales, "clamped_scales", "log-scale", f"beyond ±{LOG_SCALE_LIMIT:g} clamped"),
@@ -158,6 +170,13 @@ class Tally:
             left = self.rows - self.dropped
             notes.append(Note("invisible", left, "the scene is invisible: every opacity is below 1/255"))
         return notes
+
+
+def logits_of(alphas: NDArray[Any]) -> NDArray[Any]:
+    """Return the logits of opacities; ±∞ for 1 and 0."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        logits: NDArray[Any] = np.log(alphas) - np.log1p(-alphas)
+    return logits
 
 
 def _finite_rows(values: NDArray[Any]) -> NDArray[np.bool_]:

@@ -15,13 +15,7 @@ _PATH = re.compile(r"(?:&(?P<anchor>\w+)\s+)?!!python/object/apply:pathlib\.(?P<
 
 
 class Settings:
-    """A block of settings.
-
-    Args:
-        lines: all lines of the file.
-        first: index of the block's first line.
-        indent: spaces before its keys.
-    """
+    """A block of settings: the lines of the file, the block's first line, and the spaces before its keys."""
 
     def __init__(self, lines: list[str], first: int = 0, indent: int = 0) -> None:
         self._lines, self._first, self._indent = lines, first, indent
@@ -57,12 +51,13 @@ class Settings:
         pure = PureWindowsPath if match["kind"] == "Windows" else PurePosixPath
         return Path(pure(*parts).as_posix()) if parts else None
 
-    def block(self, key: str) -> tuple[str, Settings] | None:
-        """Return a key's tag (the class of the object) and its block; None if it is missing."""
+    def block(self, key: str, *deeper: str) -> tuple[str, Settings] | None:
+        """Return the tag (class) and the block of a key, or of a key in its block; None if it is missing."""
         at = self._find(key)
         if at is None:
             return None
-        return self._text(at, key), Settings(self._lines, at + 1, self._indent + 2)
+        block = Settings(self._lines, at + 1, self._indent + 2)
+        return block.block(*deeper) if deeper else (self._text(at, key), block)
 
     def _find(self, key: str) -> int | None:
         start = " " * self._indent + key + ":"

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from g2ard.errors import DAMAGED, InputError
+from g2ard.errors import InputError, damaged
 from g2ard.io.jsonfile import (
     Fields,
     fields_of,
@@ -36,7 +36,7 @@ from g2ard.io.limits import check_unpacked
 from g2ard.io.paths import check_regular
 from g2ard.io.sanitize import Raw
 from g2ard.io.sog_chunk import Chunk, Decoder, count_of, means_of, render_model_of, rest_of
-from g2ard.io.stream import SceneStream, file_identity
+from g2ard.io.stream import RawStream, file_identity, from_row
 from g2ard.io.types import Note
 from g2ard.progress import plural
 from g2ard.scene.transform import one_model
@@ -89,15 +89,6 @@ def _listed(index: Path) -> list[Path]:
     return chunks
 
 
-def stream(path: Path) -> SceneStream:
-    """Open a SOG scene, version 1 or 2: a .sog, a meta.json or its folder, or a folder of chunks.
-
-    Chunks are padded with zeros to the highest SH degree. Memory holds a chunk's images, 20 to 28 bytes per
-    Gaussian.
-    """
-    return _SogStream(path)
-
-
 def _offset(chunks: list[Chunk]) -> NDArray[np.float64]:
     """Return the offset that g2ard stored under "g2ard"; zeros if it is missing or chunks differ."""
     found = set()
@@ -117,8 +108,12 @@ def _left_out(path: Path, read_count: int) -> list[Note]:
     return [Note("ignored_chunks", others, text)] if others > 0 else []
 
 
-class _SogStream(SceneStream):
-    """Scene of one or more chunks; blocks do not cross chunks."""
+class Stream(RawStream):
+    """SOG scene, version 1 or 2: a .sog, a meta.json or its folder, or a folder of chunks.
+
+    Chunks are padded with zeros to the highest SH degree, and blocks do not cross chunks. Memory holds a
+    chunk's images, 20 to 28 bytes per Gaussian.
+    """
 
     def __init__(self, path: Path) -> None:
         with _opened(path) as chunks:
@@ -141,17 +136,13 @@ class _SogStream(SceneStream):
 
     def raw(self, rows: int, start: int) -> Iterator[Raw]:
         with _opened(self.path) as chunks:
-            for chunk, count in zip(chunks, self._counts, strict=True):
-                if start >= count:
-                    start -= count
-                    continue
-                decoder = Decoder(chunk, count)
-                for at in range(start, count, rows):
+            for number, begin in from_row(self._counts, start):
+                count = self._counts[number]
+                decoder = Decoder(chunks[number], count)
+                for at in range(begin, count, rows):
                     raw = Raw.empty(min(rows, count - at), self._rest)
-                    raw.offset = self.offset
                     decoder.fill(slice(at, at + len(raw.means)), raw)
                     yield raw
-                start = 0
 
 
 @contextmanager
@@ -174,7 +165,7 @@ def _opened(path: Path) -> Iterator[list[Chunk]]:
     except InputError:
         raise
     except (zipfile.BadZipFile, EOFError, OSError, ValueError, struct.error, OverflowError) as error:
-        raise InputError(f"is not a complete .sog archive ({error})", path=path, hint=DAMAGED) from error
+        raise damaged(f"is not a complete .sog archive ({error})", path=path) from error
 
 
 def _bundle_loader(path: Path, bundle: zipfile.ZipFile, prefix: str) -> Callable[[str], bytes]:

@@ -17,7 +17,7 @@ from g2ard.config.choices import RenderModel
 from g2ard.errors import InputError
 from g2ard.io.jsonfile import Fields, listed, names_of, numbers, object_of, whole
 from g2ard.io.limits import opened_image
-from g2ard.io.sanitize import BLOCK, Raw
+from g2ard.io.sanitize import BLOCK, Raw, logits_of
 
 _COEFFICIENTS = {0: 0, 1: 3, 2: 8, 3: 15}
 _LARGEST = float.fromhex("0x1.fffffep+127")
@@ -184,8 +184,7 @@ def _logits(part: Fields) -> NDArray[Any]:
     if "codebook" not in part:
         low, high = (_bound(part, end, 3) for end in ("mins", "maxs"))
         return low + (high - low) * alpha
-    with np.errstate(divide="ignore"):
-        return np.log(alpha) - np.log1p(-alpha)
+    return logits_of(alpha)
 
 
 class _Values:

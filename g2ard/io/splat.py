@@ -9,54 +9,37 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from g2ard.errors import DAMAGED, InputError
+from g2ard.errors import InputError, damaged
 from g2ard.io.atomic import atomic_output
 from g2ard.io.packing import world_means, writable
 from g2ard.io.sanitize import Raw
-from g2ard.io.stream import SceneStream
+from g2ard.io.stream import RawStream
 from g2ard.scene.splats import SH_C0, Splats, unit_quats
 
 _ROW = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
 
 
-def stream(path: Path) -> SceneStream:
-    """Open a .splat: linear scales, 8-bit colour and opacity, quaternions as bytes around 128."""
-    return _SplatStream(path)
+class Stream(RawStream):
+    """Rows of a .splat: linear scales, 8-bit colour and opacity, quaternions as bytes around 128."""
 
-
-class _SplatStream(SceneStream):
     def __init__(self, path: Path) -> None:
-        super().__init__(path, _count(path))
+        size = path.stat().st_size
+        if not size or size % _ROW.itemsize:
+            text = f"is not a complete .splat: {size:,} bytes are not a multiple of 32"
+            raise damaged(text, path=path)
+        super().__init__(path, size // _ROW.itemsize)
 
     def raw(self, rows: int, start: int) -> Iterator[Raw]:
         for first in range(start, self.count, rows):
             block = np.fromfile(self.path, _ROW, rows, offset=first * _ROW.itemsize)
             if len(block) < min(rows, self.count - first):
                 raise InputError("was truncated while it was read", path=self.path)
-            yield _raw(block)
-
-
-def _count(path: Path) -> int:
-    size = path.stat().st_size
-    if not size or size % _ROW.itemsize:
-        raise InputError(
-            f"is not a complete .splat: {size:,} bytes are not a multiple of 32", path=path, hint=DAMAGED
-        )
-    return size // _ROW.itemsize
-
-
-def _raw(rows: NDArray[Any]) -> Raw:
-    raw = Raw.empty(len(rows), 0)
-    raw.means[:] = rows["mean"]
-    with np.errstate(
-        divide="ignore", invalid="ignore"
-    ):  # rows with a negative scale become NaN and are dropped
-        raw.log_scales[:] = np.log(rows["scale"].astype(np.float64))
-        alphas = rows["rgba"][:, 3] / 255
-        raw.logit_opacities[:] = np.log(alphas) - np.log1p(-alphas)
-    raw.sh0[:, 0] = (rows["rgba"][:, :3] / 255 - 0.5) / SH_C0
-    raw.quats[:] = (rows["quat"].astype(np.float32) - 128) / 128
-    return raw
+            raw = Raw.empty(len(block), 0)
+            raw.means[:] = block["mean"]
+            raw.set_linear(block["scale"], block["rgba"][:, 3] / 255)
+            raw.sh0[:, 0] = (block["rgba"][:, :3] / 255 - 0.5) / SH_C0
+            raw.quats[:] = (block["quat"].astype(np.float32) - 128) / 128
+            yield raw
 
 
 def write(path: Path, splats: Splats, *, overwrite: bool = False) -> None:

@@ -12,7 +12,6 @@ import math
 import struct
 import sys
 import zlib
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -21,11 +20,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard.config.choices import Axes
-from g2ard.errors import DAMAGED, InputError, missing, require
+from g2ard.errors import InputError, damaged, missing, require
 from g2ard.io import packing
 from g2ard.io.atomic import atomic_output
 from g2ard.io.limits import check_unpacked
-from g2ard.io.sanitize import Raw, cleaned
+from g2ard.io.sanitize import Raw, cleaned, logits_of
 from g2ard.io.types import Note, Scene
 from g2ard.scene.splats import Splats
 from g2ard.scene.transform import change_of_axes, with_axes
@@ -67,10 +66,6 @@ def decoded(path: Path, data: bytes) -> Scene:
     """Read the bytes of an .spz like `read`; `path` names their file in messages."""
     if data[:2] == b"\x1f\x8b":
         data = _gunzip(path, data)
-    if data[:4] == _MAGIC and len(data) < _HEADER:
-        raise InputError(f"truncated: {len(data)} of {_HEADER} bytes of the header", path=path, hint=DAMAGED)
-    if data[:4] != _MAGIC:
-        raise InputError(f"not an SPZ file (begins with {data[:4]!r})", path=path)
     sizes = _sizes(path, data)
     version, count, degree, fraction_bits, flags, stream_count = struct.unpack_from("<IIBBBB", data, 4)
     stored = _COEFFICIENTS[degree]
@@ -82,8 +77,7 @@ def decoded(path: Path, data: bytes) -> Scene:
     raw.means[:] = _fixed24(positions.reshape(-1, 3)).reshape(-1, 3) / (1 << fraction_bits) * (1, -1, -1)
     raw.log_scales[:] = scales.reshape(-1, 3) / 16 - 10
     raw.quats[:] = (_quats_xyz if version == 2 else _quats_packed)(rotations) * (1, 1, -1, -1)
-    with np.errstate(divide="ignore"):
-        raw.logit_opacities[:] = np.log(alphas / 255) - np.log1p(-(alphas / 255))
+    raw.logit_opacities[:] = logits_of(alphas / 255)
     raw.sh0[:, 0] = (colors.reshape(-1, 3) / 255 - 0.5) / _COLOR_SCALE
     bands = sh.reshape(count, stored, 3)[:, :kept]
     raw.shN[:] = (bands.astype(np.float32) - 128) / 128 * FLIPS[:kept, None]
@@ -109,7 +103,7 @@ def _extensions(path: Path, data: bytes) -> tuple[Axes, int]:
     while at + 8 <= min(end, len(data)):
         kind, size = struct.unpack_from("<II", data, at)
         if at + 8 + size > min(end, len(data)):
-            raise InputError("truncated: an extension is cut off", path=path, hint=DAMAGED)
+            raise damaged("truncated: an extension is cut off", path=path)
         if kind == _COORDINATE_SYSTEM and size == 4:
             (number,) = struct.unpack_from("<I", data, at + 8)
             if number > len(_SYSTEMS):
@@ -126,21 +120,21 @@ def _gunzip(path: Path, data: bytes) -> bytes:
     stream = zlib.decompressobj(16 + zlib.MAX_WBITS)
     try:
         head = stream.decompress(data, _HEADER)
-        if len(head) < _HEADER:
-            return head
         promised = sum(_sizes(path, head))
         check_unpacked(path, len(data), promised)
         body = stream.decompress(stream.unconsumed_tail, promised) if promised else b""
     except zlib.error as error:
-        raise InputError(f"truncated or broken gzip stream ({error})", path=path, hint=DAMAGED) from error
+        raise damaged(f"truncated or broken gzip stream ({error})", path=path) from error
     return head + body
 
 
 def _sizes(path: Path, head: bytes) -> list[int]:
     """Return the header's sizes of positions, alphas, colours, scales, rotations and harmonics, bytes."""
-    version, count, degree, fraction_bits = struct.unpack_from("<IIBB", head, 4)
     if head[:4] != _MAGIC:
         raise InputError(f"not an SPZ file (begins with {head[:4]!r})", path=path)
+    if len(head) < _HEADER:
+        raise damaged(f"truncated: {len(head)} of {_HEADER} bytes of the header", path=path)
+    version, count, degree, fraction_bits = struct.unpack_from("<IIBB", head, 4)
     if version not in (2, 3, 4):
         raise InputError(f"unsupported SPZ version {version}; expected 2, 3 or 4", path=path)
     if degree >= len(_COEFFICIENTS):
@@ -155,37 +149,30 @@ def _sizes(path: Path, head: bytes) -> list[int]:
 
 def _slices(path: Path, data: bytes, sizes: list[int]) -> list[bytes]:
     """Return the attributes of versions 2 and 3, which follow the header."""
-    ends = 16 + np.cumsum(sizes)
+    ends = _HEADER + np.cumsum(sizes)
     if len(data) < ends[-1]:
-        raise InputError(f"truncated: {len(data):,} of {ends[-1]:,} bytes", path=path, hint=DAMAGED)
+        raise damaged(f"truncated: {len(data):,} of {ends[-1]:,} bytes", path=path)
     return [data[end - size : end] for end, size in zip(ends, sizes, strict=True)]
 
 
 def _zstd_streams(path: Path, data: bytes, stream_count: int, sizes: list[int]) -> list[bytes]:
     """Unpack the streams of version 4: a table of (packed, unpacked) sizes, then a frame per stream."""
-    decompress = _zstd(path)
     check_unpacked(path, len(data), sum(sizes))
     try:
         (table,) = struct.unpack_from("<I", data, 16)
         entries = [struct.unpack_from("<QQ", data, table + 16 * i) for i in range(stream_count)]
     except struct.error as error:
-        raise InputError("truncated: the table of streams is cut off", path=path, hint=DAMAGED) from error
+        raise damaged("truncated: the table of streams is cut off", path=path) from error
     streams, start = [], table + 16 * stream_count
     for i, size in enumerate(sizes):
         packed, unpacked = entries[i] if i < stream_count else (0, 0)
-        if unpacked != size:
-            raise InputError(
-                f"stream {i} holds {unpacked:,} bytes, expected {size:,}", path=path, hint=DAMAGED
-            )
         if start + packed > len(data):
-            raise InputError(f"truncated in stream {i}", path=path, hint=DAMAGED)
-        streams.append(decompress(data[start : start + packed], size) if size else b"")
+            raise damaged(f"truncated in stream {i}", path=path)
+        stream = _unpacked(path, data[start : start + packed], size) if size == unpacked > 0 else b""
+        if unpacked != size or len(stream) != size:
+            raise damaged(f"stream {i} does not hold {size:,} bytes", path=path)
+        streams.append(stream)
         start += packed
-    for i, (stream, size) in enumerate(zip(streams, sizes, strict=True)):
-        if len(stream) != size:
-            raise InputError(
-                f"stream {i} unpacks to {len(stream):,} bytes, expected {size:,}", path=path, hint=DAMAGED
-            )
     return streams
 
 
@@ -201,17 +188,13 @@ def _zstandard(path: Path) -> Any:
     return zstd
 
 
-def _zstd(path: Path) -> Callable[[bytes, int], bytes]:
-    """Return a function that unpacks a frame, at most one byte past its expected size."""
+def _unpacked(path: Path, frame: bytes, size: int) -> bytes:
+    """Unpack a frame of Zstandard, at most one byte past its expected size."""
     zstd = _zstandard(path)
-
-    def decompress(frame: bytes, size: int) -> bytes:
-        try:
-            return bytes(zstd.ZstdDecompressor().decompress(frame, max_length=size + 1))
-        except zstd.ZstdError as error:
-            raise InputError(f"broken Zstandard stream ({error})", path=path, hint=DAMAGED) from error
-
-    return decompress
+    try:
+        return bytes(zstd.ZstdDecompressor().decompress(frame, max_length=size + 1))
+    except zstd.ZstdError as error:
+        raise damaged(f"broken Zstandard stream ({error})", path=path) from error
 
 
 def _fixed24(triples: NDArray[np.uint8]) -> NDArray[np.int32]:
@@ -231,19 +214,11 @@ def _quats_xyz(codes: NDArray[np.uint8]) -> NDArray[np.float64]:
 def _quats_packed(codes: NDArray[np.uint8]) -> NDArray[np.float64]:
     """Decode quaternions of versions 3 and 4: 2 bits for the largest of x y z w, and 9 bits of |q|·√2 plus a
     sign for the others."""
-    packed = codes.view("<u4").astype(np.uint32)
-    largest = packed >> np.uint32(30)
-    xyzw = np.zeros((len(packed), 4))
-    left = packed.copy()
-    for i in (3, 2, 1, 0):  # the last component is in the lowest bits
-        rows = largest != i
-        part: NDArray[Any] = left[rows]
-        magnitude = (part & np.uint32(511)) / (511 * np.sqrt(2))
-        xyzw[rows, i] = np.where(part & np.uint32(512), -magnitude, magnitude)
-        left[rows] = part >> np.uint32(10)
-    rest = np.sqrt(np.maximum(0, 1 - (xyzw**2).sum(1)))
-    xyzw[np.arange(len(packed)), largest] = rest
-    return xyzw[:, [3, 0, 1, 2]]
+    packed = codes.view("<u4")
+    parts = packed[:, None] >> np.array([20, 10, 0], np.uint32)
+    magnitudes = (parts & np.uint32(511)) / (511 * np.sqrt(2))
+    others = np.where(parts & np.uint32(512), -magnitudes, magnitudes)
+    return packing.from_smallest_three(packed >> np.uint32(30), others)[:, [3, 0, 1, 2]]
 
 
 def write(

@@ -52,27 +52,17 @@ class SceneStream(ABC):
         self.sh_degree = _DEGREE_OF_REST[rest]
         self.offset = np.zeros(3) if offset is None else offset
 
-    @abstractmethod
-    def raw(self, rows: int, start: int) -> Iterator[Raw]:
-        """Yield the source's rows from `start`, at most `rows` at a time; callers may change the arrays."""
-
     def identity(self) -> list[Any]:
         """Return JSON that identifies this source, see `file_identity`."""
         return file_identity([self.path])
 
+    @abstractmethod
     def positions(self, rows: int) -> Iterator[NDArray[np.float32]]:
         """Yield the (n, 3) means of all rows in blocks, without cleaning."""
-        return (raw.means for raw in self.raw(rows, 0))
 
+    @abstractmethod
     def blocks(self, rows: int, start: int = 0) -> Iterator[Splats]:
         """Yield rows from `start` in blocks of at most `rows`, cleaned as in `g2ard.io.read_scene`."""
-        for raw in self.raw(rows, start):
-            keep, before = np.ones(len(raw.means), bool), self.tally.dropped
-            for first in range(0, len(keep), BLOCK):
-                part = slice(first, first + BLOCK)
-                keep[part] = self.tally.clean(raw.take(part))
-            splats = raw.activated(self.render_model)
-            yield splats if self.tally.dropped == before else splats.take(keep)
 
     def all_notes(self) -> tuple[Note, ...]:
         """Return all notes once `blocks` has finished; raise an `InputError` if no row is finite."""
@@ -81,11 +71,30 @@ class SceneStream(ABC):
     def whole(self) -> Scene:
         """Read all rows into memory."""
         raw, kept = Raw.empty(self.count, (self.sh_degree + 1) ** 2 - 1), 0
-        raw.offset = self.offset
         for block in self.blocks(BLOCK):
-            raw.take(slice(kept, kept := kept + len(block))).fill(block, block.scales)
+            raw.take(slice(kept, kept := kept + len(block))).fill(block)
         notes = self.all_notes()
-        return Scene(raw.take(slice(kept)).activated(self.render_model), notes)
+        return Scene(raw.take(slice(kept)).activated(self.render_model, self.offset), notes)
+
+
+class RawStream(SceneStream):
+    """Scene whose rows must be cleaned."""
+
+    @abstractmethod
+    def raw(self, rows: int, start: int) -> Iterator[Raw]:
+        """Yield the source's rows from `start`, at most `rows` at a time; callers may change the arrays."""
+
+    def positions(self, rows: int) -> Iterator[NDArray[np.float32]]:
+        return (raw.means for raw in self.raw(rows, 0))
+
+    def blocks(self, rows: int, start: int = 0) -> Iterator[Splats]:
+        for raw in self.raw(rows, start):
+            keep, before = np.ones(len(raw.means), bool), self.tally.dropped
+            for first in range(0, len(keep), BLOCK):
+                part = slice(first, first + BLOCK)
+                keep[part] = self.tally.clean(raw.take(part))
+            splats = raw.activated(self.render_model, self.offset)
+            yield splats if self.tally.dropped == before else splats.take(keep)
 
 
 class PartsStream(SceneStream):
@@ -117,27 +126,13 @@ class PartsStream(SceneStream):
     def positions(self, rows: int) -> Iterator[NDArray[np.float32]]:
         return (self._part(number).means for number in range(len(self._counts)))
 
-    def raw(self, rows: int, start: int) -> Iterator[Raw]:
-        for part in self._pieces(rows, start):
-            raw = Raw.empty(len(part), part.shN.shape[1])
-            raw.fill(part, np.log(part.scales))
-            raw.offset = self.offset
-            yield raw
-
     def blocks(self, rows: int, start: int = 0) -> Iterator[Splats]:
-        done = start
-        for part in self._pieces(rows, start):
-            done += len(part)
-            self.tally.rows = done
-            yield part
-
-    def _pieces(self, rows: int, start: int) -> Iterator[Splats]:
-        for number, count in enumerate(self._counts):
-            if start < count:
-                part = replace(self._part(number), render_model=self.render_model)
-                for first in range(start, count, rows):
-                    yield part.take(slice(first, first + rows))
-            start = max(0, start - count)
+        for number, begin in from_row(self._counts, start):
+            part = replace(self._part(number), render_model=self.render_model)
+            for first in range(begin, len(part), rows):
+                block = part.take(slice(first, first + rows))
+                self.tally.add(block)
+                yield block
 
     def all_notes(self) -> tuple[Note, ...]:
         return self.notes
@@ -147,8 +142,7 @@ class JoinedScenes(SceneStream):
     """Several scenes as one."""
 
     def __init__(self, streams: list[SceneStream]) -> None:
-        highest = max(stream.sh_degree for stream in streams)
-        rest = (highest + 1) ** 2 - 1
+        rest = (max(stream.sh_degree for stream in streams) + 1) ** 2 - 1
         count = sum(stream.count for stream in streams)
         notes = [replace(n, text=f"{s.path}: {n.text}") for s in streams for n in s.notes]
         model = one_model([stream.render_model for stream in streams])
@@ -161,27 +155,29 @@ class JoinedScenes(SceneStream):
     def positions(self, rows: int) -> Iterator[NDArray[np.float32]]:
         for stream in self._streams:
             for means in stream.positions(rows):
-                yield self._moved(means, stream)
+                yield self._moved(means, stream.offset)
 
-    def raw(self, rows: int, start: int) -> Iterator[Raw]:
-        for stream in self._streams:
-            if start < stream.count:
-                for raw in stream.raw(rows, start):
-                    yield self._fitted(raw, stream)
-            start = max(0, start - stream.count)
+    def blocks(self, rows: int, start: int = 0) -> Iterator[Splats]:
+        for number, begin in from_row([stream.count for stream in self._streams], start):
+            stream = self._streams[number]
+            stream.tally = self.tally
+            for block in stream.blocks(rows, begin):
+                shN = np.zeros((len(block), self._rest, 3), np.float32)
+                shN[:, : block.shN.shape[1]] = block.shN
+                means = self._moved(block.means, stream.offset)
+                yield replace(block, means=means, shN=shN, offset=self.offset)
 
-    def _moved(self, means: NDArray[np.float32], stream: SceneStream) -> NDArray[np.float32]:
-        shift = stream.offset - self.offset
+    def _moved(self, means: NDArray[np.float32], offset: NDArray[np.float64]) -> NDArray[np.float32]:
+        shift = offset - self.offset
         return (means + shift).astype(np.float32) if shift.any() else means
 
-    def _fitted(self, raw: Raw, stream: SceneStream) -> Raw:
-        stored = raw.shN.shape[1]
-        if stored < self._rest:
-            shN = np.zeros((len(raw.means), self._rest, 3), np.float32)
-            shN[:, :stored] = raw.shN
-            raw.shN = shN
-        raw.means, raw.offset = self._moved(raw.means, stream), self.offset
-        return raw
+
+def from_row(counts: Sequence[int], start: int) -> Iterator[tuple[int, int]]:
+    """Yield the index and the first row of each part that ends after row `start` of all parts."""
+    for number, count in enumerate(counts):
+        if start < count:
+            yield number, start
+        start = max(0, start - count)
 
 
 def file_identity(files: Sequence[Path]) -> list[Any]:

@@ -7,19 +7,13 @@ from pathlib import Path
 from g2ard.io.stream import PartsStream
 
 
-def stream(path: Path) -> PartsStream:
-    """Open tiles for reading one at a time."""
-    from g2ard.tiles.store import TileStore
+class Stream(PartsStream):
+    """Tiles, read one at a time."""
 
-    store = TileStore.open(path)
-    counts = [tile.rows for tile in store.tiles]
-    return PartsStream(
-        path,
-        counts,
-        store.read,
-        store.sh_degree,
-        store.offset,
-        [store.key],
-        store.notes,
-        store.render_model,
-    )
+    def __init__(self, path: Path) -> None:
+        from g2ard.tiles.store import TileStore
+
+        store = TileStore.open(path)
+        counts = [tile.rows for tile in store.tiles]
+        parts = counts, store.read, store.sh_degree, store.offset
+        super().__init__(path, *parts, [store.key], store.notes, store.render_model)

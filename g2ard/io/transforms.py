@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +11,8 @@ from numpy.typing import NDArray
 
 from g2ard.errors import InputError
 from g2ard.io.jsonfile import Fields, fields_of, matrix, number, optional_text, read_json, text, whole
-from g2ard.io.photos import Frame, find_photo, inverse, photo_size, rigid, view_set
-from g2ard.io.types import Note, ViewSet
+from g2ard.io.photos import Frame, Lens, find_photo, inverse, photo_size, rigid, view_set
+from g2ard.io.types import ViewSet
 
 _MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
 
@@ -29,22 +28,16 @@ FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 def read(path: Path, images: Path | None = None) -> ViewSet:
     """Read frames with their photos and intrinsics, which override those of the file.
 
-    Args:
-        path: the JSON, or a folder with transforms.json, or with transforms_train.json and
-            transforms_test.json, which then are the splits. Either finds a transforms_test.json beside
-            transforms_train.json.
-        images: folder to search for photos by file name; None uses the paths in the JSON.
+    `path` is the JSON, or a folder with transforms.json, or with transforms_train.json and
+    transforms_test.json, which then are the splits. transforms_train.json finds the other beside it.
     """
     if path.name != _TRAIN:
         return view_set(path, frames(path, images))
     if (path.parent / _TEST).is_file():
-        note = Note("test_beside", 1, f"{_TEST} beside it has the test views")
         both = [*_frames(path, images, "train"), *_frames(path.parent / _TEST, images, "test")]
-    else:
-        note = Note("no_test_beside", 1, f"no {_TEST} beside it; every 8th of its views is held out")
-        both = frames(path, images)
-    found = view_set(path, both)
-    return replace(found, notes=(*found.notes, note))
+        return view_set(path, both).noted("test_beside", 1, f"{_TEST} beside it has the test views")
+    text = f"no {_TEST} beside it; every 8th of its views is held out"
+    return view_set(path, frames(path, images)).noted("no_test_beside", 1, text)
 
 
 def frames(path: Path, images: Path | None = None) -> list[Frame]:
@@ -105,7 +98,7 @@ def _frame(path: Path, index: int, content: dict[str, Any], entry: Any, images: 
         viewmat=opencv_view(world_from_camera),
         photo=photo,
         mask=mask,
-        **_intrinsics(path, frame, photo),
+        lens=_intrinsics(path, frame, photo),
     )
 
 
@@ -124,7 +117,7 @@ def opencv_view(world_from_camera: NDArray[np.float64]) -> NDArray[np.float64]:
     return inverse(world_from_camera @ FLIP)
 
 
-def _intrinsics(path: Path, values: Fields, photo: Path) -> dict[str, Any]:
+def _intrinsics(path: Path, values: Fields, photo: Path) -> Lens:
     model = text(values, "camera_model", "OPENCV")
     if model not in _MODELS or values.get("is_fisheye"):
         known = ", ".join(_MODELS)
@@ -137,11 +130,8 @@ def _intrinsics(path: Path, values: Fields, photo: Path) -> dict[str, Any]:
     if fx is None or fy is None:
         raise values.place.error("has no focal length (fl_x or camera_angle_x)")
     cx, cy = number(values, "cx", width / 2), number(values, "cy", height / 2)
-    return {
-        "K": np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]),
-        "size": (width, height),
-        "distortion": tuple(number(values, key, 0.0) for key in ("k1", "k2", "p1", "p2", "k3")),
-    }
+    distortion = tuple(number(values, key, 0.0) for key in ("k1", "k2", "p1", "p2", "k3"))
+    return Lens((width, height), np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), distortion)
 
 
 def _focal(values: Fields, axis: str, pixels: int) -> float | None:

@@ -117,6 +117,10 @@ class ViewSet:
         weights = None if self.weights is None else self.weights[rows]
         return ViewSet(self.cameras.take(rows), self.notes, splits, weights)
 
+    def noted(self, code: str, count: int, text: str) -> ViewSet:
+        """Add a note."""
+        return replace(self, notes=(*self.notes, Note(code, count, text)))
+
     def resized(self, longest: int | None) -> ViewSet:
         """Shrink views to a longer side of at most `longest` pixels; None keeps them."""
         return replace(self, cameras=self.cameras.resized(longest))

@@ -133,16 +133,13 @@ def read(path: Path) -> Scene:
     raw = Raw.empty(count, size - 1)
     raw.means[:] = means * _TURN
     raw.quats[:] = _values(path, prims[0], "orientations", 4, count)[:, [3, 0, 1, 2]] * _QUAT_TURN
-    alphas = _values(path, prims[0], "opacities", 1, count)[:, 0].astype(np.float64)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        raw.log_scales[:] = np.log(_values(path, prims[0], "scales", 3, count).astype(np.float64))
-        raw.logit_opacities[:] = np.log(alphas) - np.log1p(-alphas)
+    alphas = _values(path, prims[0], "opacities", 1, count)[:, 0]
+    raw.set_linear(_values(path, prims[0], "scales", 3, count), alphas)
     bands = _values(path, prims[0], f"{_SH}Coefficients", 3, count * size).reshape(count, size, 3)
     raw.sh0[:] = bands[:, :1]
     raw.shN[:] = bands[:, 1:] * FLIPS[: size - 1, None]
     scene = cleaned(path, raw)
-    splats = placed(scene.splats, _to_ply(pxr, stage, prims[0]))
-    return replace(scene, splats=splats)
+    return replace(scene, splats=placed(scene.splats, _to_ply(pxr, stage, prims[0])))
 
 
 def _values(path: Path, prim: Any, name: str, width: int, count: int | None) -> NDArray[np.float32]:

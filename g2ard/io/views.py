@@ -14,7 +14,7 @@ from g2ard.errors import InputError
 from g2ard.io import jsonfile
 from g2ard.io.atomic import atomic_output
 from g2ard.io.camera_files import beside
-from g2ard.io.photos import Frame, rigid, view_set
+from g2ard.io.photos import Frame, Lens, rigid, view_set
 from g2ard.io.types import ViewSet
 from g2ard.progress import plural
 from g2ard.scene.cameras import Cameras
@@ -42,15 +42,15 @@ def _frame(path: Path, index: int, entry: Any, images: Path | None) -> Frame:
     weight = None if view.get("weight") is None else jsonfile.number(view, "weight")
     if weight is not None and weight < 0:
         raise view.place.to("weight").unexpected(weight, "a number ≥ 0")
-    lens = jsonfile.listed(view, "distortion")
+    size = jsonfile.whole(view, "width"), jsonfile.whole(view, "height")
+    count = len(jsonfile.listed(view, "distortion"))
+    distortion = *(jsonfile.numbers(view, "distortion", count) if count else ()), *[0.0] * 5
     return Frame(
         name=jsonfile.text(view, "name"),
         viewmat=_exact(view),
-        K=np.array(jsonfile.numbers(view, "K", 3, 3)),
-        size=(jsonfile.whole(view, "width"), jsonfile.whole(view, "height")),
+        lens=Lens(size, np.array(jsonfile.numbers(view, "K", 3, 3)), distortion[:5]),
         photo=None if photo is None else images / Path(photo).name if images else path.parent / photo,
         mask=None if mask is None else path.parent / mask,
-        distortion=(*(jsonfile.numbers(view, "distortion", len(lens)) if lens else ()), *[0.0] * 5)[:5],
         split=jsonfile.optional_text(view, "split"),
         weight=weight,
     )

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from g2ard.errors import DAMAGED, InputError
+from g2ard.errors import InputError, damaged
 from g2ard.io import kind, read_points, read_views
 from helpers.faults import Fault, check_fault, faulty
 from helpers.realdata import real
@@ -75,7 +75,7 @@ def test_a_cut_column_is_named(tmp_path: Path, name: str, keep: int, fault: Faul
     with pytest.raises(InputError) as caught:
         (read_points if "points" in name else read_views)(folder)
     check_fault(caught.value, path, fault)
-    assert caught.value.hint == DAMAGED
+    assert caught.value.hint == damaged("").hint
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,6 @@ import json
 import math
 import struct
 import sys
-import zipfile
 import zlib
 from collections.abc import Callable
 from dataclasses import replace
@@ -24,7 +23,7 @@ from helpers.commands import CommandLine
 from helpers.faults import Fault, faulty
 from helpers.glb_files import glb_parts, write_glb
 from helpers.packed_files import save_spz, truth
-from helpers.sog_files import parts
+from helpers.sog_files import parts, zipped
 from helpers.trainer_files import inria
 from helpers.view_files import colmap, edit, orbit, transforms, views
 
@@ -147,10 +146,7 @@ def png(width: int, height: int) -> bytes:
 
 
 def sog(path: Path, changed: dict[str, bytes]) -> Path:
-    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
-        for name, content in {**parts(), **changed}.items():
-            archive.writestr(name, content)
-    return path
+    return zipped(path, parts() | changed)
 
 
 def sog_count(path: Path, count: int) -> Path:
@@ -288,14 +284,14 @@ def test_nothing_is_written_after_such_a_claim(command_line: CommandLine, tmp_pa
     assert str(path.name) in told
 
 
-def test_zstd_frames_are_unpacked_up_to_their_size(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    from g2ard.io.spz import _zstd
+def test_zstd_frames_are_unpacked_up_to_their_size(tmp_path: Path) -> None:
+    from g2ard.io.spz import _unpacked
 
     if sys.version_info >= (3, 14):
         from compression import zstd
     else:
         from backports import zstd
-    assert len(_zstd(tmp_path)(zstd.compress(bytes(80_000_000)), 1000)) == 1001
+    assert len(_unpacked(tmp_path, zstd.compress(bytes(80_000_000)), 1000)) == 1001
 
 
 def test_huge_photos_are_rejected_before_decoding(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
