@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from plyfile import PlyData, PlyElement
 
+from g2ard.io import write_splats
 from g2ard.scene.splats import Splats
 
 
@@ -141,4 +142,11 @@ def save_spz(path: Path, scene: Splats, version: int, magic: bytes = b"NGSP") ->
     gap = b"extension"  # the header says where the table begins
     head += bytes([len(streams)]) + struct.pack("<I12x", 32 + len(gap))
     path.write_bytes(head + gap + table + b"".join(packed))
+    return path
+
+
+def saved(folder: Path, name: str, scene: Splats, **options: object) -> Path:
+    """Write a scene as a.NAME, or as NAME if that has a folder."""
+    path = folder / (name if "/" in name else f"a.{name}")
+    write_splats(path, scene, **options)
     return path

@@ -1,7 +1,6 @@
 """A small valid file of every kind that g2ard reads, for fuzzing."""
 
 import json
-import zipfile
 from collections.abc import Callable
 from pathlib import Path
 
@@ -11,7 +10,8 @@ from g2ard.io import write_splats, write_views
 from helpers.cloud_files import columns, las, ply
 from helpers.dataset_files import cambridge
 from helpers.packed_files import compressed, save_spz, truth
-from helpers.sog_files import parts
+from helpers.sog_files import folder as sog_folder
+from helpers.sog_files import parts, zipped
 from helpers.trainer_files import data_of, export, inria, result_of, run_of
 from helpers.view_files import colmap, orbit, transforms, views
 
@@ -22,13 +22,6 @@ def ascii_cloud(path: Path) -> Path:
     lines += [f"property uchar {c}" for c in ("red", "green", "blue")]
     lines += ["end_header", "0 0 1 1 2 3", "1 0 0 4 5 6", "0 1 0 7 8 9"]
     path.write_text("\n".join(lines) + "\n")
-    return path
-
-
-def bundle(path: Path) -> Path:
-    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
-        for name, content in parts().items():
-            archive.writestr(name, content)
     return path
 
 
@@ -53,17 +46,9 @@ def landmarks(folder: Path, name: str) -> Path:
     return folder / "college" / name
 
 
-def chunks(folder: Path) -> Path:
-    """Return the meta.json of a SOG folder."""
-    for name, content in parts().items():
-        (folder / name).write_bytes(content)
-    return folder / "meta.json"
-
-
 def levels(folder: Path) -> Path:
     """Return the lod-meta.json of a folder of SOG chunks."""
-    (folder / "0_0").mkdir()
-    chunks(folder / "0_0")
+    sog_folder(folder / "0_0", parts())
     tree = {"children": [{"lods": {"0": {"file": 0, "offset": 0, "count": 10}}}]}
     path = folder / "lod-meta.json"
     path.write_text(json.dumps({"lodLevels": 1, "filenames": ["0_0/meta.json"], "tree": tree}))
@@ -86,8 +71,8 @@ MAKERS: dict[str, Callable[[Path], Path]] = {
     "spz 3": lambda f: save_spz(f / "a.spz", truth(9, 1), 3),
     "spz 4": lambda f: save_spz(f / "a.spz", truth(9, 1), 4),
     "splat": lambda f: saved(f / "a.splat", write_splats, truth(9, 0)),
-    "sog": lambda f: bundle(f / "a.sog"),
-    "meta.json": chunks,
+    "sog": lambda f: zipped(f / "a.sog", parts()),
+    "meta.json": lambda f: sog_folder(f, parts()) / "meta.json",
     "lod-meta.json": levels,
     "glb": lambda f: saved(f / "a.glb", write_splats, truth(9, 1)),
     "cloud": lambda f: ply(f / "a.ply", columns("f4", "u1"), np.arange(36.0).reshape(6, 6), faces=3),

@@ -23,6 +23,14 @@ def six() -> Cameras:
     return around(6, (64, 48))
 
 
+def bent(rows: int | slice, distortion: object) -> Cameras:
+    """Return views with distortion in some rows, and a principal point beside the middle in row 1."""
+    distortions, Ks = np.zeros((6, 5)), six().Ks.copy()
+    distortions[rows] = distortion
+    Ks[1, :2, 2] += (3, -2)
+    return replace(six(), Ks=Ks, distortions=distortions)
+
+
 def same(mine: Cameras, theirs: Cameras, *, lens: bool = True) -> None:
     assert mine.names == theirs.names
     np.testing.assert_allclose(mine.viewmats, theirs.viewmats, atol=1e-12)
@@ -48,24 +56,14 @@ def test_views_come_back(tmp_path: Path, format: str) -> None:
 
 @pytest.mark.parametrize("format", ["nerfstudio", "colmap"])
 def test_lenses_come_back(tmp_path: Path, format: str) -> None:
-    views = six()
-    bent = np.zeros((6, 5))
-    bent[:3, :4] = [0.05, -0.02, 1e-3, 2e-3]
-    Ks = views.Ks.copy()
-    Ks[1, :2, 2] += (3, -2)
-    views = replace(views, Ks=Ks, distortions=bent)
+    views = bent(slice(0, 3), [0.05, -0.02, 1e-3, 2e-3, 0])
     path = tmp_path / NAMES[format]
     write_views(path, views)
     same(read_view_set(path).cameras, views)
 
 
 def test_what_a_format_cannot_hold_is_said(tmp_path: Path) -> None:
-    views = six()
-    Ks = views.Ks.copy()
-    Ks[1, :2, 2] += (3, -2)
-    bent = np.zeros((6, 5))
-    bent[2] = 0.01
-    views, weights = replace(views, Ks=Ks, distortions=bent), np.ones(6)
+    views, weights = bent(2, 0.01), np.ones(6)
     told = "without 1 principal point beside the image's middle, lens distortion of 1 view, splits, sampling"
     with pytest.warns(UserWarning, match=told):
         write_views(tmp_path / "cameras.json", views, splits=SPLITS, weights=weights)

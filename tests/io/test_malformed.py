@@ -1,12 +1,13 @@
-"""Over fifty malformed files for each reader: each is read as data that make sense, or ends in one line."""
+"""No damaged file ends in a traceback: readers answer with sound data or one line of InputError."""
 
 import re
 from pathlib import Path
 
 import pytest
 
-from fuzz_readers import read_checked
+from fuzz_readers import fuzz, read_checked
 from helpers.malformations import malformed
+from helpers.project import ROOT
 from helpers.reader_cases import MAKERS, READ
 
 
@@ -46,3 +47,26 @@ def test_a_property_of_another_kind_is_named(tmp_path: Path, what: str) -> None:
         told = (line or "").replace(str(tmp_path), "")
         named = any(key in told for key in keys) or re.search(r"\bx\b", told)
         assert line is None or not keys or named, f"{how}: {line}"
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("what", MAKERS)
+def test_mutated_files_give_sound_data_or_one_error_line(tmp_path: Path, what: str) -> None:
+    tally = fuzz(what, MAKERS[what], tmp_path, runs=100, seed=0)
+    assert set(tally) <= {"read", "refused"}, tally
+
+
+ONCE_BROKEN = sorted((ROOT / "tests" / "fuzz_corpus").iterdir())
+"""Files that a reader once answered otherwise, as CASE--WHAT."""
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("file", ONCE_BROKEN, ids=lambda file: file.name)
+def test_files_that_once_broke_a_reader_end_in_one_line(tmp_path: Path, file: Path) -> None:
+    what = file.name.partition("--")[0]
+    path = MAKERS[what](tmp_path)
+    path.write_bytes(file.read_bytes())
+    line = read_checked(tmp_path / READ[what] if what in READ else path)
+    assert line is not None
+    assert "\n" not in line
+    assert str(tmp_path) in line

@@ -120,13 +120,15 @@ def test_spz_equals_compressed_ply_of_the_same_scene() -> None:
 
 def test_splat_by_hand(tmp_path: Path) -> None:
     row = struct.pack("<6f8B", 1, 2, 3, 0.1, 0.2, 0.3, 255, 0, 128, 64, 255, 128, 0, 128)
-    (tmp_path / "a.splat").write_bytes(row)
+    opaque = struct.pack("<6f8B", 0, 0, 0, 1, 1, 1, 9, 9, 9, 255, 255, 128, 128, 128)
+    (tmp_path / "a.splat").write_bytes(row + opaque)
     splats = read_splats(tmp_path / "a.splat")
-    np.testing.assert_allclose(splats.means, [[1, 2, 3]])
-    np.testing.assert_allclose(splats.scales, [[0.1, 0.2, 0.3]], rtol=1e-6)
-    np.testing.assert_allclose(splats.colors, [[1, 0, 128 / 255]], atol=1e-6)
-    np.testing.assert_allclose(splats.opacities, [64 / 255], atol=1e-6)
-    np.testing.assert_allclose(splats.quats, [[127 / 128, 0, -1, 0]])
+    np.testing.assert_allclose(splats.means[0], [1, 2, 3])
+    np.testing.assert_allclose(splats.scales[0], [0.1, 0.2, 0.3], rtol=1e-6)
+    np.testing.assert_allclose(splats.colors[0], [1, 0, 128 / 255], atol=1e-6)
+    np.testing.assert_allclose(splats.opacities[0], 64 / 255, atol=1e-6)
+    np.testing.assert_allclose(splats.quats[0], [127 / 128, 0, -1, 0])
+    assert splats.logit_opacities[1] == LOGIT_LIMIT
 
 
 def test_splat_round_trip(tmp_path: Path) -> None:
@@ -147,9 +149,3 @@ def test_an_odd_size_is_not_a_splat_file(tmp_path: Path, size: int) -> None:
     (tmp_path / "a.splat").write_bytes(b"\0" * size)
     with pytest.raises(InputError, match="multiple of 32"):
         read_splats(tmp_path / "a.splat")
-
-
-def test_full_opacity_in_splat_is_clamped(tmp_path: Path) -> None:
-    row = struct.pack("<6f8B", 0, 0, 0, 1, 1, 1, 9, 9, 9, 255, 255, 128, 128, 128)
-    (tmp_path / "a.splat").write_bytes(row)
-    assert read_splats(tmp_path / "a.splat").logit_opacities[0] == LOGIT_LIMIT

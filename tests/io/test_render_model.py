@@ -16,6 +16,7 @@ from g2ard.scene.splats import Splats
 from g2ard.scene.transform import join
 from g2ard.tiles.ingest import ingest
 from helpers.commands import CommandLine, refused, succeeds
+from helpers.packed_files import saved
 from helpers.scenes import around, checkered_ball
 
 SAYS_SO = ("ply", "compressed.ply", "sog", "spz", "folder/meta.json")
@@ -35,12 +36,6 @@ def images(scene: Splats) -> np.ndarray:
 @pytest.fixture(scope="module")
 def truth() -> np.ndarray:
     return images(mip_ball())
-
-
-def saved(folder: Path, name: str, scene: Splats, **options: object) -> Path:
-    path = folder / ("a." + name if "/" not in name else name)
-    write_splats(path, scene, **options)
-    return path
 
 
 @pytest.mark.parametrize("name", SAYS_SO)

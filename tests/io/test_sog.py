@@ -3,7 +3,6 @@
 import importlib.util
 import io
 import json
-import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +16,7 @@ from g2ard.io.sanitize import LOGIT_LIMIT
 from helpers.faults import Fault, check_fault, faulty
 from helpers.realdata import real
 from helpers.scenes import assert_same_bits
-from helpers.sog_files import folder, parts, square, webp
+from helpers.sog_files import folder, parts, square, webp, zipped
 
 
 def decoded(files: dict[str, bytes], name: str, count: int) -> np.ndarray:
@@ -71,12 +70,8 @@ def test_decodes_every_field(tmp_path: Path, version: int, bands: int) -> None:
 @pytest.mark.parametrize("prefix", ["", "scene/"])
 def test_zipped(tmp_path: Path, prefix: str) -> None:
     files = parts()
-    with zipfile.ZipFile(tmp_path / "a.sog", "w") as bundle:
-        for name, content in files.items():
-            bundle.writestr(prefix + name, content)
     plain = read_splats(folder(tmp_path / "plain", files))
-    zipped = read_splats(tmp_path / "a.sog")
-    assert_same_bits(plain, zipped)
+    assert_same_bits(plain, read_splats(zipped(tmp_path / "a.sog", files, prefix)))
     assert kind(tmp_path / "a.sog") == kind(tmp_path / "plain") == "splats"
     np.testing.assert_array_equal(read_splats(tmp_path / "plain" / "meta.json").means, plain.means)
 
@@ -196,36 +191,24 @@ def test_a_gap_in_a_codebook_drops_what_names_it(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "fault"),
+    ("changes", "fault"),
     [
-        ("a" * 5000 + "/meta.json", ("filenames[0]", None)),
-        (5, ("filenames[0]", None)),
-        ("a\n/meta.json", ("filenames[0]", None)),
+        ({"filenames": ["a" * 5000 + "/meta.json"]}, ("filenames[0]", None)),
+        ({"filenames": [5]}, ("filenames[0]", None)),
+        ({"filenames": ["a\n/meta.json"]}, ("filenames[0]", None)),
+        ({"tree": {"lods": {"0": {"file": -1}}}}, ("tree.lods.0.file", None)),
+        ({"tree": {"lods": {"0": {"file": 2}}}}, ("tree.lods.0.file", None)),
+        ({"tree": {"lods": {"0": {"file": 0.5}}}}, ("tree.lods.0.file", None)),
+        ({"tree": {"children": [{}, 5]}}, ("tree.children[1]", None)),
+        ({"tree": {"children": {}}}, ("tree.children", None)),
+        ({"tree": {"lods": []}}, ("tree.lods", None)),
+        ({"tree": []}, ("tree", None)),
     ],
 )
-def test_broken_names_in_lod_meta(tmp_path: Path, name: Any, fault: Fault) -> None:
-    index = {"filenames": [name], "tree": {"lods": {"0": {"file": 0}}}}
-    (tmp_path / "lod-meta.json").write_text(json.dumps(index))
-    with faulty(tmp_path / "lod-meta.json", fault):
-        read_splats(tmp_path)
-
-
-@pytest.mark.parametrize(
-    ("tree", "fault"),
-    [
-        ({"lods": {"0": {"file": -1}}}, ("tree.lods.0.file", None)),
-        ({"lods": {"0": {"file": 2}}}, ("tree.lods.0.file", None)),
-        ({"lods": {"0": {"file": 0.5}}}, ("tree.lods.0.file", None)),
-        ({"children": [{}, 5]}, ("tree.children[1]", None)),
-        ({"children": {}}, ("tree.children", None)),
-        ({"lods": []}, ("tree.lods", None)),
-        ([], ("tree", None)),
-    ],
-)
-def test_broken_lod_meta_is_named(tmp_path: Path, tree: Any, fault: Fault) -> None:
+def test_broken_lod_meta_is_named(tmp_path: Path, changes: dict[str, Any], fault: Fault) -> None:
     for name in "ab":
         folder(tmp_path / name, parts(count=4))
-    index = {"filenames": ["a/meta.json", "b/meta.json"], "tree": tree}
+    index = {"filenames": ["a/meta.json", "b/meta.json"], "tree": {"lods": {"0": {"file": 0}}}} | changes
     (tmp_path / "lod-meta.json").write_text(json.dumps(index))
     with faulty(tmp_path / "lod-meta.json", fault):
         read_splats(tmp_path)
@@ -235,8 +218,7 @@ def test_broken_zip_is_named(tmp_path: Path) -> None:
     (tmp_path / "a.sog").write_bytes(b"PK\x03\x04nonsense")
     with pytest.raises(InputError, match=r"a\.sog: is not a complete \.sog archive"):
         read_splats(tmp_path / "a.sog")
-    with zipfile.ZipFile(tmp_path / "b.sog", "w") as bundle:
-        bundle.writestr("other.txt", "x")
+    zipped(tmp_path / "b.sog", {"other.txt": b"x"})
     with pytest.raises(InputError, match=r"no meta\.json"):
         read_splats(tmp_path / "b.sog")
 
