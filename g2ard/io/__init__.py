@@ -139,10 +139,10 @@ def check_scene(path: str | Path) -> tuple[Path, str]:
     path = run_scene(path)
     found = file_format(path)
     if KINDS[found] != "splats":
-        words = {"cloud_ply": "a point cloud (no f_dc, scale, rot)", "las": "a point cloud"}
         is_cloud = KINDS[found] == "points"
+        what = "a point cloud (no f_dc, scale, rot)" if is_cloud else found
         hint = "`g2ard lift` turns it into a scene" if is_cloud else "give the scene's file"
-        raise InputError(f"expected a Gaussian scene, found {words.get(found, found)}", path=path, hint=hint)
+        raise InputError(f"expected a Gaussian scene, found {what}", path=path, hint=hint)
     return path, found
 
 

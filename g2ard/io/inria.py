@@ -35,16 +35,15 @@ def read(path: Path, images: Path | None = None) -> ViewSet:
         images = file.parent / "images"
     frames = [_frame(file, i, camera, images) for i, camera in enumerate(listed)]
     times = Counter(frame.name for frame in frames)
-    twice = {name for name, count in times.items() if count > 1}
-    if not twice:
-        return view_set(file, frames)
-    named = [
-        frame._replace(name=f"{frame.name}_{camera.get('id', i)}") if frame.name in twice else frame
-        for i, (frame, camera) in enumerate(zip(frames, listed, strict=True))
-    ]
-    count = sum(times[name] for name in twice)
-    text = f"{plural(count, 'camera')} of {len(frames)} have repeated names; their ids are appended"
-    return view_set(file, named).noted("repeated_names", count, text)
+    for i, frame in enumerate(frames):
+        if times[frame.name] > 1:
+            frames[i] = frame._replace(name=f"{frame.name}_{listed[i].get('id', i)}")
+    found = view_set(file, frames)
+    repeated = sum(count for count in times.values() if count > 1)
+    if not repeated:
+        return found
+    text = f"{plural(repeated, 'camera')} of {len(frames)} have repeated names; their ids are appended"
+    return found.noted("repeated_names", repeated, text)
 
 
 def _frame(path: Path, index: int, entry: Any, images: Path | None) -> Frame:

@@ -112,7 +112,7 @@ class JoinedClouds(PointStream):
     def __init__(self, streams: list[PointStream]) -> None:
         super().__init__(streams[0].path, sum(s.count for s in streams), streams[0].offset)
         self._streams = streams
-        self._divisors: list[float | None] = [None] * len(streams)
+        self._divisors: dict[int, float] = {}
 
     def raw(self, rows: int, start: int) -> Iterator[RawPoints]:
         for number, begin in from_row([stream.count for stream in self._streams], start):
@@ -122,14 +122,13 @@ class JoinedClouds(PointStream):
 
     def _divisor(self, number: int, rows: int) -> float:
         """Return a file's divisor, which takes an additional pass over its points."""
-        known = self._divisors[number]
-        if known is None:
+        if number not in self._divisors:
             stream = self._streams[number]
             stream.tally = PointTally()
             for points in stream.raw(rows, 0):
                 stream.tally.finite(points)
-            known = self._divisors[number] = stream.divisor
-        return known
+            self._divisors[number] = stream.divisor
+        return self._divisors[number]
 
     def notes(self) -> tuple[Note, ...]:
         return tuple(replace(n, text=f"{s.path}: {n.text}") for s in self._streams for n in s.notes())

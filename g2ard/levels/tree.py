@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryFile
 from typing import Any
@@ -117,25 +117,17 @@ def _reach(splats: Splats) -> Float:
     return np.einsum("nij,nj->ni", np.abs(frames), splats.scales.astype(np.float64))
 
 
-@dataclass(eq=False)
 class _Tree:
     """Rows of all levels, numbered consecutively; the rows of a node are in ascending order."""
 
-    levels: Sequence[Level]
-    rule: Cut
-    scratch: Path | None
-    starts: Rows = field(init=False)
-    means: NDArray[Any] = field(init=False)
-    kept: Rows = field(init=False)
-    filled: int = 0
-
-    def __post_init__(self) -> None:
-        self.starts = np.cumsum([0, *(len(level) for level in self.levels)])
+    def __init__(self, levels: Sequence[Level], rule: Cut, scratch: Path | None) -> None:
+        self.levels, self.rule, self.scratch = levels, rule, scratch
+        self.starts = np.cumsum([0, *map(len, levels)])
         count, at = int(self.starts[-1]), 0
-        self.kept = self.room(count)
-        wide = any(isinstance(level, Splats) and level.means.dtype == np.float64 for level in self.levels)
+        self.kept, self.filled = self.room(count), 0
+        wide = any(isinstance(level, Splats) and level.means.dtype == np.float64 for level in levels)
         self.means = self.room((count, 3), np.float64 if wide else np.float32)
-        for number, level in enumerate(self.levels):
+        for number, level in enumerate(levels):
             for block in [level.means] if isinstance(level, Splats) else level.positions():
                 if not np.isfinite(block).all():
                     raise InputError(f"a mean of level {number} is not finite", parameter="levels")
@@ -207,8 +199,6 @@ class _Tree:
             if a < b:
                 some = level.take(part)
                 means, reach = some.means.astype(np.float64), _reach(some)
-                low, high = (
-                    np.minimum(low, (means - reach).min(axis=0)),
-                    np.maximum(high, (means + reach).max(axis=0)),
-                )
+                low = np.minimum(low, (means - reach).min(axis=0))
+                high = np.maximum(high, (means + reach).max(axis=0))
         return Leaf(low, high, tuple(parts))
