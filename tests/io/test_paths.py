@@ -12,7 +12,6 @@ from g2ard.io import read_scene, read_splats, read_views, write_splats, write_vi
 from g2ard.io.paths import output_names, real_path
 from g2ard.scene.splats import Splats
 from helpers.commands import CommandLine, succeeds
-from helpers.faults import Fault, faulty
 from helpers.systems import needs_links
 from helpers.view_files import colmap, edit, orbit, views
 
@@ -98,24 +97,6 @@ def test_an_absurd_number_of_a_coefficient(scene: Path) -> None:
     scene.write_bytes(content)
     with pytest.raises(InputError, match="'opacity'"):
         read_splats(scene)
-
-
-@pytest.mark.parametrize(
-    ("change", "fault"),
-    [
-        ({"split": 3}, ("split", 0)),
-        ({"name": 3}, ("name", 0)),
-        ({"distortion": [float("nan")] * 5}, ("distortion[0]", 0)),
-        ({"distortion": [1e300]}, (None, 0)),
-        ({"K": [[1e308, 0, 1], [0, 9, 1], [0, 0, 1]]}, (None, 0)),
-    ],
-)
-def test_views_of_absurd_values(tmp_path: Path, change: dict[str, object], fault: Fault) -> None:
-    path = tmp_path / "v.json"
-    write_views(path, views(1))
-    edit(path, lambda content: content["views"][0].update(change))
-    with faulty(path, fault):
-        read_views(path)
 
 
 def test_quaternions_of_any_length_turn_views_alike(tmp_path: Path) -> None:

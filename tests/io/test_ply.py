@@ -60,15 +60,10 @@ def test_round_trip(tmp_path_factory, count: int, degree: int, seed: int, normal
     assert [note.code for note in found.notes] == (["invisible"] if nothing_shows else [])
 
 
-def test_more_than_one_block(tmp_path: Path) -> None:
-    truth = scene(count=20_000, degree=1)
+def test_layout_is_the_standard_one(tmp_path: Path) -> None:
+    truth = scene(count=20_000, degree=2)  # more than one block
     write_splats(tmp_path / "a.ply", truth)
     assert_same(read_splats(tmp_path / "a.ply"), truth)
-
-
-def test_layout_is_the_standard_one(tmp_path: Path) -> None:
-    truth = scene(degree=2)
-    write_splats(tmp_path / "a.ply", truth)
     ply = PlyData.read(tmp_path / "a.ply")
     expected = columns(truth)
     assert [p.name for p in ply["vertex"].properties] == list(expected)

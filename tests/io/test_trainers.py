@@ -140,21 +140,6 @@ def test_a_run_s_data_state_their_split(tmp_path: Path) -> None:
         read_view_set(path)
 
 
-@pytest.mark.parametrize(
-    ("change", "fault"),
-    [
-        ({"applied_scale": 0}, ("applied_scale", None)),
-        ({"applied_scale": "x"}, ("applied_scale", None)),
-        ({"applied_transform": [[1], [2, 3]]}, ("applied_transform[0][1]", None)),
-        ({"train_filenames": 5}, ("train_filenames", None)),
-    ],
-)
-def test_bad_data_of_a_run(tmp_path: Path, change: dict[str, Any], fault: Fault) -> None:
-    path = data_of(tmp_path, **change)
-    with faulty(path, fault):
-        read_view_set(run_of(tmp_path))
-
-
 def test_a_run_with_an_odd_split(tmp_path: Path) -> None:
     data_of(tmp_path)
     run = run_of(tmp_path, mode="interval")
@@ -196,30 +181,29 @@ def test_a_run_without_config_takes_the_transforms_beside(tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize(
-    ("settings", "change", "file", "fault"),
+    ("file", "change", "fault"),
     [
-        (
-            {"parser": "Phototourism"},
-            {},
-            "config.yml",
-            "unsupported data parser 'PhototourismDataParser'",
-        ),
-        ({"data": "null", "manager": "null"}, {}, "config.yml", ("data", None)),
-        ({"data": "gone"}, {}, "config.yml", "data gone does not exist"),
-        ({}, {"transform": None}, "dataparser_transforms.json", ("transform", None)),
-        ({}, {"transform": [[1, 2], [3, 4]]}, "dataparser_transforms.json", ("transform[0][2]", None)),
-        ({}, {"transform": (2 * T[:3]).tolist()}, "dataparser_transforms.json", ("transform", None)),
-        ({}, {"scale": 0}, "dataparser_transforms.json", ("scale", None)),
-        ({}, {"scale": "big"}, "dataparser_transforms.json", ("scale", None)),
+        ("config.yml", {"parser": "Phototourism"}, "unsupported data parser 'PhototourismDataParser'"),
+        ("config.yml", {"data": "null", "manager": "null"}, ("data", None)),
+        ("config.yml", {"data": "gone"}, "data gone does not exist"),
+        ("dataparser_transforms.json", {"transform": None}, ("transform", None)),
+        ("dataparser_transforms.json", {"transform": [[1, 2], [3, 4]]}, ("transform[0][2]", None)),
+        ("dataparser_transforms.json", {"transform": (2 * T[:3]).tolist()}, ("transform", None)),
+        ("dataparser_transforms.json", {"scale": 0}, ("scale", None)),
+        ("dataparser_transforms.json", {"scale": "big"}, ("scale", None)),
+        ("transforms.json", {"applied_scale": 0}, ("applied_scale", None)),
+        ("transforms.json", {"applied_scale": "x"}, ("applied_scale", None)),
+        ("transforms.json", {"applied_transform": [[1], [2, 3]]}, ("applied_transform[0][1]", None)),
+        ("transforms.json", {"train_filenames": 5}, ("train_filenames", None)),
     ],
 )
-def test_bad_runs(
-    tmp_path: Path, settings: dict[str, str], change: dict[str, Any], file: str, fault: Fault
-) -> None:
-    data_of(tmp_path)
-    run = run_of(tmp_path, **settings)
-    edit(run / "dataparser_transforms.json", lambda c: c.update(change))
-    with faulty(run / file, fault):
+def test_bad_runs(tmp_path: Path, file: str, change: dict[str, Any], fault: Fault) -> None:
+    data = data_of(tmp_path, **(change if file == "transforms.json" else {}))
+    run = run_of(tmp_path, **(change if file == "config.yml" else {}))
+    path = data if file == "transforms.json" else run / file
+    if file == "dataparser_transforms.json":
+        edit(path, lambda content: content.update(change))
+    with faulty(path, fault):
         read_view_set(run)
 
 

@@ -60,44 +60,37 @@ def test_poses_without_any_photo_stay(tmp_path: Path) -> None:
     assert [n.code for n in found.notes] == ["no_photos"]
 
 
+def frame(index: int, **changes: Any) -> Callable[[dict[str, Any]], Any]:
+    return lambda content: content["frames"][index].update(changes)
+
+
+def entry(index: int, row: int, column: int, value: Any) -> Callable[[dict[str, Any]], Any]:
+    return lambda c: c["frames"][index]["transform_matrix"][row].__setitem__(column, value)
+
+
 BAD: list[tuple[Callable[[dict[str, Any]], Any], Fault]] = [
     (lambda c: c.update(frames=[]), "no views found"),
     (lambda c: c["frames"][1].pop("file_path"), ("file_path", 1)),
-    (lambda c: c["frames"][1].update(transform_matrix=[[1, 2], [3, 4]]), ("transform_matrix[0][2]", 1)),
-    (
-        lambda c: c["frames"][0]["transform_matrix"][0].__setitem__(0, float("nan")),
-        ("transform_matrix[0][0]", 0),
-    ),
-    (
-        lambda c: c["frames"][0].update(transform_matrix=np.diag([1, 1, -1, 1]).tolist()),
-        ("transform_matrix", 0),
-    ),
-    (
-        lambda c: c["frames"][0].update(transform_matrix=np.diag([1, 2, 3, 1]).tolist()),
-        ("transform_matrix", 0),
-    ),
-    (lambda c: c["frames"][0].update(transform_matrix="x"), ("transform_matrix", 0)),
-    (
-        lambda c: c["frames"][0]["transform_matrix"][0].__setitem__(0, "x" * 999),
-        ("transform_matrix[0][0]", 0),
-    ),
-    (
-        lambda c: c["frames"][1]["transform_matrix"].__setitem__(1, [0, {}, 0, 0]),
-        ("transform_matrix[1][1]", 1),
-    ),
+    (frame(1, transform_matrix=[[1, 2], [3, 4]]), ("transform_matrix[0][2]", 1)),
+    (entry(0, 0, 0, float("nan")), ("transform_matrix[0][0]", 0)),
+    (frame(0, transform_matrix=np.diag([1, 1, -1, 1]).tolist()), ("transform_matrix", 0)),
+    (frame(0, transform_matrix=np.diag([1, 2, 3, 1]).tolist()), ("transform_matrix", 0)),
+    (frame(0, transform_matrix="x"), ("transform_matrix", 0)),
+    (entry(0, 0, 0, "x" * 999), ("transform_matrix[0][0]", 0)),
+    (entry(1, 1, 1, {}), ("transform_matrix[1][1]", 1)),
     (lambda c: c["frames"][1]["transform_matrix"][2].pop(), ("transform_matrix[2][3]", 1)),
-    (lambda c: c["frames"][1]["transform_matrix"][2].__setitem__(1, []), ("transform_matrix[2][1]", 1)),
-    (lambda c: c["frames"][0].update(k1=[]), ("k1", 0)),
-    (lambda c: c["frames"][0].update(k1="x"), ("k1", 0)),
+    (entry(1, 2, 1, []), ("transform_matrix[2][1]", 1)),
+    (frame(0, k1=[]), ("k1", 0)),
+    (frame(0, k1="x"), ("k1", 0)),
     (lambda c: c["frames"].__setitem__(0, 7), (None, 0)),
     (lambda c: c.pop("fl_x"), (None, 0)),
     (lambda c: c.pop("w"), (None, 0)),
     (lambda c: c.update(w=8.5), ("w", 0)),
-    (lambda c: c["frames"][1].update(h=6.25), ("h", 1)),
+    (frame(1, h=6.25), ("h", 1)),
     (lambda c: c.update(fl_x=-3), (None, 0)),
     (lambda c: c.update(camera_model="OPENCV_FISHEYE"), "OPENCV_FISHEYE"),
     (lambda c: c.update(is_fisheye=True), "fisheye"),
-    (lambda c: c["frames"][1].update(file_path="images/000.png"), "2 views are named '000.png'"),
+    (frame(1, file_path="images/000.png"), "2 views are named '000.png'"),
 ]
 
 

@@ -57,10 +57,17 @@ def test_own_views_name_photos_splits_and_weights(tmp_path: Path) -> None:
         (lambda c: c["views"][1].update(width=80.5), ("width", 1)),
         (lambda c: c["views"][0].update(height=math.inf), ("height", 0)),
         (lambda c: c.update(views=[]), "no views found"),
-        (
-            lambda c: c["views"][0].update(camera_from_world=np.zeros((4, 4)).tolist()),
-            ("camera_from_world", 0),
-        ),
+        *[
+            (lambda c, change=change: c["views"][0].update(change), fault)
+            for change, fault in (
+                ({"camera_from_world": np.zeros((4, 4)).tolist()}, ("camera_from_world", 0)),
+                ({"split": 3}, ("split", 0)),
+                ({"name": 3}, ("name", 0)),
+                ({"distortion": [math.nan] * 5}, ("distortion[0]", 0)),
+                ({"distortion": [1e300]}, (None, 0)),
+                ({"K": [[1e308, 0, 1], [0, 9, 1], [0, 0, 1]]}, (None, 0)),
+            )
+        ],
     ],
 )
 def test_bad_own_views(tmp_path: Path, change: Callable[[dict[str, Any]], Any], fault: Fault) -> None:
