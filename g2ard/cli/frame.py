@@ -69,7 +69,7 @@ _COMMON: dict[str, tuple[Any, ...]] = {
     "overwrite": (bool, typer.Option("-w", "--overwrite", help="Replace existing outputs."), False),
     "json": (
         str | None,
-        typer.Option("--json", metavar="FILE|-", help="Write the result as JSON; - is stdout."),
+        typer.Option(metavar="FILE|-", help="Write the result as JSON; - is stdout."),
     ),
     "seed": (int, typer.Option(min=0, help="Random seed."), 0),
     "threads": (int, typer.Option(min=0, max=256, help="CPU threads; 0 uses all cores."), 0),
@@ -90,7 +90,6 @@ _SETTINGS: dict[str, tuple[Any, ...]] = {
     "set": (
         list[str] | None,
         typer.Option(
-            "--set",
             metavar="PATH=VALUE",
             help="Change a setting, such as recover.schedule.steps=300; repeatable. See docs/options.md.",
         ),

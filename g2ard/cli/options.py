@@ -22,6 +22,7 @@ from g2ard.config.choices import (
     PresetName,
     ScheduleName,
     ViewFormat,
+    is_made,
 )
 from g2ard.errors import InputError, require_torch
 
@@ -37,7 +38,6 @@ SceneArgument = Annotated[
 ViewsOption = Annotated[
     Path | None,
     typer.Option(
-        "--views",
         metavar="VIEWS",
         help="Cameras: COLMAP folder, transforms.json, cameras.json, training run or g2ard's .json.",
     ),
@@ -49,15 +49,9 @@ def _views_or_made(text: str) -> Path | str:
     return "made" if text == "made" else Path(text)
 
 
-def is_made(views: object) -> bool:
-    """Return whether `--views made` was given."""
-    return views == "made"
-
-
 ViewsOrMadeOption = Annotated[
     Path | None,
     typer.Option(
-        "--views",
         parser=_views_or_made,
         metavar="VIEWS|made",
         help="Cameras: COLMAP folder, transforms.json, cameras.json, training run or g2ard's .json. "
@@ -66,17 +60,11 @@ ViewsOrMadeOption = Annotated[
 ]
 ImagesOption = Annotated[
     Path | None,
-    typer.Option(
-        "--images",
-        metavar="DIR",
-        help="Folder of the photos of --views, if they are elsewhere.",
-    ),
+    typer.Option(metavar="DIR", help="Folder of the photos of --views, if they are elsewhere."),
 ]
 AlphaOption = Annotated[
     Alpha,
-    typer.Option(
-        "--alpha", help="Photos with alpha: composite them over the background, or mask what is transparent."
-    ),
+    typer.Option(help="Photos with alpha: composite them over the background, or mask what is transparent."),
 ]
 
 
@@ -93,7 +81,7 @@ def with_images(views: Path | None, images: Path | None, alpha: Alpha = "composi
 
 
 LookOption = Annotated[
-    Path, typer.Option("--views", metavar="VIEWS", help="Cameras, with photos unless --teacher is given.")
+    Path, typer.Option(metavar="VIEWS", help="Cameras, with photos unless --teacher is given.")
 ]
 OutputOption = Annotated[
     Path,
@@ -183,7 +171,6 @@ def _spot(text: str) -> Spot:
 KeepRegionOption = Annotated[
     list[Spot] | None,
     typer.Option(
-        "--keep-region",
         parser=_spot,
         metavar="X,Y,Z,R|X,Y,Z,X,Y,Z",
         help="Keep more detail in a sphere or box, scene units; repeatable. "
@@ -196,16 +183,15 @@ SplitOption = Annotated[
 ]
 ShDegreeOption = Annotated[
     int | None,
-    typer.Option("--sh-degree", min=0, max=3, help="SH degree of the result; by default that of the scene."),
+    typer.Option(min=0, max=3, help="SH degree of the result; by default that of the scene."),
 ]
 FormatOption = Annotated[
     FormatName,
-    typer.Option("--format", case_sensitive=False, help="Format of the scene in RUN."),
+    typer.Option(case_sensitive=False, help="Format of the scene in RUN."),
 ]
 ViewFormatOption = Annotated[
     ViewFormat | None,
     typer.Option(
-        "--format",
         case_sensitive=False,
         help="Format of OUT; by default that of its name: cameras.json is INRIA's, transforms.json "
         "nerfstudio's, another .json g2ard's, a folder COLMAP text.",
@@ -214,7 +200,6 @@ ViewFormatOption = Annotated[
 ViewsFormatOption = Annotated[
     ViewFormat,
     typer.Option(
-        "--views-format",
         case_sensitive=False,
         help="Also write generated views as cameras.json (inria), transforms.json (nerfstudio) or colmap/.",
     ),
@@ -253,11 +238,7 @@ def background_of(run: Run, given: Triple | None, *scenes: Path | None) -> Tripl
 
 TeacherOption = Annotated[
     Path | None,
-    typer.Option(
-        "--teacher",
-        metavar="SCENE",
-        help="Train on or score against renders of this scene instead of photos.",
-    ),
+    typer.Option(metavar="SCENE", help="Train on or score against renders of this scene instead of photos."),
 ]
 PhotosOption = Annotated[
     bool,
@@ -278,7 +259,6 @@ PresetOption = Annotated[
 PaperOption = Annotated[
     PaperPresetName | None,
     typer.Option(
-        "--preset",
         help="Settings of the paper, or paper-trained, paper-lift, paper-noisy for its regularisers. "
         "Other options win.",
         metavar="[paper|paper-…]",
@@ -307,7 +287,6 @@ def _duration(text: str) -> float:
 RecoveryTimeOption = Annotated[
     float | None,
     typer.Option(
-        "--recovery-time",
         parser=_duration,
         metavar="TIME",
         help="Time limit for recovery alone: 90s, 2m or 1h.",
@@ -320,7 +299,7 @@ def views_count(text: str) -> Count | str:
     return "auto" if text.strip() == "auto" else Count.parse(text)
 
 
-PolicyOption = Annotated[Policy | None, typer.Option("--policy", help="Selection criterion.")]
+PolicyOption = Annotated[Policy | None, typer.Option(help="Selection criterion.")]
 
 
 def recovery_engine(run: Run) -> Engine:

@@ -8,8 +8,7 @@ from typing import Any
 import typer
 
 from g2ard.cli.frame import Run
-from g2ard.cli.options import is_made
-from g2ard.config.choices import Colour
+from g2ard.config.choices import Colour, is_made
 from g2ard.io import ViewSet
 from g2ard.jobs.inputs import load_split_views, load_trained, make_targets
 from g2ard.jobs.view_checks import propose_background, warn_of_sight

@@ -83,3 +83,8 @@ ViewFormat = Literal["g2ard", "inria", "nerfstudio", "colmap"]
 
 FormatName = Literal["ply", "sog", "spz", "glb", "compressed.ply", "splat", "usda", "usdc"]
 """Formats that scenes can be written to (`g2ard.io.scene_formats`)."""
+
+
+def is_made(views: object) -> bool:
+    """Return whether views are to be generated rather than given."""
+    return isinstance(views, str) and views == "made"

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from g2ard.config.choices import RenderModel
+from g2ard.config.choices import RenderModel, is_made
 from g2ard.errors import InputError
 from g2ard.io.paths import real_path
 from g2ard.io.types import Points
@@ -20,7 +20,7 @@ from g2ard.jobs.measured_budget import Aim, aim_of
 from g2ard.jobs.photos import sparse_file, sparse_points, topped_up
 from g2ard.jobs.simplify import Reduction
 from g2ard.jobs.view_checks import propose_background, warn_of_photos
-from g2ard.jobs.views import RunViews, is_made, views_of
+from g2ard.jobs.views import RunViews, views_of
 from g2ard.pipeline import Distilled
 from g2ard.progress import Progress, Say, plural, silent, unsaid
 from g2ard.scene.splats import Splats

@@ -10,7 +10,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from g2ard.config.choices import RenderModel
+from g2ard.config.choices import RenderModel, is_made
 from g2ard.errors import G2ardError, InputError, OutputError
 from g2ard.io.atomic import drop_empty, parents_made
 from g2ard.io.detect import MANIFEST
@@ -20,7 +20,7 @@ from g2ard.jobs.distill_options import DistillOptions
 from g2ard.jobs.inputs import Views, load_view_sets, say_regions
 from g2ard.jobs.levels import LevelReport, check_ratios, level_size
 from g2ard.jobs.tiling import RECOVERY_TIMES, Tiling, refuse_whole, whole_options, workers_for
-from g2ard.jobs.views import RunViews, cameras_for_weights, is_made, pool_times, views_of
+from g2ard.jobs.views import RunViews, cameras_for_weights, pool_times, views_of
 from g2ard.levels import Cut
 from g2ard.pipeline import DistillConfig
 from g2ard.progress import Progress, Say, plural, silent, unsaid

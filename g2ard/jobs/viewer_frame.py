@@ -9,10 +9,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from g2ard.config.choices import is_made
 from g2ard.errors import InputError
 from g2ard.jobs.inputs import Views, load_views
 from g2ard.jobs.view_checks import opaque_points
-from g2ard.jobs.views import is_made, views_or_pool
+from g2ard.jobs.views import views_or_pool
 from g2ard.poses.site import Site
 from g2ard.progress import Progress, Say, silent, unsaid
 from g2ard.scene.cameras import Camera, Cameras

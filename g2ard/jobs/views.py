@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from g2ard.config.choices import is_made
 from g2ard.errors import InputError
 from g2ard.io import ViewSet
 from g2ard.jobs.inputs import (
@@ -73,11 +74,6 @@ class RunViews:
         """Shrink all views for training and scoring."""
         apart = self.apart and self.apart.resized(longest)
         return replace(self, train=self.train.resized(longest), test=self.test.resized(longest), apart=apart)
-
-
-def is_made(views: object) -> bool:
-    """Return whether views are to be generated rather than given."""
-    return isinstance(views, str) and views == "made"
 
 
 def views_of(

@@ -15,7 +15,7 @@ from g2ard.cli.frame import Run, command
 from g2ard.cli.outputs import Outputs, budgets_of
 from g2ard.cli.run_result import say_views, say_weight, tell_quality, told, write_table
 from g2ard.cli.tile_options import tiling_of
-from g2ard.config.choices import Focus
+from g2ard.config.choices import Focus, is_made
 from g2ard.io import kind
 from g2ard.progress import plural
 
@@ -119,7 +119,7 @@ def distill(
     names = ("method", "keep_region", "schedule", "steps", "recovery_time", "focus", "background", "seed")
     settings = run.settings(DistillConfig(), *names, preset=preset)
     budgets = budgets_of(run)
-    given = views is not None and not opt.is_made(views)
+    given = views is not None and not is_made(views)
     _check_options(scene, views, held_out, photos)
     settings.setdefault("recover.engine", opt.recovery_engine(run))
     outputs = Outputs(run, output, budgets)
@@ -173,13 +173,13 @@ def _check_options(
     scene: Path | None, views: Path | None, held_out: Path | None, photos: bool | None
 ) -> None:
     """Reject inputs that leave nothing to distil, to train on or to score on."""
-    if opt.is_made(str(held_out)):
+    if is_made(str(held_out)):
         raise typer.BadParameter(
             "--held-out must be a file of views; generated views already hold out every 8th"
         )
-    if scene is None and (views is None or opt.is_made(views)):
+    if scene is None and (views is None or is_made(views)):
         raise typer.BadParameter("give a SCENE, or photos with their poses as --views")
-    if photos and opt.is_made(views):
+    if photos and is_made(views):
         raise typer.BadParameter("--photos: generated views have no photos; give --views VIEWS")
     if scene is None and photos is False:
         raise typer.BadParameter("--renders needs a SCENE to render; give one or remove --renders")

@@ -12,7 +12,7 @@ import typer
 from g2ard.cli import options as opt
 from g2ard.cli.budget_options import Count, LooksOption, RatioOption, one_budget
 from g2ard.cli.frame import Run, command
-from g2ard.config.choices import BLACK, Method
+from g2ard.config.choices import BLACK, Method, is_made
 from g2ard.errors import InputError
 from g2ard.io.atomic import atomic_folder, check_output
 from g2ard.io.paths import output_names
@@ -192,7 +192,7 @@ def _looks(
         raise typer.BadParameter("-n and -r go with --color flags, cells or parents (without --parents)")
     if count is None:
         return None
-    if views is not None and not opt.is_made(views):
+    if views is not None and not is_made(views):
         raise typer.BadParameter("-n generates views, so it excludes --views; give one")
     if count.is_share:
         raise typer.BadParameter(
