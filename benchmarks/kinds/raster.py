@@ -100,51 +100,51 @@ def built_in_view(splats: Splats, width: int, height: int) -> Cameras:
 
 def _row(splats: Splats, cameras: Cameras, isa: str, repeats: int) -> Row:
     settings = RasterSettings(antialiased=False)
-    local = cameras.recentred(splats.offset)
-    arrays, view = arrays_of(splats), view_of(local, 0, settings)
+    arrays, view = arrays_of(splats), view_of(cameras.recentred(splats.offset), 0, settings)
     width, height = view[2]
     rasterizer = _core.Rasterizer(isa)
     target, _, _, _ = rasterizer.forward(arrays, view, settings, [0.0, 0.0, 0.0], 0)
     counts = rasterizer.counts()
     contributing = int(_core.accumulate(arrays, [view], settings)["hits"].sum())
-    objective = Photometric(settings, (0.0, 0.0, 0.0), 0.2)
-    trainer = _core.Trainer(arrays, objective, splats.scales.max(1), isa)
-    upside_down = np.ascontiguousarray(target[::-1])
+    trainer = _core.Trainer(arrays, Photometric(settings, (0.0, 0.0, 0.0), 0.2), splats.scales.max(1), isa)
     limits = _core.machine_limits()
-    rehearsals, steps = [], []
-    for _ in range(repeats):
-        trainer.gradients_only(view, upside_down)
-        rehearsals.append(trainer.passes())
-        trainer.step(view, upside_down, Rates(*[0.0] * 6))  # rates of 0 keep the scene
-        steps.append(trainer.passes())
-    memory = trainer.memory()
-    again = _core.machine_limits()
+    passes = _milliseconds(trainer, view, np.ascontiguousarray(target[::-1]), repeats)
+    memory, again = trainer.memory(), _core.machine_limits()
     flops_rate, bandwidth = max(limits[0], again[0]), max(limits[1], again[1])
-    fastest = min(rehearsals, key=lambda p: sum(p.values()))
-    forward = 1e3 * sum(fastest[name] for name in ("project", "sort", "bin", "forward"))
-    backward = 1e3 * (fastest["backward"] + fastest["gather"])
-    loss = 1e3 * min(p["loss"] for p in rehearsals)
-    gather = min(p["gather"] for p in rehearsals)
-    adam = 1e3 * max(0.0, min(p["gather"] for p in steps) - gather)
     flops_ms = 1e-6 * contributing * (FLOPS_FORWARD + FLOPS_BACKWARD) / flops_rate
     bytes_ms = 1e-6 * _bytes(splats, counts, width * height) / bandwidth
     return {
         "width": width,
         "height": height,
-        "forward_ms": forward,
-        "backward_ms": backward,
-        "loss_ms": loss,
-        "adam_ms": adam,
-        "total_ms": forward + backward + loss + adam,
+        **passes,
+        "total_ms": sum(passes.values()),
         "pairs": counts["pairs"],
         "contributing": contributing,
         "limit_flops_ms": flops_ms,
         "limit_bytes_ms": bytes_ms,
-        "limit_share": max(flops_ms, bytes_ms) / (forward + backward),
+        "limit_share": max(flops_ms, bytes_ms) / (passes["forward_ms"] + passes["backward_ms"]),
         "fma_gflops": flops_rate,
         "read_gb_s": bandwidth,
         "gaussian_bytes": memory["gaussians"] / len(splats),
         "image_bytes": memory["images"],
+    }
+
+
+def _milliseconds(trainer: Any, view: Any, target: Any, repeats: int) -> dict[str, float]:
+    """Return the best times of a step's passes; Adam's is what a step adds to the gradients' gathering."""
+    rehearsals, steps = [], []
+    for _ in range(repeats):
+        trainer.gradients_only(view, target)
+        rehearsals.append(trainer.passes())
+        trainer.step(view, target, Rates(*[0.0] * 6))  # rates of 0 keep the scene
+        steps.append(trainer.passes())
+    fastest = min(rehearsals, key=lambda p: sum(p.values()))
+    gather = min(p["gather"] for p in rehearsals)
+    return {
+        "forward_ms": 1e3 * sum(fastest[name] for name in ("project", "sort", "bin", "forward")),
+        "backward_ms": 1e3 * (fastest["backward"] + fastest["gather"]),
+        "loss_ms": 1e3 * min(p["loss"] for p in rehearsals),
+        "adam_ms": 1e3 * max(0.0, min(p["gather"] for p in steps) - gather),
     }
 
 
