@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from g2ard.errors import InputError, damaged
 from g2ard.io.colmap import Record, model_folder, number, parsing, text_lines
+from g2ard.io.jsonfile import Place
 from g2ard.io.point_stream import WholeCloud
 
 _COUNT = Record(["COUNT"], "Q")
@@ -61,11 +62,6 @@ def _text(path: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
     inside = (values[:, 3:] >= 0) & (values[:, 3:] <= 255)
     if not inside.all():
         i, channel = (int(at) for at in np.argwhere(~inside)[0])
-        raise InputError(
-            f"is {rows[i][4 + channel]!r}, expected 0 to 255",
-            path=path,
-            property="RGB"[channel],
-            index=i,
-            item="point",
-        )
+        place = Place(path, i, "point", "RGB"[channel])
+        raise place.error(f"is {rows[i][4 + channel]!r}, expected 0 to 255")
     return values[:, :3], values[:, 3:].astype(np.uint8)

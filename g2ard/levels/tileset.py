@@ -6,7 +6,6 @@ node's children or in the leaf itself.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -22,6 +21,7 @@ from g2ard.io.glb import EXTENSION, SPZ_EXTENSION, spz_glb
 from g2ard.io.packing import writable
 from g2ard.levels.tree import Cut, Leaf, Level, Node
 from g2ard.levels.tree import cut as cut_tree
+from g2ard.levels.write import read_object, write_json
 from g2ard.progress import Progress, silent
 from g2ard.scene.transform import unit_up
 
@@ -182,11 +182,11 @@ def save_tileset(
             (folder / name).write_bytes(content)
             written += len(content)
             progress("write", number, len(tiles.files))
-        text = json.dumps(tileset, separators=(",", ":"))
-        (folder / "tileset.json").write_text(text, encoding="utf-8", newline="\n")
+        write_json(folder / "tileset.json", tileset)
+        written += (folder / "tileset.json").stat().st_size
     for name in before - tiles.files.keys():
         (path / name).unlink(missing_ok=True)
-    return written + len(text)
+    return written
 
 
 def _upright(up: ArrayLike) -> Float:
@@ -247,12 +247,7 @@ def _tile(node: Node | Leaf, error: float, children: list[dict[str, Any]]) -> di
 
 def _named_in(file: Path) -> set[str]:
     """Return the names of the .glb files beside a tileset.json that it names."""
-    try:
-        text = file.read_text(encoding="utf-8")
-        tiles = [json.loads(text)["root"]]
-    except (OSError, ValueError, KeyError, TypeError):
-        return set()
-    found = set()
+    tiles, found = [read_object(file).get("root", {})], set()
     while tiles:
         tile = tiles.pop()
         found.add(str(tile.get("content", {}).get("uri", "")))

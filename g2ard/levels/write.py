@@ -68,12 +68,41 @@ def save_levels(
         InputError: no levels, a level that is empty or not finite, or different offsets.
         OutputError: see `atomic_folder`.
     """
-    rule = cut or Cut()
+    rule, path = cut or Cut(), Path(path)
     tree = cut_tree(levels, rule, work)
     files = _Files(levels, rule.most, {})
-    root = _node(tree, files)
+    meta = _meta(levels, rule, _node(tree, files), list(files.parts), environment is not None)
+    before = _named_in(path)
+    if work is not None:
+        _sweep(work)
+        files.write(work, path, progress)
+    with atomic_folder(path, overwrite) as folder:
+        if work is None:
+            files.write(folder, path, progress)
+        else:
+            (work / _BESIDE).write_text(str(folder), encoding="utf-8", newline="\n")
+            for name in files.parts:  # linked, not moved: an interrupted call resumes from them
+                shutil.copytree((work / name).parent, (folder / name).parent, copy_function=_linked)
+        if environment is not None:
+            _write_part(folder / _ENVIRONMENT, sog_files(path / _ENVIRONMENT, environment))
+        write_json(folder / "lod-meta.json", meta)
+        written = {
+            file.relative_to(folder): file.stat().st_size for file in folder.rglob("*") if file.is_file()
+        }
+    _remove(path, before - written.keys())
+    if work is not None:
+        for name in files.parts:
+            shutil.rmtree((work / name).parent, ignore_errors=True)
+        (work / _BESIDE).unlink()
+    return sum(written.values())
+
+
+def _meta(
+    levels: Sequence[Level], rule: Cut, root: dict[str, Any], names: list[str], has_environment: bool
+) -> dict[str, Any]:
+    """Return the content of lod-meta.json."""
     counts = [len(level) for level in levels]
-    meta: dict[str, Any] = {
+    return {
         "version": 1,
         "asset": {
             "generator": f"g2ard {__version__}",
@@ -84,37 +113,17 @@ def save_levels(
         "count": sum(counts),
         "counts": counts,
         "lodLevels": len(levels),
-        **({} if environment is None else {"environment": _ENVIRONMENT}),
-        "filenames": list(files.parts),
+        **({"environment": _ENVIRONMENT} if has_environment else {}),
+        "filenames": names,
         "tree": root,
     }
-    before = _named_in(Path(path))
-    if work is not None:
-        _sweep(work)
-        files.write(work, Path(path), progress)
-    with atomic_folder(path, overwrite) as folder:
-        if work is None:
-            files.write(folder, Path(path), progress)
-        else:
-            (work / _BESIDE).write_text(str(folder), encoding="utf-8", newline="\n")
-            for name in files.parts:  # linked, not moved: an interrupted call resumes from them
-                shutil.copytree((work / name).parent, (folder / name).parent, copy_function=_linked)
-        if environment is not None:
-            (folder / _ENVIRONMENT).parent.mkdir()
-            for name, content in sog_files(Path(path) / _ENVIRONMENT, environment).items():
-                (folder / _ENVIRONMENT).with_name(name).write_bytes(content)
-        (folder / "lod-meta.json").write_text(
-            json.dumps(meta, separators=(",", ":")), encoding="utf-8", newline="\n"
-        )
-        written = {
-            file.relative_to(folder): file.stat().st_size for file in folder.rglob("*") if file.is_file()
-        }
-    _remove(Path(path), before - written.keys())
-    if work is not None:
-        for name in files.parts:
-            shutil.rmtree((work / name).parent, ignore_errors=True)
-        (work / _BESIDE).unlink()
-    return sum(written.values())
+
+
+def _write_part(meta: Path, files: dict[str, bytes]) -> None:
+    """Write the files of a SOG folder, of which `meta` is the meta.json, atomically."""
+    with atomic_folder(meta.parent) as begun:
+        for name, content in files.items():
+            (begun / name).write_bytes(content)
 
 
 def _sweep(work: Path) -> None:
@@ -159,9 +168,7 @@ class _Files:
         """Write all missing files, each atomically; `path` names them in messages."""
         for number, name in enumerate(self.parts, start=1):
             if not (folder / name).exists():
-                with atomic_folder((folder / name).parent) as begun:
-                    for file, content in sog_files(path / name, self._rows(name), ordered=True).items():
-                        (begun / file).write_bytes(content)
+                _write_part(folder / name, sog_files(path / name, self._rows(name), ordered=True))
             progress("write", number, len(self.parts))
 
     def _rows(self, name: str) -> Splats:
@@ -189,9 +196,9 @@ def _rounded(values: Sequence[float] | NDArray[np.float64]) -> list[float]:
 def _named_in(path: Path) -> set[Path]:
     """Return the relative paths of all level files that the folder's `lod-meta.json` names."""
     named: set[Path] = set()
-    meta = _json(path / "lod-meta.json")
+    meta = read_object(path / "lod-meta.json")
     for part in map(Path, [*_names(meta, "filenames", _PART), *_names(meta, "environment", _PART)]):
-        entries = [entry for entry in _json(path / part).values() if isinstance(entry, dict)]
+        entries = [entry for entry in read_object(path / part).values() if isinstance(entry, dict)]
         images = [image for entry in entries for image in _names(entry, "files", _IMAGE)]
         named |= {part, *map(part.with_name, images)}
     return named
@@ -212,9 +219,15 @@ def _names(content: dict[str, Any], key: str, pattern: re.Pattern[str]) -> list[
     return [name for name in map(str, names) if pattern.fullmatch(name)]
 
 
-def _json(file: Path) -> dict[str, Any]:
+def read_object(file: Path) -> dict[str, Any]:
+    """Return the JSON object in a file; an empty one if there is none."""
     try:
         content = json.loads(file.read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return {}
     return content if isinstance(content, dict) else {}
+
+
+def write_json(file: Path, content: dict[str, Any]) -> None:
+    """Write JSON without spaces."""
+    file.write_text(json.dumps(content, separators=(",", ":")), encoding="utf-8", newline="\n")
