@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from plyfile import PlyData
 
 from g2ard.errors import InputError
-from g2ard.io import kind, read_scene, read_splats, write_splats
+from g2ard.io import kind, open_stream, read_scene, read_splats, write_splats
 from g2ard.io.sanitize import LOG_SCALE_LIMIT, LOGIT_LIMIT
 from g2ard.scene.splats import ARRAYS, DRAWN_LOGIT, Splats
 from helpers.ply_files import columns, save, scene
@@ -210,8 +210,9 @@ def test_missing_and_unknown_files(tmp_path: Path) -> None:
 def test_cloud_is_not_a_scene(tmp_path: Path) -> None:
     path = save(tmp_path / "a.ply", {n: np.zeros(2) for n in ("x", "y", "z", "red", "green", "blue")})
     assert kind(path) == "points"
-    with pytest.raises(InputError, match="point cloud"):
-        read_splats(path)
+    for read in (read_splats, open_stream):
+        with pytest.raises(InputError, match="expected a Gaussian scene, found a point cloud"):
+            read(path)
 
 
 def test_broken_scene_is_not_written(tmp_path: Path) -> None:

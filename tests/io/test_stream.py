@@ -114,12 +114,6 @@ def test_several_are_one_scene(tmp_path: Path) -> None:
         open_stream([])
 
 
-def test_point_clouds_are_rejected_as_scenes(tmp_path: Path) -> None:
-    path = save(tmp_path / "a.ply", {n: np.zeros(2) for n in ("x", "y", "z", "red", "green", "blue")})
-    with pytest.raises(InputError, match="expected a Gaussian scene"):
-        open_stream(path)
-
-
 def test_another_time_is_another_source(tmp_path: Path) -> None:
     path = tmp_path / "a.ply"
     write_splats(path, scene(50))
