@@ -114,108 +114,14 @@ fn along(cov: &Sym3, n: DVec3) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::simplify::pool;
-
-    /// Support as far as INRIA's renderer draws.
-    const SUPPORT: f64 = 3.0;
-
-    fn disc_at(mean: [f64; 3], quat: [f64; 4]) -> Gaussian {
-        Gaussian {
-            mean,
-            rotation: crate::linalg::rotation_from_quat(quat),
-            scales: [1.0, 1.0, 0.01],
-        }
-    }
-
-    fn covered(members: &[Gaussian]) -> f64 {
-        let parts: Vec<_> = members
-            .iter()
-            .map(|g| (footprint(g.scales), g.mean, g.covariance()))
-            .collect();
-        let (mean, cov) = pool(&parts);
-        coverage(members, &Gaussian::from_moments(mean, &cov), SUPPORT)
-    }
-
-    const FLAT: [f64; 4] = [1.0, 0.0, 0.0, 0.0];
-
-    /// `side`² discs, `step` apart, at height `z`.
-    fn floor(side: usize, step: f64, z: f64) -> Vec<Gaussian> {
-        let at = |i: usize| step * i as f64;
-        (0..side * side)
-            .map(|i| disc_at([at(i % side), at(i / side), z], FLAT))
-            .collect()
-    }
-
-    #[test]
-    fn a_flat_floor_is_covered_however_its_discs_overlap() {
-        for step in [0.0, 0.3, 1.0, 2.0, 4.0] {
-            let got = covered(&floor(4, step, 0.0));
-            assert!(got > 0.9, "{step}: {got}");
-        }
-        let row: Vec<_> = (0..10)
-            .map(|i| disc_at([f64::from(i), 0.0, 0.0], FLAT))
-            .collect();
-        assert!(covered(&row) > 0.9);
-    }
-
-    #[test]
-    fn two_parallel_sheets_are_not_however_far_apart() {
-        // Supports part at 2 · 3 · 0.01.
-        for gap in [0.07, 0.1, 0.5, 1.0, 1.9, 3.0, 10.0, 100.0] {
-            for side in [1, 2, 3, 5] {
-                let members = [floor(side, 1.0, 0.0), floor(side, 1.0, gap)].concat();
-                let got = covered(&members);
-                assert!(got < 0.6, "{side}² discs, {gap}: {got}");
-            }
-        }
-        let touching = [floor(3, 1.0, 0.0), floor(3, 1.0, 0.05)].concat();
-        assert!(covered(&touching) > 0.9);
-    }
-
-    #[test]
-    fn a_rough_floor_is_one_surface_when_its_discs_are_as_thick_as_it_is_rough() {
-        let mut members = floor(4, 1.0, 0.0);
-        let heights = [0.02, -0.02, 0.01, -0.015, 0.0];
-        for (i, g) in members.iter_mut().enumerate() {
-            g.mean[2] = heights[i % 5];
-        }
-        assert!(covered(&members) > 0.9);
-        members
-            .iter_mut()
-            .for_each(|g| g.mean[2] *= 100.0 * if g.mean[2] > 0.0 { 1.0 } else { 3.0 });
-        assert!(covered(&members) < 0.6);
-    }
-
-    #[test]
-    fn what_leans_is_foreshortened_and_a_ball_has_no_lean() {
-        let turned = |angle: f64| [(angle / 2.0).cos(), (angle / 2.0).sin(), 0.0, 0.0];
-        let mut members = vec![disc_at([0.0; 3], FLAT); 4];
-        members.push(disc_at([0.0; 3], turned(1.2)));
-        // Four discs stick out by a tenth of a narrower ellipse; of the fifth cos 1.2 counts.
-        let got = covered(&members);
-        assert!((0.75..0.88).contains(&got), "{got}");
-        let ball = |q| Gaussian {
-            scales: [1.0; 3],
-            ..disc_at([0.0; 3], q)
-        };
-        assert_eq!(covered(&[ball(FLAT), ball(turned(1.5))]), 1.0);
-    }
-
-    #[test]
-    fn a_single_member_far_off_the_plane_is_uncovered() {
-        let mut members = vec![disc_at([0.0; 3], FLAT); 20];
-        members.push(disc_at([0.0, 0.0, 0.9], FLAT));
-        // The other twenty lie 0.9/21 off the plane.
-        assert_eq!(covered(&members), 0.0);
-        members[20].mean[2] = 0.3;
-        let got = covered(&members);
-        assert!((got - 20.0 / 21.0).abs() < 1e-6, "{got}");
-    }
 
     #[test]
     fn without_area_nothing_is_uncovered() {
-        let mut g = disc_at([0.0; 3], FLAT);
-        g.scales = [1.0, 0.0, 0.0];
-        assert_eq!(coverage(&[g], &g, SUPPORT), 1.0);
+        let needle = Gaussian {
+            mean: [0.0; 3],
+            rotation: crate::linalg::rotation_from_quat([1.0, 0.0, 0.0, 0.0]),
+            scales: [1.0, 0.0, 0.0],
+        };
+        assert_eq!(coverage(&[needle], &needle, 3.0), 1.0);
     }
 }

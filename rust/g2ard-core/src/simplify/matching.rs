@@ -273,42 +273,6 @@ mod tests {
     use super::*;
     use crate::random::Lcg;
 
-    fn pairs_of(pairs: &[Pair]) -> Vec<(u32, u32)> {
-        pairs.iter().map(|p| (p.a, p.b)).collect()
-    }
-
-    #[test]
-    fn takes_the_cheapest_disjoint_pairs_and_falls_back() {
-        // 0–1 costs 1, 1–2 costs 2, 2–3 costs 5, 3–4 costs 3.
-        let lists = [
-            (1.0, 1),
-            NONE,
-            (1.0, 0),
-            (2.0, 2),
-            (2.0, 1),
-            (5.0, 3),
-            (3.0, 4),
-            (5.0, 2),
-            (3.0, 3),
-            NONE,
-        ];
-        let rows = |merges| pairs_of(&matched(&lists, 2, merges));
-        assert_eq!(rows(9), [(0, 1), (3, 4)]);
-        assert_eq!(rows(1), [(0, 1)]);
-        assert_eq!(matched(&lists, 2, 9)[1].cost, 3.0);
-        let lists = [
-            (1.0, 1),
-            NONE,
-            (1.0, 0),
-            (2.0, 2),
-            (2.0, 1),
-            (5.0, 3),
-            (5.0, 2),
-            NONE,
-        ];
-        assert_eq!(pairs_of(&matched(&lists, 2, 9)), [(0, 1), (2, 3)]);
-    }
-
     #[test]
     fn sixteen_pairs_cost_what_each_does_alone_to_the_bit() {
         let mut random = Lcg(5);
@@ -381,13 +345,15 @@ mod tests {
             .collect();
         edges.sort_by(|a, b| a.partial_cmp(b).unwrap());
         let (mut locked, mut want) = (vec![false; n], Vec::new());
-        for (_, i, _, j) in edges {
+        for (cost, i, _, j) in edges {
             if !locked[i] && !locked[j as usize] {
                 locked[i] = true;
                 locked[j as usize] = true;
-                want.push(((i as u32).min(j), (i as u32).max(j)));
+                let (a, b) = ((i as u32).min(j), (i as u32).max(j));
+                want.push(Pair { a, b, cost });
             }
         }
-        assert_eq!(pairs_of(&matched(&lists, k, n)), want);
+        assert_eq!(matched(&lists, k, n), want);
+        assert_eq!(matched(&lists, k, 20), want[..20]);
     }
 }

@@ -147,7 +147,6 @@ fn average_sh(splats: &Splats, rows: &[u32], weights: &[f64]) -> Vec<[f32; 3]> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::linalg::rotation_from_quat;
 
     #[test]
     fn softplus_is_minus_log_of_transmittance() {
@@ -166,49 +165,5 @@ mod tests {
         assert_eq!(mean, at(0.09375));
         assert!((cov[0] - (1e-4 + 0.1875 * 0.015625)).abs() < 1e-16);
         assert!((cov[3] - 1e-4).abs() < 1e-18);
-    }
-
-    #[test]
-    fn pooling_in_any_grouping_is_the_same() {
-        let member = |i: usize| {
-            let x = i as f64;
-            let g = Gaussian {
-                mean: [x.sin(), (2.0 * x).cos(), 0.1 * x],
-                rotation: rotation_from_quat([1.0, x, -0.5, 0.3 * x]),
-                scales: [1.0, 0.2, 0.05 + 0.01 * x],
-            };
-            (0.3 + (x * 7.0).sin().abs(), g.mean, g.covariance())
-        };
-        let all: Vec<_> = (0..9).map(member).collect();
-        let once = pool(&all);
-        let weight = |s: &[(f64, [f64; 3], Sym3)]| s.iter().map(|m| m.0).sum();
-        let parts: Vec<_> = [&all[..4], &all[4..5], &all[5..]]
-            .map(|s| {
-                let (mean, cov) = pool(s);
-                (weight(s), mean, cov)
-            })
-            .to_vec();
-        let twice = pool(&parts);
-        (0..3).for_each(|k| assert!((once.0[k] - twice.0[k]).abs() < 1e-14));
-        (0..6).for_each(|k| assert!((once.1[k] - twice.1[k]).abs() < 1e-13));
-    }
-
-    #[test]
-    fn merging_identical_gaussians_keeps_their_shape_and_saturates() {
-        let splats = Splats {
-            means: vec![[1.0, 2.0, 3.0]; 1000],
-            quats: vec![[0.2, 0.4, -0.1, 0.9]; 1000],
-            scales: vec![[0.3, 0.2, 0.01]; 1000],
-            logit_opacities: vec![0.0; 1000],
-            sh: vec![[0.7, -0.1, 0.2]; 1000],
-            sh_coeffs: 1,
-        };
-        let rows: Vec<u32> = (0..1000).collect();
-        let m = merge(&splats, &rows);
-        assert!(m.clamped && (sigmoid(m.logit) - MAX_OPACITY).abs() < 1e-12);
-        for (got, want) in m.gaussian.scales.iter().zip([0.3, 0.2, 0.01]) {
-            assert!((got - want).abs() < 1e-7);
-        }
-        assert_eq!(m.gaussian.mean, [1.0, 2.0, 3.0]);
     }
 }
