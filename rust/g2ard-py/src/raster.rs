@@ -8,7 +8,7 @@ use g2ard_core::raster::{
 };
 use numpy::{IntoPyArray, PyArray1, PyArrayMethods, PyReadonlyArrayDyn, PyUntypedArrayMethods};
 use pyo3::prelude::*;
-use pyo3::types::PyDict;
+use pyo3::types::{IntoPyDict, PyDict};
 
 use crate::arrays::{flat, optional};
 use crate::error::{invalid, to_py};
@@ -219,27 +219,25 @@ impl PyRasterizer {
     /// Return the work done by the last forward pass.
     fn counts<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
         let counts = self.inner.counts();
-        let dict = PyDict::new(py);
-        dict.set_item("visible", counts.visible)?;
-        dict.set_item("pairs", counts.pairs)?;
-        dict.set_item("evaluated", counts.evaluated)?;
-        Ok(dict)
+        [
+            ("visible", counts.visible as u64),
+            ("pairs", counts.pairs as u64),
+            ("evaluated", counts.evaluated),
+        ]
+        .into_py_dict(py)
     }
 }
 
 pub fn passes<'py>(py: Python<'py>, passes: &Passes) -> PyResult<Bound<'py, PyDict>> {
-    let dict = PyDict::new(py);
-    for (name, seconds) in [
+    [
         ("project", passes.project),
         ("sort", passes.sort),
         ("bin", passes.bin),
         ("forward", passes.forward),
         ("backward", passes.backward),
         ("gather", passes.gather),
-    ] {
-        dict.set_item(name, seconds)?;
-    }
-    Ok(dict)
+    ]
+    .into_py_dict(py)
 }
 
 /// Return sums per Gaussian over all `views`: a dict of (N,) arrays.

@@ -1,15 +1,12 @@
 //! `_core.shot`, `_core.normal_equations`, `_core.flow`, `_core.local_zncc`: images for registration.
 
 use g2ard_core::register::{self, Lens, Light, Photo, Render, Size};
-use numpy::ndarray::Ix2;
 use numpy::{
-    Element, PyArray1, PyArray2, PyArrayMethods, PyReadonlyArray, PyReadonlyArray2,
-    PyReadonlyArray3, PyUntypedArrayMethods,
+    PyArray1, PyArray2, PyArrayMethods, PyReadonlyArray2, PyReadonlyArray3, PyUntypedArrayMethods,
 };
 use pyo3::prelude::*;
 
 use crate::arrays::flat;
-use crate::error::invalid;
 use crate::work;
 
 type Grey<'py> = PyReadonlyArray2<'py, f64>;
@@ -20,20 +17,6 @@ fn size(image: &Grey<'_>) -> Size {
         height: image.shape()[0],
         width: image.shape()[1],
     }
-}
-
-/// The values of an (H, W) image, whose size is checked.
-fn plane<'a, T: Element>(
-    name: &'static str,
-    image: &'a PyReadonlyArray<'_, T, Ix2>,
-    size: Size,
-) -> PyResult<&'a [T]> {
-    if image.shape() != [size.height, size.width] {
-        let expected = format!("({}, {})", size.height, size.width);
-        let got = format!("{:?}", image.shape());
-        return Err(invalid(name, expected, got));
-    }
-    flat(name, image)
 }
 
 fn lens([fx, fy, cx, cy]: [f64; 4]) -> Lens {
@@ -89,12 +72,12 @@ pub fn normal_equations<'py>(
 ) -> PyResult<Normal> {
     let size = size(&photo.0);
     let photo = Photo {
-        grey: plane("photo", &photo.0, size)?,
-        right: plane("photo's gradient", &photo.1, size)?,
-        down: plane("photo's gradient", &photo.2, size)?,
-        mask: plane("photo's mask", &photo.3, size)?,
+        grey: flat("photo", &photo.0)?,
+        right: flat("photo's gradient", &photo.1)?,
+        down: flat("photo's gradient", &photo.2)?,
+        mask: flat("photo's mask", &photo.3)?,
     };
-    let shot = render(&shot, size)?;
+    let shot = render(&shot)?;
     let light = Light {
         gain: light.0,
         bias: light.1,
@@ -106,11 +89,11 @@ pub fn normal_equations<'py>(
     Ok((n.matrix, n.right, n.scale, n.cost, n.weights))
 }
 
-fn render<'a>(shot: &'a (Grey<'_>, Grey<'_>, Mask<'_>), size: Size) -> PyResult<Render<'a>> {
+fn render<'a>(shot: &'a (Grey<'_>, Grey<'_>, Mask<'_>)) -> PyResult<Render<'a>> {
     Ok(Render {
-        grey: plane("shot", &shot.0, size)?,
-        depth: plane("shot's depth", &shot.1, size)?,
-        mask: plane("shot's mask", &shot.2, size)?,
+        grey: flat("shot", &shot.0)?,
+        depth: flat("shot's depth", &shot.1)?,
+        mask: flat("shot's mask", &shot.2)?,
     })
 }
 
@@ -123,7 +106,7 @@ pub fn flow<'py>(
     xi: [f64; 6],
 ) -> PyResult<f64> {
     let size = size(&shot.0);
-    let shot = render(&shot, size)?;
+    let shot = render(&shot)?;
     let lens = self::lens(lens);
     work::quick(py, || register::flow(&shot, size, &lens, &xi))
 }
@@ -138,7 +121,7 @@ pub fn local_zncc(
     side: usize,
 ) -> PyResult<f64> {
     let size = size(&a);
-    let (a, b) = (plane("a", &a, size)?, plane("b", &b, size)?);
-    let mask = plane("mask", &mask, size)?;
+    let (a, b) = (flat("a", &a)?, flat("b", &b)?);
+    let mask = flat("mask", &mask)?;
     work::quick(py, || register::local_zncc(a, b, mask, size, side))
 }

@@ -1,13 +1,13 @@
 //! `_core.Trainer`: whole recovery steps in Rust.
 
-use g2ard_core::raster::{Camera, Isa, Settings};
+use g2ard_core::raster::{Camera, Settings};
 use g2ard_core::train::{Exported, Rates, Regularizers, StepInput, Trainer};
 use numpy::{
     IntoPyArray, PyArray1, PyArrayDyn, PyArrayMethods, PyReadonlyArray1, PyReadonlyArray2,
     PyReadonlyArray3,
 };
 use pyo3::prelude::*;
-use pyo3::types::PyDict;
+use pyo3::types::{IntoPyDict, PyDict};
 
 use crate::arrays::{flat, optional};
 use crate::constants::Config;
@@ -65,7 +65,6 @@ pub struct PyTrainer {
     settings: Settings,
     background: [f32; 3],
     ssim_weight: f32,
-    isa: Isa,
     seconds_loss: f64,
     skipped: usize,
 }
@@ -106,7 +105,6 @@ impl PyTrainer {
             settings: objective.settings.settings()?,
             background: objective.background,
             ssim_weight: objective.ssim_weight,
-            isa,
             seconds_loss: 0.0,
             skipped: 0,
         })
@@ -204,15 +202,13 @@ impl PyTrainer {
     /// Return everything that a bitwise resume needs: a dict of arrays.
     fn state<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
         let state = self.inner.store().export();
-        let dict = PyDict::new(py);
-        for (name, values) in [
-            ("values", state.values),
-            ("first", state.first),
-            ("second", state.second),
-            ("units", state.units),
-        ] {
-            dict.set_item(name, values.into_pyarray(py))?;
-        }
+        let dict = [
+            ("values", state.values.into_pyarray(py)),
+            ("first", state.first.into_pyarray(py)),
+            ("second", state.second.into_pyarray(py)),
+            ("units", state.units.into_pyarray(py)),
+        ]
+        .into_py_dict(py)?;
         dict.set_item("steps", state.steps.into_pyarray(py))?;
         dict.set_item("order", state.order.into_pyarray(py))?;
         Ok(dict)
@@ -237,18 +233,10 @@ impl PyTrainer {
         self.skipped
     }
 
-    #[getter]
-    fn isa(&self) -> &'static str {
-        self.isa.name()
-    }
-
     /// Return the bytes held: "gaussians" grow with the Gaussians, "images" with the image.
     fn memory<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
         let memory = self.inner.memory();
-        let dict = PyDict::new(py);
-        dict.set_item("gaussians", memory.gaussians)?;
-        dict.set_item("images", memory.images)?;
-        Ok(dict)
+        [("gaussians", memory.gaussians), ("images", memory.images)].into_py_dict(py)
     }
 
     /// Return the seconds of the last step by pass; "gather" holds Adam.
