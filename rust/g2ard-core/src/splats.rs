@@ -21,10 +21,6 @@ impl Splats {
         self.means.len()
     }
 
-    pub fn is_empty(&self) -> bool {
-        self.means.is_empty()
-    }
-
     /// The SH triples of Gaussian `i`, `sh_coeffs` of them.
     pub fn sh_of(&self, i: usize) -> &[[f32; 3]] {
         &self.sh[i * self.sh_coeffs..(i + 1) * self.sh_coeffs]

@@ -1,19 +1,21 @@
 //! The backend that callers use: GPU kernels while they work, then the CPU, with the reasons.
 
 use std::sync::atomic::{AtomicU64, Ordering};
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex};
 
 use g2ard_core::raster::{Camera, Settings};
 use g2ard_core::select::{Gaussians, Surface, ViewKernels};
 use g2ard_core::simplify::{Group, GroupKernels, Merged};
-use g2ard_core::spatial::{Cells, RobustBounds};
+use g2ard_core::spatial::Cells;
 use g2ard_core::visibility::{VisibilityAccumulator, VisibilityKernels};
 use g2ard_core::{Backend, Control, Cpu, Result, Splats};
 
-use crate::rows::{Numbered, Numbers, Rows};
-use crate::runtime::{Adapter, Error, Gpu, Options, guarded};
-use crate::two::Frame;
+use crate::rows::{Rows, Run};
+use crate::runtime::{self, Error, Gpu, Options, guarded, lock};
 use crate::{groups, probe, visibility, voxels};
+
+#[cfg(test)]
+mod tests;
 
 /// The device to use.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -48,20 +50,21 @@ enum State {
     Off,
 }
 
+impl State {
+    fn gpu(&self) -> Option<Arc<Gpu>> {
+        match self {
+            Self::Open(gpu) => Some(gpu.clone()),
+            _ => None,
+        }
+    }
+}
+
 impl Device {
     pub fn new(choice: Choice, options: Options) -> Self {
         Self {
             choice,
             options,
             ..Self::default()
-        }
-    }
-
-    /// The adapter in use; None before the first kernel and on the CPU.
-    pub fn adapter(&self) -> Option<Adapter> {
-        match &*lock(&self.state) {
-            State::Open(gpu) => Some(gpu.adapter.clone()),
-            _ => None,
         }
     }
 
@@ -75,58 +78,44 @@ impl Device {
         self.served.load(Ordering::Relaxed)
     }
 
-    /// The open device, if any.
+    /// The open device; None before the first kernel and on the CPU.
     pub fn gpu(&self) -> Option<Arc<Gpu>> {
-        match &*lock(&self.state) {
-            State::Open(gpu) => Some(gpu.clone()),
-            _ => None,
-        }
+        lock(&self.state).gpu()
     }
 
     /// The device for work on `rows` rows; opened on first use if the work is large enough.
     fn ready(&self, rows: usize) -> Option<Arc<Gpu>> {
         let mut state = lock(&self.state);
-        match &*state {
-            State::Open(gpu) => return Some(gpu.clone()),
-            State::Off => return None,
-            State::Untried => {}
+        if matches!(*state, State::Untried) {
+            let opened = match self.choice {
+                Choice::Cpu => return None,
+                Choice::Auto if rows < WORTH_OPENING => return None,
+                Choice::Auto => guarded(|| self.worthwhile()),
+                Choice::Gpu => guarded(|| {
+                    let gpu = Gpu::open(true, self.options)?;
+                    probe::check(&gpu)?;
+                    Ok(Some(gpu))
+                }),
+            };
+            *state = match opened {
+                Ok(Some(gpu)) => State::Open(Arc::new(gpu)),
+                Ok(None) => State::Off,
+                Err(error) => {
+                    self.note(&error);
+                    State::Off
+                }
+            };
         }
-        let found = match self.choice {
-            Choice::Cpu => return None,
-            Choice::Auto if rows < WORTH_OPENING => return None,
-            Choice::Auto => self.worthwhile(),
-            Choice::Gpu => guarded(|| {
-                let gpu = Gpu::open(true, self.options)?;
-                probe::check(&gpu)?;
-                Ok(gpu)
-            })
-            .map(Some),
-        };
-        match found {
-            Ok(Some(gpu)) => {
-                let gpu = Arc::new(gpu);
-                *state = State::Open(gpu.clone());
-                Some(gpu)
-            }
-            Ok(None) => {
-                *state = State::Off;
-                None
-            }
-            Err(error) => {
-                *state = State::Off;
-                self.note(&error);
-                None
-            }
-        }
+        state.gpu()
     }
 
     /// A real GPU that is faster than the CPU. A missing GPU, or too little memory for one, is not reported.
-    fn worthwhile(&self) -> crate::runtime::Result<Option<Gpu>> {
-        guarded(|| match Gpu::open(false, self.options) {
+    fn worthwhile(&self) -> runtime::Result<Option<Gpu>> {
+        match Gpu::open(false, self.options) {
             Ok(gpu) => Ok(probe::pays(&gpu)?.then_some(gpu)),
             Err(Error::NoAdapter | Error::NoRoom { .. }) => Ok(None),
             Err(other) => Err(other),
-        })
+        }
     }
 
     fn note(&self, error: &Error) {
@@ -141,7 +130,7 @@ impl Device {
     fn attempt<T>(
         &self,
         rows: usize,
-        twin: impl FnOnce(&Gpu) -> crate::runtime::Result<T>,
+        twin: impl FnOnce(&Gpu) -> runtime::Result<T>,
     ) -> Result<Option<T>> {
         let Some(gpu) = self.ready(rows) else {
             return Ok(None);
@@ -166,7 +155,7 @@ impl Device {
     fn either<T>(
         &self,
         rows: usize,
-        twin: impl FnOnce(&Gpu) -> crate::runtime::Result<T>,
+        twin: impl FnOnce(&Gpu) -> runtime::Result<T>,
         cpu: impl FnOnce() -> Result<T>,
     ) -> Result<T> {
         match self.attempt(rows, twin)? {
@@ -176,19 +165,7 @@ impl Device {
     }
 }
 
-fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
-    mutex.lock().unwrap_or_else(PoisonError::into_inner)
-}
-
 impl ViewKernels for Device {
-    fn cells(&self, points: &[[f64; 3]], bounds: &RobustBounds, target: usize) -> Result<Cells> {
-        self.either(
-            points.len(),
-            |gpu| voxels::adaptive(gpu, points, bounds, target),
-            || ViewKernels::cells(&Cpu, points, bounds, target),
-        )
-    }
-
     fn view_statistics(
         &self,
         scene: &Gaussians<'_>,
@@ -230,7 +207,7 @@ impl VisibilityKernels for Device {
             camera.validate()?;
         }
         settings.validate()?;
-        if visibility::serves(settings) && !sums.is_empty() {
+        if visibility::serves(settings) && sums.len() > 0 {
             let count = sums.len();
             let twin = |gpu: &Gpu| visibility::weights(gpu, sums, cameras, settings, control);
             if let Some(weights) = self.attempt(count, twin)? {
@@ -247,7 +224,6 @@ impl Backend for Device {
         Box::new(RunOnDevice {
             device: self,
             uploaded: Mutex::default(),
-            numbers: Mutex::default(),
         })
     }
 }
@@ -256,7 +232,6 @@ impl Backend for Device {
 struct RunOnDevice<'a> {
     device: &'a Device,
     uploaded: Mutex<Rows>,
-    numbers: Mutex<Numbers>,
 }
 
 impl RunOnDevice<'_> {
@@ -264,19 +239,10 @@ impl RunOnDevice<'_> {
     fn either<T>(
         &self,
         splats: &Splats,
-        twin: impl FnOnce(&Gpu, &Rows, Frame, Numbered<'_>) -> crate::runtime::Result<T>,
+        twin: impl FnOnce(Run<'_>) -> runtime::Result<T>,
         cpu: impl FnOnce() -> Result<T>,
     ) -> Result<T> {
-        let mut numbers = lock(&self.numbers);
-        let rows = Numbered {
-            splats,
-            numbers: numbers.of(splats.len()),
-        };
-        let with_rows = |gpu: &Gpu| {
-            let mut uploaded = lock(&self.uploaded);
-            let frame = uploaded.follow(gpu, rows)?;
-            twin(gpu, &uploaded, frame, rows)
-        };
+        let with_rows = |gpu: &Gpu| twin(lock(&self.uploaded).of(gpu, splats)?);
         let without = || {
             if self.device.gpu().is_none() {
                 *lock(&self.uploaded) = Rows::default(); // a failed device is not retried
@@ -291,8 +257,8 @@ impl GroupKernels for RunOnDevice<'_> {
     fn cells(&self, splats: &Splats, kept: &[u32], target: usize) -> Result<Cells> {
         self.either(
             splats,
-            |gpu, uploaded, frame, rows| voxels::of_rows(gpu, uploaded, frame, rows, kept, target),
-            || GroupKernels::cells(&Cpu, splats, kept, target),
+            |run| voxels::adaptive(run, kept, target),
+            || Cpu.cells(splats, kept, target),
         )
     }
 
@@ -305,7 +271,7 @@ impl GroupKernels for RunOnDevice<'_> {
     ) -> Result<Vec<f64>> {
         self.either(
             splats,
-            |gpu, uploaded, _, rows| groups::energies(gpu, uploaded, rows, count, group, control),
+            |run| groups::energies(run, count, group, control),
             || Cpu.energies(splats, count, group, control),
         )
     }
@@ -319,89 +285,12 @@ impl GroupKernels for RunOnDevice<'_> {
     ) -> Result<Vec<(Merged, f64)>> {
         self.either(
             splats,
-            |gpu, uploaded, frame, rows| {
-                groups::merges(gpu, uploaded, frame, rows, groups, support, control)
-            },
+            |run| groups::merges(run, groups, support, control),
             || Cpu.merges(splats, groups, support, control),
         )
     }
 
-    fn rows_replaced(&self, copied: &[u32]) {
-        lock(&self.numbers).replace(copied);
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::testing::no_adapter;
-
-    fn open() -> Option<Device> {
-        let device = Device::new(Choice::Gpu, Options::default());
-        if device.ready(1).is_none() {
-            no_adapter("failures");
-            return None;
-        }
-        Some(device)
-    }
-
-    #[test]
-    fn whatever_a_twin_ends_in_the_cpu_answers_and_one_line_says_why() {
-        let name = || "a device".to_owned();
-        let failures = [
-            Error::NoDevice {
-                name: name(),
-                why: name(),
-            },
-            Error::OutOfMemory,
-            Error::NoRoom { bytes: 2, left: 1 },
-            Error::Lost(name()),
-            Error::Timeout(30),
-            Error::Refused(name()),
-            Error::Panicked(name()),
-            Error::Wrong(name()),
-        ];
-        for failure in failures {
-            let Some(device) = open() else { return };
-            let why = failure.to_string();
-            let twin = |_: &Gpu| -> crate::runtime::Result<u8> { Err(failure) };
-            assert_eq!(device.either(1, twin, || Ok(7)).unwrap(), 7);
-            assert_eq!(device.notes(), [format!("GPU: {why}; goes on on the CPU")]);
-            assert!(device.gpu().is_none(), "left for good");
-            assert_eq!(device.served(), 0);
-        }
-    }
-
-    #[test]
-    fn what_is_too_large_for_one_kernel_is_no_reason_to_leave() {
-        let (what, limit) = ("rows", 3);
-        let large = Error::TooLarge {
-            what,
-            bytes: 4,
-            limit,
-        };
-        let many = Error::TooMany {
-            what,
-            count: 4,
-            limit,
-        };
-        let told = "4 rows are too many for the device, which takes 3 at most";
-        assert_eq!(many.to_string(), told);
-        for failure in [large, many] {
-            let Some(device) = open() else { return };
-            let twin = |_: &Gpu| -> crate::runtime::Result<u8> { Err(failure) };
-            assert_eq!(device.either(1, twin, || Ok(7)).unwrap(), 7);
-            assert_eq!(device.notes().len(), 1);
-            assert_eq!(device.either(1, |_| Ok(8), || Ok(7)).unwrap(), 8);
-        }
-    }
-
-    #[test]
-    fn a_stop_is_no_failure() {
-        let Some(device) = open() else { return };
-        let twin = |_: &Gpu| -> crate::runtime::Result<u8> { Err(Error::Interrupted) };
-        let found = device.either(1, twin, || Ok(7));
-        assert_eq!(found.unwrap_err(), g2ard_core::Error::Interrupted);
-        assert!(device.notes().is_empty());
+    fn rows_replaced(&self) {
+        lock(&self.uploaded).clear();
     }
 }

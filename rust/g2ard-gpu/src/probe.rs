@@ -7,7 +7,7 @@ use g2ard_core::simplify::GroupKernels;
 use g2ard_core::{Control, Cpu, Splats};
 
 use crate::groups;
-use crate::rows::{Numbered, Rows};
+use crate::rows::Rows;
 use crate::runtime::{Error, Gpu, Result};
 
 /// Groups of the check, groups of the race, and rows per group.
@@ -36,11 +36,6 @@ pub fn pays(gpu: &Gpu) -> Result<bool> {
 /// Seconds of the CPU and of the device for the same groups.
 fn race(gpu: &Gpu, groups: usize) -> Result<(Duration, Duration)> {
     let splats = sample(groups * ROWS);
-    let numbers: Vec<u32> = (0..splats.len() as u32).collect();
-    let rows = Numbered {
-        splats: &splats,
-        numbers: &numbers,
-    };
     let control = Control::default();
     let group = |g: usize, rows: &mut Vec<u32>| {
         rows.extend((g * ROWS) as u32..((g + 1) * ROWS) as u32);
@@ -51,8 +46,8 @@ fn race(gpu: &Gpu, groups: usize) -> Result<(Duration, Duration)> {
     let here = began.elapsed();
     let began = Instant::now();
     let mut held = Rows::default();
-    held.follow(gpu, rows)?;
-    let got = groups::energies(gpu, &held, rows, groups, &group, &control)?;
+    let run = held.of(gpu, &splats)?;
+    let got = groups::energies(run, groups, &group, &control)?;
     let there = began.elapsed();
     if want
         .iter()
@@ -87,7 +82,7 @@ mod tests {
 
     #[test]
     fn software_is_right() {
-        let Some(gpu) = gpu("probe") else { return };
+        let Some(gpu) = gpu() else { return };
         check(&gpu).unwrap();
     }
 }

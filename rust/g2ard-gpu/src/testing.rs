@@ -2,43 +2,56 @@
 
 use g2ard_core::Splats;
 use g2ard_core::random::Lcg;
+use g2ard_core::scene::{Means, SceneRef};
 
 use crate::runtime::{Error, Gpu, Options};
 
-/// End a test without an adapter: it fails, unless the environment says that this machine tests no GPU.
-pub fn no_adapter(what: &str) {
-    let skipped = std::env::var_os("G2ARD_NO_GPU_TESTS").is_some_and(|v| v == "1");
-    assert!(
-        skipped,
-        "{what}: no adapter on this machine; install Mesa's lavapipe, or set G2ARD_NO_GPU_TESTS=1"
-    );
-}
+/// A device without a limit of its own.
+pub const WHOLE: u64 = u64::MAX;
 
-/// Any adapter, software included; None if GPU tests are switched off.
-pub fn gpu(what: &str) -> Option<Gpu> {
-    gpu_with(what, Options::default())
+/// Any adapter, software included. Without one the test fails, unless the environment switches GPU tests off.
+pub fn gpu() -> Option<Gpu> {
+    gpu_in_pieces(WHOLE)
 }
 
 /// A device that binds `bytes` at most, so that work goes in pieces.
-pub fn gpu_in_pieces(what: &str, bytes: u64) -> Option<Gpu> {
+pub fn gpu_in_pieces(bytes: u64) -> Option<Gpu> {
     let max_binding = Some(bytes);
-    gpu_with(
-        what,
-        Options {
-            max_binding,
-            ..Options::default()
-        },
-    )
-}
-
-fn gpu_with(what: &str, options: Options) -> Option<Gpu> {
+    let options = Options {
+        max_binding,
+        ..Options::default()
+    };
     match Gpu::open(true, options) {
-        Ok(gpu) => Some(gpu),
         Err(Error::NoAdapter) => {
-            no_adapter(what);
+            let skipped = std::env::var_os("G2ARD_NO_GPU_TESTS").is_some_and(|v| v == "1");
+            assert!(
+                skipped,
+                "no adapter on this machine; install Mesa's lavapipe, or set G2ARD_NO_GPU_TESTS=1"
+            );
             None
         }
-        Err(other) => panic!("{what}: {other}"),
+        opened => Some(opened.unwrap()),
+    }
+}
+
+/// Run `compare` on a device for each limit of bytes that it binds at most.
+pub fn compare_on_gpu(limits: &[u64], compare: impl Fn(&Gpu)) {
+    limits
+        .iter()
+        .filter_map(|&bytes| gpu_in_pieces(bytes))
+        .for_each(|gpu| compare(&gpu));
+}
+
+/// A scene as callers pass it.
+pub fn borrowed(splats: &Splats) -> SceneRef<'_> {
+    SceneRef {
+        means: Means::F64(&splats.means),
+        quats: &splats.quats,
+        scales: &splats.scales,
+        logit_opacities: &splats.logit_opacities,
+        sh0: &splats.sh[..splats.len()],
+        sh_rest: &[],
+        rest: 0,
     }
 }
 

@@ -2,7 +2,6 @@
 
 use std::sync::{Arc, PoisonError, RwLock};
 
-use g2ard_core::Backend;
 #[cfg(not(feature = "gpu"))]
 use g2ard_core::Cpu;
 #[cfg(feature = "gpu")]
@@ -25,11 +24,6 @@ static KERNELS: RwLock<Option<Arc<Kernels>>> = RwLock::new(None);
 pub fn kernels() -> Arc<Kernels> {
     let chosen = KERNELS.read().unwrap_or_else(PoisonError::into_inner);
     chosen.clone().unwrap_or_default()
-}
-
-/// The kernels as the core takes them.
-pub fn backend(kernels: &Arc<Kernels>) -> &dyn Backend {
-    &**kernels
 }
 
 /// Choose cpu, gpu or auto for all kernels from now on. For tests, `max_binding` limits the bytes bound at once;

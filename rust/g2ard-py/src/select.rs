@@ -1,14 +1,16 @@
 //! `g2ard.stages.select`.
 
 use g2ard_core::raster::Camera;
-use g2ard_core::select::{Coverage, Gaussians, Occluders, Problem, Surface, median_depths};
+use g2ard_core::select::{
+    Coverage, Gaussians, Occluders, Problem, Surface, ViewKernels, median_depths,
+};
 use numpy::{PyArray1, PyArray2, PyArrayMethods, PyReadonlyArray1, PyReadonlyArray2};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 
 use crate::arrays;
 use crate::constants::Config;
-use crate::device::{backend, kernels};
+use crate::device::kernels;
 use crate::error::{invalid, to_py};
 use crate::views::View;
 use crate::work::{long, quick};
@@ -43,8 +45,7 @@ pub fn select_surface<'py>(
     cells: usize,
 ) -> PyResult<Bound<'py, PyDict>> {
     let scene = scene.borrow()?;
-    let kernels = kernels();
-    let surface = long(py, None, |_| Surface::of(&scene, cells, backend(&kernels)))?;
+    let surface = long(py, None, |_| Surface::of(&scene, cells))?;
     let out = PyDict::new(py);
     out.set_item("size", surface.size)?;
     out.set_item("centers", arrays::matrix(py, surface.centers)?)?;
@@ -79,7 +80,7 @@ pub fn select_view_statistics<'py>(
     let cameras: Vec<Camera> = views.iter().map(View::camera).collect();
     let kernels = kernels();
     let found = long(py, progress, |control| {
-        backend(&kernels).view_statistics(&scene, &cameras, control)
+        kernels.view_statistics(&scene, &cameras, control)
     })?;
     arrays::matrix(py, found)
 }
@@ -130,7 +131,7 @@ pub fn select_visible<'py>(
     let cameras: Vec<Camera> = views.iter().map(View::camera).collect();
     let kernels = kernels();
     let seen = long(py, progress, |control| {
-        backend(&kernels).visible_cells(&scene, &surface, tolerance, &cameras, control)
+        kernels.visible_cells(&scene, &surface, tolerance, &cameras, control)
     })?;
     let mut starts = vec![0u64];
     for cells in &seen {

@@ -1,15 +1,16 @@
 //! `g2ard.stages.simplify`.
 
+use g2ard_core::Backend;
 use g2ard_core::simplify::{
     Outcome, Pairwise, PairwiseRound, Paper, PaperPlan, PaperRound, Visibility, protection_flags,
 };
 use numpy::{PyArray1, PyArrayMethods, PyReadonlyArray1};
 use pyo3::prelude::*;
-use pyo3::types::PyDict;
+use pyo3::types::{IntoPyDict, PyDict};
 
 use crate::arrays;
 use crate::constants::Config;
-use crate::device::{backend, kernels};
+use crate::device::kernels;
 use crate::scene::PyScene;
 use crate::work::long;
 
@@ -44,7 +45,7 @@ pub fn simplify_flags<'py>(
     let kernels = kernels();
     let found = long(py, progress, |control| {
         let splats = ordered.splats(&scene);
-        let run = backend(&kernels).group_kernels();
+        let run = kernels.group_kernels();
         let found = protection_flags(&splats, cells, &config.0, &*run, control)?;
         let mut by_row = vec![false; found.len()];
         for (&row, &flag) in ordered.rows.iter().zip(&found) {
@@ -72,7 +73,7 @@ pub fn simplify_paper<'py>(
     let (policy, protected) = (config.0, arrays::optional("protected", &protected)?);
     let kernels = kernels();
     let outcome = long(py, progress, |control| {
-        let run = backend(&kernels).group_kernels();
+        let run = kernels.group_kernels();
         let plan = PaperPlan {
             schedule: &schedule,
             cells,
@@ -109,26 +110,22 @@ pub fn simplify_pairwise<'py>(
 }
 
 fn pairwise_dict<'py>(py: Python<'py>, r: &PairwiseRound) -> PyResult<Bound<'py, PyDict>> {
-    let round = PyDict::new(py);
-    for (key, value) in [
+    [
         ("before", r.before),
         ("dropped", r.dropped),
         ("merged", r.merged),
         ("trimmed", 0),
         ("after", r.after),
-    ] {
-        round.set_item(key, value)?;
-    }
-    Ok(round)
+    ]
+    .into_py_dict(py)
 }
 
 fn round_dict<'py>(py: Python<'py>, r: &PaperRound) -> PyResult<Bound<'py, PyDict>> {
-    let refused = PyDict::new(py);
-    refused.set_item("energy", r.refused_energy)?;
-    refused.set_item("coverage", r.refused_coverage)?;
-    let round = PyDict::new(py);
-    round.set_item("refused", refused)?;
-    for (key, value) in [
+    let refused = [
+        ("energy", r.refused_energy),
+        ("coverage", r.refused_coverage),
+    ];
+    let round = [
         ("before", r.before),
         ("dropped", r.dropped),
         ("cells", r.cells),
@@ -138,9 +135,9 @@ fn round_dict<'py>(py: Python<'py>, r: &PaperRound) -> PyResult<Bound<'py, PyDic
         ("clamped_opacities", r.clamped_opacities),
         ("trimmed", r.trimmed),
         ("after", r.after),
-    ] {
-        round.set_item(key, value)?;
-    }
+    ]
+    .into_py_dict(py)?;
+    round.set_item("refused", refused.into_py_dict(py)?)?;
     Ok(round)
 }
 

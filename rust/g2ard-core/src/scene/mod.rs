@@ -26,10 +26,6 @@ impl Means<'_> {
         }
     }
 
-    pub fn is_empty(&self) -> bool {
-        self.len() == 0
-    }
-
     pub fn get(&self, i: usize) -> [f64; 3] {
         match self {
             Self::F32(m) => m[i].map(f64::from),
@@ -54,10 +50,6 @@ pub struct SceneRef<'a> {
 impl SceneRef<'_> {
     pub fn len(&self) -> usize {
         self.means.len()
-    }
-
-    pub fn is_empty(&self) -> bool {
-        self.len() == 0
     }
 
     /// The logit of a row, finite.

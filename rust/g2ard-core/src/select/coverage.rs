@@ -95,16 +95,12 @@ impl Problem<'_> {
         Error::unless_equal("positions", self.positions.len(), n, "rows")?;
         let cells = self.surface.len() as u32;
         if self.visible.iter().flatten().any(|&c| c >= cells) {
-            return Err(Error::invalid(
-                "visible",
-                format!("cells below {cells}"),
-                "one beyond",
-            ));
+            let expected = format!("cells below {cells}");
+            return Err(Error::invalid("visible", expected, "one beyond"));
         }
-        let state = State::new(*self, *coverage);
         let k = k.min(n);
         control.begin(k as u64);
-        state.choose(k, control)
+        State::new(*self, *coverage).choose(k, control)
     }
 }
 

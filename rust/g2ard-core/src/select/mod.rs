@@ -2,7 +2,6 @@
 
 mod coverage;
 mod depth;
-mod kernels;
 mod occluders;
 mod pinhole;
 mod surface;
@@ -10,8 +9,7 @@ mod visible;
 
 pub use coverage::{Chosen, Coverage, Problem};
 pub use depth::median_depths;
-pub use kernels::ViewKernels;
 pub use occluders::{Occluder, Occluders};
 pub use pinhole::Pinhole;
 pub use surface::{Gaussians, Surface};
-pub use visible::{statistics_of, view_statistics, visible_cells};
+pub use visible::{ViewKernels, statistics_of};

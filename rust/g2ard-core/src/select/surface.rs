@@ -2,10 +2,8 @@
 
 use rayon::prelude::*;
 
-use super::ViewKernels;
-
 use crate::linalg::{Sym3, covariance, outer, rotation_from_quat, sub, symmetric_eigen};
-use crate::spatial::RobustBounds;
+use crate::spatial::{Cells, RobustBounds};
 use crate::{Error, Result};
 
 /// A scene's geometry, borrowed; means are centred by the caller.
@@ -81,9 +79,9 @@ pub struct Surface {
 
 impl Surface {
     /// About `target` adaptive voxels of the scene.
-    pub fn of(scene: &Gaussians<'_>, target: usize, kernels: &dyn ViewKernels) -> Result<Self> {
+    pub fn of(scene: &Gaussians<'_>, target: usize) -> Result<Self> {
         scene.validate()?;
-        let cells = kernels.cells(scene.means, &RobustBounds::of(scene.means), target)?;
+        let cells = Cells::adaptive(scene.means, &RobustBounds::of(scene.means), target);
         let rows: Vec<_> = (0..cells.len())
             .into_par_iter()
             .map(|c| cell(scene, cells.members_of(c)))
@@ -101,10 +99,6 @@ impl Surface {
 
     pub fn len(&self) -> usize {
         self.centers.len()
-    }
-
-    pub fn is_empty(&self) -> bool {
-        self.centers.is_empty()
     }
 }
 
@@ -169,7 +163,6 @@ fn normalise(weights: &mut [f64]) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::Cpu;
 
     #[test]
     fn a_plane_of_discs_knows_its_normal() {
@@ -190,7 +183,7 @@ mod tests {
             opacities: &opacities,
         };
         for target in [n, 60] {
-            let surface = Surface::of(&scene, target, &Cpu).unwrap();
+            let surface = Surface::of(&scene, target).unwrap();
             assert!((surface.weights.iter().sum::<f64>() - 1.0).abs() < 1e-12);
             for c in 0..surface.len() {
                 assert!(surface.normals[c][2].abs() > 1.0 - 1e-9);
@@ -208,7 +201,7 @@ mod tests {
             scales: &[[1.0; 3]],
             opacities: &[1.0],
         };
-        assert!(Surface::of(&scene, 10, &Cpu).is_err());
+        assert!(Surface::of(&scene, 10).is_err());
         let scene = Gaussians {
             means: &[[0.0, f64::NAN, 0.0]],
             quats: &[[1.0, 0.0, 0.0, 0.0]],
@@ -216,7 +209,7 @@ mod tests {
             opacities: &[1.0],
         };
         assert_eq!(
-            Surface::of(&scene, 10, &Cpu),
+            Surface::of(&scene, 10),
             Err(Error::NonFinite {
                 field: "scene",
                 count: 1,

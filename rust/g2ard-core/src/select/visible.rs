@@ -1,32 +1,34 @@
-//! Visibility of surface cells and depths in each view.
+//! Visibility of surface cells and depths in each view: the kernels that selection calls, and the CPU's.
 
 use rayon::prelude::*;
 
-use super::Surface;
 use super::depth::Scratch;
 use super::occluders::Occluders;
 use super::pinhole::Pinhole;
+use super::{Gaussians, Surface};
 use crate::raster::Camera;
-use crate::{Control, Result};
+use crate::{Control, Cpu, Result};
 
-/// The share of each camera's pixels that show the scene, and their median depth: see [`statistics_of`].
-pub fn view_statistics(
-    scene: &Occluders,
-    cameras: &[Camera],
-    control: &Control,
-) -> Result<Vec<[f32; 2]>> {
-    control.begin(cameras.len() as u64);
-    cameras
-        .par_iter()
-        .map_init(Scratch::default, |scratch, camera| {
-            control.check()?;
-            let view = Pinhole::of(camera);
-            scratch.clear(&view, 1.0);
-            scratch.trace(scene, &view);
-            control.advance(1);
-            Ok(statistics_of(&scratch.depth))
-        })
-        .collect()
+/// Kernels over a scene and its views. An implementation may differ from [`Cpu`]'s within a stated tolerance.
+pub trait ViewKernels: Sync {
+    /// The share of each camera's pixels that show the scene, and their median depth: see [`statistics_of`].
+    fn view_statistics(
+        &self,
+        scene: &Gaussians<'_>,
+        cameras: &[Camera],
+        control: &Control,
+    ) -> Result<Vec<[f32; 2]>>;
+
+    /// The cells that each camera sees, ascending: the cell's centre falls on the image and lies within max(cell size,
+    /// `tolerance` · its depth) of the median depth in that pixel.
+    fn visible_cells(
+        &self,
+        scene: &Gaussians<'_>,
+        surface: &Surface,
+        tolerance: f32,
+        cameras: &[Camera],
+        control: &Control,
+    ) -> Result<Vec<Vec<u32>>>;
 }
 
 /// The share of pixels that show the scene, and the median of their depths (0 without any).
@@ -41,27 +43,52 @@ pub fn statistics_of(image: &[f32]) -> [f32; 2] {
     [share, median]
 }
 
-/// The cells that each camera sees, ascending: the cell's centre falls on the image and lies within max(cell size,
-/// `tolerance` · its depth) of the median depth in that pixel.
-pub fn visible_cells(
-    scene: &Occluders,
-    surface: &Surface,
-    tolerance: f32,
+/// Call `look` for every camera, with buffers that a thread reuses.
+fn each_view<T: Send>(
     cameras: &[Camera],
     control: &Control,
-) -> Result<Vec<Vec<u32>>> {
+    look: impl Fn(&mut Scratch, &Pinhole) -> T + Sync,
+) -> Result<Vec<T>> {
     control.begin(cameras.len() as u64);
-    let centers: Vec<[f32; 3]> = surface
-        .centers
-        .iter()
-        .map(|c| c.map(|v| v as f32))
-        .collect();
     cameras
         .par_iter()
         .map_init(Scratch::default, |scratch, camera| {
             control.check()?;
-            let view = Pinhole::of(camera);
-            scratch.clear(&view, 0.0);
+            let found = look(scratch, &Pinhole::of(camera));
+            control.advance(1);
+            Ok(found)
+        })
+        .collect()
+}
+
+impl ViewKernels for Cpu {
+    fn view_statistics(
+        &self,
+        scene: &Gaussians<'_>,
+        cameras: &[Camera],
+        control: &Control,
+    ) -> Result<Vec<[f32; 2]>> {
+        let scene = Occluders::of(scene);
+        each_view(cameras, control, |scratch, view| {
+            scratch.clear(view, 1.0);
+            scratch.trace(&scene, view);
+            statistics_of(&scratch.depth)
+        })
+    }
+
+    fn visible_cells(
+        &self,
+        scene: &Gaussians<'_>,
+        surface: &Surface,
+        tolerance: f32,
+        cameras: &[Camera],
+        control: &Control,
+    ) -> Result<Vec<Vec<u32>>> {
+        let scene = Occluders::of(scene);
+        let centers = surface.centers.iter().map(|c| c.map(|v| v as f32));
+        let centers: Vec<[f32; 3]> = centers.collect();
+        each_view(cameras, control, |scratch, view| {
+            scratch.clear(view, 0.0);
             let mut cells: Vec<(u32, u32, f32)> = Vec::new();
             for (cell, &center) in centers.iter().enumerate() {
                 if let Some((pixel, z)) = view.pixel(center) {
@@ -69,13 +96,12 @@ pub fn visible_cells(
                     cells.push((cell as u32, pixel, z));
                 }
             }
-            scratch.trace(scene, &view);
-            control.advance(1);
+            scratch.trace(&scene, view);
             let near = |&(_, pixel, z): &(u32, u32, f32)| {
                 let median = scratch.depth[pixel as usize];
                 median > 0.0 && (z - median).abs() <= (surface.size as f32).max(tolerance * z)
             };
-            Ok(cells.iter().filter(|c| near(c)).map(|c| c.0).collect())
+            cells.iter().filter(|c| near(c)).map(|c| c.0).collect()
         })
-        .collect()
+    }
 }

@@ -1,7 +1,6 @@
 //! Gaussians from a partition of the rows: each cluster's moments in f64, from its raw members.
 
-use rayon::prelude::*;
-
+use super::kernels::in_chunks;
 use super::moments::{pool, rendered_area, sigmoid};
 use super::{GONE, Step};
 use crate::scene::limits::MAX_OPACITY;
@@ -24,6 +23,12 @@ pub struct Partition {
 }
 
 impl Partition {
+    /// The rows that are not [`GONE`], ascending.
+    pub fn kept(&self) -> Vec<u32> {
+        let rows = 0..self.of.len() as u32;
+        rows.filter(|&i| self.of[i as usize] != GONE).collect()
+    }
+
     /// Members of cluster `c`, ascending: `rows[starts[c]..starts[c + 1]]`.
     fn members(&self) -> (Vec<u32>, Vec<u32>) {
         let mut starts = vec![0u32; self.count + 2];
@@ -46,29 +51,19 @@ impl Partition {
     ///
     /// Mass is α·A as rendered, A with the row's dilation `blur` (a variance), and is conserved: α of a
     /// cluster is Σm / A. Where that passes 0.99, the cluster grows instead along its two longer axes, to at
-    /// most `growth` times the area. Returns also how many clusters reached α = 0.99. A cluster with a `protected`
-    /// member is protected.
+    /// most `growth` times the area.
     pub fn assemble(
         &self,
         scene: &SceneRef,
         ordered: &Ordered,
-        protected: &[bool],
         growth: f64,
-        blur: impl Fn(usize) -> f64 + Sync,
+        blur: &[f32],
         control: &Control,
-    ) -> Result<(Step, usize)> {
+    ) -> Result<Step> {
         let (starts, rows) = self.members();
-        let chunks: Vec<Vec<Made>> = (0..self.count.div_ceil(CHUNK))
-            .into_par_iter()
-            .map(|chunk| {
-                control.check()?;
-                let here = chunk * CHUNK..((chunk + 1) * CHUNK).min(self.count);
-                let members = |c: usize| &rows[starts[c] as usize..starts[c + 1] as usize];
-                Ok(here
-                    .map(|c| make(scene, ordered, members(c), growth, &blur))
-                    .collect())
-            })
-            .collect::<Result<_>>()?;
+        let members = |c: usize| &rows[starts[c] as usize..starts[c + 1] as usize];
+        let make = |c: usize| make(scene, ordered, members(c), growth, blur);
+        let made = in_chunks(self.count, control, make)?;
         let mut step = Step {
             splats: Splats {
                 sh_coeffs: scene.rest + 1,
@@ -78,25 +73,23 @@ impl Partition {
             ..Step::default()
         };
         step.splats.sh.reserve(self.count * (scene.rest + 1));
-        let mut clamped = 0;
-        for (c, made) in chunks.into_iter().flatten().enumerate() {
-            let members = &rows[starts[c] as usize..starts[c + 1] as usize];
-            step.protected
-                .push(members.iter().any(|&i| protected[i as usize]));
-            step.copied
-                .push(if members.len() == 1 { members[0] } else { GONE });
-            clamped += usize::from(made.clamped);
+        for (c, made) in made.enumerate() {
+            step.clamped += usize::from(made.clamped);
             step.splats.means.push(made.mean);
             step.splats.quats.push(made.quat);
             step.splats.scales.push(made.scales);
             step.splats.logit_opacities.push(made.logit);
-            average_sh(scene, ordered, members, &made.weights, &mut step.splats.sh);
+            average_sh(
+                scene,
+                ordered,
+                members(c),
+                &made.weights,
+                &mut step.splats.sh,
+            );
         }
-        Ok((step, clamped))
+        Ok(step)
     }
 }
-
-const CHUNK: usize = 1024;
 
 /// A cluster's Gaussian; its SH are written later, into the one array of all.
 struct Made {
@@ -110,13 +103,7 @@ struct Made {
 }
 
 /// Merges a cluster's `members`; parameters are those of [`Partition::assemble`].
-fn make(
-    scene: &SceneRef,
-    ordered: &Ordered,
-    members: &[u32],
-    growth: f64,
-    blur: impl Fn(usize) -> f64,
-) -> Made {
+fn make(scene: &SceneRef, ordered: &Ordered, members: &[u32], growth: f64, blur: &[f32]) -> Made {
     if let [only] = members {
         let row = ordered.rows[*only as usize] as usize;
         return Made {
@@ -134,7 +121,7 @@ fn make(
         .map(|&i| {
             let row = ordered.rows[i as usize] as usize;
             let g = ordered.gaussian(scene, row);
-            let (cov, blur) = (g.covariance(), blur(i as usize));
+            let (cov, blur) = (g.covariance(), f64::from(blur[i as usize]));
             least_blur = least_blur.min(blur);
             let alpha = sigmoid(f64::from(scene.logit(row))).min(MAX_OPACITY);
             (alpha * rendered_area(&cov, blur), g.mean, cov)

@@ -37,9 +37,8 @@ pub trait GroupKernels: Sync {
         control: &Control,
     ) -> Result<Vec<(Merged, f64)>>;
 
-    /// Announce that the next calls use new rows: `copied` is the old row that each copies, or [`super::GONE`]. A
-    /// device that holds rows then sends only new ones.
-    fn rows_replaced(&self, _copied: &[u32]) {}
+    /// Announce that the next calls use new rows, which a device must be sent.
+    fn rows_replaced(&self) {}
 }
 
 /// The means of the rows in `kept`; borrowed if those are all rows.
@@ -50,9 +49,6 @@ pub fn means_of<'a>(splats: &'a Splats, kept: &[u32]) -> Cow<'a, [[f64; 3]]> {
     }
     kept.iter().map(|&i| means[i as usize]).collect()
 }
-
-/// Groups between two checks of the control.
-const CHUNK: usize = 256;
 
 impl GroupKernels for Cpu {
     fn cells(&self, splats: &Splats, kept: &[u32], target: usize) -> Result<Cells> {
@@ -67,13 +63,14 @@ impl GroupKernels for Cpu {
         group: &Group<'_>,
         control: &Control,
     ) -> Result<Vec<f64>> {
-        in_chunks(count, control, |g| {
+        let energies = in_chunks(count, control, |g| {
             let mut rows = Vec::new();
             let own = group(g, &mut rows);
             let points: Vec<_> = rows.iter().map(|&i| splats.means[i as usize]).collect();
             let colors: Vec<_> = rows.iter().map(|&i| color(splats, i as usize)).collect();
             affine_energy(&points, &colors, own)
-        })
+        })?;
+        Ok(energies.collect())
     }
 
     fn merges(
@@ -83,27 +80,31 @@ impl GroupKernels for Cpu {
         support: f64,
         control: &Control,
     ) -> Result<Vec<(Merged, f64)>> {
-        in_chunks(groups.len(), control, |g| {
+        let merges = in_chunks(groups.len(), control, |g| {
             let merged = merge(splats, groups[g]);
             let members = groups[g].iter().map(|&i| Gaussian::of(splats, i as usize));
             let covered = coverage(&members.collect::<Vec<_>>(), &merged.gaussian, support);
             (merged, covered)
-        })
+        })?;
+        Ok(merges.collect())
     }
 }
 
-/// `each` of 0 … count − 1, in order, unless the caller stops it.
-fn in_chunks<T: Send>(
+/// Groups between two checks of the control.
+const CHUNK: usize = 256;
+
+/// `make` of 0 … count − 1 on all threads, in order, unless the caller stops it.
+pub(super) fn in_chunks<T: Send>(
     count: usize,
     control: &Control,
-    each: impl Fn(usize) -> T + Sync,
-) -> Result<Vec<T>> {
+    make: impl Fn(usize) -> T + Sync,
+) -> Result<impl Iterator<Item = T>> {
     let chunks: Vec<Vec<T>> = (0..count.div_ceil(CHUNK))
         .into_par_iter()
         .map(|c| {
             control.check()?;
-            Ok((c * CHUNK..count.min((c + 1) * CHUNK)).map(&each).collect())
+            Ok((c * CHUNK..count.min((c + 1) * CHUNK)).map(&make).collect())
         })
         .collect::<Result<_>>()?;
-    Ok(chunks.into_iter().flatten().collect())
+    Ok(chunks.into_iter().flatten())
 }

@@ -23,7 +23,7 @@ pub struct Leaves<'a> {
     scene: &'a SceneRef<'a>,
     ordered: &'a Ordered,
     /// The ordered rows that are kept, ascending.
-    kept: Vec<u32>,
+    pub kept: Vec<u32>,
     /// The variance that rendering adds to each ordered row.
     blur: &'a [f32],
     visibility: Option<Visibility<'a>>,

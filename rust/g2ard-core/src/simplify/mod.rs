@@ -42,8 +42,6 @@ pub struct Step {
     pub splats: Splats,
     /// Output row of each input row, or [`GONE`].
     pub parents: Vec<u32>,
-    /// Whether a row, or a member of it, is protected: in a cell of uneven colour (`residual.rs`).
-    pub protected: Vec<bool>,
-    /// The input row that an output row is a copy of, or [`GONE`] where it was made by merging.
-    pub copied: Vec<u32>,
+    /// Merged rows whose α was clipped, so that some of their mass is lost.
+    pub clamped: usize,
 }

@@ -100,8 +100,7 @@ impl Pairwise {
         let budget = schedule.last().copied().unwrap_or(scene.len());
         control.begin(scene.len().saturating_sub(budget) as u64);
         let (mut partition, dropped) = self.drop_transparent(scene, ordered, budget);
-        let kept = (0..scene.len() as u32).filter(|&i| partition.of[i as usize] != GONE);
-        let leaves = Leaves::new(scene, ordered, kept.collect(), &blur, visibility, None);
+        let leaves = Leaves::new(scene, ordered, partition.kept(), &blur, visibility, None);
         let geometric = self.geometric(visibility);
         let mut rounds = Vec::new();
         let mut nodes = self.premerge(leaves, geometric, &mut partition, budget, &mut rounds);
@@ -120,17 +119,9 @@ impl Pairwise {
         }
         partition.count = nodes.len();
         drop(nodes);
-        let (step, clamped) = partition.assemble(
-            scene,
-            ordered,
-            &protected,
-            self.max_growth,
-            |i| blur[i].into(),
-            control,
-        )?;
-        let mut outcome = step.finish(scene, ordered, rounds);
-        outcome.clamped_opacities = clamped;
-        Ok(outcome)
+        let step = partition.assemble(scene, ordered, self.max_growth, &blur, control)?;
+        let protected = step.inherited(&protected);
+        Ok(step.finish(scene, ordered, protected, rounds))
     }
 
     /// Merge the cheapest pairs of neighbours in rounds, down to each count of `schedule`. After a round `on_pairs`
@@ -311,7 +302,7 @@ impl RunMerging<'_> {
         let (at, map, codes) = nodes.morton(&every, LATTICES[step % LATTICES.len()]);
         let of = self.partition.of.par_iter_mut().filter(|c| **c != GONE);
         of.for_each(|c| *c = map[runs.of[*c as usize] as usize]);
-        (Shuffled::new(nodes, at), codes)
+        (Shuffled { nodes, at }, codes)
     }
 }
 

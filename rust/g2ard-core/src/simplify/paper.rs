@@ -88,14 +88,10 @@ impl Paper {
         control: &Control,
     ) -> Result<Outcome<PaperRound>> {
         let mut step = Step::start(ordered.splats(scene));
-        step.protected = match protected {
-            Some(protected) if protected.len() == ordered.rows.len() => ordered.sorted(protected),
-            Some(protected) => {
-                return Err(Error::invalid(
-                    "protected",
-                    format!("{} rows", ordered.rows.len()),
-                    protected.len(),
-                ));
+        let mut protected = match protected {
+            Some(flags) => {
+                Error::unless_equal("protected", flags.len(), ordered.rows.len(), "rows")?;
+                ordered.sorted(flags)
             }
             None => super::protection_flags(&step.splats, plan.cells, self, kernels, control)?,
         };
@@ -108,20 +104,14 @@ impl Paper {
                 cells: plan.cells,
                 grid: ordered.grid,
             };
-            let (next, report) =
-                self.round(&step.splats, &step.protected, target, kernels, control)?;
+            let (next, report) = self.round(&step.splats, &protected, target, kernels, control)?;
+            protected = next.inherited(&protected);
             control.advance((report.before - report.after) as u64);
-            kernels.rows_replaced(&next.copied);
+            kernels.rows_replaced();
             step = step.then(next);
             rounds.push(report);
         }
-        let clamped = rounds
-            .iter()
-            .map(|r: &PaperRound| r.clamped_opacities)
-            .sum();
-        let mut outcome = step.finish(scene, ordered, rounds);
-        outcome.clamped_opacities = clamped;
-        Ok(outcome)
+        Ok(step.finish(scene, ordered, protected, rounds))
     }
 
     /// Run one round to exactly the budget, or keep all rows if there are no more.
@@ -148,8 +138,8 @@ impl Paper {
         };
         let mut merges = self.judge(splats, &groups, kernels, &mut report, control)?;
         undo_costliest(&groups, &mut merges, budget, &mut report);
-        let built = build(splats, protected, &groups, merges, target.grid, &mut report);
-        Ok((self.trim(built, budget, &mut report), report))
+        let built = build(splats, &groups, merges, target.grid, &mut report);
+        Ok((self.trim(built, protected, budget, &mut report), report))
     }
 
     fn priority(&self, splats: &Splats, protected: &[bool]) -> Vec<f64> {
@@ -253,24 +243,31 @@ impl Paper {
         Ok(accepted)
     }
 
-    fn trim(&self, built: Step, budget: usize, report: &mut PaperRound) -> Step {
+    /// Keep the rows of highest priority down to the budget; `protected` are the flags of the round's input.
+    fn trim(
+        &self,
+        built: Step,
+        protected: &[bool],
+        budget: usize,
+        report: &mut PaperRound,
+    ) -> Step {
         let n = built.splats.len();
         if n <= budget {
             return built;
         }
         report.trimmed = n - budget;
-        let stay = best(&self.priority(&built.splats, &built.protected), budget);
+        let protected = built.inherited(protected);
+        let stay = best(&self.priority(&built.splats, &protected), budget);
         let mut to = vec![GONE; n];
         stay.iter()
             .enumerate()
             .for_each(|(out, &row)| to[row as usize] = out as u32);
-        let follow = |p: u32| if p == GONE { GONE } else { to[p as usize] };
-        Step {
+        let trimmed = Step {
             splats: take(&built.splats, &stay),
-            parents: built.parents.into_iter().map(follow).collect(),
-            protected: stay.iter().map(|&i| built.protected[i as usize]).collect(),
-            copied: stay.iter().map(|&i| built.copied[i as usize]).collect(),
-        }
+            parents: to,
+            clamped: 0,
+        };
+        built.then(trimmed)
     }
 }
 
@@ -308,7 +305,6 @@ fn undo_costliest(
 /// The groups' rows in order: one for a merged group, else its members.
 fn build(
     splats: &Splats,
-    protected: &[bool],
     groups: &[Vec<u32>],
     merges: Vec<Option<Box<Candidate>>>,
     grid: f64,
@@ -323,22 +319,18 @@ fn build(
         if let Some(candidate) = candidate {
             report.merged_groups += 1;
             report.merged_members += rows.len();
-            report.clamped_opacities += usize::from(candidate.merged.clamped);
+            out.clamped += usize::from(candidate.merged.clamped);
             let to = out.splats.len() as u32;
             rows.iter().for_each(|&i| out.parents[i as usize] = to);
             push_merged(&mut out.splats, candidate.merged, grid);
-            out.protected
-                .push(rows.iter().any(|&i| protected[i as usize]));
-            out.copied.push(GONE);
             continue;
         }
         for &i in rows {
             out.parents[i as usize] = out.splats.len() as u32;
             push_copy(&mut out.splats, splats, i as usize);
-            out.protected.push(protected[i as usize]);
-            out.copied.push(i);
         }
     }
+    report.clamped_opacities = out.clamped;
     out
 }
 

@@ -81,15 +81,11 @@ impl Rows for Nodes {
 
 /// Nodes in another order than they lie in: at 13 million, to move them would take half the memory of all.
 pub struct Shuffled {
-    nodes: Nodes,
-    at: Vec<u32>,
+    pub nodes: Nodes,
+    pub at: Vec<u32>,
 }
 
 impl Shuffled {
-    pub fn new(nodes: Nodes, at: Vec<u32>) -> Self {
-        Self { nodes, at }
-    }
-
     /// The nodes, moved to their places.
     pub fn settled(mut self) -> Nodes {
         self.nodes.gather(&self.at);

@@ -11,7 +11,7 @@ use super::importance::Importance;
 use super::leaves::{Leaves, floor, typical_size};
 use super::morton_tree::{cut, merge_costs};
 use super::pairwise::PairwiseRound;
-use super::rows::{Rows, Shuffled};
+use super::rows::Rows;
 use super::{GONE, Outcome, Pairwise, Visibility};
 use crate::scene::{Ordered, SceneRef};
 use crate::{Control, Error, Result};
@@ -77,16 +77,14 @@ pub struct Tile<'a> {
 impl Tile<'_> {
     /// Σ αT² of the views, and mass, of the rows that are kept; the frame's floor is not read.
     pub fn sums(&self) -> Result<(f64, f64)> {
-        self.policy.check(self.scene, self.visibility, None)?;
-        let (blur, kept) = (self.blurs(), self.kept());
-        Ok(self.leaves(kept, &blur).sums())
+        let blur = self.blurs();
+        Ok(self.leaves(&blur)?.sums())
     }
 
     /// The cost of closing each gap between neighbours in Morton order, from the first kept row on.
     pub fn run_costs(&self) -> Result<Vec<f32>> {
-        self.policy.check(self.scene, self.visibility, None)?;
-        let (blur, kept) = (self.blurs(), self.kept());
-        let leaves = self.leaves(kept, &blur);
+        let blur = self.blurs();
+        let leaves = self.leaves(&blur)?;
         Ok(merge_costs(&leaves.codes(), &leaves, self.geometric()))
     }
 
@@ -99,35 +97,28 @@ impl Tile<'_> {
         costs: &[f32],
         control: &Control,
     ) -> Result<TilePlan> {
-        self.policy.check(self.scene, self.visibility, None)?;
-        let (blur, kept) = (self.blurs(), self.kept());
-        let leaves = self.leaves(kept.clone(), &blur);
+        let blur = self.blurs();
+        let leaves = self.leaves(&blur)?;
         if runs == 0 || runs > leaves.len() {
-            return Err(Error::invalid(
-                "runs",
-                format!("1 to {}", leaves.len()),
-                runs,
-            ));
+            let expected = format!("1 to {}", leaves.len());
+            return Err(Error::invalid("runs", expected, runs));
         }
-        if costs.len() + 1 != leaves.len() {
-            let expected = format!("{} gaps", leaves.len() - 1);
-            return Err(Error::invalid("costs", expected, costs.len()));
-        }
+        Error::unless_equal("costs", costs.len(), leaves.len() - 1, "gaps")?;
         control.begin((runs - schedule.last().map_or(runs, |&last| last.min(runs))) as u64);
         let (mut nodes, at) = if runs < leaves.len() {
             let parts = cut(costs, runs);
-            let merged = leaves.merged(&parts);
+            let mut merged = leaves.merged(&parts);
             // Runs in Morton order anew, and each kept row's run there.
             let every: Vec<u32> = (0..runs as u32).collect();
             let (from, map, _) = merged.morton(&every, [0.0; 3]);
+            merged.gather(&from);
             let of = parts.of.iter().map(|&run| map[run as usize]);
-            let of: Vec<u32> = of.collect();
-            (Shuffled::new(merged, from).settled(), of)
+            (merged, of.collect::<Vec<u32>>())
         } else {
             (leaves.nodes(), (0..runs as u32).collect())
         };
         let mut run_of = vec![GONE; self.scene.len()];
-        for (&row, &run) in kept.iter().zip(&at) {
+        for (&row, &run) in leaves.kept.iter().zip(&at) {
             run_of[row as usize] = run;
         }
         // The run that each node began with; a merged node keeps that of the node it was merged into.
@@ -165,33 +156,16 @@ impl Tile<'_> {
         count: usize,
         control: &Control,
     ) -> Result<Outcome<PairwiseRound>> {
-        if of.len() != self.scene.len() {
-            return Err(Error::invalid(
-                "of",
-                format!("{} rows", self.scene.len()),
-                of.len(),
-            ));
-        }
-        let blur = self.blurs();
-        let protected = vec![false; of.len()];
-        let (step, clamped) = Partition { of, count }.assemble(
+        Error::unless_equal("of", of.len(), self.scene.len(), "rows")?;
+        let growth = self.policy.max_growth;
+        let step = Partition { of, count }.assemble(
             self.scene,
             self.ordered,
-            &protected,
-            self.policy.max_growth,
-            |i| blur[i].into(),
+            growth,
+            &self.blurs(),
             control,
         )?;
-        let mut outcome = step.finish(self.scene, self.ordered, Vec::new());
-        outcome.clamped_opacities = clamped;
-        Ok(outcome)
-    }
-
-    /// The ordered rows that a renderer draws; one row at least.
-    fn kept(&self) -> Vec<u32> {
-        let (partition, _) = self.policy.drop_transparent(self.scene, self.ordered, 1);
-        let rows = 0..self.scene.len() as u32;
-        rows.filter(|&i| partition.of[i as usize] != GONE).collect()
+        Ok(step.finish(self.scene, self.ordered, vec![false; count], Vec::new()))
     }
 
     fn blurs(&self) -> Vec<f32> {
@@ -200,15 +174,18 @@ impl Tile<'_> {
             .blurs(self.scene, self.ordered, self.visibility, usual)
     }
 
-    fn leaves<'b>(&'b self, kept: Vec<u32>, blur: &'b [f32]) -> Leaves<'b> {
-        Leaves::new(
+    /// The rows that a renderer draws; one row at least.
+    fn leaves<'b>(&'b self, blur: &'b [f32]) -> Result<Leaves<'b>> {
+        self.policy.check(self.scene, self.visibility, None)?;
+        let (partition, _) = self.policy.drop_transparent(self.scene, self.ordered, 1);
+        Ok(Leaves::new(
             self.scene,
             self.ordered,
-            kept,
+            partition.kept(),
             blur,
             self.visibility,
             Some(&self.frame),
-        )
+        ))
     }
 
     fn geometric(&self) -> f32 {

@@ -19,8 +19,8 @@ pub struct Cells {
     /// Cell `c` holds `members[starts[c]..starts[c + 1]]`.
     pub starts: Vec<u32>,
     pub members: Vec<u32>,
-    /// Morton code of each cell; None for a point beyond the lattice, which is a cell of its own.
-    keys: Vec<Option<u64>>,
+    /// Morton code of each cell, ascending; None, at the end, for a point beyond the lattice, which is a cell of its own.
+    pub keys: Vec<Option<u64>>,
 }
 
 impl Cells {
@@ -56,31 +56,16 @@ impl Cells {
             }
         }
         starts.push(points.len() as u32);
-        let members = keyed.into_par_iter().map(|(_, i)| i).collect();
-        Self::from_parts(size, starts, members, keys)
-    }
-
-    /// Cells found elsewhere: `keys` are Morton codes, ascending, None last.
-    pub fn from_parts(
-        size: f64,
-        starts: Vec<u32>,
-        members: Vec<u32>,
-        keys: Vec<Option<u64>>,
-    ) -> Self {
         Self {
             size,
             starts,
-            members,
+            members: keyed.into_par_iter().map(|(_, i)| i).collect(),
             keys,
         }
     }
 
     pub fn len(&self) -> usize {
         self.keys.len()
-    }
-
-    pub fn is_empty(&self) -> bool {
-        self.keys.is_empty()
     }
 
     pub fn members_of(&self, cell: usize) -> &[u32] {

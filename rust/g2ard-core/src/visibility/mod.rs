@@ -1,7 +1,6 @@
 //! Visibility of a whole scene in little memory: each view projects only the groups of rows around its frustum.
 
 mod groups;
-mod kernels;
 
 use std::any::Any;
 use std::ops::Range;
@@ -9,15 +8,44 @@ use std::sync::Arc;
 
 use rayon::prelude::*;
 
-use crate::Result;
 use crate::raster::accumulate::{SQUARED, Total};
 use crate::raster::disjoint::DisjointSlice;
 use crate::raster::params::check_count;
 use crate::raster::simd::LANES;
 use crate::raster::{Camera, Frustum, Rasterizer, Settings, TileGrid};
 use crate::scene::{Means, Ordered, SceneRef};
+use crate::{Control, Cpu, Result};
 use groups::{Bounds, Group, VisibleGroup, VisibleGroups};
-pub use kernels::VisibilityKernels;
+
+/// Kernels over a scene that views look at. An implementation may differ from [`Cpu`]'s within a stated tolerance.
+pub trait VisibilityKernels: Sync {
+    /// Adds views in the scene's coordinates.
+    fn add_views(
+        &self,
+        sums: &mut VisibilityAccumulator,
+        cameras: &[Camera],
+        settings: &Settings,
+        control: &Control,
+    ) -> Result<()>;
+}
+
+impl VisibilityKernels for Cpu {
+    fn add_views(
+        &self,
+        sums: &mut VisibilityAccumulator,
+        cameras: &[Camera],
+        settings: &Settings,
+        control: &Control,
+    ) -> Result<()> {
+        control.begin(cameras.len() as u64);
+        for camera in cameras {
+            control.check()?;
+            sums.add(camera, settings)?;
+            control.advance(1);
+        }
+        Ok(())
+    }
+}
 
 /// Σ αT² and the smallest pixel of each of N Gaussians over the views added so far. The result depends neither on the
 /// order of the rows nor on the number of threads: equal depths are drawn in the order of the scene's content.
@@ -67,10 +95,6 @@ impl VisibilityAccumulator {
     /// Number of Gaussians.
     pub fn len(&self) -> usize {
         self.weight.len()
-    }
-
-    pub fn is_empty(&self) -> bool {
-        self.weight.is_empty()
     }
 
     /// Mean, quaternion, scales and logit of a Gaussian, numbered in the order of the scene's content.

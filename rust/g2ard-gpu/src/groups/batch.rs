@@ -4,25 +4,18 @@ use g2ard_core::Control;
 use g2ard_core::simplify::Group;
 use rayon::prelude::*;
 
-use crate::rows::{Part, Rows};
-use crate::runtime::{Buffer, Gpu, Kernel, Pending, Result, Work};
+use crate::rows::{Part, Run};
+use crate::runtime::{Buffer, Kernel, Pending, Result, Work};
 
 /// A kernel with one thread per group.
-pub struct Twin {
-    pub kernel: Kernel,
+pub struct Twin<'a> {
+    pub kernel: &'a Kernel,
     /// The part of a member's row that it reads.
     pub part: Part,
     /// Words per answer.
     pub answer: usize,
-}
-
-/// Rows on the device, their numbers, and further inputs of a kernel.
-#[derive(Clone, Copy)]
-pub struct Source<'a> {
-    pub rows: &'a Rows,
-    pub numbers: &'a [u32],
+    /// A further input, and further constants.
     pub extra: Option<&'a Buffer>,
-    /// Further constants of the kernel.
     pub constants: [u32; 2],
 }
 
@@ -68,23 +61,24 @@ struct Segment {
     own: u32,
 }
 
-/// Runs a kernel over all groups.
-pub fn run(
-    gpu: &Gpu,
+/// Run a kernel over all groups.
+pub fn run_twin(
+    run: Run<'_>,
     twin: &Twin,
-    source: Source<'_>,
     count: usize,
     group: &Group<'_>,
     control: &Control,
 ) -> Result<Found> {
-    let most_rows = (gpu.max_words() / twin.part.words).min(ROWS);
-    let most_groups = gpu.max_words() / twin.answer.max(SEGMENT);
-    let largest = LARGEST.min(most_rows).min(gpu.max_rounds() / ROUNDS);
-    let mut found = Found {
+    let most_rows = (run.gpu.max_words() / twin.part.words).min(ROWS);
+    let most_groups = run.gpu.max_words() / twin.answer.max(SEGMENT);
+    let largest = LARGEST.min(most_rows).min(run.gpu.max_rounds() / ROUNDS);
+    let mut batches = Batches {
+        run,
+        twin,
+        submitted: None,
         answers: vec![0; count * twin.answer],
-        large: Vec::new(),
     };
-    let (mut batch, mut submitted) = (Batch::default(), None);
+    let (mut batch, mut large) = (Batch::default(), Vec::new());
     for first in (0..count).step_by(CHUNK) {
         control.check()?;
         let ids: Vec<usize> = (first..count.min(first + CHUNK)).collect();
@@ -92,22 +86,24 @@ pub fn run(
             .par_chunks(TASK)
             .map(|ids| part(ids, largest, group))
             .collect();
-        for (part, large) in parts {
-            found.large.extend(large);
-            let mut from = 0;
+        for (part, too_large) in parts {
+            large.extend(too_large);
             for segment in part.groups {
-                let to = from + segment.count as usize;
-                if batch.rows.len() + to - from > most_rows || batch.groups.len() == most_groups {
-                    batch.start(gpu, twin, source, &mut submitted, &mut found)?;
+                let rows = &part.rows[segment.first as usize..][..segment.count as usize];
+                let full = batch.rows.len() + rows.len() > most_rows;
+                if full || batch.groups.len() == most_groups {
+                    batches.start(std::mem::take(&mut batch))?;
                 }
-                batch.push(segment.id, segment.own, &part.rows[from..to]);
-                from = to;
+                batch.push(segment.id, segment.own, rows);
             }
         }
     }
-    batch.start(gpu, twin, source, &mut submitted, &mut found)?;
-    finish(twin, &mut submitted, &mut found)?;
-    Ok(found)
+    batches.start(batch)?;
+    batches.finish()?;
+    Ok(Found {
+        answers: batches.answers,
+        large,
+    })
 }
 
 /// Assemble some groups; return the batch and the groups that are too large.
@@ -125,9 +121,6 @@ fn part(ids: &[usize], largest: usize, group: &Group<'_>) -> (Batch, Vec<usize>)
     (batch, large)
 }
 
-/// A submitted batch, and the groups whose results it holds.
-type Submitted<'a> = Option<(Vec<usize>, Pending<'a>)>;
-
 impl Batch {
     fn push(&mut self, id: usize, own: u32, rows: &[u32]) {
         self.groups.push(Segment {
@@ -138,17 +131,20 @@ impl Batch {
         });
         self.rows.extend_from_slice(rows);
     }
+}
 
-    /// Submit the batch and read the results of the previous one.
-    fn start<'a>(
-        &mut self,
-        gpu: &'a Gpu,
-        twin: &Twin,
-        source: Source<'_>,
-        submitted: &mut Submitted<'a>,
-        found: &mut Found,
-    ) -> Result<()> {
-        let Self { rows, mut groups } = std::mem::take(self);
+/// Batches on their way: one at most is submitted, with the groups whose results it holds.
+struct Batches<'a> {
+    run: Run<'a>,
+    twin: &'a Twin<'a>,
+    submitted: Option<(Vec<usize>, Pending<'a>)>,
+    answers: Vec<u32>,
+}
+
+impl Batches<'_> {
+    /// Submit a batch and read the results of the previous one.
+    fn start(&mut self, batch: Batch) -> Result<()> {
+        let Batch { rows, mut groups } = batch;
         if groups.is_empty() {
             return Ok(());
         }
@@ -158,37 +154,34 @@ impl Batch {
             .iter()
             .map(|g| [g.first, g.own << 16 | g.count])
             .collect();
-        let numbers: Vec<u32> = rows.iter().map(|&i| source.numbers[i as usize]).collect();
+        let (gpu, twin) = (self.run.gpu, self.twin);
         let mut work = Work::new(gpu);
-        let members = source.rows.gather(gpu, &mut work, twin.part, &numbers)?;
+        let members = self.run.gather(&mut work, twin.part, &rows)?;
         let segments = gpu.upload("groups", segments.as_flattened())?;
-        let answers = gpu.buffer("answers", groups.len() * twin.answer)?;
+        let words = groups.len() * twin.answer;
+        let answers = gpu.buffer("answers", words)?;
         let mut buffers = vec![&members, &segments, &answers];
-        buffers.extend(source.extra);
-        let [a, b] = source.constants;
+        buffers.extend(twin.extra);
+        let [a, b] = twin.constants;
         let constants = [groups.len() as u32, a, b, 0];
-        work.run(
-            &twin.kernel,
-            groups.len().div_ceil(THREADS),
-            &constants,
-            &buffers,
-        )?;
-        let pending = work.submit(&[(&answers, groups.len() * twin.answer)])?;
-        finish(twin, submitted, found)?;
-        *submitted = Some((groups.iter().map(|g| g.id).collect(), pending));
+        let threads = groups.len().div_ceil(THREADS);
+        work.run(twin.kernel, threads, &constants, &buffers)?;
+        let pending = work.submit(&[(&answers, words)])?;
+        self.finish()?;
+        self.submitted = Some((groups.iter().map(|g| g.id).collect(), pending));
         Ok(())
     }
-}
 
-/// Read the results of a batch.
-fn finish(twin: &Twin, submitted: &mut Submitted<'_>, found: &mut Found) -> Result<()> {
-    let Some((ids, pending)) = submitted.take() else {
-        return Ok(());
-    };
-    let words = pending.take()?;
-    for (id, answer) in ids.into_iter().zip(words[0].chunks(twin.answer)) {
-        let at = id * twin.answer;
-        found.answers[at..at + twin.answer].copy_from_slice(answer);
+    /// Read the results of the submitted batch.
+    fn finish(&mut self) -> Result<()> {
+        let Some((ids, pending)) = self.submitted.take() else {
+            return Ok(());
+        };
+        let words = pending.take()?;
+        for (id, answer) in ids.into_iter().zip(words[0].chunks(self.twin.answer)) {
+            let at = id * self.twin.answer;
+            self.answers[at..at + self.twin.answer].copy_from_slice(answer);
+        }
+        Ok(())
     }
-    Ok(())
 }

@@ -7,64 +7,44 @@ use g2ard_core::simplify::{Group, GroupKernels, Merged, disc, weights};
 use g2ard_core::{Control, Cpu};
 use rayon::prelude::*;
 
-use crate::rows::{COLORED, Numbered, Rows, WEIGHED};
-use crate::runtime::{Gpu, Kernel, Result};
-use crate::two::{Frame, TWO, number};
-use batch::{Source, Twin, run};
+use crate::rows::{COLORED, Run, WEIGHED};
+use crate::runtime::{Kernel, Result};
+use crate::two::{TWO, number};
+use batch::{Twin, run_twin};
 
 const MEMBERS: &str = include_str!("members.wgsl");
-
-const ENERGY: Twin = Twin {
-    kernel: Kernel::new(
-        "groups.energy",
-        &[TWO, include_str!("energy.wgsl"), MEMBERS],
-        "energy",
-    ),
-    part: COLORED,
-    answer: 2,
-};
-
-const MERGE: Twin = Twin {
-    kernel: Kernel::new(
-        "groups.merge",
-        &[TWO, include_str!("merge.wgsl"), MEMBERS],
-        "merge",
-    ),
-    part: WEIGHED,
-    answer: 32,
-};
+const ENERGY_SOURCES: &[&str] = &[TWO, include_str!("energy.wgsl"), MEMBERS];
+const ENERGY: Kernel = Kernel::new("groups.energy", ENERGY_SOURCES, "energy");
+const MERGE_SOURCES: &[&str] = &[TWO, include_str!("merge.wgsl"), MEMBERS];
+const MERGE: Kernel = Kernel::new("groups.merge", MERGE_SOURCES, "merge");
 
 /// See [`GroupKernels::energies`].
 pub fn energies(
-    gpu: &Gpu,
-    held: &Rows,
-    rows: Numbered<'_>,
+    run: Run<'_>,
     count: usize,
     group: &Group<'_>,
     control: &Control,
 ) -> Result<Vec<f64>> {
-    let source = Source {
-        rows: held,
-        numbers: rows.numbers,
+    let twin = Twin {
+        kernel: &ENERGY,
+        part: COLORED,
+        answer: 2,
         extra: None,
         constants: [0; 2],
     };
-    let found = run(gpu, &ENERGY, source, count, group, control)?;
-    let mut energies: Vec<f64> = found.answers.chunks(ENERGY.answer).map(number).collect();
-    let large = &found.large;
-    let again = |at: usize, rows: &mut Vec<u32>| group(large[at], rows);
-    let rest = Cpu.energies(rows.splats, large.len(), &again, control)?;
-    large.iter().zip(rest).for_each(|(&g, e)| energies[g] = e);
+    let found = run_twin(run, &twin, count, group, control)?;
+    let mut energies: Vec<f64> = found.answers.chunks(twin.answer).map(number).collect();
+    let again = |at: usize, rows: &mut Vec<u32>| group(found.large[at], rows);
+    let rest = Cpu.energies(run.splats, found.large.len(), &again, control)?;
+    let large = found.large.iter().zip(rest);
+    large.for_each(|(&g, energy)| energies[g] = energy);
     Ok(energies)
 }
 
 /// See [`GroupKernels::merges`]. Opacity and SH are averaged on the CPU, because sending a row's 180 bytes of SH to a
 /// device takes longer than adding them up.
 pub fn merges(
-    gpu: &Gpu,
-    held: &Rows,
-    frame: Frame,
-    rows: Numbered<'_>,
+    run: Run<'_>,
     groups: &[&[u32]],
     support: f64,
     control: &Control,
@@ -73,18 +53,20 @@ pub fn merges(
         rows.extend_from_slice(groups[at]);
         groups[at].len()
     };
-    let disc = gpu.upload("disc", &disc().map(|at| at.map(|v| v as f32)))?;
-    let source = Source {
-        rows: held,
-        numbers: rows.numbers,
+    let disc = disc().map(|at| at.map(|v| v as f32));
+    let disc = run.gpu.upload("disc", &disc)?;
+    let twin = Twin {
+        kernel: &MERGE,
+        part: WEIGHED,
+        answer: 32,
         extra: Some(&disc),
-        constants: [(support as f32).to_bits(), frame.exponent as u32],
+        constants: [(support as f32).to_bits(), run.frame.exponent as u32],
     };
-    let found = run(gpu, &MERGE, source, groups.len(), &group, control)?;
-    let splats = rows.splats;
+    let found = run_twin(run, &twin, groups.len(), &group, control)?;
+    let splats = run.splats;
     let mut merges: Vec<_> = found
         .answers
-        .par_chunks(MERGE.answer)
+        .par_chunks(twin.answer)
         .zip(groups)
         .map(|(answer, rows)| {
             let (weights, mass) = weights(splats, rows);
@@ -94,12 +76,9 @@ pub fn merges(
         })
         .collect();
     let large: Vec<&[u32]> = found.large.iter().map(|&g| groups[g]).collect();
-    let rest = Cpu.merges(rows.splats, &large, support, control)?;
-    found
-        .large
-        .iter()
-        .zip(rest)
-        .for_each(|(&g, m)| merges[g] = m);
+    let rest = Cpu.merges(splats, &large, support, control)?;
+    let large = found.large.iter().zip(rest);
+    large.for_each(|(&g, merged)| merges[g] = merged);
     Ok(merges)
 }
 
@@ -123,7 +102,9 @@ fn gaussian(answer: &[u32], first: [f64; 3]) -> Gaussian {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::testing::{gpu, gpu_in_pieces, scenes};
+    use crate::rows::Rows;
+    use crate::runtime::Gpu;
+    use crate::testing::{WHOLE, compare_on_gpu, scenes};
     use g2ard_core::Splats;
     use g2ard_core::spatial::{Cells, RobustBounds};
 
@@ -136,7 +117,7 @@ mod tests {
         )
     }
 
-    fn compare(gpu: &Gpu, what: &str) {
+    fn compare(gpu: &Gpu) {
         let control = Control::default();
         for (name, splats) in scenes(6000) {
             let cells = cells_of(&splats);
@@ -154,31 +135,26 @@ mod tests {
                 own
             };
             let numbers: Vec<u32> = (0..splats.len() as u32).collect();
-            let numbered = Numbered {
-                splats: &splats,
-                numbers: &numbers,
-            };
             let mut held = Rows::default();
-            let frame = held.follow(gpu, numbered).unwrap();
+            let run = held.of(gpu, &splats).unwrap();
             let count = cells.len() + 9;
             let want = Cpu.energies(&splats, count, &own, &control).unwrap();
-            let got = energies(gpu, &held, numbered, count, &own, &control).unwrap();
+            let got = energies(run, count, &own, &control).unwrap();
             let apart = |a: f64, b: f64| (a - b).abs() / (a.abs() + 1e-9);
             let energy = want.iter().zip(&got).map(|(&a, &b)| apart(a, b));
             let energy = energy.fold(0.0, f64::max);
             let mut groups: Vec<&[u32]> = (0..cells.len()).map(|c| cells.members_of(c)).collect();
-            let rows: Vec<u32> = (0..splats.len() as u32).collect();
-            groups.extend(rows.chunks(700)); // of every size up to those that are left to the CPU
-            groups.extend(rows[..splats.len().min(900)].chunks(125));
+            groups.extend(numbers.chunks(700)); // of every size up to those that are left to the CPU
+            groups.extend(numbers[..splats.len().min(900)].chunks(125));
             let want = Cpu.merges(&splats, &groups, 3.0, &control).unwrap();
-            let got = merges(gpu, &held, frame, numbered, &groups, 3.0, &control).unwrap();
+            let got = merges(run, &groups, 3.0, &control).unwrap();
             let (mut moments, mut recovered) = (0f64, 0);
             for ((a, covered_a), (b, covered_b)) in want.iter().zip(&got) {
                 moments = moments.max(moments_apart(&a.gaussian, &b.gaussian));
                 recovered += usize::from((covered_a - covered_b).abs() > TOLERANCE);
             }
             eprintln!(
-                "{what} {name}: {} energies within {energy:.1e}, {} moments within {moments:.1e}; {recovered} \
+                "{name}: {} energies within {energy:.1e}, {} moments within {moments:.1e}; {recovered} \
                  coverages differ",
                 want.len(),
                 got.len(),
@@ -205,15 +181,6 @@ mod tests {
 
     #[test]
     fn energies_and_merges_are_close_to_the_cpus() {
-        let Some(gpu) = gpu("groups") else { return };
-        compare(&gpu, "groups");
-    }
-
-    #[test]
-    fn energies_and_merges_are_close_to_the_cpus_in_pieces() {
-        let Some(gpu) = gpu_in_pieces("groups in pieces", 1 << 14) else {
-            return;
-        };
-        compare(&gpu, "groups in pieces");
+        compare_on_gpu(&[WHOLE, 1 << 14], compare);
     }
 }

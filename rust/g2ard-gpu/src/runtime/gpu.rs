@@ -146,12 +146,8 @@ impl Gpu {
             });
         }
         self.room.check(bytes + RESERVE)?;
-        let inner = self.device.create_buffer(&BufferDescriptor {
-            label: Some(what),
-            size: bytes,
-            usage: BufferUsages::STORAGE | BufferUsages::COPY_SRC | BufferUsages::COPY_DST,
-            mapped_at_creation: false,
-        });
+        let usage = BufferUsages::STORAGE | BufferUsages::COPY_SRC | BufferUsages::COPY_DST;
+        let inner = self.create(what, bytes, usage);
         self.check()?;
         Ok(Buffer { inner, words })
     }
@@ -167,14 +163,20 @@ impl Gpu {
 
     /// A uniform buffer with the constants of one dispatch.
     pub(super) fn constants(&self, values: &[u32]) -> wgpu::Buffer {
-        let buffer = self.device.create_buffer(&BufferDescriptor {
-            label: Some("constants"),
-            size: 4 * values.len().next_multiple_of(4) as u64,
-            usage: BufferUsages::UNIFORM | BufferUsages::COPY_DST,
-            mapped_at_creation: false,
-        });
+        let bytes = 4 * values.len().next_multiple_of(4) as u64;
+        let usage = BufferUsages::UNIFORM | BufferUsages::COPY_DST;
+        let buffer = self.create("constants", bytes, usage);
         self.write(&buffer, bytemuck::cast_slice(values));
         buffer
+    }
+
+    pub(super) fn create(&self, label: &str, size: u64, usage: BufferUsages) -> wgpu::Buffer {
+        self.device.create_buffer(&BufferDescriptor {
+            label: Some(label),
+            size,
+            usage,
+            mapped_at_creation: false,
+        })
     }
 
     fn write(&self, buffer: &wgpu::Buffer, bytes: &[u8]) {
@@ -235,10 +237,6 @@ impl Gpu {
     pub(super) fn took(&self, kernel: &'static str, seconds: f64) {
         *lock(&self.timings).entry(kernel).or_default() += seconds;
     }
-
-    pub(super) fn fail(&self, error: Error) {
-        lock(&self.health).get_or_insert(error);
-    }
 }
 
 /// Collect errors for `check` instead of panicking.
@@ -263,6 +261,6 @@ fn one_line(text: &str) -> String {
 }
 
 /// Lock a mutex. Poisoning is ignored: no code panics while it holds one, and its data is always consistent.
-fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+pub fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }

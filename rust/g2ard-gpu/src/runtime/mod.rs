@@ -9,6 +9,7 @@ mod work;
 
 pub use adapters::{Adapter, list};
 pub use error::{Error, Result};
+pub(crate) use gpu::lock;
 pub use gpu::{Buffer, Gpu, Kernel, Options};
 pub use panics::guarded;
 pub use work::{Pending, Work};

@@ -1,12 +1,11 @@
 //! Recorded dispatches, and results to read when they are done.
 
-use std::sync::mpsc::{Receiver, channel};
+use std::iter;
 use std::time::Duration;
 
 use wgpu::{
-    BindGroupDescriptor, BindGroupEntry, BufferDescriptor, BufferUsages, CommandEncoder,
-    ComputePassDescriptor, ComputePassTimestampWrites, MapMode, PollType, QuerySet,
-    QuerySetDescriptor, QueryType,
+    BindGroupDescriptor, BindGroupEntry, BufferUsages, CommandEncoder, ComputePassDescriptor,
+    ComputePassTimestampWrites, MapMode, PollType, QuerySet, QuerySetDescriptor, QueryType,
 };
 
 use super::gpu::{Buffer, Gpu, Kernel};
@@ -38,7 +37,7 @@ struct Clock {
 pub struct Pending<'a> {
     gpu: &'a Gpu,
     index: wgpu::SubmissionIndex,
-    reads: Vec<(wgpu::Buffer, Receiver<bool>)>,
+    reads: Vec<wgpu::Buffer>,
     /// Kernels whose ticks form the last read.
     timed: Option<Vec<&'static str>>,
 }
@@ -61,7 +60,7 @@ impl<'a> Work<'a> {
         }
     }
 
-    /// Run a kernel in `groups` workgroups. Binding 0 holds `constants` (none if empty); `buffers` follow.
+    /// Run a kernel in `groups` workgroups. Binding 0 holds `constants`; `buffers` follow.
     ///
     /// Workgroups beyond one row of the dispatch continue in the next; kernels count y·(groups along x) + x.
     pub fn run(
@@ -87,10 +86,9 @@ impl<'a> Work<'a> {
             return Ok(());
         }
         let pipeline = self.gpu.pipeline(kernel)?;
-        let constants = (!constants.is_empty()).then(|| self.gpu.constants(constants));
-        let first = constants.iter().map(|buffer| (0, buffer));
+        let constants = self.gpu.constants(constants);
         let rest = buffers.iter().map(|(at, buffer)| (*at, &buffer.inner));
-        let entries: Vec<_> = first
+        let entries: Vec<_> = iter::once((0, &constants))
             .chain(rest)
             .map(|(binding, buffer)| BindGroupEntry {
                 binding,
@@ -120,36 +118,27 @@ impl<'a> Work<'a> {
 
     /// Submit the work. Each of `reads` is a buffer and the number of its first words to read when the work is done.
     pub fn submit(mut self, reads: &[(&Buffer, usize)]) -> Result<Pending<'a>> {
-        let mut copies: Vec<_> = reads
+        let mut reads: Vec<_> = reads
             .iter()
             .map(|(buffer, words)| self.readback(&buffer.inner, 4 * (*words).max(1) as u64))
             .collect();
         let timed = self.clock.take().filter(|c| !c.kernels.is_empty());
         let timed = timed.map(|clock| {
             let count = 2 * clock.kernels.len() as u32;
-            let ticks = self.gpu.device.create_buffer(&BufferDescriptor {
-                label: Some("ticks"),
-                size: 8 * u64::from(count),
-                usage: BufferUsages::QUERY_RESOLVE | BufferUsages::COPY_SRC,
-                mapped_at_creation: false,
-            });
+            let (size, usage) = (8 * u64::from(count), BufferUsages::QUERY_RESOLVE);
+            let ticks = self
+                .gpu
+                .create("ticks", size, usage | BufferUsages::COPY_SRC);
             self.encoder
                 .resolve_query_set(&clock.ticks, 0..count, &ticks, 0);
-            copies.push(self.readback(&ticks, 8 * u64::from(count)));
+            reads.push(self.readback(&ticks, size));
             clock.kernels
         });
         let index = self.gpu.queue.submit([self.encoder.finish()]);
         self.gpu.check()?;
-        let reads = copies
-            .into_iter()
-            .map(|copy| {
-                let (send, receive) = channel();
-                copy.map_async(MapMode::Read, .., move |result| {
-                    let _ = send.send(result.is_ok()); // the receiver may have given up
-                });
-                (copy, receive)
-            })
-            .collect();
+        for copy in &reads {
+            copy.map_async(MapMode::Read, .., |_| {}); // `take` sees whether it succeeded
+        }
         Ok(Pending {
             gpu: self.gpu,
             index,
@@ -160,12 +149,8 @@ impl<'a> Work<'a> {
 
     /// A copy of a buffer that the CPU can map.
     fn readback(&mut self, from: &wgpu::Buffer, size: u64) -> wgpu::Buffer {
-        let copy = self.gpu.device.create_buffer(&BufferDescriptor {
-            label: Some("readback"),
-            size,
-            usage: BufferUsages::MAP_READ | BufferUsages::COPY_DST,
-            mapped_at_creation: false,
-        });
+        let usage = BufferUsages::MAP_READ | BufferUsages::COPY_DST;
+        let copy = self.gpu.create("readback", size, usage);
         self.encoder.copy_buffer_to_buffer(from, 0, &copy, 0, size);
         copy
     }
@@ -193,17 +178,13 @@ impl Pending<'_> {
             submission_index: Some(self.index),
             timeout: Some(Duration::from_secs(PATIENCE)),
         });
-        if waited.is_err() {
-            self.gpu.fail(Error::Timeout(PATIENCE));
-        }
         self.gpu.check()?;
-        let lost = || Error::Lost("its memory could not be read".to_owned());
-        let words = self.reads.iter().map(|(copy, mapped)| {
-            let seconds = Duration::from_secs(PATIENCE);
-            if !mapped.recv_timeout(seconds).unwrap_or(false) {
-                return Err(lost());
-            }
-            let view = copy.get_mapped_range(..).map_err(|_| lost())?;
+        if waited.is_err() {
+            return Err(Error::Timeout(PATIENCE));
+        }
+        let words = self.reads.iter().map(|copy| {
+            let lost = |_| Error::Lost("its memory could not be read".to_owned());
+            let view = copy.get_mapped_range(..).map_err(lost)?;
             Ok(bytemuck::pod_collect_to_vec::<u8, u32>(&view[..]))
         });
         let mut words = words.collect::<Result<Vec<_>>>()?;

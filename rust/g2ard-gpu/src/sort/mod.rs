@@ -54,7 +54,7 @@ mod tests {
 
     #[test]
     fn sorts_stably_by_the_bits_asked_for() {
-        let Some(gpu) = gpu("sort") else { return };
+        let Some(gpu) = gpu() else { return };
         let mut random = Lcg(2);
         for (count, kinds, bits) in [
             (1usize, 1u64, 0..64),

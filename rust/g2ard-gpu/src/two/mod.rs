@@ -27,7 +27,8 @@ const BITS: i32 = 60;
 const FARTHEST: f64 = (1 << 24) as f64;
 
 impl Frame {
-    pub fn around(points: &[[f64; 3]], bounds: &RobustBounds) -> Self {
+    pub fn around(points: &[[f64; 3]]) -> Self {
+        let bounds = RobustBounds::of(points);
         let far =
             |p: &[f64; 3]| (0..3).fold(0f64, |far, k| far.max((p[k] - bounds.origin[k]).abs()));
         let farthest = points.par_iter().map(far).reduce(|| 0.0, f64::max);
@@ -61,84 +62,76 @@ mod tests {
     /// Largest relative error of an operation, in terms of the larger operand: slightly over 2⁻⁴⁵.
     const DIGITS: f64 = 3e-14;
 
-    const OPERATIONS: &str = r"
-        @group(0) @binding(0) var<uniform> zero: vec4<u32>;
-        @group(0) @binding(1) var<storage, read> pairs: array<vec4<f32>>;
-        @group(0) @binding(2) var<storage, read_write> found: array<Two>;
-
-        @compute @workgroup_size(64)
-        fn each(@builtin(global_invocation_id) id: vec3<u32>) {
-            hidden = zero.x;
-            let i = id.x;
-            if i >= arrayLength(&pairs) { return; }
-            let a = pairs[i].xy;
-            let b = pairs[i].zw;
-            found[5u * i] = add(a, b);
-            found[5u * i + 1u] = sub(a, b);
-            found[5u * i + 2u] = mul(a, b);
-            found[5u * i + 3u] = div(a, b);
-            found[5u * i + 4u] = root(mag(a));
-        }
-    ";
-
-    const EIGENS: &str = r"
-        @group(0) @binding(0) var<uniform> zero: vec4<u32>;
-        @group(0) @binding(1) var<storage, read> matrices: array<array<Two, 6>>;
-        @group(0) @binding(2) var<storage, read_write> found: array<Eigen>;
-
-        @compute @workgroup_size(64)
-        fn each(@builtin(global_invocation_id) id: vec3<u32>) {
-            hidden = zero.x;
-            if id.x < arrayLength(&matrices) {
-                found[id.x] = symmetric_eigen(matrices[id.x]);
-            }
-        }
-    ";
-
-    const DIFFERENCES: &str = r"
-        @group(0) @binding(0) var<uniform> zero: vec4<u32>;
-        @group(0) @binding(1) var<storage, read> pairs: array<vec4<u32>>;
-        @group(0) @binding(2) var<storage, read_write> found: array<Two>;
-
-        @compute @workgroup_size(64)
-        fn each(@builtin(global_invocation_id) id: vec3<u32>) {
-            hidden = zero.x;
-            if id.x < arrayLength(&pairs) {
-                found[id.x] = scaled(difference(pairs[id.x].xy, pairs[id.x].zw), -50);
-            }
-        }
-    ";
-
     /// A number in the layout that kernels read.
     fn two(x: f64) -> [f32; 2] {
         let high = x as f32;
         [high, (x - f64::from(high)) as f32]
     }
 
-    /// Run a kernel that returns `out` numbers per row.
+    /// Run `body`, which writes `out` numbers from `found[to]` on, for each of some rows of type `row`: its number is i.
     fn answers<T: bytemuck::NoUninit>(
         gpu: &Gpu,
-        name: &'static str,
-        source: &'static str,
+        [name, row, body]: [&'static str; 3],
         input: &[T],
         [rows, out]: [usize; 2],
     ) -> Vec<f64> {
-        let kernel = Kernel::new(name, Vec::leak(vec![TWO, source]), "each");
+        let source = format!(
+            "@group(0) @binding(0) var<uniform> zero: vec4<u32>;
+            @group(0) @binding(1) var<storage, read> rows: array<{row}>;
+            @group(0) @binding(2) var<storage, read_write> found: array<Two>;
+
+            @compute @workgroup_size(64)
+            fn each(@builtin(global_invocation_id) id: vec3<u32>) {{
+                hidden = zero.x;
+                if id.x >= arrayLength(&rows) {{ return; }}
+                let to = {out}u * id.x;
+                let row = rows[id.x];
+                {body}
+            }}"
+        );
+        let sources = Vec::leak(vec![TWO, String::leak(source)]);
+        let kernel = Kernel::new(name, sources, "each");
         let input = gpu.upload("input", input).unwrap();
         let found = gpu.buffer("found", 2 * out * rows).unwrap();
         let mut work = Work::new(gpu);
         let buffers = [&input, &found];
-        work.run(&kernel, rows.div_ceil(64), &[0; 4], &buffers)
+        work.run(&kernel, rows.div_ceil(64), &[0], &buffers)
             .unwrap();
         let words = work.submit(&[(&found, 2 * out * rows)]).unwrap().take();
         words.unwrap()[0].chunks(2).map(number).collect()
     }
 
+    const OPERATIONS: [&str; 3] = [
+        "test.operations",
+        "vec4<f32>",
+        "let a = row.xy;
+        let b = row.zw;
+        found[to] = add(a, b);
+        found[to + 1u] = sub(a, b);
+        found[to + 2u] = mul(a, b);
+        found[to + 3u] = div(a, b);
+        found[to + 4u] = root(mag(a));",
+    ];
+
+    const DIFFERENCES: [&str; 3] = [
+        "test.differences",
+        "vec4<u32>",
+        "found[to] = scaled(difference(row.xy, row.zw), -50);",
+    ];
+
+    const EIGENS: [&str; 3] = [
+        "test.eigens",
+        "array<Two, 6>",
+        "let e = symmetric_eigen(row);
+        for (var k = 0u; k < 3u; k++) {
+            found[to + k] = e.values[k];
+            for (var j = 0u; j < 3u; j++) { found[to + 3u + 3u * k + j] = e.vectors[k][j]; }
+        }",
+    ];
+
     #[test]
     fn operations_keep_their_digits() {
-        let Some(gpu) = gpu("two-float operations") else {
-            return;
-        };
+        let Some(gpu) = gpu() else { return };
         let mut random = Lcg(3);
         let mut numbers: Vec<f64> = (0..200_000)
             .map(|i| {
@@ -153,7 +146,7 @@ mod tests {
         }
         let pairs: Vec<_> = numbers.iter().map(|&x| two(x)).collect();
         let rows = numbers.len() / 2;
-        let found = answers(&gpu, "test.operations", OPERATIONS, &pairs, [rows, 5]);
+        let found = answers(&gpu, OPERATIONS, &pairs, [rows, 5]);
         for (pair, got) in pairs.chunks(2).zip(found.chunks(5)) {
             let [a, b] = [0, 1].map(|k: usize| f64::from(pair[k][0]) + f64::from(pair[k][1]));
             let want = [a + b, a - b, a * b, a / b, a.abs().sqrt()];
@@ -168,9 +161,7 @@ mod tests {
 
     #[test]
     fn differences_are_exact() {
-        let Some(gpu) = gpu("two-float differences") else {
-            return;
-        };
+        let Some(gpu) = gpu() else { return };
         let mut random = Lcg(4);
         let numbers: Vec<i64> = (0..20_000)
             .map(|i| {
@@ -179,7 +170,7 @@ mod tests {
             })
             .collect();
         let rows = numbers.len() / 2;
-        let found = answers(&gpu, "test.differences", DIFFERENCES, &numbers, [rows, 1]);
+        let found = answers(&gpu, DIFFERENCES, &numbers, [rows, 1]);
         for (pair, got) in numbers.chunks(2).zip(found) {
             let want = (pair[0] - pair[1]) as f64 * 2f64.powi(-50);
             assert!((got - want).abs() <= DIGITS * want.abs(), "{pair:?}");
@@ -188,9 +179,7 @@ mod tests {
 
     #[test]
     fn eigenvectors_belong_to_their_values() {
-        let Some(gpu) = gpu("two-float eigenvectors") else {
-            return;
-        };
+        let Some(gpu) = gpu() else { return };
         let mut random = Lcg(5);
         let mut matrices = vec![[0.0; 6], [1.0, 0.0, 0.0, 3.0, 0.0, 2.0], [1.0; 6]];
         for i in 0..3000 {
@@ -204,7 +193,7 @@ mod tests {
         }
         let input: Vec<_> = matrices.as_flattened().iter().map(|&x| two(x)).collect();
         let rows = matrices.len();
-        let found = answers(&gpu, "test.eigens", EIGENS, &input, [rows, 12]);
+        let found = answers(&gpu, EIGENS, &input, [rows, 12]);
         for (m, got) in matrices.iter().zip(found.chunks(12)) {
             let want = symmetric_eigen(m);
             let size = want.values[0].abs();

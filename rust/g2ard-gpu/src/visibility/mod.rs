@@ -24,7 +24,7 @@ use raster::{Goal, Marked};
 use scene::Scene;
 use view::View;
 
-/// See [`g2ard_core::select::view_statistics`].
+/// See [`g2ard_core::select::ViewKernels::view_statistics`].
 pub fn view_statistics(
     gpu: &Gpu,
     scene: &Gaussians<'_>,
@@ -36,7 +36,7 @@ pub fn view_statistics(
     each(gpu, &scene, cameras, &MEDIAN, &Look::Depths, control, read)
 }
 
-/// See [`g2ard_core::select::visible_cells`].
+/// See [`g2ard_core::select::ViewKernels::visible_cells`].
 pub fn visible_cells(
     gpu: &Gpu,
     scene: &Gaussians<'_>,
@@ -97,13 +97,6 @@ enum Look<'a> {
     Weights(&'a Buffer),
 }
 
-/// A view whose rows are being marked.
-struct Begun<'a> {
-    view: View,
-    light: Buffer,
-    marked: Marked<'a>,
-}
-
 /// Pass each view's answer to `read`: its depths, one bit per cell, or nothing.
 fn each<T>(
     gpu: &Gpu,
@@ -123,7 +116,7 @@ fn each<T>(
         }
         Ok(())
     };
-    let (mut begun, mut drawn): (Option<Begun>, Option<Pending>) = (None, None);
+    let (mut begun, mut drawn): (Option<Marked>, Option<Pending>) = (None, None);
     for camera in cameras.iter().map(Some).chain([None]) {
         control.check()?;
         let next = match camera {
@@ -131,7 +124,7 @@ fn each<T>(
             None => None,
         };
         let drawing = match begun.take() {
-            Some(view) => Some(finish(gpu, scene, view, look)?),
+            Some(marked) => Some(finish(gpu, marked, look)?),
             None => None,
         };
         take(std::mem::replace(&mut drawn, drawing))?;
@@ -142,41 +135,24 @@ fn each<T>(
 }
 
 /// Submit the first part of a view.
-fn begin<'a>(gpu: &'a Gpu, scene: &Scene, view: View, look: &Look<'_>) -> Result<Begun<'a>> {
+fn begin<'a>(gpu: &'a Gpu, scene: &'a Scene, view: View, look: &Look<'_>) -> Result<Marked<'a>> {
     let mut work = Work::new(gpu);
     let light = match look {
         Look::Cells(cells) => cells.light(gpu, &mut work, &view)?,
         _ => gpu.upload("light", &vec![1f32; view.pixels()])?,
     };
-    let marked = Marked::begin(gpu, work, scene, &view)?;
-    Ok(Begun {
-        view,
-        light,
-        marked,
-    })
+    Marked::begin(gpu, work, scene, view, light)
 }
 
 /// Submit the second part of a view.
-fn finish<'a>(
-    gpu: &'a Gpu,
-    scene: &Scene,
-    begun: Begun<'a>,
-    look: &Look<'_>,
-) -> Result<Pending<'a>> {
-    let Begun {
-        view,
-        light,
-        marked,
-    } = begun;
-    let mut work = Work::new(gpu);
+fn finish<'a>(gpu: &'a Gpu, marked: Marked<'a>, look: &Look<'_>) -> Result<Pending<'a>> {
+    let (mut work, view) = (Work::new(gpu), marked.view);
     if let Look::Weights(weights) = look {
-        let goal = Goal::Weights(weights);
-        marked.draw(gpu, &mut work, scene, &view, &light, goal)?;
+        marked.draw(&mut work, Goal::Weights(weights))?;
         return work.submit(&[]);
     }
     let depths = gpu.buffer("depth", view.pixels())?;
-    let goal = Goal::Depths(&depths);
-    marked.draw(gpu, &mut work, scene, &view, &light, goal)?;
+    marked.draw(&mut work, Goal::Depths(&depths))?;
     let answer = match look {
         Look::Cells(cells) => cells.seen(gpu, &mut work, &view, &depths)?,
         _ => depths,

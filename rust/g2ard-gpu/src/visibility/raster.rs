@@ -1,7 +1,7 @@
 //! The raster: rows that a view may show, sorted by depth, distributed over tiles and drawn front to back.
 
 use super::scene::Scene;
-use super::view::{Constants, View};
+use super::view::View;
 use crate::runtime::{Buffer, Error, Gpu, Kernel, Pending, Result, Work};
 use crate::scan;
 use crate::sort::{Keyed, sort};
@@ -43,47 +43,51 @@ pub enum Goal<'a> {
     Weights(&'a Buffer),
 }
 
-/// Marked rows of a view, which it may show.
+/// A view whose rows are being marked: those that it may show.
 pub struct Marked<'a> {
+    gpu: &'a Gpu,
+    scene: &'a Scene,
+    pub view: View,
+    /// Light left at each pixel.
+    light: Buffer,
     sums: Buffer,
     pending: Pending<'a>,
 }
 
-impl Marked<'_> {
+impl<'a> Marked<'a> {
     /// Start to mark the rows of a scene.
-    pub fn begin<'a>(
+    pub fn begin(
         gpu: &'a Gpu,
         mut work: Work<'a>,
-        scene: &Scene,
-        view: &View,
-    ) -> Result<Marked<'a>> {
+        scene: &'a Scene,
+        view: View,
+        light: Buffer,
+    ) -> Result<Self> {
         let blocks = scene.count.div_ceil(BLOCK);
-        let marks = gpu.buffer("marks", scene.count + 1)?;
+        let sums = gpu.buffer("marks", scene.count + 1)?;
         let tiles = gpu.buffer("tiles", blocks)?;
-        let constants = Constants::of(scene.count).words(view);
-        work.run(&MARK, blocks, &constants, &[&scene.rows, &marks, &tiles])?;
-        let total = scan::exclusive(gpu, &mut work, &marks, scene.count + 1)?;
+        let rows = view.over(scene.count);
+        let buffers = [&scene.rows, &sums, &tiles];
+        work.run(&MARK, blocks, rows.words(), &buffers)?;
+        let total = scan::exclusive(gpu, &mut work, &sums, scene.count + 1)?;
         let pending = work.submit(&[(&total, 1), (&tiles, blocks)])?;
-        Ok(Marked {
-            sums: marks,
+        Ok(Self {
+            gpu,
+            scene,
+            view,
+            light,
+            sums,
             pending,
         })
     }
 
-    /// Draw the marked rows onto the remaining light. Pairs that do not fit at once are drawn in several passes, nearer
-    /// ones first.
-    pub fn draw(
-        self,
-        gpu: &Gpu,
-        work: &mut Work<'_>,
-        scene: &Scene,
-        view: &View,
-        light: &Buffer,
-        goal: Goal<'_>,
-    ) -> Result<()> {
+    /// Draw the marked rows onto the light. Pairs that do not fit at once are drawn in several passes, nearer ones
+    /// first.
+    pub fn draw(self, work: &mut Work<'_>, goal: Goal<'_>) -> Result<()> {
+        let Self { gpu, scene, .. } = self;
         let found = self.pending.take()?;
-        let splats = found[0][0] as usize;
-        if splats == 0 {
+        let count = found[0][0] as usize;
+        if count == 0 {
             return Ok(());
         }
         let pairs: u64 = found[1].iter().map(|&t| u64::from(t)).sum();
@@ -94,9 +98,8 @@ impl Marked<'_> {
                 limit: MAX_PAIRS - 1,
             });
         }
-        let records = gpu.buffer("splats", SPLAT * splats)?;
-        let keyed = Keyed::new(gpu, splats)?;
-        let constants = Constants::of(scene.count).words(view);
+        let records = gpu.buffer("splats", SPLAT * count)?;
+        let keyed = Keyed::new(gpu, count)?;
         let bound = [
             (1, &scene.rows),
             (2, &self.sums),
@@ -104,68 +107,97 @@ impl Marked<'_> {
             (5, &keyed.keys),
             (6, &keyed.words),
         ];
-        work.run_at(&GATHER, scene.count.div_ceil(BLOCK), &constants, &bound)?;
-        let order = sort(gpu, work, keyed, splats, 0..DEPTH_BITS)?.words;
-        let before = gpu.buffer("tiles before", splats)?;
-        let constants = Constants::of(splats).words(view);
-        let per_splat = splats.div_ceil(THREADS);
-        work.run(&COUNT, per_splat, &constants, &[&records, &order, &before])?;
-        scan::exclusive(gpu, work, &before, splats)?;
-        let tiles = view.tiles(TILE);
-        let bounds = gpu.buffer("tile bounds", 2 * tiles)?;
-        let bits = (usize::BITS - tiles.leading_zeros()) as usize;
-        let (turn, all_pairs) = (gpu.max_words() / 2, pairs as usize);
-        for first in (0..all_pairs).step_by(turn) {
-            let pairs = turn.min(all_pairs - first);
-            let constants = Constants {
-                count: splats,
-                first,
-                pairs,
-                all_pairs,
-                ..Constants::default()
-            }
-            .words(view);
-            let keyed = Keyed::new(gpu, pairs)?;
-            let drawn = gpu.buffer("pairs", pairs)?;
-            let bound = [&records, &order, &before, &keyed.keys, &keyed.words, &drawn];
-            let per_pair = pairs.div_ceil(THREADS);
-            work.run(&EXPAND, per_pair, &constants, &bound)?;
-            let keyed = sort(gpu, work, keyed, pairs, 0..bits)?;
-            work.clear(&bounds);
-            let bound = [(4, &keyed.keys), (7, &bounds)];
-            work.run_at(&RANGES, per_pair, &constants, &bound)?;
-            let shares = match goal {
-                Goal::Depths(_) => None,
-                Goal::Weights(_) => Some(gpu.buffer("shares", pairs)?),
-            };
-            let (kernel, rounds, found) = match (goal, &shares) {
-                (Goal::Depths(depths), _) => (&DEPTHS, gpu.max_rounds(), depths),
-                (Goal::Weights(w), shares) => {
-                    let rounds = gpu.max_rounds() / WEIGH_ROUNDS;
-                    (&WEIGH, rounds, shares.as_ref().unwrap_or(w))
-                }
-            };
-            let bound = [&records, &keyed.words, &drawn, &bounds, light, found];
-            let rounds = rounds.min(pairs);
-            for first in (0..pairs).step_by(rounds) {
-                let constants = Constants {
-                    first,
-                    pairs: rounds,
-                    ..Constants::default()
-                };
-                work.run(kernel, tiles, &constants.words(view), &bound)?;
-            }
-            if let (Goal::Weights(weights), Some(shares)) = (goal, &shares) {
-                let bound = [
-                    (1, &records),
-                    (2, &order),
-                    (3, &before),
-                    (8, shares),
-                    (9, weights),
-                ];
-                work.run_at(&COLLECT, per_splat, &constants, &bound)?;
-            }
+        let rows = self.view.over(scene.count);
+        let blocks = scene.count.div_ceil(BLOCK);
+        work.run_at(&GATHER, blocks, rows.words(), &bound)?;
+        let order = sort(gpu, work, keyed, count, 0..DEPTH_BITS)?.words;
+        let before = gpu.buffer("tiles before", count)?;
+        let splats = self.view.over(count);
+        let groups = count.div_ceil(THREADS);
+        let buffers = [&records, &order, &before];
+        work.run(&COUNT, groups, splats.words(), &buffers)?;
+        scan::exclusive(gpu, work, &before, count)?;
+        let drawing = Drawing {
+            gpu,
+            view: View {
+                all_pairs: pairs as u32,
+                ..splats
+            },
+            light: &self.light,
+            records,
+            order,
+            before,
+            bounds: gpu.buffer("tile bounds", 2 * splats.tiles(TILE))?,
+        };
+        let turn = gpu.max_words() / 2;
+        for first in (0..pairs as usize).step_by(turn) {
+            drawing.pass(work, goal, first, turn.min(pairs as usize - first))?;
         }
         Ok(())
+    }
+}
+
+/// Splats of a view, nearest first, with the number of pairs of splat and tile before each.
+struct Drawing<'a> {
+    gpu: &'a Gpu,
+    view: View,
+    light: &'a Buffer,
+    records: Buffer,
+    order: Buffer,
+    before: Buffer,
+    /// Where each tile's pairs lie.
+    bounds: Buffer,
+}
+
+impl Drawing<'_> {
+    /// Draw `pairs` pairs from the `first` on.
+    fn pass(&self, work: &mut Work<'_>, goal: Goal<'_>, first: usize, pairs: usize) -> Result<()> {
+        let Self { gpu, records, .. } = self;
+        let view = View {
+            first: first as u32,
+            pairs: pairs as u32,
+            ..self.view
+        };
+        let keyed = Keyed::new(gpu, pairs)?;
+        let drawn = gpu.buffer("pairs", pairs)?;
+        let (keys, words) = (&keyed.keys, &keyed.words);
+        let bound = [records, &self.order, &self.before, keys, words, &drawn];
+        let groups = pairs.div_ceil(THREADS);
+        work.run(&EXPAND, groups, view.words(), &bound)?;
+        let tiles = view.tiles(TILE);
+        let bits = (usize::BITS - tiles.leading_zeros()) as usize;
+        let keyed = sort(gpu, work, keyed, pairs, 0..bits)?;
+        work.clear(&self.bounds);
+        let bound = [(4, &keyed.keys), (7, &self.bounds)];
+        work.run_at(&RANGES, groups, view.words(), &bound)?;
+        let draw = |work: &mut Work<'_>, kernel: &Kernel, found: &Buffer, rounds: usize| {
+            let numbers = &keyed.words;
+            let bound = [records, numbers, &drawn, &self.bounds, self.light, found];
+            let rounds = rounds.min(pairs);
+            (0..pairs).step_by(rounds).try_for_each(|first| {
+                let view = View {
+                    first: first as u32,
+                    pairs: rounds as u32,
+                    ..view
+                };
+                work.run(kernel, tiles, view.words(), &bound)
+            })
+        };
+        match goal {
+            Goal::Depths(depths) => draw(work, &DEPTHS, depths, gpu.max_rounds()),
+            Goal::Weights(weights) => {
+                let shares = gpu.buffer("shares", pairs)?;
+                draw(work, &WEIGH, &shares, gpu.max_rounds() / WEIGH_ROUNDS)?;
+                let bound = [
+                    (1, records),
+                    (2, &self.order),
+                    (3, &self.before),
+                    (8, &shares),
+                    (9, weights),
+                ];
+                let groups = (view.count as usize).div_ceil(THREADS);
+                work.run_at(&COLLECT, groups, view.words(), &bound)
+            }
+        }
     }
 }

@@ -1,8 +1,9 @@
+use std::collections::HashSet;
 use std::sync::Arc;
 
 use super::*;
-use crate::testing::{gpu, gpu_in_pieces, scenes};
-use g2ard_core::scene::{Means, Ordered, SceneRef};
+use crate::testing::{WHOLE, borrowed, compare_on_gpu, gpu, scenes};
+use g2ard_core::scene::Ordered;
 use g2ard_core::select::ViewKernels;
 use g2ard_core::visibility::VisibilityKernels;
 use g2ard_core::{Cpu, Splats};
@@ -45,16 +46,7 @@ fn cameras(center: [f64; 3], radius: f64) -> Vec<Camera> {
 const TOLERANCE: f64 = 1e-5;
 
 fn compare_weights(gpu: &Gpu, what: &str, splats: &Splats, cameras: &[Camera]) {
-    let sh0 = vec![[0.0; 3]; splats.len()];
-    let scene = SceneRef {
-        means: Means::F64(&splats.means),
-        quats: &splats.quats,
-        scales: &splats.scales,
-        logit_opacities: &splats.logit_opacities,
-        sh0: &sh0,
-        sh_rest: &[],
-        rest: 0,
-    };
+    let scene = borrowed(splats);
     let ordered = Arc::new(Ordered::new(&scene).unwrap());
     let control = Control::default();
     let settings = Settings::default();
@@ -79,7 +71,7 @@ fn compare_weights(gpu: &Gpu, what: &str, splats: &Splats, cameras: &[Camera]) {
     assert!(apart <= TOLERANCE && off <= 1e-3, "{what}");
 }
 
-fn compare(gpu: &Gpu, what: &str) {
+fn compare(gpu: &Gpu) {
     let control = Control::default();
     let (mut same, mut all) = (0, 0);
     for (name, splats) in scenes(6000) {
@@ -98,24 +90,20 @@ fn compare(gpu: &Gpu, what: &str) {
             scales: &splats.scales,
             opacities: &opacities,
         };
-        let surface = Surface::of(&scene, 2000, &Cpu).unwrap();
+        let surface = Surface::of(&scene, 2000).unwrap();
         let cameras = cameras(center, radius);
         let want = Cpu
             .visible_cells(&scene, &surface, 0.02, &cameras, &control)
             .unwrap();
         let got = visible_cells(gpu, &scene, &surface, 0.02, &cameras, &control).unwrap();
-        let equal: usize = want
-            .iter()
-            .zip(&got)
-            .map(|(a, b)| {
-                let (a, b): (std::collections::HashSet<_>, std::collections::HashSet<_>) =
-                    (a.iter().collect(), b.iter().collect());
-                surface.len() - a.symmetric_difference(&b).count()
-            })
+        let set = |cells: &Vec<u32>| cells.iter().copied().collect::<HashSet<_>>();
+        let pairs = want.iter().zip(&got);
+        let equal: usize = pairs
+            .map(|(a, b)| surface.len() - set(a).symmetric_difference(&set(b)).count())
             .sum();
         let cells = surface.len() * cameras.len();
         let seen: usize = want.iter().map(Vec::len).sum();
-        eprintln!("{what} {name}: {equal} of {cells} cells alike, {seen} of them seen");
+        eprintln!("{name}: {equal} of {cells} cells alike, {seen} of them seen");
         same += equal;
         all += cells;
         let want = Cpu.view_statistics(&scene, &cameras, &control).unwrap();
@@ -126,32 +114,21 @@ fn compare(gpu: &Gpu, what: &str) {
                 |k: usize| (a[k] - b[k]).abs() <= 1e-4 * a[k].abs() || name.contains("wild");
             assert!(close(0) && close(1), "{name}: {a:?} {b:?}");
         }
-        compare_weights(gpu, &format!("{what} {name}"), &splats, &cameras);
+        compare_weights(gpu, name, &splats, &cameras);
     }
     let share = same as f64 / all as f64;
-    eprintln!("{what}: {:.4} % of visible sets equal", 100.0 * share);
+    eprintln!("{:.4} % of visible sets equal", 100.0 * share);
     assert!(share >= 0.9999);
 }
 
 #[test]
-fn views_see_the_cells_they_see_on_the_cpu() {
-    let Some(gpu) = gpu("visibility") else { return };
-    compare(&gpu, "visibility");
-}
-
-#[test]
-fn views_see_the_same_when_pairs_are_drawn_in_turns() {
-    let Some(gpu) = gpu_in_pieces("visibility in turns", 1 << 19) else {
-        return;
-    };
-    compare(&gpu, "visibility in turns");
+fn views_see_what_they_see_on_the_cpu_also_when_pairs_are_drawn_in_turns() {
+    compare_on_gpu(&[WHOLE, 1 << 19], compare);
 }
 
 #[test]
 fn a_crowded_tile_is_drawn_to_its_end() {
-    let Some(gpu) = gpu("a crowded tile") else {
-        return;
-    };
+    let Some(gpu) = gpu() else { return };
     // A crowd in one corner, and an image-filling background behind it.
     let mut means = vec![[-0.49, -0.49, 0.0]; 70_000];
     means.push([0.0, 0.0, 1.0]);

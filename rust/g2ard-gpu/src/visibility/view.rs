@@ -1,5 +1,6 @@
 //! A camera in the layout that kernels read.
 
+use bytemuck::{Pod, Zeroable};
 use g2ard_core::raster::{Camera, Settings};
 use g2ard_core::select::Pinhole;
 
@@ -8,13 +9,31 @@ use crate::runtime::{Error, Result};
 /// Pixel spans have 16 bits.
 const MAX_SIDE: usize = u16::MAX as usize;
 
-/// `View` of pinhole.wgsl, except for the fields that change per kernel.
+/// `View` of pinhole.wgsl. Fields from `count` to `tolerance` change per kernel and are 0 at first.
+#[derive(Clone, Copy, Pod, Zeroable)]
+#[repr(C)]
 pub struct View {
-    pinhole: Pinhole,
-    eye: [f64; 3],
+    pub rotation: [[f32; 4]; 3],
+    pub eye: [f32; 4],
+    pub focal: [f32; 2],
+    pub center: [f32; 2],
+    pub limits: [[f32; 2]; 2],
+    pub size: [u32; 2],
+    pub near: f32,
+    /// Number of rows, cells or splats.
+    pub count: u32,
+    /// The first pair of splat and tile, the number of pairs from there, and the total.
+    pub first: u32,
+    pub pairs: u32,
+    pub all_pairs: u32,
+    /// Edge of a cell, and its depth tolerance as a share of its depth.
+    pub cell: f32,
+    pub tolerance: f32,
     /// Upper limit of α; the transmittance at which a pixel ends.
-    alpha_max: f32,
-    light_min: f32,
+    pub alpha_max: f32,
+    pub light_min: f32,
+    /// A uniform's size is a multiple of four words.
+    pub padding: u32,
 }
 
 impl View {
@@ -28,64 +47,43 @@ impl View {
                 limit: MAX_SIDE as u64,
             });
         }
+        let pinhole = Pinhole::of(camera);
+        let eye = camera.position();
+        let lost = eye.map(|v| (v - f64::from(v as f32)) as f32);
+        let row = |k: usize| {
+            let [x, y, z] = pinhole.rotation[k];
+            [x, y, z, lost[k]]
+        };
+        let [x, y, z] = eye.map(|v| v as f32);
         Ok(Self {
-            pinhole: Pinhole::of(camera),
-            eye: camera.position(),
+            rotation: [row(0), row(1), row(2)],
+            eye: [x, y, z, 0.0],
+            focal: pinhole.focal,
+            center: pinhole.center,
+            limits: pinhole.limits,
+            size: [camera.width as u32, camera.height as u32],
+            near: pinhole.near,
             alpha_max: settings.alpha_max,
             light_min: settings.transmittance_min,
+            ..Self::zeroed()
         })
     }
 
+    /// This view for a kernel over `count` rows, cells or splats.
+    pub fn over(self, count: usize) -> Self {
+        let count = count as u32;
+        Self { count, ..self }
+    }
+
+    pub fn words(&self) -> &[u32] {
+        bytemuck::cast_slice(std::slice::from_ref(self))
+    }
+
     pub fn pixels(&self) -> usize {
-        self.pinhole.width * self.pinhole.height
+        self.size[0] as usize * self.size[1] as usize
     }
 
     pub fn tiles(&self, side: usize) -> usize {
-        self.pinhole.width.div_ceil(side) * self.pinhole.height.div_ceil(side)
-    }
-}
-
-/// Fields of a view that change per kernel.
-#[derive(Default, Clone, Copy)]
-pub struct Constants {
-    /// Number of rows, cells or splats.
-    pub count: usize,
-    /// The first pair of splat and tile, the number of pairs from there, and the total.
-    pub first: usize,
-    pub pairs: usize,
-    pub all_pairs: usize,
-    /// Edge of a cell, and its depth tolerance as a share of its depth.
-    pub cell: f32,
-    pub tolerance: f32,
-}
-
-impl Constants {
-    pub fn of(count: usize) -> Self {
-        Self {
-            count,
-            ..Self::default()
-        }
-    }
-
-    pub fn words(&self, view: &View) -> Vec<u32> {
-        let v = &view.pinhole;
-        let mut numbers = Vec::with_capacity(36);
-        for (row, eye) in v.rotation.iter().zip(view.eye) {
-            numbers.extend(row);
-            numbers.push((eye - f64::from(eye as f32)) as f32);
-        }
-        numbers.extend(view.eye.map(|v| v as f32));
-        numbers.push(0.0);
-        numbers.extend(v.focal);
-        numbers.extend(v.center);
-        numbers.extend(v.limits.as_flattened());
-        let mut words: Vec<u32> = numbers.into_iter().map(f32::to_bits).collect();
-        words.extend([v.width as u32, v.height as u32, v.near.to_bits()]);
-        let counts = [self.count, self.first, self.pairs, self.all_pairs];
-        words.extend(counts.map(|n| n as u32));
-        let limits = [self.cell, self.tolerance, view.alpha_max, view.light_min];
-        words.extend(limits.map(f32::to_bits));
-        words.push(0); // a uniform's size is a multiple of four words
-        words
+        (self.size[0] as usize).div_ceil(side) * (self.size[1] as usize).div_ceil(side)
     }
 }

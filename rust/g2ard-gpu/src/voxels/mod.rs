@@ -5,7 +5,7 @@ use g2ard_core::simplify::means_of;
 use g2ard_core::spatial::{BITS, Cells, OCTAVES, RobustBounds, octave_counts, search_size, unit};
 use rayon::prelude::*;
 
-use crate::rows::{Numbered, POINTS, Rows};
+use crate::rows::{POINTS, Run};
 use crate::runtime::{Buffer, Gpu, Kernel, Result, Work};
 use crate::scan;
 use crate::sort::{Keyed, sort};
@@ -28,46 +28,29 @@ const KEY: usize = 2;
 /// A point beyond the lattice.
 const OUTSIDE: u64 = u64::MAX;
 
-/// See [`Cells::adaptive`].
-pub fn adaptive(
-    gpu: &Gpu,
-    points: &[[f64; 3]],
-    bounds: &RobustBounds,
-    target: usize,
-) -> Result<Cells> {
-    let frame = Frame::around(points, bounds);
-    let pieces = points.chunks(most_points(gpu)).map(|piece| {
-        let fixed: Vec<_> = piece.par_iter().map(|&p| frame.fixed(p)).collect();
-        gpu.upload("positions", &fixed)
-    });
-    let pieces = pieces.collect::<Result<_>>()?;
-    Lattice::new(gpu, pieces, frame, points, *bounds).adaptive(target)
-}
-
 /// See [`g2ard_core::simplify::GroupKernels::cells`].
-pub fn of_rows(
-    gpu: &Gpu,
-    held: &Rows,
-    frame: Frame,
-    rows: Numbered<'_>,
-    kept: &[u32],
-    target: usize,
-) -> Result<Cells> {
-    let points = means_of(rows.splats, kept);
-    let numbers: Vec<u32> = kept.iter().map(|&i| rows.numbers[i as usize]).collect();
+pub fn adaptive(run: Run<'_>, kept: &[u32], target: usize) -> Result<Cells> {
+    let points = means_of(run.splats, kept);
     let bounds = RobustBounds::of(&points);
-    let mut work = Work::new(gpu);
-    let pieces = numbers
-        .chunks(most_points(gpu))
-        .map(|numbers| held.gather(gpu, &mut work, POINTS, numbers))
+    let mut work = Work::new(run.gpu);
+    let pieces = kept
+        .chunks((run.gpu.max_words() / POINT).max(1))
+        .map(|rows| run.gather(&mut work, POINTS, rows))
         .collect::<Result<_>>()?;
     work.submit(&[])?;
-    Lattice::new(gpu, pieces, frame, &points, bounds).adaptive(target)
-}
-
-/// Most points that one buffer can hold.
-fn most_points(gpu: &Gpu) -> usize {
-    (gpu.max_words() / POINT).max(1)
+    let reach = |p: &[f64; 3]| {
+        let from_corner = [0, 1, 2].map(|k| p[k] - bounds.origin[k] + bounds.radius);
+        from_corner.into_iter().fold(0.0, f64::max)
+    };
+    let lattice = Lattice {
+        gpu: run.gpu,
+        frame: run.frame,
+        bounds,
+        reach: points.par_iter().map(reach).reduce(|| 0.0, f64::max),
+        count: points.len(),
+        pieces,
+    };
+    lattice.adaptive(target)
 }
 
 /// Positions on the device, in pieces. Their keys must fit into one buffer.
@@ -81,28 +64,7 @@ struct Lattice<'a> {
     pieces: Vec<Buffer>,
 }
 
-impl<'a> Lattice<'a> {
-    fn new(
-        gpu: &'a Gpu,
-        pieces: Vec<Buffer>,
-        frame: Frame,
-        points: &[[f64; 3]],
-        bounds: RobustBounds,
-    ) -> Self {
-        let reach = |p: &[f64; 3]| {
-            let from_corner = [0, 1, 2].map(|k| p[k] - bounds.origin[k] + bounds.radius);
-            from_corner.into_iter().fold(0.0, f64::max)
-        };
-        Self {
-            gpu,
-            frame,
-            bounds,
-            reach: points.par_iter().map(reach).reduce(|| 0.0, f64::max),
-            count: points.len(),
-            pieces,
-        }
-    }
-
+impl Lattice<'_> {
     /// Cells of which about `target` are occupied.
     fn adaptive(&self, target: usize) -> Result<Cells> {
         if self.count == 0 {
@@ -152,8 +114,8 @@ impl<'a> Lattice<'a> {
         let sorted = self.sorted(&mut work, unit(&self.bounds), true)?;
         let blocks = self.count.div_ceil(BLOCK);
         let counts = self.gpu.buffer("octaves", OCTAVES * blocks)?;
-        let constants = [self.count as u32, 0, 0, 0];
-        work.run(&APART, blocks, &constants, &[&sorted.keys, &counts])?;
+        let buffers = [&sorted.keys, &counts];
+        work.run(&APART, blocks, &[self.count as u32], &buffers)?;
         let found = work.submit(&[(&counts, OCTAVES * blocks)])?.take()?;
         let mut apart = [0; OCTAVES];
         for block in found[0].chunks(OCTAVES) {
@@ -174,11 +136,10 @@ impl<'a> Lattice<'a> {
     fn edges(&self, work: &mut Work, size: f64) -> Result<(Keyed, Buffer, Buffer)> {
         let sorted = self.sorted(work, size, false)?;
         let ranks = self.gpu.buffer("ranks", self.count)?;
-        let constants = [self.count as u32, 0, 0, 0];
         let groups = self.count.div_ceil(THREADS);
         // Bindings are numbered: `ranks` follows `counts`, which this kernel does not use.
         let bound = [(1, &sorted.keys), (3, &ranks)];
-        work.run_at(&EDGES, groups, &constants, &bound)?;
+        work.run_at(&EDGES, groups, &[self.count as u32], &bound)?;
         let total = scan::exclusive(self.gpu, work, &ranks, self.count)?;
         Ok((sorted, ranks, total))
     }
@@ -196,21 +157,27 @@ impl<'a> Lattice<'a> {
         let mut work = Work::new(self.gpu);
         let bound = [(1, &sorted.keys), (3, &ranks), (4, &starts), (5, &codes)];
         let groups = rows.div_ceil(THREADS);
-        work.run_at(&COMPACT, groups, &[rows as u32, 0, 0, 0], &bound)?;
+        work.run_at(&COMPACT, groups, &[rows as u32], &bound)?;
         let found = work.submit(&[(&starts, cells), (&codes, KEY * cells)])?;
         let [mut starts, codes] = <[_; 2]>::try_from(found.take()?).unwrap_or_default();
         starts.push(rows as u32);
         let code = |words: &[u32]| u64::from(words[1]) << 32 | u64::from(words[0]);
         let codes = codes.chunks(KEY).map(code);
         let inside = codes.map(|code| (code != OUTSIDE).then_some(code));
-        Ok(Cells::from_parts(size, starts, members, inside.collect()))
+        Ok(Cells {
+            size,
+            starts,
+            members,
+            keys: inside.collect(),
+        })
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::testing::{gpu, gpu_in_pieces, scenes};
+    use crate::rows::Rows;
+    use crate::testing::{WHOLE, compare_on_gpu, scenes};
     use std::collections::HashMap;
 
     /// Points nearer to a border than this share of a cell may fall into the next cell.
@@ -218,13 +185,16 @@ mod tests {
 
     /// Compare cells with the CPU's: cells of one size hold the same rows, except for rows on a border, and about as
     /// many cells are found.
-    fn compare(gpu: &Gpu, what: &str) {
+    fn compare(gpu: &Gpu) {
         for (name, splats) in scenes(12_000) {
             let points = &splats.means;
             let bounds = RobustBounds::of(points);
+            let all: Vec<u32> = (0..points.len() as u32).collect();
+            let mut held = Rows::default();
+            let run = held.of(gpu, &splats).unwrap();
             for target in [1, 3000] {
                 let want = Cells::adaptive(points, &bounds, target);
-                let got = adaptive(gpu, points, &bounds, target).unwrap();
+                let got = adaptive(run, &all, target).unwrap();
                 let off = (got.len() as f64 / want.len() as f64 - 1.0).abs();
                 assert!(off < 0.04, "{name}: {} of {} cells", got.len(), want.len());
                 let same = Cells::with_size(points, &bounds, got.size);
@@ -237,10 +207,7 @@ mod tests {
                         assert_eq!(*cells.entry(id).or_insert(of_cpu[i]), of_cpu[i], "{name}");
                     }
                 }
-                eprintln!(
-                    "{what} {name}: {} cells, {moved} rows on borders",
-                    got.len()
-                );
+                eprintln!("{name}: {} cells, {moved} rows on borders", got.len());
                 let few = moved * 1000 <= points.len() + 3000;
                 assert!(few || name == "identical", "{name}: {moved} on borders");
             }
@@ -265,17 +232,6 @@ mod tests {
 
     #[test]
     fn cells_are_the_cpus_but_on_borders() {
-        let Some(gpu) = gpu("voxels") else {
-            return;
-        };
-        compare(&gpu, "voxels");
-    }
-
-    #[test]
-    fn cells_are_the_cpus_but_on_borders_in_pieces() {
-        let Some(gpu) = gpu_in_pieces("voxels in pieces", 1 << 17) else {
-            return;
-        };
-        compare(&gpu, "voxels in pieces");
+        compare_on_gpu(&[WHOLE, 1 << 17], compare);
     }
 }
