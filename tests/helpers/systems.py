@@ -9,8 +9,6 @@ from pathlib import Path
 
 import pytest
 
-__all__ = ["is_worker", "needs_links", "needs_modes", "needs_proc", "needs_processes", "needs_signals"]
-
 needs_signals = pytest.mark.skipif(
     os.name == "nt", reason="Windows ends a program at once instead of sending a signal"
 )
@@ -49,3 +47,13 @@ def is_worker(pid: int) -> bool:
     with suppress(OSError):
         return b"spawn_main" in Path(f"/proc/{pid}/cmdline").read_bytes()
     return False
+
+
+def workers_of(parent: int) -> set[int]:
+    """Return the child processes that work on tiles. Threads and processes may end while they are listed."""
+    children: list[str] = []
+    with suppress(OSError):
+        for task in Path(f"/proc/{parent}/task").iterdir():
+            with suppress(OSError):
+                children += (task / "children").read_text().split()
+    return {pid for pid in map(int, children) if is_worker(pid)}

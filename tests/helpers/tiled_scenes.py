@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from g2ard.io import write_splats, write_views
 from g2ard.progress import Progress, silent
 from g2ard.scene.cameras import Cameras, look_at
 from g2ard.scene.splats import Splats
@@ -45,6 +46,13 @@ def ring(count: int = 6) -> Cameras:
         [(160, 120)] * count,
         [f"{i}" for i in range(count)],
     )
+
+
+def town_in(folder: Path, count: int = 9000, views: int = 8) -> Path:
+    """Write town.ply and views.json, of which the last two are test views, into a folder; return it."""
+    write_splats(folder / "town.ply", town(count))
+    write_views(folder / "views.json", ring(views), splits=["train"] * (views - 2) + ["test"] * 2)
+    return folder
 
 
 def reduced(

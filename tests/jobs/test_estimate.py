@@ -5,7 +5,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 import g2ard
@@ -17,16 +16,11 @@ from g2ard.system.memory import peak_rss
 from helpers.commands import CommandLine, refused, succeeds
 from helpers.photos import photos_of
 from helpers.project import environment
-
-
-def ball(count: int = 900) -> g2ard.Splats:
-    points = np.random.default_rng(0).normal(size=(count, 3))
-    points /= np.linalg.norm(points, axis=1, keepdims=True)
-    return g2ard.Splats.create(points, scales=np.full((count, 3), 0.05), logit_opacities=np.full(count, 4))
+from helpers.scenes import checkered_ball
 
 
 def test_a_dry_run_counts_and_writes_nothing(tmp_path: Path, command_line: CommandLine) -> None:
-    g2ard.save(tmp_path / "ball.ply", ball())
+    g2ard.save(tmp_path / "ball.ply", checkered_ball(900))
     ask = ("distill", "ball.ply", "-r", "10", "-o", "run", "--steps", "12", "--size", "48", "--json", "-")
     out, error = succeeds(command_line, tmp_path, *ask, "--dry-run")
     assert [path.name for path in tmp_path.iterdir()] == ["ball.ply"]
@@ -42,17 +36,18 @@ def test_a_dry_run_counts_and_writes_nothing(tmp_path: Path, command_line: Comma
     assert told["pixels"] == 48 * 36
 
 
-def test_several_budgets_have_a_total(tmp_path: Path, command_line: CommandLine) -> None:
-    g2ard.save(tmp_path / "ball.ply", ball())
+def test_several_budgets_have_a_total(folder: Path, command_line: CommandLine) -> None:
     ask = ("distill", "ball.ply", "-r", "5,10", "-o", "{ratio}", "--steps", "4", "--size", "48", "--dry-run")
-    error = succeeds(command_line, tmp_path, *ask).err
+    before = set(folder.iterdir())
+    error = succeeds(command_line, folder, *ask, "--json", "told.json").err
     assert "all 2 with shared targets: about" in error
+    assert error.endswith("only told.json is written\n"), error
+    assert set(folder.iterdir()) - before == {folder / "told.json"}
 
 
 def test_memory_grows_with_views_and_gaussians(monkeypatch: pytest.MonkeyPatch) -> None:
-    job = prepare(
-        ball(), [Budget(90, None)], DistillOptions(size=48, settings={"steps": 3, "recovery_time": 7.0})
-    )
+    options = DistillOptions(size=48, settings={"steps": 3, "recovery_time": 7.0})
+    job = prepare(checkered_ball(900), [Budget(90)], options)
     monkeypatch.setattr("g2ard.jobs.estimate.peak_rss", lambda: 10**9)
     few, many = estimate(job, 90), estimate(job, 450)
     assert few.bytes > 10**9 + 12 * few.views * few.pixels
@@ -68,20 +63,12 @@ def test_memory_grows_with_views_and_gaussians(monkeypatch: pytest.MonkeyPatch) 
     assert many.bytes - few.bytes >= 983 * 800
 
 
-def test_a_dry_run_says_which_file_it_writes(tmp_path: Path, command_line: CommandLine) -> None:
-    g2ard.save(tmp_path / "ball.ply", ball())
-    ask = ("distill", "ball.ply", "-r", "10", "-o", "run", "--steps", "4", "--size", "48", "--dry-run")
-    error = succeeds(command_line, tmp_path, *ask, "--json", "told.json").err
-    assert error.endswith("only told.json is written\n"), error
-    assert {path.name for path in tmp_path.iterdir()} == {"ball.ply", "told.json"}
-
-
 @pytest.mark.skipif(peak_rss() is None, reason="peak memory cannot be read on this system")
 @pytest.mark.parametrize("source", ["scene", "photos"])
 def test_the_estimate_of_memory_is_close(source: str, tmp_path: Path) -> None:
     """The estimate includes the program itself, which dominates for a small scene."""
     if source == "scene":
-        g2ard.save(tmp_path / "ball.ply", ball(20_000))
+        g2ard.save(tmp_path / "ball.ply", checkered_ball(20_000))
         ask = ["distill", "ball.ply", "-r", "4", "--steps", "12", "--size", "320"]
     else:
         photos_of(tmp_path / "photos")
@@ -94,24 +81,14 @@ def test_the_estimate_of_memory_is_close(source: str, tmp_path: Path) -> None:
 
 def peak_of(ask: list[str], folder: Path) -> int:
     """Return the peak resident bytes of a run as a program."""
-    program = [sys.executable, "-m", "g2ard", *ask, "-q"]
-
     code = (
-        "import resource, subprocess, sys; status = subprocess.run(sys.argv[1:]).returncode;"
-        "print(status, resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss)"
+        "import subprocess, sys; from resource import RUSAGE_CHILDREN, getrusage\n"
+        "subprocess.run(sys.argv[1:], check=True); print(getrusage(RUSAGE_CHILDREN).ru_maxrss)"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", code, *program],
-        cwd=folder,
-        env=environment(),
-        capture_output=True,
-        text=True,
-        timeout=300,
-        check=True,
-    )
-    status, peak = map(int, done.stdout.split())
-    assert status == 0, done.stderr
-    return peak if sys.platform == "darwin" else 1024 * peak
+    program = [sys.executable, "-c", code, sys.executable, "-m", "g2ard", *ask, "-q"]
+    done = subprocess.run(program, cwd=folder, env=environment(), capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    return int(done.stdout) * (1 if sys.platform == "darwin" else 1024)
 
 
 def test_a_dry_run_is_in_nobodys_way(command_line: CommandLine, folder: Path) -> None:

@@ -9,14 +9,14 @@ import pytest
 
 import g2ard
 from g2ard.errors import InputError
-from g2ard.io import read_splats, write_splats, write_views
+from g2ard.io import read_splats, write_splats
 from g2ard.rendering.visibility import SampledVisibility, visibility_source
 from g2ard.scene.regions import check_region, in_any
 from g2ard.stages.simplify import SimplifyConfig
 from g2ard.stages.simplify import simplify as reduce
 from g2ard.stages.simplify.pairs import emphasised
 from helpers.commands import CommandLine, succeeds
-from helpers.tiled_scenes import ring, town
+from helpers.tiled_scenes import ring, town, town_in
 
 BALL, BOX = (2.5, 0.0, 0.0, 2.0), (-8.0, -4.0, 0.0, -4.0, 0.0, 1.0)
 
@@ -85,12 +85,10 @@ def test_invalid_regions_are_named(region: tuple[float, ...], said: str) -> None
 
 
 def test_the_commands(command_line: CommandLine, tmp_path: Path) -> None:
-    write_splats(tmp_path / "town.ply", town(3000))
-    write_views(tmp_path / "views.json", ring(8), splits=["train"] * 6 + ["test"] * 2)
+    town_in(tmp_path, 3000)
 
     def run(*args: object) -> str:
-        said = succeeds(command_line, tmp_path, *args).err
-        return said
+        return succeeds(command_line, tmp_path, *args).err
 
     common = ("town.ply", "-r", 10, "--views", "views.json")
     spot = ("--keep-region", "2.5,0,0,2")

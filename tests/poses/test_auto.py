@@ -219,10 +219,3 @@ def test_up_is_found_by_layers_when_noise_lies_behind_floor_and_ceiling() -> Non
     assert "layers" in found.why
     assert found.grounded
     assert abs(found.axis[2]) > np.cos(np.radians(5))
-
-
-def test_people_walk_in_a_real_room() -> None:
-    pool = plan_pool(read_splats(real("showroom/0_6")), 64, kind="walk")
-    assert pool.kind == "walk"
-    assert len(pool.cameras) == 64
-    assert pool.up[2] > 0.99

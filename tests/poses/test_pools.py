@@ -240,11 +240,12 @@ def test_invalid_requests_are_one_clear_error(change, words) -> None:
         make_pool(one(), **{"count": 4, **change})
 
 
-def test_invisible_scenes_are_refused() -> None:
+@pytest.mark.parametrize(
+    "splats", [one(logit_opacities=[-np.inf]), Splats.create([[np.nan, 0, 0]], scales=[[1, 1, 1]])]
+)
+def test_invisible_scenes_are_refused(splats) -> None:
     with pytest.raises(InputError, match="visible"):
-        make_pool(one(logit_opacities=[-np.inf]))
-    with pytest.raises(InputError, match="visible"):
-        make_pool(Splats.create([[np.nan, 0, 0]], scales=[[1, 1, 1]]))
+        make_pool(splats)
 
 
 def test_command(scenes, command_line: CommandLine, tmp_path: Path) -> None:
@@ -290,15 +291,16 @@ def test_threads_do_not_matter(scenes, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "kind", "up"),
+    ("name", "asked", "kind", "up"),
     [
-        ("playbot/0_0", "orbit", (0, -1, 0)),
-        ("taebak_park/0_4", "walk + aerial", (0, -1, 0)),
-        ("format_samples/guitar.compressed.ply", "orbit", (0, -1, 0)),
+        ("playbot/0_0", "auto", "orbit", (0, -1, 0)),
+        ("taebak_park/0_4", "auto", "walk + aerial", (0, -1, 0)),
+        ("format_samples/guitar.compressed.ply", "auto", "orbit", (0, -1, 0)),
+        ("showroom/0_6", "walk", "walk", (0, 0, 1)),
     ],
 )
-def test_real_scenes(name, kind, up) -> None:
-    pool = plan_pool(read_splats(real(name)), 128)
+def test_real_scenes(name, asked, kind, up) -> None:
+    pool = plan_pool(read_splats(real(name)), 128, kind=asked)
     assert pool.kind == kind
     assert pool.up @ up > np.cos(np.radians(5))
     assert len(pool.cameras) == 128

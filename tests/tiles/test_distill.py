@@ -7,15 +7,14 @@ import signal
 import subprocess
 import sys
 import time
-from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from g2ard.errors import InputError
-from g2ard.io import read_splats, write_splats, write_views
-from g2ard.jobs.tiling import Tiling, bytes_of, is_tiled, workers_for
+from g2ard.io import read_splats, write_splats
+from g2ard.jobs.tiling import Tiling, workers_for
 from g2ard.scene.splats import Splats
 from g2ard.scene.targets import TeacherRenders
 from g2ard.stages.evaluate import evaluate
@@ -25,16 +24,13 @@ from g2ard.stages.simplify import simplify
 from g2ard.tiles.ingest import ingest
 from helpers.commands import CommandLine, succeeds
 from helpers.project import environment
-from helpers.systems import is_worker, needs_proc
-from helpers.tiled_scenes import ring, town
+from helpers.systems import is_worker, needs_proc, workers_of
+from helpers.tiled_scenes import ring, town, town_in
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("town")
-    write_splats(folder / "town.ply", town())
-    write_views(folder / "views.json", ring(8), splits=["train"] * 6 + ["test"] * 2)
-    return folder
+    return town_in(tmp_path_factory.mktemp("town"))
 
 
 def test_frozen_rows_stay_and_the_others_learn() -> None:
@@ -114,24 +110,17 @@ def test_tiles_are_read_as_one_scene(command_line: CommandLine, folder: Path, tm
     assert (tmp_path / "one.ply").read_bytes() == (tmp_path / "two.ply").read_bytes()
 
 
-def test_a_killed_command_leaves_no_workers_and_resumes(folder: Path, tmp_path: Path) -> None:
+def test_a_killed_command_resumes(folder: Path, tmp_path: Path) -> None:
     words = ["simplify", folder / "town.ply", "-r", "10", "-o", tmp_path / "x.ply", "--tile-rows", "700"]
     command = [sys.executable, "-m", "g2ard", *map(str, words), "--workers", "2", "--no-views"]
     steps = tmp_path / ".x.ply.tiles" / "steps"
-    with subprocess.Popen(command, env=environment(), stderr=subprocess.PIPE) as running:
-        children: list[int] = []
+    with subprocess.Popen(command, env=environment(), stderr=subprocess.DEVNULL) as running:
         until = time.monotonic() + 120
         while running.poll() is None and time.monotonic() < until and len(list(steps.glob("[!.]*.npz"))) < 3:
             time.sleep(0.01)
-        listed = Path(f"/proc/{running.pid}/task/{running.pid}/children")
-        children = [int(pid) for pid in listed.read_text().split()] if listed.exists() else []
         running.kill()
     done = {path.name: path.stat().st_mtime_ns for path in steps.glob("[!.]*.npz")}
     assert done
-    until = time.monotonic() + 30
-    while any(Path(f"/proc/{pid}").exists() for pid in children) and time.monotonic() < until:
-        time.sleep(0.1)
-    assert not [pid for pid in children if Path(f"/proc/{pid}").exists()]
     again = subprocess.run([*command, "--work", str(steps.parent)], env=environment(), check=False)
     assert again.returncode == 0
     assert len(read_splats(tmp_path / "x.ply")) == 900
@@ -139,16 +128,16 @@ def test_a_killed_command_leaves_no_workers_and_resumes(folder: Path, tmp_path: 
 
 
 @needs_proc
-@pytest.mark.parametrize("seconds", [0.0, 0.3])
-def test_new_workers_end_with_a_killed_command(folder: Path, tmp_path: Path, seconds: float) -> None:
+@pytest.mark.parametrize("seconds", [0.0, 0.3, 3.0])
+def test_workers_end_with_a_killed_command(folder: Path, tmp_path: Path, seconds: float) -> None:
     words = ["simplify", folder / "town.ply", "-r", "10", "-o", tmp_path / "x.ply", "--tile-rows", "700"]
     command = [sys.executable, "-m", "g2ard", *map(str, words), "--workers", "2", "--no-views"]
     with subprocess.Popen(command, env=environment(), stderr=subprocess.DEVNULL) as running:
         until = time.monotonic() + 60
-        while not (workers := _workers(running.pid)) and time.monotonic() < until:
+        while not (workers := workers_of(running.pid)) and time.monotonic() < until:
             time.sleep(0.005)
         time.sleep(seconds)
-        workers |= _workers(running.pid)
+        workers |= workers_of(running.pid)
         running.kill()
     assert workers
     until = time.monotonic() + 30
@@ -157,14 +146,6 @@ def test_new_workers_end_with_a_killed_command(folder: Path, tmp_path: Path, sec
     for pid in left:
         os.kill(pid, signal.SIGKILL)
     assert not left
-
-
-def _workers(parent: int) -> set[int]:
-    """Return its child processes that work on tiles."""
-    listed = Path(f"/proc/{parent}/task/{parent}/children")
-    with suppress(OSError):
-        return {int(pid) for pid in listed.read_text().split() if is_worker(int(pid))}
-    return set()
 
 
 def test_memory_is_a_size(command_line: CommandLine, folder: Path, tmp_path: Path) -> None:
@@ -184,20 +165,10 @@ def test_distill_in_one_piece_heeds_memory(command_line: CommandLine, folder: Pa
     assert not list(tmp_path.iterdir())
 
 
-def test_memory_decides_only_the_number_of_workers(folder: Path, tmp_path: Path) -> None:
+def test_more_memory_takes_more_workers(folder: Path, tmp_path: Path) -> None:
     store = ingest(folder / "town.ply", tmp_path / "tiles", tile_rows=2500)
-    need = 10**9
-    assert workers_for(store, Tiling(memory=need, cores=64)) < workers_for(
-        store, Tiling(memory=4 * need, cores=64)
-    )
-    with pytest.raises(
-        InputError, match=r"--workers 9 take about .* GB, more than --memory .*; --workers \d fit"
-    ):
-        workers_for(store, Tiling(memory=need, workers=9))
-
-    assert bytes_of("4GB") == 4 * 10**9
-    assert not is_tiled(folder / "town.ply", Tiling())
-    assert is_tiled(folder / "town.ply", Tiling(tile_rows=8999))
+    few, many = (workers_for(store, Tiling(memory=size, cores=64)) for size in (10**9, 4 * 10**9))
+    assert 1 < few < many
 
 
 def test_distill_in_tiles_recovers(command_line: CommandLine, folder: Path, tmp_path: Path) -> None:

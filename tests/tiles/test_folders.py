@@ -6,7 +6,6 @@ from pathlib import Path
 
 import pytest
 
-from g2ard import io
 from g2ard.errors import InputError, OutputError
 from g2ard.io.lock import LOCK, locked
 from g2ard.levels import Cut, save_levels
@@ -17,16 +16,14 @@ from helpers.commands import CommandLine, refused, succeeds
 from helpers.interruptions import interrupt_at
 from helpers.level_files import files_of, scattered
 from helpers.project import ROOT
-from helpers.tiled_scenes import reduced, ring, town
+from helpers.tiled_scenes import reduced, town_in
 
 BLIND = ("--no-views", "--workers", "1", "--tile-rows", "700")
 
 
 @pytest.fixture(scope="module")
 def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("folders")
-    io.write_splats(folder / "town.ply", town(1600))
-    io.write_views(folder / "views.json", ring(8), splits=["train"] * 6 + ["test"] * 2)
+    folder = town_in(tmp_path_factory.mktemp("folders"), 1600)
     ingest(folder / "town.ply", folder / "tiles", tile_rows=700)
     return folder
 

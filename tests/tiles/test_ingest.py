@@ -16,7 +16,7 @@ import pytest
 from g2ard.errors import InputError, OutputError
 from g2ard.io import read_scene, write_splats
 from g2ard.tiles.ingest import ingest
-from g2ard.tiles.kdtree import KdTree, Sampler, cut_tree
+from g2ard.tiles.kdtree import Sampler
 from g2ard.tiles.store import TileStore, packed
 from helpers.commands import succeeds
 from helpers.ingested import as_set, assert_same_sets, halos_of, saved, tiles_of, town
@@ -172,14 +172,6 @@ def test_equal_positions_stay_together(tmp_path: Path) -> None:
     assert sorted(t.rows for t in store.tiles)[-1] == 600
     assert sorted(t.rows for t in store.tiles)[-2] <= 100
     assert [note.code for note in store.notes] == ["overfull_tiles"]
-
-
-def test_trees_survive_their_json() -> None:
-    points = np.random.default_rng(0).normal(size=(500, 3)).astype(np.float32)
-    tree = cut_tree(points, 1, 60)
-    assert tree.leaves >= 9
-    assert KdTree.from_json(json.loads(json.dumps(tree.to_json()))) == tree
-    assert sum(len(core) for core, _ in tree.route(points)) == 500
 
 
 def test_a_sample_keeps_its_size_though_points_repeat() -> None:

@@ -19,7 +19,7 @@ from g2ard.tiles.ingest import ingest
 from g2ard.tiles.store import StoredScene
 from helpers.commands import refused, succeeds
 from helpers.level_files import files_of, leaves_of, scattered
-from helpers.tiled_scenes import ring, town
+from helpers.tiled_scenes import town_in
 
 
 def snapped(count: int, seed: int) -> Splats:
@@ -30,10 +30,7 @@ def snapped(count: int, seed: int) -> Splats:
 
 @pytest.fixture(scope="module")
 def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("lod")
-    io.write_splats(folder / "town.ply", town(6000))
-    io.write_views(folder / "views.json", ring(8), splits=["train"] * 6 + ["test"] * 2)
-    return folder
+    return town_in(tmp_path_factory.mktemp("lod"), 6000)
 
 
 def sorted_cut(means: np.ndarray, rows: np.ndarray, most: int) -> list[set[int]]:

@@ -35,8 +35,8 @@ def advised(told: str) -> int:
     return int(found[1].replace(",", ""))
 
 
-def tiles(scene: Path, folder: Path, rows: int) -> tuple[TileStore, Tiling]:
-    return ingest(scene, folder / "tiles", tile_rows=rows), Tiling(folder=folder)
+def tiles(scene: Path, folder: Path, rows: int) -> TileStore:
+    return ingest(scene, folder / "tiles", tile_rows=rows)
 
 
 @pytest.mark.parametrize("memory", ["201600kB", "202MB", "203MB"])
@@ -46,18 +46,18 @@ def test_tiles_that_are_advised_fit(scene: Path, tmp_path: Path, memory: str) ->
         InputError, match=r"in one piece take about 20[4-9] MB, 200 MB of it the program"
     ) as e:
         check_memory(scene, Tiling(memory=size), LEVELS_TIMES, RECOVERY_TIMES)
-    store, _ = tiles(scene, tmp_path / "a", advised(str(e.value)))
+    store = tiles(scene, tmp_path / "a", advised(str(e.value)))
     assert len(store.tiles) > 1
     assert workers_for(store, Tiling(memory=size, folder=tmp_path / "a"), RECOVERY_TIMES) == 1
-    store, _ = tiles(scene, tmp_path / "b", 11_000)
+    store = tiles(scene, tmp_path / "b", 11_000)
     with pytest.raises(InputError, match=r"a tile of [\d,]+ Gaussians and [\d,]+ around it takes about") as e:
         workers_for(store, Tiling(memory=size, folder=tmp_path / "b"), RECOVERY_TIMES)
-    again, _ = tiles(scene, tmp_path / "c", advised(str(e.value)))
+    again = tiles(scene, tmp_path / "c", advised(str(e.value)))
     assert workers_for(again, Tiling(memory=size), RECOVERY_TIMES) == 1
 
 
 def test_an_error_names_the_least_memory_that_works(scene: Path, tmp_path: Path) -> None:
-    store, _ = tiles(scene, tmp_path / "a", 6000)
+    store = tiles(scene, tmp_path / "a", 6000)
     for refuse in (
         lambda: check_memory(scene, Tiling(memory=200_000_000), LEVELS_TIMES, RECOVERY_TIMES),
         lambda: workers_for(store, Tiling(memory=200_000_000, folder=tmp_path / "a"), RECOVERY_TIMES),
@@ -66,12 +66,12 @@ def test_an_error_names_the_least_memory_that_works(scene: Path, tmp_path: Path)
             refuse()
         told = re.search(r"tiles take is about (\d+) MB, with --tile-rows 1,000$", str(e.value))
         assert told, e.value
-        least, _ = tiles(scene, tmp_path / told[1], 1000)
+        least = tiles(scene, tmp_path / told[1], 1000)
         assert workers_for(least, Tiling(memory=bytes_of(f"{told[1]}MB")), RECOVERY_TIMES) == 1
 
 
 def test_tiles_of_a_folder_are_not_cut_anew(scene: Path, tmp_path: Path) -> None:
-    store, _ = tiles(scene, tmp_path, 6000)
+    store = tiles(scene, tmp_path, 6000)
     with pytest.raises(InputError, match=r"; `g2ard ingest \S+tiles -o DIR --tile-rows [\d,]+` takes less"):
         workers_for(store, Tiling(memory=bytes_of("202MB"), folder=tmp_path / ".x.tiles"))
 
@@ -79,11 +79,11 @@ def test_tiles_of_a_folder_are_not_cut_anew(scene: Path, tmp_path: Path) -> None
 def test_the_machines_memory_is_the_default(
     scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    store, tiling = tiles(scene, tmp_path, 6000)
+    store = tiles(scene, tmp_path, 6000)
     monkeypatch.setattr(policy, "_physical_memory", lambda: 4_000_000_000)
     told = r"--workers 1000 take about 20\d[\d.]* GB, more than the 3\.2 GB used of the machine's"
     with pytest.raises(InputError, match=told + r" memory; --workers 1\d fit$"):
-        workers_for(store, Tiling(folder=tiling.folder, workers=1000))
+        workers_for(store, Tiling(folder=tmp_path, workers=1000))
 
 
 def test_no_more_tiles_are_advised_than_are_made() -> None:

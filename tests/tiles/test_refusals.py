@@ -5,28 +5,19 @@ from pathlib import Path
 import pytest
 
 from g2ard.errors import InputError
-from g2ard.io import write_splats, write_views
 from g2ard.jobs.distill_options import DistillOptions
 from g2ard.jobs.tiling import whole_options
 from g2ard.levels import Cut
 from g2ard.tiles.ingest import ingest
-from helpers.commands import CommandLine, succeeds
-from helpers.tiled_scenes import ring, town
+from helpers.commands import CommandLine, refused, succeeds
+from helpers.tiled_scenes import town_in
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("town")
-    write_splats(folder / "town.ply", town(3000))
-    write_views(folder / "views.json", ring(4))
+    folder = town_in(tmp_path_factory.mktemp("town"), 3000, views=4)
     ingest(folder / "town.ply", folder / "tiles", tile_rows=1500)
     return folder
-
-
-def refused(command_line: CommandLine, cwd: Path, code: int, *words: object) -> str:
-    status, _, said = command_line(*words, cwd=cwd)
-    assert status == code, said
-    return " ".join(said.split())
 
 
 _SIMPLIFY = ("simplify", "-r", "10", "-o", "x.ply")
@@ -57,14 +48,14 @@ def test_options_that_need_one_piece_are_named_as_typed(
     command_line: CommandLine, folder: Path, command: tuple[str, ...], given: str, named: str
 ) -> None:
     words = (*command, "town.ply", *given.split(), "--tile-rows", "1500")
-    told = refused(command_line, folder, 1, *words)
+    told = refused(command_line, folder, *words, status=1)
     end = "but it is processed in tiles; use --tile-rows 3,000 for one piece"
-    assert told == f"g2ard: town.ply: {named} needs the whole scene in memory, {end}"
+    assert told == f"g2ard: town.ply: {named} needs the whole scene in memory, {end}\n"
     assert not (folder / "x").exists()
 
 
 def test_several_whole_options_are_named_together(command_line: CommandLine, folder: Path) -> None:
-    told = refused(command_line, folder, 1, *_DISTILL, "tiles", "--clean", "--photos")
+    told = refused(command_line, folder, *_DISTILL, "tiles", "--clean", "--photos", status=1)
     assert "tiles: --clean and --photos need the whole scene in memory" in told
     assert "use `g2ard ingest tiles -o DIR --tile-rows 3,000` for one piece" in told
     assert whole_options(DistillOptions(photos=False)) == []
@@ -72,16 +63,18 @@ def test_several_whole_options_are_named_together(command_line: CommandLine, fol
 
 
 def test_rows_of_tiles_that_lie_in_a_folder_are_theirs(command_line: CommandLine, folder: Path) -> None:
-    told = refused(command_line, folder, 2, *_SIMPLIFY, "tiles", "--tile-rows", "1k")
+    told = refused(command_line, folder, *_SIMPLIFY, "tiles", "--tile-rows", "1k")
     assert "--tile-rows: tiles already has tiles of 1,500; to change them, run `g2ard ingest tiles" in told
-    told = refused(command_line, folder, 1, *_SIMPLIFY, "tiles", "--tile-rows", "1500", "--method", "fast")
+    told = refused(
+        command_line, folder, *_SIMPLIFY, "tiles", "--tile-rows", "1500", "--method", "fast", status=1
+    )
     assert "--method fast" in told  # the same rows are no other
 
 
 @pytest.mark.parametrize("rows", ["0", "25%", "200%", "x"])
 def test_tile_rows_is_a_count_not_a_share(command_line: CommandLine, folder: Path, rows: str) -> None:
     for words in (_SIMPLIFY, ("ingest", "-o", "other")):
-        told = refused(command_line, folder, 2, *words, "town.ply", "--tile-rows", rows)
+        told = refused(command_line, folder, *words, "town.ply", "--tile-rows", rows)
         assert f"'--tile-rows': expected a positive count such as 250000, 250k or 1.5M, got '{rows}'" in told
 
 
@@ -90,14 +83,14 @@ def test_tile_rows_is_a_count_not_a_share(command_line: CommandLine, folder: Pat
 def test_extents_are_finite(
     command_line: CommandLine, folder: Path, extent: str, tiled: tuple[str, ...]
 ) -> None:
-    told = refused(command_line, folder, 2, "lod", "town.ply", "-o", "x", "--chunk-extent", extent, *tiled)
+    told = refused(command_line, folder, "lod", "town.ply", "-o", "x", "--chunk-extent", extent, *tiled)
     assert "--chunk-extent: expected a finite number above 0, got" in told
     with pytest.raises(InputError, match="extent: expected a finite number"):
         Cut(extent=float(extent))
 
 
 def test_ratios_that_do_not_rise_are_usage(command_line: CommandLine, folder: Path) -> None:
-    told = refused(command_line, folder, 2, "lod", "town.ply", "-o", "x", "-r", "2,1")
+    told = refused(command_line, folder, "lod", "town.ply", "-o", "x", "-r", "2,1")
     assert "--ratios: expected rising numbers of at least 1, got 2, 1" in told
 
 

@@ -6,20 +6,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from g2ard.io import read_splats, write_splats, write_views
+from g2ard.io import read_splats
 from g2ard.jobs.tiling import Tiling, is_tiled
 from helpers.cloud_files import columns, ply
 from helpers.commands import CommandLine, succeeds
-from helpers.tiled_scenes import ring, town
+from helpers.tiled_scenes import town_in
 
 QUICK = "--tile-rows", "1500", "--workers", "1", "--size", "48", "--steps", "10"
 
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    write_splats(tmp_path / "town.ply", town(3000))
-    write_views(tmp_path / "views.json", ring(6), splits=["train"] * 4 + ["test"] * 2)
-    return tmp_path
+    return town_in(tmp_path, 3000, views=6)
 
 
 def test_a_stopped_distill_resumes(

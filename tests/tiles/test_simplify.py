@@ -23,7 +23,7 @@ from g2ard.tiles.ingest import ingest
 from g2ard.tiles.merging import cheapest
 from g2ard.tiles.steps import GONE
 from g2ard.tiles.store import TileStore
-from helpers.systems import is_worker, needs_proc
+from helpers.systems import needs_proc, workers_of
 from helpers.tiled_scenes import reduced, ring, town
 
 
@@ -154,10 +154,10 @@ def test_workers_killed_at_random_cost_time_alone(
         while not stop.is_set() and len(killed) < 5:
             time.sleep(0.02)
             files = len(list(tmp_path.glob("[!.]*.npz")))
-            if files >= done + 3 and (children := _children()):
+            if files >= done + 3 and (children := workers_of(os.getpid())):
                 time.sleep(draw.uniform(0, 0.05))
                 with suppress(ProcessLookupError):
-                    os.kill(draw.choice(children), signal.SIGKILL)
+                    os.kill(draw.choice(sorted(children)), signal.SIGKILL)
                     killed.append(files)
                 done = files
 
@@ -171,15 +171,6 @@ def test_workers_killed_at_random_cost_time_alone(
     assert len(killed) >= 3
     assert small.fingerprint() == fingerprint
     assert len(list(tmp_path.glob("[!.]*.npz"))) == len(list(work.glob("[!.]*.npz")))
-
-
-def _children() -> list[int]:
-    """Return the worker processes of this one. Threads and processes may end while they are listed."""
-    pids = []
-    for task in Path("/proc/self/task").iterdir():
-        with suppress(OSError):
-            pids += [int(pid) for pid in (task / "children").read_text().split()]
-    return [pid for pid in pids if is_worker(pid)]
 
 
 def test_finished_work_is_not_repeated(store: TileStore, tmp_path: Path, fingerprint: str) -> None:
