@@ -80,7 +80,7 @@ def _gazes(turn: Floats, rise: Floats) -> Floats:
     return directions(turn, np.cos(rise), np.sin(rise))
 
 
-def plan_inside(survey: Survey, count: int, shift: int = 0) -> Poses:
+def plan_inside(survey: Survey, count: int) -> Poses:
     """Plan at most `count` poses within rooms, gazing all around and near the horizon.
 
     Every second pose stands where there is most clearance. Gazes into a near wall, or out of the scene, are
@@ -90,7 +90,7 @@ def plan_inside(survey: Survey, count: int, shift: int = 0) -> Poses:
     wide = max(1, int(_WIDE * len(places)))
 
     def tried(start: int, stop: int) -> tuple[Poses, Floats]:
-        at, turn, pitch = halton(start, stop, 3, survey.seed + shift + 1).T
+        at, turn, pitch = halton(start, stop, 3, survey.seed + 1).T
         reach = np.where(np.arange(start, stop) % 2 == 0, wide, len(places))
         poses = Poses(places[(at * reach).astype(int)], _gazes(turn, between(_ROOM_PITCHES, pitch)))
         seen = Rays(survey, poses)
@@ -155,7 +155,7 @@ def _together(site: Site, points: Floats) -> NDArray[np.bool_]:
     return np.bincount(label, minlength=count)[label] >= max(2.0, _HALLS * count)
 
 
-def plan_sharp(survey: Survey, count: int, shift: int = 0, *, also: Poses | None = None) -> Poses:
+def plan_sharp(survey: Survey, count: int, also: Poses | None = None) -> Poses:
     """Plan at most `count` poses in free space whose image is full and shows detail.
 
     A trained scene does so from where its photos were taken. `also` are poses to try first.
@@ -163,7 +163,7 @@ def plan_sharp(survey: Survey, count: int, shift: int = 0, *, also: Poses | None
     site = survey.site
 
     def tried(start: int, stop: int) -> tuple[Poses, Floats]:
-        *at, turn, pitch = halton(2 * start, 2 * stop, 5, survey.seed + shift + 2).T
+        *at, turn, pitch = halton(2 * start, 2 * stop, 5, survey.seed + 2).T
         points = between(site.box, np.stack(at, axis=1))
         free = site.is_free(points, 3)
         poses = Poses(points[free], _gazes(turn, np.radians(between(_SHARP_PITCHES, pitch)))[free])

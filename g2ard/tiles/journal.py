@@ -119,11 +119,6 @@ class Journal:
         names = [(tile_name(i), rows) for i, rows in enumerate(self.tiles.rows)]
         return names + [(halo_name(i), rows) for i, rows in enumerate(self.halos.rows)]
 
-    @property
-    def nbytes(self) -> int:
-        """Bytes written."""
-        return self.row_bytes * (sum(self.tiles.rows) + sum(self.halos.rows))
-
     def positions(self, name: str, count: int) -> Points:
         """Return the (count, 3) float32 positions in a file, the first three numbers of each row."""
         rows = np.memmap(self.folder / name, "u1", "r", shape=(count, self.row_bytes))

@@ -41,7 +41,7 @@ class Feed(ABC):
         stream: the source.
         row_bytes: bytes per row; a row begins with its float32 position.
         room: bytes on disk per row in the end, including all copies.
-        settings: settings stored in the journal.
+        settings: settings stored in the journal; `ingest` sets them.
         render_model: see `Splats`.
     """
 
@@ -50,9 +50,7 @@ class Feed(ABC):
     room: int
     sh_degree = 0
     render_model: RenderModel = "classic"
-
-    def __init__(self) -> None:
-        self.settings: dict[str, Any] = {}
+    settings: dict[str, Any]
 
     @abstractmethod
     def positions(self, rows: int) -> Iterator[Points]:
@@ -67,7 +65,6 @@ class SceneFeed(Feed):
     """Feed of a scene's Gaussians."""
 
     def __init__(self, stream: SceneStream) -> None:
-        super().__init__()
         self.stream: SceneStream = stream
         self.row_bytes = self.room = 4 * row_width(stream.sh_degree)
         self.sh_degree, self.render_model = stream.sh_degree, stream.render_model
@@ -86,7 +83,6 @@ class PointFeed(Feed):
     room = _POINT.itemsize + 4 * row_width(0)
 
     def __init__(self, stream: PointStream, config: LiftConfig) -> None:
-        super().__init__()
         self.stream: PointStream = stream
         self.config = config
 
