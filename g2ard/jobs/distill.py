@@ -16,13 +16,13 @@ from g2ard.jobs.budget import Budget
 from g2ard.jobs.distill_options import DistillOptions
 from g2ard.jobs.inputs import Views, clutter_seen, load_scene, say_regions
 from g2ard.jobs.job import DistillJob
-from g2ard.jobs.measured_budget import Aim, aim_of
+from g2ard.jobs.measured_budget import Aim, Reduction, aim_of
 from g2ard.jobs.photos import sparse_file, sparse_points, topped_up
-from g2ard.jobs.simplify import Reduction
 from g2ard.jobs.view_checks import propose_background, warn_of_photos
 from g2ard.jobs.views import RunViews, views_of
 from g2ard.pipeline import Distilled
 from g2ard.progress import Progress, Say, plural, silent, unsaid
+from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
 from g2ard.scene.targets import kinds_told
 from g2ard.stages.lift import lift
@@ -143,7 +143,8 @@ def prepare(
         counted(len(prior))
     default_degree = 3 if read.lifted else None  # points have one colour each, photos show more
     degree = options.configured(sh_degree=default_degree).recover.sh_degree
-    aims = _aims(prior, budgets, options, degree, read.name, progress, say)
+    reduce, file = Reduction(prior, seed=recover.seed, progress=progress, say=say), f"scene.{options.format}"
+    aims = [aim_of(each, reduce, read.name, file, recovered=True, sh_degree=degree) for each in budgets]
     views = views_of(
         prior,
         options,
@@ -152,26 +153,27 @@ def prepare(
         progress=progress,
         say=say,
     )
-    sources = _sources(views, options.photos, read.lifted)
-    regularizers, preset_label, measured = _regularizers(prior, views, options, sources, read)
-    if sources.photos:
+    photos, renders = _sources(views, options.photos, read.lifted)
+    cameras = views.train.cameras
+    found = _regularizers(options, read, prior, cameras if photos else None)
+    regularizers, preset_label, measured = found
+    if photos:
         given = options.named("recover.background") is not None
-        propose_background(views.train.cameras, recover.background, given, say)
-    if sources.photos and not read.lifted:
-        warn_of_photos(prior, views.train.cameras, recover.background, say)
-    say(_task(prior, aims, views, sources))
+        propose_background(cameras, recover.background, given, say)
+        if not read.lifted:
+            warn_of_photos(prior, cameras, recover.background, say)
+    say(_task(prior, aims, cameras, photos))
     say(f"regularisers: {preset_label}")
     config = options.configured(regularizers, default_degree)
     config = replace(config, recover=replace(config.recover, from_points=read.from_photos))
     say_regions(prior, config.simplify, read.name, say)
     return DistillJob(
         prior=prior,
-        aims=aims,
-        views=replace(views, apart=None) if sources.photos else views,  # photos exist only for given poses
-        teacher=prior if sources.renders else None,
-        photos_over_renders=sources.photos and sources.renders,
+        aims=tuple(aims),
+        views=replace(views, apart=None) if photos else views,  # photos exist only for given poses
+        teacher=prior if renders else None,
+        photos_over_renders=photos and renders,
         config=config,
-        weights=views.train.weights if config.select.weighted else None,
         lifted=read.lifted,
         preset=preset_label,
         measured=measured,
@@ -182,17 +184,8 @@ def prepare(
     )
 
 
-@dataclass(frozen=True)
-class _Sources:
-    """Sources of targets: photos where views have them, renders of the dense scene elsewhere, or one of the
-    two."""
-
-    photos: bool
-    renders: bool
-
-
-def _sources(views: RunViews, photos: bool | None, lifted: bool) -> _Sources:
-    """Decide the sources of the targets.
+def _sources(views: RunViews, photos: bool | None, lifted: bool) -> tuple[bool, bool]:
+    """Return whether photos are targets, and whether renders of the dense scene are, at least elsewhere.
 
     Args:
         photos: the option: True allows only photos, False only renders, None both.
@@ -207,65 +200,32 @@ def _sources(views: RunViews, photos: bool | None, lifted: bool) -> _Sources:
             f"view {name} has no photo", hint=f"give views with photos, their {{images=DIR}}, or {scene}"
         )
     use_photos = lifted or (any(pictured) if photos is None else photos)
-    return _Sources(photos=use_photos, renders=not (use_photos and all(pictured)))
+    return use_photos, not (use_photos and all(pictured))
 
 
 def _regularizers(
-    prior: Splats, views: RunViews, options: DistillOptions, sources: _Sources, read: _Read
+    options: DistillOptions, read: _Read, prior: Splats, photos: Cameras | None
 ) -> tuple[Regularizers, str, PriorMeasures]:
     """Choose regularisers with `regularizers_for`, or none for points of photos.
 
-    View consistency is measured only for photos.
+    Args:
+        photos: training views, if they have photos; only then is their consistency measured.
     """
-    kind, paper = (
-        options.named("recover.regularizers") or "auto",
-        options.named("recover.schedule") == "paper",
-    )
+    kind = options.named("recover.regularizers") or "auto"
+    paper = options.named("recover.schedule") == "paper"
     if read.from_photos and kind == "auto" and not paper:
         return FREE, "none (points found in photos are not a surface to hold to)", measure_prior(prior)
-    return regularizers_for(
-        "paper-lift" if read.lifted and kind == "paper" else kind,
-        prior,
-        views.train.cameras if sources.photos else None,
-        paper=paper,
-    )
+    if read.lifted and kind == "paper":
+        kind = "paper-lift"
+    return regularizers_for(kind, prior, photos, paper=paper)
 
 
-def _task(prior: Splats, aims: Sequence[Aim], views: RunViews, sources: _Sources) -> str:
+def _task(prior: Splats, aims: Sequence[Aim], train: Cameras, photos: bool) -> str:
     """Describe the task in one line."""
-    paths = views.train.cameras.image_paths
-    photos = sum(path is not None for path in paths) if sources.photos else 0
+    pictured = sum(path is not None for path in train.image_paths) if photos else 0
     counts = ", ".join([*(f"{aim.count:,}" for aim in aims[:-1]), plural(aims[-1].count, "Gaussian")])
-    against = kinds_told(photos, len(paths) - photos)
-    return f"{len(prior):,} → {counts}; {plural(len(paths), 'view')} against {against}"
-
-
-def _aims(
-    prior: Splats,
-    budgets: Sequence[Budget],
-    options: DistillOptions,
-    degree: int | None,
-    name: str,
-    progress: Progress,
-    say: Say,
-) -> tuple[Aim, ...]:
-    """Resolve the budgets; bytes are measured at the result's SH degree."""
-    seed = options.config.recover.seed
-    written = prior if degree is None else prior.with_sh_degree(degree)
-    return tuple(
-        aim_of(
-            budget,
-            prior if budget.bytes is None else written,
-            name,
-            file=f"scene.{options.format}",
-            reduce=Reduction(prior, seed=seed, progress=progress),
-            recovered=True,
-            seed=seed,
-            progress=progress,
-            say=say,
-        )
-        for budget in budgets
-    )
+    against = kinds_told(pictured, len(train) - pictured)
+    return f"{len(prior):,} → {counts}; {plural(len(train), 'view')} against {against}"
 
 
 @dataclass(frozen=True, eq=False)

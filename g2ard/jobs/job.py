@@ -5,7 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from g2ard.jobs.inputs import make_targets
 from g2ard.jobs.measured_budget import Aim
@@ -30,7 +32,6 @@ class DistillJob:
         teacher: the scene rendered for targets; None if all targets are photos.
         photos_over_renders: use photos where views have them and renders for the rest; always False without a
             teacher.
-        weights: (C,) sampling weight per view, if the views state them.
         lifted: whether `prior` is a lifted point cloud.
         preset: the regularisers chosen, and why.
         measured: the measures that decided it.
@@ -44,7 +45,6 @@ class DistillJob:
     teacher: Splats | None
     photos_over_renders: bool
     config: DistillConfig
-    weights: Any
     lifted: bool
     preset: str
     measured: PriorMeasures
@@ -62,6 +62,11 @@ class DistillJob:
     def against(self) -> str:
         """Kinds of the scoring targets, as text for summaries."""
         return kinds_of(self.held_out)
+
+    @property
+    def weights(self) -> NDArray[np.float64] | None:
+        """(C,) sampling weight per training view, if the views state them."""
+        return self.views.train.weights if self.config.select.weighted else None
 
     @cached_property
     def targets(self) -> Targets:

@@ -1,15 +1,15 @@
-"""Resolution of budgets for a scene: the count that fits a file size or keeps a quality."""
+"""Reductions of a scene, and the count that fits a file size or keeps a quality."""
 
 from __future__ import annotations
 
 import math
 import tempfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import dataclass, field
+from functools import cached_property, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,15 +18,15 @@ from g2ard.errors import InputError
 from g2ard.io import read_splats, write_splats
 from g2ard.io.scene_formats import scene_format, written_bytes
 from g2ard.jobs.budget import Budget
+from g2ard.jobs.inputs import Views, say_regions
+from g2ard.jobs.views import cameras_for_weights
 from g2ard.progress import Progress, Say, plural, silent, unsaid
 from g2ard.rendering.metrics import psnr, ssim
 from g2ard.rendering.renderer import Renderer
+from g2ard.rendering.visibility import visibility_source
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
-from g2ard.stages.simplify import simplify
-
-if TYPE_CHECKING:
-    from g2ard.stages.simplify import Simplified
+from g2ard.stages.simplify import Simplified, SimplifyConfig, Visibility, VisibilitySource, simplify
 
 _VIEWS, _SIDE = 12, 400
 """Number of views in which quality is measured, and their longer side in pixels."""
@@ -46,6 +46,80 @@ _SLOPE = 4.0
 """Expected gain in dB for twice the Gaussians, until two counts are measured."""
 _FEWEST = 64
 """Smallest count that a search tries."""
+
+
+@dataclass(eq=False)
+class Reduction:
+    """Reductions of one scene to any budget: count → `Simplified`, as `simplify` returns it.
+
+    Poses and visibility are computed once, and the last two results are cached. Arguments and errors are
+    those of `simplify`.
+    """
+
+    splats: Splats
+    views: Views | None = None
+    blind: bool = False
+    config: SimplifyConfig = field(default_factory=SimplifyConfig)
+    beside: str | Path | None = None
+    up: Sequence[float] | None = None
+    seed: int = 0
+    progress: Progress = silent
+    say: Say = unsaid
+    _made: dict[int, Simplified] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if self.views is not None and self.blind:
+            raise InputError("views and blind exclude each other")
+        say_regions(self.splats, self.config, "the scene", self.say)
+
+    def __call__(self, count: int) -> Simplified:
+        """Return the scene at a budget."""
+        if count not in self._made:
+            made = simplify(
+                self.splats,
+                count,
+                visibility=self._visibility if count < len(self.splats) else None,
+                config=self.config,
+                progress=self.progress,
+            )
+            self._made = dict([*self._made.items(), (count, made)][-2:])
+        return self._made[count]
+
+    @cached_property
+    def _visibility(self) -> VisibilitySource | None:
+        if self.blind:
+            return None
+        cameras = cameras_for_weights(
+            self.splats,
+            self.views,
+            self.config.method,
+            beside=self.beside,
+            up=self.up,
+            seed=self.seed,
+            progress=self.progress,
+            say=self.say,
+        )
+        return None if cameras is None else _remembering(visibility_source(cameras, progress=self.progress))
+
+
+def _remembering(source: VisibilitySource) -> VisibilitySource:
+    """Cache the visibility of the first scene, which every reduction starts with."""
+    first: list[tuple[Splats, Visibility]] = []
+
+    def remembered(scene: Splats) -> Visibility:
+        if first and _same(first[0][0], scene):
+            return first[0][1]
+        seen = source(scene)
+        if not first:
+            first.append((scene, seen))
+        return seen
+
+    return remembered
+
+
+def _same(a: Splats, b: Splats) -> bool:
+    """Return whether two scenes share their geometry arrays; scales are clamped anew by each reduction."""
+    return all(getattr(a, name) is getattr(b, name) for name in ("means", "quats", "logit_opacities"))
 
 
 @dataclass(frozen=True)
@@ -248,27 +322,27 @@ class Aim:
 
 def aim_of(
     budget: Budget,
-    splats: Splats,
-    name: str = "scene",
+    reduce: Reduction,
+    name: str,
+    file: str,
     *,
-    file: str = "scene.ply",
-    reduce: Callable[[int], Simplified],
     recovered: bool = False,
-    seed: int = 0,
-    progress: Progress = silent,
-    say: Say = unsaid,
+    sh_degree: int | None = None,
 ) -> Aim:
-    """Resolve a budget for a scene.
+    """Resolve a budget for the scene of `reduce`, which makes the result.
 
     Args:
+        name: the scene's name in errors.
         file: a file name; its suffix is the format for `Budget.fit`.
-        reduce: count → scene, by the method that makes the result.
         recovered: whether recovery follows. Bytes are then searched with the method `fast` and a margin.
+        sh_degree: of the result; None is the scene's.
     """
+    splats, say = reduce.splats, reduce.say
     if budget.min_psnr is not None or budget.min_ssim is not None:
-        wanted = Quality(budget.min_psnr or 0.0, budget.min_ssim or 0.0)
-        return _aim_for_quality(splats, wanted, file, reduce, seed, progress, say)
+        return _aim_for_quality(reduce, Quality(budget.min_psnr or 0.0, budget.min_ssim or 0.0), file)
     if budget.bytes is not None:
+        if sh_degree is not None:
+            splats = splats.with_sh_degree(sh_degree)
         most = int(budget.bytes * _MARGIN) if recovered else budget.bytes
         made = partial(simplify, splats, method="fast") if recovered else reduce
         found = count_for_bytes(splats, most, file, lambda count: made(count).splats)
@@ -280,19 +354,12 @@ def aim_of(
     return Aim(found)
 
 
-def _aim_for_quality(
-    splats: Splats,
-    wanted: Quality,
-    file: str,
-    reduce: Callable[[int], Simplified],
-    seed: int,
-    progress: Progress,
-    say: Say,
-) -> Aim:
+def _aim_for_quality(reduce: Reduction, wanted: Quality, file: str) -> Aim:
     """Find the count that keeps a quality in generated views, as read back from the format of `file`."""
     from g2ard.poses import plan_pool
 
-    pool = plan_pool(splats, _VIEWS, seed=seed, rows=_ROWS, for_weights=True, progress=progress)
+    splats, say = reduce.splats, reduce.say
+    pool = plan_pool(splats, _VIEWS, seed=reduce.seed, rows=_ROWS, for_weights=True, progress=reduce.progress)
     cameras = pool.cameras.resized(_SIDE)
 
     def written(count: int) -> Splats:

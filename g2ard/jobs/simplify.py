@@ -3,23 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 from g2ard.config.choices import RenderModel
 from g2ard.config.presets import configured
-from g2ard.errors import InputError
 from g2ard.jobs.budget import Budget
-from g2ard.jobs.inputs import Views, load_scene, say_regions
-from g2ard.jobs.measured_budget import aim_of
-from g2ard.jobs.views import cameras_for_weights
+from g2ard.jobs.inputs import Views, load_scene
+from g2ard.jobs.measured_budget import Reduction, aim_of
 from g2ard.progress import Progress, Say, silent, unsaid
-from g2ard.rendering.visibility import visibility_source
 from g2ard.scene.splats import Splats
-from g2ard.stages.simplify import Simplified, SimplifyConfig, Visibility, VisibilitySource
-from g2ard.stages.simplify import simplify as merge
+from g2ard.stages.simplify import Simplified, SimplifyConfig
 
 
 def simplify(
@@ -103,66 +97,11 @@ def simplify(
         progress=progress,
         say=say,
     )
-    file = f"scene.{format}"
-    aim = aim_of(wanted, splats, name, file=file, reduce=reduce, seed=seed, progress=progress, say=say)
+    aim = aim_of(wanted, reduce, name, f"scene.{format}")
     small = reduce(aim.count)
     if judgement := aim.judge(small.splats):
         say(judgement[1])
     return small
-
-
-@dataclass(eq=False)
-class Reduction:
-    """Reductions of one scene to any budget: count → `Simplified`, as `simplify` returns it.
-
-    Poses and visibility are computed once, and the last two results are cached. Arguments and errors are
-    those of `simplify`.
-    """
-
-    splats: Splats
-    views: Views | None = None
-    blind: bool = False
-    config: SimplifyConfig = field(default_factory=SimplifyConfig)
-    beside: str | Path | None = None
-    up: Sequence[float] | None = None
-    seed: int = 0
-    progress: Progress = silent
-    say: Say = unsaid
-    _made: dict[int, Simplified] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        if self.views is not None and self.blind:
-            raise InputError("views and blind exclude each other")
-        say_regions(self.splats, self.config, "the scene", self.say)
-
-    def __call__(self, count: int) -> Simplified:
-        """Return the scene at a budget."""
-        if count not in self._made:
-            made = merge(
-                self.splats,
-                count,
-                visibility=self._visibility if count < len(self.splats) else None,
-                config=self.config,
-                progress=self.progress,
-            )
-            self._made = dict([*self._made.items(), (count, made)][-2:])
-        return self._made[count]
-
-    @cached_property
-    def _visibility(self) -> VisibilitySource | None:
-        if self.blind:
-            return None
-        cameras = cameras_for_weights(
-            self.splats,
-            self.views,
-            self.config.method,
-            beside=self.beside,
-            up=self.up,
-            seed=self.seed,
-            progress=self.progress,
-            say=self.say,
-        )
-        return None if cameras is None else _remembering(visibility_source(cameras, progress=self.progress))
 
 
 def _scene(
@@ -172,23 +111,3 @@ def _scene(
     if isinstance(scene, Splats):
         return scene, beside, "scene"
     return load_scene(scene, say, render_model), beside or scene, str(scene)
-
-
-def _remembering(source: VisibilitySource) -> VisibilitySource:
-    """Cache the visibility of the first scene, which every reduction starts with."""
-    first: list[tuple[Splats, Visibility]] = []
-
-    def remembered(scene: Splats) -> Visibility:
-        if first and _same(first[0][0], scene):
-            return first[0][1]
-        seen = source(scene)
-        if not first:
-            first.append((scene, seen))
-        return seen
-
-    return remembered
-
-
-def _same(a: Splats, b: Splats) -> bool:
-    """Return whether two scenes share their geometry arrays; scales are clamped anew by each reduction."""
-    return all(getattr(a, name) is getattr(b, name) for name in ("means", "quats", "logit_opacities"))

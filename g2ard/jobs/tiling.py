@@ -292,16 +292,16 @@ def whole_options(options: DistillOptions) -> list[str]:
 
     Tiles learn from renders, so `photos=False` is fine.
     """
+    if options.preset.startswith("paper"):
+        return whole_method(None, options.preset)
     config = options.config
-    whole = whole_method(config.simplify.method, options.preset)
-    by_preset = bool(whole) and whole[0].startswith("--preset")
     given = {
-        "--set select.views_count": config.select.views_count is not None and not by_preset,
-        "--schedule paper": config.recover.schedule.round_steps > 0 and not by_preset,
+        "--set select.views_count": config.select.views_count is not None,
+        "--schedule paper": config.recover.schedule.round_steps > 0,
         "--clean": options.clean,
         "--photos": bool(options.photos),
         "--set select.reselect": config.select.reselect,
         "--recovery-time": config.recover.recovery_time is not None,
         "--device cuda": config.recover.engine != "fused",
     }
-    return whole + [name for name, there in given.items() if there]
+    return whole_method(config.simplify.method, None) + [name for name, there in given.items() if there]

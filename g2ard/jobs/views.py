@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,12 +13,7 @@ import numpy as np
 from g2ard.config.choices import is_made
 from g2ard.errors import InputError
 from g2ard.io import ViewSet
-from g2ard.jobs.inputs import (
-    Views,
-    drop_held_out,
-    load_view_sets,
-    load_views,
-)
+from g2ard.jobs.inputs import Views, drop_held_out, load_view_sets, load_views
 from g2ard.jobs.view_checks import as_pool, check_sight, found_views, warn_of_sight
 from g2ard.progress import Progress, Say, silent, unsaid
 from g2ard.scene.cameras import Cameras
@@ -97,58 +93,70 @@ def views_of(
             are generated.
         represents: Gaussians per row if `prior` is a sample of a larger scene; the pool grows with it.
     """
-    views, held_out, size, up = options.views, options.held_out, options.size, options.up
-    seed, select = options.config.recover.seed, replace(options.config.select, focus=options.focus)
-    spare = round(_APART * _times(prior, represents))
     found = None
-    if views is None and beside is not None:
-        wanted = ["train"] if held_out is not None else ["train", "test"]
-        found = views = found_views(beside, prior, wanted, say)
-    if views is not None and not is_made(views):
-        if held_out is None:
-            train, test = load_view_sets(views, ["train", "test"], size, say, unpictured=teach)
-        else:
-            (train,) = load_view_sets(views, [for_training], size, say, unpictured=teach)
-            (test,) = load_view_sets(held_out, [for_scores], size, say, unpictured=teach)
-            train = drop_held_out(train, test.cameras, say)
-        if not found:
-            check_sight(prior, train.cameras, say)
-        if found and not size:
-            train, test = (replace(part, cameras=as_pool(part.cameras)) for part in (train, test))
-        if not teach or any(train.cameras.image_paths):
-            if options.config.select.focus:
-                say("warning: --focus has no effect on views with photos")
-            select = replace(select, focus="far")
+    if options.views is None and beside is not None:
+        wanted = ["train"] if options.held_out is not None else ["train", "test"]
+        found = found_views(beside, prior, wanted, say)
+    given = found or options.views
+    plan = partial(
+        _planned,
+        prior,
+        up=options.up,
+        seed=options.config.recover.seed,
+        represents=represents,
+        progress=progress,
+    )
+    load = partial(load_view_sets, size=options.size, say=say, unpictured=teach)
+    spare = round(_APART * _times(prior, represents))
+    select = replace(options.config.select, focus=options.focus)
+    if given is None or is_made(given):
         if not teach:
-            return RunViews(train, test.cameras)
-        try:
-            planned = _planned(prior, _APART, up, seed, progress, represents=represents)
-        except InputError:  # the scene has no room for poses
-            return RunViews(train, test.cameras)
-        train, apart = _mixed(train, planned, select, spare, size, say)
-        return RunViews(train, test.cameras, apart)
+            raise InputError(
+                "generated views have no photos", parameter="photos", hint="give {views} that have them"
+            )
+        held_out = None if options.held_out is None else load(options.held_out, [for_scores])[0].cameras
+        return _generated(plan(_POOL, grow=_GROW), held_out, options.size, select, spare, say)
+    if options.held_out is None:
+        train, test = load(given, ["train", "test"])
+    else:
+        (train,), (test,) = load(given, [for_training]), load(options.held_out, [for_scores])
+        train = drop_held_out(train, test.cameras, say)
+    if not found:
+        check_sight(prior, train.cameras, say)
+    elif not options.size:
+        train, test = (replace(part, cameras=as_pool(part.cameras)) for part in (train, test))
+    if not teach or any(train.cameras.image_paths):
+        if options.config.select.focus:
+            say("warning: --focus has no effect on views with photos")
+        select = replace(select, focus="far")
     if not teach:
-        raise InputError(
-            "generated views have no photos", parameter="photos", hint="give {views} that have them"
-        )
-    held = None
-    if held_out is not None:
-        (held,) = load_view_sets(held_out, [for_scores], size, say, unpictured=teach)
-    planned = _planned(prior, _POOL, up, seed, progress, _GROW, represents)
+        return RunViews(train, test.cameras)
+    try:
+        planned = plan(_APART)
+    except InputError:  # the scene has no room for poses
+        return RunViews(train, test.cameras)
+    train, apart = _mixed(train, planned, select, spare, options.size, say)
+    return RunViews(train, test.cameras, apart)
+
+
+def _generated(
+    planned: Pool, held_out: Cameras | None, size: int | None, select: SelectConfig, spare: int, say: Say
+) -> RunViews:
+    """Split a pool into views for training and for scoring; all train if `held_out` are scored."""
     names = planned.cameras.names
-    held_back = split_mask(None, names, "test") if held is None else np.zeros(len(names), bool)
+    held_back = split_mask(None, names, "test") if held_out is None else np.zeros(len(names), bool)
     usual = ViewSet(planned.cameras, splits=tuple(np.where(held_back, "test", "train").tolist()))
     train, apart = _mixed(usual.take(~held_back), planned, select, spare, None, say)
+    test = planned.cameras.take(held_back)
     pool = ViewSet(
-        Cameras.of([*train.cameras, *usual.cameras.take(held_back)]),
-        splits=("train",) * len(train.cameras) + ("test",) * int(held_back.sum()),
+        Cameras.of([*train.cameras, *test]),
+        splits=("train",) * len(train.cameras) + ("test",) * len(test),
     )
     say(f"poses: {_of(planned, pool.cameras.names)}")
-    train = train.resized(size)
-    if held is not None:
-        train = drop_held_out(train, held.cameras, say)
-    scored = usual.cameras.take(held_back).resized(size) if held is None else held.cameras
-    return RunViews(train, scored, apart and apart.resized(size), pool, planned.unseen)
+    train, test = train.resized(size), test.resized(size)
+    if held_out is not None:
+        train, test = drop_held_out(train, held_out, say), held_out
+    return RunViews(train, test, apart and apart.resized(size), pool, planned.unseen)
 
 
 def _mixed(
@@ -213,7 +221,7 @@ def views_or_pool(
     if views is None and beside is not None and (found := found_views(beside, scene, [], say)):
         return found
     if count is None:
-        planned = _planned(scene, _POOL, up, seed, progress, _GROW)
+        planned = _planned(scene, _POOL, up=up, seed=seed, progress=progress, grow=_GROW)
     else:
         planned = plan_pool(scene, count, up=up, seed=seed, rows=_ROWS, progress=progress)
     say(f"poses: {_of(planned, planned.cameras.names)}")
@@ -289,6 +297,7 @@ def cameras_for_weights(
 def _planned(
     prior: Splats,
     count: int,
+    *,
     up: Up,
     seed: int,
     progress: Progress,

@@ -93,8 +93,8 @@ class Journal:
         try:
             tree = KdTree.from_json(content["cells"])
             key, margin = str(content["key"]), float(content["margin"])
-            journal = cls(folder, key, tree, margin, row_bytes, tally(**content["tally"]), {})
-            journal.settings = dict(content.get("settings", {}))
+            counts, settings = tally(**content["tally"]), dict(content.get("settings", {}))
+            journal = cls(folder, key, tree, margin, row_bytes, counts, settings)
             journal.next_row = int(content["next_row"])
             journal.low, journal.high = content["low"], content["high"]
             for kind in ("tiles", "halos"):

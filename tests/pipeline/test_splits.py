@@ -64,8 +64,8 @@ class Watch:
 
 @pytest.fixture
 def watch(monkeypatch: pytest.MonkeyPatch) -> Watch:
+    import g2ard.jobs.measured_budget
     import g2ard.jobs.score
-    import g2ard.jobs.simplify
     import g2ard.pipeline.adapt
     import g2ard.stages.evaluate
     import g2ard.stages.recover
@@ -85,7 +85,7 @@ def watch(monkeypatch: pytest.MonkeyPatch) -> Watch:
     watched(g2ard.pipeline.adapt, "adapt", 1, seen.trained)
     for module in (g2ard.stages.recover, g2ard.pipeline):
         watched(module, "recover", 1, seen.trained)
-    for module in (g2ard.jobs.simplify, g2ard.pipeline):
+    for module in (g2ard.jobs.measured_budget, g2ard.pipeline):
         watched(module, "visibility_source", 0, seen.looked)
     for module in (g2ard.stages.evaluate, g2ard.jobs.score):
         watched(module, "evaluate", 1, seen.scored)

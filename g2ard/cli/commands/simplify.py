@@ -64,8 +64,7 @@ def simplify(
     """
     from g2ard.cli.tiled import TiledCommand
     from g2ard.jobs.inputs import say_notes
-    from g2ard.jobs.measured_budget import aim_of
-    from g2ard.jobs.simplify import Reduction
+    from g2ard.jobs.measured_budget import Reduction, aim_of
     from g2ard.jobs.tiling import WHOLE_TIMES, check_memory, is_tiled
     from g2ard.stages.simplify import SimplifyConfig
 
@@ -97,9 +96,7 @@ def simplify(
     reading = started - began  # shared by all budgets
     common: dict[str, Any] = {"seed": run.seed, "progress": run.progress, "say": run.say}
     reduce = Reduction(splats, views=given, blind=no_views, config=config, beside=scene, up=up, **common)
-    aims = [
-        aim_of(budget, splats, str(scene), file=output.name, reduce=reduce, **common) for budget in budgets
-    ]
+    aims = [aim_of(budget, reduce, str(scene), output.name) for budget in budgets]
     reports = []
     rows = maps.paths(total) if maps else [None] * len(aims)
     for aim, place, parents in zip(aims, outputs.paths(total), rows, strict=True):
