@@ -46,10 +46,8 @@ class RasterSettings:
     near: float | Sequence[float] | None = None
 
     def __post_init__(self) -> None:
-        if self.convention not in CONVENTIONS:
-            raise InputError(
-                f"expected {' or '.join(CONVENTIONS)}, got {self.convention!r}", parameter="convention"
-            )
+        known = self.convention in CONVENTIONS
+        require("convention", repr(self.convention), known, " or ".join(CONVENTIONS))
         require("alpha_max", self.alpha_max, 1 / 255 <= self.alpha_max < 1, "a value in [1/255, 1)")
 
     def near_of(self, index: int) -> float:
@@ -185,10 +183,9 @@ class Renderer:
         require("background", len(self.background), len(self.background) == 3, "3 numbers")
         if settings is not None and not isinstance(settings.near, int | float | None):
             raise InputError("expected one distance for all views", parameter="near")
-        self._offset, middle = splats.offset, middle_of(splats)
-        if middle is not None:
-            splats = splats.recentred(splats.offset + middle)
-        self._middle = middle
+        self._offset, self._middle = splats.offset, middle_of(splats)
+        if self._middle is not None:
+            splats = splats.recentred(splats.offset + self._middle)
         self._settings = settings_for(splats.means, settings, antialiased=splats.antialiased)
         self._arrays = arrays_of(splats)
         self._rasterizer = _core.Rasterizer()
@@ -240,9 +237,8 @@ class Renderer:
         here = Cameras.of([camera]).recentred(self._offset)
         if self._middle is not None:
             here = here.recentred(self._middle)
-        settings = self._settings
-        view = view_of(here, 0, settings)
-        return self._rasterizer.forward(self._arrays, view, settings, self.background, depths)
+        view = view_of(here, 0, self._settings)
+        return self._rasterizer.forward(self._arrays, view, self._settings, self.background, depths)
 
 
 def render(

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from g2ard import _core
 from g2ard.progress import Progress, counter, silent
 from g2ard.rendering.renderer import RasterSettings, arrays_of, centred, settings_for, view_of
-from g2ard.scene.cameras import Cameras
+from g2ard.scene.cameras import Cameras, evenly_spaced
 from g2ard.scene.prepared import as_prepared
 from g2ard.scene.splats import Splats
 from g2ard.scene.splits import usual_rows
@@ -142,9 +142,7 @@ class _Sampler:
     """Function of `visibility_source`: `rounds` of views, of which the first `used` are rendered."""
 
     def __init__(self, cameras: Cameras, longest: int, progress: Progress) -> None:
-        count = min(MOST_VIEWS, len(cameras))
-        sample = np.unique(np.linspace(0, len(cameras) - 1, count).round().astype(int))
-        full = cameras.take(sample)
+        full = cameras.take(evenly_spaced(len(cameras), MOST_VIEWS))
         self.cameras = full.resized(longest)
         self.shrunk = np.float32((self.cameras.widths / full.widths).mean())
         apart = max(1, math.ceil(len(self.cameras) / ROUND))

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from g2ard.rendering.renderer import Renderer
 from g2ard.rendering.visibility import visibility
-from g2ard.scene.cameras import Cameras
+from g2ard.scene.cameras import Cameras, evenly_spaced
 from g2ard.scene.splats import SH_C0, Splats
 from g2ard.scene.targets import Targets, mask_of
 
@@ -53,9 +53,9 @@ def colour_change(splats: Splats, targets: Targets, background: tuple[float, flo
     normal, right = np.zeros((4, 4)), np.zeros((4, 3))
     before = pixels = 0.0
     renderer = Renderer(splats, background=background)
-    for view in np.unique(np.linspace(0, len(cameras) - 1, min(len(cameras), _VIEWS)).round().astype(int)):
-        rendered = renderer.render(cameras[int(view)])
-        image, mask = targets[int(view)], mask_of(targets, int(view))
+    for view in evenly_spaced(len(cameras), _VIEWS):
+        rendered = renderer.render(cameras[view])
+        image, mask = targets[view], mask_of(targets, view)
         counts = np.ones(image.shape[:2], bool) if mask is None else mask
         rows = np.flatnonzero(counts)[:: max(1, int(counts.sum()) // _PIXELS)]
         alpha = rendered.alpha.reshape(-1, 1)[rows].astype(np.float64)

@@ -255,8 +255,8 @@ class Cameras:
 
     def usual_share(self, points: ArrayLike) -> float:
         """Return the share of (N, 3) world points in a view, as the median over at most 16 views."""
-        some = np.unique(np.linspace(0, len(self) - 1, min(len(self), _MEDIAN_OF)).round().astype(int))
-        return float(np.median([self[int(view)].holds(points).mean() for view in some]))
+        shares = [self[view].holds(points).mean() for view in evenly_spaced(len(self), _MEDIAN_OF)]
+        return float(np.median(shares))
 
     def recentred(self, offset: ArrayLike) -> Cameras:
         """Return the views in coordinates relative to the world point `offset` (see `Splats.offset`)."""
@@ -290,6 +290,16 @@ class Cameras:
             distortions=np.asarray(distortions, np.float64).reshape(-1, 5),
             mask_paths=tuple(mask_paths),
         )
+
+
+def evenly_spaced(count: int, most: int) -> list[int]:
+    """Return at most `most` evenly spaced indices below `count`, the first and last included.
+
+    >>> evenly_spaced(9, 3), evenly_spaced(2, 3)
+    ([0, 4, 8], [0, 1])
+    """
+    indices: list[int] = np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int)).tolist()
+    return indices
 
 
 def look_at(position: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0)) -> NDArray[np.float64]:

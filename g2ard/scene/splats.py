@@ -75,10 +75,8 @@ class Splats:
             got = getattr(self, name).shape
             require(name, got, got == shape, f"shape {shape}")
         require("shN", rest, rest in _DEGREE_OF_REST, "0, 3, 8 or 15 coefficients")
-        if self.render_model not in RENDER_MODELS:
-            raise InputError(
-                f"expected {' or '.join(RENDER_MODELS)}, got {self.render_model!r}", parameter="render_model"
-            )
+        model = self.render_model
+        require("render_model", repr(model), model in RENDER_MODELS, " or ".join(RENDER_MODELS))
 
     @classmethod
     def create(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from g2ard.errors import InputError
+from g2ard.errors import InputError, require
 
 
 def checked_weights(weights: ArrayLike | None, count: int) -> NDArray[np.float64] | None:
@@ -17,10 +17,7 @@ def checked_weights(weights: ArrayLike | None, count: int) -> NDArray[np.float64
     if weights is None:
         return None
     values = np.asarray(weights, np.float64)
-    if values.shape != (count,):
-        raise InputError(
-            f"expected {count} weights, one per view, got shape {values.shape}", parameter="weights"
-        )
+    require("weights", f"shape {values.shape}", values.shape == (count,), f"{count} weights, one per view")
     bad = np.flatnonzero(~(np.isfinite(values) & (values >= 0)))
     if len(bad):
         raise InputError(f"view {bad[0]}: {values[bad[0]]} is not a number ≥ 0", parameter="weights")

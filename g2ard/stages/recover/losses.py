@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.nn.functional import conv2d
 
 from g2ard import _core
-from g2ard.errors import InputError
+from g2ard.errors import require
 from g2ard.stages.recover.anchors import Anchors, Regularizers
 from g2ard.stages.recover.extent import rotations
 
@@ -53,12 +53,9 @@ def l1_ssim(image: Tensor, target: Tensor, ssim_weight: float = 0.2) -> Tensor:
     0.0
     """
     for name, tensor in (("image", image), ("target", target)):
-        if tensor.dtype != torch.float32 or tensor.device.type != "cpu" or tensor.ndim != 3:
-            raise InputError(
-                f"expected (H, W, C) float32 on the CPU, "
-                f"got {tuple(tensor.shape)} {tensor.dtype} on {tensor.device}",
-                parameter=name,
-            )
+        fits = tensor.dtype == torch.float32 and tensor.device.type == "cpu" and tensor.ndim == 3
+        given = f"{tuple(tensor.shape)} {tensor.dtype} on {tensor.device}"
+        require(name, given, fits, "(H, W, C) float32 on the CPU")
     loss: Tensor = _L1Ssim.apply(image, target, ssim_weight)
     return loss
 

@@ -9,7 +9,7 @@ import numpy as np
 from g2ard.errors import InputError
 from g2ard.rendering.renderer import RasterSettings, Renderer
 from g2ard.report.base import Report
-from g2ard.scene.cameras import Cameras
+from g2ard.scene.cameras import Cameras, evenly_spaced
 from g2ard.scene.splats import Splats
 from g2ard.stages.recover.anchors import REGULARIZERS, Regularizers, needle
 
@@ -82,16 +82,15 @@ def view_consistency(scene: Splats, cameras: Cameras) -> float | None:
         return None
     small = cameras.resized(_SAMPLE_PIXELS)
     renderer = Renderer(scene, settings=RasterSettings(antialiased=False))
-    sample = np.unique(np.linspace(0, len(small) - 1, min(len(small), _SAMPLE_VIEWS)).round().astype(int))
     agreeing = floating = 0
-    for a in sample:
+    for a in evenly_spaced(len(small), _SAMPLE_VIEWS):
         distance = np.linalg.norm(small.positions - small.positions[a], axis=1)
         distance[a] = np.inf
         b = int(distance.argmin())
-        depth, other = (renderer.render(small[int(view)], median=True).median for view in (a, b))
+        depth, other = (renderer.render(small[view], median=True).median for view in (a, b))
         assert depth is not None
         assert other is not None
-        expected, seen = _carried(depth, other, small, int(a), b)
+        expected, seen = _carried(depth, other, small, a, b)
         ratio = np.where(seen > 0, seen, np.inf) / expected
         agreeing += int((np.abs(ratio - 1) <= _SAME_DEPTH).sum())
         floating += int((ratio > 1 + _SAME_DEPTH).sum())

@@ -10,6 +10,7 @@ import numpy as np
 
 from g2ard.rendering.metrics import psnr
 from g2ard.rendering.renderer import Renderer
+from g2ard.scene.cameras import evenly_spaced
 from g2ard.scene.splats import Splats
 from g2ard.scene.splits import rows_by_kind
 from g2ard.scene.targets import Subset, Targets, mask_of
@@ -30,9 +31,7 @@ class Probe:
     def __init__(
         self, targets: Targets, background: tuple[float, float, float], most: float = math.inf
     ) -> None:
-        count = len(targets.cameras)
-        sample = np.linspace(0, count - 1, min(count, _VIEWS)).round().astype(int)
-        self._views = [int(view) for view in np.unique(sample)]
+        self._views = evenly_spaced(len(targets.cameras), _VIEWS)
         self._targets, self._background, self._most = targets, background, most
         self._next = 0.0
         self._latest = (float("nan"), 0)

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from g2ard import _core
 from g2ard.config.choices import BLACK
-from g2ard.errors import InputError
+from g2ard.errors import InputError, require
 from g2ard.rendering.renderer import RasterSettings, View, view_of
 from g2ard.scene.cameras import Cameras
 
@@ -120,10 +120,8 @@ def rasterize(
         raise InputError(f"expected a view index below {len(cameras)}, got {index}")
     params = (means, quats, log_scales, logit_opacities, sh0, shN)
     for name, tensor in zip(_NAMES, params, strict=True):
-        if tensor.dtype != torch.float32 or tensor.device.type != "cpu":
-            raise InputError(
-                f"expected float32 on the CPU, got {tensor.dtype} on {tensor.device}", parameter=name
-            )
+        fits = tensor.dtype == torch.float32 and tensor.device.type == "cpu"
+        require(name, f"{tensor.dtype} on {tensor.device}", fits, "float32 on the CPU")
     colour = [float(c) for c in background]
     out: tuple[Tensor, Tensor, Tensor] = _Rasterize.apply(
         view_of(cameras, index, settings), settings, colour, *params

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from g2ard.errors import require
-from g2ard.scene.cameras import Cameras
+from g2ard.scene.cameras import Cameras, evenly_spaced
 from g2ard.scene.splats import Splats
 from g2ard.scene.splits import usual_rows
 
@@ -244,7 +244,7 @@ def steps_for(scene: Splats, cameras: Cameras, steps: int) -> int:
     2000
     """
     usual = cameras.take(usual_rows(cameras.names))
-    some = np.unique(np.linspace(0, len(scene) - 1, min(len(scene), _POINTS)).round().astype(int))
+    some = evenly_spaced(len(scene), _POINTS)
     points = scene.means[some].astype(np.float64) + scene.offset
     share = max(usual.usual_share(points), 1 / _MOST_TIMES**2)
     return round(steps / math.sqrt(share) * (len(cameras) / len(usual)))

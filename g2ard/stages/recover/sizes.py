@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from g2ard.scene.cameras import Cameras
+from g2ard.scene.cameras import Cameras, evenly_spaced
 from g2ard.scene.splats import Splats
 
 _NEEDLE = 1e-2
@@ -43,7 +43,7 @@ def typical_share(splats: Splats, cameras: Cameras) -> float:
     """
     cameras = cameras.recentred(splats.offset)
     largest, found = splats.scales.max(1, initial=0.0).astype(np.float64), []
-    for view in np.unique(np.linspace(0, len(cameras) - 1, min(_VIEWS, len(cameras))).round().astype(int)):
+    for view in evenly_spaced(len(cameras), _VIEWS):
         pose, K = cameras.viewmats[view], cameras.Ks[view]
         size = np.array([cameras.widths[view], cameras.heights[view]], np.float64)
         at = (splats.means @ pose[:3, :3].T + pose[:3, 3]) @ K.T

@@ -13,6 +13,7 @@ again.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,8 +35,7 @@ _COARSER = 10
 """Factor on `still` for all levels but the finest."""
 
 
-@dataclass(frozen=True, eq=False)
-class Level:
+class Level(NamedTuple):
     """A photo at one size: (H, W) float64 blurred grey, its gradients, and the mask of valid pixels."""
 
     grey: Float
@@ -44,8 +44,7 @@ class Level:
     mask: Mask
 
 
-@dataclass(frozen=True, eq=False)
-class Shot:
+class Shot(NamedTuple):
     """A render prepared for alignment.
 
     Args:
@@ -120,18 +119,13 @@ def normal_equations(
 
     `scale` is σ of the residuals; None estimates it. Results do not depend on the number of threads.
     """
-    of_photo = photo.grey, photo.right, photo.down, photo.mask
-    matrix, target, *rest = _core.normal_equations(of_photo, _parts(shot), _lens(K), (gain, bias), scale)
+    matrix, target, *rest = _core.normal_equations(photo, shot, _lens(K), (gain, bias), scale)
     return Normal(np.array(matrix), np.array(target), *rest)
 
 
 def moves(shot: Shot, K: Float, xi: Float) -> float:
     """Return the root mean square motion, in pixels, of the valid pixels under ξ."""
-    return _core.flow(_parts(shot), _lens(K), xi.tolist())
-
-
-def _parts(shot: Shot) -> tuple[Float, Float, Mask]:
-    return shot.grey, shot.depth, shot.mask
+    return _core.flow(shot, _lens(K), xi.tolist())
 
 
 def _lens(K: Float) -> tuple[float, float, float, float]:

@@ -77,25 +77,21 @@ class RegisterConfig:
     alike: float = 10.0
 
     def __post_init__(self) -> None:
-        require("size", self.size, self.size >= 32, "at least 32 pixels")
-        require("align_size", self.align_size, self.align_size >= 32, "at least 32 pixels")
+        for name in ("size", "align_size"):
+            require(name, getattr(self, name), getattr(self, name) >= 32, "at least 32 pixels")
         require("refine", self.refine, self.refine in REFINEMENTS, f"one of {', '.join(REFINEMENTS)}")
-        require("coarsest", self.coarsest, self.coarsest >= 16, "at least 16 pixels")
-        require("iterations", self.iterations, self.iterations >= 1, "at least 1")
+        for name in ("coarsest", "pool_size"):
+            require(name, getattr(self, name), getattr(self, name) >= 16, "at least 16 pixels")
         require("still", self.still, self.still > 0, "a positive number of pixels")
-        require("accept", self.accept, 0 < self.accept <= 1, "a value in (0, 1]")
+        for name in ("accept", "ratio", "min_alpha", "min_overlap"):
+            require(name, getattr(self, name), 0 < getattr(self, name) <= 1, "a value in (0, 1]")
         require("doubt", self.doubt, 0 <= self.doubt <= 1, "a value in [0, 1]")
-        for name in ("passes", "features"):
+        for name in ("passes", "features", "iterations", "candidates"):
             require(name, getattr(self, name), getattr(self, name) >= 1, "at least 1")
-        require("ratio", self.ratio, 0 < self.ratio <= 1, "a value in (0, 1]")
         require("min_inliers", self.min_inliers, self.min_inliers >= 6, "at least 6")
         for name in _POSITIVE:
             require(name, getattr(self, name), getattr(self, name) > 0, "a positive number")
-        require("min_alpha", self.min_alpha, 0 < self.min_alpha <= 1, "a value in (0, 1]")
-        require("min_overlap", self.min_overlap, 0 < self.min_overlap <= 1, "a value in (0, 1]")
         require("window", self.window, self.window >= 3 and self.window % 2 == 1, "an odd number from 3 on")
-        require("candidates", self.candidates, self.candidates >= 1, "at least 1")
-        require("pool_size", self.pool_size, self.pool_size >= 16, "at least 16 pixels")
 
     def levels(self) -> list[int]:
         """Return longer sides in pixels, coarse to fine, halving `align_size` down to about `coarsest`.

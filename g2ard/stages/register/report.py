@@ -197,12 +197,11 @@ def summarize(
 
 def _accuracy(errors: Sequence[PoseError | None], true: int, metres: float | None) -> Accuracy:
     values = np.array([(e.position, e.rotation) for e in errors if e is not None]).reshape(-1, 2)
-    if not len(values):
-        none = () if metres is None else tuple(Recall(m, d, 0.0) for m, d in RECALLS)
-        return Accuracy(0, None, None, none)
     recalls = []
     for limit, degrees in RECALLS if metres is not None else ():
         within = (values[:, 0] * metres <= limit) & (values[:, 1] <= degrees)
         recalls.append(Recall(limit, degrees, int(within.sum()) / true))
-    median, worst = np.median(values, 0).tolist(), values.max(0).tolist()
-    return Accuracy(len(values), PoseError(*median), PoseError(*worst), tuple(recalls))
+    median = worst = None
+    if len(values):
+        median, worst = (PoseError(*found.tolist()) for found in (np.median(values, 0), values.max(0)))
+    return Accuracy(len(values), median, worst, tuple(recalls))

@@ -87,7 +87,7 @@ def flag(
     >>> float(flags[plane[:, 0] < 8].mean()), float(flags[plane[:, 0] > 12].mean())
     (0.0, 1.0)
     """
-    _check_budget(budget, None)
+    require("budget", budget, budget >= 1, "at least 1")
     scene, finite = finite_rows_of(splats)
     found = _core.simplify_flags(scene.core, budget, config.resolved("paper"), counter(progress, "flag"))
     flags = np.zeros(len(splats), bool)
@@ -155,9 +155,14 @@ def simplify(
     method = config.method if method is None else method
     require("method", repr(method), method in METHODS, f"one of {', '.join(METHODS)}")
     scene, finite = finite_rows_of(splats)
-    _check_budget(budget, len(scene))
+    require("budget", budget, budget >= 1, "at least 1")
+    require("budget", budget, budget <= len(scene), f"at most {len(scene)} (the scene's Gaussians)")
     if protected is not None:
-        protected = np.ascontiguousarray(_check_flags(protected, len(splats))[finite])
+        protected = np.asarray(protected)
+        fits = protected.dtype == np.bool_ and protected.shape == (len(splats),)
+        given = f"{protected.dtype} {protected.shape}"
+        require("protected", given, fits, f"bool of shape ({len(splats)},)")
+        protected = np.ascontiguousarray(protected[finite])
     if not (scene.opacities >= (config.resolved(method).min_opacity or 0.0)).any():
         scene, config = with_some_opacity(scene), replace(config, min_opacity=0.0)
     if config.keep_region and (method == "paper" or visibility is None):
@@ -190,20 +195,6 @@ def _paper(
         protected=protected,
         progress=counter(progress, "simplify"),
     )
-
-
-def _check_budget(budget: int, count: int | None) -> None:
-    require("budget", budget, budget >= 1, "at least 1")
-    require("budget", budget, count is None or budget <= count, f"at most {count} (the scene's Gaussians)")
-
-
-def _check_flags(protected: NDArray[np.bool_], count: int) -> NDArray[np.bool_]:
-    flags = np.asarray(protected)
-    if flags.dtype != np.bool_ or flags.shape != (count,):
-        raise InputError(
-            f"expected bool of shape ({count},), got {flags.dtype} {flags.shape}", parameter="protected"
-        )
-    return flags
 
 
 def _simplified(splats: Splats, finite: NDArray[np.bool_] | slice, out: dict[str, Any]) -> Simplified:
