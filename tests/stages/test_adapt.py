@@ -1,4 +1,4 @@
-"""Appearance refitted on frozen geometry."""
+"""Appearance refitted on frozen geometry: colours changed at once, and Gaussians that few views have seen."""
 
 import signal
 from dataclasses import replace
@@ -10,8 +10,11 @@ import pytest
 from g2ard import io
 from g2ard.errors import InputError
 from g2ard.pipeline.adapt import AdaptConfig, adapt
-from g2ard.scene.targets import TeacherRenders
+from g2ard.rendering.renderer import render
+from g2ard.scene.appearance import blended_appearance, colour_change, recoloured, views_seeing
+from g2ard.scene.targets import Subset, TeacherRenders
 from g2ard.stages.evaluate import evaluate
+from g2ard.stages.simplify import simplify
 from helpers.commands import CommandLine, refused, succeeds
 from helpers.scenes import around, checkered_ball
 
@@ -102,3 +105,91 @@ def test_command(command_line: CommandLine, tmp_path: Path) -> None:
     np.testing.assert_allclose(out.scales, start.scales, rtol=1e-6)
     assert np.abs(out.sh0 - start.sh0).max() > 0.1
     assert "out.ply" in refused(command_line, tmp_path, "adapt", "pale.ply", *options, status=1)
+
+
+BACKGROUND = (0.2, 0.3, 0.1)
+MATRIX = np.array([[0.8, 0.1, 0.0], [0.0, 0.7, 0.1], [0.05, 0.0, 0.9]])
+SHIFT = np.array([0.05, 0.0, 0.02])
+
+
+def evening(count: int = 800):  # type: ignore[no-untyped-def]
+    """A ball of many colours, and the same under another light."""
+    ball = checkered_ball(count)
+    colours = np.random.default_rng(3).uniform(-1, 1, ball.sh0.shape).astype(np.float32)
+    ball = replace(ball, sh0=colours, shN=0.1 * ball.shN)
+    matrix = MATRIX.astype(np.float32)
+    rest = (MATRIX.sum(1) * 0.5 + SHIFT - 0.5) / 0.28209479177387814
+    lit = replace(ball, sh0=ball.sh0 @ matrix.T + rest.astype(np.float32), shN=ball.shN @ matrix.T)
+    return ball, lit
+
+
+def test_a_change_of_light_is_found_and_made() -> None:
+    ball, lit = evening()
+    change = colour_change(ball, TeacherRenders(lit, VIEWS, background=BACKGROUND), BACKGROUND)
+    np.testing.assert_allclose(change.matrix, MATRIX, atol=0.02)
+    np.testing.assert_allclose(change.shift, SHIFT, atol=0.02)
+    assert change.gain > 15
+    moved = recoloured(ball, change)
+    for view in (0, 7):
+        got, want = (render(s, VIEWS[view], background=BACKGROUND).image for s in (moved, lit))
+        np.testing.assert_allclose(got, want, atol=0.02)
+
+
+def test_an_unchanged_light_gives_the_identity() -> None:
+    ball = checkered_ball(500)
+    change = colour_change(ball, TeacherRenders(ball, VIEWS), (0.0, 0.0, 0.0))
+    np.testing.assert_allclose(change.matrix, np.eye(3), atol=1e-6)
+    assert adapt(ball, TeacherRenders(ball, VIEWS), AdaptConfig(steps=5)).report.colour_change is None
+
+
+def test_masked_pixels_are_ignored(tmp_path: Path) -> None:
+    ball, lit = evening(500)
+
+    class HalfBlack(TeacherRenders):
+        def __getitem__(self, view: int):  # type: ignore[no-untyped-def]
+            return np.where(self.mask(view)[..., None], super().__getitem__(view), np.float32(0))
+
+        def mask(self, view: int):  # type: ignore[no-untyped-def]
+            height, width = int(self.cameras.heights[view]), int(self.cameras.widths[view])
+            return np.broadcast_to(np.arange(width) < width // 2, (height, width))
+
+    change = colour_change(ball, HalfBlack(lit, VIEWS), (0.0, 0.0, 0.0))
+    np.testing.assert_allclose(change.matrix, MATRIX, atol=0.03)
+
+
+def test_views_that_see_a_gaussian_are_counted() -> None:
+    ball = checkered_ball(800)
+    all_round, one = views_seeing(ball, VIEWS), views_seeing(ball, VIEWS.take([0]))
+    assert 0 <= one.min() <= one.max() < 1
+    assert all_round.max() > 4
+    eye = VIEWS.positions[0] / np.linalg.norm(VIEWS.positions[0])
+    facing = (ball.means @ eye) / np.linalg.norm(ball.means, axis=1)
+    assert one[facing > 0.8].mean() > 10 * one[facing < -0.2].mean()
+
+
+def test_a_blend_goes_its_share_of_the_way() -> None:
+    ball, lit = evening(50)
+    share = np.linspace(0, 1, 50)
+    mixed = blended_appearance(ball, lit, share)
+    np.testing.assert_array_equal(mixed.sh0[0], ball.sh0[0])
+    np.testing.assert_allclose(mixed.sh0[-1], lit.sh0[-1], atol=1e-6)
+    want = ball.shN + share[:, None, None] * (lit.shN - ball.shN)
+    np.testing.assert_allclose(mixed.shN, want, atol=1e-6)
+    np.testing.assert_array_equal(mixed.means, ball.means)
+
+
+def test_few_images_also_change_unseen_gaussians() -> None:
+    """Three photos of one side: the other side gets the light but no noise."""
+    ball, lit = evening(1500)
+    targets = TeacherRenders(lit, VIEWS)
+    facing = VIEWS.positions @ VIEWS.positions[0]
+    rows, others = np.argsort(-facing)[:3], Subset(targets, np.argsort(facing)[:6])
+    compact = simplify(ball, 300).splats  # of fewer the reduction's error hides the light's
+    psnr = {}
+    for prior_views in (0.0, 1.0):
+        config = AdaptConfig(steps=300, prior_views=prior_views)
+        done = adapt(compact, Subset(targets, rows), config)
+        psnr[prior_views] = evaluate(done.splats, others).psnr
+    assert psnr[1.0] > evaluate(compact, others).psnr + 2
+    assert psnr[1.0] > psnr[0.0] + 0.3
+    assert 0.3 < done.report.prior_share < 0.95

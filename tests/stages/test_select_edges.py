@@ -13,6 +13,7 @@ from g2ard.io import read_view_set, write_splats, write_views
 from g2ard.progress import plural
 from g2ard.scene.cameras import look_at
 from g2ard.scene.splats import Splats
+from g2ard.scene.transform import join
 from g2ard.stages.select import CoverageOptions, select
 from helpers.commands import CommandLine
 from helpers.scenes import around, checkered_ball, views_at
@@ -24,13 +25,7 @@ BALL = checkered_ball(800)
 
 def balls(count: int) -> Splats:
     """Balls along x, 50 apart."""
-    shift = 50 * np.repeat(np.arange(count), len(BALL))
-    return Splats.create(
-        np.tile(BALL.means, (count, 1)) + np.column_stack([shift, 0 * shift, 0 * shift]),
-        quats=np.tile(BALL.quats, (count, 1)),
-        scales=np.tile(BALL.scales, (count, 1)),
-        logit_opacities=np.tile(BALL.logit_opacities, count),
-    )
+    return join([replace(BALL, means=BALL.means + np.float32([50 * i, 0, 0])) for i in range(count)])
 
 
 @pytest.mark.parametrize("policy", MEASURING)
