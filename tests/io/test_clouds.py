@@ -28,12 +28,6 @@ def test_ply(tmp_path: Path, position: str, color: str, top: float) -> None:
     assert kind(path) == "points"
 
 
-def test_ply_keeps_map_coordinates(tmp_path: Path) -> None:
-    rows = np.c_[(FAR + 0.001)[None], [[1, 2, 3]]]
-    points = read_points(ply(tmp_path / "a.ply", columns("f8", "u1"), rows))
-    np.testing.assert_array_equal(points.positions, rows[:, :3])
-
-
 def test_ply_with_other_color_names(tmp_path: Path) -> None:
     names = ("diffuse_red", "diffuse_green", "diffuse_blue")
     rows = np.array([[0, 0, 0, 255, 0, 51.0]])

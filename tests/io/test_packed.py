@@ -12,7 +12,7 @@ from plyfile import PlyData, PlyElement
 from g2ard.errors import InputError, MissingDependencyError
 from g2ard.io import kind, read_scene, read_splats, write_splats
 from g2ard.io.sanitize import LOGIT_LIMIT
-from helpers.packed_files import compressed, parity, save_spz, truth
+from helpers.packed_files import compressed, save_spz, truth
 from helpers.realdata import real
 
 
@@ -56,13 +56,6 @@ def test_spz(tmp_path: Path, version: int, degree: int) -> None:
     np.testing.assert_allclose(found.shN, scene.shN, atol=0.5 / 128 + 1e-6)
     same = np.abs((found.quats * scene.quats).sum(1))
     assert same.min() > (0.99 if version == 2 else 0.99999)  # w is derived in version 2, coarse near 0
-
-
-def test_spz_flips_are_a_half_turn_about_x() -> None:
-    """Colour seen along d in our axes equals colour seen along (x, −y, −z) in SPZ's."""
-    from g2ard.io.spz import FLIPS
-
-    assert [parity(band, m) for band in (1, 2, 3) for m in range(-band, band + 1)] == FLIPS.tolist()
 
 
 def test_not_an_spz(tmp_path: Path) -> None:

@@ -106,7 +106,7 @@ def test_bad_transforms(tmp_path: Path, change: Callable[[dict[str, Any]], Any],
     ("content", "message"),
     [
         ("", "not JSON"),
-        ("[1]", "is a JSON list, but not"),
+        *((content, "is a JSON list, but not") for content in ("[1]", "[]", "[1, 2]", '[{"a": 1}]')),
         ("{}", "neither"),
         ('{"views": []}', "'format' is None"),
     ],
