@@ -4,17 +4,27 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from g2ard.config.choices import POOL_KINDS
-from g2ard.errors import InputError
+from g2ard.errors import InputError, require
 from g2ard.poses.numbers import middle, norms, strata
 from g2ard.poses.outside import plan_aerial, plan_orbit
 from g2ard.poses.sight import Lens, Poses, Survey
 from g2ard.poses.site import Site
-from g2ard.poses.within import is_room, plan_anywhere, plan_inside, plan_near, plan_sharp, plan_walk, reach_of
+from g2ard.poses.within import (
+    Reach,
+    is_room,
+    plan_anywhere,
+    plan_inside,
+    plan_near,
+    plan_sharp,
+    plan_walk,
+    reach_of,
+)
 from g2ard.progress import Progress, counter, silent
 from g2ard.scene.cameras import Camera, Cameras
 from g2ard.scene.splats import Splats
@@ -112,31 +122,20 @@ def plan_pool(
         InputError: as for `make_pool`.
     """
     lens = Lens(size, _FOV if fov is None else fov)
-    if count < 1:
-        raise InputError(f"expected at least 1 pose, got {count}", parameter="count")
-    if rows is not None and rows < 1:
-        raise InputError(f"expected at least 1, got {rows}", parameter="rows")
-    if kind not in POOL_KINDS:
-        raise InputError(f"expected one of {', '.join(POOL_KINDS)}, got {kind!r}", parameter="kind")
+    require("count", count, count >= 1, "at least 1 pose")
+    require("rows", rows, rows is None or rows >= 1, "at least 1")
+    require("kind", repr(kind), kind in POOL_KINDS, f"one of {', '.join(POOL_KINDS)}")
     progress("scene", 0, 1)
     site = Site.of(splats, up, rows, represents)
     progress("scene", 1, 1)
     survey = Survey(splats, represents, site, lens, seed, counter(progress, "poses"))
     if kind == "auto" and fov is None and is_room(survey):
         survey = replace(survey, lens=Lens(size, _FOV_WIDE))
-
-    def plan(count: int) -> tuple[Poses, list[str], str]:
-        if kind == "auto":
-            parts, why = _auto(survey, count)
-        else:
-            parts, why = {kind: _PLANNERS[kind](survey, count)}, "as requested"
-        return Poses.joined([*parts.values()]).take(slice(count)), [*parts], why
-
-    poses, used, why = plan(count)
+    poses, used, why = _planned(survey, kind, count)
     held = _held(survey, poses)
     wanted = round(count * max(1.0, min(grow, 1 / np.sqrt(held))))
     if len(poses) == count and wanted > _WORTH * count:
-        poses, used, why = plan(wanted)
+        poses, used, why = _planned(survey, kind, wanted)
     if len(poses) < count:
         raise InputError(
             f"{len(poses)} of {count} poses found a free place with a view ({kind}: {why}); "
@@ -144,23 +143,13 @@ def plan_pool(
             "or give views of the scene"
         )
     reach = reach_of(survey, poses)
-    far = poses, reach
+    more = partial(_more, survey, poses, reach)
     need = max(float(np.interp(reach[2].mean(), _COARSE, (0, 1))), 1 - held if for_weights else 0.0)
-    near_poses = plan_near(survey, *far, int(near * need * len(poses)), 1)
+    near_poses = plan_near(survey, poses, reach, int(near * need * len(poses)), 1)
     if len(near_poses):
         kept = np.linspace(0, len(poses) - 1, len(poses) - len(near_poses)).round().astype(int)
         poses, used = Poses.joined([poses.take(kept), near_poses]), [*used, "near"]
         reach = reach_of(survey, poses)
-
-    def more(kind: str, count: int) -> list[Camera]:
-        wide = replace(survey, lens=Lens(size, _FOV_WIDE))
-        if kind == "near":  # of the pool before any pose stepped nearer, and with another seed
-            views = survey.cameras(plan_near(survey, *far, count))
-        else:
-            found = plan_walk(wide, count, 3) if kind == "standing" else plan_anywhere(wide, count)
-            views = wide.cameras(found)
-        return [replace(view, name=view.name.replace("pose", kind)) for view in views]
-
     spread = max(float(np.ptp(poses.eyes, axis=0).max()), np.finfo(float).tiny)
     features = np.concatenate([poses.eyes / spread, poses.gazes / 4], axis=1)  # close for similar poses
     order = strata(features, HOLD_OUT, seed)
@@ -174,6 +163,26 @@ def plan_pool(
         held=held,
         more=more,
     )
+
+
+def _planned(survey: Survey, kind: str, count: int) -> tuple[Poses, list[str], str]:
+    """Return at most `count` poses of a kind, the kinds used, and the reasons."""
+    if kind == "auto":
+        parts, why = _auto(survey, count)
+    else:
+        parts, why = {kind: _PLANNERS[kind](survey, count)}, "as requested"
+    return Poses.joined([*parts.values()]).take(slice(count)), [*parts], why
+
+
+def _more(survey: Survey, poses: Poses, reach: Reach, kind: str, count: int) -> list[Camera]:
+    """Plan `Pool.more` views; near ones step from `poses`, with another seed than the pool's own."""
+    if kind == "near":
+        views = survey.cameras(plan_near(survey, poses, reach, count))
+    else:
+        wide = replace(survey, lens=Lens(survey.lens.size, _FOV_WIDE))
+        found = plan_walk(wide, count, 3) if kind == "standing" else plan_anywhere(wide, count)
+        views = wide.cameras(found)
+    return [replace(view, name=view.name.replace("pose", kind)) for view in views]
 
 
 def _auto(survey: Survey, count: int) -> tuple[dict[str, Poses], str]:
