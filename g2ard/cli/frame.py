@@ -124,6 +124,7 @@ class Run:
         self.json: str | None = common["json"]
         self.console = Console(quiet=common["quiet"])
         self.render_model: RenderModel | None = common.get("render_model")
+        self.only_checks = False  # end once the settings are checked
         self.noted = False  # whether a GPU failed
         self._adapter: str | None = None  # last adapter in use
         self.kept: list[str] = []  # what remains after Ctrl-C, for its message
@@ -154,6 +155,8 @@ class Run:
             if "recover.steps" in values and other in values:
                 flag = "--recovery-time" if "time" in other else f"--set {other}"
                 raise typer.BadParameter(f"--steps and {flag} exclude each other; give one")
+        if self.only_checks:
+            raise _Checked
         return values
 
     @contextmanager
@@ -336,6 +339,8 @@ def command(
             printing = shared_values.pop("print_config")
             run = Run(name, shared_values, dict(values), flags_of(ctx.command))
             if printing:
+                if run.config.get("set"):
+                    _check_settings(run, fn, values)
                 typer.echo(printed(ctx, {**values, **shared_values, **run.config}), nl=False)
                 return
             with interrupt.RaisesInterrupt():
@@ -356,6 +361,17 @@ def command(
 def _parameter(name: str, kind: Any, option: Any, default: Any = None) -> inspect.Parameter:
     annotation = Annotated[kind, option]
     return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
+
+
+class _Checked(Exception):
+    """Signal that settings are valid."""
+
+
+def _check_settings(run: Run, fn: Callable[..., None], options: dict[str, Any]) -> None:
+    """Check the values of --set without running the command."""
+    run.only_checks = True
+    with contextlib.suppress(_Checked):
+        fn(run, **options)
 
 
 def _execute(run: Run, fn: Callable[..., None], options: dict[str, Any], cuda: bool) -> None:

@@ -59,8 +59,13 @@ class Outputs:
             )
 
     def paths(self, total: int | None = None) -> list[Path]:
-        """Return the paths in the order of the budgets, or [] if they depend on an unknown `total`."""
-        if total is None and self._unknown():
+        """Return the paths in the order of the budgets.
+
+        Args:
+            total: Gaussians of the scene, by which ratios and counts convert into each other. If it is
+                unknown (None) and names depend on it, the result is [].
+        """
+        if total is None and self._needs_total():
             return []
         found = [Path(self._named(budget, total)) for budget in self._budgets]
         if len(set(found)) < len(found):
@@ -77,7 +82,8 @@ class Outputs:
                 check(path, budget)
                 self._checked.add(path)
 
-    def _unknown(self) -> bool:
+    def _needs_total(self) -> bool:
+        """Return whether a name holds the count of a ratio, or the ratio of a count."""
         by_ratio = self._budgets[0].ratio is not None
         return ("{count}" if by_ratio else "{ratio}") in self._pattern or (
             "{count}" in self._pattern and any(budget.count is None for budget in self._budgets)

@@ -250,12 +250,15 @@ def _finite(word: str) -> float:
 
 
 def _images_txt(path: Path) -> list[_Image]:
+    """Read images.txt: per image a line with its pose (wxyz and translation, camera from world), camera
+    and name, then a line with its points, which may be empty and is skipped.
+    """
     lines = text_lines(path)
-    while lines and not lines[0].strip():
+    while lines and not lines[0].strip():  # before the first image: would swap poses and points
         lines.pop(0)
     images = []
-    for i, line in enumerate(lines[::2]):  # every second line has the image's points and may be empty
-        if words := line.split(maxsplit=9):
+    for i, line in enumerate(lines[::2]):
+        if words := line.split(maxsplit=9):  # otherwise an empty line at the end of the file
             pose = tuple(number(path, "image", i, words, name, at, _finite) for name, at in _POSE_COLUMNS)
             camera = int(number(path, "image", i, words, "CAMERA_ID", 8))
             if len(words) < 10:

@@ -112,7 +112,7 @@ def run_background(path: str | Path) -> Colour | None:
 
 
 def find_views(scene: str | Path) -> Path | None:
-    """Return the cameras that a scene was trained with, for `read_view_set`, or None.
+    """Return the path of the cameras that a scene was trained with, for `read_view_set`, or None.
 
     Searched in this order:
 
@@ -124,6 +124,9 @@ def find_views(scene: str | Path) -> Path | None:
 
     Args:
         scene: a scene's file or folder; it need not exist.
+
+    Returns:
+        A file, or a folder of lists; relative if `scene` is.
     """
     from g2ard.io import gsplat_run, inria, nerfstudio, nerfstudio_export
 
@@ -139,10 +142,10 @@ def find_views(scene: str | Path) -> Path | None:
     ):
         found = own
     run = own.parent / gsplat_run.NAME
-    with suppress(InputError):
+    with suppress(InputError):  # a cfg.yml that cannot be read is some other program's
         if found is None and own.name == "ply" and gsplat_run.is_run(run):
             found = run
-    if found is None:  # a damaged file: its reader raises the error
+    if found is None:  # a cameras.json without cameras is damaged: its reader raises the error
         found = next((file for file in places if file.is_file()), None)
     return found if found is None or scene.is_absolute() else Path(os.path.relpath(found))
 

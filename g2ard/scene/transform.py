@@ -30,6 +30,9 @@ _PARITY = np.repeat(np.array([-1, 1, -1], np.float32), (3, 5, 7))
 def transform(splats: Splats, matrix: ArrayLike) -> Splats:
     """Apply x ↦ s·R·x + t to means, scales, rotations and harmonics.
 
+    World coordinates are means + `offset`: a shift far beyond the scene's extent goes into the float64
+    `offset`, since float32 means would lose their digits.
+
     Args:
         splats: the scene.
         matrix: (4, 4) row-major, a similarity: one scale s > 0, a rotation R, a translation t in scene units.
@@ -50,7 +53,8 @@ def transform(splats: Splats, matrix: ArrayLike) -> Splats:
     means = scale * splats.means.astype(np.float64) @ rotation.T
     offset = scale * splats.offset @ rotation.T
     extent = float(np.linalg.norm(np.ptp(means, axis=0))) if len(means) else 0.0
-    if splats.offset.any() or np.abs(shift).max() > _FAR * extent > 0:
+    far = 0 < _FAR * extent < np.abs(shift).max()  # an extent of 0 says nothing about the scene's size
+    if splats.offset.any() or far:
         offset = offset + shift
     else:
         means, offset = means + shift, np.zeros(3)

@@ -16,6 +16,9 @@ def test_a_config_file_is_written_and_read_by_flags_names(command_line: CommandL
     assert not (folder / "r5").exists()
     for line in ("ratio = [5, 10]", 'schedule = "fast"', "steps = 4", "background = [0.5, 0, 1]"):
         assert line in out
+    wrong = command_line(*ask, "--set", "steps=-3", "--print-config", cwd=folder)
+    assert wrong[0] == 2
+    assert "--set: steps: expected at least 1, got -3" in wrong[2]
     (folder / "c.toml").write_text(out)
     again = command_line("distill", "ball.ply", "--config", "c.toml", "--print-config", cwd=folder)
     assert again == (0, out, "")

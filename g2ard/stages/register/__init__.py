@@ -243,14 +243,28 @@ def _featured(search: Search, aligned: list[Candidate], photo: Photo) -> list[Ca
 
 
 def _reported(name: str, best: Candidate, config: RegisterConfig, renders: int) -> PhotoReport:
+    """Build the report of a photo's best candidate.
+
+    `sigma` is the standard deviation of position (scene units) and rotation (degrees), None without a
+    covariance; fields of feature matching keep their defaults after direct alignment alone.
+
+    Args:
+        name: the photo.
+        best: its best pose; rows and columns of the (6, 6) covariance are position, then rotation.
+        config: limits that decide between registered, uncertain and refused.
+        renders: number of renders that its search took.
+    """
     found = best.found
     sigma = None
     if found.covariance is not None:
-        position, rotation = (np.sqrt(np.trace(found.covariance[at, at])) for at in _HALVES)
+        position = np.sqrt(np.trace(found.covariance[:3, :3]))
+        rotation = np.sqrt(np.trace(found.covariance[3:, 3:]))
         sigma = PoseError(float(position), float(np.degrees(rotation)))
     status, reason = _status(best.zncc, sigma, found.depth, config)
     names = ("matches", "inliers", "spread", "reprojection", "passes")
-    of_features: dict[str, Any] = {name: getattr(best.solved, name) for name in names if best.solved}
+    of_features: dict[str, Any] = {}
+    if best.solved is not None:
+        of_features = {name: getattr(best.solved, name) for name in names}
     return PhotoReport(
         name=name,
         status=status,
@@ -267,9 +281,6 @@ def _reported(name: str, best: Candidate, config: RegisterConfig, renders: int) 
         renders=renders,
         camera_from_world=_rows(found.viewmat),
     )
-
-
-_HALVES = (slice(0, 3), slice(3, 6))
 
 
 def _status(
