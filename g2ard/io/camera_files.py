@@ -35,7 +35,8 @@ def view_format(path: Path, given: ViewFormat | None = None) -> ViewFormat:
     suffix, name = path.suffix.lower(), path.name.lower()
     if given is None and suffix == "":
         return "colmap"
-    if suffix != (".json" if given != "colmap" else ""):
+    expected = "" if given == "colmap" else ".json"
+    if suffix != expected:
         where = "a folder" if given == "colmap" else ".json, or as a folder for COLMAP"
         raise OutputError(f"views are written as {where}", path=path)
     if given is not None:

@@ -211,7 +211,11 @@ def listed(holder: Fields, key: str) -> Items:
 
 
 def names_of(holder: Fields, key: str, count: int) -> list[str]:
-    """Return the first `count` file names of a list."""
+    """Return the `count` file names that a format prescribes, from the list `holder[key]`.
+
+    Raises:
+        InputError: no list, too few items, or a name that is empty or not printable.
+    """
     value, found = holder[key], []
     if not isinstance(value, Items):
         raise holder.place.to(key).unexpected(value, "a list")

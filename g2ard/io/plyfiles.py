@@ -120,7 +120,11 @@ def comments_of(offset: NDArray[np.float64], render_model: RenderModel) -> list[
 
 
 def read_element(path: Path, header: PlyHeader, *names: str) -> list[NDArray[Any]]:
-    """Return the rows of elements, memory-mapped if the file is binary."""
+    """Return an array of rows per element name, memory-mapped if the file is binary.
+
+    Lists are first read as triangles, since lists of a known length can be mapped; if a polygon has another
+    number of corners, the file is read again, more slowly.
+    """
     from plyfile import PlyData, PlyElementParseError, PlyParseError
 
     size = path.stat().st_size
@@ -134,7 +138,7 @@ def read_element(path: Path, header: PlyHeader, *names: str) -> list[NDArray[Any
         except PlyElementParseError:
             if not triangles:
                 raise
-            ply = PlyData.read(path, mmap="r")  # polygons: slower
+            ply = PlyData.read(path, mmap="r")
     except PlyElementParseError as error:
         raise _parse_error(path, header, error) from error
     except (PlyParseError, ValueError, OSError, OverflowError, MemoryError) as error:
@@ -185,7 +189,10 @@ def row_blocks(
 
 
 def spread_rows(rows: NDArray[Any]) -> NDArray[Any]:
-    """Return about 100,000 evenly spaced rows, without loading the pages between them."""
+    """Return evenly spaced rows: 100,000 to 200,000 of them, or all if there are fewer.
+
+    A memory map of a file is read row by row, so that the pages between are not loaded.
+    """
     step = max(1, len(rows) // 100_000)
     if not isinstance(rows, np.memmap) or step == 1:
         return np.asarray(rows[::step])

@@ -71,9 +71,10 @@ def written_bytes(path: Path) -> int:
 
 
 def lost_in(path: str | Path, splats: Splats, **options: object) -> list[Note]:
-    """Return notes on what the format of an output path cannot hold."""
+    """Return notes on what the format of an output path cannot hold; `options` are the writer's."""
     found = scene_format(path)
-    if found.models or options.get("compress") == "spz" or not splats.antialiased:
+    states_model = found.models or options.get("compress") == "spz"  # SPZ inside a .glb has a flag for it
+    if states_model or not splats.antialiased:
         return []
     from g2ard.io.types import Note
 

@@ -129,7 +129,11 @@ def _gunzip(path: Path, data: bytes) -> bytes:
 
 
 def _sizes(path: Path, head: bytes) -> list[int]:
-    """Return the header's sizes of positions, alphas, colours, scales, rotations and harmonics, bytes."""
+    """Return the bytes of the unpacked positions, alphas, colours, scales, rotations and harmonics.
+
+    They follow from the header's count and SH degree: positions are 3 × 24 bits; a rotation is three bytes in
+    version 2, and three components of 10 bits with the index of the fourth since version 3.
+    """
     if head[:4] != _MAGIC:
         raise InputError(f"not an SPZ file (begins with {head[:4]!r})", path=path)
     if len(head) < _HEADER:

@@ -57,16 +57,20 @@ def files_of(folder: Path) -> dict[Path, str | None]:
 
 
 def _frames(path: Path, images: Path | None, split: str | None = None) -> list[Frame]:
+    """Read the frames of a transforms.json.
+
+    If it lists the names of its splits, these count (None for an unlisted frame), otherwise `split`.
+    """
     content = read_json(path)
     listed = content.get("frames")
     if not isinstance(listed, list) or not listed:
         raise InputError("no views found ('frames' is empty)", path=path)
     found = [_frame(path, i, content, frame, images) for i, frame in enumerate(listed)]
-    stated = _stated(path, content)
-    if not stated:
+    split_of = _stated(path, content)
+    if not split_of:
         return [frame._replace(split=split) for frame in found]
     names = [Path(str(frame.get("file_path"))).as_posix() for frame in listed]
-    return [frame._replace(split=stated.get(name)) for frame, name in zip(found, names, strict=True)]
+    return [frame._replace(split=split_of.get(name)) for frame, name in zip(found, names, strict=True)]
 
 
 def _stated(path: Path, content: dict[str, Any]) -> dict[str, str]:

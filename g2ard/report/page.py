@@ -69,7 +69,7 @@ def _span(start: float, extent: float, size: int) -> slice:
 
 
 def worst_windows(image: NDArray[np.uint8], target: NDArray[np.uint8]) -> list[Window]:
-    """Return the windows with the largest error, worst first, without overlaps.
+    """Return the windows with the largest error, worst first, in shares of the image's size.
 
     >>> target = np.zeros((100, 100, 3), np.uint8)
     >>> image = target.copy()
@@ -89,6 +89,7 @@ def worst_windows(image: NDArray[np.uint8], target: NDArray[np.uint8]) -> list[W
     while len(found) < _CROPS and sums.max() >= 0:
         top, left = (int(k) for k in np.unravel_index(int(np.argmax(sums)), sums.shape))
         found.append(Window(left / width, top / height, columns / width, rows / height))
+        # No later window may overlap this one.
         sums[max(0, top - rows + 1) : top + rows, max(0, left - columns + 1) : left + columns] = -1
     return found
 

@@ -128,6 +128,7 @@ def _show(run: Run, title: str, rows: list[list[str]]) -> None:
 
 
 def _rows(figures: dict[str, Any]) -> list[list[str]]:
+    """Return the (label, text) rows of a table of what `describe` found; keys depend on the kind of file."""
     unit = {"splats": "Gaussians", "points": "points", "views": "views"}[figures["kind"]]
     rows = [["format", figures["format"]], [unit, f"{figures['count']:,}"], ["size", _size(figures["bytes"])]]
     if figures["kind"] == "splats":

@@ -249,8 +249,8 @@ class Loop:
 
     @property
     def regularizers(self) -> dict[str, float]:
-        """Number of regularised steps, their share of the time beyond plain steps, and their period (0 if
-        inactive)."""
+        """Number of regularised steps, the share of all steps' time that regularising them added, and their
+        period in steps (0 if inactive)."""
         (plain, plain_seconds), (regularized, regularized_seconds) = self.tally
         extra = regularized_seconds - regularized * plain_seconds / plain if plain and regularized else 0.0
         weights = self.config.regularizers

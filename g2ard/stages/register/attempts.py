@@ -129,7 +129,12 @@ class Search:
         return None if solved is None else self._refined(start, solved, photo)
 
     def by_matches(self, pose: Float, photo: Photo, passes: int) -> Solved | None:
-        """Match and solve PnP only; return None like `by_features`."""
+        """Match a photo with up to `passes` renders, the first from `pose` (4 × 4, camera from world), and
+        solve PnP.
+
+        Returns:
+            The pose with its matches; None without a matcher or with fewer than `min_inliers` inliers.
+        """
         if self.match is None:
             return None
         found = solve(
