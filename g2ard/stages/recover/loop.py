@@ -82,8 +82,8 @@ class Loop:
 
     @cached_property
     def key(self) -> str:
-        """Fingerprint that a checkpoint must have; computed only with a checkpoint."""
-        parts = [repr(self.config), self.student.fingerprint(), fingerprint_of(self.targets)]
+        """Fingerprint of inputs and contents that a checkpoint must have; computed only with one."""
+        parts = [repr(_STATE), repr(self.config), self.student.fingerprint(), fingerprint_of(self.targets)]
         if self.weights is not None:
             parts.append(repr(self.weights.tolist()))
         if self.validation_key is not None:
