@@ -25,7 +25,7 @@ _VIEWS = 3
 _METHODS = ("method", "variant", "arm", "format", "matcher", "isa")
 """Columns that name what a kind of study compares."""
 _MARKS = {"steps": "●", "seconds": "◍", "released": "○"}
-"""How a cell is matched → the mark of its dot in legends."""
+"""Marks of the dots in legends, by the way a cell is matched."""
 
 
 def write_report(folder: Path, studies: Sequence[Study], rows: Sequence[Row]) -> None:

@@ -220,7 +220,7 @@ def _names(content: dict[str, Any], key: str, pattern: re.Pattern[str]) -> list[
 
 
 def read_object(file: Path) -> dict[str, Any]:
-    """Return the JSON object in a file; an empty one if there is none."""
+    """Return a file's JSON object, or {} if the file is missing or holds something else."""
     try:
         content = json.loads(file.read_text(encoding="utf-8"))
     except (OSError, ValueError):
