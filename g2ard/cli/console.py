@@ -92,7 +92,7 @@ class Console:
             self._bars = Progress(
                 TextColumn("{task.description:<12}"),
                 BarColumn(),
-                TextColumn("{task.completed:.0f}/{task.total:.0f}"),
+                TextColumn("{task.fields[count]}"),
                 TimeElapsedColumn(table_column=whole()),
                 TextColumn("ETA"),
                 TimeRemainingColumn(table_column=whole()),
@@ -100,9 +100,11 @@ class Console:
                 console=Rich(stderr=True),
             )
             self._bars.start()
+        count = f"{done}/{total}" if total else f"{done}"  # a format of the column would meet a total of None
         if stage not in self._tasks:
-            self._tasks[stage] = self._bars.add_task(stage, total=total or None, figures="")
-        self._bars.update(self._tasks[stage], completed=done, total=total or None, figures=figures)
+            self._tasks[stage] = self._bars.add_task(stage, total=total or None, figures="", count="")
+        task = self._tasks[stage]
+        self._bars.update(task, completed=done, total=total or None, figures=figures, count=count)
 
     def _print(self, stage: str, done: int, total: int, figures: str) -> None:
         now = time.monotonic()
