@@ -19,7 +19,7 @@ from g2ard.io.paths import real_path
 from g2ard.io.photos import inverse
 from g2ard.io.transforms import FLIP
 from g2ard.progress import plural
-from g2ard.scene.cameras import Cameras
+from g2ard.scene.cameras import USUAL, Cameras
 from g2ard.scene.transform import quaternion_of
 
 _OFF_CENTRE = 0.5
@@ -63,6 +63,8 @@ def lost_views(
         lost.append(f"{what} of {plural(int(bent.sum()), 'view')}")
     if format != "nerfstudio" and any(word not in (None, "train") for word in splits):
         lost.append("splits")
+    kinds = sum(kind != USUAL for kind in cameras.kinds)
+    lost += [f"kinds of {plural(kinds, 'view')}"] if kinds else []
     return lost + (["sampling weights"] if weighted else [])
 
 

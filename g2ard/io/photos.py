@@ -16,7 +16,7 @@ from g2ard.io.jsonfile import Place
 from g2ard.io.limits import opened_image
 from g2ard.io.types import Note, ViewSet
 from g2ard.progress import plural
-from g2ard.scene.cameras import Cameras
+from g2ard.scene.cameras import USUAL, Cameras
 from g2ard.scene.transform import rotation_matrices
 
 ASPECT_SLACK = 0.02
@@ -52,6 +52,7 @@ class Frame(NamedTuple):
     split: str | None = None
     weight: float | None = None
     mask: Path | None = None
+    kind: str = USUAL
 
 
 def find_photo(path: Path) -> Path:
@@ -113,6 +114,7 @@ def _cameras(path: Path, frames: Sequence[Frame]) -> Cameras:
             [f.photo for f in frames],
             [f.lens.distortion for f in frames],
             [_mask(f) for f in frames],
+            [f.kind for f in frames],
         )
     except InputError as error:
         raise error.at(path=path) from error

@@ -17,7 +17,7 @@ from g2ard.io.camera_files import beside
 from g2ard.io.photos import Frame, Lens, rigid, view_set
 from g2ard.io.types import ViewSet
 from g2ard.progress import plural
-from g2ard.scene.cameras import Cameras
+from g2ard.scene.cameras import USUAL, Cameras
 
 _FORMAT = "g2ard-views"
 _VERSION = 1
@@ -53,6 +53,7 @@ def _frame(path: Path, index: int, entry: Any, images: Path | None) -> Frame:
         mask=None if mask is None else path.parent / mask,
         split=jsonfile.optional_text(view, "split"),
         weight=weight,
+        kind=jsonfile.optional_text(view, "kind") or USUAL,
     )
 
 
@@ -93,6 +94,7 @@ def write(
             "mask": beside(cameras.mask_paths[i], path),
             "split": parts[i],
             "weight": drawn[i],
+            "kind": None if cameras.kinds[i] == USUAL else cameras.kinds[i],
         }
         lines.append(json.dumps({key: value for key, value in view.items() if value is not None}))
     head = f'{{"format": "{_FORMAT}", "version": {_VERSION}, "views": [\n'

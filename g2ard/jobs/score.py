@@ -13,8 +13,8 @@ from g2ard.pipeline import Distilled
 from g2ard.progress import Progress
 from g2ard.rendering.visibility import overdraw
 from g2ard.report.kinds import KindScore, by_kind
+from g2ard.scene.cameras import USUAL
 from g2ard.scene.splats import Splats
-from g2ard.scene.splits import USUAL
 from g2ard.scene.targets import Targets
 from g2ard.stages.evaluate import evaluate
 

@@ -16,9 +16,9 @@ from g2ard.io import ViewSet
 from g2ard.jobs.inputs import Views, drop_held_out, load_view_sets, load_views
 from g2ard.jobs.view_checks import as_pool, check_sight, found_views, warn_of_sight
 from g2ard.progress import Progress, Say, silent, unsaid
-from g2ard.scene.cameras import Cameras
+from g2ard.scene.cameras import USUAL, Cameras, rows_by_kind
 from g2ard.scene.splats import Splats
-from g2ard.scene.splits import USUAL, for_scores, for_training, rows_by_kind, split_mask, splits_of
+from g2ard.scene.splits import for_scores, for_training, split_mask, splits_of
 
 if TYPE_CHECKING:
     from g2ard.jobs.distill_options import DistillOptions
@@ -152,7 +152,7 @@ def _generated(
         Cameras.of([*train.cameras, *test]),
         splits=("train",) * len(train.cameras) + ("test",) * len(test),
     )
-    say(f"poses: {_of(planned, pool.cameras.names)}")
+    say(f"poses: {_of(planned, pool.cameras)}")
     train, test = train.resized(size), test.resized(size)
     if held_out is not None:
         train, test = drop_held_out(train, held_out, say), held_out
@@ -224,15 +224,15 @@ def views_or_pool(
         planned = _planned(scene, _POOL, up=up, seed=seed, progress=progress, grow=_GROW)
     else:
         planned = plan_pool(scene, count, up=up, seed=seed, rows=_ROWS, progress=progress)
-    say(f"poses: {_of(planned, planned.cameras.names)}")
+    say(f"poses: {_of(planned, planned.cameras)}")
     return ViewSet(planned.cameras, splits=splits_of(None, planned.cameras.names))
 
 
-def _of(pool: Pool, names: Sequence[str]) -> str:
+def _of(pool: Pool, cameras: Cameras) -> str:
     """Describe a pool, and views of further kinds, briefly."""
-    kinds = [pool.kind, *(kind for kind in rows_by_kind(names) if kind != USUAL)]
+    kinds = [pool.kind, *(kind for kind in rows_by_kind(cameras.kinds) if kind != USUAL)]
     guess = "; the up direction is a guess" if "guess" in pool.why else ""
-    return f"{len(names)}, {' + '.join(kinds)}{guess}"
+    return f"{len(cameras)}, {' + '.join(kinds)}{guess}"
 
 
 def cameras_for_weights(

@@ -182,7 +182,7 @@ def _more(survey: Survey, poses: Poses, reach: Reach, kind: str, count: int) -> 
         wide = replace(survey, lens=Lens(survey.lens.size, _FOV_WIDE))
         found = plan_walk(wide, count, 3) if kind == "standing" else plan_anywhere(wide, count)
         views = wide.cameras(found)
-    return [replace(view, name=view.name.replace("pose", kind)) for view in views]
+    return [replace(view, name=view.name.replace("pose", kind), kind=kind) for view in views]
 
 
 def _auto(survey: Survey, count: int) -> tuple[dict[str, Poses], str]:

@@ -16,7 +16,6 @@ from g2ard.rendering.renderer import RasterSettings, arrays_of, centred, setting
 from g2ard.scene.cameras import Cameras, evenly_spaced
 from g2ard.scene.prepared import as_prepared
 from g2ard.scene.splats import Splats
-from g2ard.scene.splits import usual_rows
 
 MOST_VIEWS, LONGEST = 96, 300
 """Largest number of views per scene or tile, and the longer side of their renders in pixels."""
@@ -135,7 +134,7 @@ def visibility_source(
         scene → `SampledVisibility`. The scene's arrays are C-contiguous and float32, except its means. A
         `g2ard.scene.prepared.PreparedScene` is not sorted again.
     """
-    return _Sampler(cameras.take(usual_rows(cameras.names)), longest, progress)
+    return _Sampler(cameras.usual(), longest, progress)
 
 
 class _Sampler:

@@ -16,9 +16,9 @@ from g2ard.rendering.metrics import psnr
 from g2ard.rendering.renderer import Renderer
 from g2ard.report.kinds import COLUMNS, KindScore, cells
 from g2ard.report.page import Comparison, Page, Shown
+from g2ard.scene.cameras import USUAL, rows_by_kind
 from g2ard.scene.images import contact_sheet, to_bytes, write_png
 from g2ard.scene.splats import Splats
-from g2ard.scene.splits import rows_by_kind
 from g2ard.scene.targets import Targets
 
 _SHOWN = 3
@@ -105,8 +105,8 @@ def verdict(report: dict[str, Any]) -> str:
 
 def _worst(scores: Sequence[dict[str, Any]]) -> list[int]:
     """Choose the views to show: the worst of each kind in turn, weakest kind first."""
-    names = [view["name"] for view in scores]
-    kinds = [sorted(rows, key=lambda row: scores[row]["psnr"]) for rows in rows_by_kind(names).values()]
+    found = rows_by_kind([view.get("kind", USUAL) for view in scores])
+    kinds = [sorted(rows, key=lambda row: scores[row]["psnr"]) for rows in found.values()]
     kinds.sort(key=lambda rows: fmean(scores[row]["psnr"] for row in rows))
     return [row for turn in zip_longest(*kinds) for row in turn if row is not None][:_SHOWN]
 

@@ -8,7 +8,7 @@ from statistics import fmean
 from typing import Any
 
 from g2ard.report.base import Report
-from g2ard.scene.splits import USUAL, rows_by_kind
+from g2ard.scene.cameras import USUAL, rows_by_kind
 
 _LOST = 0.05
 """Loss of a view in dB that counts."""
@@ -32,8 +32,8 @@ class KindScore(Report):
     """Scores in the views of one kind, none of them used for training.
 
     Args:
-        kind: far, middle, near, standing or anywhere; `usual` for other generated views, `given` for the
-            user's.
+        kind: near, standing, anywhere or another kind that views state; otherwise `usual` for generated
+            views and `given` for the user's.
         views: number of views.
         psnr: mean PSNR, dB.
         ssim: mean SSIM; None for a scene in tiles.
@@ -57,17 +57,16 @@ def by_kind(
     """Summarise scores by kind of view.
 
     Args:
-        before: `name`, `psnr` and, unless the scene is in tiles, `ssim` of each view with the simplified
-            scene.
+        before: `name`, `kind` unless usual, `psnr` and, unless the scene is in tiles, `ssim` of each view
+            with the simplified scene.
         after: the same with the recovered scene.
-        usual: name of the kind of views whose name states none.
+        usual: name for the usual kind.
 
-    >>> view = {"name": "near_0000", "psnr": 30.0, "ssim": 0.9}
+    >>> view = {"name": "near_0000", "kind": "near", "psnr": 30.0, "ssim": 0.9}
     >>> found, = by_kind([view], [view | {"psnr": 31.0}])
     >>> found.kind, found.psnr.gain, found.worst
     ('near', 1.0, 'near_0000')
     """
-    names = [view["name"] for view in after]
 
     def changes(score: str, rows: Sequence[int]) -> list[Change]:
         return [Change(before[row][score], after[row][score]) for row in rows]
@@ -76,7 +75,7 @@ def by_kind(
         return Change(fmean(change.before for change in found), fmean(change.after for change in found))
 
     scores = []
-    for kind, rows in rows_by_kind(names).items():
+    for kind, rows in rows_by_kind([view.get("kind", USUAL) for view in after]).items():
         psnr = changes("psnr", rows)
         worst = min(range(len(rows)), key=lambda i: psnr[i].after)
         scores.append(
@@ -85,7 +84,7 @@ def by_kind(
                 len(rows),
                 mean(psnr),
                 mean(changes("ssim", rows)) if "ssim" in after[rows[0]] else None,
-                names[rows[worst]],
+                after[rows[worst]]["name"],
                 psnr[worst],
                 sum(change.gain < -_LOST for change in psnr),
             )

@@ -14,6 +14,9 @@ from g2ard.errors import InputError, require
 from g2ard.io.limits import check_image
 from g2ard.progress import plural
 
+USUAL = "usual"
+"""Kind of views that state none: given views, and the poses that suit the scene."""
+
 _LARGEST = 1e12
 """Largest value of poses and intrinsics; larger ones are damaged data and overflow when squared."""
 
@@ -22,7 +25,7 @@ _MEDIAN_OF = 16
 
 _SHAPES = {"viewmats": (4, 4), "Ks": (3, 3), "widths": (), "heights": (), "distortions": (5,)}
 """Arrays of `Cameras` and their shapes per view."""
-_TUPLES = ("names", "image_paths", "mask_paths")
+_TUPLES = ("names", "image_paths", "mask_paths", "kinds")
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,6 +41,7 @@ class Camera:
         image_path: the photo, or None.
         mask_path: mask of its valid pixels; None if all are.
         distortion: (5,) float64, OpenCV k1 k2 p1 p2 k3 of the photo.
+        kind: kind of view, see `Cameras`.
 
     Shapes and values are checked by `Cameras`.
 
@@ -54,6 +58,7 @@ class Camera:
     image_path: Path | None = None
     mask_path: Path | None = None
     distortion: NDArray[np.float64] = field(default_factory=lambda: np.zeros(5))
+    kind: str = USUAL
 
     @classmethod
     def facing(
@@ -107,6 +112,8 @@ class Cameras:
         distortions: (C, 5) float64, OpenCV k1 k2 p1 p2 k3 of the *photo*; `g2ard.scene.images` undistorts on
             loading, to these Ks. Zero for a pinhole photo.
         source: the file or folder that lists the views, for messages; None for views created in memory.
+        kinds: C kinds of views, such as "near" or "anywhere"; () for "usual" ones. Simplification uses usual
+            views alone, as does the number of recovery steps. Validation and reports score each kind apart.
 
     Raises:
         InputError: mismatched shapes, a non-finite pose, an empty image, or one of more than 160 million
@@ -122,6 +129,7 @@ class Cameras:
     distortions: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 5)))
     mask_paths: tuple[Path | None, ...] = ()
     source: Path | None = None
+    kinds: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         n = len(self.viewmats)
@@ -129,6 +137,8 @@ class Cameras:
             object.__setattr__(self, "image_paths", (None,) * n)
         if not self.mask_paths:
             object.__setattr__(self, "mask_paths", (None,) * n)
+        if not self.kinds:
+            object.__setattr__(self, "kinds", (USUAL,) * n)
         if not len(self.distortions):
             object.__setattr__(self, "distortions", np.zeros((n, 5)))
         for name, shape in _SHAPES.items():
@@ -169,6 +179,7 @@ class Cameras:
             self.image_paths[i],
             self.mask_paths[i],
             self.distortions[i],
+            self.kinds[i],
         )
 
     def __iter__(self) -> Iterator[Camera]:
@@ -191,6 +202,7 @@ class Cameras:
             [v.image_path for v in found],
             [v.distortion for v in found],
             [v.mask_path for v in found],
+            [v.kind for v in found],
         )
 
     @property
@@ -222,6 +234,10 @@ class Cameras:
         arrays: dict[str, Any] = {name: getattr(self, name)[rows] for name in _SHAPES}
         tuples: dict[str, Any] = {name: tuple(getattr(self, name)[i] for i in rows) for name in _TUPLES}
         return replace(self, **arrays, **tuples)
+
+    def usual(self) -> Cameras:
+        """Return the views of the usual kind; all views if there are no others."""
+        return self.take(rows_by_kind(self.kinds).get(USUAL, range(len(self))))
 
     def resized(self, longest: int | None) -> Cameras:
         """Return the views with their longer side shrunk to at most `longest` pixels (None keeps them)."""
@@ -275,6 +291,7 @@ class Cameras:
         image_paths: Sequence[Path | None] = (),
         distortions: Sequence[Any] = (),
         mask_paths: Sequence[Path | None] = (),
+        kinds: Sequence[str] = (),
     ) -> Cameras:
         """Stack per-view lists; `sizes` holds (width, height)."""
         n = len(viewmats)
@@ -289,7 +306,18 @@ class Cameras:
             image_paths=tuple(image_paths),
             distortions=np.asarray(distortions, np.float64).reshape(-1, 5),
             mask_paths=tuple(mask_paths),
+            kinds=tuple(kinds),
         )
+
+
+def rows_by_kind(kinds: Sequence[str]) -> dict[str, list[int]]:
+    """Return the indices of the views of each kind: usual ones first, others in order of appearance.
+
+    >>> rows_by_kind(["near", "usual", "near"])
+    {'usual': [1], 'near': [0, 2]}
+    """
+    rows = {kind: [i for i, found in enumerate(kinds) if found == kind] for kind in (USUAL, *kinds)}
+    return {kind: found for kind, found in rows.items() if found}
 
 
 def evenly_spaced(count: int, most: int) -> list[int]:

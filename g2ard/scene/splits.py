@@ -17,41 +17,6 @@ from g2ard.scene.cameras import Cameras
 HOLD_OUT = 8
 """Without a split file every 8th name is in the test split, as in Mip-NeRF 360's and INRIA's evaluations."""
 
-USUAL = "usual"
-"""Kind of a view whose name states none: given views, and the poses that suit the scene."""
-
-_KINDS = ("far", "middle", "near", "standing", "anywhere")
-
-
-def kind_of(name: str) -> str:
-    """Return the kind of view that a name states.
-
-    >>> kind_of("pose_0007_anywhere"), kind_of("near_0007"), kind_of("IMG_7.jpg")
-    ('anywhere', 'near', 'usual')
-    """
-    return next((kind for kind in _KINDS if kind in name.split("_")), USUAL)
-
-
-def rows_by_kind(names: Sequence[str]) -> dict[str, list[int]]:
-    """Return the indices of the views of each kind, in a fixed order of kinds.
-
-    >>> rows_by_kind(["near_0", "a.jpg", "near_1"])
-    {'usual': [1], 'near': [0, 2]}
-    """
-    kinds = [kind_of(name) for name in names]
-    rows = {kind: [i for i, found in enumerate(kinds) if found == kind] for kind in (USUAL, *_KINDS)}
-    return {kind: found for kind, found in rows.items() if found}
-
-
-def usual_rows(names: Sequence[str]) -> list[int]:
-    """Return the indices of the views whose names state no kind; of all if there are no others.
-
-    >>> usual_rows(["pose_0", "anywhere_0"]), usual_rows(["anywhere_0"])
-    ([0], [0])
-    """
-    rows = [i for i, name in enumerate(names) if kind_of(name) == USUAL]
-    return rows or list(range(len(names)))
-
 
 def split_mask(
     views: str | Path | None, names: Sequence[str], which: str, *, stated: Sequence[str | None] = ()

@@ -60,9 +60,9 @@ def kinds_told(photos: int, renders: int) -> str:
 
 
 def fingerprint_of(targets: Targets) -> str:
-    """Return a hash of the views, their names and the source of their images, for checkpoints."""
+    """Return a hash of the views, their kinds and the source of their images, for checkpoints."""
     cameras = targets.cameras
-    digest = hashlib.sha256(f"{_source(targets)} {cameras.names}".encode())
+    digest = hashlib.sha256(f"{_source(targets)} {cameras.kinds}".encode())
     for array in (cameras.viewmats, cameras.Ks, cameras.widths, cameras.heights):
         digest.update(np.ascontiguousarray(array).tobytes())
     return digest.hexdigest()

@@ -13,6 +13,7 @@ from g2ard.progress import Progress, plural, silent
 from g2ard.rendering.lpips import Lpips
 from g2ard.rendering.metrics import psnr, ssim
 from g2ard.rendering.renderer import RasterSettings, Renderer
+from g2ard.scene.cameras import USUAL
 from g2ard.scene.images import as_saved
 from g2ard.scene.splats import Splats
 from g2ard.scene.targets import Targets, against_of, mask_of
@@ -22,7 +23,7 @@ from g2ard.scene.targets import Targets, against_of, mask_of
 class ViewScore:
     """Scores of one view: PSNR in dB, SSIM in [−1, 1], LPIPS by network (empty without weights).
 
-    `against` is "photo" or "teacher" if the targets say so.
+    `against` is "photo" or "teacher" if the targets say so, `kind` the kind of view (`Cameras.kinds`).
     """
 
     name: str
@@ -30,6 +31,7 @@ class ViewScore:
     ssim: float
     lpips: Mapping[str, float] = field(default_factory=dict)
     against: str | None = None
+    kind: str = USUAL
 
 
 @dataclass(frozen=True)
@@ -76,6 +78,7 @@ class Evaluation:
             "views": [
                 {"name": v.name, "psnr": v.psnr, "ssim": v.ssim}
                 | ({"against": v.against} if v.against else {})
+                | ({"kind": v.kind} if v.kind != USUAL else {})
                 for v in self.views
             ],
         }
@@ -125,6 +128,6 @@ def evaluate(
         perceived = {net: model(image, target) for net, model in (lpips or {}).items()}
         mask = mask_of(targets, view)
         figures = psnr(image, target, mask), ssim(image, target, mask)
-        scores.append(ViewScore(name, *figures, perceived, against_of(targets, view)))
+        scores.append(ViewScore(name, *figures, perceived, against_of(targets, view), cameras.kinds[view]))
         progress(stage, view + 1, len(cameras))
     return Evaluation(len(splats), splats.nbytes, tuple(scores))

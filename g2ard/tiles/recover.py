@@ -14,10 +14,9 @@ from g2ard.config.paths import changed, values_of
 from g2ard.jobs.views import RunViews
 from g2ard.rendering.renderer import RasterSettings, Renderer, settings_for
 from g2ard.report.kinds import KindScore, by_kind
-from g2ard.scene.cameras import Cameras
+from g2ard.scene.cameras import USUAL, Cameras
 from g2ard.scene.prepared import PreparedScene
 from g2ard.scene.splats import SH_C0, Splats
-from g2ard.scene.splits import USUAL
 from g2ard.scene.targets import TeacherRenders
 from g2ard.scene.transform import join
 from g2ard.stages.recover import RecoverConfig, recover
@@ -250,10 +249,10 @@ def recover_tiles(
         for tile, lost, steps in zip(student.tiles, errors, taken, strict=True)
     )
     lost = np.sum(errors, axis=0)
-    shown = [(name, *_psnr(lost[:, i])) for i, name in enumerate(views.test.names) if lost[0, i, 1]]
+    shown = [(camera, *_psnr(lost[:, i])) for i, camera in enumerate(views.test) if lost[0, i, 1]]
     kinds = by_kind(
-        [{"name": name, "psnr": before} for name, before, _ in shown],
-        [{"name": name, "psnr": after} for name, _, after in shown],
+        [{"name": view.name, "kind": view.kind, "psnr": before} for view, before, _ in shown],
+        [{"name": view.name, "kind": view.kind, "psnr": after} for view, _, after in shown],
         USUAL if views.pool is not None else "given",
     )
     pixels = int(lost[0, :, 1].sum()) // 3

@@ -12,8 +12,7 @@ from g2ard.jobs.distill_options import DistillOptions
 from g2ard.jobs.views import views_of
 from g2ard.poses import plan_pool
 from g2ard.rendering.visibility import visibility_source
-from g2ard.scene.cameras import Cameras
-from g2ard.scene.splits import rows_by_kind
+from g2ard.scene.cameras import Cameras, rows_by_kind
 from helpers.commands import CommandLine, refused, succeeds
 from reference import poses as naive
 
@@ -57,7 +56,7 @@ def test_views_are_made_where_none_are_given(command_line: CommandLine, folder: 
 )
 def test_views_of_other_kinds_join_the_usual_ones(make, focus: str | None, kinds: set[str]) -> None:
     views = views_of(make(), DistillOptions(views="made", settings={"focus": focus}))
-    rows = rows_by_kind(views.train.cameras.names)
+    rows = rows_by_kind(views.train.cameras.kinds)
     assert set(rows) == kinds
     share = {kind: len(found) / len(views.train.cameras) for kind, found in rows.items()}
     if focus is None:
@@ -65,9 +64,9 @@ def test_views_of_other_kinds_join_the_usual_ones(make, focus: str | None, kinds
     elif focus != "far":
         assert share[focus] == pytest.approx(0.5, abs=0.02)
     assert all(views.train.cameras.widths[rows.get("anywhere", [])] == (800 if focus == "anywhere" else 400))
-    assert set(rows_by_kind(views.test.names)) == {"usual"}
+    assert set(views.test.kinds) == {"usual"}
     assert views.apart is not None
-    assert set(rows_by_kind(views.apart.names)) == {"near"} | kinds - {"usual"}
+    assert set(views.apart.kinds) == {"near"} | kinds - {"usual"}
     assert not set(views.apart.names) & set(views.train.cameras.names)
     assert views.pool is not None
     assert len(views.pool.cameras) == len(views.train.cameras) + len(views.test)
@@ -90,5 +89,5 @@ def test_given_views_stay_first(tmp_path: Path) -> None:
     ]
     plain, mixed = (found.train.cameras for found in views)
     assert mixed.names[: len(plain)] == plain.names
-    assert set(rows_by_kind(mixed.names[len(plain) :])) == {"anywhere"}
+    assert set(mixed.kinds[len(plain) :]) == {"anywhere"}
     assert len(mixed) - len(plain) == round(len(plain) / 3)

@@ -13,7 +13,6 @@ from g2ard.config.paths import changed
 from g2ard.errors import InputError
 from g2ard.io import read_splats, write_splats
 from g2ard.pipeline import DistillConfig, SelectConfig, distill
-from g2ard.scene.splits import kind_of
 from g2ard.scene.targets import Targets, TeacherRenders
 from g2ard.stages.recover import RecoverConfig
 from g2ard.stages.recover.schedule import PAPER, TUNED
@@ -70,14 +69,13 @@ def test_command_on_a_trained_scene(command_line: CommandLine, tmp_path: Path) -
     assert report["scores"]["recovered"]["psnr"] > report["scores"]["simplified"]["psnr"]
     assert report["against"] == "teacher renders"
     apart = report["apart"]
-    assert {kind_of(view["name"]) for view in apart["recovered"]["views"]} == {"near"}
+    assert {view["kind"] for view in apart["recovered"]["views"]} == {"near"}
     assert not {view["name"] for view in report["scores"]["recovered"]["views"]} & {
         view["name"] for view in apart["recovered"]["views"]
     }
     assert 0 <= report["unseen"] < 0.5
     assert [row["kind"] for row in report["kinds"]] == ["usual", "near"]
-    near = [view for view in apart["recovered"]["views"] if kind_of(view["name"]) == "near"]
-    worst = min(near, key=lambda view: view["psnr"])
+    worst = min(apart["recovered"]["views"], key=lambda view: view["psnr"])
     assert (report["kinds"][1]["worst"], report["kinds"][1]["worst_psnr"]["after"]) == (
         worst["name"],
         worst["psnr"],
@@ -99,10 +97,11 @@ def test_a_loss_in_any_kind_of_view_is_reported() -> None:
 
     def said(usual: float, near: float | None, unseen: float | None, ssim: float = 0.0) -> list[str]:
         before, after = [], []
-        for name, gain in (("pose", usual), ("near", near)):
+        for kind, gain in (("usual", usual), ("near", near)):
             for i, share in enumerate((2.5, -0.5) if gain is not None else ()):
-                before.append({"name": f"{name}_{i}", "psnr": 30.0, "ssim": 0.9})
-                after.append({"name": f"{name}_{i}", "psnr": 30.0 + share * gain, "ssim": 0.9 + ssim})
+                view = {"name": f"{kind}_{i}", "kind": kind}
+                before.append({**view, "psnr": 30.0, "ssim": 0.9})
+                after.append({**view, "psnr": 30.0 + share * gain, "ssim": 0.9 + ssim})
         kinds = [kind.as_dict() for kind in by_kind(before, after)]
         return told({"rounds": [], "kinds": kinds, "causes": [], "unseen": unseen})
 

@@ -44,7 +44,7 @@ def test_distill_writes_a_report(command_line: CommandLine, tmp_path: Path) -> N
 
 
 VIEWS = [
-    {"name": name, "psnr": psnr, "ssim": 0.9}
+    {"name": name, "psnr": psnr, "ssim": 0.9} | ({"kind": "near"} if "near" in name else {})
     for name, psnr in zip(
         ("pose_0", "pose_1", "near_0", "near_1", "near_2"), (38, 30, 29, 25, 27), strict=True
     )

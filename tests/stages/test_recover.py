@@ -446,8 +446,8 @@ def test_the_guard_goes_by_the_kind_of_view_that_loses_most() -> None:
 def test_validation_views_are_scored_by_kind(student: Splats) -> None:
     from g2ard.stages.recover.probe import Probe, score_by_kind
 
-    names = (*(f"near_{i}" for i in range(10)), *(f"pose_{i}_anywhere" for i in range(3)))
-    targets = TeacherRenders(TEACHER, replace(around(13, (32, 24)), names=names))
+    kinds = ("near",) * 10 + ("anywhere",) * 3
+    targets = TeacherRenders(TEACHER, replace(around(13, (32, 24)), kinds=kinds))
     found = score_by_kind(targets, (0.0, 0.0, 0.0))(student)
     assert list(found) == ["near", "anywhere"]
     near = TeacherRenders(TEACHER, targets.cameras.take(range(10)))

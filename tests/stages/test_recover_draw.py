@@ -95,7 +95,7 @@ def test_the_command_scores_held_out_views_by_kind(
 ) -> None:
     write_splats(tmp_path / "teacher.ply", TEACHER)
     write_splats(tmp_path / "student.ply", student)
-    views = replace(around(8), names=tuple(f"{i}_{'anywhere' if i % 4 else 'pose'}" for i in range(8)))
+    views = replace(around(8), kinds=tuple("anywhere" if i % 4 else "usual" for i in range(8)))
     write_views(tmp_path / "views.json", views, splits=("train", "test") * 4)
     ask = ("recover", "student.ply", "--views", "views.json", "--teacher", "teacher.ply", "--steps", 20)
     ask = (*ask, "-o", "out.ply", "--json", "-")

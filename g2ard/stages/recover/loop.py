@@ -19,7 +19,6 @@ from g2ard.errors import InputError, require_torch
 from g2ard.progress import Progress, silent
 from g2ard.rendering.renderer import settings_for
 from g2ard.scene.splats import Splats
-from g2ard.scene.splits import usual_rows
 from g2ard.scene.targets import Targets, fingerprint_of, mask_of
 from g2ard.stages.recover.anchors import Anchors, drift95, needle
 from g2ard.stages.recover.config import RecoverConfig
@@ -125,7 +124,7 @@ class Loop:
             regularizers=config.regularizers,
             means_in_scales=config.schedule.means_in_scales,
             frozen=self.frozen,
-            relative=0 < len(usual_rows(self.targets.cameras.names)) < len(self.targets.cameras),
+            relative=len(self.targets.cameras.usual()) < len(self.targets.cameras),
         )
         return engine_class(config.engine)(objective)
 

@@ -78,8 +78,8 @@ def recover(
         weights: (C,) sampling weight of each view; None draws all equally often.
         anchors: frozen geometry; None takes the student's. For a student that was recovered before, pass the
             anchors of its construction.
-        validation: views of other kinds than `targets`, such as near ones, not trained on. Names state their
-            kinds (`g2ard.scene.splits.kind_of`). If a kind loses quality, changes are scaled back per
+        validation: views of other kinds (`Cameras.kinds`) than `targets`, such as near ones, not trained on.
+            If a kind loses quality, changes are scaled back per
             Gaussian by how often it was seen (`recover.guard`), and a recovery that only harms a kind ends
             early. At most eight views per kind are used.
         frozen: (N,) bool, mask of Gaussians that stay unchanged, such as those of another tile; requires the

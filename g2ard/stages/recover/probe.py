@@ -10,9 +10,8 @@ import numpy as np
 
 from g2ard.rendering.metrics import psnr
 from g2ard.rendering.renderer import Renderer
-from g2ard.scene.cameras import evenly_spaced
+from g2ard.scene.cameras import evenly_spaced, rows_by_kind
 from g2ard.scene.splats import Splats
-from g2ard.scene.splits import rows_by_kind
 from g2ard.scene.targets import Subset, Targets, mask_of
 
 _VIEWS = 8
@@ -63,6 +62,6 @@ def score_by_kind(
 ) -> Callable[[Splats], dict[str, float]]:
     """Return a function that scores a scene: kind of view → mean PSNR of up to eight views of that kind, each
     at most 40 dB."""
-    rows = rows_by_kind(targets.cameras.names)
+    rows = rows_by_kind(targets.cameras.kinds)
     probes = {kind: Probe(Subset(targets, found), background, _VISIBLE) for kind, found in rows.items()}
     return lambda splats: {kind: probe.all_of(splats) for kind, probe in probes.items()}

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from g2ard.report.base import LEFT_OUT, Report
-from g2ard.scene.splits import USUAL
+from g2ard.scene.cameras import USUAL
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,6 @@ import numpy as np
 from g2ard.errors import require
 from g2ard.scene.cameras import Cameras, evenly_spaced
 from g2ard.scene.splats import Splats
-from g2ard.scene.splits import usual_rows
 
 _REACH = 0.01
 """Default `reach`: Gaussians larger than a hundredth of the image hardly move, unless that is typical."""
@@ -243,7 +242,7 @@ def steps_for(scene: Splats, cameras: Cameras, steps: int) -> int:
     >>> steps_for(line, view, 1000)
     2000
     """
-    usual = cameras.take(usual_rows(cameras.names))
+    usual = cameras.usual()
     some = evenly_spaced(len(scene), _POINTS)
     points = scene.means[some].astype(np.float64) + scene.offset
     share = max(usual.usual_share(points), 1 / _MOST_TIMES**2)
