@@ -1,5 +1,6 @@
 """`import g2ard`: its names, and results with the same bits as the commands'."""
 
+import ast
 import inspect
 import json
 import subprocess
@@ -44,6 +45,18 @@ def test_every_public_name_exists_and_no_function_is_a_module() -> None:
     assert set(dir(g2ard)) == set(g2ard.__all__)
     with pytest.raises(AttributeError, match="no attribute 'simplfy'"):
         g2ard.simplfy  # type: ignore[attr-defined]
+
+
+def test_no_text_has_doubled_braces() -> None:
+    """Only f-strings halve them; in any other text a user reads {{ratio}}."""
+    package = Path(g2ard.__file__).parent
+    found = [
+        f"{path.relative_to(package)}:{node.lineno}"
+        for path in package.rglob("*.py")
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, ast.Constant) and isinstance(node.value, str) and "{{" in node.value
+    ]
+    assert not found
 
 
 def test_results_print_as_one_short_line() -> None:

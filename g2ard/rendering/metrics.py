@@ -13,7 +13,7 @@ _Image = NDArray[np.floating[Any]]
 
 
 def psnr(image: _Image, target: _Image, mask: NDArray[np.bool_] | None = None) -> float:
-    """Return the PSNR, −10·log₁₀ MSE for a peak of 1, at most 100 dB (identical images).
+    """Return the PSNR, −10·log₁₀ MSE for a peak of 1, at most 100 dB (identical images); NaN for NaN pixels.
 
     Args:
         image: (H, W, C) in [0, 1].
@@ -31,7 +31,7 @@ def psnr(image: _Image, target: _Image, mask: NDArray[np.bool_] | None = None) -
     """
     if mask is not None:
         image, target = image[mask][:, None], target[mask][:, None]
-    return min(100.0, _core.psnr(_float32(image), _float32(target)))
+    return float(np.minimum(100.0, _core.psnr(_float32(image), _float32(target))))
 
 
 def ssim(image: _Image, target: _Image, mask: NDArray[np.bool_] | None = None) -> float:

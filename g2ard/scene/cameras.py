@@ -146,6 +146,9 @@ class Cameras:
             require(name, got, got == (n, *shape), f"shape {(n, *shape)}")
         for name in _TUPLES:
             require(name, len(getattr(self, name)), len(getattr(self, name)) == n, str(n))
+        if len(set(self.names)) < n:
+            twice = next(name for name in self.names if self.names.count(name) > 1)
+            raise InputError(f"{twice!r} is given twice; every view needs its own name", parameter="names")
         for i in range(n):
             given = (self.viewmats[i], self.Ks[i], self.distortions[i])
             if not all(np.isfinite(values).all() for values in given):

@@ -156,8 +156,10 @@ def _open(path: Path) -> NDArray[np.float32]:
         with opened_image(path) as image:
             if image.mode.startswith("I") or image.mode == "F":  # 16-bit grey has several modes
                 values = np.asarray(image, np.float32)
-                top = 1.0 if image.mode == "F" else 65535.0
-                return np.repeat((values / np.float32(top))[..., None], 3, axis=2)
+                values = values / np.float32(1.0 if image.mode == "F" else 65535.0)
+                if not (values.min() >= 0 and values.max() <= 1):  # also NaN
+                    raise InputError("expected values in [0, 1]", path=path)
+                return np.repeat(values[..., None], 3, axis=2)
             if image.has_transparency_data:
                 rgba = np.asarray(image.convert("RGBA"), np.float32) / np.float32(255)
                 rgba[..., :3] *= rgba[..., 3:]

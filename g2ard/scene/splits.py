@@ -132,9 +132,7 @@ def _read_split(views: Path) -> dict[str, list[str]] | None:
     content: dict[str, Any] = read_json(path)
     lists = {key: value for key, value in content.items() if isinstance(value, list)}
     if not lists or not all(isinstance(name, str) for value in lists.values() for name in value):
-        raise InputError(
-            'expected lists of names, as in {{"train": ["a.jpg"], "test": ["b.jpg"]}}', path=path
-        )
+        raise InputError('expected lists of names, as in {"train": ["a.jpg"], "test": ["b.jpg"]}', path=path)
     return lists
 
 

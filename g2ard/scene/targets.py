@@ -144,7 +144,8 @@ class Photos(_Cached):
     """Photos of `cameras`, undistorted and at each camera's size; cached as 8-bit.
 
     Alpha is composited over the background. A photo with a mask is black outside of it. An exposure is the
-    affine colour transform C that trainers fit (photo = C·render); a photo that has one is mapped by C⁻¹.
+    affine colour transform C that trainers fit (photo = C·render); a photo that has one is mapped by C⁻¹ and
+    clipped to [0, 1].
 
     Args:
         cameras: views, all with a photo.
@@ -204,6 +205,7 @@ class Photos(_Cached):
         undo = self._undo.get(view)
         if undo is not None:
             photo = np.ascontiguousarray(photo @ undo[:, :3].T + undo[:, 3], dtype=np.float32)
+            photo = np.clip(photo, 0, 1, out=photo)
         mask = self.mask(view)
         if mask is not None:  # SSIM's window reaches across the mask's edge
             photo[~mask] = 0

@@ -3,6 +3,7 @@
 import json
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -88,6 +89,13 @@ def test_own_views_reject_mismatched_values(tmp_path: Path) -> None:
         write_views(tmp_path / "a.json", views(2), weights=[1])
     with pytest.raises(OutputError, match=r"written as \.json"):
         write_views(tmp_path / "a.txt", views(2))
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("name", ["a.json", "cameras.json", "transforms.json", "model"])
+def test_no_two_views_have_one_name(tmp_path: Path, name: str) -> None:
+    with pytest.raises(InputError, match="names: 'v1' is given twice"):
+        write_views(tmp_path / name, replace(views(3), names=("v0", "v1", "v1")))
     assert list(tmp_path.iterdir()) == []
 
 

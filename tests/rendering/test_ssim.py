@@ -6,8 +6,14 @@ import torch
 from numpy.typing import NDArray
 
 from g2ard import _core
+from g2ard.config.choices import BLACK
 from g2ard.errors import InputError
+from g2ard.rendering.metrics import psnr, ssim
+from g2ard.rendering.renderer import Renderer
+from g2ard.scene.cameras import Cameras
 from g2ard.stages.recover.losses import l1_ssim
+from g2ard.stages.recover.probe import Probe
+from helpers.scenes import around, checkered_ball
 from reference import ssim as reference
 
 Image = NDArray[np.float32]
@@ -58,6 +64,32 @@ def test_metrics_are_the_twin_s(shape: tuple[int, int, int], kind: str) -> None:
     assert abs(_core.psnr(a, b) - -10 * np.log10(np.mean((a64 - b64) ** 2))) < 1e-9
     assert abs(_core.ssim(a, a) - 1) < 1e-12
     assert _core.psnr(a, a) == np.inf
+
+
+def test_nan_is_no_perfect_score() -> None:
+    views = around(2, (16, 12))
+    ball = checkered_ball(50)
+    image = Renderer(ball).clipped(views[0])
+    spoilt = image.copy()
+    spoilt[3, 4] = np.nan
+    everywhere = np.ones(image.shape[:2], bool)
+    for mask in (None, everywhere):
+        assert np.isnan([psnr(image, spoilt, mask), ssim(image, spoilt, mask)]).all()
+    targets = Spoilt(views)
+    assert np.isnan(Probe(targets, BLACK).all_of(ball))
+    assert np.isnan(Probe(targets, BLACK, 40.0).all_of(ball))
+
+
+class Spoilt:
+    """Targets of which one pixel is NaN."""
+
+    def __init__(self, cameras: Cameras) -> None:
+        self.cameras = cameras
+
+    def __getitem__(self, view: int) -> NDArray[np.float32]:
+        target = np.zeros((12, 16, 3), np.float32)
+        target[0, view] = np.nan
+        return target
 
 
 def test_shapes_must_fit() -> None:

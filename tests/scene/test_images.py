@@ -179,3 +179,13 @@ def test_contact_sheet_holds_its_images() -> None:
     assert contact_sheet(rows, labels).shape[0] < sheet.shape[0]
     with pytest.raises(InputError, match="needs images"):
         contact_sheet([], ["photo"])
+
+
+@pytest.mark.parametrize("value", [1.94, -0.1, np.nan])
+def test_float_photos_are_within_0_and_1(tmp_path: Path, value: float) -> None:
+    pixels = np.full((6, 8), 0.5, np.float32)
+    whole = camera(save(tmp_path / "a.tiff", pixels), (8, 6))
+    np.testing.assert_array_equal(load_image(whole, 0), 0.5)
+    pixels[2, 3] = value
+    with pytest.raises(InputError, match=r"b\.tiff: expected values in \[0, 1\]"):
+        load_image(camera(save(tmp_path / "b.tiff", pixels), (8, 6)), 0)

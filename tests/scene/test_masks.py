@@ -143,6 +143,9 @@ def test_exposures_are_undone(tmp_path: Path) -> None:
     assert list(found) == ["view_001"]
     np.testing.assert_allclose(Photos(cameras, exposures=found)[1], plain, atol=6e-3)
     np.testing.assert_array_equal(Photos(cameras, exposures=found)[2], Photos(cameras)[2])
+    dark: NDArray[np.float64] = np.hstack([np.eye(3) / 2, np.full((3, 1), 0.1)])
+    brightened = Photos(cameras, exposures={"view_002": dark})[2]
+    assert (brightened.min(), brightened.max()) == (0, 1)  # the contract of targets
     with pytest.raises(InputError, match="exposure of view_001: expected an invertible"):
         Photos(cameras, exposures={"view_001": np.zeros((3, 4))})
     (tmp_path / "exposure.json").write_text('{"view_001": [1, 2]}')

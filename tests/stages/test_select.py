@@ -254,8 +254,7 @@ def test_every_policy_on_every_pool(policy):
     if policy != "uniform":
         np.testing.assert_array_equal(few.order, everything.order[:5])  # best first
         assert few.left_out == pytest.approx(1 - few.gains.sum())
-    twice = pool.take(np.repeat(np.arange(12), 2))
-    twice = replace(twice, names=tuple(f"{i}" for i in range(24)))
+    twice = Cameras.of(replace(pool[i // 2], name=str(i)) for i in range(24))
     assert len(run(twice, 20).order) == 20
     away = views([[4.0, 0, 0], [0, 4.0, 0], [9.0, 9, 9]], np.array([[0.0, 0, 0], [0, 0, 0], [99, 99, 99]]))
     partly = run(away, 3)

@@ -54,7 +54,8 @@ class Probe:
 
     def _score(self, renderer: Renderer, view: int) -> float:
         image = renderer.clipped(self._targets.cameras[view])
-        return min(self._most, psnr(image, self._targets[view], mask_of(self._targets, view)))
+        score = psnr(image, self._targets[view], mask_of(self._targets, view))
+        return float(np.minimum(self._most, score))  # not `min`, which drops NaN
 
 
 def score_by_kind(
