@@ -11,12 +11,12 @@ from PIL import Image
 
 from benchmarks.rows import Row
 from g2ard.config.choices import BLACK, Colour
+from g2ard.io.images import as_saved, to_bytes
 from g2ard.rendering.lpips import Lpips
 from g2ard.rendering.metrics import psnr, ssim
 from g2ard.rendering.renderer import RasterSettings, Renderer
-from g2ard.scene.images import as_saved, to_bytes
+from g2ard.rendering.targets import Targets, mask_of
 from g2ard.scene.splats import Splats
-from g2ard.scene.targets import Targets, mask_of
 
 __all__ = ["View", "figures", "pictured", "save_jpeg", "score"]
 

@@ -16,14 +16,14 @@ from benchmarks.study import SceneSpec, Study
 from benchmarks.views import hidden_targets
 from g2ard import io
 from g2ard.errors import InputError
+from g2ard.io.splits import for_scores, for_training, not_held_out, split_mask, splits_of
 from g2ard.poses import make_pool
 from g2ard.progress import plural
 from g2ard.rendering.renderer import RasterSettings
+from g2ard.rendering.targets import Photos, PhotosOrRenders, Targets, TeacherRenders
 from g2ard.rendering.visibility import visibility_source
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
-from g2ard.scene.splits import for_scores, for_training, not_held_out, split_mask, splits_of
-from g2ard.scene.targets import Photos, PhotosOrRenders, Targets, TeacherRenders
 from g2ard.stages.lift import lift
 from g2ard.stages.simplify import simplify
 

@@ -40,7 +40,6 @@ if TYPE_CHECKING:
     from typing import Any
 
     from g2ard._core import __version__
-    from g2ard.config.presets import preset
     from g2ard.errors import G2ardError, InputError, MissingDependencyError, OutputError
     from g2ard.io import Points
     from g2ard.io import read_points as load_points
@@ -48,19 +47,22 @@ if TYPE_CHECKING:
     from g2ard.io import read_views as load_views
     from g2ard.io import write_splats as save
     from g2ard.io import write_views as save_views
+    from g2ard.io.tile_store import TileStore
     from g2ard.jobs.distill import distill
     from g2ard.jobs.distill_options import DistillOptions
     from g2ard.jobs.levels import lod
     from g2ard.jobs.simplify import simplify
     from g2ard.levels import Georeference, save_levels, save_tileset
-    from g2ard.pipeline import DistillConfig, Distilled, SelectConfig
-    from g2ard.pipeline import distill as distill_against
     from g2ard.pipeline.adapt import AdaptConfig, Adapted, adapt
+    from g2ard.pipeline.config import DistillConfig, SelectConfig
+    from g2ard.pipeline.distill import Distilled
+    from g2ard.pipeline.distill import distill as distill_against
+    from g2ard.pipeline.presets import preset
     from g2ard.poses import make_pool
     from g2ard.rendering.renderer import RasterSettings, Rendered, Renderer, render
+    from g2ard.rendering.targets import Photos, TeacherRenders
     from g2ard.scene.cameras import Camera, Cameras, look_at
     from g2ard.scene.splats import Splats
-    from g2ard.scene.targets import Photos, TeacherRenders
     from g2ard.stages.evaluate import Evaluation, evaluate
     from g2ard.stages.lift import lift
     from g2ard.stages.recover import RecoverConfig, Recovered, recover
@@ -70,7 +72,6 @@ if TYPE_CHECKING:
     from g2ard.stages.select import CoverageOptions, Selection, select
     from g2ard.stages.simplify import Simplified, SimplifyConfig
     from g2ard.tiles.ingest import ingest
-    from g2ard.tiles.store import TileStore
 
 __all__ = [
     "AdaptConfig",
@@ -135,14 +136,15 @@ _HOMES = {
     "scene.cameras": ("Camera", "Cameras", "look_at"),
     "errors": ("G2ardError", "InputError", "MissingDependencyError", "OutputError"),
     "io.types": ("Points",),
-    "pipeline": ("DistillConfig", "Distilled", "SelectConfig"),
+    "pipeline.config": ("DistillConfig", "SelectConfig"),
+    "pipeline.distill": ("Distilled",),
     "levels": ("Georeference", "save_levels", "save_tileset"),
     "jobs.distill": ("distill",),
     "jobs.distill_options": ("DistillOptions",),
     "jobs.levels": ("lod",),
     "jobs.simplify": ("simplify",),
     "poses": ("make_pool",),
-    "config.presets": ("preset",),
+    "pipeline.presets": ("preset",),
     "scene.splats": ("Splats",),
     "pipeline.adapt": ("AdaptConfig", "Adapted", "adapt"),
     "stages.evaluate": ("Evaluation", "evaluate"),
@@ -154,14 +156,14 @@ _HOMES = {
     "rendering.renderer": ("RasterSettings", "Rendered", "Renderer", "render"),
     "stages.select": ("CoverageOptions", "Selection", "select"),
     "stages.simplify": ("Simplified", "SimplifyConfig"),
-    "scene.targets": ("Photos", "TeacherRenders"),
+    "rendering.targets": ("Photos", "TeacherRenders"),
     "tiles.ingest": ("ingest",),
-    "tiles.store": ("TileStore",),
+    "io.tile_store": ("TileStore",),
 }
 """Module → its public names."""
 
 _ALIASES = {
-    "distill_against": ("pipeline", "distill"),
+    "distill_against": ("pipeline.distill", "distill"),
     "load": ("io", "read_splats"),
     "load_points": ("io", "read_points"),
     "load_views": ("io", "read_views"),

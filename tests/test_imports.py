@@ -1,4 +1,4 @@
-"""Imports: no cycles, stages import only foundations, and `import g2ard` loads nothing heavy."""
+"""Imports: packages only import packages before them, and there are no cycles within a package."""
 
 import ast
 from collections.abc import Iterator
@@ -8,18 +8,26 @@ import g2ard
 
 ROOT = Path(g2ard.__file__).parent
 
-FOUNDATIONS = {
+LAYERS = (
     "_core",
-    "__version__",
-    "config",
     "errors",
-    "io",
     "progress",
-    "rendering",
-    "report",
-    "scene",
     "system",
-}
+    "config",
+    "scene",
+    "io",
+    "rendering",
+    "poses",
+    "stages",
+    "report",
+    "pipeline",
+    "tiles",
+    "levels",
+    "viewer",
+    "jobs",
+    "cli",
+)
+"""Packages and modules of `g2ard`, lowest first. Each imports only those before it."""
 
 
 def modules() -> dict[str, Path]:
@@ -32,55 +40,43 @@ def modules() -> dict[str, Path]:
 
 
 def imported(path: Path) -> Iterator[str]:
-    """Return what a module imports of g2ard, also in functions, except for type checkers."""
-    tree = ast.parse(path.read_text(encoding="utf-8"))
-    for node in ast.walk(tree):
-        if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.dump(node.test):
-            node.body = []
-    for node in ast.walk(tree):
+    """Return what a module imports of g2ard, also in functions and for type checkers."""
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == "g2ard":
             yield from (f"{node.module}.{alias.name}" for alias in node.names)
         elif isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names if alias.name.startswith("g2ard"))
 
 
-def graph() -> dict[str, set[str]]:
-    """Module → the modules that it imports; a name that is no module stands for the module it lies in."""
+def test_packages_import_only_layers_below() -> None:
+    wrong = []
+    for module, path in modules().items():
+        if module in ("g2ard", "g2ard.__main__"):  # above all layers
+            continue
+        package = module.split(".")[1]
+        below = LAYERS[: LAYERS.index(package) + 1]
+        wrong += [f"{module} imports {name}" for name in imported(path) if name.split(".")[1] not in below]
+    assert wrong == []
+
+
+def test_no_import_cycles() -> None:
     known = modules()
     edges: dict[str, set[str]] = {}
     for module, path in known.items():
         targets = {name if name in known else name.rpartition(".")[0] for name in imported(path)}
-        edges[module] = targets & known.keys() - {module}
-    return edges
+        edges[module] = targets & known.keys() - {module, "g2ard"}
+    tops = [module for module in edges if not edges[module]]
+    while tops:  # remove modules that import nothing, until none is left
+        edges = {module: targets - set(tops) for module, targets in edges.items() if module not in tops}
+        tops = [module for module in edges if not edges[module]]
+    assert not edges
 
 
-def reachable(edges: dict[str, set[str]], start: str) -> set[str]:
-    """Return all modules that a module imports, directly or not."""
-    seen: set[str] = set()
-    waiting = list(edges[start])
-    while waiting:
-        module = waiting.pop()
-        if module not in seen:
-            seen.add(module)
-            waiting += edges[module]
-    return seen
-
-
-def test_no_import_cycles() -> None:
-    edges = graph()
-    del edges["g2ard"]  # it loads the public names only when they are used
-    edges = {module: targets - {"g2ard"} for module, targets in edges.items()}
-    assert not {module for module in edges if module in reachable(edges, module)}
-
-
-def test_stages_import_only_foundations() -> None:
-    wrong = []
-    for module, path in modules().items():
-        if not module.startswith("g2ard.stages."):
-            continue
-        stage = ".".join(module.split(".")[:3])
-        for name in imported(path):
-            package = name.split(".")[1]
-            if package not in FOUNDATIONS and not name.startswith(stage):
-                wrong.append(f"{module} imports {name}")
+def test_stages_do_not_import_each_other() -> None:
+    stages = {name: path for name, path in modules().items() if name.startswith("g2ard.stages.")}
+    own = {name: ".".join(name.split(".")[:3]) for name in stages}
+    named = ((module, name) for module, path in stages.items() for name in imported(path))
+    wrong = [
+        f"{m} imports {n}" for m, n in named if n.startswith("g2ard.stages.") and not n.startswith(own[m])
+    ]
     assert wrong == []

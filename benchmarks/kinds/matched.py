@@ -32,12 +32,12 @@ from g2ard import __version__, io
 from g2ard.config.choices import ADAPT_SCHEDULES, CONVENTIONS, LPIPS_INPUTS, SCHEDULE_NAMES
 from g2ard.config.choices import METHODS as SIMPLIFIERS
 from g2ard.errors import InputError
+from g2ard.io.splits import states_splits
 from g2ard.rendering.lpips import Lpips, load_lpips
 from g2ard.rendering.renderer import RasterSettings
+from g2ard.rendering.targets import Targets
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
-from g2ard.scene.splits import states_splits
-from g2ard.scene.targets import Targets
 from g2ard.stages.recover.anchors import REGULARIZERS, needle
 from g2ard.stages.recover.prior import regularizers_for
 from g2ard.stages.simplify import round_counts

@@ -16,12 +16,13 @@ from benchmarks.runner import Cell
 from benchmarks.score import figures, score
 from benchmarks.study import SceneSpec, Study, key
 from benchmarks.workspace import PROTOCOLS, Workspace, budget_of, kinds_for
-from g2ard.config.presets import PRESETS, configured
 from g2ard.errors import InputError
-from g2ard.pipeline import DistillConfig, distill
+from g2ard.pipeline.config import DistillConfig
+from g2ard.pipeline.distill import distill
+from g2ard.pipeline.presets import PRESETS, configured
+from g2ard.rendering.targets import Targets
 from g2ard.rendering.visibility import visibility_source
 from g2ard.scene.splats import Splats
-from g2ard.scene.targets import Targets
 from g2ard.stages.recover import recover
 from g2ard.stages.recover.anchors import Anchors, drift95, effective_rank, needle
 from g2ard.stages.recover.prior import regularizers_for

@@ -19,9 +19,9 @@ from benchmarks.workspace import Workspace, reduced
 from g2ard import io
 from g2ard.config.choices import Keep
 from g2ard.config.paths import changed
-from g2ard.config.presets import GS_CPR
 from g2ard.errors import InputError
 from g2ard.jobs.register import photos_of, poses_for
+from g2ard.pipeline.presets import GS_CPR
 from g2ard.rendering.renderer import Renderer
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats

@@ -17,11 +17,11 @@ from benchmarks.rows import Row
 from benchmarks.runner import Cell
 from benchmarks.study import SceneSpec, Study, key
 from benchmarks.workspace import Workspace
+from g2ard.io.splits import splits_of, states_splits
 from g2ard.poses import make_pool, plan_pool
+from g2ard.rendering.targets import Subset, Targets, TeacherRenders
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
-from g2ard.scene.splits import splits_of, states_splits
-from g2ard.scene.targets import Subset, Targets, TeacherRenders
 from g2ard.stages.evaluate import evaluate
 from g2ard.stages.recover import RecoverConfig, recover
 from g2ard.stages.recover.anchors import REGULARIZERS

@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 from g2ard import io
 from g2ard.errors import G2ardError
 from g2ard.io.atomic import atomic_output
+from g2ard.io.images import to_bytes
+from g2ard.rendering.targets import CACHE_BYTES, Targets, against_of, mask_of
 from g2ard.scene.cameras import Cameras
-from g2ard.scene.images import to_bytes
-from g2ard.scene.targets import CACHE_BYTES, Targets, against_of, mask_of
 from g2ard.stages.recover.anchors import Anchors, Regularizers
 from g2ard.stages.recover.schedule import Rates, Schedule
 

@@ -17,7 +17,7 @@ app = typer.Typer(
 
 def _version(show: bool) -> None:
     if show:
-        from g2ard import __version__
+        from g2ard._core import __version__
 
         typer.echo(f"g2ard {__version__}")
         raise typer.Exit

@@ -29,13 +29,13 @@ from g2ard.cli.tile_options import TILES
 from g2ard.cli.usage import flags_of, in_flags, typed
 from g2ard.config.choices import RenderModel, ViewFormat
 from g2ard.config.paths import full_paths, parse_settings
-from g2ard.config.presets import configured
 from g2ard.errors import G2ardError, InputError
 from g2ard.io import write_splats, write_views
 from g2ard.io.atomic import atomic_output, check_output
 from g2ard.io.detect import run_scene
 from g2ard.io.paths import real_path
 from g2ard.io.scene_formats import lost_in
+from g2ard.pipeline.presets import configured
 from g2ard.progress import plural
 from g2ard.system import devices, interrupt
 
@@ -311,7 +311,7 @@ def command(
         settings: whether it takes --set, see `Run.settings`.
         scenes: whether it reads scenes and takes --render-model, see `Run.load`.
         budgets: whether it takes budgets, see `g2ard.cli.outputs.budgets_of`.
-        tiles: whether it works on scenes in tiles, see `g2ard.cli.tile_options.tiling_of`.
+        tiles: whether it works on scenes in tiles, see `g2ard.cli.tiling.tiling_of`.
     """
 
     def register(fn: Callable[..., None]) -> Callable[..., None]:

@@ -13,9 +13,9 @@ from g2ard.io import ViewSet
 from g2ard.jobs.inputs import load_split_views, load_trained, make_targets
 from g2ard.jobs.view_checks import propose_background, warn_of_sight
 from g2ard.jobs.views import views_or_pool
+from g2ard.rendering.targets import Targets
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
-from g2ard.scene.targets import Targets
 
 
 def check_teacher(views: Path | None, teacher: Path | None, photos: bool) -> None:

@@ -15,11 +15,12 @@ from g2ard.cli.run_result import loss
 from g2ard.config.paths import listed
 from g2ard.io import ply
 from g2ard.io.scene_formats import scene_format
+from g2ard.io.tile_store import TileStore
 from g2ard.jobs.budget import Budget
 from g2ard.jobs.distill_options import DistillOptions
 from g2ard.jobs.tiled import distill_in_tiles, simplify_in_tiles, working
 from g2ard.jobs.tiling import Tiling, refuse_whole, whole_budgets, whole_options
-from g2ard.jobs.views import RunViews
+from g2ard.pipeline.run_views import RunViews
 from g2ard.progress import plural
 from g2ard.report.distilled import tiled_report
 from g2ard.report.kinds import COLUMNS, cells
@@ -27,7 +28,6 @@ from g2ard.stages.simplify import SimplifyConfig
 from g2ard.system.memory import peak_rss_of_all
 from g2ard.tiles.merging import TiledScene
 from g2ard.tiles.recover import TiledScores
-from g2ard.tiles.store import TileStore
 
 _HINT = "the simplified scene is better there (`g2ard simplify` writes it)"
 
@@ -137,7 +137,7 @@ class TiledCommand:
 
     def _write(self, place: Path, small: TiledScene) -> None:
         if scene_format(place).suffix == ".ply":
-            ply.write(place, small, overwrite=self.run.overwrite)
+            ply.write(place, small.stream(), overwrite=self.run.overwrite)
         else:
             self.run.write(place, small.whole(), compare=True)
 

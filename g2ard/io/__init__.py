@@ -256,7 +256,7 @@ def read_views(path: str | Path, *, images: str | Path | None = None, split: str
         path: a COLMAP folder (or its images_4), a transforms.json or its folder, a nerfstudio, gsplat or
             INRIA run, a Cambridge Landmarks scene, or a .json written by g2ard.
         images: folder of the photos, if they have moved.
-        split: "train", "test", or "all"; see `g2ard.scene.splits.split_mask`.
+        split: "train", "test", or "all"; see `g2ard.io.splits.split_mask`.
 
     Returns:
         The views in OpenCV axes, sorted by name for COLMAP, otherwise in file order. Views whose photo is
@@ -286,8 +286,8 @@ def read_view_set(
         alpha: "mask" makes a photo with alpha and without a mask its own mask.
     """
     from g2ard.io.photos import alpha_as_masks, pictured
+    from g2ard.io.splits import split_mask
     from g2ard.io.types import ViewFiles
-    from g2ard.scene.splits import split_mask
 
     if not isinstance(path, ViewFiles):
         path = ViewFiles(Path(path), Path(images) if images else None, alpha)

@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 
 from g2ard.io import kind, read_cloud, read_scene, read_view_set
 from g2ard.io.detect import file_format, run_scene
+from g2ard.io.images import colour_text, photo_traits
 from g2ard.io.sog import chunks_of
 from g2ard.io.types import Note, Points, ViewSet
 from g2ard.progress import plural
 from g2ard.scene.cameras import Cameras
-from g2ard.scene.images import colour_text, photo_traits
 from g2ard.scene.splats import Splats
 
 _QUANTILES = (0, 1, 25, 50, 75, 99, 100)

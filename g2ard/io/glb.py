@@ -185,7 +185,7 @@ def _harmonics(degree: int) -> list[tuple[str, int]]:
 def _document(
     node: dict[str, Any], names: list[str], views: list[Any], accessors: list[Any], size: int
 ) -> dict[str, Any]:
-    from g2ard import __version__
+    from g2ard._core import __version__
 
     splatting: dict[str, Any] = {
         "kernel": "ellipse",

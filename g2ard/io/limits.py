@@ -5,16 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any
+from typing import IO, TYPE_CHECKING
 
 from g2ard.errors import InputError, damaged
 from g2ard.io.paths import check_regular
+from g2ard.scene.cameras import LARGEST_IMAGE, check_image
 
 if TYPE_CHECKING:
     from PIL.Image import Image
-
-LARGEST_IMAGE = 160_000_000
-"""Maximum pixels of an image or view; a decoded pixel takes 12 bytes."""
 
 _LARGEST_RATIO = 100
 _ALWAYS_UNPACKED = 64 << 20
@@ -33,12 +31,6 @@ def check_unpacked(path: str | Path, packed: int, unpacked: int) -> None:
     most = max(_ALWAYS_UNPACKED, _LARGEST_RATIO * packed)
     if unpacked > most:
         raise InputError(f"{packed:,} bytes would unpack to {unpacked:,}; the limit is {most:,}", path=path)
-
-
-def check_image(width: int, height: int, **fields: Any) -> None:
-    """Raise an `InputError` with `fields` for an image of more than `LARGEST_IMAGE` pixels."""
-    if width * height > LARGEST_IMAGE:
-        raise InputError(f"has {width:,}×{height:,} pixels; the limit is {LARGEST_IMAGE:,}", **fields)
 
 
 @contextmanager

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.lib.recfunctions import structured_to_unstructured
@@ -15,13 +15,10 @@ from g2ard.config.choices import RenderModel
 from g2ard.errors import InputError
 from g2ard.io import plyfiles
 from g2ard.io.sanitize import BLOCK, LOG_SCALE_LIMIT, Raw
-from g2ard.io.stream import RawStream
+from g2ard.io.stream import RawStream, SceneStream
 from g2ard.io.types import Note
 from g2ard.progress import plural
 from g2ard.scene.splats import Splats, unit_quats
-
-if TYPE_CHECKING:
-    from g2ard.tiles.merging import TiledScene
 
 _MEANS = ["x", "y", "z"]
 _DC = ["f_dc_0", "f_dc_1", "f_dc_2"]
@@ -132,21 +129,25 @@ def _means(block: NDArray[Any], shift: NDArray[np.float64]) -> NDArray[np.float3
     return np.asarray(means - shift if shift.any() else means, np.float32)
 
 
-def write(path: Path, scene: Splats | TiledScene, *, overwrite: bool = False, normals: bool = False) -> None:
+def write(path: Path, scene: Splats | SceneStream, *, overwrite: bool = False, normals: bool = False) -> None:
     """Write a binary little-endian 3DGS .ply: x y z, f_dc, f_rest, opacity, scale, rot.
 
     A non-zero `offset` and an antialiased render model are stored in comments, which `Stream` restores.
     `normals` adds zero nx ny nz, 12 bytes per Gaussian, for programs with a fixed layout such as INRIA's SIBR
-    viewer (which also needs SH degree 3). Tiles are written one at a time.
+    viewer (which also needs SH degree 3). A stream is written block by block.
     """
-    if not len(scene):
+    if isinstance(scene, Splats):
+        count, parts = len(scene), iter([scene])
+    else:
+        count, parts = scene.count, scene.blocks(BLOCK)
+    if not count:
         raise InputError("not written: the scene has no Gaussians", path=path)
     names = [*_MEANS, *(_NORMALS if normals else []), *_DC]
     names += [f"f_rest_{k}" for k in range(3 * ((scene.sh_degree + 1) ** 2 - 1))]
     names += ["opacity", *_SCALES, *_QUATS]
-    blocks = _blocks(path, [scene] if isinstance(scene, Splats) else scene, names, normals)
+    blocks = _blocks(path, parts, names, normals)
     comments = plyfiles.comments_of(scene.offset, scene.render_model)
-    plyfiles.write_rows(path, dict.fromkeys(names, "<f4"), len(scene), blocks, overwrite, comments)
+    plyfiles.write_rows(path, dict.fromkeys(names, "<f4"), count, blocks, overwrite, comments)
 
 
 def _blocks(

@@ -21,7 +21,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from g2ard import __version__, _core
+from g2ard import _core
+from g2ard._core import __version__
 from g2ard.errors import InputError
 from g2ard.io.atomic import atomic_folder, atomic_output
 from g2ard.io.packing import coded, log_scales, morton_order, smallest_three, unit_quats, writable

@@ -5,14 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 
 from g2ard.io.stream import PartsStream
+from g2ard.io.tile_store import TileStore
 
 
 class Stream(PartsStream):
     """Tiles, read one at a time."""
 
     def __init__(self, path: Path) -> None:
-        from g2ard.tiles.store import TileStore
-
         store = TileStore.open(path)
         counts = [tile.rows for tile in store.tiles]
         parts = counts, store.read, store.sh_degree, store.offset

@@ -8,13 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard.config.choices import Colour
+from g2ard.io.images import colour_text, photo_traits
 from g2ard.progress import plural
 from g2ard.rendering.metrics import psnr
 from g2ard.rendering.renderer import Renderer
+from g2ard.rendering.targets import Targets, against_of, mask_of
 from g2ard.scene.cameras import Cameras
-from g2ard.scene.images import colour_text, photo_traits
 from g2ard.scene.splats import Splats
-from g2ard.scene.targets import Targets, against_of, mask_of
 from g2ard.stages.recover.report import RecoverReport
 from g2ard.stages.recover.sizes import typical_share
 

@@ -19,12 +19,13 @@ from g2ard.jobs.job import DistillJob
 from g2ard.jobs.measured_budget import Aim, Reduction, aim_of
 from g2ard.jobs.photos import sparse_file, sparse_points, topped_up
 from g2ard.jobs.view_checks import propose_background, warn_of_photos
-from g2ard.jobs.views import RunViews, views_of
-from g2ard.pipeline import Distilled
+from g2ard.jobs.views import views_of
+from g2ard.pipeline.distill import Distilled
+from g2ard.pipeline.run_views import RunViews
 from g2ard.progress import Progress, Say, plural, silent, unsaid
+from g2ard.rendering.targets import kinds_told
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
-from g2ard.scene.targets import kinds_told
 from g2ard.stages.lift import lift
 from g2ard.stages.recover.anchors import FREE, Regularizers
 from g2ard.stages.recover.prior import PriorMeasures, measure_prior, regularizers_for

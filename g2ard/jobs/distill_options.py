@@ -10,9 +10,9 @@ from typing import Any
 
 from g2ard.config.choices import Focus, RenderModel
 from g2ard.config.paths import full_paths
-from g2ard.config.presets import PRESETS, configured
 from g2ard.jobs.inputs import Views
-from g2ard.pipeline import DistillConfig
+from g2ard.pipeline.config import DistillConfig
+from g2ard.pipeline.presets import PRESETS, configured
 from g2ard.stages.recover.anchors import Regularizers
 
 
@@ -33,7 +33,7 @@ class DistillOptions:
         clean: remove clutter first (`g2ard.stages.clean`).
         render_model: overrides what the scene's file says: "classic" or "antialiased".
         format: file format for a budget in bytes: ply, compressed.ply, sog, spz, glb, splat, usda or usdc.
-        preset: settings by name, see `g2ard.config.presets`.
+        preset: settings by name, see `g2ard.pipeline.presets`.
         settings: values of `DistillConfig` by path, which override the preset.
     """
 

@@ -9,16 +9,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from g2ard.errors import InputError
+from g2ard.io.tile_store import row_width
 from g2ard.jobs.job import DistillJob
 from g2ard.jobs.tiling import RECOVERY_TIMES, TileMemory, amount
-from g2ard.pipeline import final_steps
+from g2ard.pipeline.distill import final_steps
 from g2ard.progress import plural
+from g2ard.rendering.targets import CACHE_BYTES, Targets
 from g2ard.scene.splats import Splats
-from g2ard.scene.targets import CACHE_BYTES, Targets
 from g2ard.stages.recover import recover
 from g2ard.stages.simplify import round_counts, simplify
 from g2ard.system.memory import peak_rss
-from g2ard.tiles.store import row_width
 
 _TRIED, _STEPS = 4, 8
 """Number of views rendered and of steps taken for the estimate."""

@@ -15,14 +15,14 @@ from g2ard.config.choices import RenderModel
 from g2ard.errors import InputError
 from g2ard.io import Note, ViewFiles, ViewSet, read_scene, read_view_set
 from g2ard.io.exposures import find_exposures
+from g2ard.io.splits import not_held_out, split_mask, splits_of
 from g2ard.progress import Progress, Say, plural, silent, unsaid
 from g2ard.rendering.renderer import RasterSettings, Renderer
+from g2ard.rendering.targets import Photos, PhotosOrRenders, Targets, TeacherRenders
 from g2ard.rendering.visibility import visibility
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.regions import in_any
 from g2ard.scene.splats import Splats
-from g2ard.scene.splits import not_held_out, split_mask, splits_of
-from g2ard.scene.targets import Photos, PhotosOrRenders, Targets, TeacherRenders
 
 if TYPE_CHECKING:
     from g2ard.stages.clean import Cleaning

@@ -11,14 +11,15 @@ from numpy.typing import NDArray
 
 from g2ard.jobs.inputs import make_targets
 from g2ard.jobs.measured_budget import Aim
-from g2ard.jobs.views import RunViews
-from g2ard.pipeline import DistillConfig, Distilled
-from g2ard.pipeline import distill as pipeline
+from g2ard.pipeline.config import DistillConfig
+from g2ard.pipeline.distill import Distilled
+from g2ard.pipeline.distill import distill as pipeline
+from g2ard.pipeline.run_views import RunViews
 from g2ard.progress import Progress, Say, silent, unsaid
 from g2ard.rendering.renderer import Renderer
+from g2ard.rendering.targets import Targets, kinds_of
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
-from g2ard.scene.targets import Targets, kinds_of
 from g2ard.stages.recover.prior import PriorMeasures
 
 

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from g2ard.config.choices import BLACK, Colour, RenderModel
 from g2ard.errors import InputError
+from g2ard.io.reports import Report
 from g2ard.jobs.budget import Budget
 from g2ard.jobs.distill import prepare
 from g2ard.jobs.distill_options import DistillOptions
@@ -22,14 +23,13 @@ from g2ard.jobs.inputs import Views, load_scene, make_targets
 from g2ard.jobs.job import DistillJob
 from g2ard.jobs.viewer_frame import up_of
 from g2ard.levels.tree import Level
-from g2ard.pipeline import distill as pipeline
+from g2ard.pipeline.distill import distill as pipeline
 from g2ard.progress import Progress, Say, plural, silent, unsaid
+from g2ard.rendering.targets import Targets
 from g2ard.rendering.visibility import visibility_source
-from g2ard.report.base import Report
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.sky import sky_mask
 from g2ard.scene.splats import Splats
-from g2ard.scene.targets import Targets
 from g2ard.stages.evaluate import evaluate
 from g2ard.stages.simplify import simplify
 

@@ -13,8 +13,8 @@ from g2ard.io import read_splats
 from g2ard.io.scene_formats import scene_format
 from g2ard.poses import plan_pool
 from g2ard.progress import Progress
+from g2ard.rendering.targets import Targets, TeacherRenders
 from g2ard.scene.splats import Splats
-from g2ard.scene.targets import Targets, TeacherRenders
 from g2ard.stages.evaluate import evaluate
 
 _LOSS = 1.0

@@ -16,13 +16,13 @@ from numpy.typing import NDArray
 
 from g2ard.config.choices import BLACK, Colour
 from g2ard.errors import InputError
+from g2ard.io.images import composited, load_premultiplied
+from g2ard.io.splits import for_training
 from g2ard.io.types import Points
 from g2ard.jobs.hull import VisualHull, visual_hull
 from g2ard.jobs.inputs import load_view_sets
 from g2ard.progress import Progress, Say, plural, silent
 from g2ard.scene.cameras import Cameras
-from g2ard.scene.images import composited, load_premultiplied
-from g2ard.scene.splits import for_training
 
 if TYPE_CHECKING:
     from g2ard.jobs.inputs import Views

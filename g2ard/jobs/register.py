@@ -39,7 +39,7 @@ def photos_of(
 
     Args:
         path: views with photos, or a folder of photos.
-        split: split of the views, see `g2ard.scene.splits`; "all" for a folder.
+        split: split of the views, see `g2ard.io.splits`; "all" for a folder.
         intrinsics: for a folder: views with the intrinsics of each photo by name, or the same for all.
         focal: for a folder: focal length in pixels of the stored photo; centred principal point, no
             distortion.

@@ -9,13 +9,13 @@ from g2ard.config.choices import Colour
 from g2ard.config.paths import listed
 from g2ard.jobs.causes import likely_causes
 from g2ard.jobs.job import DistillJob
-from g2ard.pipeline import Distilled
+from g2ard.pipeline.distill import Distilled
 from g2ard.progress import Progress
+from g2ard.rendering.targets import Targets
 from g2ard.rendering.visibility import overdraw
 from g2ard.report.kinds import KindScore, by_kind
 from g2ard.scene.cameras import USUAL
 from g2ard.scene.splats import Splats
-from g2ard.scene.targets import Targets
 from g2ard.stages.evaluate import evaluate
 
 

@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Any
 
 from g2ard.config.choices import RenderModel
-from g2ard.config.presets import configured
 from g2ard.jobs.budget import Budget
 from g2ard.jobs.inputs import Views, load_scene
 from g2ard.jobs.measured_budget import Reduction, aim_of
+from g2ard.pipeline.presets import configured
 from g2ard.progress import Progress, Say, silent, unsaid
 from g2ard.scene.splats import Splats
 from g2ard.stages.simplify import Simplified, SimplifyConfig

@@ -15,14 +15,16 @@ from g2ard.errors import G2ardError, InputError, OutputError
 from g2ard.io.atomic import drop_empty, parents_made
 from g2ard.io.detect import MANIFEST
 from g2ard.io.lock import locked
+from g2ard.io.tile_store import StoredScene, TileStore
 from g2ard.jobs.budget import Budget
 from g2ard.jobs.distill_options import DistillOptions
 from g2ard.jobs.inputs import Views, load_view_sets, say_regions
 from g2ard.jobs.levels import LevelReport, check_ratios, level_size
 from g2ard.jobs.tiling import RECOVERY_TIMES, Tiling, refuse_whole, whole_options, workers_for
-from g2ard.jobs.views import RunViews, cameras_for_weights, pool_times, views_of
+from g2ard.jobs.views import cameras_for_weights, pool_times, views_of
 from g2ard.levels import Cut
-from g2ard.pipeline import DistillConfig
+from g2ard.pipeline.config import DistillConfig
+from g2ard.pipeline.run_views import RunViews
 from g2ard.progress import Progress, Say, plural, silent, unsaid
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
@@ -36,7 +38,6 @@ from g2ard.tiles.merging import TiledScene, key_of, simplify_tiles
 from g2ard.tiles.recover import TiledScores, recover_tiles
 from g2ard.tiles.sights import Surroundings
 from g2ard.tiles.steps import TiledRun
-from g2ard.tiles.store import StoredScene, TileStore
 
 _WORK_NAME = re.compile(r"tiles|steps|(student|merged|level|written)-[0-9a-f]{16}")
 """Names that commands create in the work folder."""

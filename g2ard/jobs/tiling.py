@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 from g2ard.errors import InputError, require
 from g2ard.io import open_stream
 from g2ard.io.detect import MANIFEST, kind
-from g2ard.tiles.store import TileStore, row_width
+from g2ard.io.tile_store import TileStore, row_width
 
 if TYPE_CHECKING:
     from g2ard.jobs.budget import Budget

@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 from g2ard.config.choices import Colour
 from g2ard.errors import InputError
 from g2ard.io import find_views, read_view_set
+from g2ard.io.splits import split_mask
 from g2ard.progress import Say, plural, unsaid
+from g2ard.rendering.targets import Photos
 from g2ard.scene.cameras import Cameras, unseeing
 from g2ard.scene.splats import Splats
-from g2ard.scene.splits import split_mask
-from g2ard.scene.targets import Photos
 
 _SIDE = 800
 """Longer side in pixels, as in a generated pool."""
@@ -102,7 +102,7 @@ def propose_background(cameras: Cameras, background: Colour, given: bool, say: S
     Args:
         given: whether it was chosen rather than the default.
     """
-    from g2ard.scene.images import colour_text, photo_traits
+    from g2ard.io.images import colour_text, photo_traits
 
     pairs = zip(cameras.image_paths, cameras.mask_paths, strict=True)
     photos = [photo for photo, mask in pairs if photo is not None and mask != photo]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -13,12 +13,13 @@ import numpy as np
 from g2ard.config.choices import is_made
 from g2ard.errors import InputError
 from g2ard.io import ViewSet
+from g2ard.io.splits import for_scores, for_training, split_mask, splits_of
 from g2ard.jobs.inputs import Views, drop_held_out, load_view_sets, load_views
 from g2ard.jobs.view_checks import as_pool, check_sight, found_views, warn_of_sight
+from g2ard.pipeline.run_views import RunViews
 from g2ard.progress import Progress, Say, silent, unsaid
 from g2ard.scene.cameras import USUAL, Cameras, rows_by_kind
 from g2ard.scene.splats import Splats
-from g2ard.scene.splits import for_scores, for_training, split_mask, splits_of
 
 if TYPE_CHECKING:
     from g2ard.jobs.distill_options import DistillOptions
@@ -46,30 +47,6 @@ _WEIGHT_VIEWS, _WEIGHT_ROWS = 96, 100_000
 """Size of the pool for simplification, of which as many are used as the scene needs, and the Gaussians that
 it is planned on.
 """
-
-
-@dataclass(frozen=True, eq=False)
-class RunViews:
-    """Views of a run.
-
-    Args:
-        train: views for training, of the usual and other kinds.
-        test: usual views for scoring.
-        apart: views of other kinds; None if there are none.
-        pool: the whole generated pool, written beside the result.
-        unseen: share of the sampled matter that no view of the pool sees.
-    """
-
-    train: ViewSet
-    test: Cameras
-    apart: Cameras | None = None
-    pool: ViewSet | None = None
-    unseen: float | None = None
-
-    def resized(self, longest: int) -> RunViews:
-        """Shrink all views for training and scoring."""
-        apart = self.apart and self.apart.resized(longest)
-        return replace(self, train=self.train.resized(longest), test=self.test.resized(longest), apart=apart)
 
 
 def views_of(

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from g2ard import __version__
+from g2ard._core import __version__
 from g2ard.errors import InputError, missing, require
 from g2ard.io.atomic import atomic_folder
 from g2ard.io.glb import EXTENSION, SPZ_EXTENSION, spz_glb

@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard.errors import InputError, require
+from g2ard.io.tile_store import StoredScene
 from g2ard.scene.splats import Splats
 from g2ard.scene.transform import rotation_matrices
-from g2ard.tiles.store import StoredScene
 
 Level = Splats | StoredScene
 """A level of detail: a scene in memory, or rows on disk."""

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from g2ard import __version__
+from g2ard._core import __version__
 from g2ard.io.atomic import atomic_folder
 from g2ard.io.packing import morton_order
 from g2ard.io.sog_write import sog_files

@@ -11,11 +11,11 @@ import numpy as np
 
 from g2ard.config.choices import ADAPT_SCHEDULES, AdaptSchedule
 from g2ard.errors import InputError, require
+from g2ard.io.reports import Report
+from g2ard.pipeline.recolour import blended_appearance, colour_change, recoloured, views_seeing
 from g2ard.progress import Progress, plural, silent
-from g2ard.report.base import Report
-from g2ard.scene.appearance import blended_appearance, colour_change, recoloured, views_seeing
+from g2ard.rendering.targets import Targets, fingerprint_of
 from g2ard.scene.splats import Splats
-from g2ard.scene.targets import Targets, fingerprint_of
 from g2ard.stages.recover import RecoverConfig, checkpoint, recover
 from g2ard.stages.recover.anchors import FREE
 from g2ard.stages.recover.config import FitConfig
@@ -212,8 +212,8 @@ def adapt(
     """Refit spherical harmonics and opacities to targets; means, rotations and scales stay.
 
     First, one affine map c ↦ M·(c, 1) is applied to all colours if it gains enough (M (3, 4) by least
-    squares, `g2ard.scene.appearance.colour_change`), so that a change of light is right in unseen places too.
-    Second, each Gaussian's appearance is fitted with L = (1−λ)·L1 + λ·(1−SSIM) as in recovery, without
+    squares, `g2ard.pipeline.recolour.colour_change`), so that a change of light is right in unseen places
+    too. Second, each Gaussian's appearance is fitted with L = (1−λ)·L1 + λ·(1−SSIM) as in recovery, without
     regularisers. Last, a Gaussian seen by v images moves v/(v + prior_views) of the way to its fit. PSNR on
     other trajectories then measures the geometry (`tab:geobase`).
 

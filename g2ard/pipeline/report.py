@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from g2ard.report.base import LEFT_OUT, Report
+from g2ard.io.reports import LEFT_OUT, Report
 from g2ard.stages.recover.report import RecoverReport
 from g2ard.stages.simplify.report import SimplifyReport
 

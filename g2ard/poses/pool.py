@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from g2ard.config.choices import POOL_KINDS
 from g2ard.errors import InputError, require
+from g2ard.io.splits import HOLD_OUT
 from g2ard.poses.numbers import middle, norms, strata
 from g2ard.poses.outside import plan_aerial, plan_orbit
 from g2ard.poses.sight import Lens, Poses, Survey
@@ -28,7 +29,6 @@ from g2ard.poses.within import (
 from g2ard.progress import Progress, counter, silent
 from g2ard.scene.cameras import Camera, Cameras
 from g2ard.scene.splats import Splats
-from g2ard.scene.splits import HOLD_OUT
 
 _PLANNERS: dict[str, Callable[..., Poses]] = {
     "orbit": plan_orbit,

@@ -11,15 +11,15 @@ from typing import Any
 import numpy as np
 
 from g2ard.config.choices import BLACK, Colour
+from g2ard.io.images import contact_sheet, to_bytes, write_png
 from g2ard.progress import plural
 from g2ard.rendering.metrics import psnr
 from g2ard.rendering.renderer import Renderer
+from g2ard.rendering.targets import Targets
 from g2ard.report.kinds import COLUMNS, KindScore, cells
 from g2ard.report.page import Comparison, Page, Shown
 from g2ard.scene.cameras import USUAL, rows_by_kind
-from g2ard.scene.images import contact_sheet, to_bytes, write_png
 from g2ard.scene.splats import Splats
-from g2ard.scene.targets import Targets
 
 _SHOWN = 3
 """Pictures of the page, and rows of the preview picture."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from statistics import fmean
 from typing import Any
 
-from g2ard.report.base import Report
+from g2ard.io.reports import Report
 from g2ard.scene.cameras import USUAL, rows_by_kind
 
 _LOST = 0.05

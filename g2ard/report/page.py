@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard.io.atomic import atomic_output
-from g2ard.scene.images import to_bytes
+from g2ard.io.images import to_bytes
 
 _WINDOW, _CROPS = 0.28, 2
 """Side of an automatic crop as a share of the image's, and number of crops."""

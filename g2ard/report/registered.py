@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 
 from g2ard.config.choices import Colour
 from g2ard.errors import InputError
+from g2ard.io.images import load_image, to_bytes
 from g2ard.progress import plural
 from g2ard.rendering.renderer import Renderer
 from g2ard.report.page import Comparison, Page, Shown
 from g2ard.scene.cameras import Cameras
-from g2ard.scene.images import load_image, to_bytes
 from g2ard.scene.splats import Splats
 
 if TYPE_CHECKING:

@@ -11,11 +11,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from g2ard.errors import InputError, require
-from g2ard.io.limits import check_image
 from g2ard.progress import plural
 
 USUAL = "usual"
 """Kind of views that state none: given views, and the poses that suit the scene."""
+
+LARGEST_IMAGE = 160_000_000
+"""Maximum pixels of an image or view; a decoded pixel takes 12 bytes."""
 
 _LARGEST = 1e12
 """Largest value of poses and intrinsics; larger ones are damaged data and overflow when squared."""
@@ -26,6 +28,12 @@ _MEDIAN_OF = 16
 _SHAPES = {"viewmats": (4, 4), "Ks": (3, 3), "widths": (), "heights": (), "distortions": (5,)}
 """Arrays of `Cameras` and their shapes per view."""
 _TUPLES = ("names", "image_paths", "mask_paths", "kinds")
+
+
+def check_image(width: int, height: int, **fields: Any) -> None:
+    """Raise an `InputError` with `fields` for an image of more than `LARGEST_IMAGE` pixels."""
+    if width * height > LARGEST_IMAGE:
+        raise InputError(f"has {width:,}×{height:,} pixels; the limit is {LARGEST_IMAGE:,}", **fields)
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,7 +117,7 @@ class Cameras:
         names: C unique names of photos or poses.
         image_paths: C paths of photos or None.
         mask_paths: C paths of masks or None.
-        distortions: (C, 5) float64, OpenCV k1 k2 p1 p2 k3 of the *photo*; `g2ard.scene.images` undistorts on
+        distortions: (C, 5) float64, OpenCV k1 k2 p1 p2 k3 of the *photo*; `g2ard.io.images` undistorts on
             loading, to these Ks. Zero for a pinhole photo.
         source: the file or folder that lists the views, for messages; None for views created in memory.
         kinds: C kinds of views, such as "near" or "anywhere"; () for "usual" ones. Simplification uses usual

@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 
 from g2ard.config.choices import BLACK, Colour
+from g2ard.io.images import as_saved
 from g2ard.progress import Progress, plural, silent
 from g2ard.rendering.lpips import Lpips
 from g2ard.rendering.metrics import psnr, ssim
 from g2ard.rendering.renderer import RasterSettings, Renderer
+from g2ard.rendering.targets import Targets, against_of, mask_of
 from g2ard.scene.cameras import USUAL
-from g2ard.scene.images import as_saved
 from g2ard.scene.splats import Splats
-from g2ard.scene.targets import Targets, against_of, mask_of
 
 
 @dataclass(frozen=True)
@@ -107,7 +107,7 @@ def evaluate(
         background: RGB in [0, 1] behind the scene.
         lpips: networks to score with, from `g2ard.rendering.lpips.load_lpips`.
         settings: the renderer's conventions; None means gsplat's. Teacher renders have their own, see
-            `g2ard.scene.targets.TeacherRenders`.
+            `g2ard.rendering.targets.TeacherRenders`.
         eight_bit: round renders and targets to multiples of 1/255, as in evaluations from saved PNGs.
         progress: called after each view.
         stage: stage name for progress.

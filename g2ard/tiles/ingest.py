@@ -16,12 +16,12 @@ from g2ard.io import kind, open_point_stream, open_stream
 from g2ard.io.detect import JOURNAL, MANIFEST, POINTS
 from g2ard.io.lock import LOCK, locked
 from g2ard.io.stream import SceneStream
+from g2ard.io.tile_store import VERSION, TileStore
 from g2ard.io.types import Note
 from g2ard.progress import Progress, Say, plural, silent, unsaid
 from g2ard.stages.lift import LiftConfig
 from g2ard.tiles.journal import Journal, clear, is_tile_file
 from g2ard.tiles.pour import PointFeed, SceneFeed, lift_tiles, pour
-from g2ard.tiles.store import VERSION, TileStore
 
 TILE_ROWS = 5_000_000
 """Default largest number of rows per tile."""

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from g2ard.errors import InputError, OutputError
 from g2ard.io.detect import JOURNAL, MANIFEST, POINTS
 from g2ard.io.jsonfile import read_json
-from g2ard.tiles.kdtree import KdTree, Points
-from g2ard.tiles.store import FORMAT, VERSION, halo_name, tile_name
+from g2ard.io.tile_store import FORMAT, VERSION, halo_name, tile_name
+from g2ard.scene.kdtree import KdTree, Points
 
 _TILE_FILE = re.compile(r"(tile|halo)-\d{5,}\.f32|\.?(tiles|journal)\.json(\.new)?|\.points")
 

@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 from g2ard.config.choices import RenderModel
 from g2ard.errors import InputError
 from g2ard.io.stream import PartsStream
+from g2ard.io.tile_store import TileStore
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats, unit_quats
 from g2ard.scene.transform import join
 from g2ard.tiles.sights import Sights, Surroundings
 from g2ard.tiles.steps import TiledRun
-from g2ard.tiles.store import TileStore
 from g2ard.tiles.tasks import load, small_scene
 
 _HALF = 1 << 16

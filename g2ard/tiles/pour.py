@@ -17,12 +17,12 @@ from g2ard.errors import OutputError
 from g2ard.io.detect import POINTS
 from g2ard.io.point_stream import PointStream, PointTally
 from g2ard.io.stream import SceneStream
+from g2ard.io.tile_store import TileStore, halo_name, packed, row_width, tile_name
 from g2ard.progress import Progress, Say, plural
+from g2ard.scene.kdtree import KdTree, Points, Sampler, cut_tree, margin_of
 from g2ard.scene.splats import Splats
 from g2ard.stages.lift import LiftConfig, lift
 from g2ard.tiles.journal import Journal, clear
-from g2ard.tiles.kdtree import KdTree, Points, Sampler, cut_tree, margin_of
-from g2ard.tiles.store import TileStore, halo_name, packed, row_width, tile_name
 
 _SAMPLE = 1 << 20
 """Size of the sample of positions that determines the tiles (12 MB)."""

@@ -11,20 +11,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard.config.paths import changed, values_of
-from g2ard.jobs.views import RunViews
+from g2ard.io.tile_store import TileStore
+from g2ard.pipeline.run_views import RunViews
 from g2ard.rendering.renderer import RasterSettings, Renderer, settings_for
+from g2ard.rendering.targets import TeacherRenders
 from g2ard.report.kinds import KindScore, by_kind
 from g2ard.scene.cameras import USUAL, Cameras
 from g2ard.scene.prepared import PreparedScene
 from g2ard.scene.splats import SH_C0, Splats
-from g2ard.scene.targets import TeacherRenders
 from g2ard.scene.transform import join
 from g2ard.stages.recover import RecoverConfig, recover
 from g2ard.stages.recover.anchors import Anchors
 from g2ard.tiles.executor import Workers
 from g2ard.tiles.merging import TiledScene, finished, key_of
 from g2ard.tiles.sights import Surroundings, in_sight, light_of, written
-from g2ard.tiles.store import TileStore
 from g2ard.tiles.tasks import (
     Arguments,
     Arrays,

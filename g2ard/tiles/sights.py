@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 
 from g2ard import _core
 from g2ard.io.atomic import atomic_output
+from g2ard.io.tile_store import TileStore
 from g2ard.rendering.visibility import LONGEST, MOST_VIEWS, NEAR
 from g2ard.scene.cameras import Cameras
 from g2ard.tiles.executor import Workers
 from g2ard.tiles.steps import COARSE, TiledRun
-from g2ard.tiles.store import TileStore
 from g2ard.tiles.tasks import Task, is_whole, load, scene_of
 
 _IN_SIGHT = 0.01

@@ -27,6 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard import _core
+from g2ard.io.tile_store import TileStore
 from g2ard.rendering.renderer import RasterSettings, view_of
 from g2ard.rendering.visibility import CONVERGED, NEAR, ROUND, SampledVisibility, spread
 from g2ard.scene.cameras import Cameras
@@ -36,7 +37,6 @@ from g2ard.scene.transform import join
 from g2ard.stages.simplify import SimplifyConfig, round_counts, simplify
 from g2ard.stages.simplify.pairs import emphasised, splats_of
 from g2ard.tiles.executor import Workers
-from g2ard.tiles.store import TileStore
 from g2ard.tiles.tasks import (
     Arguments,
     Arrays,

@@ -18,13 +18,13 @@ from numpy.typing import NDArray
 
 from g2ard.errors import InputError
 from g2ard.io.atomic import atomic_output
+from g2ard.io.tile_store import TileStore
 from g2ard.rendering.renderer import RasterSettings
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.prepared import PreparedScene, as_prepared, finite_rows_of
 from g2ard.scene.splats import Splats
 from g2ard.scene.transform import join
 from g2ard.stages.simplify.pairs import fit_opacities
-from g2ard.tiles.store import TileStore
 
 Arrays = dict[str, NDArray[Any]]
 """Output of a task: arrays by name, stored as one .npz file."""

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from g2ard import __version__
+from g2ard._core import __version__
 from g2ard.config.choices import BLACK
 from g2ard.errors import InputError, OutputError
 from g2ard.io.atomic import atomic_output, check_output

@@ -14,8 +14,8 @@ from benchmarks.runner import run as run_studies
 from benchmarks.score import figures, score
 from benchmarks.study import Study, read_study
 from g2ard import io
+from g2ard.rendering.targets import TeacherRenders
 from g2ard.scene.splats import Splats
-from g2ard.scene.targets import TeacherRenders
 from g2ard.stages.evaluate import evaluate
 from g2ard.stages.recover.anchors import PAPER_REGULARIZERS
 from g2ard.stages.simplify import round_counts

@@ -10,10 +10,10 @@ import pytest
 
 import g2ard
 from g2ard.config.paths import changed, listed, parse_settings
-from g2ard.config.presets import preset
 from g2ard.errors import InputError
 from g2ard.io import write_splats, write_views
-from g2ard.pipeline import DistillConfig
+from g2ard.pipeline.config import DistillConfig
+from g2ard.pipeline.presets import preset
 from g2ard.stages.recover.anchors import REGULARIZERS
 from g2ard.stages.recover.schedule import PAPER
 from g2ard.stages.simplify import SimplifyConfig

@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 
 from g2ard.io import write_splats
+from g2ard.io.tile_store import TileStore, packed
 from g2ard.scene.splats import Splats
-from g2ard.tiles.store import TileStore, packed
 
 
 def town(count: int = 6000, degree: int = 0, seed: int = 0, offset: tuple[float, ...] = (0, 0, 0)) -> Splats:

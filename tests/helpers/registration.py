@@ -3,8 +3,8 @@
 import numpy as np
 
 from benchmarks.kinds.register import displaced as off
+from g2ard.io.images import resized
 from g2ard.scene.cameras import Camera, Cameras
-from g2ard.scene.images import resized
 from g2ard.stages.register.align import Level, level_of
 from g2ard.stages.register.config import RegisterConfig
 from g2ard.stages.register.grey import grey_of

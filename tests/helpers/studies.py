@@ -11,7 +11,7 @@ from benchmarks.rows import Row
 from benchmarks.runner import run
 from benchmarks.study import DEFINITIONS, SceneSpec, read_study
 from g2ard import io
-from g2ard.scene.images import write_png
+from g2ard.io.images import write_png
 from helpers.scenes import around, checkered_ball
 
 STUDY = """

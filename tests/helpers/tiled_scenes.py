@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from g2ard.io import write_splats, write_views
+from g2ard.io.tile_store import TileStore
 from g2ard.progress import Progress, silent
 from g2ard.scene.cameras import Cameras, look_at
 from g2ard.scene.splats import Splats
@@ -13,7 +14,6 @@ from g2ard.stages.simplify import SimplifyConfig
 from g2ard.tiles.executor import Workers, executor
 from g2ard.tiles.merging import simplify_tiles
 from g2ard.tiles.steps import TiledRun
-from g2ard.tiles.store import TileStore
 
 
 def town(count: int = 9000, seed: int = 0) -> Splats:

@@ -8,7 +8,7 @@ import pytest
 
 from g2ard import io
 from g2ard.errors import InputError
-from g2ard.scene.images import load_image
+from g2ard.io.images import load_image
 from helpers.dataset_files import POSES, cambridge, mip_nerf_360, opengl
 from helpers.view_files import photo
 

@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 
 from g2ard.errors import InputError
-from g2ard.io import kind, limits, read_scene, read_splats, read_view_set, write_splats, write_views
-from g2ard.scene.images import load_image
+from g2ard.io import kind, read_scene, read_splats, read_view_set, write_splats, write_views
+from g2ard.io.images import load_image
 from g2ard.scene.splats import Splats, unit_quats
 from g2ard.stages.simplify import simplify
 from helpers.commands import CommandLine
@@ -295,7 +295,9 @@ def test_zstd_frames_are_unpacked_up_to_their_size(tmp_path: Path) -> None:
 
 
 def test_huge_photos_are_rejected_before_decoding(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(limits, "LARGEST_IMAGE", 1_000_000)  # Pillow warns of what is near the true limit
+    monkeypatch.setattr(
+        "g2ard.scene.cameras.LARGEST_IMAGE", 1_000_000
+    )  # Pillow warns of what is near the true limit
     side = 1001
     head = png(1, 1).replace(struct.pack(">II", 1, 1), struct.pack(">II", side, side))
     crc = struct.pack(">I", zlib.crc32(head[12:29]))

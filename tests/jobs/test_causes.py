@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from g2ard.io.images import write_png
 from g2ard.jobs.causes import likely_causes
 from g2ard.rendering.renderer import Renderer
+from g2ard.rendering.targets import Photos
 from g2ard.scene.cameras import Cameras
-from g2ard.scene.images import write_png
 from g2ard.scene.splats import Splats
-from g2ard.scene.targets import Photos
 from g2ard.stages.recover.report import Gain, RecoverReport, Regularized
 from helpers.scenes import around, checkered_ball
 

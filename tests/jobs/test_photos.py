@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 import g2ard
+from g2ard.io.images import load_premultiplied, write_png
 from g2ard.jobs.hull import visual_hull
 from g2ard.jobs.photos import points_along_rays
-from g2ard.scene.images import load_premultiplied, write_png
 from helpers.commands import CommandLine, refused, succeeds
 from helpers.photos import photos_of, rgba_photos_of
 

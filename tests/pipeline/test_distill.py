@@ -12,8 +12,9 @@ import g2ard
 from g2ard.config.paths import changed
 from g2ard.errors import InputError
 from g2ard.io import read_splats, write_splats
-from g2ard.pipeline import DistillConfig, SelectConfig, distill
-from g2ard.scene.targets import Targets, TeacherRenders
+from g2ard.pipeline.config import DistillConfig, SelectConfig
+from g2ard.pipeline.distill import distill
+from g2ard.rendering.targets import Targets, TeacherRenders
 from g2ard.stages.recover import RecoverConfig
 from g2ard.stages.recover.schedule import PAPER, TUNED
 from g2ard.stages.simplify import SimplifyConfig
@@ -118,7 +119,7 @@ def test_a_loss_in_any_kind_of_view_is_reported() -> None:
 
 
 def test_steps_by_need_are_for_teachers() -> None:
-    from g2ard.pipeline import _Rounds
+    from g2ard.pipeline.distill import _Rounds
 
     part = replace(around(12), Ks=around(12).Ks * [[[4], [4], [1]]])  # a sixteenth of the ball in each
 

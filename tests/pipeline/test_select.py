@@ -11,10 +11,11 @@ import pytest
 from g2ard.config.paths import changed
 from g2ard.errors import InputError
 from g2ard.io import write_splats, write_views
-from g2ard.pipeline import DistillConfig, distill
+from g2ard.pipeline.config import DistillConfig
+from g2ard.pipeline.distill import distill
+from g2ard.rendering.targets import TeacherRenders
 from g2ard.scene.cameras import Cameras, look_at
 from g2ard.scene.splats import ARRAYS
-from g2ard.scene.targets import TeacherRenders
 from g2ard.stages.recover import RecoverConfig
 from g2ard.stages.recover.schedule import TUNED
 from g2ard.stages.select import select
@@ -83,7 +84,7 @@ def test_given_weights_stand() -> None:
 
 
 def test_views_are_selected_once_by_default(monkeypatch: pytest.MonkeyPatch) -> None:
-    import g2ard.pipeline as stage
+    import g2ard.pipeline.distill as stage
 
     counts: list[int] = []
     whole = stage.select

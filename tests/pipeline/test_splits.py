@@ -13,7 +13,7 @@ from benchmarks.study import DEFINITIONS, SceneSpec, read_study
 from benchmarks.workspace import Workspace
 from g2ard.errors import InputError
 from g2ard.io import read_view_set, write_splats, write_views
-from g2ard.scene.splits import for_scores, for_training, not_held_out, split_mask, splits_of
+from g2ard.io.splits import for_scores, for_training, not_held_out, split_mask, splits_of
 from helpers.commands import CommandLine, refused, succeeds
 from helpers.photos import cloud_of, photos_of
 from helpers.scenes import around, checkered_ball
@@ -67,6 +67,7 @@ def watch(monkeypatch: pytest.MonkeyPatch) -> Watch:
     import g2ard.jobs.measured_budget
     import g2ard.jobs.score
     import g2ard.pipeline.adapt
+    import g2ard.pipeline.distill
     import g2ard.stages.evaluate
     import g2ard.stages.recover
 
@@ -83,9 +84,9 @@ def watch(monkeypatch: pytest.MonkeyPatch) -> Watch:
         monkeypatch.setattr(module, name, told)
 
     watched(g2ard.pipeline.adapt, "adapt", 1, seen.trained)
-    for module in (g2ard.stages.recover, g2ard.pipeline):
+    for module in (g2ard.stages.recover, g2ard.pipeline.distill):
         watched(module, "recover", 1, seen.trained)
-    for module in (g2ard.jobs.measured_budget, g2ard.pipeline):
+    for module in (g2ard.jobs.measured_budget, g2ard.pipeline.distill):
         watched(module, "visibility_source", 0, seen.looked)
     for module in (g2ard.stages.evaluate, g2ard.jobs.score):
         watched(module, "evaluate", 1, seen.scored)

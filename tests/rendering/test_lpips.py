@@ -8,7 +8,7 @@ import torch
 
 from g2ard.errors import InputError
 from g2ard.rendering.lpips import Lpips, load_lpips
-from g2ard.scene.targets import TeacherRenders
+from g2ard.rendering.targets import TeacherRenders
 from g2ard.stages.evaluate import evaluate
 from helpers.lpips_weights import ALEX, weights
 from helpers.scenes import around, checkered_ball

@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 from g2ard import io
 from g2ard.errors import InputError
 from g2ard.io.exposures import find_exposures
+from g2ard.io.images import load_mask, write_png
 from g2ard.rendering.metrics import psnr, ssim
 from g2ard.rendering.renderer import render
+from g2ard.rendering.targets import Photos
 from g2ard.scene.cameras import Cameras
-from g2ard.scene.images import load_mask, write_png
 from g2ard.scene.splats import Splats
-from g2ard.scene.targets import Photos
 from g2ard.stages.evaluate import evaluate
 from g2ard.stages.recover import RecoverConfig, recover
 from g2ard.stages.recover.anchors import Regularizers

@@ -69,7 +69,7 @@ def test_the_near_plane_is_the_conventions_in_ordinary_scenes():
 
 def test_recovery_works_in_any_unit():
     pytest.importorskip("torch")
-    from g2ard.scene.targets import TeacherRenders
+    from g2ard.rendering.targets import TeacherRenders
     from g2ard.stages.recover import RecoverConfig, recover
 
     figures = []

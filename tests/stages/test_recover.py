@@ -15,9 +15,9 @@ import pytest
 from numpy.typing import NDArray
 
 from g2ard.errors import InputError
+from g2ard.rendering.targets import TeacherRenders
 from g2ard.rendering.visibility import visibility
 from g2ard.scene.splats import Splats
-from g2ard.scene.targets import TeacherRenders
 from g2ard.stages.evaluate import evaluate
 from g2ard.stages.recover import RecoverConfig, loop, probe, recover, trials
 from g2ard.stages.recover import checkpoint as checkpoint_module

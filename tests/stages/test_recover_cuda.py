@@ -11,7 +11,7 @@ import torch
 
 from g2ard import io
 from g2ard.errors import InputError, MissingDependencyError
-from g2ard.scene.targets import TeacherRenders
+from g2ard.rendering.targets import TeacherRenders
 from g2ard.stages.recover import RecoverConfig, gsplat_engine, recover
 from g2ard.stages.recover.losses import l1_ssim, l1_ssim_anywhere
 from g2ard.stages.simplify import simplify

@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 
 from g2ard.errors import InputError
 from g2ard.io import read_splats, write_splats, write_views
+from g2ard.rendering.targets import TeacherRenders
 from g2ard.scene.splats import ARRAYS, Splats
-from g2ard.scene.targets import TeacherRenders
 from g2ard.stages.evaluate import evaluate
 from g2ard.stages.recover import RecoverConfig, recover
 from g2ard.stages.recover.draw import checked_weights, drawn

@@ -10,9 +10,9 @@ import pytest
 import g2ard
 from g2ard.errors import InputError
 from g2ard.io import ace, read_views, write_splats, write_views
+from g2ard.io.images import write_png
 from g2ard.jobs.register import matched, photos_of, read_poses
 from g2ard.scene.cameras import Cameras
-from g2ard.scene.images import write_png
 from g2ard.stages.register import PhotoReport, PoseError, RegisterConfig, pose_error, register
 from g2ard.stages.register.report import summarize
 from helpers.commands import CommandLine, succeeds
@@ -209,7 +209,7 @@ def test_a_lens_for_all_where_names_differ(site: Path, tmp_path: Path) -> None:
 
 def test_photos_to_poses_to_an_adapted_scene(site: Path, command_line: CommandLine, tmp_path: Path) -> None:
     """`adapt` and `recover` read the output of `register`, and the scene takes on the photos' light."""
-    from g2ard.scene.targets import Photos
+    from g2ard.rendering.targets import Photos
 
     photos = ("--photos", site / "photos", "--intrinsics", site / "views.json", "--size", "128")
     ask = ("register", site / "scene.ply", *photos, "--poses", site / "coarse.txt", "-o", "poses.json")

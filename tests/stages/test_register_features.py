@@ -12,9 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from g2ard.errors import InputError, MissingDependencyError
+from g2ard.io.images import write_png
 from g2ard.rendering.renderer import Rendered, Renderer
 from g2ard.scene.cameras import Camera, Cameras
-from g2ard.scene.images import write_png
 from g2ard.stages.register import PhotoReport, pose_error, register
 from g2ard.stages.register import matchers as module
 from g2ard.stages.register.matchers import checked_pairs, matcher_named, mutual

@@ -26,9 +26,9 @@ from g2ard import _core, io
 from g2ard.config.choices import METHODS
 from g2ard.rendering import visibility
 from g2ard.rendering.renderer import RasterSettings, Renderer, arrays_of, view_of
+from g2ard.rendering.targets import TeacherRenders
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
-from g2ard.scene.targets import TeacherRenders
 from g2ard.stages.recover import RecoverConfig, recover
 from g2ard.stages.recover.anchors import REGULARIZERS
 from g2ard.stages.select import CoverageOptions, select

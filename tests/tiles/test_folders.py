@@ -8,10 +8,10 @@ import pytest
 
 from g2ard.errors import InputError, OutputError
 from g2ard.io.lock import LOCK, locked
+from g2ard.io.tile_store import StoredScene, TileStore
 from g2ard.levels import Cut, save_levels
 from g2ard.tiles import ingest as ingest_module
 from g2ard.tiles.ingest import ingest
-from g2ard.tiles.store import StoredScene, TileStore
 from helpers.commands import CommandLine, refused, succeeds
 from helpers.interruptions import interrupt_at
 from helpers.level_files import files_of, scattered

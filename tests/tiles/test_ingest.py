@@ -15,9 +15,9 @@ import pytest
 
 from g2ard.errors import InputError, OutputError
 from g2ard.io import read_scene, write_splats
+from g2ard.io.tile_store import TileStore, packed
+from g2ard.scene.kdtree import Sampler
 from g2ard.tiles.ingest import ingest
-from g2ard.tiles.kdtree import Sampler
-from g2ard.tiles.store import TileStore, packed
 from helpers.commands import succeeds
 from helpers.ingested import as_set, assert_same_sets, halos_of, saved, tiles_of, town
 from helpers.interruptions import interrupt_at
@@ -130,7 +130,7 @@ def test_a_sample_does_not_depend_on_the_order(tmp_path: Path, monkeypatch: pyte
 
 def test_overfull_tiles_of_a_sample_are_split(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("g2ard.tiles.pour._SAMPLE", 60)
-    monkeypatch.setattr("g2ard.tiles.kdtree._SIGMAS", 0.0)
+    monkeypatch.setattr("g2ard.scene.kdtree._SIGMAS", 0.0)
     source = saved(tmp_path / "town.ply", town(20_000))
     said: list[str] = []
     store = ingest(source, tmp_path / "a", tile_rows=2000, say=said.append)

@@ -9,6 +9,7 @@ import pytest
 from g2ard import io
 from g2ard.errors import InputError
 from g2ard.io import sog
+from g2ard.io.tile_store import StoredScene
 from g2ard.jobs.distill_options import DistillOptions
 from g2ard.jobs.tiled import TiledLevels, lod_in_tiles
 from g2ard.jobs.tiling import Tiling
@@ -16,7 +17,6 @@ from g2ard.levels import Cut, cut, save_levels, tree
 from g2ard.scene.splats import Splats
 from g2ard.system.memory import peak_rss
 from g2ard.tiles.ingest import ingest
-from g2ard.tiles.store import StoredScene
 from helpers.commands import refused, succeeds
 from helpers.level_files import files_of, leaves_of, scattered
 from helpers.tiled_scenes import town_in

@@ -7,6 +7,7 @@ import pytest
 
 from g2ard.errors import InputError
 from g2ard.io import write_splats
+from g2ard.io.tile_store import TileStore
 from g2ard.jobs import tiling as policy
 from g2ard.jobs.tiling import (
     LEVELS_TIMES,
@@ -18,7 +19,6 @@ from g2ard.jobs.tiling import (
     workers_for,
 )
 from g2ard.tiles.ingest import ingest
-from g2ard.tiles.store import TileStore
 from helpers.tiled_scenes import town
 
 

@@ -8,9 +8,9 @@ import pytest
 
 from g2ard.errors import InputError, OutputError
 from g2ard.io import Points, open_point_stream, read_cloud, write_points
+from g2ard.io.tile_store import TileStore, packed
 from g2ard.stages.lift import LiftConfig, lift
 from g2ard.tiles.ingest import ingest
-from g2ard.tiles.store import TileStore, packed
 from helpers import cloud_files
 from helpers.ingested import as_set, halos_of, saved, tiles_of, town
 from helpers.interruptions import interrupt_at

@@ -14,15 +14,15 @@ import pytest
 from g2ard import _core
 from g2ard.errors import InputError
 from g2ard.io import read_splats, write_splats
+from g2ard.io.tile_store import TileStore
+from g2ard.rendering.targets import TeacherRenders
 from g2ard.scene.cameras import Cameras, look_at
 from g2ard.scene.prepared import finite_rows_of
-from g2ard.scene.targets import TeacherRenders
 from g2ard.stages.evaluate import evaluate
 from g2ard.stages.simplify import SimplifyConfig, round_counts, simplify
 from g2ard.tiles.ingest import ingest
 from g2ard.tiles.merging import cheapest
 from g2ard.tiles.steps import GONE
-from g2ard.tiles.store import TileStore
 from helpers.systems import needs_proc, workers_of
 from helpers.tiled_scenes import reduced, ring, town
 

@@ -12,7 +12,7 @@ from g2ard.cli.frame import Run, command
 from g2ard.cli.resume import check_scene_run, stoppable
 from g2ard.config.choices import AdaptSchedule
 from g2ard.config.paths import listed
-from g2ard.config.presets import PRESETS, configured
+from g2ard.pipeline.presets import PRESETS, configured
 from g2ard.progress import plural
 
 

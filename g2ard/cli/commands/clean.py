@@ -137,9 +137,9 @@ def _paint(path: Path, splats: Splats, found: Cleaning, cameras: Cameras, overwr
     """Write up to three views of the scene, its clutter coloured by kind on grey, and the result."""
     import numpy as np
 
+    from g2ard.io.images import contact_sheet, write_png
     from g2ard.rendering.renderer import Renderer
     from g2ard.report.paint import painted
-    from g2ard.scene.images import contact_sheet, write_png
 
     colors = np.array([*_COLORS.values(), (0.45, 0.48, 0.52)])[found.kind]
     scenes = [splats, painted(splats, colors), splats.take(found.keep)]

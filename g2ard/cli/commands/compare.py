@@ -42,7 +42,7 @@ def compare(
     from g2ard.jobs.view_checks import check_sight
     from g2ard.jobs.viewer_frame import frame_with
     from g2ard.jobs.views import views_or_pool
-    from g2ard.scene.targets import TeacherRenders
+    from g2ard.rendering.targets import TeacherRenders
     from g2ard.stages.evaluate import evaluate
     from g2ard.viewer import check_page_output, write_page
 

@@ -14,7 +14,7 @@ from g2ard.cli import options as opt
 from g2ard.cli.frame import Run, command
 from g2ard.cli.outputs import Outputs, budgets_of
 from g2ard.cli.run_result import say_views, say_weight, tell_quality, told, write_table
-from g2ard.cli.tile_options import tiling_of
+from g2ard.cli.tiling import tiling_of
 from g2ard.config.choices import Focus, is_made
 from g2ard.io import kind
 from g2ard.progress import plural
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from g2ard.cli.run_folder import RunFolder
     from g2ard.jobs.budget import Budget
     from g2ard.jobs.job import DistillJob
-    from g2ard.pipeline import Distilled
+    from g2ard.pipeline.distill import Distilled
 
 
 @command(
@@ -113,7 +113,7 @@ def distill(
     from g2ard.jobs.distill import prepare
     from g2ard.jobs.distill_options import DistillOptions
     from g2ard.jobs.tiling import is_tiled
-    from g2ard.pipeline import DistillConfig
+    from g2ard.pipeline.config import DistillConfig
 
     began = time.monotonic()
     names = ("method", "keep_region", "schedule", "steps", "recovery_time", "focus", "background", "seed")

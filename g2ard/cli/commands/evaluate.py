@@ -62,8 +62,8 @@ def evaluate(
     from g2ard.jobs.view_checks import check_sight
     from g2ard.rendering.lpips import load_lpips
     from g2ard.rendering.renderer import RasterSettings
+    from g2ard.rendering.targets import kinds_of
     from g2ard.rendering.visibility import overdraw
-    from g2ard.scene.targets import kinds_of
     from g2ard.stages.evaluate import evaluate as score
     from g2ard.stages.recover.anchors import needle
 

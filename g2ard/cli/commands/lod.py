@@ -13,7 +13,7 @@ import typer
 from g2ard.cli import options as opt
 from g2ard.cli.budget_options import Ratios
 from g2ard.cli.frame import Run, command
-from g2ard.cli.tile_options import tiling_of
+from g2ard.cli.tiling import tiling_of
 from g2ard.config.choices import BLACK, Colour
 from g2ard.errors import OutputError
 from g2ard.progress import plural

@@ -59,8 +59,8 @@ def poses(
     up: UpOption = None,
 ) -> None:
     """Generate views for a scene: poses in free space that see it well."""
+    from g2ard.io.splits import splits_of
     from g2ard.poses import plan_pool
-    from g2ard.scene.splits import splits_of
 
     check_views_output(output, run.overwrite, format)
     splats = run.load(scene)

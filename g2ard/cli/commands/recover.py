@@ -12,8 +12,8 @@ from g2ard.cli.frame import Run, command
 from g2ard.cli.resume import check_scene_run, stoppable
 from g2ard.cli.run_result import loss
 from g2ard.config.paths import listed
-from g2ard.config.presets import PRESETS, configured
 from g2ard.errors import InputError
+from g2ard.pipeline.presets import PRESETS, configured
 from g2ard.progress import plural
 
 if TYPE_CHECKING:
@@ -22,10 +22,10 @@ if TYPE_CHECKING:
 
     from g2ard.config.choices import Colour
     from g2ard.io import ViewSet
+    from g2ard.rendering.targets import Targets
     from g2ard.report.kinds import KindScore
     from g2ard.scene.cameras import Cameras
     from g2ard.scene.splats import Splats
-    from g2ard.scene.targets import Targets
     from g2ard.stages.recover import Recovered
 
 
@@ -68,7 +68,7 @@ def recover(
 ) -> None:
     """Optimise a fixed set of Gaussians against photos or a teacher's renders."""
     from g2ard.cli.teaching import Teaching, check_teacher
-    from g2ard.scene.targets import kinds_of
+    from g2ard.rendering.targets import kinds_of
     from g2ard.stages.recover import RecoverConfig
     from g2ard.stages.recover import recover as optimize
     from g2ard.stages.recover.anchors import Anchors
@@ -155,8 +155,8 @@ def _score(
     """Score held-out views, and print the table, losses and likely causes of a poor result."""
     from g2ard.jobs.causes import likely_causes
     from g2ard.jobs.score import scores_by_kind
+    from g2ard.rendering.targets import kinds_of
     from g2ard.report.kinds import COLUMNS, cells
-    from g2ard.scene.targets import kinds_of
 
     kinds = scores_by_kind(student, result.splats, held_out, colour, run.progress)
     title = f"held-out views against {kinds_of(held_out)}, before → after:"

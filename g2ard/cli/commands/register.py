@@ -11,9 +11,9 @@ from g2ard.cli import options as opt
 from g2ard.cli.frame import Run, command
 from g2ard.config.choices import BLACK, Keep, Refinement
 from g2ard.config.paths import changed, listed
-from g2ard.config.presets import GS_CPR
 from g2ard.errors import InputError
 from g2ard.io import check_views_output
+from g2ard.pipeline.presets import GS_CPR
 from g2ard.progress import plural
 
 if TYPE_CHECKING:

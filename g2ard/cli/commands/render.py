@@ -76,13 +76,13 @@ def render(
     up: opt.UpOption = None,
 ) -> None:
     """Render views of a scene as PNG, or show how it would be simplified."""
+    from g2ard.io.animation import write_animation
+    from g2ard.io.images import to_bytes
     from g2ard.jobs.inputs import load_views
     from g2ard.jobs.turntable import turntable
     from g2ard.jobs.view_checks import warn_of_sight
     from g2ard.jobs.views import views_or_pool
     from g2ard.rendering.renderer import RasterSettings, Renderer
-    from g2ard.scene.animation import write_animation
-    from g2ard.scene.images import to_bytes
 
     if output is None and sheet is None:
         raise typer.BadParameter("give -o DIR, --sheet FILE.png or both")
@@ -139,7 +139,7 @@ def render(
 
 def _folder_or_animation(run: Run, output: Path | None, depth: bool) -> tuple[Path | None, Path | None]:
     """Check the output, and return it as a folder or as an animation's file."""
-    from g2ard.scene.animation import SUFFIXES, check_animation
+    from g2ard.io.animation import SUFFIXES, check_animation
 
     if output is None:
         return None, None
@@ -159,7 +159,7 @@ def _write_view(stem: Path, rendered: Rendered, depth: bool) -> None:
     """Write one view as STEM.png and, with `depth`, STEM.depth.npy."""
     import numpy as np
 
-    from g2ard.scene.images import write_png
+    from g2ard.io.images import write_png
 
     stem.parent.mkdir(parents=True, exist_ok=True)
     write_png(stem.with_name(stem.name + ".png"), rendered.image)
@@ -171,7 +171,7 @@ def _write_sheet(
     path: Path, images: list[NDArray[np.uint8]], names: tuple[str, ...], overwrite: bool
 ) -> None:
     """Write a roughly square grid of all images, captioned by row."""
-    from g2ard.scene.images import contact_sheet, write_png
+    from g2ard.io.images import contact_sheet, write_png
 
     columns = math.ceil(math.sqrt(len(images)))
     rows = [images[i : i + columns] for i in range(0, len(images), columns)]

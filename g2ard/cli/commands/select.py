@@ -11,8 +11,8 @@ from g2ard.cli import options as opt
 from g2ard.cli.budget_options import Count
 from g2ard.cli.frame import Run, command
 from g2ard.config.paths import listed
-from g2ard.config.presets import configured
 from g2ard.io import check_views_output
+from g2ard.pipeline.presets import configured
 from g2ard.progress import plural
 
 if TYPE_CHECKING:
@@ -52,7 +52,7 @@ def select(
     """
     from g2ard.jobs.inputs import load_split_views
     from g2ard.jobs.view_checks import warn_of_sight
-    from g2ard.pipeline import SelectConfig
+    from g2ard.pipeline.config import SelectConfig
     from g2ard.stages.select import select as choose
 
     settings = run.settings(SelectConfig(), "policy", preset=preset)

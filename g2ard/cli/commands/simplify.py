@@ -14,11 +14,11 @@ from g2ard.cli import options as opt
 from g2ard.cli.frame import Run, command
 from g2ard.cli.outputs import Outputs, budgets_of
 from g2ard.cli.run_result import say_weight, tell_quality
-from g2ard.cli.tile_options import tiling_of
+from g2ard.cli.tiling import tiling_of
 from g2ard.config.paths import listed
-from g2ard.config.presets import configured
 from g2ard.io.atomic import atomic_output
 from g2ard.io.scene_formats import written_bytes
+from g2ard.pipeline.presets import configured
 from g2ard.progress import plural
 from g2ard.system.memory import peak_rss
 

@@ -18,8 +18,8 @@ from g2ard.config.choices import ENGINES
 from g2ard.errors import InputError, require_torch
 from g2ard.progress import Progress, silent
 from g2ard.rendering.renderer import settings_for
+from g2ard.rendering.targets import Targets, fingerprint_of, mask_of
 from g2ard.scene.splats import Splats
-from g2ard.scene.targets import Targets, fingerprint_of, mask_of
 from g2ard.stages.recover.anchors import Anchors, drift95, needle
 from g2ard.stages.recover.config import RecoverConfig
 from g2ard.stages.recover.draw import drawn

@@ -10,9 +10,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from g2ard.errors import InputError
 from g2ard.progress import Progress, plural, silent
+from g2ard.rendering.targets import Targets, fingerprint_of
 from g2ard.scene.cameras import unseeing
 from g2ard.scene.splats import Splats
-from g2ard.scene.targets import Targets, fingerprint_of
 from g2ard.stages.recover.anchors import Anchors, drift95, needle
 from g2ard.stages.recover.config import RecoverConfig
 from g2ard.stages.recover.draw import checked_weights

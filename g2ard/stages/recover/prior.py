@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from g2ard.errors import InputError
+from g2ard.io.reports import Report
 from g2ard.rendering.renderer import RasterSettings, Renderer
-from g2ard.report.base import Report
 from g2ard.scene.cameras import Cameras, evenly_spaced
 from g2ard.scene.splats import Splats
 from g2ard.stages.recover.anchors import REGULARIZERS, Regularizers, needle

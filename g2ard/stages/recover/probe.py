@@ -10,9 +10,9 @@ import numpy as np
 
 from g2ard.rendering.metrics import psnr
 from g2ard.rendering.renderer import Renderer
+from g2ard.rendering.targets import Subset, Targets, mask_of
 from g2ard.scene.cameras import evenly_spaced, rows_by_kind
 from g2ard.scene.splats import Splats
-from g2ard.scene.targets import Subset, Targets, mask_of
 
 _VIEWS = 8
 """Views that are scored, of training and of each kind of validation views."""

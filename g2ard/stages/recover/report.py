@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from g2ard.report.base import LEFT_OUT, Report
+from g2ard.io.reports import LEFT_OUT, Report
 from g2ard.scene.cameras import USUAL
 
 

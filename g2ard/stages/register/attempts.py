@@ -8,9 +8,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from g2ard.io.images import load_image, load_mask, resized
 from g2ard.rendering.renderer import Renderer
 from g2ard.scene.cameras import Camera, Cameras
-from g2ard.scene.images import load_image, load_mask, resized
 from g2ard.stages.register.align import Aligned, Level, align, inverse, level_of
 from g2ard.stages.register.config import RegisterConfig
 from g2ard.stages.register.grey import grey_of, local_zncc

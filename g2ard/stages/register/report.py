@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from g2ard.config.choices import Keep
 from g2ard.errors import require
+from g2ard.io.reports import Report
 from g2ard.progress import plural
-from g2ard.report.base import Report
 from g2ard.scene.cameras import Cameras
 
 Status = Literal["registered", "uncertain", "refused"]

@@ -21,8 +21,8 @@ from g2ard.errors import InputError
 from g2ard.io.detect import MANIFEST
 from g2ard.io.jsonfile import read_json
 from g2ard.io.types import Note
+from g2ard.scene.kdtree import KdTree
 from g2ard.scene.splats import Splats
-from g2ard.tiles.kdtree import KdTree
 
 FORMAT, VERSION = "g2ard tiles", 1
 

@@ -3,7 +3,7 @@
 import numpy as np
 
 from g2ard.rendering.renderer import Renderer
-from g2ard.scene.targets import TeacherRenders
+from g2ard.rendering.targets import TeacherRenders
 from helpers.scenes import around, checkered_ball
 
 

@@ -11,11 +11,12 @@ import pytest
 
 import g2ard
 from g2ard.config.paths import changed, listed
-from g2ard.config.presets import preset
 from g2ard.errors import InputError
 from g2ard.io import read_splats, write_splats, write_views
-from g2ard.pipeline import SelectConfig, distill
-from g2ard.scene.targets import TeacherRenders
+from g2ard.pipeline.config import SelectConfig
+from g2ard.pipeline.distill import distill
+from g2ard.pipeline.presets import preset
+from g2ard.rendering.targets import TeacherRenders
 from g2ard.stages.recover import RecoverConfig, recover
 from g2ard.stages.recover.anchors import PAPER_REGULARIZERS, Anchors, Regularizers, drift95
 from g2ard.stages.recover.schedule import PAPER, Schedule

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from g2ard.errors import InputError
-from g2ard.scene.splits import split_mask
+from g2ard.io.splits import split_mask
 
 
 def split_names(views: str | Path, names: list[str], which: str) -> list[str]:

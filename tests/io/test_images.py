@@ -8,8 +8,8 @@ from PIL import Image
 
 from g2ard.errors import InputError, OutputError
 from g2ard.io import read_views
+from g2ard.io.images import contact_sheet, load_image, to_bytes, write_png
 from g2ard.scene.cameras import Cameras
-from g2ard.scene.images import contact_sheet, load_image, to_bytes, write_png
 from helpers.realdata import real
 
 

@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard.rendering.renderer import Renderer
+from g2ard.rendering.targets import Targets, mask_of
 from g2ard.rendering.visibility import visibility
 from g2ard.scene.cameras import Cameras, evenly_spaced
 from g2ard.scene.splats import SH_C0, Splats
-from g2ard.scene.targets import Targets, mask_of
 
 _VIEWS = 16
 """Number of evenly spaced targets used to fit the change of colours."""

@@ -9,8 +9,8 @@ import pytest
 
 import g2ard
 from g2ard.io import write_splats, write_views
+from g2ard.io.images import write_png
 from g2ard.rendering.renderer import render
-from g2ard.scene.images import write_png
 from helpers.commands import CommandLine, refused, succeeds
 from helpers.scenes import around, checkered_ball
 

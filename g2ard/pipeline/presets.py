@@ -96,6 +96,6 @@ def preset(name: str = "paper", config: Any = None) -> Any:
     >>> paper.simplify.method, paper.recover.regularizers.anchor, paper.recover.schedule.round_steps
     ('paper', 0.001, 8000)
     """
-    from g2ard.pipeline import DistillConfig
+    from g2ard.pipeline.config import DistillConfig
 
     return configured(DistillConfig() if config is None else config, name)

@@ -12,10 +12,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from g2ard.config.choices import BLACK, Colour
 from g2ard.errors import InputError
+from g2ard.io.images import load_image, load_mask
 from g2ard.progress import Progress, plural, silent
 from g2ard.rendering.renderer import RasterSettings, Renderer
 from g2ard.scene.cameras import Cameras
-from g2ard.scene.images import load_image, load_mask
 from g2ard.scene.splats import Splats
 
 CACHE_BYTES = 2_000_000_000

@@ -1,0 +1,323 @@
+"""The whole pipeline: select, simplify, freeze anchors and recover, in rounds."""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from g2ard.pipeline.config import DistillConfig, SelectConfig
+from g2ard.pipeline.report import DistillReport, RoundReport, StageSeconds, ViewsReport
+from g2ard.progress import Progress, plural, silent
+from g2ard.rendering.targets import Photos, PhotosOrRenders, Subset, Targets, fingerprint_of
+from g2ard.rendering.visibility import visibility_source
+from g2ard.scene.cameras import Cameras
+from g2ard.scene.splats import Splats
+from g2ard.stages.recover import checkpoint as checkpoints
+from g2ard.stages.recover import recover
+from g2ard.stages.recover.anchors import Anchors
+from g2ard.stages.recover.draw import checked_weights
+from g2ard.stages.recover.optimize import Watch
+from g2ard.stages.recover.schedule import steps_for, steps_from_points
+from g2ard.stages.select import select
+from g2ard.stages.simplify import round_counts, simplify
+
+__all__ = ["DistillConfig", "Distilled", "SelectConfig", "distill", "final_steps"]
+
+_ARRAYS = ("means", "quats", "scales", "logit_opacities", "sh0", "shN")
+
+
+@dataclass(frozen=True, eq=False)
+class Distilled:
+    """A compact scene and a report.
+
+    Args:
+        splats: exactly `budget` Gaussians.
+        simplified: the scene before recovery at its final count: the anchors of the final recovery, and the
+            reference of Drift95.
+        report: views, rounds and times.
+        held_out: held-out targets for scoring; None if the caller has their own.
+    """
+
+    splats: Splats
+    simplified: Splats
+    report: DistillReport
+    held_out: Targets | None = None
+
+    def __repr__(self) -> str:
+        gain = self.report.rounds[-1].recover[-1:]
+        scores = f", {gain[0].psnr}" if gain else ""
+        return f"Distilled({plural(len(self.splats), 'Gaussian')}{scores})"
+
+
+def distill(
+    prior: Splats,
+    budget: int,
+    targets: Targets,
+    config: DistillConfig | None = None,
+    *,
+    weights: ArrayLike | None = None,
+    validation: Targets | None = None,
+    work: Path | None = None,
+    progress: Progress = silent,
+    watch: Watch | None = None,
+) -> Distilled:
+    """Distil a dense prior into exactly `budget` Gaussians.
+
+    The scene is simplified in one step, or, if the schedule has `round_steps`, in rounds of N_r = max(N_S,
+    ⌈0.75·N_{r−1}⌉) with recovery after each.
+
+    Args:
+        prior: a trained scene or a lifted point cloud; cameras are in world coordinates, including its
+            offset.
+        budget: N_S, at most the prior's count.
+        targets: photos, or the prior's own renders.
+        config: see `DistillConfig`.
+        weights: (C,) sampling weight of each view; None computes them.
+        validation: views of another kind, not trained on, that limit recovery's changes if they lose quality,
+            see `g2ard.stages.recover.recover`.
+        work: folder for finished rounds and checkpoints; the same call resumes from it.
+        progress: called by all stages.
+        watch: called after every step of every recovery, see `g2ard.stages.recover.recover`.
+
+    Returns:
+        The compact scene with its unrecovered version and report.
+
+    Raises:
+        InputError: the budget does not fit, no view sees the prior, or `work` belongs to another run.
+        KeyboardInterrupt: after Ctrl-C; the same call resumes from `work`.
+    """
+    config = config or DistillConfig()
+    counts = [budget]
+    if config.recover.schedule.round_steps > 0:
+        kept, fold = config.simplify.retention_of("paper"), config.simplify.fold
+        counts = round_counts(len(prior), budget, kept, fold)
+    rounds = _Rounds(
+        prior,
+        budget,
+        targets,
+        config,
+        len(counts),
+        checked_weights(weights, len(targets.cameras)),
+        validation=validation,
+        work=work,
+        progress=progress,
+        watch=watch,
+    )
+    for number, count in enumerate(counts, start=1):
+        rounds.advance(number, count, final=number == len(counts))
+    report = DistillReport(
+        tuple(map(RoundReport.of, rounds.log)), StageSeconds.of(rounds.seconds), rounds.supervision.report
+    )
+    return Distilled(rounds.state, rounds.simplified, report)
+
+
+def final_steps(config: DistillConfig, scene: Splats, cameras: Cameras, *, photos: bool) -> int:
+    """Return the steps of the last recovery: as set, the schedule's, or more by need.
+
+    More are needed for points of photos, and for renders of which each shows little of the scene.
+    """
+    schedule = config.recover.schedule
+    if config.recover.steps is not None:
+        return config.recover.steps
+    if schedule.means_in_scales and config.recover.from_points:
+        return steps_from_points(len(scene), schedule.steps)
+    if not schedule.means_in_scales or photos:
+        return schedule.steps
+    return steps_for(scene, cameras, schedule.steps)
+
+
+@dataclass(frozen=True, eq=False)
+class _Supervision:
+    """Training targets with sampling weights, and a report of their selection."""
+
+    targets: Targets
+    weights: Any
+    report: ViewsReport | None
+
+    @classmethod
+    def of(
+        cls, scene: Splats, targets: Targets, config: DistillConfig, weights: Any, progress: Progress
+    ) -> _Supervision:
+        """Select the views that see `scene`; given `weights` override those of the selection."""
+        cameras = targets.cameras
+        how = config.select
+        if how.views_count is None and (weights is not None or not how.weighted):
+            return cls(targets, weights, None)
+        policy = how.policy if how.views_count is not None else "auto"
+        chosen = select(
+            scene,
+            cameras,
+            how.count_of(len(cameras)),
+            policy=policy,
+            seed=config.recover.seed,
+            options=how,
+            progress=progress,
+        )
+        rows = np.argsort(chosen.order)
+        subset = Subset(targets, chosen.order[rows])
+        if weights is not None:
+            weights = weights[chosen.order[rows]]
+        elif how.weighted:
+            weights = chosen.weights[rows]
+        report = ViewsReport(
+            policy=policy,
+            candidates=len(cameras),
+            chosen=[cameras.names[i] for i in chosen.order],
+            weighted=weights is not None,
+            refused=[cameras.names[i] for i in chosen.refused],
+            left_out=chosen.left_out,
+        )
+        return cls(subset, weights, report)
+
+
+@dataclass(eq=False)
+class _Rounds:
+    """State of the rounds: scene, protection flags and log; each stage is saved if `work` is given."""
+
+    prior: Splats
+    budget: int
+    targets: Targets
+    config: DistillConfig
+    count: int
+    weights: Any = None
+    validation: Targets | None = None
+    work: Path | None = None
+    progress: Progress = silent
+    watch: Watch | None = None
+
+    def __post_init__(self) -> None:
+        self.state = self.simplified = self.prior
+        self.protected: Any = None
+        self.log: list[dict[str, Any]] = []
+        self.seconds = {"select": 0.0, "simplify": 0.0, "recover": 0.0}
+        self._select(self.prior)
+
+    @cached_property
+    def key(self) -> str:
+        """Fingerprint that saved stages must have; computed only with a work folder."""
+        weights = None if self.weights is None else self.weights.tolist()
+        options = repr((self.budget, self.config, weights))
+        parts = [options, self.prior.fingerprint(), fingerprint_of(self.targets)]
+        if self.validation is not None:
+            parts.append(fingerprint_of(self.validation))
+        return hashlib.sha256("\n".join(parts).encode()).hexdigest()
+
+    def advance(self, number: int, count: int, *, final: bool) -> None:
+        """Run one round: simplify to `count` and recover; the final round adds the final recovery."""
+        entry: dict[str, Any] = {"count": count}
+        if self.config.select.reselect and number > 1:
+            self._select(self.state)
+        self._simplify(number, count, entry)
+        if self.config.recover.schedule.round_steps > 0:
+            self._recover(f"round-{number}", entry, final=False)
+        if final:
+            self._recover("final", entry, final=True)
+        self.log.append(entry)
+
+    def _select(self, scene: Splats) -> None:
+        began = time.monotonic()
+        self.supervision = _Supervision.of(scene, self.targets, self.config, self.weights, self.progress)
+        self.seconds["select"] += time.monotonic() - began
+        if self.config.select.views_count is not None:  # load all now, so that later steps take equal time
+            targets, count = self.supervision.targets, len(self.supervision.targets.cameras)
+            for view in range(count):
+                targets[view]
+                self.progress("targets", view + 1, count)
+
+    def _simplify(self, number: int, count: int, entry: dict[str, Any]) -> None:
+        name = f"simplified-{number}"
+        if self._restore(name, entry):
+            self._count_resumed(entry["simplify"]["seconds"])
+        else:
+            began = time.monotonic()
+            blind = self.config.simplify.method == "paper"
+            done = simplify(
+                self.state,
+                count,
+                config=self.config.simplify,
+                visibility=None if blind else visibility_source(self.targets.cameras, progress=self.progress),
+                protected=self.protected,
+                final_budget=self.budget,
+                progress=self.progress,
+            )
+            self.state, self.protected = done.splats, done.protected
+            entry["simplify"] = {**done.report.as_dict(), "seconds": time.monotonic() - began}
+            self._save(name, entry)
+        self.seconds["simplify"] += entry["simplify"]["seconds"]
+        if self.config.recover.sh_degree is not None:
+            self.state = self.state.with_sh_degree(self.config.recover.sh_degree)
+        self.simplified = self.state
+
+    def _recover(self, name: str, entry: dict[str, Any], *, final: bool) -> None:
+        if self._restore(name, entry):
+            self._count_resumed(entry["recover"][-1]["seconds"])
+        else:
+            config = replace(
+                self.config.recover,
+                steps=self._steps() if final else None,
+                recovery_time=self._time_limit(final),
+                final=final,
+            )
+            checkpoint = self.work / f"{name}.checkpoint.npz" if self.work else None
+            done = recover(
+                self.state,
+                self.supervision.targets,
+                config,
+                weights=self.supervision.weights,
+                anchors=Anchors.of(self.simplified, config.regularizers.in_plane),
+                validation=self.validation,
+                checkpoint=checkpoint,
+                progress=self.progress,
+                stage="recover" if final else f"recover {name}",
+                watch=self.watch,
+            )
+            self.state = done.splats
+            entry.setdefault("recover", []).append(done.report.as_dict())
+            if done.report.resumed is not None:
+                self._count_resumed(done.report.resumed)
+            self._save(name, entry)
+            if checkpoint is not None:
+                checkpoint.unlink(missing_ok=True)
+        self.seconds["recover"] += entry["recover"][-1]["seconds"]
+
+    def _steps(self) -> int:
+        photos = isinstance(self.targets, Photos | PhotosOrRenders)
+        return final_steps(self.config, self.state, self.supervision.targets.cameras, photos=photos)
+
+    def _time_limit(self, final: bool) -> float | None:
+        """Return this recovery's share of the time limit for all."""
+        config, schedule = self.config.recover, self.config.recover.schedule
+        if config.recovery_time is None:
+            return None
+        final_steps = schedule.steps if config.steps is None else config.steps
+        all_steps = final_steps + self.count * schedule.round_steps
+        return config.recovery_time * (final_steps if final else schedule.round_steps) / all_steps
+
+    def _count_resumed(self, seconds: float) -> None:
+        """Add the time of a stage, or part of one, that an earlier call took."""
+        self.seconds["resumed"] = self.seconds.get("resumed", 0.0) + seconds
+
+    def _save(self, name: str, entry: dict[str, Any]) -> None:
+        if self.work is None:
+            return
+        arrays = {array: getattr(self.state, array) for array in _ARRAYS}
+        arrays["protected"] = np.asarray(self.protected)
+        checkpoints.save(self.work / f"{name}.npz", self.key, {"entry": entry}, arrays)
+
+    def _restore(self, name: str, entry: dict[str, Any]) -> bool:
+        """Restore a finished stage of an earlier run, and return whether it was found."""
+        path = self.work / f"{name}.npz" if self.work else None
+        if path is None or not path.exists():
+            return False
+        meta, arrays = checkpoints.load(path, self.key)
+        self.protected = arrays.pop("protected")
+        self.state = replace(self.prior, **arrays)
+        entry.update(meta["entry"])
+        return True
