@@ -32,7 +32,8 @@ if TYPE_CHECKING:
 SceneArgument = Annotated[
     Path,
     typer.Argument(
-        metavar="SCENE", help="Scene: .ply (3DGS), SOG, .spz, .glb, .splat, .compressed.ply or OpenUSD."
+        metavar="SCENE",
+        help="Scene: .ply (3DGS), SOG, .spz, .glb, .splat, .ksplat, .compressed.ply or OpenUSD.",
     ),
 ]
 ViewsOption = Annotated[

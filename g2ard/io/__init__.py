@@ -2,9 +2,9 @@
 
 | reads | from |
 |---|---|
-| `read_splats`, `read_scene` | 3DGS .ply, .compressed.ply, SOG folder or .sog, .spz, .glb, .splat, OpenUSD |
+| `read_splats`, `read_scene` | .ply (3DGS), .compressed.ply, SOG, .spz, .glb, .splat, .ksplat, OpenUSD |
 | `read_points`, `read_cloud` | .ply, .las, .laz, COLMAP points3D |
-| `read_views`, `read_view_set` | COLMAP, transforms.json, INRIA, nerfstudio, gsplat, Cambridge, g2ard |
+| `read_views`, `read_view_set` | COLMAP, transforms.json, trainers' cameras, data sets, g2ard's own |
 
 The first function of each row returns data; the second also returns notes about the file (`Note`).
 `find_views` finds the cameras that trainers leave beside a scene. Readers are imported on first use.
@@ -76,8 +76,8 @@ def read_splats(path: str | Path, *, render_model: RenderModel | None = None) ->
     """Read a Gaussian scene.
 
     Args:
-        path: .ply (3DGS), .compressed.ply, .sog or a SOG folder, .spz, .glb, .splat, OpenUSD (.usda,
-            .usdc); or a folder written by `distill` or `ingest`.
+        path: .ply (3DGS), .compressed.ply, .sog or a SOG folder, .spz, .glb, .splat, .ksplat, OpenUSD
+            (.usda, .usdc); or a folder written by `distill` or `ingest`.
         render_model: "classic" or "antialiased"; None means what the file says, classic if it says nothing.
 
     Returns:
@@ -254,7 +254,8 @@ def read_views(path: str | Path, *, images: str | Path | None = None, split: str
 
     Args:
         path: a COLMAP folder (or its images_4), a transforms.json or its folder, a nerfstudio, gsplat or
-            INRIA run, a Cambridge Landmarks scene, or a .json written by g2ard.
+            INRIA run, LLFF's poses_bounds.npy, a Polycam capture, a Cambridge Landmarks scene, or a
+            .json written by g2ard.
         images: folder of the photos, if they have moved.
         split: "train", "test", or "all"; see `g2ard.io.splits.split_mask`.
 

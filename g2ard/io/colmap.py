@@ -22,6 +22,10 @@ _MODELS = (
 _PARAMETERS = {"SIMPLE_PINHOLE": 3, "PINHOLE": 4, "SIMPLE_RADIAL": 4, "RADIAL": 5, "OPENCV": 8}
 
 
+_PARTS = tuple(f"{part}{suffix}" for suffix in (".bin", ".txt") for part in ("cameras", "images", "points3D"))
+"""Files of a model."""
+
+
 class _Image(NamedTuple):
     name: str
     camera: int
@@ -49,6 +53,19 @@ def _tables(folder: Path) -> tuple[Path, Path] | None:
         cameras, images = folder / f"cameras{suffix}", folder / f"images{suffix}"
         if cameras.is_file() and images.is_file():
             return cameras, images
+    return None
+
+
+def incomplete(path: Path) -> InputError | None:
+    """Return the error for a model without cameras or images, or None if there is no part of one."""
+    folder = path.parent if path.is_file() else path
+    for place in (folder, folder / "sparse" / "0", folder / "sparse", folder / "colmap" / "sparse" / "0"):
+        held = [name for name in _PARTS if (place / name).is_file()]
+        if held and _tables(place) is None:
+            suffix = Path(held[0]).suffix
+            lacking = [f"{part}{suffix}" for part in ("cameras", "images") if f"{part}{suffix}" not in held]
+            text = f"COLMAP model without {' and '.join(lacking)}; found {', '.join(held)}"
+            return InputError(text, path=place, hint="copy the whole model: cameras (lenses), images (poses)")
     return None
 
 
@@ -81,7 +98,8 @@ def frames(path: Path, images: Path | None = None) -> tuple[Path, list[Frame]]:
     folder = model_folder(path)
     tables = _tables(folder) if folder else None
     if folder is None or tables is None:
-        raise InputError("has no COLMAP model (cameras and images, .bin or .txt)", path=path)
+        error = incomplete(path)
+        raise error or InputError("has no COLMAP model (cameras and images, .bin or .txt)", path=path)
     binary = tables[0].suffix == ".bin"
     with parsing(tables[0]):
         cameras = (_cameras_bin if binary else _cameras_txt)(tables[0])

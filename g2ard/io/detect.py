@@ -13,12 +13,21 @@ from typing import Any, Literal, get_args
 
 from g2ard.config.choices import BLACK, Colour
 from g2ard.errors import InputError
-from g2ard.io.paths import check_regular
+from g2ard.io.paths import check_regular, is_photo
 
-SceneFile = Literal["ply", "compressed_ply", "sog", "spz", "glb", "splat", "usd", "tiles"]
+SceneFile = Literal["ply", "compressed_ply", "sog", "spz", "glb", "splat", "ksplat", "usd", "tiles"]
 CloudFile = Literal["cloud_ply", "las", "points3d"]
 ViewsFile = Literal[
-    "colmap", "transforms", "cambridge", "inria", "nerfstudio", "nerfstudio_export", "gsplat_run", "views"
+    "colmap",
+    "transforms",
+    "cambridge",
+    "inria",
+    "llff",
+    "nerfstudio",
+    "nerfstudio_export",
+    "gsplat_run",
+    "polycam",
+    "views",
 ]
 Format = SceneFile | CloudFile | ViewsFile
 Kind = Literal["splats", "points", "views"]
@@ -32,13 +41,28 @@ KINDS: dict[str, Kind] = {
 
 _BY_NAME: dict[str, Format] = {
     **{"meta.json": "sog", "lod-meta.json": "sog", "config.yml": "nerfstudio", "cfg.yml": "gsplat_run"},
+    "poses_bounds.npy": "llff",
     **dict.fromkeys(("points3d.bin", "points3d.txt"), "points3d"),
     **dict.fromkeys(("cameras.bin", "cameras.txt", "images.bin", "images.txt"), "colmap"),
 }
 _BY_SUFFIX: dict[str, Format] = {
-    **{".sog": "sog", ".spz": "spz", ".glb": "glb", ".splat": "splat", ".las": "las", ".laz": "las"},
+    **{
+        ".sog": "sog",
+        ".spz": "spz",
+        ".glb": "glb",
+        ".splat": "splat",
+        ".ksplat": "ksplat",
+        ".las": "las",
+        ".laz": "las",
+    },
     **dict.fromkeys((".usda", ".usdc", ".usd", ".usdz"), "usd"),
 }
+
+_CONVERTERS = {
+    ".lcc": "`splat-transform scene.lcc scene.ply` (npm: @playcanvas/splat-transform) converts it",
+    ".rad": "convert the scene that it was built from; Spark builds .rad files from .ply, .spz or .sog",
+}
+"""What to do with scenes of other programs."""
 
 MANIFEST, JOURNAL, POINTS = "tiles.json", "journal.json", ".points"
 """Files of finished and unfinished folders of tiles, and their folder of points to lift."""
@@ -72,9 +96,11 @@ def file_format(path: str | Path) -> Format:
         return _ply_format(path)
     if suffix == ".json":
         return _json_format(path)
+    if suffix in _CONVERTERS:
+        raise InputError(f"{suffix[1:].upper()} files are not supported", path=path, hint=_CONVERTERS[suffix])
     raise InputError(
-        f"unknown format {path.suffix!r} (scenes: .ply .sog .spz .glb .splat .usda .usdc; point clouds: "
-        ".ply .las .laz; views: a COLMAP folder, a .json, or a training run)",
+        f"unknown format {path.suffix!r} (scenes: .ply .sog .spz .glb .splat .ksplat .usda .usdc; point "
+        "clouds: .ply .las .laz; views: a COLMAP folder, a .json, or a training run)",
         path=path,
     )
 
@@ -159,10 +185,6 @@ def _holds(file: Path, test: Callable[[Any], bool]) -> bool:
     return False
 
 
-def is_photo(path: Path) -> bool:
-    return path.suffix.lower() in (".png", ".jpg", ".jpeg", ".webp")
-
-
 def _folder_format(path: Path) -> Format:
     from g2ard.io.sog import chunks_of
 
@@ -171,9 +193,9 @@ def _folder_format(path: Path) -> Format:
     if chunks_of(path):
         return "sog"
 
-    from g2ard.io import gsplat_run, inria, nerfstudio
+    from g2ard.io import gsplat_run, inria, llff, nerfstudio, polycam
     from g2ard.io.cambridge import is_cambridge
-    from g2ard.io.colmap import model_folder, photos_beside
+    from g2ard.io.colmap import incomplete, model_folder, photos_beside
     from g2ard.io.nerfstudio_export import exported
     from g2ard.io.transforms import files_of
 
@@ -187,6 +209,10 @@ def _folder_format(path: Path) -> Format:
         return "transforms"
     if is_cambridge(path):
         return "cambridge"
+    if (path / llff.NAME).is_file():
+        return "llff"
+    if polycam.cameras_in(path):
+        return "polycam"
     if photos_beside(path):
         return "colmap"
     if (path / inria.NAME).is_file():
@@ -195,6 +221,8 @@ def _folder_format(path: Path) -> Format:
         return "gsplat_run"
     if any((path / journal).is_file() for journal in (JOURNAL, f"{POINTS}/{JOURNAL}")):
         raise InputError("has unfinished tiles", path=path, hint="run the same `g2ard ingest` to continue")
+    if error := incomplete(path):
+        raise error
     raise InputError(f"is not a supported folder{_instead(path)}", path=path)
 
 
@@ -235,7 +263,8 @@ def _instead(path: Path) -> str:
         )
     return (
         " (looked for SOG's meta.json, `ingest`'s tiles.json, a COLMAP sparse/0, transforms.json, "
-        "cameras.json, nerfstudio's and gsplat's runs, Cambridge's dataset_train.txt)"
+        "cameras.json, LLFF's poses_bounds.npy, Polycam's keyframes, nerfstudio's and gsplat's runs, "
+        "Cambridge's dataset_train.txt)"
     )
 
 

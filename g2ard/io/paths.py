@@ -74,3 +74,8 @@ def _inside(path: str | Path, i: int, name: str) -> PurePosixPath:
         short = name if len(name) <= _LONGEST else f"{name[:_LONGEST]}…"
         raise InputError(f"has the invalid file name {short!r}", path=path, index=i, item="view")
     return PurePosixPath(*kept)
+
+
+def is_photo(path: Path) -> bool:
+    """Return whether a name has the suffix of a photo."""
+    return path.suffix.lower() in (".png", ".jpg", ".jpeg", ".webp")

@@ -10,7 +10,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard.errors import InputError
-from g2ard.io.jsonfile import Fields, fields_of, matrix, number, optional_text, read_json, text, whole
+from g2ard.io.jsonfile import (
+    Fields,
+    fields_of,
+    matrix,
+    number,
+    numbers,
+    optional_text,
+    read_json,
+    text,
+    whole,
+)
 from g2ard.io.photos import Frame, Lens, find_photo, inverse, photo_size, rigid, view_set
 from g2ard.io.types import ViewSet
 
@@ -97,6 +107,9 @@ def _frame(path: Path, index: int, content: dict[str, Any], entry: Any, images: 
         raise frame.place.to("mask_path").error(f"is {mask}, which does not exist")
     world_from_camera = rigid(matrix(frame, "transform_matrix"), frame.place.to("transform_matrix"))
     photo = find_photo(images / Path(file_path).name if images else path.parent / file_path)
+    if images is None and not photo.is_file():  # photos beside the file that names them in a folder
+        beside = find_photo(path.parent / Path(file_path).name)
+        photo = beside if beside.is_file() else photo
     return Frame(
         name=file_path.removeprefix("./").removeprefix("images/"),
         viewmat=opencv_view(world_from_camera),
@@ -129,13 +142,27 @@ def _intrinsics(path: Path, values: Fields, photo: Path) -> Lens:
         error = values.place.error(f"has an unsupported {lens} lens; expected {known}")
         raise error.at(hint="undistort the photos")
     width, height = _size(path, values, photo)
+    distortion = tuple(number(values, key, 0.0) for key in ("k1", "k2", "p1", "p2", "k3"))
+    if (K := _matrix(values)) is not None:
+        return Lens((width, height), K, distortion)
     fx = _focal(values, "x", width)
     fy = _focal(values, "y", height) or fx
     if fx is None or fy is None:
-        raise values.place.error("has no focal length (fl_x or camera_angle_x)")
+        raise values.place.error("has no focal length (fl_x, camera_angle_x, or a 3×3 K or intrinsics)")
     cx, cy = number(values, "cx", width / 2), number(values, "cy", height / 2)
-    distortion = tuple(number(values, key, 0.0) for key in ("k1", "k2", "p1", "p2", "k3"))
     return Lens((width, height), np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), distortion)
+
+
+def _matrix(values: Fields) -> NDArray[np.float64] | None:
+    """Return a frame's 3×3 `K` or `intrinsics`, without skew, or None."""
+    key = next((key for key in ("K", "intrinsics") if isinstance(values.get(key), list)), None)
+    if key is None:
+        return None
+    K = np.array(numbers(values, key, 3, 3))
+    if not (K[0, 0] > 0 and K[1, 1] > 0 and np.array_equal(K[2], [0, 0, 1])):
+        raise values.place.to(key).error("is not a matrix of focal lengths and a principal point")
+    K[0, 1] = K[1, 0] = 0
+    return K
 
 
 def _focal(values: Fields, axis: str, pixels: int) -> float | None:
@@ -153,8 +180,9 @@ def _focal(values: Fields, axis: str, pixels: int) -> float | None:
 
 
 def _size(path: Path, values: Fields, photo: Path) -> tuple[int, int]:
-    if "w" in values and "h" in values:
-        return whole(values, "w"), whole(values, "h")
+    for width, height in (("w", "h"), ("width", "height")):
+        if width in values and height in values:
+            return whole(values, width), whole(values, height)
     if photo.is_file():
         return photo_size(photo, path)
     error = values.place.error(f"has neither w and h nor a photo {photo}")

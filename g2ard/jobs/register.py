@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from g2ard.config.choices import Alpha
 from g2ard.errors import InputError
 from g2ard.io import ace, read_view_set
-from g2ard.io.detect import file_format, is_photo
+from g2ard.io.detect import file_format
+from g2ard.io.paths import is_photo
 from g2ard.io.photos import has_alpha, photo_size
 from g2ard.progress import Progress, Say, silent, unsaid
 from g2ard.scene.cameras import Camera, Cameras

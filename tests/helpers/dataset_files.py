@@ -1,5 +1,6 @@
 """Data sets in their published layout, with few views."""
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,38 @@ POSES = [look_at([3 * np.cos(a), 3 * np.sin(a), 1.5], [0, 0, 0]) for a in np.lin
 
 def opengl(view: np.ndarray) -> np.ndarray:
     return np.linalg.inv(view) @ np.diag([1.0, -1, -1, 1])
+
+
+def llff(root: Path, scale: int = 4) -> None:
+    """poses_bounds.npy for photos of 400×300 pixels, of which a smaller copy exists."""
+    rows = []
+    for i, view in enumerate(POSES):
+        pose = np.linalg.inv(view)  # right, down, forward
+        down_right_back = np.stack([pose[:3, 1], pose[:3, 0], -pose[:3, 2]], axis=1)
+        head = np.array([[300.0], [400.0], [380.0]])
+        rows.append([*np.hstack([down_right_back, pose[:3, 3:], head]).ravel(), 1.0, 9.0])
+        photo(root / f"images_{scale}" / f"IMG_{i:04d}.JPG", (400 // scale, 300 // scale))
+    np.save(root / "poses_bounds.npy", np.array(rows))
+
+
+def polycam(root: Path, folder: str = "corrected_") -> None:
+    """Keyframes of a Polycam capture, named by their time in microseconds."""
+    for i, view in enumerate(POSES):
+        name, pose = str(9_999_000 + 500 * i), opengl(view)
+        frame = {f"t_{row}{column}": pose[row, column] for row in range(3) for column in range(4)}
+        frame |= {
+            "fx": 95.0,
+            "fy": 96.0,
+            "cx": 51.0,
+            "cy": 37.0,
+            "width": 100,
+            "height": 75,
+            "blur_score": 30.0,
+        }
+        cameras = root / "keyframes" / f"{folder}cameras"
+        cameras.mkdir(parents=True, exist_ok=True)
+        (cameras / f"{name}.json").write_text(json.dumps(frame))
+        photo(root / "keyframes" / f"{folder}images" / f"{name}.jpg", (100, 75))
 
 
 def mip_nerf_360(root: Path) -> None:

@@ -150,3 +150,14 @@ def saved(folder: Path, name: str, scene: Splats, **options: object) -> Path:
     path = folder / (name if "/" in name else f"a.{name}")
     write_splats(path, scene, **options)
     return path
+
+
+# ── .ksplat ──────────────────────────────────────────────────────────────────────────────────────────
+
+
+def unpacked_ksplat(name: str, folder: Path) -> Path:
+    """Unpack a file of `tests/io/ksplat`, which GaussianSplats3D wrote."""
+    packed = Path(__file__).parents[1] / "io" / "ksplat" / f"{name}.ksplat.gz"
+    path = folder / f"{name}.ksplat"
+    path.write_bytes(gzip.decompress(packed.read_bytes()))
+    return path

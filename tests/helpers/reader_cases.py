@@ -8,8 +8,8 @@ import numpy as np
 
 from g2ard.io import write_splats, write_views
 from helpers.cloud_files import columns, las, ply
-from helpers.dataset_files import cambridge
-from helpers.packed_files import compressed, save_spz, truth
+from helpers.dataset_files import cambridge, llff, polycam
+from helpers.packed_files import compressed, save_spz, truth, unpacked_ksplat
 from helpers.sog_files import folder as sog_folder
 from helpers.sog_files import parts, zipped
 from helpers.trainer_files import data_of, export, inria, result_of, run_of
@@ -46,6 +46,17 @@ def landmarks(folder: Path, name: str) -> Path:
     return folder / "college" / name
 
 
+def poses_bounds(folder: Path) -> Path:
+    llff(folder)
+    return folder / "poses_bounds.npy"
+
+
+def keyframe(folder: Path) -> Path:
+    """Return the first camera of a Polycam capture."""
+    polycam(folder / "capture")
+    return min((folder / "capture" / "keyframes" / "corrected_cameras").iterdir())
+
+
 def levels(folder: Path) -> Path:
     """Return the lod-meta.json of a folder of SOG chunks."""
     sog_folder(folder / "0_0", parts())
@@ -71,6 +82,7 @@ MAKERS: dict[str, Callable[[Path], Path]] = {
     "spz 3": lambda f: save_spz(f / "a.spz", truth(9, 1), 3),
     "spz 4": lambda f: save_spz(f / "a.spz", truth(9, 1), 4),
     "splat": lambda f: saved(f / "a.splat", write_splats, truth(9, 0)),
+    "ksplat": lambda f: unpacked_ksplat("level2-sh2", f),
     "sog": lambda f: zipped(f / "a.sog", parts()),
     "meta.json": lambda f: sog_folder(f, parts()) / "meta.json",
     "lod-meta.json": levels,
@@ -87,6 +99,8 @@ MAKERS: dict[str, Callable[[Path], Path]] = {
     "points3D.txt": lambda f: table(f, "points3D.txt", text=True),
     "dataset_train.txt": lambda f: landmarks(f, "dataset_train.txt"),
     "reconstruction.nvm": lambda f: landmarks(f, "reconstruction.nvm"),
+    "poses_bounds.npy": poses_bounds,
+    "Polycam": keyframe,
     "transforms": lambda f: transforms(f / "a.json", orbit(2)),
     "cameras.json": lambda f: inria(f / "cameras.json", orbit(3)),
     "dataparser_transforms.json": lambda f: run_file(f, "dataparser_transforms.json"),
@@ -102,5 +116,6 @@ READ = {
     "transforms of a run": "outputs/poster/splatfacto/today",
     "dataset_train.txt": "college",
     "reconstruction.nvm": "college",
+    "Polycam": "capture",
 }
 """The path to read instead of the damaged file, in the test's folder."""

@@ -9,7 +9,7 @@ import pytest
 from g2ard import io
 from g2ard.errors import InputError
 from g2ard.io.images import load_image
-from helpers.dataset_files import POSES, cambridge, mip_nerf_360, opengl
+from helpers.dataset_files import POSES, cambridge, llff, mip_nerf_360, opengl, polycam
 from helpers.view_files import photo
 
 
@@ -92,3 +92,72 @@ def test_cambridges_errors_name_the_line(tmp_path: Path) -> None:
     (tmp_path / "reconstruction.nvm").write_text("nothing")
     with pytest.raises(InputError, match="NVM_V3"):
         io.read_views(tmp_path)
+
+
+def test_llff(tmp_path: Path) -> None:
+    llff(tmp_path)
+    for path in (tmp_path, tmp_path / "poses_bounds.npy"):
+        found = io.read_view_set(path)
+        np.testing.assert_allclose(found.cameras.viewmats, POSES, atol=1e-9)
+        np.testing.assert_allclose(found.cameras.Ks[0], [[95, 0, 50], [0, 95, 37.5], [0, 0, 1]])
+        assert found.cameras.names[3] == "IMG_0003.JPG"
+        assert load_image(found.cameras, 3).shape == (75, 100, 3)
+    photo(tmp_path / "images_4" / "IMG_0009.JPG", (100, 75))
+    with pytest.raises(InputError, match=r"has 9 poses for 10 photos in .*images_4"):
+        io.read_views(tmp_path)
+
+
+def test_a_damaged_poses_bounds_is_refused(tmp_path: Path) -> None:
+    file = tmp_path / "poses_bounds.npy"
+    file.write_bytes(b"no array")
+    with pytest.raises(InputError, match=r"poses_bounds.npy: is not a NumPy array"):
+        io.read_views(file)
+    np.save(file, np.zeros((3, 12)))
+    with pytest.raises(InputError, match="holds 3×12 values of float64, expected N×17"):
+        io.read_views(file)
+    np.save(file, np.zeros((3, 17)))
+    with pytest.raises(InputError, match="row 0 has height 0"):
+        io.read_views(file)
+
+
+@pytest.mark.parametrize(("folder", "notes"), [("corrected_", []), ("", ["tracked_poses"])])
+def test_polycam(folder: str, notes: list[str], tmp_path: Path) -> None:
+    polycam(tmp_path, folder)
+    found = io.read_view_set(tmp_path)
+    np.testing.assert_allclose(found.cameras.viewmats, POSES, atol=1e-9)
+    np.testing.assert_allclose(found.cameras.Ks[0], [[95, 0, 51], [0, 96, 37], [0, 0, 1]])
+    assert found.cameras.names[:3] == ("9999000.jpg", "9999500.jpg", "10000000.jpg")  # in order of time
+    assert [note.code for note in found.notes] == notes
+    (next((tmp_path / "keyframes").glob("*cameras/*.json"))).write_text("{}")
+    with pytest.raises(InputError, match="property 't_00' is missing"):
+        io.read_views(tmp_path)
+
+
+@pytest.mark.parametrize("key", ["K", "intrinsics"])
+def test_a_frame_may_carry_its_matrix_and_photos_may_lie_beside_the_file(key: str, tmp_path: Path) -> None:
+    frames = []
+    for i, view in enumerate(POSES):
+        K = [[90.0 + i, 0, 50], [0, 91, 40], [0, 0, 1]]
+        frame = {"file_path": f"images/{i}.png", key: K, "transform_matrix": opengl(view).tolist()}
+        frames.append(frame)
+        photo(tmp_path / f"{i}.png", (100, 80))
+    file = tmp_path / "cameras_of_a_person.json"
+    file.write_text(json.dumps({"frames": frames}))
+    found = io.read_views(file)
+    np.testing.assert_allclose(found.Ks[2], [[92, 0, 50], [0, 91, 40], [0, 0, 1]])
+    assert found.image_paths[2] == tmp_path / "2.png"
+    frames[1][key] = [[0, 0, 50], [0, 91, 40], [0, 0, 1]]
+    file.write_text(json.dumps({"frames": frames}))
+    with pytest.raises(InputError, match=f"property '{key}' of frame 1 is not a matrix of focal lengths"):
+        io.read_views(file)
+
+
+@pytest.mark.parametrize("part", ["sparse/0/images.txt", "sparse/0/cameras.txt"])
+def test_a_colmap_model_without_a_table_says_which(part: str, tmp_path: Path) -> None:
+    mip_nerf_360(tmp_path)
+    (tmp_path / part).unlink()
+    for path in (tmp_path, tmp_path / "sparse" / "0"):
+        with pytest.raises(
+            InputError, match=f"COLMAP model without {Path(part).name}; found .*copy the whole model"
+        ):
+            io.read_views(path)

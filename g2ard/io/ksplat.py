@@ -1,0 +1,153 @@
+"""Reader for .ksplat of GaussianSplats3D: sections of rows at one of three compression levels, SH 0–2."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from g2ard.errors import InputError, damaged
+from g2ard.io.sanitize import Raw, cleaned
+from g2ard.io.types import Scene
+from g2ard.scene.splats import SH_C0
+
+_HEADER, _SECTION = 4096, 1024
+"""Bytes of the file's header and of a section's."""
+
+_SH_COUNTS = {0: 0, 1: 9, 2: 24}
+_SH_RANGE = (-1.5, 1.5)
+"""Range of 8-bit harmonics if the header gives none."""
+
+_SCALE_RANGE = 32767
+"""Half of the steps of a 16-bit position within its bucket, if a section gives none."""
+
+
+class _Section(NamedTuple):
+    rows: int
+    capacity: int
+    bucket_size: int
+    buckets: int
+    block: float
+    bucket_bytes: int
+    steps: int
+    full: int
+    partial: int
+    degree: int
+
+
+def read(path: Path) -> Scene:
+    """Read a scene. Version 0.1 is read, the only one published.
+
+    A row holds its position, linear scales, rotation (wxyz), 8-bit RGBA and harmonics, channel after channel
+    per band. Levels 1 and 2 store halves, and positions as 16-bit steps within a bucket's cube:
+    x = (q − s)·b/2s + centre. Level 2 stores harmonics in 8 bits between the header's limits.
+    """
+    data = path.read_bytes()
+    if len(data) < _HEADER:
+        raise damaged("is cut off within its header", path=path)
+    if data[0] != 0 or data[1] < 1:
+        raise InputError(f"unsupported version {data[0]}.{data[1]}; expected 0.1", path=path)
+    words, floats = np.frombuffer(data, "<u4", 11), np.frombuffer(data, "<f4", 11)
+    level, sections = int(words[5] & 0xFFFF), int(words[1])
+    if level not in (0, 1, 2):
+        raise InputError(f"unsupported compression level {level}; expected 0, 1 or 2", path=path)
+    limits = tuple(float(given) or usual for given, usual in zip(floats[9:11], _SH_RANGE, strict=True))
+    at = _HEADER + sections * _SECTION
+    if len(data) < at:
+        raise damaged(f"is cut off within the headers of {sections} sections", path=path)
+    parts = []
+    for i in range(sections):
+        section = _section(path, data, i)
+        parts.append(_rows(path, data, i, at, section, level, limits))
+        at = parts[-1][1]
+    count, rest = (
+        sum(len(raw.means) for raw, _ in parts),
+        max((raw.shN.shape[1] for raw, _ in parts), default=0),
+    )
+    whole, start = Raw.empty(count, rest), 0
+    whole.shN[:] = 0
+    for raw, _ in parts:
+        into = whole.take(slice(start, start := start + len(raw.means)))
+        for name in ("means", "quats", "log_scales", "logit_opacities", "sh0"):
+            getattr(into, name)[:] = getattr(raw, name)
+        into.shN[:, : raw.shN.shape[1]] = raw.shN
+    return cleaned(path, whole)
+
+
+def _section(path: Path, data: bytes, i: int) -> _Section:
+    """Read the header of section `i`."""
+    at = _HEADER + i * _SECTION
+    words = np.frombuffer(data, "<u4", 11, at).tolist()
+    block = float(np.frombuffer(data, "<f4", 1, at + 16)[0])
+    degree = words[10] & 0xFFFF
+    if degree not in _SH_COUNTS:
+        text = f"has the unsupported SH degree {degree}; expected 0, 1 or 2"
+        raise InputError(text, path=path, index=i, item="section")
+    count, capacity, size, buckets = words[:4]
+    return _Section(
+        min(count, capacity),
+        capacity,
+        size,
+        buckets,
+        block,
+        words[5] & 0xFFFF,
+        words[6] or _SCALE_RANGE,
+        words[8],
+        words[9],
+        degree,
+    )
+
+
+def _rows(
+    path: Path, data: bytes, i: int, at: int, section: _Section, level: int, limits: tuple[float, ...]
+) -> tuple[Raw, int]:
+    """Return the rows of section `i`, which begins at byte `at`, and the byte after it."""
+    packed = "<f4" if level == 0 else "<u2"
+    real = "<f4" if level == 0 else "<f2"
+    harmonics = _SH_COUNTS[section.degree]
+    row = np.dtype(
+        [
+            ("mean", packed, 3),
+            ("scale", real, 3),
+            ("quat", real, 4),
+            ("rgba", "u1", 4),
+            ("sh", "u1" if level == 2 else real, (harmonics,)),
+        ]
+    )
+    begin = at + 4 * section.partial + section.bucket_bytes * section.buckets
+    end = begin + row.itemsize * section.capacity
+    if end > len(data):
+        raise damaged("is cut off", path=path, index=i, item="section")
+    rows = np.frombuffer(data, row, section.rows, begin)
+    raw = Raw.empty(section.rows, harmonics // 3)
+    raw.means[:] = rows["mean"] if level == 0 else _centres(path, data, i, at, section, rows["mean"])
+    raw.set_linear(rows["scale"], rows["rgba"][:, 3] / 255)
+    raw.quats[:] = rows["quat"]
+    raw.sh0[:, 0] = (rows["rgba"][:, :3] / 255 - 0.5) / SH_C0
+    values = rows["sh"].astype(np.float64)
+    if level == 2:
+        values = values / 255 * (limits[1] - limits[0]) + limits[0]
+    for first, last in ((0, 9), (9, 24))[: section.degree]:
+        band = values[:, first:last].reshape(section.rows, 3, -1)
+        raw.shN[:, first // 3 : last // 3] = band.transpose(0, 2, 1)
+    return raw, end
+
+
+def _centres(
+    path: Path, data: bytes, i: int, at: int, section: _Section, steps: NDArray[Any]
+) -> NDArray[np.float64]:
+    """Return positions from 16-bit steps: full buckets first, then partial ones of the listed lengths."""
+    if section.bucket_bytes < 12 or section.full + section.partial != section.buckets:
+        raise damaged("has inconsistent buckets", path=path, index=i, item="section")
+    lengths = np.frombuffer(data, "<u4", section.partial, at).astype(np.int64)
+    lengths = np.concatenate([np.full(section.full, section.bucket_size, np.int64), lengths])
+    if lengths.sum() < section.rows:
+        raise damaged("has more rows than its buckets hold", path=path, index=i, item="section")
+    start = at + 4 * section.partial
+    shape = (section.buckets, section.bucket_bytes)
+    table = np.frombuffer(data, "u1", shape[0] * shape[1], start).reshape(shape)
+    centres = np.ascontiguousarray(table[:, :12]).view("<f4").astype(np.float64)
+    bucket = np.repeat(np.arange(section.buckets), np.minimum(lengths, section.rows))[: section.rows]
+    return (steps.astype(np.float64) - section.steps) * (section.block / 2 / section.steps) + centres[bucket]

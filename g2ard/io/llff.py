@@ -1,0 +1,72 @@
+"""Reader for LLFF's poses_bounds.npy beside a folder of photos."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from g2ard.errors import InputError, damaged
+from g2ard.io.jsonfile import Place
+from g2ard.io.paths import is_photo
+from g2ard.io.photos import Frame, Lens, inverse, photo_size, rigid, view_set
+from g2ard.io.types import ViewSet
+from g2ard.progress import plural
+
+NAME = "poses_bounds.npy"
+
+_AXES = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+"""Columns that turn down, right, backwards into right, down, forward."""
+
+
+def read(path: Path, images: Path | None = None) -> ViewSet:
+    """Read the poses of all photos of a folder, in the order of their names.
+
+    Each row holds a 3×5 matrix and the nearest and farthest depth, which are ignored. The matrix is
+    world_from_camera with axes down, right, backwards, and the column height, width, focal length in pixels.
+
+    `path` is the file or its folder. Photos lie in `images`, or in `images_4` or the like if that is missing,
+    and may be smaller than the stated size.
+    """
+    file = path / NAME if path.is_dir() else path
+    try:
+        rows = np.load(
+            file, mmap_mode="r", allow_pickle=False
+        )  # mapped: a header cannot claim more than there is
+    except Exception as error:  # numpy raises any exception for damaged headers
+        raise damaged(f"is not a NumPy array ({' '.join(str(error).split())})", path=file) from error
+    if rows.ndim != 2 or rows.shape[1] not in (15, 17) or rows.dtype.kind != "f" or not len(rows):
+        shape = "×".join(map(str, rows.shape))
+        raise InputError(f"holds {shape} values of {rows.dtype}, expected N×17 numbers", path=file)
+    photos = _photos(file.parent, images)
+    if photos and len(photos) != len(rows):
+        text = f"has {plural(len(rows), 'pose')} for {plural(len(photos), 'photo')} in {photos[0].parent}"
+        raise InputError(text, path=file, hint="{images=DIR} names the folder with one photo per pose")
+    frames = []
+    for i, row in enumerate(rows.astype(np.float64)):
+        matrix = row[:15].reshape(3, 5)
+        photo = photos[i] if photos else None
+        frames.append(_frame(Place(file, i, "row"), matrix, photo))
+    return view_set(file, frames)
+
+
+def _frame(place: Place, matrix: np.ndarray, photo: Path | None) -> Frame:
+    height, width, focal = matrix[:, 4].tolist()
+    if not (height >= 1 and width >= 1 and focal > 0 and np.isfinite(matrix).all()):
+        raise place.error(f"has height {height}, width {width} and focal length {focal}")
+    pose = rigid(np.hstack([matrix[:, :3] @ _AXES, matrix[:, 3:4]]), place)
+    size = round(width), round(height)
+    lens = Lens(size, np.array([[focal, 0, size[0] / 2], [0, focal, size[1] / 2], [0, 0, 1]]))
+    if photo is not None:
+        lens = lens.at(photo_size(photo, place.path))
+    name = f"{place.index:05d}" if photo is None else photo.name
+    return Frame(name, inverse(pose), lens, photo)
+
+
+def _photos(folder: Path, images: Path | None) -> list[Path]:
+    """Return the photos that belong to the rows, sorted by name; none if there is no folder of photos."""
+    named = sorted((p for p in folder.glob("images*") if p.is_dir()), key=lambda p: (len(p.name), p.name))
+    for place in [images] if images else named:
+        if found := sorted(p for p in place.iterdir() if is_photo(p)):
+            return found
+    return []

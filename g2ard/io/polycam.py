@@ -1,0 +1,53 @@
+"""Reader for Polycam's raw data: one .json of ARKit's camera per photo in `keyframes`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from g2ard.errors import InputError
+from g2ard.io.jsonfile import fields_of, number, read_json, whole
+from g2ard.io.photos import Frame, Lens, rigid, view_set
+from g2ard.io.transforms import opencv_view
+from g2ard.io.types import ViewSet
+
+_FOLDERS = (("corrected_cameras", "corrected_images"), ("cameras", "images"))
+"""Folders of cameras and photos: after Polycam's optimisation, and as ARKit tracked them."""
+
+
+def cameras_in(path: Path) -> tuple[Path, Path] | None:
+    """Return the folders of cameras and of photos of a capture, optimised ones first, or None."""
+    for cameras, photos in _FOLDERS:
+        folder = path / "keyframes" / cameras
+        if folder.is_dir() and any(folder.glob("*.json")):
+            return folder, path / "keyframes" / photos
+    return None
+
+
+def read(path: Path, images: Path | None = None) -> ViewSet:
+    """Read the keyframes of a capture: fx, fy, cx, cy, width, height, and rows t_00 … t_23 of
+    world_from_camera in OpenGL axes, metres, y up.
+    """
+    folders = cameras_in(path)
+    if folders is None:
+        raise InputError("has no keyframes/cameras with .json files", path=path)
+    cameras, photos = folders
+    files = sorted(cameras.glob("*.json"), key=lambda file: (len(file.stem), file.stem))
+    found = view_set(path, [_frame(file, images or photos) for file in files])
+    if cameras.name == "corrected_cameras":
+        return found
+    text = "the capture has no corrected_cameras; these are ARKit's poses as tracked"
+    return found.noted("tracked_poses", len(files), text)
+
+
+def _frame(file: Path, photos: Path) -> Frame:
+    fields = fields_of(file, read_json(file))
+    rows = [[number(fields, f"t_{row}{column}") for column in range(4)] for row in range(3)]
+    fx, fy, cx, cy = (number(fields, key) for key in ("fx", "fy", "cx", "cy"))
+    size = whole(fields, "width"), whole(fields, "height")
+    if not (fx > 0 and fy > 0 and min(size) > 0):
+        raise fields.place.error(f"has focal lengths {fx}, {fy} and {size[0]}×{size[1]} pixels")
+    photo = photos / f"{file.stem}.jpg"
+    lens = Lens(size, np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]))
+    return Frame(photo.name, opencv_view(rigid(np.array(rows), fields.place)), lens, photo)

@@ -1,0 +1,61 @@
+""".ksplat of GaussianSplats3D: files that it wrote (see `ksplat/README.md`), and damaged copies."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from g2ard.errors import InputError
+from g2ard.io import kind, read_scene
+from helpers.packed_files import truth, unpacked_ksplat
+
+
+@pytest.mark.parametrize(
+    ("name", "degree", "place", "size", "harmonics"),
+    [
+        ("level0-sh2", 2, 0, 1e-6, 0),
+        ("level1-sh1", 1, 2 / 32767, 1e-3, 1e-3),
+        ("level2-sh2", 2, 2 / 32767, 1e-3, 2 / 255),
+    ],
+)
+def test_ksplat(name: str, degree: int, place: float, size: float, harmonics: float, tmp_path: Path) -> None:
+    path, scene = unpacked_ksplat(name, tmp_path), truth(60, 3)
+    assert kind(path) == "splats"
+    found = read_scene(path).splats
+    order = np.abs(scene.means[:, None] - found.means).max(2).argmin(1)
+    assert sorted(order) == list(range(60))
+    found = found.take(order)
+    assert found.sh_degree == degree
+    np.testing.assert_allclose(found.means, scene.means, atol=place)
+    np.testing.assert_allclose(found.scales, scene.scales, rtol=size)
+    np.testing.assert_allclose(np.abs((found.quats * scene.quats).sum(1)), 1, atol=2e-3)
+    np.testing.assert_allclose(found.opacities, scene.opacities, atol=1 / 255)
+    np.testing.assert_allclose(found.colors, scene.colors, atol=1 / 255)
+    np.testing.assert_allclose(found.shN, scene.shN[:, : (degree + 1) ** 2 - 1], atol=harmonics)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda data: data[:100], "cut off within its header"),
+        (lambda data: data[:4200], "cut off within the headers of 1 sections"),
+        (lambda data: data[:-1], "section 0 is cut off"),
+        (lambda data: b"\1" + data[1:], "unsupported version 1.1"),
+        (lambda data: data[:20] + b"\7" + data[21:], "unsupported compression level 7"),
+        (lambda data: data[:4136] + b"\3" + data[4137:], "section 0 has the unsupported SH degree 3"),
+        (lambda data: data[:4128] + b"\xff" + data[4129:], "section 0 has inconsistent buckets"),
+        (lambda data: data[:5120] + bytes(4) + data[5124:], "section 0 has more rows than its buckets hold"),
+    ],
+)
+def test_a_damaged_ksplat_is_refused(change, message: str, tmp_path: Path) -> None:
+    path = unpacked_ksplat("level2-sh2", tmp_path)
+    path.write_bytes(change(path.read_bytes()))
+    with pytest.raises(InputError, match=message):
+        read_scene(path)
+
+
+@pytest.mark.parametrize(("name", "tool"), [("a.lcc", "splat-transform"), ("a.rad", "Spark")])
+def test_a_format_that_is_not_read_names_what_converts_it(name: str, tool: str, tmp_path: Path) -> None:
+    (tmp_path / name).write_bytes(b"data")
+    with pytest.raises(InputError, match=tool):
+        read_scene(tmp_path / name)
