@@ -16,6 +16,7 @@ from g2ard.jobs.view_checks import opaque_points
 from g2ard.jobs.views import views_or_pool
 from g2ard.poses.site import Site
 from g2ard.progress import Progress, Say, silent, unsaid
+from g2ard.rendering.renderer import Renderer
 from g2ard.scene.cameras import Camera, Cameras
 from g2ard.scene.splats import Splats
 from g2ard.scene.transform import transform, unit_up
@@ -30,8 +31,14 @@ _ROWS = 100_000
 _ROLL = 0.1
 """Ratio of the spread of the views' x axes along and across a direction, below which it is up."""
 
-_FOV = (10.0, 120.0)
-"""Field of view that the viewer accepts, in degrees."""
+_TURNED = 1e-3
+"""Second eigenvalue of the same spread below which all views face one way: 2° of their x axes."""
+
+_UPRIGHT = 0.8
+"""Length of the mean of the photos' up directions, above which it is up."""
+
+_TRIED, _SIDE = 12, 160
+"""Number of typical views that are rendered to choose the opening one, and their longer side in pixels."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,6 +68,23 @@ class ViewerFrame:
         turn[:3, :3] = self.rotation
         return transform(replace(splats.recentred(self.origin), offset=np.zeros(3)), turn)
 
+    def start_at(self, view: Camera, points: NDArray[np.float64]) -> Start:
+        """Convert a view for the viewer, without roll; it orbits the median depth of the points in view."""
+        held = points[view.holds(points)]
+        if not len(held):
+            held = self.origin[None]
+        ahead = view.viewmat[2, :3]
+        depth = float(np.median(np.abs((held - view.position) @ ahead)))
+        to_viewer = np.diag([-1.0, -1.0, 1.0]) @ self.rotation  # the viewer rotates scenes by 180° about z
+
+        def there(point: NDArray[np.float64]) -> tuple[float, float, float]:
+            x, y, z = (float(v) for v in to_viewer @ (point - self.origin))
+            return x, y, z
+
+        sides = np.array([view.width, view.height]) / np.diag(view.K)[:2]
+        across, down = (float(v) for v in np.degrees(2 * np.arctan(sides / 2)))
+        return Start(there(view.position), there(view.position + depth * ahead), (across, down))
+
 
 def frame_of(
     scene: Splats,
@@ -78,7 +102,7 @@ def frame_of(
     Args:
         scene: the scene, or the left one of two.
         views: cameras, or their path; "made" generates a pool.
-        start: name of the initial view; None takes the one that contains most of the scene.
+        start: name of the initial view; None takes a typical one with much detail.
         up: (3,) direction away from the ground; None takes it from the views, or estimates it.
     """
     try:
@@ -101,19 +125,19 @@ def frame_with(
     axis = _level(cameras) if up is None else None
     stand = ViewerFrame(_turn(up_of(scene, up) if axis is None else axis), _middle(scene))
     points = opaque_points(scene)
-    view = cameras[_chosen(cameras, points, start)]
-    return replace(stand, start=_start(stand, view, points), name=view.name)
+    view = cameras[_named(cameras, start)] if start else _typical(scene, cameras, stand.up, points)
+    return replace(stand, start=stand.start_at(view, points), name=view.name)
 
 
 def _level(cameras: Cameras) -> NDArray[np.float64] | None:
-    """Return the up direction shared by all views, or None if they roll or all face one way."""
-    across = cameras.viewmats[:, 0, :3]
+    """Return the up direction that views share, or that of photos which all face one way; otherwise None."""
+    across, up = cameras.viewmats[:, 0, :3], -cameras.viewmats[:, 1, :3].mean(axis=0)
     values, vectors = np.linalg.eigh(across.T @ across / len(cameras))
-    if values[0] > _ROLL * values[1]:
-        return None
-    up = -cameras.viewmats[:, 1, :3].sum(axis=0)
-    axis: NDArray[np.float64] = vectors[:, 0]
-    return axis if axis @ up >= 0 else -axis
+    if values[0] <= _ROLL * values[1] and values[1] > _TURNED:
+        axis: NDArray[np.float64] = vectors[:, 0]
+        above = up - cameras.forwards.mean(axis=0) / 2  # most cameras look down, some straight down
+        return axis if axis @ above >= 0 else -axis
+    return unit_up(up) if any(cameras.image_paths) and np.linalg.norm(up) > _UPRIGHT else None
 
 
 def up_of(scene: Splats, up: Sequence[float] | None = None) -> NDArray[np.float64]:
@@ -143,28 +167,34 @@ def _middle(scene: Splats) -> NDArray[np.float64]:
     return np.median(opaque_points(scene), axis=0)
 
 
-def _chosen(cameras: Cameras, points: NDArray[np.float64], name: str | None) -> int:
-    """Return the index of the named view, or of the first that contains most points."""
-    if name is None:
-        return int(np.argmax([view.holds(points).mean() for view in cameras]))
+def _named(cameras: Cameras, name: str) -> int:
     if name not in cameras.names:
         raise InputError(f"no view {name!r} among {', '.join(cameras.names[:4])}, …", parameter="start")
     return cameras.names.index(name)
 
 
-def _start(stand: ViewerFrame, view: Camera, points: NDArray[np.float64]) -> Start:
-    """Convert a view for the viewer, without roll; it orbits the median depth of the points in view."""
-    held = points[view.holds(points)]
-    if not len(held):
-        held = stand.origin[None]
-    ahead = view.viewmat[2, :3]
-    depth = float(np.median(np.abs((held - view.position) @ ahead)))
-    to_viewer = np.diag([-1.0, -1.0, 1.0]) @ stand.rotation  # the viewer rotates scenes by 180° about z
+def _typical(scene: Splats, cameras: Cameras, up: NDArray[np.float64], points: NDArray[np.float64]) -> Camera:
+    """Return the usual view whose render has most detail among those nearest to the median view.
 
-    def there(point: NDArray[np.float64]) -> tuple[float, float, float]:
-        x, y, z = (float(v) for v in to_viewer @ (point - stand.origin))
-        return x, y, z
+    Views are compared by pitch, depth and share of the points in view, in median deviations: the median view
+    frames the subject, and detail tells its front from its back.
+    """
+    cameras = cameras.usual()
+    traits = np.array([_traits(view, up, points) for view in cameras])
+    away = np.abs(traits - np.median(traits, axis=0))
+    spread = np.median(away, axis=0)
+    order = np.argsort((away / np.where(spread > 0, spread, 1)).sum(axis=1), kind="stable")
+    tried, renderer = cameras.take(order[:_TRIED]), Renderer(scene)
+    return tried[int(np.argmax([_detail(renderer.clipped(view)) for view in tried.resized(_SIDE)]))]
 
-    side, focal = (view.width, view.K[0, 0]) if view.width >= view.height else (view.height, view.K[1, 1])
-    fov = float(np.degrees(2 * np.arctan(side / 2 / focal)))
-    return Start(there(view.position), there(view.position + depth * ahead), float(np.clip(fov, *_FOV)))
+
+def _traits(view: Camera, up: NDArray[np.float64], points: NDArray[np.float64]) -> tuple[float, float, float]:
+    """Return a view's pitch in radians, logarithm of the median depth, and share of the points in view."""
+    held, ahead = view.holds(points), view.viewmat[2, :3]
+    depth = np.median((points[held] - view.position) @ ahead) if held.any() else 1e-30
+    return float(np.arcsin(np.clip(ahead @ up, -1, 1))), float(np.log(depth)), float(held.mean())
+
+
+def _detail(image: NDArray[np.float32]) -> float:
+    """Return the mean absolute difference of neighbouring pixels."""
+    return float(sum(np.abs(np.diff(image, axis=axis)).mean(dtype=np.float64) for axis in (0, 1)))

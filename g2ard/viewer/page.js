@@ -16,7 +16,16 @@ async function module(base64) {
   return import(URL.createObjectURL(new Blob([text], { type: 'text/javascript' })));
 }
 
-const { start, background, files, antialiased } = JSON.parse(read('view'));
+const { start, stops, background, files, antialiased } = JSON.parse(read('view'));
+
+// The viewer's field of view is along the window's longer side; all of the given view is to be in sight.
+function fitted({ position, target, fov }) {
+  const [x, y] = fov.map(degrees => Math.tan(degrees * Math.PI / 360));
+  const half = innerWidth >= innerHeight ? Math.max(x, y * innerWidth / innerHeight)
+    : Math.max(y, x * innerHeight / innerWidth);
+  return { position, target, fov: Math.min(120, Math.max(10, Math.atan(half) * 360 / Math.PI)) };
+}
+
 const settings = {
   version: 2,
   tonemapping: 'none',
@@ -30,8 +39,10 @@ const settings = {
     fringing: { enabled: false, intensity: 0.5 }
   },
   animTracks: [],
-  cameras: start ? [{ initial: start }] : [],
-  annotations: [],
+  cameras: start ? [{ initial: fitted(start) }] : [],
+  annotations: stops.map(({ title, ...view }) => ({
+    title, text: '', position: view.target, extras: {}, camera: { initial: fitted(view) }
+  })),
   startMode: 'default'
 };
 

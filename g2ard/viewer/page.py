@@ -31,12 +31,12 @@ class Start:
 
     Args:
         target: centre of rotation, scene units.
-        fov: degrees, along the window's longer side.
+        fov: horizontal and vertical field of view in degrees, both of which fit into the window.
     """
 
     position: tuple[float, float, float]
     target: tuple[float, float, float]
-    fov: float
+    fov: tuple[float, float]
 
 
 @dataclass(frozen=True)
@@ -63,6 +63,7 @@ def write_page(
     scenes: Sequence[tuple[str, Splats]],
     *,
     start: Start | None = None,
+    stops: Sequence[tuple[str, Start]] = (),
     background: Sequence[float] = BLACK,
     overwrite: bool = False,
 ) -> Written:
@@ -73,11 +74,13 @@ def write_page(
     Args:
         scenes: (label, scene), one or two, left to right, in the same frame: x right, y down, z ahead.
         start: initial camera; None lets the viewer frame the whole scene.
+        stops: (title, camera) of views to step through, by arrows below the scene.
     """
     path = check_page_output(path, overwrite)
     packed = [_sog(path, label, splats) for label, splats in scenes]
     shown = {
         "start": None if start is None else asdict(start),
+        "stops": [{"title": title, **asdict(stop)} for title, stop in stops],
         "background": [float(channel) for channel in background],
         "files": [f"scene{index}.sog" for index in range(len(scenes))],
         "antialiased": [splats.antialiased for _, splats in scenes],

@@ -1,6 +1,7 @@
 """Turntables and animations of `render`, and `compare`."""
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -49,7 +50,7 @@ def test_an_mp4_without_ffmpeg_says_so(
     assert "ffmpeg" in told
 
 
-def test_compare_prints_scores_and_opens_at_the_worst_view(tmp_path: Path, command_line: CommandLine) -> None:
+def test_compare_prints_scores_and_opens_at_a_typical_view(tmp_path: Path, command_line: CommandLine) -> None:
     ball = checkered_ball(800)
     write_splats(tmp_path / "a.ply", ball)
     write_splats(tmp_path / "b.ply", ball.take(np.arange(800) % 2 == 0))
@@ -59,7 +60,12 @@ def test_compare_prints_scores_and_opens_at_the_worst_view(tmp_path: Path, comma
     assert len(found["views"]) == 4
     assert found["psnr"] == pytest.approx(np.mean([view["psnr"] for view in found["views"]]))
     assert found["psnr"] < 40
-    assert (tmp_path / "page.html").stat().st_size > 10_000
+    page = (tmp_path / "page.html").read_text(encoding="utf-8")
+    titles = re.findall(r'"title": "([^"]+)"', page)
+    worst = sorted(found["views"], key=lambda view: view["psnr"])[:3]
+    assert [title.split(":")[0] for title in titles] == ["typical", "worst 1", "worst 2", "worst 3"]
+    assert titles[1:] == [f"worst {i}: {v['name']}, {v['psnr']:.1f} dB" for i, v in enumerate(worst, 1)]
+    assert worst[0]["name"] not in titles[0]
     assert "worst: " in succeeds(command_line, tmp_path, *ask).out
     same = json.loads(
         succeeds(command_line, tmp_path, "compare", "a.ply", "a.ply", *ask[3:], "--json", "-").out

@@ -30,14 +30,20 @@ def show(browser: Browser, page: Path | str) -> None:
     browser.run("g2ard.ready.then(() => null)")
 
 
-def drawn(browser: Browser, accept: Callable[[np.ndarray], bool], index: int = 0) -> np.ndarray:
+def drawn(
+    browser: Browser,
+    accept: Callable[[np.ndarray], bool],
+    index: int = 0,
+    size: tuple[int, int] = (WIDTH, HEIGHT),
+) -> np.ndarray:
     """(H, W, 3) in [0, 1]: what a viewer draws, without the controls above it. Sorting runs beside drawing:
     frames are asked for until one is accepted; the last one is given after a minute."""
-    size = f"{{width: {WIDTH}, height: {HEIGHT}, supersample: 1}}"
+    width, height = size
+    wanted = f"{{width: {width}, height: {height}, supersample: 1}}"
     until = time.monotonic() + 60
     while True:
-        shot = browser.run(f"g2ard.ready.then(viewers => viewers[{index}].captureFrame({size}))")["data"]
-        pixels = np.frombuffer(base64.b64decode(shot), np.uint8).reshape(HEIGHT, WIDTH, 4)
+        shot = browser.run(f"g2ard.ready.then(viewers => viewers[{index}].captureFrame({wanted}))")["data"]
+        pixels = np.frombuffer(base64.b64decode(shot), np.uint8).reshape(height, width, 4)
         picture = pixels[..., :3] / np.float32(255)
         if accept(picture) or time.monotonic() > until:
             return picture
@@ -51,7 +57,8 @@ def like(expected: np.ndarray, decibels: float) -> Callable[[np.ndarray], bool]:
 
 def assert_shows(browser: Browser, expected: np.ndarray, decibels: float, index: int = 0) -> np.ndarray:
     """Check that a viewer draws an expected picture; return what it draws."""
-    picture = drawn(browser, like(expected, decibels), index)
+    height, width = expected.shape[:2]
+    picture = drawn(browser, like(expected, decibels), index, (width, height))
     assert psnr(picture, expected) > decibels
     return picture
 

@@ -8,6 +8,7 @@ import gzip
 import hashlib
 import json
 import re
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -77,9 +78,13 @@ def test_the_bundle_is_the_one_its_readme_names() -> None:
 
 def test_a_page_holds_viewer_and_scene_and_names_no_address(tmp_path: Path) -> None:
     ball = checkered_ball(200)
-    start = Start((1.0, 2.0, 3.0), (0.0, 0.0, 0.5), 42.0)
+    start = Start((1.0, 2.0, 3.0), (0.0, 0.0, 0.5), (42.0, 30.0))
     written = write_page(
-        tmp_path / "a.html", [("a </script> & b", ball)], start=start, background=(1.0, 0.5, 0.25)
+        tmp_path / "a.html",
+        [("a </script> & b", ball)],
+        start=start,
+        stops=[("worst", start)],
+        background=(1.0, 0.5, 0.25),
     )
     parts = Parts(tmp_path / "a.html")
     assert written.bytes == (tmp_path / "a.html").stat().st_size
@@ -87,7 +92,8 @@ def test_a_page_holds_viewer_and_scene_and_names_no_address(tmp_path: Path) -> N
     assert parts.labels == ["a </script> & b"]
     view = json.loads(parts.scripts["view"])
     assert view == {
-        "start": {"position": [1, 2, 3], "target": [0, 0, 0.5], "fov": 42},
+        "start": {"position": [1, 2, 3], "target": [0, 0, 0.5], "fov": [42, 30]},
+        "stops": [{"title": "worst", "position": [1, 2, 3], "target": [0, 0, 0.5], "fov": [42, 30]}],
         "background": [1, 0.5, 0.25],
         "files": ["scene0.sog"],
         "antialiased": [False],
@@ -138,7 +144,8 @@ def in_viewer(points: np.ndarray, start: Start, width: int, height: int) -> np.n
     right = np.cross([0, 1, 0], back)
     right /= np.linalg.norm(right)
     x, y, z = np.stack([right, np.cross(back, right), back]) @ (world - eye).T
-    focal = max(width, height) / 2 / np.tan(np.radians(start.fov) / 2)
+    focal = width / 2 / np.tan(np.radians(start.fov[0]) / 2)
+    assert focal == pytest.approx(height / 2 / np.tan(np.radians(start.fov[1]) / 2))
     return np.stack([width / 2 - focal * x / z, height / 2 + focal * y / z], 1)
 
 
@@ -177,14 +184,40 @@ def test_level_views_tell_up_and_a_single_one_does_not() -> None:
     assert alone.name == "view_005"
 
 
-def test_the_start_is_the_view_that_holds_most_or_the_one_named() -> None:
-    ball = checkered_ball(400)
+def test_drones_that_look_straight_down_are_above() -> None:
+    views = []
+    for k, turn in enumerate(np.linspace(0, 2 * np.pi, 9)[:-1]):
+        top = np.array([np.cos(turn), np.sin(turn), 0])
+        views.append(Camera.facing([k, 1, 5], [k, 1, 0] - 0.1 * top, up=top, name=str(k)))
+    assert np.allclose(frame_with(checkered_ball(400), Cameras.of(views)).up, [0, 0, 1], atol=1e-6)
+
+
+def test_photos_that_all_face_one_way_tell_up() -> None:
+    up, tilts = np.array([0.6, 0, 0.8]), np.random.default_rng(0).normal(size=(6, 3)) * 0.02
+    views = Cameras.of(
+        Camera.facing([k / 9, -4, 0], [k / 9, 0, 0], up=up + tilt, name=f"{k}.jpg")
+        for k, tilt in enumerate(tilts)
+    )
+    photos = replace(views, image_paths=tuple(map(Path, views.names)))
+    assert np.allclose(frame_with(checkered_ball(400), photos).up, [0.6, 0, 0.8], atol=0.05)
+
+
+def test_a_page_starts_at_a_typical_view_with_detail_or_the_one_named() -> None:
+    ball = checkered_ball(3000)
+    plain = np.where(ball.means[:, 1, None, None] > 0, np.float32(0), ball.sh0)  # behind
+    scene = replace(ball, sh0=plain, shN=0 * ball.shN)
     away = Camera.facing([0, -4, 0], [0, -9, 0], name="away")
-    near = Camera.facing([0, -1.5, 0], [0, 0, 0], fov=30, name="near")
-    whole = Camera.facing([0, -4, 0], [0, 0, 0], name="whole")
-    views = Cameras.of([away, near, whole])
-    assert frame_with(ball, views).name == "whole"
-    assert frame_with(ball, views, start="near").name == "near"
+    below = Camera.facing([0.1, -0.5, -3], [0, 0, 0], name="below")
+    close = replace(Camera.facing([0, -3, 1], [0, 0, 0], name="close"), kind="near")
+    ring = [
+        Camera.facing([3 * np.sin(turn), 3 * np.cos(turn), 1], [0, 0, 0], name=f"pose_{turn:.1f}")
+        for turn in np.linspace(0, 6, 12)
+    ]
+    views = Cameras.of([away, below, close, *ring])
+    opened = views[views.names.index(str(frame_with(scene, views).name))]
+    assert opened.name.startswith("pose_")
+    assert opened.position[1] < -2
+    assert frame_with(ball, views, start="below").name == "below"
     assert frame_with(ball, views, start="away").start is not None  # sees nothing, and may still be asked for
     with pytest.raises(InputError, match="no view 'far'"):
         frame_with(ball, views, start="far")

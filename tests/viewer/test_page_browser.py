@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from g2ard.io import read_splats, write_splats
+from g2ard.jobs.view_checks import opaque_points
 from g2ard.jobs.viewer_frame import frame_with
 from g2ard.rendering.metrics import psnr
 from g2ard.scene.cameras import Camera, Cameras
@@ -133,3 +134,44 @@ def test_both_scenes_share_a_camera(browser: Browser, tmp_path: Path) -> None:
     right = drawn(browser, as_the_left, 1)
     assert psnr(right, left) > 60
     assert psnr(right, before) < 25
+
+
+def test_arrows_lead_to_the_next_stop(browser: Browser, tmp_path: Path) -> None:
+    scene = scattered()
+    other = Camera.facing([-1.5, -1.6, 1.2], [0.1, 0, 0], width=WIDTH, height=HEIGHT, fov=40)
+    stand, points = frame_with(scene, Cameras.of([FRONT]), up=(0, 0, 1)), opaque_points(scene)
+    stops = [(name, stand.start_at(view, points)) for name, view in (("typical", FRONT), ("worst", other))]
+    page = tmp_path / "stops.html"
+    write_page(page, [("scene", stand.of(scene))], start=stand.start, stops=stops, background=GREY)
+    show(browser, page)
+    assert_shows(browser, rendered(scene), 38)
+    title = "document.querySelector('.sse-annotationNavTitle').textContent"
+    assert browser.run(title) == "typical"
+    top, bottom = browser.run(
+        "(box => [box.top, box.bottom])(document.querySelector('.sse-annotationNav').getBoundingClientRect())"
+    )
+    assert HEIGHT / 2 < top < bottom < HEIGHT
+    browser.run("document.querySelector('.sse-annotationNext').click()")
+    goal = ", ".join(map(str, stops[1][1].position))
+    moved = browser.run(
+        "g2ard.ready.then(([viewer]) => new Promise(done => { const until = Date.now() + 60000;"
+        f"const goal = viewer.app.root.findByName('camera').getPosition().clone().set({goal});"
+        "const look = () => { const at = viewer.app.root.findByName('camera').getPosition().distance(goal);"
+        "at < 0.02 || Date.now() > until ? done(at) : setTimeout(look, 50); }; look(); }))"
+    )
+    assert moved < 0.02
+    assert browser.run(title) == "worst"
+
+
+@pytest.mark.parametrize("size", [(300, 600), (600, 300)])
+def test_a_window_of_any_shape_shows_the_whole_view(tmp_path: Path, size: tuple[int, int]) -> None:
+    """The view's middle keeps its place, and its longer side fills the window."""
+    scene, (width, height) = scattered(), size
+    zoom = min(width / WIDTH, height / HEIGHT)
+    K = np.diag([FRONT.K[0, 0] * zoom, FRONT.K[1, 1] * zoom, 1])
+    K[:2, 2] = width / 2, height / 2
+    page = save(tmp_path / "page.html", scene)
+    with Browser(width, height) as browser:
+        show(browser, page)
+        expected = rendered(scene, replace(FRONT, K=K, width=width, height=height))
+        assert_shows(browser, expected, 38)

@@ -28,7 +28,10 @@ def compare(
     output: Annotated[
         Path | None,
         typer.Option(
-            "-o", "--output", metavar="FILE.html", help="Write a page with a divider, open at the worst view."
+            "-o",
+            "--output",
+            metavar="FILE.html",
+            help="Write a page with a divider: a typical view, then the worst ones.",
         ),
     ] = None,
     views: opt.ViewsOrMadeOption = None,
@@ -39,7 +42,7 @@ def compare(
 ) -> None:
     """Compare renders of two scenes: PSNR, SSIM, the worst views, and a page to look at."""
     from g2ard.jobs.inputs import load_views
-    from g2ard.jobs.view_checks import check_sight
+    from g2ard.jobs.view_checks import check_sight, opaque_points
     from g2ard.jobs.viewer_frame import frame_with
     from g2ard.jobs.views import views_or_pool
     from g2ard.rendering.targets import TeacherRenders
@@ -66,6 +69,7 @@ def compare(
     targets = TeacherRenders(reference, cameras, background=colour)
     scores = evaluate(other, targets, background=colour, progress=run.progress)
     worst = sorted(scores.views, key=lambda view: view.psnr)[:_WORST]
+    psnr = {view.name: view.psnr for view in scores.views}
     run.console.table(
         f"{second} against {first}: {plural(len(cameras), 'view')}",
         ["", "Gaussians", "PSNR, dB", "SSIM"],
@@ -76,11 +80,28 @@ def compare(
         stdout=run.json != "-",
     )
     if output is not None:
-        stand = frame_with(reference, cameras, start=worst[0].name)
+        names = sorted(cameras.names, key=lambda name: psnr[name])
+        middle = [cameras.names.index(name) for name in names[len(names) // 4 : -(-3 * len(names) // 4)]]
+        stand, points = frame_with(reference, cameras.take(middle)), opaque_points(reference)
+        shown = {"typical": str(stand.name)} | {f"worst {i}": v.name for i, v in enumerate(worst, 1)}
+        stops = [
+            (
+                f"{what}: {name}, {psnr[name]:.1f} dB",
+                stand.start_at(cameras[cameras.names.index(name)], points),
+            )
+            for what, name in shown.items()
+        ]
         scenes = [
             (name, stand.of(splats))
             for name, splats in zip(short_names(paths), (reference, other), strict=True)
         ]
-        write_page(output, scenes, start=stand.start, background=colour, overwrite=run.overwrite)
-        run.say(f"{output}: opens at {worst[0].name}")
+        write_page(
+            output,
+            scenes,
+            start=stand.start,
+            stops=stops,
+            background=colour,
+            overwrite=run.overwrite,
+        )
+        run.say(f"{output}: opens at {stand.name}; the arrows below lead to the worst views")
     run.result({**scores.as_dict(), "output": None if output is None else str(output)})

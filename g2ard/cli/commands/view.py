@@ -33,7 +33,7 @@ def view(
     images: opt.ImagesOption = None,
     start: Annotated[
         str | None,
-        typer.Option(metavar="NAME", help="View to open with; by default the one that shows most."),
+        typer.Option(metavar="NAME", help="View to open with; by default a typical one with much detail."),
     ] = None,
     background: opt.BackgroundOption = None,
     up: opt.UpOption = None,
