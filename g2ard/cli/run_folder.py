@@ -6,6 +6,7 @@ import json
 import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from g2ard.io.jsonfile import read_json
 from g2ard.io.scene_formats import FORMATS
 from g2ard.jobs.budget import DEVICES, Budget
 from g2ard.jobs.viewer_frame import frame_with
+from g2ard.pipeline.run_views import RunViews
 from g2ard.progress import plural
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
@@ -57,7 +59,7 @@ class RunFolder:
         self.path, self.scene, self.work = path, path / name, path / _WORK
         self._report = path / "report.json"  # written last
         self._simplified = path / "simplified" / "scene.ply"  # with --keep, for `evaluate --anchors`
-        self._view = path / "view.html"
+        self._view, self._views = path / "view.html", path / "views.json"
 
     @property
     def is_done(self) -> bool:
@@ -68,10 +70,9 @@ class RunFolder:
     def _is_finished(self) -> bool:
         return self.scene.exists() and self._report.exists() and not left_at(self.work)
 
-    def check(self, budget: Budget, views_given: bool) -> None:
-        """Raise an `OutputError` unless the run may write here; without given views it writes views.json."""
-        views = [] if views_given else [self.path / "views.json"]
-        self._run.spare_inputs(self.scene, *self._other_scenes(), self._simplified, *views)
+    def check(self, budget: Budget) -> None:
+        """Raise an `OutputError` unless the run may write here."""
+        self._run.spare_inputs(self.scene, *self._other_scenes(), self._simplified, self._views)
         left = left_at(self.work)
         killed = self.path.is_dir() and [path.name for path in self.path.iterdir()] == [_WORK]
         if not left and not (self._resume and self._is_finished) and not killed:
@@ -136,13 +137,21 @@ class RunFolder:
         self._simplified.parent.mkdir(exist_ok=True)
         write_splats(self._simplified, splats, overwrite=True)
 
-    def write_pool(self, pool: ViewSet) -> None:
-        """Write generated views, also in the format of --views-format."""
-        write_views(self.path / "views.json", pool.cameras, splits=pool.splits, overwrite=True)
+    def write_views(self, views: RunViews) -> None:
+        """Write the run's views with their splits, generated ones also in the format of --views-format."""
+        own = views.pool or views.train
+        if "test" not in own.splits:
+            train, taken = own.cameras, set(own.cameras.names)
+            test = [
+                replace(view, name=f"{view.name} (held out)") if view.name in taken else view
+                for view in views.test
+            ]
+            splits = ("train",) * len(train) + ("test",) * len(test)
+            own = ViewSet(Cameras.of([*train, *test]), splits=splits)
+        write_views(self._views, own.cameras, splits=own.splits, overwrite=True)
         also: ViewFormat = self._run.config["views_format"]
-        if also in _VIEWS:
-            place = self.path / _VIEWS[also]
-            self._run.write_views(place, pool.cameras, also, pool.splits, overwrite=True)
+        if views.pool is not None and also in _VIEWS:
+            self._run.write_views(self.path / _VIEWS[also], own.cameras, also, own.splits, overwrite=True)
 
     def write_report(self, report: dict[str, Any]) -> None:
         with atomic_output(self._report, overwrite=True) as temporary:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +10,10 @@ import typer
 
 from g2ard.cli.frame import Run
 from g2ard.config.choices import Colour, is_made
+from g2ard.errors import InputError
 from g2ard.io import ViewSet
+from g2ard.io.detect import run_scene, run_views
+from g2ard.io.jsonfile import read_json
 from g2ard.jobs.inputs import load_split_views, load_trained, make_targets
 from g2ard.jobs.view_checks import propose_background, warn_of_sight
 from g2ard.jobs.views import views_or_pool
@@ -26,6 +30,24 @@ def check_teacher(views: Path | None, teacher: Path | None, photos: bool) -> Non
         raise typer.BadParameter("--views made needs a --teacher: generated views have no photos")
     if teacher is None and views is None:
         raise typer.BadParameter("give --views, or a --teacher to generate views of")
+
+
+def teaching_of_run(scenes: Sequence[Path]) -> tuple[Path, Path | None, bool, int | None] | None:
+    """Return --views, --teacher, --photos and --size of the first run among the scenes, or None."""
+    runs = (path for path in scenes if run_scene(path) != path and run_views(path) != path)
+    folder = next(runs, None)
+    if folder is None:
+        return None
+    report = read_json(folder / "report.json")
+    against = report.get("against", "teacher renders")
+    if against == "photos":
+        return folder, None, False, report["config"]["size"]
+    teacher = Path(report["config"]["scene"])
+    if not teacher.exists():
+        raise InputError(
+            f"was made from {teacher}, which is not there", path=folder, hint="give {teacher=SCENE}"
+        )
+    return folder, teacher, "photo" in against, report["config"]["size"]
 
 
 class Teaching:

@@ -117,8 +117,7 @@ class TiledCommand:
             "views": {"train": len(views.train.cameras), "test": len(views.test)},
             "config": run.config,
         }
-        if views.pool is not None:
-            folder.write_pool(views.pool)
+        folder.write_views(views)
         self._write(folder.scene, small)
         title = f"{self.scene.name}: {store.count:,} → {len(small):,}"
         tiled_report(folder.path / "report.html", title, report)

@@ -16,6 +16,7 @@ from g2ard.rendering.targets import PhotosOrRenders, TeacherRenders
 from g2ard.stages.evaluate import evaluate
 from helpers.commands import CommandLine, refused, succeeds
 from helpers.lpips_weights import weights
+from helpers.photos import rgba_photos_of
 from helpers.scenes import around, checkered_ball
 from helpers.studies import pictured
 
@@ -112,3 +113,24 @@ def test_reports_state_file_sizes(command_line: CommandLine, folder: Path) -> No
 def test_unscaled_images_need_a_network(folder: Path, command_line: CommandLine) -> None:
     ask = ("evaluate", "ball.ply", "--views", "views.json", "--lpips-input", "unscaled")
     assert "--lpips-input" in refused(command_line, folder, *ask)
+
+
+@pytest.mark.parametrize("photos", [True, False])
+def test_a_run_is_scored_as_it_was_made(photos: bool, tmp_path: Path, command_line: CommandLine) -> None:
+    ball = checkered_ball(400)
+    io.write_splats(tmp_path / "ball.ply", ball)
+    rgba_photos_of(tmp_path / "photos")
+    of = ("--views", "photos", "-n", 80) if photos else ("ball.ply", "-r", 5)
+    made = ("distill", *of, "--steps", 4, "--size", 40, "--background", "0.2,0.3,0.4", "-o", "run")
+    succeeds(command_line, tmp_path, *made)
+    (tmp_path / "elsewhere").mkdir()
+    there = tmp_path / "elsewhere" if photos else tmp_path
+    out = succeeds(command_line, there, "evaluate", tmp_path / "run", "--json", "-").out
+    told = json.loads((tmp_path / "run" / "report.json").read_text())["scores"]["recovered"]
+    found = json.loads(out)
+    assert found["against"] == ("photos" if photos else "teacher")
+    assert [view["name"] for view in found["scenes"][0]["views"]] == [view["name"] for view in told["views"]]
+    assert found["scenes"][0]["psnr"] == pytest.approx(told["psnr"], abs=1e-6)
+    if not photos:
+        (tmp_path / "ball.ply").unlink()
+        assert "ball.ply" in refused(command_line, tmp_path, "evaluate", "run", status=1)

@@ -129,7 +129,7 @@ def distill(
 
     def check(path: Path, budget: Budget) -> None:
         if not dry_run:
-            folder_at(path).check(budget, given)
+            folder_at(path).check(budget)
 
     outputs.check(check)
     early = [folder_at(path) for path in outputs.paths()]
@@ -267,8 +267,7 @@ def _distil(
             folder.drop_view()
         _write_scene(run, job, result, report, folder)
         folder.write_simplified(result.simplified if run.config["keep"] else None)
-        if (pool := job.views.pool) is not None:
-            folder.write_pool(pool)
+        folder.write_views(job.views)
     write_table(run, report)
     for line in told(report, verbose=run.verbose):
         run.say(line)

@@ -27,7 +27,13 @@ if TYPE_CHECKING:
 )
 def evaluate(
     run: Run,
-    scenes: Annotated[list[Path], typer.Argument(metavar="SCENE...", help="Scenes to score.")],
+    scenes: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="SCENE|RUN...",
+            help="Scenes to score. A `distill` run brings its held-out views, targets and background.",
+        ),
+    ],
     views: opt.ViewsOrMadeOption = None,
     images: opt.ImagesOption = None,
     alpha: opt.AlphaOption = "composite",
@@ -56,7 +62,7 @@ def evaluate(
 
     For the evaluation of the original 3DGS, use --convention inria --8bit --lpips-input unscaled.
     """
-    from g2ard.cli.teaching import Teaching, check_teacher
+    from g2ard.cli.teaching import Teaching, check_teacher, teaching_of_run
     from g2ard.io.describe import bytes_of
     from g2ard.jobs.inputs import load_views
     from g2ard.jobs.view_checks import check_sight
@@ -69,7 +75,11 @@ def evaluate(
 
     if lpips_input != "scaled" and lpips is None:
         raise typer.BadParameter("--lpips-input goes with --lpips; give --lpips DIR")
-    check_teacher(views, teacher, photos)
+    if views is None and teacher is None and (own := teaching_of_run(scenes)):
+        views, teacher, photos, made_at = own
+        size = size or made_at
+    else:
+        check_teacher(views, teacher, photos)
     views = opt.with_images(views, images, alpha)
     for path in scenes:
         check_scene(path)
