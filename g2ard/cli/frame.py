@@ -127,7 +127,9 @@ class Run:
         self.only_checks = False  # end once the settings are checked
         self.noted = False  # whether a GPU failed
         self._adapter: str | None = None  # last adapter in use
-        self.kept: list[str] = []  # what remains after Ctrl-C, for its message
+        self.kept: list[str] = []  # outputs and checkpoints that remain, for messages of errors and Ctrl-C
+        self.unfinished: str | None = None  # what else Ctrl-C leaves
+        self._failed: str | None = None  # what an error ended after the scene was written
         given = (*options.values(), common["config"])
         paths = [p for value in given for p in (value if isinstance(value, list) else [value])]
         written = (options.get("output"), common.get("work"))
@@ -167,6 +169,20 @@ class Run:
         except InputError as error:
             raise typer.BadParameter(in_flags(error, self.flags)) from None
 
+    @contextmanager
+    def finishing(self, what: str) -> Iterator[None]:
+        """Name `what` in the message if it fails; the scene is already written."""
+        try:
+            yield
+        except Exception:
+            self._failed = self._failed or what
+            raise
+
+    def failure(self, reason: str) -> str:
+        """Return the message of an error: what failed, why, and what remains."""
+        failed = "" if self._failed is None else f"{self._failed} failed: "
+        return "; ".join([failed + reason, *self.kept])
+
     def progress(self, stage: str, done: int, total: int, info: Mapping[str, Any] | None = None) -> None:
         """Report progress, after GPU messages since the last call."""
         self.tell_notes()
@@ -193,13 +209,14 @@ class Run:
         """Write the result and the resolved options to --json."""
         if self.json is None:
             return
-        text = json.dumps({**data, **self._used(), "config": self.config}, indent=2, default=_plain)
-        if self.json == "-":
-            print(text, flush=True)
-            return
+        with self.finishing("--json"):
+            text = json.dumps({**data, **self._used(), "config": self.config}, indent=2, default=_plain)
+            if self.json == "-":
+                print(text, flush=True)
+                return
 
-        with atomic_output(Path(self.json), overwrite=self.overwrite) as temporary:
-            temporary.write_text(text + "\n", encoding="utf-8", newline="\n")
+            with atomic_output(Path(self.json), overwrite=self.overwrite) as temporary:
+                temporary.write_text(text + "\n", encoding="utf-8", newline="\n")
 
     def results(self, reports: list[dict[str, Any]]) -> None:
         """Write the result of one budget, or of several under `runs`."""
@@ -227,12 +244,15 @@ class Run:
     ) -> None:
         """Write a scene, and report what its format cannot hold and, with `compare`, a large loss."""
         write_splats(path, splats, overwrite=self.overwrite or overwrite, **options)
+        self.kept.append(f"{path} is written")
         for note in lost_in(path, splats, **options):
             self.say(f"note: {path}: {note}")
         if compare:
             from g2ard.jobs.packing import loss_warning
 
-            if warning := loss_warning(path, splats, options):
+            with self.finishing("comparing the file with the scene"):
+                warning = loss_warning(path, splats, options)
+            if warning:
                 self.say(warning)
 
     def write_views(
@@ -250,6 +270,7 @@ class Run:
 
         overwrite = self.overwrite or overwrite
         write_views(path, cameras, splits=splits, weights=weights, format=format, overwrite=overwrite)
+        self.kept.append(f"{path} is written")
         if lost := lost_views(cameras, view_format(path, format), splits, weights is not None):
             self.say(f"note: {path}: without {', '.join(lost)}")
 
@@ -259,6 +280,15 @@ class Run:
         for output in outputs:
             if real_path(output) in taken:
                 raise typer.BadParameter(f"{output} is both an input and the output; name another output")
+
+    def input_newer_than(self, output: Path) -> Path | None:
+        """Return an input file that was modified after an output, or None."""
+        made = output.stat().st_mtime_ns
+        return next((path for path in self.input_files() if path.stat().st_mtime_ns > made), None)
+
+    def input_files(self) -> list[Path]:
+        """Return the inputs that are files, or runs with a scene's file."""
+        return [path for path in map(run_scene, self._inputs) if path.is_file()]
 
     def check_extra(self, flag: str, path: Path, given: Path | None = None) -> None:
         """Check a further output, whose option is `given`: it must be no other path of the command."""
@@ -398,19 +428,19 @@ def _execute(run: Run, fn: Callable[..., None], options: dict[str, Any], cuda: b
         with contextlib.closing(run.console), _device(run):
             fn(run, **options)
     except KeyboardInterrupt:
-        run.console.error(f"interrupted; {'; '.join(run.kept) or 'nothing was written'}")
+        left = [run.unfinished, *run.kept] if run.unfinished else run.kept
+        run.console.error(f"interrupted; {'; '.join(left) or 'nothing was written'}")
         raise typer.Exit(interrupt.status()) from None
     except (G2ardError, OSError, MemoryError) as e:
-        run.console.error(one_line(e, run.flags))
+        run.console.error(run.failure(one_line(e, run.flags)))
         raise typer.Exit(1) from None
     except (typer.Exit, typer.BadParameter):
         raise
     except Exception as e:
         if run.verbose:
             traceback.print_exc()
-        run.console.error(
-            f"internal error, please report it: {type(e).__name__}: {e} (-v shows the traceback)"
-        )
+        reason = run.failure(f"{type(e).__name__}: {' '.join(str(e).split())}")
+        run.console.error(f"internal error, please report it: {reason} (-v shows the traceback)")
         raise typer.Exit(1) from None
 
 

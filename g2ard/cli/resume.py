@@ -10,26 +10,45 @@ from pathlib import Path
 import typer
 
 from g2ard.cli.frame import Run
-from g2ard.errors import OutputError
+from g2ard.errors import InputError, OutputError
 from g2ard.io import check_scene_output
+from g2ard.io.atomic import drop_empty, parents_made
+from g2ard.io.lock import check_unlocked, locked
 
 OPTIONS = "options.json"
 """File in a folder of checkpoints with the options of their run."""
 
 
+def is_finished(run: Run, place: Path, resume: bool, output: Path) -> bool:
+    """Return whether --resume finds `output` finished; raise an error if an input changed since then."""
+    if not resume or run.overwrite or left_at(place) or not output.exists():
+        return False
+    if changed := run.input_newer_than(output):
+        raise finished_before(output, changed)
+    return True
+
+
+def finished_before(output: Path, changed: Path) -> OutputError:
+    """Return the error of a finished output whose input is another file now."""
+    return OutputError(
+        f"finished before {changed} changed", path=output, hint="-w without --resume starts over"
+    )
+
+
 def check_scene_run(run: Run, place: Path, resume: bool, output: Path) -> None:
     """Check that the command may write the scene `output`, or resume from the checkpoints at `place`."""
-    if left_at(place) or not (resume and output.exists()):
+    if not is_finished(run, place, resume, output):
         check_scene_output(output, run.overwrite)
     check_stopped(run, place, resume, output)
 
 
 def check_stopped(run: Run, place: Path, resume: bool, output: Path) -> None:
     """Check that checkpoints at `place` may be resumed or replaced; exit if `output` is finished."""
-    left = left_at(place)
-    if resume and not left and not run.overwrite and output.exists():
+    check_unlocked(place.parent, _lock_of(place))
+    if is_finished(run, place, resume, output):
         run.say(f"{output}: already finished; -w without --resume starts over")
         raise typer.Exit
+    left = left_at(place)
     if resume and not left:
         run.say(f"{output}: nothing to resume, starting over")
     if left and not (resume or run.overwrite):
@@ -37,14 +56,34 @@ def check_stopped(run: Run, place: Path, resume: bool, output: Path) -> None:
 
 
 @contextmanager
-def stoppable(run: Run, place: Path, resume: bool) -> Iterator[None]:
-    """Keep checkpoints at `place` if the command is interrupted, and remove them when it succeeds."""
+def stoppable(run: Run, place: Path, resume: bool, output: Path) -> Iterator[None]:
+    """Remove checkpoints at `place` when the command succeeds, and name them when it does not.
+
+    No other run may write `output` meanwhile.
+    """
+    made = parents_made(place)
+    try:
+        with locked(place.parent, _lock_of(place)):
+            if output.exists() and not run.overwrite:  # another run wrote it since it was checked
+                raise OutputError("exists", path=output, hint="{overwrite=True} replaces it")
+            with _kept(run, place, resume):
+                yield
+    finally:
+        drop_empty(made)
+
+
+def _lock_of(place: Path) -> str:
+    return f".{place.name.lstrip('.')}.lock"
+
+
+@contextmanager
+def _kept(run: Run, place: Path, resume: bool) -> Iterator[None]:
     if not resume:
         _remove(place)
     try:
         yield
-    except KeyboardInterrupt:
-        if left_at(place):
+    except (Exception, KeyboardInterrupt) as error:
+        if left_at(place) and not (resume and isinstance(error, InputError)):
             run.kept.append(f"run the same command with --resume to continue from {place}")
         raise
     else:

@@ -4,19 +4,21 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from g2ard.cli.frame import Run
-from g2ard.cli.resume import OPTIONS, check_stopped, left_at
+from g2ard.cli.resume import OPTIONS, check_stopped, finished_before, is_finished, left_at
 from g2ard.config.choices import Colour, ViewFormat
 from g2ard.errors import InputError, OutputError
 from g2ard.io import ViewSet, write_splats, write_views
 from g2ard.io.atomic import atomic_output, check_output
 from g2ard.io.jsonfile import read_json
+from g2ard.io.lock import check_unlocked, locked
+from g2ard.io.paths import file_identity
 from g2ard.io.scene_formats import FORMATS
 from g2ard.jobs.budget import DEVICES, Budget
 from g2ard.jobs.viewer_frame import frame_with
@@ -60,22 +62,20 @@ class RunFolder:
         self._report = path / "report.json"  # written last
         self._simplified = path / "simplified" / "scene.ply"  # with --keep, for `evaluate --anchors`
         self._view, self._views = path / "view.html", path / "views.json"
+        self._inputs: dict[str, Any] = {}  # identity of each file that this run reads
 
     @property
     def is_done(self) -> bool:
         """Whether --resume finds a finished run."""
-        return self._resume and not self._run.overwrite and self._is_finished
-
-    @property
-    def _is_finished(self) -> bool:
-        return self.scene.exists() and self._report.exists() and not left_at(self.work)
+        return self.scene.exists() and is_finished(self._run, self.work, self._resume, self._report)
 
     def check(self, budget: Budget) -> None:
         """Raise an `OutputError` unless the run may write here."""
         self._run.spare_inputs(self.scene, *self._other_scenes(), self._simplified, self._views)
+        check_unlocked(self.path)
         left = left_at(self.work)
         killed = self.path.is_dir() and [path.name for path in self.path.iterdir()] == [_WORK]
-        if not left and not (self._resume and self._is_finished) and not killed:
+        if not left and not self.is_done and not killed:
             check_output(self.path, self._run.overwrite, folder=True)
         if left or not self._resume:
             check_stopped(self._run, self.work, self._resume, self.scene)
@@ -83,6 +83,7 @@ class RunFolder:
             self._check_same(self.work / OPTIONS, budget, "begun")
         elif self.is_done:
             self._check_same(self._report, budget, "finished")
+            self._check_inputs()
 
     def _check_same(self, record: Path, budget: Budget, how: str) -> None:
         """Raise an `OutputError` if the budget or options that an earlier run recorded differ."""
@@ -93,15 +94,37 @@ class RunFolder:
                 hint="-w without --resume starts over",
             )
 
+    def _check_inputs(self) -> None:
+        """Raise an `OutputError` if a file that the finished run read is another one now."""
+        for name, known in read_json(self._report).get("inputs", {}).items():
+            path = Path(name)
+            if path.is_file() and file_identity([path]) != [known]:
+                raise finished_before(self.path, path)
+
     def tell_finished(self) -> dict[str, Any]:
         """Say that the run is finished, and return its report."""
         self._run.say(f"{self.path}: already finished; -w without --resume starts over")
         return read_json(self._report)
 
     @contextmanager
-    def working(self, input_count: int, output_count: int) -> Iterator[None]:
-        """Create the folder for checkpoints; after an error or Ctrl-C, keep it only if it can be resumed."""
-        run, made = self._run, not self.path.exists()
+    def working(self, input_count: int, output_count: int, photos: Iterable[Path]) -> Iterator[None]:
+        """Create the folder for checkpoints; after an error or Ctrl-C, keep what it holds.
+
+        No other run may write here meanwhile.
+        """
+        files = [*self._run.input_files(), *photos]
+        self._inputs = dict(zip(map(str, files), file_identity(files), strict=True))
+        made = not self.path.exists()
+        self.path.mkdir(parents=True, exist_ok=True)
+        with locked(self.path):
+            if self.scene.exists() and not (self._run.overwrite or left_at(self.work)):
+                raise OutputError("exists", path=self.path, hint="{overwrite=True} replaces it")
+            with self._working(input_count, output_count, made=made):
+                yield
+
+    @contextmanager
+    def _working(self, input_count: int, output_count: int, *, made: bool) -> Iterator[None]:
+        run = self._run
         if self._resume and not left_at(self.work):
             run.say(f"{self.path}: nothing to resume, starting over")
         if not self._resume:
@@ -114,19 +137,21 @@ class RunFolder:
         try:
             yield
         except (Exception, KeyboardInterrupt) as error:
-            if left_at(self.work) and (self._resume or isinstance(error, KeyboardInterrupt)):
-                run.kept.append(f"run the same command with --resume to continue in {self.path}")
-                if not isinstance(error, KeyboardInterrupt | InputError):
-                    run.say(run.kept[-1])
+            if left_at(self.work):
+                if not (self._resume and isinstance(error, InputError)):
+                    run.kept.append(f"run the same command with --resume to continue in {self.path}")
             else:
-                shutil.rmtree(self.path if made else self.work, ignore_errors=True)
+                shutil.rmtree(
+                    self.path if made and not self.scene.exists() else self.work, ignore_errors=True
+                )
             raise
         shutil.rmtree(self.work)
 
     def write_scene(self, splats: Splats) -> None:
-        """Write the scene, and remove an earlier run's scenes in other formats."""
+        """Write the scene, and remove an earlier run's scenes in other formats and the pages about them."""
         self._run.write(self.scene, splats, overwrite=True)
-        for other in self._other_scenes():
+        pages = (self.path / name for name in ("report.json", "report.html", "preview.png", "view.html"))
+        for other in (*self._other_scenes(), *pages):
             other.unlink(missing_ok=True)
 
     def write_simplified(self, splats: Splats | None) -> None:
@@ -154,8 +179,9 @@ class RunFolder:
             self._run.write_views(self.path / _VIEWS[also], own.cameras, also, own.splits, overwrite=True)
 
     def write_report(self, report: dict[str, Any]) -> None:
-        with atomic_output(self._report, overwrite=True) as temporary:
-            text = json.dumps(report, indent=2, default=str)
+        told = {**report, "config": self._run.config, "inputs": self._inputs}
+        with self._run.finishing("report.json"), atomic_output(self._report, overwrite=True) as temporary:
+            text = json.dumps(told, indent=2, default=str)
             temporary.write_text(text + "\n", encoding="utf-8", newline="\n")
 
     def write_view(self, splats: Splats, cameras: Cameras, background: Colour) -> tuple[int | None, str]:
@@ -166,16 +192,11 @@ class RunFolder:
         """
         count, most = len(splats), DEVICES["web"]
         if count > most:
-            self.drop_view()
             return None, f"{self._view} skipped: over {most:,} Gaussians (`g2ard view` writes it anyway)"
         stand = frame_with(splats, cameras)
         shown = [(f"{self.scene.name}: {plural(count, 'Gaussian')}", stand.of(splats))]
         written = write_page(self._view, shown, start=stand.start, background=background, overwrite=True)
         return written.bytes, f"view: {self._view} ({written.bytes / 1e6:.2f} MB)"
-
-    def drop_view(self) -> None:
-        """Remove an earlier run's page."""
-        self._view.unlink(missing_ok=True)
 
     def _other_scenes(self) -> list[Path]:
         """Return the scene's file names in other formats."""

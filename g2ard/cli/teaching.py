@@ -14,7 +14,7 @@ from g2ard.errors import InputError
 from g2ard.io import ViewSet
 from g2ard.io.detect import run_scene, run_views
 from g2ard.io.jsonfile import read_json
-from g2ard.jobs.inputs import load_split_views, load_trained, make_targets
+from g2ard.jobs.inputs import load_split_views, load_trained, make_targets, scorable
 from g2ard.jobs.view_checks import propose_background, warn_of_sight
 from g2ard.jobs.views import views_or_pool
 from g2ard.rendering.targets import Targets
@@ -90,7 +90,9 @@ class Teaching:
         """Return the targets of the test views, made on first access; None if there are no such views."""
         pool, _ = load_split_views(views, "all", unpictured=self.dense is not None)
         tested = [i for i, split in enumerate(pool.splits) if split == "test"]
-        return self._made(pool.cameras.take(tested).resized(size), lazy=True) if tested else None
+        if not tested:
+            return None
+        return scorable(self._made(pool.cameras.take(tested).resized(size), lazy=True), self._run.say)
 
     def _made(self, cameras: Cameras, **options: Any) -> Targets:
         return make_targets(cameras, self.dense, self._background, photos=self._photos, **options)

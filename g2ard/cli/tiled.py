@@ -47,7 +47,7 @@ class TiledCommand:
     def simplify(self, config: SimplifyConfig, views: Any, blind: bool, up: Sequence[float] | None) -> None:
         """Run `g2ard simplify`."""
         run, reports = self.run, []
-        run.kept = [f"finished steps are in {self.tiling.folder}; run the same command to continue"]
+        run.unfinished = f"finished steps are in {self.tiling.folder}; run the same command to continue"
         with working(self.tiling, views):
             made = simplify_in_tiles(
                 self.scene,
@@ -75,7 +75,6 @@ class TiledCommand:
                 }
                 seconds = report["seconds"]["total"]
                 run.say(f"{place}: {len(small):,} of {store.count:,} Gaussians in {seconds:.1f} s")
-                run.kept.append(f"{place} is written")
                 reports.append(report)
         run.results(reports)
 
@@ -89,7 +88,7 @@ class TiledCommand:
             own = [f"--{name.replace('_', '-')}" for name in ("dry_run", "keep") if run.config[name]]
             refuse_whole(self.scene, [*whole_options(options), *whole_budgets(self.budgets), *own])
             again = "run the same command with --resume to continue"
-            run.kept = [f"finished steps are in {self.tiling.folder}; {again}"]
+            run.unfinished = f"finished steps are in {self.tiling.folder}; {again}"
             folders = [folder_at(path) for path in self.outputs.paths()]
             reports = {at: folder.tell_finished() for at, folder in enumerate(folders) if folder.is_done}
             left = [at for at in range(len(self.budgets)) if at not in reports]
@@ -115,12 +114,12 @@ class TiledCommand:
             **self._report(store, small),
             "scores": asdict(scores),
             "views": {"train": len(views.train.cameras), "test": len(views.test)},
-            "config": run.config,
         }
-        folder.write_views(views)
         self._write(folder.scene, small)
+        folder.write_views(views)
         title = f"{self.scene.name}: {store.count:,} → {len(small):,}"
-        tiled_report(folder.path / "report.html", title, report)
+        with run.finishing("report.html"):
+            tiled_report(folder.path / "report.html", title, report)
         folder.write_report(report)
         title = "held-out views against teacher renders, simplified → recovered:"
         run.console.table(title, list(COLUMNS), cells(scores.kinds))
@@ -137,6 +136,7 @@ class TiledCommand:
     def _write(self, place: Path, small: TiledScene) -> None:
         if scene_format(place).suffix == ".ply":
             ply.write(place, small.stream(), overwrite=self.run.overwrite)
+            self.run.kept.append(f"{place} is written")
         else:
             self.run.write(place, small.whole(), compare=True)
 

@@ -114,7 +114,8 @@ def open_stream(
     file of other formats. Several scenes get the offset of the first and the highest of their SH degrees;
     their render models must agree. `render_model` overrides what files say.
     """
-    from g2ard.io.stream import JoinedScenes, PartsStream, file_identity
+    from g2ard.io.paths import file_identity
+    from g2ard.io.stream import JoinedScenes, PartsStream
 
     if not isinstance(path, str | Path):
         streams = [open_stream(part, render_model=render_model) for part in path]

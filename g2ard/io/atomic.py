@@ -47,7 +47,11 @@ def _refuse_existing(path: Path, overwrite: bool, folder: bool) -> None:
     if folder and not path.is_dir():
         raise OutputError("is a file", path=path, hint="give the name of a folder")
     if not overwrite and (not folder or any(path.iterdir())):
-        raise OutputError("exists", path=path, hint="{overwrite=True} replaces it")
+        raise _exists(path)
+
+
+def _exists(path: Path) -> OutputError:
+    return OutputError("exists", path=path, hint="{overwrite=True} replaces it")
 
 
 def _beside(path: Path) -> Path:
@@ -59,7 +63,8 @@ def _beside(path: Path) -> Path:
 def atomic_output(path: str | Path, overwrite: bool = False) -> AbstractContextManager[Path]:
     """Yield a temporary path with the same suffix, and rename it to `path` on success.
 
-    On failure or Ctrl-C, the temporary file is removed and an existing `path` is kept.
+    On failure or Ctrl-C, the temporary file is removed and an existing `path` is kept. Without `overwrite`,
+    so is a `path` that another process made in the meantime.
 
     >>> import tempfile
     >>> folder = Path(tempfile.mkdtemp())
@@ -68,7 +73,7 @@ def atomic_output(path: str | Path, overwrite: bool = False) -> AbstractContextM
     >>> [p.name for p in folder.iterdir()]
     ['a.txt']
     """
-    return _renamed(check_output(path, overwrite), folder=False)
+    return _renamed(check_output(path, overwrite), overwrite, folder=False)
 
 
 def atomic_folder(path: str | Path, overwrite: bool = False) -> AbstractContextManager[Path]:
@@ -76,20 +81,24 @@ def atomic_folder(path: str | Path, overwrite: bool = False) -> AbstractContextM
 
     If `path` exists, files of the same name are replaced and other files are kept.
     """
-    return _renamed(check_output(path, overwrite, folder=True), folder=True)
+    return _renamed(check_output(path, overwrite, folder=True), overwrite, folder=True)
 
 
 @contextmanager
-def _renamed(path: Path, folder: bool) -> Iterator[Path]:
+def _renamed(path: Path, overwrite: bool, *, folder: bool) -> Iterator[Path]:
     temporary, made = _beside(path), parents_made(path)
     try:
         if folder:
             temporary.mkdir()
         yield temporary
-        if path.is_dir():
-            _move_into(temporary, path)
+        if folder:
+            _refuse_existing(path, overwrite, folder)
+            if not path.exists():
+                with suppress(FileExistsError):
+                    path.mkdir()
+            _move_into(temporary, path, overwrite)
         else:
-            os.replace(temporary, path)
+            _move(temporary, path, overwrite)
     except OSError as error:
         elsewhere = error.filename is not None and not str(error.filename).startswith(str(temporary))
         if elsewhere or isinstance(error, OutputError):
@@ -117,10 +126,29 @@ def drop_empty(folders: list[Path]) -> None:
             folder.rmdir()
 
 
-def _move_into(source: Path, target: Path) -> None:
+def _move(source: Path, target: Path, overwrite: bool) -> None:
+    """Rename a file; without `overwrite`, raise an `OutputError` if the target exists at that moment."""
+    if overwrite:
+        os.replace(source, target)
+        return
+    try:
+        try:
+            os.link(source, target)
+        except FileExistsError:
+            raise
+        except OSError:  # a file system without hard links
+            target.touch(exist_ok=False)
+            os.replace(source, target)
+        else:
+            source.unlink()
+    except FileExistsError:
+        raise _exists(target) from None
+
+
+def _move_into(source: Path, target: Path, overwrite: bool) -> None:
     for item in sorted(source.rglob("*")):
         place = target / item.relative_to(source)
         if item.is_dir():
             place.mkdir(exist_ok=True)
         else:
-            os.replace(item, place)
+            _move(item, place, overwrite)

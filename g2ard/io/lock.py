@@ -40,8 +40,10 @@ else:
 
 
 @contextmanager
-def locked(folder: Path) -> Iterator[None]:
+def locked(folder: Path, name: str = LOCK) -> Iterator[None]:
     """Lock an existing folder, or raise an `OutputError` if another process holds it.
+
+    `name` is that of the lock file, for a folder with several outputs.
 
     File systems without locks are not locked.
 
@@ -53,7 +55,7 @@ def locked(folder: Path) -> Iterator[None]:
     >>> list(folder.iterdir())
     []
     """
-    path = folder / LOCK
+    path = folder / name
     file = _opened(path)
     while not _held(path, file):  # removed by its holder after it was opened
         os.close(file)
@@ -65,6 +67,13 @@ def locked(folder: Path) -> Iterator[None]:
         yield
     finally:
         _release(path, file)
+
+
+def check_unlocked(folder: Path, name: str = LOCK) -> None:
+    """Raise an `OutputError` if another process holds the lock of a folder."""
+    if (folder / name).exists():
+        with locked(folder, name):
+            pass
 
 
 def _opened(path: Path) -> int:

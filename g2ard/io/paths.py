@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path, PurePosixPath, PureWindowsPath
+from typing import Any
 
 from g2ard.errors import InputError
+
+_ENDS = 1 << 16
+"""Bytes at each end of a file to hash."""
 
 _LONGEST = 200
 """Longest file name, bytes; systems allow 255, including suffixes and temporary names."""
@@ -79,3 +84,19 @@ def _inside(path: str | Path, i: int, name: str) -> PurePosixPath:
 def is_photo(path: Path) -> bool:
     """Return whether a name has the suffix of a photo."""
     return path.suffix.lower() in (".png", ".jpg", ".jpeg", ".webp")
+
+
+def file_identity(files: Iterable[Path]) -> list[Any]:
+    """Return name, size, modification time and a hash of both ends per file."""
+    identity = []
+    for path in files:
+        try:
+            state = path.stat()
+            with path.open("rb") as file:
+                digest = hashlib.sha256(file.read(_ENDS))
+                file.seek(max(0, state.st_size - _ENDS))
+                digest.update(file.read(_ENDS))
+        except OSError as error:
+            raise InputError(f"{error.strerror}", path=path) from error
+        identity.append([path.name, state.st_size, state.st_mtime_ns, digest.hexdigest()])
+    return identity

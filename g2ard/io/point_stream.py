@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from g2ard.io.paths import file_identity
 from g2ard.io.sanitize import RowTally
-from g2ard.io.stream import file_identity, from_row
+from g2ard.io.stream import from_row
 from g2ard.io.types import Cloud, Note, Points
 
 _ROWS = 1 << 20

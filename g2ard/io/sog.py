@@ -33,10 +33,10 @@ from g2ard.io.jsonfile import (
     read_json,
 )
 from g2ard.io.limits import check_unpacked
-from g2ard.io.paths import check_regular
+from g2ard.io.paths import check_regular, file_identity
 from g2ard.io.sanitize import Raw
 from g2ard.io.sog_chunk import Chunk, Decoder, count_of, means_of, render_model_of, rest_of
-from g2ard.io.stream import RawStream, file_identity, from_row
+from g2ard.io.stream import RawStream, from_row
 from g2ard.io.types import Note
 from g2ard.progress import plural
 from g2ard.scene.transform import one_model

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
@@ -13,14 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard.config.choices import RenderModel
-from g2ard.errors import InputError
+from g2ard.io.paths import file_identity
 from g2ard.io.sanitize import BLOCK, Raw, Tally
 from g2ard.io.types import Note, Scene
 from g2ard.scene.splats import Splats
 from g2ard.scene.transform import one_model
-
-_ENDS = 1 << 16
-"""Bytes at each end of a file to hash."""
 
 _DEGREE_OF_REST = {0: 0, 3: 1, 8: 2, 15: 3}
 
@@ -178,19 +174,3 @@ def from_row(counts: Sequence[int], start: int) -> Iterator[tuple[int, int]]:
         if start < count:
             yield number, start
         start = max(0, start - count)
-
-
-def file_identity(files: Sequence[Path]) -> list[Any]:
-    """Return name, size, modification time and a hash of both ends per file."""
-    identity = []
-    for path in files:
-        try:
-            state = path.stat()
-            with path.open("rb") as file:
-                digest = hashlib.sha256(file.read(_ENDS))
-                file.seek(max(0, state.st_size - _ENDS))
-                digest.update(file.read(_ENDS))
-        except OSError as error:
-            raise InputError(f"{error.strerror}", path=path) from error
-        identity.append([path.name, state.st_size, state.st_mtime_ns, digest.hexdigest()])
-    return identity

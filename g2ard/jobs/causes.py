@@ -122,12 +122,13 @@ def _of_photos(splats: Splats, held_out: Targets, background: Colour) -> tuple[f
 def compared(
     splats: Splats, targets: Targets, views: Iterable[int], background: Colour
 ) -> Iterator[tuple[Floats, Floats, Floats]]:
-    """Yield alpha (N,), render and target (N, 3) of the pixels of each view that count."""
+    """Yield alpha (N,), render and target (N, 3) of the pixels that count, of each view that has any."""
     renderer = Renderer(splats, background=background)
     for view in views:
         mask, drawn = mask_of(targets, view), renderer.render(targets.cameras[view])
         counted = np.ones(drawn.alpha.shape, bool) if mask is None else mask
-        yield drawn.alpha[counted], np.clip(drawn.image, 0, 1)[counted], targets[view][counted]
+        if counted.any():
+            yield drawn.alpha[counted], np.clip(drawn.image, 0, 1)[counted], targets[view][counted]
 
 
 def _poses(alike: float) -> str:

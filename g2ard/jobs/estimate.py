@@ -66,7 +66,7 @@ def estimate(job: DistillJob, budget: int, *, page: bool = True) -> Estimate:
     train, test, apart = job.views.train.cameras, job.views.test, job.views.apart
     near = 0 if apart is None or job.teacher is None else len(apart)
     some = np.unique(np.linspace(0, len(train) - 1, min(_TRIED, len(train))).round().astype(int))
-    targets = job.tried(train.take(some))
+    targets = job.targets_for(train.take(some), lazy=True)
     began = time.monotonic()
     for view in range(len(targets.cameras)):
         targets[view]

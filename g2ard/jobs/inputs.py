@@ -18,7 +18,7 @@ from g2ard.io.exposures import find_exposures
 from g2ard.io.splits import not_held_out, split_mask, splits_of
 from g2ard.progress import Progress, Say, plural, silent, unsaid
 from g2ard.rendering.renderer import RasterSettings, Renderer
-from g2ard.rendering.targets import Photos, PhotosOrRenders, Targets, TeacherRenders
+from g2ard.rendering.targets import Photos, PhotosOrRenders, Targets, TeacherRenders, with_pixels
 from g2ard.rendering.visibility import visibility
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.regions import in_any
@@ -165,6 +165,14 @@ def make_targets(
     if teacher is None:
         return Photos(cameras, background=background, exposures=exposures)
     return PhotosOrRenders(cameras, teacher, background=background, exposures=exposures, **renders)
+
+
+def scorable(targets: Targets, say: Say = unsaid) -> Targets:
+    """Return the targets that have a valid pixel, and say how many have none."""
+    kept = with_pixels(targets)
+    if skipped := len(targets.cameras) - len(kept.cameras):
+        say(f"{plural(skipped, 'photo')} not scored: the mask leaves no pixel")
+    return kept
 
 
 def clutter_seen(

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from g2ard.jobs.inputs import make_targets
+from g2ard.jobs.inputs import make_targets, scorable
 from g2ard.jobs.measured_budget import Aim
 from g2ard.pipeline.config import DistillConfig
 from g2ard.pipeline.distill import Distilled
@@ -60,6 +60,11 @@ class DistillJob:
         return tuple(aim.count for aim in self.aims)
 
     @property
+    def reads_photos(self) -> bool:
+        """Whether any target may be a photo."""
+        return self.teacher is None or self.photos_over_renders
+
+    @property
     def against(self) -> str:
         """Kinds of the scoring targets, as text for summaries."""
         return kinds_of(self.held_out)
@@ -72,12 +77,14 @@ class DistillJob:
     @cached_property
     def targets(self) -> Targets:
         """Training targets."""
-        return self._targets(self.views.train.cameras, lazy=self.config.select.views_count is not None)
+        return self.targets_for(
+            self.views.train.cameras, self._renderer, lazy=self.config.select.views_count is not None
+        )
 
     @cached_property
     def held_out(self) -> Targets:
-        """Held-out targets of the same kind, for scoring only."""
-        return self._targets(self.views.test)
+        """Held-out targets of the same kind that have a valid pixel, for scoring only."""
+        return scorable(self.targets_for(self.views.test, self._renderer), self.say)
 
     @cached_property
     def validation(self) -> Targets | None:
@@ -93,7 +100,7 @@ class DistillJob:
         cameras = self.views.apart
         if cameras is None or self.teacher is None or len(cameras) < 2:
             return None
-        return self._targets(cameras.take(range(first, len(cameras), 2)))
+        return self.targets_for(cameras.take(range(first, len(cameras), 2)), self._renderer)
 
     def render_targets(self) -> None:
         """Render all targets that are not lazy; `run` calls this too."""
@@ -106,18 +113,17 @@ class DistillJob:
         background = self.config.recover.background
         return None if self.teacher is None else Renderer(self.teacher, background=background)
 
-    def tried(self, cameras: Cameras) -> Targets:
-        """Return lazy targets for a few views."""
-        return self._targets(cameras, lazy=True)
-
-    def _targets(self, cameras: Cameras, *, lazy: bool = False) -> Targets:
+    def targets_for(
+        self, cameras: Cameras, renderer: Renderer | None = None, *, lazy: bool = False
+    ) -> Targets:
+        """Return targets of this job's kind for views; see `g2ard.jobs.inputs.make_targets`."""
         return make_targets(
             cameras,
             self.teacher,
             self.config.recover.background,
             lazy=lazy,
             photos=self.photos_over_renders,
-            renderer=self._renderer,
+            renderer=renderer,
             progress=self.progress,
             say=self.say,
         )

@@ -19,13 +19,12 @@ from g2ard.io.reports import Report
 from g2ard.jobs.budget import Budget
 from g2ard.jobs.distill import prepare
 from g2ard.jobs.distill_options import DistillOptions
-from g2ard.jobs.inputs import Views, load_scene, make_targets
+from g2ard.jobs.inputs import Views, load_scene, scorable
 from g2ard.jobs.job import DistillJob
 from g2ard.jobs.viewer_frame import up_of
 from g2ard.levels.tree import Level
 from g2ard.pipeline.distill import distill as pipeline
 from g2ard.progress import Progress, Say, plural, silent, unsaid
-from g2ard.rendering.targets import Targets
 from g2ard.rendering.visibility import visibility_source
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.sky import sky_mask
@@ -190,7 +189,7 @@ def _level(
     """Return the level, its unrecovered version, and its report."""
     began = time.perf_counter()
     longest = level_size(job.views.train.cameras, ratio)
-    held_out = _targets(job, job.views.test, longest)
+    held_out = scorable(job.targets_for(job.views.test.resized(longest)), job.say)
     if recover:
         apart = None if job.views.apart is None or job.teacher is None else job.views.apart.resized(longest)
         if work is not None:
@@ -198,10 +197,10 @@ def _level(
         done = pipeline(
             finer,
             count,
-            _targets(job, job.views.train.cameras, longest),
+            job.targets_for(job.views.train.cameras.resized(longest)),
             job.config,
             weights=job.weights,
-            validation=None if apart is None else _targets(job, apart.take(range(0, len(apart), 2)), longest),
+            validation=None if apart is None else job.targets_for(apart.take(range(0, len(apart), 2))),
             work=work,
             progress=job.progress,
         )
@@ -224,16 +223,6 @@ def _merged(job: DistillJob, finer: Splats, count: int) -> Splats:
     """Merge to the next level, weighted by visibility in the training views."""
     visibility = visibility_source(job.views.train.cameras, progress=job.progress)
     return simplify(finer, count, visibility=visibility, progress=job.progress).splats
-
-
-def _targets(job: DistillJob, cameras: Cameras, longest: int) -> Targets:
-    return make_targets(
-        cameras.resized(longest),
-        job.teacher,
-        job.config.recover.background,
-        progress=job.progress,
-        say=job.say,
-    )
 
 
 def tileset_up(levels: Sequence[Level], up: Sequence[float] | None = None) -> NDArray[np.float64]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
+from functools import cached_property, partial
 from typing import Any, Protocol
 
 import numpy as np
@@ -13,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from g2ard.config.choices import BLACK, Colour
 from g2ard.errors import InputError
 from g2ard.io.images import load_image, load_mask
+from g2ard.io.paths import file_identity
 from g2ard.progress import Progress, plural, silent
 from g2ard.rendering.renderer import RasterSettings, Renderer
 from g2ard.scene.cameras import Cameras
@@ -109,13 +111,26 @@ class Subset(_Chosen):
         super().__init__(targets.cameras.take(rows), [(targets, int(row)) for row in rows])
 
 
+def with_pixels(targets: Targets) -> Targets:
+    """Return the targets except those whose mask leaves no pixel.
+
+    Raises:
+        InputError: none is left.
+    """
+    masks = ((view, mask_of(targets, view)) for view in range(len(targets.cameras)))
+    rows = [view for view, mask in masks if mask is None or mask.any()]
+    if not rows:
+        raise InputError(f"the masks of {plural(len(targets.cameras), 'view')} leave no pixel")
+    return targets if len(rows) == len(targets.cameras) else Subset(targets, rows)
+
+
 class _Cached(ABC):
     """Cache of what `_make` returns, up to `limit` bytes, first come first kept."""
 
     def __init__(self, cameras: Cameras, limit: int) -> None:
         self.cameras = cameras
         self._limit = limit
-        self._kept: dict[int, NDArray[Any]] = {}
+        self._kept: dict[int, NDArray[Any] | None] = {}
         self._bytes = 0
 
     @abstractmethod
@@ -123,21 +138,26 @@ class _Cached(ABC):
         """Create the image of one view, as it is cached."""
 
     def _stored(self, view: int) -> NDArray[Any]:
-        image = self._kept.get(view)
-        if image is None:
-            image = self._make(view)
-            if self._bytes + image.nbytes <= self._limit:
-                self._kept[view] = image
-                self._bytes += image.nbytes
-        return image
+        return self._cached(self._kept, view, self._make)
 
-    def fill(self, progress: Progress, stage: str) -> None:
-        """Create all targets now, within the cache's limit, so that later steps take equal time."""
-        for view in range(len(self.cameras)):
+    def _cached(self, kept: dict[int, Any], view: int, make: Callable[[int], Any]) -> Any:
+        """Return what `kept` holds of a view, or make it, and keep it within the limit."""
+        if view in kept:
+            return kept[view]
+        made = make(view)
+        size = 0 if made is None else made.nbytes
+        if self._bytes + size <= self._limit:
+            kept[view] = made
+            self._bytes += size
+        return made
+
+    def fill(self, value_bytes: int, progress: Progress, stage: str) -> None:
+        """Create the targets that the cache will hold now, so that later steps take equal time."""
+        sizes = 3 * value_bytes * self.cameras.widths.astype(np.int64) * self.cameras.heights
+        count = int((np.cumsum(sizes) <= self._limit).sum())
+        for view in range(count):
             self._stored(view)
-            progress(stage, view + 1, len(self.cameras))
-            if self._bytes >= self._limit:
-                break
+            progress(stage, view + 1, count)
 
 
 class Photos(_Cached):
@@ -175,17 +195,21 @@ class Photos(_Cached):
             )
         super().__init__(cameras, limit)
         self._background = background
-        self.source = "photos " + " ".join(str(path) for path in cameras.image_paths)
-        if any(cameras.mask_paths):
-            self.source += " masks " + " ".join(str(path) for path in cameras.mask_paths)
         self._masks: dict[int, NDArray[np.bool_] | None] = {}
         self._undo = {
             view: _inverse(name, exposures[name])
             for view, name in enumerate(cameras.names)
             if exposures and name in exposures
         }
-        if self._undo:
-            self.source += f" exposures {[(v, m.tolist()) for v, m in self._undo.items()]}"
+
+    @cached_property
+    def source(self) -> str:
+        """Identity of the photos, masks and exposures; hashes the files."""
+        photos, masks = self.cameras.image_paths, self.cameras.mask_paths
+        files = [file_identity(filter(None, paths)) for paths in (photos, masks)]
+        masked = [path is not None for path in masks]
+        exposures = [(view, matrix.tolist()) for view, matrix in self._undo.items()]
+        return f"photos {files} {masked} {exposures} {self._background}"
 
     def against(self, view: int) -> str:
         """Return the kind, see `against_of`."""
@@ -193,9 +217,8 @@ class Photos(_Cached):
 
     def mask(self, view: int) -> NDArray[np.bool_] | None:
         """Return the mask of valid pixels, or None."""
-        if view not in self._masks:
-            self._masks[view] = load_mask(self.cameras, view)
-        return self._masks[view]
+        mask: NDArray[np.bool_] | None = self._cached(self._masks, view, partial(load_mask, self.cameras))
+        return mask
 
     def _make(self, view: int) -> NDArray[np.uint8]:
         return np.rint(load_image(self.cameras, view, self._background) * 255).astype(np.uint8)
@@ -262,7 +285,7 @@ class TeacherRenders(_Cached):
         self._background, self._settings = background, settings
         self._renderer = renderer
         if not lazy:
-            self.fill(progress, "teacher")
+            self.fill(2 if self._rounded else 4, progress, "teacher")
             self._renderer = None  # its buffers are larger than the scene
 
     @property

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from g2ard.config.choices import BLACK, Colour
+from g2ard.errors import InputError
 from g2ard.io.images import as_saved
 from g2ard.progress import Progress, plural, silent
 from g2ard.rendering.lpips import Lpips
@@ -116,7 +117,7 @@ def evaluate(
         One `ViewScore` per view, and their means.
 
     Raises:
-        InputError: a photo cannot be read.
+        InputError: a photo cannot be read, or its mask leaves no pixel.
     """
     cameras = targets.cameras
     renderer = Renderer(splats, background=background, settings=settings)
@@ -127,6 +128,8 @@ def evaluate(
             image, target = as_saved(image), as_saved(target)
         perceived = {net: model(image, target) for net, model in (lpips or {}).items()}
         mask = mask_of(targets, view)
+        if mask is not None and not mask.any():
+            raise InputError(f"({name}) has no valid pixel", index=view, item="view")
         figures = psnr(image, target, mask), ssim(image, target, mask)
         scores.append(ViewScore(name, *figures, perceived, against_of(targets, view), cameras.kinds[view]))
         progress(stage, view + 1, len(cameras))

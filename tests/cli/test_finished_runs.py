@@ -1,12 +1,17 @@
 """`--resume` on a run that has finished, or that was interrupted with other options."""
 
 import json
+import os
 import subprocess
 from pathlib import Path
 
+import pytest
+
 import g2ard
+from g2ard.io import write_views
 from helpers.commands import CommandLine, interrupt_at_checkpoint, program, refused, succeeds
-from helpers.scenes import checkered_ball
+from helpers.photos import photographed
+from helpers.scenes import around, checkered_ball
 from helpers.systems import needs_signals
 
 
@@ -22,6 +27,29 @@ def test_resuming_a_finished_run_says_so(command_line: CommandLine, folder: Path
     ask = ("recover", "ball.ply", *teacher, "-o", "b.ply", "--steps", 3)
     succeeds(command_line, folder, *ask)
     assert "b.ply: already finished" in succeeds(command_line, folder, *ask, "--resume").err
+
+
+@pytest.mark.parametrize(
+    ("words", "names"),
+    [
+        ("distill ball.ply -r 10 --no-view -o run", ("ball.ply", "photos.json", "view_003.png")),
+        ("recover ball.ply -o out.ply", ("ball.ply", "photos.json")),
+    ],
+)
+def test_a_run_of_other_inputs_is_not_finished(
+    words: str, names: tuple[str, ...], folder: Path, command_line: CommandLine
+) -> None:
+    write_views(folder / "photos.json", photographed(folder, checkered_ball(400), around(16, (48, 36))))
+    ask = (*words.split(), "--views", "photos.json", "--steps", 2)
+    succeeds(command_line, folder, *ask)
+    assert "already finished" in succeeds(command_line, folder, *ask, "--resume").err
+    for name in names:
+        path, content, times = folder / name, (folder / name).read_bytes(), (folder / name).stat()
+        path.write_bytes(content + b"\n")
+        line = refused(command_line, folder, *ask, "--resume", status=1)
+        assert f"finished before {name} changed" in line
+        path.write_bytes(content)
+        os.utime(path, ns=(times.st_atime_ns, times.st_mtime_ns))
 
 
 SHORT = ("distill", "ball.ply", "--steps", 5, "--size", 48)

@@ -63,7 +63,7 @@ def test_messages_name_the_split(folder: Path, command_line: CommandLine, comman
 def test_an_interrupt_names_resume(tmp_path: Path, capsys: pytest.CaptureFixture[str], kind: str) -> None:
     common = ("overwrite", "seed", "threads", "device", "verbose", "json", "quiet", "config")
     run, place = Run("recover", dict.fromkeys(common), {}), tmp_path / "place"
-    with pytest.raises(KeyboardInterrupt), stoppable(run, place, resume=False):
+    with pytest.raises(KeyboardInterrupt), stoppable(run, place, resume=False, output=tmp_path / "out"):
         raise KeyboardInterrupt  # before any checkpoint
     assert capsys.readouterr().err == ""
 
@@ -73,11 +73,11 @@ def test_an_interrupt_names_resume(tmp_path: Path, capsys: pytest.CaptureFixture
         (place / "file" if kind == "folder" else place).touch()
         raise KeyboardInterrupt
 
-    with pytest.raises(KeyboardInterrupt), stoppable(run, place, resume=False):
+    with pytest.raises(KeyboardInterrupt), stoppable(run, place, resume=False, output=tmp_path / "out"):
         stopped_later()
     assert run.kept == [f"run the same command with --resume to continue from {place}"]
     assert place.exists()
-    with stoppable(run, place, resume=True):
+    with stoppable(run, place, resume=True, output=tmp_path / "out"):
         assert place.exists()
     assert not place.exists()
 

@@ -111,3 +111,31 @@ def test_folder_overwrites_only_its_own_names(tmp_path: Path) -> None:
     assert (out / "a").read_text() == "new"
     assert (out / "mine").read_text() == "mine"
     assert [p.name for p in tmp_path.iterdir()] == ["out"]
+
+
+@pytest.mark.parametrize("links", [True, False])
+@pytest.mark.parametrize("folder", [False, True])
+def test_what_another_process_made_meanwhile_is_kept(
+    tmp_path: Path, folder: bool, links: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def unsupported(*paths: object) -> None:
+        raise PermissionError(1, "Operation not permitted")  # as on exFAT
+
+    if not links:
+        monkeypatch.setattr(os, "link", unsupported)
+    path = tmp_path / "a"
+    theirs, output = (path / "b", atomic_folder) if folder else (path, atomic_output)
+
+    def written_second() -> None:
+        with output(path) as own:
+            (own / "b" if folder else own).write_text("second")
+            theirs.parent.mkdir(exist_ok=True)
+            theirs.write_text("first")
+
+    with pytest.raises(OutputError, match="a: exists"):
+        written_second()
+    assert theirs.read_text() == "first"
+    assert [file.name for file in tmp_path.iterdir()] == ["a"]
+    with output(path.with_name("c")) as own:
+        (own / "b" if folder else own).write_text("new")
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["a", "c"]

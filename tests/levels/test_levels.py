@@ -1,11 +1,13 @@
 """Levels of detail: the tree, what leaves lose, streamed SOG, and the command."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+import g2ard
 from g2ard import io
 from g2ard.errors import InputError
 from g2ard.io import sog
@@ -15,7 +17,8 @@ from g2ard.scene.splats import Splats
 from g2ard.scene.transform import join, rotation_matrices
 from helpers.commands import refused, succeeds
 from helpers.level_files import files_of, leaves_of, scattered
-from helpers.scenes import checkered_ball
+from helpers.scenes import around, checkered_ball
+from helpers.view_files import photo
 
 
 @pytest.mark.parametrize("rule", [Cut(), Cut(most=300), Cut(most=10_000, extent=3, least=50), Cut(most=1)])
@@ -175,3 +178,16 @@ def test_the_sky_is_the_environment(tmp_path: Path, command_line) -> None:
     meta = json.loads((tmp_path / "out" / "lod-meta.json").read_text())
     assert ("environment" in meta, meta["counts"]) == (False, [900, 113])
     assert not (tmp_path / "out" / "env").exists()
+
+
+def test_levels_learn_from_photos_where_views_have_them(tmp_path: Path) -> None:
+    """Half of the views have photos, and these are black."""
+    ball, views = checkered_ball(400), around(16, (48, 36))
+    black = photo(tmp_path / "black.png", (48, 36))
+    views = replace(views, image_paths=tuple(black if i % 2 else None for i in range(16)))
+    levels = {
+        photos: lod(ball, ratios=(8,), views=views, photos=photos, steps=20).splats[0]
+        for photos in (None, False)
+    }
+    mixed, renders = (g2ard.render(level, views[1]).image.mean() for level in levels.values())
+    assert mixed < 0.95 * renders

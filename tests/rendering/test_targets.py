@@ -1,10 +1,17 @@
-"""Targets: which renders are kept, and at what precision."""
+"""Targets: what is kept, at what precision, and what identifies it."""
+
+import os
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
+import pytest
 
 from g2ard.rendering.renderer import Renderer
-from g2ard.rendering.targets import TeacherRenders
+from g2ard.rendering.targets import Photos, TeacherRenders, fingerprint_of
+from helpers.photos import photographed
 from helpers.scenes import around, checkered_ball
+from helpers.view_files import photo
 
 
 def test_renders_beyond_the_limit_are_kept_in_16_bits() -> None:
@@ -17,3 +24,36 @@ def test_renders_beyond_the_limit_are_kept_in_16_bits() -> None:
         assert rounded[i].dtype == np.float32
         assert 0 < np.abs(rounded[i] - image).max() <= 0.51 / 65535
     assert len(rounded._kept) == len(views)
+
+
+def test_no_more_is_rendered_than_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    ball, views = checkered_ball(400), around(12, (32, 24))
+    rendered: list[object] = []
+    real = Renderer.clipped
+    monkeypatch.setattr(Renderer, "clipped", lambda self, view: rendered.append(view) or real(self, view))
+    targets = TeacherRenders(ball, views, limit=5 * 2 * 3 * 32 * 24 + 99)
+    assert len(rendered) == len(targets._kept) == 5
+
+
+def test_masks_count_towards_the_limit(tmp_path: Path) -> None:
+    views = photographed(tmp_path, checkered_ball(400), around(6, (32, 24)))
+    photos = Photos(replace(views, mask_paths=views.image_paths[::-1]), limit=3 * (3 + 1) * 32 * 24 + 99)
+    for view in range(6):
+        assert photos[view].shape == (24, 32, 3)
+    kept = [*photos._kept.values(), *photos._masks.values()]
+    assert sum(array.nbytes for array in kept if array is not None) <= photos._limit
+    assert len(kept) == 6
+
+
+def test_a_replaced_photo_or_mask_changes_the_fingerprint(tmp_path: Path) -> None:
+    paths = [photo(tmp_path / f"{name}.png", (32, 24)) for name in ("photo", "mask")]
+    views = replace(around(1, (32, 24)), image_paths=(paths[0],), mask_paths=(paths[1],))
+    before = fingerprint_of(Photos(views))
+    assert fingerprint_of(Photos(views)) == before
+    for path in paths:
+        old = path.stat()
+        photo(path, (32, 24), red=9)
+        os.utime(path, ns=(old.st_atime_ns, old.st_mtime_ns))
+        after = fingerprint_of(Photos(views))
+        assert after != before
+        before = after

@@ -66,7 +66,7 @@ def adapt(
     splats = run.load(compact)
     teaching = Teaching(run, teacher, config.background, chosen=background is not None)
     _, targets = teaching.training(splats, opt.with_images(views, images, alpha), split, size)
-    with stoppable(run, work, resume):
+    with stoppable(run, work, resume, output):
         work.mkdir(parents=True, exist_ok=True)
         result = refit(splats, targets, config, work=work, progress=run.progress)
         run.write(output, result.splats)

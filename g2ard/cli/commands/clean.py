@@ -101,10 +101,6 @@ def clean(
         found, cameras = clutter_seen(
             splats, kinds, strength=strength, seed=run.seed, progress=run.progress, say=run.say
         )
-    if preview is not None and cameras is not None:
-        _paint(preview, splats, found, cameras, run.overwrite)
-        run.kept.append(f"{preview} is written")
-        run.say(f"picture: {preview}")
     kept = int(found.keep.sum())
     if not dry_run and output is not None:
         if not kept:
@@ -115,6 +111,10 @@ def clean(
         run.say(f"{output}: keeps {kept:,} of {plural(len(splats), 'Gaussian')}")
         if split_sky is not None and sky.any():
             run.write(split_sky, whole.take(sky))
+    if preview is not None and cameras is not None:
+        with run.finishing("--preview"):
+            _paint(preview, splats, found, cameras, run.overwrite)
+        run.say(f"picture: {preview}")
     counts = {"input_count": len(whole), "output_count": kept, "found": found.counts}
     run.result(counts if split_sky is None else {**counts, "sky_count": int(sky.sum())})
 

@@ -95,13 +95,14 @@ def compare(
             (name, stand.of(splats))
             for name, splats in zip(short_names(paths), (reference, other), strict=True)
         ]
-        write_page(
-            output,
-            scenes,
-            start=stand.start,
-            stops=stops,
-            background=colour,
-            overwrite=run.overwrite,
-        )
+        with run.finishing("--output"):
+            write_page(
+                output,
+                scenes,
+                start=stand.start,
+                stops=stops,
+                background=colour,
+                overwrite=run.overwrite,
+            )
         run.say(f"{output}: opens at {stand.name}; the arrows below lead to the worst views")
     run.result({**scores.as_dict(), "output": None if output is None else str(output)})

@@ -240,34 +240,35 @@ def _distil_all(
         if folder.path in finished:
             reports.append(finished[folder.path])
             continue
+        before = run.kept
         result, report = _distil(run, source, job, aim.count, folder, began)
         reports.append(report)
-        run.kept.append(f"{folder.path} is finished{others}")
+        run.kept = [*before, f"{folder.path} is finished{others}"]
+        judged = aim, result.splats
         began = time.monotonic()
     run.results(reports)
-    tell_quality(run, aim, result.splats)
+    tell_quality(run, *judged)
 
 
 def _distil(
     run: Run, source: Path, job: DistillJob, budget: int, folder: RunFolder, began: float
 ) -> tuple[Distilled, dict[str, Any]]:
     """Distil to one budget, write the run's folder and print a summary; its time counts from `began`."""
-    from g2ard.jobs.score import report_of
-
     page = ""
-    with folder.working(len(job.prior), budget):
+    with folder.working(len(job.prior), budget, _photos(job)):
         result = job.run(budget, work=folder.work)
-        report = report_of(job, result)
-        report["seconds"]["total"] = time.monotonic() - began + report["seconds"].get("resumed", 0.0)
-        _write_pages(source, job, result, report, folder.path)
-        if run.config["view"]:
-            seen, colour = job.views.train.cameras, job.config.recover.background
-            report["bytes"]["view"], page = folder.write_view(result.splats, seen, colour)
-        else:
-            folder.drop_view()
-        _write_scene(run, job, result, report, folder)
+        folder.write_scene(result.splats)
         folder.write_simplified(result.simplified if run.config["keep"] else None)
         folder.write_views(job.views)
+        with run.finishing("scoring"):
+            report = _scored(run, job, result, folder)
+        report["seconds"]["total"] = time.monotonic() - began + report["seconds"].get("resumed", 0.0)
+        _write_pages(run, source, job, result, report, folder.path)
+        if run.config["view"]:
+            seen, colour = job.views.train.cameras, job.config.recover.background
+            with run.finishing("view.html"):
+                report["bytes"]["view"], page = folder.write_view(result.splats, seen, colour)
+        folder.write_report(report)
     write_table(run, report)
     for line in told(report, verbose=run.verbose):
         run.say(line)
@@ -283,8 +284,28 @@ def _distil(
     return result, report
 
 
+def _photos(job: DistillJob) -> list[Path]:
+    """Return the photos and masks that the job reads."""
+    views = (job.views.train.cameras, job.views.test)
+    paths = (path for cameras in views for path in (*cameras.image_paths, *cameras.mask_paths))
+    return list(dict.fromkeys(path for path in paths if path is not None)) if job.reads_photos else []
+
+
+def _scored(run: Run, job: DistillJob, result: Distilled, folder: RunFolder) -> dict[str, Any]:
+    """Return the report, with scores of the file read back if it is packed."""
+    from g2ard.jobs.packing import score_file
+    from g2ard.jobs.score import report_of
+
+    report = report_of(job, result)
+    report["bytes"]["file"] = folder.scene.stat().st_size
+    if folder.scene.name != "scene.ply":
+        colour = job.config.recover.background
+        report["packed"] = score_file(folder.scene, job.held_out, colour, run.progress)
+    return report
+
+
 def _write_pages(
-    source: Path, job: DistillJob, result: Distilled, report: dict[str, Any], folder: Path
+    run: Run, source: Path, job: DistillJob, result: Distilled, report: dict[str, Any], folder: Path
 ) -> None:
     """Write report.html and preview.png."""
     from g2ard.report.distilled import distill_report, preview
@@ -293,19 +314,7 @@ def _write_pages(
     title = f"{source.name}: {len(job.prior):,} → {len(result.splats):,}"
     targets = [job.held_out] if job.apart is None else [job.held_out, job.apart]
     colour = job.config.recover.background
-    distill_report(folder / "report.html", title, scenes, targets, report, colour, told=told(report))
-    preview(folder / "preview.png", job.held_out, scenes, colour)
-
-
-def _write_scene(
-    run: Run, job: DistillJob, result: Distilled, report: dict[str, Any], folder: RunFolder
-) -> None:
-    """Write the scene, read it back and score it if it is packed, and write report.json."""
-    from g2ard.jobs.packing import score_file
-
-    folder.write_scene(result.splats)
-    report["bytes"]["file"] = folder.scene.stat().st_size
-    if folder.scene.name != "scene.ply":
-        colour = job.config.recover.background
-        report["packed"] = score_file(folder.scene, job.held_out, colour, run.progress)
-    folder.write_report({**report, "config": run.config})
+    with run.finishing("report.html"):
+        distill_report(folder / "report.html", title, scenes, targets, report, colour, told=told(report))
+    with run.finishing("preview.png"):
+        preview(folder / "preview.png", job.held_out, scenes, colour)

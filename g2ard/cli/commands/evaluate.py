@@ -64,7 +64,7 @@ def evaluate(
     """
     from g2ard.cli.teaching import Teaching, check_teacher, teaching_of_run
     from g2ard.io.describe import bytes_of
-    from g2ard.jobs.inputs import load_views
+    from g2ard.jobs.inputs import load_views, scorable
     from g2ard.jobs.view_checks import check_sight
     from g2ard.rendering.lpips import load_lpips
     from g2ard.rendering.renderer import RasterSettings
@@ -88,7 +88,8 @@ def evaluate(
     teaching = Teaching(run, teacher, colour, chosen=chosen is not None, photos=photos)
     frozen = run.load(anchors) if anchors else None
     cameras = load_views(teaching.views(views), split, size, run.say, unpictured=teaching.dense is not None)
-    targets = teaching.targets(cameras, settings=settings)
+    targets = scorable(teaching.targets(cameras, settings=settings), run.say)
+    cameras = targets.cameras
     networks = load_lpips(lpips, scaled=lpips_input == "scaled") if lpips else None
     rows: list[dict[str, Any]] = []
     for path in scenes:

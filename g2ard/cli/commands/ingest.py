@@ -48,7 +48,7 @@ def ingest(
         run.say(f"{output}: nothing to resume, starting over")
     config = LiftConfig()
     config = changed(config, run.settings(config))
-    run.kept = [f"finished tiles are in {output}; run the same command to continue"]
+    run.unfinished = f"finished tiles are in {output}; run the same command to continue"
     began = time.perf_counter()
     store = into_tiles(
         scenes,

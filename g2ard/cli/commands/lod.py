@@ -116,7 +116,7 @@ def lod(
     Each level is merged from the one before, then recovered.
     Scenes larger than memory and folders of tiles are processed tile by tile.
     """
-    from g2ard.cli.resume import check_stopped, left_at, stoppable
+    from g2ard.cli.resume import check_stopped, is_finished, stoppable
     from g2ard.io import kind as kind_of
     from g2ard.io.atomic import check_output
     from g2ard.jobs.levels import check_ratios
@@ -143,7 +143,7 @@ def lod(
     writer = _Writer(run, output, kind, rule, spot, up)
     run.spare_inputs(writer.meta)
     stopped = output.with_name(f".{output.name}.unfinished")
-    finished = resume and writer.meta.exists() and not run.overwrite and (tiled or not left_at(stopped))
+    finished = is_finished(run, stopped, resume, writer.meta)
     if finished:
         _check_same(writer.meta, ratios)
     else:
@@ -155,7 +155,7 @@ def lod(
         _in_tiles(writer, scene, ratios, tiling, views, steps, size, colour, recover)
         return
     check_memory(scene, tiling, LEVELS_TIMES, RECOVERY_TIMES)
-    with stoppable(run, stopped, resume):
+    with stoppable(run, stopped, resume, writer.meta):
         stopped.mkdir(parents=True, exist_ok=True)
         levels = levels_of(
             scene,
@@ -174,6 +174,7 @@ def lod(
             say=run.say,
         )
         written = writer.save(levels.splats, sky=levels.sky)
+        run.kept.append(f"{output} is written")
     _tell(run, output, levels, written)
 
 
@@ -200,7 +201,7 @@ def _in_tiles(
     options = DistillOptions(
         views=views, size=size, up=writer.up, render_model=run.render_model, settings=settings
     )
-    run.kept = [f"finished steps are in {folder}; run the same command to continue"]
+    run.unfinished = f"finished steps are in {folder}; run the same command to continue"
     with working(tiling, views):
         levels = lod_in_tiles(
             scene, ratios, tiling, options, recover=recover, progress=run.progress, say=run.say

@@ -99,7 +99,7 @@ def recover(
     )
     run.say(f"regularisers: {why}" + ("" if dense else "; measured on the student, as there is no teacher"))
     config = configured(RecoverConfig(), preset, settings)
-    with stoppable(run, checkpoint, resume):
+    with stoppable(run, checkpoint, resume, output):
         result = optimize(
             splats,
             targets,
@@ -111,8 +111,9 @@ def recover(
         )
         run.write(output, result.splats)
     _tell_outcome(run, result)
-    held_out = teaching.held_out(views, size) if split == "train" else None
-    kinds = _score(run, splats, result, held_out, chosen.cameras, colour) if held_out else ()
+    with run.finishing("scoring"):
+        held_out = teaching.held_out(views, size) if split == "train" else None
+        kinds = _score(run, splats, result, held_out, chosen.cameras, colour) if held_out else ()
     gain, count = result.report.psnr, plural(len(splats), "Gaussian")
     run.say(f"{output}: {count}, {opt.trained_on(split)} {gain.before:.2f} → {gain.after:.2f} dB")
     report = {**result.report.as_dict(), "preset": why, "prior": measured.as_dict()}

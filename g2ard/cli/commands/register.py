@@ -163,11 +163,12 @@ def register(
     lines = _told(summary)
     for line in lines:
         run.say(line)
-    if report is not None:
-        title = f"Photos in {scene.name}"
-        registration_report(report, title, splats, taken, found, starts, config.size, lines, colour)
     if len(found.cameras):
         run.write_views(output, found.cameras, format)
+    if report is not None:
+        title = f"Photos in {scene.name}"
+        with run.finishing("--report"):
+            registration_report(report, title, splats, taken, found, starts, config.size, lines, colour)
     written = str(output) if len(found.cameras) else None
     result = {**found.report.as_dict(), "summary": summary.as_dict(), "output": written}
     run.result({**result, "settings": listed(config)})

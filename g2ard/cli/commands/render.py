@@ -128,10 +128,13 @@ def render(
             if folder is not None:
                 _write_view(folder / places[view], rendered, depth)
             run.progress("render", view + 1, len(cameras))
-    if sheet is not None:
-        _write_sheet(sheet, shown, cameras.names, run.overwrite)
+    run.kept += [f"{output} is written"] if output is not None else []
     if animation is not None:
         write_animation(animation, shown, fps=fps, overwrite=run.overwrite)
+        run.kept.append(f"{animation} is written")
+    if sheet is not None:
+        with run.finishing("--sheet"):
+            _write_sheet(sheet, shown, cameras.names, run.overwrite)
     written = [str(path) for path in (output, animation, sheet) if path]
     run.say(f"{plural(len(cameras), 'image')} in {' and '.join(written)}")
     run.result({"images": len(cameras), "output": written[0]})

@@ -104,7 +104,8 @@ def simplify(
         simplified = time.perf_counter()
         run.write(place, small.splats)
         if parents is not None:
-            _write_parents(run, parents, small)
+            with run.finishing("--parents"):
+                _write_parents(run, parents, small)
         written = time.perf_counter()
         seconds = {"read": reading, "simplify": simplified - started, "write": written - simplified}
         seconds["total"] = sum(seconds.values())
@@ -113,7 +114,6 @@ def simplify(
         _tell(run, scene, small, place, seconds["total"])
         if aim.bytes is not None:
             run.say(f"{place}: {written_bytes(place):,} of {aim.bytes:,} bytes")
-        run.kept.append(f"{place} is written")
     run.results(reports)
     tell_quality(run, aims[0], small.splats)
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from g2ard.rendering.metrics import psnr
 from g2ard.rendering.renderer import Renderer
-from g2ard.rendering.targets import Subset, Targets, mask_of
+from g2ard.rendering.targets import Subset, Targets, mask_of, with_pixels
 from g2ard.scene.cameras import evenly_spaced, rows_by_kind
 from g2ard.scene.splats import Splats
 
@@ -25,11 +25,12 @@ _FIRST_SHARE = 0.1
 
 
 class Probe:
-    """PSNR of a few evenly spaced views, each at most `most`."""
+    """PSNR of a few evenly spaced views, each at most `most`; views without a valid pixel are skipped."""
 
     def __init__(
         self, targets: Targets, background: tuple[float, float, float], most: float = math.inf
     ) -> None:
+        targets = with_pixels(targets)
         self._views = evenly_spaced(len(targets.cameras), _VIEWS)
         self._targets, self._background, self._most = targets, background, most
         self._next = 0.0

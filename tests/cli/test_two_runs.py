@@ -1,0 +1,44 @@
+"""Two runs with one output: one writes it, the other fails."""
+
+from collections.abc import Callable
+from pathlib import Path
+from pkgutil import resolve_name
+from typing import Any
+
+import pytest
+
+from helpers.commands import CommandLine
+
+TRAIN = "--views views.json --teacher ball.ply --steps 2"
+COMMANDS = {
+    "distill ball.ply -r 8 --views views.json --steps 2 --no-view -o run": "g2ard.jobs.job.DistillJob.run",
+    f"recover ball.ply {TRAIN} -o out.ply": "g2ard.stages.recover.recover",
+    f"adapt ball.ply {TRAIN} -o out.ply": "g2ard.pipeline.adapt.adapt",
+    "lod ball.ply -r 4,8 --merge-only --views views.json -o levels": "g2ard.jobs.levels.lod",
+    "simplify ball.ply -r 8 --no-views -o out.ply": "g2ard.cli.frame.write_splats",
+    "select ball.ply --views views.json -k 3 -o out.json": "g2ard.cli.frame.write_views",
+    "render ball.ply --views views.json -o out": "g2ard.rendering.renderer.Renderer.render",
+}
+"""Command → the function in it that begins another run of the same command."""
+
+
+@pytest.mark.parametrize("words", COMMANDS)
+def test_one_of_two_runs_writes_the_output(
+    words: str, folder: Path, command_line: CommandLine, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    name, others = COMMANDS[words], []
+    real: Callable[..., Any] = resolve_name(name)
+
+    def interrupted(*given: Any, **named: Any) -> Any:
+        if not others:
+            others.append(None)
+            others[0] = command_line(*words.split(), cwd=folder)
+        return real(*given, **named)
+
+    monkeypatch.setattr(name, interrupted)
+    first = command_line(*words.split(), cwd=folder)
+    done = [first, others[0]]
+    assert sorted(status for status, _, _ in done) == [0, 1], done
+    refused = next(error for status, _, error in done if status)
+    assert "in use by process" in refused or "exists; -w" in refused, refused
+    assert not list(folder.glob("**/*.lock"))
