@@ -14,6 +14,10 @@ from g2ard.scene.splats import Splats
 _REACH = 0.01
 """Default `reach`: Gaussians larger than a hundredth of the image hardly move, unless that is typical."""
 
+_FINEST = 1.0
+"""Pixels, default `finest`: the sampling limit. Of a Gaussian with this standard deviation, exp(−π²/2), under
+1 %, of the spectrum's peak is left at the Nyquist frequency, so its pixels determine its shape."""
+
 _UNTRAINED_RMSE = 0.1
 """Initial RMSE above which a scene counts as untrained, so that large Gaussians must move."""
 
@@ -36,6 +40,10 @@ class Rates:
     the same for its own axis (`recover.extent`). Otherwise many layers moving together, such as a sky's,
     would move the image by the sum of their steps.
 
+    Gaussians below a pixel hardly move either: the same rates are multiplied by σ²/(σ² + finest²), with σ in
+    pixels before dilation. Adam divides by the gradient's own size, and would otherwise move what a view
+    cannot resolve as far as everything else.
+
     Args:
         means: in units of the Gaussian's radius if `means_in_scales`, otherwise scene units.
         log_scales: natural-log units.
@@ -44,6 +52,7 @@ class Rates:
         sh0: band-0 coefficients.
         shN: higher-band coefficients.
         reach: share of the image's longer side; infinite treats all sizes alike. Set by the schedule.
+        finest: pixels; 0 treats all sizes alike. Set by the schedule.
 
     Raises:
         InputError: a value out of range.
@@ -56,12 +65,14 @@ class Rates:
     sh0: float
     shN: float
     reach: float = field(default=math.inf, metadata={"setting": False})
+    finest: float = field(default=0.0, metadata={"setting": False})
 
     def __post_init__(self) -> None:
         for name in ("means", "log_scales", "quats", "logit_opacities", "sh0", "shN"):
             value = getattr(self, name)
             require(name, value, 0 <= value < math.inf, "a rate, at least 0")
         require("reach", self.reach, self.reach > 0, "more than 0")
+        require("finest", self.finest, 0 <= self.finest < math.inf, "pixels, at least 0")
 
     def scaled(self, geometry: float, appearance: float) -> Rates:
         """Multiply rates of means, scales and rotations by `geometry`, of opacity and SH by `appearance`."""
@@ -73,6 +84,7 @@ class Rates:
             self.sh0 * appearance,
             self.shN * appearance,
             self.reach,
+            self.finest,
         )
 
 
@@ -90,6 +102,7 @@ class Schedule:
         appearance_decay: shares (rounds, final) to which appearance rates decay exponentially; 1 keeps them.
         multiplier: factor on all rates; None chooses it by short trials, starting at `multiplier_for`.
         reach: see `Rates`; None chooses it from the initial error (`reach_for`).
+        finest: see `Rates`.
         reference_extent: `rates.means` is scaled by the cameras' extent (`Cameras.extent`) over this, so that
             the scene's unit does not matter; None takes it in scene units.
         guarded: whether a recovery that loses quality returns to the best scene or its start; otherwise all
@@ -107,6 +120,7 @@ class Schedule:
     appearance_decay: tuple[float, float] = (1.0, 1.0)
     multiplier: float | None = None
     reach: float | None = None
+    finest: float = _FINEST
     reference_extent: float | None = None
     guarded: bool = True
 
@@ -119,6 +133,7 @@ class Schedule:
         for name in ("multiplier", "reach", "reference_extent"):
             value = getattr(self, name)
             require(name, value, value is None or value > 0, "more than 0, or none")
+        require("finest", self.finest, 0 <= self.finest < math.inf, "pixels, at least 0")
 
     @classmethod
     def named(cls, name: str) -> Schedule:
@@ -160,7 +175,8 @@ class Schedule:
         if self.cosine_floor is not None:
             cosine = self.cosine_floor + (1 - self.cosine_floor) * 0.5 * (1 + math.cos(math.pi * t))
         decay = self.appearance_decay[1 if final else 0] ** t
-        return replace(self.rates.scaled(cosine * multiplier, cosine * decay * multiplier), reach=reach)
+        rates = self.rates.scaled(cosine * multiplier, cosine * decay * multiplier)
+        return replace(rates, reach=reach, finest=self.finest)
 
 
 TUNED = Schedule(
@@ -178,6 +194,7 @@ PAPER = Schedule(
     appearance_decay=(0.36, 0.1),
     multiplier=1.0,
     reach=math.inf,
+    finest=0.0,
     reference_extent=5.75,
     guarded=False,
 )

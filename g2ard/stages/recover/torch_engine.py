@@ -80,21 +80,21 @@ class TorchEngine:
             total = total + regularization(means, p["quats"], p["log_scales"], self._anchors, weights)
         self._adam.zero_grad(set_to_none=True)
         torch.autograd.backward(total)
-        shares = self._shares(means.detach(), view, rates.reach)
+        shares = self._shares(means.detach(), view, rates)
         for group in self._adam.param_groups:
             group["lr"], group["share"] = getattr(rates, group["name"]), shares.get(group["name"])
         self._adam.step()
         return float(loss.detach())
 
-    def _shares(self, means: Tensor, view: int, reach: float) -> dict[str, Tensor]:
+    def _shares(self, means: Tensor, view: int, rates: Rates) -> dict[str, Tensor]:
         """Return factors on each rate, per row or value, from sizes in this view."""
-        if math.isinf(reach):
+        if math.isinf(rates.reach) and not rates.finest:
             return {}
         p, near, cameras = self._parameters, self._settings.near_of(view), self._objective.cameras
         largest, axes = extents(means, p["quats"], p["log_scales"], cameras, view, near)
-        pixels = reach * float(max(cameras.widths[view], cameras.heights[view]))
-        whole = share_of_rate(largest, pixels)[:, None]
-        return {"means": whole, "quats": whole, "log_scales": share_of_rate(axes, pixels)}
+        pixels = rates.reach * float(max(cameras.widths[view], cameras.heights[view]))
+        whole, own = (share_of_rate(sizes, pixels, rates.finest) for sizes in (largest, axes))
+        return {"means": whole[:, None], "quats": whole[:, None], "log_scales": own}
 
     def _render(self, means: Tensor, view: int) -> Tensor:
         """Render one view (H, W, 3), differentiably."""

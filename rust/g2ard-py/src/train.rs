@@ -28,6 +28,8 @@ struct PyRates {
     sh_n: f32,
     /// Share of the longer side of a view.
     reach: f64,
+    /// Pixels.
+    finest: f32,
 }
 
 impl PyRates {
@@ -82,6 +84,7 @@ impl PyTrainer {
             relative: None,
             rates: Rates::default(),
             reach: None,
+            finest: 0.0,
             regularizers: None,
         }
     }
@@ -153,6 +156,7 @@ impl PyTrainer {
             mask: optional("mask", &mask)?,
             relative,
             reach: rates.reach_in(&camera),
+            finest: rates.finest,
             rates: rates.into(),
             regularizers: regularizers.map(|r| r.0),
             ..self.input(&camera, target)

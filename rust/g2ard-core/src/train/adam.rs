@@ -39,6 +39,7 @@ pub struct Update<'a> {
     pub biases: &'a Biases,
     pub rates: &'a Rates,
     pub reach: Option<f32>,
+    pub finest: f32,
     pub regularize: Option<(&'a Regularizers, &'a Anchors)>,
     /// One bit per row of a group, 0 if it is frozen; `None` freezes nothing.
     pub free: Option<&'a [u16]>,
@@ -187,19 +188,27 @@ impl Update<'_> {
         }
     }
 
-    /// 1/(1 + (σ/c)¹⁶) from σ², where σ is a size in pixels.
+    /// σ²/(σ² + finest²) · 1/(1 + (σ/reach)¹⁶) from σ², where σ is a size in pixels.
     #[inline(always)]
     fn share<F: Lanes>(&self, variance: F) -> F {
         let one = F::splat(1.0);
+        let least = F::splat(self.finest * self.finest);
+        let seen = match self.finest > 0.0 {
+            true => {
+                let variance = variance.min(F::splat(1e12));
+                variance * (variance + least).recip()
+            }
+            false => one,
+        };
         let Some(reach) = self.reach else {
-            return one;
+            return seen;
         };
         // Beyond ten times the reach nothing moves anyway, and the eighth power stays within f32.
         let shrink = F::splat(1.0 / reach);
         let ratio = (variance * shrink * shrink).min(F::splat(100.0));
         let square = ratio * ratio;
         let fourth = square * square;
-        one / fourth.fma(fourth, one)
+        seen / fourth.fma(fourth, one)
     }
 }
 

@@ -66,6 +66,9 @@ pub struct StepInput<'a> {
     /// means and rotations σ is the Gaussian's longer side, for each scale its own axis. `None` leaves all rates
     /// unchanged.
     pub reach: Option<f32>,
+    /// A size in pixels, c: the same rates are multiplied by σ²/(σ² + c²), because a view determines no shape below its
+    /// sampling limit. 0 leaves them unchanged.
+    pub finest: f32,
     /// Added to the loss of this step; needs anchors.
     pub regularizers: Option<Regularizers>,
 }
@@ -230,6 +233,9 @@ impl Trainer {
         {
             return Err(Error::invalid("reach", "pixels, more than 0", reach));
         }
+        if !(input.finest >= 0.0 && input.finest.is_finite()) {
+            return Err(Error::invalid("finest", "pixels, at least 0", input.finest));
+        }
         if input.regularizers.is_some() && self.anchors.is_none() {
             return Err(Error::invalid("regularizers", "anchors set before", "none"));
         }
@@ -287,6 +293,7 @@ impl Trainer {
                     biases,
                     rates: &input.rates,
                     reach: input.reach,
+                    finest: input.finest,
                     regularize,
                     free: (!free.is_empty()).then_some(free),
                 },

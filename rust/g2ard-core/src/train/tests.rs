@@ -24,6 +24,7 @@ fn steps_give_the_same_bits_on_any_number_of_threads_and_learn() {
                 sh_n: 1e-3,
             },
             reach: None,
+            finest: 0.0,
             regularizers: None,
         };
         let steps = if cfg!(miri) { 2 } else { 8 };
