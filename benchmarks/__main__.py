@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import sys
+
+from g2ard.errors import MissingDependencyError
 from g2ard.system import interrupt
 
 __all__ = ["main"]
@@ -9,7 +12,10 @@ __all__ = ["main"]
 
 def main() -> None:
     interrupt.ends_the_program()
-    from benchmarks.commands import app
+    try:
+        from benchmarks.commands import app
+    except MissingDependencyError as e:
+        sys.exit(f"benchmarks: {e}")
     from g2ard.cli import run_program
 
     run_program(app, "benchmarks")

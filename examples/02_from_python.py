@@ -1,11 +1,19 @@
-"""The same from Python: the whole job in one call, then stage by stage, on a city that takes seconds."""
+"""The same from Python: the whole job in one call, then stage by stage, on a city that takes seconds.
+
+Run it in a checkout, after `pip install .` or `make setup`: python examples/02_from_python.py
+"""
 
 from __future__ import annotations
+
+import sys
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 import g2ard
+
+sys.path.append(str(Path(__file__).resolve().parents[1]))  # benchmarks, which are not installed
 from benchmarks.synth import City, city
 
 SKY = (0.6, 0.8, 1.0)

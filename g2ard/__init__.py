@@ -174,14 +174,34 @@ _ALIASES = {
 
 
 def __getattr__(name: str) -> Any:
+    if name == "_core":
+        return _extension()
     home, own = _ALIASES.get(name, (next((m for m, names in _HOMES.items() if name in names), None), name))
     if home is None:
         raise AttributeError(f"module 'g2ard' has no attribute {name!r}")
     from importlib import import_module
 
-    found = getattr(import_module(f"g2ard.{home}"), own)
+    found = getattr(_extension() if home == "_core" else import_module(f"g2ard.{home}"), own)
     globals()[name] = found
     return found
+
+
+def _extension() -> Any:
+    """Import `g2ard._core`; a checkout has none until it is built."""
+    from importlib import import_module
+
+    try:
+        return import_module("g2ard._core")
+    except ModuleNotFoundError:
+        from pathlib import Path
+
+        from g2ard.errors import MissingDependencyError
+
+        raise MissingDependencyError(
+            "this checkout has no Rust extension, and Python prefers it to an installed g2ard",
+            path=Path(__file__).parents[1],
+            hint="run `pip install -e .` or `make setup` there, or start Python in another folder",
+        ) from None
 
 
 def __dir__() -> list[str]:

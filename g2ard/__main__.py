@@ -11,13 +11,19 @@ def main() -> None:
     interrupt.ends_the_program()
     if not sys.warnoptions:
         warnings.simplefilter("ignore")  # an error is one line; of what is no error we tell in our own words
-    from g2ard.cli import main as command_line
-
     try:
+        from g2ard.cli import main as command_line
+
         command_line()
     except SystemExit as end:
         if end.code in interrupt.STATUSES:
             interrupt.leave()
+        raise
+    except ImportError as e:
+        from g2ard.errors import MissingDependencyError
+
+        if isinstance(e, MissingDependencyError):  # the extension's: those of commands are caught there
+            sys.exit(f"g2ard: {e}")
         raise
 
 

@@ -1,5 +1,8 @@
 """Optional packages that are not installed."""
 
+import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -9,6 +12,7 @@ from g2ard import errors
 from g2ard.errors import MissingDependencyError
 from g2ard.rendering.lpips import load_lpips
 from helpers.commands import CommandLine, refused
+from helpers.project import ROOT
 from helpers.scenes import around, checkered_ball
 
 
@@ -26,3 +30,20 @@ def test_features_need_torch(
     ask = ("evaluate", "ball.ply", "--teacher", "ball.ply", "--views", "views.json", "--lpips", ".")
     assert "LPIPS needs torch" in refused(command_line, folder, *ask, status=1)
     g2ard.recover(ball, targets, g2ard.RecoverConfig(steps=1))
+
+
+def test_a_checkout_without_its_extension_says_what_to_do(tmp_path: Path) -> None:
+    """After `pip install .`, Python run in the checkout finds the sources, which have no extension."""
+    for folder in ("g2ard", "benchmarks"):
+        shutil.copytree(ROOT / folder, tmp_path / folder, ignore=shutil.ignore_patterns("_core.*", "record"))
+    for words in (
+        ["-m", "g2ard", "--version"],
+        ["-m", "benchmarks", "--help"],
+        ["-c", "import g2ard; g2ard.simplify"],
+    ):
+        done = subprocess.run([sys.executable, *words], cwd=tmp_path, capture_output=True, text=True)
+        assert done.returncode == 1
+        said = done.stderr.splitlines()
+        assert f"{tmp_path}: this checkout has no Rust extension" in said[-1]
+        assert "`pip install -e .` or `make setup`" in said[-1]
+        assert len(said) == 1 or words[0] == "-c"
