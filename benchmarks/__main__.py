@@ -16,7 +16,7 @@ def main() -> None:
         from benchmarks.commands import app
     except MissingDependencyError as e:
         sys.exit(f"benchmarks: {e}")
-    from g2ard.cli import run_program
+    from g2ard.cli.main import run_program
 
     run_program(app, "benchmarks")
 

@@ -17,6 +17,7 @@ from benchmarks.views import hidden_targets
 from g2ard import io
 from g2ard.errors import InputError
 from g2ard.io.splits import for_scores, for_training, not_held_out, split_mask, splits_of
+from g2ard.io.types import ViewSet
 from g2ard.poses import make_pool
 from g2ard.progress import plural
 from g2ard.rendering.renderer import RasterSettings
@@ -161,7 +162,7 @@ class Workspace:
         """The number of views that were dropped from training because they are scored."""
         return len(self._training()) - len(self.train_cameras)
 
-    def read(self, path: Path) -> io.ViewSet:
+    def read(self, path: Path) -> ViewSet:
         """Read views; those without photos are kept if the scene's targets allow it."""
         return io.read_view_set(path, unpictured=self.scene.targets == "either")
 
@@ -170,7 +171,7 @@ class Workspace:
         found = self.read(path)
         return self.small(found, split_mask(path, found.cameras.names, split, stated=found.splits))
 
-    def small(self, found: io.ViewSet, mask: NDArray[np.bool_]) -> Cameras:
+    def small(self, found: ViewSet, mask: NDArray[np.bool_]) -> Cameras:
         """Select views and shrink them to the study's size."""
         return found.take(mask).resized(self.study.size).cameras
 

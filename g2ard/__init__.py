@@ -41,13 +41,13 @@ if TYPE_CHECKING:
 
     from g2ard._core import __version__
     from g2ard.errors import G2ardError, InputError, MissingDependencyError, OutputError
-    from g2ard.io import Points
     from g2ard.io import read_points as load_points
     from g2ard.io import read_splats as load
     from g2ard.io import read_views as load_views
     from g2ard.io import write_splats as save
     from g2ard.io import write_views as save_views
     from g2ard.io.tile_store import TileStore
+    from g2ard.io.types import Points
     from g2ard.jobs.distill import distill
     from g2ard.jobs.distill_options import DistillOptions
     from g2ard.jobs.levels import lod

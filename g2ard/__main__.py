@@ -12,7 +12,7 @@ def main() -> None:
     if not sys.warnoptions:
         warnings.simplefilter("ignore")  # an error is one line; of what is no error we tell in our own words
     try:
-        from g2ard.cli import main as command_line
+        from g2ard.cli.main import main as command_line
 
         command_line()
     except SystemExit as end:

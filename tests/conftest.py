@@ -56,7 +56,7 @@ def _apart(words: list[str], cwd: Path, env: dict[str, str]) -> Said:
 
 
 def _here(words: list[str], cwd: Path, env: dict[str, str]) -> Said:
-    from g2ard.cli import main
+    from g2ard.cli.main import main
 
     program, *words = _program(words)
     if program == "benchmarks":

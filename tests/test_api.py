@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 import g2ard
-from g2ard.io import Points
 from g2ard.io.reports import Report
+from g2ard.io.types import Points
 from g2ard.scene.splats import ARRAYS, Splats
 from helpers.commands import CommandLine, succeeds
 from helpers.scenes import around, checkered_ball

@@ -55,7 +55,7 @@ def command_options() -> dict[str, set[str]]:
     """Return the options of each command."""
     from typer.main import get_command
 
-    from g2ard.cli.commands import register_commands
+    from g2ard.cli.app import register_commands
     from g2ard.cli.frame import app
 
     register_commands()
@@ -215,7 +215,7 @@ def test_plots_match_the_recorded_rows() -> None:
 
 
 def test_the_readme_names_every_command_and_scene_format() -> None:
-    from g2ard.cli.commands import COMMANDS
+    from g2ard.cli.app import COMMANDS
     from g2ard.io.detect import KINDS
 
     text = (ROOT / "README.md").read_text(encoding="utf-8")

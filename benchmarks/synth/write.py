@@ -15,8 +15,9 @@ from PIL import Image
 
 from benchmarks.synth.city import City, CityConfig, city
 from g2ard import __version__
-from g2ard.io import Points, atomic_folder, check_output, write_views
+from g2ard.io import atomic_folder, check_output, write_views
 from g2ard.io.cloud_ply import write_blocks
+from g2ard.io.types import Points
 from g2ard.progress import Progress, silent
 from g2ard.scene.cameras import Cameras
 

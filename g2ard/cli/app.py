@@ -1,10 +1,32 @@
-"""The typer application that commands register on."""
+"""The typer application, and its commands."""
 
 from __future__ import annotations
 
+from importlib import import_module
 from typing import Annotated
 
 import typer
+
+COMMANDS = (
+    "distill",
+    "simplify",
+    "recover",
+    "adapt",
+    "register",
+    "lift",
+    "ingest",
+    "convert",
+    "clean",
+    "poses",
+    "select",
+    "render",
+    "view",
+    "lod",
+    "evaluate",
+    "compare",
+    "info",
+)
+"""Names of commands in the order of `g2ard --help`; each is a module of `g2ard.cli.commands`."""
 
 app = typer.Typer(
     help="Distil dense 3D Gaussian scenes into compact, standard 3DGS scenes of an exact size.",
@@ -30,3 +52,9 @@ def _root(
     ] = False,
 ) -> None:
     pass
+
+
+def register_commands(asked: str | None = None) -> None:
+    """Register the command `asked`, or all commands if there is no such command."""
+    for name in (asked,) if asked in COMMANDS else COMMANDS:
+        import_module(f"g2ard.cli.commands.{name}")

@@ -67,8 +67,7 @@ def _read(path: Path) -> dict[str, Any]:
 
 def _parameters(ctx: typer.Context, path: Path, tables: Iterable[str]) -> dict[str, dict[str, Any]]:
     """Return the parameters of this command and of those with a table, by command and dashed name."""
-    from g2ard.cli.app import app
-    from g2ard.cli.commands import COMMANDS, register_commands
+    from g2ard.cli.app import COMMANDS, app, register_commands
 
     name = str(ctx.info_name)
     others = set(tables) - {name}

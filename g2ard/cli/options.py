@@ -76,7 +76,7 @@ def with_images(views: Path | None, images: Path | None, alpha: Alpha = "composi
         raise typer.BadParameter("--images goes with --views VIEWS")
     if not given or (images is None and alpha == "composite"):
         return views
-    from g2ard.io import ViewFiles
+    from g2ard.io.types import ViewFiles
 
     return ViewFiles(Path(str(views)), images, alpha)
 

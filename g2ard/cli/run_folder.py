@@ -14,12 +14,13 @@ from g2ard.cli.frame import Run
 from g2ard.cli.resume import OPTIONS, check_stopped, finished_before, is_finished, left_at
 from g2ard.config.choices import Colour, ViewFormat
 from g2ard.errors import InputError, OutputError
-from g2ard.io import ViewSet, write_splats, write_views
+from g2ard.io import write_splats, write_views
 from g2ard.io.atomic import atomic_output, check_output
 from g2ard.io.jsonfile import read_json
 from g2ard.io.lock import check_unlocked, locked
 from g2ard.io.paths import file_identity
 from g2ard.io.scene_formats import FORMATS
+from g2ard.io.types import ViewSet
 from g2ard.jobs.budget import DEVICES, Budget
 from g2ard.jobs.viewer_frame import frame_with
 from g2ard.pipeline.run_views import RunViews

@@ -11,9 +11,9 @@ import typer
 from g2ard.cli.frame import Run
 from g2ard.config.choices import Colour, is_made
 from g2ard.errors import InputError
-from g2ard.io import ViewSet
 from g2ard.io.detect import run_scene, run_views
 from g2ard.io.jsonfile import read_json
+from g2ard.io.types import ViewSet
 from g2ard.jobs.inputs import load_split_views, load_trained, make_targets, scorable
 from g2ard.jobs.view_checks import propose_background, warn_of_sight
 from g2ard.jobs.views import views_or_pool

@@ -55,7 +55,7 @@ Keep = Literal["registered", "uncertain", "all"]
 """Photos whose poses registration keeps."""
 
 Alpha = Literal["composite", "mask"]
-"""Treatment of transparent pixels of photos (`g2ard.io.ViewFiles`)."""
+"""Treatment of transparent pixels of photos (`g2ard.io.types.ViewFiles`)."""
 
 Convention = Literal["gsplat", "inria"]
 """Rasteriser conventions that renderers disagree on (`g2ard.rendering.renderer`)."""

@@ -102,9 +102,9 @@ def sparse_points(file: Path | None) -> Points | None:
 def sparse_file(views: Views) -> Path | None:
     """Return the path of a COLMAP model, of a transforms.json's `ply_file_path`, or of the input.ply beside
     INRIA's cameras.json, which may not exist; None for other views."""
-    from g2ard.io import ViewFiles
     from g2ard.io.detect import file_format
     from g2ard.io.jsonfile import read_json
+    from g2ard.io.types import ViewFiles
 
     given = views.path if isinstance(views, ViewFiles) else views
     if not isinstance(given, str | Path):

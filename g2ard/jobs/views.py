@@ -12,8 +12,8 @@ import numpy as np
 
 from g2ard.config.choices import is_made
 from g2ard.errors import InputError
-from g2ard.io import ViewSet
 from g2ard.io.splits import for_scores, for_training, split_mask, splits_of
+from g2ard.io.types import ViewSet
 from g2ard.jobs.inputs import Views, drop_held_out, load_view_sets, load_views
 from g2ard.jobs.view_checks import as_pool, check_sight, found_views, warn_of_sight
 from g2ard.pipeline.run_views import RunViews

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from g2ard.cli.commands import COMMANDS
+from g2ard.cli.app import COMMANDS
 from g2ard.cli.console import Console
 from helpers.commands import CommandLine, succeeds
 
@@ -20,7 +20,7 @@ def imported_by(statement: str, *heavy: str) -> list[str]:
 
 def test_import_and_help_load_nothing_heavy() -> None:
     assert imported_by("import g2ard", "torch", "numpy", "PIL", "typer", "rich", "g2ard._core") == []
-    show_help = "import contextlib, io\nfrom g2ard.cli import main\nsys.argv = ['g2ard', '--help']\n"
+    show_help = "import contextlib, io\nfrom g2ard.cli.main import main\nsys.argv = ['g2ard', '--help']\n"
     show_help += "with contextlib.redirect_stdout(io.StringIO()), contextlib.suppress(SystemExit): main()\n"
     assert imported_by(show_help, "torch", "numpy", "PIL") == []
 
@@ -72,7 +72,7 @@ def test_an_interrupt_while_a_string_is_executed_ends_with_130_too(tmp_path: Pat
     """`python -m` would end by the signal although the interrupt was handled."""
     (tmp_path / "stopped.py").write_text("""
 import sys
-import g2ard.cli
+import g2ard.cli.main
 from g2ard.__main__ import main
 def stopped():
     try:
@@ -80,7 +80,7 @@ def stopped():
     except KeyboardInterrupt:
         print("kept")
     sys.exit(130)
-g2ard.cli.main = stopped
+g2ard.cli.main.main = stopped
 main()
 """)
     command = [sys.executable, "-m", "stopped"]

@@ -6,8 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from g2ard.io import Points, write_points, write_splats, write_views
+from g2ard.io import write_points, write_splats, write_views
 from g2ard.io.describe import describe
+from g2ard.io.types import Points
 from g2ard.scene.cameras import Cameras, look_at
 from g2ard.scene.splats import Splats
 from helpers.commands import CommandLine, succeeds

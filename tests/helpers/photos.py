@@ -8,8 +8,9 @@ import numpy as np
 from PIL import Image
 
 import g2ard
-from g2ard.io import Points, write_points
+from g2ard.io import write_points
 from g2ard.io.images import write_png
+from g2ard.io.types import Points
 from g2ard.scene.splats import SH_C0
 from helpers.scenes import around, checkered_ball
 from helpers.view_files import edit, transforms

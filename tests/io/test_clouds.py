@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from g2ard.errors import InputError, MissingDependencyError, OutputError
-from g2ard.io import Points, kind, read_cloud, read_points, write_points
+from g2ard.io import kind, read_cloud, read_points, write_points
+from g2ard.io.types import Points
 from helpers.cloud_files import FAR, columns, las, ply
 from helpers.realdata import real
 

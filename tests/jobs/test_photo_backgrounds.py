@@ -10,9 +10,10 @@ import pytest
 from PIL import Image
 
 import g2ard
-from g2ard.io import ViewFiles, read_view_set, write_splats
+from g2ard.io import read_view_set, write_splats
 from g2ard.io.describe import describe
 from g2ard.io.images import photo_traits, write_png
+from g2ard.io.types import ViewFiles
 from g2ard.rendering.targets import Photos
 from helpers.commands import CommandLine, refused, succeeds
 from helpers.photos import BALL, cloud_of, photos_of, rgba_photos_of

@@ -41,7 +41,7 @@ def folder(tmp_path: Path) -> Path:
 @pytest.fixture
 def g2ard(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Program:
     """The program in this process and in the folder, so that stages can be watched."""
-    from g2ard.cli.commands import register_commands
+    from g2ard.cli.app import register_commands
     from g2ard.cli.frame import app
 
     monkeypatch.chdir(folder)

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from g2ard.config.choices import Colour
-    from g2ard.io import ViewSet
+    from g2ard.io.types import ViewSet
     from g2ard.rendering.targets import Targets
     from g2ard.report.kinds import KindScore
     from g2ard.scene.cameras import Cameras

@@ -17,7 +17,7 @@ from g2ard.progress import plural
 
 if TYPE_CHECKING:
     from g2ard.config.choices import ViewFormat
-    from g2ard.io import ViewSet
+    from g2ard.io.types import ViewSet
 
 
 @command(

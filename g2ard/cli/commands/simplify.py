@@ -23,7 +23,7 @@ from g2ard.progress import plural
 from g2ard.system.memory import peak_rss
 
 if TYPE_CHECKING:
-    from g2ard.io import Scene
+    from g2ard.io.types import Scene
     from g2ard.jobs.budget import Budget
     from g2ard.stages.simplify import Simplified, SimplifyConfig
 

@@ -1,0 +1,71 @@
+"""Reading and writing coloured point clouds of any format."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from g2ard.errors import InputError, OutputError
+from g2ard.io.detect import file_format, kind
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from g2ard.io.point_stream import PointStream
+    from g2ard.io.types import Cloud, Points
+
+
+def read_points(path: str | Path) -> Points:
+    """Read a coloured point cloud.
+
+    Args:
+        path: .ply with x y z red green blue, .las, .laz, COLMAP's points3D.bin or .txt, or a COLMAP folder.
+
+    Returns:
+        Positions in float64, world units; colours in [0, 1].
+
+    Raises:
+        InputError: the file is missing, damaged, has no colours, or no finite point.
+        MissingDependencyError: .las or .laz without `pip install g2ard[las]`.
+    """
+    return read_cloud(path).points
+
+
+def read_cloud(path: str | Path) -> Cloud:
+    """Read a coloured point cloud with notes on the file."""
+    return open_point_stream(path).whole()
+
+
+def open_point_stream(path: str | Path | Sequence[str | Path]) -> PointStream:
+    """Open a coloured point cloud, or several as one, for reading in blocks.
+
+    Memory holds one block of a .ply, .las or .laz, or the whole file of other formats. Several clouds get
+    the offset of the first.
+    """
+    from g2ard.io.point_stream import JoinedClouds
+
+    if not isinstance(path, str | Path):
+        streams = [open_point_stream(part) for part in path]
+        if not streams:
+            raise InputError("no point cloud given")
+        return streams[0] if len(streams) == 1 else JoinedClouds(streams)
+    path, found = Path(path), file_format(path)
+    modules = {"cloud_ply": "cloud_ply", "las": "las", "points3d": "points3d", "colmap": "points3d"}
+    if found not in modules:
+        scene = kind(path) == "splats"
+        what = "a Gaussian scene" if scene else found
+        hint = "run `simplify` or `distill` on it" if scene else "give the point cloud's file"
+        raise InputError(f"expected a coloured point cloud, found {what}", path=path, hint=hint)
+    stream: PointStream = import_module(f"g2ard.io.{modules[found]}").Stream(path)
+    return stream
+
+
+def write_points(path: str | Path, points: Points, *, overwrite: bool = False) -> None:
+    """Write a coloured point cloud as .ply (float64 positions, 8-bit colours) atomically."""
+    from g2ard.io import cloud_ply
+
+    path = Path(path)
+    if path.suffix.lower() != ".ply":
+        raise OutputError("point clouds are written as .ply", path=path)
+    cloud_ply.write(path, points, overwrite=overwrite)

@@ -1,0 +1,138 @@
+"""Reading and writing Gaussian scenes of any format."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import replace
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from g2ard.errors import InputError
+from g2ard.io.atomic import check_output
+from g2ard.io.detect import KINDS, file_format, run_scene
+from g2ard.io.scene_formats import check_options, lost_in, scene_format
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from g2ard.config.choices import RenderModel
+    from g2ard.io.stream import SceneStream
+    from g2ard.io.types import Scene
+    from g2ard.scene.splats import Splats
+
+
+def read_splats(path: str | Path, *, render_model: RenderModel | None = None) -> Splats:
+    """Read a Gaussian scene.
+
+    Args:
+        path: .ply (3DGS), .compressed.ply, .sog or a SOG folder, .spz, .glb, .splat, .ksplat, OpenUSD
+            (.usda, .usdc); or a folder written by `distill` or `ingest`.
+        render_model: "classic" or "antialiased"; None means what the file says, classic if it says nothing.
+
+    Returns:
+        The scene: linear scales, logit opacities, means relative to `offset`.
+
+    Raises:
+        InputError: the file is missing, damaged, not a scene, or has no finite row.
+
+    >>> import tempfile, g2ard
+    >>> path = Path(tempfile.mkdtemp()) / "two.ply"
+    >>> g2ard.save(path, g2ard.Splats.create([[0, 0, 0], [1, 0, 0]], scales=[[1, 1, 1], [1, 2, 3]]))
+    >>> g2ard.load(path).scales.round(5).tolist()
+    [[1.0, 1.0, 1.0], [1.0, 2.0, 3.0]]
+    """
+    return read_scene(path, render_model=render_model).splats
+
+
+def read_scene(path: str | Path, *, render_model: RenderModel | None = None) -> Scene:
+    """Read a Gaussian scene with notes on dropped rows, clamped values and ignored properties."""
+    path, found = check_scene(path)
+    module = import_module(f"g2ard.io.{found}")
+    scene: Scene = module.Stream(path).whole() if hasattr(module, "Stream") else module.read(path)
+    if render_model is None:
+        return scene
+    return replace(scene, splats=replace(scene.splats, render_model=render_model))
+
+
+def open_stream(
+    path: str | Path | Sequence[str | Path], *, render_model: RenderModel | None = None
+) -> SceneStream:
+    """Open a scene, or several as one, for reading in blocks.
+
+    Memory holds one block of a .ply, .compressed.ply or .splat, one chunk of a SOG, one tile, or the whole
+    file of other formats. Several scenes get the offset of the first and the highest of their SH degrees;
+    their render models must agree. `render_model` overrides what files say.
+    """
+    from g2ard.io.paths import file_identity
+    from g2ard.io.stream import JoinedScenes, PartsStream
+
+    if not isinstance(path, str | Path):
+        streams = [open_stream(part, render_model=render_model) for part in path]
+        if not streams:
+            raise InputError("no scene given")
+        return streams[0] if len(streams) == 1 else JoinedScenes(streams)
+    path, found = check_scene(path)
+    module = import_module(f"g2ard.io.{found}")
+    if hasattr(module, "Stream"):
+        stream: SceneStream = module.Stream(path)
+    else:
+        scene: Scene = module.read(path)
+        splats = scene.splats
+        parts = [len(splats)], lambda _: splats, splats.sh_degree, splats.offset
+        stream = PartsStream(path, *parts, file_identity([path]), scene.notes, splats.render_model)
+    stream.render_model = render_model or stream.render_model
+    return stream
+
+
+def check_scene(path: str | Path) -> tuple[Path, str]:
+    """Return a scene's file or folder and its format; raise an `InputError` if it is not a scene."""
+    path = run_scene(path)
+    found = file_format(path)
+    if KINDS[found] != "splats":
+        is_cloud = KINDS[found] == "points"
+        what = "a point cloud (no f_dc, scale, rot)" if is_cloud else found
+        hint = "`g2ard lift` turns it into a scene" if is_cloud else "give the scene's file"
+        raise InputError(f"expected a Gaussian scene, found {what}", path=path, hint=hint)
+    return path, found
+
+
+def check_scene_output(path: str | Path, overwrite: bool = False) -> Path:
+    """Raise the `OutputError` that `write_splats` would raise, before any work."""
+    if scene_format(path).function == "write_folder":
+        check_output(Path(path).parent, overwrite, folder=True)
+        return Path(path)
+    return check_output(path, overwrite)
+
+
+def write_splats(path: str | Path, splats: Splats, *, overwrite: bool = False, **options: Any) -> None:
+    """Write a Gaussian scene atomically.
+
+    Args:
+        path: .ply (3DGS), .compressed.ply, .sog, .spz, .glb (KHR_gaussian_splatting), .splat, .usda,
+            .usdc; NAME/meta.json for a SOG folder.
+        splats: the scene.
+        overwrite: whether to replace an existing file.
+        **options: format options: `normals=True` adds nx ny nz to a .ply; `spz_version=4` writes .spz
+            version 4 instead of 3, and with it `axes="RFU"` stores right-forward-up instead of
+            right-up-back; `compress="spz"` writes an SPZ inside of a .glb.
+
+    Warns:
+        UserWarning: an antialiased scene in a format that cannot say so (.glb, .splat, OpenUSD).
+
+    Raises:
+        OutputError: the file exists or cannot be written, or the extension or an option is unsupported.
+        InputError: the scene is empty, has a non-finite value, or one that the format cannot store.
+        MissingDependencyError: .spz of version 4 before Python 3.14 without `pip install backports.zstd`.
+
+    >>> import tempfile, g2ard
+    >>> path = Path(tempfile.mkdtemp()) / "one.sog"
+    >>> g2ard.save(path, g2ard.Splats.create([[0, 0, 0]], scales=[[1, 2, 3]]))
+    >>> len(g2ard.load(path))
+    1
+    """
+    found = check_options(path, options)
+    writer = getattr(import_module(f"g2ard.io.{found.module}"), found.function)
+    writer(Path(path), splats, overwrite=overwrite, **options)
+    for note in lost_in(path, splats, **options):
+        warnings.warn(f"{path}: {note}", stacklevel=2)

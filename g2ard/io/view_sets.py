@@ -1,0 +1,138 @@
+"""Reading and writing views of any format."""
+
+from __future__ import annotations
+
+import warnings
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from g2ard.errors import InputError
+from g2ard.io.atomic import atomic_folder, atomic_output, check_output
+from g2ard.io.detect import KINDS, file_format, run_views
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import ArrayLike
+
+    from g2ard.config.choices import Alpha, ViewFormat
+    from g2ard.io.types import ViewFiles, ViewSet
+    from g2ard.scene.cameras import Cameras
+
+
+def check_views_output(path: str | Path, overwrite: bool = False, format: ViewFormat | None = None) -> Path:
+    """Raise the `OutputError` that `write_views` would raise, before any work."""
+    from g2ard.io.camera_files import view_format
+
+    return check_output(path, overwrite, folder=view_format(Path(path), format) == "colmap")
+
+
+def read_views(path: str | Path, *, images: str | Path | None = None, split: str = "all") -> Cameras:
+    """Read views.
+
+    Args:
+        path: a COLMAP folder (or its images_4), a transforms.json or its folder, a nerfstudio, gsplat or
+            INRIA run, LLFF's poses_bounds.npy, a Polycam capture, a Cambridge Landmarks scene, or a
+            .json written by g2ard.
+        images: folder of the photos, if they have moved.
+        split: "train", "test", or "all"; see `g2ard.io.splits.split_mask`.
+
+    Returns:
+        The views in OpenCV axes, sorted by name for COLMAP, otherwise in file order. Views whose photo is
+        missing are skipped, unless all photos are missing.
+
+    Raises:
+        InputError: the file is missing or damaged, or has no views in the split.
+    """
+    return read_view_set(path, images=images, split=split).cameras
+
+
+def read_view_set(
+    path: str | Path | ViewFiles,
+    *,
+    images: str | Path | None = None,
+    split: str = "all",
+    unpictured: bool = False,
+    alpha: Alpha = "composite",
+) -> ViewSet:
+    """Read views with their splits, weights and notes.
+
+    Args:
+        path: as for `read_views`, or `ViewFiles`, whose `images` and `alpha` then count.
+        images: as for `read_views`.
+        split: as for `read_views`.
+        unpictured: whether to keep views without photos among others.
+        alpha: "mask" makes a photo with alpha and without a mask its own mask.
+    """
+    from g2ard.io.photos import alpha_as_masks, pictured
+    from g2ard.io.splits import split_mask
+    from g2ard.io.types import ViewFiles
+
+    if not isinstance(path, ViewFiles):
+        path = ViewFiles(Path(path), Path(images) if images else None, alpha)
+    images, alpha, path = path.images, path.alpha, run_views(path.path)
+    found = file_format(path)
+    if KINDS[found] != "views":
+        what = "a Gaussian scene" if KINDS[found] == "splats" else "a point cloud"
+        raise InputError(
+            f"expected views (a COLMAP folder, transforms.json, g2ard's .json), found {what}", path=path
+        )
+    if images is not None and not images.is_dir():
+        raise InputError("no such folder of photos", path=images)
+    try:
+        views = import_module(f"g2ard.io.{found}").read(path, images)
+    except OSError as error:  # invalid photo name, unreadable folder
+        raise InputError(error.strerror or str(error), path=path) from error
+    views = views if unpictured else pictured(views)
+    views = alpha_as_masks(views) if alpha == "mask" else views
+    return views.take(split_mask(path, views.cameras.names, split, stated=views.splits))
+
+
+def write_views(
+    path: str | Path,
+    cameras: Cameras,
+    *,
+    splits: Sequence[str | None] = (),
+    weights: ArrayLike | None = None,
+    format: ViewFormat | None = None,
+    overwrite: bool = False,
+) -> None:
+    """Write views as g2ard's .json, which `read_views` restores to the same bits, or for other programs.
+
+    Args:
+        path: the .json to write, or a folder for COLMAP; photo paths are stored relative to it.
+        cameras: C views.
+        splits: "train", "test" or None per view, or ().
+        weights: (C,) sampling weights, NaN for views without one, or None.
+        format: "g2ard", "inria", "nerfstudio" or "colmap" (text). None decides by name: cameras.json is
+            INRIA's, transforms*.json nerfstudio's, a name without suffix a COLMAP project.
+        overwrite: whether to replace an existing file.
+
+    Warns:
+        UserWarning: the format cannot hold something of the views.
+
+    Raises:
+        OutputError: the file exists, cannot be written, or is not a .json.
+        InputError: there are no views, or `splits` or `weights` have another length.
+    """
+    from g2ard.io import camera_files, views
+
+    path = Path(path)
+    kind = camera_files.view_format(path, format)
+    if kind == "g2ard":
+        views.write(path, cameras, splits=splits, weights=weights, overwrite=overwrite)
+        return
+    if not len(cameras):
+        raise InputError("not written: there are no views", path=path)
+    if kind == "colmap":
+        with atomic_folder(path, overwrite) as temporary:
+            camera_files.write_colmap(temporary, cameras)
+    else:
+        with atomic_output(path, overwrite) as temporary:
+            if kind == "inria":
+                camera_files.write_inria(temporary, cameras)
+            else:
+                camera_files.write_nerfstudio(temporary, cameras, path, splits)
+    if lost := camera_files.lost_views(cameras, kind, splits, weights is not None):
+        warnings.warn(f"{path}: without {', '.join(lost)}", stacklevel=2)

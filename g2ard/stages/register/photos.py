@@ -1,0 +1,273 @@
+"""Registration of photos: estimating camera poses against a scene."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from g2ard.config.choices import BLACK, Keep
+from g2ard.errors import InputError, require
+from g2ard.progress import Progress, silent
+from g2ard.rendering.renderer import Renderer
+from g2ard.scene.cameras import Cameras
+from g2ard.scene.splats import Splats
+from g2ard.stages.register.acceptance import acceptance
+from g2ard.stages.register.attempts import Candidate, Photo, Search, Start, loaded
+from g2ard.stages.register.config import RegisterConfig
+from g2ard.stages.register.grey import band_passed
+from g2ard.stages.register.matchers import matcher_named
+from g2ard.stages.register.pool import PoolRenders, small_render, turned
+from g2ard.stages.register.pose import pose_error
+from g2ard.stages.register.report import (
+    KEPT,
+    PhotoReport,
+    PoseError,
+    Registered,
+    RegisterReport,
+)
+
+Float = NDArray[np.float64]
+_FEATURES_BONUS = 0.05
+"""Bonus in likeness for a pose confirmed by features.
+
+Likeness detects poses that are wrong by metres, features those that are wrong by decimetres.
+"""
+
+
+def register(
+    scene: Splats,
+    photos: Cameras,
+    *,
+    starts: Mapping[str, ArrayLike] | None = None,
+    pool: Cameras | None = None,
+    truth: Mapping[str, ArrayLike] | None = None,
+    config: RegisterConfig | None = None,
+    keep: Keep = "registered",
+    background: Sequence[float] = BLACK,
+    progress: Progress = silent,
+) -> Registered:
+    """Estimate the poses of photos by features and by direct alignment with renders of the scene.
+
+    A photo starts from its pose in `starts`. Matches with a render at that pose, lifted by the render's
+    depth, give a new pose by PnP; this is repeated and refined (`g2ard.stages.register.solve`). If there are
+    too few matches, the photo is aligned directly, coarse to fine (`g2ard.stages.register.align`). If the
+    result is doubtful, alignment is tried again from the start rotated so that a small render fits best.
+
+    A photo without a pose starts from the `candidates` poses of `pool` whose renders at `pool_size` pixels,
+    rotated likewise, are most similar: by features from the pose with the most inliers, or by alignment from
+    each. The result with the highest median local ZNCC is kept, and the ZNCC decides its status.
+    An unreadable photo gets status "refused"; the others are still registered.
+
+    Args:
+        scene: the scene; poses are in world coordinates, including its offset.
+        photos: C views with photos, K, size and distortion; their poses are ignored.
+        starts: name → (4, 4) camera_from_world.
+        pool: starting poses for photos that are not in `starts`.
+        truth: name → (4, 4) camera_from_world, used only for scoring.
+        config: see `RegisterConfig`.
+        keep: which poses to keep: "registered", "uncertain" (both), or "all", which falls back to the
+            starting pose.
+        background: RGB behind the scene.
+        progress: called after every photo.
+
+    Returns:
+        The kept cameras, and a report on all photos.
+
+    Raises:
+        InputError: no photos, an unknown `keep`, no starting pose or pool, an invalid pose, or an unknown
+            matcher.
+        MissingDependencyError: a matcher is requested but the extra `register` is not installed.
+
+    >>> from g2ard.scene.cameras import Camera
+    >>> dot = Splats.create([[0, 0, 0]], scales=[[0.1] * 3], logit_opacities=[9])
+    >>> view = Cameras.of([Camera.facing([0, -2, 0], [0, 0, 0], name="a.png")])
+    >>> report = register(dot, view, starts={"a.png": view.viewmats[0]}).report
+    >>> report.photos[0].status, report.photos[0].reason
+    ('refused', 'view 0 (a.png) has no photo; pass views with photos')
+    """
+    config = config or RegisterConfig()
+    if not len(photos):
+        raise InputError("no photos to register")
+    require("keep", repr(keep), keep in KEPT, ", ".join(KEPT))
+    given = _poses("starts", starts, photos)
+    true = _poses("truth", truth, photos)
+    if not given and pool is None:
+        raise InputError("no photo has a starting pose; pass starting poses or a pool", parameter="starts")
+    renderer = Renderer(scene, background=background)
+    renders = None if pool is None else PoolRenders(renderer, pool, config)
+    search = Search(renderer, config, matcher_named(config.matcher, config.ratio, config.features))
+    rows, kept, poses, matches = [], [], [], {}
+    for i, name in enumerate(photos.names):
+        began = time.perf_counter()
+        start = Start(given[name], given[name], name) if name in given else None
+        row, best = _register_photo(search, photos, i, start, renders, true.get(name))
+        if best is not None and best.solved is not None:
+            matches[name] = np.concatenate([best.solved.pixels, best.solved.seen], 1)
+        if best is None and keep == "all" and start is not None:
+            row = replace(row, camera_from_world=_rows(start.pose), error=row.start_error)
+        rows.append(replace(row, seconds=time.perf_counter() - began))
+        if row.camera_from_world is not None and row.status in KEPT[keep]:
+            kept.append(i)
+            poses.append(np.array(row.camera_from_world))
+        progress("register", i + 1, len(photos))
+    cameras = photos.take(np.array(kept, int))
+    if kept:
+        cameras = replace(cameras, viewmats=np.stack(poses))
+    return Registered(cameras, RegisterReport(tuple(rows)), matches)
+
+
+def _rows(matrix: Float) -> tuple[tuple[float, ...], ...]:
+    return tuple(map(tuple, matrix.tolist()))
+
+
+def _poses(what: str, poses: Mapping[str, ArrayLike] | None, photos: Cameras) -> dict[str, Float]:
+    """Return the poses of the photos that have one."""
+    out = {}
+    for name in photos.names:
+        if poses and name in poses:
+            pose = np.asarray(poses[name], np.float64)
+            rigid = pose.shape == (4, 4) and np.isfinite(pose).all()
+            if not (rigid and np.allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-6)):
+                raise InputError(f"{name}: not a rigid 4×4 pose", parameter=what)
+            out[name] = pose
+    return out
+
+
+def _register_photo(
+    search: Search,
+    photos: Cameras,
+    index: int,
+    given: Start | None,
+    pool: PoolRenders | None,
+    true: Float | None,
+) -> tuple[PhotoReport, Candidate | None]:
+    """Register one photo from the pose `given`, otherwise from the pool.
+
+    Returns:
+        The photo's report, with errors against the pose `true` if given, and its best candidate, if any.
+    """
+    name = photos.names[index]
+    start_error = None if given is None or true is None else PoseError(*pose_error(given.pose, true))
+    refused = PhotoReport(name, "refused", start=given.name if given else None, start_error=start_error)
+    if given is None and pool is None:
+        return replace(refused, reason="no pose to start from"), None
+    try:
+        photo = loaded(photos, index, search.config, search.renderer.background)
+    except InputError as error:
+        return replace(refused, reason=str(error)), None
+    search.renders = 0
+    if given is not None:
+        candidates = _from_pose(search, given, photo)
+    else:
+        assert pool is not None
+        candidates = _from_pool(search, pool, photo)
+    renders = search.renders
+    if not candidates:
+        least = f"{search.config.min_overlap:.0%} of the photo"
+        why = f"away from edges, the scene covers less than {least} at the starting pose"
+        if not search.config.fallback:
+            why = f"fewer than {search.config.min_inliers} matches confirm a pose"
+        return replace(refused, reason=why, renders=renders), None
+    best = max(candidates, key=lambda c: c.zncc + (_FEATURES_BONUS if c.solved else 0))
+    row = _reported(name, best, search.config, renders)
+    if true is not None:
+        start_error = PoseError(*pose_error(best.start.pose, true))
+        end_error = PoseError(*pose_error(best.found.viewmat, true))
+        row = replace(row, start_error=start_error, error=end_error)
+    return row, best
+
+
+def _from_pose(search: Search, given: Start, photo: Photo) -> list[Candidate]:
+    """Try features, then alignment, then alignment from a rotated start, then features from the result."""
+    config = search.config
+
+    def accepted(found: list[Candidate]) -> bool:
+        return any(c.zncc >= config.accept for c in found)
+
+    out = [c] if (c := search.by_features(given, photo)) else []
+    if accepted(out) or not config.fallback:
+        return out
+    aligned = [c] if (c := search.by_alignment(given, photo)) else []
+    if not accepted(aligned):
+        camera, grey = photo.small
+        render = small_render(search.renderer, replace(camera, viewmat=given.pose), config)
+        there = turned(given.pose, render, band_passed(grey), camera.K)
+        search.renders += 1
+        again = replace(given, begins=there.viewmat)
+        if there.pixels and (c := search.by_alignment(again, photo)):
+            aligned.append(c)
+    return out + aligned + _featured(search, aligned, photo)
+
+
+def _from_pool(search: Search, pool: PoolRenders, photo: Photo) -> list[Candidate]:
+    """Try features from the pose with the most inliers, otherwise alignment from each similar pose."""
+    order, renders = pool.ranked(*photo.small)
+    search.renders += renders
+    starts = [
+        Start(pool.pool.viewmats[at], there.viewmat, pool.pool.names[at], rank)
+        for rank, (at, there) in enumerate(order[: search.config.candidates], 1)
+    ]
+    first = [(s, start) for start in starts if (s := search.by_matches(start.begins, photo, 1))]
+    if first:
+        solved, start = max(first, key=lambda each: each[0].inliers)
+        if c := search.by_features(replace(start, begins=solved.viewmat), photo):
+            return [c]
+    if not search.config.fallback:
+        return []
+    aligned = [c for start in starts if (c := search.by_alignment(start, photo))]
+    return aligned + _featured(search, aligned, photo)
+
+
+def _featured(search: Search, aligned: list[Candidate], photo: Photo) -> list[Candidate]:
+    """Try features from the most similar aligned pose, unless its status would be refused."""
+    best = max(aligned, key=lambda c: c.zncc, default=None)
+    if best is None or best.zncc < min(search.config.doubt, search.config.accept):
+        return []
+    found = search.by_features(replace(best.start, begins=best.found.viewmat), photo)
+    return [found] if found else []
+
+
+def _reported(name: str, best: Candidate, config: RegisterConfig, renders: int) -> PhotoReport:
+    """Build the report of a photo's best candidate.
+
+    `sigma` is the standard deviation of position (scene units) and rotation (degrees), None without a
+    covariance; fields of feature matching keep their defaults after direct alignment alone.
+
+    Args:
+        name: the photo.
+        best: its best pose; rows and columns of the (6, 6) covariance are position, then rotation.
+        config: limits that decide between registered, uncertain and refused.
+        renders: number of renders that its search took.
+    """
+    found = best.found
+    sigma = None
+    if found.covariance is not None:
+        position = np.sqrt(np.trace(found.covariance[:3, :3]))
+        rotation = np.sqrt(np.trace(found.covariance[3:, 3:]))
+        sigma = PoseError(float(position), float(np.degrees(rotation)))
+    status, reason = acceptance(best.zncc, sigma, found.depth, config)
+    names = ("matches", "inliers", "spread", "reprojection", "passes")
+    of_features: dict[str, Any] = {}
+    if best.solved is not None:
+        of_features = {name: getattr(best.solved, name) for name in names}
+    return PhotoReport(
+        name=name,
+        status=status,
+        reason=reason,
+        start=best.start.name,
+        rank=best.start.rank,
+        **of_features,
+        zncc=best.zncc,
+        gain=found.gain,
+        bias=found.bias,
+        overlap=found.overlap,
+        covariance=None if found.covariance is None else _rows(found.covariance),
+        sigma=sigma,
+        renders=renders,
+        camera_from_world=_rows(found.viewmat),
+    )

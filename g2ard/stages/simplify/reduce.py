@@ -1,0 +1,238 @@
+"""Simplification to an exact budget: rounds of drop, merge and trim (section 3.2 of the paper)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from g2ard import _core
+from g2ard.config.choices import METHODS
+from g2ard.errors import InputError, require
+from g2ard.progress import Progress, counter, plural, silent
+from g2ard.scene.prepared import PreparedScene, finite_rows_of, with_some_opacity
+from g2ard.scene.splats import DRAWN_LOGIT, Splats, unit_quats
+from g2ard.stages.simplify.config import SimplifyConfig, round_counts
+from g2ard.stages.simplify.pairs import (
+    Visibility,
+    VisibilitySource,
+    merge,
+    merge_and_fit,
+    rows_of,
+    splats_of,
+)
+from g2ard.stages.simplify.report import SimplifyReport, SimplifyRound
+
+_DEFAULTS = SimplifyConfig()
+
+
+@dataclass(frozen=True, eq=False)
+class Simplified:
+    """Result of simplification.
+
+    Args:
+        splats: exactly `budget` Gaussians, in an order that depends only on the scene's content. Their
+            geometry serves as recovery's anchors.
+        parents: (N,) int64, output row of each input row; −1 if it was dropped or trimmed.
+        protected: (M,) bool, whether any of the rows merged into a Gaussian is protected.
+        report: figures of the simplification.
+    """
+
+    splats: Splats
+    parents: NDArray[np.int64]
+    protected: NDArray[np.bool_]
+    report: SimplifyReport
+
+    def __repr__(self) -> str:
+        return f"Simplified({len(self.parents):,} → {plural(len(self.splats), 'Gaussian')})"
+
+
+def flag(
+    splats: Splats, budget: int, *, config: SimplifyConfig = _DEFAULTS, progress: Progress = silent
+) -> NDArray[np.bool_]:
+    """Compute protection flags of a raw prior: p_i = 1[E_c(i) > ε_h] (eq. `frequency`).
+
+    E_j is the mean squared residual of an affine predictor of colour, clamped to [0, 1], within cell j, over
+    about `budget` cells; a cell with few members borrows those of its face neighbours for the fit.
+
+    Args:
+        splats: the raw prior; in a recovered scene fitting hides the residual.
+        budget: the final count N_S, which sets the cell size.
+        config: uses `flag_threshold` and `flag_members`.
+        progress: called when done.
+
+    Returns:
+        (N,) bool; False for rows that are not finite.
+
+    Raises:
+        InputError: no finite row, or a budget below 1.
+
+    >>> plane = np.stack(np.meshgrid(range(20), range(20), [0]), -1).reshape(-1, 3)
+    >>> noise = np.random.default_rng(0).normal(size=(400, 1, 3)) * (plane[:, :1, None] > 9)
+    >>> scene = Splats.create(plane, scales=np.ones((400, 3)), sh0=noise)
+    >>> flags = flag(scene, 40)
+    >>> float(flags[plane[:, 0] < 8].mean()), float(flags[plane[:, 0] > 12].mean())
+    (0.0, 1.0)
+    """
+    require("budget", budget, budget >= 1, "at least 1")
+    scene, finite = finite_rows_of(splats)
+    found = _core.simplify_flags(scene.core, budget, config.resolved("paper"), counter(progress, "flag"))
+    flags = np.zeros(len(splats), bool)
+    flags[finite] = found
+    return flags
+
+
+def simplify(
+    splats: Splats,
+    budget: int,
+    *,
+    method: str | None = None,
+    visibility: Visibility | VisibilitySource | None = None,
+    protected: NDArray[np.bool_] | None = None,
+    final_budget: int | None = None,
+    config: SimplifyConfig = _DEFAULTS,
+    progress: Progress = silent,
+) -> Simplified:
+    """Reduce a scene to exactly `budget` Gaussians.
+
+    `default` minimises the error in the image. Down to three times the budget it merges along Morton order,
+    cheapest first. Then it merges the cheapest pairs of neighbours, in rounds in which each cluster merges at
+    most once. Mean, covariance and SH are averaged by mass, and the mass *as rendered* m = α·A is conserved,
+    with A = √tr adj(Σ + e²I) and e the renderer's blur. The cost of a merge is the squared error of its
+    projections times its visibility. Without `visibility` no cameras are needed. If `visibility` is a
+    function, opacities are finally fitted to what the views see.
+
+    `fast` merges only along Morton order, on two lattices in turn, without a neighbour graph.
+
+    `paper` works in rounds that keep 75 %. Each drops α < 0.01, merges cell × colour-bin groups by moment
+    matching if the affine-energy and surface-coverage guards pass, down to the round's count, and trims the
+    rest by π = −log(1 − α)·A·(1 + λ_h·p) (eq. `importance`). Every round has about one cell per Gaussian of
+    the final budget (`docs/g2ard-and-the-paper.md` has our reading).
+
+    Rows below the method's least α are dropped first, unless the budget needs them. The result does not
+    depend on the order of the rows, the unit, or the number of threads.
+
+    Args:
+        splats: the scene. Infinite logits mean α = 0 or 1, scales are limited to e⁴³; rows with other
+            non-finite values are dropped and counted.
+        budget: Gaussians to keep, at most those of the scene.
+        method: overrides the config's.
+        visibility: for `default` and `fast`: visibility of each Gaussian (`g2ard.rendering.visibility`), or a
+            function scene → visibility, also called on the result to fit its opacities.
+        protected: (N,) bool flags to inherit. If None, `paper` computes them (see `flag`); the other methods
+            do not use them.
+        final_budget: for `paper`: N_S, if this call is one round on the way to a smaller count; it sets the
+            size of cells. None means `budget`.
+        config: the constants.
+        progress: called with the number of Gaussians removed.
+
+    Returns:
+        The scene, the new row of each row, the inherited flags and a report.
+
+    Raises:
+        InputError: a budget below 1 or above the count of finite rows, arrays of another length, or an
+            unknown method.
+
+    >>> rng = np.random.default_rng(0)
+    >>> scene = Splats.create(rng.normal(size=(1000, 3)), scales=np.full((1000, 3), 0.1))
+    >>> small = simplify(scene, 100)
+    >>> len(small.splats), small.parents.shape, int(small.parents.max())
+    (100, (1000,), 99)
+    """
+    method = config.method if method is None else method
+    require("method", repr(method), method in METHODS, f"one of {', '.join(METHODS)}")
+    scene, finite = finite_rows_of(splats)
+    require("budget", budget, budget >= 1, "at least 1")
+    require("budget", budget, budget <= len(scene), f"at most {len(scene)} (the scene's Gaussians)")
+    if protected is not None:
+        protected = np.asarray(protected)
+        fits = protected.dtype == np.bool_ and protected.shape == (len(splats),)
+        given = f"{protected.dtype} {protected.shape}"
+        require("protected", given, fits, f"bool of shape ({len(splats)},)")
+        protected = np.ascontiguousarray(protected[finite])
+    if not (scene.opacities >= (config.resolved(method).min_opacity or 0.0)).any():
+        scene, config = with_some_opacity(scene), replace(config, min_opacity=0.0)
+    if config.keep_region and (method == "paper" or visibility is None):
+        raise InputError(
+            "needs views; `paper` uses none, and `fast` only given ones", parameter="keep_region"
+        )
+    if method == "paper":
+        out = _paper(scene, budget, protected, final_budget or budget, config, progress)
+    elif callable(visibility):
+        out = merge_and_fit(scene, budget, method, visibility, protected, config, progress)
+    else:
+        seen = None if visibility is None else rows_of(visibility, len(splats), finite)
+        out = merge(scene, budget, method, seen, protected, config, progress)
+    return _simplified(splats, finite, out)
+
+
+def _paper(
+    scene: PreparedScene,
+    budget: int,
+    protected: NDArray[np.bool_] | None,
+    cells: int,
+    config: SimplifyConfig,
+    progress: Progress,
+) -> dict[str, Any]:
+    return _core.simplify_paper(
+        scene.core,
+        round_counts(len(scene), budget, config.retention_of("paper"), config.fold),
+        cells,
+        config.resolved("paper"),
+        protected=protected,
+        progress=counter(progress, "simplify"),
+    )
+
+
+def _simplified(splats: Splats, finite: NDArray[np.bool_] | slice, out: dict[str, Any]) -> Simplified:
+    parents = np.full(len(splats), -1, np.int64)
+    parents[finite] = out["parents"]
+    small = splats_of(splats, out).with_sh_degree(splats.sh_degree)
+    small = replace(small, quats=unit_quats(small.quats))  # unmerged rows keep their quaternions
+    kept = int(np.count_nonzero(parents >= 0))
+    alone = int(np.count_nonzero(np.bincount(parents[parents >= 0], minlength=len(small)) == 1))
+    protected: NDArray[np.bool_] = out["protected"]
+    report = SimplifyReport(
+        input_count=len(splats),
+        output_count=len(small),
+        merged_members=kept - alone,
+        rounds=tuple(SimplifyRound.of(r) for r in out["rounds"]),
+        protected=int(np.count_nonzero(protected)),
+        nonfinite_rows=0 if isinstance(finite, slice) else len(splats) - int(np.count_nonzero(finite)),
+        infinite_logits=out["infinite_logits"],
+        clamped_opacities=out["clamped_opacities"],
+        fitted=out.get("fitted", 0),
+        unseen=out.get("unseen"),
+        faded=_faded(splats, small, parents),
+        skipped={
+            "alone": alone,
+            "sh_bands": splats.sh_degree - math.isqrt(out["sh"].shape[1]) + 1,
+            **_spared(out["rounds"]),
+        },
+    )
+    return Simplified(small, parents, protected, report)
+
+
+def _faded(splats: Splats, small: Splats, parents: NDArray[np.int64]) -> int:
+    """Count merged rows too faint to draw although a member was drawn: distant floaters whose mass is spread
+    too thin."""
+    faint = small.logit_opacities < DRAWN_LOGIT
+    if not faint.any():
+        return 0
+    drawn = np.zeros(len(small), bool)
+    drawn[parents[(parents >= 0) & (splats.logit_opacities >= DRAWN_LOGIT)]] = True
+    return int(np.count_nonzero(faint & drawn))
+
+
+def _spared(rounds: list[dict[str, Any]]) -> dict[str, int]:
+    """Count work that the paper's rounds skipped."""
+    if not rounds or "cells" not in rounds[0]:
+        return {}
+    return {
+        "coverages": sum(r["refused"]["energy"] for r in rounds),
+        "binnings": sum(r["cells"] == 0 for r in rounds),
+        "trims": sum(r["trimmed"] == 0 for r in rounds),
+    }
