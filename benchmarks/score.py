@@ -16,6 +16,7 @@ from g2ard.rendering.lpips import Lpips
 from g2ard.rendering.metrics import psnr, ssim
 from g2ard.rendering.renderer import RasterSettings, Renderer
 from g2ard.rendering.targets import Targets, mask_of
+from g2ard.scene.samples import evenly_spaced
 from g2ard.scene.splats import Splats
 
 __all__ = ["View", "figures", "pictured", "save_jpeg", "score"]
@@ -83,7 +84,7 @@ def pictured(count: int) -> list[int]:
     >>> pictured(3), len(pictured(100))
     ([0, 1, 2], 32)
     """
-    chosen = np.unique(np.linspace(0, count - 1, min(count, _PICTURES)).round().astype(int))
+    chosen = evenly_spaced(count, _PICTURES)
     return [int(view) for view in chosen]
 
 

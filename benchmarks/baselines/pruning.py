@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from g2ard.rendering.visibility import visibility
 from g2ard.scene.cameras import Cameras
+from g2ard.scene.shape import longer_axes
 from g2ard.scene.splats import Splats
 
 __all__ = ["global_significance", "importance", "keep_best", "optical_mass", "sample"]
@@ -31,7 +32,7 @@ def optical_mass(splats: Splats) -> NDArray[np.float64]:
     This is `eq:importance` without protection.
     −log(1 − σ(x)) is computed as softplus(x), which is accurate for α near 1.
     """
-    widest = np.sort(splats.scales.astype(np.float64), axis=1)[:, 1:]
+    widest = longer_axes(splats.scales.astype(np.float64))
     return np.logaddexp(0, splats.logit_opacities.astype(np.float64)) * widest.prod(1)
 
 

@@ -37,9 +37,10 @@ from g2ard.rendering.lpips import Lpips, load_lpips
 from g2ard.rendering.renderer import RasterSettings
 from g2ard.rendering.targets import Targets
 from g2ard.scene.cameras import Cameras
+from g2ard.scene.shape import needle_share
 from g2ard.scene.splats import Splats
-from g2ard.stages.recover.anchors import REGULARIZERS, needle
-from g2ard.stages.recover.prior import regularizers_for
+from g2ard.stages.recover.anchors import REGULARIZERS
+from g2ard.stages.recover.auto_preset import regularizers_for
 from g2ard.stages.simplify import round_counts
 
 __all__ = ["Matched", "MatchedWorkspace"]
@@ -158,7 +159,7 @@ class Matched(Study):
             "against": place.scene.targets,
             "count": len(splats),
             "bytes": splats.nbytes,
-            "needle": needle(splats.scales),
+            "needle": needle_share(splats.scales),
             "dropped": place.dropped,
         }
         rows = []

@@ -22,10 +22,11 @@ from g2ard.pipeline.distill import distill
 from g2ard.pipeline.presets import PRESETS, configured
 from g2ard.rendering.targets import Targets
 from g2ard.rendering.visibility import visibility_source
+from g2ard.scene.shape import effective_rank, needle_share
 from g2ard.scene.splats import Splats
 from g2ard.stages.recover import recover
-from g2ard.stages.recover.anchors import Anchors, drift95, effective_rank, needle
-from g2ard.stages.recover.prior import regularizers_for
+from g2ard.stages.recover.anchors import Anchors, drift95
+from g2ard.stages.recover.auto_preset import regularizers_for
 from g2ard.stages.recover.report import RecoverReport
 from g2ard.stages.simplify import round_counts, simplify
 
@@ -254,7 +255,7 @@ class _Run:
                 "seconds": seconds,
                 "cpu_s": self.cpu,
                 **figures(scored),
-                "needle": needle(splats.scales),
+                "needle": needle_share(splats.scales),
                 "rank_p1": float(np.percentile(effective_rank(splats.scales), 1)),
                 "final": final,
             }

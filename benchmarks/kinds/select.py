@@ -21,6 +21,7 @@ from g2ard.io.splits import splits_of, states_splits
 from g2ard.poses import make_pool, plan_pool
 from g2ard.rendering.targets import Subset, Targets, TeacherRenders
 from g2ard.scene.cameras import Cameras
+from g2ard.scene.samples import evenly_spaced
 from g2ard.scene.splats import Splats
 from g2ard.stages.evaluate import evaluate
 from g2ard.stages.recover import RecoverConfig, recover
@@ -295,4 +296,4 @@ def _nearer(prior: Splats, cameras: Cameras) -> Cameras:
 
 
 def _evenly(rows: Rows, count: int) -> Rows:
-    return rows[np.unique(np.linspace(0, len(rows) - 1, min(count, len(rows))).round().astype(int))]
+    return rows[evenly_spaced(len(rows), count)]

@@ -25,7 +25,7 @@ from g2ard.progress import plural
 from g2ard.report.distilled import tiled_report
 from g2ard.report.kinds import COLUMNS, cells
 from g2ard.stages.simplify import SimplifyConfig
-from g2ard.system.memory import peak_rss_of_all
+from g2ard.system.peak_memory import peak_rss_of_all
 from g2ard.tiles.merging import TiledScene
 from g2ard.tiles.recover import TiledScores
 

@@ -37,7 +37,7 @@ SCHEDULE_NAMES: tuple[ScheduleName, ...] = get_args(ScheduleName)
 PaperPresetName = Literal["paper", "paper-trained", "paper-lift", "paper-noisy"]
 """The paper's regularisers, for a prior that is measured or named."""
 PresetName = Literal["auto", "trained", "lift", "noisy", PaperPresetName]
-"""Regularisers for each kind of prior (`g2ard.stages.recover.prior`)."""
+"""Regularisers for each kind of prior (`g2ard.stages.recover.auto_preset`)."""
 
 Engine = Literal["fused", "torch", "gsplat"]
 """Engines that run recovery's steps (`g2ard.stages.recover.engine`)."""

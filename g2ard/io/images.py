@@ -20,6 +20,7 @@ from g2ard.io.atomic import atomic_output
 from g2ard.io.limits import opened_image
 from g2ard.io.photos import ASPECT_SLACK
 from g2ard.scene.cameras import Cameras
+from g2ard.scene.samples import evenly_spaced
 
 _LOOKED_AT = 5
 """Photos whose borders are compared."""
@@ -105,7 +106,7 @@ def photo_traits(photos: Sequence[Path]) -> PhotoTraits:
         with suppress(InputError, FileNotFoundError), opened_image(photo) as header:
             sizes[header.size] += 1
             alpha += header.has_transparency_data
-    few = np.unique(np.linspace(0, len(photos) - 1, min(_LOOKED_AT, len(photos))).astype(int))
+    few = evenly_spaced(len(photos), _LOOKED_AT, floor=True)
     shown = []
     for i in few:
         with suppress(InputError):

@@ -15,6 +15,7 @@ from g2ard.io.jsonfile import Fields, fields_of, matrix, number, read_json
 from g2ard.io.photos import Frame, inverse, rigid, view_set
 from g2ard.io.settings import Settings, below, read_settings
 from g2ard.io.types import ViewSet
+from g2ard.scene.samples import evenly_spaced
 
 NAME = "dataparser_transforms.json"
 """File beside config.yml with `transform`, 3×4, and `scale`."""
@@ -123,7 +124,7 @@ def _split(frames: Sequence[Frame], options: Settings) -> list[Frame]:
         if not 0 <= fraction <= 1:
             raise ValueError(f"train_split_fraction {fraction}")
         many = math.ceil(count * fraction)
-        train = np.isin(rank, np.linspace(0, count - 1, many, dtype=int))
+        train = np.isin(rank, evenly_spaced(count, many, floor=True))
     elif mode == "interval":
         interval = int(options.word("eval_interval") or 8)
         if interval < 1:

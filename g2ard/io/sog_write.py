@@ -26,6 +26,7 @@ from g2ard._core import __version__
 from g2ard.errors import InputError
 from g2ard.io.atomic import atomic_folder, atomic_output
 from g2ard.io.packing import coded, log_scales, morton_order, smallest_three, unit_quats, writable
+from g2ard.scene.shape import longer_axes
 from g2ard.scene.splats import Splats
 
 _COLUMNS = 64
@@ -164,7 +165,7 @@ def _weights(splats: Splats) -> NDArray[np.float32]:
 
     The root gains 0.35 dB over equal weights on a scene at 10×; α·A itself gains nothing.
     """
-    longer = np.sort(splats.scales.astype(np.float64), axis=1)[:, 1:].prod(axis=1)
+    longer = longer_axes(splats.scales.astype(np.float64)).prod(axis=1)
     shown = np.sqrt(splats.opacities * np.minimum(longer, 1e30))
     mean = shown.mean()
     return (shown / mean if mean > 0 else np.ones(len(splats))).astype(np.float32)

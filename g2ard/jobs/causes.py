@@ -14,6 +14,7 @@ from g2ard.rendering.metrics import psnr
 from g2ard.rendering.renderer import Renderer
 from g2ard.rendering.targets import Targets, against_of, mask_of
 from g2ard.scene.cameras import Cameras
+from g2ard.scene.samples import evenly_spaced
 from g2ard.scene.splats import Splats
 from g2ard.stages.recover.report import RecoverReport
 from g2ard.stages.recover.sizes import typical_share
@@ -90,7 +91,7 @@ def _of_photos(splats: Splats, held_out: Targets, background: Colour) -> tuple[f
         The median correlation of renders and photos, 1 without photos, and at most one cause.
     """
     views = [v for v in range(len(held_out.cameras)) if against_of(held_out, v) == "photo"]
-    views = [views[i] for i in np.unique(np.linspace(0, len(views) - 1, _VIEWS).astype(int)) if views]
+    views = [views[i] for i in evenly_spaced(len(views), _VIEWS, floor=True)]
     alike, gains, seen_through, errors = [], [], [], []
     for alpha, image, photo in compared(splats, held_out, views, background):
         alike.append(correlation(image, photo))

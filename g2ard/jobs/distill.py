@@ -28,7 +28,7 @@ from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
 from g2ard.stages.lift import lift
 from g2ard.stages.recover.anchors import FREE, Regularizers
-from g2ard.stages.recover.prior import PriorMeasures, measure_prior, regularizers_for
+from g2ard.stages.recover.auto_preset import PriorMeasures, measure_prior, regularizers_for
 
 Scene = Splats | Points | str | Path | None
 

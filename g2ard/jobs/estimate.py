@@ -8,17 +8,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from g2ard.errors import InputError
-from g2ard.io.tile_store import row_width
 from g2ard.jobs.job import DistillJob
-from g2ard.jobs.tiling import RECOVERY_TIMES, TileMemory, amount
 from g2ard.pipeline.distill import final_steps
-from g2ard.progress import plural
 from g2ard.rendering.targets import CACHE_BYTES, Targets
+from g2ard.scene.samples import evenly_spaced
 from g2ard.scene.splats import Splats
 from g2ard.stages.recover import recover
 from g2ard.stages.simplify import round_counts, simplify
-from g2ard.system.memory import peak_rss
+from g2ard.system.peak_memory import peak_rss
 
 _TRIED, _STEPS = 4, 8
 """Number of views rendered and of steps taken for the estimate."""
@@ -65,7 +62,7 @@ def estimate(job: DistillJob, budget: int, *, page: bool = True) -> Estimate:
     """Estimate a job at one budget from a few renders and steps and one fast merge."""
     train, test, apart = job.views.train.cameras, job.views.test, job.views.apart
     near = 0 if apart is None or job.teacher is None else len(apart)
-    some = np.unique(np.linspace(0, len(train) - 1, min(_TRIED, len(train))).round().astype(int))
+    some = evenly_spaced(len(train), _TRIED)
     targets = job.targets_for(train.take(some), lazy=True)
     began = time.monotonic()
     for view in range(len(targets.cameras)):
@@ -91,21 +88,6 @@ def estimate(job: DistillJob, budget: int, *, page: bool = True) -> Estimate:
         + 2 * merged.nbytes  # the recovered scene, and its rows during writing
         + min(CACHE_BYTES, views * pixels * (12 if job.teacher is not None else 3)),
     )
-
-
-def check_memory(job: DistillJob, most: int | None, *, page: bool = True) -> None:
-    """Reject a job whose estimated memory exceeds `most` bytes at any budget; None means no limit."""
-    if most is None:
-        return
-    need = max(estimate(job, budget, page=page).bytes for budget in job.budgets)
-    if need > most:
-        count = len(job.prior)
-        told = f"--memory: {plural(count, 'Gaussian')} in one piece take about {amount(need, up=True)}, "
-        told += f"more than {amount(most)}; smaller views, --size, take less"
-        if job.teacher is not None and not job.lifted:  # tiles support this job
-            tiles = TileMemory(count, 4 * row_width(job.prior.sh_degree), RECOVERY_TIMES)
-            told += f"; in tiles {tiles.advice(most, max(1, count // 2))}"
-        raise InputError(told)
 
 
 def total(estimates: Sequence[Estimate]) -> tuple[float, int]:

@@ -20,7 +20,7 @@ from g2ard.rendering.renderer import Renderer
 from g2ard.rendering.targets import Targets, kinds_of
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
-from g2ard.stages.recover.prior import PriorMeasures
+from g2ard.stages.recover.auto_preset import PriorMeasures
 
 
 @dataclass(frozen=True, eq=False)

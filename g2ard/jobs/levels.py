@@ -27,6 +27,7 @@ from g2ard.pipeline.distill import distill as pipeline
 from g2ard.progress import Progress, Say, plural, silent, unsaid
 from g2ard.rendering.visibility import visibility_source
 from g2ard.scene.cameras import Cameras
+from g2ard.scene.samples import evenly_spaced
 from g2ard.scene.sky import sky_mask
 from g2ard.scene.splats import Splats
 from g2ard.stages.evaluate import evaluate
@@ -230,7 +231,7 @@ def tileset_up(levels: Sequence[Level], up: Sequence[float] | None = None) -> ND
     coarse = levels[-1]
     if up is None and coarse.offset.any():
         return np.array([0.0, 0, 1])
-    rows = np.linspace(0, len(coarse) - 1, min(len(coarse), _ROWS)).astype(np.int64)
+    rows = np.array(evenly_spaced(len(coarse), _ROWS, floor=True))
     return up_of(coarse.take(rows), up)
 
 

@@ -25,6 +25,7 @@ from g2ard.rendering.metrics import psnr, ssim
 from g2ard.rendering.renderer import Renderer
 from g2ard.rendering.visibility import visibility_source
 from g2ard.scene.cameras import Cameras
+from g2ard.scene.samples import evenly_spaced
 from g2ard.scene.splats import Splats
 from g2ard.stages.simplify import Simplified, SimplifyConfig, Visibility, VisibilitySource, simplify
 
@@ -175,7 +176,7 @@ def count_for_bytes(splats: Splats, wanted: int, name: str, reduce: Callable[[in
         name: a file name; its suffix is the format.
     """
     fewest, most = min(_FEWEST, len(splats)), len(splats)
-    sample = splats.take(np.unique(np.linspace(0, most - 1, min(most, _SAMPLE)).astype(int)))
+    sample = splats.take(np.array(evenly_spaced(most, _SAMPLE, floor=True)))
     count = int(len(sample) * wanted / file_bytes(sample, name))
     fits, over = (0, 0), (most + 1, 0)  # (count, bytes); 0 bytes means no such file yet
     probes = 0

@@ -15,6 +15,7 @@ from g2ard.io.splits import split_mask
 from g2ard.progress import Say, plural, unsaid
 from g2ard.rendering.targets import Photos
 from g2ard.scene.cameras import Cameras, unseeing
+from g2ard.scene.samples import evenly_spaced
 from g2ard.scene.splats import Splats
 
 _SIDE = 800
@@ -85,7 +86,7 @@ def warn_of_photos(splats: Splats, cameras: Cameras, background: Colour, say: Sa
     from g2ard.jobs.causes import UNLIKE, compared, correlation
 
     pictured = np.flatnonzero([path is not None for path in cameras.image_paths])
-    tried = np.unique(np.linspace(0, len(pictured) - 1, min(_LOOKED_AT, len(pictured))).astype(int))
+    tried = evenly_spaced(len(pictured), _LOOKED_AT, floor=True)
     photos = Photos(cameras.take(pictured[tried]).resized(_SMALL), background=background)
     views = compared(splats, photos, range(len(tried)), background)
     alike = [correlation(image, photo) for _, image, photo in views]
@@ -134,5 +135,5 @@ def opaque_points(splats: Splats) -> NDArray[np.float64]:
     """Return (K, 3) world means of a sample of the Gaussians of opacity 0.5 or more, otherwise of all."""
     opaque = np.flatnonzero(splats.opacities >= 0.5)
     rows = opaque if len(opaque) else np.arange(len(splats))
-    sample = rows[np.linspace(0, len(rows) - 1, min(_SAMPLE, len(rows))).astype(int)]
+    sample = rows[evenly_spaced(len(rows), _SAMPLE, floor=True)]
     return splats.means[sample].astype(np.float64) + splats.offset

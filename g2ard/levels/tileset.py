@@ -23,6 +23,7 @@ from g2ard.levels.tree import Cut, Leaf, Level, Node
 from g2ard.levels.tree import cut as cut_tree
 from g2ard.levels.write import read_object, write_json
 from g2ard.progress import Progress, silent
+from g2ard.scene.shape import longer_axes
 from g2ard.scene.transform import unit_up
 
 Float = NDArray[np.float64]
@@ -224,7 +225,7 @@ class _Tiles:
 
     def _error(self, level: int, rows: list[NDArray[np.int64]]) -> float:
         """Return 16 standard deviations of the median Gaussian, along its two longer axes."""
-        scales = np.sort(self.levels[level].take(np.concatenate(rows)).scales, axis=1)[:, 1:]
+        scales = longer_axes(self.levels[level].take(np.concatenate(rows)).scales)
         return _MOST_ERROR * float(np.median(np.sqrt(scales.astype(np.float64).prod(axis=1))))
 
     def content(self, name: str) -> list[bytes]:

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from g2ard.rendering.renderer import Renderer
 from g2ard.rendering.targets import Targets, mask_of
 from g2ard.rendering.visibility import visibility
-from g2ard.scene.cameras import Cameras, evenly_spaced
+from g2ard.scene.cameras import Cameras
+from g2ard.scene.samples import evenly_spaced
 from g2ard.scene.splats import SH_C0, Splats
 
 _VIEWS = 16

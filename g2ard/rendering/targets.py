@@ -16,6 +16,7 @@ from g2ard.errors import InputError
 from g2ard.io.images import load_image, load_mask
 from g2ard.io.paths import file_identity
 from g2ard.progress import Progress, plural, silent
+from g2ard.rendering.exposure import inverse_exposure
 from g2ard.rendering.renderer import RasterSettings, Renderer
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
@@ -197,7 +198,7 @@ class Photos(_Cached):
         self._background = background
         self._masks: dict[int, NDArray[np.bool_] | None] = {}
         self._undo = {
-            view: _inverse(name, exposures[name])
+            view: inverse_exposure(name, exposures[name])
             for view, name in enumerate(cameras.names)
             if exposures and name in exposures
         }
@@ -233,14 +234,6 @@ class Photos(_Cached):
         if mask is not None:  # SSIM's window reaches across the mask's edge
             photo[~mask] = 0
         return photo
-
-
-def _inverse(name: str, exposure: NDArray[np.float64]) -> NDArray[np.float32]:
-    matrix = np.asarray(exposure, np.float64)
-    if matrix.shape != (3, 4) or not np.isfinite(matrix).all() or abs(np.linalg.det(matrix[:, :3])) < 1e-6:
-        raise InputError(f"exposure of {name}: expected an invertible 3×4 matrix")
-    inverse = np.linalg.inv(matrix[:, :3])
-    return np.hstack([inverse, -inverse @ matrix[:, 3:]]).astype(np.float32)
 
 
 _STEPS = np.float32(65_535)

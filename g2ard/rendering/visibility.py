@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 from g2ard import _core
 from g2ard.progress import Progress, counter, silent
 from g2ard.rendering.renderer import RasterSettings, arrays_of, centred, settings_for, view_of
-from g2ard.scene.cameras import Cameras, evenly_spaced
+from g2ard.scene.cameras import Cameras
 from g2ard.scene.prepared import as_prepared
+from g2ard.scene.samples import evenly_spaced
 from g2ard.scene.splats import Splats
 
 MOST_VIEWS, LONGEST = 96, 300

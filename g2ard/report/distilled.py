@@ -19,6 +19,7 @@ from g2ard.rendering.targets import Targets
 from g2ard.report.kinds import COLUMNS, KindScore, cells
 from g2ard.report.page import Comparison, Page, Shown
 from g2ard.scene.cameras import USUAL, rows_by_kind
+from g2ard.scene.samples import evenly_spaced
 from g2ard.scene.splats import Splats
 
 _SHOWN = 3
@@ -158,7 +159,7 @@ def preview(
         scenes: (label, scene), left to right after the target.
     """
     count = len(targets.cameras)
-    chosen = np.unique(np.linspace(0, count - 1, min(count, _SHOWN)).round().astype(int))
+    chosen = evenly_spaced(count, _SHOWN)
     rows, captions = [], []
     renderers = [Renderer(splats, background=background) for _, splats in scenes]
     for view in map(int, chosen):

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from g2ard.errors import InputError, require
 from g2ard.progress import plural
+from g2ard.scene.samples import evenly_spaced
 
 USUAL = "usual"
 """Kind of views that state none: given views, and the poses that suit the scene."""
@@ -329,16 +330,6 @@ def rows_by_kind(kinds: Sequence[str]) -> dict[str, list[int]]:
     """
     rows = {kind: [i for i, found in enumerate(kinds) if found == kind] for kind in (USUAL, *kinds)}
     return {kind: found for kind, found in rows.items() if found}
-
-
-def evenly_spaced(count: int, most: int) -> list[int]:
-    """Return at most `most` evenly spaced indices below `count`, the first and last included.
-
-    >>> evenly_spaced(9, 3), evenly_spaced(2, 3)
-    ([0, 4, 8], [0, 1])
-    """
-    indices: list[int] = np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int)).tolist()
-    return indices
 
 
 def look_at(position: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0)) -> NDArray[np.float64]:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from g2ard.scene.samples import weighted_quantile
+from g2ard.scene.shape import longer_axes
 from g2ard.scene.splats import Splats
 
 _FAR = (np.sqrt(2) + 1) / (np.sqrt(2) - 1)
@@ -41,20 +43,14 @@ def sky_mask(splats: Splats) -> NDArray[np.bool_]:
         if not len(rows):
             break
         means, weights = splats.means[rows].astype(np.float64), opacities[rows]
-        middle = np.array([_quantile(means[:, axis], weights, 0.5) for axis in range(3)])
+        middle = np.array([weighted_quantile(means[:, axis], weights, 0.5) for axis in range(3)])
         away = np.linalg.norm(means - middle, axis=1)
-        reach = _FAR * _quantile(away, weights, _NEAR)
+        reach = _FAR * weighted_quantile(away, weights, _NEAR)
         rows = rows[away <= reach]
     away = np.linalg.norm(splats.means.astype(np.float64) - middle, axis=1)
     sky = away > reach
-    sizes = np.sort(splats.scales[sky].astype(np.float64), axis=1)
-    covered = opacities[sky] * sizes[:, 1] * sizes[:, 2] / (2 * away[sky] ** 2)  # 2πσσ of 4π steradians
+    middle_size, largest = longer_axes(splats.scales[sky].astype(np.float64)).T
+    covered = opacities[sky] * middle_size * largest / (2 * away[sky] ** 2)  # 2πσσ of 4π steradians
     if covered.sum() <= _SMALL:
         sky[:] = False
     return sky
-
-
-def _quantile(values: NDArray[np.float64], weights: NDArray[np.float64], share: float) -> float:
-    order = np.argsort(values, kind="stable")
-    total = np.cumsum(weights[order])
-    return float(values[order[np.searchsorted(total, share * total[-1])]])

@@ -24,6 +24,7 @@ from g2ard.errors import InputError, require
 from g2ard.progress import Progress, silent
 from g2ard.rendering.renderer import Renderer
 from g2ard.scene.cameras import Camera, Cameras
+from g2ard.scene.shape import NEEDLE_LENGTH, longer_axes
 from g2ard.scene.splats import DRAWN_LOGIT, Splats
 from g2ard.scene.transform import rotation_matrices
 
@@ -35,8 +36,6 @@ _HALF_STEP = 0.5 / 255
 """Half an 8-bit step."""
 _REACH = 3.0
 """Standard deviations at which renderers cut off a footprint."""
-_ELONGATED = 10.0
-"""Ratio of length to width above which a Gaussian is a needle or a streak."""
 _SMALL_GROUP = 1e-3
 """Share of the scene's Gaussians and of its light below which a separate group is a floater."""
 _NEIGHBORS = 16
@@ -246,8 +245,8 @@ def _needles(splats: Splats, rest: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 def _elongated(splats: Splats, rows: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
     """Return those of `rows` that are ten times as long as wide, and (n, 3) vectors from mean to end (2σ)."""
-    order = np.sort(splats.scales[rows], axis=1).astype(np.float64)
-    long = rows[order[:, 2] > _ELONGATED * np.maximum(order[:, 1], 1e-30)]
+    width, length = longer_axes(splats.scales[rows].astype(np.float64)).T
+    long = rows[length > NEEDLE_LENGTH * np.maximum(width, 1e-30)]
     axis = np.argmax(splats.scales[long], axis=1)
     along = np.take_along_axis(rotation_matrices(splats.quats[long]), axis[:, None, None], axis=2)[:, :, 0]
     return long, 2 * splats.scales[long, axis].astype(np.float64)[:, None] * along

@@ -18,7 +18,7 @@ from typing import Any
 from g2ard import _core
 from g2ard.errors import InputError
 from g2ard.progress import Progress, silent
-from g2ard.system.memory import forget_workers, note_worker, peak_rss
+from g2ard.system.peak_memory import forget_workers, note_worker, peak_rss
 from g2ard.tiles.tasks import Task, run_task
 
 _TRIES = 5

@@ -16,6 +16,7 @@ from g2ard.io.atomic import atomic_output
 from g2ard.io.tile_store import TileStore
 from g2ard.rendering.visibility import LONGEST, MOST_VIEWS, NEAR
 from g2ard.scene.cameras import Cameras
+from g2ard.scene.samples import evenly_spaced, weighted_quantile
 from g2ard.tiles.executor import Workers
 from g2ard.tiles.steps import COARSE, TiledRun
 from g2ard.tiles.tasks import Task, is_whole, load, scene_of
@@ -71,7 +72,7 @@ class Sights:
         self.frame = frame
         if np.isfinite(pixels).any():
             known = np.isfinite(pixels)
-            pixel = _weighted_median(pixels[known], np.array(run.sizes)[known])
+            pixel = weighted_quantile(pixels[known], np.array(run.sizes)[known], 0.5)
             self.frame = _core.TileFrame(*frame).with_views(pixel, *map(float, sums)).values()
 
     @property
@@ -94,9 +95,7 @@ class Sights:
     def _chosen(self, light: NDArray[np.float64], tile: int) -> dict[str, Any]:
         """Choose the views of a tile, evenly spaced among those that see it."""
         sight = in_sight(light, tile)
-        some = sight[
-            np.unique(np.linspace(0, len(sight) - 1, min(MOST_VIEWS, len(sight))).round().astype(int))
-        ]
+        some = sight[evenly_spaced(len(sight), MOST_VIEWS)]
         return {
             "views": some.tolist(),
             "light": light[some, tile].tolist(),
@@ -162,9 +161,3 @@ def light_of(store: TileStore, coarse: list[Path], cameras: Cameras, workers: Wo
     ]
     paths = workers.run(tasks, "light")
     return np.concatenate([load(path, "weights")[0] for path in paths])
-
-
-def _weighted_median(values: NDArray[np.float64], weights: NDArray[Any]) -> float:
-    order = np.argsort(values, kind="stable")
-    sums = np.cumsum(weights[order])
-    return float(values[order][np.searchsorted(sums, sums[-1] / 2)])

@@ -12,7 +12,7 @@ from g2ard.jobs.budget import Budget
 from g2ard.jobs.distill import prepare
 from g2ard.jobs.distill_options import DistillOptions
 from g2ard.jobs.estimate import estimate, total
-from g2ard.system.memory import peak_rss
+from g2ard.system.peak_memory import peak_rss
 from helpers.commands import CommandLine, refused, succeeds
 from helpers.photos import photos_of
 from helpers.project import environment

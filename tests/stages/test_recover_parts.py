@@ -20,8 +20,8 @@ from g2ard.stages.recover.anchors import (
     effective_rank,
     needle,
 )
+from g2ard.stages.recover.auto_preset import regularizers_for, view_consistency
 from g2ard.stages.recover.losses import TorchAnchors, anchor_loss, regularization, shape_loss
-from g2ard.stages.recover.prior import regularizers_for, view_consistency
 from g2ard.stages.recover.schedule import PAPER, TUNED, Schedule
 from helpers.scenes import around, checkered_ball
 from reference.rotations import rotations

@@ -15,7 +15,7 @@ from g2ard.jobs.tiled import TiledLevels, lod_in_tiles
 from g2ard.jobs.tiling import Tiling
 from g2ard.levels import Cut, cut, save_levels, tree
 from g2ard.scene.splats import Splats
-from g2ard.system.memory import peak_rss
+from g2ard.system.peak_memory import peak_rss
 from g2ard.tiles.ingest import ingest
 from helpers.commands import refused, succeeds
 from helpers.level_files import files_of, leaves_of, scattered

@@ -12,6 +12,7 @@ from g2ard.cli.options import SceneArgument, picture
 from g2ard.errors import InputError
 from g2ard.io import check_scene_output
 from g2ard.progress import plural
+from g2ard.scene.samples import evenly_spaced
 
 if TYPE_CHECKING:
     from g2ard.scene.cameras import Cameras
@@ -143,7 +144,7 @@ def _paint(path: Path, splats: Splats, found: Cleaning, cameras: Cameras, overwr
 
     colors = np.array([*_COLORS.values(), (0.45, 0.48, 0.52)])[found.kind]
     scenes = [splats, painted(splats, colors), splats.take(found.keep)]
-    chosen = np.unique(np.linspace(0, len(cameras) - 1, min(3, len(cameras))).astype(int))
+    chosen = evenly_spaced(len(cameras), 3, floor=True)
     renderers = [Renderer(scene) for scene in scenes]
     rows = [[r.clipped(cameras[int(view)]) for r in renderers] for view in chosen]
     counts = zip(_WORDS, found.counts.items(), strict=True)

@@ -70,8 +70,8 @@ def evaluate(
     from g2ard.rendering.renderer import RasterSettings
     from g2ard.rendering.targets import kinds_of
     from g2ard.rendering.visibility import overdraw
+    from g2ard.scene.shape import needle_share
     from g2ard.stages.evaluate import evaluate as score
-    from g2ard.stages.recover.anchors import needle
 
     if lpips_input != "scaled" and lpips is None:
         raise typer.BadParameter("--lpips-input goes with --lpips; give --lpips DIR")
@@ -111,7 +111,7 @@ def evaluate(
                 "scene": str(path),
                 **scored.as_dict(),
                 "drift95": drift,
-                "needle": needle(splats.scales),
+                "needle": needle_share(splats.scales),
                 "file_bytes": bytes_of(path),
                 "overdraw": overdraw(splats, cameras, run.progress),
             }

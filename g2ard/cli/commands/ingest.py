@@ -13,7 +13,7 @@ from g2ard.cli.frame import Run, command
 from g2ard.cli.options import ResumeOption
 from g2ard.config.paths import changed
 from g2ard.progress import plural
-from g2ard.system.memory import peak_rss
+from g2ard.system.peak_memory import peak_rss
 
 
 @command("ingest", example="g2ard ingest city.ply -o tiles/ --tile-rows 2M", settings=True, scenes=True)

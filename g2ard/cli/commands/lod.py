@@ -121,7 +121,8 @@ def lod(
     from g2ard.io.atomic import check_output
     from g2ard.jobs.levels import check_ratios
     from g2ard.jobs.levels import lod as levels_of
-    from g2ard.jobs.tiling import LEVELS_TIMES, RECOVERY_TIMES, check_memory, is_tiled
+    from g2ard.jobs.memory_limit import LEVELS_TIMES, RECOVERY_TIMES, check_whole_memory
+    from g2ard.jobs.tiling import is_tiled
     from g2ard.levels import Cut
 
     if kind_of(scene) == "points":
@@ -154,7 +155,7 @@ def lod(
     if tiled:
         _in_tiles(writer, scene, ratios, tiling, views, steps, size, colour, recover)
         return
-    check_memory(scene, tiling, LEVELS_TIMES, RECOVERY_TIMES)
+    check_whole_memory(scene, tiling, LEVELS_TIMES, RECOVERY_TIMES)
     with stoppable(run, stopped, resume, writer.meta):
         stopped.mkdir(parents=True, exist_ok=True)
         levels = levels_of(
@@ -193,7 +194,7 @@ def _in_tiles(
     from g2ard.jobs.distill_options import DistillOptions
     from g2ard.jobs.levels import recovery_settings
     from g2ard.jobs.tiled import lod_in_tiles, working
-    from g2ard.system.memory import peak_rss_of_all
+    from g2ard.system.peak_memory import peak_rss_of_all
 
     run, folder = writer.run, tiling.folder
     assert folder is not None

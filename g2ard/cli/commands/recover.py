@@ -72,7 +72,7 @@ def recover(
     from g2ard.stages.recover import RecoverConfig
     from g2ard.stages.recover import recover as optimize
     from g2ard.stages.recover.anchors import Anchors
-    from g2ard.stages.recover.prior import regularizers_for
+    from g2ard.stages.recover.auto_preset import regularizers_for
 
     background = opt.background_of(run, background, student)
     names = ("schedule", "steps", "recovery_time", "sh_degree", "background", "seed")

@@ -20,7 +20,7 @@ from g2ard.io.atomic import atomic_output
 from g2ard.io.scene_formats import written_bytes
 from g2ard.pipeline.presets import configured
 from g2ard.progress import plural
-from g2ard.system.memory import peak_rss
+from g2ard.system.peak_memory import peak_rss
 
 if TYPE_CHECKING:
     from g2ard.io.types import Scene
@@ -65,7 +65,8 @@ def simplify(
     from g2ard.cli.tiled import TiledCommand
     from g2ard.jobs.inputs import say_notes
     from g2ard.jobs.measured_budget import Reduction, aim_of
-    from g2ard.jobs.tiling import WHOLE_TIMES, check_memory, is_tiled
+    from g2ard.jobs.memory_limit import WHOLE_TIMES, check_whole_memory
+    from g2ard.jobs.tiling import is_tiled
     from g2ard.stages.simplify import SimplifyConfig
 
     settings = run.settings(SimplifyConfig(), "method", "keep_region", preset=preset)
@@ -83,7 +84,7 @@ def simplify(
         _refuse_whole(scene, budgets, config, preset, parents)
         TiledCommand(run, scene, outputs, tiling, budgets).simplify(config, given, no_views, up)
         return
-    check_memory(scene, tiling, WHOLE_TIMES)
+    check_whole_memory(scene, tiling, WHOLE_TIMES)
     maps = None if parents is None else Outputs(run, parents, budgets, name="--parents")
     if maps is not None:
         maps.check(lambda path, _: run.check_extra("--parents", path, parents))

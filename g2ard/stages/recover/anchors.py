@@ -1,4 +1,4 @@
-"""Construction-time anchors, weights of the two regularisers, and geometry diagnostics."""
+"""Construction-time anchors, weights of the two regularisers, and drift from the anchors."""
 
 from __future__ import annotations
 
@@ -10,9 +10,6 @@ from numpy.typing import NDArray
 from g2ard.errors import require
 from g2ard.scene.splats import Splats
 from g2ard.scene.transform import rotation_matrices
-
-NEEDLE_RANK = 1.1
-"""Effective rank below which a Gaussian is a needle."""
 
 
 @dataclass(frozen=True)
@@ -139,22 +136,6 @@ class Anchors:
             r_parallel=(in_plane * np.maximum(tangential, floor)).astype(np.float32),
             r_perp=np.maximum(scales[:, 2], floor).astype(np.float32),
         )
-
-
-def effective_rank(scales: NDArray[np.float32]) -> NDArray[np.float64]:
-    """Return (N,) exp(−Σ q log q), q = s/Σs, in [1, 3].
-
-    >>> effective_rank(np.array([[1, 1, 1], [1, 1, 1e-9], [1, 1e-9, 1e-9]])).round(3).tolist()
-    [3.0, 2.0, 1.0]
-    """
-    q = scales.astype(np.float64)
-    q /= np.maximum(q.sum(1, keepdims=True), np.finfo(np.float64).tiny)
-    return np.exp(-(q * np.log(np.maximum(q, np.finfo(np.float64).tiny))).sum(1))
-
-
-def needle(scales: NDArray[np.float32]) -> float:
-    """Return the share of Gaussians whose effective rank is below `NEEDLE_RANK`."""
-    return float((effective_rank(scales) < NEEDLE_RANK).mean()) if len(scales) else 0.0
 
 
 def drift95(anchors: Anchors, means: NDArray[np.float32]) -> float:

@@ -14,16 +14,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 import g2ard.stages.recover.checkpoint as checkpoints
-from g2ard.config.choices import ENGINES
-from g2ard.errors import InputError, require_torch
 from g2ard.progress import Progress, silent
 from g2ard.rendering.renderer import settings_for
 from g2ard.rendering.targets import Targets, fingerprint_of, mask_of
+from g2ard.scene.shape import needle_share
 from g2ard.scene.splats import Splats
-from g2ard.stages.recover.anchors import Anchors, drift95, needle
+from g2ard.stages.recover.anchors import Anchors, drift95
 from g2ard.stages.recover.config import RecoverConfig
 from g2ard.stages.recover.draw import drawn
 from g2ard.stages.recover.engine import Engine, Objective
+from g2ard.stages.recover.engine_choice import engine_class
 from g2ard.stages.recover.guard import Guard
 from g2ard.stages.recover.probe import Probe
 from g2ard.stages.recover.schedule import multiplier_for, reach_for
@@ -191,7 +191,7 @@ class Loop:
             self._resume(checkpoint)
         earlier, began, saved = self.seconds, time.monotonic(), time.monotonic()
         with checkpoints.deferred_interrupt() as interrupted:
-            while self._share() < 1 and self.guard.stopped is None:
+            while self._used_share() < 1 and self.guard.stopped is None:
                 self._step()
                 self._look()
                 now = time.monotonic()
@@ -209,7 +209,7 @@ class Loop:
                 if interrupted.is_set():
                     raise KeyboardInterrupt
 
-    def _share(self) -> float:
+    def _used_share(self) -> float:
         """Return the used share of the steps or of the time limit."""
         if self.config.recovery_time is not None:
             return self.seconds / self.config.recovery_time
@@ -219,7 +219,7 @@ class Loop:
         config, step = self.config, self.done
         regularize = config.regularizers.active and (step + 1) % config.regularizers.period == 0
         began = time.monotonic()
-        loss = self._learn(self.engine, step, self._share(), self.multiplier, regularize=regularize)
+        loss = self._learn(self.engine, step, self._used_share(), self.multiplier, regularize=regularize)
         self.losses.append(loss)
         tally = self.tally[regularize]
         tally[0] += 1
@@ -229,7 +229,7 @@ class Loop:
     def _look(self) -> None:
         """After too large a loss, continue from the best scene with a third of the rates; `run` ends when
         `guard.stopped` is set."""
-        share = self._share()
+        share = self._used_share()
         short = self.config.recovery_time is None and self.config.horizon < _SHORT
         if short or not self.guard.due(share):
             return
@@ -241,9 +241,9 @@ class Loop:
 
     def _log(self) -> None:
         """Log Drift95 and Needle at every tenth of the recovery."""
-        if len(self.geometry) < int(min(1.0, self._share()) * _LOG_POINTS):
+        if len(self.geometry) < int(min(1.0, self._used_share()) * _LOG_POINTS):
             scene = self.engine.splats()
-            figures = {"drift95": drift95(self.anchors, scene.means), "needle": needle(scene.scales)}
+            figures = {"drift95": drift95(self.anchors, scene.means), "needle": needle_share(scene.scales)}
             self.geometry.append({"step": self.done, **figures})
 
     @property
@@ -264,7 +264,7 @@ class Loop:
         recent = np.mean(self.losses[-20:])
         total = self.config.horizon
         if self.config.recovery_time is not None:
-            total = max(self.done, round(self.done / max(self._share(), 1e-9)))
+            total = max(self.done, round(self.done / max(self._used_share(), 1e-9)))
         shown, at = self.probe.latest(self.engine.splats, self.done, self.seconds)
         figures = {"loss": f"{recent:.4f}", "PSNR": f"{shown:.2f} dB at step {at}", "steps/s": f"{speed:.1f}"}
         progress(stage, self.done, total, figures)
@@ -299,22 +299,3 @@ class Loop:
 def finite(reach: float) -> float | None:
     """Return `reach`, or None for infinity, which JSON lacks."""
     return None if math.isinf(reach) else reach
-
-
-def engine_class(name: str) -> Callable[[Objective], Engine]:
-    """Return the engine class of a name in `RecoverConfig.engine`, importing its packages on demand."""
-    if name == "fused":
-        from g2ard.stages.recover.fused_engine import FusedEngine
-
-        return FusedEngine
-    if name in ("torch", "gsplat"):
-        require_torch(f"engine '{name}'")
-    if name == "torch":
-        from g2ard.stages.recover.torch_engine import TorchEngine
-
-        return TorchEngine
-    if name == "gsplat":
-        from g2ard.stages.recover.gsplat_engine import GsplatEngine
-
-        return GsplatEngine
-    raise InputError(f"expected {', '.join(ENGINES)}, got {name!r}", parameter="engine")

@@ -12,8 +12,9 @@ from g2ard.errors import InputError
 from g2ard.progress import Progress, plural, silent
 from g2ard.rendering.targets import Targets, fingerprint_of
 from g2ard.scene.cameras import unseeing
+from g2ard.scene.shape import needle_share
 from g2ard.scene.splats import Splats
-from g2ard.stages.recover.anchors import Anchors, drift95, needle
+from g2ard.stages.recover.anchors import Anchors, drift95
 from g2ard.stages.recover.config import RecoverConfig
 from g2ard.stages.recover.draw import checked_weights
 from g2ard.stages.recover.guard import Guard
@@ -150,7 +151,7 @@ def recover(
             extent=targets.cameras.extent,
             trials=tuple(map(Trial.of, loop.trials)),
             drift95=drift95(anchors, result.means),
-            needle=needle(result.scales),
+            needle=needle_share(result.scales),
             geometry=tuple(map(Geometry.of, loop.geometry)),
             regularizers=Regularized.of(loop.regularizers),
             backed_off=tuple(map(Look.of, loop.guard.backed_off)),

@@ -11,7 +11,8 @@ import numpy as np
 from g2ard.rendering.metrics import psnr
 from g2ard.rendering.renderer import Renderer
 from g2ard.rendering.targets import Subset, Targets, mask_of, with_pixels
-from g2ard.scene.cameras import evenly_spaced, rows_by_kind
+from g2ard.scene.cameras import rows_by_kind
+from g2ard.scene.samples import evenly_spaced
 from g2ard.scene.splats import Splats
 
 _VIEWS = 8

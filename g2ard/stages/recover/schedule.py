@@ -8,7 +8,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from g2ard.errors import require
-from g2ard.scene.cameras import Cameras, evenly_spaced
+from g2ard.scene.cameras import Cameras
+from g2ard.scene.samples import evenly_spaced
 from g2ard.scene.splats import Splats
 
 _REACH = 0.01

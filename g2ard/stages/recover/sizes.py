@@ -5,12 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from g2ard.scene.cameras import Cameras, evenly_spaced
+from g2ard.scene.cameras import Cameras
+from g2ard.scene.samples import evenly_spaced
+from g2ard.scene.shape import NEEDLE_UNIT, longer_axes
 from g2ard.scene.splats import Splats
-
-_NEEDLE = 1e-2
-"""Least ratio of the middle to the largest scale, so that a needle's unit is at least a tenth of its length.
-"""
 
 _VIEWS = 8
 
@@ -24,9 +22,9 @@ def radii(splats: Splats) -> NDArray[np.float32]:
     >>> radii(Splats.create([[0, 0, 0]], scales=[[9.0, 1e-9, 4.0]])).tolist()
     [6.0]
     """
-    scales = np.sort(splats.scales.astype(np.float64), axis=1)
-    middle = np.maximum(scales[:, 1], _NEEDLE * scales[:, 2])
-    return np.ascontiguousarray(np.sqrt(middle * scales[:, 2]).astype(np.float32))
+    middle, largest = longer_axes(splats.scales.astype(np.float64)).T
+    middle = np.maximum(middle, NEEDLE_UNIT * largest)
+    return np.ascontiguousarray(np.sqrt(middle * largest).astype(np.float32))
 
 
 def typical_share(splats: Splats, cameras: Cameras) -> float:

@@ -9,9 +9,11 @@ import numpy as np
 from g2ard.errors import InputError
 from g2ard.io.reports import Report
 from g2ard.rendering.renderer import RasterSettings, Renderer
-from g2ard.scene.cameras import Cameras, evenly_spaced
+from g2ard.scene.cameras import Cameras
+from g2ard.scene.samples import evenly_spaced
+from g2ard.scene.shape import needle_share
 from g2ard.scene.splats import Splats
-from g2ard.stages.recover.anchors import REGULARIZERS, Regularizers, needle
+from g2ard.stages.recover.anchors import REGULARIZERS, Regularizers
 
 _LIFT_THICKNESS = 0.2
 _LIFT_SPREAD = 2.5
@@ -63,7 +65,7 @@ def measure_prior(prior: Splats, cameras: Cameras | None = None) -> PriorMeasure
     thickness = scales[:, 0] / np.maximum(scales[:, 1], tiny)
     low, middle, high = np.quantile(thickness, [0.25, 0.5, 0.75]) if len(prior) else (1.0, 1.0, 1.0)
     return PriorMeasures(
-        needle=needle(prior.scales),
+        needle=needle_share(prior.scales),
         thickness=float(middle),
         thickness_spread=float(high / max(low, tiny)),
         view_dependent=bool(prior.shN.any()),

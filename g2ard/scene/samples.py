@@ -1,0 +1,35 @@
+"""Evenly spaced indices, and weighted quantiles."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+def evenly_spaced(count: int, most: int, *, floor: bool = False) -> list[int]:
+    """Return at most `most` evenly spaced indices below `count`, the first and last included.
+
+    Args:
+        count: number of items; 0 gives no index.
+        most: largest number of indices.
+        floor: round down instead of to the nearest index.
+
+    >>> evenly_spaced(9, 3), evenly_spaced(2, 3), evenly_spaced(4, 3), evenly_spaced(4, 3, floor=True)
+    ([0, 4, 8], [0, 1], [0, 2, 3], [0, 1, 3])
+    """
+    spaced = np.linspace(0, count - 1, min(count, most))
+    indices: list[int] = np.unique((np.floor if floor else np.round)(spaced).astype(int)).tolist()
+    return indices
+
+
+def weighted_quantile(values: NDArray[Any], weights: NDArray[Any], share: float) -> float:
+    """Return the value below which the share of the weight lies.
+
+    >>> weighted_quantile(np.array([3.0, 1.0, 2.0]), np.array([1.0, 1.0, 2.0]), 0.5)
+    2.0
+    """
+    order = np.argsort(values, kind="stable")
+    total = np.cumsum(weights[order])
+    return float(values[order[np.searchsorted(total, share * total[-1])]])

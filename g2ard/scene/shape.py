@@ -1,0 +1,43 @@
+"""Shapes of Gaussians: needles, the effective rank, and the two longer axes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+NEEDLE_RANK = 1.1
+"""Effective rank below which reports count a Gaussian as a needle."""
+
+NEEDLE_LENGTH = 10.0
+"""Ratio of length to width above which cleaning looks at a Gaussian as a needle or a streak."""
+
+NEEDLE_UNIT = 1e-2
+"""Least ratio of the middle to the largest scale in recovery: a needle's unit is at least a tenth of its
+length."""
+
+
+def longer_axes(scales: NDArray[Any]) -> NDArray[Any]:
+    """Return the (N, 2) scales of the two longer axes, ascending.
+
+    >>> longer_axes(np.array([[3, 1, 2]])).tolist()
+    [[2, 3]]
+    """
+    return np.sort(scales, axis=1)[:, 1:]
+
+
+def effective_rank(scales: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Return (N,) exp(−Σ q log q), q = s/Σs, in [1, 3].
+
+    >>> effective_rank(np.array([[1, 1, 1], [1, 1, 1e-9], [1, 1e-9, 1e-9]])).round(3).tolist()
+    [3.0, 2.0, 1.0]
+    """
+    q = scales.astype(np.float64)
+    q /= np.maximum(q.sum(1, keepdims=True), np.finfo(np.float64).tiny)
+    return np.exp(-(q * np.log(np.maximum(q, np.finfo(np.float64).tiny))).sum(1))
+
+
+def needle_share(scales: NDArray[np.float32]) -> float:
+    """Return the share of needles: Gaussians whose effective rank is below `NEEDLE_RANK`."""
+    return float((effective_rank(scales) < NEEDLE_RANK).mean()) if len(scales) else 0.0
