@@ -83,11 +83,11 @@ def verdict(report: dict[str, Any]) -> str:
         report: what `g2ard distill` writes as report.json.
 
     >>> change = {"before": 30.0, "after": 36.6}
-    >>> kind = {"kind": "near", "views": 1, "psnr": change, "ssim": change, "worst": "near_0003",
+    >>> kind = {"kind": "near", "views": 12, "psnr": change, "ssim": change, "worst": "near_0003",
     ...         "worst_psnr": change, "lost": 0}
     >>> verdict({"input_count": 5000, "output_count": 500, "lifted": False, "against": "teacher renders",
-    ...          "kinds": [kind]})
-    '500 of 5,000 Gaussians reproduce the scene at 36.6 dB on average; the worst view is near_0003 (36.6 dB).'
+    ...          "kinds": [kind]})  # doctest: +ELLIPSIS
+    '500 of 5,000 Gaussians reproduce the scene at 36.6 dB, the mean of 12 held-out views; ...'
     """
     kinds = [KindScore.of(kind) for kind in report["kinds"]]
     if not kinds:
@@ -100,8 +100,10 @@ def verdict(report: dict[str, Any]) -> str:
     if report.get("lifted"):
         count = f"{plural(report['output_count'], 'Gaussian')} from {plural(report['input_count'], 'point')}"
     what = "photos" if "photo" in report.get("against", "") else "scene"
-    mean = fmean(kind.psnr.after for kind in kinds)
-    return f"{count} reproduce the {what} at {mean:.1f} dB on average; {last}."
+    views = sum(kind.views for kind in kinds)
+    mean = sum(kind.views * kind.psnr.after for kind in kinds) / views
+    over = f"the mean of {views} held-out views" if views > 1 else "in one held-out view"
+    return f"{count} reproduce the {what} at {mean:.1f} dB, {over}; {last}."
 
 
 def _worst(scores: Sequence[dict[str, Any]]) -> list[int]:

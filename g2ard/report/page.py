@@ -120,11 +120,11 @@ class Page:
     ) -> None:
         """Add a table; cells (row, column) in `best` are bold."""
         head = "".join(f"<th>{escape(name)}</th>" for name in columns)
-        body = []
+        body, mark = [], ' class="best"'
         for i, row in enumerate(rows):
             cells = "".join(
-                f'<td class="best">{escape(cell)}</td>' if (i, j) in best else f"<td>{escape(cell)}</td>"
-                for j, cell in enumerate(row)
+                f'<td data-column="{escape(name)}"{mark * ((i, j) in best)}>{escape(cell)}</td>'
+                for j, (name, cell) in enumerate(zip(columns, row, strict=True))
             )
             body.append(f"<tr>{cells}</tr>")
         self._parts.append(
@@ -222,6 +222,11 @@ h3{margin:28px 0 4px}h4{margin:0 0 8px;font-weight:600}
 table{border-collapse:collapse;font-size:13px;font-variant-numeric:tabular-nums;margin:8px 0}
 th,td{padding:4px 10px;text-align:right;border-bottom:1px solid var(--line);white-space:nowrap}
 th:first-child,td:first-child{text-align:left}th{color:var(--soft);font-weight:600}.best{font-weight:700}
+@media(max-width:600px){main{padding:16px 12px 60px}thead{display:none}table,tbody,tr{display:block}
+tr{padding:6px 0;border-bottom:1px solid var(--line)}
+td{display:flex;justify-content:space-between;gap:12px;padding:1px 0;border:0;white-space:normal;
+overflow-wrap:anywhere}td:first-child{font-weight:600}
+td::before{content:attr(data-column);color:var(--soft);font-weight:400;text-align:left;overflow-wrap:normal}}
 .view{background:var(--card);border-radius:8px;padding:14px;margin:14px 0}
 .slider{position:relative;overflow:hidden;border-radius:6px}
 .slider img{position:absolute;inset:0;width:100%;height:100%;user-select:none}
