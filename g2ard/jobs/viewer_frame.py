@@ -19,7 +19,7 @@ from g2ard.progress import Progress, Say, silent, unsaid
 from g2ard.rendering.renderer import Renderer
 from g2ard.scene.cameras import Camera, Cameras
 from g2ard.scene.splats import Splats
-from g2ard.scene.transform import transform, unit_up
+from g2ard.scene.transform import quaternion_of, transform, unit_up
 from g2ard.viewer import Start
 
 _POOL = 32
@@ -27,6 +27,9 @@ _POOL = 32
 
 _ROWS = 100_000
 """Gaussians used to estimate the up direction."""
+
+_TO_VIEWER = np.diag([-1.0, -1.0, 1.0])
+"""Rotation that the viewer applies to scenes: by 180° about z."""
 
 _ROLL = 0.1
 """Ratio of the spread of the views' x axes along and across a direction, below which it is up."""
@@ -68,6 +71,18 @@ class ViewerFrame:
         turn[:3, :3] = self.rotation
         return transform(replace(splats.recentred(self.origin), offset=np.zeros(3)), turn)
 
+    def placed(self, offset: NDArray[np.float64]) -> tuple[list[float], list[float]]:
+        """Return quaternion x y z w and translation that put a scene with this offset where `of` and the
+        viewer put it."""
+        turn = _TO_VIEWER @ self.rotation
+        w, *xyz = quaternion_of(turn).tolist()
+        return [*xyz, w], (turn @ (offset - self.origin)).tolist()
+
+    def world(self, point: Sequence[float]) -> NDArray[np.float64]:
+        """Return world coordinates of a point in the viewer's axes."""
+        back: NDArray[np.float64] = self.rotation.T @ _TO_VIEWER @ np.asarray(point) + self.origin
+        return back
+
     def start_at(self, view: Camera, points: NDArray[np.float64]) -> Start:
         """Convert a view for the viewer, without roll; it orbits the median depth of the points in view."""
         held = points[view.holds(points)]
@@ -75,7 +90,7 @@ class ViewerFrame:
             held = self.origin[None]
         ahead = view.viewmat[2, :3]
         depth = float(np.median(np.abs((held - view.position) @ ahead)))
-        to_viewer = np.diag([-1.0, -1.0, 1.0]) @ self.rotation  # the viewer rotates scenes by 180° about z
+        to_viewer = _TO_VIEWER @ self.rotation
 
         def there(point: NDArray[np.float64]) -> tuple[float, float, float]:
             x, y, z = (float(v) for v in to_viewer @ (point - self.origin))

@@ -28,7 +28,7 @@ from g2ard.scene.transform import unit_up
 
 Float = NDArray[np.float64]
 
-_TILE_OF_SCENE = np.array([[-1.0, 0, 0], [0, 0, -1], [0, -1, 0]])
+TILE_OF_SCENE = np.array([[-1.0, 0, 0], [0, 0, -1], [0, -1, 0]])
 """Rotation from the scene's axes to a tile's: glTF's (half a turn about z), then z up instead of y."""
 
 _MOST_ERROR = 16.0
@@ -162,7 +162,7 @@ def save_tileset(
     root = parts[0] if len(parts) == 1 else _tile(tree, size, parts)
     matrix = np.eye(4) if place is None else place.matrix()
     turn = np.eye(4)
-    turn[:3, :3] = _upright(up) @ _TILE_OF_SCENE.T
+    turn[:3, :3] = _upright(up) @ TILE_OF_SCENE.T
     root["transform"] = (matrix @ turn).T.ravel().tolist()
     extensions = [EXTENSION, SPZ_EXTENSION]
     tileset = {
@@ -236,8 +236,8 @@ class _Tiles:
 
 
 def _tile(node: Node | Leaf, error: float, children: list[dict[str, Any]]) -> dict[str, Any]:
-    middle = _TILE_OF_SCENE @ (node.low + node.high) / 2
-    half = np.abs(_TILE_OF_SCENE @ (node.high - node.low)) / 2
+    middle = TILE_OF_SCENE @ (node.low + node.high) / 2
+    half = np.abs(TILE_OF_SCENE @ (node.high - node.low)) / 2
     tile: dict[str, Any] = {
         "boundingVolume": {"box": [*middle.tolist(), *np.diag(half).ravel().tolist()]},
         "geometricError": error,

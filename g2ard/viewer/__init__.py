@@ -3,6 +3,6 @@
 `supersplat/` holds the published viewer; its README.md tells the version and how to update it.
 """
 
-from g2ard.viewer.page import Start, check_page_output, write_page
+from g2ard.viewer.page import Start, check_page_output, write_globe_page, write_page, write_stream_page
 
-__all__ = ["Start", "check_page_output", "write_page"]
+__all__ = ["Start", "check_page_output", "write_globe_page", "write_page", "write_stream_page"]

@@ -16,7 +16,7 @@ async function module(base64) {
   return import(URL.createObjectURL(new Blob([text], { type: 'text/javascript' })));
 }
 
-const { start, stops, background, files, antialiased } = JSON.parse(read('view'));
+const { start, stops, background, files, antialiased, placed } = JSON.parse(read('view'));
 
 // The viewer's field of view is along the window's longer side; all of the given view is to be in sight.
 function fitted({ position, target, fov }) {
@@ -130,11 +130,19 @@ async function viewer(createViewer, index, container) {
     container,
     settings,
     contentUrl: files[index],
-    contents: Promise.resolve(new Response(bytes(read(`scene${index}`)))),
+    ...(document.getElementById(`scene${index}`) // otherwise streamed from beside the page
+      ? { contents: Promise.resolve(new Response(bytes(read(`scene${index}`)))) } : {}),
     renderer: 'webgl',
     ui: index === 0,
     noanim: true
   });
+  if (placed) { // streamed files keep the scene's axes
+    handle.app.root.on('childinsert', node => {
+      if (node.name !== 'gsplat') return;
+      node.setLocalRotation(...placed.rotation);
+      node.setLocalPosition(...placed.position);
+    });
+  }
   asTrained(handle.app.scene.gsplat, antialiased[index]);
   sortToTheEnd(handle.app);
   const drawn = new Promise(resolve => {
@@ -190,6 +198,10 @@ function divide(right, leader) {
 }
 
 async function main() {
+  if (placed && location.protocol === 'file:') {
+    throw new Error('its levels are loaded over http. Run "python -m http.server" in their folder and open '
+      + 'http://localhost:8000');
+  }
   const { createViewer } = await module(read('viewer'));
   const started = [await viewer(createViewer, 0, document.getElementById('scenes'))];
   if (files.length === 2) {

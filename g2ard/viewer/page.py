@@ -84,12 +84,58 @@ def write_page(
         "background": [float(channel) for channel in background],
         "files": [f"scene{index}.sog" for index in range(len(scenes))],
         "antialiased": [splats.antialiased for _, splats in scenes],
+        "placed": None,
     }
-    text = _page([label for label, _ in scenes], shown, packed)
+    size = _write(path, _page([label for label, _ in scenes], shown, packed), overwrite)
+    return Written(size, tuple(map(len, packed)))
+
+
+def write_stream_page(
+    path: str | Path,
+    title: str,
+    *,
+    start: Start | None,
+    rotation: Sequence[float],
+    position: Sequence[float],
+    antialiased: bool,
+    background: Sequence[float] = BLACK,
+) -> int:
+    """Write a page that streams lod-meta.json from its own folder, and return its bytes.
+
+    Args:
+        start: as for `write_page`.
+        rotation, position: quaternion x y z w and translation from the files' axes to the viewer's.
+    """
+    shown = {
+        "start": None if start is None else asdict(start),
+        "stops": [],
+        "background": [float(channel) for channel in background],
+        "files": ["lod-meta.json"],
+        "antialiased": [antialiased],
+        "placed": {"rotation": [float(q) for q in rotation], "position": [float(x) for x in position]},
+    }
+    return _write(Path(path), _page([title], shown, []), overwrite=True)
+
+
+def write_globe_page(
+    path: str | Path, title: str, *, eye: Sequence[float], target: Sequence[float], fov: float
+) -> int:
+    """Write a page that shows the tileset.json of its own folder with a CesiumJS named in its address.
+
+    Args:
+        eye, target: (3,) initial camera in the axes of the tiles.
+        fov: degrees, along the window's longer side.
+    """
+    view = {"eye": [float(x) for x in eye], "target": [float(x) for x in target], "fov": float(fov)}
+    text = (_HERE / "globe.html").read_text(encoding="utf-8")
+    text = text.replace("{generator}", f"g2ard {__version__}").replace("{title}", escape(title))
+    return _write(Path(path), text.replace("{view}", json.dumps(view)), overwrite=True)
+
+
+def _write(path: Path, text: str, overwrite: bool) -> int:
     with atomic_output(path, overwrite) as temporary:
         temporary.write_text(text, encoding="utf-8", newline="\n")
-        size = temporary.stat().st_size
-    return Written(size, tuple(map(len, packed)))
+        return temporary.stat().st_size
 
 
 def _sog(path: Path, label: str, splats: Splats) -> bytes:

@@ -12,15 +12,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from g2ard.jobs.level_page import write_level_page
 from g2ard.jobs.levels import lod
-from g2ard.jobs.viewer_frame import frame_with
 from g2ard.levels import Cut, Georeference, save_levels, save_tileset
 from g2ard.rendering.metrics import psnr
 from g2ard.rendering.renderer import Renderer
 from g2ard.scene.cameras import Camera, Cameras
 from g2ard.scene.splats import Splats
 from g2ard.scene.transform import join
-from g2ard.viewer import write_page
 from helpers.browser import Browser
 from helpers.pages import FRONT, GREY, HEIGHT, WIDTH, assert_shows, rendered, show
 from helpers.peers import package
@@ -59,24 +58,9 @@ def browser() -> Iterator[Browser]:
 def streaming(
     folder: Path, name: str, levels: tuple[Splats, ...], camera: Camera, sky: Splats | None = None
 ) -> None:
-    """A page beside streamed levels, which it loads as they are needed."""
-    stand = frame_with(levels[0], Cameras.of([camera]), up=(0, 0, 1))
-    save_levels(
-        folder / name,
-        [stand.of(level) for level in levels],
-        cut=Cut(4096, 1.0, 512),
-        environment=None if sky is None else stand.of(sky),
-        overwrite=True,
-    )
-    page = folder / f"{name}.html"
-    write_page(page, [("scene", stand.of(levels[0]))], start=stand.start, background=GREY, overwrite=True)
-    text, count = re.subn(
-        r"contentUrl: files\[index\],\s*contents: [^\n]*\n",
-        f"contentUrl: '{name}/lod-meta.json',\n",
-        page.read_text(),
-    )
-    assert count == 1
-    page.write_text(text)
+    """A folder of levels with the page that `lod` writes, opening at a camera."""
+    save_levels(folder / name, levels, cut=Cut(4096, 1.0, 512), environment=sky, overwrite=True)
+    write_level_page(folder / name, levels, "sog", views=Cameras.of([camera]), up=(0, 0, 1), background=GREY)
 
 
 @pytest.mark.parametrize("finest", [0, 1, 2])
@@ -89,7 +73,7 @@ def test_each_level(
     meta = json.loads((folder / name / "lod-meta.json").read_text())
     assert meta["lodLevels"] == len(RATIOS) - finest
     browser.requests.clear()
-    show(browser, f"{address}/{name}.html")
+    show(browser, f"{address}/{name}/")
     assert_shows(browser, rendered(levels[finest]), 35)
     fetched = {url.removeprefix(f"{address}/{name}/") for url in browser.requests if f"/{name}/" in url}
     assert "lod-meta.json" in fetched
@@ -106,7 +90,7 @@ def test_the_environment(browser: Browser, served: tuple[Path, str], levels: tup
         rays, scales=np.full((400, 3), 0.5), logit_opacities=np.ones(400), sh0=rng.normal(size=(400, 1, 3))
     )
     streaming(folder, "sky", levels, FRONT, sky)
-    show(browser, f"{address}/sky.html")
+    show(browser, f"{address}/sky/")
     assert_shows(browser, rendered(join([levels[0], sky])), 35)
 
 
@@ -171,3 +155,48 @@ def test_cesium_shows_each_level_on_the_globe(
         found = psnr(browser.picture() / np.float32(255), expected)
     assert found > 35, browser.run("shown()")
     assert {name[0] for name in browser.run("shown()").split(",")} == {str(level)}
+
+
+NEEDS = "document.getElementById('needs').innerText"
+
+
+def told(browser: Browser, url: str) -> str:
+    """Open a page for CesiumJS and return the message that it shows instead of tiles, or ""."""
+    browser.open(url)
+    browser.run(
+        "new Promise(done => { const look = () => window.g2ard ? done() : setTimeout(look, 20); look(); })"
+    )
+    return str(browser.run(f"g2ard.ready.then(() => '', () => {NEEDS})"))
+
+
+def test_a_globe_page_without_cesium_says_what_it_needs(
+    browser: Browser, served: tuple[Path, str], levels: tuple[Splats, ...]
+) -> None:
+    folder, address = served
+    views = Cameras.of([FRONT])
+    write_level_page(folder, levels, "3dtiles", views=views, up=(0, 0, 1))
+    assert "?cesium=https://" in told(browser, f"{address}/index.html")
+    assert "No CesiumJS at" in told(browser, f"{address}/index.html?cesium=nowhere/")
+    assert "http.server" in told(browser, (folder / "index.html").as_uri())
+    page = folder / "typed.html"
+    page.write_text((folder / "index.html").read_text().replace("CESIUM = ''", "CESIUM = 'typed'"))
+    assert "typed/Cesium.js" in told(browser, f"{address}/typed.html")
+
+
+@pytest.mark.parametrize("place", [None, Georeference(24.75, 59.43, 30, 40)])
+def test_a_globe_page_opens_at_the_view(
+    browser: Browser, served: tuple[Path, str], levels: tuple[Splats, ...], place: Georeference | None
+) -> None:
+    folder, address = served
+    peer = package("cesium", "Build", "Cesium")
+    name = f"page-{place is None}"
+    save_tileset(folder / name, levels[-1:], up=(0, 0, 1), place=place)
+    (folder / name / "cesium").symlink_to(peer)
+    write_level_page(folder / name, levels[-1:], "3dtiles", views=Cameras.of([FRONT]), up=(0, 0, 1))
+    assert told(browser, f"{address}/{name}/?cesium=cesium") == ""
+    expected, until, found = rendered(levels[-1]), time.monotonic() + 60, 0.0
+    inside = np.abs(expected - GREY).max(-1) > 0.1  # nothing behind the ball but the globe and the sky
+    while found < 25 and time.monotonic() < until:
+        browser.run("new Promise(done => setTimeout(done, 500))")
+        found = psnr(browser.picture()[inside][None] / np.float32(255), expected[inside][None])
+    assert found > 25

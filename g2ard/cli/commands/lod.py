@@ -141,7 +141,8 @@ def lod(
         raise typer.BadParameter("--environment needs --format sog")
     if environment and tiled:
         raise typer.BadParameter("--environment needs a scene that fits into memory")
-    writer = _Writer(run, output, kind, rule, spot, up)
+    views, colour = opt.with_images(views, images), background or BLACK
+    writer = _Writer(run, scene, output, kind, rule, spot, up, views, colour)
     run.spare_inputs(writer.meta)
     stopped = output.with_name(f".{output.name}.unfinished")
     finished = is_finished(run, stopped, resume, writer.meta)
@@ -151,7 +152,6 @@ def lod(
         check_output(output, run.overwrite, folder=True)
     if finished or not tiled:
         check_stopped(run, stopped, resume, writer.meta)
-    views, colour = opt.with_images(views, images), background or BLACK
     if tiled:
         _in_tiles(writer, scene, ratios, tiling, views, steps, size, colour, recover)
         return
@@ -217,15 +217,19 @@ class _Writer:
     """Writer of the output folder.
 
     Args:
+        kind: "sog" or "3dtiles".
         spot: place on the globe, or the map system in which the scene's offset is the place.
     """
 
     run: Run
+    scene: Path
     output: Path
-    kind: str
+    kind: Literal["sog", "3dtiles"]
     cut: Cut
     spot: Any
     up: Sequence[float] | None
+    views: Any
+    background: Colour
 
     @property
     def meta(self) -> Path:
@@ -233,7 +237,7 @@ class _Writer:
         return self.output / ("lod-meta.json" if self.kind == "sog" else "tileset.json")
 
     def save(self, levels: Sequence[Level], work: Path | None = None, sky: Splats | None = None) -> int:
-        """Write the levels and return their bytes."""
+        """Write the levels and a page that shows them, and return their bytes."""
         from g2ard.jobs.levels import tileset_up
         from g2ard.levels import Georeference, save_levels, save_tileset
 
@@ -241,7 +245,8 @@ class _Writer:
         common: dict[str, Any] = {"cut": self.cut, "overwrite": run.overwrite, "work": work}
         common["progress"] = run.progress
         if self.kind == "sog":
-            return save_levels(self.output, levels, environment=sky, **common)
+            written = save_levels(self.output, levels, environment=sky, **common)
+            return written + self._page(levels, self.up)
         if spot is not None and not isinstance(spot, Georeference):
             spot = Georeference.of_map(spot, levels[0].offset)
             run.say(
@@ -250,7 +255,26 @@ class _Writer:
         axis = tileset_up(levels, self.up)
         rounded = ", ".join(f"{round(value, 3) + 0.0:g}" for value in axis)
         run.say(f"up is {rounded}" + ("" if self.up else "; --up X,Y,Z changes it"))
-        return save_tileset(self.output, levels, up=axis, place=spot, **common)
+        written = save_tileset(self.output, levels, up=axis, place=spot, **common)
+        return written + self._page(levels, axis.tolist())
+
+    def _page(self, levels: Sequence[Level], up: Sequence[float] | None) -> int:
+        from g2ard.jobs.level_page import write_level_page
+
+        run = self.run
+        written = write_level_page(
+            self.output,
+            levels,
+            self.kind,
+            views=self.views,
+            beside=self.scene,
+            up=up,
+            background=self.background,
+            seed=run.seed,
+            progress=run.progress,
+        )
+        run.say(f"page: python -m http.server --directory {self.output}, then http://localhost:8000")
+        return written
 
 
 def _georeference(text: str) -> Any:
