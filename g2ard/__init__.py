@@ -50,9 +50,10 @@ if TYPE_CHECKING:
     from g2ard.io.types import Points
     from g2ard.jobs.distill import distill
     from g2ard.jobs.distill_options import DistillOptions
-    from g2ard.jobs.levels import lod
+    from g2ard.jobs.levels import lod, save_tileset
+    from g2ard.jobs.register import register
     from g2ard.jobs.simplify import simplify
-    from g2ard.levels import Georeference, save_levels, save_tileset
+    from g2ard.levels import Georeference, save_levels
     from g2ard.pipeline.adapt import AdaptConfig, Adapted, adapt
     from g2ard.pipeline.config import DistillConfig, SelectConfig
     from g2ard.pipeline.distill import Distilled
@@ -68,7 +69,7 @@ if TYPE_CHECKING:
     from g2ard.stages.recover import RecoverConfig, Recovered, recover
     from g2ard.stages.recover.anchors import Regularizers
     from g2ard.stages.recover.config import FitConfig
-    from g2ard.stages.register import RegisterConfig, Registered, register
+    from g2ard.stages.register import RegisterConfig, Registered
     from g2ard.stages.select import CoverageOptions, Selection, select
     from g2ard.stages.simplify import Simplified, SimplifyConfig
     from g2ard.tiles.ingest import ingest
@@ -138,10 +139,11 @@ _HOMES = {
     "io.types": ("Points",),
     "pipeline.config": ("DistillConfig", "SelectConfig"),
     "pipeline.distill": ("Distilled",),
-    "levels": ("Georeference", "save_levels", "save_tileset"),
+    "levels": ("Georeference", "save_levels"),
     "jobs.distill": ("distill",),
     "jobs.distill_options": ("DistillOptions",),
-    "jobs.levels": ("lod",),
+    "jobs.levels": ("lod", "save_tileset"),
+    "jobs.register": ("register",),
     "jobs.simplify": ("simplify",),
     "poses": ("make_pool",),
     "pipeline.presets": ("preset",),
@@ -152,7 +154,7 @@ _HOMES = {
     "stages.recover": ("RecoverConfig", "Recovered", "recover"),
     "stages.recover.config": ("FitConfig",),
     "stages.recover.anchors": ("Regularizers",),
-    "stages.register": ("RegisterConfig", "Registered", "register"),
+    "stages.register": ("RegisterConfig", "Registered"),
     "rendering.renderer": ("RasterSettings", "Rendered", "Renderer", "render"),
     "stages.select": ("CoverageOptions", "Selection", "select"),
     "stages.simplify": ("Simplified", "SimplifyConfig"),

@@ -7,6 +7,7 @@ import re
 from collections.abc import Callable
 from contextlib import suppress
 from difflib import get_close_matches
+from functools import lru_cache
 from itertools import islice
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -89,6 +90,13 @@ def file_format(path: str | Path) -> Format:
             raise InputError("is a broken link", path=path)
         raise InputError(f"no such file or folder{_near(path)}", path=path)
     check_regular(path)
+    state = path.stat()
+    return _of_file(path, state.st_mtime_ns, state.st_size)
+
+
+@lru_cache(maxsize=64)
+def _of_file(path: Path, modified: int, size: int) -> Format:
+    """Return the format of a file, looked into once until it is modified or has another size."""
     suffix = path.suffix.lower()
     if found := _BY_NAME.get(path.name.lower()) or _BY_SUFFIX.get(suffix):
         return found

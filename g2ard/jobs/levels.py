@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from g2ard.config.choices import BLACK, Colour, RenderModel
 from g2ard.errors import InputError
+from g2ard.io.detect import kind
 from g2ard.io.reports import Report
 from g2ard.jobs.budget import Budget
 from g2ard.jobs.distill import prepare
@@ -22,12 +23,13 @@ from g2ard.jobs.distill_options import DistillOptions
 from g2ard.jobs.inputs import Views, load_scene, scorable
 from g2ard.jobs.job import DistillJob
 from g2ard.jobs.viewer_frame import up_of
-from g2ard.levels.tree import Level
+from g2ard.levels.tileset import Georeference, map_system
+from g2ard.levels.tileset import save_tileset as write_tileset
+from g2ard.levels.tree import Cut, Level
 from g2ard.pipeline.distill import distill as pipeline
 from g2ard.progress import Progress, Say, plural, silent, unsaid
 from g2ard.rendering.visibility import visibility_source
 from g2ard.scene.cameras import Cameras
-from g2ard.scene.samples import evenly_spaced
 from g2ard.scene.sky import sky_mask
 from g2ard.scene.splats import Splats
 from g2ard.stages.evaluate import evaluate
@@ -131,6 +133,7 @@ def lod(
     [800, 200, 100]
     """
     check_ratios(ratios)
+    check_trained(scene)
     sky = None
     if split_sky:
         if not isinstance(scene, Splats):
@@ -174,6 +177,16 @@ def recovery_settings(steps: int | None, background: Colour, seed: int) -> dict[
     """Return the settings of a level's recovery by path."""
     found = {"recover.background": background, "recover.seed": seed}
     return found if steps is None else {**found, "recover.steps": steps}
+
+
+def check_trained(scene: Splats | str | Path) -> None:
+    """Reject the path of a point cloud, which cannot render training images."""
+    if not isinstance(scene, Splats) and kind(scene) == "points":
+        raise InputError(
+            "a point cloud cannot render training images",
+            path=scene,
+            hint="distil it first, then make levels of the result",
+        )
 
 
 def check_ratios(ratios: Sequence[float]) -> None:
@@ -226,13 +239,71 @@ def _merged(job: DistillJob, finer: Splats, count: int) -> Splats:
     return simplify(finer, count, visibility=visibility, progress=job.progress).splats
 
 
-def tileset_up(levels: Sequence[Level], up: Sequence[float] | None = None) -> NDArray[np.float64]:
+def save_tileset(
+    path: str | Path,
+    levels: Sequence[Level],
+    *,
+    up: Sequence[float] | None = None,
+    place: Georeference | str | None = None,
+    cut: Cut | None = None,
+    overwrite: bool = False,
+    work: Path | None = None,
+    progress: Progress = silent,
+    say: Say = unsaid,
+) -> int:
+    """Write levels of detail as 3D Tiles 1.1, exactly like the command `g2ard lod --format 3dtiles`.
+
+    A tile's geometric error is 16 standard deviations of its median Gaussian, so that viewers refine it where
+    these exceed a pixel at the usual 16 pixels of screen-space error.
+
+    Args:
+        path: the output folder, for `tileset.json` and `LEVEL_N.glb`.
+        levels: the same scene at several levels, finest first, with equal offsets, in metres.
+        up: (3,) direction away from the ground; None means z for map coordinates, otherwise an estimate.
+        place: where the scene's `offset` lies on the globe, or the name of the map system of its coordinates,
+            such as "EPSG:32635". None leaves it at the tileset's origin, z up.
+        cut: splitting rule of the tree, and the most Gaussians of a tile; None means `Cut()`.
+        overwrite: replace files in the folder, and remove files of its previous `tileset.json`.
+        work: folder for temporary files, which saves memory.
+        progress: called for files written.
+        say: called with the place, and with an estimated up direction.
+
+    Returns:
+        Bytes written.
+
+    Raises:
+        InputError: no levels, a level that is empty or not finite, different offsets, or an unknown map
+            system.
+        OutputError: the folder exists and may not be replaced, or cannot be written.
+    """
+    if isinstance(place, str):
+        place = Georeference.of_map(map_system(place), levels[0].offset)
+        say(f"longitude {place.longitude:.6f}, latitude {place.latitude:.6f}, heading {place.heading:.3f}")
+    return write_tileset(
+        path,
+        levels,
+        up=tileset_up(levels, None, say) if up is None else up,
+        place=place,
+        cut=cut,
+        overwrite=overwrite,
+        work=work,
+        progress=progress,
+    )
+
+
+def tileset_up(
+    levels: Sequence[Level], up: Sequence[float] | None = None, say: Say = unsaid
+) -> NDArray[np.float64]:
     """Return the (3,) up direction for 3D Tiles: `up`, z in map coordinates, or an estimate."""
     coarse = levels[-1]
     if up is None and coarse.offset.any():
-        return np.array([0.0, 0, 1])
-    rows = np.array(evenly_spaced(len(coarse), _ROWS, floor=True))
-    return up_of(coarse.take(rows), up)
+        axis = np.array([0.0, 0, 1])
+    else:
+        rows = np.linspace(0, len(coarse) - 1, min(len(coarse), _ROWS)).astype(np.int64)
+        axis = up_of(coarse.take(rows), up)
+    rounded = ", ".join(f"{round(value, 3) + 0.0:g}" for value in axis)
+    say(f"up is {rounded}" + ("" if up else "; --up X,Y,Z changes it"))
+    return axis
 
 
 def level_size(cameras: Cameras, ratio: float) -> int:

@@ -1,30 +1,217 @@
-"""Inputs of registration: photos with intrinsics, starting poses, and reference poses."""
+"""`g2ard.register`: photos with intrinsics, starting poses and reference poses, then the stage."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
-from typing import TypeVar
+from typing import Any, Literal, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from g2ard.config.choices import Alpha
-from g2ard.errors import InputError
+from g2ard.config.choices import BLACK, Alpha, Colour, Keep, RenderModel
+from g2ard.config.paths import changed, full_paths
+from g2ard.errors import InputError, require
 from g2ard.io import ace, read_view_set
 from g2ard.io.detect import file_format
 from g2ard.io.paths import is_photo
 from g2ard.io.photos import has_alpha, photo_size
+from g2ard.jobs.inputs import load_scene
+from g2ard.jobs.view_checks import propose_background
+from g2ard.pipeline.presets import GS_CPR
 from g2ard.progress import Progress, Say, silent, unsaid
 from g2ard.scene.cameras import Camera, Cameras
 from g2ard.scene.splats import Splats
+from g2ard.stages.register import RegisterConfig, Registered
+from g2ard.stages.register import register as find_poses
 
-Poses = dict[str, NDArray[np.float64]]
+Poses = Mapping[str, ArrayLike]
 Found = TypeVar("Found")
 
 _ROWS = 200_000
 """Gaussians that poses are planned on."""
+
+
+@dataclass(frozen=True, eq=False)
+class RegisterJob:
+    """A prepared registration: inputs are read and everything is decided. The fields are those of
+    `g2ard.stages.register.register`."""
+
+    scene: Splats
+    photos: Cameras
+    starts: dict[str, NDArray[np.float64]]
+    pool: Cameras | None
+    truth: dict[str, NDArray[np.float64]]
+    config: RegisterConfig
+    keep: Keep
+    background: Colour
+    progress: Progress = silent
+
+    def run(self) -> Registered:
+        """Estimate the poses."""
+        return find_poses(
+            self.scene,
+            self.photos,
+            starts=self.starts,
+            pool=self.pool,
+            truth=self.truth,
+            config=self.config,
+            keep=self.keep,
+            background=self.background,
+            progress=self.progress,
+        )
+
+
+def register(
+    scene: Splats | str | Path,
+    photos: Cameras | str | Path,
+    *,
+    poses: Poses | str | Path | None = None,
+    pool: Cameras | str | Path | int | None = None,
+    truth: Poses | str | Path | None = None,
+    config: RegisterConfig | None = None,
+    settings: Mapping[str, Any] | None = None,
+    keep: Keep = "registered",
+    protocol: Literal["gs-cpr"] | None = None,
+    split: str = "all",
+    intrinsics: str | Path | None = None,
+    focal: float | None = None,
+    alpha: Alpha = "composite",
+    background: Colour | None = None,
+    render_model: RenderModel | None = None,
+    seed: int = 0,
+    progress: Progress = silent,
+    say: Say = unsaid,
+) -> Registered:
+    """Estimate camera poses of photos against a scene, exactly like the command `g2ard register`.
+
+    A photo starts from its pose in `poses`, or from the most similar view of `pool`. Features matched with a
+    render there give a new pose by PnP, which is refined; with too few matches, the photo is aligned directly
+    with renders, coarse to fine. The result's likeness to the photo decides its status: registered, uncertain
+    or refused. See `g2ard.stages.register.register`.
+
+    Args:
+        scene: the scene, or its path; poses are in world coordinates.
+        photos: views with photos, or their path, or a folder of photos.
+        poses: name → (4, 4) camera_from_world, or a file of poses: views in any format, or ACE's text. None
+            starts from the photos' own poses, unless there is a pool.
+        pool: starting views for photos that are not in `poses`: cameras, their path, or a number of views to
+            generate.
+        truth: true poses to score with, given like `poses`; not used otherwise.
+        config: options of registration; None means the defaults.
+        settings: values of `config` by path, such as {"register.passes": 1}.
+        keep: poses to keep: "registered", "uncertain" (both), or "all", which falls back to the start.
+        protocol: "gs-cpr" sets one pass of matches, no refinement, no fallback, and keeps all photos.
+        split: split of the views in `photos`.
+        intrinsics: for a folder of photos: views with the intrinsics of each photo by name, or the same for
+            all.
+        focal: for a folder of photos: focal length, pixels.
+        alpha: "mask" ignores transparent pixels instead of showing them over the background.
+        background: RGB in [0, 1] behind the scene; None means black.
+        render_model: overrides what the scene's file says.
+        seed: seed of a generated pool.
+        progress: called after every photo.
+        say: called with log messages.
+
+    Returns:
+        The kept cameras, and a report on all photos.
+
+    Raises:
+        InputError: no photos, no starting pose or pool, an invalid pose or setting, or an unreadable scene.
+        MissingDependencyError: a matcher is requested but the extra `register` is not installed.
+
+    >>> from g2ard.scene.cameras import Camera
+    >>> dot = Splats.create([[0, 0, 0]], scales=[[0.1] * 3], logit_opacities=[9])
+    >>> view = Cameras.of([Camera.facing([0, -2, 0], [0, 0, 0], name="a.png")])
+    >>> report = register(dot, view).report
+    >>> report.photos[0].status, report.photos[0].reason
+    ('refused', 'view 0 (a.png) has no photo; pass views with photos')
+    """
+    return prepare(
+        scene,
+        photos,
+        poses=poses,
+        pool=pool,
+        truth=truth,
+        config=config,
+        settings=settings,
+        keep=keep,
+        protocol=protocol,
+        split=split,
+        intrinsics=intrinsics,
+        focal=focal,
+        alpha=alpha,
+        background=background,
+        render_model=render_model,
+        seed=seed,
+        progress=progress,
+        say=say,
+    ).run()
+
+
+def prepare(
+    scene: Splats | str | Path,
+    photos: Cameras | str | Path,
+    *,
+    poses: Poses | str | Path | None = None,
+    pool: Cameras | str | Path | int | None = None,
+    truth: Poses | str | Path | None = None,
+    config: RegisterConfig | None = None,
+    settings: Mapping[str, Any] | None = None,
+    keep: Keep = "registered",
+    protocol: Literal["gs-cpr"] | None = None,
+    split: str = "all",
+    intrinsics: str | Path | None = None,
+    focal: float | None = None,
+    alpha: Alpha = "composite",
+    background: Colour | None = None,
+    render_model: RenderModel | None = None,
+    seed: int = 0,
+    progress: Progress = silent,
+    say: Say = unsaid,
+) -> RegisterJob:
+    """Read the inputs of `register`, whose arguments these are, and decide everything."""
+    config, keep = configured(config or RegisterConfig(), settings or {}, protocol, keep)
+    taken, posed = photos, True
+    if not isinstance(taken, Cameras):
+        path = Path(taken)
+        posed = intrinsics is None and focal is None
+        lens = None if intrinsics is None else Path(intrinsics)
+        taken = photos_of(path, split=split, intrinsics=lens, focal=focal, alpha=alpha, say=say)
+    if poses is None and pool is None and not posed:
+        raise InputError("photos have no initial pose", path=path, hint="give {poses} or {pool}")
+    if poses is None:
+        poses = dict(zip(taken.names, taken.viewmats, strict=True)) if pool is None else {}
+    starts, true = (_named(given, taken.names) for given in (poses, truth or {}))
+    splats = scene if isinstance(scene, Splats) else load_scene(scene, say, render_model)
+    propose_background(taken, background or BLACK, background is not None, say)
+    places = pool if pool is None or isinstance(pool, Cameras) else pool_of(splats, pool, seed, progress, say)
+    return RegisterJob(splats, taken, starts, places, true, config, keep, background or BLACK, progress)
+
+
+def configured(
+    config: RegisterConfig, settings: Mapping[str, Any], protocol: str | None, keep: Keep
+) -> tuple[RegisterConfig, Keep]:
+    """Return the options with the settings and those of a protocol, which they must not contradict."""
+    settings = full_paths(settings, config)
+    if protocol is None:
+        return changed(config, settings), keep
+    require("protocol", repr(protocol), protocol == "gs-cpr", "gs-cpr")
+    for name in ("passes", "refine"):
+        fixed = GS_CPR[f"register.{name}"]
+        given = settings.get(f"register.{name}", fixed)
+        require(name, given, given == fixed, f"{fixed} with gs-cpr")
+    matcher = settings.get("register.matcher")
+    require("matcher", matcher, matcher != "direct", "matched features with gs-cpr")
+    require("keep", keep, keep != "uncertain", "all with gs-cpr")
+    return changed(config, GS_CPR | settings), "all"
+
+
+def _named(given: Poses | str | Path, names: Sequence[str]) -> dict[str, NDArray[np.float64]]:
+    if isinstance(given, str | Path):
+        return poses_for(Path(given), names)
+    return {name: np.asarray(pose, np.float64) for name, pose in given.items()}
 
 
 def photos_of(
@@ -162,7 +349,7 @@ def _check_aspects(files: list[Path], sizes: list[tuple[int, int]], views: list[
         )
 
 
-def read_poses(path: Path) -> Poses:
+def read_poses(path: Path) -> dict[str, NDArray[np.float64]]:
     """Read name → (4, 4) camera_from_world from views in any format, or from ACE's text (`g2ard.io.ace`)."""
     if path.suffix.lower() == ".txt" and path.is_file():
         return ace.read(path)
@@ -170,7 +357,7 @@ def read_poses(path: Path) -> Poses:
     return dict(zip(cameras.names, cameras.viewmats, strict=True))
 
 
-def poses_for(path: Path, names: Sequence[str]) -> Poses:
+def poses_for(path: Path, names: Sequence[str]) -> dict[str, NDArray[np.float64]]:
     """Read the poses of the named photos, see `read_poses` and `matched`."""
     found = matched(read_poses(path), names)
     if not found:
@@ -196,13 +383,15 @@ def matched(found: Mapping[str, Found], names: Sequence[str]) -> dict[str, Found
     return out
 
 
-def pool_of(scene: Splats, pool: str, seed: int, progress: Progress = silent, say: Say = unsaid) -> Cameras:
+def pool_of(
+    scene: Splats, pool: str | Path | int, seed: int, progress: Progress = silent, say: Say = unsaid
+) -> Cameras:
     """Return poses from a file of views, or plan as many as a number says; `say` receives their kind."""
-    if not pool.strip().isdigit():
-        return read_view_set(Path(pool), unpictured=True).cameras
+    if not str(pool).strip().isdigit():
+        return read_view_set(Path(str(pool)), unpictured=True).cameras
     from g2ard.poses import plan_pool
 
-    planned = plan_pool(scene, int(pool), seed=seed, rows=_ROWS, progress=progress)
+    planned = plan_pool(scene, int(str(pool)), seed=seed, rows=_ROWS, progress=progress)
     say(
         f"pool: {len(planned.cameras)} poses, {planned.kind} ({planned.why}); if the photos were taken "
         "differently, generate similar poses with `g2ard poses --kind` and pass the file to --pool"

@@ -132,28 +132,8 @@ def save_tileset(
     work: Path | None = None,
     progress: Progress = silent,
 ) -> int:
-    """Write levels of detail as 3D Tiles 1.1: `tileset.json` and `LEVEL_N.glb`.
-
-    A tile's geometric error is 16 standard deviations of its median Gaussian, so that viewers refine it where
-    these exceed a pixel at the usual 16 pixels of screen-space error.
-
-    Args:
-        path: the output folder.
-        levels: the same scene at several levels, finest first, with equal offsets, in metres.
-        up: (3,) direction away from the ground.
-        place: where the scene's `offset` lies on the globe; None leaves it at the tileset's origin, z up.
-        cut: splitting rule of the tree, and the most Gaussians of a tile; None means `Cut()`.
-        overwrite: replace files in the folder, and remove files of its previous `tileset.json`.
-        work: folder for temporary files, which saves memory.
-        progress: called for files written.
-
-    Returns:
-        Bytes written.
-
-    Raises:
-        InputError: no levels, a level that is empty or not finite, or different offsets.
-        OutputError: see `atomic_folder`.
-    """
+    """Write `tileset.json` and `LEVEL_N.glb`; see `g2ard.jobs.levels.save_tileset`, with `up` and `place`
+    decided."""
     path, rule = Path(path), cut or Cut()
     tree = cut_tree(levels, rule, work)
     tiles = _Tiles(levels, rule.most, path)

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from g2ard.jobs.level_page import write_level_page
-from g2ard.jobs.levels import lod
-from g2ard.levels import Cut, Georeference, save_levels, save_tileset
+from g2ard.jobs.levels import lod, save_tileset
+from g2ard.levels import Cut, Georeference, save_levels
 from g2ard.rendering.metrics import psnr
 from g2ard.rendering.renderer import Renderer
 from g2ard.scene.cameras import Camera, Cameras

@@ -9,7 +9,8 @@ import pytest
 
 from g2ard.errors import InputError
 from g2ard.io import read_splats, write_splats
-from g2ard.levels import Cut, Georeference, save_tileset
+from g2ard.jobs.levels import lod, save_tileset
+from g2ard.levels import Cut, Georeference
 from g2ard.levels.tileset import map_system
 from g2ard.scene.splats import Splats
 from helpers.commands import CommandLine, refused, succeeds
@@ -153,3 +154,13 @@ def test_the_command_writes_3d_tiles(tmp_path: Path, command_line: CommandLine) 
     message = refused(command_line, tmp_path, "lod", "a.ply", "-o", "b", "--georeference", "0,0,0")
     assert "--format 3dtiles" in message
     assert "latitude" in refused(command_line, tmp_path, *words, "c", "--georeference", "0,99,0")
+
+
+def test_python_decides_up_and_place_as_the_command_does(tmp_path: Path, command_line: CommandLine) -> None:
+    write_splats(tmp_path / "ball.ply", checkered_ball(400))
+    ask = ("-r", "1,4", "--merge-only", "--size", 48, "--format", "3dtiles", "--georeference", "EPSG:32635")
+    succeeds(command_line, tmp_path, "lod", "ball.ply", *ask, "-o", "globe")
+    levels = lod(tmp_path / "ball.ply", ratios=(1, 4), recover=False, size=48).splats
+    save_tileset(tmp_path / "python", levels, place="EPSG:32635", cut=Cut(512 * 1024, 16.0, 8 * 1024))
+    for file in (tmp_path / "python").iterdir():
+        assert (tmp_path / "globe" / file.name).read_bytes() == file.read_bytes(), file.name

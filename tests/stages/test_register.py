@@ -169,10 +169,14 @@ def test_the_command_writes_and_scores_views(site: Path, command_line: CommandLi
         ("--photos views.json --focal 100", 1, "these views state their intrinsics"),
         ("--photos views.json --metres-per-unit 2", 2, "goes with --truth"),
         ("--photos views.json --keep some", 2, "keep"),
-        ("--photos views.json --protocol gs-cpr --passes 2", 2, "gs-cpr sets --passes"),
+        ("--photos views.json --protocol gs-cpr --passes 2", 2, "--passes: expected 1 with gs-cpr, got 2"),
         ("--photos views.json --report page.txt", 1, "ends in .html"),
         ("--photos empty --focal 128", 1, "neither photos nor views in this folder"),
-        ("--photos views.json --protocol gs-cpr --matcher direct", 2, "gs-cpr sets --matcher"),
+        (
+            "--photos views.json --protocol gs-cpr --matcher direct",
+            2,
+            "--matcher: expected matched features",
+        ),
         ("--photos views.json --report scene.ply -w", 2, "is also an input or output"),
         ("--photos views.json --pool absent.json", 1, "absent.json"),
         ("--photos views.json --poses away.txt", 1, "none of 4 photos was registered"),
@@ -267,3 +271,26 @@ def test_broken_photos_are_refused_rows(site: Path, command_line: CommandLine, t
         assert "none of 1 photo was registered; view_000.png" in err
         assert json.loads(out)["photos"][0]["status"] == "refused"
         assert (tmp_path / "page.html").is_file()
+
+
+def test_python_registers_as_the_command_does(site: Path, command_line: CommandLine, tmp_path: Path) -> None:
+    ask = (
+        "--photos",
+        site / "views.json",
+        "--poses",
+        site / "coarse.txt",
+        "--size",
+        96,
+        "--matcher",
+        "direct",
+    )
+    out = succeeds(
+        command_line, tmp_path, "register", site / "scene.ply", *ask, "-o", "a.json", "--json", "-"
+    )
+    settings = {"size": 96, "matcher": "direct"}
+    found = g2ard.register(
+        site / "scene.ply", site / "views.json", poses=site / "coarse.txt", settings=settings
+    )
+    poses = [row["camera_from_world"] for row in json.loads(out.out)["photos"]]
+    assert poses == [row.as_dict()["camera_from_world"] for row in found.report.photos]
+    np.testing.assert_array_equal(found.cameras.viewmats, read_views(tmp_path / "a.json").viewmats)

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from g2ard.jobs.levels import Levels
     from g2ard.jobs.tiled import TiledLevels
     from g2ard.jobs.tiling import Tiling
-    from g2ard.levels import Cut
+    from g2ard.levels import Cut, Georeference
     from g2ard.levels.tree import Level
     from g2ard.scene.splats import Splats
 
@@ -117,18 +117,14 @@ def lod(
     Scenes larger than memory and folders of tiles are processed tile by tile.
     """
     from g2ard.cli.resume import check_stopped, is_finished, stoppable
-    from g2ard.io import kind as kind_of
     from g2ard.io.atomic import check_output
-    from g2ard.jobs.levels import check_ratios
+    from g2ard.jobs.levels import check_ratios, check_trained
     from g2ard.jobs.levels import lod as levels_of
     from g2ard.jobs.memory_limit import LEVELS_TIMES, RECOVERY_TIMES, check_whole_memory
     from g2ard.jobs.tiling import is_tiled
     from g2ard.levels import Cut
 
-    if kind_of(scene) == "points":
-        raise typer.BadParameter(
-            "a point cloud cannot render training images; distil it first, then run `lod` on the result"
-        )
+    check_trained(scene)
     with run.usage():
         check_ratios(ratios)
         rule = Cut(most * 1024, extent, least * 1024)
@@ -175,7 +171,6 @@ def lod(
             say=run.say,
         )
         written = writer.save(levels.splats, sky=levels.sky)
-        run.kept.append(f"{output} is written")
     _tell(run, output, levels, written)
 
 
@@ -218,7 +213,7 @@ class _Writer:
 
     Args:
         kind: "sog" or "3dtiles".
-        spot: place on the globe, or the map system in which the scene's offset is the place.
+        spot: place on the globe, or the name of the map system in which the scene's offset is the place.
     """
 
     run: Run
@@ -226,7 +221,7 @@ class _Writer:
     output: Path
     kind: Literal["sog", "3dtiles"]
     cut: Cut
-    spot: Any
+    spot: Georeference | str | None
     up: Sequence[float] | None
     views: Any
     background: Colour
@@ -238,25 +233,20 @@ class _Writer:
 
     def save(self, levels: Sequence[Level], work: Path | None = None, sky: Splats | None = None) -> int:
         """Write the levels and a page that shows them, and return their bytes."""
-        from g2ard.jobs.levels import tileset_up
-        from g2ard.levels import Georeference, save_levels, save_tileset
+        from g2ard.jobs.levels import save_tileset, tileset_up
+        from g2ard.levels import save_levels
 
-        run, spot = self.run, self.spot
+        run = self.run
         common: dict[str, Any] = {"cut": self.cut, "overwrite": run.overwrite, "work": work}
         common["progress"] = run.progress
         if self.kind == "sog":
-            written = save_levels(self.output, levels, environment=sky, **common)
-            return written + self._page(levels, self.up)
-        if spot is not None and not isinstance(spot, Georeference):
-            spot = Georeference.of_map(spot, levels[0].offset)
-            run.say(
-                f"longitude {spot.longitude:.6f}, latitude {spot.latitude:.6f}, heading {spot.heading:.3f}"
-            )
-        axis = tileset_up(levels, self.up)
-        rounded = ", ".join(f"{round(value, 3) + 0.0:g}" for value in axis)
-        run.say(f"up is {rounded}" + ("" if self.up else "; --up X,Y,Z changes it"))
-        written = save_tileset(self.output, levels, up=axis, place=spot, **common)
-        return written + self._page(levels, axis.tolist())
+            axis, written = self.up, save_levels(self.output, levels, environment=sky, **common)
+        else:
+            axis = tileset_up(levels, self.up, run.say).tolist()
+            written = save_tileset(self.output, levels, up=axis, place=self.spot, say=run.say, **common)
+        run.kept.append(f"{self.output} is written")
+        with run.finishing("the page"):
+            return written + self._page(levels, axis)
 
     def _page(self, levels: Sequence[Level], up: Sequence[float] | None) -> int:
         from g2ard.jobs.level_page import write_level_page
@@ -277,13 +267,14 @@ class _Writer:
         return written
 
 
-def _georeference(text: str) -> Any:
-    """Return the place, or the map system in which the scene's offset is the place."""
+def _georeference(text: str) -> Georeference | str:
+    """Return the place, or the name of the map system in which the scene's offset is the place."""
     from g2ard.levels import Georeference
     from g2ard.levels.tileset import map_system
 
     if text[:1].isalpha():
-        return map_system(text)
+        map_system(text)  # known?
+        return text
     return Georeference(*opt.numbers("--georeference", text, 4 if text.count(",") == 3 else 3))
 
 

@@ -9,18 +9,13 @@ import typer
 
 from g2ard.cli import options as opt
 from g2ard.cli.frame import Run, command
-from g2ard.config.choices import BLACK, Keep, Refinement
-from g2ard.config.paths import changed, listed
+from g2ard.config.choices import Keep, Refinement
+from g2ard.config.paths import listed
 from g2ard.errors import InputError
 from g2ard.io import check_views_output
-from g2ard.pipeline.presets import GS_CPR
 from g2ard.progress import plural
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
-    from g2ard.scene.cameras import Cameras
     from g2ard.stages.register.report import Accuracy, Summary
 
 
@@ -115,21 +110,16 @@ def register(
 
     Each photo is registered, uncertain or refused; OUT gets the registered ones as views.
     """
-    from g2ard.jobs.register import photos_of, pool_of, poses_for
-    from g2ard.jobs.view_checks import propose_background
+    from g2ard.jobs.register import configured, prepare
     from g2ard.report.registered import registration_report
     from g2ard.stages.register import RegisterConfig
-    from g2ard.stages.register import register as find
     from g2ard.stages.register.report import summarize
     from g2ard.viewer import check_page_output
 
-    names = ("size", "matcher", "refine", "passes", "accept")
-    settings = run.settings(RegisterConfig(), *names)
-    if protocol == "gs-cpr":
-        _refuse_contradictions(passes, refine, keep, matcher)
-        settings, keep = GS_CPR | settings, "all"
-        run.config |= {"keep": keep}
-    config = changed(RegisterConfig(), settings)
+    settings = run.settings(RegisterConfig(), "size", "matcher", "refine", "passes", "accept")
+    with run.usage():
+        config, keep = configured(RegisterConfig(), settings, protocol, keep)
+    run.config |= {"keep": keep}
     if metres_per_unit is not None and truth is None:
         raise typer.BadParameter("--metres-per-unit goes with --truth")
     if intrinsics is not None and focal is not None:
@@ -138,28 +128,27 @@ def register(
     if report is not None:
         run.check_extra("--report", report)
         check_page_output(report, run.overwrite)
-    taken = photos_of(photos, split=split, intrinsics=intrinsics, focal=focal, alpha=alpha, say=run.say)
-    if poses is None and pool is None and photos.is_dir() and (intrinsics is not None or focal is not None):
-        raise InputError("photos have no initial pose; give --poses or --pool", path=photos)
-    starts = _starts(poses, pool, taken)
-    true = {} if truth is None else poses_for(truth, taken.names)
-    splats, chosen = run.load(scene), opt.background_of(run, background, scene)
-    colour = chosen or BLACK
-    propose_background(taken, colour, chosen is not None, run.say)
-    places = pool_of(splats, pool, run.seed, run.progress, run.say) if pool is not None else None
-    found = find(
-        splats,
-        taken,
-        starts=starts,
-        pool=places,
-        truth=true,
+    job = prepare(
+        scene,
+        photos,
+        poses=poses,
+        pool=pool,
+        truth=truth,
         config=config,
         keep=keep,
-        background=colour,
+        split=split,
+        intrinsics=intrinsics,
+        focal=focal,
+        alpha=alpha,
+        background=opt.background_of(run, background, scene),
+        render_model=run.render_model,
+        seed=run.seed,
         progress=run.progress,
+        say=run.say,
     )
+    found = job.run()
     rows = found.report.photos
-    summary = summarize(rows, keep=keep, true=len(true), metres_per_unit=metres_per_unit)
+    summary = summarize(rows, keep=keep, true=len(job.truth), metres_per_unit=metres_per_unit)
     lines = _told(summary)
     for line in lines:
         run.say(line)
@@ -168,7 +157,9 @@ def register(
     if report is not None:
         title = f"Photos in {scene.name}"
         with run.finishing("--report"):
-            registration_report(report, title, splats, taken, found, starts, config.size, lines, colour)
+            registration_report(
+                report, title, job.scene, job.photos, found, job.starts, config.size, lines, job.background
+            )
     written = str(output) if len(found.cameras) else None
     result = {**found.report.as_dict(), "summary": summary.as_dict(), "output": written}
     run.result({**result, "settings": listed(config)})
@@ -176,29 +167,6 @@ def register(
         first = next(row for row in rows if row.status != "registered")
         raise InputError(f"none of {plural(len(rows), 'photo')} was registered; {first.name}: {first.reason}")
     run.say(f"{output}: {len(found.cameras)} of {plural(len(rows), 'photo')}")
-
-
-def _starts(poses: Path | None, pool: str | None, photos: Cameras) -> dict[str, NDArray[np.float64]]:
-    """Return the initial poses by name: those of --poses, or without --pool the photos' own."""
-    from g2ard.jobs.register import poses_for
-
-    if poses is not None:
-        return poses_for(poses, photos.names)
-    return dict(zip(photos.names, photos.viewmats, strict=True)) if pool is None else {}
-
-
-def _refuse_contradictions(
-    passes: int | None, refine: Refinement | None, keep: Keep, matcher: str | None
-) -> None:
-    """Reject options that contradict --protocol gs-cpr."""
-    contradicts = {
-        "--passes": passes not in (None, 1),
-        "--refine": refine not in (None, "none"),
-        "--keep": keep not in ("registered", "all"),
-        "--matcher": matcher == "direct",
-    }
-    if found := next((name for name, given in contradicts.items() if given), None):
-        raise typer.BadParameter(f"--protocol gs-cpr sets {found}; remove {found}")
 
 
 def _told(summary: Summary) -> list[str]:
