@@ -113,6 +113,9 @@ class Ratios(tuple[float, ...]):
         return cls(parse_ratio(part) for part in text.split(","))
 
 
+BUDGET_FLAGS = "-n COUNT, -r RATIO, --fit, or --min-psnr and --min-ssim"
+"""Options of a budget, for messages."""
+
 BUDGETS: dict[str, tuple[Any, ...]] = {
     "count": (
         list[Counts] | None,

@@ -1,17 +1,33 @@
-"""Status on stderr: progress bars on a terminal, plain lines elsewhere, nothing with --quiet."""
+"""Status on stderr: one live line in a terminal, plain lines elsewhere, nothing with --quiet."""
 
 from __future__ import annotations
 
+import os
 import sys
+import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from rich.progress import Progress, TaskID
+    from rich.console import RenderableType
+    from rich.live import Live
+    from rich.table import Table
 
 _PLAIN_PERIOD = 10.0
-"""Seconds between progress lines of a stage when stderr is not a terminal."""
+"""Seconds between lines of a stage when stderr is not a terminal that can redraw its last line."""
+_DELAY, _TICK = 0.4, 0.125
+"""Seconds before the live line appears, and between its updates; short commands never import rich."""
+_QUIET = 1.0
+"""Seconds after the end of a stage until the live line says that the command is still working."""
+_KNOWN = 0.1
+"""Share of the expected work after which the time that the whole command still needs is shown."""
+_ECHO = 5
+"""Characters left free at the right for ^C, which terminals echo; a line that wraps cannot be removed."""
+_BAR = 12, 40
+"""Fewest and most characters of a bar."""
 
 
 def duration(seconds: float) -> str:
@@ -27,33 +43,128 @@ def duration(seconds: float) -> str:
     return f"{int(seconds // 3600)} h {int(seconds % 3600 // 60):02d} min"
 
 
+def _clock(seconds: float) -> str:
+    """Format a duration as on a clock.
+
+    >>> _clock(75.2), _clock(4000)
+    ('1:15', '1:06:40')
+    """
+    minutes, rest = divmod(int(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
+
+
+@dataclass
+class _Stage:
+    """The current stage; `first` units were done when it began, as after --resume."""
+
+    name: str
+    began: float
+    first: int = 0
+    done: int = 0
+    total: int = 0
+    figures: list[str] = field(default_factory=list)
+    ended: float | None = None
+    printed: float = 0.0
+
+    @property
+    def share(self) -> float:
+        """Share of this call's units that are done; 0 if their number is unknown."""
+        return (self.done - self.first) / (self.total - self.first) if self.total > self.first else 0.0
+
+    def left(self, now: float) -> float | None:
+        """Return the estimated seconds to the end, or None if they are unknown."""
+        elapsed, share = now - self.began, self.share
+        return elapsed / share * (1 - share) if share > 0 and elapsed >= 1 else None
+
+
+class _Plan:
+    """The stages that a command expects, in order, with relative times; those that end set the scale.
+
+    >>> plan = _Plan([("targets", 2.0), ("simplify", 1.0), ("recover", 6.0), ("score", 2.0)], 0.0)
+    >>> plan.reach("targets"), plan.reach("recover")  # "simplify" was not needed
+    (None, None)
+    >>> plan.left("recover", 10.0, 0.5, 6.0)  # 16 s for 8 units: 6 s for the rest of recovery, 4 s to score
+    10.0
+    """
+
+    def __init__(self, stages: Sequence[tuple[str, float]], now: float) -> None:
+        self._ahead, self._began = list(stages), now
+        self._current = ("", 0.0)
+        self._done = 0.0
+
+    def reach(self, stage: str) -> None:
+        """Note that a stage begins; those expected before it are over, or not needed."""
+        names = [name for name, _ in self._ahead]
+        if stage in names:
+            row = names.index(stage)
+            self._done += self._current[1]
+            self._current, self._ahead = self._ahead[row], self._ahead[row + 1 :]
+
+    def left(self, stage: str, now: float, share: float, left: float) -> float | None:
+        """Return the seconds that the command still needs, if known.
+
+        Args:
+            share: share of the stage that is done.
+            left: seconds that the stage still needs.
+        """
+        begun = self._done + self._current[1]
+        rest = sum(weight for _, weight in self._ahead)
+        if stage != self._current[0] or self._done + share * self._current[1] < _KNOWN * (begun + rest):
+            return None
+        return left + rest * (now - self._began + left) / begun if rest else None
+
+
 class Console:
-    """Progress callback (see `g2ard.progress`) that draws bars."""
+    """Progress callback (see `g2ard.progress`) and printer of messages.
 
-    def __init__(self, *, quiet: bool = False) -> None:
+    In a terminal, a thread redraws one line for the current stage, which disappears with it. Otherwise, the
+    thread prints a line every 10 s.
+    """
+
+    def __init__(self, *, quiet: bool = False, name: str = "") -> None:
         self.quiet = quiet
-        self._bars: Progress | None = None
-        self._tasks: dict[str, TaskID] = {}
-        self._plain: dict[str, tuple[float, float]] = {}  # stage → (began, last line)
-        self._done: dict[str, int] = {}
+        self._name = name
+        self._began = time.monotonic()
+        self._stage: _Stage | None = None
+        self._plan: _Plan | None = None
+        self._live: Live | None = None
+        self._drawn = sys.stderr.isatty() and os.environ.get("TERM") not in ("dumb", "unknown")
+        self._ended = threading.Event()
+        self._lock = threading.RLock()
 
-    def say(self, text: str) -> None:
-        if self.quiet:
+    def __enter__(self) -> Console:
+        if not self.quiet:
+            threading.Thread(target=self._keep_telling, daemon=True).start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, where: TracebackType | None
+    ) -> None:
+        self._ended.set()
+        self._clear()
+
+    def say(self, text: str, *, asked: bool = False) -> None:
+        """Print a line of status; with --quiet only what was asked for."""
+        if self.quiet and not asked:
             return
-        if self._bars is not None:
-            self._bars.console.print(text, markup=False, highlight=False)
-        else:
-            print(text, file=sys.stderr, flush=True)
+        with self._lock:
+            if self._stage is not None and not self._stage.total:
+                self._end_stage()  # its length was unknown; the message tells its result
+            if self._live is not None:
+                self._live.console.print(text, markup=False, highlight=False, soft_wrap=True)
+            else:
+                print(text, file=sys.stderr, flush=True)
 
     def error(self, text: str) -> None:
-        self.close()
-        print(f"g2ard: {text}", file=sys.stderr, flush=True)
+        with self._lock:
+            self._clear()
+            print(f"g2ard: {text}", file=sys.stderr, flush=True)
 
     def table(self, title: str, columns: list[str], rows: list[list[str]], *, stdout: bool = False) -> None:
         """Print a table; columns with a header are right-aligned, except the first."""
         if self.quiet:
             return
-        self.close()
         from rich.console import Console as Rich
         from rich.table import Table
 
@@ -63,73 +174,141 @@ class Console:
         for row in rows:
             table.add_row(*row)
         stream = sys.stdout if stdout else sys.stderr
-        Rich(file=stream, width=None if stream.isatty() else 120).print(table, markup=False, highlight=False)
+        with self._lock:
+            self._clear()
+            Rich(file=stream, width=None if stream.isatty() else 120).print(
+                table, markup=False, highlight=False
+            )
+
+    def print(self, text: str) -> None:
+        """Print to stdout, also with --quiet."""
+        with self._lock:
+            self._clear()
+            print(text, flush=True)
+
+    def expect(self, stages: Sequence[tuple[str, float]]) -> None:
+        """Announce the stages to come, in order, with relative times: the source of the command's ETA."""
+        self._plan = _Plan(stages, time.monotonic())
 
     def __call__(self, stage: str, done: int, total: int, info: Mapping[str, Any] | None = None) -> None:
-        """Show the progress of a stage, with the figures of `info`."""
+        """Show the progress of a stage, with the figures of `info`; a total of 0 is unknown."""
         if self.quiet:
             return
-        figures = "  ".join(f"{k} {v}" for k, v in (info or {}).items())
-        if done < self._done.get(stage, 0):  # the next part of a job runs this stage anew
-            self._plain.pop(stage, None)
-            if self._bars is not None and stage in self._tasks:
-                self._bars.reset(self._tasks[stage])
-        self._done[stage] = done
-        if sys.stderr.isatty():
-            self._draw(stage, done, total, figures)
-        else:
-            self._print(stage, done, total, figures)
+        with self._lock:
+            now, current = time.monotonic(), self._stage
+            if current is None or current.name != stage or done < current.done or current.ended:
+                self._end_stage()
+                current = self._stage = _Stage(stage, now, done if done < total else 0, printed=now)
+                if self._plan is not None:
+                    self._plan.reach(stage)
+            current.done, current.total = done, total
+            current.figures = [f"{name} {value}" for name, value in (info or {}).items()]
+            if total and done >= total:
+                self._end_stage()
 
-    def _draw(self, stage: str, done: int, total: int, figures: str) -> None:
-        if self._bars is None:
+    def _end_stage(self) -> None:
+        """Finish the current stage; without a terminal, print its last line unless it was short."""
+        stage = self._stage
+        if stage is not None and stage.ended is None:
+            stage.ended = time.monotonic()
+            long = stage.ended - stage.began >= (1 if stage.total > 1 else _PLAIN_PERIOD)
+            if long and not (self._drawn or self.quiet):
+                self._print(stage, stage.ended)
+
+    def _keep_telling(self) -> None:
+        """Draw the live line, or print lines, until the command ends."""
+        if self._ended.wait(_DELAY):
+            return
+        while True:
+            with self._lock:
+                if self._ended.is_set():
+                    return
+                self.tick()
+            if self._ended.wait(_TICK if self._drawn else 1.0):
+                return
+
+    def tick(self) -> None:
+        """Draw the live line, or print a line if there has been none about this stage for a while."""
+        if self._drawn:
+            self._draw()
+            return
+        stage, now = self._stage, time.monotonic()
+        if stage is not None and stage.ended is None and now - stage.printed >= _PLAIN_PERIOD:
+            stage.printed = now
+            self._print(stage, now)
+
+    def _print(self, stage: _Stage, now: float) -> None:
+        """Print a stage as one line."""
+        count = f"{stage.done}/{stage.total}" if stage.total > 1 else str(stage.done or "")
+        parts = [f"{stage.name}: {count}".rstrip(), duration(now - stage.began)]
+        if stage.ended is None and (left := stage.left(now)) is not None:
+            parts.append(f"ETA {duration(left)}")
+            if (whole := self._whole(stage, now, left)) is not None:
+                parts.append(f"all {duration(whole)}")
+        print("  ".join([*parts, *stage.figures]), file=sys.stderr, flush=True)
+
+    def _draw(self) -> None:
+        """Draw the live line."""
+        if self._live is None:
             from rich.console import Console as Rich
-            from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
-            from rich.table import Column
+            from rich.live import Live
 
-            def whole() -> Column:
-                return Column(min_width=len("0:00:00"))  # narrow windows cut the figures instead
-
-            self._bars = Progress(
-                TextColumn("{task.description:<12}"),
-                BarColumn(),
-                TextColumn("{task.fields[count]}"),
-                TimeElapsedColumn(table_column=whole()),
-                TextColumn("ETA"),
-                TimeRemainingColumn(table_column=whole()),
-                TextColumn("{task.fields[figures]}", table_column=Column(no_wrap=True)),
-                console=Rich(stderr=True),
+            screen = Rich(stderr=True)
+            self._live = Live(
+                console=screen,
+                get_renderable=lambda: self._line(screen.width - _ECHO),
+                auto_refresh=False,
+                transient=True,
+                redirect_stdout=False,
+                redirect_stderr=False,
             )
-            self._bars.start()
-        count = f"{done}/{total}" if total else f"{done}"  # a format of the column would meet a total of None
-        if stage not in self._tasks:
-            self._tasks[stage] = self._bars.add_task(stage, total=total or None, figures="", count="")
-        task = self._tasks[stage]
-        self._bars.update(task, completed=done, total=total or None, figures=figures, count=count)
+            self._live.start()
+            screen.show_cursor(True)  # so that no end of the process can leave it hidden
+        self._live.refresh()
 
-    def _print(self, stage: str, done: int, total: int, figures: str) -> None:
-        now = time.monotonic()
-        began, last = self._plain.setdefault(stage, (now, now))
-        finished = bool(total) and done >= total
-        if now - last < _PLAIN_PERIOD and not finished:
-            return
-        if finished and now - began < 1.0:
-            del self._plain[stage]  # too short for a line
-            return
-        elapsed = now - began
-        parts = [f"{stage}: {done}/{total}" if total else f"{stage}: {done}", duration(elapsed)]
-        if total and 0 < done < total:
-            parts.append(f"ETA {duration(elapsed / done * (total - done))}")
-        if figures:
-            parts.append(figures)
-        print("  ".join(parts), file=sys.stderr, flush=True)
-        if finished:
-            del self._plain[stage]
-        else:
-            self._plain[stage] = (began, now)
+    def _whole(self, stage: _Stage, now: float, left: float) -> float | None:
+        """Return the seconds that the whole command still needs, if known."""
+        return None if self._plan is None else self._plan.left(stage.name, now, stage.share, left)
 
-    def close(self) -> None:
-        """End all bars."""
-        if self._bars is not None:
-            self._bars.stop()
-            self._bars = None
-            self._tasks.clear()
+    def _line(self, free: int) -> Table:
+        """Return the live line: what matters most of the current stage in as many characters as are free."""
+        from rich.progress_bar import ProgressBar
+        from rich.table import Table
+        from rich.text import Text
+
+        stage, now = self._stage, time.monotonic()
+        if stage is None or (stage.ended is not None and now - stage.ended > _QUIET):
+            stage = _Stage(f"{self._name}: working", self._began)
+        total = f"{stage.total:,}"
+        cells = [stage.name]
+        if stage.total > 1:
+            cells.append(f"{stage.done:,}".rjust(len(total)) + f"/{total}")
+        elif stage.done:
+            cells.append(f"{stage.done:,}")
+        if stage.ended is None and (left := stage.left(now)) is not None:
+            cells.append(f"ETA {_clock(left)}")
+            if (whole := self._whole(stage, now, left)) is not None:
+                cells.append(f"all {_clock(whole)}")
+        cells.append(_clock((stage.ended or now) - stage.began))
+        while len(cells) > 1 and len("  ".join(cells)) > free:
+            cells.pop()
+        free -= len("  ".join([*cells, ""]))
+        bar = _BAR[0] if free >= _BAR[0] else 0
+        for figure in stage.figures:
+            if len(figure) + 2 <= free - bar - 2:
+                cells.append(figure)
+                free -= len(figure) + 2
+        row: list[RenderableType] = [Text(cell, no_wrap=True, overflow="ellipsis") for cell in cells]
+        if bar:
+            width = min(free, _BAR[1])
+            row.insert(1, ProgressBar(stage.total or None, stage.done, width=width, pulse=stage.total < 2))
+        table = Table.grid(padding=(0, 2, 0, 0))
+        table.add_row(*row)
+        return table
+
+    def _clear(self) -> None:
+        """Remove the live line; the next update of a stage draws it again."""
+        with self._lock:
+            if self._live is not None:
+                self._live.stop()
+                self._live = None

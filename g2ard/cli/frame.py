@@ -122,7 +122,7 @@ class Run:
         self.device: str = common["device"]
         self.verbose: bool = common["verbose"]
         self.json: str | None = common["json"]
-        self.console = Console(quiet=common["quiet"])
+        self.console = Console(quiet=common["quiet"], name=name)
         self.render_model: RenderModel | None = common.get("render_model")
         self.only_checks = False  # end once the settings are checked
         self.noted = False  # whether a GPU failed
@@ -171,7 +171,8 @@ class Run:
 
     @contextmanager
     def finishing(self, what: str) -> Iterator[None]:
-        """Name `what` in the message if it fails; the scene is already written."""
+        """Begin a stage and name it in the message if it fails; the scene is already written."""
+        self.begin(what.removeprefix("--"))
         try:
             yield
         except Exception:
@@ -187,6 +188,10 @@ class Run:
         """Report progress, after GPU messages since the last call."""
         self.tell_notes()
         self.console(stage, done, total, info)
+
+    def begin(self, stage: str) -> None:
+        """Report that a stage of unknown length begins; the next stage or message ends it."""
+        self.progress(stage, 0, 0)
 
     def tell_notes(self) -> None:
         """Report GPU fallbacks since the last call, and warn once if the adapter is a software renderer."""
@@ -205,6 +210,11 @@ class Run:
         self.tell_notes()
         self.console.say(text)
 
+    def answer(self, text: str) -> None:
+        """Print a line that the user asked for to stderr, also with --quiet."""
+        self.tell_notes()
+        self.console.say(text, asked=True)
+
     def result(self, data: dict[str, Any]) -> None:
         """Write the result and the resolved options to --json."""
         if self.json is None:
@@ -212,7 +222,7 @@ class Run:
         with self.finishing("--json"):
             text = json.dumps({**data, **self._used(), "config": self.config}, indent=2, default=_plain)
             if self.json == "-":
-                print(text, flush=True)
+                self.console.print(text)
                 return
 
             with atomic_output(Path(self.json), overwrite=self.overwrite) as temporary:
@@ -237,12 +247,14 @@ class Run:
         """Read a scene with --render-model, and report its notes."""
         from g2ard.jobs.inputs import load_scene
 
+        self.begin("read")
         return load_scene(path, self.say, self.render_model)
 
     def write(
         self, path: Path, splats: Splats, *, overwrite: bool = False, compare: bool = False, **options: Any
     ) -> None:
         """Write a scene, and report what its format cannot hold and, with `compare`, a large loss."""
+        self.begin("write")
         write_splats(path, splats, overwrite=self.overwrite or overwrite, **options)
         self.kept.append(f"{path} is written")
         for note in lost_in(path, splats, **options):
@@ -425,7 +437,7 @@ def _execute(run: Run, fn: Callable[..., None], options: dict[str, Any], cuda: b
 
             _core.set_num_threads(run.threads)
             os.environ["RAYON_NUM_THREADS"] = str(run.threads)  # for child processes
-        with contextlib.closing(run.console), _device(run):
+        with run.console, _device(run):
             fn(run, **options)
     except KeyboardInterrupt:
         left = [run.unfinished, *run.kept] if run.unfinished else run.kept

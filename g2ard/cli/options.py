@@ -268,12 +268,13 @@ PaperOption = Annotated[
 ScheduleOption = Annotated[
     ScheduleName | None,
     typer.Option(
-        help="Recovery schedule: fast (300 steps), default (1,000), best (6,000) or paper (in rounds)."
+        help="Recovery schedule: fast, default or best (at least 300, 1,000 or 6,000 steps, more for photos "
+        "and rooms), or paper (in rounds)."
     ),
 ]
 StepsOption = Annotated[
     int | None,
-    typer.Option(min=1, help="Steps of the last recovery; by default the schedule's."),
+    typer.Option(min=1, help="Steps of the last recovery; by default as many as the schedule needs."),
 ]
 MethodOption = Annotated[Method | None, typer.Option(help="Simplification method.")]
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import typer
 
-from g2ard.cli.budget_options import BUDGETS
+from g2ard.cli.budget_options import BUDGET_FLAGS, BUDGETS
 from g2ard.cli.frame import Run
 from g2ard.jobs.budget import Budget
 
@@ -18,9 +18,7 @@ def budgets_of(run: Run) -> list[Budget]:
     counts, ratios, fit, min_psnr, min_ssim = (run.shared[name] for name in BUDGETS)
     quality = min_psnr is not None or min_ssim is not None
     if [bool(counts), bool(ratios), fit is not None, quality].count(True) != 1:
-        raise typer.BadParameter(
-            "give the budget as one of -n COUNT, -r RATIO, --fit, or --min-psnr and --min-ssim"
-        )
+        raise typer.BadParameter(f"give the budget as one of {BUDGET_FLAGS}")
     if fit is not None or quality:
         with run.usage():
             return [Budget(fit=fit, min_psnr=min_psnr, min_ssim=min_ssim)]

@@ -21,8 +21,12 @@ _FEW = 0.005
 """Share of the scene too small to report."""
 
 
-def write_table(run: Run, report: dict[str, Any]) -> None:
-    """Print the scores by kind of view, under counts, sizes and times."""
+def write_table(run: Run, report: dict[str, Any], larger: str = "") -> None:
+    """Print the scores by kind of view, under counts, sizes and times.
+
+    Args:
+        larger: why the result is larger than its source, if that is not said elsewhere.
+    """
     from g2ard.report.kinds import COLUMNS, KindScore, cells
 
     size = report["bytes"]
@@ -30,9 +34,10 @@ def write_table(run: Run, report: dict[str, Any]) -> None:
     times = ", ".join(f"{name} {value:.1f} s" for name, value in seconds.items())
     count = report["input_count"]
     before = plural(count, "point") if report["lifted"] else f"{count:,}"
+    why = f" ({larger})" if larger and size["output"] > size["input"] else ""
     run.say(
         f"{before} → {plural(report['output_count'], 'Gaussian')}, "
-        f"{size['input'] / 1e6:.2f} → {size['output'] / 1e6:.2f} MB as .ply; {times}"
+        f"{size['input'] / 1e6:.2f} → {size['output'] / 1e6:.2f} MB as .ply{why}; {times}"
     )
     title = f"held-out views against {report['against']}, simplified → recovered:"
     run.console.table(title, list(COLUMNS), cells(map(KindScore.of, report["kinds"])))
@@ -96,11 +101,15 @@ def say_weight(run: Run, source: Path, output: Path, splats: Splats, *, lifted: 
     if made < given:
         return
     sizes = f"{output}: {made / 1e6:.2f} MB, {what} {given / 1e6:.2f} MB"
+    run.say(f"{sizes}: {why_large(splats)}")
+
+
+def why_large(splats: Splats) -> str:
+    """Explain a scene that is larger than its source, or say what makes it smaller."""
     share = splats.shN.nbytes / splats.nbytes
-    hint = "packed formats are smaller than .ply"
-    if share:
-        hint = f"{share:.0%} of it is SH above degree 0 (--set recover.sh_degree=0 removes it)"
-    run.say(f"{sizes}: {hint}")
+    if not share:
+        return "packed formats are smaller than .ply"
+    return f"{share:.0%} of it is SH above degree 0; --set recover.sh_degree=0 removes it"
 
 
 def tell_quality(run: Run, aim: Aim, splats: Splats) -> None:

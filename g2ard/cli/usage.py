@@ -9,6 +9,7 @@ from typing import Any
 
 import typer
 
+from g2ard.cli.budget_options import BUDGET_FLAGS, BUDGETS
 from g2ard.errors import G2ardError
 
 _FLAGS = {"overwrite=True": "-w (--overwrite)", "engine": "--device cuda", "engine='fused'": "--device cpu"}
@@ -62,6 +63,8 @@ def usage_line(error: typer.TyperException) -> str:
     """Return the line for a usage error: typer's message, or a shorter one for an invalid value."""
     refused = getattr(error.__cause__, "errors", None)
     parameter: Any = getattr(error, "param", None)
+    if type(error).__name__ == "MissingParameter" and (missing := _missing(error)):
+        return f"missing {' and '.join(missing)}"
     if (long := _of_one_dash(error)) is not None:
         return f"{long[1:]}: long options need two dashes; write {long}"
     if isinstance(error, typer.BadParameter) and parameter is None:  # a check of several options at once
@@ -72,6 +75,22 @@ def usage_line(error: typer.TyperException) -> str:
     source = _config_of(error, parameter.name)
     expected = f"expected {_allowed(parameter)}, got {given!r}"
     return f"Invalid value for {parameter.get_error_hint()}: {expected}{source}"
+
+
+def _missing(error: Any) -> list[str]:
+    """List a missing option with the others that are missing too, and the budget."""
+    options = [p for p in error.ctx.command.params if p.param_type_name == "option"]
+    if error.param not in options:
+        return []
+    words = {part for word in sys.argv[1:] for part in (word.partition("=")[0], word[:2])}
+    typed = words | set(error.ctx.default_map or {})
+    found = [
+        f"{min(p.opts, key=len)} {p.metavar or p.name.upper()}"
+        for p in options
+        if p.required and not typed & {*p.opts, p.name}
+    ]
+    budgets = {word for p in options if p.name in BUDGETS for word in (*p.opts, p.name)}
+    return [*found, *([f"a budget ({BUDGET_FLAGS})"] if budgets and not budgets & typed else [])]
 
 
 def _of_one_dash(error: typer.TyperException) -> str | None:

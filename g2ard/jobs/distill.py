@@ -18,7 +18,7 @@ from g2ard.jobs.inputs import Views, clutter_seen, load_scene, say_regions
 from g2ard.jobs.job import DistillJob
 from g2ard.jobs.measured_budget import Aim, Reduction, aim_of
 from g2ard.jobs.photos import sparse_file, sparse_points, topped_up
-from g2ard.jobs.view_checks import propose_background, warn_of_photos
+from g2ard.jobs.view_checks import check_photos, propose_background
 from g2ard.jobs.views import views_of
 from g2ard.pipeline.distill import Distilled
 from g2ard.pipeline.run_views import RunViews
@@ -135,6 +135,8 @@ def prepare(
     """
     began = time.monotonic()
     recover = options.config.recover  # rejects invalid settings before anything is read
+    if not isinstance(scene, Splats):
+        progress("read", 0, 0)
     read = _read(scene, budgets, options, progress, say)
     prior, cleaned = read.prior, None
     if options.clean:
@@ -162,7 +164,7 @@ def prepare(
         given = options.named("recover.background") is not None
         propose_background(cameras, recover.background, given, say)
         if not read.lifted:
-            warn_of_photos(prior, cameras, recover.background, say)
+            check_photos(prior, cameras, recover.background, say, insisted=options.photos is True)
     say(_task(prior, aims, cameras, photos))
     say(f"regularisers: {preset_label}")
     config = options.configured(regularizers, default_degree)
@@ -215,7 +217,11 @@ def _regularizers(
     kind = options.named("recover.regularizers") or "auto"
     paper = options.named("recover.schedule") == "paper"
     if read.from_photos and kind == "auto" and not paper:
-        return FREE, "none (points found in photos are not a surface to hold to)", measure_prior(prior)
+        return (
+            FREE,
+            "none (points found in photos are rough guesses, which recovery may move freely)",
+            measure_prior(prior),
+        )
     if read.lifted and kind == "paper":
         kind = "paper-lift"
     return regularizers_for(kind, prior, photos, paper=paper)

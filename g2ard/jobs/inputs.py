@@ -209,7 +209,9 @@ def clutter_seen(
     pixels = int((cameras.widths.astype(int) * cameras.heights).sum())
     unoccluded = unoccluded_means(splats, cameras, progress)
     floating = find_floating(splats, cameras, progress) if set(kinds) & set(FLOATING) else None
-    found = find_clutter(splats, seen, unoccluded, pixels, kinds, floating=floating, strength=strength)
+    found = find_clutter(
+        splats, seen, unoccluded, pixels, kinds, floating=floating, strength=strength, progress=progress
+    )
     parts = [f"{count:,} {name}" for name, count in found.counts.items() if name in kinds]
     gone = len(splats) - int(found.keep.sum())
     light = f"{seen.weight[~found.keep].sum() / max(seen.weight.sum(), 1e-30):.1%} of the light"

@@ -17,8 +17,8 @@ from g2ard.rendering.targets import Targets, TeacherRenders
 from g2ard.scene.splats import Splats
 from g2ard.stages.evaluate import evaluate
 
-_LOSS = 1.0
-"""Loss that is worth a warning, dB."""
+_LOSS, _INVISIBLE = 1.0, 45.0
+"""Loss that is worth a warning, and the PSNR above which nobody sees it, dB."""
 _USUAL = 35.0
 """PSNR of a good scene, to which the difference between two scenes is related, dB."""
 _VIEWS, _SIZE, _ROWS = 4, (400, 300), 100_000
@@ -34,15 +34,17 @@ def score_file(path: Path, targets: Targets, background: Colour, progress: Progr
 
 
 def score_lines(packed: dict[str, Any], size: int, unpacked: float) -> list[str]:
-    """Return a packed file's size in bytes and score beside that of the unpacked scene, and a warning if the
-    loss is large.
+    """Return a packed file's size in bytes and score beside that of the unpacked scene, and a warning if its
+    loss is large and visible.
 
     >>> score_lines({"file": "scene.sog", "psnr": 37.86}, 1_310_000, 37.94)
     ['scene.sog: 1.3 MB, 37.9 dB in held-out views (37.9 as .ply)']
+    >>> len(score_lines({"file": "scene.sog", "psnr": 58.6}, 1_310_000, 62.6))
+    1
     """
     name, psnr = packed["file"], packed["psnr"]
     lines = [f"{name}: {size / 1e6:.1f} MB, {psnr:.1f} dB in held-out views ({unpacked:.1f} as .ply)"]
-    if unpacked - psnr > _LOSS:
+    if unpacked - psnr > _LOSS and psnr < _INVISIBLE:
         lines.append(f"warning: {name}: the format costs {unpacked - psnr:.1f} dB; {_better(name)}")
     return lines
 

@@ -26,6 +26,9 @@ _SEEING = 0.5
 """Share of cameras that must see the scene for found views to be used."""
 _LOOKED_AT, _SMALL = 15, 160
 """Number of photos compared with the scene, and their longer side in pixels."""
+_UNRELATED = 0.15
+"""Correlation below which the photos are of something else, or posed in other coordinates. Playbot and guitar
+with the photos of plush, caliterra and chair: −0.01 to 0.03 for five of the six pairs."""
 _DIFFERENT = 4 / 255
 """Difference of two background colours that matters."""
 _BLIND = 0.1
@@ -78,8 +81,10 @@ def check_sight(splats: Splats, cameras: Cameras, say: Say = unsaid) -> None:
     warn_of_sight(splats, cameras, say)
 
 
-def warn_of_photos(splats: Splats, cameras: Cameras, background: Colour, say: Say) -> None:
-    """Warn if the scene's renders look unlike its photos.
+def check_photos(
+    splats: Splats, cameras: Cameras, background: Colour, say: Say, *, insisted: bool = False
+) -> None:
+    """Reject photos that show nothing of the scene, unless `insisted`; warn if they look unlike it.
 
     The measure is the correlation of pixel brightness, as the median over a few small photos.
     """
@@ -90,9 +95,16 @@ def warn_of_photos(splats: Splats, cameras: Cameras, background: Colour, say: Sa
     photos = Photos(cameras.take(pictured[tried]).resized(_SMALL), background=background)
     views = compared(splats, photos, range(len(tried)), background)
     alike = [correlation(image, photo) for _, image, photo in views]
-    if alike and np.median(alike) < UNLIKE:
+    found = float(np.median(alike)) if alike else 1.0
+    if found < _UNRELATED and not insisted:
+        raise InputError(
+            f"the photos do not show the scene (correlation {found:.2f}): they probably show "
+            "another scene, or their poses use other coordinates",
+            hint="{views=made} needs no photos, {photos=True} uses these anyway",
+        )
+    if found < UNLIKE:
         say(
-            f"warning: the scene does not look like the photos (correlation {np.median(alike):.2f}); check "
+            f"warning: the scene does not look like the photos (correlation {found:.2f}); check "
             "the views with `g2ard render --views`, or replace them with --views made"
         )
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -165,6 +166,8 @@ class _Fit:
         while len(self.stretches) < len(lengths) and not self.converged:
             self._stretch(lengths[len(self.stretches)])
             self._save()
+        taken = sum(stretch["steps"] for stretch in self.stretches)
+        self.progress("adapt", taken, taken, {})
 
     def _stretch(self, steps: int) -> None:
         config = self.config
@@ -177,14 +180,18 @@ class _Fit:
             seed=config.seed + len(self.stretches),
         )
         within = self.work / "steps.npz" if self.work else None
-        found = recover(
-            self.splats, self.targets, how, checkpoint=within, progress=self.progress, stage="adapt"
-        )
-        before, after, old = found.report.psnr.before, found.report.psnr.after, self.splats
+        before = sum(stretch["steps"] for stretch in self.stretches)
+
+        def progress(stage: str, done: int, total: int, info: Mapping[str, Any] | None = None) -> None:
+            self.progress(stage, before + done, config.steps, info or {})
+
+        told = silent if self.progress is silent else progress
+        found = recover(self.splats, self.targets, how, checkpoint=within, progress=told, stage="adapt")
+        gain, old = found.report.psnr, self.splats
         self.splats = replace(found.splats, means=old.means, quats=old.quats, scales=old.scales)
-        self.stretches.append({"steps": steps, "psnr": after})
+        self.stretches.append({"steps": steps, "psnr": gain.after})
         self.seconds += found.report.seconds
-        self.converged = after - before < config.tolerance
+        self.converged = gain.after - gain.before < config.tolerance
 
     def _save(self) -> None:
         if self.work:

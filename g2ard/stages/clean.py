@@ -73,6 +73,7 @@ def find_clutter(
     *,
     floating: Floating | None = None,
     strength: float = 0.0,
+    progress: Progress = silent,
 ) -> Cleaning:
     """Find Gaussians to remove; one of several kinds gets the first in the order of `KINDS`.
 
@@ -84,6 +85,7 @@ def find_clutter(
         kinds: kinds to find.
         floating: from `find_floating`; None finds neither haze nor streaks.
         strength: 0 to 1: haze and streaks float in more than 1 − `strength` of the views.
+        progress: called before each kind.
 
     Raises:
         InputError: an unknown kind, or `seen` or `unoccluded` of another length.
@@ -104,10 +106,12 @@ def find_clutter(
         finders["haze"] = lambda rest: floating.middle > 1 - strength
         finders["streak"] = lambda rest: floating.ends > 1 - strength
     for number, name in enumerate(KINDS):
+        progress("clutter", number, len(KINDS))
         if name in kinds and name in finders:
             rest = (kind < 0) & ~hidden  # invisible Gaussians support nothing either
             found = finders[name](rest)
             kind[found & (kind < 0)] = number
+    progress("clutter", len(KINDS), len(KINDS))
     return Cleaning(kind)
 
 

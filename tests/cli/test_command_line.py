@@ -46,11 +46,13 @@ def test_config_files_are_utf_8(tmp_path: Path, mark: bytes) -> None:
 
 
 def test_progress_lines(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    clock = iter(range(100))
-    monkeypatch.setattr("g2ard.cli.console.time.monotonic", lambda: next(clock))
+    now = 0.0
+    monkeypatch.setattr("g2ard.cli.console.time.monotonic", lambda: now)
     console = Console()
     for done in range(1, 41):
+        now += 1
         console("recover", done, 40, {"loss": 0.5})
+        console.tick()
     console("short", 1, 1)
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == 4  # every 10 s, and the end

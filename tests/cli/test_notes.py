@@ -8,7 +8,7 @@ import pytest
 
 import g2ard
 from g2ard.io import write_views
-from helpers.commands import CommandLine, succeeds
+from helpers.commands import CommandLine, refused, succeeds
 from helpers.photos import BALL, cloud_of, photos_of
 from helpers.scenes import around, checkered_ball
 
@@ -18,7 +18,7 @@ def test_a_result_larger_than_its_input_is_noted(command_line: CommandLine, tmp_
     cloud_of(tmp_path / "scan.ply", BALL)
     ask = ("distill", "scan.ply", "--views", "photos", "-n", 1000, "--steps", 3)
     error = command_line(*ask, "-o", "run", cwd=tmp_path)[2]
-    assert "run/scene.ply: 0.24 MB, scan.ply has 0.03 MB: 76% of it is SH above degree 0 (" in error
+    assert "run/scene.ply: 0.24 MB, scan.ply has 0.03 MB: 76% of it is SH above degree 0; " in error
     g2ard.save(tmp_path / "ball.ply", BALL)
     assert "MB" not in command_line("simplify", "ball.ply", "-r", 2, "-o", "s.ply", cwd=tmp_path)[2]
 
@@ -92,6 +92,9 @@ def test_photos_of_another_world_are_noted(command_line: CommandLine, folder: Pa
     own = checkered_ball(1200)
     g2ard.save(folder / "own.ply", own)
     g2ard.save(folder / "other.ply", replace(own, means=6 * own.means, scales=6 * own.scales))
+    assert "the photos do not show the scene (correlation" in refused(
+        command_line, folder, "distill", "other.ply", *ask, "-o", "run", status=1
+    )
     for scene, warned in (("other.ply", True), ("own.ply", False)):
-        error = succeeds(command_line, folder, "distill", scene, *ask, "-o", "run").err
+        error = succeeds(command_line, folder, "distill", scene, *ask, "--photos", "-o", "run").err
         assert ("warning: the scene does not look like the photos (correlation" in error) == warned, error

@@ -126,3 +126,14 @@ def test_refused_in_one_line(
     before = sorted(folder.rglob("*"))
     assert words in refused(command_line, folder, *command.split(), status=status)
     assert sorted(folder.rglob("*")) == before
+
+
+def test_all_missing_options_are_named_at_once(command_line: CommandLine, folder: Path) -> None:
+    for ask, missing in (
+        ("simplify ball.ply", ("-o OUT", "a budget (-n COUNT")),
+        ("distill ball.ply -n 9", ("-o RUN",)),
+        ("register ball.ply", ("--photos", "-o OUT")),
+    ):
+        error = refused(command_line, folder, *ask.split())
+        assert all(f"{option}" in error for option in missing), error
+        assert ("a budget" in error) == ("a budget (-n COUNT" in missing), error

@@ -1,49 +1,194 @@
-"""Commands in a pseudo-terminal, where status is drawn instead of printed."""
+"""Every command in a pseudo-terminal: the screen that it leaves, its exit status and its stdout."""
 
-import os
-import subprocess
-import sys
+import re
+import shlex
+import shutil
+from collections.abc import Callable, Iterator
+from functools import cache
+from importlib import import_module
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from helpers.project import environment
+import g2ard
+from g2ard.cli.app import COMMANDS
+from helpers.cloud_files import las
+from helpers.photos import photographed, photos_of
+from helpers.scenes import around, checkered_ball
+from helpers.terminal import Screen, Terminal
 
-pty = pytest.importorskip("pty", reason="pseudo-terminals are POSIX")
+pytest.importorskip("pty", reason="pseudo-terminals are POSIX")
+pytest.importorskip("pyte")
+
+MORE = {
+    "distill": "--views poses.json --size 48 --steps 8",
+    "simplify": "--views poses.json",
+    "recover": "--steps 8",
+    "adapt": "--steps 8",
+    "register": "--focal 64 --matcher direct --keep all",
+    "lift": "",
+    "ingest": "--tile-rows 500",
+    "convert": "",
+    "clean": "",
+    "poses": "--count 8",
+    "select": "-k 4",
+    "render": "--size 48",
+    "view": "",
+    "lod": "--views poses.json -r 1,4 --size 48 --steps 4",
+    "evaluate": "",
+    "compare": "--views poses.json --size 48",
+    "info": "",
+}
+"""Options added to each command's example so that it is quick on the stand-ins for its files."""
+DRAWN = {
+    "distill": "recover",
+    "simplify": "simplify",
+    "recover": "recover",
+    "adapt": "adapt",
+    "register": "register",
+    "clean": "depths",
+    "evaluate": "evaluate",
+}
+"""Stages whose bars commands draw."""
+TO_STDOUT = ("evaluate", "compare", "info")
+KINDS = [
+    *((columns, {}) for columns in (40, 200)),
+    (80, {"NO_COLOR": "1"}),
+    (80, {"TERM": "dumb"}),
+]
+BAR = re.compile("^[^┏┡]*[━╸╺]|ETA|: working")
+"""Parts of the live line; tables have such lines too."""
 
 
-def in_terminal(folder: Path, *arguments: object) -> tuple[int, str]:
-    """Run a command with stderr on a terminal: its exit status and what the terminal receives."""
-    ours, theirs = pty.openpty()
-    running = subprocess.Popen(
-        [sys.executable, "-m", "g2ard", *map(str, arguments)],
-        cwd=folder,
-        env=environment(TERM="xterm-256color", COLUMNS="80", LINES="24"),
-        stdout=theirs,
-        stderr=theirs,
-    )
-    os.close(theirs)
-    received = b""
-    while True:
-        try:
-            piece = os.read(ours, 1 << 16)
-        except OSError:  # Linux reports the closed side as an error
-            break
-        if not piece:
-            break
-        received += piece
-    os.close(ours)
-    return running.wait(), received.decode()
+@cache
+def example(command: str) -> list[str]:
+    """Return the words of the example in a command's help, without the program's name, and its options."""
+    from g2ard.cli.frame import app
+
+    import_module(f"g2ard.cli.commands.{command}")
+    found = next(one.epilog for one in app.registered_commands if one.name == command)
+    return [*shlex.split(found.removeprefix("Example: g2ard ")), *shlex.split(MORE[command]), "-w"]
 
 
-@pytest.mark.parametrize(
-    "ask",
-    [
-        "simplify ball.ply -r 10 -o small.ply",
-        "recover ball.ply --teacher ball.ply --views views.json --steps 2 -o recovered.ply",
-        "evaluate ball.ply --teacher ball.ply --views views.json",
-    ],
-)
-def test_commands_run_in_a_terminal(ask: str, folder: Path) -> None:
-    status, received = in_terminal(folder, *ask.split())
-    assert status == 0, received
+@pytest.fixture(scope="module")
+def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Stand-ins for the files of all examples."""
+    folder = tmp_path_factory.mktemp("inputs")
+    ball = checkered_ball(300)
+    g2ard.save(folder / "scene.ply", ball)
+    for name in ("garden", "dense", "room", "city"):
+        shutil.copy(folder / "scene.ply", folder / f"{name}.ply")
+    g2ard.save(folder / "small.ply", g2ard.simplify(ball, count=30).splats)
+    g2ard.save(folder / "tree.spz", ball)
+    (folder / "run").mkdir()
+    shutil.copy(folder / "small.ply", folder / "run" / "scene.ply")
+    (folder / "run" / "report.json").write_text("{}")
+    g2ard.save_views(folder / "poses.json", around(12, (48, 36)))
+    las(folder / "stadium.laz", ball.means.astype(float), np.full((300, 3), 9000, np.uint16))
+    photos_of(folder / "winter", scene=ball, count=6)
+    (folder / "new").mkdir()
+    views = photographed(folder / "new", ball, around(2))
+    (folder / "coarse.txt").write_text("".join(map(_ace, views.names, views.viewmats)))
+    return folder
+
+
+def _ace(name: str, pose: np.ndarray) -> str:
+    w = np.sqrt(max(1 + np.trace(pose[:3, :3]), 1e-12)) / 2
+    x, y, z = (pose[[2, 0, 1], [1, 2, 0]] - pose[[1, 2, 0], [2, 0, 1]]) / (4 * w)
+    numbers = (w, x, y, z, *pose[:3, 3])
+    return f"{name}.png {' '.join(map(str, numbers))}\n"
+
+
+@pytest.fixture(scope="module")
+def terminal() -> Iterator[Terminal]:
+    started = Terminal()
+    yield started
+    started.close()
+
+
+@pytest.fixture
+def shown(terminal: Terminal, inputs: Path, tmp_path: Path) -> Callable[..., Screen]:
+    """Runs a command's example with stand-ins in a new folder."""
+
+    def run(command: str, *more: str, columns: int = 80, **how: str | bool) -> Screen:
+        folder = tmp_path / "files"
+        if not folder.exists():
+            shutil.copytree(inputs, folder)
+        return terminal.run([*example(command), *more], folder, columns, **how)
+
+    return run
+
+
+def assert_tidy(screen: Screen) -> None:
+    assert screen.cursor, screen.received
+    assert "Traceback" not in screen.received, screen.received
+    assert not [line for line in screen.lines if BAR.search(line)], "\n".join(screen.lines)
+
+
+def test_every_command_has_a_row() -> None:
+    assert set(MORE) == set(COMMANDS)
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_a_terminal_ends_with_the_messages_of_a_pipe(
+    command: str,
+    shown: Callable[..., Screen],
+    inputs: Path,
+    command_line: Callable[..., tuple[int, str, str]],
+) -> None:
+    screen = shown(command)
+    assert screen.status == 0, screen.received
+    assert_tidy(screen)
+    if command in DRAWN:
+        assert re.search(f"{DRAWN[command]}.*━", screen.received), "no bar was drawn"
+    if command not in TO_STDOUT:
+        assert not screen.out
+        return
+    status, out, _ = command_line(*example(command), cwd=inputs)
+    assert (screen.status, _timeless(screen.out)) == (status, _timeless(out))
+
+
+def _timeless(text: str) -> str:
+    """Return a text without floats, which may be times."""
+    return re.sub(r"\d+\.\d+(e-\d+)?", "#", text)
+
+
+@pytest.mark.parametrize(("columns", "variables"), KINDS)
+@pytest.mark.parametrize("command", ["simplify", "recover", "evaluate"])
+def test_any_terminal_is_left_tidy(
+    command: str, columns: int, variables: dict[str, str], shown: Callable[..., Screen]
+) -> None:
+    screen = shown(command, columns=columns, **variables)
+    assert screen.status == 0, screen.received
+    assert_tidy(screen)
+    if "NO_COLOR" in variables:
+        assert not re.search(r"\x1b\[[\d;]*3\dm", screen.received), "colours in spite of NO_COLOR"
+    if variables.get("TERM") == "dumb":
+        assert "\x1b" not in screen.received
+
+
+@pytest.mark.parametrize("command", TO_STDOUT)
+def test_results_on_the_terminal_itself(command: str, shown: Callable[..., Screen]) -> None:
+    screen = shown(command, piped=False)
+    assert screen.status == 0, screen.received
+    assert_tidy(screen)
+    assert screen.lines[-1]
+
+
+@pytest.mark.parametrize("columns", [40, 80])
+@pytest.mark.parametrize("command", ["recover", "distill", "adapt"])
+def test_ctrl_c_leaves_one_line_and_a_cursor(
+    command: str, columns: int, shown: Callable[..., Screen]
+) -> None:
+    screen = shown(command, "--steps", "100000", columns=columns, stop_at=DRAWN[command])
+    assert screen.status == 130, screen.received
+    assert_tidy(screen)
+    assert "g2ard: interrupted; " in "".join(screen.lines)
+
+
+def test_an_error_in_the_middle_comes_last(shown: Callable[..., Screen]) -> None:
+    screen = shown("recover", "--set", "recover.steps=3", "--views", "missing.json")
+    assert screen.status in (1, 2)
+    assert_tidy(screen)
+    assert "missing.json" in "".join(screen.lines)

@@ -3,6 +3,7 @@
 import itertools
 import json
 import math
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -244,8 +245,9 @@ def test_progress_figures(student: Splats, targets: TeacherRenders, monkeypatch:
         watch=lambda step, _, splats: scenes.update({step: splats()}),
     )
     assert [a[1] for a in seen] == list(range(1, 61))
-    assert set(seen[-1][3]) == {"loss", "PSNR", "steps/s"}
-    shown = {tuple(figures["PSNR"].split(" dB at step ")) for *_, figures in seen}
+    assert set(seen[-2][3]) == {"loss", "PSNR", "steps/s"}
+    assert "PSNR" not in seen[-1][3]  # that of an earlier step would pass for the result's
+    shown = {tuple(re.findall(r"[\d.]+", figures["PSNR"])) for *_, figures in seen[:-1]}
     assert len(shown) > 2
     for value, step in shown:  # each is of the step it names
         want = probe.Probe(targets, (0.0, 0.0, 0.0)).all_of(scenes[int(step)])

@@ -12,7 +12,6 @@ from g2ard.cli.options import SceneArgument, picture
 from g2ard.errors import InputError
 from g2ard.io import check_scene_output
 from g2ard.progress import plural
-from g2ard.scene.samples import evenly_spaced
 
 if TYPE_CHECKING:
     from g2ard.scene.cameras import Cameras
@@ -97,10 +96,11 @@ def clean(
         sky = sky_mask(whole)
         splats = whole.take(~sky)
         run.say(f"sky: {plural(int(sky.sum()), 'Gaussian')}" if sky.any() else "the scene has no sky")
+    tell = run.answer if dry_run else run.say
     found, cameras = Cleaning(np.full(len(splats), -1, np.int8)), None
     if kinds:
         found, cameras = clutter_seen(
-            splats, kinds, strength=strength, seed=run.seed, progress=run.progress, say=run.say
+            splats, kinds, strength=strength, seed=run.seed, progress=run.progress, say=tell
         )
     kept = int(found.keep.sum())
     if not dry_run and output is not None:
@@ -141,6 +141,7 @@ def _paint(path: Path, splats: Splats, found: Cleaning, cameras: Cameras, overwr
     from g2ard.io.images import contact_sheet, write_png
     from g2ard.rendering.renderer import Renderer
     from g2ard.report.paint import painted
+    from g2ard.scene.samples import evenly_spaced
 
     colors = np.array([*_COLORS.values(), (0.45, 0.48, 0.52)])[found.kind]
     scenes = [splats, painted(splats, colors), splats.take(found.keep)]

@@ -66,7 +66,7 @@ def compare(
     )
     cameras = load_views(found, "all", size, run.say)
     check_sight(reference, cameras, run.say)
-    targets = TeacherRenders(reference, cameras, background=colour)
+    targets = TeacherRenders(reference, cameras, background=colour, progress=run.progress)
     scores = evaluate(other, targets, background=colour, progress=run.progress)
     worst = sorted(scores.views, key=lambda view: view.psnr)[:_WORST]
     psnr = {view.name: view.psnr for view in scores.views}
@@ -80,6 +80,7 @@ def compare(
         stdout=run.json != "-",
     )
     if output is not None:
+        run.begin("page")
         names = sorted(cameras.names, key=lambda name: psnr[name])
         middle = [cameras.names.index(name) for name in names[len(names) // 4 : -(-3 * len(names) // 4)]]
         stand, points = frame_with(reference, cameras.take(middle)), opaque_points(reference)

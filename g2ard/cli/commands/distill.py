@@ -13,7 +13,7 @@ import typer
 from g2ard.cli import options as opt
 from g2ard.cli.frame import Run, command
 from g2ard.cli.outputs import Outputs, budgets_of
-from g2ard.cli.run_result import say_views, say_weight, tell_quality, told, write_table
+from g2ard.cli.run_result import say_views, say_weight, tell_quality, told, why_large, write_table
 from g2ard.cli.tiling import tiling_of
 from g2ard.config.choices import Focus, is_made
 from g2ard.io import kind
@@ -52,7 +52,8 @@ def distill(
         bool | None,
         typer.Option(
             "--photos/--renders",
-            help="Training images: photos or the scene's renders; by default photos where views have them.",
+            help="Training images: photos or the scene's renders; by default photos where views have them, "
+            "if they show the scene.",
         ),
     ] = None,
     held_out: Annotated[
@@ -205,7 +206,7 @@ def _tell_estimates(run: Run, job: DistillJob, folders: Sequence[RunFolder]) -> 
         one = estimate(job, budget, page=run.config["view"])
         parts = ", ".join(f"{stage} {_rounded(seconds)} s" for stage, seconds in one.seconds.items())
         about = f"about {max(1, one.total):.0f} s ({parts}) and {one.bytes / 1e6:,.0f} MB"
-        run.say(
+        run.answer(
             f"{folder.path}: {plural(budget, 'Gaussian')}, {plural(one.views, 'view')} "
             f"of {one.pixels:,} pixels, {plural(one.steps, 'step')}: {about}"
         )
@@ -213,7 +214,7 @@ def _tell_estimates(run: Run, job: DistillJob, folders: Sequence[RunFolder]) -> 
         told.append({"output": str(folder.path), "count": budget, **asdict(one), "total_seconds": one.total})
     seconds, size = total(found)
     if len(found) > 1:
-        run.say(f"all {len(found)} with shared targets: about {seconds:.0f} s and {size / 1e6:,.0f} MB")
+        run.answer(f"all {len(found)} with shared targets: about {seconds:.0f} s and {size / 1e6:,.0f} MB")
     to_file = run.json not in (None, "-")
     run.say(f"dry run: only {run.json} is written" if to_file else "dry run: nothing is written")
     run.result({"runs": told, "total": {"seconds": seconds, "bytes": size}})
@@ -269,11 +270,12 @@ def _distil(
             with run.finishing("view.html"):
                 report["bytes"]["view"], page = folder.write_view(result.splats, seen, colour)
         folder.write_report(report)
-    write_table(run, report)
+    of_photos = job.config.recover.from_points  # such points are no scene to compare with
+    write_table(run, report, why_large(result.splats) if of_photos else "")
     for line in told(report, verbose=run.verbose):
         run.say(line)
     say_views(run, report["views"], job.config.select.views_count is not None)
-    if not job.config.recover.from_points:  # such points are no scene to compare with
+    if not of_photos:
         say_weight(run, source, folder.scene, result.splats, lifted=job.prior if job.lifted else None)
     run.say(
         f"scene: {folder.scene} ({folder.scene.stat().st_size / 1e6:.2f} MB)\n"

@@ -39,6 +39,7 @@ def info(
         return
     found, failed = [], []
     for path in paths:
+        run.begin("read")
         try:
             figures, rows = _described(path)
         except (InputError, OSError) as error:

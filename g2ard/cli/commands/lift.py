@@ -35,6 +35,7 @@ def lift(
 
     io.check_scene_output(output, run.overwrite)
     began = time.perf_counter()
+    run.begin("read")
     found = io.read_cloud(cloud)
     for note in found.notes:
         run.say(f"{cloud}: {note}")

@@ -78,6 +78,7 @@ def select(
         options=config,
         progress=run.progress,
     )
+    run.begin("write")
     kept = cameras.take(chosen.order)
     _write(run, output, format, pool, candidates.nonzero()[0][chosen.order], chosen.weights)
     if len(chosen.refused):

@@ -89,6 +89,7 @@ def simplify(
     if maps is not None:
         maps.check(lambda path, _: run.check_extra("--parents", path, parents))
     began = time.perf_counter()
+    run.begin("read")
     found = io.read_scene(scene, render_model=run.render_model)
     say_notes(scene, found.notes, run.say)
     splats, total = found.splats, len(found.splats)

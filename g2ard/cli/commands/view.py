@@ -61,6 +61,7 @@ def view(
     )
     named = zip(short_names(paths), loaded, strict=True)
     labels = [f"{name}: {plural(len(splats), 'Gaussian')}" for name, splats in named]
+    run.begin("page")
     written = write_page(
         output,
         [(label, stand.of(splats)) for label, splats in zip(labels, loaded, strict=True)],

@@ -265,8 +265,10 @@ class Loop:
         total = self.config.horizon
         if self.config.recovery_time is not None:
             total = max(self.done, round(self.done / max(self._used_share(), 1e-9)))
-        shown, at = self.probe.latest(self.engine.splats, self.done, self.seconds)
-        figures = {"loss": f"{recent:.4f}", "PSNR": f"{shown:.2f} dB at step {at}", "steps/s": f"{speed:.1f}"}
+        figures = {"loss": f"{recent:.4f}", "steps/s": f"{speed:.1f}"}
+        if self.done < total:  # the report has the result's
+            shown, at = self.probe.latest(self.engine.splats, self.done, self.seconds)
+            figures["PSNR"] = f"{shown:.2f} dB (last measured at step {at:,})"
         progress(stage, self.done, total, figures)
 
     def curve(self) -> list[float]:

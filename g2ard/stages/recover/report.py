@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from g2ard.io.reports import LEFT_OUT, Report
+from g2ard.progress import plural
 from g2ard.scene.cameras import USUAL
 
 
@@ -124,6 +125,9 @@ class RecoverReport(Report):
     skipped: dict[str, int]
     resumed: float | None = field(default=None, metadata=LEFT_OUT)
 
+    def __repr__(self) -> str:
+        return f"RecoverReport({plural(self.steps, 'step')} in {self.seconds:.1f} s, {self.psnr})"
+
 
 def outcome(report: RecoverReport) -> str | None:
     """Return a message about an unusual recovery, or None.
@@ -158,8 +162,8 @@ def outcome(report: RecoverReport) -> str | None:
         )
     if report.blend < 1:
         return (
-            "recovery ended below its start in the training views: the result is"
-            f" {report.blend:.0%} of the way to its end, which is better than both"
+            f"recovery lost PSNR in the training views; the result mixes {report.blend:.0%} of it with "
+            f"{1 - report.blend:.0%} of the simplified scene, which scores more than either"
         )
     return None
 
