@@ -12,11 +12,11 @@ from g2ard.io.colmap import parsing
 from g2ard.io.photos import Frame, Lens, photo_size, posed, view_set
 from g2ard.io.types import ViewSet
 
-_SIZE = (1920, 1080)
+_PHOTO_SIZE = (1920, 1080)
 """Size of the original photos, for which focal lengths are given."""
 
-_LISTS = {"train": "dataset_train.txt", "test": "dataset_test.txt"}
-_MODEL = "reconstruction.nvm"
+_SPLIT_FILES = {"train": "dataset_train.txt", "test": "dataset_test.txt"}
+_NVM_FILE = "reconstruction.nvm"
 
 
 class _Focal(NamedTuple):
@@ -26,7 +26,7 @@ class _Focal(NamedTuple):
 
 def is_cambridge(folder: Path) -> bool:
     """Return whether a folder holds a scene of the data set."""
-    return (folder / _MODEL).is_file() and any((folder / name).is_file() for name in _LISTS.values())
+    return (folder / _NVM_FILE).is_file() and any((folder / name).is_file() for name in _SPLIT_FILES.values())
 
 
 def read(path: Path, images: Path | None = None) -> ViewSet:
@@ -36,10 +36,10 @@ def read(path: Path, images: Path | None = None) -> ViewSet:
     VisualSFM's radial parameter r undistorts, m_u = (1 + r·|m|²)·m. OpenCV's k1 distorts; it is −r to first
     order.
     """
-    lenses = _lenses(path / _MODEL)
+    lenses = _lenses(path / _NVM_FILE)
     median = _Focal(float(np.median([lens.focal for lens in lenses.values()])), 0.0)
     frames, guessed = [], 0
-    for split, name in _LISTS.items():
+    for split, name in _SPLIT_FILES.items():
         if not (path / name).is_file():
             continue
         for photo_name, pose in _poses(path / name):
@@ -50,15 +50,15 @@ def read(path: Path, images: Path | None = None) -> ViewSet:
     found = view_set(path, frames)
     if not guessed:
         return found
-    text = f"{guessed} views are not in {_MODEL}; they get the median focal length, {median.focal:.1f}"
+    text = f"{guessed} views are not in {_NVM_FILE}; they get the median focal length, {median.focal:.1f}"
     return found.noted("guessed_focal", guessed, text)
 
 
 def _frame(where: Path, name: str, pose: list[float], lens: _Focal, photo: Path, split: str) -> Frame:
-    width, height = photo_size(photo, where) if photo.is_file() else _SIZE
+    width, height = photo_size(photo, where) if photo.is_file() else _PHOTO_SIZE
     view = posed(pose[3:], (0, 0, 0))
     view[:3, 3] = -view[:3, :3] @ np.array(pose[:3])
-    focal = lens.focal * width / _SIZE[0]
+    focal = lens.focal * width / _PHOTO_SIZE[0]
     K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
     return Frame(name, view, Lens((width, height), K, (-lens.radial, 0.0, 0.0, 0.0, 0.0)), photo, split)
 

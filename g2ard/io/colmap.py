@@ -22,7 +22,9 @@ _MODELS = (
 _PARAMETERS = {"SIMPLE_PINHOLE": 3, "PINHOLE": 4, "SIMPLE_RADIAL": 4, "RADIAL": 5, "OPENCV": 8}
 
 
-_PARTS = tuple(f"{part}{suffix}" for suffix in (".bin", ".txt") for part in ("cameras", "images", "points3D"))
+_MODEL_FILES = tuple(
+    f"{part}{suffix}" for suffix in (".bin", ".txt") for part in ("cameras", "images", "points3D")
+)
 """Files of a model."""
 
 
@@ -60,7 +62,7 @@ def incomplete(path: Path) -> InputError | None:
     """Return the error for a model without cameras or images, or None if there is no part of one."""
     folder = path.parent if path.is_file() else path
     for place in (folder, folder / "sparse" / "0", folder / "sparse", folder / "colmap" / "sparse" / "0"):
-        held = [name for name in _PARTS if (place / name).is_file()]
+        held = [name for name in _MODEL_FILES if (place / name).is_file()]
         if held and _tables(place) is None:
             suffix = Path(held[0]).suffix
             lacking = [f"{part}{suffix}" for part in ("cameras", "images") if f"{part}{suffix}" not in held]

@@ -30,11 +30,11 @@ from g2ard.io.stream import RawStream
 from g2ard.progress import plural
 from g2ard.scene.splats import SH_C0, Splats
 
-_CHUNK = 256
+_CHUNK_ROWS = 256
 _SCALE_LIMIT = 20.0
 """Log-scales are clamped to ±20, as in SuperSplat, since an outlier would coarsen its chunk."""
 
-_THREE = 11, 10, 11
+_VECTOR_BITS = 11, 10, 11
 """Bits of the three components of a position or scale."""
 
 _PACKED = ["packed_position", "packed_rotation", "packed_scale", "packed_color"]
@@ -60,7 +60,7 @@ class Stream(RawStream):
 
         names = ("vertex", "chunk", "sh") if rest else ("vertex", "chunk")
         vertex, chunk, *sh = plyfiles.read_element(path, header, *names)
-        if len(chunk) * _CHUNK < len(vertex) or (sh and len(sh[0]) != len(vertex)):
+        if len(chunk) * _CHUNK_ROWS < len(vertex) or (sh and len(sh[0]) != len(vertex)):
             raise InputError(
                 f"{len(chunk)} chunks and {plural(len(vertex), 'Gaussian')} do not fit", path=path
             )
@@ -84,10 +84,10 @@ class Stream(RawStream):
     def _decode(self, first: int, vertex: NDArray[Any], sh: NDArray[Any] | None) -> Raw:
         """Decode rows, the first of which is row `first` of the file."""
         raw, chunk, rest = Raw.empty(len(vertex), self._rest), self._chunk, self._rest
-        of = np.arange(first, first + len(vertex)) // _CHUNK
+        of = np.arange(first, first + len(vertex)) // _CHUNK_ROWS
         position, rotation, scale, color = (vertex[name] for name in _PACKED)
-        raw.means[:] = _between(chunk, of, "{}_{}", "xyz", _unpacked(position, _THREE))
-        raw.log_scales[:] = _between(chunk, of, "{}_scale_{}", "xyz", _unpacked(scale, _THREE))
+        raw.means[:] = _between(chunk, of, "{}_{}", "xyz", _unpacked(position, _VECTOR_BITS))
+        raw.log_scales[:] = _between(chunk, of, "{}_scale_{}", "xyz", _unpacked(scale, _VECTOR_BITS))
         others = (_unpacked(rotation, (10, 10, 10)) - 0.5) * np.sqrt(2)
         raw.quats[:] = from_smallest_three(rotation >> np.uint32(30), others)
         color = _unpacked(color, (8, 8, 8, 8))
@@ -131,15 +131,15 @@ def write(path: Path, splats: Splats, *, overwrite: bool = False) -> None:
     splats = splats.take(morton_order(splats.means))
     bounds: dict[str, NDArray[np.float32]] = {}
     words = np.empty(len(splats), [(name, "<u4") for name in _PACKED])
-    words["packed_position"] = _packed(_within(bounds, "", "xyz", splats.means), _THREE)
+    words["packed_position"] = _packed(_within(bounds, "", "xyz", splats.means), _VECTOR_BITS)
     largest, others = smallest_three(unit_quats(splats.quats))
     rotations = _packed(others / math.sqrt(2) + 0.5, (10, 10, 10))
     words["packed_rotation"] = largest.astype(np.uint32) << np.uint32(30) | rotations
     logs = np.clip(log_scales(splats), -_SCALE_LIMIT, _SCALE_LIMIT)
-    words["packed_scale"] = _packed(_within(bounds, "scale_", "xyz", logs), _THREE)
+    words["packed_scale"] = _packed(_within(bounds, "scale_", "xyz", logs), _VECTOR_BITS)
     color = _within(bounds, "", "rgb", splats.colors)
     words["packed_color"] = _packed(np.column_stack([color, splats.opacities]), (8, 8, 8, 8))
-    chunk = np.empty(math.ceil(len(splats) / _CHUNK), [(name, "<f4") for name in bounds])
+    chunk = np.empty(math.ceil(len(splats) / _CHUNK_ROWS), [(name, "<f4") for name in bounds])
     for name, values in bounds.items():
         chunk[name] = values
     elements = [PlyElement.describe(chunk, "chunk"), PlyElement.describe(words, "vertex")]
@@ -154,13 +154,13 @@ def _within(
     bounds: dict[str, NDArray[np.float32]], what: str, axes: str, values: NDArray[Any]
 ) -> NDArray[np.float64]:
     """Scale values to [0, 1] within their chunk, and add the chunk's bounds to `bounds`."""
-    starts = np.arange(0, len(values), _CHUNK)
+    starts = np.arange(0, len(values), _CHUNK_ROWS)
     low = np.minimum.reduceat(values, starts).astype(np.float32)
     high = np.maximum.reduceat(values, starts).astype(np.float32)
     for end, side in (("min", low), ("max", high)):
         for k, axis in enumerate(axes):
             bounds[f"{end}_{what}{axis}"] = side[:, k]
-    of = np.arange(len(values)) // _CHUNK
+    of = np.arange(len(values)) // _CHUNK_ROWS
     wide = high.astype(np.float64)[of] - low[of]
     return (values - low.astype(np.float64)[of]) / np.where(wide > 0, wide, 1.0)
 

@@ -68,7 +68,7 @@ _CONVERTERS = {
 MANIFEST, JOURNAL, POINTS = "tiles.json", "journal.json", ".points"
 """Files of finished and unfinished folders of tiles, and their folder of points to lift."""
 
-_LOOKED_INTO = 64
+_MOST_INSPECTED_FILES = 64
 """Maximum files of a folder to inspect for suggestions."""
 
 
@@ -250,7 +250,7 @@ def _instead(path: Path) -> str:
         for file in sorted(path.iterdir())
         if file.suffix.lower() in (".ply", ".json", *_BY_SUFFIX) and file.is_file()
     )
-    for file in islice(files, _LOOKED_INTO):
+    for file in islice(files, _MOST_INSPECTED_FILES):
         with suppress(InputError):
             held[kind(file)].append(file.name)
     words = {"splats": "a scene", "points": "a point cloud", "views": "views"}

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from g2ard.io.jsonfile import fields_of, numbers, read_json
 from g2ard.scene.cameras import Cameras
 
-_NAME = "exposure.json"
+_EXPOSURE_FILE = "exposure.json"
 
 
 def find_exposures(cameras: Cameras) -> dict[str, NDArray[np.float64]]:
@@ -23,7 +23,7 @@ def find_exposures(cameras: Cameras) -> dict[str, NDArray[np.float64]]:
     for name, photo in zip(cameras.names, cameras.image_paths, strict=True):
         if photo is None:
             continue
-        path = photo.parent.parent / _NAME
+        path = photo.parent.parent / _EXPOSURE_FILE
         if path not in tables:
             content = fields_of(path, read_json(path) if path.is_file() else {})
             tables[path] = {key: np.array(numbers(content, key, 3, 4)) for key in content}

@@ -48,9 +48,9 @@ _MAGIC, _JSON, _BIN = 0x46546C67, 0x4E4F534A, 0x004E4942
 _FLOAT, _USHORT, _UBYTE = 5126, 5123, 5121
 _TYPES = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 _DTYPES = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
-_FLIPS = np.array([-1, 1, -1, 1, -1, 1, -1, 1, -1, 1, -1, 1, -1, 1, -1], np.float32)
+_SH_FLIPS = np.array([-1, 1, -1, 1, -1, 1, -1, 1, -1, 1, -1, 1, -1, 1, -1], np.float32)
 """Sign of each harmonic of bands 1–3 after half a turn about z: (−1)^m."""
-_TURN = np.array([-1.0, -1, 1])
+_GLTF_TURN = np.array([-1.0, -1, 1])
 
 
 def write(path: Path, splats: Splats, *, overwrite: bool = False, compress: str | None = None) -> None:
@@ -92,7 +92,7 @@ def _plain(path: Path, splats: Splats) -> list[bytes]:
         start += len(blob)
     node: dict[str, Any] = {"mesh": 0}
     if splats.offset.any():
-        node["translation"] = (splats.offset * _TURN).tolist()
+        node["translation"] = (splats.offset * _GLTF_TURN).tolist()
     document = _document(node, list(attributes), views, accessors, start)
     return _glb(path, document, blobs)
 
@@ -121,7 +121,7 @@ def spz_glb(path: Path, splats: Splats, centre: NDArray[np.float64] | None = Non
     accessors[1] |= {"componentType": _UBYTE, "normalized": True}
     # CesiumJS needs a `matrix`, and takes the SPZ from the first buffer view.
     matrix = np.eye(4)
-    matrix[3, :3] = (splats.offset + centre) * _TURN
+    matrix[3, :3] = (splats.offset + centre) * _GLTF_TURN
     node = {"mesh": 0, "matrix": matrix.ravel().tolist()}
     view = {"buffer": 0, "byteOffset": 0, "byteLength": len(blob)}
     blob += b"\0" * (-len(blob) % 4)
@@ -134,7 +134,7 @@ def spz_glb(path: Path, splats: Splats, centre: NDArray[np.float64] | None = Non
 
 def _about_y(splats: Splats) -> Splats:
     """Turn a scene by half a turn about y, exactly: from SPZ's axes to glTF's, seen in those of a .ply."""
-    signs = (_FLIPS * spz.FLIPS)[: splats.shN.shape[1], None]
+    signs = (_SH_FLIPS * spz.FLIPS)[: splats.shN.shape[1], None]
     means = splats.means * np.array([-1, 1, -1], splats.means.dtype)
     return replace(
         splats, means=means, quats=splats.quats * np.array([1, -1, 1, -1], np.float32), shN=splats.shN * signs
@@ -159,9 +159,9 @@ def _attributes(splats: Splats) -> dict[str, NDArray[Any]]:
     linear = np.where(linear <= 0.04045, linear / 12.92, ((linear + 0.055) / 1.055) ** 2.4)
     alphas = splats.opacities[:, None]
     quats = unit_quats(splats.quats)
-    turned = quats[:, [1, 2, 3, 0]] * (*_TURN, 1)
+    turned = quats[:, [1, 2, 3, 0]] * (*_GLTF_TURN, 1)
     out: dict[str, NDArray[Any]] = {
-        "POSITION": (splats.means * _TURN).astype("<f4"),
+        "POSITION": (splats.means * _GLTF_TURN).astype("<f4"),
         "COLOR_0": np.rint(np.column_stack([linear, alphas]) * 65535).astype("<u2"),
         f"{EXTENSION}:ROTATION": turned.astype("<f4"),
         f"{EXTENSION}:SCALE": splats.scales.astype("<f4"),
@@ -169,7 +169,7 @@ def _attributes(splats: Splats) -> dict[str, NDArray[Any]]:
         f"{EXTENSION}:SH_DEGREE_0_COEF_0": splats.sh0[:, 0].astype("<f4"),
     }
     for name, k in _harmonics(splats.sh_degree):
-        out[name] = (splats.shN[:, k] * _FLIPS[k]).astype("<f4")
+        out[name] = (splats.shN[:, k] * _SH_FLIPS[k]).astype("<f4")
     return out
 
 
@@ -280,11 +280,11 @@ def _attributes_of(path: Path, document: Fields, binary: bytes, primitive: Field
     raw = Raw.empty(len(means), (degree + 1) ** 2 - 1)
     raw.set_linear(values(f"{EXTENSION}:SCALE", 3), values(f"{EXTENSION}:OPACITY", 1)[:, 0])
     with np.errstate(invalid="ignore"):  # a signalling NaN
-        raw.means[:] = means * _TURN
-        raw.quats[:] = values(f"{EXTENSION}:ROTATION", 4)[:, [3, 0, 1, 2]] * (1, *_TURN)
+        raw.means[:] = means * _GLTF_TURN
+        raw.quats[:] = values(f"{EXTENSION}:ROTATION", 4)[:, [3, 0, 1, 2]] * (1, *_GLTF_TURN)
         raw.sh0[:, 0] = values(f"{EXTENSION}:SH_DEGREE_0_COEF_0", 3)
         for name, k in _harmonics(degree):
-            raw.shN[:, k] = values(name, 3) * _FLIPS[k]
+            raw.shN[:, k] = values(name, 3) * _SH_FLIPS[k]
     return cleaned(path, raw)
 
 
@@ -355,7 +355,7 @@ def _placement(path: Path, document: Fields, mesh: int) -> NDArray[np.float64]:
             raise InputError(f"a node has {len(at)} parents", path=path)
     if not np.isfinite(total[:3, 3]).all():
         raise InputError(f"invalid translation {tuple(total[:3, 3].tolist())}", path=path)
-    return total * np.outer((*_TURN, 1), (*_TURN, 1))
+    return total * np.outer((*_GLTF_TURN, 1), (*_GLTF_TURN, 1))
 
 
 def _local(node: Fields) -> NDArray[np.float64]:

@@ -22,12 +22,12 @@ from g2ard.io.photos import ASPECT_SLACK
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.samples import evenly_spaced
 
-_LOOKED_AT = 5
+_BORDER_PHOTOS = 5
 """Photos whose borders are compared."""
-_SAME_COLOUR, _CONSTANT = 3 / 255, 0.8
+_BORDER_COLOUR_SLACK, _BORDER_SHARE = 3 / 255, 0.8
 """Largest difference from a constant border colour, and the least share of border pixels that have it."""
 
-_GAP = 6
+_SHEET_GAP = 6
 """Pixels between the images of a contact sheet."""
 
 
@@ -106,7 +106,7 @@ def photo_traits(photos: Sequence[Path]) -> PhotoTraits:
         with suppress(InputError, FileNotFoundError), opened_image(photo) as header:
             sizes[header.size] += 1
             alpha += header.has_transparency_data
-    few = evenly_spaced(len(photos), _LOOKED_AT, floor=True)
+    few = evenly_spaced(len(photos), _BORDER_PHOTOS, floor=True)
     shown = []
     for i in few:
         with suppress(InputError):
@@ -118,7 +118,7 @@ def photo_traits(photos: Sequence[Path]) -> PhotoTraits:
         return PhotoTraits(alpha, None, sizes)
     border = np.concatenate(edges)
     colour = np.median(border, axis=0)
-    same = (np.abs(border - colour).max(1) <= _SAME_COLOUR).mean() >= _CONSTANT
+    same = (np.abs(border - colour).max(1) <= _BORDER_COLOUR_SLACK).mean() >= _BORDER_SHARE
     red, green, blue = colour.tolist()
     return PhotoTraits(0, (red, green, blue) if same else None, sizes)
 
@@ -304,17 +304,20 @@ def contact_sheet(
     text = max(11, min(28, max(widths) // 20))
     font, line = ImageFont.load_default(text), round(1.6 * text)
     foot = line if row_labels else 0
-    lefts = [_GAP + sum(widths[:c]) + _GAP * c for c in range(columns)]
-    size = sum(widths) + _GAP * (columns + 1), line + sum(heights) + (foot + _GAP) * len(grid) + _GAP
+    lefts = [_SHEET_GAP + sum(widths[:c]) + _SHEET_GAP * c for c in range(columns)]
+    size = (
+        sum(widths) + _SHEET_GAP * (columns + 1),
+        line + sum(heights) + (foot + _SHEET_GAP) * len(grid) + _SHEET_GAP,
+    )
     sheet = Image.new("RGB", size, (24, 24, 24))
     draw = ImageDraw.Draw(sheet)
     for left, label in zip(lefts, labels, strict=False):
-        draw.text((left, _GAP), label, fill=(235, 235, 235), font=font)
-    top = _GAP + line
+        draw.text((left, _SHEET_GAP), label, fill=(235, 235, 235), font=font)
+    top = _SHEET_GAP + line
     for r, (row, height) in enumerate(zip(grid, heights, strict=True)):
         for left, cell in zip(lefts, row, strict=False):
             sheet.paste(cell, (left, top))
         if r < len(row_labels):
-            draw.text((_GAP, top + height), row_labels[r], fill=(200, 200, 200), font=font)
-        top += height + foot + _GAP
+            draw.text((_SHEET_GAP, top + height), row_labels[r], fill=(200, 200, 200), font=font)
+        top += height + foot + _SHEET_GAP
     return np.asarray(sheet)

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from g2ard.errors import InputError
 
-_LARGEST = sys.float_info.max
-_SHOWN = 40
+_LARGEST_NUMBER = sys.float_info.max
+_LONGEST_SHOWN_VALUE = 40
 """Longest value in a message, characters."""
 
 
@@ -144,7 +144,7 @@ def fields_of(path: str | Path, entry: Any, index: int | None = None, item: str 
     return Fields(entry, place)
 
 
-def numbers(holder: Fields, key: str, *shape: int, most: float = _LARGEST, gaps: bool = False) -> Any:
+def numbers(holder: Fields, key: str, *shape: int, most: float = _LARGEST_NUMBER, gaps: bool = False) -> Any:
     """Return a number, or nested lists of numbers, as floats.
 
     Args:
@@ -163,7 +163,7 @@ def numbers(holder: Fields, key: str, *shape: int, most: float = _LARGEST, gaps:
         if isinstance(value, bool) or not isinstance(value, int | float):
             raise place.unexpected(value, "a number")
         if not -most <= value <= most:
-            limit = "a finite number" if most == _LARGEST else f"a number within ±{most:.6g}"
+            limit = "a finite number" if most == _LARGEST_NUMBER else f"a number within ±{most:.6g}"
             raise place.unexpected(value, limit)
         return float(value)
 
@@ -248,7 +248,7 @@ def whole(holder: Fields | Items, key: Any, default: int | None = None) -> int:
     """Return a whole number ≥ 0 (80 or 80.0), or the default if the property is missing."""
     value = holder[key] if default is None or key in holder else default
     is_number = isinstance(value, int | float) and not isinstance(value, bool)
-    if not (is_number and 0 <= value <= _LARGEST and value % 1 == 0):
+    if not (is_number and 0 <= value <= _LARGEST_NUMBER and value % 1 == 0):
         raise holder.place.to(key).unexpected(value, "a whole number ≥ 0")
     return int(value)
 
@@ -260,10 +260,14 @@ def _found(value: Any) -> str:
         return f"a list of {len(value)}"
     if value is None or isinstance(value, bool):
         return json.dumps(value)
-    if isinstance(value, int) and abs(value) >= 10**_SHOWN:
+    if isinstance(value, int) and abs(value) >= 10**_LONGEST_SHOWN_VALUE:
         return "an integer of many digits"
     return f"the string {_short(repr(value))}" if isinstance(value, str) else repr(value)
 
 
 def _short(text: str) -> str:
-    return text if len(text) <= _SHOWN else f"{text[: _SHOWN // 2]}…{text[-_SHOWN // 4 :]}"
+    return (
+        text
+        if len(text) <= _LONGEST_SHOWN_VALUE
+        else f"{text[: _LONGEST_SHOWN_VALUE // 2]}…{text[-_LONGEST_SHOWN_VALUE // 4 :]}"
+    )

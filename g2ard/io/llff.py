@@ -15,7 +15,7 @@ from g2ard.progress import plural
 
 NAME = "poses_bounds.npy"
 
-_AXES = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+_LLFF_AXES = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 """Columns that turn down, right, backwards into right, down, forward."""
 
 
@@ -54,7 +54,7 @@ def _frame(place: Place, matrix: np.ndarray, photo: Path | None) -> Frame:
     height, width, focal = matrix[:, 4].tolist()
     if not (height >= 1 and width >= 1 and focal > 0 and np.isfinite(matrix).all()):
         raise place.error(f"has height {height}, width {width} and focal length {focal}")
-    pose = rigid(np.hstack([matrix[:, :3] @ _AXES, matrix[:, 3:4]]), place)
+    pose = rigid(np.hstack([matrix[:, :3] @ _LLFF_AXES, matrix[:, 3:4]]), place)
     size = round(width), round(height)
     lens = Lens(size, np.array([[focal, 0, size[0] / 2], [0, focal, size[1] / 2], [0, 0, 1]]))
     if photo is not None:

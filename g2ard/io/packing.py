@@ -14,7 +14,7 @@ from g2ard.scene.splats import Splats
 
 _MORTON_BITS = 21
 
-_OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
+_OTHER_COMPONENTS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
 """Indices of the components of a quaternion other than one."""
 
 
@@ -99,13 +99,13 @@ def smallest_three(quats: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArra
     largest = np.argmax(np.abs(quats), axis=1)
     rows = np.arange(len(quats))
     signed = quats * np.where(quats[rows, largest] < 0, -1.0, 1.0)[:, None]
-    return largest, signed[rows[:, None], _OTHERS[largest]] + 0.0
+    return largest, signed[rows[:, None], _OTHER_COMPONENTS[largest]] + 0.0
 
 
 def from_smallest_three(largest: NDArray[Any], others: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the (N, 4) unit quaternions that `smallest_three` takes apart."""
     quats, rows = np.empty((len(others), 4)), np.arange(len(others))
-    quats[rows[:, None], _OTHERS[largest]] = others
+    quats[rows[:, None], _OTHER_COMPONENTS[largest]] = others
     quats[rows, largest] = np.sqrt(np.maximum(0, 1 - (others**2).sum(axis=1)))
     return quats
 

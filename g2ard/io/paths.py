@@ -11,10 +11,10 @@ from typing import Any
 
 from g2ard.errors import InputError
 
-_ENDS = 1 << 16
+_HASHED_END_BYTES = 1 << 16
 """Bytes at each end of a file to hash."""
 
-_LONGEST = 200
+_LONGEST_NAME = 200
 """Longest file name, bytes; systems allow 255, including suffixes and temporary names."""
 
 
@@ -75,8 +75,8 @@ def output_names(path: str | Path, names: Sequence[str]) -> list[str]:
 def _inside(path: str | Path, i: int, name: str) -> PurePosixPath:
     parts = PurePosixPath(PureWindowsPath(name.replace("\0", "")).as_posix()).parts
     kept = [part for part in parts if part not in ("..", "/", "//") and not part.endswith((":", ":/"))]
-    if not kept or "\0" in name or max(len(part.encode(errors="replace")) for part in kept) > _LONGEST:
-        short = name if len(name) <= _LONGEST else f"{name[:_LONGEST]}…"
+    if not kept or "\0" in name or max(len(part.encode(errors="replace")) for part in kept) > _LONGEST_NAME:
+        short = name if len(name) <= _LONGEST_NAME else f"{name[:_LONGEST_NAME]}…"
         raise InputError(f"has the invalid file name {short!r}", path=path, index=i, item="view")
     return PurePosixPath(*kept)
 
@@ -93,9 +93,9 @@ def file_identity(files: Iterable[Path]) -> list[Any]:
         try:
             state = path.stat()
             with path.open("rb") as file:
-                digest = hashlib.sha256(file.read(_ENDS))
-                file.seek(max(0, state.st_size - _ENDS))
-                digest.update(file.read(_ENDS))
+                digest = hashlib.sha256(file.read(_HASHED_END_BYTES))
+                file.seek(max(0, state.st_size - _HASHED_END_BYTES))
+                digest.update(file.read(_HASHED_END_BYTES))
         except OSError as error:
             raise InputError(f"{error.strerror}", path=path) from error
         identity.append([path.name, state.st_size, state.st_mtime_ns, digest.hexdigest()])

@@ -24,9 +24,9 @@ _MEANS = ["x", "y", "z"]
 _DC = ["f_dc_0", "f_dc_1", "f_dc_2"]
 _SCALES = ["scale_0", "scale_1", "scale_2"]
 _QUATS = ["rot_0", "rot_1", "rot_2", "rot_3"]
-_NEEDED = [*_MEANS, *_DC, "opacity", *_SCALES, *_QUATS]
+_REQUIRED_PROPERTIES = [*_MEANS, *_DC, "opacity", *_SCALES, *_QUATS]
 _NORMALS = ["nx", "ny", "nz"]
-_FLAT = np.log(np.float32(1e-3))
+_FLAT_LOG_RATIO = np.log(np.float32(1e-3))
 """Logarithm of the thickness of 2D Gaussians over their shorter scale."""
 
 
@@ -42,7 +42,7 @@ class Stream(RawStream):
         properties = header.properties.get("vertex", [])
         mode = plyfiles.render_model_of(header)
         flat = mode == "2dgs" or ("scale_1" in properties and "scale_2" not in properties)
-        needed = [name for name in _NEEDED if not flat or name != "scale_2"]
+        needed = [name for name in _REQUIRED_PROPERTIES if not flat or name != "scale_2"]
         plyfiles.require(path, properties, needed, "a 3DGS scene")
         rest = sorted((p for p in properties if re.fullmatch(r"f_rest_\d{1,3}", p)), key=lambda p: int(p[7:]))
         stored, kept = _bands(path, rest)
@@ -78,7 +78,7 @@ class Stream(RawStream):
         raw.sh0[:, 0] = structured_to_unstructured(block[_DC])
         if self._flat:
             raw.log_scales[:, :2] = structured_to_unstructured(block[_SCALES[:2]])
-            raw.log_scales[:, 2] = raw.log_scales[:, :2].min(axis=1) + _FLAT
+            raw.log_scales[:, 2] = raw.log_scales[:, :2].min(axis=1) + _FLAT_LOG_RATIO
         else:
             raw.log_scales[:] = structured_to_unstructured(block[_SCALES])
         raw.quats[:] = structured_to_unstructured(block[_QUATS])
@@ -99,7 +99,7 @@ def _bands(path: Path, rest: list[str]) -> tuple[int, int]:
 
 
 def _ignored(properties: list[str], rest: list[str], stored: int, kept: int) -> list[Note]:
-    extra = [p for p in properties if p not in _NEEDED and p not in _NORMALS and p not in rest]
+    extra = [p for p in properties if p not in _REQUIRED_PROPERTIES and p not in _NORMALS and p not in rest]
     notes = []
     if extra:
         names = ", ".join(extra[:4]) + (", …" if len(extra) > 4 else "")

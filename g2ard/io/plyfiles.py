@@ -15,7 +15,7 @@ from g2ard.config.choices import RenderModel
 from g2ard.errors import InputError, damaged
 from g2ard.io.atomic import atomic_output
 
-_OFFSET = re.compile(r"g2ard offset (\S+) (\S+) (\S+)$")
+_OFFSET_COMMENT = re.compile(r"g2ard offset (\S+) (\S+) (\S+)$")
 _RENDER_MODES: dict[str, RenderModel | Literal["2dgs"]] = {
     "splatrendermode: default": "classic",
     "splatrendermode: mip": "antialiased",
@@ -28,7 +28,7 @@ _RENDER_MODES: dict[str, RenderModel | Literal["2dgs"]] = {
 _HEADER_LIMIT = 1 << 20
 """Longest header, bytes."""
 
-_END = re.compile(rb"^end_header[ \t]*[\r\n]", re.MULTILINE)
+_END_HEADER = re.compile(rb"^end_header[ \t]*[\r\n]", re.MULTILINE)
 
 
 @dataclass
@@ -56,7 +56,7 @@ def read_header(path: Path) -> PlyHeader:
             path=path,
             hint="export it again, or rename it to the suffix of its format",
         )
-    end = _END.search(head)  # on a line of its own, since comments may contain it
+    end = _END_HEADER.search(head)  # on a line of its own, since comments may contain it
     if end is None:
         raise damaged("broken PLY header: no end_header line", path=path)
     header = PlyHeader()
@@ -88,7 +88,7 @@ def _header_line(header: PlyHeader, words: list[str]) -> None:
 def offset_of(path: Path, header: PlyHeader) -> NDArray[np.float64]:
     """Return the (3,) offset of a comment `g2ard offset X Y Z`; zeros without one."""
     for comment in header.comments:
-        if match := _OFFSET.match(comment):
+        if match := _OFFSET_COMMENT.match(comment):
             try:
                 offset = np.array([float(word) for word in match.groups()])
             except ValueError:

@@ -16,7 +16,7 @@ from g2ard.io.sanitize import RowTally
 from g2ard.io.stream import from_row
 from g2ard.io.types import Cloud, Note, Points
 
-_ROWS = 1 << 20
+_ROWS_AT_ONCE = 1 << 20
 
 RawPoints = tuple[NDArray[np.float64], NDArray[np.float32]]
 """(n, 3) positions, world units, and (n, 3) colours; colours / `divisor` are in [0, 1]."""
@@ -79,7 +79,7 @@ class PointStream(ABC):
     def whole(self) -> Cloud:
         """Read all points, with colours in [0, 1]."""
         positions, colors, kept = np.empty((self.count, 3)), np.empty((self.count, 3), np.float32), 0
-        for block in self.blocks(_ROWS):
+        for block in self.blocks(_ROWS_AT_ONCE):
             rows = slice(kept, kept := kept + len(block[0]))
             positions[rows], colors[rows] = block
         notes = self.all_notes()

@@ -20,9 +20,9 @@ from g2ard.io.limits import opened_image
 from g2ard.io.sanitize import BLOCK, Raw, logits_of
 
 _COEFFICIENTS = {0: 0, 1: 3, 2: 8, 3: 15}
-_LARGEST = float.fromhex("0x1.fffffep+127")
+_LARGEST_FLOAT32 = float.fromhex("0x1.fffffep+127")
 """Largest float32."""
-_LARGEST_LOG = math.log1p(_LARGEST)
+_LARGEST_LOG = math.log1p(_LARGEST_FLOAT32)
 _PALETTE_COLUMNS = 64
 """Entries of the SH palette per row of its image."""
 
@@ -195,7 +195,7 @@ class _Values:
         self._book: NDArray[Any] | None = None
         if "codebook" in part:
             count = len(listed(part, "codebook"))
-            book = numbers(part, "codebook", count, most=_LARGEST, gaps=True)
+            book = numbers(part, "codebook", count, most=_LARGEST_FLOAT32, gaps=True)
             self._book = np.asarray(book, np.float32)
         else:
             self._low, self._high = (_bound(part, end, slice(3)) for end in ("mins", "maxs"))
@@ -209,7 +209,7 @@ class _Values:
         return self._book[codes]
 
 
-def _bound(part: Fields, key: str, channels: slice | int, most: float = _LARGEST) -> NDArray[Any]:
+def _bound(part: Fields, key: str, channels: slice | int, most: float = _LARGEST_FLOAT32) -> NDArray[Any]:
     """Return a bound: one number for all channels, or a list per channel with opacity as the fourth."""
     if not isinstance(value := part[key], list):
         return np.asarray(numbers(part, key, most=most))

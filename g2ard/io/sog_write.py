@@ -29,13 +29,13 @@ from g2ard.io.packing import coded, log_scales, morton_order, smallest_three, un
 from g2ard.scene.shape import longer_axes
 from g2ard.scene.splats import Splats
 
-_COLUMNS = 64
+_PALETTE_COLUMNS = 64
 """Entries of the palette per row of its image."""
 
-_LONGEST = 16_383
+_LONGEST_WEBP_SIDE = 16_383
 """Longest side of a WebP image, pixels."""
 
-_STEPS = 6
+_KMEANS_STEPS = 6
 """Steps of k-means after the split; 10 more gain 0.01 dB."""
 
 
@@ -122,7 +122,7 @@ def _size(path: Path, count: int) -> tuple[int, int]:
     """Return width and height, multiples of 4, of an image of `count` pixels."""
     width = math.ceil(math.sqrt(count) / 4) * 4
     height = math.ceil(count / width / 4) * 4
-    if max(width, height) > _LONGEST:
+    if max(width, height) > _LONGEST_WEBP_SIDE:
         raise InputError(f"not written: {count:,} Gaussians exceed the largest SOG image", path=path)
     return width, height
 
@@ -175,10 +175,10 @@ def _rest(splats: Splats) -> tuple[int, NDArray[np.float32], NDArray[np.uint8], 
     """Return the palette's size, codebook and image, and the (N,) entries of Gaussians."""
     rest = splats.shN.shape[1]
     points = np.ascontiguousarray(splats.shN.reshape(len(splats), 3 * rest))
-    entries, labels = _core.palette(points, palette_size(len(splats)), _STEPS, _weights(splats))
+    entries, labels = _core.palette(points, palette_size(len(splats)), _KMEANS_STEPS, _weights(splats))
     used = np.bincount(labels, minlength=len(entries)).astype(np.float32)
     book = _core.codebook(entries.ravel(), 256, np.repeat(used, 3 * rest))
-    rows = math.ceil(len(entries) / _COLUMNS)
-    image = np.zeros((rows * _COLUMNS, rest, 3), np.uint8)
+    rows = math.ceil(len(entries) / _PALETTE_COLUMNS)
+    image = np.zeros((rows * _PALETTE_COLUMNS, rest, 3), np.uint8)
     image[: len(entries)] = nearest(book, entries).reshape(-1, rest, 3)
-    return len(entries), book, image.reshape(rows, _COLUMNS * rest, 3), labels
+    return len(entries), book, image.reshape(rows, _PALETTE_COLUMNS * rest, 3), labels

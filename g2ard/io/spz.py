@@ -40,7 +40,7 @@ _COORDINATE_SYSTEM = 0xADBE0003
 _HEADER_4 = 32
 """Size of the header of version 4, bytes."""
 
-_SYSTEMS: tuple[Axes, ...] = (
+_ADOBE_AXES: tuple[Axes, ...] = (
     *("LDB", "RDB", "LUB", "RUB", "LDF", "RDF", "LUF", "RUF"),
     *("LBU", "RBU", "LFU", "RFU", "LBD", "RBD", "LFD", "RFD"),
 )
@@ -98,7 +98,7 @@ def decoded(path: Path, data: bytes) -> Scene:
 
 def _extensions(path: Path, data: bytes) -> tuple[Axes, int]:
     """Return the axes that the records of version 4 name, and the number of other records."""
-    axes, others, at = _SYSTEMS[3], 0, _HEADER_4
+    axes, others, at = _ADOBE_AXES[3], 0, _HEADER_4
     (end,) = struct.unpack_from("<I", data, 16)
     while at + 8 <= min(end, len(data)):
         kind, size = struct.unpack_from("<II", data, at)
@@ -106,9 +106,9 @@ def _extensions(path: Path, data: bytes) -> tuple[Axes, int]:
             raise damaged("truncated: an extension is cut off", path=path)
         if kind == _COORDINATE_SYSTEM and size == 4:
             (number,) = struct.unpack_from("<I", data, at + 8)
-            if number > len(_SYSTEMS):
+            if number > len(_ADOBE_AXES):
                 raise InputError(f"unknown coordinate system {number}; expected 0 to 16", path=path)
-            axes = _SYSTEMS[number - 1] if number else axes
+            axes = _ADOBE_AXES[number - 1] if number else axes
         else:
             others += 1
         at += 8 + size
@@ -264,7 +264,7 @@ def encoded(
     flags, records = _ANTIALIASED if splats.antialiased else 0, b""
     if axes != "RUB":
         flags |= _HAS_EXTENSIONS
-        records = struct.pack("<III", _COORDINATE_SYSTEM, 4, _SYSTEMS.index(axes) + 1)
+        records = struct.pack("<III", _COORDINATE_SYSTEM, 4, _ADOBE_AXES.index(axes) + 1)
     head = _MAGIC + struct.pack("<IIBBB", spz_version, len(splats), splats.sh_degree, bits, flags)
     if spz_version < 4:
         return gzip.compress(head + b"\0" + b"".join(streams), 9, mtime=0)

@@ -26,7 +26,7 @@ from g2ard.scene.splats import Splats
 
 FORMAT, VERSION = "g2ard tiles", 1
 
-_AT_ONCE = 1 << 16
+_ROWS_AT_ONCE = 1 << 16
 """Rows read at a time."""
 
 
@@ -223,8 +223,8 @@ class TileStore:
             InputError: as for `read`.
         """
         rows, crc = self.rows(index), 0
-        for start in range(0, len(rows), _AT_ONCE):
-            crc = zlib.crc32(rows[start : start + _AT_ONCE].data, crc)
+        for start in range(0, len(rows), _ROWS_AT_ONCE):
+            crc = zlib.crc32(rows[start : start + _ROWS_AT_ONCE].data, crc)
         self._check_contents(tile_name(index), crc, self.tiles[index].checks[0])
 
     def _check_contents(self, name: str, crc: int, expected: int) -> None:
@@ -242,8 +242,8 @@ class TileStore:
         def blocks() -> Iterator[NDArray[np.float32]]:
             nonlocal crc
             with (self.folder / name).open("rb") as file:
-                for start in range(0, count, _AT_ONCE):
-                    data = file.read(self.row_bytes * min(_AT_ONCE, count - start))
+                for start in range(0, count, _ROWS_AT_ONCE):
+                    data = file.read(self.row_bytes * min(_ROWS_AT_ONCE, count - start))
                     crc = zlib.crc32(data, crc)
                     yield np.frombuffer(data, "<f4").reshape(-1, self.row_bytes // 4)
 

@@ -25,10 +25,10 @@ from g2ard.scene.transform import placed
 _SCHEMA = "ParticleField3DGaussianSplat"
 _NAME = "Splats"
 _SH = "radiance:sphericalHarmonics"
-_TURN, _QUAT_TURN = np.array([1.0, -1, -1]), np.array([1.0, 1, -1, -1])
-_BLOCK = 8192
+_USD_TURN, _QUAT_TURN = np.array([1.0, -1, -1]), np.array([1.0, 1, -1, -1])
+_TEXT_ROWS = 8192
 """Rows formatted together as text."""
-_SIGMAS = 3.0
+_EXTENT_SIGMAS = 3.0
 """Extent of a Gaussian, as a multiple of its largest scale."""
 
 
@@ -50,8 +50,8 @@ def write(path: Path, splats: Splats, *, overwrite: bool = False) -> None:
 
 def _attributes(splats: Splats) -> dict[str, tuple[str, NDArray[np.float32]]]:
     """Return the type and the values of each array attribute; quaternions are w x y z."""
-    means = (splats.means * _TURN).astype(np.float32)
-    reach = _SIGMAS * splats.scales.max(axis=1, keepdims=True)
+    means = (splats.means * _USD_TURN).astype(np.float32)
+    reach = _EXTENT_SIGMAS * splats.scales.max(axis=1, keepdims=True)
     extent = np.stack([(means - reach).min(axis=0), (means + reach).max(axis=0)])
     rest = splats.shN * FLIPS[: splats.shN.shape[1], None]
     return {
@@ -76,14 +76,14 @@ def _print(file: TextIO, splats: Splats) -> None:
         row = ", ".join(["%.9g"] * values.shape[1])
         row = row if values.shape[1] == 1 else f"({row})"
         file.write(f"    {kind} {name} = [")
-        for start in range(0, len(values), _BLOCK):
-            block = values[start : start + _BLOCK]
+        for start in range(0, len(values), _TEXT_ROWS):
+            block = values[start : start + _TEXT_ROWS]
             file.write(
                 (", " if start else "") + ", ".join([row] * len(block)) % tuple(block.ravel().tolist())
             )
         file.write("]\n")
     if splats.offset.any():
-        shift = ", ".join(repr(float(v)) for v in splats.offset * _TURN)
+        shift = ", ".join(repr(float(v)) for v in splats.offset * _USD_TURN)
         file.write(
             f"    double3 xformOp:translate = ({shift})\n"
             '    uniform token[] xformOpOrder = ["xformOp:translate"]\n'
@@ -108,7 +108,7 @@ def _save(pxr: Any, path: Path, splats: Splats) -> None:
         values = np.ascontiguousarray(values[:, 0] if kind == "float[]" else values)
         prim.GetAttribute(name).Set(arrays.get(kind, pxr.Vt.Vec3fArray).FromNumpy(values))
     if splats.offset.any():
-        field.AddTranslateOp().Set(pxr.Gf.Vec3d(*(splats.offset * _TURN).tolist()))
+        field.AddTranslateOp().Set(pxr.Gf.Vec3d(*(splats.offset * _USD_TURN).tolist()))
     stage.GetRootLayer().Save()
 
 
@@ -131,7 +131,7 @@ def read(path: Path) -> Scene:
         raise InputError(f"unsupported SH degree {degree}; expected 0 to 3", path=path)
     size = (degree + 1) ** 2
     raw = Raw.empty(count, size - 1)
-    raw.means[:] = means * _TURN
+    raw.means[:] = means * _USD_TURN
     raw.quats[:] = _values(path, prims[0], "orientations", 4, count)[:, [3, 0, 1, 2]] * _QUAT_TURN
     alphas = _values(path, prims[0], "opacities", 1, count)[:, 0]
     raw.set_linear(_values(path, prims[0], "scales", 3, count), alphas)
@@ -157,7 +157,7 @@ def _values(path: Path, prim: Any, name: str, width: int, count: int | None) -> 
 def _to_ply(pxr: Any, stage: Any, prim: Any) -> NDArray[np.float64]:
     """Return the (4, 4) matrix from the prim's flipped axes to the axes of a .ply."""
     world = np.array(pxr.UsdGeom.XformCache().GetLocalToWorldTransform(prim)).T  # USD multiplies rows
-    flip = np.diag([*_TURN, 1.0])
+    flip = np.diag([*_USD_TURN, 1.0])
     upright = np.eye(4)
     if pxr.UsdGeom.GetStageUpAxis(stage) == pxr.UsdGeom.Tokens.z:
         upright[1:3, 1:3] = [[0, 1], [-1, 0]]

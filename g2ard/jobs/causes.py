@@ -21,33 +21,33 @@ from g2ard.stages.recover.sizes import typical_share
 
 Floats = NDArray[np.floating]
 
-_LOW, _GAP = 20.0, 3.0
+_POOR_PSNR, _OVERFIT_GAP = 20.0, 3.0
 """PSNR in held-out views below which a result is poor, and by which it may lie below the training views', dB.
 """
 
-_VIEWS = 5
+_CHECKED_PHOTOS = 5
 UNLIKE = 0.4
 """Correlation of render and photo below which they are considered unrelated. Medians: fox and caliterra with
 their own scenes (2,000 Gaussians, 20 steps) 0.86 and 0.50, plush with its own 0.98, with turned poses 0.30.
 """
-_LEARNED, _ALIKE = 0.75, 0.5
+_POSE_CORRELATION, _BRIGHTNESS_CORRELATION = 0.75, 0.5
 """Correlations below which a poor result that had enough steps fits no poses, and above which brightness is
 compared. Fox and chair with poses in wrong axes or order: 0.58 and 0.70."""
 
-_EXPOSED = 2.0
+_EXPOSURE_GAIN = 2.0
 """Gain in dB from fitting a photo's brightness that shows another exposure."""
 
-_OTHER_COLOUR, _EMPTY_ERROR = 0.1, 0.5
+_BACKGROUND_DIFFERENCE, _BACKGROUND_ERROR_SHARE = 0.1, 0.5
 """Difference of the photos' colour from the background, at their border or where the result is empty, and the
 share of the error there, that show a wrong background."""
 
-_FALLING = 0.1
+_LOSS_STILL_FALLING = 0.1
 """Share by which the loss may fall from the fourth to the last fifth of a recovery that had enough steps."""
 
-_COARSE = 0.01
+_COARSE_GAUSSIAN_SHARE = 0.01
 """Typical standard deviation of a Gaussian, as a share of the image, that shows too few Gaussians."""
 
-_FAR = 2.0
+_FAR_CAMERA_DISTANCES = 2.0
 """Distance of held-out cameras to the next training camera, in distances between training cameras."""
 
 
@@ -68,17 +68,19 @@ def likely_causes(
         scored: mean PSNR in the held-out views, dB.
     """
     gap = recovery.psnr.after - scored
-    if scored >= _LOW and gap <= _GAP:
+    if scored >= _POOR_PSNR and gap <= _OVERFIT_GAP:
         return []
     what = f"held-out views score {gap:.1f} dB less than training views"
-    if scored < _LOW:
+    if scored < _POOR_PSNR:
         what = f"the result scores only {scored:.1f} dB in held-out views"
     alike, causes = _of_photos(splats, held_out, background)
     if not causes:
-        learned = gap <= _GAP and recovery.steps >= 2 * len(trained)
-        causes = [_poses(alike)] if learned and alike < _LEARNED else []
-        causes += _of_budget(splats, trained, recovery, fits=gap > _GAP) if scored < _LOW else []
-        causes += _of_views(splats, held_out.cameras, trained) if gap > _GAP else []
+        learned = gap <= _OVERFIT_GAP and recovery.steps >= 2 * len(trained)
+        causes = [_poses(alike)] if learned and alike < _POSE_CORRELATION else []
+        causes += (
+            _of_budget(splats, trained, recovery, fits=gap > _OVERFIT_GAP) if scored < _POOR_PSNR else []
+        )
+        causes += _of_views(splats, held_out.cameras, trained) if gap > _OVERFIT_GAP else []
     if not causes:
         return [f"{what}, and no usual cause was found; see troubleshooting in the documentation"]
     return [f"{what}; likely causes:", *(f"  - {cause}" for cause in causes)]
@@ -91,7 +93,7 @@ def _of_photos(splats: Splats, held_out: Targets, background: Colour) -> tuple[f
         The median correlation of renders and photos, 1 without photos, and at most one cause.
     """
     views = [v for v in range(len(held_out.cameras)) if against_of(held_out, v) == "photo"]
-    views = [views[i] for i in evenly_spaced(len(views), _VIEWS, floor=True)]
+    views = [views[i] for i in evenly_spaced(len(views), _CHECKED_PHOTOS, floor=True)]
     alike, gains, seen_through, errors = [], [], [], []
     for alpha, image, photo in compared(splats, held_out, views, background):
         alike.append(correlation(image, photo))
@@ -103,16 +105,16 @@ def _of_photos(splats: Splats, held_out: Targets, background: Colour) -> tuple[f
         return 1.0, []
     found = float(np.median(alike))
     shown = photo_traits([path for v in views if (path := held_out.cameras.image_paths[v])]).border
-    if shown is None and np.median(errors) > _EMPTY_ERROR:
+    if shown is None and np.median(errors) > _BACKGROUND_ERROR_SHARE:
         shown = _one_colour(np.concatenate(seen_through))
-    if shown is not None and np.abs(np.subtract(shown, background)).max() > _OTHER_COLOUR:
+    if shown is not None and np.abs(np.subtract(shown, background)).max() > _BACKGROUND_DIFFERENCE:
         return found, [
             f"background: the photos show {colour_text(shown)} around the scene, not "
             f"{colour_text(background)} (--background)"
         ]
     if found < UNLIKE:
         return found, [_poses(found)]
-    if found > _ALIKE and np.median(gains) > _EXPOSED:
+    if found > _BRIGHTNESS_CORRELATION and np.median(gains) > _EXPOSURE_GAIN:
         return found, [
             f"exposure: fitting each photo's brightness would gain {np.median(gains):.1f} dB; give an "
             "exposure.json, or photos of equal exposure"
@@ -142,7 +144,7 @@ def _poses(alike: float) -> str:
 def _one_colour(pixels: Floats) -> Colour | None:
     """Return the colour of most of (N, 3) pixels, rounded; None if they differ."""
     colour = np.median(pixels, axis=0)
-    if (np.abs(pixels - colour).max(axis=1) <= _OTHER_COLOUR).mean() < 0.5:
+    if (np.abs(pixels - colour).max(axis=1) <= _BACKGROUND_DIFFERENCE).mean() < 0.5:
         return None
     red, green, blue = colour.round(2).tolist()
     return red, green, blue
@@ -169,9 +171,9 @@ def _of_budget(splats: Splats, trained: Cameras, recovery: RecoverReport, *, fit
     if recovery.steps < 2 * len(trained):
         views = plural(len(trained), "view")
         causes.append(f"too few steps: {recovery.steps:,} for {views}; raise --steps")
-    elif len(fifths) == 5 and (fall := 1 - fifths[4] / fifths[3]) > _FALLING:
+    elif len(fifths) == 5 and (fall := 1 - fifths[4] / fifths[3]) > _LOSS_STILL_FALLING:
         causes.append(f"too few steps: the loss still fell by {fall:.0%} in the last fifth; raise --steps")
-    if not fits and (share := typical_share(splats, trained)) > _COARSE:
+    if not fits and (share := typical_share(splats, trained)) > _COARSE_GAUSSIAN_SHARE:
         causes.append(
             f"too few Gaussians: the standard deviation of a typical one is {share:.1%} of the image's side; "
             "raise -n or lower -r"
@@ -185,7 +187,7 @@ def _of_views(splats: Splats, held_out: Cameras, trained: Cameras) -> list[str]:
     np.fill_diagonal(away, np.inf)
     usual = float(np.median(away.min(axis=1))) if len(trained) > 1 else 0.0
     tested = np.linalg.norm(held_out.positions[:, None] - trained.positions, axis=2).min(axis=1)
-    if usual > 0 and (ratio := float(np.median(tested)) / usual) > _FAR:
+    if usual > 0 and (ratio := float(np.median(tested)) / usual) > _FAR_CAMERA_DISTANCES:
         return [f"views: held-out cameras are {ratio:.1f} times as far from training cameras as these from "
                 "each other; train on views between"]  # fmt: skip
     return [

@@ -17,13 +17,13 @@ from g2ard.stages.recover import recover
 from g2ard.stages.simplify import round_counts, simplify
 from g2ard.system.peak_memory import peak_rss
 
-_TRIED, _STEPS = 4, 8
+_TRIAL_VIEWS, _TRIAL_STEPS = 4, 8
 """Number of views rendered and of steps taken for the estimate."""
-_MERGING = 4.0
+_MERGE_TIMES = 4.0
 """Time of merging by `default` or `paper` relative to `fast`: 2 to 6.5 measured."""
-_WATCHING = 1.3
+_RECOVERY_OVERHEAD = 1.3
 """Time of a recovery relative to its steps alone; the rest is trials of rates and validation."""
-_ONCE = "prepare", "targets"
+_SHARED_STAGES = "prepare", "targets"
 """Stages that several budgets share."""
 _PAGE_BYTES, _PAGE_FULL = 170, 130_000
 """Memory of packing the viewer page: bytes per Gaussian and SH coefficient above degree 0, and the count from
@@ -62,7 +62,7 @@ def estimate(job: DistillJob, budget: int, *, page: bool = True) -> Estimate:
     """Estimate a job at one budget from a few renders and steps and one fast merge."""
     train, test, apart = job.views.train.cameras, job.views.test, job.views.apart
     near = 0 if apart is None or job.teacher is None else len(apart)
-    some = evenly_spaced(len(train), _TRIED)
+    some = evenly_spaced(len(train), _TRIAL_VIEWS)
     targets = job.targets_for(train.take(some), lazy=True)
     began = time.monotonic()
     for view in range(len(targets.cameras)):
@@ -81,7 +81,9 @@ def estimate(job: DistillJob, budget: int, *, page: bool = True) -> Estimate:
             "prepare": job.seconds,
             "targets": per_view * views,
             "simplify": merging + per_view * len(train),  # each view is rendered once for visibility
-            "recover": _WATCHING * steps * _step_seconds(job, merged, targets) if limit is None else limit,
+            "recover": _RECOVERY_OVERHEAD * steps * _step_seconds(job, merged, targets)
+            if limit is None
+            else limit,
             "score": per_view * (2 * len(test) + near),
         },
         bytes=_peak_bytes(job, merged, page)
@@ -92,8 +94,8 @@ def estimate(job: DistillJob, budget: int, *, page: bool = True) -> Estimate:
 
 def total(estimates: Sequence[Estimate]) -> tuple[float, int]:
     """Return seconds and bytes of one run at several budgets, which share preparation and targets."""
-    once = sum(estimates[0].seconds[stage] for stage in _ONCE)
-    apart = sum(found.total - sum(found.seconds[stage] for stage in _ONCE) for found in estimates)
+    once = sum(estimates[0].seconds[stage] for stage in _SHARED_STAGES)
+    apart = sum(found.total - sum(found.seconds[stage] for stage in _SHARED_STAGES) for found in estimates)
     return once + apart, max(found.bytes for found in estimates)
 
 
@@ -114,14 +116,14 @@ def _merged(job: DistillJob, budget: int) -> tuple[Splats, float]:
     seconds = time.monotonic() - began
     if (degree := job.config.recover.sh_degree) is not None:
         merged = merged.with_sh_degree(degree)
-    return merged, seconds if job.config.simplify.method == "fast" else _MERGING * seconds
+    return merged, seconds if job.config.simplify.method == "fast" else _MERGE_TIMES * seconds
 
 
 def _step_seconds(job: DistillJob, student: Splats, targets: Targets) -> float:
     config = job.config.recover
     schedule = replace(config.schedule, multiplier=1.0, reach=1.0)
-    tried = replace(config, schedule=schedule, steps=_STEPS, recovery_time=None)
-    return recover(student, targets, tried).report.seconds / _STEPS
+    tried = replace(config, schedule=schedule, steps=_TRIAL_STEPS, recovery_time=None)
+    return recover(student, targets, tried).report.seconds / _TRIAL_STEPS
 
 
 def _steps(job: DistillJob, student: Splats) -> int:

@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 
 from g2ard.scene.cameras import Cameras
 
-_COARSE, _FINE = 64, 128
+_COARSE_VOXELS, _FINE_VOXELS = 64, 128
 """Voxels per side of the grid that finds the object's box, and of the grid within it."""
-_TOLERATED = 0.02
+_EMPTY_VIEWS_SHARE = 0.02
 """Share of the views that may see a voxel as empty, because single outlines have errors."""
-_SEEING = 0.25
+_SEEING_VIEWS_SHARE = 0.25
 """Least share of the views that must contain a voxel."""
 
 Float = NDArray[np.float64]
@@ -62,12 +62,12 @@ def visual_hull(cameras: Cameras, outlines: Sequence[Mask | None], middle: Float
         The hull, or None if nothing remains or the object is not outlined in enough views.
     """
     told = [v for v, outline in enumerate(outlines) if outline is not None and not bool(outline.all())]
-    if len(told) < max(3, _SEEING * len(cameras)):
+    if len(told) < max(3, _SEEING_VIEWS_SHARE * len(cameras)):
         return None
     half = float(np.median(np.linalg.norm(cameras.positions - middle, axis=1)))
     told = np.random.default_rng(0).permutation(told).tolist()  # other directions carve sooner
     low, size = middle - half, np.full(3, 2 * half)
-    for count in (_COARSE, _FINE):
+    for count in (_COARSE_VOXELS, _FINE_VOXELS):
         side = size / count
         middle = low + size / 2
         views = [_Outlined.of(cameras, view, outlines[view], middle, side) for view in told]
@@ -114,10 +114,10 @@ def _carved(views: Sequence[_Outlined], low: Float, side: Float, count: int) -> 
             hit = shown[np.where(inside, v, 0).astype(np.intp), np.where(inside, u, 0).astype(np.intp)]
             seen += inside
             empty += inside & ~hit
-            kept = empty <= _TOLERATED * len(views)
+            kept = empty <= _EMPTY_VIEWS_SHARE * len(views)
             if not kept.all():
                 points, left, empty, seen = points[kept], left[kept], empty[kept], seen[kept]
-        filled[slab, left] = seen >= _SEEING * len(views)
+        filled[slab, left] = seen >= _SEEING_VIEWS_SHARE * len(views)
     return filled.reshape(count, count, count)
 
 

@@ -38,10 +38,10 @@ from g2ard.stages.simplify import simplify
 RATIOS = (1.0, 2.0, 4.0, 8.0, 16.0)
 """Reduction factors; each level has half the Gaussians of the previous one, as in viewers' own tools."""
 
-_ROWS = 100_000
+_UP_SAMPLE = 100_000
 """Gaussians used to estimate the up direction."""
 
-_SMALLEST = 200
+_SMALLEST_VIEW_SIDE = 200
 """Smallest longer side of a level's views in pixels; below it, edges dominate the error."""
 
 
@@ -299,7 +299,7 @@ def tileset_up(
     if up is None and coarse.offset.any():
         axis = np.array([0.0, 0, 1])
     else:
-        rows = np.linspace(0, len(coarse) - 1, min(len(coarse), _ROWS)).astype(np.int64)
+        rows = np.linspace(0, len(coarse) - 1, min(len(coarse), _UP_SAMPLE)).astype(np.int64)
         axis = up_of(coarse.take(rows), up)
     rounded = ", ".join(f"{round(value, 3) + 0.0:g}" for value in axis)
     say(f"up is {rounded}" + ("" if up else "; --up X,Y,Z changes it"))
@@ -309,4 +309,4 @@ def tileset_up(
 def level_size(cameras: Cameras, ratio: float) -> int:
     """Return the longer side of a level's views in pixels."""
     longest = int(max(cameras.widths.max(), cameras.heights.max()))
-    return longest if ratio == 1 else max(_SMALLEST, round(longest / ratio**0.25))
+    return longest if ratio == 1 else max(_SMALLEST_VIEW_SIDE, round(longest / ratio**0.25))

@@ -29,11 +29,11 @@ from g2ard.scene.samples import evenly_spaced
 from g2ard.scene.splats import Splats
 from g2ard.stages.simplify import Simplified, SimplifyConfig, Visibility, VisibilitySource, simplify
 
-_VIEWS, _SIDE = 12, 400
+_QUALITY_VIEWS, _QUALITY_SIDE = 12, 400
 """Number of views in which quality is measured, and their longer side in pixels."""
-_ROWS = 100_000
+_POOL_SAMPLE = 100_000
 """Gaussians that those views are planned on."""
-_SAMPLE = 4096
+_PROBE_ROWS = 4096
 """Gaussians of the first probe file, which estimates the bytes per Gaussian."""
 _PROBES, _FULL, _AIM = 6, 0.98, 0.99
 """Most files written to find a count for bytes; shares of the bytes that are accepted and aimed at."""
@@ -176,7 +176,7 @@ def count_for_bytes(splats: Splats, wanted: int, name: str, reduce: Callable[[in
         name: a file name; its suffix is the format.
     """
     fewest, most = min(_FEWEST, len(splats)), len(splats)
-    sample = splats.take(np.array(evenly_spaced(most, _SAMPLE, floor=True)))
+    sample = splats.take(np.array(evenly_spaced(most, _PROBE_ROWS, floor=True)))
     count = int(len(sample) * wanted / file_bytes(sample, name))
     fits, over = (0, 0), (most + 1, 0)  # (count, bytes); 0 bytes means no such file yet
     probes = 0
@@ -360,8 +360,15 @@ def _aim_for_quality(reduce: Reduction, wanted: Quality, file: str) -> Aim:
     from g2ard.poses import plan_pool
 
     splats, say = reduce.splats, reduce.say
-    pool = plan_pool(splats, _VIEWS, seed=reduce.seed, rows=_ROWS, for_weights=True, progress=reduce.progress)
-    cameras = pool.cameras.resized(_SIDE)
+    pool = plan_pool(
+        splats,
+        _QUALITY_VIEWS,
+        seed=reduce.seed,
+        rows=_POOL_SAMPLE,
+        for_weights=True,
+        progress=reduce.progress,
+    )
+    cameras = pool.cameras.resized(_QUALITY_SIDE)
 
     def written(count: int) -> Splats:
         return as_file(reduce(count).splats, file)

@@ -29,7 +29,7 @@ from g2ard.stages.register import register as find_poses
 Poses = Mapping[str, ArrayLike]
 Found = TypeVar("Found")
 
-_ROWS = 200_000
+_POSE_SAMPLE = 200_000
 """Gaussians that poses are planned on."""
 
 
@@ -391,7 +391,7 @@ def pool_of(
         return read_view_set(Path(str(pool)), unpictured=True).cameras
     from g2ard.poses import plan_pool
 
-    planned = plan_pool(scene, int(str(pool)), seed=seed, rows=_ROWS, progress=progress)
+    planned = plan_pool(scene, int(str(pool)), seed=seed, rows=_POSE_SAMPLE, progress=progress)
     say(
         f"pool: {len(planned.cameras)} poses, {planned.kind} ({planned.why}); if the photos were taken "
         "differently, generate similar poses with `g2ard poses --kind` and pass the file to --pool"

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from g2ard.jobs.budget import Budget
     from g2ard.jobs.distill_options import DistillOptions
 
-_SMALLEST_ROW = 4
+_LEAST_FILE_ROW_BYTES = 4
 """Least bytes per Gaussian in a file: a smaller file is known to be small without opening it."""
 
 
@@ -87,7 +87,7 @@ def is_tiled(scene: Path, tiling: Tiling) -> bool:
     if (
         scene.is_file()
         and scene.suffix.lower() != ".json"
-        and scene.stat().st_size < _SMALLEST_ROW * tiling.most_rows
+        and scene.stat().st_size < _LEAST_FILE_ROW_BYTES * tiling.most_rows
     ):
         return False
 

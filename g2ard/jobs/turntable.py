@@ -13,7 +13,7 @@ from g2ard.progress import Progress, Say, silent, unsaid
 from g2ard.scene.cameras import Cameras, look_at
 from g2ard.scene.splats import Splats
 
-_POOL = 32
+_TURN_POOL = 32
 """Generated poses, of which the one that shows most of the scene begins the turn."""
 
 
@@ -36,7 +36,7 @@ def turntable(
         count: number of views; the one after the last would be the first again.
         up: (3,) axis of the circle; estimated by default.
     """
-    pool = plan_pool(scene, _POOL, size=size, up=up, seed=seed, progress=progress)
+    pool = plan_pool(scene, _TURN_POOL, size=size, up=up, seed=seed, progress=progress)
     points, axis = opaque_points(scene), np.asarray(pool.up, np.float64)
     if up is None:
         say(f"up: {','.join(f'{value:.2f}' for value in axis)}, estimated; --up X,Y,Z sets it")

@@ -18,20 +18,20 @@ from g2ard.scene.cameras import Cameras, unseeing
 from g2ard.scene.samples import evenly_spaced
 from g2ard.scene.splats import Splats
 
-_SIDE = 800
+_VIEW_SIDE = 800
 """Longer side in pixels, as in a generated pool."""
 
-_SAMPLE = 4096
-_SEEING = 0.5
+_SIGHT_SAMPLE = 4096
+_SEEING_CAMERA_SHARE = 0.5
 """Share of cameras that must see the scene for found views to be used."""
-_LOOKED_AT, _SMALL = 15, 160
+_COMPARED_PHOTOS, _COMPARED_SIDE = 15, 160
 """Number of photos compared with the scene, and their longer side in pixels."""
 _UNRELATED = 0.15
 """Correlation below which the photos are of something else, or posed in other coordinates. Playbot and guitar
 with the photos of plush, caliterra and chair: −0.01 to 0.03 for five of the six pairs."""
-_DIFFERENT = 4 / 255
+_BACKGROUND_SLACK = 4 / 255
 """Difference of two background colours that matters."""
-_BLIND = 0.1
+_BLIND_VIEWS_SHARE = 0.1
 """Share of given views that may see nothing of the scene without a warning."""
 
 
@@ -56,7 +56,7 @@ def found_views(scene: str | Path, splats: Splats, splits: Sequence[str], say: S
         return None
     count = len(views.cameras)
     seeing = int(views.cameras.facing(opaque_points(splats)).sum())
-    if seeing < _SEEING * count:
+    if seeing < _SEEING_CAMERA_SHARE * count:
         say(f"views beside the scene are not used: {path}: {seeing} of {plural(count, 'camera')} see it")
         return None
     cameras = plural(count, "camera")
@@ -67,7 +67,7 @@ def found_views(scene: str | Path, splats: Splats, splits: Sequence[str], say: S
 def warn_of_sight(splats: Splats, cameras: Cameras, say: Say) -> None:
     """Warn if more than a tenth of the given views see nothing of the scene."""
     blind = int((~cameras.facing(opaque_points(splats))).sum())
-    if blind > _BLIND * len(cameras):
+    if blind > _BLIND_VIEWS_SHARE * len(cameras):
         say(
             f"warning: {blind} of {plural(len(cameras), 'view')} see nothing of the scene; check that "
             "both use the same coordinates (`g2ard info` shows the extent of each)"
@@ -91,8 +91,8 @@ def check_photos(
     from g2ard.jobs.causes import UNLIKE, compared, correlation
 
     pictured = np.flatnonzero([path is not None for path in cameras.image_paths])
-    tried = evenly_spaced(len(pictured), _LOOKED_AT, floor=True)
-    photos = Photos(cameras.take(pictured[tried]).resized(_SMALL), background=background)
+    tried = evenly_spaced(len(pictured), _COMPARED_PHOTOS, floor=True)
+    photos = Photos(cameras.take(pictured[tried]).resized(_COMPARED_SIDE), background=background)
     views = compared(splats, photos, range(len(tried)), background)
     alike = [correlation(image, photo) for _, image, photo in views]
     found = float(np.median(alike)) if alike else 1.0
@@ -127,7 +127,10 @@ def propose_background(cameras: Cameras, background: Colour, given: bool, say: S
             "published scores use --background white"
         )
     border = traits.border
-    if border is not None and max(abs(a - b) for a, b in zip(border, background, strict=True)) > _DIFFERENT:
+    if (
+        border is not None
+        and max(abs(a - b) for a, b in zip(border, background, strict=True)) > _BACKGROUND_SLACK
+    ):
         fitting = colour_text(border)
         say(
             f"note: the photos have a constant border of {fitting}, but the background is {used}; if the "
@@ -140,12 +143,12 @@ def as_pool(cameras: Cameras) -> Cameras:
 
     INRIA's file states the size of the full photos, which its trainer had shrunk.
     """
-    return cameras if any(cameras.image_paths) else cameras.resized(_SIDE)
+    return cameras if any(cameras.image_paths) else cameras.resized(_VIEW_SIDE)
 
 
 def opaque_points(splats: Splats) -> NDArray[np.float64]:
     """Return (K, 3) world means of a sample of the Gaussians of opacity 0.5 or more, otherwise of all."""
     opaque = np.flatnonzero(splats.opacities >= 0.5)
     rows = opaque if len(opaque) else np.arange(len(splats))
-    sample = rows[evenly_spaced(len(rows), _SAMPLE, floor=True)]
+    sample = rows[evenly_spaced(len(rows), _SIGHT_SAMPLE, floor=True)]
     return splats.means[sample].astype(np.float64) + splats.offset

@@ -22,25 +22,25 @@ from g2ard.scene.splats import Splats
 from g2ard.scene.transform import quaternion_of, transform, unit_up
 from g2ard.viewer import Start
 
-_POOL = 32
+_START_POOL = 32
 """Number of generated poses from which the initial camera is chosen."""
 
-_ROWS = 100_000
+_UP_SAMPLE = 100_000
 """Gaussians used to estimate the up direction."""
 
 _TO_VIEWER = np.diag([-1.0, -1.0, 1.0])
 """Rotation that the viewer applies to scenes: by 180° about z."""
 
-_ROLL = 0.1
+_LEVEL_SPREAD_RATIO = 0.1
 """Ratio of the spread of the views' x axes along and across a direction, below which it is up."""
 
-_TURNED = 1e-3
+_ONE_WAY_SPREAD = 1e-3
 """Second eigenvalue of the same spread below which all views face one way: 2° of their x axes."""
 
-_UPRIGHT = 0.8
+_UPRIGHT_MEAN = 0.8
 """Length of the mean of the photos' up directions, above which it is up."""
 
-_TRIED, _SIDE = 12, 160
+_START_VIEWS, _START_SIDE = 12, 160
 """Number of typical views that are rendered to choose the opening one, and their longer side in pixels."""
 
 
@@ -122,7 +122,7 @@ def frame_of(
     """
     try:
         found = views_or_pool(
-            scene, views, beside=beside, count=_POOL, up=up, seed=seed, progress=progress, say=say
+            scene, views, beside=beside, count=_START_POOL, up=up, seed=seed, progress=progress, say=say
         )
     except InputError as error:
         if start is not None or not (views is None or is_made(views)):
@@ -148,11 +148,11 @@ def _level(cameras: Cameras) -> NDArray[np.float64] | None:
     """Return the up direction that views share, or that of photos which all face one way; otherwise None."""
     across, up = cameras.viewmats[:, 0, :3], -cameras.viewmats[:, 1, :3].mean(axis=0)
     values, vectors = np.linalg.eigh(across.T @ across / len(cameras))
-    if values[0] <= _ROLL * values[1] and values[1] > _TURNED:
+    if values[0] <= _LEVEL_SPREAD_RATIO * values[1] and values[1] > _ONE_WAY_SPREAD:
         axis: NDArray[np.float64] = vectors[:, 0]
         above = up - cameras.forwards.mean(axis=0) / 2  # most cameras look down, some straight down
         return axis if axis @ above >= 0 else -axis
-    return unit_up(up) if any(cameras.image_paths) and np.linalg.norm(up) > _UPRIGHT else None
+    return unit_up(up) if any(cameras.image_paths) and np.linalg.norm(up) > _UPRIGHT_MEAN else None
 
 
 def up_of(scene: Splats, up: Sequence[float] | None = None) -> NDArray[np.float64]:
@@ -160,7 +160,7 @@ def up_of(scene: Splats, up: Sequence[float] | None = None) -> NDArray[np.float6
     if up is not None:
         return unit_up(up)
     try:
-        return Site.of(scene, None, _ROWS).up.axis
+        return Site.of(scene, None, _UP_SAMPLE).up.axis
     except InputError:  # nothing visible
         return np.array([0.0, -1.0, 0.0])
 
@@ -199,8 +199,8 @@ def _typical(scene: Splats, cameras: Cameras, up: NDArray[np.float64], points: N
     away = np.abs(traits - np.median(traits, axis=0))
     spread = np.median(away, axis=0)
     order = np.argsort((away / np.where(spread > 0, spread, 1)).sum(axis=1), kind="stable")
-    tried, renderer = cameras.take(order[:_TRIED]), Renderer(scene)
-    return tried[int(np.argmax([_detail(renderer.clipped(view)) for view in tried.resized(_SIDE)]))]
+    tried, renderer = cameras.take(order[:_START_VIEWS]), Renderer(scene)
+    return tried[int(np.argmax([_detail(renderer.clipped(view)) for view in tried.resized(_START_SIDE)]))]
 
 
 def _traits(view: Camera, up: NDArray[np.float64], points: NDArray[np.float64]) -> tuple[float, float, float]:

@@ -27,20 +27,20 @@ if TYPE_CHECKING:
     from g2ard.poses import Pool
 Up = Sequence[float] | None
 
-_POOL, _GROW, _NEAR = 160, 2.0, 0.25
+_POOL_VIEWS, _POOL_GROWTH, _NEAR_SHARE = 160, 2.0, 0.25
 """Generated pool: number of poses, growth factor if views show little of the scene, and share of nearer
 poses. Every 8th pose is held out for scoring.
 """
-_ANYWHERE, _FEW = 0.4, 0.05
+_ANYWHERE_SHARE, _LEAST_ANYWHERE_SHARE = 0.4, 0.05
 """Share of the training views that look from anywhere, if other views hold nothing of the scene; if they hold
 a share h, 1−h times that, and none below the second share.
 """
-_APART = 24
+_VIEWS_APART = 24
 """Number of near views, and of each further kind that trains: one half validates recovery, the other is
 scored."""
 _POOL_GAUSSIANS = 4_000_000
 """Size of a tiled scene from which the pool grows in proportion."""
-_ROWS = 200_000
+_POOL_SAMPLE = 200_000
 """Gaussians that poses are planned on."""
 
 _WEIGHT_VIEWS, _WEIGHT_ROWS = 96, 100_000
@@ -84,7 +84,7 @@ def views_of(
         progress=progress,
     )
     load = partial(load_view_sets, size=options.size, say=say, unpictured=teach)
-    spare = round(_APART * _times(prior, represents))
+    spare = round(_VIEWS_APART * _times(prior, represents))
     select = replace(options.config.select, focus=options.focus)
     if given is None or is_made(given):
         if not teach:
@@ -92,7 +92,7 @@ def views_of(
                 "generated views have no photos", parameter="photos", hint="give {views} that have them"
             )
         held_out = None if options.held_out is None else load(options.held_out, [for_scores])[0].cameras
-        return _generated(plan(_POOL, grow=_GROW), held_out, options.size, select, spare, say)
+        return _generated(plan(_POOL_VIEWS, grow=_POOL_GROWTH), held_out, options.size, select, spare, say)
     if options.held_out is None:
         train, test = load(given, ["train", "test"])
     else:
@@ -109,7 +109,7 @@ def views_of(
     if not teach:
         return RunViews(train, test.cameras)
     try:
-        planned = plan(_APART)
+        planned = plan(_VIEWS_APART)
     except InputError:  # the scene has no room for poses
         return RunViews(train, test.cameras)
     train, apart = _mixed(train, planned, select, spare, options.size, say)
@@ -144,8 +144,8 @@ def _mixed(
     There are also as many near views if none train.
     """
     usual = len(train.cameras)
-    share = _ANYWHERE * (1 - planned.held)
-    if select.focus in ("far", "anywhere") or share <= _FEW:
+    share = _ANYWHERE_SHARE * (1 - planned.held)
+    if select.focus in ("far", "anywhere") or share <= _LEAST_ANYWHERE_SHARE:
         share = 0.0
     counts = {"near": 0, "anywhere": round(usual * share / (1 - share))}
     if select.focus not in (None, "far"):
@@ -198,9 +198,9 @@ def views_or_pool(
     if views is None and beside is not None and (found := found_views(beside, scene, [], say)):
         return found
     if count is None:
-        planned = _planned(scene, _POOL, up=up, seed=seed, progress=progress, grow=_GROW)
+        planned = _planned(scene, _POOL_VIEWS, up=up, seed=seed, progress=progress, grow=_POOL_GROWTH)
     else:
-        planned = plan_pool(scene, count, up=up, seed=seed, rows=_ROWS, progress=progress)
+        planned = plan_pool(scene, count, up=up, seed=seed, rows=_POOL_SAMPLE, progress=progress)
     say(f"poses: {_of(planned, planned.cameras)}")
     return ViewSet(planned.cameras, splits=splits_of(None, planned.cameras.names))
 
@@ -260,7 +260,7 @@ def cameras_for_weights(
             up=up,
             seed=seed,
             rows=round(_WEIGHT_ROWS * times),
-            near=_NEAR,
+            near=_NEAR_SHARE,
             for_weights=True,
             represents=represents,
             progress=progress,
@@ -290,9 +290,9 @@ def _planned(
         round(count * times),
         up=up,
         seed=seed,
-        rows=round(_ROWS * times),
+        rows=round(_POOL_SAMPLE * times),
         grow=grow,
-        near=_NEAR,
+        near=_NEAR_SHARE,
         represents=represents,
         progress=progress,
     )

@@ -31,10 +31,10 @@ Float = NDArray[np.float64]
 TILE_OF_SCENE = np.array([[-1.0, 0, 0], [0, 0, -1], [0, -1, 0]])
 """Rotation from the scene's axes to a tile's: glTF's (half a turn about z), then z up instead of y."""
 
-_MOST_ERROR = 16.0
+_SCREEN_SPACE_ERROR = 16.0
 """Error on the screen in pixels at which viewers refine a tile by default (maximumScreenSpaceError)."""
 
-_MAJOR, _FLATTENING = 6378137.0, 1 / 298.257223563
+_WGS84_RADIUS, _WGS84_FLATTENING = 6378137.0, 1 / 298.257223563
 """Major half axis in metres and flattening of the ellipsoid WGS 84."""
 
 
@@ -85,8 +85,8 @@ class Georeference:
         east = np.array([-np.sin(lon), np.cos(lon), 0])
         up = np.array([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)])
         north = np.cross(up, east)
-        squared = _FLATTENING * (2 - _FLATTENING)
-        normal = _MAJOR / np.sqrt(1 - squared * np.sin(lat) ** 2)
+        squared = _WGS84_FLATTENING * (2 - _WGS84_FLATTENING)
+        normal = _WGS84_RADIUS / np.sqrt(1 - squared * np.sin(lat) ** 2)
         matrix = np.eye(4)
         matrix[:3, 0] = np.cos(turn) * east - np.sin(turn) * north
         matrix[:3, 1] = np.sin(turn) * east + np.cos(turn) * north
@@ -206,7 +206,7 @@ class _Tiles:
     def _error(self, level: int, rows: list[NDArray[np.int64]]) -> float:
         """Return 16 standard deviations of the median Gaussian, along its two longer axes."""
         scales = longer_axes(self.levels[level].take(np.concatenate(rows)).scales)
-        return _MOST_ERROR * float(np.median(np.sqrt(scales.astype(np.float64).prod(axis=1))))
+        return _SCREEN_SPACE_ERROR * float(np.median(np.sqrt(scales.astype(np.float64).prod(axis=1))))
 
     def content(self, name: str) -> list[bytes]:
         """Return the .glb of a tile, whose node is moved to the middle of its box."""

@@ -23,7 +23,7 @@ Level = Splats | StoredScene
 Float = NDArray[np.float64]
 Rows = NDArray[np.int64]
 
-_BLOCK = 1 << 20
+_ROWS_AT_ONCE = 1 << 20
 """Rows processed together."""
 
 
@@ -108,7 +108,7 @@ def cut(levels: Sequence[Level], rule: Cut | None = None, scratch: Path | None =
 
 
 def _blocks(count: int) -> Iterator[slice]:
-    return (slice(start, min(start + _BLOCK, count)) for start in range(0, count, _BLOCK))
+    return (slice(start, min(start + _ROWS_AT_ONCE, count)) for start in range(0, count, _ROWS_AT_ONCE))
 
 
 def _reach(splats: Splats) -> Float:
@@ -136,7 +136,7 @@ class _Tree:
 
     def room(self, shape: int | tuple[int, int], dtype: type[Any] = np.int64) -> NDArray[Any]:
         """Allocate an array in memory, or in a temporary file that is removed with it."""
-        if self.scratch is None or np.prod(shape) < _BLOCK:
+        if self.scratch is None or np.prod(shape) < _ROWS_AT_ONCE:
             return np.empty(shape, dtype)
         with TemporaryFile(dir=self.scratch) as file:
             return np.memmap(file, dtype, "w+", shape=shape)

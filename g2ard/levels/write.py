@@ -29,12 +29,12 @@ from g2ard.levels.tree import cut as cut_tree
 from g2ard.progress import Progress, silent
 from g2ard.scene.splats import Splats
 
-_BESIDE = "beside.txt"
+_HIDDEN_FOLDER_FILE = "beside.txt"
 """File in the work folder that names the hidden folder of an unfinished output."""
 
-_ENVIRONMENT = "env/meta.json"
+_ENVIRONMENT_META = "env/meta.json"
 
-_PART, _IMAGE = re.compile(r"(\d+_\d+|env)/meta\.json"), re.compile(r"\w+\.webp")
+_CHUNK_META, _CHUNK_IMAGE = re.compile(r"(\d+_\d+|env)/meta\.json"), re.compile(r"\w+\.webp")
 """Names of a level's files, and of the images in them."""
 
 
@@ -80,11 +80,11 @@ def save_levels(
         if work is None:
             files.write(folder, path, progress)
         else:
-            (work / _BESIDE).write_text(str(folder), encoding="utf-8", newline="\n")
+            (work / _HIDDEN_FOLDER_FILE).write_text(str(folder), encoding="utf-8", newline="\n")
             for name in files.parts:  # linked, not moved: an interrupted call resumes from them
                 shutil.copytree((work / name).parent, (folder / name).parent, copy_function=_linked)
         if environment is not None:
-            _write_part(folder / _ENVIRONMENT, sog_files(path / _ENVIRONMENT, environment))
+            _write_part(folder / _ENVIRONMENT_META, sog_files(path / _ENVIRONMENT_META, environment))
         write_json(folder / "lod-meta.json", meta)
         written = {
             file.relative_to(folder): file.stat().st_size for file in folder.rglob("*") if file.is_file()
@@ -93,7 +93,7 @@ def save_levels(
     if work is not None:
         for name in files.parts:
             shutil.rmtree((work / name).parent, ignore_errors=True)
-        (work / _BESIDE).unlink()
+        (work / _HIDDEN_FOLDER_FILE).unlink()
     return sum(written.values())
 
 
@@ -113,7 +113,7 @@ def _meta(
         "count": sum(counts),
         "counts": counts,
         "lodLevels": len(levels),
-        **({"environment": _ENVIRONMENT} if has_environment else {}),
+        **({"environment": _ENVIRONMENT_META} if has_environment else {}),
         "filenames": names,
         "tree": root,
     }
@@ -129,7 +129,7 @@ def _write_part(meta: Path, files: dict[str, bytes]) -> None:
 def _sweep(work: Path) -> None:
     """Remove the leftovers of a killed call: partial folders in `work` and the hidden output folder."""
     begun = [path for path in work.iterdir() if path.is_dir() and path.name.startswith(".")]
-    if (note := work / _BESIDE).is_file():
+    if (note := work / _HIDDEN_FOLDER_FILE).is_file():
         beside = Path(note.read_text(encoding="utf-8"))
         begun += [beside] if beside.name.startswith(".") else []
     for path in begun:
@@ -197,9 +197,11 @@ def _named_in(path: Path) -> set[Path]:
     """Return the relative paths of all level files that the folder's `lod-meta.json` names."""
     named: set[Path] = set()
     meta = read_object(path / "lod-meta.json")
-    for part in map(Path, [*_names(meta, "filenames", _PART), *_names(meta, "environment", _PART)]):
+    for part in map(
+        Path, [*_names(meta, "filenames", _CHUNK_META), *_names(meta, "environment", _CHUNK_META)]
+    ):
         entries = [entry for entry in read_object(path / part).values() if isinstance(entry, dict)]
-        images = [image for entry in entries for image in _names(entry, "files", _IMAGE)]
+        images = [image for entry in entries for image in _names(entry, "files", _CHUNK_IMAGE)]
         named |= {part, *map(part.with_name, images)}
     return named
 

@@ -14,15 +14,15 @@ from g2ard.scene.cameras import Cameras
 from g2ard.scene.samples import evenly_spaced
 from g2ard.scene.splats import SH_C0, Splats
 
-_VIEWS = 16
+_FITTED_VIEWS = 16
 """Number of evenly spaced targets used to fit the change of colours."""
-_PIXELS = 20_000
+_FITTED_PIXELS = 20_000
 """Most pixels used per target."""
-_RIDGE = 1e-5
+_NO_CHANGE_WEIGHT = 1e-5
 """Weight of no change, as a share of the pixels, for colours that the scene lacks."""
-_LOOK = 300
+_VISIBILITY_SIDE = 300
 """Longer side in pixels of the renders that measure visibility."""
-_SEEN = 10.0
+_HALF_SEEN_WEIGHT = 10.0
 """Σ αT over these renders at which a view counts as half."""
 
 
@@ -54,11 +54,11 @@ def colour_change(splats: Splats, targets: Targets, background: tuple[float, flo
     normal, right = np.zeros((4, 4)), np.zeros((4, 3))
     before = pixels = 0.0
     renderer = Renderer(splats, background=background)
-    for view in evenly_spaced(len(cameras), _VIEWS):
+    for view in evenly_spaced(len(cameras), _FITTED_VIEWS):
         rendered = renderer.render(cameras[view])
         image, mask = targets[view], mask_of(targets, view)
         counts = np.ones(image.shape[:2], bool) if mask is None else mask
-        rows = np.flatnonzero(counts)[:: max(1, int(counts.sum()) // _PIXELS)]
+        rows = np.flatnonzero(counts)[:: max(1, int(counts.sum()) // _FITTED_PIXELS)]
         alpha = rendered.alpha.reshape(-1, 1)[rows].astype(np.float64)
         beyond = (1 - alpha) * behind
         own = rendered.image.reshape(-1, 3)[rows] - beyond
@@ -68,7 +68,7 @@ def colour_change(splats: Splats, targets: Targets, background: tuple[float, flo
         right += features.T @ missing
         before += float((missing**2).sum())
         pixels += len(rows)
-    change = np.linalg.solve(normal + _RIDGE * pixels * np.eye(4), right)
+    change = np.linalg.solve(normal + _NO_CHANGE_WEIGHT * pixels * np.eye(4), right)
     # |y − Xb|² = |y|² − 2 bᵀXᵀy + bᵀXᵀXb
     after = before - 2 * float((change * right).sum()) + float((change * (normal @ change)).sum())
     tiny = np.finfo(np.float64).tiny
@@ -87,11 +87,11 @@ def recoloured(splats: Splats, change: ColourChange) -> Splats:
 def views_seeing(splats: Splats, cameras: Cameras) -> NDArray[np.float64]:
     """Return (N,) the number of views that see each Gaussian; each counts w/(w + 10), w = Σ αT in a small
     render."""
-    small = cameras.resized(_LOOK)
+    small = cameras.resized(_VISIBILITY_SIDE)
     out = np.zeros(len(splats))
     for view in range(len(small)):
         weight = visibility(splats, small.take([view])).weight
-        out += weight / (weight + _SEEN)
+        out += weight / (weight + _HALF_SEEN_WEIGHT)
     return out
 
 

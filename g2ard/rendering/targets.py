@@ -236,7 +236,7 @@ class Photos(_Cached):
         return photo
 
 
-_STEPS = np.float32(65_535)
+_RENDER_LEVELS = np.float32(65_535)
 """Largest value of a render rounded to 16 bits."""
 
 
@@ -293,7 +293,7 @@ class TeacherRenders(_Cached):
         image = self._renderer.clipped(self.cameras[view])
         if not self._rounded:
             return image
-        image *= _STEPS
+        image *= _RENDER_LEVELS
         return np.rint(image, out=image).astype(np.uint16)
 
     def against(self, view: int) -> str:
@@ -302,7 +302,7 @@ class TeacherRenders(_Cached):
 
     def __getitem__(self, view: int) -> NDArray[np.float32]:
         image = self._stored(view)
-        return np.multiply(image, 1 / _STEPS, dtype=np.float32) if self._rounded else image
+        return np.multiply(image, 1 / _RENDER_LEVELS, dtype=np.float32) if self._rounded else image
 
 
 class PhotosOrRenders(_Chosen):

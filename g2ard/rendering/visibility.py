@@ -24,7 +24,7 @@ MOST_VIEWS, LONGEST = 96, 300
 ROUND = 16
 """Views per round."""
 
-_CHEAP = 6_000_000
+_FREE_GAUSSIAN_VIEWS = 6_000_000
 """Gaussians × views up to which another round costs almost nothing."""
 
 NEAR = 1e-3
@@ -171,7 +171,7 @@ class _Sampler:
         for number, views in enumerate(self.rounds, 1):
             before, seen = seen, self._add(sums, cameras, views)
             converged = number > 1 and seen - before < CONVERGED * rows
-            cheap = number * ROUND * rows < _CHEAP
+            cheap = number * ROUND * rows < _FREE_GAUSSIAN_VIEWS
             if converged and not cheap:
                 break
         return number

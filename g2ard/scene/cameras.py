@@ -20,15 +20,15 @@ USUAL = "usual"
 LARGEST_IMAGE = 160_000_000
 """Maximum pixels of an image or view; a decoded pixel takes 12 bytes."""
 
-_LARGEST = 1e12
+_LARGEST_CAMERA_VALUE = 1e12
 """Largest value of poses and intrinsics; larger ones are damaged data and overflow when squared."""
 
-_MEDIAN_OF = 16
+_MEDIAN_VIEWS = 16
 """Views used for medians over all views."""
 
-_SHAPES = {"viewmats": (4, 4), "Ks": (3, 3), "widths": (), "heights": (), "distortions": (5,)}
+_ARRAY_SHAPES = {"viewmats": (4, 4), "Ks": (3, 3), "widths": (), "heights": (), "distortions": (5,)}
 """Arrays of `Cameras` and their shapes per view."""
-_TUPLES = ("names", "image_paths", "mask_paths", "kinds")
+_TUPLE_FIELDS = ("names", "image_paths", "mask_paths", "kinds")
 
 
 def check_image(width: int, height: int, **fields: Any) -> None:
@@ -150,10 +150,10 @@ class Cameras:
             object.__setattr__(self, "kinds", (USUAL,) * n)
         if not len(self.distortions):
             object.__setattr__(self, "distortions", np.zeros((n, 5)))
-        for name, shape in _SHAPES.items():
+        for name, shape in _ARRAY_SHAPES.items():
             got = getattr(self, name).shape
             require(name, got, got == (n, *shape), f"shape {(n, *shape)}")
-        for name in _TUPLES:
+        for name in _TUPLE_FIELDS:
             require(name, len(getattr(self, name)), len(getattr(self, name)) == n, str(n))
         if len(set(self.names)) < n:
             twice = next(name for name in self.names if self.names.count(name) > 1)
@@ -162,8 +162,8 @@ class Cameras:
             given = (self.viewmats[i], self.Ks[i], self.distortions[i])
             if not all(np.isfinite(values).all() for values in given):
                 raise self._error(i, "has a pose or intrinsics that are not finite")
-            if max(np.abs(values).max() for values in given) > _LARGEST:
-                raise self._error(i, f"has a pose or intrinsics above {_LARGEST:.0e}")
+            if max(np.abs(values).max() for values in given) > _LARGEST_CAMERA_VALUE:
+                raise self._error(i, f"has a pose or intrinsics above {_LARGEST_CAMERA_VALUE:.0e}")
             if self.widths[i] < 1 or self.heights[i] < 1:
                 raise self._error(i, f"has an empty image, {self.widths[i]}×{self.heights[i]}")
             check_image(int(self.widths[i]), int(self.heights[i]), index=i, item="view")
@@ -243,8 +243,8 @@ class Cameras:
         """Return the views that `index` selects (a mask or indices), in its order."""
         index = np.asarray(index)
         rows = np.flatnonzero(index) if index.dtype == bool else index.astype(int).reshape(-1)
-        arrays: dict[str, Any] = {name: getattr(self, name)[rows] for name in _SHAPES}
-        tuples: dict[str, Any] = {name: tuple(getattr(self, name)[i] for i in rows) for name in _TUPLES}
+        arrays: dict[str, Any] = {name: getattr(self, name)[rows] for name in _ARRAY_SHAPES}
+        tuples: dict[str, Any] = {name: tuple(getattr(self, name)[i] for i in rows) for name in _TUPLE_FIELDS}
         return replace(self, **arrays, **tuples)
 
     def usual(self) -> Cameras:
@@ -283,7 +283,7 @@ class Cameras:
 
     def usual_share(self, points: ArrayLike) -> float:
         """Return the share of (N, 3) world points in a view, as the median over at most 16 views."""
-        shares = [self[view].holds(points).mean() for view in evenly_spaced(len(self), _MEDIAN_OF)]
+        shares = [self[view].holds(points).mean() for view in evenly_spaced(len(self), _MEDIAN_VIEWS)]
         return float(np.median(shares))
 
     def recentred(self, offset: ArrayLike) -> Cameras:

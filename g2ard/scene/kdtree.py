@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-_SIGMAS = 4.0
+_SAMPLE_SIGMAS = 4.0
 """Standard deviations by which a tile may exceed the count estimated from a sample."""
 
-_HALO = 0.03
+_HALO_SHARE = 0.03
 """Margin of a halo as a fraction of a tile's side."""
 
-_TAILS = 1, 99
+_BOX_PERCENTILES = 1, 99
 """Percentiles that bound a box when its sides are measured, to ignore floaters."""
 
 Points = NDArray[np.float32]
@@ -118,7 +118,7 @@ def cut_tree(points: Points, rows_each: float, most: int) -> KdTree:
     parts = _parts(len(points), rows_each, most)
     if parts == 1 or len(points) < 2:
         return KdTree()
-    low, high = np.percentile(points, _TAILS, axis=0)
+    low, high = np.percentile(points, _BOX_PERCENTILES, axis=0)
     spans = np.ptp(points, axis=0)
     for axis in sorted(range(3), key=lambda a: (-(high[a] - low[a]), -spans[a], a)):
         values = np.sort(points[:, axis])
@@ -133,7 +133,7 @@ def cut_tree(points: Points, rows_each: float, most: int) -> KdTree:
 def _parts(points: int, rows_each: float, most: int) -> int:
     """Return the smallest number of equal parts that are expected to hold at most `most` rows each."""
     parts = max(1, int(np.ceil(points * rows_each / most)))
-    sigmas = _SIGMAS if rows_each > 1 else 0.0
+    sigmas = _SAMPLE_SIGMAS if rows_each > 1 else 0.0
     while parts < points and (points / parts + sigmas * np.sqrt(points / parts)) * rows_each > most:
         parts += 1
     return parts
@@ -158,10 +158,10 @@ def margin_of(tree: KdTree, points: Points) -> float:
     sizes = []
     for core, _ in tree.route(points):
         if len(core):
-            low, high = np.percentile(points[core], _TAILS, axis=0)
+            low, high = np.percentile(points[core], _BOX_PERCENTILES, axis=0)
             sides = np.sort(high.astype(np.float64) - low)
             sizes.append(float(np.sqrt(sides[1] * sides[2])))
-    return _HALO * float(np.median(sizes)) if sizes else 0.0
+    return _HALO_SHARE * float(np.median(sizes)) if sizes else 0.0
 
 
 class Sampler:

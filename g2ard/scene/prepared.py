@@ -27,7 +27,7 @@ DRAWN_LOG_SCALES: tuple[float, float] = _LIMITS["drawn_log_scales"]
 LARGEST_SCALE = np.float32(np.exp(43))
 """Largest scale whose square fits float32; readers clamp to it too."""
 
-_FAINTEST = np.float32(-_LIMITS["logit_of_opaque"])
+_LEAST_LOGIT = np.float32(-_LIMITS["logit_of_opaque"])
 """Least logit; readers clamp to it too."""
 
 
@@ -85,7 +85,9 @@ def with_some_opacity(scene: PreparedScene) -> PreparedScene:
     Otherwise all rows would be dropped, or all have mass 0.
     """
     logits = scene.logit_opacities
-    return replace(scene, logit_opacities=np.where(np.isinf(logits), logits, np.maximum(logits, _FAINTEST)))
+    return replace(
+        scene, logit_opacities=np.where(np.isinf(logits), logits, np.maximum(logits, _LEAST_LOGIT))
+    )
 
 
 def _all_finite(values: NDArray[Any]) -> bool:

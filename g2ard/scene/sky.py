@@ -9,17 +9,17 @@ from g2ard.scene.samples import weighted_quantile
 from g2ard.scene.shape import longer_axes
 from g2ard.scene.splats import Splats
 
-_FAR = (np.sqrt(2) + 1) / (np.sqrt(2) - 1)
+_SKY_RADII = (np.sqrt(2) + 1) / (np.sqrt(2) - 1)
 """Least distance of the sky from the middle of the near scene, about 5.8 of its radii: between any two places
 within the radius, the distance to the sky changes by less than √2, the step between two levels of detail."""
 
-_NEAR = 2 / 3
+_NEAR_SHARE = 2 / 3
 """Share of the opacity within the radius of the near scene."""
 
-_SMALL = 1e-3
+_LEAST_SKY_SHARE = 1e-3
 """Share of all directions up to which far Gaussians are floaters."""
 
-_SAMPLE = 200_000
+_RADIUS_SAMPLE = 200_000
 """Largest number of rows that decide middle and radius."""
 
 
@@ -37,7 +37,7 @@ def sky_mask(splats: Splats) -> NDArray[np.bool_]:
     """
     opacities = splats.opacities.astype(np.float64)
     rows = np.flatnonzero(splats.finite_rows() & (opacities > 1 / 255))
-    rows = rows[:: max(1, -(-len(rows) // _SAMPLE))]
+    rows = rows[:: max(1, -(-len(rows) // _RADIUS_SAMPLE))]
     middle, reach = np.zeros(3), np.inf
     for _ in range(4):  # without the sky, which moves the middle and widens the radius
         if not len(rows):
@@ -45,12 +45,12 @@ def sky_mask(splats: Splats) -> NDArray[np.bool_]:
         means, weights = splats.means[rows].astype(np.float64), opacities[rows]
         middle = np.array([weighted_quantile(means[:, axis], weights, 0.5) for axis in range(3)])
         away = np.linalg.norm(means - middle, axis=1)
-        reach = _FAR * weighted_quantile(away, weights, _NEAR)
+        reach = _SKY_RADII * weighted_quantile(away, weights, _NEAR_SHARE)
         rows = rows[away <= reach]
     away = np.linalg.norm(splats.means.astype(np.float64) - middle, axis=1)
     sky = away > reach
     middle_size, largest = longer_axes(splats.scales[sky].astype(np.float64)).T
     covered = opacities[sky] * middle_size * largest / (2 * away[sky] ** 2)  # 2πσσ of 4π steradians
-    if covered.sum() <= _SMALL:
+    if covered.sum() <= _LEAST_SKY_SHARE:
         sky[:] = False
     return sky

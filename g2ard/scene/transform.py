@@ -16,14 +16,14 @@ from g2ard.config.choices import AXES, RenderModel
 from g2ard.errors import InputError, require
 from g2ard.scene.splats import ARRAYS, Splats
 
-_FAR = 16.0
+_RECENTRE_EXTENTS = 16.0
 """Distance in extents beyond which a move goes into `offset`, so that float32 means keep their precision."""
 
 _DIRECTIONS = {
     **{"R": (1, 0, 0), "U": (0, 1, 0), "B": (0, 0, 1)},
     **{"L": (-1, 0, 0), "D": (0, -1, 0), "F": (0, 0, -1)},
 }
-_PARITY = np.repeat(np.array([-1, 1, -1], np.float32), (3, 5, 7))
+_SH_PARITY = np.repeat(np.array([-1, 1, -1], np.float32), (3, 5, 7))
 """Sign of each harmonic of bands 1–3 under x ↦ −x."""
 
 
@@ -53,7 +53,9 @@ def transform(splats: Splats, matrix: ArrayLike) -> Splats:
     means = scale * splats.means.astype(np.float64) @ rotation.T
     offset = scale * splats.offset @ rotation.T
     extent = float(np.linalg.norm(np.ptp(means, axis=0))) if len(means) else 0.0
-    far = 0 < _FAR * extent < np.abs(shift).max()  # an extent of 0 says nothing about the scene's size
+    far = (
+        0 < _RECENTRE_EXTENTS * extent < np.abs(shift).max()
+    )  # an extent of 0 says nothing about the scene's size
     if splats.offset.any() or far:
         offset = offset + shift
     else:
@@ -224,7 +226,7 @@ def with_axes(splats: Splats, matrix: NDArray[np.float64]) -> Splats:
     turned = transform(splats, rotation)
     if sign > 0:
         return turned
-    odd = _PARITY[: splats.shN.shape[1], None]
+    odd = _SH_PARITY[: splats.shN.shape[1], None]
     return replace(turned, means=-turned.means, offset=-turned.offset, shN=turned.shN * odd)
 
 

@@ -34,9 +34,9 @@ FLOATING = ("haze", "streak")
 
 _HALF_STEP = 0.5 / 255
 """Half an 8-bit step."""
-_REACH = 3.0
+_FOOTPRINT_SIGMAS = 3.0
 """Standard deviations at which renderers cut off a footprint."""
-_SMALL_GROUP = 1e-3
+_FLOATER_SHARE = 1e-3
 """Share of the scene's Gaussians and of its light below which a separate group is a floater."""
 _NEIGHBORS = 16
 _SURFACE_SLACK = 0.01
@@ -219,7 +219,7 @@ def _giants(splats: Splats) -> NDArray[np.bool_]:
     local = np.einsum("nji,nj->ni", rotation_matrices(splats.quats[large]), middle - means[large])
     local /= np.maximum(splats.scales[large].astype(np.float64), 1e-30)
     out = np.zeros(len(splats), bool)
-    out[large[np.linalg.norm(local, axis=1) <= _REACH]] = True
+    out[large[np.linalg.norm(local, axis=1) <= _FOOTPRINT_SIGMAS]] = True
     return out
 
 
@@ -242,7 +242,7 @@ def _needles(splats: Splats, rest: NDArray[np.bool_]) -> NDArray[np.bool_]:
     other = rows[np.where(real, near, 0)]
     covered = real & (other != np.tile(long, 2)[:, None])
     away = np.linalg.norm(means[other] - ends[:, None], axis=2)
-    covered &= away <= _REACH * splats.scales[other].max(axis=2)
+    covered &= away <= _FOOTPRINT_SIGMAS * splats.scales[other].max(axis=2)
     out[long[~covered.any(axis=1).reshape(2, -1).any(axis=0)]] = True
     return out
 
@@ -265,14 +265,14 @@ def _floaters(
     if len(rows) <= _NEIGHBORS:
         return out
     means = splats.means[rows].astype(np.float64)
-    reach = _REACH * splats.scales[rows].max(axis=1).astype(np.float64)
+    reach = _FOOTPRINT_SIGMAS * splats.scales[rows].max(axis=1).astype(np.float64)
     near = _core.knn(means, _NEIGHBORS).astype(np.int64)
     away = np.linalg.norm(means[near] - means[:, None], axis=2)
     a, b = np.nonzero(away <= reach[:, None] + reach[near])
     group = _groups(len(rows), a, near[a, b])
     count = np.bincount(group, minlength=len(rows))
     light = np.bincount(group, weight[rows], minlength=len(rows))
-    small = (count <= _SMALL_GROUP * len(rows)) & (light <= _SMALL_GROUP * light.sum())
+    small = (count <= _FLOATER_SHARE * len(rows)) & (light <= _FLOATER_SHARE * light.sum())
     small &= np.bincount(group, unoccluded[rows], minlength=len(rows)) > 0
     out[rows[small[group]]] = True
     return out

@@ -21,10 +21,10 @@ from g2ard.progress import Progress, silent
 from g2ard.system.peak_memory import forget_workers, note_worker, peak_rss
 from g2ard.tiles.tasks import Task, run_task
 
-_TRIES = 5
+_MOST_WORKER_DEATHS = 5
 """Worker deaths in a row, without a finished task, before giving up. Dask gives up a task after four."""
 
-_MANAGER = 5.0
+_POOL_SHUTDOWN_SECONDS = 5.0
 """Seconds to wait for the pool's manager thread after its workers are dead.
 
 The thread releases semaphores; otherwise Python warns about them at exit.
@@ -56,7 +56,7 @@ class Workers:
             except WorkerDiedError:
                 left = sum(not task.done for task in tasks)
                 deaths = deaths + 1 if left == len(todo) else 0
-                if deaths == _TRIES:
+                if deaths == _MOST_WORKER_DEATHS:
                     raise InputError(
                         f"{stage}: workers were killed before finishing a task; give them more memory, or "
                         "lower --memory or --workers"
@@ -152,7 +152,7 @@ class _Processes:
         for process in processes:
             process.join()
         if manager is not None:
-            manager.join(timeout=_MANAGER)
+            manager.join(timeout=_POOL_SHUTDOWN_SECONDS)
         self._pool = None
 
 

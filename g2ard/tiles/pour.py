@@ -24,13 +24,13 @@ from g2ard.scene.splats import Splats
 from g2ard.stages.lift import LiftConfig, lift
 from g2ard.tiles.journal import Journal, clear
 
-_SAMPLE = 1 << 20
+_TREE_SAMPLE = 1 << 20
 """Size of the sample of positions that determines the tiles (12 MB)."""
 
-_POINT = np.dtype([("near", "<f4", 3), ("rgb", "<f4", 3), ("far", "<f8", 3)])
+_POINT_DTYPE = np.dtype([("near", "<f4", 3), ("rgb", "<f4", 3), ("far", "<f8", 3)])
 """A point: float32 position relative to the offset (determines the tile), stored colour, world position."""
 
-_AT_ONCE = 1 << 16
+_ROWS_AT_ONCE = 1 << 16
 """Rows of a lifted tile written at a time."""
 
 
@@ -79,8 +79,8 @@ class SceneFeed(Feed):
 class PointFeed(Feed):
     """Feed of a point cloud's points, for tiles to be lifted."""
 
-    row_bytes = _POINT.itemsize
-    room = _POINT.itemsize + 4 * row_width(0)
+    row_bytes = _POINT_DTYPE.itemsize
+    room = _POINT_DTYPE.itemsize + 4 * row_width(0)
 
     def __init__(self, stream: PointStream, config: LiftConfig) -> None:
         self.stream: PointStream = stream
@@ -91,7 +91,7 @@ class PointFeed(Feed):
 
     def rows(self, rows: int, start: int) -> Iterator[tuple[NDArray[Any], Points]]:
         for far, colors in self.stream.blocks(rows, start):
-            block = np.empty(len(far), _POINT)
+            block = np.empty(len(far), _POINT_DTYPE)
             block["near"], block["rgb"], block["far"] = self._near(far), colors, far
             yield block, np.ascontiguousarray(block["near"])
 
@@ -178,7 +178,7 @@ def _empty(folder: Path, key: str, tree: KdTree, margin: float, feed: Feed) -> J
 
 
 def _sampled(feed: Feed, rows: int, progress: Progress) -> tuple[Points, float]:
-    sampler, done = Sampler(feed.stream.count, _SAMPLE), 0
+    sampler, done = Sampler(feed.stream.count, _TREE_SAMPLE), 0
     for points in feed.positions(rows):
         sampler.add(points)
         done += len(points)
@@ -218,8 +218,8 @@ def lift_tiles(
     total = sum(points.tiles.rows)
     for index in range(journal.next_row, points.tree.leaves):
         splats = _lifted(points, index, feed)
-        for start in range(0, len(splats), _AT_ONCE):
-            part = splats.take(slice(start, start + _AT_ONCE))
+        for start in range(0, len(splats), _ROWS_AT_ONCE):
+            part = splats.take(slice(start, start + _ROWS_AT_ONCE))
             journal.add(packed(part), part.means)
         journal.next_row = index + 1
         journal.save()
@@ -241,4 +241,4 @@ def _lifted(points: Journal, index: int, feed: PointFeed) -> Splats:
 
 
 def _read(path: Path, count: int) -> NDArray[Any]:
-    return np.fromfile(path, _POINT, count)
+    return np.fromfile(path, _POINT_DTYPE, count)

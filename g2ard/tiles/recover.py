@@ -40,13 +40,13 @@ from g2ard.tiles.tasks import (
     tile_of,
 )
 
-_MARGIN = 16
+_SSIM_MARGIN = 16
 """Margin in pixels around a tile in its images, because SSIM's windows reach over its edge."""
 
-_OWN = 0.5
+_OWNED_ALPHA = 0.5
 """Share of a pixel's alpha from which a tile owns the pixel; empty pixels belong to all tiles."""
 
-_FEWEST = 256
+_FEWEST_OWNED_PIXELS = 256
 """Fewest owned pixels for a view to be used."""
 
 
@@ -89,7 +89,7 @@ class TileTargets(TeacherRenders):
         self, teacher: Splats, own: int, cameras: Cameras, background: tuple[float, float, float]
     ) -> None:
         masks = _masks(teacher, own, cameras)
-        shown = [view for view, mask in enumerate(masks) if mask.sum() >= _FEWEST]
+        shown = [view for view, mask in enumerate(masks) if mask.sum() >= _FEWEST_OWNED_PIXELS]
         self._masks = [masks[view] for view in shown]
         super().__init__(teacher, cameras.take(shown), background=background, lazy=True)
 
@@ -104,7 +104,7 @@ def _masks(scene: Splats, own: int, cameras: Cameras) -> list[NDArray[np.bool_]]
     white[:own] = 0.5 / SH_C0
     renderer = Renderer(replace(scene, sh0=white, shN=np.zeros((len(scene), 0, 3), np.float32)))
     drawn = (renderer.render(camera) for camera in cameras)
-    return [image.image[..., 0] >= _OWN * image.alpha for image in drawn]
+    return [image.image[..., 0] >= _OWNED_ALPHA * image.alpha for image in drawn]
 
 
 def recover_tile(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
@@ -164,7 +164,7 @@ def _cropped(cameras: Cameras, core: PreparedScene, offset: NDArray[np.float64])
     """Crop the cameras' images to a tile."""
     settings = settings_for(core.means, RasterSettings())
     # Means are relative to the store's `offset`, target cameras are in world coordinates.
-    return cropped(cameras.recentred(offset), core, settings, _MARGIN).recentred(-offset)
+    return cropped(cameras.recentred(offset), core, settings, _SSIM_MARGIN).recentred(-offset)
 
 
 def _errors(

@@ -21,16 +21,16 @@ from g2ard.tiles.executor import Workers
 from g2ard.tiles.steps import COARSE, TiledRun
 from g2ard.tiles.tasks import Task, is_whole, load, scene_of
 
-_IN_SIGHT = 0.01
+_LEAST_LIGHT_SHARE = 0.01
 """Share of a view's light from which it sees a tile."""
 
-_GLANCED = 200_000
+_MOST_NEAR_GAUSSIANS = 200_000
 """Most coarse Gaussians for which the `near` level decides which views see a tile."""
 
-_CHUNK = 64
+_VIEWS_PER_TASK = 64
 """Views per task of `light`."""
 
-_TAILS = 1, 99
+_BOX_PERCENTILES = 1, 99
 """Percentiles of its Gaussians that bound a tile's box, to ignore floaters."""
 
 
@@ -114,13 +114,15 @@ class Sights:
 
 def boxes_of(coarse: Sequence[Path]) -> NDArray[np.float64]:
     """Return the (T, 2, 3) low and high corners of tiles."""
-    return np.array([np.percentile(scene_of(path, "near").means, _TAILS, axis=0) for path in coarse])
+    return np.array(
+        [np.percentile(scene_of(path, "near").means, _BOX_PERCENTILES, axis=0) for path in coarse]
+    )
 
 
 def in_sight(light: NDArray[np.float64], tile: int) -> NDArray[np.intp]:
     """Return the views that see a tile; if they are few, include the best of the others."""
     own = light[:, tile]
-    sight = np.flatnonzero(own > _IN_SIGHT * light.sum(axis=1))
+    sight = np.flatnonzero(own > _LEAST_LIGHT_SHARE * light.sum(axis=1))
     if len(sight) < MOST_VIEWS:
         best = np.argsort(-own, kind="stable")[:MOST_VIEWS]
         sight = np.sort(best[own[best] > 0])
@@ -140,14 +142,14 @@ def written(work: Path, cameras: Cameras) -> Path:
 
 def light_of(store: TileStore, coarse: list[Path], cameras: Cameras, workers: Workers) -> NDArray[np.float64]:
     """Return (V, T) Σ αT² of each tile's coarse Gaussians in small renders of each view."""
-    level = "near" if store.count // COARSE[0] <= _GLANCED else "far"
+    level = "near" if store.count // COARSE[0] <= _MOST_NEAR_GAUSSIANS else "far"
     small = cameras.resized(LONGEST)
     views = written(workers.folder, small)
     here = small.recentred(store.offset)
     middles = boxes_of(coarse).mean(axis=1)
     away = np.linalg.norm(here.positions[:, None] - middles, axis=2).min(axis=1)
     near = NEAR * float(np.median(away)) or None
-    chunks = [range(i, min(i + _CHUNK, len(here))) for i in range(0, len(here), _CHUNK)]
+    chunks = [range(i, min(i + _VIEWS_PER_TASK, len(here))) for i in range(0, len(here), _VIEWS_PER_TASK)]
     tasks = [
         Task(
             "g2ard.tiles.steps:light",

@@ -55,16 +55,16 @@ from g2ard.tiles.tasks import (
 COARSE = (32, 512)
 """Reduction of a tile's coarse Gaussians for use near the rendered tile, and far from it."""
 
-_DEEPER = 0.6
+_PLAN_DEPTH_SHARE = 0.6
 """Plans of merges go down to this share of the Gaussians that a tile is expected to keep."""
 
-_THINNED = 8
+_COARSE_STRIDE = 8
 """Every n-th row in Morton order becomes a coarse Gaussian, widened to represent the rest."""
 
 GONE = np.uint32(0xFFFFFFFF)
 """Cluster number of a dropped row."""
 
-_SAMPLED = 1_000_000
+_FRAME_SAMPLE = 1_000_000
 """Largest sample of Gaussians that determines a scene's frame."""
 
 
@@ -82,7 +82,7 @@ def coarse(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
     """
     scene = tile_of(arguments, inputs, places)
     config = replace(_config(arguments), keep_region=())  # regions do not matter for other tiles' views
-    some = _widened(scene.take(scene.core.order[::_THINNED]), _THINNED)
+    some = _widened(scene.take(scene.core.order[::_COARSE_STRIDE]), _COARSE_STRIDE)
     near = simplify(some, max(1, len(scene) // COARSE[0]), method="fast", config=config).splats
     far = simplify(near, max(1, len(scene) // COARSE[1]), method="fast", config=config).splats
     rows = scene.core.order[:: COARSE[0]]
@@ -221,7 +221,7 @@ def pair_plan(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
     scene = tile_of(arguments, inputs, places)
     config = _config(arguments).resolved("default")
     runs, expected = arguments["runs"], arguments["expected"]
-    last = max(1, min(runs, round(_DEEPER * expected)))
+    last = max(1, min(runs, round(_PLAN_DEPTH_SHARE * expected)))
     counts = round_counts(runs, last, config.retention_of("default"), config.fold)
     tile = _seen_tile(scene, arguments, inputs)
     of, a, b, costs = tile.plan(runs, counts, load(inputs["costs"], "costs")[0])
@@ -370,7 +370,7 @@ class TiledRun:
     def sampled_frame(self) -> tuple[float, ...]:
         """Return the frame of a sample of the scene, without views."""
         sample = self.sample().with_sh_degree(0)
-        every = -(-len(sample) // _SAMPLED)
+        every = -(-len(sample) // _FRAME_SAMPLE)
         scene, _ = finite_rows_of(sample.take(slice(None, None, every)))
         return _core.TileFrame.of_sample(
             scene.core, SimplifyConfig(**self.config).resolved("default")

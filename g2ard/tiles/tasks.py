@@ -34,15 +34,15 @@ Inputs = Mapping[str, Any]
 Places = Mapping[str, Path]
 """Parameters of a task's function, see `Task`."""
 
-_FIELDS = ("means", "quats", "scales", "logit_opacities", "sh0", "shN", "offset", "render_model")
+_SCENE_ARRAYS = ("means", "quats", "scales", "logit_opacities", "sh0", "shN", "offset", "render_model")
 
-_OUTLINE, _BESIDE = 20_000, 8
+_CROP_SAMPLE, _CROP_MARGIN = 20_000, 8
 """Number of means that outline a tile for cropping, and the pixels kept around them."""
 
-_VERSION = 4
+_OUTPUT_VERSION = 4
 """Version of the functions' output; raise it when a change makes earlier files unusable."""
 
-_DAMAGED = (zipfile.BadZipFile, zlib.error, ValueError, EOFError, LookupError, RuntimeError)
+_CORRUPT_FILE_ERRORS = (zipfile.BadZipFile, zlib.error, ValueError, EOFError, LookupError, RuntimeError)
 """Exceptions that numpy and zipfile raise for corrupt files."""
 
 
@@ -76,7 +76,7 @@ class Task:
             name: [path.name for path in (paths if isinstance(paths, list) else [paths])]
             for name, paths in self.inputs.items()
         }
-        content = [_VERSION, self.function, dict(self.arguments), names]
+        content = [_OUTPUT_VERSION, self.function, dict(self.arguments), names]
         text = json.dumps(content, sort_keys=True, separators=(",", ":"))
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
@@ -118,7 +118,7 @@ def load(path: Path, *names: str) -> list[NDArray[Any]]:
     try:
         with np.load(path, allow_pickle=False) as arrays:
             return [arrays[name] for name in names]
-    except _DAMAGED as error:
+    except _CORRUPT_FILE_ERRORS as error:
         raise InputError(
             "its contents changed after writing; remove it and run the same command again", path=path
         ) from error
@@ -140,7 +140,7 @@ def small_scene(files: Mapping[str, Path], mean: float | None) -> Splats:
 
 def scene_of(path: Path, name: str) -> Splats:
     """Read a scene from a task's file."""
-    *arrays, model = load(path, *(f"{name}_{field}" for field in _FIELDS))
+    *arrays, model = load(path, *(f"{name}_{field}" for field in _SCENE_ARRAYS))
     means, quats, scales, logits, sh0, shN, offset = arrays
     return Splats(means, quats, scales, logits, sh0, shN, offset, model.item())
 
@@ -187,10 +187,10 @@ def within_halo(store: TileStore, tile: int, means: NDArray[np.float32]) -> NDAr
 
 
 def cropped(
-    cameras: Cameras, core: PreparedScene, settings: RasterSettings, beside: int = _BESIDE
+    cameras: Cameras, core: PreparedScene, settings: RasterSettings, beside: int = _CROP_MARGIN
 ) -> Cameras:
     """Crop the cameras' images to a tile, with `beside` pixels around it."""
-    points = core.means[core.core.order[:: max(1, len(core) // _OUTLINE)]].astype(np.float64)
+    points = core.means[core.core.order[:: max(1, len(core) // _CROP_SAMPLE)]].astype(np.float64)
     boxes = []
     for view, (viewmat, K) in enumerate(zip(cameras.viewmats, cameras.Ks, strict=True)):
         x, y, z = viewmat[:3, :3] @ points.T + viewmat[:3, 3:]
@@ -211,4 +211,4 @@ def cropped(
 
 
 def arrays_of(scene: Splats, name: str) -> Arrays:
-    return {f"{name}_{field}": np.asarray(getattr(scene, field)) for field in _FIELDS}
+    return {f"{name}_{field}": np.asarray(getattr(scene, field)) for field in _SCENE_ARRAYS}

@@ -10,7 +10,7 @@ import torch
 from g2ard.config.choices import AXES
 from g2ard.errors import InputError
 from g2ard.io import read_scene, read_splats, write_splats
-from g2ard.io.spz import _SYSTEMS
+from g2ard.io.spz import _ADOBE_AXES
 from g2ard.scene.splats import Splats
 from g2ard.scene.transform import change_of_axes, with_axes
 from helpers.commands import CommandLine, refused, succeeds
@@ -70,7 +70,7 @@ def test_spz_in_every_system_is_the_same_world(tmp_path: Path, name: str) -> Non
     assert bool(data[14] & 2) == (name != "RUB")
     if name != "RUB":
         record = struct.unpack_from("<III", data, 32)
-        assert record == (0xADBE0003, 4, _SYSTEMS.index(name) + 1)
+        assert record == (0xADBE0003, 4, _ADOBE_AXES.index(name) + 1)
     # what is stored without the extension: coordinates of another system taken for right, up, back
     plain = bytearray(data)
     plain[14] &= 0xFD

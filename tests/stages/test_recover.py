@@ -233,7 +233,7 @@ def test_a_recovery_time_sets_the_horizon(student: Splats, targets: TeacherRende
 
 
 def test_progress_figures(student: Splats, targets: TeacherRenders, monkeypatch: pytest.MonkeyPatch) -> None:
-    for share in ("_SHARE", "_FIRST_SHARE"):  # these steps are too short for honest ones
+    for share in ("_SCORING_TIME_SHARE", "_FIRST_SCORING_SHARE"):  # these steps are too short for honest ones
         monkeypatch.setattr(probe, share, 0.5)
     seen: list[Any] = []
     scenes: dict[int, Splats] = {}

@@ -224,7 +224,7 @@ def test_extras_name_pycolmap_where_it_has_wheels() -> None:
             for machine in ("x86_64", "AMD64", "aarch64", "arm64", "ARM64"):
                 if (system, machine) not in (("linux", "AMD64"), ("win32", "x86_64")):  # not their names
                     named = marker.evaluate({"sys_platform": system, "platform_machine": machine})
-                    assert named == ((system, machine) in module._WHEELS)
+                    assert named == ((system, machine) in module._PYCOLMAP_PLATFORMS)
 
 
 def test_a_pycolmap_that_does_not_load_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -44,7 +44,7 @@ def sorted_cut(means: np.ndarray, rows: np.ndarray, most: int) -> list[set[int]]
 
 
 def test_ties_are_cut_as_by_stable_sorts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(tree, "_BLOCK", 70)  # so that arrays are files, and blocks many
+    monkeypatch.setattr(tree, "_ROWS_AT_ONCE", 70)  # so that arrays are files, and blocks many
     levels = [snapped(900, 0), snapped(300, 1)]
     leaves = leaves_of(cut(levels, Cut(most=40), tmp_path))
     means = np.concatenate([level.means for level in levels]).astype(float)

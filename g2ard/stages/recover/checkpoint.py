@@ -18,7 +18,7 @@ from g2ard.errors import InputError
 from g2ard.io.atomic import atomic_output
 from g2ard.system import interrupt
 
-_ANEW = "{overwrite=True} starts over"
+_START_OVER_HINT = "{overwrite=True} starts over"
 
 PERIOD = 60.0
 """Seconds between two checkpoints."""
@@ -44,9 +44,13 @@ def load(path: Path, key: str) -> tuple[dict[str, Any], dict[str, Any]]:
         meta: dict[str, Any] = json.loads(str(arrays.pop("meta")))
         known = meta.pop("key")
     except Exception:  # numpy and zipfile raise many kinds of exceptions
-        raise InputError("not a checkpoint of g2ard, or a damaged one", path=path, hint=_ANEW) from None
+        raise InputError(
+            "not a checkpoint of g2ard, or a damaged one", path=path, hint=_START_OVER_HINT
+        ) from None
     if known != key:
-        raise InputError("belongs to a run with another scene or other options", path=path, hint=_ANEW)
+        raise InputError(
+            "belongs to a run with another scene or other options", path=path, hint=_START_OVER_HINT
+        )
     return meta, arrays
 
 

@@ -16,7 +16,7 @@ from g2ard.scene.splats import ARRAYS, Splats
 LOOKS = (0.1, 0.3, 0.5, 0.75)
 """Shares of the horizon at which the scene is scored."""
 
-_LOST = (5.0, 3.0, 1.0, 0.0)
+_HOPELESS_LOSSES = (5.0, 3.0, 1.0, 0.0)
 """Loss in dB against the start, at each of these shares, from which a run does not recover. Good runs dip by
 up to 3.6 dB under full rates and are level again at half of the horizon; one that ended worse was 9 dB down
 at a tenth of it."""
@@ -26,9 +26,9 @@ _BLENDS = (0.5, 0.25)
 
 _PRIOR_VIEWS = (2.0, 5.0, 10.0, 20.0)
 """Values of k in the shrinkage v/(v + k): views that must have touched a Gaussian to keep half its change."""
-_TIE = 0.1
+_TOLERATED_LOSS = 0.1
 """Loss in dB that is tolerated in a kind of validation views."""
-_HALF, _HOPELESS = 0.5, 0.5
+_VALIDATION_FROM, _VALIDATION_LOSS = 0.5, 0.5
 """Share of the horizon from which validation views can stop a run, and the loss in dB above which they do."""
 
 _STATE = ("looked", "backed_off", "stopped", "best_score", "validation")
@@ -75,10 +75,10 @@ class Guard:
         value = self.score(scene)
         if value > self.best_score:
             self.best, self.best_score = scene, value
-        if not value < self.before - _LOST[self.looked - 1] and math.isfinite(value):
+        if not value < self.before - _HOPELESS_LOSSES[self.looked - 1] and math.isfinite(value):
             if self.others is not None:
                 self.validation.append({"step": step, "psnr": self.others(scene)})
-                if share >= _HALF and self.lost > _HOPELESS:
+                if share >= _VALIDATION_FROM and self.lost > _VALIDATION_LOSS:
                     self.stopped = step
                     return "stop"
             return "on"
@@ -120,7 +120,7 @@ class Guard:
         if self.others is None:
             return result, 0.0
         self.validation.append({"step": step, "psnr": self.others(result)})
-        if self.lost <= _TIE:
+        if self.lost <= _TOLERATED_LOSS:
             return result, 0.0
         best, scores, most = self.start, self.validation[0]["psnr"], 0.0
         chosen: float | None = math.inf

@@ -30,7 +30,7 @@ from g2ard.stages.recover.schedule import multiplier_for, reach_for
 from g2ard.stages.recover.sizes import typical_share
 from g2ard.stages.recover.trials import MULTIPLIERS, Trials, trial_steps
 
-_SHORT = 20
+_SHORTEST_WITH_GUARD = 20
 """Fewest steps for going back to an earlier scene; shorter recoveries have no steps left to repeat."""
 
 _LOG_POINTS = 10
@@ -40,7 +40,16 @@ Watch = Callable[[int, float, Callable[[], Splats]], None]
 """Callback after every step: its number, the seconds so far, and a function that returns the current scene.
 """
 
-_STATE = ("done", "seconds", "multiplier", "reach", "trials", "geometry", "skipped_before", "tally")
+_CHECKPOINT_FIELDS = (
+    "done",
+    "seconds",
+    "multiplier",
+    "reach",
+    "trials",
+    "geometry",
+    "skipped_before",
+    "tally",
+)
 """Attributes of `Loop` that a checkpoint stores, besides the losses, the engine and the guard."""
 
 
@@ -82,7 +91,12 @@ class Loop:
     @cached_property
     def key(self) -> str:
         """Fingerprint of inputs and contents that a checkpoint must have; computed only with one."""
-        parts = [repr(_STATE), repr(self.config), self.student.fingerprint(), fingerprint_of(self.targets)]
+        parts = [
+            repr(_CHECKPOINT_FIELDS),
+            repr(self.config),
+            self.student.fingerprint(),
+            fingerprint_of(self.targets),
+        ]
         if self.weights is not None:
             parts.append(repr(self.weights.tolist()))
         if self.validation_key is not None:
@@ -230,7 +244,7 @@ class Loop:
         """After too large a loss, continue from the best scene with a third of the rates; `run` ends when
         `guard.stopped` is set."""
         share = self._used_share()
-        short = self.config.recovery_time is None and self.config.horizon < _SHORT
+        short = self.config.recovery_time is None and self.config.horizon < _SHORTEST_WITH_GUARD
         if short or not self.guard.due(share):
             return
         if self.guard.look(self.engine.splats(), share, self.done) == "back":
@@ -284,7 +298,7 @@ class Loop:
         return int(self._epoch[1][position])
 
     def _save(self, path: Path) -> None:
-        meta = {name: getattr(self, name) for name in _STATE} | {"guard": self.guard.meta()}
+        meta = {name: getattr(self, name) for name in _CHECKPOINT_FIELDS} | {"guard": self.guard.meta()}
         arrays = {**self.engine.state(), "losses": np.array(self.losses), **self.guard.arrays()}
         checkpoints.save(path, self.key, meta, arrays)
 
@@ -293,7 +307,7 @@ class Loop:
         self.losses = arrays.pop("losses").tolist()
         self.guard.load(meta["guard"], arrays)
         self.engine.load(arrays)
-        for name in _STATE:
+        for name in _CHECKPOINT_FIELDS:
             setattr(self, name, meta[name])
         self.resumed = self.seconds
 

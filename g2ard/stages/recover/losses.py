@@ -13,8 +13,8 @@ from g2ard.errors import require
 from g2ard.stages.recover.anchors import Anchors, Regularizers
 from g2ard.stages.recover.extent import rotations
 
-_WINDOW, _SIGMA = 11, 1.5
-_C1, _C2 = 0.01**2, 0.03**2
+_SSIM_WINDOW, _SSIM_SIGMA = 11, 1.5
+_SSIM_C1, _SSIM_C2 = 0.01**2, 0.03**2
 
 
 class _L1Ssim(torch.autograd.Function):
@@ -69,20 +69,20 @@ def l1_ssim_anywhere(image: Tensor, target: Tensor, ssim_weight: float = 0.2) ->
     True
     """
     x, y = (t.permute(2, 0, 1)[:, None] for t in (image, target))
-    offsets = torch.arange(_WINDOW, device=image.device, dtype=image.dtype) - _WINDOW // 2
-    weights = torch.exp(-(offsets**2) / (2 * _SIGMA**2))
+    offsets = torch.arange(_SSIM_WINDOW, device=image.device, dtype=image.dtype) - _SSIM_WINDOW // 2
+    weights = torch.exp(-(offsets**2) / (2 * _SSIM_SIGMA**2))
     weights = weights / weights.sum()
 
     def blurred(t: Tensor) -> Tensor:
-        t = conv2d(t, weights.view(1, 1, 1, -1), padding=(0, _WINDOW // 2))
-        return conv2d(t, weights.view(1, 1, -1, 1), padding=(_WINDOW // 2, 0))
+        t = conv2d(t, weights.view(1, 1, 1, -1), padding=(0, _SSIM_WINDOW // 2))
+        return conv2d(t, weights.view(1, 1, -1, 1), padding=(_SSIM_WINDOW // 2, 0))
 
     mean_x, mean_y = blurred(x), blurred(y)
     var_x = (blurred(x * x) - mean_x**2).clamp_min(0)
     var_y = (blurred(y * y) - mean_y**2).clamp_min(0)
     both = blurred(x * y) - mean_x * mean_y
-    above = (2 * mean_x * mean_y + _C1) * (2 * both + _C2)
-    ssim = above / ((mean_x**2 + mean_y**2 + _C1) * (var_x + var_y + _C2))
+    above = (2 * mean_x * mean_y + _SSIM_C1) * (2 * both + _SSIM_C2)
+    ssim = above / ((mean_x**2 + mean_y**2 + _SSIM_C1) * (var_x + var_y + _SSIM_C2))
     return (1 - ssim_weight) * (x - y).abs().mean() + ssim_weight * (1 - ssim.mean())
 
 

@@ -15,13 +15,13 @@ from g2ard.scene.cameras import rows_by_kind
 from g2ard.scene.samples import evenly_spaced
 from g2ard.scene.splats import Splats
 
-_VIEWS = 8
+_SCORED_VIEWS = 8
 """Views that are scored, of training and of each kind of validation views."""
-_VISIBLE = 40.0
+_INVISIBLE_PSNR = 40.0
 """PSNR in dB above which differences are invisible, so that no validation view counts for more."""
-_SHARE = 0.01
+_SCORING_TIME_SHARE = 0.01
 """Share of the time that scoring the views may take while progress is shown."""
-_FIRST_SHARE = 0.1
+_FIRST_SCORING_SHARE = 0.1
 """The same after the first score, because short runs would otherwise end before the second."""
 
 
@@ -32,7 +32,7 @@ class Probe:
         self, targets: Targets, background: tuple[float, float, float], most: float = math.inf
     ) -> None:
         targets = with_pixels(targets)
-        self._views = evenly_spaced(len(targets.cameras), _VIEWS)
+        self._views = evenly_spaced(len(targets.cameras), _SCORED_VIEWS)
         self._targets, self._background, self._most = targets, background, most
         self._next = 0.0
         self._latest = (float("nan"), 0)
@@ -51,7 +51,9 @@ class Probe:
             began = time.monotonic()
             self._latest = self.all_of(splats()), step
             first = self._next == 0.0  # the starting score is outdated soon
-            self._next = seconds + (time.monotonic() - began) / (_FIRST_SHARE if first else _SHARE)
+            self._next = seconds + (time.monotonic() - began) / (
+                _FIRST_SCORING_SHARE if first else _SCORING_TIME_SHARE
+            )
         return self._latest
 
     def _score(self, renderer: Renderer, view: int) -> float:
@@ -66,5 +68,7 @@ def score_by_kind(
     """Return a function that scores a scene: kind of view → mean PSNR of up to eight views of that kind, each
     at most 40 dB."""
     rows = rows_by_kind(targets.cameras.kinds)
-    probes = {kind: Probe(Subset(targets, found), background, _VISIBLE) for kind, found in rows.items()}
+    probes = {
+        kind: Probe(Subset(targets, found), background, _INVISIBLE_PSNR) for kind, found in rows.items()
+    }
     return lambda splats: {kind: probe.all_of(splats) for kind, probe in probes.items()}

@@ -12,23 +12,23 @@ from g2ard.scene.cameras import Cameras
 from g2ard.scene.samples import evenly_spaced
 from g2ard.scene.splats import Splats
 
-_REACH = 0.01
+_DEFAULT_REACH = 0.01
 """Default `reach`: Gaussians larger than a hundredth of the image hardly move, unless that is typical."""
 
-_FINEST = 1.0
+_DEFAULT_FINEST = 1.0
 """Pixels, default `finest`: the sampling limit. Of a Gaussian with this standard deviation, exp(−π²/2), under
 1 %, of the spectrum's peak is left at the Nyquist frequency, so its pixels determine its shape."""
 
 _UNTRAINED_RMSE = 0.1
 """Initial RMSE above which a scene counts as untrained, so that large Gaussians must move."""
 
-_POINTS = 4096
+_SIGHT_SAMPLE = 4096
 """Gaussians that `steps_for` measures views with."""
 
 _FEW_POINTS = 1250
 """Points of photos up to which the schedule's steps suffice."""
 
-_MOST_TIMES = 2.25
+_MOST_STEPS_FACTOR = 2.25
 """Limit of the factor on the schedule's steps."""
 
 
@@ -121,7 +121,7 @@ class Schedule:
     appearance_decay: tuple[float, float] = (1.0, 1.0)
     multiplier: float | None = None
     reach: float | None = None
-    finest: float = _FINEST
+    finest: float = _DEFAULT_FINEST
     reference_extent: float | None = None
     guarded: bool = True
 
@@ -230,7 +230,7 @@ def reach_for(start_rmse: float, typical: float) -> float:
     >>> reach_for(0.02, 0.005), reach_for(0.05, 0.04), reach_for(0.15, 0.005)
     (0.01, 0.04, inf)
     """
-    return max(_REACH, typical) if start_rmse < _UNTRAINED_RMSE else math.inf
+    return max(_DEFAULT_REACH, typical) if start_rmse < _UNTRAINED_RMSE else math.inf
 
 
 def steps_from_points(count: int, steps: int) -> int:
@@ -261,7 +261,7 @@ def steps_for(scene: Splats, cameras: Cameras, steps: int) -> int:
     2000
     """
     usual = cameras.usual()
-    some = evenly_spaced(len(scene), _POINTS)
+    some = evenly_spaced(len(scene), _SIGHT_SAMPLE)
     points = scene.means[some].astype(np.float64) + scene.offset
-    share = max(usual.usual_share(points), 1 / _MOST_TIMES**2)
+    share = max(usual.usual_share(points), 1 / _MOST_STEPS_FACTOR**2)
     return round(steps / math.sqrt(share) * (len(cameras) / len(usual)))

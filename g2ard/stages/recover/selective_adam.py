@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 _BETAS, _EPS = (0.9, 0.999), 1e-15
-_LARGEST = 1e18
+_LARGEST_GRADIENT = 1e18
 """Largest gradient whose square fits float32."""
 
 
@@ -50,7 +50,7 @@ class SelectiveAdam(torch.optim.Optimizer):
         groups = [group for group in self.param_groups if group["params"][0].grad is not None]
         grads = [group["params"][0].grad.flatten().view(len(group["params"][0]), -1) for group in groups]
         touched = torch.stack([(grad != 0).any(1) for grad in grads]).any(0)
-        sound = torch.stack([(grad.abs() <= _LARGEST).all(1) for grad in grads]).all(0)
+        sound = torch.stack([(grad.abs() <= _LARGEST_GRADIENT).all(1) for grad in grads]).all(0)
         self.skipped += int((touched & ~sound).sum())
         rows = (touched & sound).nonzero()[:, 0]
         for group in groups:

@@ -10,7 +10,7 @@ from g2ard.scene.samples import evenly_spaced
 from g2ard.scene.shape import NEEDLE_UNIT, longer_axes
 from g2ard.scene.splats import Splats
 
-_VIEWS = 8
+_MEASURED_VIEWS = 8
 
 
 def radii(splats: Splats) -> NDArray[np.float32]:
@@ -41,7 +41,7 @@ def typical_share(splats: Splats, cameras: Cameras) -> float:
     """
     cameras = cameras.recentred(splats.offset)
     largest, found = splats.scales.max(1, initial=0.0).astype(np.float64), []
-    for view in evenly_spaced(len(cameras), _VIEWS):
+    for view in evenly_spaced(len(cameras), _MEASURED_VIEWS):
         pose, K = cameras.viewmats[view], cameras.Ks[view]
         size = np.array([cameras.widths[view], cameras.heights[view]], np.float64)
         at = (splats.means @ pose[:3, :3].T + pose[:3, 3]) @ K.T

@@ -9,15 +9,15 @@ from collections.abc import Callable
 MULTIPLIERS = (1 / 3, 3**-0.5, 1.0, 3**0.5)
 """Multipliers of all rates; trained scenes need 1 or less, lifts more."""
 
-_TIE = 0.04
+_EQUAL_GAIN_SHARE = 0.04
 """Share of the best gain within which other gains count as equal to it."""
-_CALMEST = 0.01
+_LEAST_MULTIPLIER = 0.01
 """Multiplier below which no smaller one is tried: they change nothing visible in 8 bits."""
-_STEPS, _LIMITED_STEPS, _SHORTEST_HORIZON = (10, 60), 20, 100
+_TRIAL_STEPS, _LIMITED_STEPS, _SHORTEST_HORIZON = (10, 60), 20, 100
 """Steps of a trial: fewest and most, and under a time limit; and the shortest horizon with trials."""
-_PART = 50
+_TRIAL_DIVISOR = 50
 """Share of the horizon that one trial takes, as a divisor."""
-_TIME, _CALM_TIME = 0.1, 0.3
+_TRIAL_TIME_SHARE, _CALM_TRIAL_TIME_SHARE = 0.1, 0.3
 """Shares of a time limit for all trials: usually, and if rates are too large."""
 
 
@@ -54,12 +54,12 @@ class Trials:
 
         def good(i: int) -> bool:
             best = max(seen.values())
-            return seen[i] >= best - _TIE * max(best - self.start, 0.0)
+            return seen[i] >= best - _EQUAL_GAIN_SHARE * max(best - self.start, 0.0)
 
         at = min(range(len(MULTIPLIERS)), key=lambda i: abs(math.log(MULTIPLIERS[i] / guess)))
         for neighbours in (range(at, -1, -1), range(at + 1, len(MULTIPLIERS))):
             for i in neighbours:
-                value = self._score(MULTIPLIERS[i], _TIME)
+                value = self._score(MULTIPLIERS[i], _TRIAL_TIME_SHARE)
                 seen[i] = value if math.isfinite(value) else -math.inf
                 if not good(i):
                     break
@@ -75,8 +75,8 @@ class Trials:
         True
         """
         best = min(MULTIPLIERS)
-        while self.worsens(best) and best > _CALMEST:
-            if self._score(best / 3, _CALM_TIME) <= self.scores[best]:
+        while self.worsens(best) and best > _LEAST_MULTIPLIER:
+            if self._score(best / 3, _CALM_TRIAL_TIME_SHARE) <= self.scores[best]:
                 break
             best /= 3
         return best
@@ -109,5 +109,5 @@ def trial_steps(horizon: int, limit: float | None) -> int:
     """
     if limit is not None:
         return _LIMITED_STEPS
-    fewest, most = _STEPS
-    return 0 if horizon < _SHORTEST_HORIZON else min(most, max(fewest, horizon // _PART))
+    fewest, most = _TRIAL_STEPS
+    return 0 if horizon < _SHORTEST_HORIZON else min(most, max(fewest, horizon // _TRIAL_DIVISOR))

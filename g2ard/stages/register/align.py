@@ -30,8 +30,8 @@ Mask = NDArray[np.bool_]
 
 _DAMPING = 1e-6
 """Relative damping added to the diagonal of the normal equations."""
-_HALVINGS = 3
-_COARSER = 10
+_STEP_HALVINGS = 3
+_COARSE_STILL_FACTOR = 10
 """Factor on `still` for all levels but the finest."""
 
 
@@ -145,7 +145,7 @@ def align(
     state = Aligned(np.asarray(start, np.float64), 1.0, 0.0, None, 0.0, 0, 0.0)
     for number, (camera, photo) in enumerate(pyramid):
         last = number == len(pyramid) - 1
-        still = config.still if last else _COARSER * config.still
+        still = config.still if last else _COARSE_STILL_FACTOR * config.still
         found = _align_level(renderer, state, camera, photo, config, still, fresh=number == 0)
         if found is None:
             return None
@@ -186,7 +186,7 @@ def _align_level(
     for _ in range(config.iterations):
         step = _solved(normal)
         better = False
-        for _ in range(_HALVINGS + 1):
+        for _ in range(_STEP_HALVINGS + 1):
             if step is None:
                 break
             trial = moved(pose, step[:6])

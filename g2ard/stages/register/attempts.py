@@ -20,7 +20,7 @@ from g2ard.stages.register.pose import motion_between, moved
 from g2ard.stages.register.solve import Solved, solve
 
 Float = NDArray[np.float64]
-_FINEST = 2
+_REFINING_LEVELS = 2
 """Finest levels of direct alignment that refine a pose from features."""
 
 
@@ -151,7 +151,7 @@ class Search:
         polishes that mean.
         """
         refine = self.config.refine
-        near = self._aligned(solved.viewmat, photo, photo.pyramid[-_FINEST:])
+        near = self._aligned(solved.viewmat, photo, photo.pyramid[-_REFINING_LEVELS:])
         plain = Aligned(solved.viewmat, 1.0, 0.0, inverse(solved.information), 0.0, 0, solved.depth)
         if near is None:
             return Candidate(start, plain, self._likeness(solved.viewmat, photo), solved)

@@ -7,7 +7,14 @@ from dataclasses import dataclass
 from g2ard.config.choices import REFINEMENTS, Refinement
 from g2ard.errors import require
 
-_POSITIVE = ("max_angle_sigma", "max_position_sigma", "max_edge", "correlated", "max_reprojection", "alike")
+_POSITIVE_FIELDS = (
+    "max_angle_sigma",
+    "max_position_sigma",
+    "max_edge",
+    "correlated",
+    "max_reprojection",
+    "alike",
+)
 
 
 @dataclass(frozen=True)
@@ -89,7 +96,7 @@ class RegisterConfig:
         for name in ("passes", "features", "iterations", "candidates"):
             require(name, getattr(self, name), getattr(self, name) >= 1, "at least 1")
         require("min_inliers", self.min_inliers, self.min_inliers >= 6, "at least 6")
-        for name in _POSITIVE:
+        for name in _POSITIVE_FIELDS:
             require(name, getattr(self, name), getattr(self, name) > 0, "a positive number")
         require("window", self.window, self.window >= 3 and self.window % 2 == 1, "an odd number from 3 on")
 

@@ -13,7 +13,7 @@ Float = NDArray[np.float64]
 
 LUMA = np.array([0.299, 0.587, 0.114])
 
-_BAND = 9
+_BAND_WINDOW = 9
 """Side in pixels of the window whose mean `band_passed` subtracts."""
 
 
@@ -61,7 +61,7 @@ def box_mean(image: Float, side: int) -> Float:
 
 def band_passed(image: Float) -> Float:
     """Return the (H, W) blurred image minus its local mean, which suppresses lighting and noise."""
-    return blurred(image) - box_mean(np.pad(image, _BAND // 2, mode="edge"), _BAND)
+    return blurred(image) - box_mean(np.pad(image, _BAND_WINDOW // 2, mode="edge"), _BAND_WINDOW)
 
 
 def zncc(a: Float, b: Float, mask: NDArray[np.bool_]) -> float:

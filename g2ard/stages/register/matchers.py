@@ -26,10 +26,10 @@ Image = NDArray[np.float32]
 Pairs = tuple[Float, Float]
 Matcher = Callable[[Image, Image], Pairs]
 
-_DOUBLED = 500
+_UPSAMPLED_SIDE = 500
 """Longer side in pixels up to which SIFT upsamples an image, because small images have few features."""
 
-_WHEELS = (("linux", "x86_64"), ("darwin", "arm64"), ("win32", "AMD64"))
+_PYCOLMAP_PLATFORMS = (("linux", "x86_64"), ("darwin", "arm64"), ("win32", "AMD64"))
 """Platforms with pycolmap wheels; there is no source distribution, so the extra omits it elsewhere."""
 
 
@@ -67,7 +67,7 @@ def _unusable() -> str:
     """Return why pycolmap is unavailable, or ""."""
     if sys.modules.get("pycolmap", ...) is None or find_spec("pycolmap") is None:
         where = (sys.platform, platform.machine())
-        no_wheel = "" if where in _WHEELS else f", and has no wheel for {' '.join(where)}"
+        no_wheel = "" if where in _PYCOLMAP_PLATFORMS else f", and has no wheel for {' '.join(where)}"
         return f"pycolmap is not installed{no_wheel}"
     try:
         importlib.import_module("pycolmap")
@@ -139,7 +139,7 @@ def checked_pairs(what: str, pairs: Any, *shapes: tuple[int, ...]) -> Pairs:
 class Sift:
     """RootSIFT by pycolmap on the CPU, matched by `mutual`; features of the current photo are cached.
 
-    Images larger than `_DOUBLED` pixels are not upsampled: poses are as good, 3.2 times faster.
+    Images larger than `_UPSAMPLED_SIDE` pixels are not upsampled: poses are as good, 3.2 times faster.
 
     Descriptors are bytes of norm 512, so dot products are integers below 2²⁴, exact in float32 in any
     summation order.
@@ -173,7 +173,7 @@ class Sift:
         """Return (M, 2) positions and (M, 128) integer-valued descriptors."""
         grey = np.clip(grey_of(image) * 255 + 0.5, 0, 255).astype(np.uint8)
         doubled, whole = self._extractors
-        extractor = doubled if max(grey.shape) <= _DOUBLED else whole
+        extractor = doubled if max(grey.shape) <= _UPSAMPLED_SIDE else whole
         found, descriptors = extractor.extract_from_uint8_array(np.ascontiguousarray(grey))
         places = np.array([(point.x, point.y) for point in found], np.float64).reshape(-1, 2)
         return places, descriptors.data.astype(np.float32)

@@ -20,13 +20,13 @@ from g2ard.stages.register.matchers import Matcher
 
 Float = NDArray[np.float64]
 
-_LEAST = 6
+_LEAST_MATCHES = 6
 """Least matches and inliers for a pose; three determine it, the rest confirm it."""
-_SIGMAS = 1.4826
+_SIGMA_OF_MAD = 1.4826
 """Standard deviation of a normal distribution over its median absolute deviation."""
-_LEAST_SIGMA = 0.1
+_LEAST_MATCH_SIGMA = 0.1
 """Least σ of a match, pixels."""
-_STILL = 0.3
+_STILL_PIXELS = 0.3
 """Root mean square motion in pixels below which passes stop; about a keypoint's error."""
 
 
@@ -88,7 +88,7 @@ def solve(
         of, at, X = uv[known][inlying], seen[known][inlying], points[known][inlying]
         shift = _projected(T, there.K, X) - _projected(there.viewmat, there.K, X)
         found = _described(T, camera, int(known.sum()), of, X, at, number + 1, config)
-        if float(np.sqrt((shift**2).sum(1).mean())) < _STILL:
+        if float(np.sqrt((shift**2).sum(1).mean())) < _STILL_PIXELS:
             break
     return found
 
@@ -133,7 +133,7 @@ def solve_pnp(
     """Solve PnP for (M, 2) pixels of (M, 3) points; return pose and inlier mask, or None with too few."""
     import pycolmap
 
-    if len(uv) < _LEAST:
+    if len(uv) < _LEAST_MATCHES:
         return None
     K = camera.K
     lens = pycolmap.Camera(
@@ -149,7 +149,7 @@ def solve_pnp(
     refinement.gradient_tolerance = 1e-8
     middle = np.median(points, 0)
     answer = pycolmap.estimate_and_refine_absolute_pose(uv, points - middle, lens, options, refinement)
-    if answer is None or int(answer["num_inliers"]) < _LEAST:
+    if answer is None or int(answer["num_inliers"]) < _LEAST_MATCHES:
         return None
     T = np.eye(4)
     T[:3] = answer["cam_from_world"].matrix()
@@ -197,7 +197,7 @@ def information(T: Float, K: Float, uv: Float, points: Float) -> Float:
     right = np.stack([1 / depth, none, -x / depth, -x * y, 1 + x * x, -y]) * K[0, 0]
     down = np.stack([none, 1 / depth, -y / depth, -1 - y * y, x * y, x]) * K[1, 1]
     residual = _projected(T, K, points) - uv
-    sigma = max(_LEAST_SIGMA, _SIGMAS * float(np.median(np.abs(residual))))
+    sigma = max(_LEAST_MATCH_SIGMA, _SIGMA_OF_MAD * float(np.median(np.abs(residual))))
     weight = 1 / (1 + (residual**2).sum(1) / sigma**2)
     J = np.concatenate([right, down], 1)
     weights = np.concatenate([weight, weight]) / sigma**2

@@ -20,11 +20,11 @@ from g2ard.stages.select.surfaces import CoverageOptions, greedy, surface
 Float = NDArray[np.float64]
 Order = NDArray[np.int64]
 
-_BEND = 0.02
+_LEAST_CURVE_BEND = 0.02
 """Height above its chord below which a curve counts as straight, so that no K stands out."""
-_LARGEST = 32_768
+_LARGEST_VIEW_SIDE = 32_768
 """Largest side of a view in pixels that the rasteriser accepts."""
-_COARSE = 20_000
+_COARSE_CELLS = 20_000
 """Number of surface cells when only depths matter."""
 
 
@@ -101,7 +101,7 @@ def select(
     _check(cameras, k, policy)
     began = time.perf_counter()
     seconds: dict[str, float] = {}
-    coarse = surface(splats, min(_COARSE, max(1, len(splats))))
+    coarse = surface(splats, min(_COARSE_CELLS, max(1, len(splats))))
     depths, shares = poses.outlooks(coarse, cameras)
     alike = poses.pose_kernel(cameras, depths)
     pose_weights = poses.inverse_density(alike)
@@ -152,11 +152,13 @@ def _check(cameras: Cameras, k: int | Literal["auto"], policy: str) -> None:
     require("k", k, k == "auto" or k >= 1, "at least 1 view")
     if not len(cameras):
         raise InputError("no candidate views to select from")
-    large = np.maximum(cameras.widths, cameras.heights) > _LARGEST
+    large = np.maximum(cameras.widths, cameras.heights) > _LARGEST_VIEW_SIDE
     if large.any():
         i = int(np.argmax(large))
         size = f"{cameras.widths[i]}×{cameras.heights[i]}"
-        raise InputError(f"view {cameras.names[i]}: expected at most {_LARGEST} pixels per side, got {size}")
+        raise InputError(
+            f"view {cameras.names[i]}: expected at most {_LARGEST_VIEW_SIDE} pixels per side, got {size}"
+        )
 
 
 def _blind(policy: str, rows: Order, k: int | Literal["auto"], seed: int) -> Order:
@@ -177,4 +179,4 @@ def _knee(gains: Float) -> int:
     if not total > 0:
         return len(gains)
     above = np.cumsum(gains) / total - np.arange(1, len(gains) + 1) / len(gains)
-    return int(np.argmax(above)) + 1 if above.max() > _BEND else len(gains)
+    return int(np.argmax(above)) + 1 if above.max() > _LEAST_CURVE_BEND else len(gains)

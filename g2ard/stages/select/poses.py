@@ -16,21 +16,21 @@ from g2ard.stages.select.surfaces import Surface, core_scene, core_views
 Float = NDArray[np.float64]
 Order = NDArray[np.int64]
 
-_BANDWIDTH = 0.35
+_KERNEL_BANDWIDTH = 0.35
 """Bandwidth of the kernel exp(−(d/0.35)²): neighbours 20° apart on an orbit have similarity ½."""
-_REACH = 2.0
+_KERNEL_REACH = 2.0
 """Distance in bandwidths within which a chosen view represents a pose; beyond, the kernel is below 2 %."""
-_WORTH = 0.25
+_SCENE_SHARE_EXPONENT = 0.25
 """Exponent of a view's share of the scene in the weight of its gain."""
-_GRID = 48, 36
-_BEHIND = 1.15
+_DEPTH_GRID = 48, 36
+_HIDDEN_DEPTH_RATIO = 1.15
 """A point farther than this multiple of the nearest depth in its grid cell is hidden."""
-_ROWS = 50_000
+_INSIDE_SAMPLE = 50_000
 """Largest sample of Gaussians for detecting poses inside geometry, about thirty a pixel; sampled ones are
 enlarged."""
-_SIDE = 48
+_INSIDE_RENDER_SIDE = 48
 """Longer side in pixels of the renders for that."""
-_INSIDE = 0.02
+_INSIDE_DEPTH_SHARE = 0.02
 """A pose is inside geometry if most of its image is nearer than this share of the median depth."""
 
 
@@ -43,7 +43,7 @@ def outlooks(cells: Surface, cameras: Cameras) -> tuple[Float, Float]:
     """
     local = cameras.recentred(cells.origin)
     depths, shares = np.zeros(len(local)), np.zeros(len(local))
-    columns, rows = _GRID
+    columns, rows = _DEPTH_GRID
     for i in range(len(local)):
         x, y, z = local.viewmats[i, :3, :3] @ cells.centers.T + local.viewmats[i, :3, 3:]
         ahead = z > 0
@@ -59,7 +59,7 @@ def outlooks(cells: Surface, cameras: Cameras) -> tuple[Float, Float]:
             nearest = np.full(columns * rows, np.inf)
             np.minimum.at(nearest, place, z)
             depths[i] = np.median(z)
-            shares[i] = np.count_nonzero(z < _BEHIND * nearest[place]) / len(cells.centers)
+            shares[i] = np.count_nonzero(z < _HIDDEN_DEPTH_RATIO * nearest[place]) / len(cells.centers)
     return depths, shares
 
 
@@ -71,14 +71,14 @@ def inside_geometry(splats: Splats, cameras: Cameras, depths: Float, progress: P
     made = np.array([path is None for path in cameras.image_paths])
     if not (made.any() and (depths > 0).any()):
         return np.zeros(len(cameras), bool)
-    step = -(-len(splats) // _ROWS)
+    step = -(-len(splats) // _INSIDE_SAMPLE)
     sample = splats.take(np.arange(0, len(splats), step))
     sample = replace(sample, scales=sample.scales * np.float32(np.sqrt(step)))
     scene, origin = core_scene(sample)
-    small = core_views(cameras.resized(_SIDE), origin, scene)
+    small = core_views(cameras.resized(_INSIDE_RENDER_SIDE), origin, scene)
     share, near = _core.select_view_statistics(scene, small, progress=counter(progress, "poses")).T
     typical = np.median(np.where(near > 0, near, depths)[depths > 0])
-    inside: NDArray[np.bool_] = made & (share > 0.5) & (near < _INSIDE * typical)
+    inside: NDArray[np.bool_] = made & (share > 0.5) & (near < _INSIDE_DEPTH_SHARE * typical)
     return inside
 
 
@@ -90,7 +90,7 @@ def pose_kernel(cameras: Cameras, depths: Float) -> Float:
     positions = cameras.positions - np.median(cameras.positions, axis=0)  # robust to a single far pose
     with np.errstate(over="ignore", invalid="ignore"):  # squares of 1e300 overflow to infinity
         away = np.nan_to_num(_squares(positions), nan=np.inf) / (scale[:, None] * scale)
-    return np.exp(-(away + _squares(cameras.forwards)) / _BANDWIDTH**2)
+    return np.exp(-(away + _squares(cameras.forwards)) / _KERNEL_BANDWIDTH**2)
 
 
 def _squares(rows: Float) -> Float:
@@ -123,15 +123,15 @@ def facility_location(alike: Float, pose_weights: Float, usable: NDArray[np.bool
     Returns:
         The usable views in order.
     """
-    away, worth = _bandwidths_apart(alike), shares**_WORTH
+    away, worth = _bandwidths_apart(alike), shares**_SCENE_SHARE_EXPONENT
     best, left = np.zeros(len(alike)), usable.copy()
     nearest = np.where(usable, np.inf, -np.inf)
     order: list[int] = []
     for _ in range(int(usable.sum())):
         if not order:
             view = int(np.argmax(np.where(left, worth / np.maximum(pose_weights @ away, 1e-12), -1.0)))
-        elif nearest.max() > _REACH:
-            view = int(np.argmax(worth * np.where(nearest > _REACH, nearest, 0.0)))
+        elif nearest.max() > _KERNEL_REACH:
+            view = int(np.argmax(worth * np.where(nearest > _KERNEL_REACH, nearest, 0.0)))
         else:
             added = pose_weights @ np.maximum(alike - best[:, None], 0.0)
             view = int(np.argmax(np.where(left, worth * added, -1.0)))

@@ -18,7 +18,7 @@ _CORE = _core.defaults()
 
 _PAIRWISE, _PAPER = _CORE["default"], _CORE["paper"]
 
-_OF_METHOD = ("min_opacity", "morton_premerge_ratio", "morton_premerge_steps")
+_METHOD_DEFAULTS = ("min_opacity", "morton_premerge_ratio", "morton_premerge_steps")
 """Constants whose default depends on the method."""
 
 
@@ -127,7 +127,7 @@ class SimplifyConfig:
         own = {
             name: value
             for name, value in _CORE[method].items()
-            if name in _OF_METHOD and getattr(self, name) is None
+            if name in _METHOD_DEFAULTS and getattr(self, name) is None
         }
         if antialiased:
             own["dilation"] = 0.0

@@ -19,15 +19,15 @@ from g2ard.scene.regions import in_any
 from g2ard.scene.splats import DRAWN_LOGIT, Splats
 from g2ard.stages.simplify.config import SimplifyConfig, round_counts
 
-_FIT = 1 / 4
+_OPACITY_FIT_EXPONENT = 1 / 4
 """Exponent of the ratio of wanted to current visibility: ½ fits the given views by up to 0.1 dB better, and
 others by up to 0.7 dB worse (decision 0009).
 """
 
-_RATIO = (0.5, 2.0)
+_OPACITY_FIT_LIMITS = (0.5, 2.0)
 """Limits of that ratio."""
 
-_FLOOR = 0.05
+_OPACITY_FIT_FLOOR = 0.05
 """Share of the mean added to both sides of the ratio, so that hardly visible rows stay unchanged."""
 
 DRAWN_OPACITY = float(1 / (1 + np.exp(-DRAWN_LOGIT)))
@@ -143,9 +143,9 @@ def fit_opacities(
     """
     if mean <= 0:  # no view sees anything
         return scene
-    floor = _FLOOR * mean
+    floor = _OPACITY_FIT_FLOOR * mean
     ratio = (wanted + floor) / np.maximum(now + floor, np.finfo(float).tiny)
-    factor = np.clip(ratio, *_RATIO) ** _FIT
+    factor = np.clip(ratio, *_OPACITY_FIT_LIMITS) ** _OPACITY_FIT_EXPONENT
     alpha = scene.opacities.astype(np.float64)
     aimed = alpha * factor
     limited = np.minimum(aimed, np.maximum(alpha, MAX_OPACITY))
