@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from g2ard.errors import InputError
+from g2ard.scene.shape import effective_rank, needle_share
 from g2ard.scene.splats import Splats
 from g2ard.stages.recover import checkpoint
 from g2ard.stages.recover.anchors import (
@@ -17,8 +18,6 @@ from g2ard.stages.recover.anchors import (
     Anchors,
     Regularizers,
     drift95,
-    effective_rank,
-    needle,
 )
 from g2ard.stages.recover.auto_preset import regularizers_for, view_consistency
 from g2ard.stages.recover.losses import TorchAnchors, anchor_loss, regularization, shape_loss
@@ -78,7 +77,7 @@ def test_drift_is_counted_in_thicknesses_along_the_normal() -> None:
 def test_effective_rank_and_needle_share() -> None:
     scales = np.array([[1, 1, 1], [1, 1, 1e-6], [1, 1e-3, 1e-3]], np.float32)
     assert effective_rank(scales) == pytest.approx([3, 2, 1], abs=0.02)
-    assert needle(scales) == pytest.approx(1 / 3)
+    assert needle_share(scales) == pytest.approx(1 / 3)
 
 
 def naive_losses(
