@@ -44,7 +44,7 @@ def check_scene_run(run: Run, place: Path, resume: bool, output: Path) -> None:
 
 def check_stopped(run: Run, place: Path, resume: bool, output: Path) -> None:
     """Check that checkpoints at `place` may be resumed or replaced; exit if `output` is finished."""
-    check_unlocked(place.parent, _lock_of(place))
+    check_unlocked(place.parent, _locked_name(place, output))
     if is_finished(run, place, resume, output):
         run.say(f"{output}: already finished; -w without --resume starts over")
         raise typer.Exit
@@ -63,7 +63,7 @@ def stoppable(run: Run, place: Path, resume: bool, output: Path) -> Iterator[Non
     """
     made = parents_made(place)
     try:
-        with locked(place.parent, _lock_of(place)):
+        with locked(place.parent, _locked_name(place, output)):
             if output.exists() and not run.overwrite:  # another run wrote it since it was checked
                 raise OutputError("exists", path=output, hint="{overwrite=True} replaces it")
             with _kept(run, place, resume):
@@ -72,8 +72,9 @@ def stoppable(run: Run, place: Path, resume: bool, output: Path) -> Iterator[Non
         drop_empty(made)
 
 
-def _lock_of(place: Path) -> str:
-    return f".{place.name.lstrip('.')}.lock"
+def _locked_name(place: Path, output: Path) -> str:
+    """Return the name beside `place` of the output, or of the folder that holds it."""
+    return output.name if output.parent == place.parent else output.parent.name
 
 
 @contextmanager

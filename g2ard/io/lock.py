@@ -40,10 +40,8 @@ else:
 
 
 @contextmanager
-def locked(folder: Path, name: str = LOCK) -> Iterator[None]:
-    """Lock an existing folder, or raise an `OutputError` if another process holds it.
-
-    `name` is that of the lock file, for a folder with several outputs.
+def locked(folder: Path, output: str | None = None) -> Iterator[None]:
+    """Lock an existing folder, or one output in it, or raise an `OutputError` if another process holds it.
 
     File systems without locks are not locked.
 
@@ -55,9 +53,9 @@ def locked(folder: Path, name: str = LOCK) -> Iterator[None]:
     >>> list(folder.iterdir())
     []
     """
-    path = folder / name
-    file = _opened(path)
-    while not _held(path, file):  # removed by its holder after it was opened
+    path = _lock_file(folder, output)
+    file, shown = _opened(path), folder if output is None else folder / output
+    while not _held(path, file, shown):  # removed by its holder after it was opened
         os.close(file)
         file = _opened(path)
     try:
@@ -69,11 +67,15 @@ def locked(folder: Path, name: str = LOCK) -> Iterator[None]:
         _release(path, file)
 
 
-def check_unlocked(folder: Path, name: str = LOCK) -> None:
-    """Raise an `OutputError` if another process holds the lock of a folder."""
-    if (folder / name).exists():
-        with locked(folder, name):
+def check_unlocked(folder: Path, output: str | None = None) -> None:
+    """Raise an `OutputError` if another process holds the lock of a folder, or of one output in it."""
+    if _lock_file(folder, output).exists():
+        with locked(folder, output):
             pass
+
+
+def _lock_file(folder: Path, output: str | None) -> Path:
+    return folder / (LOCK if output is None else f".{output}{LOCK}")
 
 
 def _opened(path: Path) -> int:
@@ -83,7 +85,7 @@ def _opened(path: Path) -> int:
         raise OutputError(f"cannot write there: {error.strerror}", path=path.parent) from error
 
 
-def _held(path: Path, file: int) -> bool:
+def _held(path: Path, file: int, shown: Path) -> bool:
     """Lock the file and return whether it is still the one at `path`."""
     try:
         _lock(file)
@@ -92,8 +94,8 @@ def _held(path: Path, file: int) -> bool:
         holder = os.read(file, 20).decode("ascii", "replace").strip("\0 ")
         os.close(file)
         who = f"process {holder}" if holder.isdecimal() else "another process"
-        hint = "wait for it, or give another folder"
-        raise OutputError(f"in use by {who}", path=path.parent, hint=hint) from None
+        hint = "wait for it, or give another output"
+        raise OutputError(f"in use by {who}", path=shown, hint=hint) from None
     except OSError:
         return True  # no locks on this file system
     try:

@@ -40,5 +40,6 @@ def test_one_of_two_runs_writes_the_output(
     done = [first, others[0]]
     assert sorted(status for status, _, _ in done) == [0, 1], done
     refused = next(error for status, _, error in done if status)
-    assert "in use by process" in refused or "exists; -w" in refused, refused
+    output = words.split()[-1]
+    assert f"{output}: in use by process" in refused or f"{output}: exists; -w" in refused, refused
     assert not list(folder.glob("**/*.lock"))
