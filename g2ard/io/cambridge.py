@@ -47,11 +47,11 @@ def read(path: Path, images: Path | None = None) -> ViewSet:
             guessed += lens is None
             photo = (images or path) / photo_name
             frames.append(_frame(path / name, photo_name, pose, lens or median, photo, split))
-    found = view_set(path, frames)
+    views = view_set(path, frames)
     if not guessed:
-        return found
+        return views
     text = f"{guessed} views are not in {_NVM_FILE}; they get the median focal length, {median.focal:.1f}"
-    return found.noted("guessed_focal", guessed, text)
+    return views.noted("guessed_focal", guessed, text)
 
 
 def _frame(where: Path, name: str, pose: list[float], lens: _Focal, photo: Path, split: str) -> Frame:

@@ -50,14 +50,14 @@ def open_point_stream(path: str | Path | Sequence[str | Path]) -> PointStream:
         if not streams:
             raise InputError("no point cloud given")
         return streams[0] if len(streams) == 1 else JoinedClouds(streams)
-    path, found = Path(path), file_format(path)
+    path, format_name = Path(path), file_format(path)
     modules = {"cloud_ply": "cloud_ply", "las": "las", "points3d": "points3d", "colmap": "points3d"}
-    if found not in modules:
+    if format_name not in modules:
         scene = kind(path) == "splats"
-        what = "a Gaussian scene" if scene else found
+        what = "a Gaussian scene" if scene else format_name
         hint = "run `simplify` or `distill` on it" if scene else "give the point cloud's file"
         raise InputError(f"expected a coloured point cloud, found {what}", path=path, hint=hint)
-    stream: PointStream = import_module(f"g2ard.io.{modules[found]}").Stream(path)
+    stream: PointStream = import_module(f"g2ard.io.{modules[format_name]}").Stream(path)
     return stream
 
 

@@ -106,13 +106,13 @@ def frames(path: Path, images: Path | None = None) -> tuple[Path, list[Frame]]:
     with parsing(tables[0]):
         cameras = (_cameras_bin if binary else _cameras_txt)(tables[0])
     with parsing(tables[1]):
-        found = (_images_bin if binary else _images_txt)(tables[1])
-    if not found:
+        images_read = (_images_bin if binary else _images_txt)(tables[1])
+    if not images_read:
         raise InputError("has no images", path=tables[1])
     photos = images or _photo_folder(path, folder)
     listed = []
     sizes: dict[int, tuple[int, int]] = {}
-    for image in sorted(found, key=lambda i: i.name):
+    for image in sorted(images_read, key=lambda i: i.name):
         if image.camera not in cameras:
             raise InputError(f"{image.name!r} has the unknown camera {image.camera}", path=tables[1])
         camera = cameras[image.camera]

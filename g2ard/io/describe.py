@@ -59,8 +59,8 @@ def bytes_of(path: Path) -> int:
 
 
 def _quantiles(values: NDArray[Any]) -> dict[str, float]:
-    found = np.percentile(values.astype(np.float64), _QUANTILES)
-    return {str(q): float(v) for q, v in zip(_QUANTILES, found, strict=True)}
+    values_at = np.percentile(values.astype(np.float64), _QUANTILES)
+    return {str(q): float(v) for q, v in zip(_QUANTILES, values_at, strict=True)}
 
 
 def _extent(positions: NDArray[Any]) -> dict[str, list[float]]:

@@ -168,20 +168,22 @@ def find_views(scene: str | Path) -> Path | None:
     own = (scene if scene.is_dir() else scene.parent).absolute()
     iteration = re.fullmatch(r"iteration_\d+", own.name) and own.parent.name == "point_cloud"
     places = [own / inria.NAME, *([own.parent.parent / inria.NAME] if iteration else ())]
-    found = next((file for file in places if _holds(file, inria.is_inria)), None)
-    if found is None and (own / nerfstudio.NAME).is_file():
-        found = own / nerfstudio.NAME
-    if found is None and any(
+    cameras_file = next((file for file in places if _holds(file, inria.is_inria)), None)
+    if cameras_file is None and (own / nerfstudio.NAME).is_file():
+        cameras_file = own / nerfstudio.NAME
+    if cameras_file is None and any(
         _holds(own / name, nerfstudio_export.is_export) for name in nerfstudio_export.LISTS
     ):
-        found = own
+        cameras_file = own
     run = own.parent / gsplat_run.NAME
     with suppress(InputError):  # a cfg.yml that cannot be read is some other program's
-        if found is None and own.name == "ply" and gsplat_run.is_run(run):
-            found = run
-    if found is None:  # a cameras.json without cameras is damaged: its reader raises the error
-        found = next((file for file in places if file.is_file()), None)
-    return found if found is None or scene.is_absolute() else Path(os.path.relpath(found))
+        if cameras_file is None and own.name == "ply" and gsplat_run.is_run(run):
+            cameras_file = run
+    if cameras_file is None:  # a cameras.json without cameras is damaged: its reader raises the error
+        cameras_file = next((file for file in places if file.is_file()), None)
+    return (
+        cameras_file if cameras_file is None or scene.is_absolute() else Path(os.path.relpath(cameras_file))
+    )
 
 
 def _holds(file: Path, test: Callable[[Any], bool]) -> bool:
@@ -254,9 +256,9 @@ def _instead(path: Path) -> str:
         with suppress(InputError):
             held[kind(file)].append(file.name)
     words = {"splats": "a scene", "points": "a point cloud", "views": "views"}
-    found = [f"{', '.join(names[:5])} ({words[what]})" for what, names in held.items() if names]
-    if found:
-        return f"; give one of its files: {', '.join(found)}"
+    held_kinds = [f"{', '.join(names[:5])} ({words[what]})" for what, names in held.items() if names]
+    if held_kinds:
+        return f"; give one of its files: {', '.join(held_kinds)}"
     if runs := [folder.name for folder in sorted(path.iterdir()) if run_scene(folder) != folder]:
         return f"; give one of its runs: {', '.join(runs[:5])}"
     photos = next(

@@ -18,7 +18,7 @@ def find_exposures(cameras: Cameras) -> dict[str, NDArray[np.float64]]:
 
     Its keys are photo names, with or without the suffix.
     """
-    found: dict[str, NDArray[np.float64]] = {}
+    exposures: dict[str, NDArray[np.float64]] = {}
     tables: dict[Path, dict[str, NDArray[np.float64]]] = {}
     for name, photo in zip(cameras.names, cameras.image_paths, strict=True):
         if photo is None:
@@ -30,6 +30,6 @@ def find_exposures(cameras: Cameras) -> dict[str, NDArray[np.float64]]:
         table = tables[path]
         for key in (name, photo.name, photo.stem):
             if key in table:
-                found[name] = table[key]
+                exposures[name] = table[key]
                 break
-    return found
+    return exposures

@@ -51,8 +51,8 @@ def read(path: Path, images: Path | None = None) -> ViewSet:
     if not every.isdigit() or int(every) < 1:
         raise InputError(f"is {every!r}, expected a whole number ≥ 1", path=file, property="test_every")
     words = ["train" if i % int(every) else "test" for i in range(len(frames))]
-    found = view_set(model, [f._replace(split=word) for f, word in zip(frames, words, strict=True)])
+    views = view_set(model, [f._replace(split=word) for f, word in zip(frames, words, strict=True)])
     if settings.word("pose_opt") != "true":
-        return found
+        return views
     text = "the run optimised its poses; these are the poses before training"
-    return found.noted("optimised_poses", len(frames), text)
+    return views.noted("optimised_poses", len(frames), text)

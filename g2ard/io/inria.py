@@ -38,12 +38,12 @@ def read(path: Path, images: Path | None = None) -> ViewSet:
     for i, frame in enumerate(frames):
         if times[frame.name] > 1:
             frames[i] = frame._replace(name=f"{frame.name}_{listed[i].get('id', i)}")
-    found = view_set(file, frames)
+    views = view_set(file, frames)
     repeated = sum(count for count in times.values() if count > 1)
     if not repeated:
-        return found
+        return views
     text = f"{plural(repeated, 'camera')} of {len(frames)} have repeated names; their ids are appended"
-    return found.noted("repeated_names", repeated, text)
+    return views.noted("repeated_names", repeated, text)
 
 
 def _frame(path: Path, index: int, entry: Any, images: Path | None) -> Frame:

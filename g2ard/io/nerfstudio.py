@@ -43,12 +43,12 @@ def read(path: Path, images: Path | None = None) -> ViewSet:
     frames, A, applied_scale = _data(folder, settings, images)
     scale /= applied_scale
     trained_from_saved = rigid(D @ np.linalg.inv(A), fields.place.to("transform"))
-    found = view_set(file, [_moved(frame, trained_from_saved, scale) for frame in frames])
+    views = view_set(file, [_moved(frame, trained_from_saved, scale) for frame in frames])
     mode = _optimized(settings)
     if mode is None:
-        return found
+        return views
     text = f"the run optimised its poses ({mode}); these are the poses before training"
-    return found.noted("optimised_poses", len(frames), text)
+    return views.noted("optimised_poses", len(frames), text)
 
 
 def _data(

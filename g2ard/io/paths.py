@@ -62,9 +62,9 @@ def output_names(path: str | Path, names: Sequence[str]) -> list[str]:
     >>> output_names("v.json", ["../images/a.png", "/b/c.jpg", "d.png", "d.jpg"])
     ['images/a', 'b/c', 'd.png', 'd.jpg']
     """
-    found = [_inside(path, i, name) for i, name in enumerate(names)]
-    stems = Counter(path.with_suffix("") for path in found)
-    places = [path if stems[path.with_suffix("")] > 1 else path.with_suffix("") for path in found]
+    resolved = [_inside(path, i, name) for i, name in enumerate(names)]
+    stems = Counter(path.with_suffix("") for path in resolved)
+    places = [path if stems[path.with_suffix("")] > 1 else path.with_suffix("") for path in resolved]
     times = Counter(places)
     for name, place in zip(names, places, strict=True):
         if times[place] > 1:

@@ -107,8 +107,8 @@ def render_model_of(header: PlyHeader) -> RenderModel | Literal["2dgs"]:
     >>> render_model_of(PlyHeader(comments=["Exported from Brush", "SplatRenderMode: default"]))
     'classic'
     """
-    found = [_RENDER_MODES[text] for c in header.comments if (text := c.lower()) in _RENDER_MODES]
-    return found[-1] if found else "classic"
+    modes = [_RENDER_MODES[text] for c in header.comments if (text := c.lower()) in _RENDER_MODES]
+    return modes[-1] if modes else "classic"
 
 
 def comments_of(offset: NDArray[np.float64], render_model: RenderModel) -> list[str]:

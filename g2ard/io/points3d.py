@@ -23,10 +23,10 @@ class Stream(WholeCloud):
     def __init__(self, path: Path) -> None:
         if path.is_dir() or path.stem.lower() != "points3d":
             folder = model_folder(path) or path
-            found = next((p for s in (".bin", ".txt") if (p := folder / f"points3D{s}").is_file()), None)
-            if found is None:
+            file = next((p for s in (".bin", ".txt") if (p := folder / f"points3D{s}").is_file()), None)
+            if file is None:
                 raise InputError("has no points3D.bin or points3D.txt", path=folder)
-            path = found
+            path = file
         with parsing(path):
             positions, rgb = (_binary if path.suffix == ".bin" else _text)(path)
         super().__init__(path, positions, (rgb / 255).astype(np.float32))
@@ -57,8 +57,8 @@ def _text(path: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
     except ValueError:
         plain = False
     if not plain:  # find the wrong number
-        found = [[number(path, "point", i, w, *c, float) for c in _COLUMNS] for i, w in enumerate(rows)]
-        values = np.array(found)
+        values_read = [[number(path, "point", i, w, *c, float) for c in _COLUMNS] for i, w in enumerate(rows)]
+        values = np.array(values_read)
     inside = (values[:, 3:] >= 0) & (values[:, 3:] <= 255)
     if not inside.all():
         i, channel = (int(at) for at in np.argwhere(~inside)[0])

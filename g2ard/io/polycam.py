@@ -34,11 +34,11 @@ def read(path: Path, images: Path | None = None) -> ViewSet:
         raise InputError("has no keyframes/cameras with .json files", path=path)
     cameras, photos = folders
     files = sorted(cameras.glob("*.json"), key=lambda file: (len(file.stem), file.stem))
-    found = view_set(path, [_frame(file, images or photos) for file in files])
+    views = view_set(path, [_frame(file, images or photos) for file in files])
     if cameras.name == "corrected_cameras":
-        return found
+        return views
     text = "the capture has no corrected_cameras; these are ARKit's poses as tracked"
-    return found.noted("tracked_poses", len(files), text)
+    return views.noted("tracked_poses", len(files), text)
 
 
 def _frame(file: Path, photos: Path) -> Frame:

@@ -57,9 +57,9 @@ def scene_format(path: str | Path) -> SceneFormat:
     name = Path(path).name.lower()
     if name == "meta.json":
         return _FOLDER
-    for found in FORMATS.values():
-        if name.endswith(found.suffix):
-            return found
+    for output_format in FORMATS.values():
+        if name.endswith(output_format.suffix):
+            return output_format
     known = ", ".join(f.suffix for f in FORMATS.values())
     raise OutputError(f"scenes are written as {known}, or as a SOG folder (NAME/meta.json)", path=path)
 
@@ -72,20 +72,24 @@ def written_bytes(path: Path) -> int:
 
 def lost_in(path: str | Path, splats: Splats, **options: object) -> list[Note]:
     """Return notes on what the format of an output path cannot hold; `options` are the writer's."""
-    found = scene_format(path)
-    states_model = found.models or options.get("compress") == "spz"  # SPZ inside a .glb has a flag for it
+    output_format = scene_format(path)
+    states_model = (
+        output_format.models or options.get("compress") == "spz"
+    )  # SPZ inside a .glb has a flag for it
     if states_model or not splats.antialiased:
         return []
     from g2ard.io.types import Note
 
-    text = f"{found.suffix} cannot say that the scene is antialiased, so other programs draw it too opaque"
+    text = (
+        f"{output_format.suffix} cannot say that the scene is antialiased; other programs draw it too opaque"
+    )
     return [Note("lost_render_model", 1, text)]
 
 
 def check_options(path: str | Path, options: dict[str, object]) -> SceneFormat:
     """Return the format of an output path, or raise an `OutputError` if it lacks one of the options."""
-    found = scene_format(path)
+    output_format = scene_format(path)
     for name in options:
-        if name not in found.options:
-            raise OutputError(f"{found.suffix} has no option {name!r}", path=path)
-    return found
+        if name not in output_format.options:
+            raise OutputError(f"{output_format.suffix} has no option {name!r}", path=path)
+    return output_format

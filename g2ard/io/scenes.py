@@ -47,8 +47,8 @@ def read_splats(path: str | Path, *, render_model: RenderModel | None = None) ->
 
 def read_scene(path: str | Path, *, render_model: RenderModel | None = None) -> Scene:
     """Read a Gaussian scene with notes on dropped rows, clamped values and ignored properties."""
-    path, found = check_scene(path)
-    module = import_module(f"g2ard.io.{found}")
+    path, format_name = check_scene(path)
+    module = import_module(f"g2ard.io.{format_name}")
     scene: Scene = module.Stream(path).whole() if hasattr(module, "Stream") else module.read(path)
     if render_model is None:
         return scene
@@ -72,8 +72,8 @@ def open_stream(
         if not streams:
             raise InputError("no scene given")
         return streams[0] if len(streams) == 1 else JoinedScenes(streams)
-    path, found = check_scene(path)
-    module = import_module(f"g2ard.io.{found}")
+    path, format_name = check_scene(path)
+    module = import_module(f"g2ard.io.{format_name}")
     if hasattr(module, "Stream"):
         stream: SceneStream = module.Stream(path)
     else:
@@ -88,13 +88,13 @@ def open_stream(
 def check_scene(path: str | Path) -> tuple[Path, str]:
     """Return a scene's file or folder and its format; raise an `InputError` if it is not a scene."""
     path = run_scene(path)
-    found = file_format(path)
-    if KINDS[found] != "splats":
-        is_cloud = KINDS[found] == "points"
-        what = "a point cloud (no f_dc, scale, rot)" if is_cloud else found
+    format_name = file_format(path)
+    if KINDS[format_name] != "splats":
+        is_cloud = KINDS[format_name] == "points"
+        what = "a point cloud (no f_dc, scale, rot)" if is_cloud else format_name
         hint = "`g2ard lift` turns it into a scene" if is_cloud else "give the scene's file"
         raise InputError(f"expected a Gaussian scene, found {what}", path=path, hint=hint)
-    return path, found
+    return path, format_name
 
 
 def check_scene_output(path: str | Path, overwrite: bool = False) -> Path:
@@ -131,8 +131,8 @@ def write_splats(path: str | Path, splats: Splats, *, overwrite: bool = False, *
     >>> len(g2ard.load(path))
     1
     """
-    found = check_options(path, options)
-    writer = getattr(import_module(f"g2ard.io.{found.module}"), found.function)
+    output_format = check_options(path, options)
+    writer = getattr(import_module(f"g2ard.io.{output_format.module}"), output_format.function)
     writer(Path(path), splats, overwrite=overwrite, **options)
     for note in lost_in(path, splats, **options):
         warnings.warn(f"{path}: {note}", stacklevel=2)

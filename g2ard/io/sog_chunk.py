@@ -51,8 +51,8 @@ def count_of(chunk: Chunk) -> int:
 
 def render_model_of(chunk: Chunk) -> RenderModel:
     """Return the render model: "model", or in older files "antialias"."""
-    found = chunk.meta.get("model", "antialiased" if chunk.meta.get("antialias") is True else "default")
-    return "antialiased" if found == "antialiased" else "classic"
+    model_name = chunk.meta.get("model", "antialiased" if chunk.meta.get("antialias") is True else "default")
+    return "antialiased" if model_name == "antialiased" else "classic"
 
 
 def rest_of(chunk: Chunk) -> int:

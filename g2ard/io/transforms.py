@@ -75,12 +75,12 @@ def _frames(path: Path, images: Path | None, split: str | None = None) -> list[F
     listed = content.get("frames")
     if not isinstance(listed, list) or not listed:
         raise InputError("no views found ('frames' is empty)", path=path)
-    found = [_frame(path, i, content, frame, images) for i, frame in enumerate(listed)]
+    parsed = [_frame(path, i, content, frame, images) for i, frame in enumerate(listed)]
     split_of = _stated(path, content)
     if not split_of:
-        return [frame._replace(split=split) for frame in found]
+        return [frame._replace(split=split) for frame in parsed]
     names = [Path(str(frame.get("file_path"))).as_posix() for frame in listed]
-    return [frame._replace(split=split_of.get(name)) for frame, name in zip(found, names, strict=True)]
+    return [frame._replace(split=split_of.get(name)) for frame, name in zip(parsed, names, strict=True)]
 
 
 def _stated(path: Path, content: dict[str, Any]) -> dict[str, str]:

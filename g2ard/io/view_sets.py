@@ -72,16 +72,16 @@ def read_view_set(
     if not isinstance(path, ViewFiles):
         path = ViewFiles(Path(path), Path(images) if images else None, alpha)
     images, alpha, path = path.images, path.alpha, run_views(path.path)
-    found = file_format(path)
-    if KINDS[found] != "views":
-        what = "a Gaussian scene" if KINDS[found] == "splats" else "a point cloud"
+    format_name = file_format(path)
+    if KINDS[format_name] != "views":
+        what = "a Gaussian scene" if KINDS[format_name] == "splats" else "a point cloud"
         raise InputError(
             f"expected views (a COLMAP folder, transforms.json, g2ard's .json), found {what}", path=path
         )
     if images is not None and not images.is_dir():
         raise InputError("no such folder of photos", path=images)
     try:
-        views = import_module(f"g2ard.io.{found}").read(path, images)
+        views = import_module(f"g2ard.io.{format_name}").read(path, images)
     except OSError as error:  # invalid photo name, unreadable folder
         raise InputError(error.strerror or str(error), path=path) from error
     views = views if unpictured else pictured(views)

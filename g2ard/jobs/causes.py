@@ -103,23 +103,23 @@ def _of_photos(splats: Splats, held_out: Targets, background: Colour) -> tuple[f
         seen_through.append(photo[empty])
     if not alike:
         return 1.0, []
-    found = float(np.median(alike))
+    median_correlation = float(np.median(alike))
     shown = photo_traits([path for v in views if (path := held_out.cameras.image_paths[v])]).border
     if shown is None and np.median(errors) > _BACKGROUND_ERROR_SHARE:
         shown = _one_colour(np.concatenate(seen_through))
     if shown is not None and np.abs(np.subtract(shown, background)).max() > _BACKGROUND_DIFFERENCE:
-        return found, [
+        return median_correlation, [
             f"background: the photos show {colour_text(shown)} around the scene, not "
             f"{colour_text(background)} (--background)"
         ]
-    if found < UNLIKE:
-        return found, [_poses(found)]
-    if found > _BRIGHTNESS_CORRELATION and np.median(gains) > _EXPOSURE_GAIN:
-        return found, [
+    if median_correlation < UNLIKE:
+        return median_correlation, [_poses(median_correlation)]
+    if median_correlation > _BRIGHTNESS_CORRELATION and np.median(gains) > _EXPOSURE_GAIN:
+        return median_correlation, [
             f"exposure: fitting each photo's brightness would gain {np.median(gains):.1f} dB; give an "
             "exposure.json, or photos of equal exposure"
         ]
-    return found, []
+    return median_correlation, []
 
 
 def compared(

@@ -158,8 +158,8 @@ def prepare(
     )
     photos, renders = _sources(views, options.photos, read.lifted)
     cameras = views.train.cameras
-    found = _regularizers(options, read, prior, cameras if photos else None)
-    regularizers, preset_label, measured = found
+    choice = _regularizers(options, read, prior, cameras if photos else None)
+    regularizers, preset_label, measured = choice
     if photos:
         given = options.named("recover.background") is not None
         propose_background(cameras, recover.background, given, say)

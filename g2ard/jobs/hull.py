@@ -40,8 +40,8 @@ class VisualHull:
         at = np.floor((points - self.low) / self.side).astype(np.int64)
         inside: Mask = np.all((at >= 0) & (at < self.filled.shape), axis=-1)
         x, y, z = np.moveaxis(np.where(inside[..., None], at, 0), -1, 0)
-        found: Mask = inside & self.filled[x, y, z]
-        return found
+        inside_hull: Mask = inside & self.filled[x, y, z]
+        return inside_hull
 
     def depths(self, cameras: Cameras, view: int, count: int) -> Float:
         """Return (count,) depths that cover the grid's box in a view, evenly spaced."""
@@ -74,9 +74,9 @@ def visual_hull(cameras: Cameras, outlines: Sequence[Mask | None], middle: Float
         filled = _carved(views, low, side, count)
         if not filled.any():
             return None
-        found = np.argwhere(filled)
+        occupied = np.argwhere(filled)
         hull = VisualHull(low, side, filled)
-        low, size = low + (found.min(0) - 1) * side, (np.ptp(found, 0) + 3) * side
+        low, size = low + (occupied.min(0) - 1) * side, (np.ptp(occupied, 0) + 3) * side
     return hull
 
 

@@ -134,10 +134,10 @@ def _read(views: Views, say: Say, *, unpictured: bool = False) -> tuple[ViewSet,
         return views, None
     if not isinstance(views, str | Path | ViewFiles):
         return ViewSet(views), None
-    found = read_view_set(views, unpictured=unpictured)
-    for note in found.notes:
+    views_read = read_view_set(views, unpictured=unpictured)
+    for note in views_read.notes:
         say(f"{views}: {note}")
-    return found, views.path if isinstance(views, ViewFiles) else Path(views)
+    return views_read, views.path if isinstance(views, ViewFiles) else Path(views)
 
 
 def make_targets(
@@ -209,11 +209,11 @@ def clutter_seen(
     pixels = int((cameras.widths.astype(int) * cameras.heights).sum())
     unoccluded = unoccluded_means(splats, cameras, progress)
     floating = find_floating(splats, cameras, progress) if set(kinds) & set(FLOATING) else None
-    found = find_clutter(
+    clutter = find_clutter(
         splats, seen, unoccluded, pixels, kinds, floating=floating, strength=strength, progress=progress
     )
-    parts = [f"{count:,} {name}" for name, count in found.counts.items() if name in kinds]
-    gone = len(splats) - int(found.keep.sum())
-    light = f"{seen.weight[~found.keep].sum() / max(seen.weight.sum(), 1e-30):.1%} of the light"
+    parts = [f"{count:,} {name}" for name, count in clutter.counts.items() if name in kinds]
+    gone = len(splats) - int(clutter.keep.sum())
+    light = f"{seen.weight[~clutter.keep].sum() / max(seen.weight.sum(), 1e-30):.1%} of the light"
     say(f"{gone:,} of {plural(len(splats), 'Gaussian')} are clutter, with {light}: {', '.join(parts)}")
-    return found, cameras
+    return clutter, cameras

@@ -175,8 +175,8 @@ def lod(
 
 def recovery_settings(steps: int | None, background: Colour, seed: int) -> dict[str, Any]:
     """Return the settings of a level's recovery by path."""
-    found = {"recover.background": background, "recover.seed": seed}
-    return found if steps is None else {**found, "recover.steps": steps}
+    settings = {"recover.background": background, "recover.seed": seed}
+    return settings if steps is None else {**settings, "recover.steps": steps}
 
 
 def check_trained(scene: Splats | str | Path) -> None:

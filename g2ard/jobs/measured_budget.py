@@ -239,10 +239,10 @@ def count_for_quality(
     excesses: dict[int, float] = {}
     count = max(_FEWEST, len(splats) // 4)
     while len(excesses) < _TRIALS and missed < count < met:
-        found = quality(renders, reduce(count), cameras)
-        excesses[count] = excess = found.over(wanted)
+        measured = quality(renders, reduce(count), cameras)
+        excesses[count] = excess = measured.over(wanted)
         if excess >= 0:
-            met, good = count, found
+            met, good = count, measured
         else:
             missed = count
         if 0 <= excess <= _CLOSE_ENOUGH or met <= _FEWEST:

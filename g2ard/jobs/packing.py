@@ -29,8 +29,10 @@ _LARGEST = 2_000_000
 
 def score_file(path: Path, targets: Targets, background: Colour, progress: Progress) -> dict[str, Any]:
     """Read a scene file back and return its mean scores in the views of `targets`."""
-    found = evaluate(read_splats(path), targets, background=background, progress=progress, stage="score file")
-    return {"file": path.name, "psnr": found.psnr, "ssim": found.ssim}
+    scores = evaluate(
+        read_splats(path), targets, background=background, progress=progress, stage="score file"
+    )
+    return {"file": path.name, "psnr": scores.psnr, "ssim": scores.ssim}
 
 
 def score_lines(packed: dict[str, Any], size: int, unpacked: float) -> list[str]:

@@ -74,10 +74,10 @@ def topped_up(
         held_out: separate views for scoring; all of `views` are then for training.
         background: RGB of empty pixels.
     """
-    found = 0 if points is None else len(points)
+    sparse = 0 if points is None else len(points)
     parts = [] if points is None else [points]
-    told = [plural(found, "sparse point")] if found else []
-    if (missing := count - found) > 0:
+    told = [plural(sparse, "sparse point")] if sparse else []
+    if (missing := count - sparse) > 0:
         (train,) = load_view_sets(views, ["train" if held_out is None else for_training], _SIDE)
         parts.append(
             points_along_rays(train.cameras, missing, background=background, seed=seed, progress=progress)
@@ -278,9 +278,9 @@ def _refined(
     offsets = np.linspace(-0.75, 0.75, _FINER)
     tried = inverse_depth[:, :, None] + offsets * spacing[:, :, None]
     finer = (1 / np.maximum(tried, 1e-3 * inverse_depth[:, :, None])).reshape(len(cost), -1)
-    found = ray.costs(cameras, photos, others, finer)
-    best = found.argmin(1)
-    return finer[rows[:, 0], best], found[rows[:, 0], best]
+    costs = ray.costs(cameras, photos, others, finer)
+    best = costs.argmin(1)
+    return finer[rows[:, 0], best], costs[rows[:, 0], best]
 
 
 @dataclass(frozen=True, eq=False)
@@ -326,7 +326,7 @@ class _Rays:
         depths: Float,
     ) -> Float:
         """Return (N, D) differences of the patches to the views that agree best; ∞ if too few see them."""
-        found = np.full((len(others), *depths.shape), np.inf)
+        own_costs = np.full((len(others), *depths.shape), np.inf)
         for k, other in enumerate(others):
             total, inside = np.zeros(depths.shape), np.ones(depths.shape, bool)
             for p in range(self.aims.shape[1]):
@@ -334,9 +334,9 @@ class _Rays:
                 color, held = _sampled(cameras, photos, int(other), world)
                 total += np.abs(color - self.patches[:, p : p + 1]).mean(-1)
                 inside &= held
-            found[k][inside] = total[inside] / self.aims.shape[1]
-        found.sort(axis=0)
-        return found[:_AGREEING].mean(0)
+            own_costs[k][inside] = total[inside] / self.aims.shape[1]
+        own_costs.sort(axis=0)
+        return own_costs[:_AGREEING].mean(0)
 
 
 def _sampled(

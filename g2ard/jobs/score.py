@@ -37,7 +37,7 @@ def report_of(job: DistillJob, done: Distilled) -> dict[str, Any]:
     made = job.views.pool is not None and "test" in job.views.pool.splits
     recoveries = [recovery for entry in done.report.rounds for recovery in entry.recover]
     config = replace(job.config, simplify=job.config.simplify.resolved(antialiased=job.prior.antialiased))
-    found = done.report.as_dict()
+    report = done.report.as_dict()
     return {
         "input_count": len(job.prior),
         "output_count": len(done.splats),
@@ -60,10 +60,10 @@ def report_of(job: DistillJob, done: Distilled) -> dict[str, Any]:
         "against": job.against,
         "preset": job.preset,
         "prior": job.measured.as_dict(),
-        "rounds": found["rounds"],
-        "views": found["views"],
+        "rounds": report["rounds"],
+        "views": report["views"],
         "settings": listed(config),
-        "seconds": found["seconds"],
+        "seconds": report["seconds"],
     }
 
 
@@ -85,7 +85,7 @@ def scores_by_kind(
 ) -> tuple[KindScore, ...]:
     """Score a scene before and after recovery in held-out views, by kind of view."""
     first, second = (
-        found["views"] for found in _scores(before, after, targets, background, progress).values()
+        report["views"] for report in _scores(before, after, targets, background, progress).values()
     )
     return by_kind(first, second, "given")
 

@@ -95,16 +95,16 @@ def check_photos(
     photos = Photos(cameras.take(pictured[tried]).resized(_COMPARED_SIDE), background=background)
     views = compared(splats, photos, range(len(tried)), background)
     alike = [correlation(image, photo) for _, image, photo in views]
-    found = float(np.median(alike)) if alike else 1.0
-    if found < _UNRELATED and not insisted:
+    likeness = float(np.median(alike)) if alike else 1.0
+    if likeness < _UNRELATED and not insisted:
         raise InputError(
-            f"the photos do not show the scene (correlation {found:.2f}): they probably show "
+            f"the photos do not show the scene (correlation {likeness:.2f}): they probably show "
             "another scene, or their poses use other coordinates",
             hint="{views=made} needs no photos, {photos=True} uses these anyway",
         )
-    if found < UNLIKE:
+    if likeness < UNLIKE:
         say(
-            f"warning: the scene does not look like the photos (correlation {found:.2f}); check "
+            f"warning: the scene does not look like the photos (correlation {likeness:.2f}); check "
             "the views with `g2ard render --views`, or replace them with --views made"
         )
 

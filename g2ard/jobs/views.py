@@ -70,11 +70,11 @@ def views_of(
             are generated.
         represents: Gaussians per row if `prior` is a sample of a larger scene; the pool grows with it.
     """
-    found = None
+    views_beside = None
     if options.views is None and beside is not None:
         wanted = ["train"] if options.held_out is not None else ["train", "test"]
-        found = found_views(beside, prior, wanted, say)
-    given = found or options.views
+        views_beside = found_views(beside, prior, wanted, say)
+    given = views_beside or options.views
     plan = partial(
         _planned,
         prior,
@@ -98,7 +98,7 @@ def views_of(
     else:
         (train,), (test,) = load(given, [for_training]), load(options.held_out, [for_scores])
         train = drop_held_out(train, test.cameras, say)
-    if not found:
+    if not views_beside:
         check_sight(prior, train.cameras, say)
     elif not options.size:
         train, test = (replace(part, cameras=as_pool(part.cameras)) for part in (train, test))
@@ -153,14 +153,14 @@ def _mixed(
         counts[select.focus] = round((usual + counts["anywhere"]) * times)
     more, apart = [], []
     for kind, count in counts.items():
-        found = planned.more(kind, count + spare) if count or kind == "near" else []
-        if found and kind == "anywhere" != select.focus:  # half as wide, because they see little
-            found = [*Cameras.of(found).resized(found[0].width // 2)]
-        taken = min(count, max(len(found) - spare, len(found) // 2))
+        cameras = planned.more(kind, count + spare) if count or kind == "near" else []
+        if cameras and kind == "anywhere" != select.focus:  # half as wide, because they see little
+            cameras = [*Cameras.of(cameras).resized(cameras[0].width // 2)]
+        taken = min(count, max(len(cameras) - spare, len(cameras) // 2))
         if kind == select.focus and taken < 0.9 * count:
             say(f"warning: --focus {kind}: the scene has room for {taken} such views, {count} are wanted")
-        more += found[:taken]
-        apart += found[taken:]
+        more += cameras[:taken]
+        apart += cameras[taken:]
     others = Cameras.of(apart).resized(size) if apart else None
     if not more:
         return train, others
@@ -243,9 +243,9 @@ def cameras_for_weights(
     if method == "paper" and made:
         return None
     if views is None and beside is not None and method == "default":
-        found = found_views(beside, scene, ["train"], say)
-        if found:
-            return as_pool(load_views(found, "train", None, say))
+        views_beside = found_views(beside, scene, ["train"], say)
+        if views_beside:
+            return as_pool(load_views(views_beside, "train", None, say))
     if views is not None and not made:
         given = load_views(views, "train", None, say)
         warn_of_sight(scene, given, say)

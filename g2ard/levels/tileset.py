@@ -228,9 +228,9 @@ def _tile(node: Node | Leaf, error: float, children: list[dict[str, Any]]) -> di
 
 def _named_in(file: Path) -> set[str]:
     """Return the names of the .glb files beside a tileset.json that it names."""
-    tiles, found = [read_object(file).get("root", {})], set()
+    tiles, names = [read_object(file).get("root", {})], set()
     while tiles:
         tile = tiles.pop()
-        found.add(str(tile.get("content", {}).get("uri", "")))
+        names.add(str(tile.get("content", {}).get("uri", "")))
         tiles += tile.get("children", [])
-    return {name for name in found if name.endswith(".glb") and "/" not in name and "\\" not in name}
+    return {name for name in names if name.endswith(".glb") and "/" not in name and "\\" not in name}

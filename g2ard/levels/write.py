@@ -216,8 +216,8 @@ def _remove(path: Path, files: Collection[Path]) -> None:
 
 
 def _names(content: dict[str, Any], key: str, pattern: re.Pattern[str]) -> list[str]:
-    found = content.get(key)
-    names = found if isinstance(found, list) else [found]
+    value = content.get(key)
+    names = value if isinstance(value, list) else [value]
     return [name for name in map(str, names) if pattern.fullmatch(name)]
 
 

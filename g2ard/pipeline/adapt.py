@@ -186,11 +186,11 @@ class _Fit:
             self.progress(stage, before + done, config.steps, info or {})
 
         told = silent if self.progress is silent else progress
-        found = recover(self.splats, self.targets, how, checkpoint=within, progress=told, stage="adapt")
-        gain, old = found.report.psnr, self.splats
-        self.splats = replace(found.splats, means=old.means, quats=old.quats, scales=old.scales)
+        recovered = recover(self.splats, self.targets, how, checkpoint=within, progress=told, stage="adapt")
+        gain, old = recovered.report.psnr, self.splats
+        self.splats = replace(recovered.splats, means=old.means, quats=old.quats, scales=old.scales)
         self.stretches.append({"steps": steps, "psnr": gain.after})
-        self.seconds += found.report.seconds
+        self.seconds += recovered.report.seconds
         self.converged = gain.after - gain.before < config.tolerance
 
     def _save(self) -> None:

@@ -102,11 +102,11 @@ def load_lpips(folder: Path, *, scaled: bool = True) -> dict[str, Lpips]:
 
     out = {}
     for net, (backbone, linear) in _FILES.items():
-        found = sorted(folder.glob(backbone))
-        if not found or not (folder / linear).is_file():
+        weight_files = sorted(folder.glob(backbone))
+        if not weight_files or not (folder / linear).is_file():
             continue
         files = []
-        for path in (found[0], folder / linear):
+        for path in (weight_files[0], folder / linear):
             try:
                 files.append(torch.load(path, map_location="cpu", weights_only=True))
             except Exception as error:  # torch raises any exception from unpickling

@@ -205,16 +205,16 @@ class Cameras:
         >>> Cameras.of(pair)[1].name, len(Cameras.of(pair))
         ('-3', 2)
         """
-        found = list(views)
+        listed = list(views)
         return cls.from_lists(
-            [v.viewmat for v in found],
-            [v.K for v in found],
-            [(v.width, v.height) for v in found],
-            [v.name for v in found],
-            [v.image_path for v in found],
-            [v.distortion for v in found],
-            [v.mask_path for v in found],
-            [v.kind for v in found],
+            [v.viewmat for v in listed],
+            [v.K for v in listed],
+            [(v.width, v.height) for v in listed],
+            [v.name for v in listed],
+            [v.image_path for v in listed],
+            [v.distortion for v in listed],
+            [v.mask_path for v in listed],
+            [v.kind for v in listed],
         )
 
     @property
@@ -328,8 +328,8 @@ def rows_by_kind(kinds: Sequence[str]) -> dict[str, list[int]]:
     >>> rows_by_kind(["near", "usual", "near"])
     {'usual': [1], 'near': [0, 2]}
     """
-    rows = {kind: [i for i, found in enumerate(kinds) if found == kind] for kind in (USUAL, *kinds)}
-    return {kind: found for kind, found in rows.items() if found}
+    rows = {kind: [i for i, own in enumerate(kinds) if own == kind] for kind in (USUAL, *kinds)}
+    return {kind: members for kind, members in rows.items() if members}
 
 
 def look_at(position: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0)) -> NDArray[np.float64]:

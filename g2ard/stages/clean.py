@@ -109,8 +109,8 @@ def find_clutter(
         progress("clutter", number, len(KINDS))
         if name in kinds and name in finders:
             rest = (kind < 0) & ~hidden  # invisible Gaussians support nothing either
-            found = finders[name](rest)
-            kind[found & (kind < 0)] = number
+            marked = finders[name](rest)
+            kind[marked & (kind < 0)] = number
     progress("clutter", len(KINDS), len(KINDS))
     return Cleaning(kind)
 

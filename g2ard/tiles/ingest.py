@@ -189,12 +189,12 @@ def _check_foreign(folder: Path) -> None:
 
 def _check_tiles(folder: Path, key: str, settings: dict[str, Any], overwrite: bool, say: Say) -> None:
     """Reject tiles of another scene or other settings, and clear tiles that cannot be resumed."""
-    found = (folder / MANIFEST, folder / JOURNAL, folder / POINTS / JOURNAL)
-    manifest, *begun = [_key_in(path) for path in found]
+    markers = (folder / MANIFEST, folder / JOURNAL, folder / POINTS / JOURNAL)
+    manifest, *begun = [_key_in(path) for path in markers]
     known = {each for each in (manifest, *begun) if each is not None}
     if known - {key} and not overwrite:
         raise OutputError(
-            f"holds tiles of another scene or with other settings{_differing(found, settings)}",
+            f"holds tiles of another scene or with other settings{_differing(markers, settings)}",
             path=folder,
             hint="{overwrite=True} replaces it",
         )

@@ -134,8 +134,8 @@ def recover_tile(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays
 
     def targets(name: str) -> TileTargets | None:
         cameras = _cropped(cameras_of(inputs[name]).take(arguments[name]), core, store.offset)
-        found = TileTargets(teacher, len(core), cameras, background)
-        return found if len(found.cameras) else None
+        tile_targets = TileTargets(teacher, len(core), cameras, background)
+        return tile_targets if len(tile_targets.cameras) else None
 
     held_out, idle = targets("test"), not len(small) or not arguments["steps"]
     names = cameras_of(inputs["test"]).names
@@ -175,15 +175,15 @@ def _errors(
 ) -> NDArray[np.float64]:
     """Return the (C, 2) squared error summed over masked pixels and channels, and the number of values, of
     the views called `names`; zeros for those not among the targets."""
-    found = np.zeros((len(names), 2))
+    sums = np.zeros((len(names), 2))
     if targets is None:
-        return found
+        return sums
     renderer = Renderer(scene, background=background)
     for view, camera in enumerate(targets.cameras):
         mask = targets.mask(view)
         lost = renderer.clipped(camera)[mask] - targets[view][mask]
-        found[names.index(camera.name)] = np.sum(np.square(lost, dtype=np.float64)), lost.size
-    return found
+        sums[names.index(camera.name)] = np.sum(np.square(lost, dtype=np.float64)), lost.size
+    return sums
 
 
 def recover_tiles(

@@ -141,10 +141,10 @@ def regularizers_for(
     if kind != "auto" and kind not in REGULARIZERS:
         raise InputError(f"expected auto, paper, {', '.join(REGULARIZERS)}, got {name!r}", parameter="preset")
     paper = paper or name.startswith("paper")
-    found = measure_prior(prior, cameras)
-    kind, why = (kind, "as requested") if kind != "auto" else _judged(found)
+    measures = measure_prior(prior, cameras)
+    kind, why = (kind, "as requested") if kind != "auto" else _judged(measures)
     said = f"the paper's for {kind}" if paper else kind
-    return Regularizers.of(kind, paper=paper), f"{said} ({why})", found
+    return Regularizers.of(kind, paper=paper), f"{said} ({why})", measures
 
 
 def _judged(m: PriorMeasures) -> tuple[str, str]:

@@ -169,9 +169,9 @@ class Guard:
         """Restore the state from `meta` and `arrays`, and remove the best scene's arrays from `arrays`."""
         for name in _STATE:
             setattr(self, name, meta[name])
-        found = {name: arrays.pop(_BEST + name) for name in ARRAYS if _BEST + name in arrays}
-        if found:
-            self.best = replace(self.start, **found)
+        best_arrays = {name: arrays.pop(_BEST + name) for name in ARRAYS if _BEST + name in arrays}
+        if best_arrays:
+            self.best = replace(self.start, **best_arrays)
 
     def meta(self) -> dict[str, Any]:
         """Return the state that a checkpoint stores besides the best scene."""

@@ -40,7 +40,7 @@ def typical_share(splats: Splats, cameras: Cameras) -> float:
     0.125
     """
     cameras = cameras.recentred(splats.offset)
-    largest, found = splats.scales.max(1, initial=0.0).astype(np.float64), []
+    largest, view_shares = splats.scales.max(1, initial=0.0).astype(np.float64), []
     for view in evenly_spaced(len(cameras), _MEASURED_VIEWS):
         pose, K = cameras.viewmats[view], cameras.Ks[view]
         size = np.array([cameras.widths[view], cameras.heights[view]], np.float64)
@@ -49,6 +49,6 @@ def typical_share(splats: Splats, cameras: Cameras) -> float:
         depth = np.where(front, at[:, 2], 1.0)
         pixel = at[:, :2] / depth[:, None]
         inside = front & ((pixel >= 0) & (pixel < size)).all(1)
-        found.append(largest[inside] / depth[inside] * (K[0, 0] / size.max()))
-    shares = np.concatenate(found)
+        view_shares.append(largest[inside] / depth[inside] * (K[0, 0] / size.max()))
+    shares = np.concatenate(view_shares)
     return float(np.median(shares)) if len(shares) else 0.0

@@ -146,10 +146,10 @@ def align(
     for number, (camera, photo) in enumerate(pyramid):
         last = number == len(pyramid) - 1
         still = config.still if last else _COARSE_STILL_FACTOR * config.still
-        found = _align_level(renderer, state, camera, photo, config, still, fresh=number == 0)
-        if found is None:
+        aligned = _align_level(renderer, state, camera, photo, config, still, fresh=number == 0)
+        if aligned is None:
             return None
-        state = found
+        state = aligned
     return state
 
 
@@ -230,17 +230,17 @@ def _light(photo: Level, shot: Shot) -> tuple[float, float]:
 
 def _solved(normal: Normal) -> Float | None:
     """Solve the normal equations with unit diagonal scaling; return None if an unknown is undetermined."""
-    if (found := _unit_scaled(normal.matrix)) is None:
+    if (unit_scaled := _unit_scaled(normal.matrix)) is None:
         return None
-    scaled, unit = found
+    scaled, unit = unit_scaled
     return unit * np.linalg.solve(scaled + _DAMPING * np.eye(8), unit * normal.right)
 
 
 def inverse(matrix: Float) -> Float | None:
     """Invert a symmetric matrix with unit diagonal scaling; return None if it is singular."""
-    if (found := _unit_scaled(matrix)) is None:
+    if (unit_scaled := _unit_scaled(matrix)) is None:
         return None
-    scaled, unit = found
+    scaled, unit = unit_scaled
     if np.linalg.eigvalsh(scaled)[0] < 1e-12:
         return None
     return np.asarray(np.linalg.inv(scaled) * unit[:, None] * unit[None, :])

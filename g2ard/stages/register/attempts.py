@@ -118,10 +118,10 @@ class Search:
 
     def by_alignment(self, start: Start, photo: Photo) -> Candidate | None:
         """Align directly, coarse to fine; return None if the start does not see the scene."""
-        found = self._aligned(start.begins, photo, photo.pyramid)
-        if found is not None and self.config.refine == "exact":
-            found = self._polished(found, photo, None)
-        return None if found is None else Candidate(start, found, self._likeness(found.viewmat, photo))
+        aligned = self._aligned(start.begins, photo, photo.pyramid)
+        if aligned is not None and self.config.refine == "exact":
+            aligned = self._polished(aligned, photo, None)
+        return None if aligned is None else Candidate(start, aligned, self._likeness(aligned.viewmat, photo))
 
     def by_features(self, start: Start, photo: Photo) -> Candidate | None:
         """Match, solve PnP and refine; return None without a matcher or with too few inliers."""
@@ -137,11 +137,11 @@ class Search:
         """
         if self.match is None:
             return None
-        found = solve(
+        solved = solve(
             self.renderer, pose, photo.camera, photo.image, photo.mask, self.match, self.config, passes
         )
-        self.renders += passes if found is None else found.passes
-        return found if found is not None and found.inliers >= self.config.min_inliers else None
+        self.renders += passes if solved is None else solved.passes
+        return solved if solved is not None and solved.inliers >= self.config.min_inliers else None
 
     def _refined(self, start: Start, solved: Solved, photo: Photo) -> Candidate:
         """Refine a pose from features as `refine` says.
@@ -155,29 +155,31 @@ class Search:
         plain = Aligned(solved.viewmat, 1.0, 0.0, inverse(solved.information), 0.0, 0, solved.depth)
         if near is None:
             return Candidate(start, plain, self._likeness(solved.viewmat, photo), solved)
-        found = near
+        refined = near
         if refine != "photometric":
-            found = replace(near, viewmat=solved.viewmat, covariance=plain.covariance, depth=solved.depth)
+            refined = replace(near, viewmat=solved.viewmat, covariance=plain.covariance, depth=solved.depth)
         if refine in ("auto", "exact") and near.covariance is not None:
             of_light = np.linalg.inv(near.covariance)
             both = inverse(solved.information + of_light)
             if both is not None:
                 xi = motion_between(solved.viewmat, near.viewmat)
-                found = replace(found, viewmat=moved(solved.viewmat, both @ of_light @ xi), covariance=both)
+                refined = replace(
+                    refined, viewmat=moved(solved.viewmat, both @ of_light @ xi), covariance=both
+                )
         if refine == "exact":
-            found = self._polished(found, photo, Prior(solved.viewmat, solved.information))
-        return Candidate(start, found, self._likeness(found.viewmat, photo), solved)
+            refined = self._polished(refined, photo, Prior(solved.viewmat, solved.information))
+        return Candidate(start, refined, self._likeness(refined.viewmat, photo), solved)
 
     def _polished(self, start: Aligned, photo: Photo, prior: Prior | None) -> Aligned:
         """Polish by the exact gradient at the finest level; return the start if that fails."""
-        found = polish(self.renderer, start, *photo.pyramid[-1], prior, self.config)
-        self.renders += 1 if found is None else found.steps
-        return start if found is None else found
+        polished = polish(self.renderer, start, *photo.pyramid[-1], prior, self.config)
+        self.renders += 1 if polished is None else polished.steps
+        return start if polished is None else polished
 
     def _aligned(self, pose: Float, photo: Photo, levels: list[tuple[Camera, Level]]) -> Aligned | None:
-        found = align(self.renderer, pose, levels, self.config)
-        self.renders += 1 if found is None else found.steps
-        return found
+        aligned = align(self.renderer, pose, levels, self.config)
+        self.renders += 1 if aligned is None else aligned.steps
+        return aligned
 
     def _likeness(self, viewmat: Float, photo: Photo) -> float:
         """Return the median local ZNCC at the finest level, unblurred."""

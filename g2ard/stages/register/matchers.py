@@ -82,17 +82,17 @@ def _plugged(name: str) -> Matcher:
     path = list(sys.path)
     sys.path.insert(0, os.getcwd())
     try:
-        found = getattr(importlib.import_module(module), function, None)
+        available = getattr(importlib.import_module(module), function, None)
     except Exception as error:
         raise InputError(f"matcher {name}: cannot import {module}: {_told(error)}") from error
     finally:
         sys.path[:] = path
-    if not callable(found):
+    if not callable(available):
         raise InputError(f"matcher {name}: {module} has no function {function}")
 
     def match(photo: Image, render: Image) -> Pairs:
         try:
-            pairs = found(photo, render)
+            pairs = available(photo, render)
         except (Exception, SystemExit) as error:
             raise InputError(f"matcher {name}: {_told(error)}") from error
         return checked_pairs(f"matcher {name}", pairs, photo.shape, render.shape)
@@ -174,8 +174,8 @@ class Sift:
         grey = np.clip(grey_of(image) * 255 + 0.5, 0, 255).astype(np.uint8)
         doubled, whole = self._extractors
         extractor = doubled if max(grey.shape) <= _UPSAMPLED_SIDE else whole
-        found, descriptors = extractor.extract_from_uint8_array(np.ascontiguousarray(grey))
-        places = np.array([(point.x, point.y) for point in found], np.float64).reshape(-1, 2)
+        keypoints, descriptors = extractor.extract_from_uint8_array(np.ascontiguousarray(grey))
+        places = np.array([(point.x, point.y) for point in keypoints], np.float64).reshape(-1, 2)
         return places, descriptors.data.astype(np.float32)
 
 

@@ -228,8 +228,8 @@ def _featured(search: Search, aligned: list[Candidate], photo: Photo) -> list[Ca
     best = max(aligned, key=lambda c: c.zncc, default=None)
     if best is None or best.zncc < min(search.config.doubt, search.config.accept):
         return []
-    found = search.by_features(replace(best.start, begins=best.found.viewmat), photo)
-    return [found] if found else []
+    candidate = search.by_features(replace(best.start, begins=best.found.viewmat), photo)
+    return [candidate] if candidate else []
 
 
 def _reported(name: str, best: Candidate, config: RegisterConfig, renders: int) -> PhotoReport:
@@ -244,13 +244,13 @@ def _reported(name: str, best: Candidate, config: RegisterConfig, renders: int) 
         config: limits that decide between registered, uncertain and refused.
         renders: number of renders that its search took.
     """
-    found = best.found
+    estimate = best.found
     sigma = None
-    if found.covariance is not None:
-        position = np.sqrt(np.trace(found.covariance[:3, :3]))
-        rotation = np.sqrt(np.trace(found.covariance[3:, 3:]))
+    if estimate.covariance is not None:
+        position = np.sqrt(np.trace(estimate.covariance[:3, :3]))
+        rotation = np.sqrt(np.trace(estimate.covariance[3:, 3:]))
         sigma = PoseError(float(position), float(np.degrees(rotation)))
-    status, reason = acceptance(best.zncc, sigma, found.depth, config)
+    status, reason = acceptance(best.zncc, sigma, estimate.depth, config)
     names = ("matches", "inliers", "spread", "reprojection", "passes")
     of_features: dict[str, Any] = {}
     if best.solved is not None:
@@ -263,11 +263,11 @@ def _reported(name: str, best: Candidate, config: RegisterConfig, renders: int) 
         rank=best.start.rank,
         **of_features,
         zncc=best.zncc,
-        gain=found.gain,
-        bias=found.bias,
-        overlap=found.overlap,
-        covariance=None if found.covariance is None else _rows(found.covariance),
+        gain=estimate.gain,
+        bias=estimate.bias,
+        overlap=estimate.overlap,
+        covariance=None if estimate.covariance is None else _rows(estimate.covariance),
         sigma=sigma,
         renders=renders,
-        camera_from_world=_rows(found.viewmat),
+        camera_from_world=_rows(estimate.viewmat),
     )

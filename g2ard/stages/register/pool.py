@@ -67,9 +67,9 @@ class PoolRenders:
             self._kept[key] = [small_render(self._renderer, view, self._config) for view in views]
             renders = len(self.pool)
         photo = band_passed(grey)
-        found = [
+        similar = [
             turned(view, render, photo, camera.K)
             for view, render in zip(self.pool.viewmats, self._kept[key], strict=True)
         ]
-        order = np.argsort([-each.likeness for each in found], kind="stable").tolist()
-        return [(at, found[at]) for at in order], renders
+        order = np.argsort([-each.likeness for each in similar], kind="stable").tolist()
+        return [(at, similar[at]) for at in order], renders

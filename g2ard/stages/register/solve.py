@@ -73,9 +73,9 @@ def solve(
 
     `camera` states the photo's size and K. Returns the last pass that gave a pose, or None.
     """
-    found = None
+    solution = None
     for number in range(passes):
-        there = replace(camera, viewmat=start if found is None else found.viewmat)
+        there = replace(camera, viewmat=start if solution is None else solution.viewmat)
         out = renderer.render(there, median=True)
         uv, seen = match(photo, np.clip(out.image, 0, 1))
         counts = _at(mask, uv)
@@ -87,10 +87,10 @@ def solve(
         T, inlying = after
         of, at, X = uv[known][inlying], seen[known][inlying], points[known][inlying]
         shift = _projected(T, there.K, X) - _projected(there.viewmat, there.K, X)
-        found = _described(T, camera, int(known.sum()), of, X, at, number + 1, config)
+        solution = _described(T, camera, int(known.sum()), of, X, at, number + 1, config)
         if float(np.sqrt((shift**2).sum(1).mean())) < _STILL_PIXELS:
             break
-    return found
+    return solution
 
 
 def _at(image: NDArray[np.bool_], uv: Float) -> NDArray[np.bool_]:

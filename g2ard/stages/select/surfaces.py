@@ -105,9 +105,9 @@ def surface(splats: Splats, cells: int = 300_000) -> Surface:
     """
     require("cells", cells, cells >= 1, "at least 1")
     scene, origin = core_scene(splats)
-    found = _core.select_surface(scene, cells)
+    arrays = _core.select_surface(scene, cells)
     return Surface(
-        found["centers"], found["normals"], found["confidence"], found["weights"], found["size"], origin
+        arrays["centers"], arrays["normals"], arrays["confidence"], arrays["weights"], arrays["size"], origin
     )
 
 

@@ -79,9 +79,9 @@ def flag(
     """
     require("budget", budget, budget >= 1, "at least 1")
     scene, finite = finite_rows_of(splats)
-    found = _core.simplify_flags(scene.core, budget, config.resolved("paper"), counter(progress, "flag"))
+    flagged = _core.simplify_flags(scene.core, budget, config.resolved("paper"), counter(progress, "flag"))
     flags = np.zeros(len(splats), bool)
-    flags[finite] = found
+    flags[finite] = flagged
     return flags
 
 
