@@ -31,7 +31,7 @@ def _root() -> None:
     pass
 
 
-@command("run", parent=app, settings=True, example="python -m benchmarks run simplify scene.ply --ratios 10")
+@command("run", parent=app, settings="", example="python -m benchmarks run simplify scene.ply --ratios 10")
 def run_(
     run: Run,
     study: Annotated[

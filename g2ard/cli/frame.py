@@ -6,7 +6,6 @@ Exit status: 0 success · 1 failure · 2 usage error · 3 requirement not met ·
 
 from __future__ import annotations
 
-import contextlib
 import inspect
 import json
 import os
@@ -15,6 +14,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from itertools import combinations
 from pathlib import Path
+from pkgutil import resolve_name
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
@@ -124,7 +124,6 @@ class Run:
         self.json: str | None = common["json"]
         self.console = Console(quiet=common["quiet"], name=name)
         self.render_model: RenderModel | None = common.get("render_model")
-        self.only_checks = False  # end once the settings are checked
         self.noted = False  # whether a GPU failed
         self._adapter: str | None = None  # last adapter in use
         self.kept: list[str] = []  # outputs and checkpoints that remain, for messages of errors and Ctrl-C
@@ -157,8 +156,6 @@ class Run:
             if "recover.steps" in values and other in values:
                 flag = "--recovery-time" if "time" in other else f"--set {other}"
                 raise typer.BadParameter(f"--steps and {flag} exclude each other; give one")
-        if self.only_checks:
-            raise _Checked
         return values
 
     @contextmanager
@@ -338,7 +335,7 @@ def command(
     example: str,
     parent: typer.Typer = app,
     cuda: bool = False,
-    settings: bool = False,
+    settings: str | None = None,
     scenes: bool = False,
     budgets: bool = False,
     tiles: bool = False,
@@ -350,7 +347,8 @@ def command(
         example: command line shown at the end of its help.
         parent: group it belongs to.
         cuda: whether it supports --device cuda.
-        settings: whether it takes --set, see `Run.settings`.
+        settings: config of --set as MODULE:CLASS, see `Run.settings`, or "" if the command checks it; None
+            takes no --set.
         scenes: whether it reads scenes and takes --render-model, see `Run.load`.
         budgets: whether it takes budgets, see `g2ard.cli.outputs.budgets_of`.
         tiles: whether it works on scenes in tiles, see `g2ard.cli.tiling.tiling_of`.
@@ -360,7 +358,7 @@ def command(
         own = list(inspect.signature(fn, eval_str=True).parameters.values())[1:]
         given = BUDGETS if budgets else {}
         taken = {**(TILES if tiles else {}), **_COMMON}
-        taken |= {**(_SETTINGS if settings else {}), **(_SCENES if scenes else {})}
+        taken |= {**(_SETTINGS if settings is not None else {}), **(_SCENES if scenes else {})}
         shared_options = {**given, **taken}
         first, last = (
             [_parameter(key, *options) for key, options in part.items()] for part in (given, taken)
@@ -381,8 +379,8 @@ def command(
             printing = shared_values.pop("print_config")
             run = Run(name, shared_values, dict(values), flags_of(ctx.command))
             if printing:
-                if run.config.get("set"):
-                    _check_settings(run, fn, values)
+                if settings and run.config["set"]:
+                    _check_settings(run, settings)
                 typer.echo(printed(ctx, {**values, **shared_values, **run.config}), nl=False)
                 return
             with interrupt.RaisesInterrupt():
@@ -405,15 +403,10 @@ def _parameter(name: str, kind: Any, option: Any, default: Any = None) -> inspec
     return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
 
 
-class _Checked(Exception):
-    """Signal that settings are valid."""
-
-
-def _check_settings(run: Run, fn: Callable[..., None], options: dict[str, Any]) -> None:
-    """Check the values of --set without running the command."""
-    run.only_checks = True
-    with contextlib.suppress(_Checked):
-        fn(run, **options)
+def _check_settings(run: Run, config: str) -> None:
+    """Check the values of --set for a config, given as MODULE:CLASS."""
+    names = [name for name in ("steps", "recovery_time") if name in run.config]
+    run.settings(resolve_name(config)(), *names, preset=run.config.get("preset"))
 
 
 def _execute(run: Run, fn: Callable[..., None], options: dict[str, Any], cuda: bool) -> None:

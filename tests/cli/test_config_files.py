@@ -82,3 +82,13 @@ def test_printed_configs(
     (folder / "c.toml").write_text(out)
     ask = (command, "--config", "c.toml", "--print-config")
     assert command_line(*ask, cwd=folder) == (0, out, "")
+
+
+def test_settings_are_checked_without_running_the_command(command_line: CommandLine, folder: Path) -> None:
+    """`recover` says which background it takes from a run."""
+    (folder / "run").mkdir()
+    (folder / "ball.ply").rename(folder / "run" / "scene.ply")
+    (folder / "run" / "report.json").write_text('{"settings": {"recover.background": [1, 1, 1]}}')
+    ask = ("recover", "run", "--views", "views.json", "-o", "out.ply", "--print-config")
+    assert succeeds(command_line, folder, *ask, "--set", "steps=3").err == ""
+    assert "--set: steps: expected" in refused(command_line, folder, *ask, "--set", "steps=-3")

@@ -168,7 +168,7 @@ def test_views_and_held_out_views_given_together(folder: Path, g2ard: Program, w
     assert [set(part.names) for part in (place.train_cameras, place.scored["test"])] == [chosen, TEST]
     g2ard(*ask, "--held-out", "photos", "-o", "pool")
     assert [part for part in watch.scored if part == TEST] == [TEST] * 4
-    assert set(read_view_set(folder / "pool" / "views.json").splits) == {"train"}
+    assert set(read_view_set(folder / "pool" / "views.json").splits) == {"train", "test"}
 
 
 def test_a_held_out_view_never_trains(folder: Path, g2ard: Program, watch: Watch) -> None:

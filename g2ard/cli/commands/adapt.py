@@ -16,7 +16,12 @@ from g2ard.pipeline.presets import PRESETS, configured
 from g2ard.progress import plural
 
 
-@command("adapt", example="g2ard adapt small.ply --views winter/ -o winter.ply", settings=True, scenes=True)
+@command(
+    "adapt",
+    example="g2ard adapt small.ply --views winter/ -o winter.ply",
+    settings="g2ard.pipeline.adapt:AdaptConfig",
+    scenes=True,
+)
 def adapt(
     run: Run,
     compact: Annotated[Path, typer.Argument(metavar="COMPACT", help="Scene to adapt.")],

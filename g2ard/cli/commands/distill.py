@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     "distill",
     example="g2ard distill scene.ply -r 10 -o run/",
     cuda=True,
-    settings=True,
+    settings="g2ard.pipeline.config:DistillConfig",
     scenes=True,
     budgets=True,
     tiles=True,

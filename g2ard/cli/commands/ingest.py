@@ -16,7 +16,12 @@ from g2ard.progress import plural
 from g2ard.system.peak_memory import peak_rss
 
 
-@command("ingest", example="g2ard ingest city.ply -o tiles/ --tile-rows 2M", settings=True, scenes=True)
+@command(
+    "ingest",
+    example="g2ard ingest city.ply -o tiles/ --tile-rows 2M",
+    settings="g2ard.stages.lift:LiftConfig",
+    scenes=True,
+)
 def ingest(
     run: Run,
     scenes: Annotated[

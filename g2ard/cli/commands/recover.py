@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     "recover",
     example="g2ard recover small.ply --views poses.json --teacher scene.ply -o better.ply",
     cuda=True,
-    settings=True,
+    settings="g2ard.stages.recover:RecoverConfig",
     scenes=True,
 )
 def recover(

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 @command(
     "register",
     example="g2ard register small.ply --photos new/ --focal 1200 --poses coarse.txt -o poses.json",
-    settings=True,
+    settings="g2ard.stages.register:RegisterConfig",
     scenes=True,
 )
 def register(

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 @command(
     "select",
     example="g2ard select scene.ply --views poses.json -k 100 -o chosen.json",
-    settings=True,
+    settings="g2ard.pipeline.config:SelectConfig",
     scenes=True,
 )
 def select(

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 @command(
     "simplify",
     example="g2ard simplify garden.ply -r 10 -o garden_10x.ply",
-    settings=True,
+    settings="g2ard.stages.simplify:SimplifyConfig",
     scenes=True,
     budgets=True,
     tiles=True,
