@@ -14,6 +14,7 @@ from g2ard.rendering.targets import CACHE_BYTES, Targets
 from g2ard.scene.samples import evenly_spaced
 from g2ard.scene.splats import Splats
 from g2ard.stages.recover import recover
+from g2ard.stages.recover.schedule import steps_from_points
 from g2ard.stages.simplify import round_counts, simplify
 from g2ard.system.peak_memory import peak_rss
 
@@ -90,6 +91,29 @@ def estimate(job: DistillJob, budget: int, *, page: bool = True) -> Estimate:
         + 2 * merged.nbytes  # the recovered scene, and its rows during writing
         + min(CACHE_BYTES, views * pixels * (12 if job.teacher is not None else 3)),
     )
+
+
+def expected(job: DistillJob) -> list[tuple[str, float]]:
+    """Return the stages of a prepared job, in order, with rough relative times, for an ETA of the whole.
+
+    They are seconds for 500,000 → 50,000 Gaussians of playbot on two cores.
+    """
+    train, test = len(job.views.train.cameras), len(job.views.test)
+    stages = [("teacher", 0.03 * (train + test))]
+    for aim in job.aims:
+        schedule, steps = job.config.recover.schedule, job.config.recover.steps
+        if steps is None:
+            points = job.config.recover.from_points
+            steps = steps_from_points(aim.count, schedule.steps) if points else schedule.steps
+        stages += [
+            ("visibility", 0.01 * train),
+            ("simplify", 1.2 * len(job.prior) / 500_000),
+            ("recover", 0.02 * steps),
+            ("scoring", 0.06 * test),
+            ("report.html", 1.5),
+            ("view.html", 1.0),
+        ]
+    return stages
 
 
 def total(estimates: Sequence[Estimate]) -> tuple[float, int]:

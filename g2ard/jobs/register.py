@@ -20,7 +20,7 @@ from g2ard.io.photos import has_alpha, photo_size
 from g2ard.jobs.inputs import load_scene
 from g2ard.jobs.view_checks import propose_background
 from g2ard.pipeline.presets import GS_CPR
-from g2ard.progress import Progress, Say, silent, unsaid
+from g2ard.progress import Progress, Say, plural, silent, unsaid
 from g2ard.scene.cameras import Camera, Cameras
 from g2ard.scene.splats import Splats
 from g2ard.stages.register import RegisterConfig, Registered
@@ -386,14 +386,11 @@ def matched(found: Mapping[str, Found], names: Sequence[str]) -> dict[str, Found
 def pool_of(
     scene: Splats, pool: str | Path | int, seed: int, progress: Progress = silent, say: Say = unsaid
 ) -> Cameras:
-    """Return poses from a file of views, or plan as many as a number says; `say` receives their kind."""
+    """Return poses from a file of views, or plan as many as a number says, and `say` so."""
     if not str(pool).strip().isdigit():
         return read_view_set(Path(str(pool)), unpictured=True).cameras
     from g2ard.poses import plan_pool
 
     planned = plan_pool(scene, int(str(pool)), seed=seed, rows=_POSE_SAMPLE, progress=progress)
-    say(
-        f"pool: {len(planned.cameras)} poses, {planned.kind} ({planned.why}); if the photos were taken "
-        "differently, generate similar poses with `g2ard poses --kind` and pass the file to --pool"
-    )
+    say(f"starting from {plural(len(planned.cameras), 'generated view')} ({planned.kind})")
     return planned.cameras

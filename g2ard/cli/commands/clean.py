@@ -97,6 +97,7 @@ def clean(
         splats = whole.take(~sky)
         run.say(f"sky: {plural(int(sky.sum()), 'Gaussian')}" if sky.any() else "the scene has no sky")
     tell = run.answer if dry_run else run.say
+    run.console.expect([("visibility", 11), ("depths", 16), ("clutter", 19), ("preview", 1)])  # showroom, s
     found, cameras = Cleaning(np.full(len(splats), -1, np.int8)), None
     if kinds:
         found, cameras = clutter_seen(

@@ -228,6 +228,7 @@ def _distil_all(
     run: Run, source: Path, job: DistillJob, folders: Sequence[RunFolder], memory: int | None, began: float
 ) -> None:
     """Distil to every budget whose folder is not finished, and check the last result's quality."""
+    from g2ard.jobs.estimate import expected
     from g2ard.jobs.memory_limit import check_job_memory
 
     finished = {folder.path: folder.tell_finished() for folder in folders if folder.is_done}
@@ -235,6 +236,7 @@ def _distil_all(
         run.results(list(finished.values()))
         return
     check_job_memory(job, memory, page=run.config["view"])
+    run.console.expect(expected(job))
     job.render_targets()
     reports, others = [], " (--resume continues with the rest)" if len(folders) > 1 else ""
     for aim, folder in zip(job.aims, folders, strict=True):

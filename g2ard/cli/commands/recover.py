@@ -99,6 +99,7 @@ def recover(
     )
     run.say(f"regularisers: {why}" + ("" if dense else "; measured on the student, as there is no teacher"))
     config = configured(RecoverConfig(), preset, settings)
+    run.console.expect([("recover", 0.02 * config.horizon), ("scoring", 0.01 * len(chosen.cameras))])
     with stoppable(run, checkpoint, resume, output):
         result = optimize(
             splats,

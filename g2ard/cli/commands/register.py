@@ -165,7 +165,11 @@ def register(
     run.result({**result, "settings": listed(config)})
     if not len(found.cameras):
         first = next(row for row in rows if row.status != "registered")
-        raise InputError(f"none of {plural(len(rows), 'photo')} was registered; {first.name}: {first.reason}")
+        raise InputError(
+            f"none of {plural(len(rows), 'photo')} was registered; {first.name}: {first.reason}",
+            hint="start closer: give rough poses with {poses=FILE}, or as {pool=VIEWS} views taken like the "
+            "photos, such as the scene's training views",
+        )
     run.say(f"{output}: {len(found.cameras)} of {plural(len(rows), 'photo')}")
 
 

@@ -130,6 +130,7 @@ def recover(
     validation_key = None if validation is None else fingerprint_of(validation)
     loop = Loop(student, targets, config, view_weights, anchors, probe, guard, validation_key, frozen)
     if checkpoint is None or not checkpoint.exists():
+        progress("rates", 0, 0, {})
         loop.choose_rates(before)
     loop.run(checkpoint, progress, stage, watch)
     end = loop.engine.splats()

@@ -20,9 +20,9 @@ def acceptance(
     if sigma is None:
         return "refused", "the photo does not determine the pose"
     if zncc < min(config.doubt, config.accept):
-        return "refused", f"render and photo differ: ZNCC {zncc:.2f}"
+        return "refused", f"the best render looks unlike it (ZNCC {zncc:.2f})"
     if zncc < config.accept:
-        return "uncertain", f"render and photo differ: ZNCC {zncc:.2f}"
+        return "uncertain", f"the best render looks unlike it (ZNCC {zncc:.2f})"
     if sigma.rotation > config.max_angle_sigma:
         return "uncertain", f"the rotation is only known to {sigma.rotation:.2g}°"
     if sigma.position > config.max_position_sigma * depth:
