@@ -59,6 +59,11 @@ def test_packages_import_only_layers_below() -> None:
     assert wrong == []
 
 
+def test_architecture_lists_the_layers() -> None:
+    text = (ROOT.parent / "ARCHITECTURE.md").read_text(encoding="utf-8")
+    assert ", ".join(f"`{layer}`" for layer in LAYERS) in text
+
+
 def test_no_import_cycles() -> None:
     known = modules()
     edges: dict[str, set[str]] = {}
