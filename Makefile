@@ -8,7 +8,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK = 1
 
 RUST := $(shell find rust -name '*.rs' -o -name '*.wgsl' -o -name Cargo.toml) Cargo.toml Cargo.lock
 
-.PHONY: demo test lint docs stress fuzz fuzz-guided miri bench wheel wheel-linux release-check setup clean
+.PHONY: demo test lint docs stress fuzz fuzz-guided miri bench wheel wheel-linux ends release-check setup clean
 
 setup: $(VENV)/.built
 
@@ -93,6 +93,14 @@ $(VENV)/.zig:
 	test -x $(BIN)/pip || $(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet "maturin[zig]>=1.12,<2"
 	touch $@
+
+# Every command in a terminal, from the wheel with the oldest dependencies that pyproject.toml allows, then the newest.
+# Cargo has compiled the same for setup.
+ends: setup
+	rm -rf dist/ends
+	$(BIN)/maturin build --release --locked --quiet --out dist/ends
+	$(BIN)/python tests/release/ends.py oldest dist/ends/*.whl
+	$(BIN)/python tests/release/ends.py newest dist/ends/*.whl
 
 # What is published, as a user installs it: the wheel and the source distribution, each in a clean environment, run
 # README's Use section and must write the same bytes.

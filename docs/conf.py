@@ -17,6 +17,7 @@ exclude_patterns = ["docs/conf.py"]
 
 html_theme = "furo"
 html_title = "g2ard"
+html_extra_path = ["llms.txt"]  # an index for language models
 html_copy_source = False
 html_show_copyright = False
 

@@ -1,7 +1,7 @@
 """Other people's readers, for tests that hold our files against them.
 
-Looked for in $G2ARD_NODE_MODULES, where `npm i node@22 @playcanvas/splat-transform@3.7 @adobe/spz@0.2.3
-gltf-validator cesium` has been run; tests that need one skip where it is absent.
+Looked for in $G2ARD_NODE_MODULES, by default tests/node_modules, which `npm ci --prefix tests` fills from
+tests/package-lock.json; tests that need one skip where it is absent.
 """
 
 import json
@@ -12,6 +12,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+
+from helpers.project import ROOT
 
 _ADOBE = """
 import fs from 'node:fs';
@@ -32,17 +34,21 @@ console.log(JSON.stringify(report));
 """
 
 
+def _modules() -> Path:
+    return Path(os.environ.get("G2ARD_NODE_MODULES", ROOT / "tests" / "node_modules")).absolute()
+
+
 def package(*parts: str) -> Path:
     """Return a path in the node modules; skip the test if it is absent."""
-    root = Path(os.environ.get("G2ARD_NODE_MODULES", "node_modules")).absolute()
+    root = _modules()
     if not root.joinpath(*parts).exists():
-        pytest.skip(f"no {'/'.join(parts)} (set G2ARD_NODE_MODULES)")
+        pytest.skip(f"no {'/'.join(parts)} (npm ci --prefix tests)")
     return root.joinpath(*parts)
 
 
 def _node() -> str:
-    root = Path(os.environ.get("G2ARD_NODE_MODULES", "node_modules")).absolute()
-    return str(root / ".bin" / "node") if (root / ".bin" / "node").exists() else "node"
+    own = _modules() / ".bin" / "node"
+    return str(own) if own.exists() else "node"
 
 
 def _run(*arguments: str | Path) -> str:
