@@ -15,7 +15,8 @@ from benchmarks.process import check_measurable, machine
 from benchmarks.rows import Row, read_rows, rounded, write_rows
 from benchmarks.study import SceneSpec, Study
 from g2ard import __version__
-from g2ard.progress import Progress, silent
+from g2ard.errors import G2ardError
+from g2ard.progress import Progress, Say, silent, unsaid
 
 __all__ = ["Cell", "fingerprint", "folder_of", "run", "scene_key"]
 
@@ -44,6 +45,7 @@ def run(
     keep: bool = False,
     again: bool = False,
     progress: Progress = silent,
+    say: Say = unsaid,
 ) -> list[Row]:
     """Measure all cells that are not in `folder`/rows.csv, and return the rows of the studies in order.
 
@@ -56,6 +58,7 @@ def run(
         keep: whether to keep intermediate scenes, in work/, after success.
         again: whether to measure all cells again.
         progress: callback per cell.
+        say: called with the notes of each scene that is measured.
     """
     for study in studies:
         study.check()
@@ -70,7 +73,7 @@ def run(
     for study, scene in places:
         if again:
             shutil.rmtree(folder_of(work, study, scene) / "stages", ignore_errors=True)
-        where = scene_key(study, scene)
+        where, told = scene_key(study, scene), False
         for cell in study.cells(scene, work):
             key = fingerprint([study.settings, where, dict(cell.names), cell.more])
             named = {"study": study.name, "scene": scene.name, **cell.names}
@@ -79,6 +82,11 @@ def run(
             chosen.append((study, key))
             if not again and _done(held, key, cell.views):
                 continue
+            if not told:
+                with suppress(G2ardError, OSError):  # in its rows
+                    for note in study.notes(scene, work):
+                        say(f"{scene.name}: {note}")
+            told = True
             about = {"version": f"g2ard {__version__}", "machine": machine(), "cell": key}
             try:
                 found = [rounded({**about, **named, **row}) for row in cell.measure()]

@@ -12,9 +12,10 @@ from PIL import Image
 from benchmarks.rows import Row
 from g2ard.config.choices import BLACK, Colour
 from g2ard.io.images import as_saved, to_bytes
+from g2ard.rendering.cuda import renderer_on
 from g2ard.rendering.lpips import Lpips
 from g2ard.rendering.metrics import psnr, ssim
-from g2ard.rendering.renderer import RasterSettings, Renderer
+from g2ard.rendering.renderer import RasterSettings
 from g2ard.rendering.targets import Targets, mask_of
 from g2ard.scene.samples import evenly_spaced
 from g2ard.scene.splats import Splats
@@ -49,6 +50,7 @@ def score(
     lpips: dict[str, Lpips] | None = None,
     settings: RasterSettings | None = None,
     eight_bit: bool = False,
+    device: str = "cpu",
     pictures: Path | None = None,
 ) -> list[View]:
     """Render and score every view.
@@ -60,9 +62,10 @@ def score(
         lpips: LPIPS networks, if any.
         settings: conventions of the renderer; None means gsplat's.
         eight_bit: as in `g2ard.stages.evaluate.evaluate`.
+        device: as in `g2ard.stages.evaluate.evaluate`.
         pictures: folder for JPEGs of the `pictured` views, named by index.
     """
-    renderer = Renderer(splats, background=background, settings=settings)
+    renderer = renderer_on(device, splats, background, settings)
     views = []
     for number, name in enumerate(targets.cameras.names):
         image, target = renderer.clipped(targets.cameras[number]), targets[number]

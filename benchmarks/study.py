@@ -13,7 +13,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Self
 
-from g2ard.errors import InputError
+from g2ard.errors import InputError, require_torch
 
 if TYPE_CHECKING:
     from benchmarks.rows import Row
@@ -72,7 +72,11 @@ class SceneSpec:
         train_prior: steps that turn a lift into a "trained" prior of the same count.
         regularizers: kind of a prior given as a scene, which decides its row of the paper's `tab:s_recovery`;
             auto measures it.
-        starts: views whose poses photos are registered from, by name (start "given").
+        starts: poses that photos are registered from, by name (start "given"): views, or ACE's text.
+        points: points of a cloud to keep, evenly spaced in its file; 0 keeps all.
+        optional: names in `score` that are dropped if their file does not exist.
+        expects: the paper's counts: Gaussians of the `prior`, views to `train` and `adapt` on, and those of
+            each name in `score` (`test` without one). A run says which differ.
         synth: options of `python -m benchmarks synth city`, which then generates the scene.
     """
 
@@ -88,6 +92,9 @@ class SceneSpec:
     train_prior: int = key(0, least=0)
     regularizers: str = key("auto", choices=("auto", "trained", "lift", "noisy"))
     starts: str | None = key(None)
+    points: int = key(0, least=0)
+    optional: tuple[str, ...] = key(())
+    expects: Mapping[str, int] = key({})
     synth: Mapping[str, Any] | None = key(None)
 
     def __post_init__(self) -> None:
@@ -134,6 +141,10 @@ class Study(ABC):
     def cells(self, scene: SceneSpec, work: Path) -> Iterator[Cell]:
         """Yield the cells of a scene, without loading it."""
 
+    def notes(self, scene: SceneSpec, work: Path) -> list[str]:
+        """Return what a reader of a scene's rows should know, such as missing optional files."""
+        return []
+
     def derived(self, rows: list[Row]) -> list[Row]:
         """Return the rows with columns that depend on several rows."""
         return rows
@@ -153,12 +164,19 @@ class Study(ABC):
         return {f.name: getattr(self, f.name) for f in fields(self) if not f.metadata.get("axis")}
 
     def check(self) -> None:
-        """Check that environment variables in paths are set."""
+        """Check that environment variables in paths are set, and that the engine, if any, can run."""
         for scene in self.scenes:
-            paths = (scene.prior, scene.train, scene.adapt, *scene.score.values())
+            paths = (scene.prior, scene.train, scene.adapt, scene.starts, *scene.score.values())
             missing = next(filter(None, (_VARIABLE.search(path) for path in paths if path)), None)
             if missing is not None:
                 raise InputError(f"{self.name}: scene {scene.name}: ${missing[1]} is not set")
+        engine = getattr(self, "engine", "fused")
+        if engine != "fused":
+            require_torch(f"engine '{engine}'", "cuda" if engine == "gsplat" else "torch")
+        if engine == "gsplat":
+            from g2ard.rendering.cuda import check_cuda
+
+            check_cuda()
 
     def narrowed(self, options: Mapping[str, Any]) -> Self:
         """Return the study with changed keys; `scene.KEY` sets a key of all scenes."""

@@ -24,6 +24,7 @@ from g2ard.rendering.renderer import RasterSettings
 from g2ard.rendering.targets import Photos, PhotosOrRenders, Targets, TeacherRenders
 from g2ard.rendering.visibility import visibility_source
 from g2ard.scene.cameras import Cameras
+from g2ard.scene.samples import evenly_spaced
 from g2ard.scene.splats import Splats
 from g2ard.stages.lift import lift
 from g2ard.stages.simplify import simplify
@@ -113,7 +114,8 @@ class Workspace:
         source = self.place / self.scene.prior
         if self.lifted:
             points = io.read_points(source)
-            return lift(points.positions, points.colors)
+            every = evenly_spaced(len(points.positions), self.scene.points or len(points.positions))
+            return lift(points.positions[every], None if points.colors is None else points.colors[every])
         splats = io.read_splats(source)
         logits = np.clip(splats.logit_opacities, -_MAX_LOGIT, _MAX_LOGIT)
         return replace(splats, logit_opacities=logits)
@@ -193,10 +195,30 @@ class Workspace:
         """Split → views to score on."""
         if self.scene.score:
             score = self.scene.score.items()
-            return {name: self._apart(self.place / path, for_scores) for name, path in score}
+            there = {name: self.place / path for name, path in score if name not in self.missing}
+            return {name: self._apart(path, for_scores) for name, path in there.items()}
         if self.scene.train is not None:
             return {"test": self.views(self.place / self.scene.train, "test")}
         return {"test": self._pool("test")}
+
+    @cached_property
+    def missing(self) -> dict[str, Path]:
+        """The optional views to score on whose files do not exist, by name."""
+        paths = {name: self.place / path for name, path in self.scene.score.items()}
+        return {name: p for name, p in paths.items() if name in self.scene.optional and not p.exists()}
+
+    def notes(self) -> list[str]:
+        """Return missing optional files, and counts that differ from those the scene expects."""
+        notes = [f"{name}: {path} does not exist, so no row has it" for name, path in self.missing.items()]
+        found = {name: len(cameras) for name, cameras in self.scored.items()}
+        if "prior" in self.scene.expects:
+            found["prior"] = len(self.splats)
+        found["train"] = len(self.train_cameras)
+        for name, wanted in self.scene.expects.items():
+            if found.get(name, wanted) != wanted:
+                unit = "Gaussian" if name == "prior" else "view"
+                notes.append(f"{name}: {plural(found[name], unit)}, the paper has {wanted:,}")
+        return notes
 
     def targets(self, cameras: Cameras, settings: RasterSettings | None = None, **options: Any) -> Targets:
         """Return the targets of views: photos, or renders of the prior."""

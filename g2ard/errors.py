@@ -126,10 +126,10 @@ def missing(what: str, package: str, **fields: Any) -> MissingDependencyError:
     )
 
 
-def require_torch(feature: str) -> None:
-    """Check that torch can be imported, without importing it."""
+def require_torch(feature: str, extra: str = "torch") -> None:
+    """Check that torch can be imported, without importing it; `extra` of g2ard installs it."""
     if find_spec("torch") is None:
-        raise MissingDependencyError(f"{feature} needs torch", hint="pip install 'g2ard[torch]'")
+        raise MissingDependencyError(f"{feature} needs torch", hint=f"pip install 'g2ard[{extra}]'")
 
 
 def require(name: str, value: object, fits: bool, expected: str) -> None:

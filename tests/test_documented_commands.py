@@ -18,7 +18,6 @@ PAGES = [
     str(page.relative_to(ROOT))
     for pattern in ("*.md", "docs/**/*.md", "benchmarks/README.md")
     for page in sorted(ROOT.glob(pattern))
-    if page.name not in ("g2ard-and-the-paper.md", "datasets.md")
 ]
 
 NOT_RUN = {

@@ -29,7 +29,7 @@ from benchmarks.score import figures, pictured, save_jpeg, score
 from benchmarks.study import SceneSpec, Study, key
 from benchmarks.workspace import Workspace, budget_of
 from g2ard import __version__, io
-from g2ard.config.choices import ADAPT_SCHEDULES, CONVENTIONS, LPIPS_INPUTS, SCHEDULE_NAMES
+from g2ard.config.choices import ADAPT_SCHEDULES, CONVENTIONS, ENGINES, LPIPS_INPUTS, SCHEDULE_NAMES
 from g2ard.config.choices import METHODS as SIMPLIFIERS
 from g2ard.errors import InputError
 from g2ard.io.splits import states_splits
@@ -61,6 +61,9 @@ class Matched(Study):
         adapt_on: "train", or "all" views of `adapt` that are not of another split.
         convention: conventions of the renderer for scores.
         eight_bit: whether to round renders and targets to 8 bits before scoring, as in saved PNGs.
+        engine: engine of recovery and adaptation; gsplat also scores on the GPU: renders and LPIPS.
+        fold: the paper's rounds end with the one before if the last removes less than this share; the
+            text has 0.
         lpips: folder of LPIPS weights.
         lpips_input: "scaled" to [−1, 1], or "unscaled" as in 3DGS's evaluation (`g2ard.rendering.lpips`).
     """
@@ -79,6 +82,8 @@ class Matched(Study):
     adapt_on: str = key("train", choices=("train", "all"))
     convention: str = key("gsplat", choices=CONVENTIONS)
     eight_bit: bool = key(False)
+    engine: str = key("fused", choices=ENGINES)
+    fold: float = key(0.0, least=0)
     lpips: str | None = key(None)
     lpips_input: str = key("scaled", choices=LPIPS_INPUTS)
 
@@ -120,9 +125,13 @@ class Matched(Study):
             yield Cell(names, measure, more=[asdict(method), shared])
 
     def check(self) -> None:
-        """Check paths and load the LPIPS networks early."""
+        """Check paths and the engine, and load the LPIPS networks early."""
         super().check()
         self.networks  # noqa: B018
+
+    def notes(self, scene: SceneSpec, work: Path) -> list[str]:
+        """Return missing optional files, and counts that differ from the paper's."""
+        return MatchedWorkspace(work, self, scene).notes()
 
     def derived(self, rows: list[Row]) -> list[Row]:
         """Add the difference to the teacher's row of the same scene, prior and split."""
@@ -143,7 +152,13 @@ class Matched(Study):
         """LPIPS networks, if there are weights."""
         if self.lpips is None:
             return {}
-        return load_lpips(self.folder / self.lpips, scaled=self.lpips_input == "scaled")
+        scaled = self.lpips_input == "scaled"
+        return load_lpips(self.folder / self.lpips, scaled=scaled, device=self.device)
+
+    @property
+    def device(self) -> str:
+        """torch's device for scores."""
+        return "cuda" if self.engine == "gsplat" else "cpu"
 
     def _measured(
         self, place: MatchedWorkspace, ratio: float, method: MethodSpec, budget: Budget, seed: int
@@ -172,6 +187,7 @@ class Matched(Study):
                 lpips=self.networks,
                 settings=place.settings,
                 eight_bit=self.eight_bit,
+                device=self.device,
                 pictures=folder / pictures,
             )
             for view in pictured(len(scored)):
@@ -281,6 +297,14 @@ class MatchedWorkspace(Workspace):
             views["adapt-val"] = held_out
         return views
 
+    def notes(self) -> list[str]:
+        """Add the number of views to adapt on."""
+        notes, wanted = super().notes(), self.scene.expects.get("adapt")
+        if wanted is not None and self.study.adapt_steps:
+            found = len(self.read(self.adapted).cameras)
+            notes += [] if found == wanted else [f"adapt: {found:,} views, the paper has {wanted:,}"]
+        return notes
+
     @cached_property
     def settings(self) -> RasterSettings:
         """The settings of the renderer that scores."""
@@ -323,7 +347,12 @@ class MatchedWorkspace(Workspace):
         self, source: _Stage, views: Path, options: dict[str, Any], anchors: _Stage | None = None
     ) -> _Stage:
         """Recover against the training targets, anchored to the geometry of `anchors` or of the source."""
-        job = {"kind": "recover", **options, "background": list(self.scene.background)}
+        job = {
+            "kind": "recover",
+            "engine": self.study.engine,
+            **options,
+            "background": list(self.scene.background),
+        }
         files = {"scene": source.output, "views": views}
         files["targets"] = self._stored("targets-train", self.read(self.train).cameras)
         if anchors is not None:
@@ -335,6 +364,7 @@ class MatchedWorkspace(Workspace):
         """Adapt appearance on frozen geometry."""
         job = {
             "kind": "adapt",
+            "engine": self.study.engine,
             "steps": self.study.adapt_steps,
             "schedule": self.study.adapt_schedule,
             "sh_degree": sh_degree,
@@ -430,7 +460,7 @@ class _Pipeline:
         if not self.method.recovers:
             return []
         if self.method.rounds == "paper":
-            return round_counts(self.count, self.budget) or [self.budget]
+            return round_counts(self.count, self.budget, fold=self.place.study.fold) or [self.budget]
         return pup_rounds(self.count, self.budget) if self.method.rounds == "pup" else [self.budget]
 
     def run(self) -> _Stage:

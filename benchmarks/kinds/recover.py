@@ -16,6 +16,7 @@ from benchmarks.runner import Cell
 from benchmarks.score import figures, score
 from benchmarks.study import SceneSpec, Study, key
 from benchmarks.workspace import PROTOCOLS, Workspace, budget_of, kinds_for
+from g2ard.config.choices import ENGINES
 from g2ard.errors import InputError
 from g2ard.pipeline.config import DistillConfig
 from g2ard.pipeline.distill import distill
@@ -63,12 +64,14 @@ class Recover(Study):
     Args:
         methods: tables of `Variant`.
         steps: steps of variants that set none, over all rounds; only the last unless a variant runs each.
+        engine: engine of recovery.
         protocol: kinds of views to score: "pool", "standing" (near and standing views), "anywhere", or "all".
     """
 
     DEFAULT: ClassVar[Variant] = Variant("default")
 
     steps: tuple[int, ...] = key((1000,), least=1, axis=True)
+    engine: str = key("fused", choices=ENGINES)
     protocol: str = key("all", choices=tuple(PROTOCOLS), axis=True)
 
     def cells(self, scene: SceneSpec, work: Path) -> Iterator[Cell]:
@@ -155,6 +158,7 @@ class _Workspace(Workspace):
         weights, _, _ = regularizers_for(given.get("recover.regularizers", "auto"), self.splats, views)
         values = {
             **variant.settings,
+            "recover.engine": self.study.engine,
             "recover.regularizers": weights,
             "recover.sh_degree": self.sh_degree,
             "recover.background": self.scene.background,

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,7 @@ from benchmarks.rows import Row
 from benchmarks.runner import Cell
 from benchmarks.study import SceneSpec, Study, key
 from benchmarks.workspace import Workspace
+from g2ard.config.choices import ENGINES, Engine
 from g2ard.io.splits import splits_of, states_splits
 from g2ard.poses import make_pool, plan_pool
 from g2ard.rendering.targets import Subset, Targets, TeacherRenders
@@ -54,6 +55,7 @@ class Select(Study):
         percents: K in percent of the pool.
         draws: random subsets per pool.
         steps: steps per recovery.
+        engine: engine of recovery.
         count: Gaussians of the student.
         candidates: maximum views per pool; at least 420 in a generated city.
         tests: views per scored set.
@@ -66,6 +68,7 @@ class Select(Study):
     percents: tuple[float, ...] = key((10.0, 25.0, 50.0), least=1e-3, axis=True)
     draws: int = key(3, least=1, axis=True)
     steps: tuple[int, ...] = key((250,), least=1, axis=True)
+    engine: str = key("fused", choices=ENGINES)
     count: int = key(10_000, least=1)
     candidates: int = key(160, least=8)
     tests: int = key(24, least=1)
@@ -107,6 +110,7 @@ class Select(Study):
             sh_degree=3 if universe.lifted else None,
             background=background,
             seed=seed,
+            engine=cast(Engine, self.engine),
         )
         began = time.process_time()
         result = recover(

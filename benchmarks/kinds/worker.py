@@ -139,6 +139,7 @@ def _recover(job: Job) -> dict[str, Any]:
         sh_degree=job["sh_degree"],
         background=tuple(job["background"]),
         final=job["final"],
+        engine=job["engine"],
         seed=job["seed"],
     )
     built = io.read_splats(job["anchors"]) if job.get("anchors") else None
@@ -158,6 +159,7 @@ def _adapt(job: Job) -> dict[str, Any]:
         sh_degree=job["sh_degree"],
         background=tuple(job["background"]),
         seed=job["seed"],
+        engine=job["engine"],
     )
     done = adapt(io.read_splats(job["scene"]), _targets(job), config)
     io.write_splats(job["output"], done.splats, overwrite=True)

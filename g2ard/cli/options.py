@@ -304,15 +304,30 @@ def views_count(text: str) -> Count | str:
 PolicyOption = Annotated[Policy | None, typer.Option(help="Selection criterion.")]
 
 
-def recovery_engine(run: Run) -> Engine:
-    """Return the recovery engine for --device; raise an error if CUDA is requested and not available."""
-    if run.device != "cuda":
-        return "fused"
-    require_torch("--device cuda")
-    from g2ard.stages.recover.gsplat_engine import check_cuda
+EngineOption = Annotated[
+    Engine | None,
+    typer.Option(
+        help="Engine of the steps, with equal results up to rounding: fused (Rust, the default), torch "
+        "(autograd; needs the extra `torch`) or gsplat (NVIDIA GPU, as --device cuda; extra `cuda`)."
+    ),
+]
 
-    check_cuda()
-    return "gsplat"
+
+def choose_engine(run: Run, settings: dict[str, Any], path: str) -> None:
+    """Set the engine at `path` to gsplat for --device cuda, and check that CUDA is there for gsplat."""
+    asked = "engine"
+    if run.device == "cuda" and path not in settings:
+        settings[path], asked = "gsplat", "device"
+    if settings.get(path) == "gsplat":
+        use_cuda(asked)
+
+
+def use_cuda(asked: str = "device") -> None:
+    """Raise an error if CUDA, requested by the option `asked`, is not available."""
+    require_torch("--device cuda" if asked == "device" else "--engine gsplat", "cuda")
+    from g2ard.rendering.cuda import check_cuda
+
+    check_cuda(asked)
 
 
 def trained_on(split: str) -> str:

@@ -20,7 +20,7 @@ _PANELS = {
         *("matcher", "refine", "passes", "accept", "protocol"),
     ),
     "Recovery": (
-        *("recover", "schedule", "steps", "recovery_time", "weighted"),
+        *("recover", "schedule", "steps", "recovery_time", "weighted", "engine"),
         *("tolerance", "prior_views", "sh_degree"),
     ),
     "Output": (

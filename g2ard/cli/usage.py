@@ -12,7 +12,7 @@ import typer
 from g2ard.cli.budget_options import BUDGET_FLAGS, BUDGETS
 from g2ard.errors import G2ardError
 
-_FLAGS = {"overwrite=True": "-w (--overwrite)", "engine": "--device cuda", "engine='fused'": "--device cpu"}
+_FLAGS = {"overwrite=True": "-w (--overwrite)"}
 """Parameters, alone or with a value, whose flag has another name."""
 
 

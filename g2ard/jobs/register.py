@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
@@ -366,21 +367,32 @@ def poses_for(path: Path, names: Sequence[str]) -> dict[str, NDArray[np.float64]
 
 
 def matched(found: Mapping[str, Found], names: Sequence[str]) -> dict[str, Found]:
-    """Look up each of `names` by full name, or by a stem that is unique on both sides.
+    """Look up each of `names` by full name, by path with `_` for `/`, or by file name, without suffixes.
+
+    ACE writes `seq2/frame00001.png` as `seq2_frame00001.png`. Shortened names must be unique on both sides.
 
     >>> matched({"seq/a.png": 1, "b": 2}, ["a.jpg", "c.jpg"])
     {'a.jpg': 1}
+    >>> matched({"seq2_frame1.png": 1, "seq3_frame1.png": 2}, ["seq3/frame1.png"])
+    {'seq3/frame1.png': 2}
     """
     out = {name: found[name] for name in names if name in found}
-    stems = [PurePosixPath(name).stem for name in found]
-    ours = [PurePosixPath(name).stem for name in names]
-    by_stem = {
-        stem: value for stem, value in zip(stems, found.values(), strict=True) if stems.count(stem) == 1
-    }
-    for name, stem in zip(names, ours, strict=True):
-        if name not in out and stem in by_stem and ours.count(stem) == 1:
-            out[name] = by_stem[stem]
+    for shortened in (_flat, _stem):
+        theirs, ours = Counter(map(shortened, found)), Counter(map(shortened, names))
+        known = {shortened(name): value for name, value in found.items() if theirs[shortened(name)] == 1}
+        for name in names:
+            if name not in out and shortened(name) in known and ours[shortened(name)] == 1:
+                out[name] = known[shortened(name)]
     return out
+
+
+def _stem(name: str) -> str:
+    return PurePosixPath(name).stem
+
+
+def _flat(name: str) -> str:
+    path = PurePosixPath(name)
+    return str(path.parent / path.stem).replace("/", "_")
 
 
 def pool_of(

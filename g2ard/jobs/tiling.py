@@ -153,6 +153,6 @@ def whole_options(options: DistillOptions) -> list[str]:
         "--photos": bool(options.photos),
         "--set select.reselect": config.select.reselect,
         "--recovery-time": config.recover.recovery_time is not None,
-        "--device cuda": config.recover.engine != "fused",
+        "--engine": config.recover.engine != "fused",
     }
     return whole_method(config.simplify.method, None) + [name for name, there in given.items() if there]

@@ -178,6 +178,7 @@ class _Fit:
             ssim_weight=config.ssim_weight,
             background=config.background,
             seed=config.seed + len(self.stretches),
+            engine=config.engine,
         )
         within = self.work / "steps.npz" if self.work else None
         before = sum(stretch["steps"] for stretch in self.stretches)

@@ -16,6 +16,7 @@ _PAPER: dict[str, Any] = {
     "select.weighted": False,
     "select.reselect": False,
     "simplify.method": "paper",
+    "simplify.fold": 0.0,
     "recover.schedule": "paper",
     "recover.sh_degree": 3,
     "adapt.schedule": "paper",

@@ -34,20 +34,30 @@ class Lpips:
         scaled: map images from [0, 1] to [−1, 1], the range the networks were fitted for. False passes them
             unscaled, as 3DGS's evaluation does (graphdeco-inria/gaussian-splatting#1239). Scores of the two
             are not comparable.
+        device: torch's device to compute on.
 
     Raises:
         InputError: missing weights.
     """
 
     def __init__(
-        self, net: str, backbone: dict[str, Any], linear: dict[str, Any], *, scaled: bool = True
+        self,
+        net: str,
+        backbone: dict[str, Any],
+        linear: dict[str, Any],
+        *,
+        scaled: bool = True,
+        device: str = "cpu",
     ) -> None:
-        self.net, self.scaled = net, scaled
+        self.net, self.scaled, self.device = net, scaled, device
         self._layers: dict[int, tuple[Any, Any]] = {}
         try:
             for i in _CONV[net]:
-                self._layers[i] = (backbone[f"features.{i}.weight"], backbone[f"features.{i}.bias"])
-            self._linear = [linear[f"lin{i}.model.1.weight"].reshape(1, -1, 1, 1) for i in range(5)]
+                weight, bias = (backbone[f"features.{i}.{name}"].to(device) for name in ("weight", "bias"))
+                self._layers[i] = (weight, bias)
+            self._linear = [
+                linear[f"lin{i}.model.1.weight"].reshape(1, -1, 1, 1).to(device) for i in range(5)
+            ]
         except KeyError as error:
             raise InputError(f"LPIPS {net}: the weights lack {error}") from None
 
@@ -66,9 +76,10 @@ class Lpips:
         import torch
         from torch.nn import functional
 
-        x = torch.from_numpy(np.ascontiguousarray(image.transpose(2, 0, 1)))[None]
+        x = torch.from_numpy(np.ascontiguousarray(image.transpose(2, 0, 1)))[None].to(self.device)
         x = 2 * x - 1 if self.scaled else x
-        x = (x - torch.tensor(_MEAN).reshape(1, 3, 1, 1)) / torch.tensor(_STD).reshape(1, 3, 1, 1)
+        mean, std = (torch.tensor(v, device=self.device).reshape(1, 3, 1, 1) for v in (_MEAN, _STD))
+        x = (x - mean) / std
         taps = []
         for i in range(_TAPS[self.net][-1] + 1):
             if i in self._layers:
@@ -84,7 +95,7 @@ class Lpips:
         return taps
 
 
-def load_lpips(folder: Path, *, scaled: bool = True) -> dict[str, Lpips]:
+def load_lpips(folder: Path, *, scaled: bool = True, device: str = "cpu") -> dict[str, Lpips]:
     """Load the networks whose weights are in a folder: alexnet*.pth with alex.pth, vgg16*.pth with vgg.pth.
 
     The first of each pair holds torchvision's ImageNet weights, the second LPIPS's linear layers (v0.1).
@@ -92,6 +103,7 @@ def load_lpips(folder: Path, *, scaled: bool = True) -> dict[str, Lpips]:
     Args:
         folder: folder with the weights.
         scaled: see `Lpips`.
+        device: see `Lpips`.
 
     Raises:
         InputError: neither pair is in the folder, or a file is not a state dict.
@@ -111,7 +123,7 @@ def load_lpips(folder: Path, *, scaled: bool = True) -> dict[str, Lpips]:
                 files.append(torch.load(path, map_location="cpu", weights_only=True))
             except Exception as error:  # torch raises any exception from unpickling
                 raise InputError(f"not a torch state dict ({type(error).__name__})", path=path) from None
-        out[net] = Lpips(net, files[0], files[1], scaled=scaled)
+        out[net] = Lpips(net, files[0], files[1], scaled=scaled, device=device)
     if not out:
         raise InputError(
             "no LPIPS weights (alexnet*.pth and alex.pth, or vgg16*.pth and vgg.pth)", path=folder

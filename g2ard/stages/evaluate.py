@@ -12,9 +12,10 @@ from g2ard.config.choices import BLACK, Colour
 from g2ard.errors import InputError
 from g2ard.io.images import as_saved
 from g2ard.progress import Progress, plural, silent
+from g2ard.rendering.cuda import renderer_on
 from g2ard.rendering.lpips import Lpips
 from g2ard.rendering.metrics import psnr, ssim
-from g2ard.rendering.renderer import RasterSettings, Renderer
+from g2ard.rendering.renderer import RasterSettings
 from g2ard.rendering.targets import Targets, against_of, mask_of
 from g2ard.scene.cameras import USUAL
 from g2ard.scene.splats import Splats
@@ -93,6 +94,7 @@ def evaluate(
     lpips: Mapping[str, Lpips] | None = None,
     settings: RasterSettings | None = None,
     eight_bit: bool = False,
+    device: str = "cpu",
     progress: Progress = silent,
     stage: str = "evaluate",
 ) -> Evaluation:
@@ -110,6 +112,7 @@ def evaluate(
         settings: the renderer's conventions; None means gsplat's. Teacher renders have their own, see
             `g2ard.rendering.targets.TeacherRenders`.
         eight_bit: round renders and targets to multiples of 1/255, as in evaluations from saved PNGs.
+        device: "cuda" renders with gsplat on an NVIDIA GPU, unless `settings` ask for INRIA's conventions.
         progress: called after each view.
         stage: stage name for progress.
 
@@ -120,7 +123,7 @@ def evaluate(
         InputError: a photo cannot be read, or its mask leaves no pixel.
     """
     cameras = targets.cameras
-    renderer = Renderer(splats, background=background, settings=settings)
+    renderer = renderer_on(device, splats, background, settings)
     scores = []
     for view, name in enumerate(cameras.names):
         image, target = renderer.clipped(cameras[view]), targets[view]

@@ -5,7 +5,13 @@ from pathlib import Path
 
 import numpy as np
 
-from g2ard.scene.cameras import look_at
+from g2ard.io import write_splats
+from g2ard.io.images import write_png
+from g2ard.rendering.renderer import Renderer
+from g2ard.scene.cameras import Camera, look_at
+from g2ard.scene.splats import SH_C0, Splats
+from helpers.cloud_files import ply
+from helpers.scenes import around
 from helpers.view_files import photo, quaternion
 
 POSES = [look_at([3 * np.cos(a), 3 * np.sin(a), 1.5], [0, 0, 0]) for a in np.linspace(0, 5, 9)]
@@ -47,6 +53,56 @@ def polycam(root: Path, folder: str = "corrected_") -> None:
         photo(root / "keyframes" / f"{folder}images" / f"{name}.jpg", (100, 75))
 
 
+def matrix_city(root: Path, scene: Splats, count: int = 16, size: int = 48) -> None:
+    """Write the folders of MatrixCity that the studies read, and scenes in the place of the teachers.
+
+    The pose folder has lengths in 100 m; the blocks have metres and rotations of a hundredth.
+    """
+    street = root / "small_city" / "street"
+    pose, views = street / "pose" / "block_A", around(count, (size, size))
+    pose.mkdir(parents=True)
+    angle = 2 * float(np.arctan(size / 2 / views.Ks[0, 0, 0]))
+    lens = {"camera_angle_x": angle, "fl_x": float(views.Ks[0, 0, 0]), "fl_y": float(views.Ks[0, 0, 0])}
+    lens |= {"k1": 0, "k2": 0, "k3": 0, "k4": 0, "p1": 0, "p2": 0, "cx": size / 2, "cy": size / 2}
+    head = {**lens, "w": float(size), "h": float(size)}
+    renderer = Renderer(scene)
+    for split, rows in (("train", range(count - 4)), ("test", range(count - 4, count))):
+        frames = []
+        for i in rows:
+            where = (
+                f"{split}/small_city_road_{'horizon' if i % 2 else 'vertical'}{'_test' * (split == 'test')}"
+            )
+            write_png(_made(street / where / f"{i:04d}.png"), renderer.clipped(views[i]))
+            matrix = opengl(views.viewmats[i]).tolist()
+            frames.append({"file_path": f"../../{where}/{i:04d}.png", "transform_matrix": matrix})
+        (pose / f"transforms_{split}.json").write_text(json.dumps({**head, "frames": frames}))
+    block = street / "train_dense" / "small_city_road_horizon_dense"
+    between, frames = around(40, (size, size), 2.6), []
+    for i, view in enumerate(between):
+        write_png(_made(block / f"{i:04d}.png"), renderer.clipped(view))
+        matrix = opengl(view.viewmat)
+        matrix[:3, :3] /= 100
+        matrix[:3, 3] *= 100
+        frames.append({"frame_index": i, "rot_mat": matrix.tolist()})
+    (block / "transforms.json").write_text(json.dumps({"camera_angle_x": angle, "frames": frames}))
+    points = root / "small_city_pointcloud" / "point_cloud_ds20" / "street" / "Block_A.ply"
+    colors = np.rint(255 * np.clip(0.5 + SH_C0 * scene.sh0[:, 0], 0, 1))
+    types = dict.fromkeys("xyz", "f8") | dict.fromkeys(("red", "green", "blue"), "u1")  # as Open3D writes it
+    ply(_made(points), types, np.concatenate([scene.means, colors], 1))
+    for name in ("block_A.ply", "block_A_3M.ply"):
+        write_splats(root / name, scene)
+
+
+def inria_model(root: Path, scene: Splats) -> None:
+    """Write a trained model as 3DGS's release has it."""
+    write_splats(_made(root / "point_cloud" / "iteration_30000" / "point_cloud.ply"), scene)
+
+
+def _made(path: Path) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    return path
+
+
 def mip_nerf_360(root: Path) -> None:
     model = root / "sparse" / "0"
     model.mkdir(parents=True)
@@ -60,9 +116,11 @@ def mip_nerf_360(root: Path) -> None:
     (model / "images.txt").write_text("".join(rows))
 
 
-def cambridge(root: Path, size: tuple[int, int] = (192, 108)) -> None:
+def cambridge(root: Path, size: tuple[int, int] = (192, 108), scene: Splats | None = None) -> None:
+    """Write the lists, the NVM model and the photos, which show the scene if there is one."""
     lines = {"train": [], "test": []}
     cameras = []
+    renderer = None if scene is None else Renderer(scene)
     for i, view in enumerate(POSES):
         split = "test" if i >= 6 else "train"
         name = f"seq{2 if split == 'test' else 1}/frame{i:05d}"
@@ -71,7 +129,16 @@ def cambridge(root: Path, size: tuple[int, int] = (192, 108)) -> None:
         if i != 4:
             numbers = " ".join(f"{v:.9f}" for v in (1670.0 + i, *q, *c))
             cameras.append(f"{name}.jpg\t{numbers} -0.05 0 ")
-        photo(root / f"{name}.png", size)
+        if renderer is None:
+            photo(root / f"{name}.png", size)
+        else:
+            K = [
+                [1670.0 / 1920 * size[0], 0, size[0] / 2],
+                [0, 1670.0 / 1920 * size[0], size[1] / 2],
+                [0, 0, 1],
+            ]
+            image = renderer.clipped(Camera(view, np.array(K), *size))
+            write_png(_made(root / f"{name}.png"), image)
     for split, rows in lines.items():
         head = "Visual Landmark Dataset V1\nImageFile, Camera Position [X Y Z W P Q R]\n\n"
         (root / f"dataset_{split}.txt").write_text(head + "\n".join(rows) + "\n")
@@ -79,3 +146,13 @@ def cambridge(root: Path, size: tuple[int, int] = (192, 108)) -> None:
     (root / "reconstruction.nvm").write_text(
         f"NVM_V3 \n\n{len(cameras)}\n" + "\n".join(cameras) + points, encoding="utf-8"
     )
+
+
+def ace_poses(path: Path, error: float = 0.03) -> None:
+    """Write poses of `cambridge`'s test photos, a little off, as ACE and GS-CPR publish them."""
+    lines = []
+    for i, view in enumerate(POSES[6:], 6):
+        q, t = quaternion(view[:3, :3]), view[:3, 3] + error
+        numbers = " ".join(str(v) for v in (*q, *t, 0.2, 0.03))
+        lines.append(f"seq2_frame{i:05d}.png {numbers} 1652\n")
+    path.write_text("".join(lines))

@@ -11,11 +11,12 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
+import torch
 
 import g2ard
 from g2ard.io.camera_files import write_colmap
 from g2ard.scene.splats import SH_C0
-from helpers import cloud_files
+from helpers import cloud_files, dataset_files, lpips_weights
 from helpers.feature_scenes import blotched
 from helpers.photos import cloud_of, photographed, photos_of, rgba_photos_of
 from helpers.scenes import around, checkered_ball, under_a_sky
@@ -157,6 +158,24 @@ def _sky(path: Path) -> None:
     g2ard.save(path, under_a_sky(SCENE))
 
 
+def _matrix_city(folder: Path) -> None:
+    """The data set's `small_city` alone."""
+    whole = folder.with_name("MatrixCity")
+    dataset_files.matrix_city(whole, SCENE)
+    (whole / "small_city").rename(folder)
+
+
+def _kings_college(folder: Path) -> None:
+    dataset_files.cambridge(folder, (400, 225), blotched(2500))
+
+
+def _lpips(folder: Path) -> None:
+    folder.mkdir()
+    backbone, linear = lpips_weights.weights()
+    torch.save(backbone, folder / "alexnet-owt-7be5be79.pth")
+    torch.save(linear, folder / "alex.pth")
+
+
 STAND_INS: dict[str, Callable[[Path], None]] = {
     **dict.fromkeys(("scene.ply", "scan.ply", "dense.ply", "city.ply", "room.ply", "tree.spz"), _scene),
     **dict.fromkeys(("guitar.compressed.ply", "park24.ply"), _scene),
@@ -173,6 +192,12 @@ STAND_INS: dict[str, Callable[[Path], None]] = {
     "rough.json": _rough,
     "park.ply": _sky,
     "PATH.json": _views,
+    "teacher.ply": _scene,
+    "small_city": _matrix_city,
+    "KingsCollege": _kings_college,
+    "KingsCollege.ply": lambda path: g2ard.save(path, blotched(2500)),
+    "poses_Cambridge_KingsCollege_.txt": dataset_files.ace_poses,
+    "weights": _lpips,
 }
 """Name → what makes a file or folder of that name."""
 

@@ -11,7 +11,11 @@ import torch
 
 from g2ard import io
 from g2ard.errors import InputError, MissingDependencyError
+from g2ard.rendering import cuda
+from g2ard.rendering.cuda import renderer_on
+from g2ard.rendering.renderer import RasterSettings, Renderer
 from g2ard.rendering.targets import TeacherRenders
+from g2ard.stages.evaluate import evaluate
 from g2ard.stages.recover import RecoverConfig, gsplat_engine, recover
 from g2ard.stages.recover.losses import l1_ssim, l1_ssim_anywhere
 from g2ard.stages.simplify import simplify
@@ -72,6 +76,15 @@ def test_the_engine_passes_gsplats_documented_arguments(monkeypatch: pytest.Monk
     assert reports[1].loss == pytest.approx(reports[0].loss, abs=1e-4)
 
 
+def test_scores_on_the_gpu_are_those_of_the_cpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "gsplat", SimpleNamespace(rasterization=oracle_rasterization))
+    monkeypatch.setattr(cuda, "DEVICE", "cpu")
+    small = simplify(BALL, 60, method="paper").splats
+    found = [evaluate(small, TARGETS, device=device).psnr for device in ("cpu", "cuda")]
+    assert found[1] == pytest.approx(found[0], abs=1e-3)
+    assert isinstance(renderer_on("cuda", small, (0, 0, 0), RasterSettings(convention="inria")), Renderer)
+
+
 def test_the_loss_in_plain_torch_is_the_fused_one() -> None:
     torch.manual_seed(0)
     target = torch.rand(37, 53, 3)
@@ -95,13 +108,16 @@ def test_without_cuda_the_error_is_one_line(tmp_path: Path, command_line: Comman
     io.write_views(tmp_path / "v.json", TARGETS.cameras)
     asked = ("recover", "b.ply", "--views", "v.json", "--teacher", "b.ply", "-o", "o.ply", "--device", "cuda")
     error = refused(command_line, tmp_path, *asked, status=1)
-    assert "--device cuda: torch finds no CUDA device; " in error
+    assert "--device: torch finds no CUDA device; " in error
     assert "g2ard[cuda]; --device cpu needs none" in error
+    error = refused(command_line, tmp_path, *asked[:-2], "--engine", "gsplat", status=1)
+    assert "--engine: torch finds no CUDA device; " in error
+    assert "g2ard[cuda]; --engine fused needs none" in error
     assert not (tmp_path / "o.ply").exists()
 
 
 def test_a_missing_gsplat_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
-    monkeypatch.setattr(gsplat_engine, "find_spec", lambda name: None)
+    monkeypatch.setattr(cuda, "find_spec", lambda name: None)
     with pytest.raises(MissingDependencyError, match=r"pip install 'g2ard\[cuda\]'"):
-        gsplat_engine.check_cuda()
+        cuda.check_cuda()

@@ -73,6 +73,11 @@ def test_names_match_whole_then_by_unambiguous_stems() -> None:
     assert matched({"a/1.png": 1, "b/1.png": 2}, ["1.png"]) == {}
     assert matched({"a/1.png": 1, "2": 2}, ["a/1.png", "x/2.jpg", "y/2.jpg"]) == {"a/1.png": 1}
     assert matched({"1": 1}, ["s/1.jpg"]) == {"s/1.jpg": 1}
+    aces = {"seq2_frame1.png": 2, "seq3_frame1.png": 3}
+    assert matched(aces, ["seq3/frame1.png", "seq2/frame1.png"]) == {
+        "seq3/frame1.png": 3,
+        "seq2/frame1.png": 2,
+    }
 
 
 def test_a_broken_photo_is_one_refused_row(site: Path, tmp_path: Path) -> None:

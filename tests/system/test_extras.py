@@ -22,11 +22,14 @@ def test_features_need_torch(
     monkeypatch.setattr(errors, "find_spec", lambda name: None)
     ball = checkered_ball(400)
     targets = g2ard.TeacherRenders(ball, around(4, (32, 24)))
-    for engine in ("torch", "gsplat"):
-        with pytest.raises(MissingDependencyError, match=rf"'{engine}' needs torch; .*'g2ard\[torch\]'"):
+    for engine, extra in (("torch", "torch"), ("gsplat", "cuda")):
+        with pytest.raises(MissingDependencyError, match=rf"'{engine}' needs torch; .*'g2ard\[{extra}\]'"):
             g2ard.recover(ball, targets, g2ard.RecoverConfig(steps=1, engine=engine))
     with pytest.raises(MissingDependencyError, match=r"^LPIPS needs torch"):
         load_lpips(folder)
+    ask = ("recover", "ball.ply", "--teacher", "ball.ply", "--views", "views.json", "-o", "x.ply")
+    error = refused(command_line, folder, *ask, "--engine", "gsplat", status=1)
+    assert "needs torch; pip install 'g2ard[cuda]'" in error
     ask = ("evaluate", "ball.ply", "--teacher", "ball.ply", "--views", "views.json", "--lpips", ".")
     assert "LPIPS needs torch" in refused(command_line, folder, *ask, status=1)
     g2ard.recover(ball, targets, g2ard.RecoverConfig(steps=1))

@@ -59,7 +59,7 @@ def test_several_whole_options_are_named_together(command_line: CommandLine, fol
     assert "tiles: --clean and --photos need the whole scene in memory" in told
     assert "use `g2ard ingest tiles -o DIR --tile-rows 3,000` for one piece" in told
     assert whole_options(DistillOptions(photos=False)) == []
-    assert whole_options(DistillOptions(settings={"engine": "gsplat"})) == ["--device cuda"]
+    assert whole_options(DistillOptions(settings={"engine": "gsplat"})) == ["--engine"]
 
 
 def test_rows_of_tiles_that_lie_in_a_folder_are_theirs(command_line: CommandLine, folder: Path) -> None:

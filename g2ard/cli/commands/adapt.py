@@ -19,6 +19,7 @@ from g2ard.progress import plural
 @command(
     "adapt",
     example="g2ard adapt small.ply --views winter/ -o winter.ply",
+    cuda=True,
     settings="g2ard.pipeline.adapt:AdaptConfig",
     scenes=True,
 )
@@ -48,6 +49,7 @@ def adapt(
         ),
     ] = None,
     sh_degree: opt.ShDegreeOption = None,
+    engine: opt.EngineOption = None,
     resume: opt.ResumeOption = False,
     split: opt.SplitOption = "train",
     size: opt.SizeOption = None,
@@ -64,8 +66,10 @@ def adapt(
         raise typer.BadParameter("--prior-views and the paper's schedule exclude each other; give one")
     start = AdaptConfig.scheduled(schedule)
     background = opt.background_of(run, background, compact)
-    names = ("steps", "tolerance", "schedule", "prior_views", "sh_degree", "background", "seed")
-    config = configured(start, preset or "auto", run.settings(start, *names, preset=preset))
+    names = ("steps", "tolerance", "schedule", "prior_views", "sh_degree", "engine", "background", "seed")
+    settings = run.settings(start, *names, preset=preset)
+    opt.choose_engine(run, settings, "adapt.engine")
+    config = configured(start, preset or "auto", settings)
     work = output.parent / f".{output.name}.work"
     check_scene_run(run, work, resume, output)
     splats = run.load(compact)

@@ -69,6 +69,7 @@ def distill(
     schedule: opt.ScheduleOption = None,
     steps: opt.StepsOption = None,
     recovery_time: opt.RecoveryTimeOption = None,
+    engine: opt.EngineOption = None,
     keep: Annotated[
         bool,
         typer.Option(
@@ -117,12 +118,22 @@ def distill(
     from g2ard.pipeline.config import DistillConfig
 
     began = time.monotonic()
-    names = ("method", "keep_region", "schedule", "steps", "recovery_time", "focus", "background", "seed")
+    names = (
+        "method",
+        "keep_region",
+        "schedule",
+        "steps",
+        "recovery_time",
+        "engine",
+        "focus",
+        "background",
+        "seed",
+    )
     settings = run.settings(DistillConfig(), *names, preset=preset)
     budgets = budgets_of(run)
     given = views is not None and not is_made(views)
     _check_options(scene, views, held_out, photos)
-    settings.setdefault("recover.engine", opt.recovery_engine(run))
+    opt.choose_engine(run, settings, "recover.engine")
     outputs = Outputs(run, output, budgets)
 
     def folder_at(path: Path) -> RunFolder:

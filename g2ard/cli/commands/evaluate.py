@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 @command(
     "evaluate",
     example="g2ard evaluate small.ply --views poses.json --teacher scene.ply --json -",
+    cuda=True,
     scenes=True,
 )
 def evaluate(
@@ -80,6 +81,9 @@ def evaluate(
         size = size or made_at
     else:
         check_teacher(views, teacher, photos)
+    device = "cuda" if run.device == "cuda" else "cpu"
+    if device == "cuda":
+        opt.use_cuda()
     views = opt.with_images(views, images, alpha)
     for path in scenes:
         check_scene(path)
@@ -90,7 +94,7 @@ def evaluate(
     cameras = load_views(teaching.views(views), split, size, run.say, unpictured=teaching.dense is not None)
     targets = scorable(teaching.targets(cameras, settings=settings), run.say)
     cameras = targets.cameras
-    networks = load_lpips(lpips, scaled=lpips_input == "scaled") if lpips else None
+    networks = load_lpips(lpips, scaled=lpips_input == "scaled", device=device) if lpips else None
     rows: list[dict[str, Any]] = []
     for path in scenes:
         splats = run.load(path)
@@ -102,6 +106,7 @@ def evaluate(
             lpips=networks,
             settings=settings,
             eight_bit=eight_bit,
+            device=device,
             progress=run.progress,
             stage=path.name,
         )

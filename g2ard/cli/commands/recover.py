@@ -57,6 +57,7 @@ def recover(
     steps: opt.StepsOption = None,
     recovery_time: opt.RecoveryTimeOption = None,
     sh_degree: opt.ShDegreeOption = None,
+    engine: opt.EngineOption = None,
     resume: opt.ResumeOption = False,
     split: opt.SplitOption = "train",
     weighted: Annotated[
@@ -75,14 +76,14 @@ def recover(
     from g2ard.stages.recover.auto_preset import regularizers_for
 
     background = opt.background_of(run, background, student)
-    names = ("schedule", "steps", "recovery_time", "sh_degree", "background", "seed")
+    names = ("schedule", "steps", "recovery_time", "sh_degree", "engine", "background", "seed")
     settings = run.settings(RecoverConfig(), *names, preset=preset)
     named = {**PRESETS[preset], **settings}
     check_teacher(views, teacher, photos)
     views = opt.with_images(views, images, alpha)
     checkpoint = output.parent / f".{output.name}.checkpoint.npz"
     check_scene_run(run, checkpoint, resume, output)
-    settings.setdefault("recover.engine", opt.recovery_engine(run))
+    opt.choose_engine(run, settings, "recover.engine")
     splats = run.load(student)
     colour = configured(RecoverConfig(), preset, settings).background
     teaching = Teaching(run, teacher, colour, chosen=background is not None, photos=photos)

@@ -19,6 +19,8 @@ class FitConfig:
         ssim_weight: λ in (1−λ)·L1 + λ·(1−SSIM); 0.2 as in 3DGS.
         background: RGB behind the scene.
         seed: seed of the order of views.
+        engine: "fused" runs whole steps in Rust; "torch" uses autograd over the Rust rasteriser and
+            `SelectiveAdam`, with equal results up to rounding; "gsplat" is the same on an NVIDIA GPU.
 
     Raises:
         InputError: a value out of range.
@@ -28,6 +30,7 @@ class FitConfig:
     ssim_weight: float = 0.2
     background: Colour = BLACK
     seed: int = 0
+    engine: Engine = "fused"
 
     def __post_init__(self) -> None:
         require("ssim_weight", self.ssim_weight, 0 <= self.ssim_weight <= 1, "a value in [0, 1]")
@@ -44,8 +47,6 @@ class RecoverConfig(FitConfig):
         regularizers: weights of L_anchor and L_shape (`tab:s_recovery`).
         from_points: whether the start is points found in photos, so that steps grow with their count.
         final: whether this is the recovery at the target count; the paper's rounds have another decay.
-        engine: "fused" runs whole steps in Rust; "torch" uses autograd and `SelectiveAdam`, with equal
-            results up to rounding; "gsplat" is the same on an NVIDIA GPU.
 
     Raises:
         InputError: a value out of range.
@@ -57,7 +58,6 @@ class RecoverConfig(FitConfig):
     regularizers: Regularizers = REGULARIZERS["trained"]
     from_points: bool = field(default=False, metadata={"setting": False})
     final: bool = field(default=True, metadata={"setting": False})
-    engine: Engine = "fused"
 
     def __post_init__(self) -> None:
         super().__post_init__()

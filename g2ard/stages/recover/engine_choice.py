@@ -15,13 +15,13 @@ def engine_class(name: str) -> Callable[[Objective], Engine]:
         from g2ard.stages.recover.fused_engine import FusedEngine
 
         return FusedEngine
-    if name in ("torch", "gsplat"):
-        require_torch(f"engine '{name}'")
     if name == "torch":
+        require_torch("engine 'torch'")
         from g2ard.stages.recover.torch_engine import TorchEngine
 
         return TorchEngine
     if name == "gsplat":
+        require_torch("engine 'gsplat'", "cuda")
         from g2ard.stages.recover.gsplat_engine import GsplatEngine
 
         return GsplatEngine
