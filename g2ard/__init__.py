@@ -69,6 +69,7 @@ if TYPE_CHECKING:
     from g2ard.stages.recover import RecoverConfig, Recovered, recover
     from g2ard.stages.recover.anchors import Regularizers
     from g2ard.stages.recover.config import FitConfig
+    from g2ard.stages.recover.rasterize import rasterize
     from g2ard.stages.register import RegisterConfig, Registered
     from g2ard.stages.select import CoverageOptions, Selection, select
     from g2ard.stages.simplify import Simplified, SimplifyConfig
@@ -121,6 +122,7 @@ __all__ = [
     "look_at",
     "make_pool",
     "preset",
+    "rasterize",
     "recover",
     "register",
     "render",
@@ -152,6 +154,7 @@ _HOMES = {
     "stages.evaluate": ("Evaluation", "evaluate"),
     "stages.lift": ("lift",),
     "stages.recover": ("RecoverConfig", "Recovered", "recover"),
+    "stages.recover.rasterize": ("rasterize",),
     "stages.recover.config": ("FitConfig",),
     "stages.recover.anchors": ("Regularizers",),
     "stages.register": ("RegisterConfig", "Registered"),
@@ -181,6 +184,10 @@ def __getattr__(name: str) -> Any:
     home, own = _ALIASES.get(name, (next((m for m, names in _HOMES.items() if name in names), None), name))
     if home is None:
         raise AttributeError(f"module 'g2ard' has no attribute {name!r}")
+    if name == "rasterize":
+        from g2ard.errors import require_torch
+
+        require_torch("g2ard.rasterize")
     from importlib import import_module
 
     found = getattr(_extension() if home == "_core" else import_module(f"g2ard.{home}"), own)

@@ -1,10 +1,12 @@
 """Features: matches against a naive twin, lifted points, solved poses, and invalid matchers."""
 
+import re
 import subprocess
 import sys
 import tomllib
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -331,3 +333,20 @@ def _registered(view: Camera, folder: Path, seed: int = 0) -> PhotoReport:
     starts = {"photo": off(view.viewmat, 0.1, 3, seed)}
     truth = {"photo": view.viewmat}
     return register(BALL, views, starts=starts, truth=truth, config=CONFIG).report.photos[0]
+
+
+def test_the_documented_adapter_reads_mast3rs_matches(tmp_path: Path) -> None:
+    text = (ROOT / "docs/methods/register.md").read_text(encoding="utf-8")
+    block = next(b for b in re.findall(r"(?ms)^```python\n(.*?)^```", text) if "mast3r_pairs.py" in b)
+    names: dict[str, Any] = {}
+    exec(compile(block, "mast3r_pairs.py", "exec"), names)
+    photo, render = np.zeros((562, 1000, 3)), np.zeros((750, 1000, 3))
+    # 1000×562 becomes 512×288 whole, 1000×750 becomes 512×384 whole; corners and centres in pixels of each
+    found = {"matches_im0": [[0, 0], [511, 287]], "matches_im1": [[0, 0], [511, 383]]}
+    np.savez(tmp_path / "m.npz", **found)
+    a, b = names["pairs"](tmp_path / "m.npz", photo, render)
+    np.testing.assert_allclose(a, [[0.98, 0.98], [999.02, 561.52]], atol=0.01)
+    np.testing.assert_allclose(b, [[0.98, 0.98], [999.02, 749.02]], atol=0.01)
+    np.savez(tmp_path / "n.npz", matches_im0=[[0, 0]], matches_im1=[[0, 0]])
+    (a, _) = names["pairs"](tmp_path / "n.npz", np.zeros((600, 1000, 3)), render)
+    np.testing.assert_allclose(a, [[0.98, 0.5 * 1000 / 512 + 1 * 1000 / 512]], atol=0.01)  # 307 rows, one cut
