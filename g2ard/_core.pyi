@@ -135,6 +135,11 @@ class Rasterizer:
     def counts(self) -> dict[str, int]: ...
     def passes(self) -> dict[str, float]: ...
 
+def adam_rows(
+    attributes: list[tuple[Any, ...]],
+    counts: NDArray[np.int64],
+) -> int: ...
+
 class Trainer:
     def __init__(
         self, arrays: _Arrays, objective: Photometric, units: _F32 | None = None, isa: str | None = None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
 
@@ -63,6 +64,17 @@ class TorchEngine:
         *,
         regularize: bool,
         mask: NDArray[np.bool_] | None = None,
+    ) -> float:
+        with _one_thread():
+            return self._step(view, target, rates, regularize, mask)
+
+    def _step(
+        self,
+        view: int,
+        target: NDArray[np.float32],
+        rates: Rates,
+        regularize: bool,
+        mask: NDArray[np.bool_] | None,
     ) -> float:
         p = self._parameters
         means = self._base + self._unit * p["means"]
@@ -131,7 +143,7 @@ class TorchEngine:
     def state(self) -> dict[str, NDArray[Any]]:
         arrays = {f"p.{name}": value.detach().cpu().numpy() for name, value in self._parameters.items()}
         arrays["base"], arrays["unit"] = self._base.cpu().numpy(), self._unit.cpu().numpy()
-        arrays["skipped"] = np.array(self._adam.skipped)
+        arrays["skipped"], arrays["counts"] = np.array(self._adam.skipped), self.counts
         for name, key, moment in self._moments():
             arrays[f"{key}.{name}"] = moment.cpu().numpy()
         return arrays
@@ -143,6 +155,7 @@ class TorchEngine:
         self._base = torch.from_numpy(state["base"]).to(self.device)
         self._unit = torch.from_numpy(state["unit"]).to(self.device)
         self._adam.skipped = int(state["skipped"])
+        self._adam.counts.copy_(torch.from_numpy(state["counts"]))
         for name, key, moment in self._moments():
             moment.copy_(torch.from_numpy(state[f"{key}.{name}"]))
 
@@ -153,8 +166,23 @@ class TorchEngine:
 
     @property
     def counts(self) -> NDArray[Any]:
-        return self._adam.state[self._parameters["means"]]["count"].cpu().numpy()
+        return self._adam.counts.cpu().numpy()
 
     @property
     def skipped(self) -> int:
         return self._adam.skipped
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """Run torch's own operations on one thread.
+
+    The rasteriser, the loss and Adam have threads of their own, for which torch's would wait in busy loops
+    that cost several times the step.
+    """
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)

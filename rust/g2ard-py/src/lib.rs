@@ -52,7 +52,7 @@ mod _core {
     #[pymodule_export]
     use crate::tile::{PyFrame, PyTileMerging};
     #[pymodule_export]
-    use crate::train::PyTrainer;
+    use crate::train::{PyTrainer, adam_rows};
     #[pymodule_export]
     use crate::visibility::PyVisibilityAccumulator;
     #[pymodule_export]

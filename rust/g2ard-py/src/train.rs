@@ -1,13 +1,16 @@
 //! `_core.Trainer`: whole recovery steps in Rust.
 
 use g2ard_core::raster::{Camera, Settings};
-use g2ard_core::train::{Exported, Rates, Regularizers, StepInput, Trainer};
+use g2ard_core::train::{
+    Attribute, Biases, Exported, Rates, Regularizers, StepInput, Trainer, step_rows,
+};
 use numpy::{
     IntoPyArray, PyArray1, PyArrayDyn, PyArrayMethods, PyReadonlyArray1, PyReadonlyArray2,
-    PyReadonlyArray3,
+    PyReadonlyArray3, PyReadwriteArray1, PyReadwriteArrayDyn,
 };
 use pyo3::prelude::*;
 use pyo3::types::{IntoPyDict, PyDict};
+use std::sync::{Mutex, PoisonError};
 
 use crate::arrays::{flat, optional};
 use crate::constants::Config;
@@ -259,4 +262,56 @@ fn vector<T: numpy::Element + Clone>(
     let value = state.get_item(name)?.ok_or_else(missing)?;
     let array: PyReadonlyArray1<'_, T> = value.extract()?;
     Ok(array.as_array().to_vec())
+}
+
+/// One attribute of `adam_rows`: values, first and second moments, gradients, rate, and factors of the rate.
+#[derive(FromPyObject)]
+pub struct PyAttribute<'py>(
+    PyReadwriteArrayDyn<'py, f32>,
+    PyReadwriteArrayDyn<'py, f32>,
+    PyReadwriteArrayDyn<'py, f32>,
+    Floats<'py>,
+    f32,
+    Option<Floats<'py>>,
+);
+
+impl PyAttribute<'_> {
+    fn attribute(&mut self) -> PyResult<Attribute<'_>> {
+        Ok(Attribute {
+            values: writable("values", &mut self.0)?,
+            first: writable("first moments", &mut self.1)?,
+            second: writable("second moments", &mut self.2)?,
+            gradients: flat("gradients", &self.3)?,
+            rate: self.4,
+            share: optional("shares", &self.5)?,
+        })
+    }
+}
+
+fn writable<'a>(
+    name: &'static str,
+    array: &'a mut PyReadwriteArrayDyn<'_, f32>,
+) -> PyResult<&'a mut [f32]> {
+    let strided = |_| invalid(name, "a C-contiguous array", "strides");
+    array.as_slice_mut().map_err(strided)
+}
+
+/// Take an Adam step in place with each row that has a gradient; return the number of rows skipped.
+#[pyfunction]
+pub fn adam_rows(
+    py: Python<'_>,
+    attributes: Vec<PyAttribute<'_>>,
+    mut counts: PyReadwriteArray1<'_, i64>,
+) -> PyResult<usize> {
+    static BIASES: Mutex<Option<Biases>> = Mutex::new(None);
+    let mut attributes = attributes;
+    let mut all = (attributes.iter_mut())
+        .map(PyAttribute::attribute)
+        .collect::<PyResult<Vec<_>>>()?;
+    let counts = (counts.as_slice_mut())
+        .map_err(|_| invalid("counts", "a C-contiguous array", "strides"))?;
+    work::quick(py, || {
+        let mut biases = BIASES.lock().unwrap_or_else(PoisonError::into_inner);
+        step_rows(&mut all, counts, biases.get_or_insert_default())
+    })
 }

@@ -8,12 +8,12 @@ use crate::raster::project::{RowGradients, unproject};
 use crate::raster::rasterizer::ChunkSums;
 use crate::raster::simd::{Kernel, LANES, Lanes, Lanes16, Mask};
 
-const BETA1: f64 = 0.9;
-const BETA2: f64 = 0.999;
+pub(super) const BETA1: f64 = 0.9;
+pub(super) const BETA2: f64 = 0.999;
 /// Under the root of the second moment; `selective_adam.py` has the same.
-const EPSILON: f32 = 1e-15;
+pub(super) const EPSILON: f32 = 1e-15;
 /// Beyond this the square of a gradient leaves f32: such a row is skipped as not finite.
-const GRADIENT_MAX: f32 = 1e18;
+pub(super) const GRADIENT_MAX: f32 = 1e18;
 
 /// 1/(1 − β₁ᵗ) and 1/√(1 − β₂ᵗ) for each count of steps t, worked out in f64.
 #[derive(Debug, Default)]
@@ -29,6 +29,10 @@ impl Biases {
                 (1.0 / bias(BETA2).sqrt()) as f32,
             ]);
         }
+    }
+
+    pub(super) fn of(&self, steps: usize) -> [f32; 2] {
+        self.0[steps]
     }
 }
 

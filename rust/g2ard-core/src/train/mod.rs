@@ -8,11 +8,14 @@
 mod adam;
 mod anchors;
 mod mask;
+mod row_major;
 mod store;
 #[cfg(test)]
 mod tests;
 
+pub use adam::Biases;
 pub use anchors::{Anchors, Regularizers};
+pub use row_major::{Attribute, step_rows};
 pub use store::{Exported, Store};
 
 use std::time::Instant;
@@ -28,7 +31,7 @@ use crate::raster::{
 };
 use crate::ssim::{Loss, Shape};
 use crate::{Error, Result};
-use adam::{Biases, Update};
+use adam::Update;
 use mask::Mask;
 
 /// Smaller losses, about 40 dB, are hardly visible.
