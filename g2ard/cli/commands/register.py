@@ -46,7 +46,8 @@ def register(
         str | None,
         typer.Option(
             metavar="VIEWS|N",
-            help="For photos without a pose: start from the most similar of these, or of N generated views.",
+            help="For photos without a pose: start from the most similar of these, best the scene's training "
+            "views, or of N generated views.",
         ),
     ] = None,
     intrinsics: Annotated[

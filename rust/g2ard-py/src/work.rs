@@ -58,7 +58,7 @@ pub fn quick<R: Send>(py: Python<'_>, f: impl FnOnce() -> Result<R> + Send) -> P
     }
 }
 
-/// Run long work: GIL released; every 50 ms check for Ctrl-C and call `progress(done, total)`.
+/// Run long work: GIL released; every 50 ms check for Ctrl-C and call `progress(done, total)`, last with all done.
 pub fn long<R: Send>(
     py: Python<'_>,
     progress: Option<&Bound<'_, PyAny>>,
@@ -95,7 +95,13 @@ pub fn long<R: Send>(
     });
     match (failure, outcome) {
         (Some(e), _) => Err(e),
-        (None, Some(result)) => result.map_err(to_py),
+        (None, Some(result)) => {
+            let found = result.map_err(to_py)?;
+            if let (Some(p), (_, total @ 1..)) = (progress, control.progress()) {
+                p.call1((total, total))?; // also of work that ended before its last unit
+            }
+            Ok(found)
+        }
         (None, None) => Err(panicked()),
     }
 }

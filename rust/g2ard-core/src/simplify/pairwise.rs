@@ -100,10 +100,16 @@ impl Pairwise {
         let budget = schedule.last().copied().unwrap_or(scene.len());
         control.begin(scene.len().saturating_sub(budget) as u64);
         let (mut partition, dropped) = self.drop_transparent(scene, ordered, budget);
+        control.advance(dropped as u64);
         let leaves = Leaves::new(scene, ordered, partition.kept(), &blur, visibility, None);
-        let geometric = self.geometric(visibility);
-        let mut rounds = Vec::new();
-        let mut nodes = self.premerge(leaves, geometric, &mut partition, budget, &mut rounds);
+        let mut runs = RunMerging {
+            geometric: self.geometric(visibility),
+            partition: &mut partition,
+            rounds: Vec::new(),
+            control,
+        };
+        let mut nodes = self.premerge(leaves, budget, &mut runs);
+        let (geometric, mut rounds) = (runs.geometric, runs.rounds);
         self.merge_rounds(&mut nodes, geometric, schedule, control, |pairs, map| {
             let of = partition.of.par_iter_mut().filter(|c| **c != GONE);
             of.for_each(|c| *c = map[*c as usize]);
@@ -150,14 +156,7 @@ impl Pairwise {
 
     /// Merge runs of Morton order down to `morton_premerge_ratio` times the budget. The lattice is shifted in each
     /// step, so that one step can join what another cut apart.
-    fn premerge(
-        &self,
-        leaves: Leaves,
-        geometric: f32,
-        partition: &mut Partition,
-        budget: usize,
-        rounds: &mut Vec<PairwiseRound>,
-    ) -> Nodes {
+    fn premerge(&self, leaves: Leaves, budget: usize, runs: &mut RunMerging) -> Nodes {
         let last = (self.morton_premerge_ratio * budget as f64).min(leaves.len() as f64) as usize;
         let mut targets = (0..self.morton_premerge_steps)
             .rev()
@@ -165,11 +164,6 @@ impl Pairwise {
             .filter(|&(_, target)| target < leaves.len());
         let Some((step, target)) = targets.next() else {
             return leaves.nodes();
-        };
-        let mut runs = RunMerging {
-            geometric,
-            partition,
-            rounds,
         };
         let (mut rows, mut codes) = runs.merge(&leaves, &leaves.codes(), target, step);
         for (step, target) in targets {
@@ -281,7 +275,8 @@ impl Pairwise {
 struct RunMerging<'a> {
     geometric: f32,
     partition: &'a mut Partition,
-    rounds: &'a mut Vec<PairwiseRound>,
+    rounds: Vec<PairwiseRound>,
+    control: &'a Control,
 }
 
 impl RunMerging<'_> {
@@ -302,6 +297,7 @@ impl RunMerging<'_> {
         let (at, map, codes) = nodes.morton(&every, LATTICES[step % LATTICES.len()]);
         let of = self.partition.of.par_iter_mut().filter(|c| **c != GONE);
         of.for_each(|c| *c = map[runs.of[*c as usize] as usize]);
+        self.control.advance((rows.len() - runs.count) as u64);
         (Shuffled { nodes, at }, codes)
     }
 }
