@@ -51,6 +51,7 @@ if TYPE_CHECKING:
     from g2ard.jobs.distill import distill
     from g2ard.jobs.distill_options import DistillOptions
     from g2ard.jobs.levels import lod, save_tileset
+    from g2ard.jobs.recover import recover
     from g2ard.jobs.register import register
     from g2ard.jobs.simplify import simplify
     from g2ard.levels import Georeference, save_levels
@@ -66,7 +67,7 @@ if TYPE_CHECKING:
     from g2ard.scene.splats import Splats
     from g2ard.stages.evaluate import Evaluation, evaluate
     from g2ard.stages.lift import lift
-    from g2ard.stages.recover import RecoverConfig, Recovered, recover
+    from g2ard.stages.recover import RecoverConfig, Recovered
     from g2ard.stages.recover.anchors import Regularizers
     from g2ard.stages.recover.config import FitConfig
     from g2ard.stages.recover.rasterize import rasterize
@@ -145,6 +146,7 @@ _HOMES = {
     "jobs.distill": ("distill",),
     "jobs.distill_options": ("DistillOptions",),
     "jobs.levels": ("lod", "save_tileset"),
+    "jobs.recover": ("recover",),
     "jobs.register": ("register",),
     "jobs.simplify": ("simplify",),
     "poses": ("make_pool",),
@@ -153,7 +155,7 @@ _HOMES = {
     "pipeline.adapt": ("AdaptConfig", "Adapted", "adapt"),
     "stages.evaluate": ("Evaluation", "evaluate"),
     "stages.lift": ("lift",),
-    "stages.recover": ("RecoverConfig", "Recovered", "recover"),
+    "stages.recover": ("RecoverConfig", "Recovered"),
     "stages.recover.rasterize": ("rasterize",),
     "stages.recover.config": ("FitConfig",),
     "stages.recover.anchors": ("Regularizers",),

@@ -45,7 +45,7 @@ USAGE = [
         "simplify ball.ply -n 200,100 -o s.ply",
         "such as s_{count}.ply; commas separate counts, so write a single one as 10_000",
     ),
-    ("recover ball.ply --views made -o o.ply", "--views made needs a --teacher"),
+    ("recover ball.ply --views made -o o.ply", "generated views have no photos; give --teacher SCENE"),
     ("recover ball.ply -o o.ply --steps 3 --recovery-time 9", "; give one"),
     ("select absent.ply --views v -k auto -o out --policy random", "policy random does not measure"),
     ("select absent.ply --views v -k auto -o out --policy uniform", "policy uniform does not measure"),

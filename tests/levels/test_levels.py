@@ -17,8 +17,8 @@ from g2ard.scene.splats import Splats
 from g2ard.scene.transform import join, rotation_matrices
 from helpers.commands import refused, succeeds
 from helpers.level_files import files_of, leaves_of, scattered
+from helpers.photos import photographed
 from helpers.scenes import around, checkered_ball
-from helpers.view_files import photo
 
 
 @pytest.mark.parametrize("rule", [Cut(), Cut(most=300), Cut(most=10_000, extent=3, least=50), Cut(most=1)])
@@ -181,10 +181,10 @@ def test_the_sky_is_the_environment(tmp_path: Path, command_line) -> None:
 
 
 def test_levels_learn_from_photos_where_views_have_them(tmp_path: Path) -> None:
-    """Half of the views have photos, and these are black."""
-    ball, views = checkered_ball(400), around(16, (48, 36))
-    black = photo(tmp_path / "black.png", (48, 36))
-    views = replace(views, image_paths=tuple(black if i % 2 else None for i in range(16)))
+    """Half of the views have photos, and these are dark."""
+    ball = checkered_ball(400)
+    views = photographed(tmp_path, ball, around(16, (48, 36)), gain=0.3)
+    views = replace(views, image_paths=tuple(p if i % 2 else None for i, p in enumerate(views.image_paths)))
     levels = {
         photos: lod(ball, ratios=(8,), views=views, photos=photos, steps=20).splats[0]
         for photos in (None, False)

@@ -65,11 +65,11 @@ class Watch:
 @pytest.fixture
 def watch(monkeypatch: pytest.MonkeyPatch) -> Watch:
     import g2ard.jobs.measured_budget
+    import g2ard.jobs.recover
     import g2ard.jobs.score
     import g2ard.pipeline.adapt
     import g2ard.pipeline.distill
     import g2ard.stages.evaluate
-    import g2ard.stages.recover
 
     seen = Watch()
 
@@ -84,8 +84,8 @@ def watch(monkeypatch: pytest.MonkeyPatch) -> Watch:
         monkeypatch.setattr(module, name, told)
 
     watched(g2ard.pipeline.adapt, "adapt", 1, seen.trained)
-    for module in (g2ard.stages.recover, g2ard.pipeline.distill):
-        watched(module, "recover", 1, seen.trained)
+    watched(g2ard.jobs.recover, "optimize", 1, seen.trained)
+    watched(g2ard.pipeline.distill, "recover", 1, seen.trained)
     for module in (g2ard.jobs.measured_budget, g2ard.pipeline.distill):
         watched(module, "visibility_source", 0, seen.looked)
     for module in (g2ard.stages.evaluate, g2ard.jobs.score):
@@ -168,7 +168,8 @@ def test_views_and_held_out_views_given_together(folder: Path, g2ard: Program, w
     assert [set(part.names) for part in (place.train_cameras, place.scored["test"])] == [chosen, TEST]
     g2ard(*ask, "--held-out", "photos", "-o", "pool")
     assert [part for part in watch.scored if part == TEST] == [TEST] * 4
-    assert set(read_view_set(folder / "pool" / "views.json").splits) == {"train", "test"}
+    pool = read_view_set(folder / "pool" / "views.json", unpictured=True)  # only held-out views have photos
+    assert set(pool.splits) == {"train", "test"}
 
 
 def test_a_held_out_view_never_trains(folder: Path, g2ard: Program, watch: Watch) -> None:

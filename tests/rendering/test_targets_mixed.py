@@ -68,7 +68,7 @@ def test_recover_takes_photos_beside_its_teacher(folder: Path, command_line: Com
     assert "8 views against 4 photos and 4 teacher renders" in told
     _, told = run(command_line, folder, *ask)
     assert "4 views against photos" in told
-    assert "--photos goes with --teacher" in refused(command_line, folder, *ask, "--photos", "-w")
+    assert "--photos: goes with a teacher" in refused(command_line, folder, *ask, "--photos", "-w")
 
 
 def test_a_teacher_needs_no_photos(folder: Path, command_line: CommandLine) -> None:

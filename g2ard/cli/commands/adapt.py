@@ -57,7 +57,7 @@ def adapt(
     preset: opt.PaperOption = None,
 ) -> None:
     """Refit colours and opacities to new images; means, rotations and scales stay fixed."""
-    from g2ard.cli.teaching import Teaching
+    from g2ard.jobs.teaching import Teaching
     from g2ard.pipeline.adapt import AdaptConfig
     from g2ard.pipeline.adapt import adapt as refit
 
@@ -73,7 +73,15 @@ def adapt(
     work = output.parent / f".{output.name}.work"
     check_scene_run(run, work, resume, output)
     splats = run.load(compact)
-    teaching = Teaching(run, teacher, config.background, chosen=background is not None)
+    teaching = Teaching(
+        teacher,
+        config.background,
+        chosen=background is not None,
+        render_model=run.render_model,
+        seed=run.seed,
+        progress=run.progress,
+        say=run.say,
+    )
     _, targets = teaching.training(splats, opt.with_images(views, images, alpha), split, size)
     with stoppable(run, work, resume, output):
         work.mkdir(parents=True, exist_ok=True)

@@ -63,9 +63,9 @@ def evaluate(
 
     For the evaluation of the original 3DGS, use --convention inria --8bit --lpips-input unscaled.
     """
-    from g2ard.cli.teaching import Teaching, check_teacher, teaching_of_run
     from g2ard.io.describe import bytes_of
     from g2ard.jobs.inputs import load_views, scorable
+    from g2ard.jobs.teaching import Teaching, check_teacher, teaching_of_run
     from g2ard.jobs.view_checks import check_sight
     from g2ard.rendering.lpips import load_lpips
     from g2ard.rendering.renderer import RasterSettings
@@ -80,7 +80,8 @@ def evaluate(
         views, teacher, photos, made_at = own
         size = size or made_at
     else:
-        check_teacher(views, teacher, photos)
+        with run.usage():
+            check_teacher(views, teacher, photos)
     device = "cuda" if run.device == "cuda" else "cpu"
     if device == "cuda":
         opt.use_cuda()
@@ -89,7 +90,16 @@ def evaluate(
         check_scene(path)
     chosen, settings = opt.background_of(run, background, *scenes), RasterSettings(convention=convention)
     colour = chosen or BLACK
-    teaching = Teaching(run, teacher, colour, chosen=chosen is not None, photos=photos)
+    teaching = Teaching(
+        teacher,
+        colour,
+        chosen=chosen is not None,
+        photos=photos,
+        render_model=run.render_model,
+        seed=run.seed,
+        progress=run.progress,
+        say=run.say,
+    )
     frozen = run.load(anchors) if anchors else None
     cameras = load_views(teaching.views(views), split, size, run.say, unpictured=teaching.dense is not None)
     targets = scorable(teaching.targets(cameras, settings=settings), run.say)

@@ -1,0 +1,296 @@
+"""`g2ard.recover`: views, targets and regularisers of a single recovery, and its scores."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from numpy.typing import ArrayLike, NDArray
+
+from g2ard.config.choices import RenderModel
+from g2ard.config.paths import full_paths
+from g2ard.errors import InputError
+from g2ard.io.types import ViewSet
+from g2ard.jobs.causes import likely_causes
+from g2ard.jobs.inputs import Views, load_scene
+from g2ard.jobs.score import scores_by_kind
+from g2ard.jobs.teaching import Teaching, check_teacher
+from g2ard.pipeline.presets import PRESETS, configured
+from g2ard.progress import Progress, Say, plural, silent, unsaid
+from g2ard.rendering.targets import Targets, kinds_of
+from g2ard.report.kinds import KindScore
+from g2ard.scene.splats import Splats
+from g2ard.stages.recover import RecoverConfig, Recovered
+from g2ard.stages.recover import recover as optimize
+from g2ard.stages.recover.anchors import Anchors
+from g2ard.stages.recover.auto_preset import PriorMeasures, regularizers_for
+from g2ard.stages.recover.optimize import Watch
+
+
+@dataclass(frozen=True, eq=False)
+class RecoverJob:
+    """A prepared recovery: inputs are read and everything is decided.
+
+    Args:
+        views: views to train on.
+        weights: sampling weight of each view; None draws all equally often.
+        anchors: the student before any recovery, or None.
+        preset: the regularisers chosen, and why.
+        measures: the measures that decided it.
+        scored: views whose test split is scored; None for no scores.
+    """
+
+    student: Splats
+    views: ViewSet
+    targets: Targets
+    config: RecoverConfig
+    weights: NDArray[Any] | None
+    anchors: Splats | None
+    preset: str
+    measures: PriorMeasures
+    teaching: Teaching
+    scored: Views | None
+    size: int | None
+    progress: Progress = silent
+
+    def run(self, checkpoint: Path | None = None, watch: Watch | None = None) -> Recovered:
+        """Recover the student; see `g2ard.recover`."""
+        built, in_plane = self.anchors, self.config.regularizers.in_plane
+        return optimize(
+            self.student,
+            self.targets,
+            self.config,
+            weights=self.weights,
+            anchors=None if built is None else Anchors.of(built, in_plane),
+            checkpoint=checkpoint,
+            progress=self.progress,
+            watch=watch,
+        )
+
+    @cached_property
+    def held_out(self) -> Targets | None:
+        """Held-out targets for scoring; None without such views."""
+        return None if self.scored is None else self.teaching.held_out(self.scored, self.size)
+
+    def score(self, result: Recovered) -> tuple[tuple[KindScore, ...], list[str]]:
+        """Score student and result in held-out views.
+
+        Returns:
+            The scores by kind of view, and lines with likely causes of a poor result; both empty without
+            held-out views.
+        """
+        if self.held_out is None:
+            return (), []
+        background = self.config.background
+        kinds = scores_by_kind(self.student, result.splats, self.held_out, background, self.progress)
+        mean = sum(kind.views * kind.psnr.after for kind in kinds) / len(self.held_out.cameras)
+        trained = self.views.cameras
+        return kinds, likely_causes(result.splats, self.held_out, trained, result.report, mean, background)
+
+
+def recover(
+    student: Splats | str | Path,
+    targets: Targets | None = None,
+    config: RecoverConfig | None = None,
+    *,
+    views: Views | None = None,
+    teacher: Splats | str | Path | None = None,
+    photos: bool = False,
+    preset: str = "auto",
+    settings: Mapping[str, Any] | None = None,
+    split: str = "train",
+    size: int | None = None,
+    weighted: bool | None = None,
+    render_model: RenderModel | None = None,
+    weights: ArrayLike | None = None,
+    anchors: Anchors | Splats | str | Path | None = None,
+    validation: Targets | None = None,
+    frozen: NDArray[Any] | None = None,
+    checkpoint: Path | None = None,
+    progress: Progress = silent,
+    say: Say = unsaid,
+    watch: Watch | None = None,
+) -> Recovered:
+    """Optimise every attribute of a fixed set of Gaussians against photos or a teacher's renders.
+
+    With `views` or a `teacher`, targets and regularisers are decided exactly as by the command `g2ard
+    recover`. With `targets` and a `config`, nothing is decided. No Gaussian is added or removed, and a
+    student that only gets worse is returned unchanged; see `g2ard.stages.recover.optimize.recover`.
+
+    Args:
+        student: the scene to recover, or its path; cameras are in world coordinates, including its offset.
+        targets: photos or teacher renders with their cameras, instead of `views` and `teacher`.
+        config: options, with `targets`; None means the defaults.
+        views: cameras with photos, or their path. With a teacher, None uses cameras found beside it, or
+            generates views; "made" always generates them.
+        teacher: the dense scene that renders the targets, or its path; None takes the photos of the views.
+        photos: with a teacher, use photos where views have them.
+        preset: settings by name, without `targets`; see `g2ard.preset`.
+        settings: values of `RecoverConfig` by path, without `targets`, such as {"recover.steps": 300}; they
+            override the preset.
+        split: split of the views to train on.
+        size: longer side of the views in pixels, if they are larger.
+        weighted: draw views by the weights that they state; None asks the preset.
+        render_model: overrides what the scenes' files say.
+        weights: (C,) sampling weight of each view of `targets`; None draws all equally often.
+        anchors: the student before any recovery, if it was recovered before, or its frozen geometry; None
+            takes the student's own.
+        validation: with `targets`: views of other kinds that are not trained on. If a kind loses quality,
+            changes are scaled back per Gaussian, and a recovery that only harms a kind ends early.
+        frozen: with `targets`: (N,) bool, Gaussians that stay unchanged; requires the engine `fused`.
+        checkpoint: a file written every minute and at Ctrl-C. If it exists, recovery resumes from it, with a
+            bitwise equal result.
+        progress: called after every step with loss, PSNR of a few training views and steps/s.
+        say: called with log messages.
+        watch: called after every step; its time does not count.
+
+    Returns:
+        The recovered scene, its Gaussians in the student's order, and a report.
+
+    Raises:
+        InputError: no Gaussians, no views or targets, an argument that goes with the other kind of targets,
+            an unknown setting, or a checkpoint of another run.
+        KeyboardInterrupt: after Ctrl-C, when the checkpoint is written.
+
+    >>> import g2ard
+    >>> import numpy as np
+    >>> rng = np.random.default_rng(0)
+    >>> means, sh0 = rng.normal(size=(500, 3)), rng.normal(size=(500, 1, 3))
+    >>> scene = Splats.create(means, scales=np.full((500, 3), 0.1), sh0=sh0)
+    >>> small = g2ard.simplify(scene, ratio=5).splats
+    >>> views = g2ard.make_pool(scene, 8, size=(64, 48))
+    >>> better = g2ard.recover(small, views=views, teacher=scene, settings={"steps": 30})
+    >>> len(better.splats), better.report.psnr.after > better.report.psnr.before
+    (100, True)
+    """
+    if targets is None:
+        _refuse("targets", config=config, weights=weights, validation=validation, frozen=frozen)
+        if isinstance(anchors, Anchors):
+            raise InputError("expected the student before any recovery", parameter="anchors")
+        job = prepare(
+            student,
+            views=views,
+            teacher=teacher,
+            photos=photos,
+            preset=preset,
+            settings=settings,
+            split=split,
+            size=size,
+            weighted=weighted,
+            render_model=render_model,
+            anchors=anchors,
+            progress=progress,
+            say=say,
+        )
+        return job.run(checkpoint, watch)
+    decided = {"preset": None if preset == "auto" else preset, "photos": photos or None}
+    _refuse("views or a teacher", views=views, teacher=teacher, settings=settings, size=size, **decided)
+    config = config or RecoverConfig()
+    start = _scene(student, render_model, say)
+    if not isinstance(anchors, Anchors | None):
+        anchors = Anchors.of(_built(anchors, start, render_model, say), config.regularizers.in_plane)
+    return optimize(
+        start,
+        targets,
+        config,
+        weights=weights,
+        anchors=anchors,
+        validation=validation,
+        frozen=frozen,
+        checkpoint=checkpoint,
+        progress=progress,
+        watch=watch,
+    )
+
+
+def _refuse(needed: str, **given: object) -> None:
+    """Reject arguments that need another source of targets."""
+    name = next((name for name, value in given.items() if value is not None), None)
+    if name is not None:
+        raise InputError(f"goes with {needed}", parameter=name)
+
+
+def prepare(
+    student: Splats | str | Path,
+    *,
+    views: Views | None = None,
+    teacher: Splats | str | Path | None = None,
+    photos: bool = False,
+    preset: str = "auto",
+    settings: Mapping[str, Any] | None = None,
+    split: str = "train",
+    size: int | None = None,
+    weighted: bool | None = None,
+    render_model: RenderModel | None = None,
+    anchors: Splats | str | Path | None = None,
+    progress: Progress = silent,
+    say: Say = unsaid,
+) -> RecoverJob:
+    """Read the inputs of `recover` without `targets`, and decide everything."""
+    check_teacher(views, teacher, photos)
+    given = full_paths(settings or {}, RecoverConfig())
+    named = {**PRESETS[preset], **given}
+    config = configured(RecoverConfig(), preset, given)
+    start = _scene(student, render_model, say)
+    teaching = Teaching(
+        teacher,
+        config.background,
+        chosen="recover.background" in given,
+        photos=photos,
+        render_model=render_model,
+        seed=config.seed,
+        progress=progress,
+        say=say,
+    )
+    pool = teaching.views(views)
+    chosen, targets = teaching.training(start, pool, split, size)
+    say(f"{plural(len(chosen.cameras), 'view')} against {kinds_of(targets)}")
+    weighted = named.get("select.weighted", True) if weighted is None else weighted
+    weights = chosen.weights if weighted else None
+    if weights is not None:
+        say(f"sampling {plural(len(weights), 'view')} by weight")
+    built = None if anchors is None else _built(anchors, start, render_model, say)
+    regularizers, why, measures = regularizers_for(
+        named.get("recover.regularizers", "auto"),
+        teaching.dense or built or start,
+        None if teaching.dense else chosen.cameras,
+        paper=named.get("recover.schedule") == "paper",
+    )
+    of_student = "" if teaching.dense else "; measured on the student, as there is no teacher"
+    say(f"regularisers: {why}{of_student}")
+    return RecoverJob(
+        start,
+        chosen,
+        targets,
+        configured(RecoverConfig(), preset, {**given, "recover.regularizers": regularizers}),
+        weights,
+        built,
+        why,
+        measures,
+        teaching,
+        pool if split == "train" else None,
+        size,
+        progress,
+    )
+
+
+def _scene(scene: Splats | str | Path, render_model: RenderModel | None, say: Say) -> Splats:
+    return scene if isinstance(scene, Splats) else load_scene(scene, say, render_model)
+
+
+def _built(
+    anchors: Splats | str | Path, student: Splats, render_model: RenderModel | None, say: Say
+) -> Splats:
+    """Return the student as it was built, in its present coordinates."""
+    scene = _scene(anchors, render_model, say)
+    if len(scene) != len(student):
+        raise InputError(
+            f"has {plural(len(scene), 'Gaussian')}, the student has {len(student):,}",
+            path=None if isinstance(anchors, Splats) else anchors,
+            parameter="anchors" if isinstance(anchors, Splats) else None,
+            hint="anchors are the student before any recovery",
+        )
+    return scene.recentred(student.offset)

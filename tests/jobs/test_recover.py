@@ -1,0 +1,54 @@
+"""`g2ard.recover` with views or a teacher, as the command decides them."""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import g2ard
+from g2ard.errors import InputError
+from g2ard.io import write_views
+from helpers.commands import CommandLine, succeeds
+from helpers.photos import photographed
+from helpers.scenes import around, checkered_ball
+
+BALL, VIEWS = checkered_ball(400), around(16, (48, 36))
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
+        {"teacher": "ball.ply"},
+        {"views": "photos.json"},
+        {"views": "photos.json", "teacher": "ball.ply"},
+        {"views": "photos.json", "anchors": "ball.ply"},
+    ],
+)
+def test_python_recovers_as_the_command_does(
+    source: dict[str, str], folder: Path, command_line: CommandLine
+) -> None:
+    write_views(folder / "photos.json", photographed(folder, BALL, VIEWS), weights=range(1, 17))
+    flags = [word for name, path in source.items() for word in (f"--{name}", path)]
+    ask = ("recover", "ball.ply", *flags, "--steps", 4, "--size", 40, "--set", "ssim_weight=0.3")
+    succeeds(command_line, folder, *ask, "-o", "out.ply")
+    paths: dict[str, Any] = {name: folder / path for name, path in source.items()}
+    settings = {"recover.steps": 4, "ssim_weight": 0.3}
+    done = g2ard.recover(folder / "ball.ply", **paths, size=40, settings=settings)
+    g2ard.save(folder / "python.ply", done.splats)
+    assert (folder / "python.ply").read_bytes() == (folder / "out.ply").read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ({"targets": g2ard.TeacherRenders(BALL, VIEWS), "views": VIEWS}, "views: goes with"),
+        ({"targets": g2ard.TeacherRenders(BALL, VIEWS), "settings": {}}, "settings: goes with"),
+        ({"views": VIEWS, "teacher": BALL, "config": g2ard.RecoverConfig()}, "config: goes with targets"),
+        ({"views": VIEWS, "photos": True}, "photos: goes with a teacher"),
+        ({}, "there are no targets; give views, or a teacher"),
+        ({"views": VIEWS, "teacher": BALL, "anchors": BALL.take(range(9))}, "the student has 400"),
+    ],
+)
+def test_arguments_of_one_source_of_targets_do_not_go_with_another(given: dict[str, Any], words: str) -> None:
+    with pytest.raises(InputError, match=words):
+        g2ard.recover(BALL, **given)
