@@ -19,6 +19,10 @@ from helpers.scenes import around, checkered_ball
 
 Said = tuple[int, str, str]
 
+os.environ.pop(
+    "CI", None
+)  # with it, pytest shows the whole difference of two files, which takes hours for megabytes
+
 _OF_THE_PROCESS = {"--threads", "--device", "--devices"}
 """Options that change the whole process: calls with them run in a process of their own."""
 

@@ -37,12 +37,13 @@ def write_level_page(
     Args:
         levels: the levels in the folder, finest first.
         kind: streamed SOG, or 3D Tiles with z up.
-        views, beside, up: see `g2ard.jobs.viewer_frame.frame_of`.
+        views, beside, up: see `g2ard.jobs.viewer_frame.frame_of`. The page's title names
+            `beside`, or else the folder.
     """
     coarse = levels[-1]
     few = coarse.take(np.linspace(0, len(coarse) - 1, min(len(coarse), _ROWS)).astype(np.int64))
     frame = frame_of(few, views, beside=beside, up=up, seed=seed, progress=progress)
-    page, title, offset = folder / "index.html", folder.resolve().name, np.asarray(few.offset)
+    page, title, offset = folder / "index.html", Path(beside or folder).resolve().name, np.asarray(few.offset)
     if kind == "sog":
         rotation, position = frame.placed(offset)
         placed: dict[str, Any] = {"rotation": rotation, "position": position}

@@ -1,5 +1,6 @@
 """Scenes for levels of detail, and the files written for them."""
 
+from hashlib import sha256
 from pathlib import Path
 
 import numpy as np
@@ -23,5 +24,7 @@ def leaves_of(tree: Node | Leaf) -> list[Leaf]:
     return [tree] if isinstance(tree, Leaf) else list(tree.leaves())
 
 
-def files_of(folder: Path) -> dict[str, bytes]:
-    return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+def files_of(folder: Path) -> dict[str, str]:
+    """Return the digest of each file by its path in the folder."""
+    files = [path for path in folder.rglob("*") if path.is_file()]
+    return {str(p.relative_to(folder)): sha256(p.read_bytes()).hexdigest() for p in files}
