@@ -14,7 +14,7 @@ from g2ard.io.paths import real_path
 from g2ard.io.types import Points
 from g2ard.jobs.budget import Budget
 from g2ard.jobs.distill_options import DistillOptions
-from g2ard.jobs.inputs import Views, clutter_seen, load_scene, say_regions
+from g2ard.jobs.inputs import Views, clutter_seen, load_scene
 from g2ard.jobs.job import DistillJob
 from g2ard.jobs.measured_budget import Aim, Reduction, aim_of
 from g2ard.jobs.photos import sparse_file, sparse_points, topped_up
@@ -146,8 +146,9 @@ def prepare(
         counted(len(prior))
     default_degree = 3 if read.lifted else None  # points have one colour each, photos show more
     degree = options.configured(sh_degree=default_degree).recover.sh_degree
-    reduce, file = Reduction(prior, seed=recover.seed, progress=progress, say=say), f"scene.{options.format}"
-    aims = [aim_of(each, reduce, read.name, file, recovered=True, sh_degree=degree) for each in budgets]
+    for budget in budgets:
+        if not budget.is_measured:
+            budget.of(len(prior), read.name)  # rejects a count before views are planned
     views = views_of(
         prior,
         options,
@@ -156,8 +157,19 @@ def prepare(
         progress=progress,
         say=say,
     )
+    cameras, simplify = views.train.cameras, options.config.simplify
+    reduce = Reduction(
+        prior,
+        cameras=cameras,
+        blind=simplify.method == "paper",
+        config=simplify,
+        seed=recover.seed,
+        progress=progress,
+        say=say,
+    )
+    file = f"scene.{options.format}"
+    aims = [aim_of(each, reduce, read.name, file, recovered=True, sh_degree=degree) for each in budgets]
     photos, renders = _sources(views, options.photos, read.lifted)
-    cameras = views.train.cameras
     choice = _regularizers(options, read, prior, cameras if photos else None)
     regularizers, preset_label, measured = choice
     if photos:
@@ -169,7 +181,6 @@ def prepare(
     say(f"regularisers: {preset_label}")
     config = options.configured(regularizers, default_degree)
     config = replace(config, recover=replace(config.recover, from_points=read.from_photos))
-    say_regions(prior, config.simplify, read.name, say)
     return DistillJob(
         prior=prior,
         aims=tuple(aims),

@@ -53,12 +53,16 @@ _FEWEST = 64
 class Reduction:
     """Reductions of one scene to any budget: count → `Simplified`, as `simplify` returns it.
 
-    Poses and visibility are computed once, and the last two results are cached. Arguments and errors are
-    those of `simplify`.
+    Poses and visibility are computed once, and the last two results are cached. Other arguments and errors
+    are those of `simplify`.
+
+    Args:
+        cameras: cameras that give visibility weights to every method, instead of `views`.
     """
 
     splats: Splats
     views: Views | None = None
+    cameras: Cameras | None = None
     blind: bool = False
     config: SimplifyConfig = field(default_factory=SimplifyConfig)
     beside: str | Path | None = None
@@ -90,16 +94,18 @@ class Reduction:
     def _visibility(self) -> VisibilitySource | None:
         if self.blind:
             return None
-        cameras = cameras_for_weights(
-            self.splats,
-            self.views,
-            self.config.method,
-            beside=self.beside,
-            up=self.up,
-            seed=self.seed,
-            progress=self.progress,
-            say=self.say,
-        )
+        cameras = self.cameras
+        if cameras is None:
+            cameras = cameras_for_weights(
+                self.splats,
+                self.views,
+                self.config.method,
+                beside=self.beside,
+                up=self.up,
+                seed=self.seed,
+                progress=self.progress,
+                say=self.say,
+            )
         return None if cameras is None else _remembering(visibility_source(cameras, progress=self.progress))
 
 

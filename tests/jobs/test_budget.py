@@ -3,13 +3,16 @@
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 import g2ard
 from g2ard.errors import InputError
 from g2ard.io import read_splats, write_splats
-from g2ard.jobs.budget import DEVICES
+from g2ard.jobs.budget import DEVICES, Budget
+from g2ard.jobs.distill import prepare
+from g2ard.jobs.distill_options import DistillOptions
 from g2ard.jobs.measured_budget import Aim, Quality, count_for_bytes, count_for_quality, file_bytes
 from g2ard.scene.splats import Splats
 from g2ard.stages.simplify import simplify
@@ -69,6 +72,20 @@ def test_simplify_fits(tmp_path: Path, command_line: CommandLine) -> None:
     told = succeeds(command_line, tmp_path, "simplify", "a.ply", "--min-psnr", "25", "-o", "d.ply").err
     assert "should keep 2" in told
     assert " dB, SSIM " in told.splitlines()[-1]
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [{"method": "fast"}, {"method": "paper"}, {"method": "default"}, {"keep_region": ((0, 0, 1, 0.5),)}],
+)
+def test_distill_measures_the_simplification_that_it_makes(settings: dict[str, Any]) -> None:
+    said: list[str] = []
+    options = DistillOptions(views=around(16, (48, 36)), settings={"steps": 1, **settings})
+    job = prepare(checkered_ball(800), [Budget(min_psnr=24)], options, say=said.append)
+    judged = job.aims[0].judge(job.run().simplified)
+    assert judged is not None
+    count, _, rest = judged[1].partition(": ")
+    assert f"{count} should keep {rest.removesuffix(' in 12 views')}" in said
 
 
 @pytest.mark.parametrize(
