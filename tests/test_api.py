@@ -3,6 +3,7 @@
 import ast
 import inspect
 import json
+import re
 import subprocess
 import sys
 from importlib import import_module
@@ -45,6 +46,19 @@ def test_every_public_name_exists_and_no_function_is_a_module() -> None:
     assert set(dir(g2ard)) == set(g2ard.__all__)
     with pytest.raises(AttributeError, match="no attribute 'simplfy'"):
         g2ard.simplfy  # type: ignore[attr-defined]
+
+
+def test_every_parameter_is_explained_where_it_stands() -> None:
+    for name in g2ard.__all__:
+        function = getattr(g2ard, name)
+        if not inspect.isfunction(function):
+            continue
+        text = (inspect.getdoc(function) or "").partition("Args:")[2].partition("\n\n")[0]
+        told = dict(re.findall(r"(?m)^    ([\w, ]+): (.*)$", text))
+        explained = {one for names in told for one in names.split(", ")}
+        assert {*inspect.signature(function).parameters} <= explained | {"options"}, name
+        referred = [one for one, words in told.items() if words.startswith(("see ", "as for "))]
+        assert set(referred) <= {"config"}, name  # a dataclass with a page entry of its own
 
 
 def test_no_text_has_doubled_braces() -> None:

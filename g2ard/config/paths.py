@@ -12,16 +12,15 @@ A config with a classmethod `named` can be set as a whole by name: `recover.sche
 from __future__ import annotations
 
 import math
-import types
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, fields, is_dataclass, replace
 from difflib import get_close_matches
-from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
 
+from g2ard.config.checks import UNIONS, check_type, described
 from g2ard.errors import InputError
 
 Config = TypeVar("Config")
-_UNIONS = (Union, types.UnionType)
 
 
 def parse_settings(texts: Iterable[str], config: Any) -> dict[str, Any]:
@@ -55,14 +54,20 @@ def full_paths(values: Mapping[str, Any], config: Any) -> dict[str, Any]:
     """Expand the keys of `values` to full paths.
 
     Raises:
-        InputError: an unknown or ambiguous path.
+        InputError: an unknown or ambiguous path, or a value of another type.
 
     >>> from g2ard.stages.recover.config import RecoverConfig
     >>> full_paths({"rates.means": 1e-3, "steps": 100}, RecoverConfig())
     {'recover.schedule.rates.means': 0.001, 'recover.steps': 100}
     """
     known = {leaf.path: leaf for leaf in _leaves(config)}
-    return {_full(name, known): value for name, value in values.items()}
+    found = {}
+    for name, value in values.items():
+        path = _full(name, known)
+        if not hasattr(known[path].value, "named"):
+            check_type(name, value, known[path].kind)
+        found[path] = value
+    return found
 
 
 def changed(config: Config, values: Mapping[str, Any]) -> Config:
@@ -191,12 +196,12 @@ def _full(name: str, known: Mapping[str, Any]) -> str:
 
 
 def _read(path: str, text: str, kind: Any) -> Any:
-    for option in get_args(kind) if get_origin(kind) in _UNIONS else (kind,):
+    for option in get_args(kind) if get_origin(kind) in UNIONS else (kind,):
         try:
             return _as(option, text)
         except ValueError:
             continue
-    raise InputError(f"expected {_described(kind)}, got {text!r}", parameter=path)
+    raise InputError(f"expected {described(kind)}, got {text!r}", parameter=path)
 
 
 def _as(kind: Any, text: str) -> Any:
@@ -218,15 +223,3 @@ def _as(kind: Any, text: str) -> Any:
     if kind is int or (kind is float and not math.isnan(float(text))):
         return kind(text)
     raise ValueError(text)
-
-
-def _described(kind: Any) -> str:
-    if get_origin(kind) in _UNIONS:
-        return " or ".join(_described(option) for option in get_args(kind))
-    if get_origin(kind) is Literal:
-        return f"one of {', '.join(map(str, get_args(kind)))}"
-    if get_origin(kind) is tuple:
-        kinds = get_args(kind)
-        return "comma-separated numbers" if kinds[-1] is Ellipsis else f"{len(kinds)} comma-separated numbers"
-    words = {bool: "true or false", int: "a whole number", float: "a number", type(None): "none"}
-    return words.get(kind, "text")

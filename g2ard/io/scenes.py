@@ -8,6 +8,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from g2ard.config.checks import checks_arguments
 from g2ard.errors import InputError
 from g2ard.io.atomic import check_output
 from g2ard.io.detect import KINDS, file_format, run_scene
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
     from g2ard.scene.splats import Splats
 
 
+@checks_arguments
 def read_splats(path: str | Path, *, render_model: RenderModel | None = None) -> Splats:
     """Read a Gaussian scene.
 
@@ -105,6 +107,7 @@ def check_scene_output(path: str | Path, overwrite: bool = False) -> Path:
     return check_output(path, overwrite)
 
 
+@checks_arguments
 def write_splats(path: str | Path, splats: Splats, *, overwrite: bool = False, **options: Any) -> None:
     """Write a Gaussian scene atomically.
 

@@ -7,6 +7,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from g2ard.config.checks import checks_arguments
 from g2ard.errors import InputError
 from g2ard.io.atomic import atomic_folder, atomic_output, check_output
 from g2ard.io.detect import KINDS, file_format, run_views
@@ -28,6 +29,7 @@ def check_views_output(path: str | Path, overwrite: bool = False, format: ViewFo
     return check_output(path, overwrite, folder=view_format(Path(path), format) == "colmap")
 
 
+@checks_arguments
 def read_views(path: str | Path, *, images: str | Path | None = None, split: str = "all") -> Cameras:
     """Read views.
 
@@ -89,6 +91,7 @@ def read_view_set(
     return views.take(split_mask(path, views.cameras.names, split, stated=views.splits))
 
 
+@checks_arguments
 def write_views(
     path: str | Path,
     cameras: Cameras,

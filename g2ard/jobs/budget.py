@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from dataclasses import dataclass
-from numbers import Real
+from numbers import Integral, Real
 
 from g2ard.errors import InputError, require
 from g2ard.progress import plural
@@ -59,6 +59,7 @@ class Budget:
                 raise InputError(f"expected one value, got {value!r}; call once per value", parameter=name)
             if name != "fit" and value is not None and not isinstance(value, Real):
                 raise InputError(f"expected a number, got {value!r}", parameter=name)
+        require("count", self.count, isinstance(self.count, Integral | None), "a whole number")
         quality = self.min_psnr if self.min_ssim is None else self.min_ssim
         if (self.count, self.ratio, self.share, self.fit, quality).count(None) != 4:
             raise InputError("expected exactly one kind of budget: count, ratio, fit, min_psnr or min_ssim")

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from g2ard.config.checks import checks_arguments
 from g2ard.config.choices import RenderModel, is_made
 from g2ard.errors import InputError
 from g2ard.io.paths import real_path
@@ -33,6 +34,7 @@ from g2ard.stages.recover.auto_preset import PriorMeasures, measure_prior, regul
 Scene = Splats | Points | str | Path | None
 
 
+@checks_arguments
 def distill(
     scene: Scene,
     *,
@@ -72,15 +74,28 @@ def distill(
         fit: largest file, such as "5MB", or a device (see `Budget`).
         min_psnr: PSNR (dB) that simplification alone must keep against the scene, in generated views.
         min_ssim: SSIM that it must keep; with `min_psnr` both hold. `say` receives the result's quality.
-        views, photos, held_out, beside, up, size, clean, render_model, format, preset: see
-            `g2ard.DistillOptions`.
+        views: cameras in world coordinates with or without photos, or the path of either. None uses cameras
+            found beside the scene, or generates views; "made" always generates them. Every 8th view, or the
+            test split of the views, is held out for scoring.
+        photos: training images. True takes photos and skips views without one, False renders the scene, None
+            takes the photo of each view and a render if it has none. A point cloud needs photos.
+        size: longer side of the views in pixels, if they are larger.
+        preset: settings by name: "auto" measures the scene; "trained", "lift" or "noisy" names its kind;
+            "paper" is the method of the paper, see `g2ard.preset`.
+        format: file format that `fit`, `min_psnr` and `min_ssim` are meant for: ply, compressed.ply, sog,
+            spz, glb, splat, usda or usdc.
+        held_out: views to score on instead of the test split; `views` are then used for training only.
+        up: (3,) direction away from the ground for generated views; None estimates it.
+        clean: remove invisible and stray Gaussians first, like `g2ard clean`.
+        render_model: "classic" or "antialiased": overrides what the scene's file says.
+        beside: a path to look for cameras beside, if `scene` is not a path.
         settings: values of `g2ard.DistillConfig` by path, such as {"recover.schedule.rates.means": 1e-3};
             they override the preset.
         work: folder for finished rounds and checkpoints; the same call resumes from it after Ctrl-C.
         progress: called by all stages.
         say: called with log messages.
         fields: settings by field name, like the command's flags: `steps=100`, `background=(1, 1, 1)`,
-            `method="fast"`. None keeps the preset's value.
+            `method="fast"`, `seed=1`. None keeps the preset's value.
 
     Returns:
         The compact scene, its unrecovered version, a report, and the held-out targets.
@@ -97,6 +112,22 @@ def distill(
     >>> small = distill(scene, ratio=10, steps=5, size=48)
     >>> len(small.splats), len(small.simplified), len(small.report.rounds)
     (90, 90, 1)
+
+    With views of your own and a budget in bytes:
+
+    >>> from g2ard.scene.cameras import Camera
+    >>> views = Cameras.of(
+    ...     Camera.facing([3 * np.cos(a), 3 * np.sin(a), 0], [0, 0, 0], width=64, height=48, name=f"{a}")
+    ...     for a in range(8)
+    ... )
+    >>> small = distill(scene, fit="20kB", views=views, steps=5)
+    >>> len(small.splats) * 4 * 17 < 20_000  # floats of a Gaussian in a .ply without harmonics
+    True
+
+    From files, and from a point cloud with photos:
+
+    >>> small = distill("scene.ply", ratio=10)  # doctest: +SKIP
+    >>> small = distill("cloud.ply", count=100_000, views="photos/", size=1600)  # doctest: +SKIP
     """
     budget = Budget(count, ratio, fit=fit, min_psnr=min_psnr, min_ssim=min_ssim)
     options = DistillOptions(

@@ -8,8 +8,11 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+from g2ard.config.checks import check_fields
 from g2ard.config.choices import Focus, RenderModel
 from g2ard.config.paths import full_paths
+from g2ard.errors import require
+from g2ard.io.scene_formats import check_format
 from g2ard.jobs.inputs import Views
 from g2ard.pipeline.config import DistillConfig
 from g2ard.pipeline.presets import PRESETS, configured
@@ -35,6 +38,9 @@ class DistillOptions:
         format: file format for a budget in bytes: ply, compressed.ply, sog, spz, glb, splat, usda or usdc.
         preset: settings by name, see `g2ard.pipeline.presets`.
         settings: values of `DistillConfig` by path, which override the preset.
+
+    Raises:
+        InputError: a value of another type, or out of range.
     """
 
     views: Views | None = None
@@ -48,6 +54,11 @@ class DistillOptions:
     format: str = "ply"
     preset: str = "auto"
     settings: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        check_fields(self)
+        check_format(self.format)
+        require("size", self.size, self.size is None or self.size >= 1, "at least 1 pixel")
 
     @cached_property
     def config(self) -> DistillConfig:

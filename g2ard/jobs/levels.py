@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from g2ard.config.checks import checks_arguments
 from g2ard.config.choices import BLACK, Colour, RenderModel
 from g2ard.errors import InputError
 from g2ard.io.detect import kind
@@ -75,6 +76,7 @@ class Levels:
         return f"Levels({', '.join(f'{len(level):,}' for level in self.splats)} Gaussians)"
 
 
+@checks_arguments
 def lod(
     scene: Splats | str | Path,
     *,
@@ -104,8 +106,10 @@ def lod(
         scene: the dense scene, or its path.
         ratios: reduction factor of each level, rising; 1 is the unchanged scene.
         recover: recover each level; otherwise only merge.
-        views: as for `g2ard.distill`.
-        photos: as for `g2ard.distill`; by default targets are renders of the scene.
+        views: cameras in world coordinates, or their path. None uses cameras found beside the scene, or
+            generates views; "made" always generates them.
+        photos: training images. False renders the scene, True takes photos, None takes the photo of each view
+            and a render if it has none.
         steps: steps of each recovery; None chooses like `g2ard.distill`.
         size: longer side in pixels of the finest level's views, if they are larger.
         background: RGB in [0, 1] behind the scene.

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from g2ard.errors import InputError
+from g2ard.errors import InputError, require
 from g2ard.io import read_splats, write_splats
 from g2ard.io.scene_formats import scene_format, written_bytes
 from g2ard.jobs.budget import Budget
@@ -73,6 +73,7 @@ class Reduction:
     _made: dict[int, Simplified] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        require("seed", self.seed, self.seed >= 0, "a whole number of at least 0")
         if self.views is not None and self.blind:
             raise InputError("views and blind exclude each other")
         say_regions(self.splats, self.config, "the scene", self.say)

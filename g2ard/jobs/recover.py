@@ -10,17 +10,19 @@ from typing import Any
 
 from numpy.typing import ArrayLike, NDArray
 
+from g2ard.config.checks import checks_arguments
 from g2ard.config.choices import RenderModel
-from g2ard.config.paths import full_paths
+from g2ard.config.paths import changed, full_paths
 from g2ard.errors import InputError
 from g2ard.io.types import ViewSet
 from g2ard.jobs.causes import likely_causes
 from g2ard.jobs.inputs import Views, load_scene
 from g2ard.jobs.score import scores_by_kind
 from g2ard.jobs.teaching import Teaching, check_teacher
+from g2ard.pipeline.config import check_recovery
 from g2ard.pipeline.presets import PRESETS, configured
 from g2ard.progress import Progress, Say, plural, silent, unsaid
-from g2ard.rendering.targets import Targets, kinds_of
+from g2ard.rendering.targets import Targets, checked_targets, kinds_of
 from g2ard.report.kinds import KindScore
 from g2ard.scene.splats import Splats
 from g2ard.stages.recover import RecoverConfig, Recovered
@@ -91,6 +93,7 @@ class RecoverJob:
         return kinds, likely_causes(result.splats, self.held_out, trained, result.report, mean, background)
 
 
+@checks_arguments
 def recover(
     student: Splats | str | Path,
     targets: Targets | None = None,
@@ -113,6 +116,7 @@ def recover(
     progress: Progress = silent,
     say: Say = unsaid,
     watch: Watch | None = None,
+    **fields: Any,
 ) -> Recovered:
     """Optimise every attribute of a fixed set of Gaussians against photos or a teacher's renders.
 
@@ -129,8 +133,8 @@ def recover(
         teacher: the dense scene that renders the targets, or its path; None takes the photos of the views.
         photos: with a teacher, use photos where views have them.
         preset: settings by name, without `targets`; see `g2ard.preset`.
-        settings: values of `RecoverConfig` by path, without `targets`, such as {"recover.steps": 300}; they
-            override the preset.
+        settings: values of `RecoverConfig` by path, without `targets`, such as
+            {"recover.schedule.rates.means": 1e-3}; they override the preset.
         split: split of the views to train on.
         size: longer side of the views in pixels, if they are larger.
         weighted: draw views by the weights that they state; None asks the preset.
@@ -146,6 +150,8 @@ def recover(
         progress: called after every step with loss, PSNR of a few training views and steps/s.
         say: called with log messages.
         watch: called after every step; its time does not count.
+        fields: settings by field name, like the command's flags: `steps=100`, `background=(1, 1, 1)`,
+            `schedule="fast"`. They override everything else; None keeps the other value.
 
     Returns:
         The recovered scene, its Gaussians in the student's order, and a report.
@@ -162,10 +168,11 @@ def recover(
     >>> scene = Splats.create(means, scales=np.full((500, 3), 0.1), sh0=sh0)
     >>> small = g2ard.simplify(scene, ratio=5).splats
     >>> views = g2ard.make_pool(scene, 8, size=(64, 48))
-    >>> better = g2ard.recover(small, views=views, teacher=scene, settings={"steps": 30})
+    >>> better = g2ard.recover(small, views=views, teacher=scene, steps=30)
     >>> len(better.splats), better.report.psnr.after > better.report.psnr.before
     (100, True)
     """
+    named = {name: value for name, value in fields.items() if value is not None}
     if targets is None:
         _refuse("targets", config=config, weights=weights, validation=validation, frozen=frozen)
         if isinstance(anchors, Anchors):
@@ -176,7 +183,7 @@ def recover(
             teacher=teacher,
             photos=photos,
             preset=preset,
-            settings=settings,
+            settings=named | dict(settings or {}),
             split=split,
             size=size,
             weighted=weighted,
@@ -188,7 +195,12 @@ def recover(
         return job.run(checkpoint, watch)
     decided = {"preset": None if preset == "auto" else preset, "photos": photos or None}
     _refuse("views or a teacher", views=views, teacher=teacher, settings=settings, size=size, **decided)
+    targets = checked_targets(targets)
+    if validation is not None:
+        validation = checked_targets(validation, "validation")
     config = config or RecoverConfig()
+    config = changed(config, full_paths(named, config))
+    check_recovery(config)
     start = _scene(student, render_model, say)
     if not isinstance(anchors, Anchors | None):
         anchors = Anchors.of(_built(anchors, start, render_model, say), config.regularizers.in_plane)
@@ -234,6 +246,7 @@ def prepare(
     given = full_paths(settings or {}, RecoverConfig())
     named = {**PRESETS[preset], **given}
     config = configured(RecoverConfig(), preset, given)
+    check_recovery(config)
     start = _scene(student, render_model, say)
     teaching = Teaching(
         teacher,

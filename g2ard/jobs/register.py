@@ -11,6 +11,7 @@ from typing import Any, Literal, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from g2ard.config.checks import checks_arguments
 from g2ard.config.choices import BLACK, Alpha, Colour, Keep, RenderModel
 from g2ard.config.paths import changed, full_paths
 from g2ard.errors import InputError, require
@@ -64,6 +65,7 @@ class RegisterJob:
         )
 
 
+@checks_arguments
 def register(
     scene: Splats | str | Path,
     photos: Cameras | str | Path,

@@ -6,7 +6,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from g2ard.config.checks import checks_arguments
 from g2ard.config.choices import RenderModel
+from g2ard.io.scene_formats import check_format
 from g2ard.jobs.budget import Budget
 from g2ard.jobs.inputs import Views, load_scene
 from g2ard.jobs.measured_budget import Reduction, aim_of
@@ -16,6 +18,7 @@ from g2ard.scene.splats import Splats
 from g2ard.stages.simplify import Simplified, SimplifyConfig
 
 
+@checks_arguments
 def simplify(
     scene: Splats | str | Path,
     *,
@@ -81,6 +84,7 @@ def simplify(
     >>> len(small.splats), small.parents.shape, small.report.output_count
     (90, (900,), 90)
     """
+    check_format(format)
     fields = {"method": method, "keep_region": keep_region}
     given = {name: value for name, value in fields.items() if value is not None}
     config = configured(config or SimplifyConfig(), settings=given | dict(settings or {}))

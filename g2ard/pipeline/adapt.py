@@ -10,12 +10,13 @@ from typing import Any
 
 import numpy as np
 
+from g2ard.config.checks import check_colour, check_fields, checks_arguments
 from g2ard.config.choices import ADAPT_SCHEDULES, AdaptSchedule
 from g2ard.errors import InputError, require
 from g2ard.io.reports import Report
 from g2ard.pipeline.recolour import blended_appearance, colour_change, recoloured, views_seeing
 from g2ard.progress import Progress, plural, silent
-from g2ard.rendering.targets import Targets, fingerprint_of
+from g2ard.rendering.targets import Targets, checked_targets, fingerprint_of
 from g2ard.scene.splats import Splats
 from g2ard.stages.recover import RecoverConfig, checkpoint, recover
 from g2ard.stages.recover.anchors import FREE
@@ -55,6 +56,9 @@ class AdaptConfig(FitConfig):
     recovery: Schedule | None = None
 
     def __post_init__(self) -> None:
+        check_fields(self)
+        check_colour("background", self.background)
+        require("seed", self.seed, self.seed >= 0, "a whole number of at least 0")
         super().__post_init__()
         views, known = self.prior_views, self.schedule in ADAPT_SCHEDULES
         require("steps", self.steps, self.steps >= 1, "at least 1")
@@ -209,6 +213,7 @@ class _Fit:
             self.stretches = meta["stretches"]
 
 
+@checks_arguments
 def adapt(
     compact: Splats,
     targets: Targets,
@@ -240,7 +245,7 @@ def adapt(
         InputError: no Gaussians, no views, or checkpoints of another run.
         KeyboardInterrupt: after Ctrl-C, when the checkpoint is written.
     """
-    config = config or AdaptConfig()
+    config, targets = config or AdaptConfig(), checked_targets(targets)
     given = compact if config.sh_degree is None else compact.with_sh_degree(config.sh_degree)
     probe = Probe(targets, config.background)
     change, start, share = None, given, np.ones(len(given))

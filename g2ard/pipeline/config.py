@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass, field
 from typing import Literal
 
+from g2ard.config.checks import check_colour, check_fields
 from g2ard.config.choices import UNMEASURED, Focus, Policy
 from g2ard.errors import InputError, require
 from g2ard.stages.lift import LiftConfig
@@ -71,9 +72,30 @@ class DistillConfig:
             and more if a view shows little of the scene (`g2ard.stages.recover.schedule`). Rounds share
             `recovery_time` in proportion to their steps.
         lift: lifting of point clouds.
+
+    Raises:
+        InputError: an invalid value.
     """
 
     select: SelectConfig = field(default_factory=SelectConfig)
     simplify: SimplifyConfig = field(default_factory=SimplifyConfig)
     recover: RecoverConfig = field(default_factory=RecoverConfig)
     lift: LiftConfig = field(default_factory=LiftConfig)
+
+    def __post_init__(self) -> None:
+        check_recovery(self.recover)
+
+
+def check_recovery(config: RecoverConfig) -> None:
+    """Reject values of other types, a background that is no colour, and steps with a time limit.
+
+    Raises:
+        InputError: the first invalid value.
+    """
+    for part in (config, config.schedule, config.schedule.rates, config.regularizers):
+        check_fields(part)
+    check_colour("background", config.background)
+    require("sh_degree", config.sh_degree, config.sh_degree in (None, 0, 1, 2, 3), "0 to 3")
+    require("seed", config.seed, config.seed >= 0, "a whole number of at least 0")
+    if config.steps is not None and config.recovery_time is not None:
+        raise InputError("steps and recovery_time exclude each other; give one", parameter="steps")

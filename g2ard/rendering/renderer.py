@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard import _core
+from g2ard.config.checks import check_colour, checks_arguments
 from g2ard.config.choices import BLACK, CONVENTIONS, Convention
 from g2ard.errors import InputError, require
 from g2ard.scene.cameras import Camera, Cameras
@@ -162,7 +163,7 @@ class Renderer:
         settings: conventions; None means gsplat's.
 
     Raises:
-        InputError: the background is not three numbers, or `settings.near` is a sequence.
+        InputError: the background is not three numbers from 0 to 1, or `settings.near` is a sequence.
 
     >>> from g2ard.scene.cameras import Camera
     >>> dot = Splats.create([[0, 0, 0]], scales=[[0.1] * 3], logit_opacities=[9])
@@ -179,8 +180,8 @@ class Renderer:
         background: Sequence[float] = BLACK,
         settings: RasterSettings | None = None,
     ) -> None:
+        check_colour("background", background)
         self.background = [float(c) for c in background]
-        require("background", len(self.background), len(self.background) == 3, "3 numbers")
         if settings is not None and not isinstance(settings.near, int | float | None):
             raise InputError("expected one distance for all views", parameter="near")
         self._offset, self._middle = splats.offset, middle_of(splats)
@@ -241,6 +242,7 @@ class Renderer:
         return self._rasterizer.forward(self._arrays, view, self._settings, self.background, depths)
 
 
+@checks_arguments
 def render(
     splats: Splats,
     camera: Camera,
@@ -265,7 +267,7 @@ def render(
         A `Rendered`: image (H, W, 3), alpha (H, W) and depth (H, W), all float32; depth in scene units.
 
     Raises:
-        InputError: an invalid camera, or a background that is not three numbers.
+        InputError: an invalid camera, or a background that is not three numbers from 0 to 1.
 
     >>> from g2ard.scene.cameras import Camera
     >>> dot = Splats.create([[0, 0, 0]], scales=[[0.1] * 3], logit_opacities=[9])

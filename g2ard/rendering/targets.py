@@ -5,7 +5,9 @@ from __future__ import annotations
 import hashlib
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import cached_property, partial
+from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
@@ -75,6 +77,71 @@ def _source(targets: Targets) -> str:
     return str(getattr(targets, "source", type(targets).__name__))
 
 
+def checked_targets(targets: Targets, parameter: str = "targets") -> Targets:
+    """Return targets whose images are (H, W, 3) float32 in [0, 1].
+
+    Images of other classes are converted on access, see `as_image`.
+
+    Raises:
+        InputError: no cameras, or on access an image that does not fit its view.
+    """
+    if isinstance(targets, _Cached | _Chosen):
+        return targets
+    if not isinstance(getattr(targets, "cameras", None), Cameras) or not hasattr(targets, "__getitem__"):
+        raise InputError(
+            f"expected cameras with an image each, got a value of type {type(targets).__name__}",
+            parameter=parameter,
+            hint="pass g2ard.Photos(cameras, images), or g2ard.TeacherRenders(scene, cameras)",
+        )
+    return _Converted(targets, parameter)
+
+
+def as_image(image: Any, cameras: Cameras, view: int, parameter: str) -> NDArray[np.uint8 | np.float32]:
+    """Return an image of a view, (H, W, 3) or (H, W, 4) in uint8 or float32, without a copy if possible.
+
+    Args:
+        image: a numpy array or torch tensor: uint8 from 0 to 255, or floats from 0 to 1.
+        cameras: the views, whose sizes the images have.
+        view: its row.
+        parameter: the argument that the image comes from, for errors.
+
+    Raises:
+        InputError: another shape, type or range.
+    """
+    if hasattr(image, "detach"):
+        image = image.detach().cpu().numpy()
+    array = np.asarray(image)
+    height, width = int(cameras.heights[view]), int(cameras.widths[view])
+    hint = None
+    if array.shape not in ((height, width, 3), (height, width, 4)):
+        wrong = f"expected shape ({height}, {width}, 3), got {array.shape}"
+        if array.shape[1:] == (height, width):
+            hint = "move the channels to the end"
+        elif array.ndim == 3:
+            hint = "scale the images to the size of their cameras, or the cameras with cameras.resized"
+    elif array.dtype == np.uint8:
+        return array
+    elif array.dtype.kind != "f":
+        wrong = f"expected uint8, or floats from 0 to 1, got {array.dtype}"
+    else:
+        least, most = float(array.min()), float(array.max())
+        if least >= -_ROUNDING and most <= 1 + _ROUNDING:
+            inside = least >= 0 and most <= 1
+            return np.asarray(array if inside else array.clip(0, 1), np.float32)
+        wrong = f"expected floats from 0 to 1, got {least:g} to {most:g}"
+        if most > _BYTE_LIKE:
+            hint = "divide by 255, or pass uint8"
+    raise InputError(
+        f"({cameras.names[view]}): {wrong}", parameter=parameter, index=view, item="view", hint=hint
+    )
+
+
+_ROUNDING = 1e-3
+"""Excess over [0, 1] that is clipped."""
+_BYTE_LIKE = 1.5
+"""Largest value above which floats are probably bytes."""
+
+
 class _Chosen:
     """Views of other targets.
 
@@ -110,6 +177,30 @@ class Subset(_Chosen):
     def __init__(self, targets: Targets, rows: ArrayLike) -> None:
         rows = np.asarray(rows, np.int64)
         super().__init__(targets.cameras.take(rows), [(targets, int(row)) for row in rows])
+
+
+class _Converted(_Chosen):
+    """Targets of another class, converted on access."""
+
+    def __init__(self, targets: Targets, parameter: str) -> None:
+        cameras = targets.cameras
+        super().__init__(cameras, [(targets, view) for view in range(len(cameras))])
+        self._parameter = parameter
+
+    def __getitem__(self, view: int) -> NDArray[np.float32]:
+        try:
+            image = super().__getitem__(view)
+        except IndexError:
+            missing = f"({self.cameras.names[view]}) has no image"
+            raise InputError(missing, parameter=self._parameter, index=view, item="view") from None
+        array = as_image(image, self.cameras, view, self._parameter)[..., :3]
+        return _as_floats(array)
+
+
+def _as_floats(image: NDArray[Any]) -> NDArray[np.float32]:
+    """Return an image as contiguous float32, divided by 255 if it has bytes."""
+    scaled = image.astype(np.float32) / np.float32(255) if image.dtype == np.uint8 else image
+    return np.ascontiguousarray(scaled, np.float32)
 
 
 def with_pixels(targets: Targets) -> Targets:
@@ -162,32 +253,58 @@ class _Cached(ABC):
 
 
 class Photos(_Cached):
-    """Photos of `cameras`, undistorted and at each camera's size; cached as 8-bit.
+    """Photos of `cameras`: their files, undistorted and at each camera's size, or given images.
 
     Alpha is composited over the background. A photo with a mask is black outside of it. An exposure is the
     affine colour transform C that trainers fit (photo = C·render); a photo that has one is mapped by C⁻¹ and
     clipped to [0, 1].
 
     Args:
-        cameras: views, all with a photo.
+        cameras: views, all with a photo unless `images` are given.
+        images: one image per view: paths of files, or (H, W, 3) arrays or torch tensors, uint8 or floats in
+            [0, 1], with alpha (H, W, 4). Arrays have the size of their camera. None reads the photos of
+            `cameras`.
         background: RGB behind transparent pixels.
         exposures: (3, 4) exposures by view name, for photos that have one.
         limit: bytes cached in memory.
 
     Raises:
-        InputError: a view without a photo, or an exposure that is not invertible.
+        InputError: a view without a photo, an image that does not fit its view, or an exposure that is not
+            invertible.
+
+    >>> from g2ard.scene.cameras import Camera
+    >>> views = Cameras.of([Camera.facing([0, -3, 0], [0, 0, 0], width=64, height=48)])
+    >>> Photos(views, [np.full((48, 64, 3), 51, np.uint8)])[0].max().round(3)
+    np.float32(0.2)
     """
 
     def __init__(
         self,
         cameras: Cameras,
+        images: Sequence[Any] | NDArray[Any] | None = None,
         *,
         background: Colour = BLACK,
         exposures: Mapping[str, NDArray[np.float64]] | None = None,
         limit: int = CACHE_BYTES,
     ) -> None:
-        missing = next(
-            (n for n, p in zip(cameras.names, cameras.image_paths, strict=True) if p is None), None
+        self._images: list[Any] | None = None
+        if images is not None:
+            if len(images) != len(cameras):
+                raise InputError(
+                    f"expected one image per view, got {len(images)} for {plural(len(cameras), 'view')}",
+                    parameter="images",
+                )
+            if all(isinstance(image, str | Path) for image in images):
+                own = zip(cameras.image_paths, cameras.mask_paths, images, strict=True)
+                masks = tuple(Path(new) if mask and mask == old else mask for old, mask, new in own)
+                cameras = replace(cameras, image_paths=tuple(map(Path, images)), mask_paths=masks)
+            else:
+                self._images = [as_image(image, cameras, i, "images") for i, image in enumerate(images)]
+                cameras = replace(cameras, image_paths=(), mask_paths=())
+        missing = (
+            None
+            if self._images
+            else next((n for n, p in zip(cameras.names, cameras.image_paths, strict=True) if p is None), None)
         )
         if missing is not None:
             raise InputError(
@@ -207,8 +324,13 @@ class Photos(_Cached):
     def source(self) -> str:
         """Identity of the photos, masks and exposures; hashes the files."""
         photos, masks = self.cameras.image_paths, self.cameras.mask_paths
-        files = [file_identity(filter(None, paths)) for paths in (photos, masks)]
+        files: list[Any] = [file_identity(filter(None, paths)) for paths in (photos, masks)]
         masked = [path is not None for path in masks]
+        if self._images is not None:
+            digest = hashlib.sha256()
+            for image in self._images:
+                digest.update(np.ascontiguousarray(image).tobytes())
+            files.append(digest.hexdigest())
         exposures = [(view, matrix.tolist()) for view, matrix in self._undo.items()]
         return f"photos {files} {masked} {exposures} {self._background}"
 
@@ -221,11 +343,13 @@ class Photos(_Cached):
         mask: NDArray[np.bool_] | None = self._cached(self._masks, view, partial(load_mask, self.cameras))
         return mask
 
-    def _make(self, view: int) -> NDArray[np.uint8]:
+    def _make(self, view: int) -> NDArray[np.uint8 | np.float32]:
+        if self._images is not None:
+            return _over(self._images[view], self._background)
         return np.rint(load_image(self.cameras, view, self._background) * 255).astype(np.uint8)
 
     def __getitem__(self, view: int) -> NDArray[np.float32]:
-        photo = self._stored(view).astype(np.float32) / np.float32(255)
+        photo = _as_floats(self._stored(view))
         undo = self._undo.get(view)
         if undo is not None:
             photo = np.ascontiguousarray(photo @ undo[:, :3].T + undo[:, 3], dtype=np.float32)
@@ -234,6 +358,15 @@ class Photos(_Cached):
         if mask is not None:  # SSIM's window reaches across the mask's edge
             photo[~mask] = 0
         return photo
+
+
+def _over(image: NDArray[Any], background: Colour) -> NDArray[np.uint8 | np.float32]:
+    """Composite an image with alpha over the background."""
+    if image.shape[2] == 3:
+        return image
+    floats = _as_floats(image)
+    colour = np.array(background, np.float32)
+    return np.ascontiguousarray(floats[..., :3] * floats[..., 3:] + colour * (1 - floats[..., 3:]))
 
 
 _RENDER_LEVELS = np.float32(65_535)

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from g2ard.config.checks import checks_arguments
 from g2ard.config.choices import BLACK, Colour
 from g2ard.errors import InputError
 from g2ard.io.images import as_saved
@@ -16,7 +17,7 @@ from g2ard.rendering.cuda import renderer_on
 from g2ard.rendering.lpips import Lpips
 from g2ard.rendering.metrics import psnr, ssim
 from g2ard.rendering.renderer import RasterSettings
-from g2ard.rendering.targets import Targets, against_of, mask_of
+from g2ard.rendering.targets import Targets, against_of, checked_targets, mask_of
 from g2ard.scene.cameras import USUAL
 from g2ard.scene.splats import Splats
 
@@ -86,6 +87,7 @@ class Evaluation:
         }
 
 
+@checks_arguments
 def evaluate(
     splats: Splats,
     targets: Targets,
@@ -122,6 +124,7 @@ def evaluate(
     Raises:
         InputError: a photo cannot be read, or its mask leaves no pixel.
     """
+    targets = checked_targets(targets)
     cameras = targets.cameras
     renderer = renderer_on(device, splats, background, settings)
     scores = []

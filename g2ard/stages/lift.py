@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from g2ard import _core
+from g2ard.config.checks import check_fields, checks_arguments
 from g2ard.errors import InputError, require
 from g2ard.progress import Progress, counter, silent
 from g2ard.scene.splats import SH_C0, Splats
@@ -29,7 +30,11 @@ class LiftConfig:
     max_anisotropy: float = _CORE["max_anisotropy"]
     opacity: float = 0.5
 
+    def __post_init__(self) -> None:
+        check_fields(self)
 
+
+@checks_arguments
 def lift(
     points: ArrayLike,
     colors: ArrayLike,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from g2ard.config.checks import check_fields
 from g2ard.config.choices import REFINEMENTS, Refinement
 from g2ard.errors import require
 
@@ -84,6 +85,7 @@ class RegisterConfig:
     alike: float = 10.0
 
     def __post_init__(self) -> None:
+        check_fields(self)
         for name in ("size", "align_size"):
             require(name, getattr(self, name), getattr(self, name) >= 32, "at least 32 pixels")
         require("refine", self.refine, self.refine in REFINEMENTS, f"one of {', '.join(REFINEMENTS)}")

@@ -9,6 +9,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from g2ard.config.checks import checks_arguments
 from g2ard.config.choices import POLICIES, UNMEASURED
 from g2ard.errors import InputError, require
 from g2ard.progress import Progress, plural, silent
@@ -59,6 +60,7 @@ class Selection:
         return f"Selection({plural(len(self.order), 'view')}, policy={self.policy!r})"
 
 
+@checks_arguments
 def select(
     splats: Splats,
     cameras: Cameras,
@@ -98,7 +100,7 @@ def select(
     >>> select(ball, views, 2).order.tolist()
     [1, 3]
     """
-    _check(cameras, k, policy)
+    _check(cameras, k, policy, seed)
     began = time.perf_counter()
     seconds: dict[str, float] = {}
     coarse = surface(splats, min(_COARSE_CELLS, max(1, len(splats))))
@@ -142,13 +144,12 @@ def select(
     )
 
 
-def _check(cameras: Cameras, k: int | Literal["auto"], policy: str) -> None:
-    """Reject an invalid number of views, an unknown policy, and candidates that are missing or too large."""
+def _check(cameras: Cameras, k: int | Literal["auto"], policy: str, seed: int) -> None:
+    """Reject an invalid number or seed, an unknown policy, and candidates that are missing or too large."""
     require("policy", repr(policy), policy in POLICIES, ", ".join(POLICIES))
     if k == "auto" and policy in UNMEASURED:
         raise InputError(f"'auto' needs a policy that measures gains, got {policy!r}", parameter="k")
-    if k != "auto" and not isinstance(k, int | np.integer):
-        raise InputError(f"expected 'auto' or a whole number of views, got {k!r}", parameter="k")
+    require("seed", seed, seed >= 0, "a whole number of at least 0")
     require("k", k, k == "auto" or k >= 1, "at least 1 view")
     if not len(cameras):
         raise InputError("no candidate views to select from")

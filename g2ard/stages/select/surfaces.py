@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard import _core
+from g2ard.config.checks import check_fields
 from g2ard.errors import InputError, require
 from g2ard.progress import Progress, counter, silent
 from g2ard.rendering.renderer import View, settings_for, view_of
@@ -49,6 +50,7 @@ class CoverageOptions:
     depth_tolerance: float = 0.01
 
     def __post_init__(self) -> None:
+        check_fields(self)
         require("cells", self.cells, self.cells >= 1, "at least 1")
         for name in ("kappa", "offset", "epsilon"):
             value = getattr(self, name)

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from typing import cast
 
 from g2ard import _core
+from g2ard.config.checks import check_fields
 from g2ard.config.choices import METHODS, Method
 from g2ard.errors import require
 from g2ard.scene.regions import Region, as_regions
@@ -91,6 +92,7 @@ class SimplifyConfig:
     protection: float = _PAPER["protection"]
 
     def __post_init__(self) -> None:
+        check_fields(self)
         require("method", repr(self.method), self.method in METHODS, f"one of {', '.join(METHODS)}")
         retention, alpha = self.retention, self.min_opacity
         require("retention", retention, retention is None or 0 < retention < 1, "a number between 0 and 1")

@@ -1,0 +1,136 @@
+"""Checks of values against the annotated types of arguments and of config fields."""
+
+from __future__ import annotations
+
+import inspect
+import math
+import types
+from collections.abc import Callable, Sequence
+from dataclasses import fields
+from functools import cache, wraps
+from numbers import Integral, Real
+from typing import Any, Literal, ParamSpec, TypeVar, Union, get_args, get_origin, get_type_hints
+
+from g2ard.errors import InputError
+
+P = ParamSpec("P")
+Result = TypeVar("Result")
+
+UNIONS = (Union, types.UnionType)
+_LONGEST = 60
+"""Longest text of a value in a message; a longer one is described by its type."""
+
+
+def check_fields(config: Any) -> None:
+    """Reject values of a dataclass that do not have the types of their fields.
+
+    Raises:
+        InputError: the first such field.
+    """
+    owner: Any = type(config)
+    kinds = _hints(owner)
+    for field in fields(config):
+        check_type(field.name, getattr(config, field.name), kinds[field.name])
+
+
+def check_type(name: str, value: Any, kind: Any) -> None:
+    """Reject a value that does not have the annotated type `kind`.
+
+    Whole numbers are also numbers, NaN is no number, and any sequence can be a tuple. Types that cannot be
+    tested, such as protocols and arrays, are not checked.
+
+    Raises:
+        InputError: another type.
+
+    >>> check_type("seed", 3, int)
+    >>> check_type("seed", 2.5, int | None)
+    Traceback (most recent call last):
+    g2ard.errors.InputError: seed: expected a whole number or none, got 2.5
+    """
+    if not _fits(value, kind):
+        got = repr(value)
+        if len(got) > _LONGEST or "\n" in got:
+            got = f"a value of type {type(value).__name__}"
+        raise InputError(f"expected {described(kind)}, got {got}", parameter=name)
+
+
+def check_colour(name: str, colour: Any) -> None:
+    """Reject a colour that is not three numbers from 0 to 1.
+
+    >>> check_colour("background", (0, 0, 255))
+    Traceback (most recent call last):
+    g2ard.errors.InputError: background: expected 3 numbers from 0 to 1 (red, green, blue), got (0, 0, 255)
+    """
+    if not _fits(colour, tuple[float, float, float]) or not all(0 <= channel <= 1 for channel in colour):
+        raise InputError(f"expected 3 numbers from 0 to 1 (red, green, blue), got {colour!r}", parameter=name)
+
+
+def checks_arguments(function: Callable[P, Result]) -> Callable[P, Result]:
+    """Check every argument of a public function with `check_type` before the call."""
+    signature = inspect.signature(function)
+    loose = {name for name, p in signature.parameters.items() if p.kind is p.VAR_KEYWORD}
+
+    @wraps(function)
+    def checked(*args: P.args, **kwargs: P.kwargs) -> Result:
+        kinds = _hints(function)
+        for name, value in signature.bind(*args, **kwargs).arguments.items():
+            if name not in loose:
+                check_type(name, value, kinds[name])
+        return function(*args, **kwargs)
+
+    return checked
+
+
+def described(kind: Any) -> str:
+    """Describe a type in an error message.
+
+    >>> described(int | None), described(Literal["a", "b"]), described(tuple[float, float])
+    ('a whole number or none', 'one of a, b', '2 comma-separated numbers')
+    """
+    if get_origin(kind) in UNIONS:
+        return " or ".join(dict.fromkeys(map(described, get_args(kind))))
+    if get_origin(kind) is Literal:
+        return f"one of {', '.join(map(str, get_args(kind)))}"
+    if get_origin(kind) is tuple:
+        kinds = get_args(kind)
+        return "comma-separated numbers" if kinds[-1] is Ellipsis else f"{len(kinds)} comma-separated numbers"
+    if get_origin(kind) is Sequence:
+        return "several values"
+    words = {bool: "true or false", int: "a whole number", float: "a number", str: "text", type(None): "none"}
+    return words.get(kind) or str(getattr(kind, "__name__", kind))
+
+
+@cache
+def _hints(owner: Any) -> dict[str, Any]:
+    """Return the types of fields or arguments; `object` for names imported for type checkers only."""
+    if isinstance(owner, type):
+        return get_type_hints(owner)
+    hints: dict[str, Any] = {}
+    for name, kind in owner.__annotations__.items():
+        alone: Any = types.SimpleNamespace(__annotations__={name: kind})
+        try:
+            hints |= get_type_hints(alone, owner.__globals__)
+        except NameError:
+            hints[name] = object
+    return hints
+
+
+def _fits(value: Any, kind: Any) -> bool:
+    origin, inner = get_origin(kind), get_args(kind)
+    if origin in UNIONS:
+        return any(_fits(value, option) for option in inner)
+    if origin is Literal:
+        return isinstance(value, str) and value in inner
+    if origin is tuple or origin is Sequence:
+        several = hasattr(value, "__len__") and not isinstance(value, str)
+        if origin is Sequence or not several or inner[-1] is Ellipsis:
+            return several
+        return len(value) == len(inner) and all(map(_fits, value, inner))
+    if kind is bool:
+        return isinstance(value, bool) or getattr(getattr(value, "dtype", None), "kind", "") == "b"
+    if kind is int or kind is float:
+        number = isinstance(value, Integral if kind is int else Real) and not isinstance(value, bool)
+        return number and not (kind is float and math.isnan(float(value)))
+    if not isinstance(kind, type) or getattr(kind, "_is_protocol", False):
+        return True
+    return isinstance(value, kind)

@@ -1,0 +1,160 @@
+"""Arguments of public functions: invalid ones are named, and images are taken as people have them."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+import g2ard
+from helpers.scenes import around, checkered_ball
+
+BALL, VIEWS = checkered_ball(300), around(8, (48, 36))
+SMALL = g2ard.simplify(BALL, count=30, blind=True).splats
+TARGETS = g2ard.TeacherRenders(BALL, VIEWS)
+IMAGES = np.stack([TARGETS[view] for view in range(len(VIEWS))])
+
+
+class Own:
+    """Targets of a class that is not g2ard's."""
+
+    def __init__(self, images: Any) -> None:
+        self.cameras, self.images = VIEWS, images
+
+    def __getitem__(self, view: int) -> Any:
+        return self.images[view]
+
+
+COLOUR = "expected 3 numbers from 0 to 1"
+WRONG: list[tuple[str, dict[str, Any], str, str]] = [
+    ("distill", {"size": 0}, "size", "at least 1 pixel, got 0"),
+    ("distill", {"size": 47.5}, "size", "a whole number or none, got 47.5"),
+    ("distill", {"format": "foo"}, "format", "expected one of ply, sog"),
+    ("distill", {"background": (300, 0, 0)}, "background", COLOUR),
+    ("distill", {"background": "white"}, "background", "got 'white'"),
+    ("distill", {"count": 100.5, "ratio": None}, "count", "a whole number or none, got 100.5"),
+    ("distill", {"settings": {"simplify.neighbors": 2.5}}, "simplify.neighbors", "a whole number, got 2.5"),
+    ("distill", {"seed": -1}, "seed", "at least 0, got -1"),
+    ("distill", {"steps": "5"}, "steps", "a whole number or none, got '5'"),
+    ("distill", {"steps": 3, "recovery_time": 1}, "steps", "exclude each other"),
+    ("distill", {"sh_degree": 4}, "sh_degree", "0 to 3, got 4"),
+    ("distill", {"focus": "close"}, "focus", "expected one of far, near"),
+    ("distill", {"render_model": "mip"}, "render_model", "expected one of classic, antialiased or none"),
+    ("distill", {"views": VIEWS.viewmats}, "views", "got a value of type ndarray"),
+    ("distill", {"scene": 3}, "scene", "expected Splats or Points or text or Path or none, got 3"),
+    ("simplify", {"seed": -1}, "seed", "at least 0, got -1"),
+    ("simplify", {"format": "foo"}, "format", "expected one of ply, sog"),
+    ("simplify", {"settings": {"neighbors": 2.5}}, "neighbors", "a whole number, got 2.5"),
+    ("lod", {"ratios": 4}, "ratios", "expected several values, got 4"),
+    ("lod", {"size": 0}, "size", "at least 1 pixel"),
+    ("lod", {"background": (300, 0, 0)}, "background", COLOUR),
+    ("recover", {"steps": 3, "recovery_time": 1}, "steps", "exclude each other"),
+    ("recover", {"config": g2ard.RecoverConfig(seed=-1)}, "seed", "at least 0, got -1"),
+    ("recover", {"targets": IMAGES}, "targets", "expected cameras with an image each"),
+    ("recover", {"validation": IMAGES}, "validation", "expected cameras with an image each"),
+    ("recover", {"targets": Own(255 * IMAGES)}, "targets", "divide by 255, or pass uint8"),
+    ("recover", {"targets": Own(IMAGES * np.nan)}, "targets", "from 0 to 1, got nan to nan"),
+    ("recover", {"targets": Own(IMAGES[:3])}, "targets", "view 3 (view_003) has no image"),
+    ("recover", {"targets": Own(IMAGES.transpose(0, 3, 1, 2))}, "targets", "move the channels to the end"),
+    ("recover", {"targets": Own(IMAGES.astype(int))}, "targets", "expected uint8, or floats from 0 to 1"),
+    ("adapt", {"targets": Own(255 * IMAGES)}, "targets", "divide by 255, or pass uint8"),
+    ("evaluate", {"targets": VIEWS}, "targets", "pass g2ard.Photos(cameras, images)"),
+    ("evaluate", {"background": (0, 0, 2)}, "background", COLOUR),
+    ("render", {"camera": VIEWS}, "camera", "expected Camera, got Cameras(8 views)"),
+    ("render", {"background": (0, 0)}, "background", COLOUR),
+    ("select", {"k": 2.5}, "k", "a whole number or one of auto, got 2.5"),
+    ("select", {"seed": -1}, "seed", "at least 0, got -1"),
+    ("load", {"path": 3}, "path", "expected text or Path, got 3"),
+    ("save", {"path": 3}, "path", "expected text or Path, got 3"),
+    ("SimplifyConfig", {"neighbors": 2.5}, "neighbors", "a whole number, got 2.5"),
+    ("RegisterConfig", {"passes": "3"}, "passes", "a whole number, got '3'"),
+    ("AdaptConfig", {"background": (0, 0, 255)}, "background", COLOUR),
+    ("AdaptConfig", {"seed": -1}, "seed", "at least 0, got -1"),
+    ("SelectConfig", {"cells": 1.5}, "cells", "a whole number, got 1.5"),
+    ("Photos", {"images": IMAGES[:3]}, "images", "expected one image per view, got 3 for 8 views"),
+    ("Photos", {"images": 255 * IMAGES}, "images", "divide by 255, or pass uint8"),
+    ("Photos", {"images": IMAGES[:, :30]}, "images", "expected shape (36, 48, 3), got (30, 48, 3)"),
+]
+VALID: dict[str, dict[str, Any]] = {
+    "distill": {"scene": BALL, "ratio": 10, "views": VIEWS, "steps": 2},
+    "simplify": {"scene": BALL, "ratio": 10},
+    "lod": {"scene": BALL, "ratios": (4,)},
+    "recover": {"student": SMALL, "targets": TARGETS},
+    "adapt": {"compact": SMALL, "targets": TARGETS},
+    "evaluate": {"splats": SMALL, "targets": TARGETS},
+    "render": {"splats": BALL, "camera": VIEWS[0]},
+    "select": {"splats": BALL, "cameras": VIEWS, "k": 2},
+    "save": {"splats": BALL},
+    "Photos": {"cameras": VIEWS},
+}
+
+
+@pytest.mark.parametrize(("name", "wrong", "parameter", "words"), WRONG)
+def test_invalid_arguments_are_named(name: str, wrong: dict[str, Any], parameter: str, words: str) -> None:
+    with pytest.raises(g2ard.G2ardError) as caught:
+        getattr(g2ard, name)(**{**VALID.get(name, {}), **wrong})
+    assert str(caught.value.parameter).rpartition(".")[2] == parameter.rpartition(".")[2]
+    assert words in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_recover_takes_settings_by_name() -> None:
+    config = g2ard.RecoverConfig(steps=3, background=(1, 1, 1))
+    whole = g2ard.recover(SMALL, TARGETS, config)
+    assert g2ard.recover(SMALL, TARGETS, steps=3, background=(1, 1, 1)).splats.fingerprint() == (
+        whole.splats.fingerprint()
+    )
+    rates = g2ard.RecoverConfig(schedule=g2ard.preset("paper").recover.schedule)
+    assert g2ard.recover(SMALL, TARGETS, rates, steps=3).report.multiplier == 1  # keeps the schedule
+    decided: dict[str, Any] = {"views": VIEWS, "teacher": BALL}
+    by_name = g2ard.recover(SMALL, **decided, steps=3, schedule="fast")
+    by_path = g2ard.recover(SMALL, **decided, settings={"recover.steps": 3, "schedule": "fast"})
+    assert by_name.splats.fingerprint() == by_path.splats.fingerprint()
+    with pytest.raises(g2ard.InputError, match="unknown setting 'step'; did you mean"):
+        g2ard.recover(SMALL, TARGETS, step=3)
+
+
+BYTES = np.rint(IMAGES * 255).astype(np.uint8)
+
+
+@pytest.mark.parametrize(
+    "images",
+    [
+        IMAGES,
+        IMAGES.astype(np.float64),
+        list(IMAGES),
+        torch.tensor(IMAGES),
+        list(torch.tensor(IMAGES.astype(np.float64))),
+        np.minimum(IMAGES + 1e-4, 1.0005),
+        BYTES,
+        list(BYTES),
+        torch.tensor(BYTES),
+        np.concatenate([BYTES, np.full((*BYTES.shape[:3], 1), 255, np.uint8)], axis=3),
+    ],
+)
+def test_images_as_people_have_them(images: Any) -> None:
+    given = [g2ard.Photos(VIEWS, images)]
+    if images[0].shape[2] == 3:
+        given.append(Own(images))  # type: ignore[arg-type]
+    for targets in given:
+        done = g2ard.recover(SMALL, targets, steps=2)
+        assert done.report.psnr.before == pytest.approx(
+            g2ard.recover(SMALL, TARGETS, steps=2).report.psnr.before, abs=0.02
+        )
+        assert g2ard.evaluate(SMALL, targets).psnr == pytest.approx(
+            g2ard.evaluate(SMALL, TARGETS).psnr, abs=0.02
+        )
+
+
+def test_files_and_alpha_as_images(tmp_path: Path) -> None:
+    paths = [tmp_path / f"{i}.png" for i in range(len(VIEWS))]
+    for path, image in zip(paths, BYTES, strict=True):
+        Image.fromarray(image).save(path)
+    for given in (paths, [str(path) for path in paths]):
+        photos = g2ard.Photos(VIEWS, given)
+        assert np.abs(photos[3] - IMAGES[3]).max() < 0.003
+        assert photos.source == g2ard.Photos(VIEWS, paths).source != g2ard.Photos(VIEWS, BYTES).source
+    clear = np.concatenate([BYTES, np.zeros((*BYTES.shape[:3], 1), np.uint8)], axis=3)
+    assert g2ard.Photos(VIEWS, clear, background=(1, 0.5, 0))[0][0, 0].tolist() == [1, 0.5, 0]
