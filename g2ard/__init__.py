@@ -54,6 +54,7 @@ if TYPE_CHECKING:
     from g2ard.jobs.recover import recover
     from g2ard.jobs.register import register
     from g2ard.jobs.simplify import simplify
+    from g2ard.jobs.viewer_frame import up_of
     from g2ard.levels import Georeference, save_levels
     from g2ard.pipeline.adapt import AdaptConfig, Adapted, adapt
     from g2ard.pipeline.config import DistillConfig, SelectConfig
@@ -133,6 +134,7 @@ __all__ = [
     "save_views",
     "select",
     "simplify",
+    "up_of",
 ]
 
 _HOMES = {
@@ -149,6 +151,7 @@ _HOMES = {
     "jobs.recover": ("recover",),
     "jobs.register": ("register",),
     "jobs.simplify": ("simplify",),
+    "jobs.viewer_frame": ("up_of",),
     "poses": ("make_pool",),
     "pipeline.presets": ("preset",),
     "scene.splats": ("Splats",),

@@ -157,6 +157,14 @@ def test_the_python_guide_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     assert g2ard.load("better.sog").means.shape == (len(BALL) // 10, 3)
 
 
+def test_the_guide_to_own_views_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    names = run_guide("own-views.md")
+    assert (names["image"] > 0.05).any(axis=2).mean() > 0.1  # it shows the scene
+    assert abs(names["view"].viewmat[1, :3] @ names["up"]) > 0.99  # upright
+    assert len(names["result"].splats) == len(BALL) // 10
+
+
 def test_the_rasteriser_guide_trains_a_scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     names = run_guide("rasteriser.md")

@@ -156,7 +156,24 @@ def _level(cameras: Cameras) -> NDArray[np.float64] | None:
 
 
 def up_of(scene: Splats, up: Sequence[float] | None = None) -> NDArray[np.float64]:
-    """Return `up` if given, otherwise estimate it from the scene, with −y as a fallback."""
+    """Return a scene's up direction, which is not stored in its file.
+
+    Args:
+        scene: the scene.
+        up: (3,) the direction, if it is known. None estimates it from floors and surfaces, with −y as a
+            fallback.
+
+    Returns:
+        (3,) float64 unit vector in world coordinates, for `Camera.facing` and `look_at`.
+
+    Raises:
+        InputError: an `up` that is not three finite numbers, or zero.
+
+    >>> floor = np.stack(np.meshgrid(np.arange(20), [0], np.arange(20)), -1).reshape(-1, 3)
+    >>> flat = np.full((400, 3), [0.5, 0.05, 0.5])
+    >>> np.abs(up_of(Splats.create(floor, scales=flat, logit_opacities=np.full(400, 4)))).round(3).tolist()
+    [0.0, 1.0, 0.0]
+    """
     if up is not None:
         return unit_up(up)
     try:

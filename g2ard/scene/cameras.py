@@ -81,11 +81,24 @@ class Camera:
         up: ArrayLike = (0.0, 0.0, 1.0),
         name: str = "view",
     ) -> Camera:
-        """Create a view from `position` to `target` with the image's top towards `up`; `fov` is horizontal,
-        degrees.
+        """Create a view from `position` to `target`.
+
+        Args:
+            position: (3,) the camera's centre, world coordinates.
+            target: (3,) the point in the image's centre.
+            width: pixels.
+            height: pixels.
+            fov: horizontal field of view, degrees.
+            up: (3,) direction of the image's top. Most trained scenes have y down, so up is (0, -1, 0);
+                `g2ard.up_of` estimates it.
+            name: a name, unique among the views of one `Cameras`.
 
         Raises:
             InputError: position and target coincide, or the field of view is not between 0 and 180°.
+
+        >>> upright = Camera.facing([0, 0, -4], [0, 0, 0], up=[0, -1, 0])
+        >>> upright.viewmat[1].tolist()  # the image's y is the world's
+        [0.0, 1.0, 0.0, 0.0]
         """
         require("fov", fov, 0 < fov < 180, "degrees between 0 and 180")
         focal = width / 2 / np.tan(np.radians(fov) / 2)
@@ -200,6 +213,9 @@ class Cameras:
     @classmethod
     def of(cls, views: Iterable[Camera]) -> Cameras:
         """Combine single views.
+
+        Args:
+            views: views with different names.
 
         >>> pair = [Camera.facing([0, y, 0], [0, 0, 0], name=str(y)) for y in (-2, -3)]
         >>> Cameras.of(pair)[1].name, len(Cameras.of(pair))

@@ -214,6 +214,7 @@ OF_PAGE: dict[str, dict[str, Callable[[Path], None]]] = {
     "README.md": {"scene.ply": _small, "new": _new_with_lenses},
     "docs/how-to/web-delivery.md": {"project": _map_colmap},
     "docs/how-to/clean-floaters.md": {"scene.ply": _sky},
+    "docs/how-to/own-views.md": {"views.json": _views},
 }
 """Page → names that mean something else there."""
 
