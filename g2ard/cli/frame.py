@@ -148,7 +148,6 @@ class Run:
         given = {name: self.config[name] for name in names if self.config[name] not in (None, [], ())}
         try:
             typed = parse_settings(self.config["set"] or [], config)
-            configured(config, preset or "auto", typed)
         except InputError as e:
             raise typer.BadParameter(f"--set: {e}") from None
         values = full_paths(given, config) | typed
@@ -156,6 +155,14 @@ class Run:
             if "recover.steps" in values and other in values:
                 flag = "--recovery-time" if "time" in other else f"--set {other}"
                 raise typer.BadParameter(f"--steps and {flag} exclude each other; give one")
+        try:
+            configured(config, preset or "auto", values)
+        except InputError as e:
+            name = e.parameter or ""
+            if not name or any(f".{path}".endswith(f".{name}") for path in typed):
+                raise typer.BadParameter(f"--set: {e}") from None
+            option = e.at(parameter=name.rpartition(".")[2])
+            raise typer.BadParameter(in_flags(option, self.flags)) from None
         return values
 
     @contextmanager

@@ -16,7 +16,8 @@ from g2ard.errors import InputError
 P = ParamSpec("P")
 Result = TypeVar("Result")
 
-UNIONS = (Union, types.UnionType)
+_UNIONS = (Union, types.UnionType)
+_SCALARS = (bool, int, float, str, type(None))
 _LONGEST = 60
 """Longest text of a value in a message; a longer one is described by its type."""
 
@@ -51,7 +52,9 @@ def check_type(name: str, value: Any, kind: Any) -> None:
         got = repr(value)
         if len(got) > _LONGEST or "\n" in got:
             got = f"a value of type {type(value).__name__}"
-        raise InputError(f"expected {described(kind)}, got {got}", parameter=name)
+        one = isinstance(value, list | tuple) and all(option in _SCALARS for option in options_of(kind))
+        wanted, hint = ("one value", "call once per value") if one else (described(kind), None)
+        raise InputError(f"expected {wanted}, got {got}", parameter=name, hint=hint)
 
 
 def check_colour(name: str, colour: Any) -> None:
@@ -87,8 +90,8 @@ def described(kind: Any) -> str:
     >>> described(int | None), described(Literal["a", "b"]), described(tuple[float, float])
     ('a whole number or none', 'one of a, b', '2 comma-separated numbers')
     """
-    if get_origin(kind) in UNIONS:
-        return " or ".join(dict.fromkeys(map(described, get_args(kind))))
+    if get_origin(kind) in _UNIONS:
+        return " or ".join(dict.fromkeys(map(described, options_of(kind))))
     if get_origin(kind) is Literal:
         return f"one of {', '.join(map(str, get_args(kind)))}"
     if get_origin(kind) is tuple:
@@ -98,6 +101,11 @@ def described(kind: Any) -> str:
         return "several values"
     words = {bool: "true or false", int: "a whole number", float: "a number", str: "text", type(None): "none"}
     return words.get(kind) or str(getattr(kind, "__name__", kind))
+
+
+def options_of(kind: Any) -> tuple[Any, ...]:
+    """Return the types of a union, or the only type."""
+    return get_args(kind) if get_origin(kind) in _UNIONS else (kind,)
 
 
 @cache
@@ -117,7 +125,7 @@ def _hints(owner: Any) -> dict[str, Any]:
 
 def _fits(value: Any, kind: Any) -> bool:
     origin, inner = get_origin(kind), get_args(kind)
-    if origin in UNIONS:
+    if origin in _UNIONS:
         return any(_fits(value, option) for option in inner)
     if origin is Literal:
         return isinstance(value, str) and value in inner

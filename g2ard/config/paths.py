@@ -17,7 +17,7 @@ from dataclasses import dataclass, fields, is_dataclass, replace
 from difflib import get_close_matches
 from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
 
-from g2ard.config.checks import UNIONS, check_type, described
+from g2ard.config.checks import check_type, described, options_of
 from g2ard.errors import InputError
 
 Config = TypeVar("Config")
@@ -196,7 +196,7 @@ def _full(name: str, known: Mapping[str, Any]) -> str:
 
 
 def _read(path: str, text: str, kind: Any) -> Any:
-    for option in get_args(kind) if get_origin(kind) in UNIONS else (kind,):
+    for option in options_of(kind):
         try:
             return _as(option, text)
         except ValueError:

@@ -76,6 +76,11 @@ class Reduction:
         require("seed", self.seed, self.seed >= 0, "a whole number of at least 0")
         if self.views is not None and self.blind:
             raise InputError("views and blind exclude each other")
+        weighed = self.cameras is not None or self.views is not None or self.config.method == "default"
+        if self.config.pixel_scale != SimplifyConfig.pixel_scale and weighed and not self.blind:
+            raise InputError("has no effect with views", parameter="simplify.pixel_scale")
+        if self.config.dilation != SimplifyConfig.dilation and self.splats.antialiased:
+            raise InputError("has no effect on antialiased scenes", parameter="simplify.dilation")
         say_regions(self.splats, self.config, "the scene", self.say)
 
     def __call__(self, count: int) -> Simplified:

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Any, TypeVar
 
 from g2ard.config.paths import changed, full_paths
-from g2ard.errors import require
+from g2ard.errors import InputError, require
 
 Config = TypeVar("Config")
 
@@ -56,7 +56,8 @@ def configured(config: Config, preset: str = "auto", settings: Mapping[str, Any]
         settings: values by path or unambiguous tail.
 
     Raises:
-        InputError: an unknown preset or setting, or a value out of its range.
+        InputError: an unknown preset or setting, a value out of its range, or a constant that the method of
+            simplification does not use.
 
     >>> from g2ard.stages.recover.config import RecoverConfig
     >>> config = configured(RecoverConfig(), "paper", {"steps": 3000})
@@ -66,14 +67,41 @@ def configured(config: Config, preset: str = "auto", settings: Mapping[str, Any]
     from g2ard.stages.recover.schedule import Schedule
 
     require("preset", repr(preset), preset in PRESETS, f"one of {', '.join(PRESETS)}")
-    values = {**PRESETS[preset], **full_paths(settings or {}, config)}
+    given = full_paths(settings or {}, config)
+    values = {**PRESETS[preset], **given}
     schedule, steps = values.get("recover.schedule", "default"), values.get("recover.steps")
     if isinstance(schedule, str):
         if schedule == "paper":
             values.setdefault("recover.sh_degree", 3)
         named = Schedule.named(schedule)
         values["recover.schedule"] = named if steps is None else named.scaled(steps)
-    return changed(config, values)
+    made = changed(config, values)
+    _check_used(made, {path for path in PRESETS[preset] if path not in given})
+    return made
+
+
+def _check_used(config: Any, preset: Collection[str]) -> None:
+    """Reject settings that have no effect on the method or policy, except for the paths set by a preset."""
+    from g2ard.pipeline.config import DistillConfig
+    from g2ard.stages.simplify.config import SimplifyConfig
+
+    joined = isinstance(config, DistillConfig)
+    simplify = config.simplify if joined else config
+    if isinstance(simplify, SimplifyConfig):
+        rounds = joined and config.recover.schedule.round_steps > 0
+        apart = {path.rpartition(".")[2] for path in preset if path.startswith("simplify.")}
+        try:
+            simplify.check_used(rounds=rounds, apart=apart)
+        except InputError as error:
+            raise error.at(parameter=f"simplify.{error.parameter}") from None
+    if joined:
+        chosen = config.select.views_count is not None
+        if config.select.policy != "auto" and not chosen and "select.policy" not in preset:
+            raise InputError("has no effect without views_count", parameter="select.policy")
+        try:
+            config.select.check_used(config.select.policy if chosen else "auto")
+        except InputError as error:
+            raise error.at(parameter=f"select.{error.parameter}") from None
 
 
 def preset(name: str = "paper", config: Any = None) -> Any:

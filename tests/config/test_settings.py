@@ -110,7 +110,7 @@ def folder(tmp_path: Path) -> Path:
 
 COMMANDS = [
     ("simplify", "a.ply", "-r", 4, "-o", "out.ply"),
-    ("select", "a.ply", "--views", "v.json", "-k", 3, "-o", "out.json"),
+    ("select", "a.ply", "--views", "v.json", "-k", 3, "--policy", "directional", "-o", "out.json"),
     ("recover", "a.ply", "--views", "v.json", "--teacher", "a.ply", "-o", "out.ply", "--steps", 3),
     ("adapt", "a.ply", "--views", "v.json", "--teacher", "a.ply", "-o", "out.ply", "--steps", 3),
     ("distill", "a.ply", "--views", "v.json", "-r", 4, "-o", "out", "--steps", 3),

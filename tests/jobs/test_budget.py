@@ -140,6 +140,6 @@ BALL = checkered_ball(400)
 
 @pytest.mark.parametrize(("name", "value"), [("ratio", [5, 10]), ("count", (9, 8)), ("min_psnr", "high")])
 def test_a_budget_is_one_number(name: str, value: object) -> None:
-    words = f"{name}: expected " + ("a number, got 'high'" if value == "high" else "one value, got ")
+    words = f"{name}: expected " + ("a number or none, got 'high'" if value == "high" else "one value, got ")
     with pytest.raises(InputError, match=f"^{words}"):
         g2ard.distill(BALL, **{name: value})  # type: ignore[arg-type]

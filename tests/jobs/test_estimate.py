@@ -46,7 +46,7 @@ def test_several_budgets_have_a_total(folder: Path, command_line: CommandLine) -
 
 
 def test_memory_grows_with_views_and_gaussians(monkeypatch: pytest.MonkeyPatch) -> None:
-    options = DistillOptions(size=48, settings={"steps": 3, "recovery_time": 7.0})
+    options = DistillOptions(size=48, settings={"recovery_time": 7.0})
     job = prepare(checkered_ball(900), [Budget(90)], options)
     monkeypatch.setattr("g2ard.jobs.estimate.peak_rss", lambda: 10**9)
     few, many = estimate(job, 90), estimate(job, 450)

@@ -129,7 +129,11 @@ def test_the_commands(command_line: CommandLine, tmp_path: Path) -> None:
         ),
         (("--keep-region", "0,0,1"), 2, "expected X,Y,Z,R or X,Y,Z,X,Y,Z, got 0, 0, 1"),
         (("--keep-region", "0,0,0,1", "--no-views"), 2, "--keep-region needs views"),
-        (("--keep-region", "0,0,0,1", "--method", "paper"), 2, "--keep-region needs views"),
+        (
+            ("--keep-region", "0,0,0,1", "--method", "paper"),
+            2,
+            "--keep-region: has no effect on the method paper",
+        ),
         (("--keep-region", "0,0,0,-1"), 2, "expected a radius > 0"),
     ],
 )

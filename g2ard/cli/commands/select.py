@@ -62,6 +62,7 @@ def select(
         raise typer.BadParameter("give the candidates with --views VIEWS")
     with run.usage():
         config = configured(SelectConfig(), preset or "auto", settings)
+        config.check_used(config.policy)
     if config.views_count is None:
         raise typer.BadParameter("give the number of views with -k K")
     check_views_output(output, run.overwrite, format)

@@ -74,8 +74,8 @@ def simplify(
     budgets = budgets_of(run)
     if views is not None and no_views:
         raise typer.BadParameter("--views and --no-views exclude each other; give one")
-    if keep_region and (no_views or config.method == "paper"):
-        raise typer.BadParameter("--keep-region needs views; remove --no-views or --method paper")
+    if keep_region and no_views:
+        raise typer.BadParameter("--keep-region needs views; remove --no-views")
     tiling = tiling_of(run, scene, output)
     outputs = Outputs(run, output, budgets)
     outputs.check(lambda path, _: io.check_scene_output(path, run.overwrite))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -60,6 +60,25 @@ class CoverageOptions:
         )
         require("anchors", self.anchors, 1 <= self.anchors <= 64, "1 to 64")
         require("alpha", self.alpha, 0 <= self.alpha < float("inf"), "at least 0")
+
+    def check_used(self, policy: str) -> None:
+        """Reject options that were changed but that the policy does not use.
+
+        >>> CoverageOptions(kappa=5.0).check_used("coverage")
+        Traceback (most recent call last):
+        g2ard.errors.InputError: kappa: has no effect on the policy coverage, only on directional
+        """
+        for option in fields(CoverageOptions):
+            only = ("directional",) if option.name in _OF_DIRECTIONS else ("directional", "coverage")
+            if policy not in only and getattr(self, option.name) != option.default:
+                raise InputError(
+                    f"has no effect on the policy {policy}, only on {' and '.join(only)}",
+                    parameter=option.name,
+                )
+
+
+_OF_DIRECTIONS = ("kappa", "anchors")
+"""Options of directions, which only the policy directional measures."""
 
 
 @dataclass(frozen=True, eq=False)

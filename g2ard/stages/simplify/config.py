@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Collection
 from dataclasses import dataclass, replace
 from typing import cast
 
 from g2ard import _core
 from g2ard.config.checks import check_fields
 from g2ard.config.choices import METHODS, Method
-from g2ard.errors import require
+from g2ard.errors import InputError, require
 from g2ard.scene.regions import Region, as_regions
 
 _RETENTION: dict[str, float] = {"default": 0.65, "fast": 0.65, "paper": 0.75}
@@ -21,6 +22,20 @@ _PAIRWISE, _PAPER = _CORE["default"], _CORE["paper"]
 
 _METHOD_DEFAULTS = ("min_opacity", "morton_premerge_ratio", "morton_premerge_steps")
 """Constants whose default depends on the method."""
+
+
+_PAIRS, _OF_PAPER = ("default", "fast"), ("paper",)
+_USED_BY: dict[str, tuple[str, ...]] = {
+    **dict.fromkeys(("retention", "fold"), ("default", "paper")),
+    "neighbors": ("default",),
+    **dict.fromkeys(
+        ("morton_premerge_ratio", "morton_premerge_steps", "geometric_weight", "dilation"), _PAIRS
+    ),
+    **dict.fromkeys(("pixel_scale", "max_growth", "keep_region", "keep_times"), _PAIRS),
+    **dict.fromkeys(("color_bin", "max_energy", "min_coverage", "support"), _OF_PAPER),
+    **dict.fromkeys(("flag_threshold", "flag_members", "protection"), _OF_PAPER),
+}
+"""Constant → the methods that use it; the others are used by all."""
 
 
 @dataclass(frozen=True)
@@ -116,6 +131,30 @@ class SimplifyConfig:
         ):
             value = getattr(self, name)
             require(name, value, value >= 0, "a number ≥ 0")
+
+    def check_used(self, *, rounds: bool = False, apart: Collection[str] = ()) -> None:
+        """Reject constants that were changed but that the method does not use.
+
+        Args:
+            rounds: whether the config also sets the counts of rounds with recovery in between.
+            apart: names that are not checked.
+
+        Raises:
+            InputError: the first such constant.
+
+        >>> SimplifyConfig(method="fast", max_energy=0.5).check_used()
+        Traceback (most recent call last):
+        g2ard.errors.InputError: max_energy: has no effect on the method fast, only on paper
+        """
+        for name, methods in _USED_BY.items():
+            value = getattr(self, name)
+            unchanged = value == getattr(type(self), name) or name in apart
+            if self.method in methods or unchanged or (rounds and name in ("retention", "fold")):
+                continue
+            only = " and ".join(methods)
+            raise InputError(f"has no effect on the method {self.method}, only on {only}", parameter=name)
+        if self.keep_times != type(self).keep_times and not self.keep_region:
+            raise InputError("has no effect without regions to keep", parameter="keep_times")
 
     def resolved(self, method: str | None = None, *, antialiased: bool = False) -> SimplifyConfig:
         """Return the config for a method (by default its own), with None replaced by the method's constants.

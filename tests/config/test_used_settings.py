@@ -1,0 +1,223 @@
+"""No setting is silently ignored: it changes the result of every method, or is refused with a reason."""
+
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+
+import g2ard
+from g2ard.config.choices import POLICIES
+from g2ard.config.paths import values_of
+from g2ard.pipeline.presets import configured
+from g2ard.stages.lift import LiftConfig
+from helpers.scenes import around, checkered_ball
+
+VIEWS = around(8, (48, 36))
+
+
+def _uneven(count: int) -> g2ard.Splats:
+    rng = np.random.default_rng(1)
+    ball = checkered_ball(count)
+    scales = ball.scales * np.exp(rng.normal(0, 0.7, (count, 3))).astype(np.float32)
+    return replace(ball, logit_opacities=rng.normal(-1, 3, count).astype(np.float32), scales=scales)
+
+
+SCENE = _uneven(900)
+SMALL = g2ard.simplify(SCENE, count=60, blind=True).splats
+TARGETS = g2ard.TeacherRenders(SCENE, VIEWS)
+
+SIMPLIFY: dict[str, Any] = {
+    "retention": 0.5,
+    "fold": 0.5,
+    "min_opacity": 0.3,
+    "morton_premerge_ratio": 1.5,
+    "morton_premerge_steps": 3,
+    "neighbors": 3,
+    "geometric_weight": 0.0,
+    "dilation": 2.0,
+    "pixel_scale": 20.0,
+    "max_growth": 1.0,
+    "keep_region": ((0, 0, 1, 0.8),),
+    "keep_times": 16.0,
+    "color_bin": 2.0,
+    "max_energy": 0.0,
+    "min_coverage": 2.0,
+    "support": 0.5,
+    "flag_threshold": 1e-6,
+    "flag_members": 1,
+    "protection": 9.0,
+}
+RECOVER: dict[str, Any] = {
+    "sh_degree": 2,
+    "ssim_weight": 0.9,
+    "background": (1.0, 0.5, 0.0),
+    "seed": 1,
+    "schedule.rates.means": 0.5,
+    "schedule.rates.log_scales": 0.5,
+    "schedule.rates.quats": 0.5,
+    "schedule.rates.logit_opacities": 0.5,
+    "schedule.rates.sh0": 0.5,
+    "schedule.rates.shN": 0.5,
+    "schedule.cosine_floor": 0.9,
+    "schedule.appearance_decay": (0.5, 0.5),
+    "schedule.multiplier": 0.1,
+    "schedule.reach": 1e-3,
+    "schedule.finest": 9.0,
+    "schedule.reference_extent": 0.5,
+    "schedule.guarded": False,
+    "steps": 9,
+    "recovery_time": 0.02,
+    "regularizers.anchor": 50.0,
+    "regularizers.shape": 50.0,
+    "regularizers.effective_rank": True,
+    "regularizers.thickness": 50.0,
+    "regularizers.rank_offset": 0.2,
+    "regularizers.period": 2,
+    "regularizers.in_plane": 0.01,
+}
+LIFT: dict[str, Any] = {
+    "neighbors": 5,
+    "spread": 2.0,
+    "normal_ratio": 0.5,
+    "max_anisotropy": 1.5,
+    "opacity": 0.9,
+}
+SELECT: dict[str, Any] = {
+    "cells": 50,
+    "kappa": 1.0,
+    "alpha": 0.1,
+    "offset": 5.0,
+    "anchors": 4,
+    "epsilon": 9.0,
+    "depth_tolerance": 0.5,
+}
+
+
+def _simplified(method: str, **how: Any) -> Callable[[Mapping[str, Any]], object]:
+    def run(settings: Mapping[str, Any]) -> object:
+        return g2ard.simplify(SCENE, count=80, method=method, settings=settings, **how).splats.fingerprint()
+
+    return run
+
+
+def _recovered(settings: Mapping[str, Any]) -> object:
+    return g2ard.recover(SMALL, TARGETS, **settings).splats.fingerprint()
+
+
+def _selected(policy: str) -> Callable[[Mapping[str, Any]], object]:
+    def run(settings: Mapping[str, Any]) -> object:
+        named = {f"select.{name}": value for name, value in settings.items()}
+        chosen_by = {"policy": policy, "views_count": 5}
+        options = configured(g2ard.DistillConfig(), settings={**chosen_by, **named}).select
+        chosen = g2ard.select(SCENE, VIEWS, 5, policy=policy, options=options)
+        return chosen.order.tolist(), chosen.gains.tolist()
+
+    return run
+
+
+def _lifted(settings: Mapping[str, Any]) -> object:
+    colors = np.full((len(SCENE), 3), 0.5)
+    return g2ard.lift(SCENE.means, colors, **settings).fingerprint()
+
+
+RUNS: dict[str, tuple[Callable[[Mapping[str, Any]], object], dict[str, Any]]] = {
+    **{method: (_simplified(method, views=VIEWS), SIMPLIFY) for method in ("default", "fast")},
+    **{f"{method} blind": (_simplified(method, blind=True), SIMPLIFY) for method in ("default", "fast")},
+    "paper": (_simplified("paper"), SIMPLIFY),
+    "recover": (_recovered, RECOVER),
+    **{policy: (_selected(policy), SELECT) for policy in POLICIES},
+    "lift": (_lifted, LIFT),
+}
+BESIDE: dict[str, dict[str, Any]] = {
+    "recover": {"steps": 6, "regularizers.period": 1, "regularizers.shape": 1.0},
+    "recover: recovery_time": {"steps": None},
+    "recover: schedule.guarded": {"steps": 24, "schedule.multiplier": 30.0},
+    "paper: max_energy": {"color_bin": 1.0},
+    "paper: protection": {"flag_threshold": 0.1},
+    "recover: regularizers.rank_offset": {"regularizers.effective_rank": True},
+}
+"""Run, or run and setting → other settings, with which it matters."""
+
+
+@cache
+def _usual(run: str, setting: str) -> object:
+    return RUNS[run][0](_beside(run, setting))
+
+
+def _beside(run: str, setting: str) -> dict[str, Any]:
+    return {**BESIDE.get(run, {}), **BESIDE.get(f"{run}: {setting}", {})}
+
+
+@pytest.mark.parametrize(
+    ("run", "setting"), [(run, name) for run, (_, table) in RUNS.items() for name in table]
+)
+def test_a_setting_changes_the_result_or_is_refused(run: str, setting: str) -> None:
+    function, table = RUNS[run]
+    try:
+        result = function({**_beside(run, setting), setting: table[setting]})
+    except g2ard.InputError as error:
+        result = str(error)
+    if isinstance(result, str) and setting in result:
+        assert re.search("has no effect|needs views", result)
+    else:
+        assert result != _usual(run, setting if f"{run}: {setting}" in BESIDE else "")
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"simplify.max_energy": 0.5}, "simplify.max_energy: has no effect on the method default"),
+        ({"method": "paper", "max_growth": 2.0}, "simplify.max_growth: has no effect on the method paper"),
+        ({"method": "fast", "retention": 0.5}, "simplify.retention: has no effect on the method fast"),
+        ({"kappa": 3.0}, "select.kappa: has no effect on the policy auto"),
+        ({"policy": "coverage"}, "select.policy: has no effect without views_count"),
+        ({"pixel_scale": 2.0}, "simplify.pixel_scale: has no effect with views"),
+    ],
+)
+def test_distill_refuses_settings_without_effect(settings: dict[str, Any], words: str) -> None:
+    with pytest.raises(g2ard.InputError, match=words):
+        g2ard.distill(SCENE, ratio=10, views=VIEWS, steps=1, settings=settings)
+
+
+def test_values_of_a_preset_may_have_no_effect() -> None:
+    configured(g2ard.DistillConfig(), "paper", {"method": "fast", "views_count": None})
+    with pytest.raises(g2ard.InputError, match="has no effect on the method fast"):
+        configured(g2ard.SimplifyConfig(), "paper", {"method": "fast", "fold": 0.5})
+
+
+def test_the_tables_hold_every_setting() -> None:
+    for config, table in (
+        (g2ard.SimplifyConfig(), SIMPLIFY),
+        (g2ard.RecoverConfig(), RECOVER),
+        (g2ard.CoverageOptions(), SELECT),
+        (LiftConfig(), LIFT),
+    ):
+        named = {path.partition(".")[2] for path in values_of(config)}
+        assert named - {
+            "method",
+            "engine",
+            "schedule.steps",
+            "schedule.round_steps",
+            "schedule.means_in_scales",
+        } == set(table)
+
+
+def test_given_weights_of_regularisers_are_used() -> None:
+    weights = g2ard.Regularizers.of("lift")
+    given: dict[str, Any] = {"settings": {"recover.regularizers": weights}, "views": VIEWS, "steps": 2}
+    told: list[str] = []
+    whole = g2ard.distill(SCENE, ratio=10, say=told.append, **given)
+    named = g2ard.distill(SCENE, ratio=10, regularizers="lift", views=VIEWS, steps=2)
+    assert whole.splats.fingerprint() == named.splats.fingerprint()
+    assert "regularisers: as given" in told
+    again = g2ard.recover(SMALL, teacher=SCENE, **given)
+    assert (
+        again.splats.fingerprint()
+        == g2ard.recover(
+            SMALL, teacher=SCENE, views=VIEWS, steps=2, settings={"regularizers": "lift"}
+        ).splats.fingerprint()
+    )
