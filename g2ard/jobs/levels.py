@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -21,6 +21,7 @@ from g2ard.io.reports import Report
 from g2ard.jobs.budget import Budget
 from g2ard.jobs.distill import prepare
 from g2ard.jobs.distill_options import DistillOptions
+from g2ard.jobs.estimate import Estimate, estimate
 from g2ard.jobs.inputs import Views, load_scene, scorable
 from g2ard.jobs.job import DistillJob
 from g2ard.jobs.viewer_frame import up_of
@@ -136,6 +137,56 @@ def lod(
     >>> [len(level) for level in lod(ball, ratios=(1, 4, 8), steps=3, size=48).splats]
     [800, 200, 100]
     """
+    job, sky = prepare_levels(
+        scene,
+        ratios,
+        views=views,
+        photos=photos,
+        steps=steps,
+        size=size,
+        background=background,
+        beside=beside,
+        up=up,
+        render_model=render_model,
+        split_sky=split_sky,
+        seed=seed,
+        progress=progress,
+        say=say,
+    )
+    splats: list[Splats] = []
+    reports: list[LevelReport] = []
+    finer = job.prior
+    for ratio, aim in zip(ratios, job.aims, strict=True):
+        if ratio == 1:
+            splats.append(job.prior)
+            reports.append(LevelReport(len(job.prior), 1.0, level_size(job.views.train.cameras, 1), 0.0))
+            continue
+        say(f"level {len(splats)}: {plural(aim.count, 'Gaussian')}")
+        place = None if work is None else work / f"level-{len(splats)}"
+        level, finer, report = _level(job, finer, aim.count, ratio, recover, place)
+        splats.append(level)
+        reports.append(report)
+    return Levels(tuple(splats), tuple(reports), sky)
+
+
+def prepare_levels(
+    scene: Splats | str | Path,
+    ratios: Sequence[float],
+    *,
+    views: Views | None = None,
+    photos: bool | None = False,
+    steps: int | None = None,
+    size: int | None = None,
+    background: Colour = BLACK,
+    beside: str | Path | None = None,
+    up: Sequence[float] | None = None,
+    render_model: RenderModel | None = None,
+    split_sky: bool = False,
+    seed: int = 0,
+    progress: Progress = silent,
+    say: Say = unsaid,
+) -> tuple[DistillJob, Splats | None]:
+    """Read the scene and decide everything for `lod`, whose arguments these are; return the sky too."""
     check_ratios(ratios)
     check_trained(scene)
     sky = None
@@ -161,20 +212,16 @@ def lod(
         progress=progress,
         say=say,
     )
-    splats: list[Splats] = []
-    reports: list[LevelReport] = []
-    finer = job.prior
-    for ratio, aim in zip(ratios, job.aims, strict=True):
-        if ratio == 1:
-            splats.append(job.prior)
-            reports.append(LevelReport(len(job.prior), 1.0, level_size(job.views.train.cameras, 1), 0.0))
-            continue
-        say(f"level {len(splats)}: {plural(aim.count, 'Gaussian')}")
-        place = None if work is None else work / f"level-{len(splats)}"
-        level, finer, report = _level(job, finer, aim.count, ratio, recover, place)
-        splats.append(level)
-        reports.append(report)
-    return Levels(tuple(splats), tuple(reports), sky)
+    return job, sky
+
+
+def estimate_level(job: DistillJob, count: int, ratio: float, *, recover: bool) -> Estimate:
+    """Estimate time and memory of one level; merging alone takes no recovery."""
+    longest = level_size(job.views.train.cameras, ratio)
+    found = estimate(replace(job, views=job.views.resized(longest), seconds=0.0), count, page=False)
+    if recover:
+        return found
+    return replace(found, steps=0, seconds={**found.seconds, "targets": 0.0, "recover": 0.0})
 
 
 def recovery_settings(steps: int | None, background: Colour, seed: int) -> dict[str, Any]:

@@ -120,6 +120,22 @@ def test_ratios_rise(ratios: tuple[float, ...]) -> None:
         lod(checkered_ball(50), ratios=ratios)
 
 
+def test_a_dry_run_estimates_every_level_and_writes_nothing(tmp_path: Path, command_line) -> None:
+    g2ard.save(tmp_path / "ball.ply", checkered_ball(400))
+    g2ard.save_views(tmp_path / "v.json", around(8, (32, 24)))
+    ask = ("lod", "ball.ply", "-r", "1,4,8", "--views", "v.json", "-o", "lod", "--dry-run")
+    told = succeeds(command_line, tmp_path, *ask, "--steps", "90", "--json", "-")
+    levels = json.loads(told.out)["levels"]
+    assert [(one["level"], one["count"], one["steps"]) for one in levels] == [(1, 100, 90), (2, 50, 90)]
+    lines = [line for line in told.err.splitlines() if "about" in line]
+    assert [line.partition(":")[0] for line in lines] == ["level 1", "level 2", "all levels"]
+    merged = succeeds(command_line, tmp_path, *ask, "--merge-only", "-q").err
+    assert "level 2: 50 Gaussians: about 1 s\n" in merged
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["ball.ply", "v.json"]
+    succeeds(command_line, tmp_path, *ask[:-1], "--merge-only")
+    succeeds(command_line, tmp_path, *ask)  # also beside a finished output
+
+
 def test_the_command(tmp_path: Path, command_line) -> None:
     io.write_splats(tmp_path / "ball.ply", checkered_ball(800))
     given = ("lod", "ball.ply", "-o", "deep/out", "-r", "1,4,8", "--merge-only", "--size", "48")

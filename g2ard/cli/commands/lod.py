@@ -110,6 +110,10 @@ def lod(
     background: opt.BackgroundOption = None,
     up: opt.UpOption = None,
     resume: opt.ResumeOption = False,
+    dry_run: Annotated[
+        bool,
+        typer.Option("--dry-run", help="Estimate time and memory, then exit."),
+    ] = False,
 ) -> None:
     """Write levels of detail as streamed SOG or 3D Tiles.
 
@@ -141,37 +145,67 @@ def lod(
     writer = _Writer(run, scene, output, kind, rule, spot, up, views, colour)
     run.spare_inputs(writer.meta)
     stopped = output.with_name(f".{output.name}.unfinished")
-    finished = is_finished(run, stopped, resume, writer.meta)
-    if finished:
+    finished = not dry_run and is_finished(run, stopped, resume, writer.meta)
+    if dry_run:
+        if tiled:
+            raise typer.BadParameter("--dry-run is for scenes that fit into memory")
+    elif finished:
         _check_same(writer.meta, ratios)
     else:
         check_output(output, run.overwrite, folder=True)
-    if finished or not tiled:
+    if finished or not (tiled or dry_run):
         check_stopped(run, stopped, resume, writer.meta)
     if tiled:
         _in_tiles(writer, scene, ratios, tiling, views, steps, size, colour, recover)
         return
     check_whole_memory(scene, tiling, LEVELS_TIMES, RECOVERY_TIMES)
+    choices: dict[str, Any] = {
+        "views": views,
+        "steps": steps,
+        "size": size,
+        "background": colour,
+        "up": up,
+        "render_model": run.render_model,
+        "split_sky": environment,
+        "seed": run.seed,
+        "progress": run.progress,
+        "say": run.say,
+    }
+    if dry_run:
+        _tell_estimates(run, scene, ratios, recover, choices)
+        return
     with stoppable(run, stopped, resume, writer.meta):
         stopped.mkdir(parents=True, exist_ok=True)
-        levels = levels_of(
-            scene,
-            ratios=ratios,
-            recover=recover,
-            views=views,
-            steps=steps,
-            size=size,
-            background=colour,
-            up=up,
-            render_model=run.render_model,
-            split_sky=environment,
-            seed=run.seed,
-            work=stopped,
-            progress=run.progress,
-            say=run.say,
-        )
+        levels = levels_of(scene, ratios=ratios, recover=recover, work=stopped, **choices)
         written = writer.save(levels.splats, sky=levels.sky)
     _tell(run, output, levels, written)
+
+
+def _tell_estimates(
+    run: Run, scene: Path, ratios: Sequence[float], recover: bool, choices: dict[str, Any]
+) -> None:
+    """Print the estimated time and memory of each level and of all."""
+    from dataclasses import asdict
+
+    from g2ard.jobs.levels import estimate_level, prepare_levels
+
+    job, _ = prepare_levels(scene, ratios, **choices)
+    told, seconds = [], job.seconds
+    for number, (ratio, aim) in enumerate(zip(ratios, job.aims, strict=True)):
+        if ratio == 1:
+            continue
+        run.begin("estimate")
+        one = estimate_level(job, aim.count, ratio, recover=recover)
+        seconds += one.total
+        steps = f", {plural(one.steps, 'step')}" if recover else ""
+        count = plural(aim.count, "Gaussian")
+        run.answer(f"level {number}: {count}{steps}: about {max(1, one.total):.0f} s")
+        told.append({"level": number, "count": aim.count, **asdict(one), "total_seconds": one.total})
+    most = max((one["bytes"] for one in told), default=0)
+    run.answer(f"all levels: about {max(1, seconds):.0f} s and {most / 1e6:,.0f} MB")
+    to_file = run.json not in (None, "-")
+    run.say(f"dry run: only {run.json} is written" if to_file else "dry run: nothing is written")
+    run.result({"levels": told, "total": {"seconds": seconds, "bytes": most}})
 
 
 def _in_tiles(
