@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from g2ard.io import kind, read_cloud, read_scene, read_view_set
 from g2ard.io.detect import file_format, run_scene
 from g2ard.io.images import colour_text, photo_traits
 from g2ard.io.sog import chunks_of
+from g2ard.io.splits import splits_of
 from g2ard.io.types import Note, Points, ViewSet
 from g2ard.progress import plural
 from g2ard.scene.cameras import Cameras
@@ -39,6 +41,7 @@ def describe(path: str | Path) -> dict[str, Any]:
         notes, figures = cloud.notes, _points(cloud.points)
     else:
         views = read_view_set(path)
+        views = replace(views, splits=splits_of(path, views.cameras.names, views.splits))
         notes, figures = (*views.notes, *_photo_notes(views.cameras)), _views(views)
     return {
         "path": str(path),

@@ -99,6 +99,7 @@ def _of_file(path: Path, modified: int, size: int) -> Format:
     """Return the format of a file, looked into once until it is modified or has another size."""
     suffix = path.suffix.lower()
     if found := _BY_NAME.get(path.name.lower()) or _BY_SUFFIX.get(suffix):
+        _check_content(path, suffix)
         return found
     if suffix == ".ply":
         return _ply_format(path)
@@ -111,6 +112,20 @@ def _of_file(path: Path, modified: int, size: int) -> Format:
         "clouds: .ply .las .laz; views: a COLMAP folder, a .json, or a training run)",
         path=path,
     )
+
+
+def _check_content(path: Path, suffix: str) -> None:
+    """Reject a file of another format than its name says, if its first bytes tell."""
+    with path.open("rb") as file:
+        held = _BY_CONTENT.get(file.read(4))
+    if held is not None and suffix in (".sog", ".spz", ".glb", ".splat", ".ksplat") and held != suffix:
+        raise InputError(
+            f"is a {held} file in spite of its name", path=path, hint=f"rename it to {path.stem}{held}"
+        )
+
+
+_BY_CONTENT = {b"ply\n": ".ply", b"ply\r": ".ply", b"PK\x03\x04": ".sog", b"glTF": ".glb", b"NGSP": ".spz"}
+"""First bytes of formats → their suffix."""
 
 
 def run_scene(path: str | Path) -> Path:

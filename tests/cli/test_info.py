@@ -1,6 +1,7 @@
 """`g2ard info`: its figures, and one line for every file that it cannot read."""
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,8 @@ from g2ard.io.describe import describe
 from g2ard.io.types import Points
 from g2ard.scene.cameras import Cameras, look_at
 from g2ard.scene.splats import Splats
-from helpers.commands import CommandLine, succeeds
+from helpers.commands import CommandLine, refused, succeeds
+from helpers.photos import BALL, photos_of
 from helpers.realdata import real
 
 
@@ -51,6 +53,22 @@ def test_cloud(tmp_path: Path) -> None:
     assert (found["kind"], found["count"]) == ("points", 50)
     np.testing.assert_array_equal(found["extent"]["max"], positions.max(0))
     np.testing.assert_allclose(found["color"]["mean"], [0.2] * 3, atol=1e-6)
+
+
+def test_a_scene_in_a_file_of_another_format_is_named(tmp_path: Path, command_line: CommandLine) -> None:
+    scene(tmp_path / "a.ply")
+    (tmp_path / "a.ply").rename(tmp_path / "a.sog")
+    error = refused(command_line, tmp_path, "info", "a.sog", status=1)
+    assert error == "g2ard: a.sog: is a .ply file in spite of its name; rename it to a.ply\n"
+
+
+def test_photos_show_their_split_and_points(tmp_path: Path, command_line: CommandLine) -> None:
+    photos_of(tmp_path / "photos", points=True, count=9)
+    found = json.loads(succeeds(command_line, tmp_path, "info", "photos", "--json", "-").out)
+    assert (found["splits"], found["sparse_points"]) == ({"test": 2, "train": 7}, len(BALL))
+    shown = succeeds(command_line, tmp_path, "info", "photos").out
+    for row in (f"sparse points +│ {len(BALL):,}", "test +│ 2", "train +│ 7"):
+        assert re.search(row, shown)
 
 
 def test_views(tmp_path: Path) -> None:

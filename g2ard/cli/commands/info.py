@@ -66,6 +66,11 @@ def _described(path: Path) -> tuple[dict[str, Any], list[list[str]]]:
     scene = run_scene(path)
     if scene == path:
         figures = describe(path)
+        if figures["kind"] == "views":
+            from g2ard.jobs.photos import sparse_file, sparse_points
+
+            points = sparse_points(sparse_file(path))
+            figures["sparse_points"] = 0 if points is None else len(points)
         return figures, _rows(figures)
     figures, report = describe(scene), read_json(path / "report.json")
     against, scores = _scores(report)
@@ -149,6 +154,8 @@ def _rows(figures: dict[str, Any]) -> list[list[str]]:
     if "color" in figures:
         rows.append(["mean colour", _vector(figures["color"]["mean"])])
     rows += [[key, f"{figures[key]:,}"] for key in ("photos", "distorted") if key in figures]
+    if "sparse_points" in figures:
+        rows.append(["sparse points", f"{figures['sparse_points']:,}"])
     for key in ("sizes", "splits", "odd"):
         rows += [[name.replace("_", " "), f"{count:,}"] for name, count in figures.get(key, {}).items()]
     return rows + [["note", note["text"]] for note in figures["notes"]]
