@@ -262,7 +262,7 @@ def _regularizers(
     if read.from_photos and kind == "auto" and not paper:
         return (
             FREE,
-            "none (points found in photos are rough guesses, which recovery may move freely)",
+            "none (recovery moves points from photos freely, because they are rough)",
             measure_prior(prior),
         )
     if read.lifted and kind == "paper":
