@@ -1,0 +1,186 @@
+"""One job, four ways: flags, a config file, --set and Python give the same bits."""
+
+import itertools
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+import g2ard
+from helpers.commands import CommandLine, succeeds
+from helpers.photos import cloud_of
+from helpers.scenes import around, checkered_ball
+
+BALL, VIEWS = checkered_ball(400), around(16, (48, 36))
+Values = Mapping[str, Any]
+
+COLOUR = st.sampled_from([(1.0, 1.0, 1.0), (0.25, 0.5, 0.0)])
+REGION = st.sampled_from([((0.0, 0.0, 1.0, 0.8),)])
+RECOVERY = {
+    "steps": st.integers(2, 4),
+    "background": COLOUR,
+    "seed": st.integers(1, 3),
+    "schedule": st.sampled_from(["fast", "best", "paper"]),
+}
+FIELDS: dict[str, tuple[str, dict[str, st.SearchStrategy[Any]], set[str]]] = {
+    "simplify": (
+        "simplify ball.ply -r 8 --views views.json",
+        {"method": st.sampled_from(["default", "fast"]), "keep_region": REGION},
+        {"method", "keep_region"},
+    ),
+    "distill": (
+        "distill ball.ply -r 8 --views views.json --size 32 --no-view",
+        {**RECOVERY, "method": st.sampled_from(["fast", "paper"])},
+        {*RECOVERY, "method"},
+    ),
+    "recover": (
+        "recover small.ply --views views.json --teacher ball.ply",
+        {**RECOVERY, "sh_degree": st.integers(0, 3)},
+        {*RECOVERY, "sh_degree"},
+    ),
+    "adapt": (
+        "adapt small.ply --views views.json --teacher ball.ply --split all",
+        {
+            "steps": st.integers(2, 4),
+            "background": COLOUR,
+            "seed": st.integers(1, 3),
+            "tolerance": st.just(0.5),
+            "prior_views": st.sampled_from([0.0, 4.0]),
+            "sh_degree": st.integers(0, 3),
+        },
+        {"steps", "background", "seed", "tolerance", "prior_views", "sh_degree"},
+    ),
+    "lift": (
+        "lift cloud.ply",
+        {
+            "neighbors": st.integers(4, 12),
+            "spread": st.sampled_from([0.5, 2.0]),
+            "normal_ratio": st.sampled_from([0.05, 0.2]),
+            "max_anisotropy": st.sampled_from([1.5, 8.0]),
+            "opacity": st.sampled_from([0.25, 0.75]),
+        },
+        set(),
+    ),
+    "lod": (
+        "lod ball.ply -r 2,4 --views views.json",
+        {
+            "steps": st.integers(2, 4),
+            "background": COLOUR,
+            "seed": st.integers(1, 3),
+            "size": st.sampled_from([24, 32]),
+        },
+        set(),
+    ),
+}
+"""Command → its words, the values of its options, and those options that are settings too."""
+NEEDED: dict[str, dict[str, Any]] = {command: {"steps": 3} for command in ("distill", "recover", "adapt")} | {
+    "lod": {"steps": 3, "size": 32}
+}
+"""Values that every drawn job has, unless it has others."""
+
+
+def _text(value: object, between: str = ",") -> str:
+    """Write a value as a user types it."""
+    if isinstance(value, tuple) and isinstance(value[0], tuple):
+        return ";".join(map(_text, value))
+    return between.join(map(str, value)) if isinstance(value, tuple) else str(value)
+
+
+def _flags(values: Values) -> list[str]:
+    words = []
+    for name, value in values.items():
+        words += [f"--{name.replace('_', '-')}", _text(value)]
+    return words
+
+
+def _config(command: str, values: Values) -> str:
+    """Write a config file; a number stays a number."""
+    lines = [f"[{command}]"]
+    for name, value in values.items():
+        lines.append(f"{name} = {value if isinstance(value, int | float) else repr(_text(value))}")
+    return "\n".join(lines) + "\n"
+
+
+def _python(command: str, values: dict[str, Any], folder: Path) -> bytes:
+    small = g2ard.load(folder / "small.ply")
+    if command == "lod":
+        levels = g2ard.lod(folder / "ball.ply", ratios=(2, 4), views=folder / "views.json", **values)
+        g2ard.save_levels(folder / "python", levels.splats, overwrite=True)
+        return _bytes(folder / "python")
+    if command == "simplify":
+        made = g2ard.simplify(folder / "ball.ply", ratio=8, views=folder / "views.json", **values).splats
+    elif command == "distill":
+        made = g2ard.distill(
+            folder / "ball.ply", ratio=8, views=folder / "views.json", size=32, **values
+        ).splats
+    elif command == "recover":
+        made = g2ard.recover(
+            folder / "small.ply", views=folder / "views.json", teacher=folder / "ball.ply", **values
+        ).splats
+    elif command == "adapt":
+        background = values.get("background", (0.0, 0.0, 0.0))
+        targets = g2ard.TeacherRenders(g2ard.load(folder / "ball.ply"), VIEWS, background=background)
+        made = g2ard.adapt(small, targets, replace(g2ard.AdaptConfig.scheduled("default"), **values)).splats
+    else:
+        points = g2ard.load_points(folder / "cloud.ply")
+        made = g2ard.lift(points.positions, points.colors, **values)
+    g2ard.save(folder / "python.ply", made, overwrite=True)
+    return (folder / "python.ply").read_bytes()
+
+
+def _bytes(output: Path) -> bytes:
+    """Return a scene's file, or all files of levels except for their page."""
+    if output.is_file():
+        return output.read_bytes()
+    if (output / "scene.ply").is_file():
+        return (output / "scene.ply").read_bytes()
+    files = (path for path in sorted(output.rglob("*")) if path.is_file())
+    kept = [path for path in files if path.suffix in (".webp", ".json") and path.parent != output]
+    assert kept
+    return b"".join(path.read_bytes() for path in kept)
+
+
+@pytest.fixture(scope="module")
+def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("inputs")
+    g2ard.save(folder / "ball.ply", BALL)
+    g2ard.save(folder / "small.ply", g2ard.simplify(BALL, count=50, blind=True).splats)
+    g2ard.save_views(folder / "views.json", VIEWS)
+    cloud_of(folder / "cloud.ply", BALL)
+    return folder
+
+
+@pytest.mark.parametrize("command", FIELDS)
+def test_the_ways_agree(command: str, inputs: Path, command_line: CommandLine) -> None:
+    words, fields, in_settings = FIELDS[command]
+    number = itertools.count()
+
+    def run(*more: str) -> bytes:
+        name = f"{command}{next(number)}"
+        output = name if command in ("distill", "lod") else f"{name}.ply"
+        succeeds(command_line, inputs, *words.split(), *more, "-o", output, "-q")
+        return _bytes(inputs / output)
+
+    @settings(
+        max_examples=2 if command in ("distill", "lod") else 6,
+        deadline=None,
+        derandomize=True,
+        suppress_health_check=list(HealthCheck),
+        database=None,
+    )
+    @given(st.fixed_dictionaries({}, optional=fields))
+    def agree(drawn: dict[str, Any]) -> None:
+        values = {**NEEDED.get(command, {}), **drawn}
+        expected = _python(command, values, inputs)
+        assert run(*_flags(values)) == expected
+        (inputs / "c.toml").write_text(_config(command, values))
+        assert run("--config", "c.toml") == expected
+        named = [word for n in values if n in in_settings for word in ("--set", f"{n}={_text(values[n])}")]
+        others = {name: value for name, value in values.items() if name not in in_settings}
+        assert run(*named, *_flags(others)) == expected
+
+    agree()
