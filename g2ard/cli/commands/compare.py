@@ -55,6 +55,8 @@ def compare(
         run.spare_inputs(output)
     reference, other = (run.load(path) for path in paths)
     colour = opt.background_of(run, background, first, second) or BLACK
+    page = [] if output is None else [("page", 2.0)]
+    run.console.expect([("poses", 1.0), ("teacher", 2.0), ("evaluate", 3.0), *page])
     found = views_or_pool(
         reference,
         opt.with_images(views, images),

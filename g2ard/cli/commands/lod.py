@@ -176,6 +176,7 @@ def lod(
         return
     with stoppable(run, stopped, resume, writer.meta):
         stopped.mkdir(parents=True, exist_ok=True)
+    run.console.expect(_expected(ratios, recover, steps))
         levels = levels_of(scene, ratios=ratios, recover=recover, work=stopped, **choices)
         written = writer.save(levels.splats, sky=levels.sky)
     _tell(run, output, levels, written)
@@ -183,6 +184,20 @@ def lod(
 
 def _tell_estimates(
     run: Run, scene: Path, ratios: Sequence[float], recover: bool, choices: dict[str, Any]
+def _expected(ratios: Sequence[float], recover: bool, steps: int | None) -> list[tuple[str, float]]:
+    """Return the stages to come with rough relative times, seconds for playbot; views shrink by √√ratio."""
+    stages = [("poses", 1.0)]
+    for ratio in ratios:
+        share = ratio**-0.5
+        if ratio > 1:
+            recovery = (
+                [("teacher", 4 * share), ("recover", 0.02 * (steps or 1000) * share)] if recover else []
+            )
+            stages += [*recovery[:1], ("visibility", 1.5 * share), ("simplify", 1.2), *recovery[1:]]
+            stages.append(("evaluate", share))
+    return [*stages, ("write", 3.0), ("the page", 1.0)]
+
+
 ) -> None:
     """Print the estimated time and memory of each level and of all."""
     from dataclasses import asdict

@@ -92,6 +92,8 @@ def simplify(
     run.begin("read")
     found = io.read_scene(scene, render_model=run.render_model)
     say_notes(scene, found.notes, run.say)
+    seen = [("read", 0.2), ("poses", 1.0), ("visibility", 2.0)]  # seconds for playbot
+    run.console.expect([*seen, *[("simplify", 1.2), ("visibility", 0.5), ("write", 0.1)] * len(budgets)])
     splats, total = found.splats, len(found.splats)
     outputs.check(lambda path, _: io.check_scene_output(path, run.overwrite), total)
     started = time.perf_counter()
