@@ -124,6 +124,7 @@ class Run:
         self.json: str | None = common["json"]
         self.console = Console(quiet=common["quiet"], name=name)
         self.render_model: RenderModel | None = common.get("render_model")
+        self.typed: frozenset[str] = frozenset()  # options given on the command line
         self.noted = False  # whether a GPU failed
         self._adapter: str | None = None  # last adapter in use
         self.kept: list[str] = []  # outputs and checkpoints that remain, for messages of errors and Ctrl-C
@@ -172,6 +173,12 @@ class Run:
             yield
         except InputError as error:
             raise typer.BadParameter(in_flags(error, self.flags)) from None
+
+    def refuse_typed(self, reason: str, *names: str) -> None:
+        """Raise a usage error if an option without effect is on the command line; the reason ends it."""
+        for name in names:
+            if name in self.typed:
+                raise typer.BadParameter(f"{self.flags.get(name, name)} has no effect {reason}; remove it")
 
     @contextmanager
     def finishing(self, what: str) -> Iterator[None]:
@@ -385,6 +392,7 @@ def command(
                 shared_values["set"] = typed_last
             printing = shared_values.pop("print_config")
             run = Run(name, shared_values, dict(values), flags_of(ctx.command))
+            run.typed = frozenset(name for name in values if typed(ctx, name))
             if printing:
                 if settings and run.config["set"]:
                     _check_settings(run, settings)

@@ -61,6 +61,8 @@ def adapt(
     from g2ard.pipeline.adapt import AdaptConfig
     from g2ard.pipeline.adapt import adapt as refit
 
+    if teacher is not None:
+        run.refuse_typed("with --teacher, whose renders are the targets", "images", "alpha")
     schedule = schedule or PRESETS[preset or "auto"].get("adapt.schedule", "default")
     if schedule == "paper" and prior_views:
         raise typer.BadParameter("--prior-views and the paper's schedule exclude each other; give one")

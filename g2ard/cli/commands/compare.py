@@ -9,7 +9,7 @@ import typer
 
 from g2ard.cli import options as opt
 from g2ard.cli.frame import Run, command
-from g2ard.config.choices import BLACK
+from g2ard.config.choices import BLACK, is_made
 from g2ard.io.detect import run_scene
 from g2ard.io.paths import short_names
 from g2ard.progress import plural
@@ -49,14 +49,16 @@ def compare(
     from g2ard.stages.evaluate import evaluate
     from g2ard.viewer import check_page_output, write_page
 
+    if views is not None and not is_made(views):
+        run.refuse_typed("on given views", "count")
     paths = run_scene(first), run_scene(second)
     if output is not None:
         check_page_output(output, run.overwrite)
         run.spare_inputs(output)
-    reference, other = (run.load(path) for path in paths)
-    colour = opt.background_of(run, background, first, second) or BLACK
     page = [] if output is None else [("page", 2.0)]
     run.console.expect([("poses", 1.0), ("teacher", 2.0), ("evaluate", 3.0), *page])
+    reference, other = (run.load(path) for path in paths)
+    colour = opt.background_of(run, background, first, second) or BLACK
     found = views_or_pool(
         reference,
         opt.with_images(views, images),

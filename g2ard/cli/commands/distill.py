@@ -133,6 +133,10 @@ def distill(
     budgets = budgets_of(run)
     given = views is not None and not is_made(views)
     _check_options(scene, views, held_out, photos)
+    if given:
+        run.refuse_typed("on given views", "views_format")
+    if scene is None or photos:
+        run.refuse_typed("without generated views", "up")
     opt.choose_engine(run, settings, "recover.engine")
     outputs = Outputs(run, output, budgets)
 

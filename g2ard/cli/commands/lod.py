@@ -129,6 +129,8 @@ def lod(
     from g2ard.levels import Cut
 
     check_trained(scene)
+    if not recover:
+        run.refuse_typed("with --merge-only", "steps")
     with run.usage():
         check_ratios(ratios)
         rule = Cut(most * 1024, extent, least * 1024)
@@ -174,16 +176,14 @@ def lod(
     if dry_run:
         _tell_estimates(run, scene, ratios, recover, choices)
         return
+    run.console.expect(_expected(ratios, recover, steps))
     with stoppable(run, stopped, resume, writer.meta):
         stopped.mkdir(parents=True, exist_ok=True)
-    run.console.expect(_expected(ratios, recover, steps))
         levels = levels_of(scene, ratios=ratios, recover=recover, work=stopped, **choices)
         written = writer.save(levels.splats, sky=levels.sky)
     _tell(run, output, levels, written)
 
 
-def _tell_estimates(
-    run: Run, scene: Path, ratios: Sequence[float], recover: bool, choices: dict[str, Any]
 def _expected(ratios: Sequence[float], recover: bool, steps: int | None) -> list[tuple[str, float]]:
     """Return the stages to come with rough relative times, seconds for playbot; views shrink by √√ratio."""
     stages = [("poses", 1.0)]
@@ -198,6 +198,8 @@ def _expected(ratios: Sequence[float], recover: bool, steps: int | None) -> list
     return [*stages, ("write", 3.0), ("the page", 1.0)]
 
 
+def _tell_estimates(
+    run: Run, scene: Path, ratios: Sequence[float], recover: bool, choices: dict[str, Any]
 ) -> None:
     """Print the estimated time and memory of each level and of all."""
     from dataclasses import asdict

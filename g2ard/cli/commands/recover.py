@@ -63,6 +63,8 @@ def recover(
     from g2ard.jobs.teaching import check_teacher
     from g2ard.stages.recover import RecoverConfig
 
+    if teacher is not None and not photos:
+        run.refuse_typed("with --teacher, unless --photos is given", "alpha")
     background = opt.background_of(run, background, student)
     names = ("schedule", "steps", "recovery_time", "sh_degree", "engine", "background", "seed")
     settings = run.settings(RecoverConfig(), *names, preset=preset)

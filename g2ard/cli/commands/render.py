@@ -90,6 +90,12 @@ def render(
         raise typer.BadParameter("--orbit generates its views, so it excludes --views and -n")
     output, animation = _folder_or_animation(run, output, depth)
     looks = _looks(color, count, ratio, parents, views)
+    if views is not None and not is_made(views):
+        run.refuse_typed("without generated views", "up")
+    if animation is None:
+        run.refuse_typed("without an animation", "fps")
+    if color != "parents" or parents is not None:
+        run.refuse_typed("without --color parents and -n or -r", "method")
     views = opt.with_images(views, images)
     if sheet is not None:
         check_output(sheet, run.overwrite)

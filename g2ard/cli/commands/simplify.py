@@ -15,6 +15,7 @@ from g2ard.cli.frame import Run, command
 from g2ard.cli.outputs import Outputs, budgets_of
 from g2ard.cli.run_result import say_weight, tell_quality
 from g2ard.cli.tiling import tiling_of
+from g2ard.config.choices import is_made
 from g2ard.config.paths import listed
 from g2ard.io.atomic import atomic_output
 from g2ard.io.scene_formats import written_bytes
@@ -76,6 +77,9 @@ def simplify(
         raise typer.BadParameter("--views and --no-views exclude each other; give one")
     if keep_region and no_views:
         raise typer.BadParameter("--keep-region needs views; remove --no-views")
+    given_views = views is not None and not is_made(views)
+    if given_views or no_views or config.method == "paper" or (config.method == "fast" and views is None):
+        run.refuse_typed("without generated views", "up")
     tiling = tiling_of(run, scene, output)
     outputs = Outputs(run, output, budgets)
     outputs.check(lambda path, _: io.check_scene_output(path, run.overwrite))
@@ -88,12 +92,12 @@ def simplify(
     maps = None if parents is None else Outputs(run, parents, budgets, name="--parents")
     if maps is not None:
         maps.check(lambda path, _: run.check_extra("--parents", path, parents))
+    seen = [("read", 0.2), ("poses", 1.0), ("visibility", 2.0)]  # seconds for playbot
+    run.console.expect([*seen, *[("simplify", 1.2), ("visibility", 0.5), ("write", 0.1)] * len(budgets)])
     began = time.perf_counter()
     run.begin("read")
     found = io.read_scene(scene, render_model=run.render_model)
     say_notes(scene, found.notes, run.say)
-    seen = [("read", 0.2), ("poses", 1.0), ("visibility", 2.0)]  # seconds for playbot
-    run.console.expect([*seen, *[("simplify", 1.2), ("visibility", 0.5), ("write", 0.1)] * len(budgets)])
     splats, total = found.splats, len(found.splats)
     outputs.check(lambda path, _: io.check_scene_output(path, run.overwrite), total)
     started = time.perf_counter()
