@@ -57,6 +57,7 @@ def test_every_parameter_is_explained_where_it_stands() -> None:
         told = dict(re.findall(r"(?m)^    ([\w, ]+): (.*)$", text))
         explained = {one for names in told for one in names.split(", ")}
         assert {*inspect.signature(function).parameters} <= explained | {"options"}, name
+        assert ">>>" in (function.__doc__ or "") or name == "distill_against", name
         referred = [one for one, words in told.items() if words.startswith(("see ", "as for "))]
         assert set(referred) <= {"config"}, name  # a dataclass with a page entry of its own
 

@@ -28,6 +28,16 @@ def read_points(path: str | Path) -> Points:
     Raises:
         InputError: the file is missing, damaged, has no colours, or no finite point.
         MissingDependencyError: .las or .laz without `pip install g2ard[las]`.
+
+    >>> import tempfile, g2ard
+    >>> path = Path(tempfile.mkdtemp()) / "cloud.ply"
+    >>> vertices = "property float x\\nproperty float y\\nproperty float z\\n"
+    >>> colours = "property uchar red\\nproperty uchar green\\nproperty uchar blue\\nend_header\\n"
+    >>> header = "ply\\nformat ascii 1.0\\nelement vertex 1\\n" + vertices + colours
+    >>> _ = path.write_text(header + "1 2 3 255 0 51\\n")
+    >>> points = g2ard.load_points(path)
+    >>> points.positions.tolist(), points.colors.round(2).tolist()[0][:2]
+    ([[1.0, 2.0, 3.0]], [1.0, 0.0])
     """
     return read_cloud(path).points
 

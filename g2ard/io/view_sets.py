@@ -46,6 +46,13 @@ def read_views(path: str | Path, *, images: str | Path | None = None, split: str
 
     Raises:
         InputError: the file is missing or damaged, or has no views in the split.
+
+    >>> import tempfile, g2ard
+    >>> path = Path(tempfile.mkdtemp()) / "views.json"
+    >>> around = [g2ard.Camera.facing([4, y, 0], [0, 0, 0], name=f"view_{y}") for y in range(8)]
+    >>> g2ard.save_views(path, g2ard.Cameras.of(around))
+    >>> g2ard.load_views(path), g2ard.load_views(path, split="test").names
+    (Cameras(8 views), ('view_0',))
     """
     return read_view_set(path, images=images, split=split).cameras
 
@@ -118,6 +125,12 @@ def write_views(
     Raises:
         OutputError: the file exists, cannot be written, or is not a .json.
         InputError: there are no views, or `splits` or `weights` have another length.
+
+    >>> import tempfile, g2ard
+    >>> folder = Path(tempfile.mkdtemp())
+    >>> views = g2ard.Cameras.of([g2ard.Camera.facing([0, -3, 0], [0, 0, 0], name="front")])
+    >>> g2ard.save_views(folder / "views.json", views, splits=["train"])
+    >>> g2ard.save_views(folder / "transforms.json", views, splits=["train"])  # for nerfstudio
     """
     from g2ard.io import camera_files, views
 

@@ -14,6 +14,7 @@ from g2ard.jobs.viewer_frame import frame_of
 from g2ard.levels.tileset import TILE_OF_SCENE
 from g2ard.levels.tree import Level
 from g2ard.progress import Progress, silent
+from g2ard.scene.samples import evenly_spaced
 from g2ard.viewer import Start, write_globe_page, write_stream_page
 
 _ROWS = 500_000
@@ -41,7 +42,7 @@ def write_level_page(
             `beside`, or else the folder.
     """
     coarse = levels[-1]
-    few = coarse.take(np.linspace(0, len(coarse) - 1, min(len(coarse), _ROWS)).astype(np.int64))
+    few = coarse.take(np.array(evenly_spaced(len(coarse), _ROWS, floor=True)))
     frame = frame_of(few, views, beside=beside, up=up, seed=seed, progress=progress)
     page, title, offset = folder / "index.html", Path(beside or folder).resolve().name, np.asarray(few.offset)
     if kind == "sog":

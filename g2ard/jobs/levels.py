@@ -32,6 +32,7 @@ from g2ard.pipeline.distill import distill as pipeline
 from g2ard.progress import Progress, Say, plural, silent, unsaid
 from g2ard.rendering.visibility import visibility_source
 from g2ard.scene.cameras import Cameras
+from g2ard.scene.samples import evenly_spaced
 from g2ard.scene.sky import sky_mask
 from g2ard.scene.splats import Splats
 from g2ard.stages.evaluate import evaluate
@@ -326,6 +327,14 @@ def save_tileset(
         InputError: no levels, a level that is empty or not finite, different offsets, or an unknown map
             system.
         OutputError: the folder exists and may not be replaced, or cannot be written.
+
+    >>> import tempfile
+    >>> grid = np.stack(np.meshgrid(range(8), range(8), [0]), -1).reshape(-1, 3)
+    >>> fine = Splats.create(grid, scales=np.ones((64, 3)))
+    >>> folder = Path(tempfile.mkdtemp()) / "tiles"
+    >>> size = save_tileset(folder, [fine, fine.take(range(0, 64, 4))], up=(0, 0, 1))
+    >>> sorted(path.suffix for path in folder.iterdir() if path.suffix == ".json")
+    ['.json']
     """
     if isinstance(place, str):
         place = Georeference.of_map(map_system(place), levels[0].offset)
@@ -350,7 +359,7 @@ def tileset_up(
     if up is None and coarse.offset.any():
         axis = np.array([0.0, 0, 1])
     else:
-        rows = np.linspace(0, len(coarse) - 1, min(len(coarse), _UP_SAMPLE)).astype(np.int64)
+        rows = np.array(evenly_spaced(len(coarse), _UP_SAMPLE, floor=True))
         axis = up_of(coarse.take(rows), up)
     rounded = ", ".join(f"{round(value, 3) + 0.0:g}" for value in axis)
     say(f"up is {rounded}" + ("" if up else "; --up X,Y,Z changes it"))

@@ -66,7 +66,15 @@ def save_levels(
 
     Raises:
         InputError: no levels, a level that is empty or not finite, or different offsets.
-        OutputError: see `atomic_folder`.
+        OutputError: the folder exists and may not be replaced, or cannot be written.
+
+    >>> import tempfile
+    >>> grid = np.stack(np.meshgrid(range(8), range(8), [0]), -1).reshape(-1, 3)
+    >>> fine = Splats.create(grid, scales=np.ones((64, 3)))
+    >>> folder = Path(tempfile.mkdtemp()) / "streamed"
+    >>> size = save_levels(folder, [fine, fine.take(range(0, 64, 4))])
+    >>> (folder / "lod-meta.json").is_file()
+    True
     """
     rule, path = cut or Cut(), Path(path)
     tree = cut_tree(levels, rule, work)

@@ -244,6 +244,15 @@ def adapt(
     Raises:
         InputError: no Gaussians, no views, or checkpoints of another run.
         KeyboardInterrupt: after Ctrl-C, when the checkpoint is written.
+
+    >>> import g2ard
+    >>> rng = np.random.default_rng(0)
+    >>> scene = Splats.create(rng.normal(size=(300, 3)), scales=np.full((300, 3), 0.2))
+    >>> views = g2ard.make_pool(scene, 4, size=(64, 48))
+    >>> dark = [g2ard.render(scene, view).image.clip(0, 1) / 2 for view in views]
+    >>> darker = adapt(scene, g2ard.Photos(views, dark), AdaptConfig(steps=20))
+    >>> darker.report.psnr.after > darker.report.psnr.before
+    True
     """
     config, targets = config or AdaptConfig(), checked_targets(targets)
     given = compact if config.sh_degree is None else compact.with_sh_degree(config.sh_degree)
