@@ -109,5 +109,6 @@ def compare(
                 background=colour,
                 overwrite=run.overwrite,
             )
+        run.kept.append(f"{output} is written")
         run.say(f"{output}: opens at {stand.name}; the arrows below lead to the worst views")
     run.result({**scores.as_dict(), "output": None if output is None else str(output)})

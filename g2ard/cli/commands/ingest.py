@@ -66,6 +66,7 @@ def ingest(
         say=run.say,
     )
     seconds = time.perf_counter() - began
+    run.kept.append(f"{output} is written")
     for note in store.notes:
         run.say(f"{scenes[0]}: {note}")
     halo = sum(tile.halo for tile in store.tiles)

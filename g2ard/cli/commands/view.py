@@ -69,6 +69,7 @@ def view(
         background=opt.background_of(run, background, scene, other) or BLACK,
         overwrite=run.overwrite,
     )
+    run.kept.append(f"{output} is written")
     sizes = " and ".join(f"{size / 1e6:.2f}" for size in written.scenes)
     run.say(f"{output}: {' | '.join(labels)}; {sizes} MB as SOG, {written.bytes / 1e6:.2f} MB in all")
     run.result(
