@@ -120,6 +120,8 @@ def register(
     settings = run.settings(RegisterConfig(), "size", "matcher", "refine", "passes", "accept")
     with run.usage():
         config, keep = configured(RegisterConfig(), settings, protocol, keep)
+    if config.matcher == "direct":
+        run.refuse_typed("with --matcher direct, which matches no features", "refine", "passes")
     run.config |= {"keep": keep}
     if metres_per_unit is not None and truth is None:
         raise typer.BadParameter("--metres-per-unit goes with --truth")
