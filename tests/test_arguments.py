@@ -100,6 +100,17 @@ def test_invalid_arguments_are_named(name: str, wrong: dict[str, Any], parameter
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize("white", [[1, 1, 1], np.ones(3), np.ones(3, np.float32)])
+def test_a_colour_is_any_three_numbers(white: Any) -> None:
+    targets = [g2ard.TeacherRenders(BALL, VIEWS, background=colour) for colour in (white, (1, 1, 1))]
+    np.testing.assert_array_equal(targets[0][0], targets[1][0])
+    ours, theirs = (
+        g2ard.recover(SMALL, targets[1], steps=2, background=colour, seed=np.int64(1)).splats.fingerprint()
+        for colour in (white, (1.0, 1.0, 1.0))
+    )
+    assert ours == theirs
+
+
 def test_recover_takes_settings_by_name() -> None:
     config = g2ard.RecoverConfig(steps=3, background=(1, 1, 1))
     whole = g2ard.recover(SMALL, TARGETS, config)

@@ -37,8 +37,8 @@ def check_fields(config: Any) -> None:
 def check_type(name: str, value: Any, kind: Any) -> None:
     """Reject a value that does not have the annotated type `kind`.
 
-    Whole numbers are also numbers, NaN is no number, and any sequence can be a tuple. Types that cannot be
-    tested, such as protocols and arrays, are not checked.
+    Whole numbers are also numbers, NaN is no number, and a list can be a tuple. Types that cannot be tested,
+    such as protocols and arrays, are not checked.
 
     Raises:
         InputError: another type.
@@ -64,6 +64,8 @@ def check_colour(name: str, colour: Any) -> None:
     Traceback (most recent call last):
     g2ard.errors.InputError: background: expected 3 numbers from 0 to 1 (red, green, blue), got (0, 0, 255)
     """
+    if hasattr(colour, "tolist"):
+        colour = colour.tolist()
     if not _fits(colour, tuple[float, float, float]) or not all(0 <= channel <= 1 for channel in colour):
         raise InputError(f"expected 3 numbers from 0 to 1 (red, green, blue), got {colour!r}", parameter=name)
 
@@ -133,7 +135,7 @@ def _fits(value: Any, kind: Any) -> bool:
         several = hasattr(value, "__len__") and not isinstance(value, str)
         if origin is Sequence or not several or inner[-1] is Ellipsis:
             return several
-        return len(value) == len(inner) and all(map(_fits, value, inner))
+        return isinstance(value, list | tuple) and len(value) == len(inner) and all(map(_fits, value, inner))
     if kind is bool:
         return isinstance(value, bool) or getattr(getattr(value, "dtype", None), "kind", "") == "b"
     if kind is int or kind is float:

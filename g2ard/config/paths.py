@@ -64,6 +64,8 @@ def full_paths(values: Mapping[str, Any], config: Any) -> dict[str, Any]:
     found = {}
     for name, value in values.items():
         path = _full(name, known)
+        if get_origin(known[path].kind) is tuple and hasattr(value, "tolist"):
+            value = tuple(value.tolist())
         if not hasattr(known[path].value, "named"):
             check_type(name, value, known[path].kind)
         found[path] = value

@@ -244,7 +244,7 @@ def check_trained(scene: Splats | str | Path) -> None:
 def check_ratios(ratios: Sequence[float]) -> None:
     """Reject ratios that do not rise from 1 or more."""
     rising = all(a < b for a, b in pairwise(ratios))
-    if not ratios or not rising or not all(1 <= ratio < math.inf for ratio in ratios):
+    if not len(ratios) or not rising or not all(1 <= ratio < math.inf for ratio in ratios):
         given = ", ".join(f"{ratio:g}" for ratio in ratios)
         raise InputError(f"expected rising numbers of at least 1, got {given}", parameter="ratios")
 
