@@ -85,6 +85,10 @@ FormatName = Literal["ply", "sog", "spz", "glb", "compressed.ply", "splat", "usd
 """Formats that scenes can be written to (`g2ard.io.scene_formats`)."""
 
 
+PlyLayout = Literal["inria"]
+"""Fixed layouts of .ply files (`g2ard.io.ply`)."""
+
+
 def is_made(views: object) -> bool:
     """Return whether views are to be generated rather than given."""
     return isinstance(views, str) and views == "made"

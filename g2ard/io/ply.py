@@ -11,8 +11,8 @@ import numpy as np
 from numpy.lib.recfunctions import structured_to_unstructured
 from numpy.typing import NDArray
 
-from g2ard.config.choices import RenderModel
-from g2ard.errors import InputError
+from g2ard.config.choices import PlyLayout, RenderModel
+from g2ard.errors import InputError, require
 from g2ard.io import plyfiles
 from g2ard.io.sanitize import BLOCK, LOG_SCALE_LIMIT, Raw
 from g2ard.io.stream import RawStream, SceneStream
@@ -129,13 +129,23 @@ def _means(block: NDArray[Any], shift: NDArray[np.float64]) -> NDArray[np.float3
     return np.asarray(means - shift if shift.any() else means, np.float32)
 
 
-def write(path: Path, scene: Splats | SceneStream, *, overwrite: bool = False, normals: bool = False) -> None:
+def write(
+    path: Path,
+    scene: Splats | SceneStream,
+    *,
+    overwrite: bool = False,
+    normals: bool = False,
+    layout: PlyLayout | None = None,
+) -> None:
     """Write a binary little-endian 3DGS .ply: x y z, f_dc, f_rest, opacity, scale, rot.
 
     A non-zero `offset` and an antialiased render model are stored in comments, which `Stream` restores.
-    `normals` adds zero nx ny nz, 12 bytes per Gaussian, for programs with a fixed layout such as INRIA's SIBR
-    viewer (which also needs SH degree 3). A stream is written block by block.
+    `normals` adds zero nx ny nz after x y z. The layout "inria" is that of INRIA's trainer, for programs that
+    go by position: normals, and SH degree 3 padded with zeros, 248 bytes per Gaussian. A stream is written
+    block by block.
     """
+    require("layout", repr(layout), layout in (None, "inria"), "'inria' or None")
+    normals, degree = normals or layout == "inria", 3 if layout == "inria" else scene.sh_degree
     if isinstance(scene, Splats):
         count, parts = len(scene), iter([scene])
     else:
@@ -143,10 +153,12 @@ def write(path: Path, scene: Splats | SceneStream, *, overwrite: bool = False, n
     if not count:
         raise InputError("not written: the scene has no Gaussians", path=path)
     names = [*_MEANS, *(_NORMALS if normals else []), *_DC]
-    names += [f"f_rest_{k}" for k in range(3 * ((scene.sh_degree + 1) ** 2 - 1))]
+    names += [f"f_rest_{k}" for k in range(3 * ((degree + 1) ** 2 - 1))]
     names += ["opacity", *_SCALES, *_QUATS]
-    blocks = _blocks(path, parts, names, normals)
+    blocks = _blocks(path, (part.with_sh_degree(degree) for part in parts), names, normals)
     comments = plyfiles.comments_of(scene.offset, scene.render_model)
+    if layout == "inria":
+        comments = comments[1:]  # those that carry values: importers by position may count lines
     plyfiles.write_rows(path, dict.fromkeys(names, "<f4"), count, blocks, overwrite, comments)
 
 

@@ -35,7 +35,7 @@ class SceneFormat(NamedTuple):
 
 FORMATS: dict[FormatName, SceneFormat] = {
     "compressed.ply": SceneFormat(".compressed.ply", "compressed_ply", lossy=True),
-    "ply": SceneFormat(".ply", "ply", options=("normals",)),
+    "ply": SceneFormat(".ply", "ply", options=("normals", "layout")),
     "sog": SceneFormat(".sog", "sog_write", lossy=True),
     "spz": SceneFormat(".spz", "spz", options=("spz_version", "axes"), axes="RUB", lossy=True),
     "glb": SceneFormat(".glb", "glb", options=("compress",), models=False, axes="LUF"),

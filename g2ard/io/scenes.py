@@ -116,9 +116,9 @@ def write_splats(path: str | Path, splats: Splats, *, overwrite: bool = False, *
             .usdc; NAME/meta.json for a SOG folder.
         splats: the scene.
         overwrite: whether to replace an existing file.
-        **options: format options: `normals=True` adds nx ny nz to a .ply; `spz_version=4` writes .spz
-            version 4 instead of 3, and with it `axes="RFU"` stores right-forward-up instead of
-            right-up-back; `compress="spz"` writes an SPZ inside of a .glb.
+        **options: format options: `normals=True` adds nx ny nz to a .ply, and `layout="inria"` also pads it
+            to SH degree 3; `spz_version=4` writes .spz version 4 instead of 3, and with it `axes="RFU"`
+            stores right-forward-up instead of right-up-back; `compress="spz"` writes an SPZ inside of a .glb.
 
     Warns:
         UserWarning: an antialiased scene in a format that cannot say so (.glb, .splat, OpenUSD).

@@ -11,8 +11,9 @@ import typer
 from g2ard import io
 from g2ard.cli.frame import Run, command
 from g2ard.cli.options import ShDegreeOption, numbers
-from g2ard.config.choices import Axes
-from g2ard.errors import InputError
+from g2ard.config.choices import Axes, PlyLayout
+from g2ard.errors import InputError, OutputError
+from g2ard.io import table
 from g2ard.io.scene_formats import check_options, scene_format, written_bytes
 
 if TYPE_CHECKING:
@@ -38,7 +39,8 @@ def convert(
             "-o",
             "--output",
             metavar="OUT",
-            help="Output: .ply, .compressed.ply, .sog, .spz, .glb, .splat, .usda, .usdc or NAME/meta.json.",
+            help="Output: .ply, .compressed.ply, .sog, .spz, .glb, .splat, .usda, .usdc or NAME/meta.json; "
+            ".csv for a table of attributes.",
         ),
     ] = None,
     box: Annotated[
@@ -47,6 +49,18 @@ def convert(
     ] = None,
     sphere: Annotated[
         str | None, typer.Option(metavar="X,Y,Z,R", help="Keep Gaussians within R of a point.")
+    ] = None,
+    invert: Annotated[
+        bool, typer.Option("--invert", help="Keep what --box and --sphere would drop.")
+    ] = False,
+    where: Annotated[
+        str | None,
+        typer.Option(
+            metavar="CONDITION",
+            help="Keep Gaussians for which this holds, such as 'opacity > 0.05 and scale < 2'. Opacity, red, "
+            "green and blue are 0 to 1; x, y, z, scale (the largest σ) and thickness (the smallest) are in "
+            "scene units.",
+        ),
     ] = None,
     transform: Annotated[
         str | None,
@@ -75,6 +89,12 @@ def convert(
         ),
     ] = None,
     sh_degree: ShDegreeOption = None,
+    layout: Annotated[
+        PlyLayout | None,
+        typer.Option(
+            help="Write the .ply in INRIA's layout: normals and SH degree 3, 248 bytes per Gaussian."
+        ),
+    ] = None,
     spz_version: Annotated[
         int | None, typer.Option(min=2, max=4, help="Version of .spz files; 3 by default, 4 is smaller.")
     ] = None,
@@ -85,12 +105,21 @@ def convert(
     """Convert scenes to another format or other axes, and merge, crop or move them."""
     import numpy as np
 
+    from g2ard.scene.attributes import Condition
     from g2ard.scene.transform import in_box, in_sphere, join, moving, with_axes
     from g2ard.scene.transform import transform as moved
 
     scenes, output = _parted(run, scenes, output)
-    given = {"spz_version": spz_version, "compress": compress}
+    given = {"spz_version": spz_version, "compress": compress, "layout": layout}
     options: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
+    if invert and box is None and sphere is None:
+        raise typer.BadParameter("--invert goes with --box or --sphere")
+    if layout is not None and sh_degree not in (None, 3):
+        raise typer.BadParameter("--layout inria has SH degree 3; leave --sh-degree out")
+    condition = None
+    if where is not None:
+        with run.usage():
+            condition = Condition(where)
     corners = None if box is None else numbers("--box", box, 6)
     ball = None if sphere is None else numbers("--sphere", sphere, 4)
     turn = None if rotate is None else numbers("--rotate", rotate, 3)
@@ -100,15 +129,21 @@ def convert(
         matrix = moving(scale or 1, turn or (0, 0, 0), shift or (0, 0, 0)) @ (
             np.eye(4) if matrix is None else matrix
         )
-    check_options(output, options)
+    as_table = output.suffix.lower() == ".csv"
+    _check_output(run, output, options)
     change = None if to_axes is None else _change_of_axes(output, to_axes, options)
-    io.check_scene_output(output, run.overwrite)
     splats = join([run.load(path) for path in scenes])
     read = len(splats)
+    kept_rows = np.ones(read, bool)
     if corners is not None:
-        splats = splats.take(in_box(splats, corners[:3], corners[3:]))
+        kept_rows &= in_box(splats, corners[:3], corners[3:])
     if ball is not None:
-        splats = splats.take(in_sphere(splats, ball[:3], ball[3]))
+        kept_rows &= in_sphere(splats, ball[:3], ball[3])
+    kept_rows ^= invert
+    if condition is not None:
+        kept_rows &= condition.of(splats)
+    if not kept_rows.all():
+        splats = splats.take(kept_rows)
     _check_left(splats, read)
     if matrix is not None:
         splats = moved(splats, matrix)
@@ -118,7 +153,11 @@ def convert(
         splats = splats.with_sh_degree(sh_degree)
     if change is not None:
         splats = with_axes(splats, change)
-    run.write(output, splats, compare=True, **options)
+    if as_table:
+        run.begin("write")
+        table.write(output, splats, overwrite=run.overwrite)
+    else:
+        run.write(output, splats, compare=True, **options)
     size = written_bytes(output)
     kept = f"{len(splats):,}" if len(splats) == read else f"{len(splats):,} of {read:,}"
     what = "Gaussian" if kept == "1" else "Gaussians"
@@ -137,12 +176,23 @@ def _parted(run: Run, paths: list[Path], output: Path | None) -> tuple[list[Path
     return scenes, output
 
 
+def _check_output(run: Run, output: Path, options: dict[str, Any]) -> None:
+    """Check the output and the options of its format."""
+    if output.suffix.lower() != ".csv":
+        check_options(output, options)
+        io.check_scene_output(output, run.overwrite)
+        return
+    if options:
+        raise OutputError(f".csv has no option {next(iter(options))!r}", path=output)
+    io.check_output(output, run.overwrite)
+
+
 def _change_of_axes(output: Path, axes: Axes, options: dict[str, Any]) -> NDArray[np.float64] | None:
     """Return the change of axes before writing, None if the format's writer makes it."""
     from g2ard.scene.transform import change_of_axes
 
-    found = scene_format(output)
-    if found.axes is None:
+    found = None if output.suffix.lower() == ".csv" else scene_format(output)
+    if found is None or found.axes is None:
         return change_of_axes("RDF", axes)
     if axes == found.axes:
         return None
@@ -160,7 +210,8 @@ def _change_of_axes(output: Path, axes: Axes, options: dict[str, Any]) -> NDArra
 def _check_left(splats: Splats, read: int) -> None:
     if not len(splats):
         raise InputError(
-            f"none of {read:,} Gaussians are within --box and --sphere; `g2ard info` shows the scene's extent"
+            f"--box, --sphere and --where keep none of {read:,} Gaussians; `g2ard info` shows the scene's "
+            "extent, opacities and scales"
         )
 
 

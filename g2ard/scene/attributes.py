@@ -1,0 +1,170 @@
+"""Attributes of Gaussians by name, as columns, and conditions on them."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import reduce
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from g2ard.errors import InputError
+from g2ard.scene.splats import Splats
+
+_LONGEST = 1000
+"""Characters of a condition at most, so that it cannot nest too deeply."""
+
+_TABLE: dict[tuple[str, ...], Callable[[Splats], NDArray[Any]]] = {
+    ("x", "y", "z"): lambda splats: splats.means.astype(np.float64) + splats.offset,
+    ("opacity",): lambda splats: splats.opacities[:, None],
+    ("scale_x", "scale_y", "scale_z"): lambda splats: splats.scales,
+    ("rot_w", "rot_x", "rot_y", "rot_z"): lambda splats: splats.quats,
+    ("red", "green", "blue"): lambda splats: splats.colors,
+}
+_DERIVED: dict[tuple[str, ...], Callable[[Splats], NDArray[Any]]] = {
+    ("scale",): lambda splats: splats.scales.max(axis=1, keepdims=True),
+    ("thickness",): lambda splats: splats.scales.min(axis=1, keepdims=True),
+}
+
+ATTRIBUTES = tuple(name for names in (*_TABLE, *_DERIVED) for name in names)
+"""Names of attributes that conditions can use."""
+
+
+def columns(splats: Splats) -> dict[str, NDArray[Any]]:
+    """Return the columns of a table of attributes, each (N,), in order.
+
+    World coordinates x, y, z; opacity in [0, 1]; scale_x, scale_y and scale_z, the standard deviations along
+    the Gaussian's own axes in scene units; the quaternion rot_w, rot_x, rot_y, rot_z; the base colour red,
+    green, blue, usually in [0, 1]; and the coefficients of further harmonics, red_1, green_1, blue_1 onwards.
+
+    >>> list(columns(Splats.create([[1, 2, 3]], scales=[[1, 1, 1]])))[:5]
+    ['x', 'y', 'z', 'opacity', 'scale_x']
+    """
+    found = {
+        name: values[:, at]
+        for names, of in _TABLE.items()
+        for values in [of(splats)]
+        for at, name in enumerate(names)
+    }
+    for k in range(splats.shN.shape[1]):
+        for channel, color in enumerate(("red", "green", "blue")):
+            found[f"{color}_{k + 1}"] = splats.shN[:, k, channel]
+    return found
+
+
+@dataclass(frozen=True)
+class Condition:
+    """A condition on Gaussians, such as `opacity > 0.05 and scale < 2`.
+
+    Names are `ATTRIBUTES`: those of `columns`, and the largest and smallest of the three standard deviations,
+    `scale` and `thickness`. Arithmetic (+, -, *, /, abs, sqrt, min, max) and comparisons (<, <=, >, >=, ==,
+    !=, also chained) are supported, joined with and, or and not. Anything else is rejected; nothing runs as
+    Python.
+
+    >>> two = Splats.create([[0, 0, 0], [9, 0, 0]], scales=[[1, 1, 1], [1, 2, 3]])
+    >>> Condition("abs(x) <= 5 and not scale > 2").of(two).tolist()
+    [True, False]
+
+    Raises:
+        InputError: the text is not a condition, or uses an unknown name or operation.
+    """
+
+    text: str
+
+    def __post_init__(self) -> None:
+        self.of(Splats.create(np.zeros((1, 3)), scales=np.ones((1, 3))))
+
+    def of(self, splats: Splats) -> NDArray[np.bool_]:
+        """Return the (N,) mask of Gaussians that fulfil the condition."""
+        try:
+            with np.errstate(all="ignore"):
+                found = _value(_tree(self.text), splats)
+        except RecursionError as error:
+            raise _invalid("nests too deeply") from error
+        if not _is_condition(found):
+            raise _invalid(f"{self.text!r} is a number; compare it with another")
+        return np.array(np.broadcast_to(found, len(splats)))
+
+
+_ARITHMETIC: dict[type[ast.AST], Callable[[Any, Any], Any]] = {
+    **{ast.Add: np.add, ast.Sub: np.subtract, ast.Mult: np.multiply, ast.Div: np.divide},
+}
+_COMPARISONS: dict[type[ast.AST], Callable[[Any, Any], Any]] = {
+    **{ast.Lt: np.less, ast.LtE: np.less_equal, ast.Gt: np.greater, ast.GtE: np.greater_equal},
+    **{ast.Eq: np.equal, ast.NotEq: np.not_equal},
+}
+_SIGNS: dict[type[ast.AST], Callable[[Any], Any]] = {ast.USub: np.negative, ast.UAdd: np.positive}
+_FUNCTIONS: dict[str, Callable[[list[Any]], Any]] = {
+    "abs": lambda values: np.abs(*values),
+    "sqrt": lambda values: np.sqrt(*values),
+    "min": lambda values: reduce(np.minimum, values),
+    "max": lambda values: reduce(np.maximum, values),
+}
+
+
+def _tree(text: str) -> ast.expr:
+    if len(text) > _LONGEST:
+        raise _invalid(f"expected at most {_LONGEST} characters, got {len(text)}")
+    try:
+        return ast.parse(text.strip(), mode="eval").body
+    except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
+        raise _invalid(f"{text!r} is not a condition") from error
+
+
+def _value(node: ast.expr, splats: Splats) -> Any:
+    """Return the value of an expression: numbers or booleans, one or one per Gaussian."""
+    match node:
+        case ast.BoolOp(op, operands):
+            join = np.logical_and if isinstance(op, ast.And) else np.logical_or
+            return reduce(join, [_condition(one, splats) for one in operands])
+        case ast.UnaryOp(ast.Not(), operand):
+            return np.logical_not(_condition(operand, splats))
+        case ast.UnaryOp(op, operand) if type(op) in _SIGNS:
+            return _SIGNS[type(op)](_number(operand, splats))
+        case ast.BinOp(left, op, right) if type(op) in _ARITHMETIC:
+            return _ARITHMETIC[type(op)](_number(left, splats), _number(right, splats))
+        case ast.Compare(left, ops, others) if all(type(op) in _COMPARISONS for op in ops):
+            values = [_number(one, splats) for one in (left, *others)]
+            steps = zip(ops, values, values[1:], strict=False)
+            return reduce(np.logical_and, [_COMPARISONS[type(op)](a, b) for op, a, b in steps])
+        case ast.Call(ast.Name(name), arguments, []) if name in _FUNCTIONS:
+            if (len(arguments) == 1) != (name in ("abs", "sqrt")) or not arguments:
+                raise _invalid(
+                    f"{name} takes {'one number' if name in ('abs', 'sqrt') else 'several numbers'}"
+                )
+            return _FUNCTIONS[name]([_number(one, splats) for one in arguments])
+        case ast.Constant(bool()):
+            pass
+        case ast.Constant(int() | float() as value) if abs(value) < 1e300:
+            return np.float64(value)
+        case ast.Name(name) if name in ATTRIBUTES:
+            names, of = next(item for item in (*_TABLE.items(), *_DERIVED.items()) if name in item[0])
+            return of(splats)[:, names.index(name)].astype(np.float64)
+        case ast.Name(name):
+            raise _invalid(f"unknown name {name!r}")
+    raise _invalid(f"{ast.unparse(node)!r} is not supported")
+
+
+def _is_condition(value: Any) -> bool:
+    return bool(np.asarray(value).dtype == bool)
+
+
+def _condition(node: ast.expr, splats: Splats) -> Any:
+    value = _value(node, splats)
+    if not _is_condition(value):
+        raise _invalid(f"{ast.unparse(node)!r} is a number; and, or and not take comparisons")
+    return value
+
+
+def _number(node: ast.expr, splats: Splats) -> Any:
+    value = _value(node, splats)
+    if _is_condition(value):
+        raise _invalid(f"{ast.unparse(node)!r} is a comparison where a number is expected")
+    return value
+
+
+def _invalid(text: str) -> InputError:
+    return InputError(text, parameter="where", hint=f"names are {', '.join(ATTRIBUTES)}")
