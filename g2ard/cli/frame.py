@@ -34,7 +34,7 @@ from g2ard.io import write_splats, write_views
 from g2ard.io.atomic import atomic_output, check_output
 from g2ard.io.detect import run_scene
 from g2ard.io.paths import real_path
-from g2ard.io.scene_formats import lost_in
+from g2ard.io.scene_formats import axes_note, lost_in
 from g2ard.pipeline.presets import configured
 from g2ard.progress import plural
 from g2ard.system import devices, interrupt
@@ -270,6 +270,8 @@ class Run:
         self.kept.append(f"{path} is written")
         for note in lost_in(path, splats, **options):
             self.say(f"note: {path}: {note}")
+        if about_axes := axes_note(path, options):
+            self.say(f"note: {path}: {about_axes}")
         if compare:
             from g2ard.jobs.packing import loss_warning
 

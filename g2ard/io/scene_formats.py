@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple, get_args
+from typing import TYPE_CHECKING, Any, NamedTuple, get_args
 
 from g2ard.config.choices import FormatName
 from g2ard.errors import OutputError, require
@@ -90,6 +90,22 @@ def lost_in(path: str | Path, splats: Splats, **options: object) -> list[Note]:
         f"{output_format.suffix} cannot say that the scene is antialiased; other programs draw it too opaque"
     )
     return [Note("lost_render_model", 1, text)]
+
+
+def axes_note(path: str | Path, options: dict[str, Any]) -> str | None:
+    """Return a note on the axes of a written file if programs differ in them; `options` are the writer's."""
+    output_format, axes = scene_format(path), options.get("axes")
+    if output_format.suffix != ".spz" or (axes is not None and options.get("spz_version", 3) == 4):
+        return None
+    if axes == "RDF":
+        return (
+            "has the coordinates of a .ply, as splat-transform and SuperSplat read .spz; programs that "
+            "follow the definition show it turned by half a turn"
+        )
+    return (
+        "has the axes of the definition (right, up, back); splat-transform and SuperSplat show it turned by "
+        "half a turn; `g2ard convert --to-axes RDF` writes a file for them"
+    )
 
 
 def check_options(path: str | Path, options: dict[str, object]) -> SceneFormat:

@@ -118,7 +118,9 @@ def write_splats(path: str | Path, splats: Splats, *, overwrite: bool = False, *
         overwrite: whether to replace an existing file.
         **options: format options: `normals=True` adds nx ny nz to a .ply, and `layout="inria"` also pads it
             to SH degree 3; `spz_version=4` writes .spz version 4 instead of 3, and with it `axes="RFU"`
-            stores right-forward-up instead of right-up-back; `compress="spz"` writes an SPZ inside of a .glb.
+            stores right-forward-up instead of right-up-back; version 3 with `axes="RDF"` stores the
+            coordinates of a .ply, as splat-transform and SuperSplat read .spz; `compress="spz"` writes an SPZ
+            inside of a .glb.
 
     Warns:
         UserWarning: an antialiased scene in a format that cannot say so (.glb, .splat, OpenUSD).

@@ -62,6 +62,14 @@ def read(path: Path) -> Scene:
     return decoded(path, path.read_bytes())
 
 
+def names_axes(path: Path) -> bool:
+    """Return whether a file of version 4 names its axes."""
+    data = path.read_bytes()
+    if len(data) < _HEADER_4 or data[:4] != _MAGIC or data[4] != 4 or not data[14] & _HAS_EXTENSIONS:
+        return False
+    return _extensions(path, data)[0] != "RUB"
+
+
 def decoded(path: Path, data: bytes) -> Scene:
     """Read the bytes of an .spz like `read`; `path` names their file in messages."""
     if data[:2] == b"\x1f\x8b":
@@ -232,13 +240,15 @@ def write(
 
     Scales are clamped to e^−10 … e^5.94, harmonics to ±1, colours to slightly more than [0, 1].
     Version 3 uses gzip, 4 Zstandard (smaller files), 2 gzip with coarser rotations. Version 4 can store other
-    `axes`, which it names; readers that ignore extensions show such a scene turned or mirrored.
+    `axes`, which it names; readers that ignore extensions show such a scene turned or mirrored. Versions 2
+    and 3 store right-up-back, or with RDF the coordinates of a .ply, against the definition and unnamed, as
+    splat-transform and SuperSplat read every .spz.
     """
     require("spz_version", spz_version, spz_version in (2, 3, 4), "2, 3 or 4")
     if axes != "RUB":
-        if spz_version != 4:
+        if spz_version != 4 and axes != "RDF":
             raise InputError(
-                f"version {spz_version} has right-up-back axes only",
+                f"version {spz_version} has RUB axes, or RDF for programs that expect those of a .ply",
                 path=path,
                 hint="{spz_version=4} can name others",
             )
@@ -246,7 +256,8 @@ def write(
     splats = packing.writable(path, splats)
     splats = splats.take(packing.morton_order(splats.means))
     means = packing.world_means(path, splats, ".spz")
-    content = encoded(path, splats, means, fraction_bits(path, means, splats), spz_version, axes)
+    named: Axes = axes if spz_version == 4 else "RUB"
+    content = encoded(path, splats, means, fraction_bits(path, means, splats), spz_version, named)
     with atomic_output(path, overwrite) as temporary:
         temporary.write_bytes(content)
 

@@ -15,6 +15,7 @@ from g2ard.poses import plan_pool
 from g2ard.progress import Progress
 from g2ard.rendering.targets import Targets, TeacherRenders
 from g2ard.scene.splats import Splats
+from g2ard.scene.transform import change_of_axes, with_axes
 from g2ard.stages.evaluate import evaluate
 
 _LOSS, _INVISIBLE = 1.0, 45.0
@@ -64,7 +65,10 @@ def loss_warning(path: Path, splats: Splats, options: dict[str, Any]) -> str | N
         pool = plan_pool(splats, _VIEWS, size=_SIZE, rows=_ROWS)
     except InputError:
         return None
-    away = evaluate(read_splats(path), TeacherRenders(splats, pool.cameras)).psnr
+    stored = read_splats(path)
+    if options.get("axes") == "RDF" and options.get("spz_version", 3) != 4:  # unnamed, so read as RUB
+        stored = with_axes(stored, change_of_axes("RDF", "RUB"))
+    away = evaluate(stored, TeacherRenders(splats, pool.cameras)).psnr
     psnr = -10 * float(np.log10(10 ** (-_USUAL / 10) + 10 ** (-away / 10)))
     if _USUAL - psnr <= _LOSS:
         return None

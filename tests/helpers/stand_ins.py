@@ -193,6 +193,7 @@ STAND_INS: dict[str, Callable[[Path], None]] = {
     "park.ply": _sky,
     "PATH.json": _views,
     "teacher.ply": _scene,
+    "theirs.spz": lambda path: g2ard.save(path, SCENE, axes="RDF"),
     "small_city": _matrix_city,
     "KingsCollege": _kings_college,
     "KingsCollege.ply": lambda path: g2ard.save(path, blotched(2500)),

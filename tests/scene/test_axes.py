@@ -1,5 +1,6 @@
 """Axes by name: the same world in every system, harmonics included, and in the files that name them."""
 
+import gzip
 import struct
 from pathlib import Path
 
@@ -14,9 +15,15 @@ from g2ard.io.spz import _ADOBE_AXES
 from g2ard.scene.splats import Splats
 from g2ard.scene.transform import change_of_axes, with_axes
 from helpers.commands import CommandLine, refused, succeeds
-from helpers.peers import adobe_spz
+from helpers.peers import adobe_spz, splat_transform
 from reference.raster import sh_basis
 from reference.rotations import covariances
+
+
+def decoded_spz(path: Path) -> bytes:
+    """Bytes of an .spz of version 2 or 3."""
+    return gzip.decompress(path.read_bytes())
+
 
 WORLD = {"R": [1, 0, 0], "L": [-1, 0, 0], "U": [0, 1, 0], "D": [0, -1, 0], "B": [0, 0, 1], "F": [0, 0, -1]}
 """Directions of the letters, written out, in the world right, up, back."""
@@ -131,4 +138,44 @@ def test_convert_stores_other_axes(command_line: CommandLine, tmp_path: Path) ->
     succeeds(command_line, tmp_path, "convert", "a.ply", "b.spz", "--to-axes", "LBU")
     assert (tmp_path / "b.spz").read_bytes()[:8] == b"NGSP\4\0\0\0"
     given = "convert", "a.ply", "c.spz", "--spz-version", "3", "--to-axes", "RFU"
-    assert "version 3 has right-up-back axes only" in refused(command_line, tmp_path, *given, status=1)
+    assert "version 3 has RUB axes, or RDF" in refused(command_line, tmp_path, *given, status=1)
+
+
+def test_spz_with_the_axes_of_a_ply(command_line: CommandLine, tmp_path: Path) -> None:
+    write_splats(tmp_path / "a.ply", scene())
+    printed = succeeds(command_line, tmp_path, "convert", "a.ply", "usual.spz")
+    assert "--to-axes RDF" in printed.err
+    printed = succeeds(command_line, tmp_path, "convert", "a.ply", "theirs.spz", "--to-axes", "RDF")
+    assert "half a turn" in printed.err
+    assert "warning" not in printed.err
+    usual, theirs = (decoded_spz(tmp_path / name) for name in ("usual.spz", "theirs.spz"))
+    assert theirs[4] == usual[4] == 3
+    assert not theirs[14] & 2
+    succeeds(command_line, tmp_path, "convert", "theirs.spz", "back.ply", "--from-axes", "RDF")
+    succeeds(command_line, tmp_path, "convert", "usual.spz", "same.ply")
+    read = [read_splats(tmp_path / f"{name}.ply") for name in ("back", "same")]
+    back, same = (splats.take(np.lexsort(splats.means.T)) for splats in read)
+    np.testing.assert_array_equal(back.means, same.means)
+    for mine, other in zip(world(back, "RDF"), world(same, "RDF"), strict=True):
+        np.testing.assert_allclose(mine, other, atol=0.05)
+    turned = read_splats(tmp_path / "theirs.spz")  # as readers of the definition see it
+    np.testing.assert_array_equal(turned.means, read[0].means * (1, -1, -1))
+    write_splats(tmp_path / "named.spz", scene(), spz_version=4, axes="RFU")
+    given = "convert", "named.spz", "c.ply", "--from-axes", "RDF"
+    assert "names its axes" in refused(command_line, tmp_path, *given, status=1)
+
+
+def test_splat_transform_reads_and_writes_spz_with_the_axes_of_a_ply(
+    command_line: CommandLine, tmp_path: Path
+) -> None:
+    write_splats(tmp_path / "a.ply", scene())
+    succeeds(command_line, tmp_path, "convert", "a.ply", "theirs.spz", "--to-axes", "RDF")
+    splat_transform(tmp_path / "theirs.spz", tmp_path / "theirs.ply")
+    splat_transform(tmp_path / "a.ply", tmp_path / "written.spz")
+    succeeds(command_line, tmp_path, "convert", "written.spz", "written.ply", "--from-axes", "RDF")
+    for name in ("theirs.ply", "written.ply"):
+        read = read_splats(tmp_path / name)
+        rows, others = (np.lexsort(np.round(s.means, 2).T) for s in (read, scene()))
+        got, want = world(read.take(rows), "RDF"), world(scene().take(others), "RDF")
+        for mine, other, near in zip(got, want, (1e-3, 0.05, 0.5), strict=True):  # scales are rounded by 3 %
+            np.testing.assert_allclose(mine, other, atol=near, rtol=0.07)

@@ -14,7 +14,7 @@ from g2ard.cli.options import ShDegreeOption, numbers
 from g2ard.config.choices import Axes, PlyLayout
 from g2ard.errors import InputError, OutputError
 from g2ard.io import table
-from g2ard.io.scene_formats import check_options, scene_format, written_bytes
+from g2ard.io.scene_formats import FORMATS, check_options, scene_format, written_bytes
 
 if TYPE_CHECKING:
     import numpy as np
@@ -80,6 +80,15 @@ def convert(
         str | None, typer.Option(metavar="X,Y,Z", help="Then move by this, scene units.")
     ] = None,
     recentre: Annotated[bool, typer.Option("--recentre", help="Drop the offset to map coordinates.")] = False,
+    from_axes: Annotated[
+        Axes | None,
+        typer.Option(
+            case_sensitive=False,
+            metavar="NAME",
+            help="Axes of the files' coordinates if not those of their format, such as RDF for .spz of "
+            "splat-transform.",
+        ),
+    ] = None,
     to_axes: Annotated[
         Axes | None,
         typer.Option(
@@ -132,7 +141,7 @@ def convert(
     as_table = output.suffix.lower() == ".csv"
     _check_output(run, output, options)
     change = None if to_axes is None else _change_of_axes(output, to_axes, options)
-    splats = join([run.load(path) for path in scenes])
+    splats = join([_loaded(run, path, from_axes) for path in scenes])
     read = len(splats)
     kept_rows = np.ones(read, bool)
     if corners is not None:
@@ -203,8 +212,26 @@ def _change_of_axes(output: Path, axes: Axes, options: dict[str, Any]) -> NDArra
             hint="write .spz (version 4), which can name others, or .ply, .sog or .splat, which name none",
         )
     options["axes"] = axes
-    options.setdefault("spz_version", 4)
+    if axes != "RDF":
+        options.setdefault("spz_version", 4)
     return None
+
+
+def _loaded(run: Run, path: Path, axes: Axes | None) -> Splats:
+    """Read a scene whose file may store other axes than its format defines."""
+    splats = run.load(path)
+    if axes is None:
+        return splats
+    from g2ard.io import spz
+    from g2ard.scene.transform import change_of_axes, with_axes
+
+    path, name = io.check_scene(path)
+    if name == "spz" and spz.names_axes(path):
+        raise InputError("names its axes, which are followed", path=path, hint="leave {from_axes} out")
+    defined = next((known.axes for known in FORMATS.values() if known.module == name and known.axes), "RDF")
+    if axes == defined:
+        return splats
+    return with_axes(splats, change_of_axes(axes, "RDF") @ change_of_axes("RDF", defined))
 
 
 def _check_left(splats: Splats, read: int) -> None:
