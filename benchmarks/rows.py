@@ -60,6 +60,7 @@ COLUMNS: dict[str, Column] = {
     "psnr": Column(float, ".2f", "mean over the views, dB"),
     "psnr_worst": Column(float, ".2f", "of the worst view, dB"),
     "ssim": Column(float, ".4f", "mean over the views"),
+    "edge_psnr": Column(float, ".2f", "PSNR of the images' gradients, mean over the views, dB"),
     "lpips_vgg": Column(float, ".4f", "mean over the views"),
     "lpips_alex": Column(float, ".4f", "mean over the views"),
     "luma_drift": Column(float, None, "mean of |mean luma of the render − the target's|, in recorded rows"),

@@ -14,7 +14,7 @@ from g2ard.config.choices import BLACK, Colour
 from g2ard.io.images import as_saved, to_bytes
 from g2ard.rendering.cuda import renderer_on
 from g2ard.rendering.lpips import Lpips
-from g2ard.rendering.metrics import psnr, ssim
+from g2ard.rendering.metrics import edge_psnr, psnr, ssim
 from g2ard.rendering.renderer import RasterSettings
 from g2ard.rendering.targets import Targets, mask_of
 from g2ard.scene.samples import evenly_spaced
@@ -26,7 +26,9 @@ _PICTURES = 32
 _QUALITY = 88
 
 View = dict[str, Any]
-"""A view's name, psnr, ssim and lpips_NET, and whether it is black: in 8 bits, though its target is not."""
+"""A view's name, psnr, ssim, edge_psnr and lpips_NET, and whether it is black: in 8 bits, though its target
+is not.
+"""
 
 
 def figures(views: list[View]) -> Row:
@@ -34,7 +36,7 @@ def figures(views: list[View]) -> Row:
     counted = [view for view in views if not view["black"]] or views
     means: Row = {
         name: float(np.mean([view[name] for view in counted]))
-        for name in ("psnr", "ssim", "lpips_vgg", "lpips_alex")
+        for name in ("psnr", "ssim", "edge_psnr", "lpips_vgg", "lpips_alex")
         if name in views[0]
     }
     worst = min(view["psnr"] for view in counted)
@@ -73,6 +75,7 @@ def score(
             image, target = as_saved(image), as_saved(target)
         mask = mask_of(targets, number)
         view: View = {"name": name, "psnr": psnr(image, target, mask), "ssim": ssim(image, target, mask)}
+        view["edge_psnr"] = edge_psnr(image, target, mask)
         view |= {f"lpips_{net}": model(image, target) for net, model in (lpips or {}).items()}
         view["black"] = not to_bytes(image).any() and bool(to_bytes(target).any())
         views.append(view)

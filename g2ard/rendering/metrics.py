@@ -1,4 +1,4 @@
-"""Image metrics: PSNR and SSIM of float images in [0, 1]."""
+"""Image metrics: PSNR, PSNR of gradients and SSIM of float images in [0, 1]."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard import _core
+from g2ard.errors import InputError
 
 _Image = NDArray[np.floating[Any]]
 
@@ -32,6 +33,44 @@ def psnr(image: _Image, target: _Image, mask: NDArray[np.bool_] | None = None) -
     if mask is not None:
         image, target = image[mask][:, None], target[mask][:, None]
     return float(np.minimum(100.0, _core.psnr(_float32(image), _float32(target))))
+
+
+def edge_psnr(image: _Image, target: _Image, mask: NDArray[np.bool_] | None = None) -> float:
+    """Return the PSNR of the images' gradients: how well edges, wires and text are kept.
+
+    It is −10·log₁₀ of the mean squared error of the differences between neighbouring pixels, along rows and
+    columns, for a peak of 1, at most 100 dB. A smooth error of colour hardly counts, a lost line does.
+
+    Args:
+        image: (H, W, C) in [0, 1].
+        target: of the same shape.
+        mask: (H, W), True for pixels that count; a difference counts if both its pixels do. None means all.
+
+    Returns:
+        dB; 100 if no difference counts.
+
+    Raises:
+        InputError: shapes that differ.
+
+    >>> flat, shifted = np.full((4, 4, 3), 0.4), np.full((4, 4, 3), 0.6)
+    >>> line = flat.copy()
+    >>> line[:, 2] = 0.6
+    >>> edge_psnr(flat, shifted), round(edge_psnr(flat, line), 2)
+    (100.0, 18.75)
+    """
+    if image.shape != target.shape:
+        raise InputError(f"expected the image's shape {image.shape}, got {target.shape}", parameter="target")
+    error = _float32(image) - _float32(target)
+    total, count = 0.0, 0
+    for near, far in ((np.s_[:-1], np.s_[1:]), (np.s_[:, :-1], np.s_[:, 1:])):
+        steps = error[far] - error[near]
+        if mask is not None:
+            steps = steps[mask[far] & mask[near]]
+        total += float(np.square(steps).sum(dtype=np.float64))
+        count += steps.size
+    if total == 0 or not count:
+        return 100.0
+    return float(np.minimum(100.0, -10 * np.log10(total / count)))
 
 
 def ssim(image: _Image, target: _Image, mask: NDArray[np.bool_] | None = None) -> float:

@@ -48,6 +48,8 @@ def distill_report(
     page = Page(title, verdict(report))
     page.table(COLUMNS, cells(map(KindScore.of, report["kinds"])))
     page.paragraph("PSNR and SSIM: simplified → recovered.")
+    if edges := edges_line(report):
+        page.paragraph(edges)
     for line in told:
         page.paragraph(line)
     page.heading("Worst views")
@@ -74,6 +76,23 @@ def distill_report(
         f"which blend {report['overdraw']:.1f} Gaussians per pixel."
     )
     page.write(path)
+
+
+def edges_line(report: dict[str, Any]) -> str | None:
+    """Return the scores of thin structures, None for reports without them.
+
+    >>> edges_line({"kinds": [{"kind": "near", "views": 2, "psnr": {"before": 1, "after": 2}, "ssim": None,
+    ...             "worst": "a", "worst_psnr": {"before": 1, "after": 2}, "lost": 0,
+    ...             "edge_psnr": {"before": 30.0, "after": 33.5}}]})
+    'Edges, wires and text (PSNR of gradients): near 30.00 → 33.50 dB.'
+    """
+    kinds = [KindScore.of(kind) for kind in report["kinds"]]
+    found = [
+        f"{kind.kind} {kind.edge_psnr.before:.2f} → {kind.edge_psnr.after:.2f} dB"
+        for kind in kinds
+        if kind.edge_psnr
+    ]
+    return f"Edges, wires and text (PSNR of gradients): {', '.join(found)}." if found else None
 
 
 def verdict(report: dict[str, Any]) -> str:

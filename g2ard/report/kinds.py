@@ -40,6 +40,7 @@ class KindScore(Report):
         worst: name of the view with the lowest PSNR after recovery.
         worst_psnr: PSNR of that view, dB.
         lost: number of views that lost over 0.05 dB.
+        edge_psnr: mean PSNR of gradients, dB; None for a scene in tiles.
     """
 
     kind: str
@@ -49,6 +50,7 @@ class KindScore(Report):
     worst: str
     worst_psnr: Change
     lost: int
+    edge_psnr: Change | None = None
 
 
 def by_kind(
@@ -57,8 +59,8 @@ def by_kind(
     """Summarise scores by kind of view.
 
     Args:
-        before: `name`, `kind` unless usual, `psnr` and, unless the scene is in tiles, `ssim` of each view
-            with the simplified scene.
+        before: `name`, `kind` unless usual, `psnr` and, unless the scene is in tiles, `ssim` and
+            `edge_psnr` of each view with the simplified scene.
         after: the same with the recovered scene.
         usual: name for the usual kind.
 
@@ -70,6 +72,9 @@ def by_kind(
 
     def changes(score: str, rows: Sequence[int]) -> list[Change]:
         return [Change(before[row][score], after[row][score]) for row in rows]
+
+    def mean_if_scored(score: str, rows: Sequence[int]) -> Change | None:
+        return mean(changes(score, rows)) if score in after[rows[0]] else None
 
     def mean(found: Sequence[Change]) -> Change:
         return Change(fmean(change.before for change in found), fmean(change.after for change in found))
@@ -83,10 +88,11 @@ def by_kind(
                 usual if kind == USUAL else kind,
                 len(rows),
                 mean(psnr),
-                mean(changes("ssim", rows)) if "ssim" in after[rows[0]] else None,
+                mean_if_scored("ssim", rows),
                 after[rows[worst]]["name"],
                 psnr[worst],
                 sum(change.gain < -_LOST for change in psnr),
+                mean_if_scored("edge_psnr", rows),
             )
         )
     return tuple(scores)

@@ -15,7 +15,7 @@ from g2ard.io.images import as_saved
 from g2ard.progress import Progress, plural, silent
 from g2ard.rendering.cuda import renderer_on
 from g2ard.rendering.lpips import Lpips
-from g2ard.rendering.metrics import psnr, ssim
+from g2ard.rendering.metrics import edge_psnr, psnr, ssim
 from g2ard.rendering.renderer import RasterSettings
 from g2ard.rendering.targets import Targets, against_of, checked_targets, mask_of
 from g2ard.scene.cameras import USUAL
@@ -24,7 +24,8 @@ from g2ard.scene.splats import Splats
 
 @dataclass(frozen=True)
 class ViewScore:
-    """Scores of one view: PSNR in dB, SSIM in [−1, 1], LPIPS by network (empty without weights).
+    """Scores of one view: PSNR and that of gradients in dB, SSIM in [−1, 1], LPIPS by network (empty without
+    weights).
 
     `against` is "photo" or "teacher" if the targets say so, `kind` the kind of view (`Cameras.kinds`).
     """
@@ -32,6 +33,7 @@ class ViewScore:
     name: str
     psnr: float
     ssim: float
+    edge_psnr: float
     lpips: Mapping[str, float] = field(default_factory=dict)
     against: str | None = None
     kind: str = USUAL
@@ -66,6 +68,11 @@ class Evaluation:
         return float(np.mean([v.ssim for v in self.views]))
 
     @property
+    def edge_psnr(self) -> float:
+        """Mean of the views' PSNR of gradients, in dB."""
+        return float(np.mean([v.edge_psnr for v in self.views]))
+
+    @property
     def lpips(self) -> dict[str, float]:
         """Mean of the views' LPIPS, by network."""
         return {net: float(np.mean([v.lpips[net] for v in self.views])) for net in self.views[0].lpips}
@@ -77,9 +84,10 @@ class Evaluation:
             "bytes": self.bytes,
             "psnr": self.psnr,
             "ssim": self.ssim,
+            "edge_psnr": self.edge_psnr,
             "lpips": self.lpips or None,
             "views": [
-                {"name": v.name, "psnr": v.psnr, "ssim": v.ssim}
+                {"name": v.name, "psnr": v.psnr, "ssim": v.ssim, "edge_psnr": v.edge_psnr}
                 | ({"against": v.against} if v.against else {})
                 | ({"kind": v.kind} if v.kind != USUAL else {})
                 for v in self.views
@@ -103,8 +111,9 @@ def evaluate(
     """Render every view of `targets` and score it.
 
     PSNR = −10·log₁₀ of the mean squared difference over pixels and channels, in dB, at most 100; SSIM (Wang
-    et al. 2004) has an 11×11 Gaussian window, σ 1.5, zero-padded, values in 0–1. Renders are clamped to
-    [0, 1] without 8-bit rounding, unless `eight_bit` is set. If a photo has a mask, only masked pixels count.
+    et al. 2004) has an 11×11 Gaussian window, σ 1.5, zero-padded, values in 0–1; the PSNR of gradients is
+    that of differences between neighbouring pixels, for thin structures. Renders are clamped to [0, 1]
+    without 8-bit rounding, unless `eight_bit` is set. If a photo has a mask, only masked pixels count.
 
     Args:
         splats: the scene; cameras are in world coordinates, including its offset.
@@ -145,7 +154,16 @@ def evaluate(
         mask = mask_of(targets, view)
         if mask is not None and not mask.any():
             raise InputError(f"({name}) has no valid pixel", index=view, item="view")
-        figures = psnr(image, target, mask), ssim(image, target, mask)
-        scores.append(ViewScore(name, *figures, perceived, against_of(targets, view), cameras.kinds[view]))
+        scores.append(
+            ViewScore(
+                name,
+                psnr(image, target, mask),
+                ssim(image, target, mask),
+                edge_psnr(image, target, mask),
+                perceived,
+                against_of(targets, view),
+                cameras.kinds[view],
+            )
+        )
         progress(stage, view + 1, len(cameras))
     return Evaluation(len(splats), splats.nbytes, tuple(scores))

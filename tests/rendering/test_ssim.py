@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from g2ard import _core
 from g2ard.config.choices import BLACK
 from g2ard.errors import InputError
-from g2ard.rendering.metrics import psnr, ssim
+from g2ard.rendering.metrics import edge_psnr, psnr, ssim
 from g2ard.rendering.renderer import Renderer
 from g2ard.scene.cameras import Cameras
 from g2ard.stages.recover.losses import l1_ssim
@@ -66,6 +66,34 @@ def test_metrics_are_the_twin_s(shape: tuple[int, int, int], kind: str) -> None:
     assert _core.psnr(a, a) == np.inf
 
 
+def test_edges_are_the_twin_s() -> None:
+    rng = np.random.default_rng(0)
+    a, b = rng.random((2, 9, 7, 3)).astype(np.float32)
+    mask = rng.random((9, 7)) < 0.7
+    for chosen in (None, mask):
+        squares = []
+        for y, x in np.ndindex(9, 7):
+            for down, right in ((1, 0), (0, 1)):
+                there = y + down, x + right
+                inside = there[0] < 9 and there[1] < 7
+                if inside and (chosen is None or (chosen[y, x] and chosen[there])):
+                    steps = (image[there].astype(float) - image[y, x] for image in (a, b))
+                    squares.append((next(steps) - next(steps)) ** 2)
+        want = -10 * np.log10(np.mean(squares))
+        assert edge_psnr(a, b, chosen) == pytest.approx(want, abs=1e-4)
+
+
+def test_edges_see_a_blurred_line_before_a_wrong_colour() -> None:
+    target = np.full((64, 64, 3), 0.5, np.float32)
+    target[:, 20:22] = 0.9
+    wrong, blurred = target + 0.1, target.copy()
+    blurred[:, 18:24] = target[:, 18:24].mean(1, keepdims=True)
+    assert psnr(wrong, target) < psnr(blurred, target) < 30
+    assert edge_psnr(wrong, target) > 60
+    assert edge_psnr(blurred, target) < 30
+    assert edge_psnr(target, target) == edge_psnr(target[:1, :1], wrong[:1, :1]) == 100
+
+
 def test_nan_is_no_perfect_score() -> None:
     views = around(2, (16, 12))
     ball = checkered_ball(50)
@@ -74,7 +102,7 @@ def test_nan_is_no_perfect_score() -> None:
     spoilt[3, 4] = np.nan
     everywhere = np.ones(image.shape[:2], bool)
     for mask in (None, everywhere):
-        assert np.isnan([psnr(image, spoilt, mask), ssim(image, spoilt, mask)]).all()
+        assert np.isnan([score(image, spoilt, mask) for score in (psnr, ssim, edge_psnr)]).all()
     targets = Spoilt(views)
     assert np.isnan(Probe(targets, BLACK).all_of(ball))
     assert np.isnan(Probe(targets, BLACK, 40.0).all_of(ball))
@@ -96,6 +124,8 @@ def test_shapes_must_fit() -> None:
     a = np.zeros((4, 5, 3), np.float32)
     with pytest.raises(InputError, match="target: expected the image's shape"):
         _core.ssim(a, a[:3])
+    with pytest.raises(InputError, match="target: expected the image's shape"):
+        edge_psnr(a, a[:3])
     with pytest.raises(InputError, match="image"):
         _core.psnr(a[:0], a[:0])
     with pytest.raises(InputError, match=r"target: expected \(H, W, C\) float32"):

@@ -59,7 +59,9 @@ def evaluate(
     size: opt.SizeOption = None,
     background: opt.BackgroundOption = None,
 ) -> None:
-    """Score scenes against photos or a teacher's renders: PSNR, SSIM, size, needles, Gaussians per pixel.
+    """Score scenes against photos or a teacher's renders: PSNR, SSIM, edges, size, needles, overdraw.
+
+    Edges is the PSNR of the images' gradients: how well wires, text and outlines are kept.
 
     For the evaluation of the original 3DGS, use --convention inria --8bit --lpips-input unscaled.
     """
@@ -158,6 +160,7 @@ def _table(run: Run, title: str, rows: list[dict[str, Any]]) -> None:
         "file MB": [f"{r['file_bytes'] / 1e6:.2f}" for r in rows],
         "PSNR": [f"{r['psnr']:.2f}" for r in rows],
         "SSIM": [f"{r['ssim']:.4f}" for r in rows],
+        "edges": [f"{r['edge_psnr']:.2f}" for r in rows],
         "needles": [f"{r['needle']:.1%}" for r in rows],
         "Gaussians/px": [f"{r['overdraw']:.1f}" for r in rows],
     }
