@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -23,8 +24,12 @@ from g2ard.scene.splats import Splats
 _QUANTILES = (0, 1, 25, 50, 75, 99, 100)
 
 
-def describe(path: str | Path) -> dict[str, Any]:
+def describe(path: str | Path, more: Callable[[Splats], dict[str, Any]] | None = None) -> dict[str, Any]:
     """Summarise a scene, point cloud or views.
+
+    Args:
+        path: the file or folder.
+        more: further figures of a scene.
 
     Returns:
         `path`, `kind`, `format`, `bytes`, `count`, `extent` {min, max, robust_min, robust_max: the 1st and
@@ -35,7 +40,7 @@ def describe(path: str | Path) -> dict[str, Any]:
     path, what = Path(path), kind(path)
     if what == "splats":
         scene = read_scene(path)
-        notes, figures = scene.notes, _splats(scene.splats)
+        notes, figures = scene.notes, _splats(scene.splats) | ({} if more is None else more(scene.splats))
     elif what == "points":
         cloud = read_cloud(path)
         notes, figures = cloud.notes, _points(cloud.points)

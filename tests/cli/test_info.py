@@ -2,6 +2,7 @@
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from g2ard.scene.splats import Splats
 from helpers.commands import CommandLine, refused, succeeds
 from helpers.photos import BALL, photos_of
 from helpers.realdata import real
+from helpers.scenes import checkered_ball
 
 
 def scene(path: Path, count: int = 400) -> Splats:
@@ -44,6 +46,22 @@ def test_scene(tmp_path: Path) -> None:
     assert found["largest_scale"]["100"] == pytest.approx(splats.scales.max(), rel=1e-6)
     assert found["odd"]["opacity_below_0.005"] == (splats.opacities < 0.005).sum() > 0
     assert found["odd"]["same_position_as_another"] == 0
+
+
+def test_close_views_blend_more_gaussians(tmp_path: Path, command_line: CommandLine) -> None:
+    ball = checkered_ball(1000)
+    write_splats(tmp_path / "a.ply", ball)
+    write_splats(tmp_path / "huge.ply", replace(ball, scales=ball.scales * 4))
+    found = {}
+    for name in ("a.ply", "huge.ply"):
+        printed = succeeds(command_line, tmp_path, "info", name, "--json", "-")
+        found[name] = json.loads(printed.out)["close_overdraw"]
+        assert 1 < found[name]["mean"] <= found[name]["worst"]
+    assert found["huge.ply"]["mean"] > 2 * found["a.ply"]["mean"]
+    assert "Gaussians per pixel, near" in succeeds(command_line, tmp_path, "info", "a.ply").out
+    write_splats(tmp_path / "clear.ply", replace(ball, logit_opacities=np.full(1000, -15, np.float32)))
+    printed = succeeds(command_line, tmp_path, "info", "clear.ply", "--json", "-")
+    assert "close_overdraw" not in json.loads(printed.out)
 
 
 def test_cloud(tmp_path: Path) -> None:

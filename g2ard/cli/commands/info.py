@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -12,6 +12,9 @@ from g2ard.cli.frame import Run, command, one_line
 from g2ard.errors import InputError
 from g2ard.io.detect import run_scene
 from g2ard.progress import plural
+
+if TYPE_CHECKING:
+    from g2ard.scene.splats import Splats
 
 
 @command("info", example="g2ard info scene.ply --json -")
@@ -28,7 +31,7 @@ def info(
         bool, typer.Option("--devices", help="List GPUs and which one --device would use.")
     ] = False,
 ) -> None:
-    """Show what a file holds: counts, extents, SH degree, opacities, scales, invalid values.
+    """Show what a file holds: counts, extents, SH degree, opacities, scales, overdraw, invalid values.
 
     Files that cannot be read are reported and skipped; the exit status is then 1.
     """
@@ -65,24 +68,31 @@ def _described(path: Path) -> tuple[dict[str, Any], list[list[str]]]:
         return stopped, _rows_of_stopped(path, stopped)
     scene = run_scene(path)
     if scene == path:
-        figures = describe(path)
+        figures = describe(path, _overdraw)
         if figures["kind"] == "views":
             from g2ard.jobs.photos import sparse_file, sparse_points
 
             points = sparse_points(sparse_file(path))
             figures["sparse_points"] = 0 if points is None else len(points)
         return figures, _rows(figures)
-    figures, report = describe(scene), read_json(path / "report.json")
+    figures, report = describe(scene, _overdraw), read_json(path / "report.json")
     against, scores = _scores(report)
     figures["run"] = {"input_count": report["input_count"], "against": against, "scores": scores}
     rows = [["made from", plural(report["input_count"], "Gaussian")]]
     if "overdraw" in report:  # not of runs in tiles
         figures["run"]["overdraw"] = report["overdraw"]
-        rows.append(["Gaussians per pixel", f"{report['overdraw']:.1f}"])
+        rows.append(["Gaussians per pixel, held-out", f"{report['overdraw']:.1f}"])
     for name, found in scores.items():
         ssim = f", SSIM {found['ssim']:.4f}" if "ssim" in found else ""
         rows.append([name, f"{found['psnr']:.2f} dB{ssim} against {against}"])
     return figures, [*_rows(figures), *rows]
+
+
+def _overdraw(splats: Splats) -> dict[str, Any]:
+    from g2ard.jobs.close_up import close_up
+
+    found = close_up(splats)
+    return {} if found is None else {"close_overdraw": found.as_dict()}
 
 
 def _scores(report: dict[str, Any]) -> tuple[str, dict[str, dict[str, float]]]:
@@ -151,6 +161,9 @@ def _rows(figures: dict[str, Any]) -> list[list[str]]:
             quantiles = figures[key]
             label = f"{key.replace('_', ' ')} ({' '.join(quantiles)} %)"
             rows.append([label, "  ".join(f"{value:.3g}" for value in quantiles.values())])
+    if "close_overdraw" in figures:
+        close = figures["close_overdraw"]
+        rows.append(["Gaussians per pixel, near", f"{close['mean']:.0f}, at worst {close['worst']:.0f}"])
     if "color" in figures:
         rows.append(["mean colour", _vector(figures["color"]["mean"])])
     rows += [[key, f"{figures[key]:,}"] for key in ("photos", "distorted") if key in figures]
