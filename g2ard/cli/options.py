@@ -61,7 +61,7 @@ ViewsOrMadeOption = Annotated[
 ]
 ImagesOption = Annotated[
     Path | None,
-    typer.Option(metavar="DIR", help="Folder of the photos of --views, if they are elsewhere."),
+    typer.Option(metavar="DIR", help="Folder of the photos of the views, if they are elsewhere."),
 ]
 AlphaOption = Annotated[
     Alpha,

@@ -24,12 +24,18 @@ from g2ard.scene.splats import Splats
 _QUANTILES = (0, 1, 25, 50, 75, 99, 100)
 
 
-def describe(path: str | Path, more: Callable[[Splats], dict[str, Any]] | None = None) -> dict[str, Any]:
+def describe(
+    path: str | Path,
+    more: Callable[[Splats], dict[str, Any]] | None = None,
+    *,
+    images: Path | None = None,
+) -> dict[str, Any]:
     """Summarise a scene, point cloud or views.
 
     Args:
         path: the file or folder.
         more: further figures of a scene.
+        images: folder of the photos of views, if they are elsewhere.
 
     Returns:
         `path`, `kind`, `format`, `bytes`, `count`, `extent` {min, max, robust_min, robust_max: the 1st and
@@ -45,7 +51,7 @@ def describe(path: str | Path, more: Callable[[Splats], dict[str, Any]] | None =
         cloud = read_cloud(path)
         notes, figures = cloud.notes, _points(cloud.points)
     else:
-        views = read_view_set(path)
+        views = read_view_set(path, images=images)
         views = replace(views, splits=splits_of(path, views.cameras.names, views.splits))
         notes, figures = (*views.notes, *_photo_notes(views.cameras)), _views(views)
     return {

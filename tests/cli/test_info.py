@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from g2ard.io import write_points, write_splats, write_views
 from g2ard.io.describe import describe
@@ -99,6 +100,19 @@ def test_views(tmp_path: Path) -> None:
     assert found["sizes"] == {"8×6": 3}
     assert found["splits"] == {"train": 2, "test": 1}
     assert found["fov_degrees"]["50"] == pytest.approx(90)
+
+
+def test_photos_of_views_that_are_elsewhere(tmp_path: Path, command_line: CommandLine) -> None:
+    K = [[4, 0, 4], [0, 4, 3], [0, 0, 1]]
+    cameras = Cameras.from_lists([look_at([3, 0, 1], [0, 0, 0])], [K], [(8, 6)], ["a.png"])
+    write_views(tmp_path / "a.json", replace(cameras, image_paths=(tmp_path / "gone" / "a.png",)))
+    (tmp_path / "photos").mkdir()
+    Image.new("RGBA", (8, 6)).save(tmp_path / "photos" / "a.png")
+    found = json.loads(succeeds(command_line, tmp_path, "info", "a.json", "--json", "-").out)
+    assert found["photos"] == 0
+    words = ("info", "a.json", "--images", "photos", "--json", "-")
+    found = json.loads(succeeds(command_line, tmp_path, *words).out)
+    assert (found["photos"], found["notes"][0]["code"]) == (1, "alpha")
 
 
 def test_command(tmp_path: Path, command_line: CommandLine) -> None:

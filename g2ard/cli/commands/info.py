@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from g2ard.cli import options as opt
 from g2ard.cli.frame import Run, command, one_line
 from g2ard.errors import InputError
 from g2ard.io.detect import run_scene
@@ -27,6 +28,7 @@ def info(
             help="Scenes, coloured point clouds, views, or folders of `distill` runs.",
         ),
     ] = None,
+    images: opt.ImagesOption = None,
     devices: Annotated[
         bool, typer.Option("--devices", help="List GPUs and which one --device would use.")
     ] = False,
@@ -44,7 +46,7 @@ def info(
     for path in paths:
         run.begin("read")
         try:
-            figures, rows = _described(path)
+            figures, rows = _described(path, images)
         except (InputError, OSError) as error:
             if len(paths) == 1:
                 raise
@@ -58,7 +60,7 @@ def info(
         raise typer.Exit(1)
 
 
-def _described(path: Path) -> tuple[dict[str, Any], list[list[str]]]:
+def _described(path: Path, images: Path | None) -> tuple[dict[str, Any], list[list[str]]]:
     """Return a file's figures, with scores for a run, and the table rows that show them."""
     from g2ard.cli.run_folder import stopped_run
     from g2ard.io.describe import describe
@@ -68,7 +70,7 @@ def _described(path: Path) -> tuple[dict[str, Any], list[list[str]]]:
         return stopped, _rows_of_stopped(path, stopped)
     scene = run_scene(path)
     if scene == path:
-        figures = describe(path, _overdraw)
+        figures = describe(path, _overdraw, images=images)
         if figures["kind"] == "views":
             from g2ard.jobs.photos import sparse_file, sparse_points
 
