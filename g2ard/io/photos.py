@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -21,6 +23,16 @@ from g2ard.scene.transform import rotation_matrices
 
 ASPECT_SLACK = 0.02
 """Relative difference in aspect ratio that rounding may cause; more means another photo."""
+
+_EXIF, _FOCAL, _FILM_FOCAL = 0x8769, 0x920A, 0xA405
+_SENSOR_PIXELS, _SENSOR_UNIT, _STORED_WIDTH = 0xA20E, 0xA210, 0xA002
+"""Tags of EXIF: its own directory, focal lengths in mm, sensor pixels per unit, the unit, and the width."""
+
+_UNITS = {2: 25.4, 3: 10.0, 4: 1.0, 5: 1e-3}
+"""Millimetres of a unit of sensor pixels: inch, cm, mm and µm."""
+
+_FILM_DIAGONAL = math.hypot(36, 24)
+"""Diagonal of 35 mm film, mm."""
 
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG", ".webp")
 
@@ -70,6 +82,29 @@ def photo_size(path: Path, listed_in: Path | None = None) -> tuple[int, int]:
             return image.size
     except InputError as error:
         raise error if listed_in is None else error.at(hint=f"it is listed in {listed_in}") from None
+
+
+def exif_focal(path: Path) -> float | None:
+    """Return the focal length in pixels by a photo's EXIF, None without one or for a broken photo.
+
+    It comes from the focal length for 35 mm film, whose frame has a diagonal of 43.27 mm; otherwise from that
+    in millimetres and the sensor's pixels per unit.
+    """
+    try:
+        with opened_image(path) as image:
+            size, tags = image.size, image.getexif().get_ifd(_EXIF)
+    except (InputError, OSError):
+        return None
+    with suppress(TypeError, ValueError, ZeroDivisionError):
+        film = float(tags.get(_FILM_FOCAL, 0))
+        found = film * math.hypot(*size) / _FILM_DIAGONAL
+        if not film:
+            per_mm = float(tags.get(_SENSOR_PIXELS, 0)) / _UNITS.get(tags.get(_SENSOR_UNIT, 2), 25.4)
+            resized = size[0] / float(tags.get(_STORED_WIDTH, size[0]))
+            found = float(tags.get(_FOCAL, 0)) * per_mm * resized
+        if 0.1 < found / max(size) < 100:
+            return found
+    return None
 
 
 def rigid(matrix: NDArray[np.float64], place: Place) -> NDArray[np.float64]:

@@ -18,7 +18,7 @@ from g2ard.errors import InputError, require
 from g2ard.io import ace, read_view_set
 from g2ard.io.detect import file_format
 from g2ard.io.paths import is_photo
-from g2ard.io.photos import has_alpha, photo_size
+from g2ard.io.photos import exif_focal, has_alpha, photo_size
 from g2ard.jobs.inputs import load_scene
 from g2ard.jobs.view_checks import propose_background
 from g2ard.pipeline.presets import GS_CPR
@@ -109,7 +109,7 @@ def register(
         split: split of the views in `photos`.
         intrinsics: for a folder of photos: views with the intrinsics of each photo by name, or the same for
             all.
-        focal: for a folder of photos: focal length, pixels.
+        focal: for a folder of photos: focal length, pixels. Without it and `intrinsics`, EXIF states it.
         alpha: "mask" ignores transparent pixels instead of showing them over the background.
         background: RGB in [0, 1] behind the scene; None means black.
         render_model: overrides what the scene's file says.
@@ -179,7 +179,7 @@ def prepare(
     taken, posed = photos, True
     if not isinstance(taken, Cameras):
         path = Path(taken)
-        posed = intrinsics is None and focal is None
+        posed = not _photos_in(path)
         lens = None if intrinsics is None else Path(intrinsics)
         taken = photos_of(path, split=split, intrinsics=lens, focal=focal, alpha=alpha, say=say)
     if poses is None and pool is None and not posed:
@@ -233,7 +233,7 @@ def photos_of(
         split: split of the views, see `g2ard.io.splits`; "all" for a folder.
         intrinsics: for a folder: views with the intrinsics of each photo by name, or the same for all.
         focal: for a folder: focal length in pixels of the stored photo; centred principal point, no
-            distortion.
+            distortion. None takes that of the photos' EXIF, with a message.
         alpha: "mask" ignores transparent pixels instead of showing them over the background.
 
     Returns:
@@ -256,18 +256,14 @@ def photos_of(
         raise InputError(
             f"a folder of photos has no split {split!r}; pass views, or drop the split", path=path
         )
-    if (intrinsics is None) == (focal is None):
-        raise InputError(
-            "photos without views need their intrinsics",
-            path=path,
-            hint="give {intrinsics=VIEWS} or {focal=PIXELS}",
-        )
+    if intrinsics is not None and focal is not None:
+        raise InputError("give intrinsics or a focal length, not both", parameter="intrinsics")
     names = [file.relative_to(path).as_posix() for file in files]
     sizes = _sizes(files)
-    if focal is not None:
-        views = [_centred(focal, size) for size in sizes]
+    if intrinsics is None:
+        focals = [focal] * len(files) if focal is not None else _exif_focals(path, files, say)
+        views = [_centred(pixels, size) for pixels, size in zip(focals, sizes, strict=True)]
     else:
-        assert intrinsics is not None
         views = _lenses(intrinsics, names)
         _check_aspects(files, sizes, views)
     return Cameras.of(
@@ -280,6 +276,23 @@ def photos_of(
         )
         for view, name, file in zip(views, names, files, strict=True)
     )
+
+
+def _exif_focals(path: Path, files: list[Path], say: Say) -> list[float]:
+    """Return each photo's focal length in pixels by its EXIF; photos without one get the median."""
+    stated = [exif_focal(file) for file in files]
+    known = [pixels for pixels in stated if pixels is not None]
+    if not known:
+        raise InputError(
+            "photos without views need their intrinsics, and no EXIF states a focal length",
+            path=path,
+            hint="give {intrinsics=VIEWS} or {focal=PIXELS}",
+        )
+    usual = float(np.median(known))
+    without = len(files) - len(known)
+    others = f"; {plural(without, 'photo')} without one get the median" if without else ""
+    say(f"note: {path}: focal lengths by EXIF, {usual:,.0f} pixels in the median, no distortion{others}")
+    return [usual if pixels is None else pixels for pixels in stated]
 
 
 def _photos_in(path: Path) -> list[Path]:

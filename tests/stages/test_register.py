@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 import g2ard
 from g2ard.errors import InputError
@@ -214,6 +215,31 @@ def test_a_lens_for_all_where_names_differ(site: Path, tmp_path: Path) -> None:
     np.testing.assert_array_equal(taken.Ks, np.repeat(one.Ks, 4, 0))
     centred = photos_of(site / "photos", focal=100)
     assert centred.Ks[0].tolist() == [[100, 0, 64], [0, 100, 48], [0, 0, 1]]
+
+
+def with_exif(path: Path, size: tuple[int, int], tags: dict[int, object]) -> None:
+    exif = Image.Exif()
+    exif.get_ifd(0x8769).update(tags)
+    Image.new("RGB", size).save(path, exif=exif)
+
+
+def test_the_focal_length_of_exif(tmp_path: Path) -> None:
+    film, focal, per_unit, unit, stored = 0xA405, 0x920A, 0xA20E, 0xA210, 0xA002
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    with_exif(photos / "a.jpg", (360, 240), {film: 28})  # 28 / 36 of the longer side
+    with_exif(photos / "b.jpg", (600, 400), {focal: 24.0, per_unit: 2540.0, unit: 2, stored: 3600})
+    with_exif(photos / "c.jpg", (600, 400), {focal: 24.0, per_unit: 1000.0, unit: 3})
+    with_exif(photos / "d.jpg", (600, 400), {focal: 24.0})
+    with_exif(photos / "e.jpg", (600, 400), {film: 0, focal: float("nan"), per_unit: 1.0})
+    (photos / "f.jpg").write_bytes(b"broken")
+    said: list[str] = []
+    taken = photos_of(photos, say=said.append)
+    focals = [280, 400, 2400]
+    np.testing.assert_allclose(taken.Ks[:, 0, 0], [*focals, 400, 400, 400], rtol=1e-5)
+    assert "focal lengths by EXIF, 400 pixels in the median" in said[0]
+    assert "3 photos without one" in said[0]
+    assert photos_of(photos, focal=100).Ks[0, 0, 0] == 100
 
 
 def test_photos_to_poses_to_an_adapted_scene(site: Path, command_line: CommandLine, tmp_path: Path) -> None:

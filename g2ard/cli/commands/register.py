@@ -55,7 +55,10 @@ def register(
         typer.Option(metavar="VIEWS", help="Intrinsics for a folder of photos: by name, or one for all."),
     ] = None,
     focal: Annotated[
-        float | None, typer.Option(metavar="PX", min=1, help="Focal length for a folder of photos, pixels.")
+        float | None,
+        typer.Option(
+            metavar="PX", min=1, help="Focal length for a folder of photos, pixels; by default their EXIF's."
+        ),
     ] = None,
     size: Annotated[
         int | None,
