@@ -13,7 +13,6 @@ from g2ard.cli.frame import Run, command
 from g2ard.cli.options import ShDegreeOption, numbers
 from g2ard.config.choices import Axes, PlyLayout
 from g2ard.errors import InputError, OutputError
-from g2ard.io import table
 from g2ard.io.scene_formats import FORMATS, check_options, scene_format, written_bytes
 
 if TYPE_CHECKING:
@@ -114,6 +113,7 @@ def convert(
     """Convert scenes to another format or other axes, and merge, crop or move them."""
     import numpy as np
 
+    from g2ard.io import table
     from g2ard.scene.attributes import Condition
     from g2ard.scene.transform import in_box, in_sphere, join, moving, with_axes
     from g2ard.scene.transform import transform as moved
