@@ -1,0 +1,95 @@
+"""Files shown by Spark, a viewer of other people's, which tells the axes that it takes each format in."""
+
+import json
+import threading
+from collections.abc import Iterator
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from g2ard.io import write_splats
+from g2ard.rendering.metrics import psnr
+from g2ard.rendering.renderer import Renderer
+from g2ard.scene.cameras import Camera
+from helpers.browser import Browser
+from helpers.peers import package
+from helpers.scenes import checkered_ball
+
+WIDTH, HEIGHT = 160, 120
+VIEW = Camera.facing([1.8, -1.6, 0.9], [0.3, 0, 0.2], width=WIDTH, height=HEIGHT, fov=55)
+PAGE = """<!doctype html><style>body { margin: 0; overflow: hidden }</style>
+<script type="importmap">{ "imports": { "three": "./three/build/three.module.js",
+  "three/addons/": "./three/examples/jsm/", "@sparkjsdev/spark": "./spark/spark.module.js" } }</script>
+<script type="module">
+import * as THREE from "three";
+import { SparkRenderer, SplatMesh } from "@sparkjsdev/spark";
+window.show = async (url, turned, matrix, fov) => {
+  const renderer = new THREE.WebGLRenderer({ antialias: false, preserveDrawingBuffer: true });
+  renderer.setSize(innerWidth, innerHeight);
+  document.body.replaceChildren(renderer.domElement);
+  const scene = new THREE.Scene();
+  const camera = new THREE.PerspectiveCamera(fov, innerWidth / innerHeight, 0.01, 100);
+  new THREE.Matrix4().fromArray(matrix).decompose(camera.position, camera.quaternion, camera.scale);
+  const mesh = new SplatMesh({ url });
+  if (turned) mesh.quaternion.set(1, 0, 0, 0);
+  scene.add(new SparkRenderer({ renderer }), mesh);
+  await mesh.initialized;
+  for (let frame = 0; frame < 8; frame++) {
+    renderer.render(scene, camera);
+    await new Promise(done => setTimeout(done, 50));
+  }
+};
+</script>"""
+
+
+class _Quiet(SimpleHTTPRequestHandler):
+    def log_message(self, *_: object) -> None:
+        pass
+
+
+@pytest.fixture(scope="module")
+def shown(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, Browser]]:
+    """A folder, and a browser with Spark's page in it."""
+    folder = tmp_path_factory.mktemp("spark")
+    (folder / "three").symlink_to(package("three"))
+    (folder / "spark").symlink_to(package("@sparkjsdev", "spark", "dist"))
+    (folder / "index.html").write_text(PAGE)
+    server = ThreadingHTTPServer(("127.0.0.1", 0), partial(_Quiet, directory=str(folder)))
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    with Browser(WIDTH, HEIGHT) as browser:
+        browser.open(f"http://127.0.0.1:{server.server_port}/")
+        browser.run(
+            "new Promise(done => { const look = () => window.show ? done() : setTimeout(look, 50); look(); })"
+        )
+        yield folder, browser
+    server.shutdown()
+    server.server_close()
+
+
+@pytest.mark.parametrize(
+    ("name", "turned", "options"),
+    [
+        ("a.ply", True, {}),
+        ("a.sog", True, {}),
+        ("a.spz", False, {}),
+        ("as_ply.spz", True, {"axes": "RDF"}),
+    ],
+)
+def test_spark_shows_a_file(
+    shown: tuple[Path, Browser], name: str, turned: bool, options: dict[str, str]
+) -> None:
+    """As `docs/how-to/engines.md` says: only an .spz by its definition stands upright as it is."""
+    folder, browser = shown
+    scene = checkered_ball(2000)
+    write_splats(folder / name, scene, **options)
+    flip = np.diag([1.0, -1, -1, 1])
+    matrix = flip @ np.linalg.inv(VIEW.viewmat) @ flip
+    fov = float(np.degrees(2 * np.arctan(HEIGHT / 2 / VIEW.K[1, 1])))
+    expected = np.clip(Renderer(scene).image(VIEW), 0, 1)
+    for turn in (turned, not turned):
+        browser.run(f"show('{name}', {json.dumps(turn)}, {json.dumps(matrix.T.ravel().tolist())}, {fov})")
+        likeness = psnr(browser.picture() / np.float32(255), expected)
+        assert (likeness > 30) == (turn == turned), likeness
