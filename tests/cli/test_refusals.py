@@ -76,7 +76,7 @@ INPUT = [
     ("lift ball.ply -o o.ply", "run `simplify` or `distill`"),
     ("convert ball.ply b.ksplat", "scenes are written as"),
     ("convert ball.ply b.ply --spz-version 3", "no option 'spz_version'"),
-    ("convert ball.ply b.ply --box 8,8,8,9,9,9", "are within --box and --sphere"),
+    ("convert ball.ply b.ply --box 8,8,8,9,9,9", "keep none of 400 Gaussians"),
     ("convert ball.ply o.ply --box 1,1,1,0,0,0", "the lower corner comes first"),
     ("recover absent.ply --views v.json -o out.obj", "out.obj: scenes are written as"),
     ("recover ball.ply --views none.json -o out.ply", "none.json"),
