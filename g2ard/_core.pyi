@@ -207,6 +207,9 @@ def select_greedy(
     config: CoverageOptions,
     progress: Callable[[int, int], None] | None = None,
 ) -> tuple[NDArray[np.uint32], _F64, int]: ...
+def select_light(
+    received: _F32, before: _F64, k: int, progress: Callable[[int, int], None] | None = None
+) -> tuple[NDArray[np.uint32], _F64]: ...
 
 _Grey = NDArray[np.float64]
 _Mask = NDArray[np.bool_]

@@ -133,7 +133,7 @@ def _recover(job: Job) -> dict[str, Any]:
         targets[view]
     config = RecoverConfig(
         schedule=_schedule(job["schedule"], targets.cameras),
-        steps=job["steps"],
+        steps=job["steps"] if job["seconds"] is None else None,
         recovery_time=job["seconds"],
         regularizers=Regularizers(**job["regularizers"]),
         sh_degree=job["sh_degree"],

@@ -34,6 +34,9 @@ from g2ard.stages.recover.auto_preset import PriorMeasures, measure_prior
 
 Scene = Splats | Points | str | Path | None
 
+_USUAL_RATIO = 10
+"""Reduction for which views are chosen if the count is measured later, in these views."""
+
 
 @checks_arguments
 def distill(
@@ -178,12 +181,11 @@ def prepare(
         counted(len(prior))
     default_degree = 3 if read.lifted else None  # points have one colour each, photos show more
     degree = options.configured(sh_degree=default_degree).recover.sh_degree
-    for budget in budgets:
-        if not budget.is_measured:
-            budget.of(len(prior), read.name)  # rejects a count before views are planned
+    counts = [budget.of(len(prior), read.name) for budget in budgets if not budget.is_measured]
     views = views_of(
         prior,
         options,
+        min(counts, default=max(1, len(prior) // _USUAL_RATIO)),
         beside=read.beside,
         teach=not read.lifted and options.photos is not True,
         progress=progress,

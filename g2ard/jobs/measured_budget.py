@@ -377,7 +377,6 @@ def _aim_for_quality(reduce: Reduction, wanted: Quality, file: str) -> Aim:
         _QUALITY_VIEWS,
         seed=reduce.seed,
         rows=_POOL_SAMPLE,
-        for_weights=True,
         progress=reduce.progress,
     )
     cameras = pool.cameras.resized(_QUALITY_SIDE)

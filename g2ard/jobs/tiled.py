@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import shutil
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -214,7 +214,11 @@ def distill_in_tiles(
         tiling: how; `folder` keeps finished steps, so that the same call resumes.
         options: as for `g2ard.distill`, without those that `whole_options` returns.
     """
-    with _job(scene, tiling, options, True, progress, say) as job:
+
+    def smallest(total: int) -> int:
+        return min(budget.of(total, str(scene)) for budget in budgets)
+
+    with _job(scene, tiling, options, smallest, True, progress, say) as job:
         for budget in budgets:
             count = budget.of(job.store.count, str(scene))
             small = job.simplified(job.store, count, job.views.train.cameras)
@@ -262,7 +266,11 @@ def lod_in_tiles(
     levels: list[StoredScene] = []
     reports: list[LevelReport] = []
     around: Surroundings | None = None
-    with _job(scene, tiling, options, recover, progress, say) as job:
+
+    def smallest(total: int) -> int:
+        return Budget(ratio=ratios[-1]).of(total, str(scene))
+
+    with _job(scene, tiling, options, smallest, recover, progress, say) as job:
         finer = job.store
         for number, ratio in enumerate(ratios):
             if ratio == 1:
@@ -341,9 +349,18 @@ class _Job:
 
 @contextmanager
 def _job(
-    scene: Path, tiling: Tiling, options: DistillOptions, learn: bool, progress: Progress, say: Say
+    scene: Path,
+    tiling: Tiling,
+    options: DistillOptions,
+    smallest: Callable[[int], int],
+    learn: bool,
+    progress: Progress,
+    say: Say,
 ) -> Iterator[_Job]:
-    """Open the tiles, start workers, and decide views and constants of a distillation."""
+    """Open the tiles, start workers, and decide views and constants of a distillation.
+
+    `smallest` returns the smallest budget from the scene's count.
+    """
     model = options.render_model
     with _tiles_and_workers(scene, tiling, RECOVERY_TIMES, model, progress, say) as (store, workers):
         sample = TiledRun(store, workers, options.config.simplify).sample()
@@ -351,6 +368,7 @@ def _job(
         views = views_of(
             sample,
             options,
+            smallest(store.count),
             beside=options.beside or scene,
             represents=store.count / len(sample),
             progress=progress,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -18,8 +18,10 @@ from g2ard.jobs.inputs import Views, drop_held_out, load_view_sets, load_views
 from g2ard.jobs.view_checks import as_pool, check_sight, found_views, warn_of_sight
 from g2ard.pipeline.run_views import RunViews
 from g2ard.progress import Progress, Say, silent, unsaid
-from g2ard.scene.cameras import USUAL, Cameras, rows_by_kind
+from g2ard.scene.cameras import USUAL, Camera, Cameras, rows_by_kind
 from g2ard.scene.splats import Splats
+from g2ard.stages.select.light import complete
+from g2ard.stages.simplify import simplify
 
 if TYPE_CHECKING:
     from g2ard.jobs.distill_options import DistillOptions
@@ -27,31 +29,30 @@ if TYPE_CHECKING:
     from g2ard.poses import Pool
 Up = Sequence[float] | None
 
-_POOL_VIEWS, _POOL_GROWTH, _NEAR_SHARE = 160, 2.0, 0.25
-"""Generated pool: number of poses, growth factor if views show little of the scene, and share of nearer
-poses. Every 8th pose is held out for scoring.
-"""
-_ANYWHERE_SHARE, _LEAST_ANYWHERE_SHARE = 0.4, 0.05
-"""Share of the training views that look from anywhere, if other views hold nothing of the scene; if they hold
-a share h, 1−h times that, and none below the second share.
-"""
-_VIEWS_APART = 24
-"""Number of near views, and of each further kind that trains: one half validates recovery, the other is
-scored."""
+_POOL_VIEWS, _TRAINING_VIEWS, _POOL_GROWTH = 128, 112, 2.0
+"""Generated usual views, those of them that train (every 8th is held out for scoring), and the largest factor
+if a view shows little of the scene."""
+_OFFERED_VIEWS, _VIEWS_APART = 64, 16
+"""Views of each other kind from which training views are chosen, and further ones: one half validates
+recovery, the other is scored."""
+_OTHER_KINDS = ("near", "standing", "anywhere")
+_COMPACT_ROWS = 100_000
+"""Most Gaussians of the compact scene that the choice is measured on."""
 _POOL_GAUSSIANS = 4_000_000
 """Size of a tiled scene from which the pool grows in proportion."""
 _POOL_SAMPLE = 200_000
 """Gaussians that poses are planned on."""
 
-_WEIGHT_VIEWS, _WEIGHT_ROWS = 96, 100_000
-"""Size of the pool for simplification, of which as many are used as the scene needs, and the Gaussians that
-it is planned on.
+_WEIGHT_VIEWS, _WEIGHT_ROWS, _WEIGHT_NEAR_SHARE = 96, 100_000, 0.25
+"""Size of the pool for simplification, of which as many are used as the scene needs, the Gaussians that it is
+planned on, and its share of nearer views where a view shows little.
 """
 
 
 def views_of(
     prior: Splats,
     options: DistillOptions,
+    count: int,
     *,
     beside: str | Path | None = None,
     teach: bool = True,
@@ -61,10 +62,14 @@ def views_of(
 ) -> RunViews:
     """Choose views for recovery and for scoring.
 
+    Usual views are given, found or generated. Views of other kinds that resolve what these leave unresolved
+    join them (`g2ard.stages.select.light`), measured on the scene merged to `count` by the method `fast`.
+
     Args:
         prior: the dense scene.
         options: the views, or None for those found beside the scene or generated; `focus`, the kind of views
             added to views that are given without photos or generated.
+        count: Gaussians of the compact scene.
         beside: path beside which to look for cameras.
         teach: whether the scene can render targets; otherwise views without a photo are skipped and no views
             are generated.
@@ -84,15 +89,19 @@ def views_of(
         progress=progress,
     )
     load = partial(load_view_sets, size=options.size, say=say, unpictured=teach)
-    spare = round(_VIEWS_APART * _times(prior, represents))
     select = replace(options.config.select, focus=options.focus)
+    mix = partial(
+        _mixed, prior=prior, count=count, represents=represents, size=options.size, progress=progress, say=say
+    )
     if given is None or is_made(given):
         if not teach:
             raise InputError(
                 "generated views have no photos", parameter="photos", hint="give {views} that have them"
             )
         held_out = None if options.held_out is None else load(options.held_out, [for_scores])[0].cameras
-        return _generated(plan(_POOL_VIEWS, grow=_POOL_GROWTH), held_out, options.size, select, spare, say)
+        return _generated(
+            plan(_POOL_VIEWS, grow=_POOL_GROWTH), held_out, options.size, partial(mix, select=select), say
+        )
     if options.held_out is None:
         train, test = load(given, ["train", "test"])
     else:
@@ -109,21 +118,21 @@ def views_of(
     if not teach:
         return RunViews(train, test.cameras)
     try:
-        planned = plan(_VIEWS_APART)
+        planned = plan(_OFFERED_VIEWS)
     except InputError:  # the scene has no room for poses
         return RunViews(train, test.cameras)
-    train, apart = _mixed(train, planned, select, spare, options.size, say)
+    train, apart, _ = mix(train, planned, select=select)
     return RunViews(train, test.cameras, apart)
 
 
 def _generated(
-    planned: Pool, held_out: Cameras | None, size: int | None, select: SelectConfig, spare: int, say: Say
+    planned: Pool, held_out: Cameras | None, size: int | None, mix: Callable[..., _Mixed], say: Say
 ) -> RunViews:
     """Split a pool into views for training and for scoring; all train if `held_out` are scored."""
     names = planned.cameras.names
     held_back = split_mask(None, names, "test") if held_out is None else np.zeros(len(names), bool)
     usual = ViewSet(planned.cameras, splits=tuple(np.where(held_back, "test", "train").tolist()))
-    train, apart = _mixed(usual.take(~held_back), planned, select, spare, None, say)
+    train, apart, unseen = mix(usual.take(~held_back), planned)
     test = planned.cameras.take(held_back)
     pool = ViewSet(
         Cameras.of([*train.cameras, *test]),
@@ -133,44 +142,80 @@ def _generated(
     train, test = train.resized(size), test.resized(size)
     if held_out is not None:
         train, test = drop_held_out(train, held_out, say), held_out
-    return RunViews(train, test, apart and apart.resized(size), pool, planned.unseen)
+    return RunViews(train, test, apart and apart.resized(size), pool, unseen)
+
+
+_Mixed = tuple[ViewSet, Cameras | None, float | None]
+"""Training views, further views of other kinds, and the unseen share of the scene if it was measured."""
 
 
 def _mixed(
-    train: ViewSet, planned: Pool, select: SelectConfig, spare: int, size: int | None, say: Say
-) -> tuple[ViewSet, Cameras | None]:
-    """Add views of other kinds to training views, and return them with `spare` further views of each kind.
+    train: ViewSet,
+    planned: Pool,
+    *,
+    prior: Splats,
+    count: int,
+    represents: float,
+    select: SelectConfig,
+    size: int | None,
+    progress: Progress,
+    say: Say,
+) -> _Mixed:
+    """Add views of other kinds to training views: those that `complete` chooses, or of one kind with a focus.
 
-    There are also as many near views if none train.
+    Some further views of each kind are set apart.
     """
-    usual = len(train.cameras)
-    share = _ANYWHERE_SHARE * (1 - planned.held)
-    if select.focus in ("far", "anywhere") or share <= _LEAST_ANYWHERE_SHARE:
-        share = 0.0
-    counts = {"near": 0, "anywhere": round(usual * share / (1 - share))}
-    if select.focus not in (None, "far"):
-        times = select.focus_share / (1 - select.focus_share)
-        counts[select.focus] = round((usual + counts["anywhere"]) * times)
-    more, apart = [], []
-    for kind, count in counts.items():
-        cameras = planned.more(kind, count + spare) if count or kind == "near" else []
-        if cameras and kind == "anywhere" != select.focus:  # half as wide, because they see little
-            cameras = [*Cameras.of(cameras).resized(cameras[0].width // 2)]
-        taken = min(count, max(len(cameras) - spare, len(cameras) // 2))
-        if kind == select.focus and taken < 0.9 * count:
-            say(f"warning: --focus {kind}: the scene has room for {taken} such views, {count} are wanted")
-        more += cameras[:taken]
+    usual, times = len(train.cameras), _times(prior, represents)
+    spare, focus = round(_VIEWS_APART * times), select.focus
+    grown = max(1.0, min(usual / _TRAINING_VIEWS, _POOL_GROWTH * times))
+    wanted = dict.fromkeys(_OTHER_KINDS, round(_OFFERED_VIEWS * grown))
+    if focus == "far":
+        wanted = {"near": 0}
+    elif focus is not None:
+        wanted = {"near": 0, focus: round(usual * select.focus_share / (1 - select.focus_share))}
+    offered: list[Camera] = []
+    apart: list[Camera] = []
+    for kind, most in wanted.items():
+        cameras = planned.more(kind, most + spare)
+        taken = min(most, max(len(cameras) - spare, len(cameras) // 2))
+        if kind == focus and taken < 0.9 * most:
+            say(f"warning: --focus {kind}: the scene has room for {taken} such views, {most} are wanted")
+        offered += cameras[:taken]
         apart += cameras[taken:]
     others = Cameras.of(apart).resized(size) if apart else None
-    if not more:
-        return train, others
+    more, unseen = Cameras.of(offered) if offered else None, None
+    if focus is None and more is not None:
+        compact, per_row = _compact(prior, count, represents, progress)
+        least = round(_TRAINING_VIEWS * times)
+        done = complete(
+            compact,
+            train.cameras,
+            more,
+            max(usual, least),
+            least_views=least,
+            represents=per_row,
+            progress=progress,
+        )
+        more, unseen = more.take(done.order) if len(done.order) else None, done.unseen
+    if more is None:
+        return train, others, unseen
     weights = np.ones(usual) if train.weights is None else train.weights / train.weights.mean()
-    return ViewSet(
+    mixed = ViewSet(
         Cameras.of([*train.cameras, *more]).resized(size),
         train.notes,
         train.splits and train.splits + ("train",) * len(more),
         np.append(weights, np.ones(len(more))),  # drawn equally often
-    ), others
+    )
+    return mixed, others, unseen
+
+
+def _compact(prior: Splats, count: int, represents: float, progress: Progress) -> tuple[Splats, float]:
+    """Return a scene that looks like `prior` merged to `count`, and the Gaussians that a row stands for."""
+    rows = min(count, _COMPACT_ROWS, len(prior))
+    if represents > 1:  # a sample's Gaussians cover for the others
+        prior = replace(prior, scales=prior.scales * np.float32(np.sqrt(represents)))
+    small = prior if rows == len(prior) else simplify(prior, rows, method="fast", progress=progress).splats
+    return small, count / rows
 
 
 def views_or_pool(
@@ -260,7 +305,7 @@ def cameras_for_weights(
             up=up,
             seed=seed,
             rows=round(_WEIGHT_ROWS * times),
-            near=_NEAR_SHARE,
+            near=_WEIGHT_NEAR_SHARE,
             for_weights=True,
             represents=represents,
             progress=progress,
@@ -281,7 +326,7 @@ def _planned(
     grow: float = 1.0,
     represents: float = 1.0,
 ) -> Pool:
-    """Plan a pool of `count` to `grow` × `count` views."""
+    """Plan a pool of `count` to `grow` × `count` views, more in proportion to a tiled scene's size."""
     from g2ard.poses import plan_pool
 
     times = _times(prior, represents)
@@ -292,7 +337,6 @@ def _planned(
         seed=seed,
         rows=round(_POOL_SAMPLE * times),
         grow=grow,
-        near=_NEAR_SHARE,
         represents=represents,
         progress=progress,
     )

@@ -87,7 +87,7 @@ class DistillConfig:
 
 
 def check_recovery(config: RecoverConfig) -> None:
-    """Reject values of other types, a background that is no colour, and steps with a time limit.
+    """Reject values of other types and a background that is no colour.
 
     Raises:
         InputError: the first invalid value.
@@ -97,5 +97,3 @@ def check_recovery(config: RecoverConfig) -> None:
     check_colour("background", config.background)
     require("sh_degree", config.sh_degree, config.sh_degree in (None, 0, 1, 2, 3), "0 to 3")
     require("seed", config.seed, config.seed >= 0, "a whole number of at least 0")
-    if config.steps is not None and config.recovery_time is not None:
-        raise InputError("steps and recovery_time exclude each other; give one", parameter="steps")

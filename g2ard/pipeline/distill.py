@@ -259,10 +259,11 @@ class _Rounds:
         if self._restore(name, entry):
             self._count_resumed(entry["recover"][-1]["seconds"])
         else:
+            limit = self._time_limit(final)
             config = replace(
                 self.config.recover,
-                steps=self._steps() if final else None,
-                recovery_time=self._time_limit(final),
+                steps=self._steps() if final and limit is None else None,
+                recovery_time=limit,
                 final=final,
             )
             checkpoint = self.work / f"{name}.checkpoint.npz" if self.work else None

@@ -50,7 +50,7 @@ def test_commands_read_runs(
 def test_python_reads_them_too(home: Path) -> None:
     assert len(g2ard.load(home / "runs" / "a")) == 300
     assert len(g2ard.load(home / "runs" / "b")) == 150
-    assert len(g2ard.load_views(home / "runs" / "a")) == 20
+    assert len(g2ard.load_views(home / "runs" / "a")) == 16
 
 
 def test_the_size_is_the_scene_files(home: Path, command_line: CommandLine) -> None:

@@ -37,7 +37,7 @@ def test_views_are_made_where_none_are_given(command_line: CommandLine, folder: 
     succeeds(command_line, folder, *ask)
     out = command_line("evaluate", "better.ply", *given, "--json", "-", cwd=folder)[1]
     after = json.loads(out)["scenes"][0]
-    assert len(before["views"]) >= 20
+    assert len(before["views"]) == 16
     assert after["psnr"] > before["psnr"] + 1
     for command in (("evaluate", "small.ply"), ("recover", "small.ply", "-o", "x.ply")):
         assert "--views, or a --teacher" in refused(command_line, folder, *command)
@@ -46,27 +46,33 @@ def test_views_are_made_where_none_are_given(command_line: CommandLine, folder: 
 @pytest.mark.parametrize(
     ("make", "focus", "kinds"),
     [
-        (naive.room, None, {"usual", "anywhere"}),
+        (naive.room, None, {"usual", "near", "standing", "anywhere"}),
         (naive.room, "far", {"usual"}),
-        (naive.room, "standing", {"usual", "standing", "anywhere"}),
-        (naive.statue, None, {"usual"}),
+        (naive.room, "standing", {"usual", "standing"}),
+        (naive.statue, None, {"usual", "near", "standing", "anywhere"}),
         (naive.statue, "near", {"usual", "near"}),
         (naive.statue, "anywhere", {"usual", "anywhere"}),
     ],
 )
 def test_views_of_other_kinds_join_the_usual_ones(make, focus: str | None, kinds: set[str]) -> None:
-    views = views_of(make(), DistillOptions(views="made", settings={"focus": focus}))
+    scene = make()
+    options = DistillOptions(views="made", settings={"focus": focus})
+    views = views_of(scene, options, len(scene) // 10)
     rows = rows_by_kind(views.train.cameras.kinds)
-    assert set(rows) == kinds
+    assert set(rows) <= kinds
+    assert len(rows["usual"]) == (224 if make is naive.room else 112)
     share = {kind: len(found) / len(views.train.cameras) for kind, found in rows.items()}
     if focus is None:
-        assert share["usual"] == 1 if make is naive.statue else 0.2 < share["anywhere"] < 0.4
+        assert len(rows) >= 2
+        assert share["usual"] >= 0.5
+        assert views.unseen is not None
+        assert views.unseen < 0.01
     elif focus != "far":
         assert share[focus] == pytest.approx(0.5, abs=0.02)
-    assert all(views.train.cameras.widths[rows.get("anywhere", [])] == (800 if focus == "anywhere" else 400))
+    assert (views.train.cameras.widths == 800).all()
     assert set(views.test.kinds) == {"usual"}
     assert views.apart is not None
-    assert set(views.apart.kinds) == {"near"} | kinds - {"usual"}
+    assert set(views.apart.kinds) >= {"near"} | set(rows) - {"usual"}
     assert not set(views.apart.names) & set(views.train.cameras.names)
     assert views.pool is not None
     assert len(views.pool.cameras) == len(views.train.cameras) + len(views.test)
@@ -84,7 +90,7 @@ def test_given_views_stay_first(tmp_path: Path) -> None:
     statue = naive.statue()
     write_views(tmp_path / "views.json", plan_pool(statue, 16).cameras)
     views = [
-        views_of(statue, DistillOptions(views=tmp_path / "views.json", settings=settings))
+        views_of(statue, DistillOptions(views=tmp_path / "views.json", settings=settings), 500)
         for settings in ({"focus": "far"}, {"focus": "anywhere", "focus_share": 0.25})
     ]
     plain, mixed = (found.train.cameras for found in views)

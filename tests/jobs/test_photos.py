@@ -24,7 +24,7 @@ def test_photos_alone_are_enough(points: bool, command_line: CommandLine, tmp_pa
     assert found["scores"]["recovered"]["psnr"] > max(17, found["scores"]["simplified"]["psnr"] + 1)
     said = "starting from 1,200 sparse points\n" if points else "starting from 500 points along camera rays\n"
     assert said in error
-    assert "regularisers: none (points found in photos" in error
+    assert "regularisers: none (" in error
     ours = g2ard.distill(None, views=tmp_path / "photos", count=500, steps=150).splats
     g2ard.save(tmp_path / "ours.ply", ours)
     assert (tmp_path / "ours.ply").read_bytes() == (tmp_path / "run" / "scene.ply").read_bytes()
@@ -41,10 +41,10 @@ def test_sparse_points_given_as_a_cloud_are_known_and_other_clouds_are_surfaces(
     (tmp_path / "scan.ply").write_bytes((tmp_path / "photos" / "sparse.ply").read_bytes())
     ask = ("--views", "photos", "-n", 900, "--steps", 3)
     sparse = succeeds(command_line, tmp_path, "distill", "photos/sparse.ply", *ask, "-o", "run").err
-    assert "regularisers: none (points found in photos" in sparse
+    assert "regularisers: none (" in sparse
     assert "sparse.ply has" not in sparse, sparse
     scan = succeeds(command_line, tmp_path, "distill", "scan.ply", *ask, "-o", "scan").err
-    assert "regularisers: none (points found in photos" not in scan
+    assert "regularisers: none (" not in scan
     assert "MB, scan.ply has 0." in scan, scan
 
 

@@ -70,13 +70,14 @@ def test_command_on_a_trained_scene(command_line: CommandLine, tmp_path: Path) -
     assert report["scores"]["recovered"]["psnr"] > report["scores"]["simplified"]["psnr"]
     assert report["against"] == "teacher renders"
     apart = report["apart"]
-    assert {view["kind"] for view in apart["recovered"]["views"]} == {"near"}
+    assert "near" in {view["kind"] for view in apart["recovered"]["views"]}
     assert not {view["name"] for view in report["scores"]["recovered"]["views"]} & {
         view["name"] for view in apart["recovered"]["views"]
     }
     assert 0 <= report["unseen"] < 0.5
-    assert [row["kind"] for row in report["kinds"]] == ["usual", "near"]
-    worst = min(apart["recovered"]["views"], key=lambda view: view["psnr"])
+    assert [row["kind"] for row in report["kinds"]][:2] == ["usual", "near"]
+    near = (view for view in apart["recovered"]["views"] if view["kind"] == "near")
+    worst = min(near, key=lambda view: view["psnr"])
     assert (report["kinds"][1]["worst"], report["kinds"][1]["worst_psnr"]["after"]) == (
         worst["name"],
         worst["psnr"],

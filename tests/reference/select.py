@@ -119,3 +119,18 @@ def represent(k, alike, wanted, shares):
         ]
         chosen.append(int(np.argmax(np.round(tried, 14))))
     return chosen
+
+
+def brightest(received, before, k):
+    """Greedy maximisation of Σ log(1 + before + Σ received) by trying all; return views and gains."""
+    received, total = received.astype(np.float64), before.astype(np.float64).copy()
+    views, gains = [], []
+    for _ in range(min(k, len(received))):
+        added = [
+            -np.inf if v in views else np.log((1 + total + r) / (1 + total)).sum()
+            for v, r in enumerate(received)
+        ]
+        views.append(int(np.argmax(added)))
+        gains.append(added[views[-1]])
+        total += received[views[-1]]
+    return views, gains

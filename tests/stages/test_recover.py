@@ -435,14 +435,15 @@ def test_the_guard_goes_by_the_kind_of_view_that_loses_most() -> None:
         return Guard(lambda scene: way(scene), start, 0.0, others)
 
     seen = np.full(4, 2.0)
-    part, k = guard(5, 16).choose_by_validation(
-        end, seen, 9
-    )  # anywhere loses 8 dB at the end and gains up to a quarter
+    part, k = guard(5, 16).choose_by_validation(end, seen, 9)  # loses 8 dB at the end, nothing halfway
+    assert (k, way(part)) == (2.0, pytest.approx(0.5, abs=1e-5))
+    part, k = guard(99, 16).choose_by_validation(end, seen, 9)  # the mean gains, but a kind loses
     assert (k, way(part)) == (None, pytest.approx(0.25, abs=1e-5))
     assert guard(5, 0).choose_by_validation(end, seen, 9) == (end, 0.0)
     losing = guard(5, 16)
     assert losing.look(end, 0.5, 50) == "stop"
-    assert losing.lost == pytest.approx(8)
+    assert losing.lost == pytest.approx((8 - 5) / 2)  # the mean over the kinds
+    assert guard(99, 16).look(end, 0.5, 50) == "on"
 
 
 def test_validation_views_are_scored_by_kind(student: Splats) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from g2ard.config.choices import BLACK, Colour, Engine
-from g2ard.errors import require
+from g2ard.errors import InputError, require
 from g2ard.stages.recover.anchors import REGULARIZERS, Regularizers
 from g2ard.stages.recover.schedule import TUNED, Schedule
 
@@ -64,6 +64,8 @@ class RecoverConfig(FitConfig):
         require("steps", self.steps, self.steps is None or self.steps >= 1, "at least 1")
         limit = self.recovery_time
         require("recovery_time", limit, limit is None or 0 < limit < float("inf"), "more than 0 seconds")
+        if self.steps is not None and limit is not None:
+            raise InputError("steps and recovery_time exclude each other; give one", parameter="steps")
 
     @property
     def horizon(self) -> int:

@@ -28,6 +28,8 @@ _PRIOR_VIEWS = (2.0, 5.0, 10.0, 20.0)
 """Values of k in the shrinkage v/(v + k): views that must have touched a Gaussian to keep half its change."""
 _TOLERATED_LOSS = 0.1
 """Loss in dB that is tolerated in a kind of validation views."""
+_LEAST_GAIN = 0.05
+"""Gain in dB below which a change is not worth keeping."""
 _VALIDATION_FROM, _VALIDATION_LOSS = 0.5, 0.5
 """Share of the horizon from which validation views can stop a run, and the loss in dB above which they do."""
 
@@ -45,6 +47,8 @@ class Guard:
         before: score of the start.
         others: returns the score of a scene by kind of validation view; None without such views. The kind
             that loses most decides.
+        harmful: returns the (N,) mask of Gaussians whose change made validation views worse, None if no view
+            lost.
         active: whether to look for losses; without it the result is always kept.
     """
 
@@ -52,6 +56,7 @@ class Guard:
     best: Splats
     before: float
     others: Callable[[Splats], dict[str, float]] | None = None
+    harmful: Callable[[Splats], NDArray[np.bool_] | None] = lambda scene: None
     active: bool = True
     looked: int = 0
     backed_off: list[dict[str, float]] = field(default_factory=list)
@@ -90,8 +95,14 @@ class Guard:
 
     @property
     def lost(self) -> float:
-        """Loss in dB against the start at the latest look, in the kind of validation view that lost most."""
-        return -self._gain(self.validation[-1]["psnr"]) if self.validation else 0.0
+        """Loss in dB against the start at the latest look, as the mean over the kinds of validation views.
+
+        A kind that loses alone may be mended in the end, see `choose_by_validation`.
+        """
+        if not self.validation:
+            return 0.0
+        before, now = (self.validation[look]["psnr"] for look in (0, -1))
+        return sum(before[kind] - now[kind] for kind in before) / len(before)
 
     def _gain(self, scores: dict[str, float]) -> float:
         """Return the least gain of a kind of validation view against the start."""
@@ -103,10 +114,11 @@ class Guard:
     ) -> tuple[Splats, float | None]:
         """Decide how much of a result's changes to keep, by the validation views.
 
-        Everything is kept without such views, or if every kind of them loses at most 0.1 dB against the
-        start. Otherwise the candidate is kept whose worst kind gains most: each Gaussian's change times
-        v/(v + k), where v views touched it (shrinkage towards the start); the same share of every change; or
-        the start.
+        Each Gaussian's change is multiplied by v/(v + k), where v views touched it (shrinkage towards the
+        start). k rises from 0 while the mean over the kinds rises, training views being one of them. Then
+        Gaussians that made validation views worse go back. If a kind still loses more than 0.1 dB against the
+        start, the candidate is kept whose worst kind gains most: one of the shrinkages, the same share of
+        every change, or the start.
 
         Args:
             result: the scene after the last step.
@@ -114,14 +126,41 @@ class Guard:
             step: number of the last step, for the log.
 
         Returns:
-            The scene and its k: 0 keeps the whole change, ∞ none of it, None the same share for all
-                Gaussians.
+            The scene and its k: 0 shrinks nothing, ∞ keeps the start, None the same share for all Gaussians.
         """
         if self.others is None:
             return result, 0.0
-        self.validation.append({"step": step, "psnr": self.others(result)})
-        if self.lost <= _TOLERATED_LOSS:
-            return result, 0.0
+        best, chosen, scores = result, 0.0, self.others(result)
+        self.validation.append({"step": step, "psnr": scores})
+        mean = self._mean(result, scores)
+        for k in _PRIOR_VIEWS:
+            part = blended(self.start, result, views / (views + k))
+            found = self.others(part)
+            if not self._mean(part, found) > mean + _LEAST_GAIN:
+                break
+            best, chosen, scores, mean = part, k, found, self._mean(part, found)
+        if (harmful := self.harmful(best)) is not None:
+            part = blended(self.start, best, ~harmful)
+            found = self.others(part)
+            if self._mean(part, found) > mean:
+                best, scores, mean = part, found, self._mean(part, found)
+        kept: float | None = chosen
+        gain = mean - self._mean(self.start, self.validation[0]["psnr"])
+        if self._gain(scores) < -_TOLERATED_LOSS or not gain > _LEAST_GAIN:
+            best, kept, scores = self._least_harm(result, views)
+        if best is not result:
+            self.validation.append({"step": step, "psnr": scores})
+        return best, kept
+
+    def _mean(self, scene: Splats, scores: dict[str, float]) -> float:
+        """Return the mean PSNR over training views and the kinds of validation views."""
+        return (self.score(scene) + sum(scores.values())) / (1 + len(scores))
+
+    def _least_harm(
+        self, result: Splats, views: NDArray[np.float64]
+    ) -> tuple[Splats, float | None, dict[str, float]]:
+        """Return the candidate whose worst kind of validation views gains most, its k and its scores."""
+        assert self.others is not None
         best, scores, most = self.start, self.validation[0]["psnr"], 0.0
         chosen: float | None = math.inf
         shares: list[tuple[float | None, NDArray[np.float64] | float]] = [
@@ -133,8 +172,7 @@ class Guard:
             found = self.others(part)
             if self._gain(found) > most:
                 best, chosen, scores, most = part, k, found, self._gain(found)
-        self.validation.append({"step": step, "psnr": scores})
-        return best, chosen
+        return best, chosen, scores
 
     def choose_by_training(self, result: Splats) -> tuple[Splats, float, float]:
         """Choose between the result, the best earlier scene, and blends of start and result.

@@ -19,7 +19,7 @@ from g2ard.stages.recover.config import RecoverConfig
 from g2ard.stages.recover.draw import checked_weights
 from g2ard.stages.recover.guard import Guard
 from g2ard.stages.recover.loop import Loop, Watch, finite
-from g2ard.stages.recover.probe import Probe, score_by_kind
+from g2ard.stages.recover.probe import Probe, harmful_changes, score_by_kind
 from g2ard.stages.recover.report import (
     Gain,
     Geometry,
@@ -80,9 +80,9 @@ def recover(
         anchors: frozen geometry; None takes the student's. For a student that was recovered before, pass the
             anchors of its construction.
         validation: views of other kinds (`Cameras.kinds`) than `targets`, such as near ones, not trained on.
-            If a kind loses quality, changes are scaled back per
-            Gaussian by how often it was seen (`recover.guard`), and a recovery that only harms a kind ends
-            early. At most eight views per kind are used.
+            Changes are scaled back per Gaussian by how often it was seen, as far as these views gain, and
+            Gaussians that made them worse go back (`recover.guard`). A recovery that only harms a kind ends
+            early. At most eight views per kind are scored during the steps.
         frozen: (N,) bool, mask of Gaussians that stay unchanged, such as those of another tile; requires the
             engine `fused`. None freezes none.
         checkpoint: a file written every minute and at Ctrl-C. If it exists, recovery resumes from it, with a
@@ -126,7 +126,11 @@ def recover(
     before = probe.all_of(student)
     view_weights = checked_weights(weights, len(targets.cameras))
     others = None if validation is None else score_by_kind(validation, config.background)
-    guard = Guard(probe.all_of, student, before, others, config.schedule.guarded)
+
+    def harmful(scene: Splats) -> NDArray[np.bool_] | None:
+        return None if validation is None else harmful_changes(student, scene, validation, config.background)
+
+    guard = Guard(probe.all_of, student, before, others, harmful, config.schedule.guarded)
     validation_key = None if validation is None else fingerprint_of(validation)
     loop = Loop(student, targets, config, view_weights, anchors, probe, guard, validation_key, frozen)
     if checkpoint is None or not checkpoint.exists():

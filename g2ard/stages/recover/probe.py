@@ -7,9 +7,11 @@ import time
 from collections.abc import Callable
 
 import numpy as np
+from numpy.typing import NDArray
 
+from g2ard import _core
 from g2ard.rendering.metrics import psnr
-from g2ard.rendering.renderer import Renderer
+from g2ard.rendering.renderer import Renderer, arrays_of, centred, settings_for, view_of
 from g2ard.rendering.targets import Subset, Targets, mask_of, with_pixels
 from g2ard.scene.cameras import rows_by_kind
 from g2ard.scene.samples import evenly_spaced
@@ -19,6 +21,10 @@ _SCORED_VIEWS = 8
 """Views that are scored, of training and of each kind of validation views."""
 _INVISIBLE_PSNR = 40.0
 """PSNR in dB above which differences are invisible, so that no validation view counts for more."""
+_INVISIBLE_MSE = 1e-4
+"""Mean squared error at that PSNR."""
+_TOLERATED_LOSS = 0.1
+"""Loss in dB up to which a view has not become worse."""
 _SCORING_TIME_SHARE = 0.01
 """Share of the time that scoring the views may take while progress is shown."""
 _FIRST_SCORING_SHARE = 0.1
@@ -72,3 +78,42 @@ def score_by_kind(
         kind: Probe(Subset(targets, found), background, _INVISIBLE_PSNR) for kind, found in rows.items()
     }
     return lambda splats: {kind: probe.all_of(splats) for kind, probe in probes.items()}
+
+
+def harmful_changes(
+    start: Splats, result: Splats, targets: Targets, background: tuple[float, float, float]
+) -> NDArray[np.bool_] | None:
+    """Find the Gaussians whose change made views worse; None if no view lost more than 0.1 dB.
+
+    With E the change of the squared error in each pixel, relative to the view's mean before, Σ αT·E over the
+    pixels of a Gaussian is positive if views became worse where it is seen. It must be so over all views and
+    over those that lost.
+
+    Args:
+        start: the scene before.
+        result: the scene after, of the same Gaussians.
+        targets: views, not trained on.
+    """
+    before, after = (Renderer(scene, background=background) for scene in (start, result))
+    changes, losing = [], []
+    for view, camera in enumerate(targets.cameras):
+        target, mask = targets[view], mask_of(targets, view)
+        old, new = ((r.clipped(camera).astype(np.float64) - target) ** 2 for r in (before, after))
+        change = (new - old).mean(axis=2) if mask is None else (new - old).mean(axis=2) * mask
+        changes.append(change / (max(old.mean(), _INVISIBLE_MSE) * change.size))
+        losing.append(10 * math.log10(max(new.mean(), 1e-12) / max(old.mean(), 1e-12)) > _TOLERATED_LOSS)
+    if not any(losing):
+        return None
+    scene, cameras = centred(result, targets.cameras)
+    settings = settings_for(scene.means, None, antialiased=scene.antialiased)
+    means, quats, scales, logits, sh0, _ = arrays_of(scene)
+    grey = (means, quats, scales, logits, np.zeros_like(sh0), np.zeros((len(scene), 0, 3), np.float32))
+    rasterizer, sums = _core.Rasterizer(), np.zeros((2, len(scene)))
+    for view, change in enumerate(changes):
+        rasterizer.forward(grey, view_of(cameras, view, settings), settings, [0.0, 0.0, 0.0], 0)
+        image = np.zeros((*change.shape, 3), np.float32)
+        image[..., 0] = change
+        light = rasterizer.backward(grey, image)[4][:, 0, 0]  # the gradient of a colour is Σ αT·E
+        sums[0] += light
+        sums[1] += light * losing[view]
+    return (sums[0] > 0) & (sums[1] > 0)

@@ -25,10 +25,14 @@ _UNTRAINED_RMSE = 0.1
 _SIGHT_SAMPLE = 4096
 """Gaussians that `steps_for` measures views with."""
 
+_USUAL_VIEWS, _MOST_GROWTH, _VIEWS_PER_SCHEDULE = 112, 2.25, 140
+"""Usual views that train if each holds the whole scene, the largest factor if it holds less, and the views
+that the schedule's steps are for."""
+
 _FEW_POINTS = 1250
 """Points of photos up to which the schedule's steps suffice."""
 
-_MOST_STEPS_FACTOR = 2.25
+_MOST_STEPS_FACTOR = 3.0
 """Limit of the factor on the schedule's steps."""
 
 
@@ -246,22 +250,22 @@ def steps_from_points(count: int, steps: int) -> int:
 
 
 def steps_for(scene: Splats, cameras: Cameras, steps: int) -> int:
-    """Return `steps` times 1/√share for views of a share of the scene, and more with views of other kinds.
+    """Return the steps for views against renders, 1 to 3 times `steps`.
 
-    A view of an orbit shows the whole object, but a view in a room a tenth of it. At equal steps, a room's
-    Gaussians would be trained a tenth as often; the square root is a compromise with time. Views of
-    other kinds add steps, so that usual ones, which alone decide the share, are visited as often as without
-    them. The result is from 1 to 2.25 × `steps`, times the ratio of all views to usual ones.
+    `steps` are for 140 views, each used about seven times. However many usual views there are, they count as
+    112/√h, at most 252, if one holds a share h of the scene: a view of an orbit shows the whole object, but a
+    view in a room a tenth of it. Views of other kinds count in proportion.
 
     >>> from g2ard.scene.cameras import look_at
     >>> line = Splats.create([[0, 0, 0], [9, 0, 0], [0, 0, 9], [-9, 0, 0]], scales=np.ones((4, 3)))
     >>> K = [[50, 0, 32], [0, 50, 32], [0, 0, 1]]
     >>> view = Cameras.from_lists([look_at([0, -3, 0], [0, 0, 0])], [K], [(64, 64)], ["a"])
     >>> steps_for(line, view, 1000)
-    2000
+    1600
     """
     usual = cameras.usual()
     some = evenly_spaced(len(scene), _SIGHT_SAMPLE)
     points = scene.means[some].astype(np.float64) + scene.offset
-    share = max(usual.usual_share(points), 1 / _MOST_STEPS_FACTOR**2)
-    return round(steps / math.sqrt(share) * (len(cameras) / len(usual)))
+    share = max(usual.usual_share(points), 1 / _MOST_GROWTH**2)
+    views = _USUAL_VIEWS / math.sqrt(share) * (len(cameras) / len(usual))
+    return round(steps * min(max(1.0, views / _VIEWS_PER_SCHEDULE), _MOST_STEPS_FACTOR))

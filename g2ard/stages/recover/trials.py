@@ -9,7 +9,7 @@ from collections.abc import Callable
 MULTIPLIERS = (1 / 3, 3**-0.5, 1.0, 3**0.5)
 """Multipliers of all rates; trained scenes need 1 or less, lifts more."""
 
-_EQUAL_GAIN_SHARE = 0.04
+_EQUAL_GAIN_SHARE = 0.05
 """Share of the best gain within which other gains count as equal to it."""
 _LEAST_MULTIPLIER = 0.01
 """Multiplier below which no smaller one is tried: they change nothing visible in 8 bits."""
@@ -40,8 +40,8 @@ class Trials:
     def search(self, guess: float) -> float:
         """Search `MULTIPLIERS` both ways from the one nearest to `guess`; forgets earlier trials.
 
-        The largest multiplier whose gain is within 4 % of the best is chosen. Trials are too short to show
-        the benefit of larger rates, and a long run decays its rates towards the end.
+        The largest multiplier whose gain is within 5 % of the best is chosen. Trials are too short to
+        show the benefit of larger rates, and a long run decays its rates towards the end.
 
         >>> Trials(lambda m, end: -abs(m - 1), 0, None).search(0.2)
         1.0

@@ -41,7 +41,8 @@ mod _core {
     use crate::scene::PyScene;
     #[pymodule_export]
     use crate::select::{
-        select_depth, select_greedy, select_surface, select_view_statistics, select_visible,
+        select_depth, select_greedy, select_light, select_surface, select_view_statistics,
+        select_visible,
     };
     #[pymodule_export]
     use crate::simplify::{simplify_flags, simplify_pairwise, simplify_paper};

@@ -2,7 +2,7 @@
 
 use g2ard_core::raster::Camera;
 use g2ard_core::select::{
-    Coverage, Gaussians, Occluders, Problem, Surface, ViewKernels, median_depths,
+    Coverage, Gaussians, Light, Occluders, Problem, Surface, ViewKernels, median_depths,
 };
 use numpy::{PyArray1, PyArray2, PyArrayMethods, PyReadonlyArray1, PyReadonlyArray2};
 use pyo3::prelude::*;
@@ -185,5 +185,28 @@ pub fn select_greedy<'py>(
         PyArray1::from_vec(py, chosen.views),
         PyArray1::from_vec(py, chosen.gains),
         chosen.evaluations,
+    ))
+}
+
+type Gains<'py> = (Bound<'py, PyArray1<u32>>, Bound<'py, PyArray1<f64>>);
+
+/// Return (views, gains) of greedy maximisation of Σ log(1 + before + Σ received), from (V, R) and (R,).
+#[pyfunction]
+#[pyo3(signature = (received, before, k, progress=None))]
+pub fn select_light<'py>(
+    py: Python<'py>,
+    received: PyReadonlyArray2<'py, f32>,
+    before: PyReadonlyArray1<'py, f64>,
+    k: usize,
+    progress: Option<&Bound<'py, PyAny>>,
+) -> PyResult<Gains<'py>> {
+    let light = Light {
+        received: received.as_slice()?,
+        before: arrays::flat("before", &before)?,
+    };
+    let chosen = long(py, progress, |control| light.greedy(k, control))?;
+    Ok((
+        PyArray1::from_vec(py, chosen.views),
+        PyArray1::from_vec(py, chosen.gains),
     ))
 }

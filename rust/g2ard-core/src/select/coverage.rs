@@ -1,11 +1,9 @@
 //! Greedy choice of views by how they cover the surface (the paper, eq. `view_selection`, algorithm `alg:s_avs`).
 
-use std::cmp::{Ordering, Reverse};
-use std::collections::BinaryHeap;
-
 use rayon::prelude::*;
 
 use super::Surface;
+use super::lazy::{Chosen, Objective, lazy_greedy};
 use crate::constants::constants;
 use crate::linalg::{dot, sub};
 use crate::{Control, Error, Result};
@@ -74,21 +72,8 @@ pub struct Problem<'a> {
     pub directional: bool,
 }
 
-/// Views in the order they were chosen.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Chosen {
-    pub views: Vec<u32>,
-    /// F(S ∪ v) − F(S) of each.
-    pub gains: Vec<f64>,
-    /// Number of gains computed.
-    pub evaluations: u64,
-}
-
 impl Problem<'_> {
     /// The `k` views that greedy maximisation of F picks.
-    ///
-    /// F is monotone and submodular, so a gain once computed bounds all later ones: only the view that
-    /// leads by its bound is evaluated again (CELF).
     pub fn greedy(&self, k: usize, coverage: &Coverage, control: &Control) -> Result<Chosen> {
         coverage.validate()?;
         let n = self.visible.len();
@@ -98,9 +83,7 @@ impl Problem<'_> {
             let expected = format!("cells below {cells}");
             return Err(Error::invalid("visible", expected, "one beyond"));
         }
-        let k = k.min(n);
-        control.begin(k as u64);
-        State::new(*self, *coverage).choose(k, control)
+        lazy_greedy(State::new(*self, *coverage), k, control)
     }
 }
 
@@ -111,31 +94,6 @@ struct State<'a> {
     /// P_jk and C_jk, anchor by anchor within a cell.
     targets: Vec<f64>,
     evidence: Vec<f64>,
-    evaluations: u64,
-}
-
-/// A view and the most it can add; the heap's top has the largest gain and, of equals, the lowest number.
-#[derive(PartialEq)]
-struct Bound {
-    gain: f64,
-    view: Reverse<u32>,
-    round: usize,
-}
-
-impl Eq for Bound {}
-
-impl Ord for Bound {
-    fn cmp(&self, other: &Self) -> Ordering {
-        self.gain
-            .total_cmp(&other.gain)
-            .then(self.view.cmp(&other.view))
-    }
-}
-
-impl PartialOrd for Bound {
-    fn partial_cmp(&self, other: &Self) -> Option<Ordering> {
-        Some(self.cmp(other))
-    }
 }
 
 impl<'a> State<'a> {
@@ -158,7 +116,6 @@ impl<'a> State<'a> {
             anchors,
             targets,
             evidence,
-            evaluations: 0,
         }
     }
 
@@ -199,6 +156,12 @@ impl<'a> State<'a> {
             f(j * count + k, incidence * value / total);
         }
     }
+}
+
+impl Objective for State<'_> {
+    fn views(&self) -> usize {
+        self.problem.visible.len()
+    }
 
     /// What adding a view would gain: Σ over its cells of weight · Σ p·(g(after) − g(before)).
     fn gain(&self, view: usize) -> f64 {
@@ -231,50 +194,6 @@ impl<'a> State<'a> {
         for (at, value) in changes {
             self.evidence[at] += value;
         }
-    }
-
-    /// Gains of several views, counted as evaluations.
-    fn gains(&mut self, views: &[u32]) -> Vec<f64> {
-        self.evaluations += views.len() as u64;
-        views.par_iter().map(|&v| self.gain(v as usize)).collect()
-    }
-
-    /// Chooses `k` views greedily. Gains only shrink as views are added, so an old gain bounds the present one: only the top
-    /// of the heap is evaluated again (lazy greedy).
-    fn choose(mut self, k: usize, control: &Control) -> Result<Chosen> {
-        let all: Vec<u32> = (0..self.problem.visible.len() as u32).collect();
-        let gains = self.gains(&all);
-        let mut heap: BinaryHeap<Bound> = all
-            .iter()
-            .zip(gains)
-            .map(|(&v, gain)| Bound {
-                gain,
-                view: Reverse(v),
-                round: 0,
-            })
-            .collect();
-        let mut chosen = Chosen {
-            views: Vec::new(),
-            gains: Vec::new(),
-            evaluations: 0,
-        };
-        while chosen.views.len() < k {
-            control.check()?;
-            let Some(top) = heap.pop() else { break };
-            let view = top.view.0;
-            let round = chosen.views.len();
-            if top.round < round {
-                let gain = self.gains(&[view])[0];
-                heap.push(Bound { gain, round, ..top });
-                continue;
-            }
-            self.add(view as usize);
-            chosen.views.push(view);
-            chosen.gains.push(top.gain);
-            control.advance(1);
-        }
-        chosen.evaluations = self.evaluations;
-        Ok(chosen)
     }
 }
 

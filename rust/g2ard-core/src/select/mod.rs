@@ -2,13 +2,17 @@
 
 mod coverage;
 mod depth;
+mod lazy;
+mod light;
 mod occluders;
 mod pinhole;
 mod surface;
 mod visible;
 
-pub use coverage::{Chosen, Coverage, Problem};
+pub use coverage::{Coverage, Problem};
 pub use depth::median_depths;
+pub use lazy::Chosen;
+pub use light::Light;
 pub use occluders::{Occluder, Occluders};
 pub use pinhole::Pinhole;
 pub use surface::{Gaussians, Surface};

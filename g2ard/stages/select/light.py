@@ -1,0 +1,111 @@
+"""View selection by light: views that resolve the Gaussians which other views leave unresolved."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from g2ard import _core
+from g2ard.progress import Progress, silent
+from g2ard.rendering.renderer import arrays_of, centred, settings_for, view_of
+from g2ard.scene.cameras import Cameras
+from g2ard.scene.samples import evenly_spaced
+from g2ard.scene.splats import Splats
+
+_RESOLVING_PIXELS = 16.0
+"""Light in pixels, τ, that resolves a Gaussian once: it has 13 values without harmonics."""
+_MOST_PIXELS = 64.0
+"""Most light in pixels that counts per Gaussian and view: more shows nothing new."""
+_RENDER_SIDE = 240
+"""Longer side in pixels of the renders that measure light."""
+_SAMPLED_ROWS, _SAMPLED_VIEWS = 50_000, 256
+"""Gaussians, and given views, that represent all."""
+
+
+@dataclass(frozen=True, eq=False)
+class Completion:
+    """Views that complete others.
+
+    Args:
+        order: (K,) indices into the offered views, best first.
+        gains: (K,) what each added to the objective, per Gaussian.
+        unseen: share of the Gaussians that neither the given nor the chosen views show with a pixel of light.
+    """
+
+    order: NDArray[np.int64]
+    gains: NDArray[np.float64]
+    unseen: float
+
+
+def complete(
+    scene: Splats,
+    given: Cameras,
+    offered: Cameras,
+    most: int,
+    *,
+    least_views: int = 1,
+    represents: float = 1.0,
+    progress: Progress = silent,
+) -> Completion:
+    """Choose offered views greedily by what they resolve beyond the given ones (decision 0034).
+
+    The objective is F = Σ_i log(1 + Σ_v A_vi/16) over the given and the chosen views v, where A_vi is the
+    light αT that Gaussian i sends to view v, in pixels of its full-size image, at most 64. Views are chosen
+    while the next gains more than looking again from one of the n given views, (1/n) Σ_i B_i/(1 + B_i) on
+    average, where B_i is the sum over these.
+
+    Args:
+        scene: a compact scene, such as the one to be trained.
+        given: views that are used in any case.
+        offered: candidates, of any kind.
+        most: largest number of views to choose.
+        least_views: n is at least this, so that few given views do not end the choice early.
+        represents: Gaussians to be trained per row of `scene`.
+        progress: called with the number of views rendered.
+
+    >>> from g2ard.scene.cameras import Camera
+    >>> pair = Splats.create([[0, 0, 0], [9, 0, 0]], scales=np.full((2, 3), 0.1), logit_opacities=[9, 9])
+    >>> left = Cameras.of([Camera.facing([0, -2, 0], [0, 0, 0], width=64, height=48)])
+    >>> both = [Camera.facing([x, -3, 0], [x, 0, 0], width=64, height=48, name=str(x)) for x in (0, 9)]
+    >>> done = complete(pair, left, Cameras.of(both), 1)
+    >>> done.order.tolist(), done.unseen
+    ([1], 0.0)
+    """
+    some = np.array(evenly_spaced(len(scene), _SAMPLED_ROWS), np.int64)
+    measured = given.take(evenly_spaced(len(given), _SAMPLED_VIEWS))
+    renders = len(measured) + len(offered)
+
+    def light(cameras: Cameras, first: int) -> NDArray[np.float32]:
+        return _light(
+            scene, cameras, some, 1 / represents, lambda i: progress("coverage", first + i, renders)
+        )
+
+    before = light(measured, 0).sum(axis=0, dtype=np.float64) * (len(given) / max(1, len(measured)))
+    received = light(offered, len(measured))
+    order, gains = _core.select_light(received, before, most)
+    again = float((before / (1 + before)).sum()) / max(len(given), least_views)
+    count = int(np.searchsorted(-gains, -again))  # gains fall
+    total = before + received[order[:count]].sum(axis=0, dtype=np.float64)
+    return Completion(
+        order[:count].astype(np.int64),
+        gains[:count] / len(some),
+        float((total * _RESOLVING_PIXELS < 1).mean()),
+    )
+
+
+def _light(
+    scene: Splats, cameras: Cameras, rows: NDArray[np.int64], share: float, tell: Callable[[int], None]
+) -> NDArray[np.float32]:
+    """Return (C, R) min(share·A, 64)/16 for some rows."""
+    local, here = centred(scene, cameras.resized(_RENDER_SIDE))
+    settings = settings_for(local.means, None, antialiased=local.antialiased)
+    arrays, light = arrays_of(local), np.zeros((len(cameras), len(rows)), np.float32)
+    for i in range(len(cameras)):
+        weight = _core.accumulate(arrays, [view_of(here, i, settings)], settings, None)["weight"]
+        pixels = float(cameras.widths[i] * cameras.heights[i]) / float(here.widths[i] * here.heights[i])
+        light[i] = np.minimum(weight[rows] * (pixels * share), _MOST_PIXELS) / _RESOLVING_PIXELS
+        tell(i + 1)
+    return light
