@@ -16,7 +16,7 @@ from g2ard.progress import plural
 from g2ard.rendering.metrics import psnr
 from g2ard.rendering.renderer import Renderer
 from g2ard.rendering.targets import Targets
-from g2ard.report.kinds import COLUMNS, KindScore, cells
+from g2ard.report.kinds import COLUMNS, LOST, KindScore, cells
 from g2ard.report.page import Comparison, Page, Shown
 from g2ard.scene.cameras import USUAL, rows_by_kind
 from g2ard.scene.samples import evenly_spaced
@@ -52,16 +52,19 @@ def distill_report(
         page.paragraph(edges)
     for line in told:
         page.paragraph(line)
+    views = [(part, row) for part in targets for row in range(len(part.cameras))]
+    parts = [report["scores"], *([report["apart"]] if report["apart"] else [])]
+    scores = {name: [view for part in parts for view in part[name]["views"]] for name, _ in scenes}
+    lost = _below_start(scores[scenes[0][0]], scores[scenes[-1][0]])
+    if lost:
+        page.paragraph(f"Views that ended below their start: {', '.join(text for _, text in lost)}.")
     page.heading("Worst views")
     page.paragraph(
         f"Left of the divider: the {'photo' if 'photo' in report['against'] else 'dense scene'}. "
         "Right: the result. Below: its worst regions, magnified."
     )
-    views = [(part, row) for part in targets for row in range(len(part.cameras))]
-    parts = [report["scores"], *([report["apart"]] if report["apart"] else [])]
-    scores = {name: [view for part in parts for view in part[name]["views"]] for name, _ in scenes}
     renderers = [(name, Renderer(splats, background=background)) for name, splats in reversed(scenes)]
-    for view in _worst(scores[scenes[-1][0]]):
+    for view in _shown([row for row, _ in lost], _worst(scores[scenes[-1][0]])):
         part, row = views[view]
         camera = part.cameras[row]
         shown = [
@@ -125,8 +128,26 @@ def verdict(report: dict[str, Any]) -> str:
     return f"{count} reproduce the {what} at {mean:.1f} dB, {over}; {last}."
 
 
+def _below_start(before: Sequence[dict[str, Any]], after: Sequence[dict[str, Any]]) -> list[tuple[int, str]]:
+    """Return the views whose PSNR fell by over `LOST`, most first, with a text on each.
+
+    >>> rows = [{"name": name, "psnr": 30.0} for name in "ab"]
+    >>> _below_start(rows, [{"name": "a", "psnr": 31.0}, {"name": "b", "psnr": 29.0}])
+    [(1, 'b 30.00 → 29.00 dB')]
+    """
+    falls = [old["psnr"] - new["psnr"] for old, new in zip(before, after, strict=True)]
+    rows = sorted((row for row, fall in enumerate(falls) if fall > LOST), key=lambda row: -falls[row])
+    texts = [f"{after[i]['name']} {before[i]['psnr']:.2f} → {after[i]['psnr']:.2f} dB" for i in rows]
+    return list(zip(rows, texts, strict=True))
+
+
+def _shown(lost: Sequence[int], worst: Sequence[int]) -> list[int]:
+    """Return the view that lost most, if any, then the worst ones."""
+    return list(dict.fromkeys([*lost[:1], *worst]))[:_SHOWN]
+
+
 def _worst(scores: Sequence[dict[str, Any]]) -> list[int]:
-    """Choose the views to show: the worst of each kind in turn, weakest kind first."""
+    """Return views to show: the worst of each kind in turn, weakest kind first."""
     found = rows_by_kind([view.get("kind", USUAL) for view in scores])
     kinds = [sorted(rows, key=lambda row: scores[row]["psnr"]) for rows in found.values()]
     kinds.sort(key=lambda rows: fmean(scores[row]["psnr"] for row in rows))

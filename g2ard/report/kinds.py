@@ -10,7 +10,7 @@ from typing import Any
 from g2ard.io.reports import Report
 from g2ard.scene.cameras import USUAL, rows_by_kind
 
-_LOST = 0.05
+LOST = 0.05
 """Loss of a view in dB that counts."""
 
 
@@ -91,7 +91,7 @@ def by_kind(
                 mean_if_scored("ssim", rows),
                 after[rows[worst]]["name"],
                 psnr[worst],
-                sum(change.gain < -_LOST for change in psnr),
+                sum(change.gain < -LOST for change in psnr),
                 mean_if_scored("edge_psnr", rows),
             )
         )
