@@ -144,6 +144,10 @@ OPTIONS: dict[str, dict[str, str]] = {
     "convert": {
         "box": "--box -1,-1,0,1,1,1",
         "sphere": "--sphere 0,0,1,0.5",
+        "where": "--where z<0",
+        "invert": "--where z<0 --invert",
+        "layout": "--layout inria",
+        "from_axes": "--from-axes RUB",
         "transform": "--transform move.txt",
         "scale": "--scale 2",
         "rotate": "--rotate 0,0,90",

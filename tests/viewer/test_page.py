@@ -11,6 +11,7 @@ import re
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -97,6 +98,7 @@ def test_a_page_holds_viewer_and_scene_and_names_no_address(tmp_path: Path) -> N
         "background": [1, 0.5, 0.25],
         "files": ["scene0.sog"],
         "antialiased": [False],
+        "placed": None,
     }
     assert base64.b64decode(parts.scripts["viewer"]) == (BUNDLE / "index.js.gz").read_bytes()
     back = parts.scene(0, tmp_path)
@@ -268,6 +270,9 @@ def test_a_run_has_a_page_unless_too_large(tmp_path: Path, monkeypatch: pytest.M
     assert size == path.stat().st_size
     assert "view.html" in line
     assert Parts(path).labels == ["scene.sog: 300 Gaussians"]
+    run = SimpleNamespace(write=lambda scene, splats, overwrite: write_splats(scene, splats))
+    RunFolder(run, tmp_path, "scene.sog", resume=False).write_scene(ball)
+    assert not path.exists()  # a page of an earlier run
     monkeypatch.setitem(budget.DEVICES, "web", 299)
     size, line = folder.write_view(ball, around(6), (1.0, 1.0, 1.0))
     assert size is None
