@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shutil
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
@@ -132,17 +134,21 @@ def run_(
             run.kept.append(f"finished rows are in {table}; run the same command to continue")
         raise
     write_report(output, studies, rows)
+    width = shutil.get_terminal_size().columns if sys.stderr.isatty() else 120
     for one in studies:
         own = [row for row in rows if row["study"] == one.name]
-        run.console.table(one.title, *shown((row for row in own if row.get("final", 1)), brief=True))
+        final = (row for row in own if row.get("final", 1))
+        run.console.table(one.title, *shown(final, width))
         summary = one.summary(own)
         if summary is not None:
             run.console.table(*summary)
     run.say(f"rows: {table}\nreport: {output / 'report.html'}")
     run.result({"rows": rows})
-    failed = sum("error" in row for row in rows)
+    failed = [row["error"] for row in rows if "error" in row]
     if failed:
-        run.unmet(f"{plural(failed, 'row')} failed; the same command tries again")
+        run.unmet(
+            f"{plural(len(failed), 'row')} failed; the same command tries again. The first: {failed[0]}"
+        )
 
 
 def _setting(text: str) -> tuple[str, str]:

@@ -130,6 +130,9 @@ COLUMNS: dict[str, Column] = {
     "cell": Column(str, None, "fingerprint of all that the figures depend on"),
 }  # fmt: skip
 
+_MINOR = ("edge_psnr", "psnr_worst", "seconds", "cpu_s", "steps", "count", "bytes")
+"""Columns that a brief table drops first if it is too wide."""
+
 _SURVEY = {
     "submethod": "Submethod",
     "psnr": "PSNR",
@@ -183,16 +186,21 @@ def _text(value: Any) -> str:
     return "" if value is None else f"{value:.6g}" if isinstance(value, float) else str(value)
 
 
-def shown(rows: Iterable[Row], *, brief: bool = False) -> tuple[list[str], list[list[str]]]:
+def shown(rows: Iterable[Row], width: int | None = None) -> tuple[list[str], list[list[str]]]:
     """Return columns and cells of a table of rows.
 
     Args:
         rows: rows to show.
-        brief: whether to drop columns that are the same in all rows, except the first column.
+        width: characters of a brief table, without columns that are the same in all rows, except the first
+            column. If it is still too wide, columns of `_MINOR` are dropped as well.
     """
     rows = list(rows)
     names = [n for n, column in COLUMNS.items() if column.form is not None and any(n in row for row in rows)]
-    if brief and len(rows) > 1:
+    if width is not None and len(rows) > 1:
         names = [n for i, n in enumerate(names) if i == 0 or len({row.get(n) for row in rows}) > 1]
-    cells = [[format(row[n], COLUMNS[n].form or "") if n in row else "" for n in names] for row in rows]
-    return names, cells
+    cells = {n: [format(row[n], COLUMNS[n].form or "") if n in row else "" for row in rows] for n in names}
+    for minor in _MINOR:
+        needed = sum(3 + max(map(len, [n, *column])) for n, column in cells.items()) + 1
+        if width is not None and needed > width:
+            cells.pop(minor, None)
+    return list(cells), [list(row) for row in zip(*cells.values(), strict=True)]

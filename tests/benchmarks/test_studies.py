@@ -67,6 +67,14 @@ def test_cells_are_measured_once_and_failures_again(tmp_path: Path) -> None:
     assert {row["ratio"] for row in read_rows(tmp_path / "out" / "rows.csv")} == {2.0, 10.0}
 
 
+def test_a_run_ends_with_the_reason_of_a_failure(tmp_path: Path, command_line: CommandLine) -> None:
+    path = study(tmp_path)
+    (tmp_path / "ball.ply").unlink()
+    status, _, said = command_line("benchmarks", "run", path, "-o", "out", cwd=tmp_path)
+    assert status == 3
+    assert re.search(r"rows failed.* The first: .*ball\.ply: no such file", said.splitlines()[-1])
+
+
 def test_changed_files_and_settings_replace_rows(tmp_path: Path) -> None:
     (first,) = run([toy(tmp_path, "good")], tmp_path / "out")
     changed = toy(tmp_path, "good", size=64)
@@ -103,7 +111,7 @@ def test_the_report_shows_rows_seeds_and_failures(tmp_path: Path) -> None:
     assert "<li>small &lt;balls&gt;</li>" in html
     assert f"a 10× good, 2 seeds: {rows[0]['psnr'] + 1:.2f} ± {2**0.5:.2f} dB" in html
     assert "11 of 495  renders are all black" in html
-    columns, cells = shown(rows, brief=True)
+    columns, cells = shown(rows, 120)
     assert columns[0] == "scene"
     assert "ratio" not in columns  # the same in all
     assert cells[1][-1] == "it broke"
