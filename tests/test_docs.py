@@ -5,7 +5,7 @@ import importlib.util
 import json
 import re
 import shlex
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -140,26 +140,38 @@ def test_python_examples_parse_and_their_names_exist(name: str) -> None:
                 assert node.attr in g2ard.__all__, f"{name}: g2ard.{node.attr}"
 
 
-def run_guide(name: str) -> dict[str, Any]:
-    """Run the Python of a how-to page, which finds a scene.ply, and return its names."""
+def run_guide(name: str, *, alone: bool = False) -> dict[str, Any]:
+    """Run the Python of a page, which finds a scene.ply, and return the names of its last block.
+
+    `alone` runs each block without the names of those before it, as somebody does who copies one.
+    """
     g2ard.save("scene.ply", BALL)
-    text = (ROOT / "docs/how-to" / name).read_text(encoding="utf-8")
+    text = (ROOT / name).read_text(encoding="utf-8")
     names: dict[str, Any] = {}
     for block in re.findall(r"(?ms)^```python\n(.*?)^```", text):
+        names = {} if alone else names
         exec(compile(block, name, "exec"), names)
     return names
 
 
+def test_the_readmes_python_runs_block_by_block(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(g2ard, "distill", partial(g2ard.distill, steps=20, size=48))
+    names = run_guide("README.md", alone=True)
+    assert names["scene"][0].grad.abs().max() > 0
+    assert len(names["better"].splats) == len(BALL) // 10
+
+
 def test_the_python_guide_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    names = run_guide("from-python.md")
+    names = run_guide("docs/how-to/from-python.md")
     assert len(names["better"].splats) == len(names["small"].splats) == len(BALL) // 10
     assert g2ard.load("better.sog").means.shape == (len(BALL) // 10, 3)
 
 
 def test_the_guide_to_own_views_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    names = run_guide("own-views.md")
+    names = run_guide("docs/how-to/own-views.md")
     assert (names["image"] > 0.05).any(axis=2).mean() > 0.1  # it shows the scene
     assert abs(names["view"].viewmat[1, :3] @ names["up"]) > 0.99  # upright
     assert len(names["result"].splats) == len(BALL) // 10
@@ -167,7 +179,7 @@ def test_the_guide_to_own_views_runs(tmp_path: Path, monkeypatch: pytest.MonkeyP
 
 def test_the_rasteriser_guide_trains_a_scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    names = run_guide("rasteriser.md")
+    names = run_guide("docs/how-to/rasteriser.md")
     before, after = (g2ard.evaluate(names[scene], names["targets"]).psnr for scene in ("small", "trained"))
     assert after > before
 
