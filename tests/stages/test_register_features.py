@@ -14,6 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from g2ard.errors import InputError, MissingDependencyError
+from g2ard.io import read_views
 from g2ard.io.images import write_png
 from g2ard.rendering.renderer import Rendered, Renderer
 from g2ard.scene.cameras import Camera, Cameras
@@ -335,11 +336,53 @@ def _registered(view: Camera, folder: Path, seed: int = 0) -> PhotoReport:
     return register(BALL, views, starts=starts, truth=truth, config=CONFIG).report.photos[0]
 
 
-def test_the_documented_adapter_reads_mast3rs_matches(tmp_path: Path) -> None:
+_MAST3R = f"""#!{sys.executable}
+import sys
+
+import numpy as np
+from g2ard.stages.register.matchers import Sift
+from PIL import Image
+
+
+def read(name):
+    image = Image.open(name)
+    image = image.resize([round(512 * n / max(image.size)) for n in image.size])
+    halves, centre = ([n // step * (step // 2) for n in image.size] for step in (16, 2))
+    box = [c - h for c, h in zip(centre, halves)] + [c + h for c, h in zip(centre, halves)]
+    return np.asarray(image.crop(box), np.float32) / 255
+
+
+photo, render = (np.rint(pixels - 0.5) for pixels in Sift(0.85, 4096)(*map(read, sys.argv[1:3])))
+np.savez(sys.argv[3], matches_im0=photo.astype(int), matches_im1=render.astype(int))
+"""
+"""A program in the place of MASt3R: it shrinks and crops as MASt3R does, and saves SIFT's matches."""
+
+
+def _mast3r_adapter() -> str:
     text = (ROOT / "docs/methods/register.md").read_text(encoding="utf-8")
-    block = next(b for b in re.findall(r"(?ms)^```python\n(.*?)^```", text) if "mast3r_pairs.py" in b)
+    return next(b for b in re.findall(r"(?ms)^```python\n(.*?)^```", text) if "mast3r_pairs.py" in b)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs a script that runs by its first line")
+def test_the_documented_adapter_registers(
+    command_line: CommandLine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("pycolmap")
+    _one_view(tmp_path)
+    (tmp_path / "mast3r_pairs.py").write_text(_mast3r_adapter())
+    (tmp_path / "mast3r").write_text(_MAST3R)
+    (tmp_path / "mast3r").chmod(0o755)
+    monkeypatch.setenv("MAST3R", str(tmp_path / "mast3r"))
+    succeeds(command_line, tmp_path, *_CALL, "--matcher", "mast3r_pairs:match", "--protocol", "gs-cpr")
+    true, found = (read_views(tmp_path / name).viewmats[0] for name in ("views.json", "poses.json"))
+    position, rotation = pose_error(found, true)
+    assert position < 0.01  # it starts at 0.1
+    assert rotation < 0.3  # at 3°
+
+
+def test_the_documented_adapter_reads_mast3rs_matches(tmp_path: Path) -> None:
     names: dict[str, Any] = {}
-    exec(compile(block, "mast3r_pairs.py", "exec"), names)
+    exec(compile(_mast3r_adapter(), "mast3r_pairs.py", "exec"), names)
     photo, render = np.zeros((562, 1000, 3)), np.zeros((750, 1000, 3))
     # 1000×562 becomes 512×288 whole, 1000×750 becomes 512×384 whole; corners and centres in pixels of each
     found = {"matches_im0": [[0, 0], [511, 287]], "matches_im1": [[0, 0], [511, 383]]}
