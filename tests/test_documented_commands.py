@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.study import DEFINITIONS
+from benchmarks.study import DEFINITIONS, read_study
 from helpers.commands import CommandLine
 from helpers.project import ROOT
 from helpers.stand_ins import OF_PAGE, PLACEHOLDERS, SHRUNK, STAND_INS, provide, shrunk
@@ -115,6 +115,14 @@ def test_the_commands_of_a_page_run(
     reader = Reader(page, tmp_path, store, command_line)
     for command in runnable(page):
         reader.types(command)
+    if page == "docs/datasets.md":  # its maps are those that the study of poses reads
+        study = read_study(DEFINITIONS / "paper/kings_college_registration.toml")
+        missing = [
+            p
+            for scene in study.scenes
+            if not Path(p := scene.prior.replace("$CAMBRIDGE", str(tmp_path))).exists()
+        ]
+        assert missing == []
 
 
 def test_every_reason_and_stand_in_is_used() -> None:

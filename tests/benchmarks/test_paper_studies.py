@@ -1,18 +1,23 @@
 """The studies at the paper's scale, on small data in the published layouts."""
 
 import json
+import re
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from benchmarks.kinds import matched, worker
+from benchmarks.kinds.matched import Matched
+from benchmarks.kinds.methods import ROUND_STEPS
 from benchmarks.process import Usage
 from benchmarks.study import DEFINITIONS, read_study
 from g2ard.io import read_views, write_splats, write_views
+from g2ard.stages.simplify import round_counts
 from helpers import dataset_files
 from helpers.commands import CommandLine, succeeds
 from helpers.feature_scenes import blotched
@@ -85,6 +90,7 @@ def test_every_table_has_rows_on_data_as_it_is_published(
     rows, said = study(name, *SMALL, *adapts)
     assert {row["method"] for row in rows} == {method.name for method in made.methods}
     assert {row["scene"] for row in rows} == {scene.name for scene in made.scenes}
+    assert "…" not in said, "the table is wider than the terminal"
     for row in rows:
         assert "error" not in row, row
         assert row["psnr"] > 3
@@ -104,6 +110,40 @@ def test_poses_are_registered_from_aces_file(
         assert "error" not in row, row
         assert row["photos"] == 3
         assert row["position"] < row["start_position"]
+
+
+def steps_of(study: Matched) -> tuple[int, int]:
+    """Return the steps of all cells at the paper's counts, and of the paper's method as published."""
+    steps: dict[Any, int] = {}
+    for scene, ratio, method in product(study.scenes, study.ratios, study.methods):
+        count = scene.expects.get("prior", 1_000_000)
+        counts = round_counts(count, round(count / ratio), fold=study.fold)
+        legs = method.legs({"paper": len(counts), "pup": 2}.get(method.rounds, 1))
+        for budget, seed in product(study.budgets(method) if method.recovers else (), study.seeds):
+            released = method.released_steps or 0
+            early = ROUND_STEPS if method.rounds == "paper" else released
+            if budget.kind == "steps":
+                released = round(legs[-1].share * budget.amount)
+                early = round(legs[0].share * budget.amount)
+            papers = method.reduce == "paper" and (budget.kind == "released" or not study.released)
+            cell = (papers, scene.name, ratio, method.reduce)
+            shared = () if method.shared_start else (method.name, budget, seed)
+            steps[*cell, "early", *shared] = early * (len(legs) - 1)
+            steps[*cell, "final", method.name, budget, seed] = released + study.adapt_steps
+    return sum(steps.values()), sum(n for cell, n in steps.items() if cell[0])
+
+
+def test_the_table_of_hours_follows_the_studies() -> None:
+    page = (ROOT / "docs/datasets.md").read_text(encoding="utf-8").split("## Hours")[1]
+    seconds, rate = (
+        float(re.findall(rf"([\d.]+) {unit}", page)[0]) for unit in ("CPU seconds", "steps a sec")
+    )
+    for name in PAPER:
+        study = read_study(DEFINITIONS / "paper" / f"{name}.toml")
+        if isinstance(study, Matched):
+            steps, own = steps_of(study)
+            hours = f"{steps * seconds / 3600:.0f} | {steps / rate / 3600:.1f}"
+            assert f"| `{name}` | {steps // 1000:,} | {own // 1000:,} | {hours} |" in page
 
 
 def test_the_page_lists_every_study() -> None:
