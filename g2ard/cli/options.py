@@ -314,12 +314,14 @@ EngineOption = Annotated[
 
 
 def choose_engine(run: Run, settings: dict[str, Any], path: str) -> None:
-    """Set the engine at `path` to gsplat for --device cuda, and check that CUDA is there for gsplat."""
+    """Set the engine at `path` to gsplat for --device cuda, and check early that the engine can run."""
     asked = "engine"
     if run.device == "cuda" and path not in settings:
         settings[path], asked = "gsplat", "device"
     if settings.get(path) == "gsplat":
         use_cuda(asked)
+    elif settings.get(path) == "torch":
+        require_torch("--engine torch")
 
 
 def use_cuda(asked: str = "device") -> None:

@@ -27,9 +27,16 @@ def test_features_need_torch(
             g2ard.recover(ball, targets, g2ard.RecoverConfig(steps=1, engine=engine))
     with pytest.raises(MissingDependencyError, match=r"^LPIPS needs torch"):
         load_lpips(folder)
-    ask = ("recover", "ball.ply", "--teacher", "ball.ply", "--views", "views.json", "-o", "x.ply")
-    error = refused(command_line, folder, *ask, "--engine", "gsplat", status=1)
-    assert "needs torch; pip install 'g2ard[cuda]'" in error
+    views = ("--views", "views.json", "-o", "x.ply")
+    for ask in (
+        ("recover", "ball.ply", "--teacher", "ball.ply", *views),
+        ("distill", "ball.ply", "-r", "10", *views),
+        ("adapt", "ball.ply", *views),
+    ):
+        for name, extra in (("torch", "torch"), ("gsplat", "cuda")):
+            error = refused(command_line, folder, *ask, "--engine", name, status=1)
+            assert error == f"g2ard: --engine {name} needs torch; pip install 'g2ard[{extra}]'\n"
+            assert not (folder / "x.ply").exists()
     ask = ("evaluate", "ball.ply", "--teacher", "ball.ply", "--views", "views.json", "--lpips", ".")
     assert "LPIPS needs torch" in refused(command_line, folder, *ask, status=1)
     g2ard.recover(ball, targets, g2ard.RecoverConfig(steps=1))
