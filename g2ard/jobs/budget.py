@@ -22,6 +22,10 @@ DEVICES = {
 """Gaussians that render smoothly: the defaults of Spark and of SuperSplat's viewer; fewer for Quest 3, after
 reports of its users. Sources are in `docs/how-to/headset-budget.md`.
 """
+LAYERS = {"quest3": 67}
+"""Most Gaussians per pixel of near views: pixels that the device can write over those that it shows.
+The same page derives it.
+"""
 
 _BYTES = re.compile(r"(\d+(?:\.\d+)?)\s*([kKmMgG])[bB]")
 _UNITS = {"k": 1e3, "m": 1e6, "g": 1e9}
@@ -89,11 +93,23 @@ class Budget:
     @property
     def is_measured(self) -> bool:
         """Return whether the count depends on the scene, not only on its size: `measured_budget`."""
+        return self.layers is not None or self._is_searched
+
+    @property
+    def layers(self) -> int | None:
+        """Most Gaussians per pixel of near views on the device of `fit`; None for no limit."""
+        return LAYERS.get((self.fit or "").lower())
+
+    @property
+    def _is_searched(self) -> bool:
         return self.bytes is not None or self.min_psnr is not None or self.min_ssim is not None
 
     def of(self, total: int, name: str = "scene") -> int:
-        """Return the exact count for a scene of `total` Gaussians, called `name` in errors."""
-        if self.is_measured:
+        """Return the count for a scene of `total` Gaussians, called `name` in errors.
+
+        `layers` may lower it further.
+        """
+        if self._is_searched:
             raise InputError("fit, min_psnr, min_ssim: the count depends on the scene")
         if self.ratio is not None:
             return max(1, math.floor(total / self.ratio + 0.5))

@@ -18,6 +18,7 @@ from g2ard.errors import InputError, require
 from g2ard.io import read_splats, write_splats
 from g2ard.io.scene_formats import scene_format, written_bytes
 from g2ard.jobs.budget import Budget
+from g2ard.jobs.close_up import close_up
 from g2ard.jobs.inputs import Views, say_regions
 from g2ard.jobs.views import cameras_for_weights
 from g2ard.progress import Progress, Say, plural, silent, unsaid
@@ -47,6 +48,8 @@ _SLOPE = 4.0
 """Expected gain in dB for twice the Gaussians, until two counts are measured."""
 _FEWEST = 64
 """Smallest count that a search tries."""
+_LAYER_TRIALS = 6
+"""Most counts at which overdraw is measured."""
 
 
 @dataclass(eq=False)
@@ -216,6 +219,21 @@ def count_for_bytes(splats: Splats, wanted: int, name: str, reduce: Callable[[in
     return fits[0]
 
 
+def count_for_layers(count: int, most: float, reduce: Callable[[int], Splats]) -> tuple[int, float]:
+    """Return a count up to `count` whose near views blend at most `most` Gaussians per pixel, and their mean.
+
+    Overdraw falls about with the square root of the count, which predicts the next one. The mean exceeds
+    `most` if no count tried is small enough; it is 0 for a scene without near views.
+    """
+    for _ in range(_LAYER_TRIALS):
+        near = close_up(reduce(count))
+        layers = 0.0 if near is None else near.mean
+        if layers <= most or count <= _FEWEST:
+            break
+        count = max(_FEWEST, int(count * min((_AIM * most / layers) ** 2, 0.95)))
+    return count, layers
+
+
 def _images(splats: Splats, cameras: Cameras) -> list[NDArray[Any]]:
     renderer = Renderer(splats)
     return [renderer.clipped(camera) for camera in cameras]
@@ -361,7 +379,15 @@ def aim_of(
         found = count_for_bytes(splats, most, file, lambda count: made(count).splats)
         say(f"{budget.fit}: about {plural(found, 'Gaussian')}")
         return Aim(found, bytes=budget.bytes, file=file)
-    found = budget.of(len(splats), name)
+    found = most = budget.of(len(splats), name)
+    if budget.layers is not None:
+        made = partial(simplify, splats, method="fast") if recovered else reduce
+        found, layers = count_for_layers(most, budget.layers, lambda count: made(count).splats)
+        if found < most:
+            say(
+                f"{budget.fit}: near views blend more than {budget.layers} Gaussians per pixel at {most:,}, "
+                f"{layers:.0f} at {found:,}"
+            )
     if budget.fit is not None:
         say(f"{budget.fit}: {plural(found, 'Gaussian')}")
     return Aim(found)

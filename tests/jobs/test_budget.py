@@ -10,10 +10,19 @@ import pytest
 import g2ard
 from g2ard.errors import InputError
 from g2ard.io import read_splats, write_splats
-from g2ard.jobs.budget import DEVICES, Budget
+from g2ard.jobs.budget import DEVICES, LAYERS, Budget
+from g2ard.jobs.close_up import close_up
 from g2ard.jobs.distill import prepare
 from g2ard.jobs.distill_options import DistillOptions
-from g2ard.jobs.measured_budget import Aim, Quality, count_for_bytes, count_for_quality, file_bytes
+from g2ard.jobs.measured_budget import (
+    Aim,
+    Quality,
+    Reduction,
+    aim_of,
+    count_for_bytes,
+    count_for_quality,
+    file_bytes,
+)
 from g2ard.scene.splats import Splats
 from g2ard.stages.simplify import simplify
 from helpers.commands import CommandLine, refused, succeeds
@@ -74,6 +83,24 @@ def test_simplify_fits(tmp_path: Path, command_line: CommandLine) -> None:
     assert " dB, SSIM " in told.splitlines()[-1]
 
 
+@pytest.mark.parametrize("recovered", [False, True])
+def test_quest3_bounds_overdraw(recovered: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    scene, said = checkered_ball(6000), []
+    reduce = Reduction(scene, blind=True, say=said.append)
+    plain = aim_of(Budget(fit="quest3"), reduce, "a", "a.ply", recovered=recovered)
+    assert plain.count == aim_of(Budget(fit="web"), reduce, "a", "a.ply").count == 6000
+    dense = close_up(scene)
+    assert dense is not None
+    monkeypatch.setitem(LAYERS, "quest3", dense.mean / 2)
+    found = aim_of(Budget(fit="Quest3"), reduce, "a", "a.ply", recovered=recovered).count
+    near = close_up(fast(scene, found) if recovered else reduce(found).splats)
+    assert near is not None
+    assert dense.mean / 4 < near.mean <= dense.mean / 2
+    assert f"at {found:,}" in " ".join(said)
+    monkeypatch.setitem(LAYERS, "quest3", 1e-3)  # out of reach: the search ends, and says what it has
+    assert aim_of(Budget(fit="quest3"), reduce, "a", "a.ply", recovered=recovered).count < found
+
+
 @pytest.mark.parametrize(
     "settings",
     [{"method": "fast"}, {"method": "paper"}, {"method": "default"}, {"keep_region": ((0, 0, 1, 0.5),)}],
@@ -96,6 +123,7 @@ def test_distill_measures_the_simplification_that_it_makes(settings: dict[str, A
         "--fit web --min-psnr 30 -o b.ply",
         "-o b.ply",
         "--fit 20kB -o b_{count}.ply",
+        "--fit quest3 -o b_{count}.ply",
         "--min-psnr 25 -o b_{count}.ply",
     ],
 )
