@@ -37,9 +37,14 @@ window.show = async (url, turned, matrix, fov) => {
   if (turned) mesh.quaternion.set(1, 0, 0, 0);
   scene.add(new SparkRenderer({ renderer }), mesh);
   await mesh.initialized;
-  for (let frame = 0; frame < 8; frame++) {
+  // Spark sorts in a worker: render until something shows and stays the same.
+  const gl = renderer.getContext(), pixels = new Uint8Array(4 * innerWidth * innerHeight);
+  for (let last = 0, same = 0; same < 8; await new Promise(done => setTimeout(done, 50))) {
     renderer.render(scene, camera);
-    await new Promise(done => setTimeout(done, 50));
+    gl.readPixels(0, 0, innerWidth, innerHeight, gl.RGBA, gl.UNSIGNED_BYTE, pixels);
+    const sum = pixels.reduce((total, value, i) => total + (i % 4 < 3 ? value * (i % 8191) : 0), 0);
+    same = sum && sum === last ? same + 1 : 0;
+    last = sum;
   }
 };
 </script>"""
