@@ -6,14 +6,18 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import g2ard
+from g2ard.jobs.inputs import clutter_seen
+from g2ard.scene.transform import in_sphere, moving, transform
+from g2ard.stages.clean import KINDS
 from helpers.commands import CommandLine, succeeds
 from helpers.photos import cloud_of
-from helpers.scenes import around, checkered_ball
+from helpers.scenes import around, checkered_ball, under_a_sky
 
 BALL, VIEWS = checkered_ball(400), around(16, (48, 36))
 Values = Mapping[str, Any]
@@ -75,6 +79,26 @@ FIELDS: dict[str, tuple[str, dict[str, st.SearchStrategy[Any]], set[str]]] = {
         },
         set(),
     ),
+    "convert": (
+        "convert ball.ply",
+        {
+            "sphere": st.just((0.0, 0.0, 0.5, 1.0)),
+            "scale": st.sampled_from([0.5, 2.0]),
+            "rotate": st.just((0.0, 30.0, 90.0)),
+            "translate": st.just((1.0, 0.0, -2.0)),
+            "sh_degree": st.integers(0, 2),
+        },
+        set(),
+    ),
+    "clean": (
+        "clean stray.ply",
+        {
+            "only": st.sampled_from([("invisible", "floater"), ("giant",)]),
+            "strength": st.sampled_from([0.5, 1.0]),
+            "seed": st.integers(1, 3),
+        },
+        set(),
+    ),
 }
 """Command → its words, the values of its options, and those options that are settings too."""
 NEEDED: dict[str, dict[str, Any]] = {command: {"steps": 3} for command in ("distill", "recover", "adapt")} | {
@@ -125,11 +149,30 @@ def _python(command: str, values: dict[str, Any], folder: Path) -> bytes:
         background = values.get("background", (0.0, 0.0, 0.0))
         targets = g2ard.TeacherRenders(g2ard.load(folder / "ball.ply"), VIEWS, background=background)
         made = g2ard.adapt(small, targets, replace(g2ard.AdaptConfig.scheduled("default"), **values)).splats
+    elif command == "convert":
+        made = _converted(g2ard.load(folder / "ball.ply"), **values)
+    elif command == "clean":
+        stray, kinds = g2ard.load(folder / "stray.ply"), values.pop("only", KINDS)
+        made = stray.take(clutter_seen(stray, kinds, **values)[0].keep)
     else:
         points = g2ard.load_points(folder / "cloud.ply")
         made = g2ard.lift(points.positions, points.colors, **values)
     g2ard.save(folder / "python.ply", made, overwrite=True)
     return (folder / "python.ply").read_bytes()
+
+
+def _converted(
+    scene: g2ard.Splats,
+    sphere: Any = None,
+    scale: float = 1.0,
+    rotate: Any = (0, 0, 0),
+    translate: Any = (0, 0, 0),
+    sh_degree: int | None = None,
+) -> g2ard.Splats:
+    if sphere is not None:
+        scene = scene.take(in_sphere(scene, sphere[:3], sphere[3]))
+    moved = transform(scene, moving(scale, rotate, translate))
+    return moved if sh_degree is None else moved.with_sh_degree(sh_degree)
 
 
 def _bytes(output: Path) -> bytes:
@@ -151,6 +194,8 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     g2ard.save(folder / "small.ply", g2ard.simplify(BALL, count=50, blind=True).splats)
     g2ard.save_views(folder / "views.json", VIEWS)
     cloud_of(folder / "cloud.ply", BALL)
+    faint = np.where(np.arange(400) < 20, -9, 3).astype(np.float32)
+    g2ard.save(folder / "stray.ply", under_a_sky(replace(BALL, logit_opacities=faint)))
     return folder
 
 
@@ -166,7 +211,7 @@ def test_the_ways_agree(command: str, inputs: Path, command_line: CommandLine) -
         return _bytes(inputs / output)
 
     @settings(
-        max_examples=2 if command in ("distill", "lod") else 6,
+        max_examples=2 if command in ("distill", "lod", "clean") else 6,
         deadline=None,
         derandomize=True,
         suppress_health_check=list(HealthCheck),
