@@ -18,11 +18,11 @@ if TYPE_CHECKING:
 
 _PLAIN_PERIOD = 10.0
 """Seconds between lines of a stage when stderr is not a terminal that can redraw its last line."""
-_DELAY, _TICK = 0.4, 0.125
+_LIVE_LINE_DELAY, _LIVE_LINE_PERIOD = 0.4, 0.125
 """Seconds before the live line appears, and between its updates; short commands never import rich."""
-_QUIET = 1.0
+_SILENT_SECONDS = 1.0
 """Seconds after the end of a stage until the live line says that the command is still working."""
-_KNOWN = 0.1
+_ETA_KNOWN_SHARE = 0.1
 """Share of the expected work after which the time that the whole command still needs is shown."""
 _ECHO = 5
 """Characters left free at the right for ^C, which terminals echo; a line that wraps cannot be removed."""
@@ -110,7 +110,9 @@ class _Plan:
         """
         begun = self._done + self._current[1]
         rest = sum(weight for _, weight in self._ahead)
-        if stage != self._current[0] or self._done + share * self._current[1] < _KNOWN * (begun + rest):
+        if stage != self._current[0] or self._done + share * self._current[1] < _ETA_KNOWN_SHARE * (
+            begun + rest
+        ):
             return None
         return left + rest * (now - self._began + left) / begun if rest else None
 
@@ -217,14 +219,14 @@ class Console:
 
     def _keep_telling(self) -> None:
         """Draw the live line, or print lines, until the command ends."""
-        if self._ended.wait(_DELAY):
+        if self._ended.wait(_LIVE_LINE_DELAY):
             return
         while True:
             with self._lock:
                 if self._ended.is_set():
                     return
                 self.tick()
-            if self._ended.wait(_TICK if self._drawn else 1.0):
+            if self._ended.wait(_LIVE_LINE_PERIOD if self._drawn else 1.0):
                 return
 
     def tick(self) -> None:
@@ -277,7 +279,7 @@ class Console:
         from rich.text import Text
 
         stage, now = self._stage, time.monotonic()
-        if stage is None or (stage.ended is not None and now - stage.ended > _QUIET):
+        if stage is None or (stage.ended is not None and now - stage.ended > _SILENT_SECONDS):
             stage = _Stage(f"{self._name}: working", self._began)
         total = f"{stage.total:,}"
         cells = [stage.name]

@@ -46,7 +46,7 @@ if TYPE_CHECKING:
 __all__ = ["Run", "app", "command", "one_line"]
 
 
-_RIVALS = (
+_EXCLUSIVE_OPTIONS = (
     *combinations(("count", "ratio", "fit", "min_psnr"), 2),
     *combinations(("count", "ratio", "fit", "min_ssim"), 2),
     ("steps", "recovery_time"),
@@ -57,13 +57,13 @@ _RIVALS = (
 
 def _flags_win(ctx: typer.Context, values: dict[str, Any], defaults: dict[str, Any]) -> None:
     """Let typed flags override options of the config file that they exclude."""
-    for pair in _RIVALS:
+    for pair in _EXCLUSIVE_OPTIONS:
         for flag, other in (pair, pair[::-1]):
             if typed(ctx, flag) and not typed(ctx, other) and other in defaults:
                 values[other] = defaults[other]
 
 
-_COMMON: dict[str, tuple[Any, ...]] = {
+_COMMON_OPTIONS: dict[str, tuple[Any, ...]] = {
     "quiet": (bool, typer.Option("-q", "--quiet", help="Print errors only."), False),
     "verbose": (bool, typer.Option("-v", "--verbose", help="Print more details."), False),
     "overwrite": (bool, typer.Option("-w", "--overwrite", help="Replace existing outputs."), False),
@@ -95,7 +95,7 @@ _SETTINGS: dict[str, tuple[Any, ...]] = {
         ),
     )
 }
-_SCENES: dict[str, tuple[Any, ...]] = {
+_SCENE_OPTIONS: dict[str, tuple[Any, ...]] = {
     "render_model": (
         RenderModel | None,
         typer.Option(help="How the scenes are drawn, if their files do not say it or say it wrongly."),
@@ -134,7 +134,7 @@ class Run:
         paths = [p for value in given for p in (value if isinstance(value, list) else [value])]
         written = (options.get("output"), common.get("work"))
         self._inputs = [p for p in paths if isinstance(p, Path) and all(p is not w for w in written)]
-        unrecorded = _COMMON.keys() - {"seed", "threads", "device"}
+        unrecorded = _COMMON_OPTIONS.keys() - {"seed", "threads", "device"}
         told = {**options, **{name: value for name, value in common.items() if name not in unrecorded}}
         self.config = {name: _flat(value) for name, value in told.items()}
 
@@ -373,15 +373,15 @@ def command(
     def register(fn: Callable[..., None]) -> Callable[..., None]:
         own = list(inspect.signature(fn, eval_str=True).parameters.values())[1:]
         given = BUDGETS if budgets else {}
-        taken = {**(TILES if tiles else {}), **_COMMON}
-        taken |= {**(_SETTINGS if settings is not None else {}), **(_SCENES if scenes else {})}
+        taken = {**(TILES if tiles else {}), **_COMMON_OPTIONS}
+        taken |= {**(_SETTINGS if settings is not None else {}), **(_SCENE_OPTIONS if scenes else {})}
         shared_options = {**given, **taken}
         first, last = (
             [_parameter(key, *options) for key, options in part.items()] for part in (given, taken)
         )
         all_parameters = [*first, *own, *last]
         for p in all_parameters:
-            if p.name in (*_COMMON, *_SETTINGS, *_SCENES):
+            if p.name in (*_COMMON_OPTIONS, *_SETTINGS, *_SCENE_OPTIONS):
                 into_panels(p.name, p.annotation, COMMON)
             elif name in GROUPED:
                 into_panels(p.name, p.annotation)

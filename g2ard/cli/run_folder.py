@@ -29,22 +29,22 @@ from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
 from g2ard.viewer import write_page
 
-_WORK = ".unfinished"
+_WORK_FOLDER = ".unfinished"
 """Folder in a run's folder for finished rounds and checkpoints."""
 
-_VIEWS: dict[ViewFormat, str] = {
+_VIEW_FILES: dict[ViewFormat, str] = {
     "inria": "cameras.json",
     "nerfstudio": "transforms.json",
     "colmap": "colmap",
 }
 """Names of generated views for other programs, beside views.json."""
 
-_OF_THE_CALL = (
+_CALL_OPTIONS = (
     *("output", "resume", "keep", "view", "dry_run", "threads", "device"),
     *("memory", "workers", "scheduler", "work", "views_format"),
 )
 """Options that may change when a run is resumed. `device` may change except to or from CUDA."""
-_OF_THE_BUDGET = ("count", "ratio")
+_BUDGET_OPTIONS = ("count", "ratio")
 """Budget options; each folder has one budget."""
 
 
@@ -59,7 +59,7 @@ class RunFolder:
 
     def __init__(self, run: Run, path: Path, name: str, resume: bool) -> None:
         self._run, self._resume = run, resume
-        self.path, self.scene, self.work = path, path / name, path / _WORK
+        self.path, self.scene, self.work = path, path / name, path / _WORK_FOLDER
         self._report = path / "report.json"  # written last
         self._simplified = path / "simplified" / "scene.ply"  # with --keep, for `evaluate --anchors`
         self._view, self._views = path / "view.html", path / "views.json"
@@ -75,7 +75,7 @@ class RunFolder:
         self._run.spare_inputs(self.scene, *self._other_scenes(), self._simplified, self._views)
         check_unlocked(self.path)
         left = left_at(self.work)
-        killed = self.path.is_dir() and [path.name for path in self.path.iterdir()] == [_WORK]
+        killed = self.path.is_dir() and [path.name for path in self.path.iterdir()] == [_WORK_FOLDER]
         if not left and not self.is_done and not killed:
             check_output(self.path, self._run.overwrite, folder=True)
         if left or not self._resume:
@@ -176,8 +176,10 @@ class RunFolder:
             own = ViewSet(Cameras.of([*train, *test]), splits=splits)
         write_views(self._views, own.cameras, splits=own.splits, overwrite=True)
         also: ViewFormat = self._run.config["views_format"]
-        if views.pool is not None and also in _VIEWS:
-            self._run.write_views(self.path / _VIEWS[also], own.cameras, also, own.splits, overwrite=True)
+        if views.pool is not None and also in _VIEW_FILES:
+            self._run.write_views(
+                self.path / _VIEW_FILES[also], own.cameras, also, own.splits, overwrite=True
+            )
 
     def write_report(self, report: dict[str, Any]) -> None:
         told = {**report, "config": self._run.config, "inputs": self._inputs}
@@ -207,7 +209,7 @@ class RunFolder:
 
 def stopped_run(folder: Path) -> dict[str, Any] | None:
     """Describe an interrupted run (checkpoints, counts, options), or return None without one."""
-    work = folder / _WORK
+    work = folder / _WORK_FOLDER
     if not left_at(work):
         return None
     told = read_json(work / OPTIONS) if (work / OPTIONS).exists() else {}
@@ -219,7 +221,7 @@ def _others(run: Run, before: Mapping[str, Any], budget: Budget) -> list[str]:
     """Return the names of options whose values differ from those of an earlier run."""
     then = before.get("config", {})
     now = json.loads(json.dumps(run.config, default=str))
-    names = [name for name in now if name in then and name not in (*_OF_THE_CALL, *_OF_THE_BUDGET)]
+    names = [name for name in now if name in then and name not in (*_CALL_OPTIONS, *_BUDGET_OPTIONS)]
     found = [name.replace("_", "-") for name in names if now[name] != then[name]]
     if "cuda" in (now["device"], then.get("device")) and now["device"] != then.get("device"):
         found.append("device")

@@ -14,10 +14,10 @@ if TYPE_CHECKING:
     from g2ard.report.kinds import KindScore
     from g2ard.scene.splats import Splats
 
-_LOSS, _SSIM_LOSS = 0.05, 0.001
+_REPORTED_PSNR_LOSS, _REPORTED_SSIM_LOSS = 0.05, 0.001
 """Losses against the simplified scene that are reported, in dB and SSIM."""
 
-_FEW = 0.005
+_LEAST_REPORTED_SHARE = 0.005
 """Share of the scene too small to report."""
 
 
@@ -55,7 +55,7 @@ def told(report: dict[str, Any], *, verbose: bool = False) -> list[str]:
     lines += [unregularized(rounds)] if verbose else []
     lines += [loss(KindScore.of(kind)) for kind in report["kinds"]]
     lines += report["causes"]
-    if report["unseen"] and report["unseen"] > _FEW:
+    if report["unseen"] and report["unseen"] > _LEAST_REPORTED_SHARE:
         lines.append(f"{report['unseen']:.0%} of the scene is in no view: simplified but not recovered")
     if packed := report.get("packed"):
         lines += score_lines(packed, report["bytes"]["file"], report["scores"]["recovered"]["psnr"])
@@ -68,10 +68,10 @@ def loss(
     """Describe what recovery lost in the views of a kind, if anything; `hint` ends a warning."""
     what = f"{kind.kind} views"
     ssim = kind.ssim.gain if kind.ssim else 0.0
-    if ssim < -_SSIM_LOSS and kind.psnr.gain > 0:  # neither scene is better
+    if ssim < -_REPORTED_SSIM_LOSS and kind.psnr.gain > 0:  # neither scene is better
         return f"recovery lost {-ssim:.3f} SSIM and gained {kind.psnr.gain:.2f} dB in {what}"
-    if kind.psnr.gain < -_LOSS or ssim < -_SSIM_LOSS:
-        how = f"{-kind.psnr.gain:.2f} dB" if kind.psnr.gain < -_LOSS else f"{-ssim:.3f} SSIM"
+    if kind.psnr.gain < -_REPORTED_PSNR_LOSS or ssim < -_REPORTED_SSIM_LOSS:
+        how = f"{-kind.psnr.gain:.2f} dB" if kind.psnr.gain < -_REPORTED_PSNR_LOSS else f"{-ssim:.3f} SSIM"
         worst = f"{kind.worst}: {kind.worst_psnr.before:.2f} → {kind.worst_psnr.after:.2f} dB"
         return f"warning: recovery lost {how} in {what} (worst view {worst}); {hint}"
     return f"{kind.lost} of {kind.views} {what} lost PSNR; their mean gained" if kind.lost else None

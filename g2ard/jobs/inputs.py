@@ -52,7 +52,7 @@ def say_notes(path: str | Path, notes: Sequence[Note], say: Say) -> None:
     A logit beyond ±16 is α = 0 or 1 to within 1e-7; only `g2ard info` reports these.
     """
     for note in notes:
-        if note.code not in _HARMLESS:
+        if note.code not in _UNREPORTED_NOTES:
             say(f"{path}: {note}")
 
 
@@ -71,7 +71,7 @@ def say_regions(splats: Splats, config: SimplifyConfig, name: str, say: Say) -> 
         say(f"{plural(inside, 'Gaussian')} in the regions to keep ({share:.1%}) count {times}")
 
 
-_HARMLESS = ("clamped_logits",)
+_UNREPORTED_NOTES = ("clamped_logits",)
 
 
 def load_views(

@@ -34,7 +34,7 @@ _LEAST_ROWS = 1000
 _HALO_TIMES = 1.5
 """Rows of the largest tile, halo included, relative to `--tile-rows`, at most."""
 
-_SIZE = re.compile(r"(\d+(?:\.\d+)?)\s*([kKmMgGtT]?)(?:i?[bB])?")
+_MEMORY_SIZE = re.compile(r"(\d+(?:\.\d+)?)\s*([kKmMgGtT]?)(?:i?[bB])?")
 
 
 @dataclass(frozen=True)
@@ -104,7 +104,7 @@ def bytes_of(text: str) -> int:
     >>> bytes_of("4GB"), bytes_of("1.5 gib")
     (4000000000, 1610612736)
     """
-    match = _SIZE.fullmatch(text.strip())
+    match = _MEMORY_SIZE.fullmatch(text.strip())
     base = 1024 if "i" in text.lower() else 1000
     size = (
         0.0 if match is None else float(match[1]) * base ** ["", "k", "m", "g", "t"].index(match[2].lower())

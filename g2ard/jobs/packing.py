@@ -18,13 +18,13 @@ from g2ard.scene.splats import Splats
 from g2ard.scene.transform import change_of_axes, with_axes
 from g2ard.stages.evaluate import evaluate
 
-_LOSS, _INVISIBLE = 1.0, 45.0
+_WARNED_LOSS, _INVISIBLE_LOSS_PSNR = 1.0, 45.0
 """Loss that is worth a warning, and the PSNR above which nobody sees it, dB."""
-_USUAL = 35.0
+_GOOD_PSNR = 35.0
 """PSNR of a good scene, to which the difference between two scenes is related, dB."""
 _VIEWS, _SIZE, _ROWS = 4, (400, 300), 100_000
 """Generated views to compare in: their number, pixels, and the Gaussians they are planned by."""
-_LARGEST = 2_000_000
+_MOST_COMPARED_GAUSSIANS = 2_000_000
 """Gaussians above which scenes are not compared."""
 
 
@@ -47,7 +47,7 @@ def score_lines(packed: dict[str, Any], size: int, unpacked: float) -> list[str]
     """
     name, psnr = packed["file"], packed["psnr"]
     lines = [f"{name}: {size / 1e6:.1f} MB, {psnr:.1f} dB in held-out views ({unpacked:.1f} as .ply)"]
-    if unpacked - psnr > _LOSS and psnr < _INVISIBLE:
+    if unpacked - psnr > _WARNED_LOSS and psnr < _INVISIBLE_LOSS_PSNR:
         lines.append(f"warning: {name}: the format costs {unpacked - psnr:.1f} dB; {_better(name)}")
     return lines
 
@@ -59,7 +59,7 @@ def loss_warning(path: Path, splats: Splats, options: dict[str, Any]) -> str | N
         A warning if a scene of 35 dB would lose more than 1 dB. None otherwise, and without a comparison if
         the format is exact, the scene is large or no view shows it.
     """
-    if not (scene_format(path).lossy or options.get("compress")) or len(splats) > _LARGEST:
+    if not (scene_format(path).lossy or options.get("compress")) or len(splats) > _MOST_COMPARED_GAUSSIANS:
         return None
     try:
         pool = plan_pool(splats, _VIEWS, size=_SIZE, rows=_ROWS)
@@ -69,12 +69,12 @@ def loss_warning(path: Path, splats: Splats, options: dict[str, Any]) -> str | N
     if options.get("axes") == "RDF" and options.get("spz_version", 3) != 4:  # unnamed, so read as RUB
         stored = with_axes(stored, change_of_axes("RDF", "RUB"))
     away = evaluate(stored, TeacherRenders(splats, pool.cameras)).psnr
-    psnr = -10 * float(np.log10(10 ** (-_USUAL / 10) + 10 ** (-away / 10)))
-    if _USUAL - psnr <= _LOSS:
+    psnr = -10 * float(np.log10(10 ** (-_GOOD_PSNR / 10) + 10 ** (-away / 10)))
+    if _GOOD_PSNR - psnr <= _WARNED_LOSS:
         return None
     return (
         f"warning: {path}: renders are {away:.1f} dB PSNR from the original's, which lowers a score of "
-        f"{_USUAL:.0f} dB to {psnr:.1f}; {_better(path.name)}"
+        f"{_GOOD_PSNR:.0f} dB to {psnr:.1f}; {_better(path.name)}"
     )
 
 

@@ -27,25 +27,25 @@ from g2ard.scene.cameras import Cameras
 if TYPE_CHECKING:
     from g2ard.jobs.inputs import Views
 
-_SIDE = 240
+_PHOTO_SIDE = 240
 """Longer side in pixels of the photos used to place points."""
-_DEPTHS = 48
+_TRIAL_DEPTHS = 48
 _HULL_DEPTHS = 96
 """Trial depths across a visual hull."""
-_NEAREST, _FARTHEST = 0.3, 4.0
+_NEAREST_DEPTH, _FARTHEST_DEPTH = 0.3, 4.0
 """Range of trial depths, evenly spaced in 1/z, as multiples of the view's distance from the common centre."""
-_NOTHING = 2 / 255
+_EMPTY_COLOUR_SLACK = 2 / 255
 """A pixel this close to the background colour is empty."""
-_ALIKE = 0.01
+_EQUAL_COST_SLACK = 0.01
 """Difference of costs within which depths in a hull count as equal."""
-_OTHERS, _AGREEING = 6, 2
+_COMPARED_VIEWS, _AGREEING_VIEWS = 6, 2
 """Number of nearby views compared, and of those that agree best, whose mean counts."""
 _PATCH = np.array([(0, 0), (-1, -1), (-1, 0), (-1, 1), (0, -1), (0, 1), (1, -1), (1, 0), (1, 1)])
-_SPACED = 120
+_PATCH_SPACING = 120
 """Rows and columns of the compared pixels, from a ray's own, in units of this part of the photo's side."""
-_HYPOTHESES, _FINER = 3, 5
+_REFINED_DEPTHS, _FINER_DEPTHS = 3, 5
 """Depths of a ray that are refined, and finer trials around each."""
-_SUPPORTED, _DISTINCT = 0.05, 0.25
+_MOST_POINT_COST, _MOST_POINT_COST_SHARE = 0.05, 0.25
 """Largest cost of a point, absolute and as a share of the usual cost on its ray."""
 _RAYS_PER_DOUBLING = 8
 """Rays per requested point after which both limits of cost are doubled."""
@@ -78,7 +78,7 @@ def topped_up(
     parts = [] if points is None else [points]
     told = [plural(sparse, "sparse point")] if sparse else []
     if (missing := count - sparse) > 0:
-        (train,) = load_view_sets(views, ["train" if held_out is None else for_training], _SIDE)
+        (train,) = load_view_sets(views, ["train" if held_out is None else for_training], _PHOTO_SIDE)
         parts.append(
             points_along_rays(train.cameras, missing, background=background, seed=seed, progress=progress)
         )
@@ -174,7 +174,7 @@ def points_along_rays(
         rays = min(_RAYS, max(64, -(-count // len(cameras))))
         pixels = _pixels(photos[view], outlines[view], rays, background, rng)
         if hull is None:
-            depths = distances[view] / np.linspace(1 / _NEAREST, 1 / _FARTHEST, _DEPTHS)
+            depths = distances[view] / np.linspace(1 / _NEAREST_DEPTH, 1 / _FARTHEST_DEPTH, _TRIAL_DEPTHS)
         else:
             depths = hull.depths(cameras, view, _HULL_DEPTHS)
         slack = 2.0 ** (tried // (_RAYS_PER_DOUBLING * max(count, _RAYS)))
@@ -204,7 +204,7 @@ def _neighbours(cameras: Cameras, view: int) -> NDArray[np.int64]:
     away = np.linalg.norm(cameras.positions - cameras.positions[view], axis=1) / (cameras.extent or 1.0)
     turn = 1 - cameras.forwards @ cameras.forwards[view]
     order = np.argsort(away + turn, kind="stable")
-    return order[order != view][:_OTHERS]
+    return order[order != view][:_COMPARED_VIEWS]
 
 
 def _pixels(
@@ -217,7 +217,7 @@ def _pixels(
     """Return rows and columns, (2, N ≤ count), of random pixels that show anything."""
     rows, columns = rng.integers(photo.shape[0], size=count), rng.integers(photo.shape[1], size=count)
     if outline is None:
-        kept = np.abs(photo[rows, columns] - background).max(1) > _NOTHING
+        kept = np.abs(photo[rows, columns] - background).max(1) > _EMPTY_COLOUR_SLACK
     else:
         kept = outline[rows, columns]
     return np.stack([rows, columns])[:, kept]
@@ -244,7 +244,9 @@ def _swept(
     rows = np.arange(len(cost))
     if hull is not None:
         cost[~hull.holds(ray.at(trial))] = np.inf
-        best = (cost <= cost.min(1, keepdims=True) + _ALIKE).argmax(1)  # the nearest is on the hull
+        best = (cost <= cost.min(1, keepdims=True) + _EQUAL_COST_SLACK).argmax(
+            1
+        )  # the nearest is on the hull
         depth, least = trial[rows, best], cost[rows, best]
         kept = np.isfinite(least)
     else:
@@ -252,7 +254,7 @@ def _swept(
         middle = np.maximum(finite.sum(1) // 2, 1) - 1
         usual = np.sort(cost, axis=1)[rows, middle]  # the median, since infinities are sorted last
         depth, least = _refined(cameras, photos, others, ray, trial, cost)
-        kept = finite.any(1) & (least <= slack * np.minimum(_SUPPORTED, _DISTINCT * usual))
+        kept = finite.any(1) & (least <= slack * np.minimum(_MOST_POINT_COST, _MOST_POINT_COST_SHARE * usual))
     return ray.at(depth[:, None])[kept, 0], ray.colors[kept]
 
 
@@ -271,11 +273,11 @@ def _refined(
     """
     padded = np.pad(cost, ((0, 0), (1, 1)), constant_values=np.inf)
     is_minimum = (cost <= padded[:, :-2]) & (cost <= padded[:, 2:])
-    order = np.argsort(np.where(is_minimum, cost, np.inf), axis=1, kind="stable")[:, :_HYPOTHESES]
+    order = np.argsort(np.where(is_minimum, cost, np.inf), axis=1, kind="stable")[:, :_REFINED_DEPTHS]
     rows = np.arange(len(cost))[:, None]
     inverse_depth = 1 / trial[rows, order]
     spacing = np.abs(1 / trial[:, :1] - 1 / trial[:, 1:2])
-    offsets = np.linspace(-0.75, 0.75, _FINER)
+    offsets = np.linspace(-0.75, 0.75, _FINER_DEPTHS)
     tried = inverse_depth[:, :, None] + offsets * spacing[:, :, None]
     finer = (1 / np.maximum(tried, 1e-3 * inverse_depth[:, :, None])).reshape(len(cost), -1)
     costs = ray.costs(cameras, photos, others, finer)
@@ -302,7 +304,7 @@ class _Rays:
         cls, cameras: Cameras, photos: list[NDArray[np.float32]], view: int, pixels: NDArray[np.int64]
     ) -> _Rays:
         photo, pose = photos[view], cameras.viewmats[view]
-        patch = _PATCH * max(1, round(max(photo.shape) / _SPACED))
+        patch = _PATCH * max(1, round(max(photo.shape) / _PATCH_SPACING))
         rows = np.clip(pixels[0][:, None] + patch[:, 0], 0, photo.shape[0] - 1)
         columns = np.clip(pixels[1][:, None] + patch[:, 1], 0, photo.shape[1] - 1)
         seen = np.stack([columns + 0.5, rows + 0.5, np.ones(rows.shape)], -1)
@@ -336,7 +338,7 @@ class _Rays:
                 inside &= held
             own_costs[k][inside] = total[inside] / self.aims.shape[1]
         own_costs.sort(axis=0)
-        return own_costs[:_AGREEING].mean(0)
+        return own_costs[:_AGREEING_VIEWS].mean(0)
 
 
 def _sampled(

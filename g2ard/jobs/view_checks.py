@@ -26,7 +26,7 @@ _SEEING_CAMERA_SHARE = 0.5
 """Share of cameras that must see the scene for found views to be used."""
 _COMPARED_PHOTOS, _COMPARED_SIDE = 15, 160
 """Number of photos compared with the scene, and their longer side in pixels."""
-_UNRELATED = 0.15
+_UNRELATED_CORRELATION = 0.15
 """Correlation below which the photos are of something else, or posed in other coordinates. Playbot and guitar
 with the photos of plush, caliterra and chair: −0.01 to 0.03 for five of the six pairs."""
 _BACKGROUND_SLACK = 4 / 255
@@ -96,7 +96,7 @@ def check_photos(
     views = compared(splats, photos, range(len(tried)), background)
     alike = [correlation(image, photo) for _, image, photo in views]
     likeness = float(np.median(alike)) if alike else 1.0
-    if likeness < _UNRELATED and not insisted:
+    if likeness < _UNRELATED_CORRELATION and not insisted:
         raise InputError(
             f"the photos do not show the scene (correlation {likeness:.2f}): they probably show "
             "another scene, or their poses use other coordinates",

@@ -11,13 +11,13 @@ from g2ard import _core
 from g2ard.errors import InputError, require
 from g2ard.scene.splats import SH_C0, Splats
 
-_FLAGGED = np.array([0.93, 0.33, 0.10])
-_PLAIN = np.array([0.55, 0.60, 0.66])
-_GONE = np.array([0.06, 0.06, 0.06])
+_FLAGGED_COLOUR = np.array([0.93, 0.33, 0.10])
+_PLAIN_COLOUR = np.array([0.55, 0.60, 0.66])
+_DROPPED_COLOUR = np.array([0.06, 0.06, 0.06])
 """Colour of rows that were dropped or trimmed."""
 
 _LUMA = np.array([0.2126, 0.7152, 0.0722])
-_SHADE = 0.45
+_SCENE_BRIGHTNESS_SHARE = 0.45
 """Share of the brightness taken from the scene, so that its shape stays visible."""
 
 _GOLDEN = 0.6180339887498949
@@ -39,14 +39,14 @@ def painted(splats: Splats, colors: ArrayLike) -> Splats:
     paint = np.asarray(colors, np.float64)
     require("colors", paint.shape, paint.shape == (len(splats), 3), f"shape ({len(splats)}, 3)")
     luma = np.clip(splats.colors.astype(np.float64) @ _LUMA, 0, 1)
-    shaded = paint * (1 - _SHADE + _SHADE * luma[:, None])
+    shaded = paint * (1 - _SCENE_BRIGHTNESS_SHARE + _SCENE_BRIGHTNESS_SHARE * luma[:, None])
     sh0 = np.ascontiguousarray(((shaded - 0.5) / SH_C0)[:, None], np.float32)
     return replace(splats, sh0=sh0, shN=np.zeros((len(splats), 0, 3), np.float32))
 
 
 def flag_colors(flags: ArrayLike) -> NDArray[np.float64]:
     """Return (N, 3) colours of (N,) protection flags: orange if p_i = 1 (eq. `frequency`), otherwise grey."""
-    return np.where(np.asarray(flags, bool)[:, None], _FLAGGED, _PLAIN)
+    return np.where(np.asarray(flags, bool)[:, None], _FLAGGED_COLOUR, _PLAIN_COLOUR)
 
 
 def label_colors(labels: ArrayLike) -> NDArray[np.float64]:
@@ -62,7 +62,7 @@ def label_colors(labels: ArrayLike) -> NDArray[np.float64]:
     wheel = np.abs((hue[:, None] * 6 + np.array([0.0, 4.0, 2.0])) % 6 - 3) - 1
     tone = 0.25 + 0.25 * ((numbers * _GOLDEN**2) % 1.0)
     colors = tone[:, None] + (1 - tone[:, None]) * np.clip(wheel, 0, 1)
-    return np.where(numbers[:, None] < 0, _GONE, colors)
+    return np.where(numbers[:, None] < 0, _DROPPED_COLOUR, colors)
 
 
 def cell_labels(splats: Splats, count: int) -> NDArray[np.int64]:

@@ -21,7 +21,7 @@ from g2ard.scene.splats import Splats
 _HERE = Path(__file__).parent
 _NOTICE = "The viewer on this page is SuperSplat Viewer 1.36.2 with PlayCanvas Engine 2.22.6.\n\n"
 
-_LARGEST = 380_000_000
+_LARGEST_SOG_BYTES = 380_000_000
 """Largest SOG in bytes: browsers limit text to 2²⁹ characters, and base64 needs 4 characters per 3 bytes."""
 
 
@@ -140,10 +140,10 @@ def _write(path: Path, text: str, overwrite: bool) -> int:
 
 def _sog(path: Path, label: str, splats: Splats) -> bytes:
     packed = sog_bytes(path, replace(splats, offset=np.zeros(3)))
-    if len(packed) > _LARGEST:
+    if len(packed) > _LARGEST_SOG_BYTES:
         raise InputError(
             f"{label} has {len(packed) / 1e6:.0f} MB as SOG, but browsers accept at most"
-            f" {_LARGEST / 1e6:.0f} in a page; simplify it first",
+            f" {_LARGEST_SOG_BYTES / 1e6:.0f} in a page; simplify it first",
             path=path,
         )
     return packed

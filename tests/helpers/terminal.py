@@ -85,7 +85,7 @@ def _serve() -> None:
     from g2ard.cli.app import COMMANDS
 
     # Commands on tiny scenes end before the live line would appear.
-    console._DELAY, console._TICK, console._QUIET = 0.0, 0.01, 0.02  # type: ignore[misc]
+    console._LIVE_LINE_DELAY, console._LIVE_LINE_PERIOD, console._SILENT_SECONDS = 0.0, 0.01, 0.02  # type: ignore[misc]
     for name in ("rich.live", "rich.progress_bar", "rich.table", "g2ard.pipeline", "g2ard.jobs.distill"):
         import_module(name)
     for name in COMMANDS:

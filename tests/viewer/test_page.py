@@ -131,7 +131,7 @@ def test_failures_leave_no_half_written_page(tmp_path: Path, monkeypatch: pytest
         write_page(tmp_path / "made" / "too" / "a.HTML", [("a", ball)])
     with pytest.raises(InputError, match=r"b\.html"):
         write_page(tmp_path / "b.html", [("a", ball.take(slice(0)))])
-    monkeypatch.setattr(page, "_LARGEST", 100)
+    monkeypatch.setattr(page, "_LARGEST_SOG_BYTES", 100)
     with pytest.raises(InputError, match="browsers accept at most"):
         write_page(tmp_path / "b.html", [("a", ball)])
     assert [path.name for path in tmp_path.iterdir()] == ["made"]

@@ -14,7 +14,7 @@ from g2ard.io.detect import run_scene
 from g2ard.io.paths import short_names
 from g2ard.progress import plural
 
-_WORST = 3
+_WORST_VIEWS = 3
 """Views that the table names."""
 
 
@@ -72,7 +72,7 @@ def compare(
     check_sight(reference, cameras, run.say)
     targets = TeacherRenders(reference, cameras, background=colour, progress=run.progress)
     scores = evaluate(other, targets, background=colour, progress=run.progress)
-    worst = sorted(scores.views, key=lambda view: view.psnr)[:_WORST]
+    worst = sorted(scores.views, key=lambda view: view.psnr)[:_WORST_VIEWS]
     psnr = {view.name: view.psnr for view in scores.views}
     run.console.table(
         f"{second} against {first}: {plural(len(cameras), 'view')}",

@@ -13,7 +13,7 @@ from g2ard.config.choices import PoolKind
 from g2ard.io import check_views_output
 from g2ard.progress import plural
 
-_FEW = 0.005
+_LEAST_REPORTED_SHARE = 0.005
 """Share of the scene too small to report."""
 
 
@@ -79,7 +79,9 @@ def poses(
     direction = ", ".join(f"{v:.2f}" for v in pool.up)
     run.say(f"{output}: {plural(count, 'pose')}, {pool.kind} ({pool.why}; up is {direction})")
     shares = (("is in no view", pool.unseen), ("is smaller than a pixel in all views", pool.coarse))
-    if told := [f"{share:.0%} of the scene {what}" for what, share in shares if share > _FEW]:
+    if told := [
+        f"{share:.0%} of the scene {what}" for what, share in shares if share > _LEAST_REPORTED_SHARE
+    ]:
         run.say("; ".join(told))
     run.result(
         {

@@ -23,7 +23,7 @@ and 3.5–7.3, simplified .44–.49 and 2.2–2.7.
 """
 
 _MANY_NEEDLES = 0.10
-_INCONSISTENT = 0.95
+_LEAST_CONSISTENCY = 0.95
 """Least view consistency of a faithful scene. Trained scenes have .977–.988; with a tenth of the Gaussians
 displaced .81–.97.
 """
@@ -156,4 +156,4 @@ def _judged(m: PriorMeasures) -> tuple[str, str]:
     if m.consistency is None:
         return "trained", needles
     agree = f"{m.consistency:.0%} of the surface agrees between neighbouring views"
-    return ("noisy" if m.consistency < _INCONSISTENT else "trained"), f"{needles}, {agree}"
+    return ("noisy" if m.consistency < _LEAST_CONSISTENCY else "trained"), f"{needles}, {agree}"
