@@ -17,7 +17,7 @@ from g2ard.io import write_views
 from helpers.commands import CommandLine, refused, succeeds
 from helpers.faults import INJECTED, stages_after
 from helpers.photos import cloud_of, photographed
-from helpers.scenes import around, checkered_ball
+from helpers.scenes import around, checkered_ball, under_a_sky
 
 TRAIN = "--views views.json --teacher ball.ply --steps 2"
 COMMANDS = {
@@ -26,9 +26,15 @@ COMMANDS = {
     "adapted.ply": f"adapt ball.ply {TRAIN} -o adapted.ply",
     "small.ply": "simplify ball.ply -r 8 --no-views --parents rows.npy -o small.ply",
     "clean.ply": "clean ball.ply --preview found.png -o clean.ply",
+    "tiled.ply": "simplify ball.ply -r 8 --no-views --tile-rows 150 -o tiled.ply",
+    "rest.ply": "clean sky.ply --split-sky far.ply -o rest.ply",
     "copy.splat": "convert ball.ply copy.splat",
     "lifted.ply": "lift cloud.ply -o lifted.ply",
     "levels/lod-meta.json": "lod ball.ply -r 4,8 --merge-only --views views.json -o levels",
+    "tileset/tileset.json": (
+        "lod ball.ply -r 4,8 --merge-only --views views.json --format 3dtiles -o tileset"
+    ),
+    "turn.webp": "render ball.ply --orbit 4 --size 32 -o turn.webp",
     "chosen.json": "select ball.ply --views views.json -k 4 -o chosen.json",
     "renders": "render ball.ply --views views.json --sheet look.png -o renders",
     "pool.json": "poses ball.ply -n 4 -o pool.json",
@@ -51,6 +57,7 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("inputs")
     ball = checkered_ball(400)
     g2ard.save(folder / "ball.ply", ball)
+    g2ard.save(folder / "sky.ply", under_a_sky(ball))
     g2ard.save(folder / "other.ply", ball.take(range(0, 400, 2)))
     cloud_of(folder / "cloud.ply", ball)
     write_views(folder / "views.json", around(16, (48, 36)))
@@ -87,9 +94,15 @@ def test_a_failure_after_the_result_loses_nothing(
         *_, line = error.splitlines()
         assert (status, line[:7]) == (1, "g2ard: "), (stage, error)
         assert INJECTED in line, (stage, error)
-        assert re.sub("/(lod-meta|tiles).json", "", output) + " is written" in line, (stage, error)
+        assert re.sub("/(lod-meta|tiles|tileset).json", "", output) + " is written" in line, (stage, error)
         for path in [folder / output, *(folder / output).glob("*")][-1:]:
             assert path.read_bytes() == (tmp_path / "0" / path.relative_to(folder)).read_bytes(), stage
+
+
+def test_the_table_holds_every_command_that_writes_a_file() -> None:
+    from g2ard.cli.app import COMMANDS as NAMES
+
+    assert set(NAMES) - {words.split()[0] for words in COMMANDS.values()} == {"evaluate", "info"}
 
 
 def test_a_run_whose_scores_failed_is_resumed(
