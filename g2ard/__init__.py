@@ -196,6 +196,10 @@ def __getattr__(name: str) -> Any:
     from importlib import import_module
 
     found = getattr(_extension() if home == "_core" else import_module(f"g2ard.{home}"), own)
+    if type(found) is type(__getattr__):
+        from g2ard.config.checks import checks_arguments
+
+        found = checks_arguments(found)
     globals()[name] = found
     return found
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 import inspect
 import math
 import types
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields
 from functools import cache, wraps
 from numbers import Integral, Real
 from typing import Any, Literal, ParamSpec, TypeVar, Union, get_args, get_origin, get_type_hints
 
-from g2ard.errors import InputError
+from g2ard.errors import InputError, require
 
 P = ParamSpec("P")
 Result = TypeVar("Result")
@@ -31,7 +31,7 @@ def check_fields(config: Any) -> None:
     owner: Any = type(config)
     kinds = _hints(owner)
     for field in fields(config):
-        check_type(field.name, getattr(config, field.name), kinds[field.name])
+        _check(field.name, getattr(config, field.name), kinds[field.name])
 
 
 def check_type(name: str, value: Any, kind: Any) -> None:
@@ -57,6 +57,26 @@ def check_type(name: str, value: Any, kind: Any) -> None:
         raise InputError(f"expected {wanted}, got {got}", parameter=name, hint=hint)
 
 
+def check_seed(name: str, seed: Any) -> None:
+    """Reject a seed that is not a whole number of at least 0."""
+    check_type(name, seed, int)
+    require(name, seed, seed >= 0, "a whole number of at least 0")
+
+
+def check_vector(name: str, vector: Any) -> None:
+    """Reject a point or direction that is not three finite numbers."""
+    values = vector.tolist() if hasattr(vector, "tolist") else vector
+    if not _fits(values, tuple[float, float, float]) or not all(map(math.isfinite, values)):
+        raise InputError(f"expected three finite numbers, got {vector!r}", parameter=name)
+
+
+def check_direction(name: str, direction: Any) -> None:
+    """Reject a direction that is not three finite numbers, or zero."""
+    check_vector(name, direction)
+    if not any(direction):
+        raise InputError(f"expected three finite numbers, not all zero, got {direction!r}", parameter=name)
+
+
 def check_colour(name: str, colour: Any) -> None:
     """Reject a colour that is not three numbers from 0 to 1.
 
@@ -70,8 +90,24 @@ def check_colour(name: str, colour: Any) -> None:
         raise InputError(f"expected 3 numbers from 0 to 1 (red, green, blue), got {colour!r}", parameter=name)
 
 
+_SHARED = {"seed": check_seed, "up": check_direction, "background": check_colour}
+"""Arguments and fields that mean the same everywhere → their checks."""
+
+
+def _check(name: str, value: Any, kind: Any) -> None:
+    if name not in _SHARED or (value is None and _fits(None, kind)):
+        check_type(name, value, kind)
+    else:
+        _SHARED[name](name, value)
+
+
 def checks_arguments(function: Callable[P, Result]) -> Callable[P, Result]:
-    """Check every argument of a public function with `check_type` before the call."""
+    """Check every argument of a public function before the call, like `check_fields`.
+
+    A function that does so already is returned as it is.
+    """
+    if hasattr(function, "__wrapped__"):
+        return function
     signature = inspect.signature(function)
     loose = {name for name, p in signature.parameters.items() if p.kind is p.VAR_KEYWORD}
 
@@ -79,8 +115,8 @@ def checks_arguments(function: Callable[P, Result]) -> Callable[P, Result]:
     def checked(*args: P.args, **kwargs: P.kwargs) -> Result:
         kinds = _hints(function)
         for name, value in signature.bind(*args, **kwargs).arguments.items():
-            if name not in loose:
-                check_type(name, value, kinds[name])
+            if name in kinds and name not in loose:
+                _check(name, value, kinds[name])
         return function(*args, **kwargs)
 
     return checked
@@ -100,9 +136,17 @@ def described(kind: Any) -> str:
         kinds = get_args(kind)
         return "comma-separated numbers" if kinds[-1] is Ellipsis else f"{len(kinds)} comma-separated numbers"
     if get_origin(kind) is Sequence:
-        return "several values"
-    words = {bool: "true or false", int: "a whole number", float: "a number", str: "text", type(None): "none"}
-    return words.get(kind) or str(getattr(kind, "__name__", kind))
+        return "several numbers" if get_args(kind) == (float,) else "several values"
+    words: dict[Any, str] = {
+        _Array: "an array of numbers",
+        Mapping: "names with values",
+        bool: "true or false",
+        int: "a whole number",
+        float: "a number",
+        str: "text",
+        type(None): "none",
+    }
+    return words.get(get_origin(kind) or kind) or str(getattr(kind, "__name__", kind))
 
 
 def options_of(kind: Any) -> tuple[Any, ...]:
@@ -110,22 +154,34 @@ def options_of(kind: Any) -> tuple[Any, ...]:
     return get_args(kind) if get_origin(kind) in _UNIONS else (kind,)
 
 
+class _Array:
+    """Type of arrays, and of what numpy makes arrays of."""
+
+    def __class_getitem__(cls, _: Any) -> type[_Array]:
+        return cls
+
+
+_ARRAY_NAMES = {"ArrayLike": _Array, "NDArray": _Array}
+
+
 @cache
 def _hints(owner: Any) -> dict[str, Any]:
     """Return the types of fields or arguments; `object` for names imported for type checkers only."""
     if isinstance(owner, type):
-        return get_type_hints(owner)
+        return get_type_hints(owner, localns=_ARRAY_NAMES)
     hints: dict[str, Any] = {}
     for name, kind in owner.__annotations__.items():
         alone: Any = types.SimpleNamespace(__annotations__={name: kind})
         try:
-            hints |= get_type_hints(alone, owner.__globals__)
+            hints |= get_type_hints(alone, owner.__globals__, _ARRAY_NAMES)
         except NameError:
             hints[name] = object
     return hints
 
 
 def _fits(value: Any, kind: Any) -> bool:
+    if kind is _Array or kind is Any:
+        return kind is Any or _is_array(value)
     origin, inner = get_origin(kind), get_args(kind)
     if origin in _UNIONS:
         return any(_fits(value, option) for option in inner)
@@ -133,9 +189,13 @@ def _fits(value: Any, kind: Any) -> bool:
         return isinstance(value, str) and value in inner
     if origin is tuple or origin is Sequence:
         several = hasattr(value, "__len__") and not isinstance(value, str)
+        if origin is Sequence and several and isinstance(value, list | tuple):
+            return all(_fits(one, inner[0]) for one in value)
         if origin is Sequence or not several or inner[-1] is Ellipsis:
             return several
         return isinstance(value, list | tuple) and len(value) == len(inner) and all(map(_fits, value, inner))
+    if origin is Mapping:
+        return isinstance(value, Mapping)
     if kind is bool:
         return isinstance(value, bool) or getattr(getattr(value, "dtype", None), "kind", "") == "b"
     if kind is int or kind is float:
@@ -144,3 +204,14 @@ def _fits(value: Any, kind: Any) -> bool:
     if not isinstance(kind, type) or getattr(kind, "_is_protocol", False):
         return True
     return isinstance(value, kind)
+
+
+def _is_array(value: Any) -> bool:
+    import numpy as np
+
+    if not hasattr(value, "dtype"):
+        try:
+            value = np.asarray(value)
+        except (TypeError, ValueError):  # rows of several lengths
+            return False
+    return value.ndim > 0 and (not isinstance(value, np.ndarray) or value.dtype.kind in "biuf")

@@ -6,6 +6,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from g2ard.config.checks import checks_arguments
 from g2ard.errors import InputError, OutputError
 from g2ard.io.detect import file_format, kind
 
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
     from g2ard.io.types import Cloud, Points
 
 
+@checks_arguments
 def read_points(path: str | Path) -> Points:
     """Read a coloured point cloud.
 

@@ -8,7 +8,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from g2ard.config.checks import checks_arguments
+from g2ard.config.checks import check_type, checks_arguments
 from g2ard.errors import InputError
 from g2ard.io.atomic import check_output
 from g2ard.io.detect import KINDS, file_format, run_scene
@@ -136,6 +136,9 @@ def write_splats(path: str | Path, splats: Splats, *, overwrite: bool = False, *
     >>> len(g2ard.load(path))
     1
     """
+    from g2ard.scene.splats import Splats
+
+    check_type("splats", splats, Splats)
     output_format = check_options(path, options)
     writer = getattr(import_module(f"g2ard.io.{output_format.module}"), output_format.function)
     writer(Path(path), splats, overwrite=overwrite, **options)

@@ -3,21 +3,21 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Sequence
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from g2ard.config.checks import checks_arguments
+from g2ard.config.checks import check_type, checks_arguments
+from g2ard.config.choices import ViewFormat
 from g2ard.errors import InputError
 from g2ard.io.atomic import atomic_folder, atomic_output, check_output
 from g2ard.io.detect import KINDS, file_format, run_views
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from numpy.typing import ArrayLike
 
-    from g2ard.config.choices import Alpha, ViewFormat
+    from g2ard.config.choices import Alpha
     from g2ard.io.types import ViewFiles, ViewSet
     from g2ard.scene.cameras import Cameras
 
@@ -133,7 +133,9 @@ def write_views(
     >>> g2ard.save_views(folder / "transforms.json", views, splits=["train"])  # for nerfstudio
     """
     from g2ard.io import camera_files, views
+    from g2ard.scene.cameras import Cameras
 
+    check_type("cameras", cameras, Cameras)
     path = Path(path)
     kind = camera_files.view_format(path, format)
     if kind == "g2ard":

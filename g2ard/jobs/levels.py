@@ -291,6 +291,7 @@ def _merged(job: DistillJob, finer: Splats, count: int) -> Splats:
     return simplify(finer, count, visibility=visibility, progress=job.progress).splats
 
 
+@checks_arguments
 def save_tileset(
     path: str | Path,
     levels: Sequence[Level],

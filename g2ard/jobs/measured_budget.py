@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from g2ard.errors import InputError, require
+from g2ard.config.checks import check_seed
+from g2ard.errors import InputError
 from g2ard.io import read_splats, write_splats
 from g2ard.io.scene_formats import scene_format, written_bytes
 from g2ard.jobs.budget import Budget
@@ -36,17 +37,17 @@ _POOL_SAMPLE = 100_000
 """Gaussians that those views are planned on."""
 _PROBE_ROWS = 4096
 """Gaussians of the first probe file, which estimates the bytes per Gaussian."""
-_PROBES, _FULL, _AIM = 6, 0.98, 0.99
+_BYTES_PROBES, _BYTES_ACCEPTED, _BYTES_AIM = 6, 0.98, 0.99
 """Most files written to find a count for bytes; shares of the bytes that are accepted and aimed at."""
-_MARGIN = 0.985
+_BYTES_SAFETY = 0.985
 """Safety factor on the bytes if recovery will change the scene after the search."""
-_TRIALS = 8
+_QUALITY_TRIALS = 8
 """Most counts at which quality is measured."""
-_CLOSE_ENOUGH = 0.25
+_QUALITY_TOLERANCE = 0.25
 """Excess in dB at which the search stops."""
-_SLOPE = 4.0
+_GAIN_PER_DOUBLING = 4.0
 """Expected gain in dB for twice the Gaussians, until two counts are measured."""
-_FEWEST = 64
+_FEWEST_GAUSSIANS = 64
 """Smallest count that a search tries."""
 _LAYER_TRIALS = 6
 """Most counts at which overdraw is measured."""
@@ -76,9 +77,11 @@ class Reduction:
     _made: dict[int, Simplified] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        require("seed", self.seed, self.seed >= 0, "a whole number of at least 0")
+        check_seed("seed", self.seed)
         if self.views is not None and self.blind:
             raise InputError("views and blind exclude each other")
+        if self.views is not None and self.config.method == "paper":
+            raise InputError("has no effect on the method paper", parameter="views")
         weighed = self.cameras is not None or self.views is not None or self.config.method == "default"
         if self.config.pixel_scale != SimplifyConfig.pixel_scale and weighed and not self.blind:
             raise InputError("has no effect with views", parameter="simplify.pixel_scale")
@@ -190,18 +193,18 @@ def count_for_bytes(splats: Splats, wanted: int, name: str, reduce: Callable[[in
     Args:
         name: a file name; its suffix is the format.
     """
-    fewest, most = min(_FEWEST, len(splats)), len(splats)
+    fewest, most = min(_FEWEST_GAUSSIANS, len(splats)), len(splats)
     sample = splats.take(np.array(evenly_spaced(most, _PROBE_ROWS, floor=True)))
     count = int(len(sample) * wanted / file_bytes(sample, name))
     fits, over = (0, 0), (most + 1, 0)  # (count, bytes); 0 bytes means no such file yet
     probes = 0
-    while probes < _PROBES or not fits[0]:
+    while probes < _BYTES_PROBES or not fits[0]:
         probes += 1
         count = min(max(count, fits[0] + 1, fewest), over[0] - 1, most)
         size = file_bytes(reduce(count) if count < most else splats, name)
         if size <= wanted:
             fits = (count, size)
-            if size >= _FULL * wanted or count == most:
+            if size >= _BYTES_ACCEPTED * wanted or count == most:
                 break
         else:
             over = (count, size)
@@ -212,10 +215,10 @@ def count_for_bytes(splats: Splats, wanted: int, name: str, reduce: Callable[[in
         if over[0] - fits[0] <= 1:
             break
         if fits[0] and over[1]:  # file sizes grow in steps, so interpolate with limits
-            share = (_AIM * wanted - fits[1]) / (over[1] - fits[1])
+            share = (_BYTES_AIM * wanted - fits[1]) / (over[1] - fits[1])
             count = round(fits[0] + min(max(share, 0.1), 0.9) * (over[0] - fits[0]))
         else:
-            count = int(count * _AIM * wanted / size)
+            count = int(count * _BYTES_AIM * wanted / size)
     return fits[0]
 
 
@@ -228,9 +231,9 @@ def count_for_layers(count: int, most: float, reduce: Callable[[int], Splats]) -
     for _ in range(_LAYER_TRIALS):
         near = close_up(reduce(count))
         layers = 0.0 if near is None else near.mean
-        if layers <= most or count <= _FEWEST:
+        if layers <= most or count <= _FEWEST_GAUSSIANS:
             break
-        count = max(_FEWEST, int(count * min((_AIM * most / layers) ** 2, 0.95)))
+        count = max(_FEWEST_GAUSSIANS, int(count * min((_BYTES_AIM * most / layers) ** 2, 0.95)))
     return count, layers
 
 
@@ -267,15 +270,15 @@ def count_for_quality(
     renders = _images(splats, cameras)
     met, good, missed = len(splats), Quality(float("inf"), 1.0), 0
     excesses: dict[int, float] = {}
-    count = max(_FEWEST, len(splats) // 4)
-    while len(excesses) < _TRIALS and missed < count < met:
+    count = max(_FEWEST_GAUSSIANS, len(splats) // 4)
+    while len(excesses) < _QUALITY_TRIALS and missed < count < met:
         measured = quality(renders, reduce(count), cameras)
         excesses[count] = excess = measured.over(wanted)
         if excess >= 0:
             met, good = count, measured
         else:
             missed = count
-        if 0 <= excess <= _CLOSE_ENOUGH or met <= _FEWEST:
+        if 0 <= excess <= _QUALITY_TOLERANCE or met <= _FEWEST_GAUSSIANS:
             break
         count = _next_count(excesses, met, missed, len(splats))
     return met, good
@@ -290,17 +293,17 @@ def _next_count(excesses: Mapping[int, float], met: int, missed: int, most: int)
         missed: largest count that does not, 0 until one does not.
         most: the scene's count.
     """
-    aim = _CLOSE_ENOUGH / 2
+    aim = _QUALITY_TOLERANCE / 2
     if missed and met < most:  # interpolate between them; otherwise extrapolate from the only known side
         share = (aim - excesses[missed]) / max(excesses[met] - excesses[missed], 1e-12)
         return round(missed * (met / missed) ** min(max(share, 0.05), 0.95))
     near = met if met < most else missed
     (a, at_a), (b, at_b) = min(excesses.items()), max(excesses.items())
-    slope = (at_b - at_a) / math.log2(b / a) if b > a else _SLOPE
-    steps = (aim - excesses[near]) / max(slope, _SLOPE / 4)
+    slope = (at_b - at_a) / math.log2(b / a) if b > a else _GAIN_PER_DOUBLING
+    steps = (aim - excesses[near]) / max(slope, _GAIN_PER_DOUBLING / 4)
     # Extrapolation is unreliable, and towards N the excess grows faster than linearly.
     highest = math.sqrt(near * most) if met == most else most
-    return max(_FEWEST, round(min(near * 2 ** min(max(steps, -3.0), 3.0), highest)))
+    return max(_FEWEST_GAUSSIANS, round(min(near * 2 ** min(max(steps, -3.0), 3.0), highest)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -374,7 +377,7 @@ def aim_of(
     if budget.bytes is not None:
         if sh_degree is not None:
             splats = splats.with_sh_degree(sh_degree)
-        most = int(budget.bytes * _MARGIN) if recovered else budget.bytes
+        most = int(budget.bytes * _BYTES_SAFETY) if recovered else budget.bytes
         made = partial(simplify, splats, method="fast") if recovered else reduce
         found = count_for_bytes(splats, most, file, lambda count: made(count).splats)
         say(f"{budget.fit}: about {plural(found, 'Gaussian')}")

@@ -20,7 +20,6 @@ from g2ard.jobs.inputs import Views, load_scene
 from g2ard.jobs.regularizers import choose_regularizers
 from g2ard.jobs.score import scores_by_kind
 from g2ard.jobs.teaching import Teaching, check_teacher
-from g2ard.pipeline.config import check_recovery
 from g2ard.pipeline.presets import PRESETS, configured
 from g2ard.progress import Progress, Say, plural, silent, unsaid
 from g2ard.rendering.targets import Targets, checked_targets, kinds_of
@@ -201,7 +200,6 @@ def recover(
         validation = checked_targets(validation, "validation")
     config = config or RecoverConfig()
     config = changed(config, full_paths(named, config))
-    check_recovery(config)
     start = _scene(student, render_model, say)
     if not isinstance(anchors, Anchors | None):
         anchors = Anchors.of(_built(anchors, start, render_model, say), config.regularizers.in_plane)
@@ -247,7 +245,6 @@ def prepare(
     given = full_paths(settings or {}, RecoverConfig())
     named = {**PRESETS[preset], **given}
     config = configured(RecoverConfig(), preset, given)
-    check_recovery(config)
     start = _scene(student, render_model, say)
     teaching = Teaching(
         teacher,

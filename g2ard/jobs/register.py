@@ -177,7 +177,12 @@ def prepare(
     """Read the inputs of `register`, whose arguments these are, and decide everything."""
     config, keep = configured(config or RegisterConfig(), settings or {}, protocol, keep)
     taken, posed = photos, True
-    if not isinstance(taken, Cameras):
+    require("focal", focal, focal is None or focal > 0, "more than 0 pixels")
+    if isinstance(taken, Cameras):
+        stated = {"intrinsics": intrinsics, "focal": focal, "split": split, "alpha": alpha}
+        for name, value in stated.items():
+            require(name, value, value in (None, "all", "composite"), "photos by their path, not cameras")
+    else:
         path = Path(taken)
         posed = not _photos_in(path)
         lens = None if intrinsics is None else Path(intrinsics)
@@ -414,10 +419,12 @@ def pool_of(
     scene: Splats, pool: str | Path | int, seed: int, progress: Progress = silent, say: Say = unsaid
 ) -> Cameras:
     """Return poses from a file of views, or plan as many as a number says, and `say` so."""
-    if not str(pool).strip().isdigit():
+    if not isinstance(pool, int) and not str(pool).strip().isdigit():
         return read_view_set(Path(str(pool)), unpictured=True).cameras
     from g2ard.poses import plan_pool
 
-    planned = plan_pool(scene, int(str(pool)), seed=seed, rows=_POSE_SAMPLE, progress=progress)
+    count = int(str(pool))
+    require("pool", count, count >= 1, "at least 1 view")
+    planned = plan_pool(scene, count, seed=seed, rows=_POSE_SAMPLE, progress=progress)
     say(f"starting from {plural(len(planned.cameras), 'generated view')} ({planned.kind})")
     return planned.cameras

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from g2ard.config.checks import checks_arguments
 from g2ard.config.choices import is_made
 from g2ard.errors import InputError
 from g2ard.jobs.inputs import Views, load_views
@@ -155,6 +156,7 @@ def _level(cameras: Cameras) -> NDArray[np.float64] | None:
     return unit_up(up) if any(cameras.image_paths) and np.linalg.norm(up) > _UPRIGHT_MEAN else None
 
 
+@checks_arguments
 def up_of(scene: Splats, up: Sequence[float] | None = None) -> NDArray[np.float64]:
     """Return a scene's up direction, which is not stored in its file.
 

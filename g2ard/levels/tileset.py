@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from g2ard._core import __version__
+from g2ard.config.checks import check_fields
 from g2ard.errors import InputError, missing, require
 from g2ard.io.atomic import atomic_folder
 from g2ard.io.glb import EXTENSION, SPZ_EXTENSION, spz_glb
@@ -57,6 +58,7 @@ class Georeference:
     heading: float = 0.0
 
     def __post_init__(self) -> None:
+        check_fields(self)
         require("longitude", self.longitude, abs(self.longitude) <= 180, "-180 to 180 degrees")
         require("latitude", self.latitude, abs(self.latitude) <= 90, "-90 to 90 degrees")
         for name in ("height", "heading"):

@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard._core import __version__
+from g2ard.config.checks import checks_arguments
 from g2ard.io.atomic import atomic_folder
 from g2ard.io.packing import morton_order
 from g2ard.io.sog_write import sog_files
@@ -38,6 +39,7 @@ _CHUNK_META, _CHUNK_IMAGE = re.compile(r"(\d+_\d+|env)/meta\.json"), re.compile(
 """Names of a level's files, and of the images in them."""
 
 
+@checks_arguments
 def save_levels(
     path: str | Path,
     levels: Sequence[Level],

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from g2ard.config.checks import check_colour, check_fields, checks_arguments
+from g2ard.config.checks import checks_arguments
 from g2ard.config.choices import ADAPT_SCHEDULES, AdaptSchedule
 from g2ard.errors import InputError, require
 from g2ard.io.reports import Report
@@ -56,16 +56,18 @@ class AdaptConfig(FitConfig):
     recovery: Schedule | None = None
 
     def __post_init__(self) -> None:
-        check_fields(self)
-        check_colour("background", self.background)
-        require("seed", self.seed, self.seed >= 0, "a whole number of at least 0")
         super().__post_init__()
         views, known = self.prior_views, self.schedule in ADAPT_SCHEDULES
         require("steps", self.steps, self.steps >= 1, "at least 1")
         require("tolerance", self.tolerance, self.tolerance >= 0, "at least 0")
         require("prior_views", views, 0 <= views < float("inf"), "a number of views, at least 0")
         require("schedule", repr(self.schedule), known, " or ".join(ADAPT_SCHEDULES))
+        require("colour_worth", self.colour_worth, self.colour_worth >= 0, "at least 0")
         require("first_stretch", self.first_stretch, self.first_stretch >= 1, "at least 1")
+        for name in ("tolerance", "prior_views", "first_stretch", "colour_worth"):
+            value = getattr(self, name)
+            if self.schedule == "paper" and value not in (0, getattr(AdaptConfig, name)):
+                raise InputError("has no effect on the schedule paper", parameter=name)
         if self.recovery is not None and self.recovery != appearance_only(self.recovery):
             raise InputError(
                 "expected rates of 0 for means, log_scales and quats, because geometry is frozen",

@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass, field
 from typing import Literal
 
-from g2ard.config.checks import check_colour, check_fields
+from g2ard.config.checks import check_fields
 from g2ard.config.choices import UNMEASURED, Focus, Policy
 from g2ard.errors import InputError, require
 from g2ard.stages.lift import LiftConfig
@@ -42,6 +42,7 @@ class SelectConfig(CoverageOptions):
     def __post_init__(self) -> None:
         super().__post_init__()
         share = not isinstance(self.views_count, float) or 0 < self.views_count <= 1
+        share = share and not (isinstance(self.views_count, int) and self.views_count < 1)
         require("views_count", self.views_count, share, "a count, auto, none, or a share in (0, 1]")
         require("focus_share", self.focus_share, 0 <= self.focus_share < 1, "a share in [0, 1)")
         if self.views_count == "auto" and self.policy in UNMEASURED:
@@ -83,17 +84,4 @@ class DistillConfig:
     lift: LiftConfig = field(default_factory=LiftConfig)
 
     def __post_init__(self) -> None:
-        check_recovery(self.recover)
-
-
-def check_recovery(config: RecoverConfig) -> None:
-    """Reject values of other types and a background that is no colour.
-
-    Raises:
-        InputError: the first invalid value.
-    """
-    for part in (config, config.schedule, config.schedule.rates, config.regularizers):
-        check_fields(part)
-    check_colour("background", config.background)
-    require("sh_degree", config.sh_degree, config.sh_degree in (None, 0, 1, 2, 3), "0 to 3")
-    require("seed", config.seed, config.seed >= 0, "a whole number of at least 0")
+        check_fields(self)

@@ -12,10 +12,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from g2ard.config.checks import checks_arguments
 from g2ard.pipeline.config import DistillConfig, SelectConfig
 from g2ard.pipeline.report import DistillReport, RoundReport, StageSeconds, ViewsReport
 from g2ard.progress import Progress, plural, silent
-from g2ard.rendering.targets import Photos, PhotosOrRenders, Subset, Targets, fingerprint_of
+from g2ard.rendering.targets import Photos, PhotosOrRenders, Subset, Targets, checked_targets, fingerprint_of
 from g2ard.rendering.visibility import visibility_source
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
@@ -56,6 +57,7 @@ class Distilled:
         return f"Distilled({plural(len(self.splats), 'Gaussian')}{scores})"
 
 
+@checks_arguments
 def distill(
     prior: Splats,
     budget: int,
@@ -93,7 +95,9 @@ def distill(
         InputError: the budget does not fit, no view sees the prior, or `work` belongs to another run.
         KeyboardInterrupt: after Ctrl-C; the same call resumes from `work`.
     """
-    config = config or DistillConfig()
+    config, targets = config or DistillConfig(), checked_targets(targets)
+    if validation is not None:
+        validation = checked_targets(validation, "validation")
     counts = [budget]
     if config.recover.schedule.round_steps > 0:
         kept, fold = config.simplify.retention_of("paper"), config.simplify.fold

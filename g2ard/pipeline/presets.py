@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
+from dataclasses import is_dataclass
 from typing import Any, TypeVar
 
+from g2ard.config.checks import checks_arguments
 from g2ard.config.paths import changed, full_paths
 from g2ard.errors import InputError, require
 
@@ -104,6 +106,7 @@ def _check_used(config: Any, preset: Collection[str]) -> None:
             raise error.at(parameter=f"select.{error.parameter}") from None
 
 
+@checks_arguments
 def preset(name: str = "paper", config: Any = None) -> Any:
     """Return the configuration of a preset; change it further with `dataclasses.replace`.
 
@@ -127,4 +130,7 @@ def preset(name: str = "paper", config: Any = None) -> Any:
     """
     from g2ard.pipeline.config import DistillConfig
 
-    return configured(DistillConfig() if config is None else config, name)
+    config = DistillConfig() if config is None else config
+    known = is_dataclass(config) and not isinstance(config, type)
+    require("config", repr(config), known, "a config, such as AdaptConfig()")
+    return configured(config, name)

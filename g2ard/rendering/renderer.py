@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard import _core
-from g2ard.config.checks import check_colour, checks_arguments
+from g2ard.config.checks import check_fields, checks_arguments
 from g2ard.config.choices import BLACK, CONVENTIONS, Convention
 from g2ard.errors import InputError, require
 from g2ard.scene.cameras import Camera, Cameras
@@ -47,9 +47,12 @@ class RasterSettings:
     near: float | Sequence[float] | None = None
 
     def __post_init__(self) -> None:
+        check_fields(self)
         known = self.convention in CONVENTIONS
         require("convention", repr(self.convention), known, " or ".join(CONVENTIONS))
         require("alpha_max", self.alpha_max, 1 / 255 <= self.alpha_max < 1, "a value in [1/255, 1)")
+        if isinstance(self.near, int | float):
+            require("near", self.near, self.near > 0, "a positive distance")
 
     def near_of(self, index: int) -> float:
         """Return the near plane of camera `index`."""
@@ -173,6 +176,7 @@ class Renderer:
     ((24, 32, 3), 2)
     """
 
+    @checks_arguments
     def __init__(
         self,
         splats: Splats,
@@ -180,7 +184,6 @@ class Renderer:
         background: Sequence[float] = BLACK,
         settings: RasterSettings | None = None,
     ) -> None:
-        check_colour("background", background)
         self.background = [float(c) for c in background]
         if settings is not None and not isinstance(settings.near, int | float | None):
             raise InputError("expected one distance for all views", parameter="near")

@@ -13,8 +13,9 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from g2ard.config.checks import checks_arguments
 from g2ard.config.choices import BLACK, Colour
-from g2ard.errors import InputError
+from g2ard.errors import InputError, require
 from g2ard.io.images import load_image, load_mask
 from g2ard.io.paths import file_identity
 from g2ard.progress import Progress, plural, silent
@@ -220,6 +221,7 @@ class _Cached(ABC):
     """Cache of what `_make` returns, up to `limit` bytes, first come first kept."""
 
     def __init__(self, cameras: Cameras, limit: int) -> None:
+        require("limit", limit, limit >= 0, "at least 0 bytes")
         self.cameras = cameras
         self._limit = limit
         self._kept: dict[int, NDArray[Any] | None] = {}
@@ -278,6 +280,7 @@ class Photos(_Cached):
     np.float32(0.2)
     """
 
+    @checks_arguments
     def __init__(
         self,
         cameras: Cameras,
@@ -392,6 +395,7 @@ class TeacherRenders(_Cached):
         InputError: a camera or a background that cannot be rendered.
     """
 
+    @checks_arguments
     def __init__(
         self,
         teacher: Splats,

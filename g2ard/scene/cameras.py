@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from g2ard.config.checks import check_direction, check_fields, check_vector
 from g2ard.errors import InputError, require
 from g2ard.progress import plural
 from g2ard.scene.samples import evenly_spaced
@@ -52,7 +53,7 @@ class Camera:
         distortion: (5,) float64, OpenCV k1 k2 p1 p2 k3 of the photo.
         kind: kind of view, see `Cameras`.
 
-    Shapes and values are checked by `Cameras`.
+    Types are checked here, shapes and values by `Cameras`.
 
     >>> camera = Camera.facing([0, -2, 0], [0, 0, 0], width=32, height=24, fov=50)
     >>> camera.position.tolist(), camera.holds([[0, 0, 0], [0, -3, 0]]).tolist()
@@ -68,6 +69,9 @@ class Camera:
     mask_path: Path | None = None
     distortion: NDArray[np.float64] = field(default_factory=lambda: np.zeros(5))
     kind: str = USUAL
+
+    def __post_init__(self) -> None:
+        check_fields(self)
 
     @classmethod
     def facing(
@@ -365,11 +369,14 @@ def look_at(position: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1
     >>> look_at([0, 0, -2], [0, 0, 0], up=[0, -1, 0]).tolist()[2]
     [0.0, 0.0, 1.0, 2.0]
     """
+    check_vector("position", position)
+    check_vector("target", target)
+    check_direction("up", up)
     eye = np.asarray(position, np.float64)
     forward = np.asarray(target, np.float64) - eye
     length = np.linalg.norm(forward)
     if not length > 0:
-        raise InputError("position and target coincide", parameter="look_at")
+        raise InputError("coincides with the position", parameter="target")
     z = forward / length
     x = np.cross(z, np.asarray(up, np.float64))
     if np.linalg.norm(x) < 1e-9 * np.linalg.norm(up):  # facing along `up`: any right axis works

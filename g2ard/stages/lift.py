@@ -32,6 +32,7 @@ class LiftConfig:
 
     def __post_init__(self) -> None:
         check_fields(self)
+        require("neighbors", self.neighbors, self.neighbors >= 3, "at least 3")
 
 
 @checks_arguments

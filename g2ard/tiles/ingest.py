@@ -10,8 +10,9 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from g2ard.config.checks import checks_arguments
 from g2ard.config.choices import RenderModel
-from g2ard.errors import InputError, OutputError
+from g2ard.errors import InputError, OutputError, require
 from g2ard.io import kind, open_point_stream, open_stream
 from g2ard.io.detect import JOURNAL, MANIFEST, POINTS
 from g2ard.io.lock import LOCK, locked
@@ -33,6 +34,7 @@ _BLOCK_BYTES = 1 << 24
 """Bytes of rows in memory at a time; processing makes about five copies of them."""
 
 
+@checks_arguments
 def ingest(
     source: str | Path | Sequence[str | Path] | SceneStream,
     folder: str | Path,
@@ -89,8 +91,8 @@ def ingest(
     [(50, 0, 0.0, 50.0), (50, 0, 50.0, 99.0)]
     """
     folder = Path(folder)
-    if tile_rows < 1 or (block_rows is not None and block_rows < 1):
-        raise InputError(f"tile_rows and block_rows: expected at least 1, got {tile_rows}, {block_rows}")
+    require("tile_rows", tile_rows, tile_rows >= 1, "at least 1")
+    require("block_rows", block_rows, block_rows is None or block_rows >= 1, "at least 1")
     feed, sources = _feed(source, lift or LiftConfig(), render_model)
     fewest = -(-feed.stream.count // MOST_TILES)
     if like is None and tile_rows < fewest:

@@ -54,6 +54,7 @@ BASES = {
     "register": (
         "register ball.ply --photos two.json --poses moved.json --matcher direct --keep all -o out.json"
     ),
+    "info": "info ball.ply --json -",
 }
 OPTIONS: dict[str, dict[str, str]] = {
     "distill": {
@@ -272,6 +273,7 @@ OPTIONS: dict[str, dict[str, str]] = {
         "background": "--background 1,1,1",
         "render_model": "--render-model antialiased",
     },
+    "info": {"images": "--images other", "devices": "--devices"},
 }
 
 
@@ -328,6 +330,14 @@ def _timeless(content: Any) -> Any:
     return [_timeless(value) for value in content] if isinstance(content, list) else content
 
 
+def _base(command: str, preset: str) -> str:
+    words = BASES[command] + preset
+    unused = (
+        " --views photos.json" if command == "simplify" and preset else ""
+    )  # the paper's method has no views
+    return words.replace(unused, "")
+
+
 class Runner:
     """Runs commands on the inputs, each in a folder of its own."""
 
@@ -346,11 +356,12 @@ class Runner:
         shutil.rmtree(folder)
         return error if status else "", written
 
-    def base(self, command: str) -> dict[str, Any]:
-        if command not in self.usual:
-            error, self.usual[command] = self.run(BASES[command])
+    def base(self, command: str, preset: str) -> dict[str, Any]:
+        words = _base(command, preset)
+        if words not in self.usual:
+            error, self.usual[words] = self.run(words)
             assert not error
-        return self.usual[command]
+        return self.usual[words]
 
 
 @pytest.fixture(scope="module")
@@ -358,14 +369,22 @@ def runner(inputs: Path, tmp_path_factory: pytest.TempPathFactory, command_line:
     return Runner(inputs, tmp_path_factory.mktemp("runs"), command_line)
 
 
-@pytest.mark.parametrize(
-    ("command", "option"), [(command, name) for command, table in OPTIONS.items() for name in table]
-)
-def test_an_option_changes_the_result_or_is_refused(command: str, option: str, runner: Runner) -> None:
-    words, budgets = BASES[command], ("count", "ratio", "fit", "min_psnr", "min_ssim")
+CASES = [(command, name, "") for command, table in OPTIONS.items() for name in table] + [
+    (command, name, " --preset paper")
+    for command, table in OPTIONS.items()
+    for name in table
+    if "preset" in table and name not in ("preset", "schedule", "weighted", "no_views")  # the preset's own
+]
+
+
+@pytest.mark.parametrize(("command", "option", "preset"), CASES)
+def test_an_option_changes_the_result_or_is_refused(
+    command: str, option: str, preset: str, runner: Runner
+) -> None:
+    words, budgets = _base(command, preset), ("count", "ratio", "fit", "min_psnr", "min_ssim")
     if option in budgets and command in ("distill", "simplify"):
         words = words.replace(" -r 8", "")
-    usual = runner.base(command)
+    usual = runner.base(command, preset)
     error, result = runner.run(f"{words} {OPTIONS[command][option]}")
     if error:
         assert error.count("\n") == 1 or error.splitlines()[-1].startswith("g2ard"), error
@@ -386,4 +405,4 @@ def test_the_tables_hold_every_option() -> None:
         named = {p.name for p in commands[command].params if p.param_type_name == "option"}
         apart = set(NO_RESULT) | set(OWN.get(command, ())) | {"output", "help"}
         assert named - apart == set(table) - {"output"}, command
-    assert set(commands) - set(OPTIONS) == {"info"}
+    assert set(commands) == set(OPTIONS)

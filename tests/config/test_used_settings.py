@@ -4,6 +4,8 @@ import re
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
+from tempfile import mkdtemp
 from typing import Any
 
 import numpy as np
@@ -12,8 +14,13 @@ import pytest
 import g2ard
 from g2ard.config.choices import POLICIES
 from g2ard.config.paths import values_of
+from g2ard.pipeline.adapt import appearance_only
 from g2ard.pipeline.presets import configured
 from g2ard.stages.lift import LiftConfig
+from g2ard.stages.recover.schedule import Schedule
+from helpers.feature_scenes import blotched
+from helpers.photos import photographed
+from helpers.registration import off
 from helpers.scenes import around, checkered_ball
 
 VIEWS = around(8, (48, 36))
@@ -79,6 +86,45 @@ RECOVER: dict[str, Any] = {
     "regularizers.period": 2,
     "regularizers.in_plane": 0.01,
 }
+ADAPT: dict[str, Any] = {
+    "sh_degree": 2,
+    "ssim_weight": 0.9,
+    "background": (1.0, 0.5, 0.0),
+    "seed": 1,
+    "steps": 9,
+    "tolerance": 50.0,
+    "schedule": "paper",
+    "prior_views": 9.0,
+    "first_stretch": 1,
+    "colour_worth": 99.0,
+    "recovery": replace(appearance_only(Schedule.named("paper")), cosine_floor=0.5),
+}
+REGISTER: dict[str, Any] = {
+    "size": 100,
+    "align_size": 64,
+    "refine": "none",
+    "passes": 1,
+    "coarsest": 64,
+    "iterations": 1,
+    "still": 1.0,
+    "accept": 1.0,
+    "doubt": 1.0,
+    "max_angle_sigma": 1e-6,
+    "max_position_sigma": 1e-9,
+    "min_alpha": 0.99,
+    "max_edge": 1e-3,
+    "min_overlap": 0.9,
+    "window": 5,
+    "candidates": 1,
+    "pool_size": 16,
+    "correlated": 1.0,
+    "features": 10,
+    "ratio": 0.6,
+    "max_reprojection": 0.5,
+    "min_inliers": 100,
+    "fallback": False,
+    "alike": 1.0,
+}
 LIFT: dict[str, Any] = {
     "neighbors": 5,
     "spread": 2.0,
@@ -124,6 +170,27 @@ def _lifted(settings: Mapping[str, Any]) -> object:
     return g2ard.lift(SCENE.means, colors, **settings).fingerprint()
 
 
+def _adapted(settings: Mapping[str, Any]) -> object:
+    config = configured(g2ard.AdaptConfig(), settings={f"adapt.{name}": v for name, v in settings.items()})
+    return g2ard.adapt(SMALL, TARGETS, config).splats.fingerprint()
+
+
+@cache
+def _photos() -> tuple[g2ard.Splats, g2ard.Cameras]:
+    scene, folder = blotched(2500), Path(mkdtemp())
+    return scene, photographed(folder, scene, around(2, (160, 120), 2.5), gain=0.7, bias=0.1)
+
+
+def _registered(settings: Mapping[str, Any]) -> object:
+    """Register a photo from a pose near its own, and one from a pool."""
+    scene, photos = _photos()
+    start = {photos.names[0]: off(photos.viewmats[0], 0.08, 2, 0)}
+    named = {f"register.{name}": value for name, value in settings.items()}
+    pool = around(6, (160, 120), 2.8)
+    done = g2ard.register(scene, photos, poses=start, pool=pool, settings=named, keep="all").report
+    return [repr(replace(photo, seconds=0.0)) for photo in done.photos]
+
+
 RUNS: dict[str, tuple[Callable[[Mapping[str, Any]], object], dict[str, Any]]] = {
     **{method: (_simplified(method, views=VIEWS), SIMPLIFY) for method in ("default", "fast")},
     **{f"{method} blind": (_simplified(method, blind=True), SIMPLIFY) for method in ("default", "fast")},
@@ -131,10 +198,17 @@ RUNS: dict[str, tuple[Callable[[Mapping[str, Any]], object], dict[str, Any]]] = 
     "recover": (_recovered, RECOVER),
     **{policy: (_selected(policy), SELECT) for policy in POLICIES},
     "lift": (_lifted, LIFT),
+    **dict.fromkeys(("adapt", "adapt paper"), (_adapted, ADAPT)),
+    **dict.fromkeys(("register sift", "register direct"), (_registered, REGISTER)),
 }
 BESIDE: dict[str, dict[str, Any]] = {
     "recover": {"steps": 6, "regularizers.period": 1, "regularizers.shape": 1.0},
     "recover: recovery_time": {"steps": None},
+    "adapt": {"steps": 6, "first_stretch": 2, "tolerance": 0.0, "colour_worth": 0.0},
+    "adapt paper": {"steps": 6, "schedule": "paper"},
+    "adapt paper: schedule": {"schedule": "default"},
+    "register sift": {"matcher": "sift", "size": 160, "align_size": 96},
+    "register direct": {"matcher": "direct", "size": 160, "align_size": 128},
     "recover: schedule.guarded": {"steps": 24, "schedule.multiplier": 30.0},
     "paper: max_energy": {"color_bin": 1.0},
     "paper: protection": {"flag_threshold": 0.1},
@@ -195,11 +269,14 @@ def test_the_tables_hold_every_setting() -> None:
         (g2ard.RecoverConfig(), RECOVER),
         (g2ard.CoverageOptions(), SELECT),
         (LiftConfig(), LIFT),
+        (g2ard.AdaptConfig(), ADAPT),
+        (g2ard.RegisterConfig(), REGISTER),
     ):
         named = {path.partition(".")[2] for path in values_of(config)}
         assert named - {
             "method",
             "engine",
+            "matcher",
             "schedule.steps",
             "schedule.round_steps",
             "schedule.means_in_scales",

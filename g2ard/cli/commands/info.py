@@ -47,6 +47,8 @@ def info(
         run.begin("read")
         try:
             figures, rows = _described(path, images)
+            if images is not None and figures.get("kind") != "views":
+                raise InputError("holds no views", path=path, hint="leave {images} out")
         except (InputError, OSError) as error:
             if len(paths) == 1:
                 raise

@@ -77,6 +77,8 @@ def simplify(
         raise typer.BadParameter("--views and --no-views exclude each other; give one")
     if keep_region and no_views:
         raise typer.BadParameter("--keep-region needs views; remove --no-views")
+    if config.method == "paper":
+        run.refuse_typed("on the method paper", "views", "images")
     given_views = views is not None and not is_made(views)
     if given_views or no_views or config.method == "paper" or (config.method == "fast" and views is None):
         run.refuse_typed("without generated views", "up")

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from g2ard.config.checks import check_fields
 from g2ard.errors import require
 from g2ard.scene.splats import Splats
 from g2ard.scene.transform import rotation_matrices
@@ -39,6 +40,7 @@ class Regularizers:
     in_plane: float = 3.0
 
     def __post_init__(self) -> None:
+        check_fields(self)
         for name in ("anchor", "shape", "thickness"):
             value = getattr(self, name)
             require(name, value, 0 <= value < float("inf"), "a weight, at least 0")

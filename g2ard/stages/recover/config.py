@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from g2ard.config.checks import check_fields
 from g2ard.config.choices import BLACK, Colour, Engine
 from g2ard.errors import InputError, require
 from g2ard.stages.recover.anchors import REGULARIZERS, Regularizers
@@ -33,6 +34,8 @@ class FitConfig:
     engine: Engine = "fused"
 
     def __post_init__(self) -> None:
+        check_fields(self)
+        require("sh_degree", self.sh_degree, self.sh_degree in (None, 0, 1, 2, 3), "0 to 3")
         require("ssim_weight", self.ssim_weight, 0 <= self.ssim_weight <= 1, "a value in [0, 1]")
 
 

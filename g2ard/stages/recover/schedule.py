@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from g2ard.config.checks import check_fields
 from g2ard.errors import require
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.samples import evenly_spaced
@@ -73,6 +74,7 @@ class Rates:
     finest: float = field(default=0.0, metadata={"setting": False})
 
     def __post_init__(self) -> None:
+        check_fields(self)
         for name in ("means", "log_scales", "quats", "logit_opacities", "sh0", "shN"):
             value = getattr(self, name)
             require(name, value, 0 <= value < math.inf, "a rate, at least 0")
@@ -130,6 +132,7 @@ class Schedule:
     guarded: bool = True
 
     def __post_init__(self) -> None:
+        check_fields(self)
         require("steps", self.steps, self.steps >= 1, "at least 1")
         require("round_steps", self.round_steps, self.round_steps >= 0, "at least 0")
         floor, decay = self.cosine_floor, self.appearance_decay

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from g2ard.config.checks import check_fields
 from g2ard.config.choices import REFINEMENTS, Refinement
-from g2ard.errors import require
+from g2ard.errors import InputError, require
 
 _POSITIVE_FIELDS = (
     "max_angle_sigma",
@@ -16,6 +16,8 @@ _POSITIVE_FIELDS = (
     "max_reprojection",
     "alike",
 )
+
+_FEATURE_FIELDS = ("passes", "features", "ratio", "max_reprojection", "min_inliers", "alike")
 
 
 @dataclass(frozen=True)
@@ -100,6 +102,13 @@ class RegisterConfig:
         require("min_inliers", self.min_inliers, self.min_inliers >= 6, "at least 6")
         for name in _POSITIVE_FIELDS:
             require(name, getattr(self, name), getattr(self, name) > 0, "a positive number")
+        if self.matcher == "direct":
+            unused = [
+                name for name in _FEATURE_FIELDS if getattr(self, name) != getattr(RegisterConfig, name)
+            ]
+            unused += ["refine"] if self.refine in ("none", "photometric") else []
+            if unused:
+                raise InputError("has no effect on the matcher direct", parameter=unused[0])
         require("window", self.window, self.window >= 3 and self.window % 2 == 1, "an odd number from 3 on")
 
     def levels(self) -> list[int]:
