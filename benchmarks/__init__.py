@@ -1,1 +1,1 @@
-"""Benchmarks: speed against the machine's limits, quality against other methods."""
+"""Benchmarks: speed, and quality against other methods."""

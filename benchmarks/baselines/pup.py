@@ -18,20 +18,33 @@ _FIRST, _TOTAL = 0.2, 0.1
 """Shares kept after the release's first and second round."""
 
 _DOWNSAMPLE = 4
+_PROBES = 8
+"""Random images per view that estimate F."""
+
 _SINGULAR = 1e-7
 """Smallest eigenvalue of F with unit diagonal above rounding errors, since pixels are summed in float32."""
 
 
-def fisher(splats: Splats, cameras: Cameras) -> NDArray[np.float64]:
-    """Return (N, 6, 6) F = Σ g gᵀ over views, pixels and channels, g = ∂C/∂(mean, log scale)."""
+def fisher(splats: Splats, cameras: Cameras, *, probes: int = _PROBES, seed: int = 0) -> NDArray[np.float64]:
+    """Estimate (N, 6, 6) F = Σ g gᵀ over views, pixels and channels, g = ∂C/∂(mean, log scale).
+
+    The gradient of an image weighted by random signs is Σ ±g. The mean of its outer products is F, because
+    products of two pixels cancel on average. Each of the `probes` per view is one backward pass.
+    """
     splats, cameras = centred(splats, cameras)
-    settings = settings_for(splats.means)
-    views = [view_of(cameras, i, settings) for i in range(len(cameras))]
-    upper = _core.sensitivity(arrays_of(splats), views, settings)
+    settings, arrays = settings_for(splats.means), arrays_of(splats)
+    rasterizer, rng = _core.Rasterizer(), np.random.default_rng(seed)
     out = np.zeros((len(splats), 6, 6))
-    rows, columns = np.triu_indices(6)
-    out[:, rows, columns] = out[:, columns, rows] = upper
-    return out
+    for i in range(len(cameras)):
+        image, *_ = rasterizer.forward(arrays, view_of(cameras, i, settings), settings, [0.0] * 3, 0)
+        for _ in range(probes):
+            signs = rng.choice(np.float32([-1, 1]), image.shape)
+            means, _, log_scales, *_ = rasterizer.backward(arrays, signs)
+            g = np.concatenate([means, log_scales], 1)
+            seen = np.flatnonzero(g.any(1))
+            g = g[seen].astype(np.float64)
+            out[seen] += g[:, :, None] * g[:, None]
+    return out / probes
 
 
 def sensitivity(splats: Splats, cameras: Cameras) -> NDArray[np.float64]:

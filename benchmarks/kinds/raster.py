@@ -1,7 +1,8 @@
-"""Study of a recovery step's passes against the machine's measured limits."""
+"""Study of the time of a recovery step."""
 
 from __future__ import annotations
 
+import timeit
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
@@ -24,9 +25,6 @@ from g2ard.stages.recover.engine import Photometric
 from g2ard.stages.recover.schedule import Rates
 
 __all__ = ["Raster", "built_in_view", "drawn"]
-
-FLOPS_FORWARD, FLOPS_BACKWARD = 36, 55
-"""Operations per contributing pixel–Gaussian pair, counted by hand (an FMA is two)."""
 
 
 @dataclass(frozen=True)
@@ -102,57 +100,14 @@ def _row(splats: Splats, cameras: Cameras, isa: str, repeats: int) -> Row:
     settings = RasterSettings(antialiased=False)
     arrays, view = arrays_of(splats), view_of(cameras.recentred(splats.offset), 0, settings)
     width, height = view[2]
-    rasterizer = _core.Rasterizer(isa)
-    target, _, _, _ = rasterizer.forward(arrays, view, settings, [0.0, 0.0, 0.0], 0)
-    counts = rasterizer.counts()
-    contributing = int(_core.accumulate(arrays, [view], settings)["hits"].sum())
+    rendered, *_ = _core.Rasterizer(isa).forward(arrays, view, settings, [0.0, 0.0, 0.0], 0)
+    target = np.ascontiguousarray(rendered[::-1])
     trainer = _core.Trainer(arrays, Photometric(settings, (0.0, 0.0, 0.0), 0.2), splats.scales.max(1), isa)
-    limits = _core.machine_limits()
-    passes = _milliseconds(trainer, view, np.ascontiguousarray(target[::-1]), repeats)
-    memory, again = trainer.memory(), _core.machine_limits()
-    flops_rate, bandwidth = max(limits[0], again[0]), max(limits[1], again[1])
-    flops_ms = 1e-6 * contributing * (FLOPS_FORWARD + FLOPS_BACKWARD) / flops_rate
-    bytes_ms = 1e-6 * _bytes(splats, counts, width * height) / bandwidth
+    still = Rates(*[0.0] * 6)  # rates of 0 keep the scene
+    steps = timeit.repeat(lambda: trainer.step(view, target, still), number=1, repeat=repeats)
     return {
         "width": width,
         "height": height,
-        **passes,
-        "total_ms": sum(passes.values()),
-        "pairs": counts["pairs"],
-        "contributing": contributing,
-        "limit_flops_ms": flops_ms,
-        "limit_bytes_ms": bytes_ms,
-        "limit_share": max(flops_ms, bytes_ms) / (passes["forward_ms"] + passes["backward_ms"]),
-        "fma_gflops": flops_rate,
-        "read_gb_s": bandwidth,
-        "gaussian_bytes": memory["gaussians"] / len(splats),
-        "image_bytes": memory["images"],
+        "total_ms": 1e3 * min(steps),
+        "contributing": int(_core.accumulate(arrays, [view], settings)["hits"].sum()),
     }
-
-
-def _milliseconds(trainer: Any, view: Any, target: Any, repeats: int) -> dict[str, float]:
-    """Return the best times of a step's passes; Adam's is what a step adds to the gradients' gathering."""
-    rehearsals, steps = [], []
-    for _ in range(repeats):
-        trainer.gradients_only(view, target)
-        rehearsals.append(trainer.passes())
-        trainer.step(view, target, Rates(*[0.0] * 6))  # rates of 0 keep the scene
-        steps.append(trainer.passes())
-    fastest = min(rehearsals, key=lambda p: sum(p.values()))
-    gather = min(p["gather"] for p in rehearsals)
-    return {
-        "forward_ms": 1e3 * sum(fastest[name] for name in ("project", "sort", "bin", "forward")),
-        "backward_ms": 1e3 * (fastest["backward"] + fastest["gather"]),
-        "loss_ms": 1e3 * min(p["loss"] for p in rehearsals),
-        "adam_ms": 1e3 * max(0.0, min(p["gather"] for p in steps) - gather),
-    }
-
-
-def _bytes(splats: Splats, counts: dict[str, int], pixels: int) -> int:
-    """Return the minimum memory traffic of a forward and a backward pass, bytes.
-
-    Parameters of visible rows are read twice and gradients written once. Each pair reads its splat twice, and
-    writes and reads ten sums. Each pixel has five values each way.
-    """
-    rows = 3 * 4 * (14 + 3 * splats.shN.shape[1]) * counts["visible"]
-    return rows + counts["pairs"] * (2 * 8 + 2 * 64 + 2 * 40) + 2 * 4 * pixels * (3 + 1 + 1)

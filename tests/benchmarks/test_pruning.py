@@ -31,7 +31,7 @@ def seen(params: Params) -> list[naive.Oracle]:
 
 
 @pytest.mark.parametrize("degree", [0, 1, 3])
-def test_pups_fisher_is_the_gram_matrix_of_autograds_jacobian(degree: int) -> None:
+def test_pups_fisher_estimates_the_gram_matrix_of_autograds_jacobian(degree: int) -> None:
     params, s = case(degree=degree)
     expected = np.zeros((len(s), 6, 6))
     fixed = [torch.from_numpy(params[name].astype(np.float64)) for name in NAMES]
@@ -45,13 +45,13 @@ def test_pups_fisher_is_the_gram_matrix_of_autograds_jacobian(degree: int) -> No
         by_mean, by_scale = torch.autograd.functional.jacobian(image, (fixed[0], fixed[2]), vectorize=True)
         g = torch.cat([by_mean, by_scale], -1).reshape(-1, len(s), 6).numpy()
         expected += np.einsum("pni,pnj->nij", g, g)
-    found = fisher(s, VIEWS)
+    found = fisher(s, VIEWS, probes=4000)
     size = np.sqrt(np.einsum("nii->ni", expected))
     np.testing.assert_allclose(
-        found / (size[:, :, None] * size[:, None]), expected / (size[:, :, None] * size[:, None]), atol=2e-4
+        found / (size[:, :, None] * size[:, None]), expected / (size[:, :, None] * size[:, None]), atol=0.15
     )
     assert (size > 0).all()
-    np.testing.assert_allclose(_log_det(found), np.linalg.slogdet(expected)[1], atol=0.02)
+    np.testing.assert_allclose(_log_det(found), np.linalg.slogdet(expected)[1], atol=0.5)
 
 
 def test_pup_prunes_the_singular_first_and_looks_at_a_quarter() -> None:

@@ -156,9 +156,6 @@ def _seen(scene: Splats, views: Cameras) -> Arrays:
     sampled = visibility.visibility_source(views, longest=80)(scene)
     yield "sampled weight", sampled.weight
     yield "sampled pixel_size", sampled.pixel_size
-    settings = RasterSettings(antialiased=False)
-    here = [view_of(views.recentred(scene.offset), i, settings) for i in range(3)]
-    yield "sensitivity", _core.sensitivity(arrays_of(scene), here, settings)
 
 
 def _named(name: str, scene: Splats, **others: NDArray[Any]) -> Arrays:

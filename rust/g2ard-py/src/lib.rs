@@ -34,15 +34,14 @@ mod _core {
     #[pymodule_export]
     use crate::quantize::{codebook, palette};
     #[pymodule_export]
-    use crate::raster::{PyRasterizer, accumulate, instruction_sets, machine_limits, sensitivity};
+    use crate::raster::{PyRasterizer, accumulate, instruction_sets};
     #[pymodule_export]
     use crate::register::{flow, local_zncc, normal_equations, shot};
     #[pymodule_export]
     use crate::scene::PyScene;
     #[pymodule_export]
     use crate::select::{
-        select_depth, select_greedy, select_light, select_surface, select_view_statistics,
-        select_visible,
+        select_greedy, select_light, select_surface, select_view_statistics, select_visible,
     };
     #[pymodule_export]
     use crate::simplify::{simplify_flags, simplify_pairwise, simplify_paper};

@@ -1,14 +1,12 @@
 //! `_core.Rasterizer`: buffers of one view, forward and backward passes, and sums for visibility.
 
-use g2ard_core::raster::limits::measure;
 use g2ard_core::raster::simd::Isa;
 use g2ard_core::raster::{
-    Accumulated, Gradients, Image, ImageGradients, Params, Passes, PoseGradient, Rasterizer,
-    SENSITIVITY_TRIANGLE,
+    Accumulated, Gradients, Image, ImageGradients, Params, PoseGradient, Rasterizer,
 };
 use numpy::{IntoPyArray, PyArray1, PyArrayMethods, PyReadonlyArrayDyn, PyUntypedArrayMethods};
 use pyo3::prelude::*;
-use pyo3::types::{IntoPyDict, PyDict};
+use pyo3::types::PyDict;
 
 use crate::arrays::{flat, optional};
 use crate::error::{invalid, to_py};
@@ -60,15 +58,6 @@ pub fn isa_named(name: Option<&str>) -> PyResult<Isa> {
 #[pyfunction]
 pub fn instruction_sets() -> Vec<&'static str> {
     Isa::available().into_iter().map(Isa::name).collect()
-}
-
-/// Measure and return (FMA 10⁹ flops/s, read 10⁹ bytes/s) of all threads.
-#[pyfunction]
-#[pyo3(signature = (isa = None))]
-pub fn machine_limits(py: Python<'_>, isa: Option<&str>) -> PyResult<(f64, f64)> {
-    let isa = isa_named(isa)?;
-    let limits = work::quick(py, || Ok(measure(isa)))?;
-    Ok((limits.fma_gflops, limits.read_gb_s))
 }
 
 #[pyclass(name = "Rasterizer", module = "g2ard._core")]
@@ -210,34 +199,6 @@ impl PyRasterizer {
         let inner = &mut self.inner;
         work::quick(py, || inner.pose_gradient(&params, &gradients))
     }
-
-    /// Return the seconds of the last calls' passes.
-    fn passes<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
-        passes(py, &self.inner.passes())
-    }
-
-    /// Return the work done by the last forward pass.
-    fn counts<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
-        let counts = self.inner.counts();
-        [
-            ("visible", counts.visible as u64),
-            ("pairs", counts.pairs as u64),
-            ("evaluated", counts.evaluated),
-        ]
-        .into_py_dict(py)
-    }
-}
-
-pub fn passes<'py>(py: Python<'py>, passes: &Passes) -> PyResult<Bound<'py, PyDict>> {
-    [
-        ("project", passes.project),
-        ("sort", passes.sort),
-        ("bin", passes.bin),
-        ("forward", passes.forward),
-        ("backward", passes.backward),
-        ("gather", passes.gather),
-    ]
-    .into_py_dict(py)
 }
 
 /// Return sums per Gaussian over all `views`: a dict of (N,) arrays.
@@ -271,30 +232,4 @@ pub fn accumulate<'py>(
     dict.set_item("peak", sums.peak.into_pyarray(py))?;
     dict.set_item("pixel_size", sums.pixel_size.into_pyarray(py))?;
     Ok(dict)
-}
-
-/// Return (N, 21) upper triangles of Σ g gᵀ over all pixels, channels and `views`, g = ∂C/∂(mean, log scale).
-#[pyfunction]
-#[pyo3(signature = (arrays, views, options, progress = None))]
-pub fn sensitivity<'py>(
-    py: Python<'py>,
-    arrays: Arrays<'py>,
-    views: Vec<View>,
-    options: RasterOptions,
-    progress: Option<&Bound<'py, PyAny>>,
-) -> PyResult<Bound<'py, numpy::PyArray2<f64>>> {
-    let params = arrays.params()?;
-    let settings = options.settings()?;
-    let sums = work::long(py, progress, |control| {
-        let mut rasterizer = Rasterizer::default();
-        let mut sums = vec![0.0; SENSITIVITY_TRIANGLE * params.len()];
-        control.begin(views.len() as u64);
-        for view in &views {
-            control.check()?;
-            rasterizer.sensitivity(&params, &view.camera(), &settings, &mut sums)?;
-            control.advance(1);
-        }
-        Ok(sums)
-    })?;
-    PyArray1::from_vec(py, sums).reshape([params.len(), SENSITIVITY_TRIANGLE])
 }

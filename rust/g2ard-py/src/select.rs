@@ -1,10 +1,8 @@
 //! `g2ard.stages.select`.
 
 use g2ard_core::raster::Camera;
-use g2ard_core::select::{
-    Coverage, Gaussians, Light, Occluders, Problem, Surface, ViewKernels, median_depths,
-};
-use numpy::{PyArray1, PyArray2, PyArrayMethods, PyReadonlyArray1, PyReadonlyArray2};
+use g2ard_core::select::{Coverage, Gaussians, Light, Problem, Surface, ViewKernels};
+use numpy::{PyArray1, PyArray2, PyReadonlyArray1, PyReadonlyArray2};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 
@@ -13,7 +11,7 @@ use crate::constants::Config;
 use crate::device::kernels;
 use crate::error::{invalid, to_py};
 use crate::views::View;
-use crate::work::{long, quick};
+use crate::work::long;
 
 /// Centred means, quats, linear scales, opacities.
 #[derive(FromPyObject)]
@@ -53,18 +51,6 @@ pub fn select_surface<'py>(
     out.set_item("confidence", PyArray1::from_vec(py, surface.confidence))?;
     out.set_item("weights", PyArray1::from_vec(py, surface.weights))?;
     Ok(out)
-}
-
-/// Return the median depth of every pixel of a view.
-#[pyfunction]
-pub fn select_depth<'py>(
-    py: Python<'py>,
-    scene: Scene<'py>,
-    view: View,
-) -> PyResult<Bound<'py, PyArray2<f32>>> {
-    let (scene, camera) = (scene.borrow()?, view.camera());
-    let depth = quick(py, || Ok(median_depths(&Occluders::of(&scene), &camera)))?;
-    PyArray1::from_vec(py, depth).reshape([camera.height, camera.width])
 }
 
 /// Return (C, 2): the share of each view's pixels that show the scene, and the median of their depths.

@@ -70,7 +70,6 @@ pub struct PyTrainer {
     settings: Settings,
     background: [f32; 3],
     ssim_weight: f32,
-    seconds_loss: f64,
     skipped: usize,
 }
 
@@ -111,7 +110,6 @@ impl PyTrainer {
             settings: objective.settings.settings()?,
             background: objective.background,
             ssim_weight: objective.ssim_weight,
-            seconds_loss: 0.0,
             skipped: 0,
         })
     }
@@ -166,24 +164,8 @@ impl PyTrainer {
         };
         let inner = &mut self.inner;
         let report = work::quick(py, || inner.step(&input))?;
-        self.seconds_loss = report.seconds_loss;
         self.skipped += report.skipped;
         Ok((report.loss, report.updated))
-    }
-
-    /// Take a step up to the gradients, which are discarded: for timing. Return the photometric loss.
-    fn gradients_only(
-        &mut self,
-        py: Python<'_>,
-        view: View,
-        target: PyReadonlyArray3<'_, f32>,
-    ) -> PyResult<f64> {
-        let (camera, target) = (view.camera(), flat("target", &target)?);
-        let input = self.input(&camera, target);
-        let inner = &mut self.inner;
-        let report = work::quick(py, || inner.gradients_only(&input))?;
-        self.seconds_loss = report.seconds_loss;
-        Ok(report.loss)
     }
 
     /// Return the six parameter arrays, rows in the caller's order.
@@ -238,19 +220,6 @@ impl PyTrainer {
     #[getter]
     fn skipped(&self) -> usize {
         self.skipped
-    }
-
-    /// Return the bytes held: "gaussians" grow with the Gaussians, "images" with the image.
-    fn memory<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
-        let memory = self.inner.memory();
-        [("gaussians", memory.gaussians), ("images", memory.images)].into_py_dict(py)
-    }
-
-    /// Return the seconds of the last step by pass; "gather" holds Adam.
-    fn passes<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
-        let dict = crate::raster::passes(py, &self.inner.passes())?;
-        dict.set_item("loss", self.seconds_loss)?;
-        Ok(dict)
     }
 }
 

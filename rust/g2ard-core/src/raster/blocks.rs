@@ -1,6 +1,6 @@
 //! The blocks of pixels that a tile is worked on in: the 4×4 of a row of sixteen lanes, or the 4×2 of either half.
 
-use super::simd::{Isa, Kernel, LANES, Lanes, Vector, dispatch};
+use super::simd::{LANES, Vector};
 use super::tile_batch::BATCH;
 use super::{ROWS, TILE};
 
@@ -20,22 +20,6 @@ pub const fn blocks<B: Vector>() -> usize {
 pub fn row_and_part<B: Vector>(block: usize) -> (usize, usize) {
     let parts = LANES / B::COUNT;
     (block / parts % ROWS, block % parts)
-}
-
-/// The lanes of a block on an instruction set.
-pub fn block_lanes(isa: Isa) -> usize {
-    dispatch(isa, BlockLanes)
-}
-
-struct BlockLanes;
-
-impl Kernel for BlockLanes {
-    type Output = usize;
-
-    #[inline(always)]
-    fn run<F: Lanes>(self) -> usize {
-        F::Block::COUNT
-    }
 }
 
 /// The blocks that each pair reaches, from the pairs that reach each block: 16×16 bit matrices, transposed by swapping

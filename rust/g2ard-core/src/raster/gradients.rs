@@ -7,12 +7,6 @@ use super::project::{RowGradients, ScreenGradients, Splat, View, unproject};
 use super::simd::{Kernel, LANES, Lanes, Lanes16};
 use crate::{Error, Result};
 
-/// Takes sixteen Gaussians' gradients at a time; groups come in any order, each at most once.
-pub(crate) trait Sink: Copy + Sync {
-    /// Only the lanes in `touched` have a gradient; the others' values are meaningless.
-    fn take<F: Lanes>(&self, group: usize, touched: u16, gradients: &RowGradients<F>);
-}
-
 /// Gradients in the torch layout, one slice per field of [`Params`]; rows that no pixel saw are not written.
 #[derive(Debug)]
 pub struct Gradients<'a> {
@@ -43,7 +37,7 @@ impl Gradients<'_> {
         Ok(())
     }
 
-    pub(crate) fn sink(&mut self, sh_coeffs: usize) -> RowMajor {
+    pub(crate) fn row_major(&mut self, sh_coeffs: usize) -> RowMajor {
         RowMajor {
             means: DisjointSlice::new(self.means),
             quats: DisjointSlice::new(self.quats),
@@ -89,7 +83,8 @@ fn scatter<F: Lanes>(
     }
 }
 
-impl Sink for RowMajor {
+impl RowMajor {
+    /// Writes sixteen Gaussians' gradients. Only the lanes in `touched` have one; the others' values are meaningless.
     #[inline(always)]
     fn take<F: Lanes>(&self, group: usize, touched: u16, g: &RowGradients<F>) {
         for k in 0..3 {
@@ -117,41 +112,18 @@ impl Sink for RowMajor {
     }
 }
 
-/// Discards the gradients: for timing the passes before.
-#[derive(Clone, Copy)]
-pub(crate) struct Discard;
-
-impl Sink for Discard {
-    #[inline(always)]
-    fn take<F: Lanes>(&self, _group: usize, _touched: u16, g: &RowGradients<F>) {
-        let mut sum = g.logit_opacity;
-        for k in 0..3 {
-            sum = sum + g.mean[k] + g.log_scale[k] + g.rgb[k];
-        }
-        for k in 0..4 {
-            sum = sum + g.quat[k];
-        }
-        for k in 0..16 {
-            sum = sum + g.basis[k];
-        }
-        let mut row = Lanes16::default();
-        sum.store(&mut row);
-        std::hint::black_box(&row);
-    }
-}
-
-/// Adds up the slots of one chunk's splats and passes every touched group to the sink.
-pub(crate) struct Gather<'a, S: Source, K: Sink> {
+/// Adds up the slots of one chunk's splats and writes every touched group's gradients.
+pub(crate) struct Gather<'a, S: Source> {
     pub view: &'a View,
     pub source: S,
-    pub sink: K,
+    pub out: RowMajor,
     /// One chunk's visible splats, in row order.
     pub splats: &'a [Splat],
     pub slots: &'a [[f32; SUMS]],
     pub written: &'a [u8],
 }
 
-impl<S: Source, K: Sink> Kernel for Gather<'_, S, K> {
+impl<S: Source> Kernel for Gather<'_, S> {
     type Output = ();
 
     #[inline(always)]
@@ -165,7 +137,7 @@ impl<S: Source, K: Sink> Kernel for Gather<'_, S, K> {
                 continue;
             }
             let gradients = unproject::<F, S>(self.view, &self.source, group, &screen);
-            self.sink.take(group, touched, &gradients);
+            self.out.take(group, touched, &gradients);
         }
     }
 }

@@ -1,9 +1,4 @@
-//! Sizes and prefetches of memory for the passes.
-
-/// Bytes of a buffer, used or not.
-pub(crate) fn bytes<T>(buffer: &Vec<T>) -> usize {
-    buffer.capacity() * size_of::<T>()
-}
+//! Prefetches of memory for the passes.
 
 /// Prefetches a value that is read soon.
 #[inline(always)]

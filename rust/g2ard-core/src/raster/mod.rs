@@ -17,13 +17,11 @@ mod forward;
 mod frustum;
 pub(crate) mod gradients;
 pub(crate) mod grid;
-pub mod limits;
 pub(crate) mod memory;
 pub(crate) mod params;
 mod pose;
 pub(crate) mod project;
 pub(crate) mod rasterizer;
-mod sensitivity;
 mod sh;
 pub mod simd;
 #[cfg(test)]
@@ -38,8 +36,7 @@ pub use gradients::Gradients;
 pub(crate) use grid::TileGrid;
 pub use params::Params;
 pub use pose::PoseGradient;
-pub use rasterizer::{Counts, Image, ImageGradients, Memory, Passes, Rasterizer};
-pub use sensitivity::TRIANGLE as SENSITIVITY_TRIANGLE;
+pub use rasterizer::{Image, ImageGradients, Rasterizer};
 pub use simd::Isa;
 
 use crate::scene::limits::MAX_OPACITY;

@@ -2,24 +2,21 @@
 
 mod accumulated;
 mod posed;
-mod sensitive;
 #[cfg(test)]
 mod tests;
 mod tiled;
 mod views;
 
 use std::ops::Range;
-use std::time::Instant;
 
 use rayon::prelude::*;
 
 use super::backward::SUMS;
-use super::blocks::{BlockMasks, MOST_BLOCKS, block_lanes};
+use super::blocks::{BlockMasks, MOST_BLOCKS};
 use super::depth_sort::{self, Key};
 use super::disjoint::DisjointSlice;
-use super::gradients::{Gather, Gradients, Sink};
+use super::gradients::{Gather, Gradients};
 use super::grid::TileGrid;
-use super::memory::bytes;
 use super::params::{Params, Source};
 use super::project::{Project, Splat, View};
 use super::simd::{Isa, LANES, Lanes16, dispatch};
@@ -29,9 +26,7 @@ use super::tiles::Bins;
 use super::{Camera, ROWS, Settings};
 use crate::{Error, Result};
 
-pub use views::{Counts, Image, ImageGradients, Memory, Passes};
-
-use views::lap;
+pub use views::{Image, ImageGradients};
 
 /// Groups of sixteen rows projected as one piece of work; one under Miri, which runs few rows.
 const CHUNK: usize = if cfg!(miri) { 1 } else { 64 };
@@ -77,7 +72,6 @@ pub struct Rasterizer {
     /// The sums of visibility, one pair's after another's.
     shares: Vec<f32>,
     written: Vec<u8>,
-    passes: Passes,
 }
 
 impl Rasterizer {
@@ -106,13 +100,11 @@ impl Rasterizer {
         settings.validate()?;
         image.validate(camera)?;
         self.prepare(*params, camera, settings, background, TileGrid::of(camera));
-        let mut clock = Instant::now();
         if image.depth.is_some() || image.median.is_some() {
             self.forward_tiles::<true>(image);
         } else {
             self.forward_tiles::<false>(image);
         }
-        self.passes.forward = lap(&mut clock);
         Ok(())
     }
 
@@ -125,39 +117,27 @@ impl Rasterizer {
     ) -> Result<()> {
         params.validate()?;
         out.validate(params)?;
-        let sink = out.sink(params.sh_coeffs);
-        self.backward_into(*params, image, sink)
-    }
-
-    pub(crate) fn backward_into<S: Source, K: Sink>(
-        &mut self,
-        source: S,
-        image: &ImageGradients,
-        sink: K,
-    ) -> Result<()> {
-        self.check_rendered("backward", source.len(), image)?;
-        let mut clock = Instant::now();
+        self.check_rendered("backward", params.len(), image)?;
+        let out = out.row_major(params.sh_coeffs);
         if image.depth.is_some() {
             self.backward_tiles::<true>(image);
         } else {
             self.backward_tiles::<false>(image);
         }
-        self.passes.backward = lap(&mut clock);
         let Some(state) = &self.state else {
             return Ok(());
         };
         self.visible().for_each(|(splats, slots)| {
             let gather = Gather {
                 view: &state.view,
-                source,
-                sink,
+                source: *params,
+                out,
                 splats,
                 slots: &self.slots[slots.clone()],
                 written: &self.written[slots],
             };
             dispatch(self.isa, gather);
         });
-        self.passes.gather = lap(&mut clock);
         Ok(())
     }
 
@@ -185,9 +165,7 @@ impl Rasterizer {
         image: &mut Image,
     ) {
         self.prepare(source, camera, settings, background, TileGrid::of(camera));
-        let mut clock = Instant::now();
         self.forward_tiles::<false>(image);
-        self.passes.forward = lap(&mut clock);
     }
 
     /// Fill the slots, then call `finish(chunk, slots of the chunk's splats)` for every chunk of rows in parallel;
@@ -197,9 +175,7 @@ impl Rasterizer {
         image: &ImageGradients,
         finish: impl Fn(&ChunkSums) -> T + Sync,
     ) -> Vec<T> {
-        let mut clock = Instant::now();
         self.backward_tiles::<false>(image);
-        self.passes.backward = lap(&mut clock);
         let Some(state) = &self.state else {
             return Vec::new();
         };
@@ -214,9 +190,7 @@ impl Rasterizer {
                 written: &self.written[slots],
             })
         };
-        let results = self.visible().enumerate().map(finish).collect();
-        self.passes.gather = lap(&mut clock);
-        results
+        self.visible().enumerate().map(finish).collect()
     }
 
     /// The visible splats of every chunk of rows, and their slots.
@@ -226,52 +200,6 @@ impl Rasterizer {
             let splats = &self.splats[first..first + count];
             (splats, self.bins.slots_of(chunk))
         })
-    }
-
-    /// Memory that the buffers hold now.
-    pub fn memory(&self) -> Memory {
-        let Bins { pairs, starts, .. } = &self.bins;
-        Memory {
-            gaussians: bytes(&self.splats)
-                + bytes(&self.tile_lists)
-                + self
-                    .intersectors
-                    .iter()
-                    .map(TileIntersector::bytes)
-                    .sum::<usize>()
-                + bytes(&self.order)
-                + bytes(&self.spare)
-                + bytes(pairs)
-                + bytes(&self.block_masks)
-                + bytes(&self.slots)
-                + bytes(&self.shares)
-                + bytes(&self.written),
-            images: bytes(starts)
-                + bytes(&self.transmittance)
-                + bytes(&self.last)
-                + self.bins.count_bytes(),
-        }
-    }
-
-    /// Times of the last calls' passes.
-    pub fn passes(&self) -> Passes {
-        self.passes
-    }
-
-    pub fn counts(&self) -> Counts {
-        let block_masks = self
-            .batches
-            .iter()
-            .flat_map(|&(first, done)| &self.block_masks[first..first + done]);
-        let blocks: u64 = block_masks
-            .flatten()
-            .map(|w| u64::from(w.count_ones()))
-            .sum();
-        Counts {
-            visible: self.order.len(),
-            pairs: self.bins.pairs.len(),
-            evaluated: blocks * block_lanes(self.isa) as u64,
-        }
     }
 
     /// Projects, sorts and bins.
@@ -292,12 +220,9 @@ impl Rasterizer {
             background,
             rows: source.len(),
         });
-        let mut clock = Instant::now();
         self.project(&view, source, grid);
-        self.passes.project = lap(&mut clock);
         self.collect_keys();
         depth_sort::sort(&mut self.order, &mut self.spare);
-        self.passes.sort = lap(&mut clock);
         self.bins.fill(
             &self.order,
             &self.tile_lists,
@@ -305,7 +230,6 @@ impl Rasterizer {
             CHUNK * LANES,
             grid,
         );
-        self.passes.bin = lap(&mut clock);
         self.batches.clear();
         let mut first = 0;
         for tile in self.bins.starts.windows(2) {

@@ -4,7 +4,6 @@ use std::ops::Range;
 
 use super::TILE;
 use super::grid::TileGrid;
-use super::memory::bytes;
 use super::simd::{LANES, Lanes, Lanes16};
 
 /// Tiles a [`TileList`] holds inline: as many as fit into half a cache line.
@@ -136,11 +135,6 @@ pub struct TileIntersector {
 }
 
 impl TileIntersector {
-    /// Bytes held.
-    pub fn bytes(&self) -> usize {
-        bytes(&self.list) + bytes(&self.ends)
-    }
-
     pub fn clear(&mut self) {
         self.list.clear();
         self.slots = 0;

@@ -7,7 +7,7 @@ use rayon::prelude::*;
 use super::depth_sort::Key;
 use super::disjoint::DisjointSlice;
 use super::grid::TileGrid;
-use super::memory::{bytes, prefetch};
+use super::memory::prefetch;
 use super::tile_lists::{TileIntersector, TileList};
 
 /// Number of stretches of the depth order: fixed, so that work is split equally for any number of threads.
@@ -33,11 +33,6 @@ pub struct Bins {
 }
 
 impl Bins {
-    /// Bytes of the counts.
-    pub fn count_bytes(&self) -> usize {
-        bytes(&self.counts)
-    }
-
     /// A tile's pairs, nearest first.
     pub fn pairs_of(&self, tile: usize) -> &[Pair] {
         &self.pairs[self.starts[tile] as usize..self.starts[tile + 1] as usize]

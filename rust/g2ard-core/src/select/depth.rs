@@ -3,7 +3,6 @@
 
 use super::occluders::Occluders;
 use super::pinhole::{ALPHA_MIN, Pinhole, Splat};
-use crate::raster::Camera;
 use crate::scene::limits::MAX_OPACITY;
 
 /// Upper limit of α, as in gsplat.
@@ -110,19 +109,20 @@ fn sort_by_high_half(keys: &mut Vec<u64>, spare: &mut Vec<u64>) {
     }
 }
 
-/// Median depths of one camera, row by row.
-pub fn median_depths(scene: &Occluders, camera: &Camera) -> Vec<f32> {
-    let (view, mut scratch) = (Pinhole::of(camera), Scratch::default());
-    scratch.clear(&view, 1.0);
-    scratch.trace(scene, &view);
-    scratch.depth
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::random::Lcg;
+    use crate::raster::Camera;
     use crate::select::Gaussians;
+
+    /// Median depths of one camera, row by row.
+    fn median_depths(scene: &Occluders, camera: &Camera) -> Vec<f32> {
+        let (view, mut scratch) = (Pinhole::of(camera), Scratch::default());
+        scratch.clear(&view, 1.0);
+        scratch.trace(scene, &view);
+        scratch.depth
+    }
 
     #[test]
     fn sorts_stably_by_the_high_half() {

@@ -10,7 +10,6 @@ mod surface;
 mod visible;
 
 pub use coverage::{Coverage, Problem};
-pub use depth::median_depths;
 pub use lazy::Chosen;
 pub use light::Light;
 pub use occluders::{Occluder, Occluders};

@@ -12,7 +12,6 @@ use rayon::prelude::*;
 use super::{Shape, window};
 use crate::Result;
 use crate::raster::disjoint::DisjointSlice;
-use crate::raster::memory::bytes;
 use crate::raster::simd::{Isa, dispatch};
 use tile::{Tile, scratch_len};
 
@@ -33,11 +32,6 @@ impl Loss {
             isa,
             ..Self::default()
         }
-    }
-
-    /// Bytes held between calls.
-    pub(crate) fn bytes(&self) -> usize {
-        bytes(&self.sums)
     }
 
     /// The loss; `gradient` receives dloss/d(image).

@@ -18,17 +18,11 @@ pub use anchors::{Anchors, Regularizers};
 pub use row_major::{Attribute, step_rows};
 pub use store::{Exported, Store};
 
-use std::time::Instant;
-
 use rayon::prelude::*;
 
-use crate::raster::gradients::Discard;
-use crate::raster::memory::bytes;
 use crate::raster::rasterizer::ChunkSums;
 use crate::raster::simd::{LANES, dispatch};
-use crate::raster::{
-    Camera, Image, ImageGradients, Isa, Memory, Params, Passes, Rasterizer, Settings,
-};
+use crate::raster::{Camera, Image, ImageGradients, Isa, Params, Rasterizer, Settings};
 use crate::ssim::{Loss, Shape};
 use crate::{Error, Result};
 use adam::Update;
@@ -85,7 +79,6 @@ pub struct Report {
     pub updated: usize,
     /// Gaussians left alone because a gradient was not finite.
     pub skipped: usize,
-    pub seconds_loss: f64,
 }
 
 /// Parameters, Adam's moments, and buffers of a step.
@@ -175,53 +168,19 @@ impl Trainer {
         Ok(())
     }
 
-    /// Times of the rasteriser's passes in the last step; Adam is in `gather`.
-    pub fn passes(&self) -> Passes {
-        self.rasterizer.passes()
-    }
-
-    /// Memory of the parameters, the moments and all buffers, without anchors.
-    pub fn memory(&self) -> Memory {
-        let rasterizer = self.rasterizer.memory();
-        let planes = [&self.image, &self.alpha, &self.gradient].map(bytes);
-        Memory {
-            gaussians: rasterizer.gaussians + self.store.bytes(),
-            images: rasterizer.images + planes.iter().sum::<usize>() + self.loss.bytes(),
-        }
-    }
-
     /// Renders the view, finds the loss and its gradients, and takes one Adam step.
     pub fn step(&mut self, input: &StepInput) -> Result<Report> {
-        let (loss, seconds_loss) = self.photometric_loss(input)?;
+        let loss = self.photometric_loss(input)?;
         let (updated, skipped) = self.adam_step(input);
         Ok(Report {
             loss,
             updated,
             skipped,
-            seconds_loss,
         })
     }
 
-    /// A step up to the gradients, which are discarded: for timing.
-    pub fn gradients_only(&mut self, input: &StepInput) -> Result<Report> {
-        let (loss, seconds_loss) = self.photometric_loss(input)?;
-        let gradients = ImageGradients {
-            rgb: &self.gradient,
-            alpha: None,
-            depth: None,
-        };
-        let parameters = self.store.parameters();
-        self.rasterizer
-            .backward_into(parameters, &gradients, Discard)?;
-        Ok(Report {
-            loss,
-            seconds_loss,
-            ..Report::default()
-        })
-    }
-
-    /// Renders the view; returns its loss against the target and the seconds that took, and leaves the gradient.
-    fn photometric_loss(&mut self, input: &StepInput) -> Result<(f64, f64)> {
+    /// Renders the view; returns its loss against the target, and leaves the gradient.
+    fn photometric_loss(&mut self, input: &StepInput) -> Result<f64> {
         let camera = input.camera;
         camera.validate()?;
         input.settings.validate()?;
@@ -259,7 +218,6 @@ impl Trainer {
             input.background,
             &mut image,
         );
-        let clock = Instant::now();
         let pixels = camera.width * camera.height;
         let mask = input.mask.map(|m| Mask::new(m, pixels)).transpose()?;
         if let Some(mask) = &mask {
@@ -277,7 +235,7 @@ impl Trainer {
             let factor = typical / (loss as f32).max(LEAST_LOSS);
             self.gradient.par_iter_mut().for_each(|g| *g *= factor);
         }
-        Ok((loss, clock.elapsed().as_secs_f64()))
+        Ok(loss)
     }
 
     /// The backward pass and Adam; returns how many Gaussians moved and how many were skipped.

@@ -2,7 +2,6 @@
 
 use crate::raster::Params;
 use crate::raster::disjoint::DisjointSlice;
-use crate::raster::memory::bytes;
 use crate::raster::params::Source;
 use crate::raster::simd::{LANES, Lanes, Lanes16};
 use crate::spatial::{codes_in_box, order};
@@ -95,12 +94,6 @@ impl Store {
 
     pub fn sh_coeffs(&self) -> usize {
         self.sh_coeffs
-    }
-
-    /// Bytes held.
-    pub(crate) fn bytes(&self) -> usize {
-        let rows = [&self.values, &self.first, &self.second, &self.units].map(bytes);
-        rows.iter().sum::<usize>() + bytes(&self.steps) + bytes(&self.order)
     }
 
     pub(crate) fn attributes(&self) -> usize {

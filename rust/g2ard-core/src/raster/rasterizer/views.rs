@@ -1,7 +1,5 @@
 //! Inputs and outputs of the passes.
 
-use std::time::Instant;
-
 use crate::raster::Camera;
 use crate::{Error, Result};
 
@@ -23,43 +21,6 @@ pub struct ImageGradients<'a> {
     pub rgb: &'a [f32],
     pub alpha: Option<&'a [f32]>,
     pub depth: Option<&'a [f32]>,
-}
-
-/// Work done by the last forward pass.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub struct Counts {
-    pub visible: usize,
-    pub pairs: usize,
-    /// (pair, 4×4 block) evaluations that contributed to a pixel, in pixels (16 a block).
-    pub evaluated: u64,
-}
-
-/// Seconds per pass of the last calls.
-#[derive(Debug, Clone, Copy, Default, PartialEq)]
-pub struct Passes {
-    pub project: f64,
-    pub sort: f64,
-    pub bin: f64,
-    pub forward: f64,
-    /// Tiles, from the image's gradient to the slots.
-    pub backward: f64,
-    /// From the slots to the parameters, and the caller's use of their gradient.
-    pub gather: f64,
-}
-
-/// Seconds since `from`, which becomes now.
-pub fn lap(from: &mut Instant) -> f64 {
-    let now = Instant::now();
-    let seconds = now.duration_since(*from).as_secs_f64();
-    *from = now;
-    seconds
-}
-
-/// Bytes held by buffers that grow with the Gaussians and their pairs, and by those that grow with the image.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub struct Memory {
-    pub gaussians: usize,
-    pub images: usize,
 }
 
 fn check(name: &'static str, got: usize, expected: usize) -> Result<()> {
