@@ -128,7 +128,9 @@ def recover(
     others = None if validation is None else score_by_kind(validation, config.background)
 
     def harmful(scene: Splats) -> NDArray[np.bool_] | None:
-        return None if validation is None else harmful_changes(student, scene, validation, config.background)
+        if validation is None:
+            return None
+        return harmful_changes(student, scene, validation, targets, config.background)
 
     guard = Guard(probe.all_of, student, before, others, harmful, config.schedule.guarded)
     validation_key = None if validation is None else fingerprint_of(validation)

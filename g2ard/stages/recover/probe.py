@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +25,8 @@ _INVISIBLE_MSE = 1e-4
 """Mean squared error at that PSNR."""
 _TOLERATED_LOSS = 0.1
 """Loss in dB up to which a view has not become worse."""
+_COMPARED_VIEWS = 64
+"""Training views that vote on whether a change was harmful, beside all validation views."""
 _SCORING_TIME_SHARE = 0.01
 """Share of the time that scoring the views may take while progress is shown."""
 _FIRST_SCORING_SHARE = 0.1
@@ -81,39 +83,53 @@ def score_by_kind(
 
 
 def harmful_changes(
-    start: Splats, result: Splats, targets: Targets, background: tuple[float, float, float]
+    start: Splats,
+    result: Splats,
+    validation: Targets,
+    training: Targets,
+    background: tuple[float, float, float],
 ) -> NDArray[np.bool_] | None:
-    """Find the Gaussians whose change made views worse; None if no view lost more than 0.1 dB.
+    """Find the Gaussians whose change made views worse; None if no validation view lost more than 0.1 dB.
 
     With E the change of the squared error in each pixel, relative to the view's mean before, Σ αT·E over the
-    pixels of a Gaussian is positive if views became worse where it is seen. It must be so over all views and
-    over those that lost.
+    pixels of a Gaussian is positive if views became worse where it is seen. It must be so over the validation
+    views that lost, and over all of them together with 64 training views: what few validation views say about
+    a Gaussian is mostly chance.
 
     Args:
         start: the scene before.
         result: the scene after, of the same Gaussians.
-        targets: views, not trained on.
+        validation: views that were not trained on.
+        training: views that were.
     """
-    before, after = (Renderer(scene, background=background) for scene in (start, result))
-    changes, losing = [], []
-    for view, camera in enumerate(targets.cameras):
-        target, mask = targets[view], mask_of(targets, view)
-        old, new = ((r.clipped(camera).astype(np.float64) - target) ** 2 for r in (before, after))
-        change = (new - old).mean(axis=2) if mask is None else (new - old).mean(axis=2) * mask
-        changes.append(change / (max(old.mean(), _INVISIBLE_MSE) * change.size))
-        losing.append(10 * math.log10(max(new.mean(), 1e-12) / max(old.mean(), 1e-12)) > _TOLERATED_LOSS)
-    if not any(losing):
+    lights = list(_changes(start, result, validation, background))
+    losing = [light for light, lost in lights if lost > _TOLERATED_LOSS]
+    if not losing:
         return None
+    compared = Subset(training, evenly_spaced(len(training.cameras), _COMPARED_VIEWS))
+    total = np.zeros(len(result))
+    for part in (lights, _changes(start, result, compared, background)):
+        for light, _ in part:
+            total += light
+    return (total > 0) & (np.sum(losing, axis=0) > 0)
+
+
+def _changes(
+    start: Splats, result: Splats, targets: Targets, background: tuple[float, float, float]
+) -> Iterator[tuple[NDArray[np.float32], float]]:
+    """Yield Σ αT·E of each Gaussian, (N,), and the loss in dB for each view."""
+    before, after = (Renderer(scene, background=background) for scene in (start, result))
     scene, cameras = centred(result, targets.cameras)
     settings = settings_for(scene.means, None, antialiased=scene.antialiased)
     means, quats, scales, logits, sh0, _ = arrays_of(scene)
     grey = (means, quats, scales, logits, np.zeros_like(sh0), np.zeros((len(scene), 0, 3), np.float32))
-    rasterizer, sums = _core.Rasterizer(), np.zeros((2, len(scene)))
-    for view, change in enumerate(changes):
-        rasterizer.forward(grey, view_of(cameras, view, settings), settings, [0.0, 0.0, 0.0], 0)
+    rasterizer = _core.Rasterizer()
+    for view, camera in enumerate(targets.cameras):
+        target, mask = targets[view], mask_of(targets, view)
+        old, new = ((r.clipped(camera).astype(np.float64) - target) ** 2 for r in (before, after))
+        change = (new - old).mean(axis=2) if mask is None else (new - old).mean(axis=2) * mask
         image = np.zeros((*change.shape, 3), np.float32)
-        image[..., 0] = change
+        image[..., 0] = change / (max(old.mean(), _INVISIBLE_MSE) * change.size)
+        rasterizer.forward(grey, view_of(cameras, view, settings), settings, [0.0, 0.0, 0.0], 0)
         light = rasterizer.backward(grey, image)[4][:, 0, 0]  # the gradient of a colour is Σ αT·E
-        sums[0] += light
-        sums[1] += light * losing[view]
-    return (sums[0] > 0) & (sums[1] > 0)
+        yield light, 10 * math.log10(max(new.mean(), 1e-12) / max(old.mean(), 1e-12))
