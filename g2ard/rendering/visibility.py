@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from g2ard import _core
 from g2ard.progress import Progress, counter, silent
 from g2ard.rendering.renderer import RasterSettings, arrays_of, centred, settings_for, view_of
-from g2ard.scene.cameras import Cameras
+from g2ard.scene.cameras import USUAL, Cameras, rows_by_kind
 from g2ard.scene.prepared import as_prepared
 from g2ard.scene.samples import evenly_spaced
 from g2ard.scene.splats import Splats
@@ -29,6 +29,10 @@ _FREE_GAUSSIAN_VIEWS = 6_000_000
 
 NEAR = 1e-3
 """Near plane as a fraction of the cameras' median distance from the scene's centre."""
+
+_OTHER_VIEWS, _OTHER_SHARE = 32, 0.1
+"""Most views of other kinds than usual ones, and their weight relative to that of all usual views, because
+they show few Gaussians with many pixels each. Measured in decision 0034."""
 
 CONVERGED = 0.01
 """Sampling stops after a round whose share of newly seen Gaussians is below this."""
@@ -126,8 +130,8 @@ def visibility_source(
     Results do not depend on the order of the scene's rows.
 
     Args:
-        cameras: the views; at most 96 of them are used, evenly spaced, and only usual ones if there are any:
-            near views would outweigh all others in Σ αT².
+        cameras: the views; at most 96 usual ones are used, evenly spaced, and at most 32 of other kinds,
+            which together weigh a tenth of the usual ones. Without usual views, all are equal.
         longest: longer side of the renders, pixels; `pixel_size` refers to the full image.
         progress: called after each view.
 
@@ -135,14 +139,19 @@ def visibility_source(
         scene → `SampledVisibility`. The scene's arrays are C-contiguous and float32, except its means. A
         `g2ard.scene.prepared.PreparedScene` is not sorted again.
     """
-    return _Sampler(cameras.usual(), longest, progress)
+    return _Sampler(cameras, longest, progress)
 
 
 class _Sampler:
-    """Function of `visibility_source`: `rounds` of views, of which the first `used` are rendered."""
+    """Function of `visibility_source`: `rounds` of usual views, of which the first `used` are rendered, and
+    `others`."""
 
     def __init__(self, cameras: Cameras, longest: int, progress: Progress) -> None:
-        full = cameras.take(evenly_spaced(len(cameras), MOST_VIEWS))
+        every = np.arange(len(cameras))
+        usual = np.array(rows_by_kind(cameras.kinds).get(USUAL, every))
+        other = np.setdiff1d(every, usual)
+        self.others = cameras.take(other[evenly_spaced(len(other), _OTHER_VIEWS)]).resized(longest)
+        full = cameras.take(usual[evenly_spaced(len(usual), MOST_VIEWS)])
         self.cameras = full.resized(longest)
         self.shrunk = np.float32((self.cameras.widths / full.widths).mean())
         apart = max(1, math.ceil(len(self.cameras) / ROUND))
@@ -163,6 +172,11 @@ class _Sampler:
             self.settings = RasterSettings(antialiased=scene.antialiased, near=NEAR * float(distance) or None)
             self.used = self._add_until_converged(sums, here, len(scene))
         weight, pixel_size = sums.by_row()
+        if len(self.others):
+            rendered = sum(map(len, self.rounds[: self.used]))
+            sums = _core.VisibilityAccumulator(core)
+            self._add(sums, self.others.recentred(scene.offset), range(len(self.others)))
+            weight += np.float32(_OTHER_SHARE * rendered / len(self.others)) * sums.by_row()[0]
         return SampledVisibility(weight, pixel_size * self.shrunk)
 
     def _add_until_converged(self, sums: _core.VisibilityAccumulator, cameras: Cameras, rows: int) -> int:

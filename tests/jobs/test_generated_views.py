@@ -78,12 +78,17 @@ def test_views_of_other_kinds_join_the_usual_ones(make, focus: str | None, kinds
     assert len(views.pool.cameras) == len(views.train.cameras) + len(views.test)
 
 
-def test_simplification_looks_from_usual_views_alone() -> None:
+def test_views_of_other_kinds_weigh_a_tenth_in_simplification() -> None:
     statue = naive.statue()
     pool = plan_pool(statue, 16)
-    usual, mixed = pool.cameras, Cameras.of([*pool.cameras, *pool.more("anywhere", 8), *pool.more("near", 4)])
-    seen, same = visibility_source(usual)(statue), visibility_source(mixed)(statue)
-    np.testing.assert_array_equal(same.weight, seen.weight)
+    others = [*pool.more("anywhere", 8), *pool.more("near", 4)]
+    usual, other, mixed = (
+        visibility_source(Cameras.of(views))(statue)
+        for views in (pool.cameras, others, [*others, *pool.cameras])
+    )
+    weight = usual.weight + 0.1 * len(pool.cameras) / len(others) * other.weight
+    np.testing.assert_allclose(mixed.weight, weight, rtol=1e-5, atol=1e-6)
+    np.testing.assert_array_equal(mixed.pixel_size, usual.pixel_size)
 
 
 def test_given_views_stay_first(tmp_path: Path) -> None:
