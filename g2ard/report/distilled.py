@@ -25,6 +25,9 @@ from g2ard.scene.splats import Splats
 _SHOWN = 3
 """Pictures of the page, and rows of the preview picture."""
 
+_POINTS = 4096
+"""Gaussians that tell how much of the scene a view has in frame."""
+
 _STAGES = ("simplified", "recovered")
 
 
@@ -195,23 +198,28 @@ def preview(
     scenes: list[tuple[str, Splats]],
     background: Colour = BLACK,
 ) -> None:
-    """Write a PNG with a row for each of three evenly spaced views: target, then each scene with its PSNR.
+    """Write a PNG with a row for each of three views: target, then each scene with its PSNR.
+
+    The views are those of each third that have most of the scene in frame.
 
     Args:
         scenes: (label, scene), left to right after the target.
     """
-    count = len(targets.cameras)
-    chosen = evenly_spaced(count, _SHOWN)
+    cameras, shown = targets.cameras, scenes[-1][1]
+    some = shown.take(evenly_spaced(len(shown), _POINTS))
+    points = some.means.astype(np.float64) + some.offset
+    share = [(camera.holds(points) * some.opacities).sum() for camera in cameras]
+    thirds = np.array_split(np.arange(len(cameras)), min(_SHOWN, len(cameras)))
     rows, captions = [], []
     renderers = [Renderer(splats, background=background) for _, splats in scenes]
-    for view in map(int, chosen):
+    for view in (max(map(int, third), key=share.__getitem__) for third in thirds):
         target = targets[view]
-        images = [renderer.image(targets.cameras[view]) for renderer in renderers]
+        images = [renderer.image(cameras[view]) for renderer in renderers]
         rows.append([target, *(np.clip(image, 0, 1) for image in images)])
         scores = [
             f"{name} {psnr(image, target):.2f} dB"
             for (name, _), image in zip(scenes, rows[-1][1:], strict=True)
         ]
-        captions.append(", ".join([targets.cameras.names[view], *scores]))
+        captions.append(", ".join([cameras.names[view], *scores]))
     labels = ["target", *(f"{name}: {plural(len(splats), 'Gaussian')}" for name, splats in scenes)]
     write_png(path, contact_sheet(rows, labels, row_labels=captions), overwrite=True)

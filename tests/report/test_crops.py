@@ -3,12 +3,19 @@
 import base64
 import json
 import re
+from dataclasses import replace
 from io import BytesIO
+from pathlib import Path
 
 import numpy as np
+import pytest
 from PIL import Image
 
+from g2ard.rendering.targets import TeacherRenders
+from g2ard.report import distilled
 from g2ard.report.page import Comparison, Page, Shown, worst_windows
+from g2ard.scene.cameras import Cameras
+from helpers.scenes import around, checkered_ball
 from helpers.studies import check_page
 
 
@@ -64,3 +71,21 @@ def test_the_caption_of_a_crop_names_its_image() -> None:
     text = page.text()
     captions = re.findall(r'class="crop">.*?<figcaption>(.*?)</figcaption>', text)
     assert set(captions) == {"target", "small<br>whole view <b>23.40 dB</b>"}
+
+
+def test_the_preview_shows_views_with_most_of_the_scene_in_frame(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    ball = checkered_ball(200)
+    near, far = (around(3, (32, 24), distance) for distance in (1.2, 4.0))
+    cameras = Cameras.of(
+        replace(camera, name=f"{name}_{i}")
+        for i, pair in enumerate(zip(near, far, strict=True))
+        for name, camera in zip(("near", "far"), pair, strict=True)
+    )
+    labels: list[str] = []
+    monkeypatch.setattr(
+        distilled, "contact_sheet", lambda rows, _, row_labels: labels.extend(row_labels) or rows[0][0]
+    )
+    distilled.preview(tmp_path / "preview.png", TeacherRenders(ball, cameras), [("ball", ball)])
+    assert [label.split(",")[0] for label in labels] == ["far_0", "far_1", "far_2"]
