@@ -143,4 +143,4 @@ def write_splats(path: str | Path, splats: Splats, *, overwrite: bool = False, *
     writer = getattr(import_module(f"g2ard.io.{output_format.module}"), output_format.function)
     writer(Path(path), splats, overwrite=overwrite, **options)
     for note in lost_in(path, splats, **options):
-        warnings.warn(f"{path}: {note}", stacklevel=2)
+        warnings.warn(f"{path}: {note}", stacklevel=3)  # past `checks_arguments`

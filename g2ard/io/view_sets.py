@@ -153,4 +153,4 @@ def write_views(
             else:
                 camera_files.write_nerfstudio(temporary, cameras, path, splits)
     if lost := camera_files.lost_views(cameras, kind, splits, weights is not None):
-        warnings.warn(f"{path}: without {', '.join(lost)}", stacklevel=2)
+        warnings.warn(f"{path}: without {', '.join(lost)}", stacklevel=3)  # past `checks_arguments`

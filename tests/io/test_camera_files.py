@@ -65,8 +65,9 @@ def test_lenses_come_back(tmp_path: Path, format: str) -> None:
 def test_what_a_format_cannot_hold_is_said(tmp_path: Path) -> None:
     views, weights = bent(2, 0.01), np.ones(6)
     told = "without 1 principal point beside the image's middle, lens distortion of 1 view, splits, sampling"
-    with pytest.warns(UserWarning, match=told):
+    with pytest.warns(UserWarning, match=told) as warned:
         write_views(tmp_path / "cameras.json", views, splits=SPLITS, weights=weights)
+    assert warned[0].filename == __file__
     same(read_view_set(tmp_path / "cameras.json").cameras, views, lens=False)
     with pytest.warns(UserWarning, match="without k3 of the lens distortion of 1 view, splits$"):
         write_views(tmp_path / "project", views, splits=SPLITS)

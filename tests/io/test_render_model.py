@@ -62,8 +62,9 @@ def test_spz_says_so_in_all_versions(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["glb", "splat"])
 def test_formats_that_cannot_say_so_say_that(tmp_path: Path, name: str) -> None:
-    with pytest.warns(UserWarning, match="cannot say that the scene is antialiased"):
+    with pytest.warns(UserWarning, match="cannot say that the scene is antialiased") as warned:
         write_splats(tmp_path / f"a.{name}", mip_ball())
+    assert warned[0].filename == __file__
     assert not read_splats(tmp_path / f"a.{name}").antialiased
     write_splats(tmp_path / f"b.{name}", checkered_ball(9))
 
