@@ -243,7 +243,11 @@ TeacherOption = Annotated[
 ]
 PhotosOption = Annotated[
     bool,
-    typer.Option("--photos", help="With --teacher: use photos where views have them, renders otherwise."),
+    typer.Option(
+        "--photos",
+        help="Use the photos of views even if they look unlike the scene; with --teacher, renders of it "
+        "where there are none.",
+    ),
 ]
 ConventionOption = Annotated[
     Convention,

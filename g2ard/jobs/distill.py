@@ -210,7 +210,8 @@ def prepare(
         given = options.named("recover.background") is not None
         propose_background(cameras, recover.background, given, say)
         if not read.lifted:
-            check_photos(prior, cameras, recover.background, say, insisted=options.photos is True)
+            insisted = options.photos is True
+            check_photos(prior, cameras, recover.background, say, insisted=insisted, renders=True)
     say(_task(prior, aims, cameras, photos))
     say(f"regularisers: {preset_label}")
     config = options.configured(regularizers, default_degree)

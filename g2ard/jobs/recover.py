@@ -131,7 +131,8 @@ def recover(
         views: cameras with photos, or their path. With a teacher, None uses cameras found beside it, or
             generates views; "made" always generates them.
         teacher: the dense scene that renders the targets, or its path; None takes the photos of the views.
-        photos: with a teacher, use photos where views have them.
+        photos: with a teacher, use photos where views have them; also accept photos that show nothing of the
+            student.
         preset: settings by name, without `targets`; see `g2ard.preset`.
         settings: values of `RecoverConfig` by path, without `targets`, such as
             {"recover.schedule.rates.means": 1e-3}; they override the preset.
@@ -241,7 +242,7 @@ def prepare(
     say: Say = unsaid,
 ) -> RecoverJob:
     """Read the inputs of `recover` without `targets`, and decide everything."""
-    check_teacher(views, teacher, photos)
+    check_teacher(views, teacher)
     given = full_paths(settings or {}, RecoverConfig())
     named = {**PRESETS[preset], **given}
     config = configured(RecoverConfig(), preset, given)

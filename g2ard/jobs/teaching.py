@@ -12,7 +12,7 @@ from g2ard.io.detect import run_scene, run_views
 from g2ard.io.jsonfile import read_json
 from g2ard.io.types import ViewSet
 from g2ard.jobs.inputs import Views, load_scene, load_split_views, load_trained, make_targets, scorable
-from g2ard.jobs.view_checks import propose_background, warn_of_sight
+from g2ard.jobs.view_checks import check_photos, propose_background, warn_of_sight
 from g2ard.jobs.views import views_or_pool
 from g2ard.progress import Progress, Say, silent, unsaid
 from g2ard.rendering.targets import Targets
@@ -20,14 +20,8 @@ from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
 
 
-def check_teacher(views: Views | None, teacher: Splats | str | Path | None, photos: bool) -> None:
+def check_teacher(views: Views | None, teacher: Splats | str | Path | None) -> None:
     """Check that there is something to train on or score against: photos of views, or a teacher."""
-    if photos and teacher is None:
-        raise InputError(
-            "goes with a teacher, without which all targets are photos",
-            parameter="photos",
-            hint="give {teacher=SCENE}",
-        )
     if teacher is None and is_made(views):
         raise InputError("generated views have no photos", parameter="views", hint="give {teacher=SCENE}")
     if teacher is None and views is None:
@@ -58,7 +52,8 @@ class Teaching:
     Args:
         teacher: the dense scene, or its path; None if all targets are photos.
         chosen: whether the user chose the background.
-        photos: use photos where views have them, and renders of the teacher otherwise.
+        photos: use photos where views have them, and renders of the teacher otherwise. Photos that show
+            nothing of the scene are accepted then.
         render_model: overrides what the teacher's file says.
         seed: seed of generated views.
     """
@@ -96,10 +91,17 @@ class Teaching:
         )
 
     def training(self, scene: Splats, views: Views, split: str, size: int | None) -> tuple[ViewSet, Targets]:
-        """Read a split of the views and return it with its targets; warn if it does not show the scene."""
+        """Read a split of the views and return it with its targets; reject photos of another scene."""
         chosen = load_trained(views, split, size, self._say, unpictured=self.dense is not None)
         warn_of_sight(scene, chosen.cameras, self._say)
-        return chosen, self.targets(chosen.cameras)
+        targets = self.targets(chosen.cameras)
+        self.check_photos(scene, chosen.cameras)
+        return chosen, targets
+
+    def check_photos(self, scene: Splats, cameras: Cameras) -> None:
+        """Reject photos that do not show the scene, unless they are insisted on."""
+        if self.dense is None or self._photos:
+            check_photos(scene, cameras, self._background, self._say, insisted=self._photos)
 
     def targets(self, cameras: Cameras, **options: Any) -> Targets:
         """Return the targets of the views; note if another background fits their photos."""

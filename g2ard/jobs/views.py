@@ -78,7 +78,7 @@ def views_of(
     views_beside = None
     if options.views is None and beside is not None:
         wanted = ["train"] if options.held_out is not None else ["train", "test"]
-        views_beside = found_views(beside, prior, wanted, say)
+        views_beside = found_views(beside, prior, wanted, say, turned=options.up is not None)
     given = views_beside or options.views
     plan = partial(
         _planned,
@@ -240,8 +240,10 @@ def views_or_pool(
 
     if views is not None and not is_made(views):
         return views
-    if views is None and beside is not None and (found := found_views(beside, scene, [], say)):
-        return found
+    if views is None and beside is not None:
+        found = found_views(beside, scene, [], say, turned=up is not None)
+        if found:
+            return found
     if count is None:
         planned = _planned(scene, _POOL_VIEWS, up=up, seed=seed, progress=progress, grow=_POOL_GROWTH)
     else:
@@ -288,7 +290,7 @@ def cameras_for_weights(
     if method == "paper" and made:
         return None
     if views is None and beside is not None and method == "default":
-        views_beside = found_views(beside, scene, ["train"], say)
+        views_beside = found_views(beside, scene, ["train"], say, turned=up is not None)
         if views_beside:
             return as_pool(load_views(views_beside, "train", None, say))
     if views is not None and not made:

@@ -29,9 +29,14 @@ NO_RESULT = {
 }
 """Options that are not for the result."""
 
-OWN = {"poses": ("render_model",), "select": ("render_model",), "register": ("pool", "matcher")}
+OWN = {
+    "poses": ("render_model",),
+    "select": ("render_model",),
+    "register": ("pool", "matcher"),
+    "evaluate": ("photos",),
+}
 """Options that need not change a result: poses depend on geometry alone; a pool is for photos without a pose,
-and a matcher that finds no features gives way to direct alignment.
+and a matcher that finds no features gives way to direct alignment; evaluate uses the photos in any case.
 """
 
 TRAIN = "--views photos.json --size 24 --steps 3"
@@ -121,6 +126,7 @@ OPTIONS: dict[str, dict[str, str]] = {
     },
     "adapt": {
         "views": "--views few.json",
+        "photos": "--photos",
         "images": "--images other",
         "alpha": "--alpha mask",
         "teacher": "--teacher sky.ply",
@@ -234,7 +240,6 @@ OPTIONS: dict[str, dict[str, str]] = {
         "images": "--images other",
         "alpha": "--alpha mask",
         "teacher": "--teacher ball.ply",
-        "photos": "--photos",
         "anchors": "--anchors fewer.ply",
         "convention": "--convention inria",
         "eight_bit": "--8bit",

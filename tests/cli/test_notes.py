@@ -85,16 +85,29 @@ def test_views_of_another_world_are_noted(
         assert (status, "the scene must use the same coordinates" in error) == (1, True), error
 
 
-def test_photos_of_another_world_are_noted(command_line: CommandLine, folder: Path) -> None:
+@pytest.mark.parametrize(
+    ("command", "more"),
+    [
+        ("distill", "-n 50 --steps 2 --dry-run -o run"),
+        ("recover", "--steps 2 -o out.ply"),
+        ("adapt", "--steps 2 -o out.ply"),
+        ("evaluate", ""),
+    ],
+)
+def test_photos_of_another_world_are_refused(
+    command: str, more: str, command_line: CommandLine, folder: Path
+) -> None:
     """The views may still see much of the scene, because both lie around the origin."""
     photos_of(folder / "photos")
-    ask = ("-n", 50, "--views", "photos", "--steps", 2, "--dry-run")
+    ask = ("--views", "photos", *more.split())
     own = checkered_ball(1200)
     g2ard.save(folder / "own.ply", own)
     g2ard.save(folder / "other.ply", replace(own, means=6 * own.means, scales=6 * own.scales))
-    assert "the photos do not show the scene (correlation" in refused(
-        command_line, folder, "distill", "other.ply", *ask, "-o", "run", status=1
-    )
+    before = sorted(folder.iterdir())
+    error = refused(command_line, folder, command, "other.ply", *ask, status=1)
+    assert "the photos do not show the scene (correlation" in error
+    assert "they probably show another scene" in error
+    assert sorted(folder.iterdir()) == before
     for scene, warned in (("other.ply", True), ("own.ply", False)):
-        error = succeeds(command_line, folder, "distill", scene, *ask, "--photos", "-o", "run").err
+        error = succeeds(command_line, folder, command, scene, *ask, "--photos", "-w").err
         assert ("warning: the scene does not look like the photos (correlation" in error) == warned, error

@@ -42,6 +42,7 @@ def test_simplify_looks_from_the_cameras_beside_the_model(command_line: CommandL
         ("given", ("--views", "model/cameras.json"), ""),
         ("made", ("--views", "made"), ""),
         ("none", ("--no-views",), ""),
+        ("turned", ("--up", "0,-1,0"), SAID.replace("scene;", "scene; --up turns generated views only;")),
         ("fast", ("--method", "fast"), ""),
         ("looking", ("--method", "fast", "--views", "made"), ""),
     ):

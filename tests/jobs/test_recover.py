@@ -44,7 +44,6 @@ def test_python_recovers_as_the_command_does(
         ({"targets": g2ard.TeacherRenders(BALL, VIEWS), "views": VIEWS}, "views: goes with"),
         ({"targets": g2ard.TeacherRenders(BALL, VIEWS), "settings": {}}, "settings: goes with"),
         ({"views": VIEWS, "teacher": BALL, "config": g2ard.RecoverConfig()}, "config: goes with targets"),
-        ({"views": VIEWS, "photos": True}, "photos: goes with a teacher"),
         ({}, "there are no targets; give views, or a teacher"),
         ({"views": VIEWS, "teacher": BALL, "anchors": BALL.take(range(9))}, "the student has 400"),
     ],

@@ -11,7 +11,7 @@ import g2ard
 from g2ard.io import write_splats, write_views
 from g2ard.io.images import write_png
 from g2ard.rendering.renderer import render
-from helpers.commands import CommandLine, refused, succeeds
+from helpers.commands import CommandLine, succeeds
 from helpers.scenes import around, checkered_ball
 
 PRIOR = checkered_ball()
@@ -68,7 +68,6 @@ def test_recover_takes_photos_beside_its_teacher(folder: Path, command_line: Com
     assert "8 views against 4 photos and 4 teacher renders" in told
     _, told = run(command_line, folder, *ask)
     assert "4 views against photos" in told
-    assert "--photos: goes with a teacher" in refused(command_line, folder, *ask, "--photos", "-w")
 
 
 def test_a_teacher_needs_no_photos(folder: Path, command_line: CommandLine) -> None:

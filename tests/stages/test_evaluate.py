@@ -94,7 +94,6 @@ def test_command(command_line: CommandLine, tmp_path: Path) -> None:
     plain = json.loads(command_line("evaluate", *common, "--teacher", "ball.ply", cwd=tmp_path)[1])
     assert plain["against"] == "teacher"
     assert plain["scenes"][0]["psnr"] != found["scenes"][0]["psnr"]
-    assert "--photos: goes with a teacher" in refused(command_line, tmp_path, "evaluate", *common, "--photos")
 
 
 def test_reports_state_file_sizes(command_line: CommandLine, folder: Path) -> None:

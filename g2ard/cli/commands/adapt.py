@@ -31,6 +31,7 @@ def adapt(
     images: opt.ImagesOption = None,
     alpha: opt.AlphaOption = "composite",
     teacher: opt.TeacherOption = None,
+    photos: opt.PhotosOption = False,
     steps: Annotated[int | None, typer.Option(min=1, help="Maximum steps; 7,000 by default.")] = None,
     tolerance: Annotated[
         float | None,
@@ -61,8 +62,8 @@ def adapt(
     from g2ard.pipeline.adapt import AdaptConfig
     from g2ard.pipeline.adapt import adapt as refit
 
-    if teacher is not None:
-        run.refuse_typed("with --teacher, whose renders are the targets", "images", "alpha")
+    if teacher is not None and not photos:
+        run.refuse_typed("with --teacher, unless --photos is given", "images", "alpha")
     schedule = schedule or PRESETS[preset or "auto"].get("adapt.schedule", "default")
     if schedule == "paper" and prior_views:
         raise typer.BadParameter("--prior-views and the paper's schedule exclude each other; give one")
@@ -75,10 +76,13 @@ def adapt(
     work = output.parent / f".{output.name}.work"
     check_scene_run(run, work, resume, output)
     splats = run.load(compact)
+    made = [] if teacher is None else [("teacher", 4.0)]
+    run.console.expect([*made, ("adapt", 0.02 * config.steps)])
     teaching = Teaching(
         teacher,
         config.background,
         chosen=background is not None,
+        photos=photos,
         render_model=run.render_model,
         seed=run.seed,
         progress=run.progress,

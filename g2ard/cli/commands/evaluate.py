@@ -78,12 +78,13 @@ def evaluate(
 
     if lpips_input != "scaled" and lpips is None:
         raise typer.BadParameter("--lpips-input goes with --lpips; give --lpips DIR")
-    if views is None and teacher is None and (own := teaching_of_run(scenes)):
+    own = teaching_of_run(scenes) if views is None and teacher is None else None
+    if own is not None:
         views, teacher, photos, made_at = own
         size = size or made_at
     else:
         with run.usage():
-            check_teacher(views, teacher, photos)
+            check_teacher(views, teacher)
     device = "cuda" if run.device == "cuda" else "cpu"
     if device == "cuda":
         opt.use_cuda()
@@ -102,6 +103,9 @@ def evaluate(
         progress=run.progress,
         say=run.say,
     )
+    teacher_stage = [] if teacher is None else [("teacher", 2.0)]
+    of_scenes = [stage for path in scenes for stage in ((path.name, 4.0), ("visibility", 1.0))]
+    run.console.expect([*teacher_stage, *of_scenes])
     frozen = run.load(anchors) if anchors else None
     cameras = load_views(teaching.views(views), split, size, run.say, unpictured=teaching.dense is not None)
     targets = scorable(teaching.targets(cameras, settings=settings), run.say)
@@ -111,6 +115,8 @@ def evaluate(
     for path in scenes:
         splats = run.load(path)
         check_sight(splats, cameras, run.say)
+        if own is None and not rows:  # photos of a run, or of another scene here, are meant
+            teaching.check_photos(splats, cameras)
         scored = score(
             splats,
             targets,

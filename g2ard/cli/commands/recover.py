@@ -69,7 +69,7 @@ def recover(
     names = ("schedule", "steps", "recovery_time", "sh_degree", "engine", "background", "seed")
     settings = run.settings(RecoverConfig(), *names, preset=preset)
     with run.usage():
-        check_teacher(views, teacher, photos)
+        check_teacher(views, teacher)
     checkpoint = output.parent / f".{output.name}.checkpoint.npz"
     check_scene_run(run, checkpoint, resume, output)
     opt.choose_engine(run, settings, "recover.engine")
