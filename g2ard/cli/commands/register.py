@@ -134,6 +134,8 @@ def register(
     if report is not None:
         run.check_extra("--report", report)
         check_page_output(report, run.overwrite)
+    planned = [] if pool is None else [("poses", 5.0), ("pool", 5.0)]
+    run.console.expect([*planned, ("register", 30.0), *([("report", 2.0)] if report else [])])
     job = prepare(
         scene,
         photos,

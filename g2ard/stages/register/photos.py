@@ -99,10 +99,11 @@ def register(
     if not given and pool is None:
         raise InputError("no photo has a starting pose; pass starting poses or a pool", parameter="starts")
     renderer = Renderer(scene, background=background)
-    renders = None if pool is None else PoolRenders(renderer, pool, config)
+    renders = None if pool is None else PoolRenders(renderer, pool, config, progress)
     search = Search(renderer, config, matcher_named(config.matcher, config.ratio, config.features))
     rows, kept, poses, matches = [], [], [], {}
     for i, name in enumerate(photos.names):
+        progress("register", i, len(photos))
         began = time.perf_counter()
         start = Start(given[name], given[name], name) if name in given else None
         row, best = _register_photo(search, photos, i, start, renders, true.get(name))
@@ -114,7 +115,7 @@ def register(
         if row.camera_from_world is not None and row.status in KEPT[keep]:
             kept.append(i)
             poses.append(np.array(row.camera_from_world))
-        progress("register", i + 1, len(photos))
+    progress("register", len(photos), len(photos))
     cameras = photos.take(np.array(kept, int))
     if kept:
         cameras = replace(cameras, viewmats=np.stack(poses))

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from g2ard.progress import Progress, silent
 from g2ard.rendering.renderer import Renderer
 from g2ard.scene.cameras import Camera, Cameras
 from g2ard.stages.register.config import RegisterConfig
@@ -51,8 +52,10 @@ def turned(viewmat: Float, render: Float, photo: Float, K: Float) -> Turned:
 class PoolRenders:
     """Renders of a pool's poses with a photo's intrinsics, cached per intrinsics."""
 
-    def __init__(self, renderer: Renderer, pool: Cameras, config: RegisterConfig) -> None:
-        self._renderer, self.pool, self._config = renderer, pool, config
+    def __init__(
+        self, renderer: Renderer, pool: Cameras, config: RegisterConfig, progress: Progress = silent
+    ) -> None:
+        self._renderer, self.pool, self._config, self._progress = renderer, pool, config, progress
         self._kept: dict[bytes, list[Float]] = {}
 
     def ranked(self, camera: Camera, grey: Float) -> tuple[list[tuple[int, Turned]], int]:
@@ -63,9 +66,11 @@ class PoolRenders:
         key = camera.K.tobytes() + bytes(str((camera.width, camera.height)), "ascii")
         renders = 0
         if key not in self._kept:
-            views = [replace(camera, viewmat=view) for view in self.pool.viewmats]
-            self._kept[key] = [small_render(self._renderer, view, self._config) for view in views]
-            renders = len(self.pool)
+            self._kept[key], renders = [], len(self.pool)
+            for view in self.pool.viewmats:
+                drawn = small_render(self._renderer, replace(camera, viewmat=view), self._config)
+                self._kept[key].append(drawn)
+                self._progress("pool", len(self._kept[key]), renders)
         photo = band_passed(grey)
         similar = [
             turned(view, render, photo, camera.K)
