@@ -26,6 +26,7 @@ from g2ard._core import __version__
 from g2ard.errors import InputError
 from g2ard.io.atomic import atomic_folder, atomic_output
 from g2ard.io.packing import coded, log_scales, morton_order, smallest_three, unit_quats, writable
+from g2ard.progress import Progress, silent
 from g2ard.scene.shape import longer_axes
 from g2ard.scene.splats import Splats
 
@@ -45,11 +46,11 @@ def write(path: Path, splats: Splats, *, overwrite: bool = False) -> None:
         temporary.write_bytes(sog_bytes(path, splats))
 
 
-def sog_bytes(path: Path, splats: Splats) -> bytes:
+def sog_bytes(path: Path, splats: Splats, progress: Progress = silent) -> bytes:
     """Return the bytes of a .sog; `path` is for messages."""
     room = io.BytesIO()
     with zipfile.ZipFile(room, "w") as bundle:
-        for name, content in sog_files(path, splats).items():
+        for name, content in sog_files(path, splats, progress=progress).items():
             bundle.writestr(zipfile.ZipInfo(name, (1980, 1, 1, 0, 0, 0)), content)
     return room.getvalue()
 
@@ -70,7 +71,9 @@ def palette_size(count: int) -> int:
     return min(1 << 16, 1 << (count.bit_length() - 1))
 
 
-def sog_files(path: Path, splats: Splats, *, ordered: bool = False) -> dict[str, bytes]:
+def sog_files(
+    path: Path, splats: Splats, *, ordered: bool = False, progress: Progress = silent
+) -> dict[str, bytes]:
     """Return the files of a scene by name, meta.json last; rows in Morton order unless already `ordered`.
 
     An `offset` is stored under "g2ard" in meta.json; other programs show the recentred scene.
@@ -84,11 +87,15 @@ def sog_files(path: Path, splats: Splats, *, ordered: bool = False) -> dict[str,
     if splats.antialiased:
         meta["model"] = "antialiased"  # newer spelling
 
+    images = 7 if splats.sh_degree else 5
+    progress("sog", 0, images)
+
     def image(name: str, pixels: NDArray[Any]) -> str:
         room = np.zeros((width * height, 4), np.uint8)
         room[:, 3] = 255
         room[: len(pixels), : pixels.shape[1]] = pixels
         files[f"{name}.webp"] = _webp(room.reshape(height, width, 4))
+        progress("sog", len(files), images)
         return f"{name}.webp"
 
     low, high, codes = _means(splats)

@@ -38,7 +38,8 @@ _FOOTPRINT_SIGMAS = 3.0
 """Standard deviations at which renderers cut off a footprint."""
 _FLOATER_SHARE = 1e-3
 """Share of the scene's Gaussians and of its light below which a separate group is a floater."""
-_NEIGHBORS = 16
+_NEIGHBORS, _BLOCK = 16, 1 << 18
+"""Nearest neighbours that can touch a Gaussian, and Gaussians that are grouped at once."""
 _SURFACE_SLACK = 0.01
 """Share of the depth within which a Gaussian belongs to the visible surface, behind or in front of it."""
 
@@ -85,7 +86,7 @@ def find_clutter(
         kinds: kinds to find.
         floating: from `find_floating`; None finds neither haze nor streaks.
         strength: 0 to 1: haze and streaks float in more than 1 − `strength` of the views.
-        progress: called before each kind.
+        progress: called before each kind, and for groups of floaters.
 
     Raises:
         InputError: an unknown kind, or `seen` or `unoccluded` of another length.
@@ -100,7 +101,7 @@ def find_clutter(
         "invisible": lambda rest: hidden,
         "giant": lambda rest: _giants(splats),
         "needle": lambda rest: _needles(splats, rest),
-        "floater": lambda rest: _floaters(splats, rest, seen.weight, unoccluded),
+        "floater": lambda rest: _floaters(splats, rest, seen.weight, unoccluded, progress),
     }
     if floating is not None:
         finders["haze"] = lambda rest: floating.middle > 1 - strength
@@ -257,7 +258,11 @@ def _elongated(splats: Splats, rows: NDArray[np.intp]) -> tuple[NDArray[np.intp]
 
 
 def _floaters(
-    splats: Splats, rest: NDArray[np.bool_], weight: NDArray[Any], unoccluded: NDArray[np.bool_]
+    splats: Splats,
+    rest: NDArray[np.bool_],
+    weight: NDArray[Any],
+    unoccluded: NDArray[np.bool_],
+    progress: Progress = silent,
 ) -> NDArray[np.bool_]:
     """Mark small groups of touching Gaussians of `rest` (3σ spheres meet), some of them unoccluded."""
     out = np.zeros(len(splats), bool)
@@ -266,10 +271,15 @@ def _floaters(
         return out
     means = splats.means[rows].astype(np.float64)
     reach = _FOOTPRINT_SIGMAS * splats.scales[rows].max(axis=1).astype(np.float64)
-    near = _core.knn(means, _NEIGHBORS).astype(np.int64)
-    away = np.linalg.norm(means[near] - means[:, None], axis=2)
-    a, b = np.nonzero(away <= reach[:, None] + reach[near])
-    group = _groups(len(rows), a, near[a, b])
+    near = _core.knn(means, _NEIGHBORS)
+    group = np.arange(len(rows))
+    for first in range(0, len(rows), _BLOCK):
+        progress("groups", first, len(rows))
+        block = slice(first, first + _BLOCK)
+        away = np.linalg.norm(means[near[block]] - means[block, None], axis=2)
+        a, b = np.nonzero(away <= reach[block, None] + reach[near[block]])
+        group = _joined(group, a + first, near[block][a, b])
+    progress("groups", len(rows), len(rows))
     count = np.bincount(group, minlength=len(rows))
     light = np.bincount(group, weight[rows], minlength=len(rows))
     small = (count <= _FLOATER_SHARE * len(rows)) & (light <= _FLOATER_SHARE * light.sum())
@@ -278,18 +288,19 @@ def _floaters(
     return out
 
 
-def _groups(count: int, a: NDArray[Any], b: NDArray[Any]) -> NDArray[np.int64]:
-    """Return the (count,) smallest row connected to each row by the edges a–b.
+def _joined(root: NDArray[np.int64], a: NDArray[Any], b: NDArray[Any]) -> NDArray[np.int64]:
+    """Join groups by edges a–b, where `root` is the smallest row of each row's group.
 
-    >>> _groups(5, np.array([3, 1]), np.array([4, 3])).tolist()
+    >>> _joined(np.arange(5), np.array([3, 1]), np.array([4, 3])).tolist()
     [0, 1, 2, 1, 1]
     """
-    root = np.arange(count)
+    root = root.copy()
     while True:
-        low = np.minimum(root[a], root[b])
-        before = root.copy()
-        np.minimum.at(root, root[a], low)
-        np.minimum.at(root, root[b], low)
-        root = root[root]
-        if (root == before).all():
+        a, b = root[a], root[b]
+        apart = a != b
+        if not apart.any():
             return root
+        a, b = a[apart], b[apart]
+        np.minimum.at(root, np.maximum(a, b), np.minimum(a, b))
+        while not np.array_equal(further := root[root], root):
+            root = further

@@ -16,6 +16,7 @@ from g2ard.config.choices import BLACK
 from g2ard.errors import InputError, OutputError
 from g2ard.io.atomic import atomic_output, check_output
 from g2ard.io.sog_write import sog_bytes
+from g2ard.progress import Progress, silent
 from g2ard.scene.splats import Splats
 
 _HERE = Path(__file__).parent
@@ -66,6 +67,7 @@ def write_page(
     stops: Sequence[tuple[str, Start]] = (),
     background: Sequence[float] = BLACK,
     overwrite: bool = False,
+    progress: Progress = silent,
 ) -> Written:
     """Write a page that shows one scene, or two with a divider under a shared camera.
 
@@ -75,9 +77,10 @@ def write_page(
         scenes: (label, scene), one or two, left to right, in the same frame: x right, y down, z ahead.
         start: initial camera; None lets the viewer frame the whole scene.
         stops: (title, camera) of views to step through, by arrows below the scene.
+        progress: called for each image of a packed scene.
     """
     path = check_page_output(path, overwrite)
-    packed = [_sog(path, label, splats) for label, splats in scenes]
+    packed = [_sog(path, label, splats, progress) for label, splats in scenes]
     shown = {
         "start": None if start is None else asdict(start),
         "stops": [{"title": title, **asdict(stop)} for title, stop in stops],
@@ -138,8 +141,8 @@ def _write(path: Path, text: str, overwrite: bool) -> int:
         return temporary.stat().st_size
 
 
-def _sog(path: Path, label: str, splats: Splats) -> bytes:
-    packed = sog_bytes(path, replace(splats, offset=np.zeros(3)))
+def _sog(path: Path, label: str, splats: Splats, progress: Progress) -> bytes:
+    packed = sog_bytes(path, replace(splats, offset=np.zeros(3)), progress)
     if len(packed) > _LARGEST_SOG_BYTES:
         raise InputError(
             f"{label} has {len(packed) / 1e6:.0f} MB as SOG, but browsers accept at most"

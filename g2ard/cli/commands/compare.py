@@ -55,7 +55,7 @@ def compare(
     if output is not None:
         check_page_output(output, run.overwrite)
         run.spare_inputs(output)
-    page = [] if output is None else [("page", 2.0)]
+    page = [] if output is None else [("page", 1.0), ("sog", 2.0), ("sog", 0.5)]
     run.console.expect([("poses", 1.0), ("teacher", 2.0), ("evaluate", 3.0), *page])
     reference, other = (run.load(path) for path in paths)
     colour = opt.background_of(run, background, first, second) or BLACK
@@ -108,6 +108,7 @@ def compare(
                 stops=stops,
                 background=colour,
                 overwrite=run.overwrite,
+                progress=run.progress,
             )
         run.kept.append(f"{output} is written")
         run.say(f"{output}: opens at {stand.name}; the arrows below lead to the worst views")

@@ -68,6 +68,7 @@ def view(
         start=stand.start,
         background=opt.background_of(run, background, scene, other) or BLACK,
         overwrite=run.overwrite,
+        progress=run.progress,
     )
     run.kept.append(f"{output} is written")
     sizes = " and ".join(f"{size / 1e6:.2f}" for size in written.scenes)
