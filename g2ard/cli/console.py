@@ -172,7 +172,7 @@ class Console:
 
         table = Table(title=title, title_justify="left", show_header=any(columns))
         for i, name in enumerate(columns):
-            table.add_column(name, justify="right" if i and name else "left")
+            table.add_column(name, justify="right" if i and name else "left", overflow="fold")
         for row in rows:
             table.add_row(*row)
         stream = sys.stdout if stdout else sys.stderr

@@ -41,12 +41,12 @@ def score_lines(packed: dict[str, Any], size: int, unpacked: float) -> list[str]
     loss is large and visible.
 
     >>> score_lines({"file": "scene.sog", "psnr": 37.86}, 1_310_000, 37.94)
-    ['scene.sog: 1.3 MB, 37.9 dB in held-out views (37.9 as .ply)']
+    ['scene.sog: 1.31 MB, 37.9 dB in held-out views (37.9 as .ply)']
     >>> len(score_lines({"file": "scene.sog", "psnr": 58.6}, 1_310_000, 62.6))
     1
     """
     name, psnr = packed["file"], packed["psnr"]
-    lines = [f"{name}: {size / 1e6:.1f} MB, {psnr:.1f} dB in held-out views ({unpacked:.1f} as .ply)"]
+    lines = [f"{name}: {size / 1e6:.2f} MB, {psnr:.1f} dB in held-out views ({unpacked:.1f} as .ply)"]
     if unpacked - psnr > _WARNED_LOSS and psnr < _INVISIBLE_LOSS_PSNR:
         lines.append(f"warning: {name}: the format costs {unpacked - psnr:.1f} dB; {_better(name)}")
     return lines

@@ -163,12 +163,12 @@ def _table(run: Run, title: str, rows: list[dict[str, Any]]) -> None:
     columns = {
         "scene": short_names([Path(r["scene"]) for r in rows]),
         "Gaussians": [f"{r['count']:,}" for r in rows],
-        "file MB": [f"{r['file_bytes'] / 1e6:.2f}" for r in rows],
+        "MB": [f"{r['file_bytes'] / 1e6:.2f}" for r in rows],
         "PSNR": [f"{r['psnr']:.2f}" for r in rows],
         "SSIM": [f"{r['ssim']:.4f}" for r in rows],
         "edges": [f"{r['edge_psnr']:.2f}" for r in rows],
         "needles": [f"{r['needle']:.1%}" for r in rows],
-        "Gaussians/px": [f"{r['overdraw']:.1f}" for r in rows],
+        "overdraw": [f"{r['overdraw']:.1f}" for r in rows],
     }
     if all(r["lpips"] for r in rows):
         columns["LPIPS"] = [" ".join(f"{net} {value:.4f}" for net, value in r["lpips"].items()) for r in rows]
