@@ -26,6 +26,8 @@ _ETA_KNOWN_SHARE = 0.1
 """Share of the expected work after which the time that the whole command still needs is shown."""
 _ECHO = 5
 """Characters left free at the right for ^C, which terminals echo; a line that wraps cannot be removed."""
+_NAME = 10
+"""Fewest characters of the first column of a table, which continues on the next line."""
 _BAR = 12, 40
 """Fewest and most characters of a bar."""
 
@@ -164,7 +166,10 @@ class Console:
             print(f"g2ard: {text}", file=sys.stderr, flush=True)
 
     def table(self, title: str, columns: list[str], rows: list[list[str]], *, stdout: bool = False) -> None:
-        """Print a table; columns with a header are right-aligned, except the first."""
+        """Print a table; columns with a header are right-aligned, except the first.
+
+        Figures stay on one line: a table that is too wide for its terminal becomes a list.
+        """
         if self.quiet:
             return
         from rich.console import Console as Rich
@@ -172,15 +177,25 @@ class Console:
 
         table = Table(title=title, title_justify="left", show_header=any(columns))
         for i, name in enumerate(columns):
-            table.add_column(name, justify="right" if i and name else "left", overflow="fold")
+            number = bool(i and name)
+            table.add_column(name, justify="right" if number else "left", overflow="fold", no_wrap=number)
         for row in rows:
             table.add_row(*row)
         stream = sys.stdout if stdout else sys.stderr
+        screen = Rich(file=stream, width=None if stream.isatty() else 120)
+        first, *others = (max(map(len, column)) for column in zip(columns, *rows, strict=True))
         with self._lock:
             self._clear()
-            Rich(file=stream, width=None if stream.isatty() else 120).print(
-                table, markup=False, highlight=False
-            )
+            if table.show_header and min(first, _NAME) + sum(others) + 3 * len(columns) + 1 > screen.width:
+                lines = [title]
+                for row in rows:
+                    figures = zip(columns[1:], row[1:], strict=True)
+                    lines.append(
+                        f"{row[0]}: " + ", ".join(f"{name} {cell}" for name, cell in figures if cell)
+                    )
+                screen.print("\n".join(lines), markup=False, highlight=False)
+            else:
+                screen.print(table, markup=False, highlight=False)
 
     def print(self, text: str) -> None:
         """Print to stdout, also with --quiet."""

@@ -1,5 +1,6 @@
 """Every command in a pseudo-terminal: the screen that it leaves, its exit status and its stdout."""
 
+import json
 import re
 import shlex
 import shutil
@@ -178,13 +179,21 @@ def test_any_terminal_is_left_tidy(command: str, shown: Callable[..., Screen]) -
             assert "\x1b" not in screen.received
 
 
+@pytest.mark.parametrize("columns", [40, 80])
 @pytest.mark.parametrize("command", TO_STDOUT)
-def test_results_on_the_terminal_itself(command: str, shown: Callable[..., Screen]) -> None:
-    screen = shown(command, piped=False)
+def test_results_on_the_terminal_itself(
+    command: str, columns: int, shown: Callable[..., Screen], tmp_path: Path
+) -> None:
+    """Figures are whole, also where a terminal has no room for their table."""
+    screen = shown(command, *["--json", "found.json"] * (command != "info"), columns=columns, piped=False)
     assert screen.status == 0, screen.received
     assert_tidy(screen)
     assert screen.lines[-1]
-    assert command == "info" or "…" not in "".join(screen.lines), "a cell is cut off"
+    if command != "info":
+        found = json.loads((tmp_path / "files" / "found.json").read_text())
+        psnr = found["psnr"] if command == "compare" else found["scenes"][0]["psnr"]
+        assert f"{psnr:.2f}" in " ".join(screen.lines)
+        assert "…" not in "".join(screen.lines)
 
 
 @pytest.mark.parametrize("command", ENDLESS)
