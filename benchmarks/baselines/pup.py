@@ -38,7 +38,7 @@ def fisher(splats: Splats, cameras: Cameras, *, probes: int = _PROBES, seed: int
     for i in range(len(cameras)):
         image, *_ = rasterizer.forward(arrays, view_of(cameras, i, settings), settings, [0.0] * 3, 0)
         for _ in range(probes):
-            signs = rng.choice(np.float32([-1, 1]), image.shape)
+            signs = rng.choice(np.array([-1, 1], np.float32), image.shape)
             means, _, log_scales, *_ = rasterizer.backward(arrays, signs)
             g = np.concatenate([means, log_scales], 1)
             seen = np.flatnonzero(g.any(1))
