@@ -23,8 +23,8 @@ _INVISIBLE_PSNR = 40.0
 """PSNR in dB above which differences are invisible, so that no validation view counts for more."""
 _INVISIBLE_MSE = 1e-4
 """Mean squared error at that PSNR."""
-_TOLERATED_LOSS = 0.1
-"""Loss in dB up to which a view has not become worse."""
+_TOLERATED_LOSS = 1.0
+"""Loss in dB up to which no Gaussian goes back for a view."""
 _COMPARED_VIEWS = 64
 """Training views that vote on whether a change was harmful, beside all validation views."""
 _SCORING_TIME_SHARE = 0.01
@@ -89,7 +89,7 @@ def harmful_changes(
     training: Targets,
     background: tuple[float, float, float],
 ) -> NDArray[np.bool_] | None:
-    """Find the Gaussians whose change made views worse; None if no validation view lost more than 0.1 dB.
+    """Find the Gaussians whose change made views worse; None if no validation view lost more than 1 dB.
 
     With E the change of the squared error in each pixel, relative to the view's mean before, Σ αT·E over the
     pixels of a Gaussian is positive if views became worse where it is seen. It must be so over the validation
