@@ -14,7 +14,6 @@ from hypothesis import strategies as st
 import g2ard
 from g2ard.jobs.inputs import clutter_seen
 from g2ard.scene.transform import in_sphere, moving, transform
-from g2ard.stages.clean import KINDS
 from helpers.commands import CommandLine, succeeds
 from helpers.photos import cloud_of
 from helpers.scenes import around, checkered_ball, under_a_sky
@@ -152,8 +151,9 @@ def _python(command: str, values: dict[str, Any], folder: Path) -> bytes:
     elif command == "convert":
         made = _converted(g2ard.load(folder / "ball.ply"), **values)
     elif command == "clean":
-        stray, kinds = g2ard.load(folder / "stray.ply"), values.pop("only", KINDS)
-        made = stray.take(clutter_seen(stray, kinds, **values)[0].keep)
+        stray = g2ard.load(folder / "stray.ply")
+        named = {"kinds" if name == "only" else name: value for name, value in values.items()}
+        made = stray.take(clutter_seen(stray, **named)[0].keep)
     else:
         points = g2ard.load_points(folder / "cloud.ply")
         made = g2ard.lift(points.positions, points.colors, **values)

@@ -64,7 +64,7 @@ ENDLESS = {
     "clean": ("visibility", ""),
     "poses": ("poses", "--count 20000"),
     "select": ("read", "--views many.json"),
-    "render": ("render", "--views many.json --size 400"),
+    "render": ("render", "-n 400 --size 400"),
     "evaluate": ("teacher", "--views many.json"),
     "compare": ("teacher", "--views many.json"),
 }

@@ -74,6 +74,10 @@ def _small(path: Path) -> None:
     g2ard.save(path, blotched())
 
 
+def _simplified(path: Path) -> None:
+    g2ard.save(path, g2ard.simplify(SCENE, count=250, method="fast").splats)
+
+
 def _cloud(path: Path) -> None:
     cloud_of(path, SCENE)
 
@@ -216,6 +220,7 @@ OF_PAGE: dict[str, dict[str, Callable[[Path], None]]] = {
     "docs/how-to/web-delivery.md": {"project": _map_colmap},
     "docs/how-to/clean-floaters.md": {"scene.ply": _sky},
     "docs/how-to/own-views.md": {"views.json": _views},
+    "docs/how-to/rasteriser.md": {"small.ply": _simplified},
 }
 """Page → names that mean something else there."""
 
