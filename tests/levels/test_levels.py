@@ -114,10 +114,15 @@ def test_an_interrupted_lod_resumes_to_the_same_bits(tmp_path: Path) -> None:
     assert [level.fingerprint() for level in again.splats] == [level.fingerprint() for level in whole.splats]
 
 
-@pytest.mark.parametrize("ratios", [(), (2, 1), (1, 1), (0.5, 2), (1, float("nan"))])
+@pytest.mark.parametrize("ratios", [(), (2, 1), (1, 1), (0.5, 2)])
 def test_ratios_rise(ratios: tuple[float, ...]) -> None:
-    with pytest.raises(InputError, match=r"ratios: expected (rising|several) numbers"):
+    with pytest.raises(InputError, match="ratios: expected rising numbers"):
         lod(checkered_ball(50), ratios=ratios)
+
+
+def test_ratios_are_numbers() -> None:
+    with pytest.raises(InputError, match=r"ratios: expected several numbers, got \(1, nan\)"):
+        lod(checkered_ball(50), ratios=(1, float("nan")))
 
 
 def test_a_dry_run_estimates_every_level_and_writes_nothing(tmp_path: Path, command_line) -> None:

@@ -86,7 +86,7 @@ def shown(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, Brow
 def test_spark_shows_a_file(
     shown: tuple[Path, Browser], name: str, turned: bool, options: dict[str, str]
 ) -> None:
-    """As `docs/how-to/engines.md` says: only an .spz by its definition stands upright as it is."""
+    """Only an .spz by its definition stands upright as it is, see `docs/how-to/engines.md`."""
     folder, browser = shown
     scene = checkered_ball(2000)
     write_splats(folder / name, scene, **options)
