@@ -26,8 +26,9 @@ _RAISED = 0.1
 _PATIENCE, _TOLERABLE = 12, 0.5
 """Candidates judged per requested pose, at most, and least score of a usable one; 1 is good."""
 
-_ROWS, SIGHT_ROWS, _LONGEST = 12_000, 24_000, 96
-"""Gaussians rendered per glance, and where lines of sight matter; pixels along the longer side."""
+_ROWS, SIGHT_ROWS, _LONGEST, _BATCH = 12_000, 24_000, 96, 32
+"""Gaussians rendered per glance, and where lines of sight matter; pixels along the longer side; and renders
+made together."""
 
 _MOST_WIDENED = 4.0
 """Largest factor by which a sample of 12,000 Gaussians grows along the two longer axes, to cover for the
@@ -178,9 +179,11 @@ class Glance:
             return
         here = cameras.resized(_LONGEST).recentred(self._middle)
         settings = RasterSettings(antialiased=self._antialiased, near=near)
-        for i in range(len(here)):
-            sums = _core.accumulate(self._arrays, [view_of(here, i, settings)], settings, None)
-            yield sums, norms(self._means - here.positions[i]), int(here.widths[i] * here.heights[i])
+        for first in range(0, len(here), _BATCH):
+            batch = range(first, min(first + _BATCH, len(here)))
+            views = [view_of(here, i, settings) for i in batch]
+            for i, sums in zip(batch, _core.accumulate_each(self._arrays, views, settings), strict=True):
+                yield sums, norms(self._means - here.positions[i]), int(here.widths[i] * here.heights[i])
 
 
 @dataclass(frozen=True, eq=False)

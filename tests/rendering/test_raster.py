@@ -9,7 +9,7 @@ import torch
 
 from g2ard import _core
 from g2ard.errors import InputError
-from g2ard.rendering.renderer import RasterSettings, render
+from g2ard.rendering.renderer import RasterSettings, arrays_of, render, settings_for, view_of
 from g2ard.rendering.visibility import visibility, visibility_source
 from g2ard.scene.cameras import Cameras, look_at
 from g2ard.stages.recover.rasterize import rasterize
@@ -262,3 +262,15 @@ def test_bad_input_is_named() -> None:
         rasterize(*short, cameras, 0)
     with pytest.raises(InputError, match="near"):
         render(splats_of(p), cameras[0], settings=RasterSettings(near=-1.0))
+
+
+def test_sums_of_each_view_alone_equal_those_of_one_call_per_view() -> None:
+    p, cameras = splats_of(scene(8, 300)), [camera(40, 30, seed=seed) for seed in range(5)]
+    settings, arrays = settings_for(p.means), arrays_of(p)
+    views = [view_of(each, 0, settings) for each in cameras]
+    together = _core.accumulate_each(arrays, views, settings)
+    for view, sums in zip(views, together, strict=True):
+        alone = _core.accumulate(arrays, [view], settings)
+        assert sums["weight"].any()
+        for name, values in alone.items():
+            np.testing.assert_array_equal(sums[name], values)

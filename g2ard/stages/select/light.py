@@ -23,6 +23,8 @@ _RENDER_SIDE = 240
 """Longer side in pixels of the renders that measure light."""
 _SAMPLED_ROWS, _SAMPLED_VIEWS = 50_000, 256
 """Gaussians, and given views, that represent all."""
+_BATCH = 32
+"""Views rendered together."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,9 +105,11 @@ def _light(
     local, here = centred(scene, cameras.resized(_RENDER_SIDE))
     settings = settings_for(local.means, None, antialiased=local.antialiased)
     arrays, light = arrays_of(local), np.zeros((len(cameras), len(rows)), np.float32)
-    for i in range(len(cameras)):
-        weight = _core.accumulate(arrays, [view_of(here, i, settings)], settings, None)["weight"]
-        pixels = float(cameras.widths[i] * cameras.heights[i]) / float(here.widths[i] * here.heights[i])
-        light[i] = np.minimum(weight[rows] * (pixels * share), _MOST_PIXELS) / _RESOLVING_PIXELS
-        tell(i + 1)
+    for first in range(0, len(cameras), _BATCH):
+        batch = range(first, min(first + _BATCH, len(cameras)))
+        views = [view_of(here, i, settings) for i in batch]
+        for i, sums in zip(batch, _core.accumulate_each(arrays, views, settings), strict=True):
+            pixels = float(cameras.widths[i] * cameras.heights[i]) / float(here.widths[i] * here.heights[i])
+            light[i] = np.minimum(sums["weight"][rows] * (pixels * share), _MOST_PIXELS) / _RESOLVING_PIXELS
+        tell(batch.stop)
     return light

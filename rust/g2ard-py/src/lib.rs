@@ -34,7 +34,7 @@ mod _core {
     #[pymodule_export]
     use crate::quantize::{codebook, palette};
     #[pymodule_export]
-    use crate::raster::{PyRasterizer, accumulate, instruction_sets};
+    use crate::raster::{PyRasterizer, accumulate, accumulate_each, instruction_sets};
     #[pymodule_export]
     use crate::register::{flow, local_zncc, normal_equations, shot};
     #[pymodule_export]

@@ -1,5 +1,6 @@
 //! `_core.Rasterizer`: buffers of one view, forward and backward passes, and sums for visibility.
 
+use g2ard_core::Result;
 use g2ard_core::raster::simd::Isa;
 use g2ard_core::raster::{
     Accumulated, Gradients, Image, ImageGradients, Params, PoseGradient, Rasterizer,
@@ -7,6 +8,7 @@ use g2ard_core::raster::{
 use numpy::{IntoPyArray, PyArray1, PyArrayMethods, PyReadonlyArrayDyn, PyUntypedArrayMethods};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
+use rayon::prelude::*;
 
 use crate::arrays::{flat, optional};
 use crate::error::{invalid, to_py};
@@ -224,6 +226,37 @@ pub fn accumulate<'py>(
         }
         Ok(sums)
     })?;
+    dict_of(py, sums)
+}
+
+/// Return the sums of `accumulate` for each view alone; views are drawn in parallel.
+#[pyfunction]
+#[pyo3(signature = (arrays, views, options, progress = None))]
+pub fn accumulate_each<'py>(
+    py: Python<'py>,
+    arrays: Arrays<'py>,
+    views: Vec<View>,
+    options: RasterOptions,
+    progress: Option<&Bound<'py, PyAny>>,
+) -> PyResult<Vec<Bound<'py, PyDict>>> {
+    let params = arrays.params()?;
+    let settings = options.settings()?;
+    let all = work::long(py, progress, |control| {
+        control.begin(views.len() as u64);
+        let one = |rasterizer: &mut Rasterizer, view: &View| {
+            control.check()?;
+            let mut sums = Accumulated::new(params.len());
+            rasterizer.accumulate(&params, &view.camera(), &settings, &mut sums)?;
+            control.advance(1);
+            Ok(sums)
+        };
+        let views = views.par_iter().map_init(Rasterizer::default, one);
+        views.collect::<Result<Vec<_>>>()
+    })?;
+    all.into_iter().map(|sums| dict_of(py, sums)).collect()
+}
+
+fn dict_of(py: Python<'_>, sums: Accumulated) -> PyResult<Bound<'_, PyDict>> {
     let dict = PyDict::new(py);
     dict.set_item("weight", sums.weight.into_pyarray(py))?;
     dict.set_item("transmittance", sums.transmittance.into_pyarray(py))?;
