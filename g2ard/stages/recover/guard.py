@@ -81,9 +81,9 @@ class Guard:
         if value > self.best_score:
             self.best, self.best_score = scene, value
         if not value < self.before - _HOPELESS_LOSSES[self.looked - 1] and math.isfinite(value):
-            if self.others is not None:
+            if self.others is not None and share >= _VALIDATION_FROM:
                 self.validation.append({"step": step, "psnr": self.others(scene)})
-                if share >= _VALIDATION_FROM and self.lost > _VALIDATION_LOSS:
+                if self.lost > _VALIDATION_LOSS:
                     self.stopped = step
                     return "stop"
             return "on"
@@ -132,29 +132,31 @@ class Guard:
             return result, 0.0
         best, chosen, scores = result, 0.0, self.others(result)
         self.validation.append({"step": step, "psnr": scores})
-        mean = self._mean(result, scores)
+        mean = self._mean(self.score(result), scores)
         for k in _PRIOR_VIEWS:
             part = blended(self.start, result, views / (views + k))
             found = self.others(part)
-            if not self._mean(part, found) > mean + _LEAST_GAIN:
+            value = self._mean(self.score(part), found)
+            if not value > mean + _LEAST_GAIN:
                 break
-            best, chosen, scores, mean = part, k, found, self._mean(part, found)
+            best, chosen, scores, mean = part, k, found, value
         if (harmful := self.harmful(best)) is not None:
             part = blended(self.start, best, ~harmful)
             found = self.others(part)
-            if self._mean(part, found) > mean:
-                best, scores, mean = part, found, self._mean(part, found)
+            value = self._mean(self.score(part), found)
+            if value > mean:
+                best, scores, mean = part, found, value
         kept: float | None = chosen
-        gain = mean - self._mean(self.start, self.validation[0]["psnr"])
+        gain = mean - self._mean(self.before, self.validation[0]["psnr"])
         if self._gain(scores) < -_TOLERATED_LOSS or not gain > _LEAST_GAIN:
             best, kept, scores = self._least_harm(result, views)
         if best is not result:
             self.validation.append({"step": step, "psnr": scores})
         return best, kept
 
-    def _mean(self, scene: Splats, scores: dict[str, float]) -> float:
-        """Return the mean PSNR over training views and the kinds of validation views."""
-        return (self.score(scene) + sum(scores.values())) / (1 + len(scores))
+    def _mean(self, trained: float, scores: dict[str, float]) -> float:
+        """Return the mean PSNR over training views, `trained`, and the kinds of validation views."""
+        return (trained + sum(scores.values())) / (1 + len(scores))
 
     def _least_harm(
         self, result: Splats, views: NDArray[np.float64]

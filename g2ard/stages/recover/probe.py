@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +23,8 @@ _INVISIBLE_PSNR = 40.0
 """PSNR in dB above which differences are invisible, so that no validation view counts for more."""
 _INVISIBLE_MSE = 1e-4
 """Mean squared error at that PSNR."""
+_LEAST_MSE = 1e-12
+"""Mean squared error below which there is none."""
 _TOLERATED_LOSS = 1.0
 """Loss in dB up to which no Gaussian goes back for a view."""
 _COMPARED_VIEWS = 64
@@ -102,34 +104,56 @@ def harmful_changes(
         validation: views that were not trained on.
         training: views that were.
     """
-    lights = list(_changes(start, result, validation, background))
-    losing = [light for light, lost in lights if lost > _TOLERATED_LOSS]
-    if not losing:
+    held = _Comparison(start, result, validation, background)
+    losing = [held.lost(view) > _TOLERATED_LOSS for view in range(len(validation.cameras))]
+    if not any(losing):
         return None
     compared = Subset(training, evenly_spaced(len(training.cameras), _COMPARED_VIEWS))
-    total = np.zeros(len(result))
-    for part in (lights, _changes(start, result, compared, background)):
-        for light, _ in part:
-            total += light
-    return (total > 0) & (np.sum(losing, axis=0) > 0)
+    trained = _Comparison(start, result, compared, background)
+    total, worse = np.zeros((2, len(result)))
+    for view, loses in enumerate(losing):
+        light = held.light(view)
+        total += light
+        worse += light * loses
+    for view in range(len(compared.cameras)):
+        total += trained.light(view)
+    return (total > 0) & (worse > 0)
 
 
-def _changes(
-    start: Splats, result: Splats, targets: Targets, background: tuple[float, float, float]
-) -> Iterator[tuple[NDArray[np.float32], float]]:
-    """Yield Σ αT·E of each Gaussian, (N,), and the loss in dB for each view."""
-    before, after = (Renderer(scene, background=background) for scene in (start, result))
-    scene, cameras = centred(result, targets.cameras)
-    settings = settings_for(scene.means, None, antialiased=scene.antialiased)
-    means, quats, scales, logits, sh0, _ = arrays_of(scene)
-    grey = (means, quats, scales, logits, np.zeros_like(sh0), np.zeros((len(scene), 0, 3), np.float32))
-    rasterizer = _core.Rasterizer()
-    for view, camera in enumerate(targets.cameras):
-        target, mask = targets[view], mask_of(targets, view)
-        old, new = ((r.clipped(camera).astype(np.float64) - target) ** 2 for r in (before, after))
-        change = (new - old).mean(axis=2) if mask is None else (new - old).mean(axis=2) * mask
-        image = np.zeros((*change.shape, 3), np.float32)
-        image[..., 0] = change / (max(old.mean(), _INVISIBLE_MSE) * change.size)
-        rasterizer.forward(grey, view_of(cameras, view, settings), settings, [0.0, 0.0, 0.0], 0)
-        light = rasterizer.backward(grey, image)[4][:, 0, 0]  # the gradient of a colour is Σ αT·E
-        yield light, 10 * math.log10(max(new.mean(), 1e-12) / max(old.mean(), 1e-12))
+class _Comparison:
+    """Squared errors of two scenes of the same Gaussians in some views, 0 where a view is masked."""
+
+    def __init__(
+        self, start: Splats, result: Splats, targets: Targets, background: tuple[float, float, float]
+    ) -> None:
+        self._renderers = [Renderer(scene, background=background) for scene in (start, result)]
+        self._targets = targets
+        scene, self._cameras = centred(result, targets.cameras)
+        self._settings = settings_for(scene.means, None, antialiased=scene.antialiased)
+        means, quats, scales, logits, sh0, _ = arrays_of(scene)
+        colours = np.zeros_like(sh0), np.zeros((len(scene), 0, 3), np.float32)
+        self._grey = (means, quats, scales, logits, *colours)
+        self._rasterizer = _core.Rasterizer()
+
+    def _errors(self, view: int) -> list[NDArray[np.float64]]:
+        camera, target = self._targets.cameras[view], self._targets[view]
+        mask = mask_of(self._targets, view)
+        errors = [
+            ((r.clipped(camera).astype(np.float64) - target) ** 2).mean(axis=2) for r in self._renderers
+        ]
+        return errors if mask is None else [error * mask for error in errors]
+
+    def lost(self, view: int) -> float:
+        """Return the loss in dB."""
+        before, after = (max(float(error.mean()), _LEAST_MSE) for error in self._errors(view))
+        return 10 * math.log10(after / before)
+
+    def light(self, view: int) -> NDArray[np.float32]:
+        """Return (N,) Σ αT·E, with E the change of the error relative to the mean before."""
+        before, after = self._errors(view)
+        image = np.zeros((*before.shape, 3), np.float32)
+        image[..., 0] = (after - before) / (max(float(before.mean()), _INVISIBLE_MSE) * before.size)
+        seen = view_of(self._cameras, view, self._settings)
+        self._rasterizer.forward(self._grey, seen, self._settings, [0.0, 0.0, 0.0], 0)
+        light: NDArray[np.float32] = self._rasterizer.backward(self._grey, image)[4][:, 0, 0]
+        return light  # the gradient of a colour is Σ αT·E
