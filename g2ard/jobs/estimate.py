@@ -9,7 +9,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from g2ard.jobs.job import DistillJob
-from g2ard.pipeline.distill import final_steps
 from g2ard.rendering.targets import CACHE_BYTES, Targets
 from g2ard.scene.samples import evenly_spaced
 from g2ard.scene.splats import Splats
@@ -153,7 +152,7 @@ def _step_seconds(job: DistillJob, student: Splats, targets: Targets) -> float:
 def _steps(job: DistillJob, student: Splats) -> int:
     """Return the steps of all recoveries: after each round, if the schedule has rounds, and of the last."""
     config, photos = job.config, job.photos_over_renders or job.teacher is None
-    last = final_steps(config, student, job.views.train.cameras, photos=photos)
+    last = config.recover.final_steps(student, job.views.train.cameras, photos=photos)
     if not config.recover.schedule.round_steps:
         return last
     kept, fold = config.simplify.retention_of("paper"), config.simplify.fold

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -22,7 +22,7 @@ from g2ard.jobs.score import scores_by_kind
 from g2ard.jobs.teaching import Teaching, check_teacher
 from g2ard.pipeline.presets import PRESETS, configured
 from g2ard.progress import Progress, Say, plural, silent, unsaid
-from g2ard.rendering.targets import Targets, checked_targets, kinds_of
+from g2ard.rendering.targets import Targets, checked_targets, kinds_of, kinds_told
 from g2ard.report.kinds import KindScore
 from g2ard.scene.splats import Splats
 from g2ard.stages.recover import RecoverConfig, Recovered
@@ -43,6 +43,7 @@ class RecoverJob:
         preset: the regularisers chosen, and why.
         measures: the measures that decided it.
         scored: views whose test split is scored; None for no scores.
+        validation: renders of views of other kinds that limit changes; None without.
     """
 
     student: Splats
@@ -56,6 +57,7 @@ class RecoverJob:
     teaching: Teaching
     scored: Views | None
     size: int | None
+    validation: Targets | None = None
     progress: Progress = silent
 
     def run(self, checkpoint: Path | None = None, watch: Watch | None = None) -> Recovered:
@@ -67,6 +69,7 @@ class RecoverJob:
             self.config,
             weights=self.weights,
             anchors=None if built is None else Anchors.of(built, in_plane),
+            validation=self.validation,
             checkpoint=checkpoint,
             progress=self.progress,
             watch=watch,
@@ -129,7 +132,8 @@ def recover(
         targets: photos or teacher renders with their cameras, instead of `views` and `teacher`.
         config: options, with `targets`; None means the defaults.
         views: cameras with photos, or their path. With a teacher, None uses cameras found beside it, or
-            generates views; "made" always generates them.
+            generates views; "made" always generates them. Generated views include those of other kinds, as in
+            `distill`, and more views get more steps.
         teacher: the dense scene that renders the targets, or its path; None takes the photos of the views.
         photos: with a teacher, use photos where views have them; also accept photos that show nothing of the
             student.
@@ -257,7 +261,7 @@ def prepare(
         progress=progress,
         say=say,
     )
-    pool = teaching.views(views)
+    pool = teaching.views(views, start)
     chosen, targets = teaching.training(start, pool, split, size)
     say(f"{plural(len(chosen.cameras), 'view')} against {kinds_of(targets)}")
     weighted = named.get("select.weighted", True) if weighted is None else weighted
@@ -271,13 +275,17 @@ def prepare(
         None if teaching.dense else chosen.cameras,
         paper=named.get("recover.schedule") == "paper",
     )
+    config = configured(RecoverConfig(), preset, {**given, "recover.regularizers": regularizers})
+    if config.recovery_time is None:
+        of_photos = kinds_of(targets) != kinds_told(0, 1)
+        config = replace(config, steps=config.final_steps(start, chosen.cameras, photos=of_photos))
     of_student = "" if teaching.dense else "; measured on the student, as there is no teacher"
     say(f"regularisers: {why}{of_student}")
     return RecoverJob(
         start,
         chosen,
         targets,
-        configured(RecoverConfig(), preset, {**given, "recover.regularizers": regularizers}),
+        config,
         weights,
         built,
         why,
@@ -285,6 +293,7 @@ def prepare(
         teaching,
         pool if split == "train" else None,
         size,
+        teaching.validation(pool, size) if split == "train" else None,
         progress,
     )
 

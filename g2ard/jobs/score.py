@@ -87,7 +87,7 @@ def scores_by_kind(
     first, second = (
         report["views"] for report in _scores(before, after, targets, background, progress).values()
     )
-    return by_kind(first, second, "given")
+    return by_kind(first, second, "given" if set(targets.cameras.kinds) == {USUAL} else USUAL)
 
 
 def _unseen(job: DistillJob, done: Distilled) -> float | None:

@@ -16,7 +16,7 @@ from g2ard.jobs.view_checks import check_photos, propose_background, warn_of_sig
 from g2ard.jobs.views import views_or_pool
 from g2ard.progress import Progress, Say, silent, unsaid
 from g2ard.rendering.targets import Targets
-from g2ard.scene.cameras import Cameras
+from g2ard.scene.cameras import USUAL, Cameras
 from g2ard.scene.splats import Splats
 
 
@@ -76,8 +76,11 @@ class Teaching:
         self._progress, self._say = progress, say
         self.dense = load_scene(teacher, say, render_model) if isinstance(teacher, str | Path) else teacher
 
-    def views(self, given: Views | None) -> Views:
-        """Return the given views, or those found beside the teacher, or generated ones."""
+    def views(self, given: Views | None, student: Splats | None = None) -> Views:
+        """Return the given views, or those found beside the teacher, or generated ones.
+
+        With a student, generated views are those that recover it, see `views_or_pool`.
+        """
         if self.dense is None:
             assert given is not None  # `check_teacher`
             return given
@@ -85,6 +88,7 @@ class Teaching:
             self.dense,
             given,
             beside=self._beside,
+            student=student,
             seed=self._seed,
             progress=self._progress,
             say=self._say,
@@ -111,11 +115,23 @@ class Teaching:
 
     def held_out(self, views: Views, size: int | None) -> Targets | None:
         """Return the targets of the test views, made on first access; None if there are no such views."""
-        pool, _ = load_split_views(views, "all", unpictured=self.dense is not None)
-        tested = [i for i, split in enumerate(pool.splits) if split == "test"]
-        if not tested:
+        cameras = self._split(views, "test")
+        if cameras is None:
             return None
-        return scorable(self._made(pool.cameras.take(tested).resized(size), lazy=True), self._say)
+        return scorable(self._made(cameras.resized(size), lazy=True), self._say)
+
+    def validation(self, views: Views, size: int | None) -> Targets | None:
+        """Return the renders of the views of other kinds in split `val`; None if there are none."""
+        cameras = None if self.dense is None or self._photos else self._split(views, "val")
+        if cameras is None or USUAL in cameras.kinds:
+            return None
+        return self._made(cameras.resized(size), progress=self._progress, say=self._say)
+
+    def _split(self, views: Views, name: str) -> Cameras | None:
+        """Return the views of a split, None if there are none."""
+        pool, _ = load_split_views(views, "all", unpictured=self.dense is not None)
+        rows = [i for i, split in enumerate(pool.splits) if split == name]
+        return pool.cameras.take(rows) if rows else None
 
     def _made(self, cameras: Cameras, **options: Any) -> Targets:
         return make_targets(cameras, self.dense, self._background, photos=self._photos, **options)

@@ -16,6 +16,7 @@ from g2ard.io.splits import for_scores, for_training, split_mask, splits_of
 from g2ard.io.types import ViewSet
 from g2ard.jobs.inputs import Views, drop_held_out, load_view_sets, load_views
 from g2ard.jobs.view_checks import as_pool, check_sight, found_views, warn_of_sight
+from g2ard.pipeline.config import SelectConfig
 from g2ard.pipeline.run_views import RunViews
 from g2ard.progress import Progress, Say, silent, unsaid
 from g2ard.scene.cameras import USUAL, Camera, Cameras, rows_by_kind
@@ -25,7 +26,6 @@ from g2ard.stages.simplify import simplify
 
 if TYPE_CHECKING:
     from g2ard.jobs.distill_options import DistillOptions
-    from g2ard.pipeline.config import SelectConfig
     from g2ard.poses import Pool
 Up = Sequence[float] | None
 
@@ -224,6 +224,7 @@ def views_or_pool(
     *,
     beside: str | Path | None = None,
     count: int | None = None,
+    student: Splats | None = None,
     up: Up = None,
     seed: int = 0,
     progress: Progress = silent,
@@ -233,6 +234,8 @@ def views_or_pool(
 
     Args:
         count: size of a generated pool; None chooses like `distill`.
+        student: a compact scene that will be recovered in a generated pool. Views of other kinds complete it
+            as in `distill`, and further ones are in the splits `test` and, for validation, `val`.
 
     Other arguments are those of `views_of`.
     """
@@ -248,8 +251,28 @@ def views_or_pool(
         planned = _planned(scene, _POOL_VIEWS, up=up, seed=seed, progress=progress, grow=_POOL_GROWTH)
     else:
         planned = plan_pool(scene, count, up=up, seed=seed, rows=_POOL_SAMPLE, progress=progress)
+    if student is not None:
+        mix = partial(
+            _mixed,
+            prior=student,
+            count=len(student),
+            represents=1.0,
+            select=SelectConfig(),
+            size=None,
+            progress=progress,
+            say=say,
+        )
+        return _with_apart(_generated(planned, None, None, mix, say))
     say(f"poses: {_of(planned, planned.cameras)}")
     return ViewSet(planned.cameras, splits=splits_of(None, planned.cameras.names))
+
+
+def _with_apart(views: RunViews) -> ViewSet:
+    """Return a generated pool, and the views of other kinds that do not train as splits `val` and `test`."""
+    assert views.pool is not None
+    apart = views.apart or ()
+    splits = tuple("val" if row % 2 == 0 else "test" for row in range(len(apart)))
+    return ViewSet(Cameras.of([*views.pool.cameras, *apart]), splits=views.pool.splits + splits)
 
 
 def _of(pool: Pool, cameras: Cameras) -> str:

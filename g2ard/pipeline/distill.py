@@ -18,18 +18,16 @@ from g2ard.pipeline.report import DistillReport, RoundReport, StageSeconds, View
 from g2ard.progress import Progress, plural, silent
 from g2ard.rendering.targets import Photos, PhotosOrRenders, Subset, Targets, checked_targets, fingerprint_of
 from g2ard.rendering.visibility import visibility_source
-from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
 from g2ard.stages.recover import checkpoint as checkpoints
 from g2ard.stages.recover import recover
 from g2ard.stages.recover.anchors import Anchors
 from g2ard.stages.recover.draw import checked_weights
 from g2ard.stages.recover.optimize import Watch
-from g2ard.stages.recover.schedule import steps_for, steps_from_points
 from g2ard.stages.select import select
 from g2ard.stages.simplify import round_counts, simplify
 
-__all__ = ["DistillConfig", "Distilled", "SelectConfig", "distill", "final_steps"]
+__all__ = ["DistillConfig", "Distilled", "SelectConfig", "distill"]
 
 _ARRAYS = ("means", "quats", "scales", "logit_opacities", "sh0", "shN")
 
@@ -120,21 +118,6 @@ def distill(
         tuple(map(RoundReport.of, rounds.log)), StageSeconds.of(rounds.seconds), rounds.supervision.report
     )
     return Distilled(rounds.state, rounds.simplified, report)
-
-
-def final_steps(config: DistillConfig, scene: Splats, cameras: Cameras, *, photos: bool) -> int:
-    """Return the steps of the last recovery: as set, the schedule's, or more by need.
-
-    More are needed for points of photos, and for renders of which each shows little of the scene.
-    """
-    schedule = config.recover.schedule
-    if config.recover.steps is not None:
-        return config.recover.steps
-    if schedule.means_in_scales and config.recover.from_points:
-        return steps_from_points(len(scene), schedule.steps)
-    if not schedule.means_in_scales or photos:
-        return schedule.steps
-    return steps_for(scene, cameras, schedule.steps)
 
 
 @dataclass(frozen=True, eq=False)
@@ -294,7 +277,8 @@ class _Rounds:
 
     def _steps(self) -> int:
         photos = isinstance(self.targets, Photos | PhotosOrRenders)
-        return final_steps(self.config, self.state, self.supervision.targets.cameras, photos=photos)
+        cameras = self.supervision.targets.cameras
+        return self.config.recover.final_steps(self.state, cameras, photos=photos)
 
     def _time_limit(self, final: bool) -> float | None:
         """Return this recovery's share of the time limit for all."""

@@ -8,9 +8,12 @@ import pytest
 import g2ard
 from g2ard.errors import InputError
 from g2ard.io import write_views
+from g2ard.jobs.recover import prepare
+from g2ard.stages.recover.schedule import steps_for
 from helpers.commands import CommandLine, succeeds
 from helpers.photos import photographed
 from helpers.scenes import around, checkered_ball
+from reference import poses as naive
 
 BALL, VIEWS = checkered_ball(400), around(16, (48, 36))
 
@@ -36,6 +39,25 @@ def test_python_recovers_as_the_command_does(
     done = g2ard.recover(folder / "ball.ply", **paths, size=40, settings=settings)
     g2ard.save(folder / "python.ply", done.splats)
     assert (folder / "python.ply").read_bytes() == (folder / "out.ply").read_bytes()
+
+
+def test_a_generated_pool_is_completed_for_the_student(folder: Path) -> None:
+    """As in `distill`: views of other kinds train, validate and are scored, and more views get more steps."""
+    student = g2ard.simplify(naive.statue(), ratio=10, method="fast").splats
+    job = prepare(student, views="made", teacher=naive.statue(), size=32)
+    kinds = job.views.cameras.kinds
+    assert kinds.count("usual") == 112
+    assert {"usual"} < set(kinds)
+    assert job.validation is not None
+    assert "usual" not in job.validation.cameras.kinds
+    assert job.held_out is not None
+    assert job.held_out.cameras.kinds.count("usual") == 16
+    assert set(job.validation.cameras.kinds) <= set(job.held_out.cameras.kinds)
+    assert job.config.steps == steps_for(student, job.views.cameras, 1000)
+    names = [*job.views.cameras.names, *job.validation.cameras.names, *job.held_out.cameras.names]
+    assert len(set(names)) == len(names)
+    given = prepare(student, views=job.views, teacher=naive.statue(), size=32)
+    assert given.validation is None
 
 
 @pytest.mark.parametrize(

@@ -7,8 +7,10 @@ from dataclasses import dataclass, field
 from g2ard.config.checks import check_fields
 from g2ard.config.choices import BLACK, Colour, Engine
 from g2ard.errors import InputError, require
+from g2ard.scene.cameras import Cameras
+from g2ard.scene.splats import Splats
 from g2ard.stages.recover.anchors import REGULARIZERS, Regularizers
-from g2ard.stages.recover.schedule import TUNED, Schedule
+from g2ard.stages.recover.schedule import TUNED, Schedule, steps_for, steps_from_points
 
 
 @dataclass(frozen=True)
@@ -76,3 +78,17 @@ class RecoverConfig(FitConfig):
         if self.steps is not None:
             return self.steps
         return self.schedule.steps if self.final else self.schedule.round_steps
+
+    def final_steps(self, scene: Splats, cameras: Cameras, *, photos: bool) -> int:
+        """Return the steps of the last recovery: as set, the schedule's, or more by need.
+
+        More are needed for points of photos, and for renders of which each shows little of the scene.
+        """
+        schedule = self.schedule
+        if self.steps is not None:
+            return self.steps
+        if schedule.means_in_scales and self.from_points:
+            return steps_from_points(len(scene), schedule.steps)
+        if not schedule.means_in_scales or photos:
+            return schedule.steps
+        return steps_for(scene, cameras, schedule.steps)
