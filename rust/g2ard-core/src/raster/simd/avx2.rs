@@ -54,28 +54,15 @@ operators!(
 
 impl Neg for Avx {
     type Output = Self;
-    #[inline(always)]
-    fn neg(self) -> Self {
-        avx2!(Self(_mm256_xor_ps(self.0, _mm256_set1_ps(-0.0))))
-    }
+    lanes! { fn neg(self) -> Self = avx2!(Self(_mm256_xor_ps(self.0, _mm256_set1_ps(-0.0)))); }
 }
 
 impl Mask for AvxMask {
-    #[inline(always)]
-    fn and(self, other: Self) -> Self {
-        avx2!(Self(_mm256_and_ps(self.0, other.0)))
-    }
-    #[inline(always)]
-    fn or(self, other: Self) -> Self {
-        avx2!(Self(_mm256_or_ps(self.0, other.0)))
-    }
-    #[inline(always)]
-    fn and_not(self, other: Self) -> Self {
-        avx2!(Self(_mm256_andnot_ps(other.0, self.0)))
-    }
-    #[inline(always)]
-    fn bits(self) -> u16 {
-        avx2!(_mm256_movemask_ps(self.0) as u16)
+    lanes! {
+        fn and(self, other: Self) -> Self = avx2!(Self(_mm256_and_ps(self.0, other.0)));
+        fn or(self, other: Self) -> Self = avx2!(Self(_mm256_or_ps(self.0, other.0)));
+        fn and_not(self, other: Self) -> Self = avx2!(Self(_mm256_andnot_ps(other.0, self.0)));
+        fn bits(self) -> u16 = avx2!(_mm256_movemask_ps(self.0) as u16);
     }
     #[inline(always)]
     fn from_bits(bits: u16) -> Self {
@@ -114,21 +101,14 @@ impl Wide for AvxWide {
 impl Real for Avx {
     type Mask = AvxMask;
 
-    #[inline(always)]
-    fn splat(value: f32) -> Self {
-        avx2!(Self(_mm256_set1_ps(value)))
-    }
-    #[inline(always)]
-    fn min(self, other: Self) -> Self {
-        avx2!(Self(_mm256_min_ps(self.0, other.0)))
-    }
-    #[inline(always)]
-    fn max(self, other: Self) -> Self {
-        avx2!(Self(_mm256_max_ps(self.0, other.0)))
-    }
-    #[inline(always)]
-    fn sqrt(self) -> Self {
-        avx2!(Self(_mm256_sqrt_ps(self.0)))
+    lanes! {
+        fn splat(value: f32) -> Self = avx2!(Self(_mm256_set1_ps(value)));
+        fn min(self, other: Self) -> Self = avx2!(Self(_mm256_min_ps(self.0, other.0)));
+        fn max(self, other: Self) -> Self = avx2!(Self(_mm256_max_ps(self.0, other.0)));
+        fn sqrt(self) -> Self = avx2!(Self(_mm256_sqrt_ps(self.0)));
+        fn ge(self, other: Self) -> AvxMask = avx2!(AvxMask(_mm256_cmp_ps::<_CMP_GE_OQ>(self.0, other.0)));
+        fn gt(self, other: Self) -> AvxMask = avx2!(AvxMask(_mm256_cmp_ps::<_CMP_GT_OQ>(self.0, other.0)));
+        fn select(mask: AvxMask, yes: Self, no: Self) -> Self = avx2!(Self(_mm256_blendv_ps(no.0, yes.0, mask.0)));
     }
     #[inline(always)]
     fn ldexp(self, n: Self) -> Self {
@@ -138,18 +118,6 @@ impl Real for Avx {
             Self(_mm256_mul_ps(self.0, power))
         })
     }
-    #[inline(always)]
-    fn ge(self, other: Self) -> AvxMask {
-        avx2!(AvxMask(_mm256_cmp_ps::<_CMP_GE_OQ>(self.0, other.0)))
-    }
-    #[inline(always)]
-    fn gt(self, other: Self) -> AvxMask {
-        avx2!(AvxMask(_mm256_cmp_ps::<_CMP_GT_OQ>(self.0, other.0)))
-    }
-    #[inline(always)]
-    fn select(mask: AvxMask, yes: Self, no: Self) -> Self {
-        avx2!(Self(_mm256_blendv_ps(no.0, yes.0, mask.0)))
-    }
 }
 
 impl Vector for Avx {
@@ -157,6 +125,12 @@ impl Vector for Avx {
 
     const COUNT: usize = 8;
 
+    lanes! {
+        fn fma(self, factor: Self, addend: Self) -> Self = avx2!(Self(_mm256_fmadd_ps(self.0, factor.0, addend.0)));
+        fn fnma(self, factor: Self, addend: Self) -> Self = avx2!(Self(_mm256_fnmadd_ps(self.0, factor.0, addend.0)));
+        fn floor(self) -> Self = avx2!(Self(_mm256_floor_ps(self.0)));
+        fn only(self, mask: AvxMask) -> Self = avx2!(Self(_mm256_and_ps(self.0, mask.0)));
+    }
     #[inline(always)]
     unsafe fn load_at(at: *const f32) -> Self {
         // SAFETY: the caller vouches for 8 readable values; the instructions exist (`avx2!`).
@@ -166,22 +140,6 @@ impl Vector for Avx {
     unsafe fn store_at(self, at: *mut f32) {
         // SAFETY: the caller vouches for 8 writable values; the instructions exist (`avx2!`).
         unsafe { _mm256_storeu_ps(at, self.0) }
-    }
-    #[inline(always)]
-    fn fma(self, factor: Self, addend: Self) -> Self {
-        avx2!(Self(_mm256_fmadd_ps(self.0, factor.0, addend.0)))
-    }
-    #[inline(always)]
-    fn fnma(self, factor: Self, addend: Self) -> Self {
-        avx2!(Self(_mm256_fnmadd_ps(self.0, factor.0, addend.0)))
-    }
-    #[inline(always)]
-    fn floor(self) -> Self {
-        avx2!(Self(_mm256_floor_ps(self.0)))
-    }
-    #[inline(always)]
-    fn only(self, mask: AvxMask) -> Self {
-        avx2!(Self(_mm256_and_ps(self.0, mask.0)))
     }
     #[inline(always)]
     fn widen(self) -> AvxWide {

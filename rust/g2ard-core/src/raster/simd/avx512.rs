@@ -51,32 +51,16 @@ operators!(
 
 impl Neg for Avx512 {
     type Output = Self;
-    #[inline(always)]
-    fn neg(self) -> Self {
-        Self(avx512!(_mm512_xor_ps(self.0, _mm512_set1_ps(-0.0))))
-    }
+    lanes! { fn neg(self) -> Self = Self(avx512!(_mm512_xor_ps(self.0, _mm512_set1_ps(-0.0)))); }
 }
 
 impl Mask for Avx512Mask {
-    #[inline(always)]
-    fn and(self, other: Self) -> Self {
-        Self(self.0 & other.0)
-    }
-    #[inline(always)]
-    fn or(self, other: Self) -> Self {
-        Self(self.0 | other.0)
-    }
-    #[inline(always)]
-    fn and_not(self, other: Self) -> Self {
-        Self(self.0 & !other.0)
-    }
-    #[inline(always)]
-    fn bits(self) -> u16 {
-        self.0
-    }
-    #[inline(always)]
-    fn from_bits(bits: u16) -> Self {
-        Self(bits)
+    lanes! {
+        fn and(self, other: Self) -> Self = Self(self.0 & other.0);
+        fn or(self, other: Self) -> Self = Self(self.0 | other.0);
+        fn and_not(self, other: Self) -> Self = Self(self.0 & !other.0);
+        fn bits(self) -> u16 = self.0;
+        fn from_bits(bits: u16) -> Self = Self(bits);
     }
 }
 
@@ -106,33 +90,14 @@ impl Wide for Avx512Wide {
 impl Real for Avx512 {
     type Mask = Avx512Mask;
 
-    #[inline(always)]
-    fn splat(value: f32) -> Self {
-        Self(avx512!(_mm512_set1_ps(value)))
-    }
-    #[inline(always)]
-    fn min(self, other: Self) -> Self {
-        Self(avx512!(_mm512_min_ps(self.0, other.0)))
-    }
-    #[inline(always)]
-    fn max(self, other: Self) -> Self {
-        Self(avx512!(_mm512_max_ps(self.0, other.0)))
-    }
-    #[inline(always)]
-    fn sqrt(self) -> Self {
-        Self(avx512!(_mm512_sqrt_ps(self.0)))
-    }
-    #[inline(always)]
-    fn ldexp(self, n: Self) -> Self {
-        Self(avx512!(_mm512_scalef_ps(self.0, n.0)))
-    }
-    #[inline(always)]
-    fn ge(self, other: Self) -> Avx512Mask {
-        Avx512Mask(avx512!(_mm512_cmp_ps_mask::<_CMP_GE_OQ>(self.0, other.0)))
-    }
-    #[inline(always)]
-    fn gt(self, other: Self) -> Avx512Mask {
-        Avx512Mask(avx512!(_mm512_cmp_ps_mask::<_CMP_GT_OQ>(self.0, other.0)))
+    lanes! {
+        fn splat(value: f32) -> Self = Self(avx512!(_mm512_set1_ps(value)));
+        fn min(self, other: Self) -> Self = Self(avx512!(_mm512_min_ps(self.0, other.0)));
+        fn max(self, other: Self) -> Self = Self(avx512!(_mm512_max_ps(self.0, other.0)));
+        fn sqrt(self) -> Self = Self(avx512!(_mm512_sqrt_ps(self.0)));
+        fn ldexp(self, n: Self) -> Self = Self(avx512!(_mm512_scalef_ps(self.0, n.0)));
+        fn ge(self, other: Self) -> Avx512Mask = Avx512Mask(avx512!(_mm512_cmp_ps_mask::<_CMP_GE_OQ>(self.0, other.0)));
+        fn gt(self, other: Self) -> Avx512Mask = Avx512Mask(avx512!(_mm512_cmp_ps_mask::<_CMP_GT_OQ>(self.0, other.0)));
     }
     #[inline(always)]
     fn select(mask: Avx512Mask, yes: Self, no: Self) -> Self {
@@ -149,6 +114,12 @@ impl Vector for Avx512 {
 
     const COUNT: usize = LANES;
 
+    lanes! {
+        fn fma(self, factor: Self, addend: Self) -> Self = Self(avx512!(_mm512_fmadd_ps(self.0, factor.0, addend.0)));
+        fn fnma(self, factor: Self, addend: Self) -> Self = Self(avx512!(_mm512_fnmadd_ps(self.0, factor.0, addend.0)));
+        fn floor(self) -> Self = Self(avx512!(_mm512_roundscale_ps::<TO_FLOOR>(self.0)));
+        fn only(self, mask: Avx512Mask) -> Self = Self(avx512!(_mm512_maskz_mov_ps(mask.0, self.0)));
+    }
     #[inline(always)]
     unsafe fn load_at(at: *const f32) -> Self {
         // SAFETY: the caller vouches for 16 readable values; the instructions exist (`avx512!`).
@@ -158,22 +129,6 @@ impl Vector for Avx512 {
     unsafe fn store_at(self, at: *mut f32) {
         // SAFETY: the caller vouches for 16 writable values; the instructions exist (`avx512!`).
         unsafe { _mm512_storeu_ps(at, self.0) }
-    }
-    #[inline(always)]
-    fn fma(self, factor: Self, addend: Self) -> Self {
-        Self(avx512!(_mm512_fmadd_ps(self.0, factor.0, addend.0)))
-    }
-    #[inline(always)]
-    fn fnma(self, factor: Self, addend: Self) -> Self {
-        Self(avx512!(_mm512_fnmadd_ps(self.0, factor.0, addend.0)))
-    }
-    #[inline(always)]
-    fn floor(self) -> Self {
-        Self(avx512!(_mm512_roundscale_ps::<TO_FLOOR>(self.0)))
-    }
-    #[inline(always)]
-    fn only(self, mask: Avx512Mask) -> Self {
-        Self(avx512!(_mm512_maskz_mov_ps(mask.0, self.0)))
     }
     #[inline(always)]
     fn widen(self) -> Avx512Wide {

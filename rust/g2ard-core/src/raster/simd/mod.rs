@@ -6,6 +6,30 @@
 
 use std::ops::{Add, Div, Mul};
 
+/// Inlined methods of one expression each.
+macro_rules! lanes {
+    ($($(#[$doc:meta])* fn $name:ident($($args:tt)*) -> $out:ty = $value:expr;)*) => {$(
+        $(#[$doc])*
+        #[inline(always)]
+        fn $name($($args)*) -> $out {
+            $value
+        }
+    )*};
+}
+
+/// Inlined methods that set each part of an array in turn, and return it.
+macro_rules! per_lane {
+    ($k:ident in $parts:expr; $(fn $name:ident($($args:tt)*) { $out:ident[$_k:ident] = $value:expr })*) => {$(
+        #[inline(always)]
+        fn $name($($args)*) -> Self {
+            for $k in $parts {
+                $out.0[$k] = $value;
+            }
+            $out
+        }
+    )*};
+}
+
 #[cfg(target_arch = "x86_64")]
 mod avx2;
 #[cfg(target_arch = "x86_64")]
@@ -98,26 +122,13 @@ pub trait Vector: Real<Mask: Mask> {
         unsafe { self.store_at(row.0.as_mut_ptr().add(first)) }
     }
 
-    #[inline(always)]
-    fn zero() -> Self {
-        Self::splat(0.0)
-    }
-
-    /// `self` where the mask holds, else 0.
-    #[inline(always)]
-    fn only(self, mask: Self::Mask) -> Self {
-        Self::select(mask, self, Self::zero())
-    }
-
-    #[inline(always)]
-    fn abs(self) -> Self {
-        self.max(-self)
-    }
-
-    /// 1 / self to about one ulp, for values far from 0 and ∞.
-    #[inline(always)]
-    fn recip(self) -> Self {
-        Self::splat(1.0) / self
+    lanes! {
+        fn zero() -> Self = Self::splat(0.0);
+        /// `self` where the mask holds, else 0.
+        fn only(self, mask: Self::Mask) -> Self = Self::select(mask, self, Self::zero());
+        fn abs(self) -> Self = self.max(-self);
+        /// 1 / self to about one ulp, for values far from 0 and ∞.
+        fn recip(self) -> Self = Self::splat(1.0) / self;
     }
 
     /// 2^self for −126 ≤ self ≤ 127: relative error ≤ 1.7e-7.

@@ -47,36 +47,15 @@ operators!(EightWide: Add add vaddq_f64, Mul mul vmulq_f64, Div div vdivq_f64);
 
 impl Neg for Eight {
     type Output = Self;
-    #[inline(always)]
-    fn neg(mut self) -> Self {
-        for k in 0..2 {
-            self.0[k] = neon!(vnegq_f32(self.0[k]));
-        }
-        self
-    }
+    per_lane! { k in 0..2; fn neg(mut self) { self[k] = neon!(vnegq_f32(self.0[k])) } }
 }
 
 impl Mask for EightMask {
-    #[inline(always)]
-    fn and(mut self, other: Self) -> Self {
-        for k in 0..2 {
-            self.0[k] = neon!(vandq_u32(self.0[k], other.0[k]));
-        }
-        self
-    }
-    #[inline(always)]
-    fn or(mut self, other: Self) -> Self {
-        for k in 0..2 {
-            self.0[k] = neon!(vorrq_u32(self.0[k], other.0[k]));
-        }
-        self
-    }
-    #[inline(always)]
-    fn and_not(mut self, other: Self) -> Self {
-        for k in 0..2 {
-            self.0[k] = neon!(vbicq_u32(self.0[k], other.0[k]));
-        }
-        self
+    per_lane! {
+        k in 0..2;
+        fn and(mut self, other: Self) { self[k] = neon!(vandq_u32(self.0[k], other.0[k])) }
+        fn or(mut self, other: Self) { self[k] = neon!(vorrq_u32(self.0[k], other.0[k])) }
+        fn and_not(mut self, other: Self) { self[k] = neon!(vbicq_u32(self.0[k], other.0[k])) }
     }
     #[inline(always)]
     fn bits(self) -> u16 {
@@ -106,16 +85,13 @@ impl Mask for EightMask {
 }
 
 impl Wide for EightWide {
+    per_lane! {
+        k in 0..4;
+        fn fma(mut self, factor: Self, addend: Self) { self[k] = neon!(vfmaq_f64(addend.0[k], self.0[k], factor.0[k])) }
+    }
     #[inline(always)]
     fn splat(value: f64) -> Self {
         Self([neon!(vdupq_n_f64(value)); 4])
-    }
-    #[inline(always)]
-    fn fma(mut self, factor: Self, addend: Self) -> Self {
-        for k in 0..4 {
-            self.0[k] = neon!(vfmaq_f64(addend.0[k], self.0[k], factor.0[k]));
-        }
-        self
     }
     #[inline(always)]
     fn store(self, out: &mut [f64]) {
@@ -143,12 +119,10 @@ impl Real for Eight {
     fn max(self, other: Self) -> Self {
         Self::select(self.gt(other), self, other)
     }
-    #[inline(always)]
-    fn sqrt(mut self) -> Self {
-        for k in 0..2 {
-            self.0[k] = neon!(vsqrtq_f32(self.0[k]));
-        }
-        self
+    per_lane! {
+        k in 0..2;
+        fn sqrt(mut self) { self[k] = neon!(vsqrtq_f32(self.0[k])) }
+        fn select(mask: EightMask, yes: Self, mut no: Self) { no[k] = neon!(vbslq_f32(mask.0[k], yes.0[k], no.0[k])) }
     }
     #[inline(always)]
     fn ldexp(mut self, n: Self) -> Self {
@@ -175,13 +149,6 @@ impl Real for Eight {
         }
         EightMask(mask)
     }
-    #[inline(always)]
-    fn select(mask: EightMask, yes: Self, mut no: Self) -> Self {
-        for k in 0..2 {
-            no.0[k] = neon!(vbslq_f32(mask.0[k], yes.0[k], no.0[k]));
-        }
-        no
-    }
 }
 
 impl Vector for Eight {
@@ -189,6 +156,12 @@ impl Vector for Eight {
 
     const COUNT: usize = 8;
 
+    per_lane! {
+        k in 0..2;
+        fn fma(mut self, factor: Self, addend: Self) { self[k] = neon!(vfmaq_f32(addend.0[k], self.0[k], factor.0[k])) }
+        fn fnma(mut self, factor: Self, addend: Self) { self[k] = neon!(vfmsq_f32(addend.0[k], self.0[k], factor.0[k])) }
+        fn floor(mut self) { self[k] = neon!(vrndmq_f32(self.0[k])) }
+    }
     #[inline(always)]
     unsafe fn load_at(at: *const f32) -> Self {
         let mut out = Self::zero();
@@ -204,27 +177,6 @@ impl Vector for Eight {
             // SAFETY: the caller vouches for 8 writable values, and 4k + 3 < 8.
             unsafe { vst1q_f32(at.add(4 * k), self.0[k]) };
         }
-    }
-    #[inline(always)]
-    fn fma(mut self, factor: Self, addend: Self) -> Self {
-        for k in 0..2 {
-            self.0[k] = neon!(vfmaq_f32(addend.0[k], self.0[k], factor.0[k]));
-        }
-        self
-    }
-    #[inline(always)]
-    fn fnma(mut self, factor: Self, addend: Self) -> Self {
-        for k in 0..2 {
-            self.0[k] = neon!(vfmsq_f32(addend.0[k], self.0[k], factor.0[k]));
-        }
-        self
-    }
-    #[inline(always)]
-    fn floor(mut self) -> Self {
-        for k in 0..2 {
-            self.0[k] = neon!(vrndmq_f32(self.0[k]));
-        }
-        self
     }
     #[inline(always)]
     fn only(mut self, mask: EightMask) -> Self {

@@ -38,13 +38,7 @@ operators!(EightWide: Add add +=, Mul mul *=, Div div /=);
 
 impl Neg for Eight {
     type Output = Self;
-    #[inline(always)]
-    fn neg(mut self) -> Self {
-        for l in 0..COUNT {
-            self.0[l] = -self.0[l];
-        }
-        self
-    }
+    per_lane! { l in 0..COUNT; fn neg(mut self) { self[l] = -self.0[l] } }
 }
 
 /// Fused where the target has the instruction; elsewhere `f32::mul_add` would be a library call.
@@ -62,26 +56,11 @@ fn mul_add(a: f32, b: f32, c: f32) -> f32 {
 pub struct EightMask([u32; COUNT]);
 
 impl Mask for EightMask {
-    #[inline(always)]
-    fn and(mut self, other: Self) -> Self {
-        for l in 0..COUNT {
-            self.0[l] &= other.0[l];
-        }
-        self
-    }
-    #[inline(always)]
-    fn or(mut self, other: Self) -> Self {
-        for l in 0..COUNT {
-            self.0[l] |= other.0[l];
-        }
-        self
-    }
-    #[inline(always)]
-    fn and_not(mut self, other: Self) -> Self {
-        for l in 0..COUNT {
-            self.0[l] &= !other.0[l];
-        }
-        self
+    per_lane! {
+        l in 0..COUNT;
+        fn and(mut self, other: Self) { self[l] = self.0[l] & other.0[l] }
+        fn or(mut self, other: Self) { self[l] = self.0[l] | other.0[l] }
+        fn and_not(mut self, other: Self) { self[l] = self.0[l] & !other.0[l] }
     }
     #[inline(always)]
     fn bits(self) -> u16 {
@@ -127,38 +106,15 @@ impl Wide for EightWide {
 impl Real for Eight {
     type Mask = EightMask;
 
+    per_lane! {
+        l in 0..COUNT;
+        fn min(mut self, other: Self) { self[l] = if self.0[l] < other.0[l] { self.0[l] } else { other.0[l] } }
+        fn max(mut self, other: Self) { self[l] = if self.0[l] > other.0[l] { self.0[l] } else { other.0[l] } }
+        fn sqrt(mut self) { self[l] = self.0[l].sqrt() }
+    }
     #[inline(always)]
     fn splat(value: f32) -> Self {
         Self([value; COUNT])
-    }
-    #[inline(always)]
-    fn min(mut self, other: Self) -> Self {
-        for l in 0..COUNT {
-            self.0[l] = if self.0[l] < other.0[l] {
-                self.0[l]
-            } else {
-                other.0[l]
-            };
-        }
-        self
-    }
-    #[inline(always)]
-    fn max(mut self, other: Self) -> Self {
-        for l in 0..COUNT {
-            self.0[l] = if self.0[l] > other.0[l] {
-                self.0[l]
-            } else {
-                other.0[l]
-            };
-        }
-        self
-    }
-    #[inline(always)]
-    fn sqrt(mut self) -> Self {
-        for l in 0..COUNT {
-            self.0[l] = self.0[l].sqrt();
-        }
-        self
     }
     #[inline(always)]
     fn ldexp(mut self, n: Self) -> Self {
@@ -201,6 +157,11 @@ impl Vector for Eight {
 
     const COUNT: usize = COUNT;
 
+    per_lane! {
+        l in 0..COUNT;
+        fn fma(mut self, factor: Self, addend: Self) { self[l] = mul_add(self.0[l], factor.0[l], addend.0[l]) }
+        fn fnma(mut self, factor: Self, addend: Self) { self[l] = mul_add(-self.0[l], factor.0[l], addend.0[l]) }
+    }
     #[inline(always)]
     unsafe fn load_at(at: *const f32) -> Self {
         // SAFETY: the caller vouches for 8 readable values.
@@ -210,20 +171,6 @@ impl Vector for Eight {
     unsafe fn store_at(self, at: *mut f32) {
         // SAFETY: the caller vouches for 8 writable values.
         unsafe { at.cast::<[f32; COUNT]>().write_unaligned(self.0) }
-    }
-    #[inline(always)]
-    fn fma(mut self, factor: Self, addend: Self) -> Self {
-        for l in 0..COUNT {
-            self.0[l] = mul_add(self.0[l], factor.0[l], addend.0[l]);
-        }
-        self
-    }
-    #[inline(always)]
-    fn fnma(mut self, factor: Self, addend: Self) -> Self {
-        for l in 0..COUNT {
-            self.0[l] = mul_add(-self.0[l], factor.0[l], addend.0[l]);
-        }
-        self
     }
     #[inline(always)]
     fn floor(mut self) -> Self {

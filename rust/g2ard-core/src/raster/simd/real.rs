@@ -35,37 +35,15 @@ pub trait Real:
 impl Real for f32 {
     type Mask = bool;
 
-    #[inline(always)]
-    fn splat(value: f32) -> Self {
-        value
-    }
-    #[inline(always)]
-    fn max(self, other: Self) -> Self {
-        self.max(other)
-    }
-    #[inline(always)]
-    fn min(self, other: Self) -> Self {
-        self.min(other)
-    }
-    #[inline(always)]
-    fn sqrt(self) -> Self {
-        self.sqrt()
-    }
-    #[inline(always)]
-    fn ldexp(self, n: Self) -> Self {
-        self * f32::from_bits(((n as i32 + 127) << 23) as u32)
-    }
-    #[inline(always)]
-    fn ge(self, other: Self) -> bool {
-        self >= other
-    }
-    #[inline(always)]
-    fn gt(self, other: Self) -> bool {
-        self > other
-    }
-    #[inline(always)]
-    fn select(mask: bool, yes: Self, no: Self) -> Self {
-        if mask { yes } else { no }
+    lanes! {
+        fn splat(value: f32) -> Self = value;
+        fn max(self, other: Self) -> Self = self.max(other);
+        fn min(self, other: Self) -> Self = self.min(other);
+        fn sqrt(self) -> Self = self.sqrt();
+        fn ldexp(self, n: Self) -> Self = self * f32::from_bits(((n as i32 + 127) << 23) as u32);
+        fn ge(self, other: Self) -> bool = self >= other;
+        fn gt(self, other: Self) -> bool = self > other;
+        fn select(mask: bool, yes: Self, no: Self) -> Self = if mask { yes } else { no };
     }
 }
 
