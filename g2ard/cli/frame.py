@@ -67,10 +67,7 @@ _COMMON_OPTIONS: dict[str, tuple[Any, ...]] = {
     "quiet": (bool, typer.Option("-q", "--quiet", help="Print errors only."), False),
     "verbose": (bool, typer.Option("-v", "--verbose", help="Print more details."), False),
     "overwrite": (bool, typer.Option("-w", "--overwrite", help="Replace existing outputs."), False),
-    "json": (
-        str | None,
-        typer.Option(metavar="FILE|-", help="Write the result as JSON; - is stdout."),
-    ),
+    "json": (str | None, typer.Option(metavar="FILE|-", help="Write the result as JSON; - is stdout.")),
     "seed": (int, typer.Option(min=0, help="Random seed."), 0),
     "threads": (int, typer.Option(min=0, max=256, help="CPU threads; 0 uses all cores."), 0),
     "device": (str, typer.Option(metavar="auto|cpu|gpu|cuda", help="Where to compute."), "auto"),

@@ -60,8 +60,7 @@ ViewsOrMadeOption = Annotated[
     ),
 ]
 ImagesOption = Annotated[
-    Path | None,
-    typer.Option(metavar="DIR", help="Folder of the photos of the views, if they are elsewhere."),
+    Path | None, typer.Option(metavar="DIR", help="Folder of the photos of the views, if they are elsewhere.")
 ]
 AlphaOption = Annotated[
     Alpha,
@@ -84,10 +83,7 @@ def with_images(views: Path | None, images: Path | None, alpha: Alpha = "composi
 LookOption = Annotated[
     Path, typer.Option(metavar="VIEWS", help="Cameras, with photos unless --teacher is given.")
 ]
-OutputOption = Annotated[
-    Path,
-    typer.Option("-o", "--output", metavar="OUT", help="Output file."),
-]
+OutputOption = Annotated[Path, typer.Option("-o", "--output", metavar="OUT", help="Output file.")]
 
 
 def picture(text: str) -> Path:
@@ -144,9 +140,7 @@ def _direction(text: str) -> Triple:
 UpOption = Annotated[
     Triple | None,
     typer.Option(
-        parser=_direction,
-        metavar="X,Y,Z",
-        help="Up direction for generated views; estimated by default.",
+        parser=_direction, metavar="X,Y,Z", help="Up direction for generated views; estimated by default."
     ),
 ]
 
@@ -183,13 +177,9 @@ SplitOption = Annotated[
     typer.Option(metavar="train|test|all", help="Views to use; every 8th is test unless a split is given."),
 ]
 ShDegreeOption = Annotated[
-    int | None,
-    typer.Option(min=0, max=3, help="SH degree of the result; by default that of the scene."),
+    int | None, typer.Option(min=0, max=3, help="SH degree of the result; by default that of the scene.")
 ]
-FormatOption = Annotated[
-    FormatName,
-    typer.Option(case_sensitive=False, help="Format of the scene in RUN."),
-]
+FormatOption = Annotated[FormatName, typer.Option(case_sensitive=False, help="Format of the scene in RUN.")]
 ViewFormatOption = Annotated[
     ViewFormat | None,
     typer.Option(
@@ -207,8 +197,7 @@ ViewsFormatOption = Annotated[
 ]
 ResumeOption = Annotated[bool, typer.Option("--resume", help="Continue an interrupted run.")]
 SizeOption = Annotated[
-    int | None,
-    typer.Option(min=16, metavar="PIXELS", help="Shrink images to this longer side."),
+    int | None, typer.Option(min=16, metavar="PIXELS", help="Shrink images to this longer side.")
 ]
 BackgroundOption = Annotated[
     Triple | None,
@@ -250,8 +239,7 @@ PhotosOption = Annotated[
     ),
 ]
 ConventionOption = Annotated[
-    Convention,
-    typer.Option(help="Renderer to follow; inria has near plane 0.2 and cuts splats at 3σ tiles."),
+    Convention, typer.Option(help="Renderer to follow; inria has near plane 0.2 and cuts splats at 3σ tiles.")
 ]
 
 PresetOption = Annotated[
@@ -292,11 +280,7 @@ def _duration(text: str) -> float:
 
 RecoveryTimeOption = Annotated[
     float | None,
-    typer.Option(
-        parser=_duration,
-        metavar="TIME",
-        help="Time limit for recovery alone: 90s, 2m or 1h.",
-    ),
+    typer.Option(parser=_duration, metavar="TIME", help="Time limit for recovery alone: 90s, 2m or 1h."),
 ]
 
 

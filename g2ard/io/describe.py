@@ -25,10 +25,7 @@ _QUANTILES = (0, 1, 25, 50, 75, 99, 100)
 
 
 def describe(
-    path: str | Path,
-    more: Callable[[Splats], dict[str, Any]] | None = None,
-    *,
-    images: Path | None = None,
+    path: str | Path, more: Callable[[Splats], dict[str, Any]] | None = None, *, images: Path | None = None
 ) -> dict[str, Any]:
     """Summarise a scene, point cloud or views.
 

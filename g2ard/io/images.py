@@ -278,10 +278,7 @@ def write_png(path: str | Path, image: ArrayLike, *, overwrite: bool = False) ->
 
 
 def contact_sheet(
-    rows: Sequence[Sequence[ArrayLike]],
-    labels: Sequence[str],
-    *,
-    row_labels: Sequence[str] = (),
+    rows: Sequence[Sequence[ArrayLike]], labels: Sequence[str], *, row_labels: Sequence[str] = ()
 ) -> NDArray[np.uint8]:
     """Arrange images in a grid: one row per view, one column per kind (photo, simplified, recovered…).
 

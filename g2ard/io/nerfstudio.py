@@ -81,10 +81,7 @@ def _parser(path: Path, settings: Settings) -> tuple[str, Settings, Path]:
         raise InputError("is missing", path=path, property="pipeline.datamanager.dataparser")
     name = parser[0].rsplit(".", 1)[-1].removesuffix("Config")
     if name not in _PARSERS:
-        raise InputError(
-            f"unsupported data parser {name!r}; expected {', '.join(_PARSERS)}",
-            path=path,
-        )
+        raise InputError(f"unsupported data parser {name!r}; expected {', '.join(_PARSERS)}", path=path)
     data = settings.path("data") or manager[1].path("data") or parser[1].path("data")
     if data is None:
         raise InputError("is missing", path=path, property="data")

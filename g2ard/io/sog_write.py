@@ -113,12 +113,7 @@ def sog_files(
         count, book, centroids, entry = _rest(splats)
         files["shN_centroids.webp"] = _webp(centroids)
         names = ["shN_centroids.webp", image("shN_labels", np.column_stack([entry & 255, entry >> 8]))]
-        meta["shN"] = {
-            "count": count,
-            "bands": splats.sh_degree,
-            "codebook": book.tolist(),
-            "files": names,
-        }
+        meta["shN"] = {"count": count, "bands": splats.sh_degree, "codebook": book.tolist(), "files": names}
     if splats.offset.any():
         meta["g2ard"] = {"offset": splats.offset.tolist()}
     files["meta.json"] = json.dumps(meta, separators=(",", ":")).encode()

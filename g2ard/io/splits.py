@@ -94,8 +94,7 @@ def for_scores(
     mask = np.array([split != "train" for split in splits_of(views, names, stated)], bool)
     if not mask.any():
         raise InputError(
-            f"all of its {len(names)} views are for training; pass views with a test split",
-            path=views,
+            f"all of its {len(names)} views are for training; pass views with a test split", path=views
         )
     return mask
 

@@ -263,12 +263,7 @@ def write(
 
 
 def encoded(
-    path: Path,
-    splats: Splats,
-    means: NDArray[np.float64],
-    bits: int,
-    spz_version: int,
-    axes: Axes = "RUB",
+    path: Path, splats: Splats, means: NDArray[np.float64], bits: int, spz_version: int, axes: Axes = "RUB"
 ) -> bytes:
     """Return the bytes of an .spz with these means, in `bits` fractional bits and the order of the rows."""
     streams = _streams(splats, means, bits, spz_version)

@@ -120,7 +120,6 @@ class Budget:
         assert self.count is not None
         if self.count > total:
             raise InputError(
-                f"expected a budget of at most its {plural(total, 'Gaussian')}, got {self.count:,}",
-                path=name,
+                f"expected a budget of at most its {plural(total, 'Gaussian')}, got {self.count:,}", path=name
             )
         return self.count

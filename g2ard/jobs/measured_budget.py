@@ -401,13 +401,7 @@ def _aim_for_quality(reduce: Reduction, wanted: Quality, file: str) -> Aim:
     from g2ard.poses import plan_pool
 
     splats, say = reduce.splats, reduce.say
-    pool = plan_pool(
-        splats,
-        _QUALITY_VIEWS,
-        seed=reduce.seed,
-        rows=_POOL_SAMPLE,
-        progress=reduce.progress,
-    )
+    pool = plan_pool(splats, _QUALITY_VIEWS, seed=reduce.seed, rows=_POOL_SAMPLE, progress=reduce.progress)
     cameras = pool.cameras.resized(_QUALITY_SIDE)
 
     def written(count: int) -> Splats:

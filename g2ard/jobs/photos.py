@@ -121,12 +121,7 @@ def sparse_file(views: Views) -> Path | None:
 
 
 def points_along_rays(
-    cameras: Cameras,
-    count: int,
-    *,
-    background: Colour = BLACK,
-    seed: int = 0,
-    progress: Progress = silent,
+    cameras: Cameras, count: int, *, background: Colour = BLACK, seed: int = 0, progress: Progress = silent
 ) -> Points:
     """Place points on the rays of random pixels, where nearby photos agree best on the colour.
 
@@ -321,11 +316,7 @@ class _Rays:
         return self.origin + self.aims[:, :1] * depths[..., None]
 
     def costs(
-        self,
-        cameras: Cameras,
-        photos: list[NDArray[np.float32]],
-        others: NDArray[np.int64],
-        depths: Float,
+        self, cameras: Cameras, photos: list[NDArray[np.float32]], others: NDArray[np.int64], depths: Float
     ) -> Float:
         """Return (N, D) differences of the patches to the views that agree best; ∞ if too few see them."""
         own_costs = np.full((len(others), *depths.shape), np.inf)

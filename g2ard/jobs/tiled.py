@@ -116,12 +116,7 @@ def _worth_keeping(folder: Path, error: G2ardError) -> bool:
 
 @contextmanager
 def _tiles_and_workers(
-    scene: Path,
-    tiling: Tiling,
-    times: float,
-    render_model: RenderModel | None,
-    progress: Progress,
-    say: Say,
+    scene: Path, tiling: Tiling, times: float, render_model: RenderModel | None, progress: Progress, say: Say
 ) -> Iterator[tuple[TileStore, Workers]]:
     """Open the tiles of a scene, streamed into `tiling.folder` if it is a file, and start workers.
 

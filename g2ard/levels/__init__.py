@@ -4,12 +4,4 @@ from g2ard.levels.tileset import Georeference, save_tileset
 from g2ard.levels.tree import Cut, Leaf, Node, cut
 from g2ard.levels.write import save_levels
 
-__all__ = [
-    "Cut",
-    "Georeference",
-    "Leaf",
-    "Node",
-    "cut",
-    "save_levels",
-    "save_tileset",
-]
+__all__ = ["Cut", "Georeference", "Leaf", "Node", "cut", "save_levels", "save_tileset"]

@@ -178,11 +178,7 @@ class Renderer:
 
     @checks_arguments
     def __init__(
-        self,
-        splats: Splats,
-        *,
-        background: Sequence[float] = BLACK,
-        settings: RasterSettings | None = None,
+        self, splats: Splats, *, background: Sequence[float] = BLACK, settings: RasterSettings | None = None
     ) -> None:
         self.background = [float(c) for c in background]
         if settings is not None and not isinstance(settings.near, int | float | None):

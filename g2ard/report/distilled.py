@@ -193,10 +193,7 @@ def tiled_report(path: Path, title: str, report: dict[str, Any]) -> None:
 
 
 def preview(
-    path: Path,
-    targets: Targets,
-    scenes: list[tuple[str, Splats]],
-    background: Colour = BLACK,
+    path: Path, targets: Targets, scenes: list[tuple[str, Splats]], background: Colour = BLACK
 ) -> None:
     """Write a PNG with a row for each of three views: target, then each scene with its PSNR.
 

@@ -113,10 +113,7 @@ class Page:
         self._parts.append(f"<p>{escape(text)}</p>")
 
     def table(
-        self,
-        columns: Sequence[str],
-        rows: Sequence[Sequence[str]],
-        best: Collection[tuple[int, int]] = (),
+        self, columns: Sequence[str], rows: Sequence[Sequence[str]], best: Collection[tuple[int, int]] = ()
     ) -> None:
         """Add a table; cells (row, column) in `best` are bold."""
         head = "".join(f"<th>{escape(name)}</th>" for name in columns)

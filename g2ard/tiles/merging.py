@@ -171,8 +171,7 @@ def _runs(run: TiledRun, costs: list[Path], budget: int) -> list[int]:
     kept = [len(load(path, "costs")[0]) + 1 for path in costs]
     if sum(kept) < budget:
         raise InputError(
-            f"expected at most {sum(kept):,} (the visible Gaussians), got {budget:,}",
-            parameter="budget",
+            f"expected at most {sum(kept):,} (the visible Gaussians), got {budget:,}", parameter="budget"
         )
     target = min(sum(kept), int(run.config["morton_premerge_ratio"] * budget))
     closed = cheapest([_costs_of(path) for path in costs], sum(kept) - max(target, len(kept)))

@@ -146,13 +146,7 @@ def pour(
 
 
 def _started(
-    folder: Path,
-    key: str,
-    feed: Feed,
-    tile_rows: int,
-    rows: int,
-    progress: Progress,
-    like: TileStore | None,
+    folder: Path, key: str, feed: Feed, tile_rows: int, rows: int, progress: Progress, like: TileStore | None
 ) -> Journal:
     """Plan the tiles, check that the disk has room, and start a journal."""
     tree, points, each = like.tree if like else KdTree(), np.empty((0, 3), np.float32), 1.0

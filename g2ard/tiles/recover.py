@@ -168,10 +168,7 @@ def _cropped(cameras: Cameras, core: PreparedScene, offset: NDArray[np.float64])
 
 
 def _errors(
-    scene: Splats,
-    targets: TileTargets | None,
-    names: Sequence[str],
-    background: tuple[float, float, float],
+    scene: Splats, targets: TileTargets | None, names: Sequence[str], background: tuple[float, float, float]
 ) -> NDArray[np.float64]:
     """Return the (C, 2) squared error summed over masked pixels and channels, and the number of values, of
     the views called `names`; zeros for those not among the targets."""

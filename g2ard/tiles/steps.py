@@ -289,10 +289,7 @@ def _config(arguments: Arguments) -> SimplifyConfig:
 
 
 def _merging(
-    scene: PreparedScene,
-    config: SimplifyConfig,
-    frame: _core.TileFrame,
-    visibility: SampledVisibility | None,
+    scene: PreparedScene, config: SimplifyConfig, frame: _core.TileFrame, visibility: SampledVisibility | None
 ) -> _core.TileMerging:
     config = config.resolved("default")
     seen = None if visibility is None else emphasised(scene, visibility, config)

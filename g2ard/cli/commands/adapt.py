@@ -39,10 +39,7 @@ def adapt(
             min=0, help="Stop when PSNR gains less than this, dB; 0.05 by default, 0 runs all steps."
         ),
     ] = None,
-    schedule: Annotated[
-        AdaptSchedule | None,
-        typer.Option(help="Learning rates and decay."),
-    ] = None,
+    schedule: Annotated[AdaptSchedule | None, typer.Option(help="Learning rates and decay.")] = None,
     prior_views: Annotated[
         float | None,
         typer.Option(

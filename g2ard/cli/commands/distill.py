@@ -58,10 +58,7 @@ def distill(
     ] = None,
     held_out: Annotated[
         Path | None,
-        typer.Option(
-            metavar="VIEWS",
-            help="Views to score on. --views is then used for training only.",
-        ),
+        typer.Option(metavar="VIEWS", help="Views to score on. --views is then used for training only."),
     ] = None,
     method: opt.MethodOption = None,
     keep_region: opt.KeepRegionOption = None,
@@ -71,16 +68,9 @@ def distill(
     recovery_time: opt.RecoveryTimeOption = None,
     engine: opt.EngineOption = None,
     keep: Annotated[
-        bool,
-        typer.Option(
-            "--keep",
-            help="Keep the simplified scene too, in RUN/simplified.",
-        ),
+        bool, typer.Option("--keep", help="Keep the simplified scene too, in RUN/simplified.")
     ] = False,
-    output: Annotated[
-        Path,
-        typer.Option("-o", "--output", metavar="RUN", help="Output folder."),
-    ],
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="RUN", help="Output folder.")],
     format: opt.FormatOption = "ply",
     views_format: opt.ViewsFormatOption = "g2ard",
     clean: Annotated[
@@ -88,8 +78,7 @@ def distill(
         typer.Option("--clean", help="First remove invisible and stray Gaussians, as `g2ard clean` does."),
     ] = False,
     view: Annotated[
-        bool,
-        typer.Option("--view/--no-view", help="Write view.html, a viewer page with the scene."),
+        bool, typer.Option("--view/--no-view", help="Write view.html, a viewer page with the scene.")
     ] = True,
     resume: opt.ResumeOption = False,
     size: opt.SizeOption = None,
@@ -99,10 +88,7 @@ def distill(
     ] = None,
     background: opt.BackgroundOption = None,
     up: opt.UpOption = None,
-    dry_run: Annotated[
-        bool,
-        typer.Option("--dry-run", help="Estimate time and memory, then exit."),
-    ] = False,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Estimate time and memory, then exit.")] = False,
 ) -> None:
     """Distil a dense scene, or a point cloud with photos, into a compact scene.
 

@@ -41,8 +41,7 @@ def evaluate(
     teacher: opt.TeacherOption = None,
     photos: opt.PhotosOption = False,
     anchors: Annotated[
-        Path | None,
-        typer.Option(metavar="SCENE", help="The same Gaussians before recovery; adds Drift95."),
+        Path | None, typer.Option(metavar="SCENE", help="The same Gaussians before recovery; adds Drift95.")
     ] = None,
     lpips: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Folder with LPIPS weights; adds LPIPS.")

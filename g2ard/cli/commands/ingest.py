@@ -25,8 +25,7 @@ from g2ard.system.peak_memory import peak_rss
 def ingest(
     run: Run,
     scenes: Annotated[
-        list[Path],
-        typer.Argument(metavar="SCENE…", help="Scenes to join, or coloured point clouds to lift."),
+        list[Path], typer.Argument(metavar="SCENE…", help="Scenes to join, or coloured point clouds to lift.")
     ],
     output: Annotated[
         Path, typer.Option("-o", "--output", metavar="DIR", help="Output folder for the tiles.")
@@ -34,9 +33,7 @@ def ingest(
     tile_rows: Annotated[
         Count | None,
         typer.Option(
-            parser=Count.parse_absolute,
-            metavar="COUNT",
-            help="Maximum Gaussians per tile; 5M by default.",
+            parser=Count.parse_absolute, metavar="COUNT", help="Maximum Gaussians per tile; 5M by default."
         ),
     ] = None,
     resume: ResumeOption = False,

@@ -38,10 +38,7 @@ def recover(
     photos: opt.PhotosOption = False,
     anchors: Annotated[
         Path | None,
-        typer.Option(
-            metavar="SCENE",
-            help="The student before any recovery, if it was recovered before.",
-        ),
+        typer.Option(metavar="SCENE", help="The student before any recovery, if it was recovered before."),
     ] = None,
     preset: opt.PresetOption = "auto",
     schedule: opt.ScheduleOption = None,

@@ -39,8 +39,7 @@ def register(
     output: opt.OutputOption,
     format: opt.ViewFormatOption = None,
     poses: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="Initial poses: views in any format, or ACE text."),
+        Path | None, typer.Option(metavar="FILE", help="Initial poses: views in any format, or ACE text.")
     ] = None,
     pool: Annotated[
         str | None,
@@ -73,19 +72,16 @@ def register(
         ),
     ] = None,
     refine: Annotated[
-        Refinement | None,
-        typer.Option(help="How to refine poses from feature matching; auto by default."),
+        Refinement | None, typer.Option(help="How to refine poses from feature matching; auto by default.")
     ] = None,
     passes: Annotated[
         int | None, typer.Option(min=1, help="Maximum renders to match per photo; 3 by default.")
     ] = None,
     accept: Annotated[
-        float | None,
-        typer.Option(min=0.01, max=1, help="Lowest ZNCC of a registered photo; 0.6 by default."),
+        float | None, typer.Option(min=0.01, max=1, help="Lowest ZNCC of a registered photo; 0.6 by default.")
     ] = None,
     keep: Annotated[
-        Keep,
-        typer.Option(help="Photos to write; with all, photos without a pose keep their initial one."),
+        Keep, typer.Option(help="Photos to write; with all, photos without a pose keep their initial one.")
     ] = "registered",
     protocol: Annotated[
         Literal["gs-cpr"] | None,
@@ -95,8 +91,7 @@ def register(
         ),
     ] = None,
     truth: Annotated[
-        Path | None,
-        typer.Option(metavar="VIEWS", help="True poses to score against; not used otherwise."),
+        Path | None, typer.Option(metavar="VIEWS", help="True poses to score against; not used otherwise.")
     ] = None,
     metres_per_unit: Annotated[
         float | None,

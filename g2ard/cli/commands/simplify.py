@@ -44,8 +44,7 @@ def simplify(
     views: opt.ViewsOrMadeOption = None,
     images: opt.ImagesOption = None,
     no_views: Annotated[
-        bool,
-        typer.Option("--no-views", help="Use no cameras, neither found nor generated."),
+        bool, typer.Option("--no-views", help="Use no cameras, neither found nor generated.")
     ] = False,
     preset: opt.PaperOption = None,
     method: opt.MethodOption = None,

@@ -133,10 +133,7 @@ def _lens(K: Float) -> tuple[float, float, float, float]:
 
 
 def align(
-    renderer: Renderer,
-    start: Float,
-    pyramid: list[tuple[Camera, Level]],
-    config: RegisterConfig,
+    renderer: Renderer, start: Float, pyramid: list[tuple[Camera, Level]], config: RegisterConfig
 ) -> Aligned | None:
     """Align a photo, coarse to fine, from a pose; return None if too few pixels are valid there.
 

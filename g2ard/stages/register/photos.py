@@ -23,13 +23,7 @@ from g2ard.stages.register.grey import band_passed
 from g2ard.stages.register.matchers import matcher_named
 from g2ard.stages.register.pool import PoolRenders, small_render, turned
 from g2ard.stages.register.pose import pose_error
-from g2ard.stages.register.report import (
-    KEPT,
-    PhotoReport,
-    PoseError,
-    Registered,
-    RegisterReport,
-)
+from g2ard.stages.register.report import KEPT, PhotoReport, PoseError, Registered, RegisterReport
 
 Float = NDArray[np.float64]
 _FEATURES_BONUS = 0.05

@@ -17,15 +17,7 @@ from numpy.typing import NDArray
 
 from g2ard.rendering.renderer import Renderer
 from g2ard.scene.cameras import Camera
-from g2ard.stages.register.align import (
-    Aligned,
-    Level,
-    Shot,
-    inverse,
-    moves,
-    normal_equations,
-    shot_of,
-)
+from g2ard.stages.register.align import Aligned, Level, Shot, inverse, moves, normal_equations, shot_of
 from g2ard.stages.register.config import RegisterConfig
 from g2ard.stages.register.grey import LUMA, blurred_back
 from g2ard.stages.register.pose import motion_between, moved

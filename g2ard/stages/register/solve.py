@@ -137,10 +137,7 @@ def solve_pnp(
         return None
     K = camera.K
     lens = pycolmap.Camera(
-        model="PINHOLE",
-        width=camera.width,
-        height=camera.height,
-        params=[K[0, 0], K[1, 1], K[0, 2], K[1, 2]],
+        model="PINHOLE", width=camera.width, height=camera.height, params=[K[0, 0], K[1, 1], K[0, 2], K[1, 2]]
     )
     options = pycolmap.AbsolutePoseEstimationOptions()
     options.ransac.max_error = config.max_reprojection

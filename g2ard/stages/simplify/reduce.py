@@ -16,14 +16,7 @@ from g2ard.progress import Progress, counter, plural, silent
 from g2ard.scene.prepared import PreparedScene, finite_rows_of, with_some_opacity
 from g2ard.scene.splats import DRAWN_LOGIT, Splats, unit_quats
 from g2ard.stages.simplify.config import SimplifyConfig, round_counts
-from g2ard.stages.simplify.pairs import (
-    Visibility,
-    VisibilitySource,
-    merge,
-    merge_and_fit,
-    rows_of,
-    splats_of,
-)
+from g2ard.stages.simplify.pairs import Visibility, VisibilitySource, merge, merge_and_fit, rows_of, splats_of
 from g2ard.stages.simplify.report import SimplifyReport, SimplifyRound
 
 _DEFAULTS = SimplifyConfig()
