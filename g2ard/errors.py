@@ -113,9 +113,7 @@ def missing(what: str, package: str, **fields: Any) -> MissingDependencyError:
     """Return the error for a feature whose optional package is not installed.
 
     Args:
-        what: the feature.
         package: package to install with pip.
-        fields: other fields of the error.
 
     >>> str(missing("the engine 'torch'", "g2ard[torch]"))
     "the engine 'torch' needs a package that is not installed; pip install 'g2ard[torch]'"

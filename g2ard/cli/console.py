@@ -104,12 +104,7 @@ class _Plan:
             self._current, self._ahead = self._ahead[row], self._ahead[row + 1 :]
 
     def left(self, stage: str, now: float, share: float, left: float) -> float | None:
-        """Return the seconds that the command still needs, if known.
-
-        Args:
-            share: share of the stage that is done.
-            left: seconds that the stage still needs.
-        """
+        """Return the seconds that the command still needs, if known."""
         begun = self._done + self._current[1]
         rest = sum(weight for _, weight in self._ahead)
         if stage != self._current[0] or self._done + share * self._current[1] < _ETA_KNOWN_SHARE * (

@@ -356,8 +356,6 @@ def command(
     """Register `fn(run, **options)` as a command.
 
     Args:
-        name: name of the command.
-        example: command line shown at the end of its help.
         parent: group it belongs to.
         cuda: whether it supports --device cuda.
         settings: config of --set as MODULE:CLASS, see `Run.settings`, or "" if the command checks it; None

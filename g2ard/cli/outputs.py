@@ -31,7 +31,6 @@ class Outputs:
     """Outputs of a command, one per budget; `{ratio}` and `{count}` in the pattern are the budget's.
 
     Args:
-        pattern: path as given.
         name: flag of the pattern, for messages.
     """
 

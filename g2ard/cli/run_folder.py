@@ -52,9 +52,7 @@ class RunFolder:
     """Folder of a run with one budget.
 
     Args:
-        path: the folder.
         name: name of the scene's file in it.
-        resume: whether to continue an interrupted run.
     """
 
     def __init__(self, run: Run, path: Path, name: str, resume: bool) -> None:

@@ -16,9 +16,7 @@ def check_output(path: str | Path, overwrite: bool = False, *, folder: bool = Fa
     """Return `path`, or raise an `OutputError` if an output cannot be written there.
 
     Args:
-        path: the output.
         overwrite: whether a file, or a folder that is not empty, may be replaced.
-        folder: whether the output is a folder.
     """
     path = Path(path)
     try:

@@ -30,7 +30,6 @@ def describe(
     """Summarise a scene, point cloud or views.
 
     Args:
-        path: the file or folder.
         more: further figures of a scene.
         images: folder of the photos of views, if they are elsewhere.
 

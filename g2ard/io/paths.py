@@ -54,7 +54,6 @@ def output_names(path: str | Path, names: Sequence[str]) -> list[str]:
 
     Args:
         path: the file of views, for errors.
-        names: names of the views.
 
     Raises:
         InputError: a name is invalid, longer than 200 bytes, or equals another one.

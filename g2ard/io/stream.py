@@ -97,7 +97,6 @@ class PartsStream(SceneStream):
     """Scene of clean parts that are loaded one at a time.
 
     Args:
-        counts: Gaussians per part.
         part: function that loads a part by index.
         identity: JSON that identifies the scene.
     """

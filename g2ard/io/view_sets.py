@@ -69,8 +69,6 @@ def read_view_set(
 
     Args:
         path: as for `read_views`, or `ViewFiles`, whose `images` and `alpha` then count.
-        images: as for `read_views`.
-        split: as for `read_views`.
         unpictured: whether to keep views without photos among others.
         alpha: "mask" makes a photo with alpha and without a mask its own mask.
     """

@@ -286,10 +286,7 @@ class _Read:
     """The dense scene as read or lifted.
 
     Args:
-        prior: the dense scene.
         lifted: whether it was lifted from a point cloud.
-        beside: path beside which to look for cameras.
-        name: its name in errors.
         from_photos: whether the points, or some of them, were found in the photos, by COLMAP or here.
     """
 

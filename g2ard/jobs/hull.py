@@ -54,7 +54,6 @@ def visual_hull(cameras: Cameras, outlines: Sequence[Mask | None], middle: Float
     """Carve away every voxel that photos show to be empty.
 
     Args:
-        cameras: C views.
         outlines: (H, W) pixels that show the object, per view; None for a view that does not say.
         middle: (3,) a point that the cameras look at.
 

@@ -33,9 +33,7 @@ class DistillJob:
         teacher: the scene rendered for targets; None if all targets are photos.
         photos_over_renders: use photos where views have them and renders for the rest; always False without a
             teacher.
-        lifted: whether `prior` is a lifted point cloud.
         preset: the regularisers chosen, and why.
-        measured: the measures that decided it.
         seconds: time of preparation, including reading.
         cleaned: number of Gaussians removed by kind of clutter; None without cleaning.
     """

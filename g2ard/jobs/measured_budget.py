@@ -189,9 +189,6 @@ def count_for_bytes(splats: Splats, wanted: int, name: str, reduce: Callable[[in
 
     A sample's bytes per Gaussian give the first count. Files of the scene reduced to trial counts then
     bracket the result, until one fills 98 % of the bytes.
-
-    Args:
-        name: a file name; its suffix is the format.
     """
     fewest, most = min(_FEWEST_GAUSSIANS, len(splats)), len(splats)
     sample = splats.take(np.array(evenly_spaced(most, _PROBE_ROWS, floor=True)))
@@ -291,7 +288,6 @@ def _next_count(excesses: Mapping[int, float], met: int, missed: int, most: int)
         excesses: excess in dB of the counts measured so far.
         met: smallest count that keeps the quality, `most` until one does.
         missed: largest count that does not, 0 until one does not.
-        most: the scene's count.
     """
     aim = _QUALITY_TOLERANCE / 2
     if missed and met < most:  # interpolate between them; otherwise extrapolate from the only known side
@@ -311,12 +307,9 @@ class Aim:
     """Budget resolved for a scene.
 
     Args:
-        count: Gaussians to reduce it to.
         bytes: largest size of the result's file; None for no limit.
         file: a file name; its suffix is the format.
         wanted: quality to keep; None for no requirement.
-        dense: the scene to compare with.
-        cameras: views to measure quality in.
     """
 
     count: int
@@ -366,7 +359,6 @@ def aim_of(
     """Resolve a budget for the scene of `reduce`, which makes the result.
 
     Args:
-        name: the scene's name in errors.
         file: a file name; its suffix is the format for `Budget.fit`.
         recovered: whether recovery follows. Bytes are then searched with the method `fast` and a margin.
         sh_degree: of the result; None is the scene's.

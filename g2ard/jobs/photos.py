@@ -69,10 +69,7 @@ def topped_up(
     """Add points along the camera rays of training views until there are `count`.
 
     Args:
-        points: the points so far; None for none.
-        views: cameras with photos, or their path.
         held_out: separate views for scoring; all of `views` are then for training.
-        background: RGB of empty pixels.
     """
     sparse = 0 if points is None else len(points)
     parts = [] if points is None else [points]
@@ -132,10 +129,7 @@ def points_along_rays(
 
     Args:
         cameras: C ≥ 3 views with photos, in world coordinates.
-        count: number of points.
         background: RGB of empty pixels.
-        seed: seed of the rays.
-        progress: called with the number of points.
 
     Returns:
         `count` points in world coordinates, with the colour of their ray's pixel.

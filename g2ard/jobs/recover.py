@@ -37,11 +37,9 @@ class RecoverJob:
     """A prepared recovery: inputs are read and everything is decided.
 
     Args:
-        views: views to train on.
         weights: sampling weight of each view; None draws all equally often.
         anchors: the student before any recovery, or None.
         preset: the regularisers chosen, and why.
-        measures: the measures that decided it.
         scored: views whose test split is scored; None for no scores.
         validation: renders of views of other kinds that limit changes; None without.
     """

@@ -168,7 +168,6 @@ def simplify_in_tiles(
 
     Args:
         tiling: how; `folder` keeps finished steps, so that the same call resumes.
-        views: as for `g2ard.simplify`.
     """
     config = config or SimplifyConfig()
     with _tiles_and_workers(scene, tiling, 1.0, render_model, progress, say) as (store, workers):
@@ -206,7 +205,6 @@ def distill_in_tiles(
     Targets are the dense scene's own renders, in views that are given, found beside it or generated.
 
     Args:
-        tiling: how; `folder` keeps finished steps, so that the same call resumes.
         options: as for `g2ard.distill`, without those that `whole_options` returns.
     """
 
@@ -250,7 +248,6 @@ def lod_in_tiles(
     against the dense scene's renders in views shrunk by √√r.
 
     Args:
-        tiling: how; `folder` keeps finished steps, so that the same call resumes.
         recover: optimise each level; otherwise levels are only merged.
 
     Returns:
@@ -303,8 +300,6 @@ class _Job:
     """A distillation in tiles with everything decided.
 
     Args:
-        sample: a fair sample of it.
-        config: of recovery.
         learn: whether anything is recovered, or only scored.
     """
 

@@ -34,7 +34,6 @@ def turntable(
 
     Args:
         count: number of views; the one after the last would be the first again.
-        up: (3,) axis of the circle; estimated by default.
     """
     pool = plan_pool(scene, _TURN_POOL, size=size, up=up, seed=seed, progress=progress)
     points, axis = opaque_points(scene), np.asarray(pool.up, np.float64)

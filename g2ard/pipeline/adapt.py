@@ -113,10 +113,8 @@ class AdaptReport(Report):
     """Figures of an adaptation.
 
     Args:
-        seconds: time for these steps.
         converged: whether the last stretch gained less than the tolerance.
         psnr: PSNR before and after, on a sample of the training views.
-        stretches: figures of each stretch.
         colour_change: gain (dB), matrix and shift of the change of all colours; None if it was not applied.
         prior_share: mean share of the previous appearance in the result.
     """
@@ -151,7 +149,6 @@ class _Fit:
     """A fit in stretches, whose state is kept in `work`, if given.
 
     Args:
-        splats: the scene, of which appearance changes.
         key: fingerprint that checkpoints must have.
     """
 

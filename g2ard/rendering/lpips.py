@@ -101,7 +101,6 @@ def load_lpips(folder: Path, *, scaled: bool = True, device: str = "cpu") -> dic
     The first of each pair holds torchvision's ImageNet weights, the second LPIPS's linear layers (v0.1).
 
     Args:
-        folder: folder with the weights.
         scaled: see `Lpips`.
         device: see `Lpips`.
 

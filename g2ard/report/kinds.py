@@ -34,8 +34,6 @@ class KindScore(Report):
     Args:
         kind: near, standing, anywhere or another kind that views state; otherwise `usual` for generated
             views and `given` for the user's.
-        views: number of views.
-        psnr: mean PSNR, dB.
         ssim: mean SSIM; None for a scene in tiles.
         worst: name of the view with the lowest PSNR after recovery.
         worst_psnr: PSNR of that view, dB.

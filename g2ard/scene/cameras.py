@@ -218,9 +218,6 @@ class Cameras:
     def of(cls, views: Iterable[Camera]) -> Cameras:
         """Combine single views.
 
-        Args:
-            views: views with different names.
-
         >>> pair = [Camera.facing([0, y, 0], [0, 0, 0], name=str(y)) for y in (-2, -3)]
         >>> Cameras.of(pair)[1].name, len(Cameras.of(pair))
         ('-3', 2)

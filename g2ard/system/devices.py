@@ -37,7 +37,6 @@ class State:
 
     Args:
         adapter: name of the adapter in use; None on the CPU and before the first kernel runs.
-        served: number of kernels it has run.
         uploaded_bytes: bytes sent to it; 0 after a fallback to the CPU.
         seconds: time on the device by kernel, if `use` was called with `timed`.
     """

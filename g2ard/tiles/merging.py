@@ -34,10 +34,8 @@ class TiledScene:
         counts: Gaussians per tile.
         tiles: reads the Gaussians of a tile, with fitted opacities.
         key: hash of the names of its files.
-        views: number of views used; 0 without views.
         unseen: Gaussians of the dense scene that no view sees; None without views.
         surroundings: placement of the dense tiles, for recovery; None without views.
-        render_model: see `Splats`.
     """
 
     counts: tuple[int, ...]

@@ -77,7 +77,6 @@ def write_page(
         scenes: (label, scene), one or two, left to right, in the same frame: x right, y down, z ahead.
         start: initial camera; None lets the viewer frame the whole scene.
         stops: (title, camera) of views to step through, by arrows below the scene.
-        progress: called for each image of a packed scene.
     """
     path = check_page_output(path, overwrite)
     packed = [_sog(path, label, splats, progress) for label, splats in scenes]

@@ -39,10 +39,7 @@ class Objective(Photometric):
     """Objective, start and variables of an engine.
 
     Args:
-        start: the initial scene.
         cameras: cameras of the views, relative to its offset.
-        anchors: anchors of the regularisers.
-        regularizers: weights of the regularisers.
         means_in_scales: optimise means in multiples of each Gaussian's initial radius.
         frozen: (N,) bool, Gaussians that stay unchanged; None freezes none.
         relative: whether to descend log(loss) times `TYPICAL_LOSS`, so that views count alike whatever their

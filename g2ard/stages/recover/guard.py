@@ -121,7 +121,6 @@ class Guard:
         every change, or the start.
 
         Args:
-            result: the scene after the last step.
             views: (N,) number of views that touched each Gaussian.
             step: number of the last step, for the log.
 

@@ -83,7 +83,6 @@ class RecoverReport(Report):
     """Figures of a recovery.
 
     Args:
-        steps: number of steps.
         seconds: time, including trials.
         loss: means over each 1 % of the steps.
         psnr: PSNR before and after on a sample of the training views.
@@ -100,7 +99,6 @@ class RecoverReport(Report):
         blend: weight of the last step's scene in the result, interpolated with the student: 1 unless the
             steps lost quality.
         kept_start: whether the result is the student, because all steps made it worse.
-        validation: validation, or None without such views.
         skipped: `non_finite`: single-Gaussian steps whose gradient was not finite.
         resumed: part of `seconds` before this call resumed; None if it did not resume.
     """

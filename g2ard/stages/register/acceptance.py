@@ -15,7 +15,6 @@ def acceptance(
         zncc: median local ZNCC of photo and render.
         sigma: standard deviations of the pose; None if the photo does not determine it.
         depth: median depth of the render, scene units.
-        config: the limits.
     """
     if sigma is None:
         return "refused", "the photo does not determine the pose"

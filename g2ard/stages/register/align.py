@@ -83,8 +83,6 @@ class Aligned:
 
     Args:
         viewmat: (4, 4) camera_from_world.
-        gain: factor on the render's grey.
-        bias: offset added to it.
         covariance: (6, 6) of ξ = (v, ω) around the result, in the camera's axes: (JᵀWJ)⁻¹·σ²·`correlated`
             with gain and bias marginalised; None if the photo does not determine the pose.
         overlap: share of valid pixels.

@@ -107,8 +107,6 @@ class Search:
     """Attempts on photos of one scene, with a count of renders.
 
     Args:
-        renderer: of the scene.
-        config: see `RegisterConfig`.
         match: a matcher; None means direct alignment only.
     """
 

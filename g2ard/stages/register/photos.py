@@ -234,10 +234,8 @@ def _reported(name: str, best: Candidate, config: RegisterConfig, renders: int) 
     covariance; fields of feature matching keep their defaults after direct alignment alone.
 
     Args:
-        name: the photo.
         best: its best pose; rows and columns of the (6, 6) covariance are position, then rotation.
         config: limits that decide between registered, uncertain and refused.
-        renders: number of renders that its search took.
     """
     estimate = best.found
     sigma = None

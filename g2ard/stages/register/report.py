@@ -40,7 +40,6 @@ class PhotoReport(Report):
     """Report of one photo.
 
     Args:
-        name: name of the photo.
         status: "registered", "uncertain" or "refused".
         reason: why it is not registered; None if it is.
         start: name of the starting pose; None if there was none.
@@ -56,8 +55,6 @@ class PhotoReport(Report):
         overlap: share of the pixels compared.
         covariance: (6, 6) covariance of (v, ω) in the camera's axes: scene units, radians.
         sigma: root of the covariance's trace for position, scene units, and rotation, degrees.
-        renders: number of renders for this photo.
-        seconds: time for this photo.
         camera_from_world: (4, 4) result; None if there is none.
         start_error: error of the starting pose; None without a reference or a starting pose.
         error: error of the result; None without a reference or a result.
@@ -148,10 +145,8 @@ class Summary(Report):
     """Summary of a registration.
 
     Args:
-        photos: number of photos.
         registered, uncertain, refused: number of photos per status.
         true: number of photos with a reference pose.
-        metres_per_unit: scale of the scene, if known.
         start: accuracy of the starting poses; None without references.
         found: accuracy of the kept poses; None without references.
     """

@@ -37,12 +37,10 @@ class Solved:
     Args:
         viewmat: (4, 4) camera_from_world.
         matches: number of matches with known depth.
-        inliers: number of inliers.
         spread: share of the image's 4 × 4 cells with an inlier.
         reprojection: median reprojection error of the inliers, pixels.
         information: (6, 6) inverse covariance of ξ = (v, ω), camera axes; see `information`.
         depth: median depth of the inliers, scene units.
-        passes: number of renders.
         pixels: (inliers, 2) pixels of the photo.
         seen: (inliers, 2) pixels of the last render.
     """

@@ -62,11 +62,8 @@ def complete(
     Args:
         scene: a compact scene, such as the one to be trained.
         given: views that are used in any case.
-        offered: candidates, of any kind.
-        most: largest number of views to choose.
         least_views: n is at least this, so that few given views do not end the choice early.
         represents: Gaussians to be trained per row of `scene`.
-        progress: called with the number of views rendered.
 
     >>> from g2ard.scene.cameras import Camera
     >>> pair = Splats.create([[0, 0, 0], [9, 0, 0]], scales=np.full((2, 3), 0.1), logit_opacities=[9, 9])

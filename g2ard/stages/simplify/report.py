@@ -12,11 +12,8 @@ class SimplifyRound(Report):
     """Report of one round: before − dropped − merged − trimmed = after.
 
     Args:
-        before: Gaussians before the round.
         dropped: dropped for low opacity.
-        merged: removed by merging.
         trimmed: trimmed for low priority.
-        after: Gaussians after the round.
         cells: `paper`: number of locality cells; 0 if none were needed.
         refused: `paper`: groups rejected, by guard.
         skipped_alone: `paper`: rows alone in their cell and colour bin.
@@ -41,10 +38,7 @@ class SimplifyReport(Report):
     """Report of a simplification.
 
     Args:
-        input_count: Gaussians of the input.
-        output_count: Gaussians of the output.
         merged_members: input rows that share an output row.
-        rounds: report of each round.
         protected: flagged output rows.
         nonfinite_rows: input rows dropped because they are not finite.
         infinite_logits: infinite logits, taken as α = 0 or 1.
