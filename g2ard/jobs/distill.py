@@ -19,7 +19,6 @@ from g2ard.jobs.inputs import Views, clutter_seen, load_scene
 from g2ard.jobs.job import DistillJob
 from g2ard.jobs.measured_budget import Aim, Reduction, aim_of
 from g2ard.jobs.photos import sparse_file, sparse_points, topped_up
-from g2ard.jobs.regularizers import choose_regularizers
 from g2ard.jobs.view_checks import check_photos, propose_background
 from g2ard.jobs.views import views_of
 from g2ard.pipeline.distill import Distilled
@@ -30,7 +29,7 @@ from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
 from g2ard.stages.lift import lift
 from g2ard.stages.recover.anchors import FREE, Regularizers
-from g2ard.stages.recover.auto_preset import PriorMeasures, measure_prior
+from g2ard.stages.recover.auto_preset import PriorMeasures, measure_prior, regularizers_for
 
 Scene = Splats | Points | str | Path | None
 
@@ -255,7 +254,7 @@ def _sources(views: RunViews, photos: bool | None, lifted: bool) -> tuple[bool, 
 def _regularizers(
     options: DistillOptions, read: _Read, prior: Splats, photos: Cameras | None
 ) -> tuple[Regularizers, str, PriorMeasures]:
-    """Choose regularisers with `choose_regularizers`, or none for points of photos.
+    """Choose regularisers with `regularizers_for`, or none for points of photos.
 
     Args:
         photos: training views, if they have photos; only then is their consistency measured.
@@ -270,7 +269,7 @@ def _regularizers(
         )
     if read.lifted and kind == "paper":
         kind = "paper-lift"
-    return choose_regularizers(kind, prior, photos, paper=paper)
+    return regularizers_for(kind, prior, photos, paper=paper)
 
 
 def _task(prior: Splats, aims: Sequence[Aim], train: Cameras, photos: bool) -> str:

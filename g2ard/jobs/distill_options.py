@@ -24,20 +24,13 @@ class DistillOptions:
     """Inputs and settings of a distillation.
 
     Args:
-        views: cameras in world coordinates, or their path. None uses cameras found beside the scene, or
-            generates a view pool; "made" always generates one. The test split is held out.
         photos: targets: True for photos, skipping views without one; False for renders of the scene; None for
             each view's photo, or a render if it has none (sec. 3.1). A point cloud needs photos, because its
             lift cannot render training images.
-        held_out: views to score on instead of the test split.
-        beside: where to look for cameras, if the scene is not a path.
-        up: (3,) direction away from the ground for generated views; None estimates it.
-        size: longer side of the views in pixels, if they are larger.
-        clean: remove clutter first (`g2ard.stages.clean`).
-        render_model: overrides what the scene's file says: "classic" or "antialiased".
         format: file format for a budget in bytes: ply, compressed.ply, sog, spz, glb, splat, usda or usdc.
-        preset: settings by name, see `g2ard.pipeline.presets`.
         settings: values of `DistillConfig` by path, which override the preset.
+
+    Others are those of `g2ard.distill`.
 
     Raises:
         InputError: a value of another type, or out of range.

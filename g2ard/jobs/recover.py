@@ -17,7 +17,6 @@ from g2ard.errors import InputError
 from g2ard.io.types import ViewSet
 from g2ard.jobs.causes import likely_causes
 from g2ard.jobs.inputs import Views, load_scene
-from g2ard.jobs.regularizers import choose_regularizers
 from g2ard.jobs.score import scores_by_kind
 from g2ard.jobs.teaching import Teaching, check_teacher
 from g2ard.pipeline.presets import PRESETS, configured
@@ -28,7 +27,7 @@ from g2ard.scene.splats import Splats
 from g2ard.stages.recover import RecoverConfig, Recovered
 from g2ard.stages.recover import recover as optimize
 from g2ard.stages.recover.anchors import Anchors
-from g2ard.stages.recover.auto_preset import PriorMeasures
+from g2ard.stages.recover.auto_preset import PriorMeasures, regularizers_for
 from g2ard.stages.recover.optimize import Watch
 
 
@@ -267,7 +266,7 @@ def prepare(
     if weights is not None:
         say(f"sampling {plural(len(weights), 'view')} by weight")
     built = None if anchors is None else _built(anchors, start, render_model, say)
-    regularizers, why, measures = choose_regularizers(
+    regularizers, why, measures = regularizers_for(
         named.get("recover.regularizers"),
         teaching.dense or built or start,
         None if teaching.dense else chosen.cameras,

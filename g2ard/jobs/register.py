@@ -52,17 +52,7 @@ class RegisterJob:
 
     def run(self) -> Registered:
         """Estimate the poses."""
-        return find_poses(
-            self.scene,
-            self.photos,
-            starts=self.starts,
-            pool=self.pool,
-            truth=self.truth,
-            config=self.config,
-            keep=self.keep,
-            background=self.background,
-            progress=self.progress,
-        )
+        return find_poses(**vars(self))
 
 
 @checks_arguments

@@ -21,7 +21,6 @@ from g2ard.jobs.distill_options import DistillOptions
 from g2ard.jobs.inputs import Views, load_view_sets, say_regions
 from g2ard.jobs.levels import LevelReport, check_ratios, level_size
 from g2ard.jobs.memory_limit import RECOVERY_TIMES, workers_for
-from g2ard.jobs.regularizers import choose_regularizers
 from g2ard.jobs.tiling import Tiling, refuse_whole, whole_options
 from g2ard.jobs.views import cameras_for_weights, pool_times, views_of
 from g2ard.levels import Cut
@@ -30,6 +29,7 @@ from g2ard.pipeline.run_views import RunViews
 from g2ard.progress import Progress, Say, plural, silent, unsaid
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
+from g2ard.stages.recover.auto_preset import regularizers_for
 from g2ard.stages.recover.schedule import steps_for
 from g2ard.stages.simplify import SimplifyConfig
 from g2ard.tiles.executor import Workers, executor
@@ -364,7 +364,7 @@ def _job(
             progress=progress,
             say=say,
         )
-        regularizers, why, _ = choose_regularizers(options.named("recover.regularizers"), sample)
+        regularizers, why, _ = regularizers_for(options.named("recover.regularizers"), sample)
         if learn:
             say(f"regularisers: {why}")
         config = options.configured(regularizers)

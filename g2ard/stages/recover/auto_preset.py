@@ -116,17 +116,17 @@ def _carried(
 
 
 def regularizers_for(
-    name: str, prior: Splats, cameras: Cameras | None = None, *, paper: bool = False
+    given: Regularizers | str | None, prior: Splats, cameras: Cameras | None = None, *, paper: bool = False
 ) -> tuple[Regularizers, str, PriorMeasures]:
-    """Choose regularisers by name or by measuring the prior.
+    """Return the value of the setting `recover.regularizers`: as given, by name, or by measuring the prior.
 
     `auto` measures: uniform thin discs without view-dependent colour are an untrained lift. Over a tenth of
     needles, or views that see through each other's surfaces, mean a noisy trained scene. Anything else is a
     faithful one.
 
     Args:
-        name: auto, trained, lift or noisy; paper is auto with the paper's weights; paper-trained, paper-lift
-            and paper-noisy are rows of its table.
+        given: weights, or a name: auto (None), trained, lift or noisy; paper is auto with the paper's
+            weights; paper-trained, paper-lift and paper-noisy are rows of its table.
         prior: the scene of the anchors, before simplification if available.
         cameras: views for measuring consistency; None skips it.
         paper: use the paper's weights, for its schedule.
@@ -137,6 +137,9 @@ def regularizers_for(
     Raises:
         InputError: an unknown preset.
     """
+    if isinstance(given, Regularizers):
+        return given, "as given", measure_prior(prior, cameras)
+    name = given or "auto"
     kind = {"paper": "auto"}.get(name, name.removeprefix("paper-"))
     if kind != "auto" and kind not in REGULARIZERS:
         raise InputError(f"expected auto, paper, {', '.join(REGULARIZERS)}, got {name!r}", parameter="preset")

@@ -73,9 +73,6 @@ def recover(
     unchanged. A schedule that is not `guarded`, such as the paper's, always takes all its steps.
 
     Args:
-        student: the scene to recover; cameras are in world coordinates, including its offset.
-        targets: photos or teacher renders with their cameras.
-        config: see `RecoverConfig`.
         weights: (C,) sampling weight of each view; None draws all equally often.
         anchors: frozen geometry; None takes the student's. For a student that was recovered before, pass the
             anchors of its construction.
@@ -85,28 +82,9 @@ def recover(
             early. At most eight views per kind are scored during the steps.
         frozen: (N,) bool, mask of Gaussians that stay unchanged, such as those of another tile; requires the
             engine `fused`. None freezes none.
-        checkpoint: a file written every minute and at Ctrl-C. If it exists, recovery resumes from it, with a
-            bitwise equal result.
-        progress: called after every step with loss, PSNR of a few training views and steps/s.
         stage: stage name for progress.
-        watch: called after every step; its time does not count.
 
-    Returns:
-        The recovered scene, its Gaussians in the student's order, and a report.
-
-    Raises:
-        InputError: no Gaussians, no views, invalid weights, or a checkpoint of another run.
-        KeyboardInterrupt: after Ctrl-C, when the checkpoint is written.
-
-    >>> import g2ard
-    >>> rng = np.random.default_rng(0)
-    >>> means, sh0 = rng.normal(size=(500, 3)), rng.normal(size=(500, 1, 3))
-    >>> scene = Splats.create(means, scales=np.full((500, 3), 0.1), sh0=sh0)
-    >>> targets = g2ard.TeacherRenders(scene, g2ard.make_pool(scene, 8, size=(64, 48)))
-    >>> small = g2ard.simplify(scene, ratio=5).splats
-    >>> better = g2ard.recover(small, targets, g2ard.RecoverConfig(steps=30))
-    >>> len(better.splats), better.report.psnr.after > better.report.psnr.before
-    (100, True)
+    Other arguments, results and errors are those of `g2ard.recover`.
     """
     config = config or RecoverConfig()
     if not len(student) or not len(targets.cameras):

@@ -58,31 +58,11 @@ def register(
     An unreadable photo gets status "refused"; the others are still registered.
 
     Args:
-        scene: the scene; poses are in world coordinates, including its offset.
         photos: C views with photos, K, size and distortion; their poses are ignored.
         starts: name → (4, 4) camera_from_world.
-        pool: starting poses for photos that are not in `starts`.
         truth: name → (4, 4) camera_from_world, used only for scoring.
-        config: see `RegisterConfig`.
-        keep: which poses to keep: "registered", "uncertain" (both), or "all", which falls back to the
-            starting pose.
-        background: RGB behind the scene.
-        progress: called after every photo.
 
-    Returns:
-        The kept cameras, and a report on all photos.
-
-    Raises:
-        InputError: no photos, an unknown `keep`, no starting pose or pool, an invalid pose, or an unknown
-            matcher.
-        MissingDependencyError: a matcher is requested but the extra `register` is not installed.
-
-    >>> from g2ard.scene.cameras import Camera
-    >>> dot = Splats.create([[0, 0, 0]], scales=[[0.1] * 3], logit_opacities=[9])
-    >>> view = Cameras.of([Camera.facing([0, -2, 0], [0, 0, 0], name="a.png")])
-    >>> report = register(dot, view, starts={"a.png": view.viewmats[0]}).report
-    >>> report.photos[0].status, report.photos[0].reason
-    ('refused', 'view 0 (a.png) has no photo; pass views with photos')
+    Other arguments, results and errors are those of `g2ard.register`.
     """
     config = config or RegisterConfig()
     if not len(photos):
