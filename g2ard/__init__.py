@@ -205,7 +205,7 @@ def __getattr__(name: str) -> Any:
 
 
 def _extension() -> Any:
-    """Import `g2ard._core`; a checkout has none until it is built."""
+    """Import `g2ard._core`, which is missing from a checkout until it is built."""
     from importlib import import_module
 
     try:

@@ -144,7 +144,7 @@ class Console:
         self._clear()
 
     def say(self, text: str, *, asked: bool = False) -> None:
-        """Print a line of status; with --quiet only what was asked for."""
+        """Print a line of status; --quiet hides it unless the user asked for it."""
         if self.quiet and not asked:
             return
         with self._lock:

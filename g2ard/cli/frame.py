@@ -219,7 +219,7 @@ class Run:
         self.console.say(text)
 
     def answer(self, text: str) -> None:
-        """Print a line that the user asked for to stderr, also with --quiet."""
+        """Print a line to stderr that the user asked for, even with --quiet."""
         self.tell_notes()
         self.console.say(text, asked=True)
 

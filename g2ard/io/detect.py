@@ -63,7 +63,7 @@ _CONVERTERS = {
     ".lcc": "`splat-transform scene.lcc scene.ply` (npm: @playcanvas/splat-transform) converts it",
     ".rad": "convert the scene that it was built from; Spark builds .rad files from .ply, .spz or .sog",
 }
-"""What to do with scenes of other programs."""
+"""Advice for scenes of other programs."""
 
 MANIFEST, JOURNAL, POINTS = "tiles.json", "journal.json", ".points"
 """Files of finished and unfinished folders of tiles, and their folder of points to lift."""

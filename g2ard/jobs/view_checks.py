@@ -29,9 +29,10 @@ _COMPARED_PHOTOS, _COMPARED_SIDE = 15, 160
 _SHOWN_SHARE = 0.05
 """Share of a photo that the scene must cover for a comparison."""
 _UNRELATED_CORRELATION = 0.2
-"""Correlation below which the photos are of something else, or posed in other coordinates. Plush, caliterra,
-fox and chair, as lifted points or as 2,000 Gaussians after 20 steps: 0.52 to 0.92 with their own photos, at
-most 0.18 with those of the others; playbot, paljassaare and guitar with these photos: at most 0.12."""
+"""Correlation below which photos show something else, or have poses in other coordinates.
+
+Plush, caliterra, fox and chair have 0.52 to 0.92 with their own photos, and at most 0.18 with the others',
+as lifted points or as 2,000 Gaussians after 20 steps. Playbot, paljassaare and guitar have at most 0.12."""
 _BACKGROUND_SLACK = 4 / 255
 """Difference of two background colours that matters."""
 _BLIND_VIEWS_SHARE = 0.1

@@ -120,7 +120,7 @@ def _map_colmap(folder: Path) -> None:
 
 
 def _city(folder: Path) -> None:
-    """What `python -m benchmarks synth city` writes."""
+    """Write the files of `python -m benchmarks synth city`."""
     folder.mkdir()
     _cloud(folder / "cloud.ply")
     for name, count in (("train", 24), ("val", 6)):
