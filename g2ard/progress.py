@@ -1,7 +1,5 @@
 """Progress and status callbacks, and helpers for messages."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from typing import Any, Protocol
 

@@ -1,7 +1,5 @@
 """The typer application, and its commands."""
 
-from __future__ import annotations
-
 from importlib import import_module
 from typing import Annotated
 

@@ -1,7 +1,5 @@
 """Config files: options in TOML, read by --config and written by --print-config."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Iterable

@@ -1,7 +1,5 @@
 """The program: its arguments, its streams and its exit status."""
 
-from __future__ import annotations
-
 import gc
 import os
 import sys

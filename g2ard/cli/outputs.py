@@ -1,7 +1,5 @@
 """Output paths: one per budget, from a pattern if there are several."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Sequence
 from pathlib import Path

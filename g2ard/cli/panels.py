@@ -1,7 +1,5 @@
 """Panels that group options in `--help`."""
 
-from __future__ import annotations
-
 from typing import Any, get_args
 
 COMMON = "Common"

@@ -1,7 +1,5 @@
 """Resume an interrupted run, or discard it with `-w`."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """The folder of a `distill` run: its files, and earlier runs in it."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from collections.abc import Iterable, Iterator, Mapping

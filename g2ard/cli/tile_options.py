@@ -1,7 +1,5 @@
 """Options for scenes larger than memory: --tile-rows, --memory, --workers, --scheduler, --work."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

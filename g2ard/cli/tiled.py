@@ -1,7 +1,5 @@
 """`simplify` and `distill` on scenes in tiles: outputs, reports and messages."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict

@@ -1,7 +1,5 @@
 """One-line messages: usage errors, and library errors with flags for parameters."""
 
-from __future__ import annotations
-
 import re
 import sys
 from collections.abc import Iterable, Mapping

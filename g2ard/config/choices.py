@@ -3,8 +3,6 @@
 This module imports nothing heavy, so that `--help` stays fast.
 """
 
-from __future__ import annotations
-
 from typing import Literal, get_args
 
 Colour = tuple[float, float, float]

@@ -1,7 +1,5 @@
 """Reader for ACE's pose files: text, one photo per line."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Animations: images in order as .gif, .webp or, by ffmpeg, .mp4."""
 
-from __future__ import annotations
-
 import itertools
 import shutil
 import subprocess

@@ -1,7 +1,5 @@
 """Reader for Cambridge Landmarks: poses from dataset_*.txt, focal lengths from reconstruction.nvm."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import NamedTuple
 

@@ -3,8 +3,6 @@
 They hold less than g2ard's own .json; `lost_views` says what a format cannot hold.
 """
 
-from __future__ import annotations
-
 import json
 import os
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """Reader and writer for coloured point clouds in .ply files."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any

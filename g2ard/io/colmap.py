@@ -1,7 +1,5 @@
 """Reader for COLMAP models: cameras and images, binary or text. Rigs and frames (COLMAP 4) are ignored."""
 
-from __future__ import annotations
-
 import math
 import struct
 from collections.abc import Callable, Iterator, Sequence

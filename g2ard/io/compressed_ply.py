@@ -1,7 +1,5 @@
 """Reader and writer for SuperSplat's .compressed.ply: 16 bytes per Gaussian, quantised in chunks of 256."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Iterator

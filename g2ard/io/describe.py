@@ -1,7 +1,5 @@
 """Figures of a file, for `g2ard info`."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace

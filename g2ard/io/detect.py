@@ -1,7 +1,5 @@
 """Format detection by extension, then by content; cameras beside a scene."""
 
-from __future__ import annotations
-
 import os
 import re
 from collections.abc import Callable

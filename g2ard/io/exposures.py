@@ -1,7 +1,5 @@
 """Reader for exposure.json of 3DGS: photo → 3×4 matrix C with photo = C·(render, 1)."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -7,8 +7,6 @@ The values of an SPZ (KHR_gaussian_splatting_compression_spz_2) are glTF coordin
 The draft asks for SPZ's own axes, which differ by half a turn about y.
 """
 
-from __future__ import annotations
-
 import json
 import struct
 from collections.abc import Sequence

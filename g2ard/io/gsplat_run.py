@@ -1,7 +1,5 @@
 """Reader for result folders of gsplat's simple_trainer.py, whose cfg.yml names the COLMAP data."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from g2ard.errors import InputError

@@ -1,7 +1,5 @@
 """Reader for cameras.json, which INRIA's trainer writes into a model's folder."""
 
-from __future__ import annotations
-
 from collections import Counter
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Reader for .ksplat of GaussianSplats3D: sections of rows at one of three compression levels, SH 0–2."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any, NamedTuple
 

@@ -1,7 +1,5 @@
 """Reader for LiDAR point clouds, .las and .laz, with laspy and lazrs."""
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Iterator
 from contextlib import contextmanager

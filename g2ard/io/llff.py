@@ -1,7 +1,5 @@
 """Reader for LLFF's poses_bounds.npy beside a folder of photos."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Folder locks between processes, released by the operating system when the holder dies."""
 
-from __future__ import annotations
-
 import os
 import sys
 from collections.abc import Iterator

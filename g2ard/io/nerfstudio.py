@@ -1,7 +1,5 @@
 """Reader for nerfstudio runs: the cameras of the data, moved into the training world."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from pathlib import Path

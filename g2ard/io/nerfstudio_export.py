@@ -1,7 +1,5 @@
 """Reader for `ns-export cameras` of nerfstudio: transforms_train.json and transforms_eval.json."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Helpers for writers of packed formats: checks, row order, quaternions."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

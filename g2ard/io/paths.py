@@ -1,7 +1,5 @@
 """Checks for paths: links, special files, names that leave their folder."""
 
-from __future__ import annotations
-
 import hashlib
 import os
 from collections import Counter

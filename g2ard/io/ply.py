@@ -1,7 +1,5 @@
 """Reader and writer for standard 3DGS .ply files, in the layout of INRIA's trainer."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterable, Iterator
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Helpers for PLY readers: headers, rows and errors that name the file."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """Coloured point clouds in blocks, for clouds larger than memory."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass, replace

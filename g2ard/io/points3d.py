@@ -1,7 +1,5 @@
 """Reader for COLMAP's sparse points as a coloured point cloud."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Reader for Polycam's raw data: one .json of ARKit's camera per photo in `keyframes`."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Base class of reports: dataclasses that convert to and from JSON."""
 
-from __future__ import annotations
-
 import types
 from collections.abc import Mapping
 from dataclasses import MISSING, dataclass, fields

@@ -4,8 +4,6 @@ A folder may hold a scene in spatial chunks, named `{lod}_{chunk}` or listed by 
 finest level of detail is read.
 """
 
-from __future__ import annotations
-
 import re
 import struct
 import zipfile

@@ -1,7 +1,5 @@
 """Decoder for a chunk of a SOG scene: a meta.json and images."""
 
-from __future__ import annotations
-
 import io
 import math
 from collections.abc import Callable, Iterator

@@ -9,8 +9,6 @@
 | shN | one of K entries of a palette, whose values go through a codebook of 256 |
 """
 
-from __future__ import annotations
-
 import io
 import json
 import math

@@ -1,7 +1,5 @@
 """Reader and writer for antimatter15's .splat: 32 bytes per Gaussian, no header, SH degree 0."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Splits of views into training and held-out ones."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 from typing import Any

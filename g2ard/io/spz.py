@@ -5,8 +5,6 @@ quaternion's y and z and every harmonic odd in them. Version 4 may name other ax
 of type, length and content between header and table of streams.
 """
 
-from __future__ import annotations
-
 import gzip
 import math
 import struct

@@ -1,7 +1,5 @@
 """Scenes in blocks, for scenes larger than memory."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace

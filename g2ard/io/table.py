@@ -1,7 +1,5 @@
 """Writer of a scene's attributes as a table in .csv, for spreadsheets and data frames."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

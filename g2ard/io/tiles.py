@@ -1,7 +1,5 @@
 """Reader for folders of tiles (`g2ard ingest`) as scenes."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from g2ard.io.stream import PartsStream

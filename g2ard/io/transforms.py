@@ -1,7 +1,5 @@
 """Reader for transforms.json of instant-ngp, nerfstudio and NeRF's synthetic scenes."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from typing import Any

@@ -4,8 +4,6 @@ The written stage has y up and z back, as SPZ: y and z change sign, as do the qu
 harmonic odd in them. Scales and opacities are linear. Band 0 precedes the other bands, as in a .ply.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, TextIO

@@ -1,7 +1,5 @@
 """Budgets: an exact count from a count, share, ratio, device, file size or quality."""
 
-from __future__ import annotations
-
 import math
 import re
 from dataclasses import dataclass

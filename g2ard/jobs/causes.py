@@ -1,7 +1,5 @@
 """Likely causes of a poor recovery, by cheap checks."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator
 
 import numpy as np

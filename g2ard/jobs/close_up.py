@@ -1,7 +1,5 @@
 """How many Gaussians viewers blend per pixel close to a scene's surfaces."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from g2ard.errors import InputError

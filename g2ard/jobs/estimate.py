@@ -1,7 +1,5 @@
 """Rough estimates of a distillation's time and memory, from a few renders and steps on this machine."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """A fully prepared distillation and its run."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path

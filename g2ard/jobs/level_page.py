@@ -1,7 +1,5 @@
 """index.html beside levels of detail."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal

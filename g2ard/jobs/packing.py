@@ -1,7 +1,5 @@
 """Quality that a packed format costs, measured by reading the file back."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

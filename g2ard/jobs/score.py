@@ -1,7 +1,5 @@
 """Scores of a distillation, as `g2ard distill` writes them to report.json, and of a recovery."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

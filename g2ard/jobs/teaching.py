@@ -1,7 +1,5 @@
 """Views and targets of the commands that train on images or score against them."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any

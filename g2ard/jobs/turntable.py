@@ -1,7 +1,5 @@
 """Turntables: ordered views on a circle around a scene."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

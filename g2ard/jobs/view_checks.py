@@ -1,7 +1,5 @@
 """Checks whether given or found views show a scene."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

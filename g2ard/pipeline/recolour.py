@@ -1,7 +1,5 @@
 """Appearance from new images: a change of all colours, and blending per Gaussian."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

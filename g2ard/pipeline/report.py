@@ -1,7 +1,5 @@
 """Reports of the pipeline: views, rounds, seconds."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 from g2ard.io.reports import LEFT_OUT, Report

@@ -1,7 +1,5 @@
 """Exposures of photos: affine colour transforms that trainers fit, undone in targets."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

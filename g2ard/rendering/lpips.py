@@ -1,7 +1,5 @@
 """LPIPS (Zhang et al. 2018), version 0.1, with weights supplied by the user; nothing is downloaded."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Image metrics: PSNR, PSNR of gradients and SSIM of float images in [0, 1]."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

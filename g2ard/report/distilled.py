@@ -1,7 +1,5 @@
 """Report page and preview picture of a distillation, and the report page of a run in tiles."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from itertools import zip_longest
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Scores of a scene before and after recovery, by kind of view."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from statistics import fmean

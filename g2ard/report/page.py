@@ -1,7 +1,5 @@
 """HTML page with style and script; each image is stored once and can be shown several times."""
 
-from __future__ import annotations
-
 import base64
 import json
 from collections.abc import Collection, Sequence

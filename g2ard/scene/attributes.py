@@ -1,7 +1,5 @@
 """Attributes of Gaussians by name, as columns, and conditions on them."""
 
-from __future__ import annotations
-
 import ast
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Scenes in the form that kernels take: finite, contiguous, within float32's range, sorted once."""
 
-from __future__ import annotations
-
 from dataclasses import fields, replace
 from functools import cached_property
 from typing import Any

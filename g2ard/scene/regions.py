@@ -1,7 +1,5 @@
 """Regions given by the user: spheres and boxes in world coordinates."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import Any

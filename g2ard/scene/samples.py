@@ -1,7 +1,5 @@
 """Evenly spaced indices, and weighted quantiles."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

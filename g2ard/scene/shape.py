@@ -1,7 +1,5 @@
 """Shapes of Gaussians: needles, the effective rank, and the two longer axes."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

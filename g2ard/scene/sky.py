@@ -1,7 +1,5 @@
 """Sky and far background of a scene."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -1,7 +1,5 @@
 """The device that kernels run on. A GPU's results are the CPU's within rounding, and repeatable."""
 
-from __future__ import annotations
-
 import os
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Peak memory of this process and its workers."""
 
-from __future__ import annotations
-
 _WORKERS: dict[int, int] = {}
 """Worker process ID → peak bytes."""
 

@@ -1,7 +1,5 @@
 """Executors of tasks: this process, processes of this machine, or a Dask cluster."""
 
-from __future__ import annotations
-
 import os
 import signal
 import threading

@@ -1,7 +1,5 @@
 """Simplification of a tiled scene to one exact budget."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Callable, Iterator, Sequence

@@ -1,7 +1,5 @@
 """Writing rows of scenes and point clouds to tile files."""
 
-from __future__ import annotations
-
 import shutil
 from abc import ABC, abstractmethod
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Recovery of a tiled scene: each tile is trained amid its frozen surroundings."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

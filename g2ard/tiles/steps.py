@@ -15,8 +15,6 @@ Between steps the tiles agree on a common frame for costs and on how many Gaussi
 N counts the tile's rows with finite values; "ordered rows" are these in Morton order.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, replace

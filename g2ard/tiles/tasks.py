@@ -1,7 +1,5 @@
 """Tasks (pure functions from files to one file), and the scenes and cameras in those files."""
 
-from __future__ import annotations
-
 import gc
 import hashlib
 import json

@@ -1,7 +1,5 @@
 """Writer for viewer pages: viewer, scenes and start camera in one HTML file."""
 
-from __future__ import annotations
-
 import base64
 import json
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """`g2ard adapt`."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

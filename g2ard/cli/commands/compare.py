@@ -1,7 +1,5 @@
 """`g2ard compare`: how far a scene is from another."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

@@ -1,7 +1,5 @@
 """`g2ard ingest`: a scene of any size → tiles."""
 
-from __future__ import annotations
-
 import time
 from pathlib import Path
 from typing import Annotated

@@ -1,7 +1,5 @@
 """`g2ard lift`: coloured point cloud → Gaussians."""
 
-from __future__ import annotations
-
 import time
 from pathlib import Path
 from typing import Annotated

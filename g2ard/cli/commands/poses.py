@@ -1,7 +1,5 @@
 """`g2ard poses`: scene → generated views."""
 
-from __future__ import annotations
-
 import re
 from typing import Annotated
 

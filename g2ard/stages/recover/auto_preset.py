@@ -1,7 +1,5 @@
 """Measures of a prior (the dense scene), and the regularisers that they suggest."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Checkpoints of recovery, and interruption between steps instead of within one."""
 
-from __future__ import annotations
-
 import json
 import signal
 import threading

@@ -1,7 +1,5 @@
 """Objective and interface of the engines that run recovery's steps."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any, Protocol
 

@@ -1,7 +1,5 @@
 """Choice of the engine that runs recovery's steps: fused, torch or gsplat."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 from g2ard.config.choices import ENGINES

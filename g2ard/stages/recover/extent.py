@@ -1,7 +1,5 @@
 """Size of each Gaussian in a view, and the resulting reduction of its rates."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 from torch import Tensor

@@ -1,7 +1,5 @@
 """Engine that runs whole steps in Rust: forward, loss, backward, regularisers and sparse Adam."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Engine for NVIDIA GPUs: gsplat's rasteriser, torch's loss, Adam by rows."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -1,7 +1,5 @@
 """Steps of one recovery, the choice of rates before them, and checkpoints."""
 
-from __future__ import annotations
-
 import hashlib
 import math
 import time

@@ -1,7 +1,5 @@
 """Losses of recovery in torch: photometric, L_shape and L_anchor (`eq:shape`, `eq:anchor`)."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import torch

@@ -1,7 +1,5 @@
 """PSNR of a few views during recovery."""
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Recovery report, and messages about unusual outcomes."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 

@@ -1,7 +1,5 @@
 """Adam that skips Gaussians without a gradient."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Length unit of each Gaussian, and the typical size of Gaussians in views."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -1,7 +1,5 @@
 """Engine in torch: autograd over the Rust rasteriser and loss, Adam by rows."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager

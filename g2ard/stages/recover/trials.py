@@ -1,7 +1,5 @@
 """Short trials that choose the multiplier of all rates."""
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Callable

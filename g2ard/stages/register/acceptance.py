@@ -1,7 +1,5 @@
 """Acceptance of an estimated pose: registered, uncertain or refused."""
 
-from __future__ import annotations
-
 from g2ard.stages.register.config import RegisterConfig
 from g2ard.stages.register.report import PoseError, Status
 

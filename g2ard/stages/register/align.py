@@ -10,8 +10,6 @@ where ∇I is the mean of g·∇R and ∇P (efficient second-order minimisation:
 again.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """Attempts on one photo: poses from features, from direct alignment, and from both."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 

@@ -1,7 +1,5 @@
 """Grey images, their gradients and similarity measures."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -5,8 +5,6 @@ A matcher is a function of two (H, W, 3) float images in [0, 1], the photo and t
 of the first pixel is (½, ½), as in COLMAP and in K.
 """
 
-from __future__ import annotations
-
 import importlib
 import os
 import platform

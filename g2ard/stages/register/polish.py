@@ -8,8 +8,6 @@ pixel; this gradient goes through the rasteriser (`Renderer.pose_gradient`). Ste
 with alignment's matrix as the Hessian.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

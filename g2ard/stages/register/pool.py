@@ -1,7 +1,5 @@
 """Starting poses for photos without one: pool poses whose small renders are most similar to the photo."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

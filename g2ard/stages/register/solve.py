@@ -6,8 +6,6 @@ Cauchy's ρ; both by pycolmap. A render at the new pose is more similar to the p
 the pose converges.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """View selection by light: views that resolve the Gaussians which other views leave unresolved."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """View selection by poses: a kernel between poses, representatives, and sampling weights."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,8 +1,6 @@
 """The methods `default` and `fast` ("pairwise" in the core): merging weighted by visibility, then fitting
 opacities."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, Protocol

@@ -1,7 +1,5 @@
 """Reports of simplification."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 from g2ard.io.reports import LEFT_OUT, Report
