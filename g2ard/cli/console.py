@@ -250,7 +250,6 @@ class Console:
             self._print(stage, now)
 
     def _print(self, stage: _Stage, now: float) -> None:
-        """Print a stage as one line."""
         count = f"{stage.done}/{stage.total}" if stage.total > 1 else str(stage.done or "")
         parts = [f"{stage.name}: {count}".rstrip(), duration(now - stage.began)]
         if stage.ended is None and (left := stage.left(now)) is not None:
@@ -260,7 +259,6 @@ class Console:
         print("  ".join([*parts, *stage.figures]), file=sys.stderr, flush=True)
 
     def _draw(self) -> None:
-        """Draw the live line."""
         if self._live is None:
             from rich.console import Console as Rich
             from rich.live import Live

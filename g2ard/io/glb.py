@@ -140,7 +140,6 @@ def _about_y(splats: Splats) -> Splats:
 
 
 def _glb(path: Path, document: dict[str, Any], blobs: list[bytes]) -> list[bytes]:
-    """Return the parts of a .glb file."""
     start = sum(map(len, blobs))
     text = json.dumps(document, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 4)

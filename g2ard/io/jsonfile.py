@@ -29,7 +29,6 @@ def read_json(path: Path) -> dict[str, Any]:
 
 
 def read_json_list(path: Path) -> list[Any]:
-    """Return the list in a JSON file."""
     content = read_any_json(path)
     if not isinstance(content, list):
         raise InputError("expected a JSON list", path=path)
@@ -74,7 +73,6 @@ class Place:
         return replace(self, property=deeper.removeprefix("."))
 
     def error(self, message: str) -> InputError:
-        """Return an error that names this place."""
         return InputError(
             message, path=self.path, property=self.property or None, index=self.index, item=self.item
         )

@@ -75,7 +75,6 @@ def read(path: Path) -> Scene:
 
 
 def _section(path: Path, data: bytes, i: int) -> _Section:
-    """Read the header of section `i`."""
     at = _HEADER + i * _SECTION
     words = np.frombuffer(data, "<u4", 11, at).tolist()
     block = float(np.frombuffer(data, "<f4", 1, at + 16)[0])

@@ -21,7 +21,6 @@ def is_export(content: Any) -> bool:
 
 
 def exported(folder: Path) -> list[Path]:
-    """Return the exported lists in a folder."""
     lists = [folder / name for name in LISTS if (folder / name).is_file()]
     return [file for file in lists if is_export(read_any_json(file))]
 

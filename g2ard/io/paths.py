@@ -28,7 +28,6 @@ def check_regular(path: Path) -> None:
 
 
 def read_text(path: Path) -> str:
-    """Return the content of a text file."""
     try:
         return path.read_text(encoding="utf-8")
     except OSError as error:

@@ -132,7 +132,6 @@ def posed(quat: ArrayLike, translation: ArrayLike) -> NDArray[np.float64]:
 
 
 def inverse(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Invert a (4, 4) rigid transform."""
     R, t = matrix[:3, :3], matrix[:3, 3]
     out = np.eye(4)
     out[:3, :3], out[:3, 3] = R.T, -R.T @ t

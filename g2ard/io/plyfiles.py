@@ -40,7 +40,6 @@ class PlyHeader:
 
 
 def read_header(path: Path) -> PlyHeader:
-    """Read a header without the data."""
     try:
         with path.open("rb") as file:
             head = file.read(_HEADER_LIMIT)

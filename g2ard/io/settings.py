@@ -82,7 +82,6 @@ class Settings:
 
 
 def read_settings(path: Path) -> Settings:
-    """Read a file of settings."""
     return Settings(read_text(path).splitlines())
 
 

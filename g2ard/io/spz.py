@@ -187,7 +187,6 @@ def _zstd_streams(path: Path, data: bytes, stream_count: int, sizes: list[int]) 
 
 
 def _zstandard(path: Path) -> Any:
-    """Return the module for Zstandard."""
     try:
         if sys.version_info >= (3, 14):
             from compression import zstd

@@ -118,7 +118,6 @@ class ViewSet:
         return ViewSet(self.cameras.take(rows), self.notes, splits, weights)
 
     def noted(self, code: str, count: int, text: str) -> ViewSet:
-        """Add a note."""
         return replace(self, notes=(*self.notes, Note(code, count, text)))
 
     def resized(self, longest: int | None) -> ViewSet:

@@ -90,7 +90,6 @@ class Reduction:
         say_regions(self.splats, self.config, "the scene", self.say)
 
     def __call__(self, count: int) -> Simplified:
-        """Return the scene at a budget."""
         if count not in self._made:
             made = simplify(
                 self.splats,

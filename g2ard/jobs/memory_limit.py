@@ -93,7 +93,6 @@ def _rounded_down(value: float) -> int:
 
 
 def _limit_text(tiling: Tiling) -> str:
-    """Return the limit of memory and its origin."""
     size = amount(tiling.usable_memory)
     return f"--memory {size}" if tiling.memory else f"the {size} used of the machine's memory"
 

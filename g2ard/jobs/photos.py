@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,12 +19,9 @@ from g2ard.io.images import composited, load_premultiplied
 from g2ard.io.splits import for_training
 from g2ard.io.types import Points
 from g2ard.jobs.hull import VisualHull, visual_hull
-from g2ard.jobs.inputs import load_view_sets
+from g2ard.jobs.inputs import Views, load_view_sets
 from g2ard.progress import Progress, Say, plural, silent
 from g2ard.scene.cameras import Cameras
-
-if TYPE_CHECKING:
-    from g2ard.jobs.inputs import Views
 
 _PHOTO_SIDE = 240
 """Longer side in pixels of the photos used to place points."""

@@ -51,7 +51,6 @@ class RegisterJob:
     progress: Progress = silent
 
     def run(self) -> Registered:
-        """Estimate the poses."""
         return find_poses(**vars(self))
 
 

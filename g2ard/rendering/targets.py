@@ -49,7 +49,6 @@ def against_of(targets: Targets, view: int) -> str | None:
 
 
 def kinds_of(targets: Targets) -> str:
-    """Describe the kinds of the targets."""
     said = [against_of(targets, view) for view in range(len(targets.cameras))]
     return kinds_told(said.count("photo"), said.count("teacher"))
 

@@ -128,7 +128,6 @@ class Page:
         )
 
     def figure(self, image: NDArray[np.uint8], caption: str) -> None:
-        """Add a picture."""
         number, text = self._image(image), escape(caption)
         self._parts.append(
             f'<figure class="wide"><img data-i="{number}" alt="{text}">'

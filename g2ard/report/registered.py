@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,9 +17,7 @@ from g2ard.rendering.renderer import Renderer
 from g2ard.report.page import Comparison, Page, Shown
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
-
-if TYPE_CHECKING:
-    from g2ard.stages.register.report import PhotoReport, Registered
+from g2ard.stages.register.report import PhotoReport, Registered
 
 _VIEWS, _SIZE = 12, 640
 """Number of photos shown, and the longer side of their images in pixels."""

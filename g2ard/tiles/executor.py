@@ -138,7 +138,6 @@ class _Processes:
             raise WorkerDiedError from None
 
     def close(self) -> None:
-        """Kill the workers."""
         if self._pool is None:
             return
         processes = list((self._pool._processes or {}).values())

@@ -149,7 +149,6 @@ class Journal:
         files.checks[index] = zlib.crc32(data, files.checks[index])
 
     def save(self) -> None:
-        """Write the journal to disk."""
         content = {
             "key": self.key,
             "settings": self.settings,

@@ -359,7 +359,6 @@ class TiledRun:
         return self.workers.run(tasks, stage)
 
     def sample(self) -> Splats:
-        """Return a representative sample of the scene."""
         return join([scene_of(path, "sample") for path in self.coarse])
 
     def sampled_frame(self) -> tuple[float, ...]:

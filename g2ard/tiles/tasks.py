@@ -80,7 +80,6 @@ class Task:
 
     @property
     def output(self) -> Path:
-        """Path of the output file."""
         return self.folder / f"{self.label}-{self.key}.npz"
 
     @property

@@ -101,7 +101,6 @@ def _rows(matrix: Float) -> tuple[tuple[float, ...], ...]:
 
 
 def _poses(what: str, poses: Mapping[str, ArrayLike] | None, photos: Cameras) -> dict[str, Float]:
-    """Return the poses of the photos that have one."""
     out = {}
     for name in photos.names:
         if poses and name in poses:

@@ -49,7 +49,6 @@ VisibilitySource = Callable[[Splats], Visibility]
 
 
 def rows_of(visibility: Visibility, count: int, finite: NDArray[np.bool_] | slice) -> SampledVisibility:
-    """Return the finite rows of a visibility, contiguous."""
     for name in ("weight", "pixel_size"):
         shape = getattr(visibility, name).shape
         if shape != (count,):
