@@ -1,5 +1,14 @@
 //! The error type of the core.
 
+/// Return the error of an invalid argument if a condition holds: `refuse!(condition => name, expected, got)`.
+macro_rules! refuse {
+    ($bad:expr => $name:expr, $expected:expr, $got:expr) => {
+        if $bad {
+            return Err($crate::Error::invalid($name, $expected, $got));
+        }
+    };
+}
+
 /// Errors of kernels. Messages are one line that names the field, the expected and the actual value.
 #[derive(Debug, thiserror::Error, PartialEq)]
 pub enum Error {
@@ -40,10 +49,8 @@ impl Error {
         expected: usize,
         what: &str,
     ) -> Result<()> {
-        if got == expected {
-            return Ok(());
-        }
-        Err(Self::invalid(name, format!("{expected} {what}"), got))
+        refuse!(got != expected => name, format!("{expected} {what}"), got);
+        Ok(())
     }
 }
 

@@ -4,11 +4,13 @@
 //! and [`train`]; [`quantize`] serves file formats, [`register`] photos. [`backend`] alone knows the stages whose kernels a device may run.
 //! Results never depend on the number of threads: every reduction has a fixed order.
 
+#[macro_use]
+pub mod error; // first, for its macro
+
 pub mod backend;
 pub mod constants;
 pub mod control;
 mod cpu;
-pub mod error;
 pub mod lift;
 pub mod linalg;
 pub mod quantize;

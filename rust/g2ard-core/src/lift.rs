@@ -5,7 +5,7 @@ use rayon::prelude::*;
 use crate::constants::constants;
 use crate::linalg::{Sym3, outer, quat_from_rotation, sub, symmetric_eigen};
 use crate::spatial::{Neighbor, Tree};
-use crate::{Control, Error, Result};
+use crate::{Control, Result};
 
 constants! {
     /// Defaults are the paper's.
@@ -23,21 +23,14 @@ constants! {
 
 impl LiftConfig {
     fn validate(&self) -> Result<()> {
-        if self.neighbors < 3 {
-            return Err(Error::invalid("neighbors", "at least 3", self.neighbors));
-        }
+        refuse!(self.neighbors < 3 => "neighbors", "at least 3", self.neighbors);
         for (name, value, least) in [
             ("spread", self.spread, 0.0),
             ("normal_ratio", self.normal_ratio, 0.0),
             ("max_anisotropy", self.max_anisotropy, 1.0),
         ] {
-            if !(value.is_finite() && value >= least && value > 0.0) {
-                return Err(Error::invalid(
-                    name,
-                    format!("a number above {least}"),
-                    value,
-                ));
-            }
+            refuse!(!(value.is_finite() && value >= least && value > 0.0) =>
+                name, format!("a number above {least}"), value);
         }
         Ok(())
     }

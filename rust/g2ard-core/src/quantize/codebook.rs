@@ -2,7 +2,7 @@
 
 use rayon::prelude::*;
 
-use crate::{Error, Result};
+use crate::Result;
 
 /// More distinct values than this are merged into at most twice as many bins; fewer are kept separate.
 const BINS: usize = 4096;
@@ -75,12 +75,8 @@ pub fn codebook(values: &[f32], weights: Option<&[f32]>, count: usize) -> Result
 }
 
 fn check(values: &[f32], weights: Option<&[f32]>, count: usize) -> Result<()> {
-    if values.is_empty() {
-        return Err(Error::invalid("values", "at least one", 0));
-    }
-    if count == 0 || count > 1 << 16 {
-        return Err(Error::invalid("count", "1 to 65536", count));
-    }
+    refuse!(values.is_empty() => "values", "at least one", 0);
+    refuse!(count == 0 || count > 1 << 16 => "count", "1 to 65536", count);
     super::palette::check_weights(weights, values.len())?;
     super::palette::check_finite("values", values, 1)
 }

@@ -91,12 +91,9 @@ pub fn palette(
     steps: usize,
     control: &Control,
 ) -> Result<Palette> {
-    if dims == 0 || values.is_empty() || !values.len().is_multiple_of(dims) {
-        return Err(Error::invalid("points", "rows of one length", values.len()));
-    }
-    if count == 0 || count > 1 << 16 {
-        return Err(Error::invalid("count", "1 to 65536", count));
-    }
+    refuse!(dims == 0 || values.is_empty() || !values.len().is_multiple_of(dims) =>
+        "points", "rows of one length", values.len());
+    refuse!(count == 0 || count > 1 << 16 => "count", "1 to 65536", count);
     let points = Rows {
         dims,
         values,
@@ -168,10 +165,7 @@ pub fn check_weights(weights: Option<&[f32]>, count: usize) -> Result<()> {
     let Some(weights) = weights else {
         return Ok(());
     };
-    if weights.len() != count {
-        let wanted = format!("one for each of {count} rows");
-        return Err(Error::invalid("weights", wanted, weights.len()));
-    }
+    refuse!(weights.len() != count => "weights", format!("one for each of {count} rows"), weights.len());
     match weights.iter().position(|w| !(w.is_finite() && *w >= 0.0)) {
         Some(row) => {
             let got = format!("{} in row {row}", weights[row]);

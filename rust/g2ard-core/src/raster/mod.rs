@@ -39,8 +39,8 @@ pub use pose::PoseGradient;
 pub use rasterizer::{Image, ImageGradients, Rasterizer};
 pub use simd::Isa;
 
+use crate::Result;
 use crate::scene::limits::MAX_OPACITY;
-use crate::{Error, Result};
 
 /// Pixels on a tile's side.
 pub const TILE: usize = 16;
@@ -70,32 +70,13 @@ impl Camera {
     pub fn validate(&self) -> Result<()> {
         let pose = self.viewmat.iter().flatten();
         let all = pose.chain([&self.fx, &self.fy, &self.cx, &self.cy]);
-        if !all.into_iter().all(|v| v.is_finite()) {
-            return Err(Error::invalid(
-                "camera",
-                "finite pose and intrinsics",
-                "NaN or infinity",
-            ));
-        }
-        if self.fx <= 0.0 || self.fy <= 0.0 {
-            return Err(Error::invalid(
-                "camera",
-                "positive focal lengths",
-                format!("{} {}", self.fx, self.fy),
-            ));
-        }
+        refuse!(!all.into_iter().all(|v| v.is_finite()) => "camera", "finite pose and intrinsics", "NaN or infinity");
+        refuse!(self.fx <= 0.0 || self.fy <= 0.0 =>
+            "camera", "positive focal lengths", format!("{} {}", self.fx, self.fy));
         let most = 1 << 15;
-        if self.width == 0 || self.height == 0 || self.width > most || self.height > most {
-            let got = format!("{}×{}", self.width, self.height);
-            return Err(Error::invalid(
-                "camera",
-                format!("an image of 1 to {most} pixels a side"),
-                got,
-            ));
-        }
-        if self.near.is_nan() || self.near <= 0.0 {
-            return Err(Error::invalid("near", "a positive distance", self.near));
-        }
+        refuse!(self.width == 0 || self.height == 0 || self.width > most || self.height > most =>
+            "camera", format!("an image of 1 to {most} pixels a side"), format!("{}×{}", self.width, self.height));
+        refuse!(self.near.is_nan() || self.near <= 0.0 => "near", "a positive distance", self.near);
         Ok(())
     }
 
@@ -168,20 +149,9 @@ impl Default for Settings {
 
 impl Settings {
     pub fn validate(&self) -> Result<()> {
-        if !(ALPHA_MIN..1.0).contains(&self.alpha_max) {
-            return Err(Error::invalid(
-                "alpha_max",
-                "a value in [1/255, 1)",
-                self.alpha_max,
-            ));
-        }
-        if !(1e-12..1.0).contains(&self.transmittance_min) {
-            return Err(Error::invalid(
-                "transmittance_min",
-                "a value in [1e-12, 1)",
-                self.transmittance_min,
-            ));
-        }
+        refuse!(!(ALPHA_MIN..1.0).contains(&self.alpha_max) => "alpha_max", "a value in [1/255, 1)", self.alpha_max);
+        refuse!(!(1e-12..1.0).contains(&self.transmittance_min) =>
+            "transmittance_min", "a value in [1e-12, 1)", self.transmittance_min);
         Ok(())
     }
 }

@@ -1,7 +1,7 @@
 //! Access to the Gaussians' stored values, sixteen rows at a time.
 
 use super::simd::{LANES, Lanes, Lanes16};
-use crate::{Error, Result};
+use crate::Result;
 
 /// N Gaussians in the torch layout: row-major borrowed slices, each in its stored (not activated) space.
 #[derive(Debug, Clone, Copy)]
@@ -33,13 +33,7 @@ impl Params<'_> {
 
     /// Every slice has N rows and K is that of a degree from 0 to 3.
     pub fn validate(&self) -> Result<()> {
-        if ![1, 4, 9, 16].contains(&self.sh_coeffs) {
-            return Err(Error::invalid(
-                "sh",
-                "1, 4, 9 or 16 coefficients",
-                self.sh_coeffs,
-            ));
-        }
+        refuse!(![1, 4, 9, 16].contains(&self.sh_coeffs) => "sh", "1, 4, 9 or 16 coefficients", self.sh_coeffs);
         let n = self.len();
         check_count(n)?;
         for (name, slice, width) in [
@@ -49,13 +43,8 @@ impl Params<'_> {
             ("sh0", self.sh0, 3),
             ("shN", self.sh_n, 3 * (self.sh_coeffs - 1)),
         ] {
-            if slice.len() != n * width {
-                return Err(Error::invalid(
-                    name,
-                    format!("{n} rows of {width}"),
-                    format!("{} values", slice.len()),
-                ));
-            }
+            refuse!(slice.len() != n * width =>
+                name, format!("{n} rows of {width}"), format!("{} values", slice.len()));
         }
         Ok(())
     }
@@ -63,9 +52,7 @@ impl Params<'_> {
 
 /// Rows and their slots are numbered in 32 bits.
 pub(crate) fn check_count(rows: usize) -> Result<()> {
-    if rows > u32::MAX as usize / 64 {
-        return Err(Error::invalid("means", "at most 67 million rows", rows));
-    }
+    refuse!(rows > u32::MAX as usize / 64 => "means", "at most 67 million rows", rows);
     Ok(())
 }
 

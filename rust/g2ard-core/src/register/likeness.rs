@@ -4,7 +4,7 @@ use rayon::prelude::*;
 
 use super::normal::median;
 use super::{Size, dot};
-use crate::{Error, Result};
+use crate::Result;
 
 /// Variance of grey in a window, in [0, 1]², below which it has no contrast to compare (1 %).
 const FLAT: f64 = 1e-4;
@@ -17,10 +17,8 @@ pub fn local_zncc(a: &[f64], b: &[f64], mask: &[bool], size: Size, side: usize) 
     size.check("a", a, 1)?;
     size.check("b", b, 1)?;
     size.check("mask", mask, 1)?;
-    if side == 0 || side > size.height.min(size.width) {
-        let expected = format!("1 to {}", size.height.min(size.width));
-        return Err(Error::invalid("side", expected, side));
-    }
+    refuse!(side == 0 || side > size.height.min(size.width) =>
+        "side", format!("1 to {}", size.height.min(size.width)), side);
     // squares about the images' middles: less is lost to rounding than about 0
     let about = [mean(a), mean(b)];
     let row = |sums: &mut [Vec<f64>; MOMENTS], y: usize| -> Vec<f64> {

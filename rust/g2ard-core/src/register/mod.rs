@@ -10,7 +10,7 @@ pub use likeness::local_zncc;
 pub use normal::{Lens, Light, Normal, Photo, Render, flow, normal_equations};
 pub use shot::{Shot, shot};
 
-use crate::{Error, Result};
+use crate::Result;
 
 /// Rows and columns of an image.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -26,13 +26,7 @@ impl Size {
 
     fn check<T>(self, name: &'static str, values: &[T], channels: usize) -> Result<()> {
         let expected = self.pixels() * channels;
-        if values.len() != expected || expected == 0 {
-            return Err(Error::invalid(
-                name,
-                format!("{expected} values, some"),
-                values.len(),
-            ));
-        }
+        refuse!(values.len() != expected || expected == 0 => name, format!("{expected} values, some"), values.len());
         Ok(())
     }
 }

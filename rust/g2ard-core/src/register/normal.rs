@@ -3,7 +3,7 @@
 use rayon::prelude::*;
 
 use super::{Size, dot, slope};
-use crate::{Error, Result};
+use crate::Result;
 
 /// Residuals beyond this many standard deviations have no weight (Tukey): 95 % as efficient as least squares.
 const TUKEY: f64 = 4.685;
@@ -119,9 +119,7 @@ pub fn normal_equations(
             .collect();
         deviation(residuals).max(LEAST_SCALE)
     });
-    if !(scale.is_finite() && scale > 0.0) {
-        return Err(Error::invalid("scale", "a positive number", scale));
-    }
+    refuse!(!(scale.is_finite() && scale > 0.0) => "scale", "a positive number", scale);
     let row = |columns: &mut Columns, y: usize| -> Sums {
         columns.iter_mut().for_each(Vec::clear);
         let mut cost = 0.0;

@@ -67,9 +67,7 @@ impl SceneRef<'_> {
 
     fn validate(&self) -> Result<()> {
         let n = self.len();
-        if n >= u32::MAX as usize {
-            return Err(Error::invalid("means", "fewer than 2³² − 1 rows", n));
-        }
+        refuse!(n >= u32::MAX as usize => "means", "fewer than 2³² − 1 rows", n);
         for (name, rows) in [
             ("quats", self.quats.len()),
             ("scales", self.scales.len()),

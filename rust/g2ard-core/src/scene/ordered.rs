@@ -5,7 +5,7 @@ use rayon::prelude::*;
 use super::{Gaussian, SceneRef};
 use crate::linalg::{rotation_from_quat, sub};
 use crate::spatial::{RobustBounds, code, codes, order};
-use crate::{Error, Result, Splats};
+use crate::{Result, Splats};
 
 /// Merged means lie on a grid of this share of the scene's radius (rounded down to a power of two), so that adding a
 /// dyadic origin back is exact.
@@ -47,10 +47,8 @@ impl Ordered {
                 *flag = true;
             }
         }
-        if rows.len() != scene.len() || there.contains(&false) {
-            let expected = format!("each of {} rows once", scene.len());
-            return Err(Error::invalid("order", expected, rows.len()));
-        }
+        refuse!(rows.len() != scene.len() || there.contains(&false) =>
+            "order", format!("each of {} rows once", scene.len()), rows.len());
         Ok(Self::of(scene, rows, bounds))
     }
 

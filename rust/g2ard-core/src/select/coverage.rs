@@ -37,14 +37,9 @@ impl Coverage {
             ("offset", self.offset, self.offset > 0.0),
             ("epsilon", self.epsilon, self.epsilon > 0.0),
         ] {
-            if !(ok && value.is_finite()) {
-                return Err(Error::invalid(name, "a positive number", value));
-            }
+            refuse!(!(ok && value.is_finite()) => name, "a positive number", value);
         }
-        if !(1..=MAX_ANCHORS).contains(&self.anchors) {
-            let expected = format!("1 to {MAX_ANCHORS}");
-            return Err(Error::invalid("anchors", expected, self.anchors));
-        }
+        refuse!(!(1..=MAX_ANCHORS).contains(&self.anchors) => "anchors", format!("1 to {MAX_ANCHORS}"), self.anchors);
         Ok(())
     }
 
@@ -79,10 +74,8 @@ impl Problem<'_> {
         let n = self.visible.len();
         Error::unless_equal("positions", self.positions.len(), n, "rows")?;
         let cells = self.surface.len() as u32;
-        if self.visible.iter().flatten().any(|&c| c >= cells) {
-            let expected = format!("cells below {cells}");
-            return Err(Error::invalid("visible", expected, "one beyond"));
-        }
+        refuse!(self.visible.iter().flatten().any(|&c| c >= cells) =>
+            "visible", format!("cells below {cells}"), "one beyond");
         lazy_greedy(State::new(*self, *coverage), k, control)
     }
 }

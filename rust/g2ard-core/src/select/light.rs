@@ -3,7 +3,7 @@
 use rayon::prelude::*;
 
 use super::lazy::{Chosen, Objective, lazy_greedy};
-use crate::{Control, Error, Result};
+use crate::{Control, Result};
 
 /// Rows summed together: the order of the sum does not depend on the number of threads.
 const CHUNK: usize = 4096;
@@ -21,14 +21,11 @@ impl Light<'_> {
     /// The `k` views that greedy maximisation of Σ_i log(1 + before_i + Σ_v received_vi) picks.
     pub fn greedy(&self, k: usize, control: &Control) -> Result<Chosen> {
         let rows = self.before.len();
-        if rows == 0 || !self.received.len().is_multiple_of(rows) {
-            let expected = format!("a multiple of {rows} values");
-            return Err(Error::invalid("received", expected, self.received.len()));
-        }
+        refuse!(rows == 0 || !self.received.len().is_multiple_of(rows) =>
+            "received", format!("a multiple of {rows} values"), self.received.len());
         let bad = |v: f64| !(v >= 0.0 && v.is_finite());
-        if self.before.iter().any(|&v| bad(v)) || self.received.iter().any(|&v| bad(v.into())) {
-            return Err(Error::invalid("received", "numbers, at least 0", "others"));
-        }
+        refuse!(self.before.iter().any(|&v| bad(v)) || self.received.iter().any(|&v| bad(v.into())) =>
+            "received", "numbers, at least 0", "others");
         let state = State {
             received: self.received,
             total: self.before.to_vec(),

@@ -26,9 +26,7 @@ impl Gaussians<'_> {
         ] {
             Error::unless_equal(name, rows, n, "rows")?;
         }
-        if n == 0 {
-            return Err(Error::invalid("means", "at least one Gaussian", 0));
-        }
+        refuse!(n == 0 => "means", "at least one Gaussian", 0);
         let bad = |i: &usize| {
             let i = *i;
             !(self.means[i].iter().all(|v| v.is_finite())

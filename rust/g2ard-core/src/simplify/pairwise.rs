@@ -201,16 +201,12 @@ impl Pairwise {
                 return Err(Error::invalid(name, format!("{} rows", scene.len()), rows));
             }
         }
-        if self.neighbors == 0 {
-            return Err(Error::invalid("neighbors", "at least 1", 0));
-        }
+        refuse!(self.neighbors == 0 => "neighbors", "at least 1", 0);
         for (name, value) in [
             ("morton_premerge_ratio", self.morton_premerge_ratio),
             ("max_growth", self.max_growth),
         ] {
-            if value.is_nan() || value < 1.0 {
-                return Err(Error::invalid(name, "at least 1", value));
-            }
+            refuse!(value.is_nan() || value < 1.0 => name, "at least 1", value);
         }
         Ok(())
     }

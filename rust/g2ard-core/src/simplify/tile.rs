@@ -99,10 +99,7 @@ impl Tile<'_> {
     ) -> Result<TilePlan> {
         let blur = self.blurs();
         let leaves = self.leaves(&blur)?;
-        if runs == 0 || runs > leaves.len() {
-            let expected = format!("1 to {}", leaves.len());
-            return Err(Error::invalid("runs", expected, runs));
-        }
+        refuse!(runs == 0 || runs > leaves.len() => "runs", format!("1 to {}", leaves.len()), runs);
         Error::unless_equal("costs", costs.len(), leaves.len() - 1, "gaps")?;
         control.begin((runs - schedule.last().map_or(runs, |&last| last.min(runs))) as u64);
         let (mut nodes, at) = if runs < leaves.len() {

@@ -22,13 +22,8 @@ impl Steps<'_> {
     /// Distances along unit rays at which they first meet a full cell; infinite where they do not.
     pub fn cast(&self, eyes: &[[f64; 3]], directions: &[[f64; 3]]) -> Result<Vec<f64>> {
         let count: usize = self.shape.iter().product();
-        if self.steps.len() != count || count == 0 {
-            return Err(Error::invalid(
-                "steps",
-                format!("{count} cells, at least 1"),
-                self.steps.len(),
-            ));
-        }
+        refuse!(self.steps.len() != count || count == 0 =>
+            "steps", format!("{count} cells, at least 1"), self.steps.len());
         Error::unless_equal("directions", directions.len(), eyes.len(), "rows")?;
         let rays = eyes.par_iter().zip(directions);
         Ok(rays

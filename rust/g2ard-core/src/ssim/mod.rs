@@ -9,7 +9,7 @@ mod metrics;
 pub use loss::Loss;
 pub use metrics::{psnr, ssim};
 
-use crate::{Error, Result};
+use crate::Result;
 
 pub(crate) const RADIUS: usize = 5;
 pub(crate) const TAPS: usize = 2 * RADIUS + 1;
@@ -34,13 +34,8 @@ impl Shape {
     }
 
     pub(crate) fn check(&self, name: &'static str, image: &[f32]) -> Result<()> {
-        if self.values() == 0 || image.len() != self.values() {
-            let expected = format!(
-                "{}×{}×{} values, more than none",
-                self.height, self.width, self.channels
-            );
-            return Err(Error::invalid(name, expected, image.len()));
-        }
+        refuse!(self.values() == 0 || image.len() != self.values() =>
+            name, format!( "{}×{}×{} values, more than none", self.height, self.width, self.channels ), image.len());
         Ok(())
     }
 }

@@ -195,12 +195,8 @@ impl Trainer {
         {
             return Err(Error::invalid("reach", "pixels, more than 0", reach));
         }
-        if !(input.finest >= 0.0 && input.finest.is_finite()) {
-            return Err(Error::invalid("finest", "pixels, at least 0", input.finest));
-        }
-        if input.regularizers.is_some() && self.anchors.is_none() {
-            return Err(Error::invalid("regularizers", "anchors set before", "none"));
-        }
+        refuse!(!(input.finest >= 0.0 && input.finest.is_finite()) => "finest", "pixels, at least 0", input.finest);
+        refuse!(input.regularizers.is_some() && self.anchors.is_none() => "regularizers", "anchors set before", "none");
         self.image.resize(shape.values(), 0.0);
         self.gradient.resize(shape.values(), 0.0);
         self.alpha.resize(camera.width * camera.height, 0.0);

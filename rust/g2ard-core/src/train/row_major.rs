@@ -45,9 +45,7 @@ pub fn step_rows(
     let rows = counts.len();
     for attribute in attributes.iter() {
         let all = attribute.values.len();
-        if rows == 0 || !all.is_multiple_of(rows) {
-            return Err(Error::invalid("values", "rows of equal length", all));
-        }
+        refuse!(rows == 0 || !all.is_multiple_of(rows) => "values", "rows of equal length", all);
         Error::unless_equal("first moments", attribute.first.len(), all, "values")?;
         Error::unless_equal("second moments", attribute.second.len(), all, "values")?;
         Error::unless_equal("gradients", attribute.gradients.len(), all, "values")?;

@@ -3,6 +3,7 @@
 use rayon::prelude::*;
 
 use super::Rasterizer;
+use crate::Result;
 use crate::raster::accumulate::{ALL, Accumulate, Accumulated, SharedSums, Total, smallest_pixels};
 use crate::raster::disjoint::DisjointSlice;
 use crate::raster::grid::TileGrid;
@@ -10,7 +11,6 @@ use crate::raster::params::{Params, Source};
 use crate::raster::simd::dispatch;
 use crate::raster::tile_batch::TileBatch;
 use crate::raster::{Camera, Settings};
-use crate::{Error, Result};
 
 impl Rasterizer {
     /// Renders a view without an image and adds what every Gaussian contributes to it.
@@ -24,13 +24,8 @@ impl Rasterizer {
         params.validate()?;
         camera.validate()?;
         settings.validate()?;
-        if sums.weight.len() != params.len() {
-            return Err(Error::invalid(
-                "accumulate",
-                format!("sums of {} rows", params.len()),
-                sums.weight.len(),
-            ));
-        }
+        refuse!(sums.weight.len() != params.len() =>
+            "accumulate", format!("sums of {} rows", params.len()), sums.weight.len());
         let colourless = Params {
             sh_n: &[],
             sh_coeffs: 1,

@@ -1,10 +1,10 @@
 //! The derivative of an image with respect to its pose.
 
 use super::{ChunkSums, ImageGradients, Rasterizer};
+use crate::Result;
 use crate::raster::params::Params;
 use crate::raster::pose::{GatherPose, PoseGradient};
 use crate::raster::simd::dispatch;
-use crate::{Error, Result};
 
 impl Rasterizer {
     /// dL/dξ of the last forward pass's pose T, where T ← exp(ξ)·T with ξ = (v, ω) in the camera's axes. `params` must be
@@ -17,13 +17,7 @@ impl Rasterizer {
     ) -> Result<PoseGradient> {
         params.validate()?;
         self.check_rendered("pose gradient", params.len(), image)?;
-        if image.depth.is_some() {
-            return Err(Error::invalid(
-                "pose gradient",
-                "no gradient of depth",
-                "one",
-            ));
-        }
+        refuse!(image.depth.is_some() => "pose gradient", "no gradient of depth", "one");
         let isa = self.isa;
         let parts = self.backward_by_chunk(image, |chunk: &ChunkSums| {
             let gather = GatherPose {
