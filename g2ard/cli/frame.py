@@ -135,6 +135,11 @@ class Run:
         told = {**options, **{name: value for name, value in common.items() if name not in unrecorded}}
         self.config = {name: _flat(value) for name, value in told.items()}
 
+    @property
+    def callbacks(self) -> dict[str, Any]:
+        """Arguments of jobs that report progress and messages."""
+        return {"progress": self.progress, "say": self.say}
+
     def settings(self, config: Any, *names: str, preset: str | None = None) -> dict[str, Any]:
         """Collect config values by path from options and --set, which wins.
 

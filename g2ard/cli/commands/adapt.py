@@ -80,8 +80,7 @@ def adapt(
         photos=photos,
         render_model=run.render_model,
         seed=run.seed,
-        progress=run.progress,
-        say=run.say,
+        **run.callbacks,
     )
     _, targets = teaching.training(splats, opt.with_images(views, images, alpha), split, size)
     with stoppable(run, work, resume, output):

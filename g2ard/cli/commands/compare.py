@@ -63,8 +63,7 @@ def compare(
         beside=paths[0],
         count=count,
         seed=run.seed,
-        progress=run.progress,
-        say=run.say,
+        **run.callbacks,
     )
     cameras = load_views(found, "all", size, run.say)
     check_sight(reference, cameras, run.say)

@@ -156,14 +156,7 @@ def distill(
     if scene is not None and is_tiled(scene, tiling):
         TiledCommand(run, scene, outputs, tiling, budgets).distill(options, folder_at)
         return
-    job = prepare(
-        scene,
-        budgets,
-        options,
-        counted=lambda total: outputs.check(check, total),
-        progress=run.progress,
-        say=run.say,
-    )
+    job = prepare(scene, budgets, options, counted=lambda total: outputs.check(check, total), **run.callbacks)
     folders = [folder_at(path) for path in outputs.paths(len(job.prior))]
     if dry_run:
         _tell_estimates(run, job, folders)

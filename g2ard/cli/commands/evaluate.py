@@ -99,8 +99,7 @@ def evaluate(
         photos=photos,
         render_model=run.render_model,
         seed=run.seed,
-        progress=run.progress,
-        say=run.say,
+        **run.callbacks,
     )
     teacher_stage = [] if teacher is None else [("teacher", 2.0)]
     of_scenes = [stage for path in scenes for stage in ((path.name, 4.0), ("visibility", 1.0))]

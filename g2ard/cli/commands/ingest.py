@@ -57,8 +57,7 @@ def ingest(
         lift=config,
         render_model=run.render_model,
         overwrite=run.overwrite,
-        progress=run.progress,
-        say=run.say,
+        **run.callbacks,
     )
     seconds = time.perf_counter() - began
     run.kept.append(f"{output} is written")

@@ -82,8 +82,7 @@ def recover(
         weighted=weighted,
         render_model=run.render_model,
         anchors=anchors,
-        progress=run.progress,
-        say=run.say,
+        **run.callbacks,
     )
     scoring = 0.01 * len(job.views.cameras)
     run.console.expect([("recover", 0.02 * job.config.horizon), ("scoring", scoring)])

@@ -146,8 +146,7 @@ def register(
         background=opt.background_of(run, background, scene),
         render_model=run.render_model,
         seed=run.seed,
-        progress=run.progress,
-        say=run.say,
+        **run.callbacks,
     )
     found = job.run()
     rows = found.report.photos

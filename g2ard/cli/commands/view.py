@@ -49,16 +49,7 @@ def view(
     loaded = [run.load(path) for path in paths]
     if views is None and scene.is_dir() and (scene / "views.json").is_file():
         views = scene / "views.json"
-    stand = frame_of(
-        loaded[0],
-        views,
-        start=start,
-        beside=paths[0],
-        up=up,
-        seed=run.seed,
-        progress=run.progress,
-        say=run.say,
-    )
+    stand = frame_of(loaded[0], views, start=start, beside=paths[0], up=up, seed=run.seed, **run.callbacks)
     named = zip(short_names(paths), loaded, strict=True)
     labels = [f"{name}: {plural(len(splats), 'Gaussian')}" for name, splats in named]
     run.begin("page")
