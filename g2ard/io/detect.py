@@ -222,26 +222,20 @@ def _folder_format(path: Path) -> Format:
     from g2ard.io.nerfstudio_export import exported
     from g2ard.io.transforms import files_of
 
-    if (path / nerfstudio.NAME).is_file():  # before its data, which has another world
-        return "nerfstudio"
-    if model_folder(path) is not None:
-        return "colmap"
-    if exported(path):
-        return "nerfstudio_export"
-    if files_of(path):
-        return "transforms"
-    if is_cambridge(path):
-        return "cambridge"
-    if (path / llff.NAME).is_file():
-        return "llff"
-    if polycam.cameras_in(path):
-        return "polycam"
-    if photos_beside(path):
-        return "colmap"
-    if (path / inria.NAME).is_file():
-        return "inria"
-    if gsplat_run.is_run(path / gsplat_run.NAME):
-        return "gsplat_run"
+    tests: tuple[tuple[Format, Callable[[Path], object]], ...] = (
+        ("nerfstudio", lambda path: (path / nerfstudio.NAME).is_file()),  # before its data in another world
+        ("colmap", model_folder),
+        ("nerfstudio_export", exported),
+        ("transforms", files_of),
+        ("cambridge", is_cambridge),
+        ("llff", lambda path: (path / llff.NAME).is_file()),
+        ("polycam", polycam.cameras_in),
+        ("colmap", photos_beside),
+        ("inria", lambda path: (path / inria.NAME).is_file()),
+        ("gsplat_run", lambda path: gsplat_run.is_run(path / gsplat_run.NAME)),
+    )
+    if found := next((name for name, holds in tests if holds(path)), None):
+        return found
     if any((path / journal).is_file() for journal in (JOURNAL, f"{POINTS}/{JOURNAL}")):
         raise InputError("has unfinished tiles", path=path, hint="run the same `g2ard ingest` to continue")
     if error := incomplete(path):
