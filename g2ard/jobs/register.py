@@ -220,15 +220,9 @@ def photos_of(
     alpha: Alpha = "composite",
     say: Say = unsaid,
 ) -> Cameras:
-    """Read photos with their intrinsics.
+    """Read views with photos, or a folder of photos with their intrinsics; see `register` for the arguments.
 
-    Args:
-        path: views with photos, or a folder of photos.
-        split: split of the views, see `g2ard.io.splits`; "all" for a folder.
-        intrinsics: for a folder: views with the intrinsics of each photo by name, or the same for all.
-        focal: for a folder: focal length in pixels of the stored photo; centred principal point, no
-            distortion. None takes that of the photos' EXIF, with a message.
-        alpha: "mask" ignores transparent pixels instead of showing them over the background.
+    `focal` is in pixels of the stored photo, with a centred principal point and no distortion.
 
     Returns:
         C cameras; photos from a folder have the identity as pose.
