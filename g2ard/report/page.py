@@ -19,6 +19,7 @@ _WINDOW, _CROPS = 0.28, 2
 
 _LONGEST = 1280
 _QUALITY = 86
+_HERE = Path(__file__).parent
 
 
 @dataclass(frozen=True, eq=False)
@@ -189,65 +190,17 @@ class Page:
     def text(self) -> str:
         """Return the HTML of the page."""
         images = json.dumps(self._images)
+        style, script = ((_HERE / name).read_text(encoding="utf-8") for name in ("page.css", "page.js"))
         return (
             '<!doctype html><html lang="en"><head><meta charset="utf-8">'
             '<meta name="viewport" content="width=device-width,initial-scale=1">'
-            f"<title>{escape(self._title)}</title><style>{_STYLE}</style></head><body><main>"
+            f"<title>{escape(self._title)}</title><style>\n{style}</style></head><body><main>"
             f"{''.join(self._parts)}</main>"
             f'<script type="application/json" id="images">{images}</script>'
-            f"<script>{_SCRIPT}</script></body></html>\n"
+            f"<script>\n{script}</script></body></html>\n"
         )
 
     def write(self, path: Path) -> None:
         """Write the page atomically, replacing an existing file."""
         with atomic_output(path, overwrite=True) as temporary:
             temporary.write_text(self.text(), encoding="utf-8", newline="\n")
-
-
-_STYLE = """
-:root{color-scheme:light dark;--bg:#fff;--fg:#1b2430;--soft:#5b6675;--line:#e3e7ec;--card:#f6f8fa}
-@media(prefers-color-scheme:dark){:root{--bg:#12161c;--fg:#e6eaf0;--soft:#98a3b3;--line:#2a313b;--card:#1a2029}}
-body{margin:0;background:var(--bg);color:var(--fg);font:15px/1.5 system-ui,sans-serif}
-main{max-width:1200px;margin:0 auto;padding:24px 20px 80px}
-h1{font-size:26px;margin:0}h2{margin:48px 0 4px;border-top:1px solid var(--line);padding-top:24px}
-h3{margin:28px 0 4px}h4{margin:0 0 8px;font-weight:600}
-.lead{font-size:18px;margin:6px 0 18px}figcaption{color:var(--soft);font-size:13px}
-.scroll{overflow-x:auto}
-table{border-collapse:collapse;font-size:13px;font-variant-numeric:tabular-nums;margin:8px 0}
-th,td{padding:4px 10px;text-align:right;border-bottom:1px solid var(--line);white-space:nowrap}
-th:first-child,td:first-child{text-align:left}th{color:var(--soft);font-weight:600}.best{font-weight:700}
-@media(max-width:600px){main{padding:16px 12px 60px}thead{display:none}table,tbody,tr{display:block}
-tr{padding:6px 0;border-bottom:1px solid var(--line)}
-td{display:flex;justify-content:space-between;gap:12px;padding:1px 0;border:0;white-space:normal;
-overflow-wrap:anywhere}td:first-child{font-weight:600}
-td::before{content:attr(data-column);color:var(--soft);font-weight:400;text-align:left;overflow-wrap:normal}}
-.view{background:var(--card);border-radius:8px;padding:14px;margin:14px 0}
-.slider{position:relative;overflow:hidden;border-radius:6px}
-.slider img{position:absolute;inset:0;width:100%;height:100%;user-select:none}
-.slider .over{clip-path:inset(0 0 0 50%)}
-.slider input{position:absolute;inset:0;width:100%;height:100%;margin:0;opacity:0;cursor:ew-resize}
-.slider::after{content:"";position:absolute;top:0;bottom:0;left:var(--at,50%);width:2px;background:#fff;
-box-shadow:0 0 3px #000;pointer-events:none}
-.slider:focus-within{outline:2px solid var(--fg)}
-.tag{position:absolute;top:8px;background:#000a;color:#fff;font-size:12px;padding:2px 8px;border-radius:4px}
-.tag.left{left:8px}.tag.right{right:8px}.pick{display:block;margin:8px 0;font-size:13px}
-select{font:inherit;max-width:100%}
-.r0{--roi:#2563eb}.r1{--roi:#d97706}
-.roi{position:absolute;box-sizing:border-box;border:2px solid var(--roi);pointer-events:none}
-.crops{display:flex;flex-wrap:wrap;gap:10px;margin-top:10px}.crop{margin:0;flex:1 1 90px;max-width:300px}
-.wide{margin:8px 0}.wide img{display:block;max-width:100%}
-.crop img{display:block;width:100%;box-sizing:border-box;border:2px solid var(--roi)}
-"""
-
-_SCRIPT = """
-const images=JSON.parse(document.getElementById('images').textContent);
-const show=img=>{img.src='data:image/jpeg;base64,'+images[img.dataset.i]};
-document.querySelectorAll('img[data-i]').forEach(show);
-document.querySelectorAll('.view').forEach(view=>{
-const slider=view.querySelector('.slider'),over=view.querySelector('.over'),range=view.querySelector('input'),
-pick=view.querySelector('select'),tag=view.querySelector('.right');
-const move=()=>{over.style.clipPath='inset(0 0 0 '+range.value+'%)';
-slider.style.setProperty('--at',range.value+'%')};
-const swap=()=>{over.dataset.i=pick.value;show(over);tag.textContent=pick.selectedOptions[0].textContent};
-range.addEventListener('input',move);pick.addEventListener('change',swap);move();swap();});
-"""
