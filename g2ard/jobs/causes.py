@@ -94,7 +94,7 @@ def _of_photos(splats: Splats, held_out: Targets, background: Colour) -> tuple[f
     views = [views[i] for i in evenly_spaced(len(views), _CHECKED_PHOTOS, floor=True)]
     alike, gains, seen_through, errors = [], [], [], []
     for alpha, image, photo in compared(splats, held_out, views, background):
-        alike.append(correlation(image, photo))
+        alike.append(correlation(image.mean(axis=1), photo.mean(axis=1)))
         gains.append(psnr(_exposed(image, photo)[None], photo[None]) - psnr(image[None], photo[None]))
         empty, error = alpha < 0.5, np.square(image - photo).sum(axis=1)
         errors.append(float(error[empty].sum() / max(float(error.sum()), 1e-12)))
@@ -149,8 +149,8 @@ def _one_colour(pixels: Floats) -> Colour | None:
 
 
 def correlation(image: Floats, photo: Floats) -> float:
-    """Return the correlation of the brightness of (N, 3) pixels."""
-    centred = [pixels.mean(axis=1) - pixels.mean() for pixels in (image, photo)]
+    """Return the correlation of (N,) values."""
+    centred = [values - values.mean() for values in (image, photo)]
     scale = np.linalg.norm(centred[0]) * np.linalg.norm(centred[1])
     return float(centred[0] @ centred[1] / scale) if scale > 0 else 0.0
 

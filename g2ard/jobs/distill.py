@@ -8,6 +8,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from g2ard.config.checks import checks_arguments
 from g2ard.config.choices import RenderModel, is_made
 from g2ard.errors import InputError
@@ -208,9 +210,10 @@ def prepare(
     if photos:
         given = options.named("recover.background") is not None
         propose_background(cameras, recover.background, given, say)
-        if not read.lifted:
-            insisted = options.photos is True
-            check_photos(prior, cameras, recover.background, say, insisted=insisted, renders=True)
+        if read.given:
+            shown = read.prior.take(np.arange(read.given)) if read.lifted else prior
+            insisted, renders_too = options.photos is True, not read.lifted
+            check_photos(shown, cameras, recover.background, say, insisted=insisted, renders=renders_too)
     say(_task(prior, aims, cameras, photos))
     say(f"regularisers: {preset_label}")
     config = options.configured(regularizers, default_degree)
@@ -286,6 +289,7 @@ class _Read:
 
     Args:
         lifted: whether it was lifted from a point cloud.
+        given: number of Gaussians, the first ones, from points that were not found in the photos.
         from_photos: whether the points, or some of them, were found in the photos, by COLMAP or here.
     """
 
@@ -293,6 +297,7 @@ class _Read:
     lifted: bool
     beside: str | Path | None
     name: str
+    given: int
     from_photos: bool = False
 
 
@@ -303,10 +308,10 @@ def _read(
     from g2ard.io import kind
 
     if isinstance(scene, Splats):
-        return _Read(scene, False, options.beside, "scene")
+        return _Read(scene, False, options.beside, "scene", len(scene))
     if isinstance(scene, str | Path) and kind(scene) == "splats":
         splats = load_scene(scene, say, options.render_model)
-        return _Read(splats, False, options.beside or scene, str(scene))
+        return _Read(splats, False, options.beside or scene, str(scene), len(splats))
     views, recover = options.views, options.config.recover
     if views is None or is_made(views):
         if scene is None:
@@ -316,6 +321,7 @@ def _read(
             "a point cloud cannot render training images", path=path, hint="give its photos with {views}"
         )
     points, name, of_photos = _points(scene, views, say)
+    given = 0 if points is None or scene is None else len(points)
     wanted = max((budget.count for budget in budgets if budget.count is not None), default=0)
     if points is None and not wanted:
         raise InputError(
@@ -337,7 +343,7 @@ def _read(
             say=say,
         )
     lifted = lift(points.positions, points.colors, **vars(options.config.lift), progress=progress)
-    return _Read(lifted, True, options.beside, name, of_photos)
+    return _Read(lifted, True, options.beside, name, given, of_photos)
 
 
 def _points(scene: Points | str | Path | None, views: Views, say: Say) -> tuple[Points | None, str, bool]:

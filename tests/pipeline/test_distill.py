@@ -157,7 +157,7 @@ def test_command_on_a_cloud_with_photos(command_line: CommandLine, tmp_path: Pat
 
 def test_a_scanned_cloud_and_photos_are_distilled(command_line: CommandLine, tmp_path: Path) -> None:
     """Positions of a million metres, one offset, photos in the same coordinates."""
-    city = ("benchmarks", "synth", "city", "-o", "city", "--points", "2k", "--views", 16, "--size", "32x24")
+    city = ("benchmarks", "synth", "city", "-o", "city", "--points", "10k", "--views", 16, "--size", "32x24")
     assert command_line(*city, "--offset", "443000,4428000,1600", cwd=tmp_path)[0] == 0
     error = refused(command_line, tmp_path, "info", "city", status=1)
     assert "cloud.ply (a point cloud), adapt.json, ood.json, train.json, val.json (views)\n" in error
@@ -167,7 +167,7 @@ def test_a_scanned_cloud_and_photos_are_distilled(command_line: CommandLine, tmp
         np.testing.assert_allclose(g2ard.load_points(tmp_path / name).positions, cloud.positions, atol=6e-4)
     ask = ("distill", name, "--views", "city/train.json", "-n", 400, "-o", "run", "--steps", 3, "--no-view")
     assert (
-        "2,000 → 400 Gaussians" in succeeds(command_line, tmp_path, *ask, "--held-out", "city/val.json").err
+        "10,000 → 400 Gaussians" in succeeds(command_line, tmp_path, *ask, "--held-out", "city/val.json").err
     )
     np.testing.assert_allclose(g2ard.load(tmp_path / "run" / "scene.ply").offset[1], 4428000, rtol=1e-4)
     away = g2ard.Cameras.of([g2ard.Camera.facing([0, 0, 0], [0, -9, 0], width=48, height=36)])
