@@ -195,6 +195,25 @@ ViewsFormatOption = Annotated[
         help="Also write generated views as cameras.json (inria), transforms.json (nerfstudio) or colmap/.",
     ),
 ]
+UNWRITTEN = Path("dry-run")
+"""Output of a dry run without -o."""
+
+
+def _need_no_output(ctx: typer.Context, dry_run: bool) -> bool:
+    if dry_run:
+        ctx.default_map = {"output": str(UNWRITTEN), **(ctx.default_map or {})}
+    return dry_run
+
+
+DryRunOption = Annotated[
+    bool,
+    typer.Option(
+        "--dry-run",
+        callback=_need_no_output,
+        is_eager=True,
+        help="Estimate time and memory, then exit; needs no -o.",
+    ),
+]
 ResumeOption = Annotated[bool, typer.Option("--resume", help="Continue an interrupted run.")]
 SizeOption = Annotated[
     int | None, typer.Option(min=16, metavar="PIXELS", help="Shrink images to this longer side.")

@@ -99,3 +99,20 @@ def test_a_dry_run_is_in_nobodys_way(command_line: CommandLine, folder: Path) ->
     assert "nothing is written" in succeeds(command_line, folder, *ask, "--dry-run").err
     succeeds(command_line, folder, "clean", "ball.ply", "-o", "views.json", "--dry-run")
     assert [path.name for path in (folder / "run").iterdir()] == ["kept.txt"]
+
+
+@pytest.mark.parametrize("budget", ["-r 10", "-n 90,45", "--fit 20kB", "--min-psnr 20"])
+def test_a_dry_run_needs_no_output(budget: str, folder: Path, command_line: CommandLine) -> None:
+    before = set(folder.iterdir())
+    ask = (*budget.split(), "--steps", 4, "--size", 48, "--dry-run")
+    succeeds(command_line, folder, "distill", "ball.ply", *ask)
+    if budget == "-r 10":
+        ask = ("--ratios", "1,2", *ask[2:])
+        succeeds(command_line, folder, "lod", "ball.ply", *ask)
+        (folder / "run.toml").write_text('output = "mine"\nsteps = 4\n')
+        error = succeeds(
+            command_line, folder, "distill", "ball.ply", *ask[-3:], "-r", 9, "--config", "run.toml"
+        ).err
+        assert "mine: " in error
+        (folder / "run.toml").unlink()
+    assert set(folder.iterdir()) == before

@@ -88,7 +88,7 @@ def distill(
     ] = None,
     background: opt.BackgroundOption = None,
     up: opt.UpOption = None,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Estimate time and memory, then exit.")] = False,
+    dry_run: opt.DryRunOption = False,
 ) -> None:
     """Distil a dense scene, or a point cloud with photos, into a compact scene.
 
@@ -124,6 +124,8 @@ def distill(
     if scene is None or photos:
         run.refuse_typed("without generated views", "up")
     opt.choose_engine(run, settings, "recover.engine")
+    if output == opt.UNWRITTEN and len(budgets) > 1:
+        output = Path("{count}")
     outputs = Outputs(run, output, budgets)
 
     def folder_at(path: Path) -> RunFolder:
@@ -200,8 +202,9 @@ def _tell_estimates(run: Run, job: DistillJob, folders: Sequence[RunFolder]) -> 
         one = estimate(job, budget, page=run.config["view"])
         parts = ", ".join(f"{stage} {_rounded(seconds)} s" for stage, seconds in one.seconds.items())
         about = f"about {max(1, one.total):.0f} s ({parts}) and {one.bytes / 1e6:,.0f} MB"
+        place = "" if folder.path == opt.UNWRITTEN else f"{folder.path}: "
         run.answer(
-            f"{folder.path}: {plural(budget, 'Gaussian')}, {plural(one.views, 'view')} "
+            f"{place}{plural(budget, 'Gaussian')}, {plural(one.views, 'view')} "
             f"of {one.pixels:,} pixels, {plural(one.steps, 'step')}: {about}"
         )
         found.append(one)

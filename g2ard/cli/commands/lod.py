@@ -110,10 +110,7 @@ def lod(
     background: opt.BackgroundOption = None,
     up: opt.UpOption = None,
     resume: opt.ResumeOption = False,
-    dry_run: Annotated[
-        bool,
-        typer.Option("--dry-run", help="Estimate time and memory, then exit."),
-    ] = False,
+    dry_run: opt.DryRunOption = False,
 ) -> None:
     """Write levels of detail as streamed SOG or 3D Tiles.
 
