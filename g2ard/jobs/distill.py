@@ -215,6 +215,8 @@ def prepare(
             insisted, renders_too = options.photos is True, not read.lifted
             check_photos(shown, cameras, recover.background, say, insisted=insisted, renders=renders_too)
     say(_task(prior, aims, cameras, photos))
+    if not read.from_photos and all(aim.count == len(prior) for aim in aims):
+        say(f"nothing to simplify: the scene has {plural(len(prior), 'Gaussian')}")
     say(f"regularisers: {preset_label}")
     config = options.configured(regularizers, default_degree)
     config = replace(config, recover=replace(config.recover, from_points=read.from_photos))

@@ -69,19 +69,18 @@ def estimate(job: DistillJob, budget: int, *, page: bool = True) -> Estimate:
     merged, merging = _merged(job, budget)
     views = len(train) + len(test) + near
     pixels = int(np.mean(train.widths.astype(np.int64) * train.heights))
-    steps = _steps(job, merged)
-    limit = job.config.recover.recovery_time
+    kept = job.is_kept(budget)
+    steps = 0 if kept else _steps(job, merged)
     return Estimate(
         views=views,
         pixels=pixels,
         steps=steps,
         seconds={
             "prepare": job.seconds,
-            "targets": per_view * views,
-            "simplify": merging + per_view * len(train),  # each view is rendered once for visibility
-            "recover": _RECOVERY_OVERHEAD * steps * _step_seconds(job, merged, targets)
-            if limit is None
-            else limit,
+            "targets": per_view * (len(test) + near if kept else views),
+            # each view is rendered once for visibility
+            "simplify": 0.0 if kept else merging + per_view * len(train),
+            "recover": _recovery_seconds(job, merged, targets, steps) if steps else 0.0,
             "score": per_view * (2 * len(test) + near),
         },
         bytes=_peak_bytes(job, merged, page)
@@ -102,10 +101,13 @@ def expected(job: DistillJob) -> list[tuple[str, float]]:
         if steps is None:
             points = job.config.recover.from_points
             steps = steps_from_points(aim.count, schedule.steps) if points else schedule.steps
+        if not job.is_kept(aim.count):
+            stages += [
+                ("visibility", 0.01 * train),
+                ("simplify", 1.2 * len(job.prior) / 500_000),
+                ("recover", 0.02 * steps),
+            ]
         stages += [
-            ("visibility", 0.01 * train),
-            ("simplify", 1.2 * len(job.prior) / 500_000),
-            ("recover", 0.02 * steps),
             ("scoring", 0.06 * test),
             ("report.html", 1.5),
             ("view.html", 1.0),
@@ -140,11 +142,14 @@ def _merged(job: DistillJob, budget: int) -> tuple[Splats, float]:
     return merged, seconds if job.config.simplify.method == "fast" else _MERGE_TIMES * seconds
 
 
-def _step_seconds(job: DistillJob, student: Splats, targets: Targets) -> float:
+def _recovery_seconds(job: DistillJob, student: Splats, targets: Targets, steps: int) -> float:
     config = job.config.recover
+    if config.recovery_time is not None:
+        return config.recovery_time
     schedule = replace(config.schedule, multiplier=1.0, reach=1.0)
     tried = replace(config, schedule=schedule, steps=_TRIAL_STEPS, recovery_time=None)
-    return recover(student, targets, tried).report.seconds / _TRIAL_STEPS
+    seconds = recover(student, targets, tried).report.seconds / _TRIAL_STEPS
+    return _RECOVERY_OVERHEAD * steps * seconds
 
 
 def _steps(job: DistillJob, student: Splats) -> int:

@@ -70,12 +70,21 @@ class DistillJob:
         """(C,) sampling weight per training view, if the views state them."""
         return self.views.train.weights if self.config.select.weighted else None
 
+    def is_kept(self, budget: int) -> bool:
+        """Return whether the scene already is the result: it fits, and its renders are the targets."""
+        degree = self.config.recover.sh_degree
+        return (
+            not self.reads_photos
+            and budget == len(self.prior)
+            and (degree is None or degree >= self.prior.sh_degree)
+            and self.config.recover.schedule.guarded
+        )
+
     @cached_property
     def targets(self) -> Targets:
         """Training targets."""
-        return self.targets_for(
-            self.views.train.cameras, self._renderer, lazy=self.config.select.views_count is not None
-        )
+        few = self.config.select.views_count is not None or all(map(self.is_kept, self.budgets))
+        return self.targets_for(self.views.train.cameras, self._renderer, lazy=few)
 
     @cached_property
     def held_out(self) -> Targets:
@@ -96,7 +105,8 @@ class DistillJob:
         cameras = self.views.apart
         if cameras is None or self.teacher is None or len(cameras) < 2:
             return None
-        return self.targets_for(cameras.take(range(first, len(cameras), 2)), self._renderer)
+        unused = first == 0 and all(map(self.is_kept, self.budgets))
+        return self.targets_for(cameras.take(range(first, len(cameras), 2)), self._renderer, lazy=unused)
 
     def render_targets(self) -> None:
         """Render all targets that are not lazy; `run` calls this too."""

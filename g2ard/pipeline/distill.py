@@ -224,7 +224,7 @@ class _Rounds:
             self._count_resumed(entry["simplify"]["seconds"])
         else:
             began = time.monotonic()
-            blind = self.config.simplify.method == "paper"
+            blind = self.config.simplify.method == "paper" or count == len(self.state)
             done = simplify(
                 self.state,
                 count,
@@ -265,6 +265,7 @@ class _Rounds:
                 progress=self.progress,
                 stage="recover" if final else f"recover {name}",
                 watch=self.watch,
+                skip_same=True,
             )
             self.state = done.splats
             entry.setdefault("recover", []).append(done.report.as_dict())

@@ -21,7 +21,7 @@ from g2ard.stages.simplify import SimplifyConfig
 from helpers.cloud_files import las
 from helpers.commands import CommandLine, refused, succeeds
 from helpers.interruptions import interrupt_at
-from helpers.photos import cloud_with_photos
+from helpers.photos import cloud_with_photos, photos_of
 from helpers.scenes import around, assert_same_bits, checkered_ball
 
 PRIOR = checkered_ball()
@@ -180,3 +180,35 @@ def test_a_scanned_cloud_and_photos_are_distilled(command_line: CommandLine, tmp
     las(tmp_path / "plain.las", cloud.positions, None)
     error = refused(command_line, tmp_path, "lift", "plain.las", "-o", "p.ply", status=1)
     assert "has no colours ('red', 'green', 'blue'); add colours" in error
+
+
+def test_a_scene_that_fits_is_written_as_it_is(command_line: CommandLine, tmp_path: Path) -> None:
+    """Nothing is merged or recovered, unless photos or a smaller SH degree ask for it."""
+    g2ard.save(tmp_path / "scene.ply", PRIOR)
+    ask = (
+        "distill",
+        "scene.ply",
+        "-n",
+        len(PRIOR),
+        "--size",
+        32,
+        "--steps",
+        4,
+        "--no-view",
+        "--json",
+        "-",
+        "-w",
+    )
+    out, error = succeeds(command_line, tmp_path, *ask, "-o", "run")
+    assert "nothing to simplify" in error
+    assert "recovery skipped" in error
+    assert "teacher:" not in error
+    assert json.loads(out)["rounds"][0]["recover"][0]["steps"] == 0
+    made = read_splats(tmp_path / "run" / "scene.ply")
+    rows = np.lexsort(made.means.T), np.lexsort(PRIOR.means.T)
+    np.testing.assert_array_equal(made.means[rows[0]], PRIOR.means[rows[1]])
+    assert json.loads(succeeds(command_line, tmp_path, *ask, "--dry-run").out)["runs"][0]["steps"] == 0
+    photos_of(tmp_path / "photos", scene=checkered_ball(1200), count=8)
+    for more in (("--views", "photos", "--photos"), ("--set", "recover.sh_degree=0")):
+        error = succeeds(command_line, tmp_path, *ask, *more, "-o", "run").err
+        assert "recovery skipped" not in error

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -32,6 +33,9 @@ from g2ard.stages.recover.report import (
 )
 
 __all__ = ["Recovered", "Watch", "recover"]
+
+_SAME_PSNR = 10 * math.log10(12 * 255**2)
+"""PSNR from which no image can show a gain, 58.9 dB: the error of rounding to 8 bits."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,6 +68,7 @@ def recover(
     progress: Progress = silent,
     stage: str = "recover",
     watch: Watch | None = None,
+    skip_same: bool = False,
 ) -> Recovered:
     """Optimise every attribute of a fixed set of Gaussians against targets (`eq:objective`).
 
@@ -83,6 +88,7 @@ def recover(
         frozen: (N,) bool, mask of Gaussians that stay unchanged, such as those of another tile; requires the
             engine `fused`. None freezes none.
         stage: stage name for progress.
+        skip_same: take no step if the student already renders as the targets.
 
     Other arguments, results and errors are those of `g2ard.recover`.
     """
@@ -103,6 +109,8 @@ def recover(
     probe = Probe(targets, config.background)
     before = probe.all_of(student)
     view_weights = checked_weights(weights, len(targets.cameras))
+    exact = skip_same and before >= _SAME_PSNR and config.schedule.guarded
+    validation = None if exact else validation
     others = None if validation is None else score_by_kind(validation, config.background)
 
     def harmful(scene: Splats) -> NDArray[np.bool_] | None:
@@ -113,12 +121,13 @@ def recover(
     guard = Guard(probe.all_of, student, before, others, harmful, config.schedule.guarded)
     validation_key = None if validation is None else fingerprint_of(validation)
     loop = Loop(student, targets, config, view_weights, anchors, probe, guard, validation_key, frozen)
-    if checkpoint is None or not checkpoint.exists():
-        progress("rates", 0, 0, {})
-        loop.choose_rates(before)
-    loop.run(checkpoint, progress, stage, watch)
-    end = loop.engine.splats()
-    result, after, blend = guard.choose_by_training(end)
+    if not exact:
+        if checkpoint is None or not checkpoint.exists():
+            progress("rates", 0, 0, {})
+            loop.choose_rates(before)
+        loop.run(checkpoint, progress, stage, watch)
+    end = student if exact else loop.engine.splats()
+    result, after, blend = (student, before, 1.0) if exact else guard.choose_by_training(end)
     prior_views: float | None = 0.0
     if result is end and validation is not None:
         result, prior_views = guard.choose_by_validation(end, loop.views_seen, loop.done)

@@ -138,6 +138,8 @@ def outcome(report: RecoverReport) -> str | None:
     rates'
     """
     start = f"(start {report.psnr.before:.2f})"
+    if not report.steps:
+        return "recovery skipped: the scene already renders as its targets"
     lines = [f"{found.psnr:.2f} dB {start} at step {found.step}" for found in report.backed_off]
     if report.kept_start:
         why = "every step made the training views worse"
