@@ -1,6 +1,6 @@
 """Progress and status callbacks, and helpers for messages."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, Protocol
 
 
@@ -41,3 +41,12 @@ def plural(count: int, one: str, many: str | None = None) -> str:
     ('1 row', '1,234 rows', '2 vertices')
     """
     return f"{count:,} {one if count == 1 else many or one + 's'}"
+
+
+def direction(axis: Iterable[float]) -> str:
+    """Format a direction as options take it.
+
+    >>> direction([-0.0, -0.9999, -0.001])
+    '0,-1,0'
+    """
+    return ",".join(f"{round(float(value), 2) + 0.0:g}" for value in axis)

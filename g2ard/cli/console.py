@@ -56,6 +56,20 @@ def _clock(seconds: float) -> str:
     return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
 
 
+def wrapped(text: str) -> str:
+    """Break lines between words where a terminal would break them within; paths stay whole."""
+    if not sys.stderr.isatty():
+        return text
+    from textwrap import TextWrapper
+
+    try:
+        columns = int(os.environ.get("COLUMNS") or 0) or os.get_terminal_size(sys.stderr.fileno()).columns
+    except (OSError, ValueError):
+        return text
+    wrapper = TextWrapper(columns or 80, break_long_words=False, break_on_hyphens=False)
+    return "\n".join(part for line in text.split("\n") for part in wrapper.wrap(line) or [""])
+
+
 @dataclass
 class _Stage:
     """The current stage; `first` units were done when it began, as after --resume."""
@@ -150,6 +164,7 @@ class Console:
         with self._lock:
             if self._stage is not None and not self._stage.total:
                 self._end_stage()  # its length was unknown; the message tells its result
+            text = wrapped(text)
             if self._live is not None:
                 self._live.console.print(text, markup=False, highlight=False, soft_wrap=True)
             else:
@@ -158,7 +173,7 @@ class Console:
     def error(self, text: str) -> None:
         with self._lock:
             self._clear()
-            print(f"g2ard: {text}", file=sys.stderr, flush=True)
+            print(wrapped(f"g2ard: {text}"), file=sys.stderr, flush=True)
 
     def table(self, title: str, columns: list[str], rows: list[list[str]], *, stdout: bool = False) -> None:
         """Print a table; columns with a header are right-aligned, except the first.

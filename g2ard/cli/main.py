@@ -8,6 +8,7 @@ from typing import TextIO
 import typer
 
 from g2ard.cli.app import app, register_commands
+from g2ard.cli.console import wrapped
 from g2ard.cli.usage import usage_line
 from g2ard.system import interrupt
 
@@ -38,7 +39,7 @@ def run_program(app: typer.Typer, name: str) -> None:
         message = usage_line(e)
         where = getattr(getattr(e, "ctx", None), "command_path", name)
         if message:  # empty when a group without arguments has already shown its help
-            print(f"{where}: {message} (see {where} --help)", file=sys.stderr)
+            print(wrapped(f"{where}: {message} (see {where} --help)"), file=sys.stderr)
         status = e.exit_code
     gc.freeze()  # skip the final collection
     sys.stdout.flush()

@@ -29,7 +29,7 @@ from g2ard.levels.tileset import Georeference, map_system
 from g2ard.levels.tileset import save_tileset as write_tileset
 from g2ard.levels.tree import Cut, Level
 from g2ard.pipeline.distill import distill as pipeline
-from g2ard.progress import Progress, Say, plural, silent, unsaid
+from g2ard.progress import Progress, Say, direction, plural, silent, unsaid
 from g2ard.rendering.visibility import visibility_source
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.samples import evenly_spaced
@@ -198,6 +198,8 @@ def prepare_levels(
         if (far := sky_mask(scene)).any():
             say(f"sky: {plural(int(far.sum()), 'Gaussian')}, kept whole")
             scene, sky = scene.take(~far), scene.take(far)
+        else:
+            say("sky: none found, so nothing is kept apart")
     job = prepare(
         scene,
         [Budget(ratio=ratio) for ratio in ratios],
@@ -362,8 +364,7 @@ def tileset_up(
     else:
         rows = np.array(evenly_spaced(len(coarse), _UP_SAMPLE, floor=True))
         axis = up_of(coarse.take(rows), up)
-    rounded = ", ".join(f"{round(value, 3) + 0.0:g}" for value in axis)
-    say(f"up is {rounded}" + ("" if up else "; --up X,Y,Z changes it"))
+    say(f"up is {direction(axis)}" + ("" if up else "; --up X,Y,Z changes it"))
     return axis
 
 

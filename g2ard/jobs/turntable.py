@@ -7,7 +7,7 @@ import numpy as np
 
 from g2ard.jobs.view_checks import opaque_points
 from g2ard.poses import plan_pool
-from g2ard.progress import Progress, Say, silent, unsaid
+from g2ard.progress import Progress, Say, direction, silent, unsaid
 from g2ard.scene.cameras import Cameras, look_at
 from g2ard.scene.splats import Splats
 
@@ -36,7 +36,7 @@ def turntable(
     pool = plan_pool(scene, _TURN_POOL, size=size, up=up, seed=seed, progress=progress)
     points, axis = opaque_points(scene), np.asarray(pool.up, np.float64)
     if up is None:
-        say(f"up: {','.join(f'{value:.2f}' for value in axis)}, estimated; --up X,Y,Z sets it")
+        say(f"up: {direction(axis)}, estimated; --up X,Y,Z sets it")
     first = max(pool.cameras, key=lambda view: float(view.holds(points).mean()))
     eye, ahead = first.position, first.viewmat[2, :3]
     held = points[first.holds(points)]

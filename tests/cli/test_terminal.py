@@ -211,3 +211,29 @@ def test_an_error_in_the_middle_comes_last(shown: Callable[..., Screen]) -> None
     assert screen.status in (1, 2)
     assert_tidy(screen)
     assert "missing.json" in "".join(screen.lines)
+
+
+LONG = (
+    ("distill", "--fit", "9MB"),
+    ("lod", "--environment"),
+    ("render", "--orbit", "3"),
+    ("distill", "--views", "winter", "--photos", "--resume"),
+    ("simplify", "-n", "10"),
+)
+
+
+@pytest.mark.parametrize("ask", LONG, ids=" ".join)
+def test_messages_break_between_words(ask: tuple[str, ...], shown: Callable[..., Screen]) -> None:
+    """At every width the words of messages, tables and bars aside, are those of a wide terminal."""
+    words = {word.strip(":,") for word in " ".join(shown(*ask, columns=500).lines).split()}
+    for columns in (40, 80):
+        screen = shown(*ask, columns=columns)
+        assert_tidy(screen)
+        strange = [
+            word
+            for line in screen.lines
+            if not re.search("[━│┃]", line)
+            for word in line.split()
+            if word.strip(":,") not in words and not re.search(r"\d", word) and len(word) < columns - 1
+        ]
+        assert not strange, "\n".join(screen.lines)

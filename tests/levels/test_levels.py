@@ -189,6 +189,9 @@ def test_the_sky_is_the_environment(tmp_path: Path, command_line) -> None:
     sky = Splats.create(60 * rays / np.linalg.norm(rays, axis=1)[:, None], scales=np.full((100, 3), 8.0))
     io.write_splats(tmp_path / "a.ply", join([ball, sky]))
     words = ("lod", "a.ply", "-o", "out", "-r", "1,8", "--merge-only", "--size", "48")
+    io.write_splats(tmp_path / "ball.ply", ball)
+    error = succeeds(command_line, tmp_path, "lod", "ball.ply", "--dry-run", "--environment").err
+    assert "sky: none" in error
     assert "sky: 100 Gaussians" in succeeds(command_line, tmp_path, *words, "--environment").err
     meta = json.loads((tmp_path / "out" / "lod-meta.json").read_text())
     assert (meta["environment"], meta["counts"]) == ("env/meta.json", [800, 100])

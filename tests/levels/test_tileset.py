@@ -140,13 +140,15 @@ def test_the_command_writes_3d_tiles(tmp_path: Path, command_line: CommandLine) 
     write_splats(tmp_path / "a.ply", replace(checkered_ball(800), offset=np.array(UTM)))
     words = ["lod", "a.ply", "-r", "1,4", "--merge-only", "--format", "3dtiles", "-o"]
     there = ["--georeference", "24.75,59.43,31.5,45"]
-    assert "up is 0, 0, 1" in succeeds(command_line, tmp_path, *words, "out", *there).err
+    error = succeeds(command_line, tmp_path, *words, "out", *there).err
+    assert "up is 0,0,1" in error
+    assert "http://localhost:8000/?cesium=" in error
     tileset = json.loads((tmp_path / "out" / "tileset.json").read_text())
     assert tileset["extras"]["counts"] == [800, 200]
     origin = np.array(tileset["root"]["transform"][12:15])
     np.testing.assert_allclose(origin, geocentric(24.75, 59.43, 31.5), atol=1e-6)
     succeeds(command_line, tmp_path, *words, "out", *there, "--resume")
-    assert "up is 0, -1, 0" in succeeds(command_line, tmp_path, *words, "down", "--up=-0,-1,-0").err
+    assert "up is 0,-1,0" in succeeds(command_line, tmp_path, *words, "down", "--up=-0,-1,-0").err
     succeeds(command_line, tmp_path, *words, "tiled", *there, "--tile-rows", "300")
     tiled = json.loads((tmp_path / "tiled" / "tileset.json").read_text())
     assert tiled["root"]["transform"] == tileset["root"]["transform"]

@@ -311,7 +311,8 @@ class _Writer:
             seed=run.seed,
             progress=run.progress,
         )
-        run.say(f"page: python -m http.server --directory {self.output}, then http://localhost:8000")
+        query = "" if self.kind == "sog" else "/?cesium=URL (a folder of CesiumJS)"
+        run.say(f"page: python -m http.server --directory {self.output}, then http://localhost:8000{query}")
         return written
 
 

@@ -9,7 +9,7 @@ from g2ard.cli.frame import Run, command
 from g2ard.cli.options import OutputOption, SceneArgument, UpOption, ViewFormatOption
 from g2ard.config.choices import PoolKind
 from g2ard.io import check_views_output
-from g2ard.progress import plural
+from g2ard.progress import direction, plural
 
 _LEAST_REPORTED_SHARE = 0.005
 """Share of the scene too small to report."""
@@ -74,8 +74,7 @@ def poses(
     )
     splits = splits_of(None, pool.cameras.names)
     run.write_views(output, pool.cameras, format, splits)
-    direction = ", ".join(f"{v:.2f}" for v in pool.up)
-    run.say(f"{output}: {plural(count, 'pose')}, {pool.kind} ({pool.why}; up is {direction})")
+    run.say(f"{output}: {plural(count, 'pose')}, {pool.kind} ({pool.why}; up is {direction(pool.up)})")
     shares = (("is in no view", pool.unseen), ("is smaller than a pixel in all views", pool.coarse))
     if told := [
         f"{share:.0%} of the scene {what}" for what, share in shares if share > _LEAST_REPORTED_SHARE
