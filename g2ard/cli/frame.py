@@ -268,7 +268,8 @@ class Run:
     ) -> None:
         """Write a scene, and report what its format cannot hold and, with `compare`, a large loss."""
         self.begin("write")
-        write_splats(path, splats, overwrite=self.overwrite or overwrite, **options)
+        replaced = self.overwrite or overwrite
+        write_splats(path, splats, overwrite=replaced, progress=self.progress, **options)
         self.kept.append(f"{path} is written")
         for note in lost_in(path, splats, **options):
             self.say(f"note: {path}: {note}")

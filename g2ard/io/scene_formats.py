@@ -22,6 +22,7 @@ class SceneFormat(NamedTuple):
         models: whether it can state the render model.
         axes: of its coordinates, by definition or unless it states others; None if scenes bring their own.
         lossy: whether it rounds values to fewer bits than float32.
+        tells: whether its writer takes `progress`.
     """
 
     suffix: str
@@ -31,21 +32,22 @@ class SceneFormat(NamedTuple):
     models: bool = True
     axes: str | None = None
     lossy: bool = False
+    tells: bool = False
 
 
 FORMATS: dict[FormatName, SceneFormat] = {
     "compressed.ply": SceneFormat(".compressed.ply", "compressed_ply", lossy=True),
     "ply": SceneFormat(".ply", "ply", options=("normals", "layout")),
-    "sog": SceneFormat(".sog", "sog_write", lossy=True),
-    "spz": SceneFormat(".spz", "spz", options=("spz_version", "axes"), axes="RUB", lossy=True),
+    "sog": SceneFormat(".sog", "sog_write", lossy=True, tells=True),
+    "spz": SceneFormat(".spz", "spz", options=("spz_version", "axes"), axes="RUB", lossy=True, tells=True),
     "glb": SceneFormat(".glb", "glb", options=("compress",), models=False, axes="LUF"),
     "splat": SceneFormat(".splat", "splat", models=False, lossy=True),
-    "usda": SceneFormat(".usda", "usd", models=False, axes="RUB"),
-    "usdc": SceneFormat(".usdc", "usd", models=False, axes="RUB"),
+    "usda": SceneFormat(".usda", "usd", models=False, axes="RUB", tells=True),
+    "usdc": SceneFormat(".usdc", "usd", models=False, axes="RUB", tells=True),
 }
 """Formats by name, longer suffixes first."""
 
-_FOLDER = SceneFormat("meta.json", "sog_write", "write_folder", lossy=True)
+_FOLDER = SceneFormat("meta.json", "sog_write", "write_folder", lossy=True, tells=True)
 
 
 def scene_format(path: str | Path) -> SceneFormat:

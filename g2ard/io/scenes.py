@@ -13,6 +13,7 @@ from g2ard.errors import InputError
 from g2ard.io.atomic import check_output
 from g2ard.io.detect import KINDS, file_format, run_scene
 from g2ard.io.scene_formats import check_options, lost_in, scene_format
+from g2ard.progress import Progress, silent
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -108,7 +109,14 @@ def check_scene_output(path: str | Path, overwrite: bool = False) -> Path:
 
 
 @checks_arguments
-def write_splats(path: str | Path, splats: Splats, *, overwrite: bool = False, **options: Any) -> None:
+def write_splats(
+    path: str | Path,
+    splats: Splats,
+    *,
+    overwrite: bool = False,
+    progress: Progress = silent,
+    **options: Any,
+) -> None:
     """Write a Gaussian scene atomically.
 
     Args:
@@ -116,6 +124,7 @@ def write_splats(path: str | Path, splats: Splats, *, overwrite: bool = False, *
             .usdc; NAME/meta.json for a SOG folder.
         splats: the scene.
         overwrite: whether to replace an existing file.
+        progress: called while a format that takes long is packed.
         **options: format options: `normals=True` adds nx ny nz to a .ply, and `layout="inria"` also pads it
             to SH degree 3; `spz_version=4` writes .spz version 4 instead of 3, and with it `axes="RFU"`
             stores right-forward-up instead of right-up-back; version 3 with `axes="RDF"` stores the
@@ -141,6 +150,7 @@ def write_splats(path: str | Path, splats: Splats, *, overwrite: bool = False, *
     check_type("splats", splats, Splats)
     output_format = check_options(path, options)
     writer = getattr(import_module(f"g2ard.io.{output_format.module}"), output_format.function)
-    writer(Path(path), splats, overwrite=overwrite, **options)
+    told = {"progress": progress} if output_format.tells else {}
+    writer(Path(path), splats, overwrite=overwrite, **told, **options)
     for note in lost_in(path, splats, **options):
         warnings.warn(f"{path}: {note}", stacklevel=3)  # past `checks_arguments`

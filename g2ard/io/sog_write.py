@@ -38,10 +38,10 @@ _KMEANS_STEPS = 6
 """Steps of k-means after the split; 10 more gain 0.01 dB."""
 
 
-def write(path: Path, splats: Splats, *, overwrite: bool = False) -> None:
+def write(path: Path, splats: Splats, *, overwrite: bool = False, progress: Progress = silent) -> None:
     """Write a .sog: the files of `sog_files`, zipped without compression; equal scenes give equal bytes."""
     with atomic_output(path, overwrite) as temporary:
-        temporary.write_bytes(sog_bytes(path, splats))
+        temporary.write_bytes(sog_bytes(path, splats, progress))
 
 
 def sog_bytes(path: Path, splats: Splats, progress: Progress = silent) -> bytes:
@@ -53,10 +53,10 @@ def sog_bytes(path: Path, splats: Splats, progress: Progress = silent) -> bytes:
     return room.getvalue()
 
 
-def write_folder(path: Path, splats: Splats, *, overwrite: bool = False) -> None:
+def write_folder(path: Path, splats: Splats, *, overwrite: bool = False, progress: Progress = silent) -> None:
     """Write `path`, a meta.json, and its images beside it."""
     with atomic_folder(path.parent, overwrite) as temporary:
-        for name, content in sog_files(path, splats).items():
+        for name, content in sog_files(path, splats, progress=progress).items():
             (temporary / name).write_bytes(content)
 
 

@@ -5,7 +5,6 @@ quaternion's y and z and every harmonic odd in them. Version 4 may name other ax
 of type, length and content between header and table of streams.
 """
 
-import gzip
 import math
 import struct
 import sys
@@ -24,12 +23,16 @@ from g2ard.io.atomic import atomic_output
 from g2ard.io.limits import check_unpacked
 from g2ard.io.sanitize import Raw, cleaned, logits_of
 from g2ard.io.types import Note, Scene
+from g2ard.progress import Progress, silent
 from g2ard.scene.splats import Splats
 from g2ard.scene.transform import change_of_axes, with_axes
 
 _MAGIC = b"NGSP"
 _HEADER = 16
 """Size of the header, bytes."""
+
+_GZIP_BLOCK = 1 << 20
+"""Bytes packed between two reports of progress, a fraction of a second."""
 
 _POSITION_BITS = 24
 _COEFFICIENTS = (0, 3, 8, 15, 24)
@@ -231,7 +234,13 @@ def _quats_packed(codes: NDArray[np.uint8]) -> NDArray[np.float64]:
 
 
 def write(
-    path: Path, splats: Splats, *, overwrite: bool = False, spz_version: int = 3, axes: Axes = "RUB"
+    path: Path,
+    splats: Splats,
+    *,
+    overwrite: bool = False,
+    spz_version: int = 3,
+    axes: Axes = "RUB",
+    progress: Progress = silent,
 ) -> None:
     """Write an .spz; equal scenes give equal bytes.
 
@@ -254,13 +263,19 @@ def write(
     splats = splats.take(packing.morton_order(splats.means))
     means = packing.world_means(path, splats, ".spz")
     named: Axes = axes if spz_version == 4 else "RUB"
-    content = encoded(path, splats, means, fraction_bits(path, means, splats), spz_version, named)
+    content = encoded(path, splats, means, fraction_bits(path, means, splats), spz_version, named, progress)
     with atomic_output(path, overwrite) as temporary:
         temporary.write_bytes(content)
 
 
 def encoded(
-    path: Path, splats: Splats, means: NDArray[np.float64], bits: int, spz_version: int, axes: Axes = "RUB"
+    path: Path,
+    splats: Splats,
+    means: NDArray[np.float64],
+    bits: int,
+    spz_version: int,
+    axes: Axes = "RUB",
+    progress: Progress = silent,
 ) -> bytes:
     """Return the bytes of an .spz with these means, in `bits` fractional bits and the order of the rows."""
     streams = _streams(splats, means, bits, spz_version)
@@ -270,13 +285,27 @@ def encoded(
         records = struct.pack("<III", _COORDINATE_SYSTEM, 4, _ADOBE_AXES.index(axes) + 1)
     head = _MAGIC + struct.pack("<IIBBB", spz_version, len(splats), splats.sh_degree, bits, flags)
     if spz_version < 4:
-        return gzip.compress(head + b"\0" + b"".join(streams), 9, mtime=0)
+        return _gzipped(head + b"\0" + b"".join(streams), progress)
     zstd = _zstandard(path)
-    packed = [zstd.compress(stream, 19) for stream in streams]
+    packed = []
+    for number, stream in enumerate(streams):
+        progress("pack", number, len(streams))
+        packed.append(zstd.compress(stream, 19))
+    progress("pack", len(streams), len(streams))
     sizes = zip(packed, streams, strict=True)
     table = b"".join(struct.pack("<QQ", len(p), len(stream)) for p, stream in sizes)
     start = struct.pack("<BI12x", len(streams), _HEADER_4 + len(records))
     return head + start + records + table + b"".join(packed)
+
+
+def _gzipped(content: bytes, progress: Progress) -> bytes:
+    """Return what `gzip.compress(content, 9, mtime=0)` does."""
+    packer, parts = zlib.compressobj(9, wbits=31), []
+    for start in range(0, len(content), _GZIP_BLOCK):
+        progress("pack", start, len(content))
+        parts.append(packer.compress(content[start : start + _GZIP_BLOCK]))
+    progress("pack", len(content), len(content))
+    return b"".join([*parts, packer.flush()])
 
 
 def fraction_bits(path: Path, means: NDArray[np.float64], splats: Splats) -> int:

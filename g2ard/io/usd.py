@@ -17,6 +17,7 @@ from g2ard.io.packing import unit_quats, writable
 from g2ard.io.sanitize import Raw, cleaned
 from g2ard.io.spz import FLIPS
 from g2ard.io.types import Scene
+from g2ard.progress import Progress, silent
 from g2ard.scene.splats import Splats
 from g2ard.scene.transform import placed
 
@@ -30,7 +31,7 @@ _EXTENT_SIGMAS = 3.0
 """Extent of a Gaussian, as a multiple of its largest scale."""
 
 
-def write(path: Path, splats: Splats, *, overwrite: bool = False) -> None:
+def write(path: Path, splats: Splats, *, overwrite: bool = False, progress: Progress = silent) -> None:
     """Write a .usda, or a .usdc if usd-core is installed; equal scenes give equal text.
 
     `offset` becomes the prim's translation. Units are metres.
@@ -40,10 +41,10 @@ def write(path: Path, splats: Splats, *, overwrite: bool = False) -> None:
     pxr = _pxr(path) if binary else None
     with atomic_output(path, overwrite) as temporary:
         if pxr is not None:
-            _save(pxr, temporary, splats)
+            _save(pxr, temporary, splats, progress)
         else:
             with temporary.open("w", encoding="utf-8", newline="\n") as file:
-                _print(file, splats)
+                _print(file, splats, progress)
 
 
 def _attributes(splats: Splats) -> dict[str, tuple[str, NDArray[np.float32]]]:
@@ -62,7 +63,7 @@ def _attributes(splats: Splats) -> dict[str, tuple[str, NDArray[np.float32]]]:
     }
 
 
-def _print(file: TextIO, splats: Splats) -> None:
+def _print(file: TextIO, splats: Splats, progress: Progress) -> None:
     file.write(
         f'#usda 1.0\n(\n    defaultPrim = "{_NAME}"\n    metersPerUnit = 1\n    upAxis = "Y"\n)\n\n'
         f'def {_SCHEMA} "{_NAME}"\n{{\n'
@@ -70,7 +71,9 @@ def _print(file: TextIO, splats: Splats) -> None:
         '    uniform token projectionModeHint = "perspective"\n'
         '    uniform token sortingModeHint = "zDepth"\n'
     )
-    for name, (kind, values) in _attributes(splats).items():
+    arrays = _attributes(splats)
+    done, total = 0, sum(len(values) for _, values in arrays.values())
+    for name, (kind, values) in arrays.items():
         row = ", ".join(["%.9g"] * values.shape[1])
         row = row if values.shape[1] == 1 else f"({row})"
         file.write(f"    {kind} {name} = [")
@@ -79,6 +82,8 @@ def _print(file: TextIO, splats: Splats) -> None:
             file.write(
                 (", " if start else "") + ", ".join([row] * len(block)) % tuple(block.ravel().tolist())
             )
+            done += len(block)
+            progress("pack", done, total)
         file.write("]\n")
     if splats.offset.any():
         shift = ", ".join(repr(float(v)) for v in splats.offset * _USD_TURN)
@@ -89,7 +94,7 @@ def _print(file: TextIO, splats: Splats) -> None:
     file.write("}\n")
 
 
-def _save(pxr: Any, path: Path, splats: Splats) -> None:
+def _save(pxr: Any, path: Path, splats: Splats, progress: Progress) -> None:
     stage = pxr.Usd.Stage.CreateNew(str(path))
     pxr.UsdGeom.SetStageUpAxis(stage, pxr.UsdGeom.Tokens.y)
     pxr.UsdGeom.SetStageMetersPerUnit(stage, 1)
@@ -100,7 +105,9 @@ def _save(pxr: Any, path: Path, splats: Splats) -> None:
     prim.GetAttribute("projectionModeHint").Set("perspective")
     prim.GetAttribute("sortingModeHint").Set("zDepth")
     arrays = {"float[]": pxr.Vt.FloatArray, "quatf[]": pxr.Vt.QuatfArray}
-    for name, (kind, values) in _attributes(splats).items():
+    attributes = _attributes(splats)
+    for done, (name, (kind, values)) in enumerate(attributes.items(), 1):
+        progress("pack", done, len(attributes))
         if kind == "quatf[]":
             values = values[:, [1, 2, 3, 0]]  # usd-core's memory order
         values = np.ascontiguousarray(values[:, 0] if kind == "float[]" else values)

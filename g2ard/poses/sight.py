@@ -25,6 +25,8 @@ _RAISED = 0.1
 
 _PATIENCE, _TOLERABLE = 12, 0.5
 """Candidates judged per requested pose, at most, and least score of a usable one; 1 is good."""
+_BLOCK = 256
+"""Candidates judged between two reports of progress, about a second; results do not depend on it."""
 
 _ROWS, SIGHT_ROWS, _LONGEST, _BATCH = 12_000, 24_000, 96, 32
 """Gaussians rendered per glance, and where lines of sight matter; pixels along the longer side; and renders
@@ -301,7 +303,7 @@ def gather(
     """
     parts, asked = [(Poses.joined([]), np.zeros(0))], 0
     while (good := sum(int((scores >= 1).sum()) for _, scores in parts)) < count and asked < patience * count:
-        more = min(max(count - good, 16), patience * count - asked)
+        more = min(max(count - good, 16), patience * count - asked, _BLOCK)
         parts.append(tried(asked, asked + more))
         asked += more
         survey.tell(min(good, count - 1), count)

@@ -100,7 +100,7 @@ def find_clutter(
     finders = {
         "invisible": lambda rest: hidden,
         "giant": lambda rest: _giants(splats),
-        "needle": lambda rest: _needles(splats, rest),
+        "needle": lambda rest: _needles(splats, rest, progress),
         "floater": lambda rest: _floaters(splats, rest, seen.weight, unoccluded, progress),
     }
     if floating is not None:
@@ -224,7 +224,7 @@ def _giants(splats: Splats) -> NDArray[np.bool_]:
     return out
 
 
-def _needles(splats: Splats, rest: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _needles(splats: Splats, rest: NDArray[np.bool_], progress: Progress) -> NDArray[np.bool_]:
     """Mark long, thin Gaussians of `rest` with both ends (2σ) beyond 3σ of their nearest neighbours.
 
     Neighbours count as spheres of their largest scale: by their true shape eight times as many were needles
@@ -238,6 +238,7 @@ def _needles(splats: Splats, rest: NDArray[np.bool_]) -> NDArray[np.bool_]:
     means = splats.means.astype(np.float64)
     ends = np.concatenate([means[long] - mean_to_end, means[long] + mean_to_end])
     points = np.concatenate([means[rows], ends])
+    progress("neighbours", 0, 0)
     near = _core.knn(np.ascontiguousarray(points), _NEIGHBORS)[len(rows) :].astype(np.int64)
     real = near < len(rows)
     other = rows[np.where(real, near, 0)]
@@ -271,6 +272,7 @@ def _floaters(
         return out
     means = splats.means[rows].astype(np.float64)
     reach = _FOOTPRINT_SIGMAS * splats.scales[rows].max(axis=1).astype(np.float64)
+    progress("neighbours", 0, 0)
     near = _core.knn(means, _NEIGHBORS)
     group = np.arange(len(rows))
     for first in range(0, len(rows), _BLOCK):

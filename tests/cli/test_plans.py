@@ -17,7 +17,7 @@ COMMANDS = [
     f"lod ball.ply -r 1,2,4 {TRAIN} -o lod",
     "lod ball.ply -r 2,4 --views views.json --size 24 --merge-only -o lod",
     f"distill ball.ply -r 8 {TRAIN} -o run",
-    f"recover ball.ply {TRAIN} --teacher ball.ply -o better.ply",
+    f"recover small.ply {TRAIN} --teacher ball.ply -o better.ply",
     "clean ball.ply --preview found.png -o clean.ply",
 ]
 
@@ -26,7 +26,9 @@ COMMANDS = [
 def test_expected_stages_come_in_order(
     command: str, tmp_path: Path, command_line: CommandLine, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    g2ard.save(tmp_path / "ball.ply", checkered_ball(300))
+    ball = checkered_ball(300)
+    g2ard.save(tmp_path / "ball.ply", ball)
+    g2ard.save(tmp_path / "small.ply", g2ard.simplify(ball, count=30).splats)
     g2ard.save_views(tmp_path / "views.json", around(16, (48, 36)))
     planned: list[str] = []
     met: list[str] = []

@@ -21,7 +21,7 @@ from helpers.glb_files import glb_parts, write_glb
 from helpers.packed_files import saved
 from helpers.peers import adobe_spz, gltf_report, splat_transform
 from helpers.realdata import real
-from helpers.scenes import assert_same_bits
+from helpers.scenes import assert_same_bits, checkered_ball
 from helpers.threads import on_threads
 from reference.rotations import covariances
 
@@ -87,6 +87,22 @@ def test_unwritable_values_are_one_line(tmp_path: Path, name: str) -> None:
     with pytest.raises(InputError, match=r"Gaussian 7 is not finite"):
         saved(tmp_path, name, broken)
     assert not [p for p in tmp_path.rglob("*") if p.is_file()]
+
+
+@pytest.mark.parametrize("name", ["a.sog", "a/meta.json", "a.spz", "a.usda"])
+def test_packing_reports_its_progress(tmp_path: Path, name: str) -> None:
+    """Telling changes no byte; the last call says that all is done."""
+    scene, told = checkered_ball(5000), []
+    for folder, how in (("quiet", {}), ("told", {"progress": lambda *report: told.append(report[:3])})):
+        (tmp_path / folder / "a").mkdir(parents=True)
+        write_splats(tmp_path / folder / name, scene, overwrite=True, **how)
+    files = [path for path in (tmp_path / "told").rglob("*") if path.is_file()]
+    for path in files:
+        assert path.read_bytes() == (tmp_path / "quiet" / path.relative_to(tmp_path / "told")).read_bytes()
+    (stage, done, total), counts = told[-1], [report[1] for report in told]
+    assert files
+    assert done == total > 1, stage
+    assert counts == sorted(counts)
 
 
 def test_names_and_options(tmp_path: Path) -> None:

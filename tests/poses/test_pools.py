@@ -113,6 +113,15 @@ def test_up_is_found_in_any_orientation(name, seed, scenes) -> None:
     assert up @ turn[:, 2] > np.cos(np.radians(5))
 
 
+def test_planning_reports_its_progress_and_does_not_depend_on_it(scenes, monkeypatch) -> None:
+    told: list[tuple] = []
+    scene = next(iter(scenes.values()))
+    whole = plan_pool(scene, 600, progress=lambda *report: told.append(report[:2])).cameras
+    assert len({done for stage, done in told if stage == "poses"}) > 2
+    monkeypatch.setattr("g2ard.poses.sight._BLOCK", 10**9)
+    np.testing.assert_array_equal(plan_pool(scene, 600).cameras.viewmats, whole.viewmats)
+
+
 @pytest.mark.parametrize("count", [1, 2, 9])
 def test_few_poses(count, scenes) -> None:
     assert len(make_pool(scenes["town"], count)) == count
