@@ -4,6 +4,7 @@
 |---|---|
 | `load`, `save` | read and write scenes, by extension |
 | `load_views`, `save_views`, `load_points` | read and write cameras, read coloured point clouds |
+| `convert`, `clean` | merge, crop and move scenes; remove their clutter |
 | `distill` | run the whole pipeline, like `g2ard distill` |
 | `distill_against` | run it on a scene in memory, against your own targets |
 | `ingest` | split a scene or point cloud of any size into tiles |
@@ -48,6 +49,8 @@ if TYPE_CHECKING:
     from g2ard.io import write_views as save_views
     from g2ard.io.tile_store import TileStore
     from g2ard.io.types import Points
+    from g2ard.jobs.clean import Cleaned, clean
+    from g2ard.jobs.convert import convert
     from g2ard.jobs.distill import distill
     from g2ard.jobs.distill_options import DistillOptions
     from g2ard.jobs.levels import lod, save_tileset
@@ -82,6 +85,7 @@ __all__ = [
     "Adapted",
     "Camera",
     "Cameras",
+    "Cleaned",
     "CoverageOptions",
     "DistillConfig",
     "DistillOptions",
@@ -112,6 +116,8 @@ __all__ = [
     "TileStore",
     "__version__",
     "adapt",
+    "clean",
+    "convert",
     "distill",
     "distill_against",
     "evaluate",
@@ -145,6 +151,8 @@ _HOMES = {
     "pipeline.config": ("DistillConfig", "SelectConfig"),
     "pipeline.distill": ("Distilled",),
     "levels": ("Georeference", "save_levels"),
+    "jobs.clean": ("Cleaned", "clean"),
+    "jobs.convert": ("convert",),
     "jobs.distill": ("distill",),
     "jobs.distill_options": ("DistillOptions",),
     "jobs.levels": ("lod", "save_tileset"),

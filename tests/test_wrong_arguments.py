@@ -17,6 +17,8 @@ LEVELS = [BALL, BALL.take(range(9))]
 CONFIGS = [name for name in g2ard.__all__ if name.endswith(("Config", "Options", "Settings"))]
 VALID: dict[str, dict[str, Any]] = {
     "adapt": {"compact": BALL, "targets": TARGETS},
+    "clean": {"scene": BALL, "only": ()},
+    "convert": {"scenes": BALL},
     "distill": {"scene": BALL, "ratio": 4, "views": VIEWS, "steps": 1},
     "distill_against": {"prior": BALL, "budget": 9, "targets": TARGETS},
     "evaluate": {"splats": BALL, "targets": TARGETS},

@@ -16,8 +16,9 @@ from g2ard.errors import InputError
 from g2ard.io.paths import real_path
 from g2ard.io.types import Points
 from g2ard.jobs.budget import Budget
+from g2ard.jobs.clean import clean as remove_clutter
 from g2ard.jobs.distill_options import DistillOptions
-from g2ard.jobs.inputs import Views, clutter_seen, load_scene
+from g2ard.jobs.inputs import Views, load_scene
 from g2ard.jobs.job import DistillJob
 from g2ard.jobs.measured_budget import Aim, Reduction, aim_of
 from g2ard.jobs.photos import sparse_file, sparse_points, topped_up
@@ -176,8 +177,8 @@ def prepare(
     read = _read(scene, budgets, options, progress, say)
     prior, cleaned = read.prior, None
     if options.clean:
-        clutter, _ = clutter_seen(prior, seed=recover.seed, progress=progress, say=say)
-        prior, cleaned = prior.take(clutter.keep), clutter.counts
+        done = remove_clutter(prior, seed=recover.seed, progress=progress, say=say)
+        prior, cleaned = done.splats, done.clutter.counts
     if counted is not None:
         counted(len(prior))
     default_degree = 3 if read.lifted else None  # points have one colour each, photos show more

@@ -20,23 +20,14 @@ from g2ard.io.types import Note, ViewFiles, ViewSet
 from g2ard.progress import Progress, Say, plural, silent, unsaid
 from g2ard.rendering.renderer import RasterSettings, Renderer
 from g2ard.rendering.targets import Photos, PhotosOrRenders, Targets, TeacherRenders, with_pixels
-from g2ard.rendering.visibility import visibility
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.regions import in_any
 from g2ard.scene.splats import Splats
 
 if TYPE_CHECKING:
-    from g2ard.stages.clean import Cleaning
     from g2ard.stages.simplify import SimplifyConfig
 Views = Cameras | ViewSet | ViewFiles | str | Path  # cameras, or the path of views
 Split = str | Callable[..., "NDArray[np.bool_]"]  # of `split_mask`, or a function like `for_training`
-
-_CLUTTER_VIEWS, _CLUTTER_SIDE = 96, 400
-"""Number of generated views for finding clutter, and their longer side in pixels."""
-_CLUTTER_ROWS = 100_000
-"""Gaussians that those views are planned on."""
-_CLUTTER_NEAR = 0.25
-"""Share of nearer views among them."""
 
 
 def load_scene(path: str | Path, say: Say = unsaid, render_model: RenderModel | None = None) -> Splats:
@@ -174,46 +165,3 @@ def scorable(targets: Targets, say: Say = unsaid) -> Targets:
     if skipped := len(targets.cameras) - len(kept.cameras):
         say(f"{plural(skipped, 'photo')} not scored: the mask leaves no pixel")
     return kept
-
-
-def clutter_seen(
-    splats: Splats,
-    kinds: tuple[str, ...] | None = None,
-    *,
-    strength: float = 0.0,
-    seed: int = 0,
-    progress: Progress = silent,
-    say: Say = unsaid,
-) -> tuple[Cleaning, Cameras]:
-    """Find clutter from generated views, and say how much there is of each kind.
-
-    Args:
-        kinds: kinds to find; None for all of `g2ard.stages.clean.KINDS`.
-        strength: see `g2ard.stages.clean.find_clutter`; 0 finds neither haze nor streaks.
-    """
-    from g2ard.poses import plan_pool
-    from g2ard.stages.clean import FLOATING, KINDS, find_clutter, find_floating, unoccluded_means
-
-    kinds = tuple(kind for kind in kinds or KINDS if strength or kind not in FLOATING)
-    pool = plan_pool(
-        splats,
-        _CLUTTER_VIEWS,
-        seed=seed,
-        rows=_CLUTTER_ROWS,
-        near=_CLUTTER_NEAR,
-        for_weights=True,
-        progress=progress,
-    )
-    cameras = pool.cameras.resized(_CLUTTER_SIDE)
-    seen = visibility(splats, cameras, progress)
-    pixels = int((cameras.widths.astype(int) * cameras.heights).sum())
-    unoccluded = unoccluded_means(splats, cameras, progress)
-    floating = find_floating(splats, cameras, progress) if set(kinds) & set(FLOATING) else None
-    clutter = find_clutter(
-        splats, seen, unoccluded, pixels, kinds, floating=floating, strength=strength, progress=progress
-    )
-    parts = [f"{count:,} {name}" for name, count in clutter.counts.items() if name in kinds]
-    gone = len(splats) - int(clutter.keep.sum())
-    light = f"{seen.weight[~clutter.keep].sum() / max(seen.weight.sum(), 1e-30):.1%} of the light"
-    say(f"{gone:,} of {plural(len(splats), 'Gaussian')} are clutter, with {light}: {', '.join(parts)}")
-    return clutter, cameras

@@ -127,7 +127,7 @@ def test_convert_keeps_the_outside_of_a_box_or_sphere(tmp_path: Path, command_li
         succeeds(command_line, tmp_path, "convert", "a.ply", "b.ply", *words, "--invert", "-w")
         np.testing.assert_array_equal(read_splats(tmp_path / "b.ply").means, scene.means[~dropped])
     line = refused(command_line, tmp_path, "convert", "a.ply", "c.ply", "--invert")
-    assert "--invert goes with --box or --sphere" in line
+    assert "--invert: has nothing to invert; give --box or --sphere" in line
 
 
 def test_convert_writes_a_table(tmp_path: Path, command_line: CommandLine) -> None:

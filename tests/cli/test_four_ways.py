@@ -12,8 +12,6 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import g2ard
-from g2ard.jobs.inputs import clutter_seen
-from g2ard.scene.transform import in_sphere, moving, transform
 from helpers.commands import CommandLine, succeeds
 from helpers.photos import cloud_of
 from helpers.scenes import around, checkered_ball, under_a_sky
@@ -79,12 +77,17 @@ FIELDS: dict[str, tuple[str, dict[str, st.SearchStrategy[Any]], set[str]]] = {
         set(),
     ),
     "convert": (
-        "convert ball.ply",
+        "convert ball.ply small.ply",
         {
+            "box": st.just((-1.0, -1.0, 0.0, 1.0, 1.0, 2.0)),
             "sphere": st.just((0.0, 0.0, 0.5, 1.0)),
+            "where": st.just("opacity > 0.1"),
+            "transform": st.just((0.0, -2, 0, 5, 2, 0, 0, 0, 0, 0, 2, 0, 0, 0, 0, 1)),
             "scale": st.sampled_from([0.5, 2.0]),
             "rotate": st.just((0.0, 30.0, 90.0)),
             "translate": st.just((1.0, 0.0, -2.0)),
+            "from_axes": st.sampled_from(["RDF", "RFU"]),
+            "to_axes": st.sampled_from(["LUF", "RUB"]),
             "sh_degree": st.integers(0, 2),
         },
         set(),
@@ -92,7 +95,7 @@ FIELDS: dict[str, tuple[str, dict[str, st.SearchStrategy[Any]], set[str]]] = {
     "clean": (
         "clean stray.ply",
         {
-            "only": st.sampled_from([("invisible", "floater"), ("giant",)]),
+            "only": st.sampled_from([("invisible", "floater"), ("giant", "haze")]),
             "strength": st.sampled_from([0.5, 1.0]),
             "seed": st.integers(1, 3),
         },
@@ -101,7 +104,8 @@ FIELDS: dict[str, tuple[str, dict[str, st.SearchStrategy[Any]], set[str]]] = {
 }
 """Command → its words, the values of its options, and those options that are settings too."""
 NEEDED: dict[str, dict[str, Any]] = {command: {"steps": 3} for command in ("distill", "recover", "adapt")} | {
-    "lod": {"steps": 3, "size": 32}
+    "lod": {"steps": 3, "size": 32},
+    "clean": {"strength": 0.5},
 }
 """Values that every drawn job has, unless it has others."""
 
@@ -149,30 +153,16 @@ def _python(command: str, values: dict[str, Any], folder: Path) -> bytes:
         targets = g2ard.TeacherRenders(g2ard.load(folder / "ball.ply"), VIEWS, background=background)
         made = g2ard.adapt(small, targets, replace(g2ard.AdaptConfig.scheduled("default"), **values)).splats
     elif command == "convert":
-        made = _converted(g2ard.load(folder / "ball.ply"), **values)
+        if "transform" in values:
+            values = {**values, "transform": np.reshape(values["transform"], (4, 4))}
+        made = g2ard.convert([folder / "ball.ply", folder / "small.ply"], **values)
     elif command == "clean":
-        stray = g2ard.load(folder / "stray.ply")
-        named = {"kinds" if name == "only" else name: value for name, value in values.items()}
-        made = stray.take(clutter_seen(stray, **named)[0].keep)
+        made = g2ard.clean(folder / "stray.ply", **values).splats
     else:
         points = g2ard.load_points(folder / "cloud.ply")
         made = g2ard.lift(points.positions, points.colors, **values)
     g2ard.save(folder / "python.ply", made, overwrite=True)
     return (folder / "python.ply").read_bytes()
-
-
-def _converted(
-    scene: g2ard.Splats,
-    sphere: Any = None,
-    scale: float = 1.0,
-    rotate: Any = (0, 0, 0),
-    translate: Any = (0, 0, 0),
-    sh_degree: int | None = None,
-) -> g2ard.Splats:
-    if sphere is not None:
-        scene = scene.take(in_sphere(scene, sphere[:3], sphere[3]))
-    moved = transform(scene, moving(scale, rotate, translate))
-    return moved if sh_degree is None else moved.with_sh_degree(sh_degree)
 
 
 def _bytes(output: Path) -> bytes:

@@ -45,7 +45,7 @@ COMMANDS = {
 }
 SLOW = {
     "distill": ("g2ard.jobs.distill.prepare", "g2ard.jobs.job.DistillJob.run"),
-    "clean": ("g2ard.jobs.inputs.clutter_seen",),
+    "clean": ("g2ard.jobs.clean.clean",),
     "lod": ("g2ard.jobs.levels.lod",),
     "register": ("g2ard.stages.register.register",),
 }

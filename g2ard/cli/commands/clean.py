@@ -14,9 +14,8 @@ from g2ard.io import check_scene_output
 from g2ard.progress import plural
 
 if TYPE_CHECKING:
+    from g2ard.jobs.clean import Cleaned
     from g2ard.scene.cameras import Cameras
-    from g2ard.scene.splats import Splats
-    from g2ard.stages.clean import Cleaning
 
 _WORDS = ("blue", "yellow", "pink", "red", "cyan", "green")
 _COLORS = {
@@ -72,14 +71,13 @@ def clean(
 
     Visibility is measured from generated views.
     """
-    import numpy as np
+    from g2ard.jobs.clean import clean as remove_clutter
+    from g2ard.jobs.clean import kinds_of
 
-    from g2ard.jobs.inputs import clutter_seen
-    from g2ard.scene.sky import sky_mask
-    from g2ard.stages.clean import Cleaning
-
-    kinds = _kinds(only, strength)
-    if preview is not None and not kinds:
+    kinds = None if only is None else tuple(word.strip() for word in only.split(",") if only != "none")
+    with run.usage():
+        kinds_of(kinds, strength)
+    if preview is not None and kinds == ():
         raise typer.BadParameter("--preview shows clutter, so that it does not go with --only none")
     if output is None and not dry_run:
         raise typer.BadParameter("give an output with -o, or --dry-run")
@@ -90,52 +88,38 @@ def clean(
     if not dry_run:
         for path in filter(None, (output, split_sky)):
             check_scene_output(path, run.overwrite)
-    whole = splats = run.load(scene)
-    sky = np.zeros(len(whole), bool)
-    if split_sky is not None:
-        sky = sky_mask(whole)
-        splats = whole.take(~sky)
-        run.say(f"sky: {plural(int(sky.sum()), 'Gaussian')}" if sky.any() else "the scene has no sky")
-    tell = run.answer if dry_run else run.say
     run.console.expect([("visibility", 11), ("depths", 16), ("clutter", 19), ("preview", 1)])  # showroom, s
-    found, cameras = Cleaning(np.full(len(splats), -1, np.int8)), None
-    if kinds:
-        found, cameras = clutter_seen(
-            splats, kinds, strength=strength, seed=run.seed, progress=run.progress, say=tell
-        )
-    kept = int(found.keep.sum())
+    run.begin("read")
+    done = remove_clutter(
+        scene,
+        only=kinds,
+        strength=strength,
+        split_sky=split_sky is not None,
+        render_model=run.render_model,
+        seed=run.seed,
+        progress=run.progress,
+        say=run.answer if dry_run else run.say,
+    )
+    total, kept = len(done.before), int(done.clutter.keep.sum())
+    sky_count = 0 if done.sky is None else len(done.sky)
     if not dry_run and output is not None:
         if not kept:
             raise InputError(
                 "every Gaussian would be removed; inspect it with --dry-run --preview", path=scene
             )
-        run.write(output, splats.take(found.keep))
-        run.say(f"{output}: keeps {kept:,} of {plural(len(splats), 'Gaussian')}")
-        if split_sky is not None and sky.any():
-            run.write(split_sky, whole.take(sky))
-    if preview is not None and cameras is not None:
+        run.write(output, done.splats)
+        run.say(f"{output}: keeps {kept:,} of {plural(total, 'Gaussian')}")
+        if split_sky is not None and done.sky is not None and sky_count:
+            run.write(split_sky, done.sky)
+    if preview is not None and done.cameras is not None:
         with run.finishing("--preview"):
-            _paint(preview, splats, found, cameras, run.overwrite)
+            _paint(preview, done, done.cameras, run.overwrite)
         run.say(f"picture: {preview}")
-    counts = {"input_count": len(whole), "output_count": kept, "found": found.counts}
-    run.result(counts if split_sky is None else {**counts, "sky_count": int(sky.sum())})
+    counts = {"input_count": total + sky_count, "output_count": kept, "found": done.clutter.counts}
+    run.result(counts if done.sky is None else {**counts, "sky_count": sky_count})
 
 
-def _kinds(only: str | None, strength: float) -> tuple[str, ...]:
-    """Return the kinds of clutter to remove, after checking that they are known and have a strength."""
-    from g2ard.stages.clean import FLOATING, KINDS
-
-    if only is None:
-        return KINDS
-    kinds = tuple(word.strip() for word in only.split(",") if only != "none")
-    if wrong := [word for word in kinds if word not in KINDS]:
-        raise typer.BadParameter(f"--only: expected {', '.join(KINDS)}, got {wrong[0]!r}")
-    if not strength and (idle := [kind for kind in kinds if kind in FLOATING]):
-        raise typer.BadParameter(f"--only {idle[0]} needs --strength, such as 0.5")
-    return kinds
-
-
-def _paint(path: Path, splats: Splats, found: Cleaning, cameras: Cameras, overwrite: bool) -> None:
+def _paint(path: Path, done: Cleaned, cameras: Cameras, overwrite: bool) -> None:
     """Write up to three views of the scene, its clutter coloured by kind on grey, and the result."""
     import numpy as np
 
@@ -144,13 +128,13 @@ def _paint(path: Path, splats: Splats, found: Cleaning, cameras: Cameras, overwr
     from g2ard.report.paint import painted
     from g2ard.scene.samples import evenly_spaced
 
-    colors = np.array([*_COLORS.values(), (0.45, 0.48, 0.52)])[found.kind]
-    scenes = [splats, painted(splats, colors), splats.take(found.keep)]
+    colors = np.array([*_COLORS.values(), (0.45, 0.48, 0.52)])[done.clutter.kind]
+    scenes = [done.before, painted(done.before, colors), done.splats]
     chosen = evenly_spaced(len(cameras), 3, floor=True)
     renderers = [Renderer(scene) for scene in scenes]
     rows = [[r.clipped(cameras[int(view)]) for r in renderers] for view in chosen]
-    counts = zip(_WORDS, found.counts.items(), strict=True)
+    counts = zip(_WORDS, done.clutter.counts.items(), strict=True)
     legend = ", ".join(f"{word}: {count:,} {name}" for word, (name, count) in counts if count)
-    labels = [f"before: {len(splats):,}", "removed, in colour", f"after: {len(scenes[2]):,}"]
+    labels = [f"before: {len(scenes[0]):,}", "removed, in colour", f"after: {len(scenes[2]):,}"]
     sheet = contact_sheet(rows, labels, row_labels=[legend] * len(rows))
     write_png(path, sheet, overwrite=overwrite)

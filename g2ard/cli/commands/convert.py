@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import typer
 
@@ -13,13 +13,7 @@ from g2ard.cli.frame import Run, command
 from g2ard.cli.options import ShDegreeOption, numbers
 from g2ard.config.choices import Axes, PlyLayout
 from g2ard.errors import InputError, OutputError
-from g2ard.io.scene_formats import FORMATS, check_options, scene_format, written_bytes
-
-if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
-    from g2ard.scene.splats import Splats
+from g2ard.io.scene_formats import SceneFormat, check_options, scene_format, written_bytes
 
 
 @command("convert", example="g2ard convert room.ply tree.spz --box -2,-2,-2,2,2,2 both.sog", scenes=True)
@@ -111,57 +105,37 @@ def convert(
     ] = None,
 ) -> None:
     """Convert scenes to another format or other axes, and merge, crop or move them."""
-    import numpy as np
-
     from g2ard.io import table
-    from g2ard.scene.attributes import Condition
-    from g2ard.scene.transform import in_box, in_sphere, join, moving, with_axes
-    from g2ard.scene.transform import transform as moved
+    from g2ard.jobs.convert import Changes, read_merged
 
     scenes, output = _parted(run, scenes, output)
     given = {"spz_version": spz_version, "compress": compress, "layout": layout}
     options: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
-    if invert and box is None and sphere is None:
-        raise typer.BadParameter("--invert goes with --box or --sphere")
     if layout is not None and sh_degree not in (None, 3):
         raise typer.BadParameter("--layout inria has SH degree 3; leave --sh-degree out")
-    condition = None
-    if where is not None:
-        with run.usage():
-            condition = Condition(where)
-    corners = None if box is None else numbers("--box", box, 6)
-    ball = None if sphere is None else numbers("--sphere", sphere, 4)
-    turn = None if rotate is None else numbers("--rotate", rotate, 3)
-    shift = None if translate is None else numbers("--translate", translate, 3)
-    matrix = None if transform is None else np.array(_matrix(transform))
-    if any(given is not None for given in (scale, turn, shift)):
-        matrix = moving(scale or 1, turn or (0, 0, 0), shift or (0, 0, 0)) @ (
-            np.eye(4) if matrix is None else matrix
+    matrix = None if transform is None else _matrix(transform)
+    with run.usage():
+        changes = Changes(
+            box=None if box is None else numbers("--box", box, 6),
+            sphere=None if sphere is None else numbers("--sphere", sphere, 4),
+            invert=invert,
+            where=where,
+            transform=matrix,
+            scale=scale,
+            rotate=None if rotate is None else numbers("--rotate", rotate, 3),
+            translate=None if translate is None else numbers("--translate", translate, 3),
+            recentre=recentre,
+            to_axes=to_axes,
+            sh_degree=sh_degree,
         )
     as_table = output.suffix.lower() == ".csv"
     _check_output(run, output, options)
-    change = None if to_axes is None else _change_of_axes(output, to_axes, options)
-    splats = join([_loaded(run, path, from_axes) for path in scenes])
-    read = len(splats)
-    kept_rows = np.ones(read, bool)
-    if corners is not None:
-        kept_rows &= in_box(splats, corners[:3], corners[3:])
-    if ball is not None:
-        kept_rows &= in_sphere(splats, ball[:3], ball[3])
-    kept_rows ^= invert
-    if condition is not None:
-        kept_rows &= condition.of(splats)
-    if not kept_rows.all():
-        splats = splats.take(kept_rows)
-    _check_left(splats, read)
-    if matrix is not None:
-        splats = moved(splats, matrix)
-    if recentre:
-        splats = replace(splats, offset=np.zeros(3))
-    if sh_degree is not None:
-        splats = splats.with_sh_degree(sh_degree)
-    if change is not None:
-        splats = with_axes(splats, change)
+    if to_axes is not None and not as_table and (defined := scene_format(output)).axes is not None:
+        changes = replace(changes, to_axes=None)  # the format's writer makes the change
+        options = _with_axes(options, defined, output, to_axes)
+    run.begin("read")
+    whole = read_merged(scenes, from_axes, run.render_model, run.say)
+    splats, read = changes.apply(whole), len(whole)
     if as_table:
         run.begin("write")
         table.write(output, splats, overwrite=run.overwrite)
@@ -196,50 +170,19 @@ def _check_output(run: Run, output: Path, options: dict[str, Any]) -> None:
     io.check_output(output, run.overwrite)
 
 
-def _change_of_axes(output: Path, axes: Axes, options: dict[str, Any]) -> NDArray[np.float64] | None:
-    """Return the change of axes before writing, None if the format's writer makes it."""
-    from g2ard.scene.transform import change_of_axes
-
-    found = None if output.suffix.lower() == ".csv" else scene_format(output)
-    if found is None or found.axes is None:
-        return change_of_axes("RDF", axes)
-    if axes == found.axes:
-        return None
-    if "axes" not in found.options:
+def _with_axes(
+    options: dict[str, Any], output_format: SceneFormat, output: Path, axes: Axes
+) -> dict[str, Any]:
+    """Return the writer's options, with other axes than those that its format defines."""
+    if axes == output_format.axes:
+        return options
+    if "axes" not in output_format.options:
         raise InputError(
-            f"{found.suffix} has {found.axes} axes by definition",
+            f"{output_format.suffix} has {output_format.axes} axes by definition",
             path=output,
             hint="write .spz (version 4), which can name others, or .ply, .sog or .splat, which name none",
         )
-    options["axes"] = axes
-    if axes != "RDF":
-        options.setdefault("spz_version", 4)
-    return None
-
-
-def _loaded(run: Run, path: Path, axes: Axes | None) -> Splats:
-    """Read a scene whose file may store other axes than its format defines."""
-    splats = run.load(path)
-    if axes is None:
-        return splats
-    from g2ard.io import spz
-    from g2ard.scene.transform import change_of_axes, with_axes
-
-    path, name = io.check_scene(path)
-    if name == "spz" and spz.names_axes(path):
-        raise InputError("names its axes, which are followed", path=path, hint="leave {from_axes} out")
-    defined = next((known.axes for known in FORMATS.values() if known.module == name and known.axes), "RDF")
-    if axes == defined:
-        return splats
-    return with_axes(splats, change_of_axes(axes, "RDF") @ change_of_axes("RDF", defined))
-
-
-def _check_left(splats: Splats, read: int) -> None:
-    if not len(splats):
-        raise InputError(
-            f"--box, --sphere and --where keep none of {read:,} Gaussians; `g2ard info` shows the scene's "
-            "extent, opacities and scales"
-        )
+    return {**({} if axes == "RDF" else {"spz_version": 4}), **options, "axes": axes}
 
 
 def _matrix(given: str) -> list[list[float]]:

@@ -1,0 +1,138 @@
+"""`g2ard.clean`: removing the clutter that generated views show, and splitting off the sky."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from g2ard.config.checks import checks_arguments
+from g2ard.config.choices import RenderModel
+from g2ard.errors import InputError, require
+from g2ard.jobs.inputs import load_scene
+from g2ard.poses import plan_pool
+from g2ard.progress import Progress, Say, plural, silent, unsaid
+from g2ard.rendering.visibility import visibility
+from g2ard.scene.cameras import Cameras
+from g2ard.scene.sky import sky_mask
+from g2ard.scene.splats import Splats
+from g2ard.stages.clean import FLOATING, KINDS, Cleaning, find_clutter, find_floating, unoccluded_means
+
+_CLUTTER_VIEWS, _CLUTTER_SIDE = 96, 400
+"""Number of generated views for finding clutter, and their longer side in pixels."""
+_CLUTTER_ROWS = 100_000
+"""Gaussians that those views are planned on."""
+_CLUTTER_NEAR = 0.25
+"""Share of nearer views among them."""
+
+
+@dataclass(frozen=True, eq=False)
+class Cleaned:
+    """Scene with its clutter marked.
+
+    Args:
+        before: the scene, without its sky if that was split off.
+        clutter: kind of clutter per Gaussian of `before`.
+        sky: sky and far background, perhaps no Gaussians; None unless it was split off.
+        cameras: the generated views; None if no kind was requested.
+    """
+
+    before: Splats
+    clutter: Cleaning
+    sky: Splats | None
+    cameras: Cameras | None
+
+    @property
+    def splats(self) -> Splats:
+        """The scene without clutter, perhaps no Gaussians."""
+        return self.before.take(self.clutter.keep)
+
+    def __repr__(self) -> str:
+        return f"Cleaned({int(self.clutter.keep.sum()):,} of {plural(len(self.before), 'Gaussian')})"
+
+
+@checks_arguments
+def clean(
+    scene: Splats | str | Path,
+    *,
+    only: Sequence[str] | None = None,
+    strength: float = 0.0,
+    split_sky: bool = False,
+    render_model: RenderModel | None = None,
+    seed: int = 0,
+    progress: Progress = silent,
+    say: Say = unsaid,
+) -> Cleaned:
+    """Remove clutter from a trained scene, exactly like the command `g2ard clean`.
+
+    Clutter is what no image of the scene needs: invisible Gaussians, giants, needles and floaters, and on
+    request haze and streaks. Visibility is measured from generated views.
+
+    Args:
+        scene: the scene, or its path.
+        only: kinds to remove: invisible, giant, needle, floater, haze and streak. None removes all, () none.
+        strength: 0 to 1: haze and streaks are removed if they float in front of the surface in more than
+            1 − `strength` of the views that see them; 0 removes none.
+        split_sky: split off the sky and the far background first.
+        render_model: overrides what the scene's file says.
+        seed: seed of the generated views.
+        progress: called during planning, visibility and depths.
+        say: called with log messages.
+
+    Returns:
+        The scene without clutter, the kind of clutter per Gaussian, and the sky.
+
+    Raises:
+        InputError: an unreadable scene, an unknown kind, or haze or streaks without a strength.
+
+    >>> import numpy as np
+    >>> ball = np.random.default_rng(0).normal(size=(900, 3))
+    >>> ball /= np.linalg.norm(ball, axis=1, keepdims=True)
+    >>> faint = np.where(np.arange(900) < 40, -9, 4)
+    >>> done = clean(Splats.create(ball, scales=np.full((900, 3), 0.05), logit_opacities=faint))
+    >>> len(done.splats), done.clutter.counts["invisible"]
+    (860, 40)
+    """
+    kinds = kinds_of(only, strength)
+    splats = scene if isinstance(scene, Splats) else load_scene(scene, say, render_model)
+    sky = None
+    if split_sky:
+        far = sky_mask(splats)
+        splats, sky = splats.take(~far), splats.take(far)
+        say(f"sky: {plural(len(sky), 'Gaussian')}" if len(sky) else "the scene has no sky")
+    if not kinds:
+        return Cleaned(splats, Cleaning(np.full(len(splats), -1, np.int8)), sky, None)
+    pool = plan_pool(
+        splats,
+        _CLUTTER_VIEWS,
+        seed=seed,
+        rows=_CLUTTER_ROWS,
+        near=_CLUTTER_NEAR,
+        for_weights=True,
+        progress=progress,
+    )
+    cameras = pool.cameras.resized(_CLUTTER_SIDE)
+    seen = visibility(splats, cameras, progress)
+    pixels = int((cameras.widths.astype(int) * cameras.heights).sum())
+    unoccluded = unoccluded_means(splats, cameras, progress)
+    floating = find_floating(splats, cameras, progress) if set(kinds) & set(FLOATING) else None
+    clutter = find_clutter(
+        splats, seen, unoccluded, pixels, kinds, floating=floating, strength=strength, progress=progress
+    )
+    parts = [f"{count:,} {name}" for name, count in clutter.counts.items() if name in kinds]
+    gone = len(splats) - int(clutter.keep.sum())
+    light = f"{seen.weight[~clutter.keep].sum() / max(seen.weight.sum(), 1e-30):.1%} of the light"
+    say(f"{gone:,} of {plural(len(splats), 'Gaussian')} are clutter, with {light}: {', '.join(parts)}")
+    return Cleaned(splats, clutter, sky, cameras)
+
+
+def kinds_of(only: Sequence[str] | None, strength: float) -> tuple[str, ...]:
+    """Return the kinds of clutter to remove, after checking that they are known and have a strength."""
+    require("strength", strength, 0 <= strength <= 1, "a number from 0 to 1")
+    for kind in only or ():
+        require("only", repr(kind), kind in KINDS, ", ".join(KINDS))
+        if not strength and kind in FLOATING:
+            raise InputError(f"{kind} needs a strength", parameter="only", hint="give {strength=0.5}")
+    return tuple(kind for kind in (KINDS if only is None else only) if strength or kind not in FLOATING)

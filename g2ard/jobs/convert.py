@@ -1,0 +1,187 @@
+"""`g2ard.convert`: merging, cropping and moving scenes, and changing their axes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from g2ard.config.checks import checks_arguments
+from g2ard.config.choices import Axes, RenderModel
+from g2ard.errors import InputError, require
+from g2ard.io import check_scene, spz
+from g2ard.io.scene_formats import FORMATS
+from g2ard.jobs.inputs import load_scene
+from g2ard.progress import Say, unsaid
+from g2ard.scene.attributes import Condition
+from g2ard.scene.splats import Splats
+from g2ard.scene.transform import (
+    change_of_axes,
+    in_box,
+    in_sphere,
+    join,
+    moving,
+    similarity,
+    transform,
+    with_axes,
+)
+
+Scene = Splats | str | Path
+
+
+@dataclass(frozen=True, eq=False)
+class Changes:
+    """Changes to a scene, checked when they are made; fields are arguments of `convert`."""
+
+    box: Sequence[float] | None = None
+    sphere: Sequence[float] | None = None
+    invert: bool = False
+    where: str | None = None
+    transform: ArrayLike | None = None
+    scale: float | None = None
+    rotate: Sequence[float] | None = None
+    translate: Sequence[float] | None = None
+    recentre: bool = False
+    to_axes: Axes | None = None
+    sh_degree: int | None = None
+
+    def __post_init__(self) -> None:
+        for name, count in (("box", 6), ("sphere", 4), ("rotate", 3), ("translate", 3)):
+            values = getattr(self, name)
+            fits = values is None or (np.shape(values) == (count,) and all(map(math.isfinite, values)))
+            require(name, values, fits, f"{count} numbers")
+        if self.invert and self.box is None and self.sphere is None:
+            raise InputError("has nothing to invert", parameter="invert", hint="give {box} or {sphere}")
+        require("scale", self.scale, self.scale is None or 0 < self.scale < math.inf, "a number above 0")
+        require("sh_degree", self.sh_degree, self.sh_degree in (None, 0, 1, 2, 3), "0 to 3")
+        if self.where is not None:
+            Condition(self.where)
+        if self.transform is not None:
+            similarity(self.transform)
+
+    def apply(self, splats: Splats) -> Splats:
+        """Return the changed scene."""
+        keep = np.ones(len(splats), bool)
+        if self.box is not None:
+            keep &= in_box(splats, self.box[:3], self.box[3:])
+        if self.sphere is not None:
+            keep &= in_sphere(splats, self.sphere[:3], self.sphere[3])
+        keep ^= self.invert
+        if self.where is not None:
+            keep &= Condition(self.where).of(splats)
+        if not keep.any():
+            raise InputError(
+                f"the conditions keep none of {len(splats):,} Gaussians",
+                hint="change {box}, {sphere} or {where}; `g2ard info` shows extent, opacities and scales",
+            )
+        if not keep.all():
+            splats = splats.take(keep)
+        matrix = self._matrix()
+        if matrix is not None:
+            splats = transform(splats, matrix)
+        if self.recentre:
+            splats = replace(splats, offset=np.zeros(3))
+        if self.sh_degree is not None:
+            splats = splats.with_sh_degree(self.sh_degree)
+        return splats if self.to_axes is None else with_axes(splats, change_of_axes("RDF", self.to_axes))
+
+    def _matrix(self) -> NDArray[np.float64] | None:
+        """Return the (4, 4) matrix of `transform` and then of `scale`, `rotate` and `translate`."""
+        matrix = None if self.transform is None else np.asarray(self.transform, np.float64)
+        if not any(given is not None for given in (self.scale, self.rotate, self.translate)):
+            return matrix
+        zero = (0.0, 0.0, 0.0)
+        turn = zero if self.rotate is None else self.rotate
+        shift = zero if self.translate is None else self.translate
+        then = moving(1.0 if self.scale is None else self.scale, turn, shift)
+        return then if matrix is None else then @ matrix
+
+
+@checks_arguments
+def convert(
+    scenes: Scene | Sequence[Scene],
+    *,
+    box: Sequence[float] | None = None,
+    sphere: Sequence[float] | None = None,
+    invert: bool = False,
+    where: str | None = None,
+    transform: ArrayLike | None = None,
+    scale: float | None = None,
+    rotate: Sequence[float] | None = None,
+    translate: Sequence[float] | None = None,
+    recentre: bool = False,
+    from_axes: Axes | None = None,
+    to_axes: Axes | None = None,
+    sh_degree: int | None = None,
+    render_model: RenderModel | None = None,
+    say: Say = unsaid,
+) -> Splats:
+    """Merge, crop and move scenes, exactly like the command `g2ard convert`; `g2ard.save` writes the result.
+
+    Options apply in their order here. `to_axes` suits formats without axes of their own, such as .ply; for
+    .spz, pass `axes` and `spz_version` to `save` instead. `layout` and `compress` are options of `save` too.
+
+    Args:
+        scenes: a scene or several, or their paths.
+        box: lower and upper corner (x, y, z, x, y, z) of what to keep, world coordinates.
+        sphere: centre and radius (x, y, z, r) of what to keep.
+        invert: keep what `box` and `sphere` would drop.
+        where: condition on the Gaussians to keep, such as "opacity > 0.05 and scale < 2"; see
+            `g2ard.scene.attributes`.
+        transform: (4, 4) matrix of uniform scale, rotation and translation, row-major.
+        scale: factor about the origin.
+        rotate: angles about the x, y and z axes in turn, degrees.
+        translate: (3,) shift, scene units.
+        recentre: drop the offset to map coordinates.
+        from_axes: axes of the files' coordinates, if not those of their format, such as "RDF".
+        to_axes: axes of the result; a scene in memory is "RDF" (right, down, forward).
+        sh_degree: SH degree of the result, 0 to 3.
+        render_model: overrides what the scenes' files say.
+        say: called with log messages.
+
+    Returns:
+        The scene.
+
+    Raises:
+        InputError: an unreadable scene, an invalid option, or no Gaussian left.
+
+    >>> pair = Splats.create([[0, 0, 0], [5, 0, 0]], scales=np.ones((2, 3)))
+    >>> convert([pair, pair], where="x > 1", scale=2).means.tolist()
+    [[10.0, 0.0, 0.0], [10.0, 0.0, 0.0]]
+    """
+    changes = Changes(
+        box, sphere, invert, where, transform, scale, rotate, translate, recentre, to_axes, sh_degree
+    )
+    return changes.apply(read_merged(scenes, from_axes, render_model, say))
+
+
+def read_merged(
+    scenes: Scene | Sequence[Scene],
+    from_axes: Axes | None = None,
+    render_model: RenderModel | None = None,
+    say: Say = unsaid,
+) -> Splats:
+    """Read scenes and join them; the arguments are those of `convert`."""
+    several = [scenes] if isinstance(scenes, Splats | str | Path) else scenes
+    return join([_loaded(scene, from_axes, render_model, say) for scene in several])
+
+
+def _loaded(scene: Scene, axes: Axes | None, render_model: RenderModel | None, say: Say) -> Splats:
+    """Read a scene whose file may store other axes than its format defines."""
+    splats = scene if isinstance(scene, Splats) else load_scene(scene, say, render_model)
+    if axes is None:
+        return splats
+    defined = "RDF"
+    if not isinstance(scene, Splats):
+        path, name = check_scene(scene)
+        if name == "spz" and spz.names_axes(path):
+            raise InputError("names its axes, which are followed", path=path, hint="leave {from_axes} out")
+        known = (each.axes for each in FORMATS.values() if each.module == name)
+        defined = next((found for found in known if found), "RDF")
+    if axes == defined:
+        return splats
+    return with_axes(splats, change_of_axes(axes, "RDF") @ change_of_axes("RDF", defined))
