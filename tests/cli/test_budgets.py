@@ -1,6 +1,7 @@
 """Budgets on the command line: counts, ratios, and several in one call."""
 
 import json
+import shutil
 from pathlib import Path
 
 import pytest
@@ -11,7 +12,9 @@ from helpers.commands import CommandLine, refused, succeeds
 from helpers.scenes import checkered_ball
 
 
-def test_several_budgets_equal_single_runs(command_line: CommandLine, folder: Path) -> None:
+def test_several_budgets_equal_single_runs(
+    command_line: CommandLine, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     several = ("simplify", "ball.ply", "-r", "4,5", "-r", 10, "-o", "s_{ratio}x_{count}.ply", "--json", "-")
     out = succeeds(command_line, folder, *several).out
     assert [run["output_count"] for run in json.loads(out)["runs"]] == [100, 80, 40]
@@ -26,6 +29,15 @@ def test_several_budgets_equal_single_runs(command_line: CommandLine, folder: Pa
     assert (folder / "runs/200/report.html").exists()
     assert (folder / "runs/100/view.html").exists()
     assert not (folder / "alone/view.html").exists()
+
+    judged: list[tuple[int, int]] = []
+    monkeypatch.setattr(
+        "g2ard.cli.commands.distill.tell_quality",
+        lambda run, aim, splats: judged.append((aim.count, len(splats))),
+    )
+    shutil.rmtree(folder / "runs/200")
+    succeeds(command_line, folder, *ask, "-n", "200,100", "-o", "runs/{count}", "--resume")
+    assert judged == [(200, 200)]  # the last budget was finished before
 
 
 @pytest.mark.parametrize(

@@ -16,6 +16,7 @@ from g2ard.config.choices import POLICIES
 from g2ard.config.paths import values_of
 from g2ard.pipeline.adapt import appearance_only
 from g2ard.pipeline.presets import configured
+from g2ard.scene.splats import SH_C0
 from g2ard.stages.lift import LiftConfig
 from g2ard.stages.recover.schedule import Schedule
 from helpers.feature_scenes import blotched
@@ -298,3 +299,15 @@ def test_given_weights_of_regularisers_are_used() -> None:
             SMALL, teacher=SCENE, views=VIEWS, steps=2, settings={"regularizers": "lift"}
         ).splats.fingerprint()
     )
+
+
+def test_recover_measures_which_weights_suit_the_scene() -> None:
+    ball = checkered_ball(900)
+    discs = g2ard.lift(ball.means, np.clip(0.5 + SH_C0 * ball.sh0[:, 0], 0, 1))
+    small = g2ard.simplify(discs, count=60, blind=True).splats
+    given: dict[str, Any] = {"teacher": discs, "views": VIEWS, "steps": 6, "settings": {"period": 1}}
+    lift, trained, measured = (
+        g2ard.recover(small, **given, regularizers=kind).splats.fingerprint()
+        for kind in ("lift", "trained", None)
+    )
+    assert measured == lift != trained
