@@ -14,6 +14,7 @@ import pytest
 
 import g2ard
 from g2ard.io import write_views
+from helpers.plans import share_plans
 from helpers.project import environment
 from helpers.scenes import around, checkered_ball
 
@@ -87,6 +88,13 @@ def _here(words: list[str], cwd: Path, env: dict[str, str]) -> Said:
                 if str(getattr(sys.modules[name], "__file__", None)).startswith(str(cwd)):
                     del sys.modules[name]
     return int(status or 0) if isinstance(status, int | None) else 1, out.getvalue(), err.getvalue()
+
+
+@pytest.fixture(autouse=True)
+def shared_plans(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Share planned views between all tests but those of planning."""
+    if request.path.parent.name != "poses":
+        share_plans(monkeypatch)
 
 
 @pytest.fixture

@@ -374,11 +374,21 @@ def runner(inputs: Path, tmp_path_factory: pytest.TempPathFactory, command_line:
     return Runner(inputs, tmp_path_factory.mktemp("runs"), command_line)
 
 
+PRESETS = {
+    " --preset paper": ("distill", "simplify", "recover", "adapt", "select"),
+    " --preset lift": ("distill", "recover"),
+    " --preset noisy": ("distill", "recover"),
+}
+"""Preset → the commands that take it."""
+OF_THE_PAPER = ("schedule", "weighted", "no_views")
+"""Options that `--preset paper` sets itself."""
+
 CASES = [(command, name, "") for command, table in OPTIONS.items() for name in table] + [
-    (command, name, " --preset paper")
-    for command, table in OPTIONS.items()
-    for name in table
-    if "preset" in table and name not in ("preset", "schedule", "weighted", "no_views")  # the preset's own
+    (command, name, preset)
+    for preset, commands in PRESETS.items()
+    for command in commands
+    for name in OPTIONS[command]
+    if name != "preset" and not (preset == " --preset paper" and name in OF_THE_PAPER)
 ]
 
 

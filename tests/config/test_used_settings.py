@@ -192,28 +192,34 @@ def _registered(settings: Mapping[str, Any]) -> object:
     return [repr(replace(photo, seconds=0.0)) for photo in done.photos]
 
 
+PRIORS = ("trained", "lift", "noisy")
 RUNS: dict[str, tuple[Callable[[Mapping[str, Any]], object], dict[str, Any]]] = {
     **{method: (_simplified(method, views=VIEWS), SIMPLIFY) for method in ("default", "fast")},
     **{f"{method} blind": (_simplified(method, blind=True), SIMPLIFY) for method in ("default", "fast")},
     "paper": (_simplified("paper"), SIMPLIFY),
-    "recover": (_recovered, RECOVER),
+    **{f"recover {kind}": (_recovered, RECOVER) for kind in PRIORS},
     **{policy: (_selected(policy), SELECT) for policy in POLICIES},
     "lift": (_lifted, LIFT),
     **dict.fromkeys(("adapt", "adapt paper"), (_adapted, ADAPT)),
     **dict.fromkeys(("register sift", "register direct"), (_registered, REGISTER)),
 }
+RECOVERY: dict[str, Any] = {"steps": 6, "regularizers.period": 1, "regularizers.shape": 1.0}
+RECOVERY_BESIDE: dict[str, dict[str, Any]] = {
+    "recovery_time": {"steps": None},
+    "schedule.guarded": {"steps": 24, "schedule.multiplier": 30.0},
+    "regularizers.rank_offset": {"regularizers.effective_rank": True},
+    "regularizers.effective_rank": {"regularizers.effective_rank": False},
+}
 BESIDE: dict[str, dict[str, Any]] = {
-    "recover": {"steps": 6, "regularizers.period": 1, "regularizers.shape": 1.0},
-    "recover: recovery_time": {"steps": None},
+    **{f"recover {kind}": {**RECOVERY, "regularizers": kind} for kind in PRIORS},
+    **{f"recover {kind}: {name}": beside for kind in PRIORS for name, beside in RECOVERY_BESIDE.items()},
     "adapt": {"steps": 6, "first_stretch": 2, "tolerance": 0.0, "colour_worth": 0.0},
     "adapt paper": {"steps": 6, "schedule": "paper"},
     "adapt paper: schedule": {"schedule": "default"},
     "register sift": {"matcher": "sift", "size": 160, "align_size": 96},
     "register direct": {"matcher": "direct", "size": 160, "align_size": 128},
-    "recover: schedule.guarded": {"steps": 24, "schedule.multiplier": 30.0},
     "paper: max_energy": {"color_bin": 1.0},
     "paper: protection": {"flag_threshold": 0.1},
-    "recover: regularizers.rank_offset": {"regularizers.effective_rank": True},
 }
 """Run, or run and setting → other settings, with which it matters."""
 
