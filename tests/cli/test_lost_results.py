@@ -19,9 +19,10 @@ from helpers.faults import INJECTED, stages_after
 from helpers.photos import cloud_of, photographed
 from helpers.scenes import around, checkered_ball, under_a_sky
 
-TRAIN = "--views views.json --teacher ball.ply --steps 2"
+VIEWED = "--views views.json --steps 2 --size 24"
+TRAIN = f"{VIEWED} --teacher ball.ply"
 COMMANDS = {
-    "run/scene.sog": "distill ball.ply -r 8 --steps 2 --views views.json --keep --format sog -o run",
+    "run/scene.sog": f"distill ball.ply -r 8 {VIEWED} --keep --format sog -o run",
     "recovered.ply": f"recover ball.ply {TRAIN} -o recovered.ply",
     "adapted.ply": f"adapt ball.ply {TRAIN} -o adapted.ply",
     "small.ply": "simplify ball.ply -r 8 --no-views --parents rows.npy -o small.ply",

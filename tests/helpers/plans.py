@@ -13,14 +13,14 @@ from g2ard.scene.splats import Splats
 
 _IMPORTERS = ("poses", "jobs.clean", "jobs.close_up", "jobs.packing", "jobs.turntable")
 """Modules in which jobs find `plan_pool`."""
-_MOST = 32
+_MOST = 12
 """Plans that are kept."""
 
 _plans: OrderedDict[str, Pool] = OrderedDict()
 
 
 def share_plans(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Plan the views of a scene once in this process; `tests/poses` tests that plans are the same each time."""
+    """Plan the views of a scene once in this process; tests/poses tests that plans are the same each time."""
     for name in _IMPORTERS:
         monkeypatch.setattr(f"g2ard.{name}.plan_pool", _shared)
 

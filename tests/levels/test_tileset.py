@@ -138,7 +138,7 @@ def test_a_map_system_gives_the_place_and_grid_north(tmp_path: Path) -> None:
 
 def test_the_command_writes_3d_tiles(tmp_path: Path, command_line: CommandLine) -> None:
     write_splats(tmp_path / "a.ply", replace(checkered_ball(800), offset=np.array(UTM)))
-    words = ["lod", "a.ply", "-r", "1,4", "--merge-only", "--format", "3dtiles", "-o"]
+    words = ["lod", "a.ply", "-r", "1,4", "--merge-only", "--size", "48", "--format", "3dtiles", "-o"]
     there = ["--georeference", "24.75,59.43,31.5,45"]
     error = succeeds(command_line, tmp_path, *words, "out", *there).err
     assert "up is 0,0,1" in error

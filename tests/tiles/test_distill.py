@@ -177,7 +177,7 @@ def test_distill_in_tiles_recovers(command_line: CommandLine, folder: Path, tmp_
         command_line,
         tmp_path,
         *("distill", folder / "town.ply", "-r", 10, "-o", tmp_path / "run", "--views", folder / "views.json"),
-        *("--tile-rows", 4000, "--steps", 200, "--workers", 1),
+        *("--tile-rows", 4000, "--steps", 60, "--size", 120, "--workers", 1),
     )
     report = json.loads((tmp_path / "run" / "report.json").read_text())
     assert report["scores"]["recovered"] > report["scores"]["simplified"] + 0.2
@@ -204,8 +204,8 @@ def test_recovery_in_tiles_takes_its_options(command_line: CommandLine, folder: 
     write_splats(tmp_path / "town.ply", town(1500))
 
     def distilled(name: str, *options: object) -> Splats:
-        args = ("distill", tmp_path / "town.ply", "-r", 10, "-o", tmp_path / name, "--steps", 60)
-        tiled = ("--views", folder / "views.json", "--tile-rows", 800, "--workers", 1)
+        args = ("distill", tmp_path / "town.ply", "-r", 10, "-o", tmp_path / name, "--steps", 5)
+        tiled = ("--views", folder / "views.json", "--size", 48, "--tile-rows", 800, "--workers", 1)
         succeeds(command_line, tmp_path, *args, *tiled, *options)
         return read_splats(tmp_path / name / "scene.ply")
 

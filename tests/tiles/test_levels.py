@@ -79,7 +79,7 @@ def test_levels_on_disk_give_the_files_of_levels_in_memory(tmp_path: Path, degre
 
 
 def levels_in_tiles(place: Path, folder: Path, **more: object) -> TiledLevels:
-    options = DistillOptions(views=place / "views.json", settings={"steps": 12})
+    options = DistillOptions(views=place / "views.json", size=64, settings={"steps": 12})
     tiling = Tiling(tile_rows=1700, workers=1, folder=folder)
     return lod_in_tiles(place / "town.ply", (1, 3, 12), tiling, options, **more)  # type: ignore[arg-type]
 
