@@ -34,7 +34,7 @@ demo: $(if $(wildcard $(VENV)/.built),setup,$(VENV)/.plain)
 # their own number of threads.
 TEST_PROCESSES ?= 2
 test: setup
-	cargo test --quiet --workspace
+	cargo test --quiet --workspace --profile bench
 	RAYON_NUM_THREADS=2 $(BIN)/python -m pytest --numprocesses $(TEST_PROCESSES) --dist loadfile
 
 # Over 10,000 random gradient cases; a slice of them is in `make test`.
