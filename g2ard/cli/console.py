@@ -158,7 +158,7 @@ class Console:
         self._clear()
 
     def say(self, text: str, *, asked: bool = False) -> None:
-        """Print a line of status; --quiet hides it unless the user asked for it."""
+        """Print a line of status. --quiet hides it, but not an answer (`asked`), such as an estimate."""
         if self.quiet and not asked:
             return
         with self._lock:

@@ -224,7 +224,7 @@ class Run:
         self.console.say(text)
 
     def answer(self, text: str) -> None:
-        """Print a line to stderr that the user asked for, even with --quiet."""
+        """Print to stderr what the command was run for, such as an estimate, even with --quiet."""
         self.tell_notes()
         self.console.say(text, asked=True)
 

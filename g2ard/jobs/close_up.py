@@ -1,4 +1,4 @@
-"""How many Gaussians viewers blend per pixel close to a scene's surfaces."""
+"""Overdraw of near views: the Gaussians blended per pixel close to a scene's surfaces."""
 
 from dataclasses import dataclass
 

@@ -160,7 +160,7 @@ def make_targets(
 
 
 def scorable(targets: Targets, say: Say = unsaid) -> Targets:
-    """Return the targets that have a valid pixel, and say how many have none."""
+    """Return the targets that have a valid pixel, and report the number of the others."""
     kept = with_pixels(targets)
     if skipped := len(targets.cameras) - len(kept.cameras):
         say(f"{plural(skipped, 'photo')} not scored: the mask leaves no pixel")

@@ -290,7 +290,7 @@ def prepare(
         teaching,
         pool if split == "train" else None,
         size,
-        teaching.validation(pool, size) if split == "train" else None,
+        teaching.validation(pool, size) if split == "train" and config.schedule.guarded else None,
         progress,
     )
 

@@ -119,14 +119,14 @@ class Teaching:
         return scorable(self._made(cameras.resized(size), lazy=True), self._say)
 
     def validation(self, views: Views, size: int | None) -> Targets | None:
-        """Return the renders of the views of other kinds in split `val`; None if there are none."""
+        """Return the renders of the views of other kinds in split `val`, or None."""
         cameras = None if self.dense is None or self._photos else self._split(views, "val")
         if cameras is None or USUAL in cameras.kinds:
             return None
         return self._made(cameras.resized(size), progress=self._progress, say=self._say)
 
     def _split(self, views: Views, name: str) -> Cameras | None:
-        """Return the views of a split, None if there are none."""
+        """Return the views of a split, or None if it is empty."""
         pool, _ = load_split_views(views, "all", unpictured=self.dense is not None)
         rows = [i for i, split in enumerate(pool.splits) if split == name]
         return pool.cameras.take(rows) if rows else None

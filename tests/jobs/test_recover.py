@@ -42,7 +42,7 @@ def test_python_recovers_as_the_command_does(
 
 
 def test_a_generated_pool_is_completed_for_the_student(folder: Path) -> None:
-    """As in `distill`: views of other kinds train, validate and are scored, and more views get more steps."""
+    """Views of other kinds train, validate and are scored, and more views get more steps, as in `distill`."""
     student = g2ard.simplify(naive.statue(), ratio=10, method="fast").splats
     job = prepare(student, views="made", teacher=naive.statue(), size=32)
     kinds = job.views.cameras.kinds

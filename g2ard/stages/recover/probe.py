@@ -22,7 +22,7 @@ _INVISIBLE_PSNR = 40.0
 _INVISIBLE_MSE = 1e-4
 """Mean squared error at that PSNR."""
 _LEAST_MSE = 1e-12
-"""Mean squared error below which there is none."""
+"""Least mean squared error, so that logarithms stay finite."""
 _TOLERATED_LOSS = 1.0
 """Loss in dB up to which no Gaussian goes back for a view."""
 _COMPARED_VIEWS = 64
