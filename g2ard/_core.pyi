@@ -38,7 +38,9 @@ def palette(
     weights: NDArray[np.float32] | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> tuple[NDArray[np.float32], NDArray[np.uint32]]: ...
-def knn(points: NDArray[np.float64], k: int) -> NDArray[np.uint32]: ...
+def knn(
+    points: NDArray[np.float64], k: int, progress: Callable[[int, int], None] | None = None
+) -> NDArray[np.uint32]: ...
 def cast_rays(
     steps: NDArray[np.int8],
     shape: list[int],

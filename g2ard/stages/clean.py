@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from g2ard import _core
 from g2ard.errors import InputError, require
-from g2ard.progress import Progress, silent
+from g2ard.progress import Progress, counter, silent
 from g2ard.rendering.renderer import Renderer
 from g2ard.scene.cameras import Camera, Cameras
 from g2ard.scene.shape import NEEDLE_LENGTH, longer_axes
@@ -238,8 +238,8 @@ def _needles(splats: Splats, rest: NDArray[np.bool_], progress: Progress) -> NDA
     means = splats.means.astype(np.float64)
     ends = np.concatenate([means[long] - mean_to_end, means[long] + mean_to_end])
     points = np.concatenate([means[rows], ends])
-    progress("neighbours", 0, 0)
-    near = _core.knn(np.ascontiguousarray(points), _NEIGHBORS)[len(rows) :].astype(np.int64)
+    found = _core.knn(np.ascontiguousarray(points), _NEIGHBORS, counter(progress, "neighbours"))
+    near = found[len(rows) :].astype(np.int64)
     real = near < len(rows)
     other = rows[np.where(real, near, 0)]
     covered = real & (other != np.tile(long, 2)[:, None])
@@ -272,8 +272,7 @@ def _floaters(
         return out
     means = splats.means[rows].astype(np.float64)
     reach = _FOOTPRINT_SIGMAS * splats.scales[rows].max(axis=1).astype(np.float64)
-    progress("neighbours", 0, 0)
-    near = _core.knn(means, _NEIGHBORS)
+    near = _core.knn(means, _NEIGHBORS, counter(progress, "neighbours"))
     group = np.arange(len(rows))
     for first in range(0, len(rows), _BLOCK):
         progress("groups", first, len(rows))

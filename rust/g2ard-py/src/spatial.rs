@@ -1,6 +1,7 @@
 //! Exact nearest neighbours; rays through cells.
 
 use g2ard_core::spatial::{Steps, Tree};
+use g2ard_core::{Control, Result};
 use numpy::ndarray::Array2;
 use numpy::{IntoPyArray, PyArray1, PyArray2, PyReadonlyArray1, PyReadonlyArray2};
 use pyo3::prelude::*;
@@ -8,14 +9,16 @@ use rayon::prelude::*;
 
 use crate::arrays;
 use crate::error::invalid;
-use crate::work::quick;
+use crate::work::{long, quick};
 
 /// Return (N, k) rows of the points nearest to each of (N, 3) finite points, without itself, by (distance, row).
 #[pyfunction]
+#[pyo3(signature = (points, k, progress=None))]
 pub fn knn<'py>(
     py: Python<'py>,
     points: PyReadonlyArray2<'py, f64>,
     k: usize,
+    progress: Option<&Bound<'py, PyAny>>,
 ) -> PyResult<Bound<'py, PyArray2<u32>>> {
     let points = arrays::rows::<f64, 3>("points", &points)?;
     if k == 0 || k >= points.len() {
@@ -26,29 +29,33 @@ pub fn knn<'py>(
         let got = format!("{:?} in row {row}", points[row]);
         return Err(invalid("points", "finite coordinates", got));
     }
-    let near = quick(py, || Ok(neighbors(points, k)))?;
+    let near = long(py, progress, |control| neighbors(points, k, control))?;
     Ok(near.into_pyarray(py))
 }
 
-fn neighbors(points: &[[f64; 3]], k: usize) -> Array2<u32> {
+fn neighbors(points: &[[f64; 3]], k: usize, control: &Control) -> Result<Array2<u32>> {
     const CHUNK: usize = 1024;
+    control.begin(points.len() as u64);
     let tree = Tree::build(points);
     let mut found = vec![0; points.len() * k];
     let chunks = found.par_chunks_mut(CHUNK * k).enumerate();
-    chunks.for_each(|(chunk, found)| {
+    chunks.try_for_each(|(chunk, found)| {
+        control.check()?;
         let range = chunk * CHUNK..points.len().min((chunk + 1) * CHUNK);
         let mut rows = found.chunks_mut(k);
         tree.nearest(range, k, |_, near| {
             let row = rows.next().into_iter().flatten();
             row.zip(near).for_each(|(to, n)| *to = n.1);
         });
-    });
+        control.advance((found.len() / k) as u64);
+        Ok(())
+    })?;
     let mut rows = Array2::zeros((points.len(), k));
     for (&row, near) in tree.rows().iter().zip(found.chunks(k)) {
         let to = rows.row_mut(row as usize);
         to.into_iter().zip(near).for_each(|(to, from)| *to = *from);
     }
-    rows
+    Ok(rows)
 }
 
 /// Return (M,) distances at which unit rays first meet a cell of 0 steps; infinite if they meet none.
