@@ -113,10 +113,10 @@ def missing(what: str, package: str, **fields: Any) -> MissingDependencyError:
     """Return the error for a feature whose optional package is not installed.
 
     Args:
-        package: package to install with pip.
+        package: the package itself, which pip installs wherever g2ard came from; an extra of g2ard would not.
 
-    >>> str(missing("the engine 'torch'", "g2ard[torch]"))
-    "the engine 'torch' needs a package that is not installed; pip install 'g2ard[torch]'"
+    >>> str(missing("reading .las and .laz", "laspy[lazrs]"))
+    "reading .las and .laz needs a package that is not installed; pip install 'laspy[lazrs]'"
     """
     quoted = f"'{package}'" if "[" in package else package
     return MissingDependencyError(
@@ -124,10 +124,10 @@ def missing(what: str, package: str, **fields: Any) -> MissingDependencyError:
     )
 
 
-def require_torch(feature: str, extra: str = "torch") -> None:
-    """Check that torch can be imported, without importing it; `extra` of g2ard installs it."""
+def require_torch(feature: str, packages: str = "torch") -> None:
+    """Check that torch can be imported, without importing it; `packages` are those to install."""
     if find_spec("torch") is None:
-        raise MissingDependencyError(f"{feature} needs torch", hint=f"pip install 'g2ard[{extra}]'")
+        raise MissingDependencyError(f"{feature} needs torch", hint=f"pip install {packages}")
 
 
 def require(name: str, value: object, fits: bool, expected: str) -> None:

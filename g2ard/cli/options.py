@@ -333,7 +333,7 @@ def choose_engine(run: Run, settings: dict[str, Any], path: str) -> None:
 
 def use_cuda(asked: str = "device") -> None:
     """Raise an error if CUDA, requested by the option `asked`, is not available."""
-    require_torch("--device cuda" if asked == "device" else "--engine gsplat", "cuda")
+    require_torch("--device cuda" if asked == "device" else "--engine gsplat", "torch gsplat")
     from g2ard.rendering.cuda import check_cuda
 
     check_cuda(asked)

@@ -29,7 +29,7 @@ def read_points(path: str | Path) -> Points:
 
     Raises:
         InputError: the file is missing, damaged, has no colours, or no finite point.
-        MissingDependencyError: .las or .laz without `pip install g2ard[las]`.
+        MissingDependencyError: .las or .laz without laspy and lazrs.
 
     >>> import tempfile, g2ard
     >>> path = Path(tempfile.mkdtemp()) / "cloud.ply"

@@ -63,7 +63,7 @@ def _opened(path: Path) -> Iterator[Any]:
         import laspy
         import lazrs  # noqa: F401 - used by laspy for .laz
     except ImportError as error:
-        raise missing("reading .las and .laz", "g2ard[las]", path=path) from error
+        raise missing("reading .las and .laz", "laspy[lazrs]", path=path) from error
     _check_records(path)
     try:
         with laspy.open(path) as reader:

@@ -137,7 +137,7 @@ def write_splats(
     Raises:
         OutputError: the file exists or cannot be written, or the extension or an option is unsupported.
         InputError: the scene is empty, has a non-finite value, or one that the format cannot store.
-        MissingDependencyError: .spz of version 4 before Python 3.14 without `pip install backports.zstd`.
+        MissingDependencyError: .spz of version 4 before Python 3.14 without backports.zstd.
 
     >>> import tempfile, g2ard
     >>> path = Path(tempfile.mkdtemp()) / "one.sog"

@@ -175,5 +175,5 @@ def _pxr(path: Path) -> Any:
         import pxr
         from pxr import Gf, Tf, Usd, UsdGeom, UsdVol, Vt  # noqa: F401
     except ImportError as error:
-        raise missing("reading OpenUSD, or writing .usdc,", "g2ard[usd]", path=path) from error
+        raise missing("reading OpenUSD, or writing .usdc,", "usd-core", path=path) from error
     return pxr

@@ -107,7 +107,7 @@ def map_system(name: str) -> Any:
     try:
         import pyproj
     except ImportError as error:
-        raise missing("a coordinate system by name", "g2ard[globe]", parameter="place") from error
+        raise missing("a coordinate system by name", "pyproj", parameter="place") from error
     try:
         system = pyproj.CRS.from_user_input(name)
     except pyproj.exceptions.CRSError:

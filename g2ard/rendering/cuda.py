@@ -36,10 +36,10 @@ def check_cuda(asked: str = "engine") -> None:
         raise InputError(
             "torch finds no CUDA device",
             parameter=asked,
-            hint=f"gsplat needs an NVIDIA GPU, torch for CUDA and g2ard[cuda]; {other} needs none",
+            hint=f"gsplat needs an NVIDIA GPU, torch for CUDA, and gsplat; {other} needs none",
         )
     if find_spec("gsplat") is None:
-        raise missing("gsplat's renderer", "g2ard[cuda]", parameter=asked)
+        raise missing("gsplat's renderer", "gsplat", parameter=asked)
 
 
 def rasterized(

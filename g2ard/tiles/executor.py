@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from g2ard import _core
-from g2ard.errors import InputError
+from g2ard.errors import InputError, missing
 from g2ard.progress import Progress, silent
 from g2ard.system.peak_memory import forget_workers, note_worker, peak_rss
 from g2ard.tiles.tasks import Task, run_task
@@ -186,7 +186,7 @@ def _dask_client(scheduler: str, workers: int) -> Iterator[Any]:
     try:
         from distributed import Client, LocalCluster
     except ImportError:
-        raise InputError('--scheduler: Dask is not installed; run pip install "g2ard[distributed]"') from None
+        raise missing("Dask", "distributed", parameter="scheduler") from None
     with ExitStack() as opened:
         if scheduler == "local":
             cluster = LocalCluster(  # type: ignore[no-untyped-call]

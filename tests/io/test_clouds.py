@@ -210,7 +210,7 @@ def test_a_panic_in_lazrs_is_one_line(laz: Path, monkeypatch: pytest.MonkeyPatch
 def test_las_needs_laspy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = las(tmp_path / "a.las", np.zeros((3, 3)), np.ones((3, 3), int))
     monkeypatch.setitem(sys.modules, "laspy", None)
-    with pytest.raises(MissingDependencyError, match=r"pip install 'g2ard\[las\]'"):
+    with pytest.raises(MissingDependencyError, match=r"pip install 'laspy\[lazrs\]'"):
         read_points(path)
 
 

@@ -109,15 +109,15 @@ def test_without_cuda_the_error_is_one_line(tmp_path: Path, command_line: Comman
     asked = ("recover", "b.ply", "--views", "v.json", "--teacher", "b.ply", "-o", "o.ply", "--device", "cuda")
     error = refused(command_line, tmp_path, *asked, status=1)
     assert "--device: torch finds no CUDA device; " in error
-    assert "g2ard[cuda]; --device cpu needs none" in error
+    assert "and gsplat; --device cpu needs none" in error
     error = refused(command_line, tmp_path, *asked[:-2], "--engine", "gsplat", status=1)
     assert "--engine: torch finds no CUDA device; " in error
-    assert "g2ard[cuda]; --engine fused needs none" in error
+    assert "and gsplat; --engine fused needs none" in error
     assert not (tmp_path / "o.ply").exists()
 
 
 def test_a_missing_gsplat_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(cuda, "find_spec", lambda name: None)
-    with pytest.raises(MissingDependencyError, match=r"pip install 'g2ard\[cuda\]'"):
+    with pytest.raises(MissingDependencyError, match=r"pip install gsplat"):
         cuda.check_cuda()

@@ -202,7 +202,7 @@ def test_without_pycolmap_direct_alignment_is_left(monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(module, "find_spec", lambda name: None)
     assert matcher_named("auto", 0.85, 100) is None
     for name in ("sift", "json:dumps"):
-        with pytest.raises(MissingDependencyError, match=r"pip install g2ard\[register\]"):
+        with pytest.raises(MissingDependencyError, match="pip install pycolmap"):
             matcher_named(name, 0.85, 100)
 
 

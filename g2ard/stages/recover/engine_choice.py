@@ -19,7 +19,7 @@ def engine_class(name: str) -> Callable[[Objective], Engine]:
 
         return TorchEngine
     if name == "gsplat":
-        require_torch("engine 'gsplat'", "cuda")
+        require_torch("engine 'gsplat'", "torch gsplat")
         from g2ard.stages.recover.gsplat_engine import GsplatEngine
 
         return GsplatEngine

@@ -56,7 +56,7 @@ def matcher_named(name: str, ratio: float, most: int) -> Matcher | None:
         raise InputError(f"expected auto, sift, direct or MODULE:FUNCTION, got {name!r}", parameter="matcher")
     if absent:
         raise MissingDependencyError(
-            f"matcher {name}: poses from matches need `pip install g2ard[register]` ({absent})"
+            f"poses from matches need pycolmap ({absent})", parameter="matcher", hint="pip install pycolmap"
         )
     return Sift(ratio, most) if name in ("auto", "sift") else _plugged(name)
 
