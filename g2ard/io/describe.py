@@ -17,6 +17,7 @@ from g2ard.io.splits import splits_of
 from g2ard.io.types import Note, Points, ViewSet
 from g2ard.progress import plural
 from g2ard.scene.cameras import Cameras
+from g2ard.scene.shape import elongation
 from g2ard.scene.splats import Splats
 
 _QUANTILES = (0, 1, 25, 50, 75, 99, 100)
@@ -95,7 +96,7 @@ def _splats(splats: Splats) -> dict[str, Any]:
         "opacity": _quantiles(opacities),
         "largest_scale": _quantiles(scales[:, 2]),
         "smallest_scale": _quantiles(scales[:, 0]),
-        "elongation": _quantiles(scales[:, 2] / scales[:, 1]),
+        "elongation": _quantiles(elongation(scales)),
         "odd": {
             "opacity_below_0.005": int(np.count_nonzero(opacities < 0.005)),
             "opacity_above_0.99": int(np.count_nonzero(opacities > 0.99)),

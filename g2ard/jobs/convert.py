@@ -130,7 +130,7 @@ def convert(
         box: lower and upper corner (x, y, z, x, y, z) of what to keep, world coordinates.
         sphere: centre and radius (x, y, z, r) of what to keep.
         invert: keep what `box` and `sphere` would drop.
-        where: condition on the Gaussians to keep, such as "opacity > 0.05 and scale < 2"; see
+        where: condition on the Gaussians to keep, such as "opacity > 0.05 and elongation < 9"; see
             `g2ard.scene.attributes`.
         transform: (4, 4) matrix of uniform scale, rotation and translation, row-major.
         scale: factor about the origin.

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard.errors import InputError
+from g2ard.scene.shape import elongation
 from g2ard.scene.splats import Splats
 
 _LONGEST = 1000
@@ -23,8 +24,9 @@ _TABLE: dict[tuple[str, ...], Callable[[Splats], NDArray[Any]]] = {
     ("red", "green", "blue"): lambda splats: splats.colors,
 }
 _DERIVED: dict[tuple[str, ...], Callable[[Splats], NDArray[Any]]] = {
-    ("scale",): lambda splats: splats.scales.max(axis=1, keepdims=True),
-    ("thickness",): lambda splats: splats.scales.min(axis=1, keepdims=True),
+    ("smallest_scale",): lambda splats: splats.scales.min(axis=1, keepdims=True),
+    ("largest_scale",): lambda splats: splats.scales.max(axis=1, keepdims=True),
+    ("elongation",): lambda splats: elongation(splats.scales)[:, None],
 }
 
 ATTRIBUTES = tuple(name for names in (*_TABLE, *_DERIVED) for name in names)
@@ -55,15 +57,15 @@ def columns(splats: Splats) -> dict[str, NDArray[Any]]:
 
 @dataclass(frozen=True)
 class Condition:
-    """A condition on Gaussians, such as `opacity > 0.05 and scale < 2`.
+    """A condition on Gaussians, such as `opacity > 0.05 and largest_scale < 2`.
 
-    Names are `ATTRIBUTES`: those of `columns`, and the largest and smallest of the three standard deviations,
-    `scale` and `thickness`. Arithmetic (+, -, *, /, abs, sqrt, min, max) and comparisons (<, <=, >, >=, ==,
-    !=, also chained) are supported, joined with and, or and not. Anything else is rejected; nothing runs as
-    Python.
+    Names are `ATTRIBUTES`: those of `columns`; `smallest_scale` and `largest_scale` of the three standard
+    deviations; and `elongation`, the largest over the middle one. Arithmetic (+, -, *, /, abs, sqrt, min,
+    max) and comparisons (<, <=, >, >=, ==, !=, also chained) are supported, joined with and, or and not.
+    Anything else is rejected; nothing runs as Python.
 
     >>> two = Splats.create([[0, 0, 0], [9, 0, 0]], scales=[[1, 1, 1], [1, 2, 3]])
-    >>> Condition("abs(x) <= 5 and not scale > 2").of(two).tolist()
+    >>> Condition("abs(x) <= 5 and not largest_scale > 2").of(two).tolist()
     [True, False]
 
     Raises:

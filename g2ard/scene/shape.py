@@ -25,6 +25,17 @@ def longer_axes(scales: NDArray[Any]) -> NDArray[Any]:
     return np.sort(scales, axis=1)[:, 1:]
 
 
+def elongation(scales: NDArray[Any]) -> NDArray[np.float64]:
+    """Return (N,) the largest over the middle of (N, 3) scales, infinite if only the middle one is 0.
+
+    >>> elongation(np.array([[3, 1, 2]])).tolist()
+    [1.5]
+    """
+    middle, largest = longer_axes(scales.astype(np.float64)).T
+    with np.errstate(all="ignore"):
+        return np.asarray(largest / middle)
+
+
 def effective_rank(scales: NDArray[np.float32]) -> NDArray[np.float64]:
     """Return (N,) exp(−Σ q log q), q = s/Σs, in [1, 3].
 

@@ -66,11 +66,12 @@ def test_convert_keeps_what_fulfils_a_condition(tmp_path: Path, command_line: Co
     scene = read_splats(tmp_path / "a.ply")
     largest = scene.scales.max(1)
     conditions = {
-        "opacity > 0.05 and scale < 2": (scene.opacities > 0.05) & (largest < 2),
+        "opacity > 0.05 and largest_scale < 2": (scene.opacities > 0.05) & (largest < 2),
         "not (red >= .5 or blue >= .5)": ~((scene.colors[:, 0] >= 0.5) | (scene.colors[:, 2] >= 0.5)),
         "999 < x <= 1001": (scene.means[:, 0] > -1) & (scene.means[:, 0] <= 1),
         "sqrt(y*y + z*z) < 3": np.hypot(scene.means[:, 1], scene.means[:, 2]) < 3,
-        "scale / max(thickness, 1e-6) > 4 - -1": largest / scene.scales.min(1) > 5,
+        "largest_scale / max(smallest_scale, 1e-6) > 4 - -1": largest / scene.scales.min(1) > 5,
+        "elongation > 2": largest / np.sort(scene.scales, axis=1)[:, 1] > 2,
     }
     for condition, mask in conditions.items():
         succeeds(command_line, tmp_path, "convert", "a.ply", "b.ply", "--where", condition, "-w")
@@ -86,7 +87,7 @@ def test_convert_keeps_what_fulfils_a_condition(tmp_path: Path, command_line: Co
     ("condition", "message"),
     [
         ("opacity", "is a number"),
-        ("opacity > 0.5 and scale", "'scale' is a number"),
+        ("opacity > 0.5 and elongation", "'elongation' is a number"),
         ("(x > 1) + 1 > 1", "is a comparison"),
         ("brightness > 1", "unknown name 'brightness'"),
         ("__import__('os').system('true') == 0", "not supported"),

@@ -50,9 +50,9 @@ def convert(
         str | None,
         typer.Option(
             metavar="CONDITION",
-            help="Keep Gaussians for which this holds, such as 'opacity > 0.05 and scale < 2'. Opacity, red, "
-            "green and blue are 0 to 1; x, y, z, scale (the largest σ) and thickness (the smallest) are in "
-            "scene units.",
+            help="Keep Gaussians for which this holds, such as 'opacity > 0.05 and largest_scale < 2'. "
+            "Opacity, red, green and blue are 0 to 1; x, y, z, smallest_scale and largest_scale (standard "
+            "deviations) are in scene units; elongation is the largest over the middle scale.",
         ),
     ] = None,
     transform: Annotated[
