@@ -142,10 +142,19 @@ def _same(a: Splats, b: Splats) -> bool:
 
 @dataclass(frozen=True)
 class Quality:
-    """Mean PSNR (dB) and SSIM against the dense scene's renders."""
+    """Mean PSNR (dB) and SSIM against the dense scene's renders; as a requirement, 0 asks for nothing."""
 
     psnr: float
     ssim: float
+
+    def __str__(self) -> str:
+        """Format what is not 0.
+
+        >>> str(Quality(38, 0)), str(Quality(38.154, 0.98))
+        ('38.00 dB', '38.15 dB, SSIM 0.9800')
+        """
+        parts = {f"{self.psnr:.2f} dB": self.psnr, f"SSIM {self.ssim:.4f}": self.ssim}
+        return ", ".join(text for text, value in parts.items() if value)
 
     def meets(self, wanted: Quality) -> bool:
         """Return whether both values are reached."""
@@ -337,13 +346,13 @@ class Aim:
         assert self.cameras is not None
         got = quality(_images(self.dense, self.cameras), as_file(splats, self.file), self.cameras)
         count, views = plural(len(splats), "Gaussian"), plural(len(self.cameras), "view")
-        line = f"{count}: {got.psnr:.2f} dB, SSIM {got.ssim:.4f} in {views}"
+        line = f"{count} keep {got} in the {views} that chose the count"
         if got.meets(self.wanted):
-            return True, line
+            return True, f"{line}; requested: {self.wanted}"
         more = f"request a count above {len(splats):,}"
         if len(splats) >= len(self.dense):
             more = f"{scene_format(self.file).suffix} cannot store more quality"
-        return False, f"{line}, less than requested; {more}"
+        return False, f"{line}, less than the requested {self.wanted}; {more}"
 
 
 def aim_of(
@@ -364,14 +373,16 @@ def aim_of(
     """
     splats, say = reduce.splats, reduce.say
     if budget.min_psnr is not None or budget.min_ssim is not None:
-        return _aim_for_quality(reduce, Quality(budget.min_psnr or 0.0, budget.min_ssim or 0.0), file)
+        wanted = Quality(budget.min_psnr or 0.0, budget.min_ssim or 0.0)
+        return _aim_for_quality(reduce, wanted, file, recovered)
     if budget.bytes is not None:
         if sh_degree is not None:
             splats = splats.with_sh_degree(sh_degree)
         most = int(budget.bytes * _BYTES_SAFETY) if recovered else budget.bytes
         made = partial(simplify, splats, method="fast") if recovered else reduce
         found = count_for_bytes(splats, most, file, lambda count: made(count).splats)
-        say(f"{budget.fit}: about {plural(found, 'Gaussian')}")
+        about = f"about {plural(found, 'Gaussian')}"
+        say(f"{budget.fit}: {_all_fit(splats) if found == len(splats) else about}")
         return Aim(found, bytes=budget.bytes, file=file)
     found = most = budget.of(len(splats), name)
     if budget.layers is not None:
@@ -383,11 +394,15 @@ def aim_of(
                 f"{layers:.0f} at {found:,}"
             )
     if budget.fit is not None:
-        say(f"{budget.fit}: {plural(found, 'Gaussian')}")
+        say(f"{budget.fit}: {_all_fit(splats) if found == len(splats) else plural(found, 'Gaussian')}")
     return Aim(found)
 
 
-def _aim_for_quality(reduce: Reduction, wanted: Quality, file: str) -> Aim:
+def _all_fit(splats: Splats) -> str:
+    return f"all {plural(len(splats), 'Gaussian')} already fit"
+
+
+def _aim_for_quality(reduce: Reduction, wanted: Quality, file: str, recovered: bool) -> Aim:
     """Find the count that keeps a quality in generated views, as read back from the format of `file`."""
     from g2ard.poses import plan_pool
 
@@ -402,5 +417,7 @@ def _aim_for_quality(reduce: Reduction, wanted: Quality, file: str) -> Aim:
     if found == len(splats):
         say(f"no smaller count was found that keeps the quality; keeping all {found:,} Gaussians")
     else:
-        say(f"{plural(found, 'Gaussian')} should keep {near.psnr:.2f} dB, SSIM {near.ssim:.4f}")
+        stage = " before recovery" if recovered else ""
+        views = plural(len(cameras), "view")
+        say(f"{plural(found, 'Gaussian')} keep {near}{stage}, in {views} generated to choose the count")
     return Aim(found, file=file, wanted=wanted, dense=splats, cameras=cameras)

@@ -76,11 +76,14 @@ def test_simplify_fits(tmp_path: Path, command_line: CommandLine) -> None:
     assert "60kB: about" in told
     assert f"b.sog: {(tmp_path / 'b.sog').stat().st_size:,} of 60,000 bytes" in told
     assert 50_000 < (tmp_path / "b.sog").stat().st_size <= 60_000
-    assert command_line("simplify", "a.ply", "--fit", "quest3", "-o", "c.ply", cwd=tmp_path)[0] == 0
+    told = succeeds(command_line, tmp_path, "simplify", "a.ply", "--fit", "quest3", "-o", "c.ply").err
+    assert "quest3: all 6,000 Gaussians already fit" in told
+    told = succeeds(command_line, tmp_path, "simplify", "a.ply", "--fit", "9MB", "-o", "e.ply").err
+    assert "9MB: all 6,000 Gaussians already fit" in told
     assert len(read_splats(tmp_path / "c.ply")) == 6000 < DEVICES["quest3"]
     told = succeeds(command_line, tmp_path, "simplify", "a.ply", "--min-psnr", "25", "-o", "d.ply").err
-    assert "should keep 2" in told
-    assert " dB, SSIM " in told.splitlines()[-1]
+    assert " Gaussians keep 2" in told
+    assert told.splitlines()[-1].endswith(" in the 12 views that chose the count; requested: 25.00 dB")
 
 
 @pytest.mark.parametrize("recovered", [False, True])
@@ -111,8 +114,8 @@ def test_distill_measures_the_simplification_that_it_makes(settings: dict[str, A
     job = prepare(checkered_ball(800), [Budget(min_psnr=24)], options, say=said.append)
     judged = job.aims[0].judge(job.run().simplified)
     assert judged is not None
-    count, _, rest = judged[1].partition(": ")
-    assert f"{count} should keep {rest.removesuffix(' in 12 views')}" in said
+    kept = judged[1].partition(" in the 12 views")[0]
+    assert f"{kept} before recovery, in 12 views generated to choose the count" in said
 
 
 @pytest.mark.parametrize(
