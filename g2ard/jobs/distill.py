@@ -162,13 +162,15 @@ def prepare(
     options: DistillOptions,
     *,
     counted: Callable[[int], object] | None = None,
+    recovers: bool = True,
     progress: Progress = silent,
     say: Say = unsaid,
 ) -> DistillJob:
     """Read inputs and decide everything that a distillation needs, for one or more budgets.
 
     `counted` is called with the number of Gaussians to reduce, before budgets and views are computed; its
-    exceptions propagate. Other arguments and errors are those of `distill`.
+    exceptions propagate. Without `recovers`, messages leave out what only recovery uses. Other
+    arguments and errors are those of `distill`.
     """
     began = time.monotonic()
     recover = options.config.recover  # rejects invalid settings before anything is read
@@ -215,10 +217,11 @@ def prepare(
             shown = read.prior.take(np.arange(read.given)) if read.lifted else prior
             insisted, renders_too = options.photos is True, not read.lifted
             check_photos(shown, cameras, recover.background, say, insisted=insisted, renders=renders_too)
-    say(_task(prior, aims, cameras, photos))
+    say(_task(prior, aims, cameras if recovers else None, photos))
     if not read.from_photos and all(aim.count == len(prior) for aim in aims):
         say(f"nothing to simplify: the scene has {plural(len(prior), 'Gaussian')}")
-    say(f"regularisers: {preset_label}")
+    if recovers:
+        say(f"regularisers: {preset_label}")
     config = options.configured(regularizers, default_degree)
     config = replace(config, recover=replace(config.recover, from_points=read.from_photos))
     return DistillJob(
@@ -278,12 +281,14 @@ def _regularizers(
     return regularizers_for(kind, prior, photos, paper=paper)
 
 
-def _task(prior: Splats, aims: Sequence[Aim], train: Cameras, photos: bool) -> str:
-    """Describe the task in one line."""
-    pictured = sum(path is not None for path in train.image_paths) if photos else 0
+def _task(prior: Splats, aims: Sequence[Aim], train: Cameras | None, photos: bool) -> str:
+    """Describe the task in one line; `train` are the views of recovery, if any."""
     counts = ", ".join([*(f"{aim.count:,}" for aim in aims[:-1]), plural(aims[-1].count, "Gaussian")])
+    if train is None:
+        return f"{len(prior):,} → {counts}"
+    pictured = sum(path is not None for path in train.image_paths) if photos else 0
     against = kinds_told(pictured, len(train) - pictured)
-    return f"{len(prior):,} → {counts}; {plural(len(train), 'view')} against {against}"
+    return f"{len(prior):,} → {counts}; {plural(len(train), 'training view')} against {against}"
 
 
 @dataclass(frozen=True, eq=False)

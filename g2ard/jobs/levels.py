@@ -65,6 +65,17 @@ class LevelReport(Report):
     simplified: float | None = None
     recovered: float | None = None
 
+    def line(self, number: int) -> str:
+        """Describe the level of a number.
+
+        >>> LevelReport(50, 2.0, 200, 1.0, simplified=31.5).line(1)
+        'level 1: 50 Gaussians (31.50 dB merged, in held-out views of 200 pixels)'
+        """
+        scores = {"merged": self.simplified, "recovered": self.recovered}
+        figures = [f"{psnr:.2f} dB {what}" for what, psnr in scores.items() if psnr is not None]
+        told = f" ({', '.join(figures)}, in held-out views of {self.size} pixels)" if figures else ""
+        return f"level {number}: {plural(self.count, 'Gaussian')}{told}"
+
 
 @dataclass(frozen=True, eq=False)
 class Levels:
@@ -150,6 +161,7 @@ def lod(
         up=up,
         render_model=render_model,
         split_sky=split_sky,
+        recover=recover,
         seed=seed,
         progress=progress,
         say=say,
@@ -159,12 +171,12 @@ def lod(
     finer = job.prior
     for ratio, aim in zip(ratios, job.aims, strict=True):
         if ratio == 1:
-            splats.append(job.prior)
-            reports.append(LevelReport(len(job.prior), 1.0, level_size(job.views.train.cameras, 1), 0.0))
-            continue
-        say(f"level {len(splats)}: {plural(aim.count, 'Gaussian')}")
-        place = None if work is None else work / f"level-{len(splats)}"
-        level, finer, report = _level(job, finer, aim.count, ratio, recover, place)
+            level = job.prior
+            report = LevelReport(len(level), 1.0, level_size(job.views.train.cameras, 1), 0.0)
+        else:
+            place = None if work is None else work / f"level-{len(splats)}"
+            level, finer, report = _level(job, finer, aim.count, ratio, recover, place)
+        say(report.line(len(splats)))
         splats.append(level)
         reports.append(report)
     return Levels(tuple(splats), tuple(reports), sky)
@@ -183,6 +195,7 @@ def prepare_levels(
     up: Sequence[float] | None = None,
     render_model: RenderModel | None = None,
     split_sky: bool = False,
+    recover: bool = True,
     seed: int = 0,
     progress: Progress = silent,
     say: Say = unsaid,
@@ -212,6 +225,7 @@ def prepare_levels(
             render_model=render_model,
             settings=recovery_settings(steps, background, seed),
         ),
+        recovers=recover,
         progress=progress,
         say=say,
     )

@@ -26,7 +26,7 @@ from g2ard.jobs.views import cameras_for_weights, pool_times, views_of
 from g2ard.levels import Cut
 from g2ard.pipeline.config import DistillConfig
 from g2ard.pipeline.run_views import RunViews
-from g2ard.progress import Progress, Say, plural, silent, unsaid
+from g2ard.progress import Progress, Say, silent, unsaid
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
 from g2ard.stages.recover.auto_preset import regularizers_for
@@ -270,8 +270,8 @@ def lod_in_tiles(
                 level, report = job.store, LevelReport(job.store.count, 1.0, size, 0.0)
             else:
                 count = Budget(ratio=ratio).of(job.store.count, str(scene))
-                say(f"level {number}: {plural(count, 'Gaussian')}")
                 level, finer, around, report = _level(job, finer, around, count, ratio)
+            say(report.line(number))
             levels.append(StoredScene(level))
             reports.append(report)
     return TiledLevels(tuple(levels), tuple(reports))

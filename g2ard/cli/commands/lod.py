@@ -203,7 +203,7 @@ def _tell_estimates(
 
     from g2ard.jobs.levels import estimate_level, prepare_levels
 
-    job, _ = prepare_levels(scene, ratios, **choices)
+    job, _ = prepare_levels(scene, ratios, recover=recover, **choices)
     told, seconds = [], job.seconds
     for number, (ratio, aim) in enumerate(zip(ratios, job.aims, strict=True)):
         if ratio == 1:
@@ -340,14 +340,6 @@ def _check_same(meta: Path, ratios: Sequence[float]) -> None:
 
 
 def _tell(run: Run, output: Path, levels: Levels | TiledLevels, size: int, **more: Any) -> None:
-    for number, report in enumerate(levels.reports):
-        figures = [
-            f"{psnr:.2f} dB {what}"
-            for what, psnr in (("merged", report.simplified), ("recovered", report.recovered))
-            if psnr is not None
-        ]
-        told = f" ({', '.join(figures)}, in held-out views of {report.size} pixels)" if figures else ""
-        run.say(f"level {number}: {plural(report.count, 'Gaussian')}{told}")
     run.say(f"{output}: {plural(len(levels.reports), 'level')}, {size / 1e6:.2f} MB")
     result: dict[str, Any] = {"output": str(output), "bytes": size}
     run.result({**result, "levels": [report.as_dict() for report in levels.reports], **more})
