@@ -101,7 +101,9 @@ def clean(
     if split_sky:
         far = sky_mask(splats)
         splats, sky = splats.take(~far), splats.take(far)
-        say(f"sky: {plural(len(sky), 'Gaussian')}" if len(sky) else "the scene has no sky")
+        say(
+            f"sky: {plural(len(sky), 'Gaussian')}" if len(sky) else "sky: none found, so nothing is split off"
+        )
     if not kinds:
         return Cleaned(splats, Cleaning(np.full(len(splats), -1, np.int8)), sky, None)
     pool = plan_pool(

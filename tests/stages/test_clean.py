@@ -170,6 +170,6 @@ def test_the_sky_is_kept_apart_and_joined_again(tmp_path: Path, command_line: Co
     assert (tmp_path / "both.ply").read_bytes() == (tmp_path / "a.ply").read_bytes()
     words[1:4] = ["near.ply", "--split-sky", "none.ply"]
     words[5] = "same.ply"
-    assert "has no sky" in succeeds(command_line, tmp_path, *words).err
+    assert "none.ply: not written" in succeeds(command_line, tmp_path, *words).err
     assert not (tmp_path / "none.ply").exists()
     refused(command_line, tmp_path, "clean", "a.ply", "--split-sky", "a.ply", "-o", "b.ply")

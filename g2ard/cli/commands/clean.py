@@ -17,15 +17,16 @@ if TYPE_CHECKING:
     from g2ard.jobs.clean import Cleaned
     from g2ard.scene.cameras import Cameras
 
-_WORDS = ("blue", "yellow", "pink", "red", "cyan", "green")
+_GREY = (0.45, 0.48, 0.52)
 _COLORS = {
-    "invisible": (0.20, 0.45, 0.95),
-    "giant": (0.95, 0.85, 0.10),
-    "needle": (0.90, 0.15, 0.75),
-    "floater": (0.95, 0.25, 0.10),
-    "haze": (0.10, 0.80, 0.85),
-    "streak": (0.25, 0.80, 0.20),
+    "invisible": ("", _GREY),  # no picture shows them
+    "giant": ("yellow", (0.95, 0.85, 0.10)),
+    "needle": ("pink", (0.90, 0.15, 0.75)),
+    "floater": ("red", (0.95, 0.25, 0.10)),
+    "haze": ("cyan", (0.10, 0.80, 0.85)),
+    "streak": ("green", (0.25, 0.80, 0.20)),
 }
+"""Colour of each kind of clutter in the picture, and its name."""
 
 
 @command("clean", example="g2ard clean garden.ply -o garden_clean.ply --preview found.png", scenes=True)
@@ -109,8 +110,11 @@ def clean(
             )
         run.write(output, done.splats)
         run.say(f"{output}: keeps {kept:,} of {plural(total, 'Gaussian')}")
-        if split_sky is not None and done.sky is not None and sky_count:
-            run.write(split_sky, done.sky)
+        if split_sky is not None and done.sky is not None:
+            if sky_count:
+                run.write(split_sky, done.sky)
+            else:
+                run.say(f"{split_sky}: not written; {output} is the whole scene")
     if preview is not None and done.cameras is not None:
         with run.finishing("--preview"):
             _paint(preview, done, done.cameras, run.overwrite)
@@ -128,13 +132,16 @@ def _paint(path: Path, done: Cleaned, cameras: Cameras, overwrite: bool) -> None
     from g2ard.report.paint import painted
     from g2ard.scene.samples import evenly_spaced
 
-    colors = np.array([*_COLORS.values(), (0.45, 0.48, 0.52)])[done.clutter.kind]
+    colors = np.array([*(color for _, color in _COLORS.values()), _GREY])[done.clutter.kind]
     scenes = [done.before, painted(done.before, colors), done.splats]
     chosen = evenly_spaced(len(cameras), 3, floor=True)
     renderers = [Renderer(scene) for scene in scenes]
     rows = [[r.clipped(cameras[int(view)]) for r in renderers] for view in chosen]
-    counts = zip(_WORDS, done.clutter.counts.items(), strict=True)
-    legend = ", ".join(f"{word}: {count:,} {name}" for word, (name, count) in counts if count)
+    found = [(name, count, _COLORS[name][0]) for name, count in done.clutter.counts.items() if count]
+    legend = ", ".join(
+        f"{word}: {count:,} {name}" if word else f"{count:,} {name} (nothing to show)"
+        for name, count, word in found
+    )
     labels = [f"before: {len(scenes[0]):,}", "removed, in colour", f"after: {len(scenes[2]):,}"]
     sheet = contact_sheet(rows, labels, row_labels=[legend] * len(rows))
     write_png(path, sheet, overwrite=overwrite)
