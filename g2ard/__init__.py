@@ -65,6 +65,7 @@ if TYPE_CHECKING:
     from g2ard.pipeline.distill import distill as distill_against
     from g2ard.pipeline.presets import preset
     from g2ard.poses import make_pool
+    from g2ard.progress import show_progress
     from g2ard.rendering.renderer import RasterSettings, Rendered, Renderer, render
     from g2ard.rendering.targets import Photos, TeacherRenders
     from g2ard.scene.cameras import Camera, Cameras, look_at
@@ -139,6 +140,7 @@ __all__ = [
     "save_tileset",
     "save_views",
     "select",
+    "show_progress",
     "simplify",
     "up_of",
 ]
@@ -162,6 +164,7 @@ _HOMES = {
     "jobs.viewer_frame": ("up_of",),
     "poses": ("make_pool",),
     "pipeline.presets": ("preset",),
+    "progress": ("show_progress",),
     "scene.splats": ("Splats",),
     "pipeline.adapt": ("AdaptConfig", "Adapted", "adapt"),
     "stages.evaluate": ("Evaluation", "evaluate"),

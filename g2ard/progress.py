@@ -1,5 +1,7 @@
 """Progress and status callbacks, and helpers for messages."""
 
+import sys
+import time
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, Protocol
 
@@ -12,6 +14,35 @@ class Progress(Protocol):
 
 def silent(stage: str, done: int, total: int, info: Mapping[str, Any] | None = None) -> None:
     """Report nothing."""
+
+
+_WIDTH = 60
+"""Characters of the line that `show_progress` redraws."""
+_last_shown = 0.0
+
+
+def show_progress(stage: str, done: int, total: int, info: Mapping[str, Any] | None = None) -> None:
+    """Show the stage in one line of stderr that is redrawn, in a terminal or a notebook.
+
+    Pass it to any function of g2ard that takes `progress`.
+
+    Args:
+        stage: name of the stage.
+        done: units done.
+        total: all units; 0 if unknown.
+        info: further figures, not shown.
+
+    >>> import g2ard
+    >>> small = g2ard.distill("scene.ply", ratio=10, progress=g2ard.show_progress)  # doctest: +SKIP
+    """
+    global _last_shown
+    now, ended = time.monotonic(), 0 < total <= done
+    if ended:
+        print(f"\r{'':{_WIDTH}}\r", end="", file=sys.stderr, flush=True)
+    elif now - _last_shown >= (0.1 if sys.stderr.isatty() else 1):
+        _last_shown = now
+        text = f"{stage}: {done:,}/{total:,}" if total > 1 else stage
+        print(f"\r{text:{_WIDTH}.{_WIDTH}}", end="", file=sys.stderr, flush=True)
 
 
 def counter(progress: Progress, stage: str) -> Callable[[int, int], None]:
