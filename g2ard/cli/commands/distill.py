@@ -204,7 +204,7 @@ def _tell_estimates(run: Run, job: DistillJob, folders: Sequence[RunFolder]) -> 
         about = f"about {max(1, one.total):.0f} s ({parts}) and {one.bytes / 1e6:,.0f} MB"
         place = "" if folder.path == opt.UNWRITTEN else f"{folder.path}: "
         run.answer(
-            f"{place}{plural(budget, 'Gaussian')}, {plural(one.views, 'view')} "
+            f"{place}{plural(budget, 'Gaussian')}, {plural(one.views, 'target image')} "
             f"of {one.pixels:,} pixels, {plural(one.steps, 'step')}: {about}"
         )
         found.append(one)
@@ -234,27 +234,33 @@ def _distil_all(
         return
     check_job_memory(job, memory, page=run.config["view"])
     run.console.expect(expected(job))
+    prepared = time.monotonic()
     job.render_targets()
+    before_runs = {"prepare": prepared - began, "targets": time.monotonic() - prepared}
     reports, others = [], " (--resume continues with the rest)" if len(folders) > 1 else ""
     for aim, folder in zip(job.aims, folders, strict=True):
         if folder.path in finished:
             reports.append(finished[folder.path])
             continue
         before = run.kept
-        result, report = _distil(run, source, job, aim.count, folder, began)
+        result, report = _distil(run, source, job, aim.count, folder, before_runs)
+        before_runs = {}  # shared by all budgets
         reports.append(report)
         run.kept = [*before, f"{folder.path} is finished{others}"]
         judged = aim, result.splats
-        began = time.monotonic()
     run.results(reports)
     tell_quality(run, *judged)
 
 
 def _distil(
-    run: Run, source: Path, job: DistillJob, budget: int, folder: RunFolder, began: float
+    run: Run, source: Path, job: DistillJob, budget: int, folder: RunFolder, before: dict[str, float]
 ) -> tuple[Distilled, dict[str, Any]]:
-    """Distil to one budget, write the run's folder and print a summary; its time counts from `began`."""
-    page = ""
+    """Distil to one budget, write the run's folder and print a summary.
+
+    Args:
+        before: seconds of the stages before this call, which count as this budget's.
+    """
+    began, page = time.monotonic(), ""
     with folder.working(len(job.prior), budget, _photos(job)):
         result = job.run(budget, work=folder.work)
         folder.write_scene(result.splats)
@@ -262,7 +268,7 @@ def _distil(
         folder.write_views(job.views)
         with run.finishing("scoring"):
             report = _scored(run, job, result, folder)
-        report["seconds"]["total"] = time.monotonic() - began + report["seconds"].get("resumed", 0.0)
+        report["seconds"] = _seconds(before, report["seconds"], time.monotonic() - began)
         _write_pages(run, source, job, result, report, folder.path)
         if run.config["view"]:
             seen, colour = job.views.train.cameras, job.config.recover.background
@@ -283,6 +289,18 @@ def _distil(
         + (f"\n{page}" if page else "")
     )
     return result, report
+
+
+def _seconds(before: dict[str, float], stages: dict[str, float], elapsed: float) -> dict[str, float]:
+    """Return the seconds by stage, with the scores as the rest of `elapsed`, and their total.
+
+    >>> _seconds({"prepare": 4.0}, {"simplify": 2.0, "recover": 9.0, "resumed": 3.0}, 10.0)
+    {'prepare': 4.0, 'simplify': 2.0, 'recover': 9.0, 'resumed': 3.0, 'score': 2.0, 'total': 17.0}
+    """
+    resumed = stages.get("resumed", 0.0)
+    measured = sum(stages.values()) - resumed
+    found = {**before, **stages, "score": elapsed + resumed - measured}
+    return {**found, "total": sum(before.values()) + elapsed + resumed}
 
 
 def _photos(job: DistillJob) -> list[Path]:
