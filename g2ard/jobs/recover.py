@@ -70,6 +70,7 @@ class RecoverJob:
             checkpoint=checkpoint,
             progress=self.progress,
             watch=watch,
+            skip_same=True,
         )
 
     @cached_property
@@ -259,8 +260,10 @@ def prepare(
         say=say,
     )
     pool = teaching.views(views, start)
-    chosen, targets = teaching.training(start, pool, split, size)
-    say(f"{plural(len(chosen.cameras), 'view')} against {kinds_of(targets)}")
+    same = teaching.dense is not None and teaching.dense.fingerprint() == start.fingerprint()
+    chosen, targets = teaching.training(start, pool, split, size, lazy=same)
+    of_split = "training view" if split == "train" else f"{split} view"
+    say(f"{plural(len(chosen.cameras), of_split)} against {kinds_of(targets)}")
     weighted = named.get("select.weighted", True) if weighted is None else weighted
     weights = chosen.weights if weighted else None
     if weights is not None:
@@ -290,7 +293,7 @@ def prepare(
         teaching,
         pool if split == "train" else None,
         size,
-        teaching.validation(pool, size) if split == "train" and config.schedule.guarded else None,
+        teaching.validation(pool, size, lazy=same) if split == "train" and config.schedule.guarded else None,
         progress,
     )
 

@@ -92,11 +92,16 @@ class Teaching:
             say=self._say,
         )
 
-    def training(self, scene: Splats, views: Views, split: str, size: int | None) -> tuple[ViewSet, Targets]:
-        """Read a split of the views and return it with its targets; reject photos of another scene."""
+    def training(
+        self, scene: Splats, views: Views, split: str, size: int | None, *, lazy: bool = False
+    ) -> tuple[ViewSet, Targets]:
+        """Read a split of the views and return it with its targets; reject photos of another scene.
+
+        `lazy` renders targets on first access.
+        """
         chosen = load_trained(views, split, size, self._say, unpictured=self.dense is not None)
         warn_of_sight(scene, chosen.cameras, self._say)
-        targets = self.targets(chosen.cameras)
+        targets = self.targets(chosen.cameras, lazy=lazy)
         self.check_photos(scene, chosen.cameras)
         return chosen, targets
 
@@ -118,12 +123,12 @@ class Teaching:
             return None
         return scorable(self._made(cameras.resized(size), lazy=True), self._say)
 
-    def validation(self, views: Views, size: int | None) -> Targets | None:
-        """Return the renders of the views of other kinds in split `val`, or None."""
+    def validation(self, views: Views, size: int | None, *, lazy: bool = False) -> Targets | None:
+        """Return the renders of the views of other kinds in split `val`, or None; see `training`."""
         cameras = None if self.dense is None or self._photos else self._split(views, "val")
         if cameras is None or USUAL in cameras.kinds:
             return None
-        return self._made(cameras.resized(size), progress=self._progress, say=self._say)
+        return self._made(cameras.resized(size), lazy=lazy, progress=self._progress, say=self._say)
 
     def _split(self, views: Views, name: str) -> Cameras | None:
         """Return the views of a split, or None if it is empty."""

@@ -41,6 +41,14 @@ def test_python_recovers_as_the_command_does(
     assert (folder / "python.ply").read_bytes() == (folder / "out.ply").read_bytes()
 
 
+def test_a_student_that_is_its_teacher_takes_no_step(folder: Path, command_line: CommandLine) -> None:
+    ask = ("recover", "ball.ply", "--teacher", "ball.ply", "--views", "views.json", "-o", "out.ply")
+    told = succeeds(command_line, folder, *ask).err
+    assert "recovery skipped: the scene already renders as its targets\n" in told
+    assert "steps/s" not in told
+    assert (folder / "out.ply").read_bytes() == (folder / "ball.ply").read_bytes()
+
+
 def test_a_generated_pool_is_completed_for_the_student(folder: Path) -> None:
     """Views of other kinds train, validate and are scored, and more views get more steps, as in `distill`."""
     student = g2ard.simplify(naive.statue(), ratio=10, method="fast").splats
