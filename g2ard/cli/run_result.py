@@ -74,7 +74,10 @@ def loss(
         how = f"{-kind.psnr.gain:.2f} dB" if kind.psnr.gain < -_REPORTED_PSNR_LOSS else f"{-ssim:.3f} SSIM"
         worst = f"{kind.worst}: {kind.worst_psnr.before:.2f} → {kind.worst_psnr.after:.2f} dB"
         return f"warning: recovery lost {how} in {what} (worst view {worst}); {hint}"
-    return f"{kind.lost} of {kind.views} {what} lost PSNR; their mean gained" if kind.lost else None
+    if not kind.lost:
+        return None
+    lost = f"{kind.lost} of {kind.views} {what} lost PSNR"
+    return f"{lost}; the mean of all {kind.views} gained {kind.psnr.gain:.2f} dB"
 
 
 def say_views(run: Run, views: dict[str, Any] | None, chosen: bool) -> None:

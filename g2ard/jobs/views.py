@@ -138,7 +138,11 @@ def _generated(
         Cameras.of([*train.cameras, *test]),
         splits=("train",) * len(train.cameras) + ("test",) * len(test),
     )
-    say(f"poses: {_of(planned, pool.cameras)}")
+    scored, apart_count = len(test if held_out is None else held_out), len(apart or ())
+    parts = {"for training": len(train.cameras), "for scores": scored + apart_count // 2}
+    parts["for validation"] = apart_count - apart_count // 2
+    counts = ", ".join(f"{count} {use}" for use, count in parts.items() if count)
+    say(f"views: {counts}; {_of(planned, pool.cameras)}")
     train, test = train.resized(size), test.resized(size)
     if held_out is not None:
         train, test = drop_held_out(train, held_out, say), held_out
@@ -263,7 +267,7 @@ def views_or_pool(
             say=say,
         )
         return _with_apart(_generated(planned, None, None, mix, say))
-    say(f"poses: {_of(planned, planned.cameras)}")
+    say(f"views: {len(planned.cameras)}, {_of(planned, planned.cameras)}")
     return ViewSet(planned.cameras, splits=splits_of(None, planned.cameras.names))
 
 
@@ -276,10 +280,10 @@ def _with_apart(views: RunViews) -> ViewSet:
 
 
 def _of(pool: Pool, cameras: Cameras) -> str:
-    """Describe a pool, and views of further kinds, briefly."""
+    """Describe the kinds of a pool, and of further views in it, briefly."""
     kinds = [pool.kind, *(kind for kind in rows_by_kind(cameras.kinds) if kind != USUAL)]
     guess = "; the up direction is a guess" if "guess" in pool.why else ""
-    return f"{len(cameras)}, {' + '.join(kinds)}{guess}"
+    return f"{' + '.join(kinds)}{guess}"
 
 
 def cameras_for_weights(

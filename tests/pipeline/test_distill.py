@@ -107,7 +107,7 @@ def test_a_loss_in_any_kind_of_view_is_reported() -> None:
         kinds = [kind.as_dict() for kind in by_kind(before, after)]
         return told({"rounds": [], "kinds": kinds, "causes": [], "unseen": unseen})
 
-    assert said(1.0, None, None) == ["1 of 2 usual views lost PSNR; their mean gained"]
+    assert said(1.0, None, None) == ["1 of 2 usual views lost PSNR; the mean of all 2 gained 1.00 dB"]
     assert said(0.02, 0.02, 0.0) == []
     line = said(0.02, -0.5, 0.0)[0]
     assert line.startswith("warning: recovery lost 0.50 dB in near views (worst view near_0: 30.00 → 28.75")

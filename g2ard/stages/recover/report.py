@@ -147,8 +147,9 @@ def outcome(report: RecoverReport) -> str | None:
         if len(looks) > 2 and looks[-1].psnr == looks[0].psnr:
             first, end = looks[0].psnr, looks[-2].psnr
             kind = min(first, key=lambda kind: end[kind] - first[kind])
-            name = "validation" if kind == USUAL else kind
-            why = f"every step made {name} views worse ({first[kind]:.2f} → {end[kind]:.2f} dB)"
+            name = "" if kind == USUAL else f" of kind {kind}"
+            change = f"{first[kind]:.2f} → {end[kind]:.2f} dB"
+            why = f"every step made validation views{name} worse ({change}; scores are of other views)"
         if lines:
             why = f"recovery fell to {', '.join(lines)}, and slower rates gained nothing"
         given_up = "" if report.stopped is None else f"; given up at step {report.stopped}"
