@@ -31,14 +31,14 @@ LEFT = [
 def folder(tmp_path: Path) -> Path:
     ball = checkered_ball(200)
     write_splats(tmp_path / "a.ply", ball)
-    write_splats(tmp_path / "teacher.ply", replace(ball, sh0=ball.sh0 / 2))
+    write_splats(tmp_path / "t.ply", replace(ball, sh0=ball.sh0 / 2))
     write_views(tmp_path / "views.json", around(16, (32, 24)))
     return tmp_path
 
 
 @pytest.mark.parametrize(("command", "left"), LEFT)
 def test_checkpoints_are_kept(folder: Path, command_line: CommandLine, command: str, left: str) -> None:
-    teacher = () if command.startswith("distill") else ("--teacher", "teacher.ply")
+    teacher = () if command.startswith("distill") else ("--teacher", "t.ply")
     ask = (*command.split(), "--views", "views.json", *teacher)
     place = folder / left
     place.parent.mkdir(parents=True, exist_ok=True)
@@ -56,7 +56,7 @@ def test_checkpoints_are_kept(folder: Path, command_line: CommandLine, command: 
 
 @pytest.mark.parametrize("command", ["recover", "adapt"])
 def test_messages_name_the_split(folder: Path, command_line: CommandLine, command: str) -> None:
-    ask = (command, "a.ply", "--steps", 2, "--views", "views.json", "--teacher", "teacher.ply", "-wo", "out.ply")
+    ask = (command, "a.ply", "--steps", 2, "--views", "views.json", "--teacher", "t.ply", "-wo", "out.ply")
     for split, words in (("train", "training views "), ("test", ", test views "), ("all", ", all views ")):
         assert words in succeeds(command_line, folder, *ask, "--split", split).err
 

@@ -108,7 +108,7 @@ impl Pairwise {
             rounds: Vec::new(),
             control,
         };
-        let mut nodes = self.premerge(leaves, budget, &mut runs);
+        let mut nodes = self.premerge(leaves, budget, &mut runs)?;
         let (geometric, mut rounds) = (runs.geometric, runs.rounds);
         self.merge_rounds(&mut nodes, geometric, schedule, control, |pairs, map| {
             let of = partition.of.par_iter_mut().filter(|c| **c != GONE);
@@ -156,20 +156,20 @@ impl Pairwise {
 
     /// Merge runs of Morton order down to `morton_premerge_ratio` times the budget. The lattice is shifted in each
     /// step, so that one step can join what another cut apart.
-    fn premerge(&self, leaves: Leaves, budget: usize, runs: &mut RunMerging) -> Nodes {
+    fn premerge(&self, leaves: Leaves, budget: usize, runs: &mut RunMerging) -> Result<Nodes> {
         let last = (self.morton_premerge_ratio * budget as f64).min(leaves.len() as f64) as usize;
         let mut targets = (0..self.morton_premerge_steps)
             .rev()
             .map(|step| (step, last.saturating_mul(1 << step.min(32))))
             .filter(|&(_, target)| target < leaves.len());
         let Some((step, target)) = targets.next() else {
-            return leaves.nodes();
+            return Ok(leaves.nodes());
         };
-        let (mut rows, mut codes) = runs.merge(&leaves, &leaves.codes(), target, step);
+        let (mut rows, mut codes) = runs.merge(&leaves, &leaves.codes(), target, step)?;
         for (step, target) in targets {
-            (rows, codes) = runs.merge(&rows, &codes, target, step);
+            (rows, codes) = runs.merge(&rows, &codes, target, step)?;
         }
-        rows.settled()
+        Ok(rows.settled())
     }
 
     /// The weight of the geometric error, in the kernels' precision.
@@ -284,17 +284,26 @@ impl RunMerging<'_> {
         codes: &[u64],
         target: usize,
         step: usize,
-    ) -> (Shuffled, Vec<u64>) {
-        let runs = cut(&merge_costs(codes, rows, self.geometric), target);
+    ) -> Result<(Shuffled, Vec<u64>)> {
+        self.control.check()?;
+        let costs = merge_costs(codes, rows, self.geometric);
+        let third = ((rows.len() - target.min(rows.len())) / 3) as u64;
+        self.control.advance(third);
+        self.control.check()?;
+        let runs = cut(&costs, target);
+        drop(costs);
         self.rounds
             .push(PairwiseRound::merging(rows.len(), runs.count));
         let nodes = rows.merged(&runs);
+        self.control.advance(third);
+        self.control.check()?;
         let every: Vec<u32> = (0..nodes.len() as u32).collect();
         let (at, map, codes) = nodes.morton(&every, LATTICES[step % LATTICES.len()]);
         let of = self.partition.of.par_iter_mut().filter(|c| **c != GONE);
         of.for_each(|c| *c = map[runs.of[*c as usize] as usize]);
-        self.control.advance((rows.len() - runs.count) as u64);
-        (Shuffled { nodes, at }, codes)
+        self.control
+            .advance((rows.len() - runs.count) as u64 - 2 * third);
+        Ok((Shuffled { nodes, at }, codes))
     }
 }
 
