@@ -10,6 +10,7 @@ import g2ard
 from g2ard.config.choices import Colour
 from g2ard.errors import InputError
 from g2ard.io.types import Points
+from g2ard.jobs import view_checks
 from g2ard.jobs.view_checks import check_photos
 from g2ard.scene.splats import SH_C0
 from helpers.photos import photographed
@@ -55,3 +56,14 @@ def test_only_photos_of_the_scene_are_accepted(kind: str, background: Colour, tm
         said.clear()
         check_photos(scene, wrong, background, said.append, insisted=True)
         assert "does not look like the photos" in said[0]
+
+
+def test_few_gaussians_are_too_little_to_reject_photos(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    photos, said = photographed(tmp_path, BALL, VIEWS), []
+    monkeypatch.setattr(view_checks, "_likeness", lambda *_: ([0.1] * 12, [0.65] * 12))
+    check_photos(BALL.take(range(999)), photos, (0, 0, 0), said.append)
+    assert "does not look like the photos (correlation 0.10)" in said[0]
+    with pytest.raises(InputError, match="the photos do not show the scene"):
+        check_photos(BALL, photos, (0, 0, 0), said.append)
