@@ -56,6 +56,16 @@ def _clock(seconds: float) -> str:
     return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
 
 
+def _figure(name: str, cell: str) -> str:
+    """Format a cell of a table outside of it, with the unit of its header behind.
+
+    >>> _figure("PSNR, dB", "31.20"), _figure("views", "8")
+    ('PSNR 31.20 dB', 'views 8')
+    """
+    what, _, unit = name.partition(", ")
+    return f"{what} {cell} {unit}".rstrip()
+
+
 def wrapped(text: str) -> str:
     """Break lines between words where a terminal would break them within; paths stay whole."""
     if not sys.stderr.isatty():
@@ -200,9 +210,8 @@ class Console:
                 lines = [title]
                 for row in rows:
                     figures = zip(columns[1:], row[1:], strict=True)
-                    lines.append(
-                        f"{row[0]}: " + ", ".join(f"{name} {cell}" for name, cell in figures if cell)
-                    )
+                    told = [_figure(name, cell) for name, cell in figures if cell]
+                    lines.append(f"{row[0]}: {', '.join(told)}")
                 screen.print("\n".join(lines), markup=False, highlight=False)
             else:
                 screen.print(table, markup=False, highlight=False)
