@@ -39,6 +39,7 @@ VALID: dict[str, dict[str, Any]] = {
     "save_tileset": {"path": "tileset", "levels": LEVELS},
     "save_views": {"path": "out.json", "cameras": VIEWS},
     "select": {"splats": BALL, "cameras": VIEWS, "k": 2},
+    "show_progress": {"stage": "read", "done": 1, "total": 2},
     "simplify": {"scene": BALL, "ratio": 4},
     "up_of": {"scene": BALL},
     "Camera": {"viewmat": np.eye(4), "K": np.eye(3), "width": 8, "height": 6},
