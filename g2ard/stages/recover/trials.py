@@ -36,16 +36,23 @@ class Trials:
         self._began = time.monotonic()
 
     def search(self, guess: float) -> float:
-        """Search `MULTIPLIERS` both ways from the one nearest to `guess`; forgets earlier trials.
+        """Search `MULTIPLIERS` downwards from the one nearest to `guess`, and upwards if that gained nothing.
 
-        The largest multiplier whose gain is within 5 % of the best is chosen. Trials are too short to
-        show the benefit of larger rates, and a long run decays its rates towards the end.
+        Earlier trials are forgotten. The largest multiplier whose gain is within 5 % of the best is chosen.
+        Trials are too short to show the benefit of larger rates, and a long run decays its rates towards the
+        end.
 
         >>> Trials(lambda m, end: -abs(m - 1), 0, None).search(0.2)
         1.0
         >>> near = {1 / 3: 32.0, 3**-0.5: 31.95}
         >>> round(Trials(lambda m, end: near.get(m, 30.0), 30, None).search(1 / 3), 3)
         0.577
+
+        Smaller multipliers than the guess gain more here, so that 1.73 is not tried:
+
+        >>> trials = Trials(lambda m, end: 31 - abs(m - 0.5), 30, None)
+        >>> round(trials.search(1.0), 3), max(trials.scores)
+        (0.577, 1.0)
         """
         self.scores.clear()
         seen: dict[int, float] = {}
@@ -56,6 +63,8 @@ class Trials:
 
         at = min(range(len(MULTIPLIERS)), key=lambda i: abs(math.log(MULTIPLIERS[i] / guess)))
         for neighbours in (range(at, -1, -1), range(at + 1, len(MULTIPLIERS))):
+            if seen and not good(at):
+                break
             for i in neighbours:
                 value = self._score(MULTIPLIERS[i], _TRIAL_TIME_SHARE)
                 seen[i] = value if math.isfinite(value) else -math.inf
