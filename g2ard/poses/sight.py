@@ -36,6 +36,9 @@ _MOST_WIDENED = 4.0
 """Largest factor by which a sample of 12,000 Gaussians grows along the two longer axes, to cover for the
 rest; a larger sample may grow more."""
 
+_CROP = 32
+"""Side in pixels of the part around an aim that tells whether the line of sight is clear."""
+
 _SOLID = 0.3
 """Least opacity of Gaussians that a view may aim at."""
 
@@ -156,30 +159,41 @@ class Glance:
                 figures[1:, i] = fine, quantile(angle, weight[seen], _COARSEST)
         return figures
 
-    def sight(self, cameras: Cameras, aims: NDArray[np.int64], close: float) -> tuple[Floats, Floats]:
-        """Return the light from close matter, and how clear the lines of sight are.
+    def clear(self, cameras: Cameras, aims: NDArray[np.int64], close: float) -> Floats:
+        """Return the mean transmittance in front of what views aim at.
 
         Args:
             cameras: C views.
-            aims: (C,) rows of `points` that they look at.
+            aims: (C,) rows of `points` that they have in the middle.
             close: distance within which matter is close, scene units.
 
         Returns:
-            (C,) share of the image that shows close matter, and (C,) mean transmittance in front of the aim.
+            (C,) transmittances, over the pixels around the middle that show the aim.
         """
-        murk, clear = np.zeros((2, len(cameras)))
-        for i, (sums, depth, pixels) in enumerate(self._renders(cameras, _NEAR * close)):
-            murk[i] = sums["weight"][depth < close].sum() / pixels
-            clear[i] = sums["transmittance"][aims[i]] / max(1, sums["hits"][aims[i]])
-        return murk, clear
+        renders = self._renders(cameras, _NEAR * close, crop=True)
+        found = [
+            sums["transmittance"][aim] / max(1, sums["hits"][aim])
+            for aim, (sums, _, _) in zip(aims, renders, strict=True)
+        ]
+        return np.array(found, np.float64)
 
-    def _renders(self, cameras: Cameras, near: float | None) -> Iterator[tuple[dict[str, Any], Floats, int]]:
+    def murk(self, cameras: Cameras, close: float) -> Floats:
+        """Return the (C,) shares of the images that show matter nearer than `close`, scene units."""
+        renders = self._renders(cameras, _NEAR * close)
+        return np.array([sums["weight"][depth < close].sum() / pixels for sums, depth, pixels in renders])
+
+    def _renders(
+        self, cameras: Cameras, near: float | None, crop: bool = False
+    ) -> Iterator[tuple[dict[str, Any], Floats, int]]:
         """Yield each camera's sums, the distances to the Gaussians, and the number of pixels."""
         from g2ard.rendering.renderer import RasterSettings, view_of
 
         if not len(cameras):
             return
         here = cameras.resized(_LONGEST).recentred(self._middle)
+        if crop:
+            sizes = np.stack([here.widths, here.heights], axis=1)
+            here = here.cropped(np.maximum(0, (sizes - _CROP) // 2), np.minimum(sizes, (sizes + _CROP) // 2))
         settings = RasterSettings(antialiased=self._antialiased, near=near)
         for first in range(0, len(here), _BATCH):
             batch = range(first, min(first + _BATCH, len(here)))

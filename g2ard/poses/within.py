@@ -195,9 +195,9 @@ def plan_anywhere(survey: Survey, count: int) -> Poses:
         distances = diagonal * _DISTANCES[0] * (_DISTANCES[1] / _DISTANCES[0]) ** far
         poses = Poses(points[aims] - distances[:, None] * gazes, gazes)
         free = site.grid.cast(poses.eyes, gazes) > distances - 2 * site.grid.cell
-        poses = poses.take(free)
-        murk, clear = glance.sight(survey.cameras(poses), aims[free], _CLOSE * diagonal * site.size)
-        return poses, ((murk <= _MURK) & (clear >= _CLEAR)).astype(float)
+        poses, close = poses.take(free), _CLOSE * diagonal * site.size
+        poses = poses.take(glance.clear(survey.cameras(poses), aims[free], close) >= _CLEAR)
+        return poses, (glance.murk(survey.cameras(poses), close) <= _MURK).astype(float)
 
     return gather(survey, count if len(rows) else 0, tried, patience=_AIMED_PATIENCE)
 

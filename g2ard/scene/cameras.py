@@ -280,6 +280,21 @@ class Cameras:
         Ks[:, 1] *= (heights / self.heights)[:, None]
         return replace(self, Ks=Ks, widths=widths, heights=heights)
 
+    def cropped(self, low: ArrayLike, high: ArrayLike) -> Cameras:
+        """Return the parts of the views from pixel `low` up to `high`, each (C, 2) or (2,), x before y.
+
+        >>> K = [[50, 0, 32], [0, 50, 32], [0, 0, 1]]
+        >>> one = Cameras.from_lists([look_at([3, 0, 0], [0, 0, 0])], [K], [(64, 64)], "a")
+        >>> part = one.cropped([16, 24], [48, 40])
+        >>> part.widths.tolist(), part.heights.tolist(), part.Ks[0, :2, 2].tolist()
+        ([32], [16], [16.0, 8.0])
+        """
+        corner = np.broadcast_to(np.asarray(low, np.int64), (len(self), 2))
+        widths, heights = (np.asarray(high, np.int64) - corner).T
+        Ks = self.Ks.copy()
+        Ks[:, :2, 2] -= corner
+        return replace(self, Ks=Ks, widths=widths, heights=heights)
+
     def facing(self, points: ArrayLike) -> NDArray[np.bool_]:
         """Return which views contain any of the points within their image.
 

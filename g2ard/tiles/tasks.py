@@ -6,7 +6,7 @@ import json
 import zipfile
 import zlib
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -200,11 +200,8 @@ def cropped(
         low = np.clip(np.floor([u.min(), v.min()]) - beside, 0, size - 1)
         high = np.clip(np.ceil([u.max(), v.max()]) + beside, low + 1, size)
         boxes.append((*low, *high))
-    left, top, right, bottom = np.array(boxes, np.int64).reshape(-1, 4).T
-    Ks = cameras.Ks.copy()
-    Ks[:, 0, 2] -= left
-    Ks[:, 1, 2] -= top
-    return replace(cameras, Ks=Ks, widths=right - left, heights=bottom - top)
+    corners = np.array(boxes, np.int64).reshape(-1, 2, 2)
+    return cameras.cropped(corners[:, 0], corners[:, 1])
 
 
 def arrays_of(scene: Splats, name: str) -> Arrays:
