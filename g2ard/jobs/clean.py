@@ -112,7 +112,6 @@ def clean(
         seed=seed,
         rows=_CLUTTER_ROWS,
         near=_CLUTTER_NEAR,
-        for_weights=True,
         progress=progress,
     )
     cameras = pool.cameras.resized(_CLUTTER_SIDE)

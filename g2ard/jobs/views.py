@@ -335,7 +335,6 @@ def cameras_for_weights(
             seed=seed,
             rows=round(_WEIGHT_ROWS * times),
             near=_WEIGHT_NEAR_SHARE,
-            for_weights=True,
             represents=represents,
             progress=progress,
         )

@@ -74,7 +74,6 @@ class Pool:
         up: (3,) unit vector in world coordinates.
         unseen: share of a sample of the matter that no pose sees.
         coarse: share that is seen, but nowhere with a standard deviation of a pixel.
-        held: share of the matter that a typical pose has in its frame.
         more: plans additional views of a kind, near, standing or anywhere: at most as many as requested.
     """
 
@@ -84,7 +83,6 @@ class Pool:
     up: NDArray[np.float64]
     unseen: float = 0.0
     coarse: float = 0.0
-    held: float = 1.0
     more: Callable[[str, int], list[Camera]] = field(default=lambda kind, count: [])
 
 
@@ -100,7 +98,6 @@ def plan_pool(
     rows: int | None = None,
     grow: float = 1.0,
     near: float = 0.0,
-    for_weights: bool = False,
     represents: float = 1.0,
     progress: Progress = silent,
 ) -> Pool:
@@ -113,9 +110,8 @@ def plan_pool(
         count: number of poses if a view holds the whole scene.
         grow: largest factor on `count`; if a view holds a share h of the scene, the factor is 1/√h.
         near: largest share of the poses that step nearer to what the others see. The actual share is near·s,
-            where s rises from 0 to 1 with the share of the matter that is only seen below a pixel. With
-            `for_weights`, s is at least 1−h.
-        for_weights: whether the pool is for weighing Gaussians rather than for training.
+            where s is at least 1−h and rises to 1 with the share of the matter that is only seen below a
+            pixel.
         represents: Gaussians of the scene per row of `splats`.
 
     Raises:
@@ -144,7 +140,7 @@ def plan_pool(
         )
     reach = reach_of(survey, poses)
     more = partial(_more, survey, poses, reach)
-    need = max(float(np.interp(reach[2].mean(), _COARSE, (0, 1))), 1 - held if for_weights else 0.0)
+    need = max(float(np.interp(reach[2].mean(), _COARSE, (0, 1))), 1 - held)
     near_poses = plan_near(survey, poses, reach, int(near * need * len(poses)), 1)
     if len(near_poses):
         kept = np.linspace(0, len(poses) - 1, len(poses) - len(near_poses)).round().astype(int)
@@ -160,7 +156,6 @@ def plan_pool(
         site.up.axis,
         unseen=float((reach[0] < 0).mean()),
         coarse=float(reach[2].mean()),
-        held=held,
         more=more,
     )
 

@@ -189,10 +189,9 @@ def test_poses_step_nearer_to_matter_under_a_pixel() -> None:
     assert coarse.coarse < plan_pool(fine, 32).coarse
 
 
-def test_pools_for_looks_step_nearer_where_a_view_holds_little(room) -> None:
-    assert "near" in plan_pool(room, 32, near=0.25, for_weights=True).kind
-    assert "near" not in plan_pool(room, 32, near=0.25).kind
-    assert "near" not in plan_pool(naive.statue(), 32, near=0.25, for_weights=True).kind
+def test_poses_step_nearer_where_a_view_holds_little(room) -> None:
+    assert "near" in plan_pool(room, 32, near=0.25).kind
+    assert "near" not in plan_pool(room, 32).kind
 
 
 def test_a_pool_reports_its_unseen_share(room) -> None:
