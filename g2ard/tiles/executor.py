@@ -28,9 +28,10 @@ _POOL_SHUTDOWN_SECONDS = 5.0
 The thread releases semaphores; otherwise Python warns about them at exit.
 """
 
-Finished = Callable[[Task], None]
-Executor = Callable[[Sequence[Task], Finished], None]
-"""Runs tasks that do not read each other's files, and calls back after each; may raise `WorkerDiedError`."""
+Told = Callable[[Task, float], None]
+Executor = Callable[[Sequence[Task], Told], None]
+"""Runs tasks that do not read each other's files, and calls back with the finished share of each, 1 at its
+end; may raise `WorkerDiedError`."""
 
 
 class WorkerDiedError(Exception):
@@ -65,15 +66,16 @@ class Workers:
         return [task.output for task in tasks]
 
     def _round(self, todo: Sequence[Task], stage: str, total: int) -> None:
-        done = total - sum(task.cost for task in todo)
+        before = total - sum(task.cost for task in todo)
+        done: dict[str, float] = {}
 
-        def finished(task: Task) -> None:
-            nonlocal done
-            done += task.cost
-            self.progress(stage, done, total)
+        def told(task: Task, share: float) -> None:
+            if share * task.cost > done.get(task.label, 0.0):
+                done[task.label] = share * task.cost
+                self.progress(stage, before + int(sum(done.values())), total)
 
-        self.progress(stage, done, total)
-        self.executor(todo, finished)
+        self.progress(stage, before, total)
+        self.executor(todo, told)
 
 
 def _check_written(tasks: Sequence[Task]) -> None:
@@ -107,10 +109,10 @@ def executor(
             yield processes.run
 
 
-def _run_here(tasks: Sequence[Task], finished: Finished) -> None:
+def _run_here(tasks: Sequence[Task], told: Told) -> None:
     for task in tasks:
-        run_task(task)
-        finished(task)
+        run_task(task, partial(told, task))
+        told(task, 1.0)
 
 
 class _Processes:
@@ -120,7 +122,7 @@ class _Processes:
         self._workers, self._threads = workers, threads
         self._pool: ProcessPoolExecutor | None = None
 
-    def run(self, tasks: Sequence[Task], finished: Finished) -> None:
+    def run(self, tasks: Sequence[Task], told: Told) -> None:
         _sweep(tasks)
         if self._pool is None:
             context = get_context("spawn")
@@ -132,7 +134,10 @@ class _Processes:
                 done, pending = wait(pending, timeout=0.2, return_when=FIRST_COMPLETED)
                 for future in done:
                     note_worker(*future.result())
-                    finished(futures[future])
+                    told(futures[future], 1.0)
+                for future in pending:
+                    if future.running():
+                        told(futures[future], futures[future].share)
         except BrokenProcessPool:
             self.close()
             raise WorkerDiedError from None
@@ -207,7 +212,7 @@ def _dask_client(scheduler: str, workers: int) -> Iterator[Any]:
         yield opened.enter_context(closing(client))
 
 
-def _run_on_dask(client: Any, threads: int, tasks: Sequence[Task], finished: Finished) -> None:
+def _run_on_dask(client: Any, threads: int, tasks: Sequence[Task], told: Told) -> None:
     """Run tasks on workers that see the same files under the same paths.
 
     Results are paths, because Dask cannot spill what workers hold in Rust's memory.
@@ -219,7 +224,7 @@ def _run_on_dask(client: Any, threads: int, tasks: Sequence[Task], finished: Fin
     try:
         for future in as_completed(futures, loop=client.loop):  # type: ignore[no-untyped-call]
             future.result()
-            finished(by_key[future.key])
+            told(by_key[future.key], 1.0)
     except BaseException as error:
         client.cancel(futures, force=True)
         if isinstance(error, KilledWorker):

@@ -35,6 +35,7 @@ from g2ard.tiles.tasks import (
     far_around,
     load,
     scene_of,
+    tell_share,
     tile_of,
 )
 
@@ -141,13 +142,15 @@ def recover_tile(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays
     train, apart = (None, None) if idle else (targets("train"), targets("apart"))
     if train is None:
         return {**arrays_of(small, "scene"), "errors": np.array([before, before]), "steps": np.array(0)}
+    steps = arguments["steps"]
     done = recover(
         student,
         train,
-        replace(config, steps=arguments["steps"]),
+        replace(config, steps=steps),
         anchors=Anchors.of(student, config.regularizers.in_plane),
         validation=apart,
         frozen=frozen,
+        watch=lambda step, seconds, splats: tell_share(step / steps),
     )
     result = done.splats.take(slice(len(small)))
     after = _errors(join([result, student.take(frozen)]), held_out, names, background)

@@ -59,6 +59,10 @@ _PLAN_DEPTH_SHARE = 0.6
 _COARSE_STRIDE = 8
 """Every n-th row in Morton order becomes a coarse Gaussian, widened to represent the rest."""
 
+_SAMPLE = 250_000, COARSE[0]
+"""Rows that stand for the scene where views are planned, as many as without tiles; and the most Gaussians
+that a row of a larger scene stands for."""
+
 GONE = np.uint32(0xFFFFFFFF)
 """Cluster number of a dropped row."""
 
@@ -70,7 +74,7 @@ def coarse(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
     """Merge a tile to a few Gaussians, near and far, and sample its rows.
 
     Args:
-        arguments: `tile`, `config`.
+        arguments: `tile`, `config`; `sampled`, the rows of which one is in the sample.
         inputs: none.
         places: `store`.
 
@@ -83,7 +87,7 @@ def coarse(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
     some = _widened(scene.take(scene.core.order[::_COARSE_STRIDE]), _COARSE_STRIDE)
     near = simplify(some, max(1, len(scene) // COARSE[0]), method="fast", config=config).splats
     far = simplify(near, max(1, len(scene) // COARSE[1]), method="fast", config=config).splats
-    rows = scene.core.order[:: COARSE[0]]
+    rows = scene.core.order[:: arguments["sampled"]]
     return {
         **arrays_of(near, "near"),
         **arrays_of(far, "far"),
@@ -326,7 +330,9 @@ class TiledRun:
         self.config = asdict(config.resolved("default", antialiased=model == "antialiased"))
         self.sizes = [tile.rows for tile in store.tiles]
         self.coarse: list[Path] = []
-        self.coarse = self.each("coarse", "coarse")
+        rows, most = _SAMPLE
+        sampled = int(np.clip(store.count // rows, 1, most))
+        self.coarse = self.each("coarse", "coarse", per_tile=[{"sampled": sampled}] * len(self.sizes))
 
     def each(
         self,

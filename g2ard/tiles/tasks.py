@@ -3,9 +3,13 @@
 import gc
 import hashlib
 import json
+import math
+import time
 import zipfile
 import zlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from contextvars import ContextVar
 from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
@@ -33,6 +37,11 @@ Places = Mapping[str, Path]
 """Parameters of a task's function, see `Task`."""
 
 _SCENE_ARRAYS = ("means", "quats", "scales", "logit_opacities", "sh0", "shN", "offset", "render_model")
+
+_TELL: ContextVar[Callable[[float], None]] = ContextVar("tell", default=lambda share: None)
+"""Takes the finished share of the task that runs."""
+_TELL_SECONDS = 0.5
+"""Least time between two shares in a task's file."""
 
 _CROP_SAMPLE, _CROP_MARGIN = 20_000, 8
 """Number of means that outline a tile for cropping, and the pixels kept around them."""
@@ -87,18 +96,56 @@ class Task:
         """Return whether the output file exists and has its table of contents."""
         return is_whole(self.output)
 
+    @property
+    def share_file(self) -> Path:
+        """File in which a worker keeps the finished share of the task while it runs."""
+        return self.folder / f".{self.output.stem}.share"
 
-def run_task(task: Task) -> Path:
-    """Run a task unless it is done; the file is written atomically."""
+    @property
+    def share(self) -> float:
+        """Finished share, from 0 to 1, as the worker last told it."""
+        with suppress(OSError, ValueError):
+            return float(self.share_file.read_text("ascii"))
+        return 0.0
+
+
+def tell_share(share: float) -> None:
+    """Tell how much of the running task is finished, from 0 to 1."""
+    _TELL.get()(share)
+
+
+def run_task(task: Task, tell: Callable[[float], None] | None = None) -> Path:
+    """Run a task unless it is done; the file is written atomically.
+
+    Args:
+        tell: called with the finished share; None writes it to the task's `share_file`.
+    """
     if task.done:
         return task.output
     module, name = task.function.split(":")
-    arrays: Arrays = getattr(import_module(module), name)(task.arguments, task.inputs, task.places)
+    before = _TELL.set(tell or _share_writer(task.share_file))
+    try:
+        arrays: Arrays = getattr(import_module(module), name)(task.arguments, task.inputs, task.places)
+    finally:
+        _TELL.reset(before)
+        task.share_file.unlink(missing_ok=True)
     with atomic_output(task.output, overwrite=True) as temporary, temporary.open("wb") as file:
         np.savez(file, **arrays)  # type: ignore[arg-type]
     del arrays
     gc.collect()  # break reference cycles between scenes and their cores
     return task.output
+
+
+def _share_writer(path: Path) -> Callable[[float], None]:
+    told = -math.inf
+
+    def tell(share: float) -> None:
+        nonlocal told
+        if (now := time.monotonic()) - told > _TELL_SECONDS:
+            told = now
+            path.write_text(f"{share:.3f}", encoding="ascii")
+
+    return tell
 
 
 def is_whole(path: Path) -> bool:

@@ -1,5 +1,6 @@
 """Scenes and views for tests of tiles."""
 
+import time
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from g2ard.stages.simplify import SimplifyConfig
 from g2ard.tiles.executor import Workers, executor
 from g2ard.tiles.merging import simplify_tiles
 from g2ard.tiles.steps import TiledRun
+from g2ard.tiles.tasks import Arguments, Arrays, Inputs, Places, tell_share
 
 
 def town(count: int = 9000, seed: int = 0) -> Splats:
@@ -68,3 +70,10 @@ def reduced(
     with executor(**where) as runs:
         run = TiledRun(store, Workers(runs, work, progress), SimplifyConfig())
         return simplify_tiles(run, budget, views).whole()
+
+
+def half_told(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
+    """Tell that half is done, long enough for the process that waits."""
+    tell_share(0.5)
+    time.sleep(1.0)
+    return {}

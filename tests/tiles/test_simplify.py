@@ -20,9 +20,11 @@ from g2ard.scene.cameras import Cameras, look_at
 from g2ard.scene.prepared import finite_rows_of
 from g2ard.stages.evaluate import evaluate
 from g2ard.stages.simplify import SimplifyConfig, round_counts, simplify
+from g2ard.tiles.executor import Workers, executor
 from g2ard.tiles.ingest import ingest
 from g2ard.tiles.merging import cheapest
-from g2ard.tiles.steps import GONE
+from g2ard.tiles.steps import GONE, TiledRun
+from g2ard.tiles.tasks import Task
 from helpers.systems import needs_proc, workers_of
 from helpers.tiled_scenes import reduced, ring, town
 
@@ -222,3 +224,23 @@ def test_budgets_out_of_reach_are_refused(store: TileStore, tmp_path: Path) -> N
         reduced(some, tmp_path, budget=550)
     with pytest.raises(InputError, match=r"the 4 tiles keep at least 4 Gaussians \(one per tile\), got 2"):
         reduced(store, tmp_path, budget=2)
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_progress_moves_within_a_task(tmp_path: Path, workers: int) -> None:
+    seen: list[int] = []
+    tasks = [
+        Task("helpers.tiled_scenes:half_told", f"half-{i}", tmp_path, {"number": i}, cost=100)
+        for i in range(2)
+    ]
+    with executor(workers) as runs:
+        Workers(runs, tmp_path, lambda stage, done, total, info=None: seen.append(done)).run(tasks, "half")
+    assert 50 in seen
+    assert seen == sorted(seen)
+    assert seen[-1] == 200
+    assert sorted(tmp_path.iterdir()) == sorted(task.output for task in tasks)
+
+
+def test_a_sample_for_views_has_enough_rows(store: TileStore, tmp_path: Path) -> None:
+    with executor() as runs:
+        assert len(TiledRun(store, Workers(runs, tmp_path), SimplifyConfig()).sample()) == store.count
