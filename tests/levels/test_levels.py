@@ -1,6 +1,7 @@
 """Levels of detail: the tree, what leaves lose, streamed SOG, and the command."""
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -135,7 +136,7 @@ def test_a_dry_run_estimates_every_level_and_writes_nothing(tmp_path: Path, comm
     lines = [line for line in told.err.splitlines() if "about" in line]
     assert [line.partition(":")[0] for line in lines] == ["level 1", "level 2", "all levels"]
     merged = succeeds(command_line, tmp_path, *ask, "--merge-only", "-q").err
-    assert "level 2: 50 Gaussians: about 1 s\n" in merged
+    assert re.search(r"^level 2: 50 Gaussians: about \d+ s$", merged, re.MULTILINE)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["ball.ply", "v.json"]
     succeeds(command_line, tmp_path, *ask[:-1], "--merge-only")
     succeeds(command_line, tmp_path, *ask)  # also beside a finished output
