@@ -18,7 +18,7 @@ from g2ard.rendering.visibility import visibility
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.sky import sky_mask
 from g2ard.scene.splats import Splats
-from g2ard.stages.clean import FLOATING, KINDS, Cleaning, find_clutter, find_floating, unoccluded_means
+from g2ard.stages.clean import FLOATING, KINDS, Cleaning, compare_depths, find_clutter
 
 _CLUTTER_VIEWS, _CLUTTER_SIDE = 96, 400
 """Number of generated views for finding clutter, and their longer side in pixels."""
@@ -117,8 +117,9 @@ def clean(
     cameras = pool.cameras.resized(_CLUTTER_SIDE)
     seen = visibility(splats, cameras, progress)
     pixels = int((cameras.widths.astype(int) * cameras.heights).sum())
-    unoccluded = unoccluded_means(splats, cameras, progress)
-    floating = find_floating(splats, cameras, progress) if set(kinds) & set(FLOATING) else None
+    unoccluded, floating = compare_depths(
+        splats, cameras, floating=bool(set(kinds) & set(FLOATING)), progress=progress
+    )
     clutter = find_clutter(
         splats, seen, unoccluded, pixels, kinds, floating=floating, strength=strength, progress=progress
     )

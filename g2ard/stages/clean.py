@@ -12,7 +12,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -81,10 +80,10 @@ def find_clutter(
     Args:
         splats: N Gaussians, finite.
         seen: their visibility (`g2ard.rendering.visibility.visibility`); uses `weight` and `peak`.
-        unoccluded: (N,) mask from `unoccluded_means`: only these can be invisible, apart from α below 1/255.
+        unoccluded: (N,) mask from `compare_depths`: only these can be invisible, apart from α below 1/255.
         pixels: number of pixels of all views together.
         kinds: kinds to find.
-        floating: from `find_floating`; None finds neither haze nor streaks.
+        floating: from `compare_depths`; None finds neither haze nor streaks.
         strength: 0 to 1: haze and streaks float in more than 1 − `strength` of the views.
         progress: called before each kind, and for groups of floaters.
 
@@ -130,20 +129,6 @@ def _invisible(splats: Splats, seen: Any, unoccluded: NDArray[np.bool_], pixels:
     return out
 
 
-def unoccluded_means(splats: Splats, cameras: Cameras, progress: Progress = silent) -> NDArray[np.bool_]:
-    """Return the (N,) mask of means in the frame of a view and at most 1 % of the depth behind its surface.
-
-    The surface is where half of a pixel's light is blocked. Gaussians deeper in all views, behind a wall or
-    in an unseen corner, may be visible from elsewhere.
-    """
-    means = splats.means.astype(np.float64) + splats.offset
-    out = np.zeros(len(splats), bool)
-    for camera, depths in _surfaces(splats, cameras, progress):
-        rows, z, surface = _in_frame(means, camera, depths)
-        out[rows[(surface == 0) | (z < (1 + _SURFACE_SLACK) * surface)]] = True
-    return out
-
-
 @dataclass(frozen=True, eq=False)
 class Floating:
     """Share of the views in which each Gaussian floats.
@@ -157,46 +142,55 @@ class Floating:
     ends: NDArray[np.float64]
 
 
-def find_floating(splats: Splats, cameras: Cameras, progress: Progress = silent) -> Floating:
-    """Return the share of the views in which each Gaussian floats in front of the visible surface.
+def compare_depths(
+    splats: Splats, cameras: Cameras, *, floating: bool = True, progress: Progress = silent
+) -> tuple[NDArray[np.bool_], Floating | None]:
+    """Compare the Gaussians' depths in each view with those of the visible surface.
 
-    Means are tested, and both ends of Gaussians ten times as long as wide. A point floats in a view if it is
+    The surface is where half of a pixel's light is blocked. A mean is unoccluded if it is in the frame of a
+    view and at most 1 % of the depth behind the surface. Gaussians deeper in all views, behind a wall or in
+    an unseen corner, may be visible from elsewhere.
+
+    Means can float, and both ends of Gaussians ten times as long as wide. A point floats in a view if it is
     nearer than the surface by more than its Gaussian's standard deviation along the ray plus 1 % of the
     depth. Views that do not show the point, or show no surface behind it, do not count. One more view counts
     as not floating, so that few views are weak evidence.
+
+    Returns:
+        The (N,) mask of unoccluded means, and the shares of views in which Gaussians float, or None.
     """
-    means = splats.means.astype(np.float64)
-    long, mean_to_end = _elongated(splats, np.arange(len(splats)))
-    points = np.concatenate([means, means[long] - mean_to_end, means[long] + mean_to_end]) + splats.offset
-    owners = np.concatenate([np.arange(len(splats)), long, long])
-    axes = rotation_matrices(splats.quats)
-    views, floats = np.ones(len(points)), np.zeros(len(points))
-    for camera, depths in _surfaces(splats, cameras, progress):
-        rows, z, surface = _in_frame(points, camera, depths)
-        shown = (surface > 0) & (z < (1 + _SURFACE_SLACK) * surface)
-        rows, z, surface = rows[shown], z[shown], surface[shown]
-        rays = points[rows] - camera.position
-        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-        owner = owners[rows]
-        along = np.einsum("nji,nj->ni", axes[owner], rays) * splats.scales[owner]
-        views[rows] += 1
-        floats[rows] += z + np.linalg.norm(along, axis=1) < (1 - _SURFACE_SLACK) * surface
-    shares = floats / views
-    ends = np.zeros(len(splats))
-    ends[long] = shares[len(splats) :].reshape(2, -1).max(axis=0)
-    return Floating(shares[: len(splats)], ends)
-
-
-def _surfaces(
-    splats: Splats, cameras: Cameras, progress: Progress
-) -> Iterator[tuple[Camera, NDArray[np.float32]]]:
-    """Yield each view with the (H, W) depths of the visible surface; 0 means no surface."""
+    count, points, owners = len(splats), splats.means.astype(np.float64), np.arange(len(splats))
+    if floating:
+        long, mean_to_end = _elongated(splats, owners)
+        points = np.concatenate([points, points[long] - mean_to_end, points[long] + mean_to_end])
+        owners = np.concatenate([owners, long, long])
+    points += splats.offset
+    unoccluded, views, floats = np.zeros(count, bool), np.ones(len(points)), np.zeros(len(points))
     renderer = Renderer(splats)
     for done, camera in enumerate(cameras, 1):
         depths = renderer.render(camera, median=True).median
         assert depths is not None
-        yield camera, depths
+        rows, z, surface = _in_frame(points, camera, depths)
+        shown = z < (1 + _SURFACE_SLACK) * surface
+        seen = rows[shown | (surface == 0)]
+        unoccluded[seen[seen < count]] = True
+        if floating:
+            views[rows[shown]] += 1
+            front = z < (1 - _SURFACE_SLACK) * surface
+            rows, z, surface = rows[front], z[front], surface[front]
+            rays = points[rows] - camera.position
+            rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+            owner = owners[rows]
+            along = np.einsum("nji,nj->ni", rotation_matrices(splats.quats[owner]), rays)
+            along = np.linalg.norm(along * splats.scales[owner], axis=1)
+            floats[rows] += z + along < (1 - _SURFACE_SLACK) * surface
         progress("depths", done, len(cameras), {})
+    if not floating:
+        return unoccluded, None
+    shares = floats / views
+    ends = np.zeros(count)
+    ends[long] = shares[count:].reshape(2, -1).max(axis=0)
+    return unoccluded, Floating(shares[:count], ends)
 
 
 def _in_frame(

@@ -14,7 +14,7 @@ from g2ard.rendering.visibility import visibility
 from g2ard.scene.cameras import look_at
 from g2ard.scene.splats import Splats
 from g2ard.scene.transform import join
-from g2ard.stages.clean import FLOATING, KINDS, find_clutter, find_floating, unoccluded_means
+from g2ard.stages.clean import FLOATING, KINDS, compare_depths, find_clutter
 from helpers.commands import CommandLine, refused, succeeds
 from helpers.scenes import around, checkered_ball, views_at
 
@@ -72,7 +72,7 @@ def test_gaussians_outside_all_views_stay() -> None:
     splats, _ = junk()
     view = around(24).take([0])
     behind = replace(splats, means=splats.means + (100 * view.positions[0]).astype(np.float32))
-    unoccluded = unoccluded_means(behind, view)
+    unoccluded, _ = compare_depths(behind, view, floating=False)
     assert not unoccluded.any()
     found = find_clutter(behind, visibility(behind, view), unoccluded, 64 * 48, ("invisible",))
     np.testing.assert_array_equal(found.kind >= 0, splats.logit_opacities < -5.54)
@@ -88,7 +88,7 @@ def test_gaussians_behind_a_wall_stay() -> None:
     before = replace(wall.take([0]), means=np.float32([[0, -1, 0]]), logit_opacities=np.float32([-5.4]))
     scene = join([wall, beyond, before])
     view = views_at([look_at([0, -4, 0], [0, 0, 0])])
-    unoccluded = unoccluded_means(scene, view)
+    unoccluded, _ = compare_depths(scene, view, floating=False)
     assert not unoccluded[x.size : -1].any()
     assert unoccluded[-1]
     hidden = visibility(scene, view).weight[x.size : -1]
@@ -124,7 +124,7 @@ def veiled(ball: Splats) -> tuple[Splats, np.ndarray]:
 def test_strength_removes_haze_and_streaks_and_keeps_the_ball() -> None:
     ball = checkered_ball(2500)
     scene, kinds = veiled(ball)
-    floating = find_floating(scene, around(96))
+    _, floating = compare_depths(scene, around(96))
     found = [find(scene, kinds=FLOATING, floating=floating, strength=s) for s in (0, 0.25, 0.5, 0.75)]
     shares = np.array([[(f.kind[kinds == kind] >= 0).mean() for kind in (-1, 4, 5)] for f in found])
     assert (shares[0] == 0).all()
