@@ -37,7 +37,7 @@ _FOOTPRINT_SIGMAS = 3.0
 """Standard deviations at which renderers cut off a footprint."""
 _FLOATER_SHARE = 1e-3
 """Share of the scene's Gaussians and of its light below which a separate group is a floater."""
-_NEIGHBORS, _BLOCK = 16, 1 << 18
+_NEIGHBORS, _BLOCK = 16, 1 << 17
 """Nearest neighbours that can touch a Gaussian, and Gaussians that are grouped at once."""
 _SURFACE_SLACK = 0.01
 """Share of the depth within which a Gaussian belongs to the visible surface, behind or in front of it."""
@@ -271,9 +271,10 @@ def _floaters(
     for first in range(0, len(rows), _BLOCK):
         progress("groups", first, len(rows))
         block = slice(first, first + _BLOCK)
-        away = np.linalg.norm(means[near[block]] - means[block, None], axis=2)
-        a, b = np.nonzero(away <= reach[block, None] + reach[near[block]])
-        group = _joined(group, a + first, near[block][a, b])
+        other = near[block]
+        away = np.sqrt(sum((axis[other] - axis[block, None]) ** 2 for axis in means.T))
+        a, b = np.nonzero(away <= reach[block, None] + reach[other])
+        group = _joined(group, a + first, other[a, b])
     progress("groups", len(rows), len(rows))
     count = np.bincount(group, minlength=len(rows))
     light = np.bincount(group, weight[rows], minlength=len(rows))
