@@ -23,7 +23,7 @@ from g2ard.jobs.job import DistillJob
 from g2ard.jobs.measured_budget import Aim, Reduction, aim_of
 from g2ard.jobs.photos import sparse_file, sparse_points, topped_up
 from g2ard.jobs.view_checks import check_photos, propose_background
-from g2ard.jobs.views import views_of
+from g2ard.jobs.views import Use, views_of
 from g2ard.pipeline.distill import Distilled
 from g2ard.pipeline.run_views import RunViews
 from g2ard.progress import Progress, Say, plural, silent, unsaid
@@ -162,16 +162,17 @@ def prepare(
     options: DistillOptions,
     *,
     counted: Callable[[int], object] | None = None,
-    recovers: bool = True,
+    use: Use = "distil",
     progress: Progress = silent,
     say: Say = unsaid,
 ) -> DistillJob:
     """Read inputs and decide everything that a distillation needs, for one or more budgets.
 
     `counted` is called with the number of Gaussians to reduce, before budgets and views are computed; its
-    exceptions propagate. Without `recovers`, messages leave out what only recovery uses. Other
-    arguments and errors are those of `distill`.
+    exceptions propagate. With the use `merging`, messages leave out what only recovery uses.
+    Other arguments and errors are those of `distill`.
     """
+    recovers = use != "merging"
     began = time.monotonic()
     recover = options.config.recover  # rejects invalid settings before anything is read
     if not isinstance(scene, Splats):
@@ -192,6 +193,7 @@ def prepare(
         min(counts, default=max(1, len(prior) // _USUAL_RATIO)),
         beside=read.beside,
         teach=not read.lifted and options.photos is not True,
+        use=use,
         progress=progress,
         say=say,
     )

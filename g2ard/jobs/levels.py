@@ -225,7 +225,7 @@ def prepare_levels(
             render_model=render_model,
             settings=recovery_settings(steps, background, seed),
         ),
-        recovers=recover,
+        use="levels" if recover else "merging",
         progress=progress,
         say=say,
     )

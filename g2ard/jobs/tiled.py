@@ -360,6 +360,7 @@ def _job(
             options,
             smallest(store.count),
             beside=options.beside or scene,
+            use="tiles" if learn else "merging",
             represents=store.count / len(sample),
             progress=progress,
             say=say,

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
@@ -28,6 +28,8 @@ if TYPE_CHECKING:
     from g2ard.jobs.distill_options import DistillOptions
     from g2ard.poses import Pool
 Up = Sequence[float] | None
+Use = Literal["distil", "levels", "tiles", "merging"]
+"""Use of generated views. Levels and tiles are scored in usual views alone; merging has no recovery."""
 
 _POOL_VIEWS, _TRAINING_VIEWS, _POOL_GROWTH = 128, 112, 2.0
 """Generated usual views, those of them that train (every 8th is held out for scoring), and the largest factor
@@ -56,6 +58,7 @@ def views_of(
     *,
     beside: str | Path | None = None,
     teach: bool = True,
+    use: Use = "distil",
     represents: float = 1.0,
     progress: Progress = silent,
     say: Say = unsaid,
@@ -73,6 +76,7 @@ def views_of(
         beside: path beside which to look for cameras.
         teach: whether the scene can render targets; otherwise views without a photo are skipped and no views
             are generated.
+        use: what the message about generated views counts.
         represents: Gaussians per row if `prior` is a sample of a larger scene; the pool grows with it.
     """
     views_beside = None
@@ -100,7 +104,12 @@ def views_of(
             )
         held_out = None if options.held_out is None else load(options.held_out, [for_scores])[0].cameras
         return _generated(
-            plan(_POOL_VIEWS, grow=_POOL_GROWTH), held_out, options.size, partial(mix, select=select), say
+            plan(_POOL_VIEWS, grow=_POOL_GROWTH),
+            held_out,
+            options.size,
+            partial(mix, select=select),
+            use,
+            say,
         )
     if options.held_out is None:
         train, test = load(given, ["train", "test"])
@@ -126,7 +135,7 @@ def views_of(
 
 
 def _generated(
-    planned: Pool, held_out: Cameras | None, size: int | None, mix: Callable[..., _Mixed], say: Say
+    planned: Pool, held_out: Cameras | None, size: int | None, mix: Callable[..., _Mixed], use: Use, say: Say
 ) -> RunViews:
     """Split a pool into views for training and for scoring; all train if `held_out` are scored."""
     names = planned.cameras.names
@@ -138,15 +147,29 @@ def _generated(
         Cameras.of([*train.cameras, *test]),
         splits=("train",) * len(train.cameras) + ("test",) * len(test),
     )
-    scored, apart_count = len(test if held_out is None else held_out), len(apart or ())
-    parts = {"for training": len(train.cameras), "for scores": scored + apart_count // 2}
-    parts["for validation"] = apart_count - apart_count // 2
-    counts = ", ".join(f"{count} {use}" for use, count in parts.items() if count)
+    counts = _uses(use, len(train.cameras), len(test if held_out is None else held_out), len(apart or ()))
     say(f"views: {counts}; {_of(planned, pool.cameras)}")
     train, test = train.resized(size), test.resized(size)
     if held_out is not None:
         train, test = drop_held_out(train, held_out, say), held_out
     return RunViews(train, test, apart and apart.resized(size), pool, unseen)
+
+
+def _uses(use: Use, train: int, test: int, apart: int) -> str:
+    """Count views by use.
+
+    >>> _uses("distil", 112, 16, 48), _uses("merging", 112, 16, 48)
+    ('112 train, 40 score, 24 validate', '112 measure visibility, 16 score')
+    """
+    if use == "merging":
+        return f"{train} measure visibility, {test} score"
+    half = apart // 2
+    parts = {
+        "train": train,
+        "score": test + (half if use == "distil" else 0),
+        "validate": apart if use == "tiles" else apart - half,
+    }
+    return ", ".join(f"{count} {name}" for name, count in parts.items() if count)
 
 
 _Mixed = tuple[ViewSet, Cameras | None, float | None]
@@ -266,7 +289,7 @@ def views_or_pool(
             progress=progress,
             say=say,
         )
-        return _with_apart(_generated(planned, None, None, mix, say))
+        return _with_apart(_generated(planned, None, None, mix, "distil", say))
     say(f"views: {len(planned.cameras)}, {_of(planned, planned.cameras)}")
     return ViewSet(planned.cameras, splits=splits_of(None, planned.cameras.names))
 
