@@ -59,6 +59,7 @@ class RunFolder:
         self._report = path / "report.json"  # written last
         self._simplified = path / "simplified" / "scene.ply"  # with --keep, for `evaluate --anchors`
         self._view, self._views = path / "view.html", path / "views.json"
+        self._scored = path / "scored.json"  # if some scored views are not in views.json
         self._inputs: dict[str, Any] = {}  # identity of each file that this run reads
 
     @property
@@ -68,7 +69,7 @@ class RunFolder:
 
     def check(self, budget: Budget) -> None:
         """Raise an `OutputError` unless the run may write here."""
-        self._run.spare_inputs(self.scene, *self._other_scenes(), self._simplified, self._views)
+        self._run.spare_inputs(self.scene, *self._other_scenes(), self._simplified, self._views, self._scored)
         check_unlocked(self.path)
         left = left_at(self.work)
         killed = self.path.is_dir() and [path.name for path in self.path.iterdir()] == [_WORK_FOLDER]
@@ -163,19 +164,22 @@ class RunFolder:
         """Write the run's views with their splits, generated ones also in the format of --views-format."""
         own = views.pool or views.train
         if "test" not in own.splits:
-            train, taken = own.cameras, set(own.cameras.names)
-            test = [
-                replace(view, name=f"{view.name} (held out)") if view.name in taken else view
-                for view in views.test
-            ]
-            splits = ("train",) * len(train) + ("test",) * len(test)
-            own = ViewSet(Cameras.of([*train, *test]), splits=splits)
+            splits = ("train",) * len(own.cameras) + ("test",) * len(views.test)
+            own = ViewSet(_joined(own.cameras, views.test), splits=splits)
         write_views(self._views, own.cameras, splits=own.splits, overwrite=True)
         also: ViewFormat = self._run.config["views_format"]
         if views.pool is not None and also in _VIEW_FILES:
             self._run.write_views(
                 self.path / _VIEW_FILES[also], own.cameras, also, own.splits, overwrite=True
             )
+
+    def write_scored(self, held_out: Cameras, others: Cameras | None) -> None:
+        """Write all scored views if some are of other kinds; otherwise remove an earlier run's."""
+        if others is None:
+            self._scored.unlink(missing_ok=True)
+            return
+        scored = _joined(others, held_out)
+        write_views(self._scored, scored, splits=["test"] * len(scored), overwrite=True)
 
     def write_report(self, report: dict[str, Any]) -> None:
         told = {**report, "config": self._run.config, "inputs": self._inputs}
@@ -201,6 +205,15 @@ class RunFolder:
         """Return the scene's file names in other formats."""
         names = (self.path / f"scene.{name}" for name in FORMATS)
         return [path for path in names if path != self.scene]
+
+
+def _joined(cameras: Cameras, held_out: Cameras) -> Cameras:
+    """Combine views, and mark names of held-out ones that other views have too."""
+    taken = set(cameras.names)
+    named = (
+        replace(view, name=f"{view.name} (held out)") if view.name in taken else view for view in held_out
+    )
+    return Cameras.of([*cameras, *named])
 
 
 def stopped_run(folder: Path) -> dict[str, Any] | None:

@@ -59,7 +59,7 @@ def test_an_unreadable_folder_names_readable_contents(command_line: CommandLine,
     ask = ("distill", "ball.ply", "-r", 10, "-o", "run", "--steps", 3, "--size", 32, "--no-view")
     assert command_line(*ask, cwd=folder)[0] == 0
     (folder / "run" / "report.json").unlink()  # a folder as `distill` leaves none
-    held = "run: is not a supported folder; give one of its files: scene.ply (a scene), views"
+    held = "run: is not a supported folder; give one of its files: scene.ply (a scene), scored.json, views"
     for ask in (
         ("simplify", "run", "-r", 2, "-o", "x.ply"),
         ("evaluate", "ball.ply", "--teacher", "ball.ply", "--views", "run"),

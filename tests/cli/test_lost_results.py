@@ -120,7 +120,7 @@ def test_a_run_whose_scores_failed_is_resumed(
     monkeypatch.setattr("g2ard.pipeline.distill.recover", None)  # it is not run again
     succeeds(command_line, folder, *ask, "--resume")
     assert sorted(path.name for path in (folder / "run").iterdir()) == [
-        *("preview.png", "report.html", "report.json", "scene.ply", "views.json"),
+        *("preview.png", "report.html", "report.json", "scene.ply", "scored.json", "views.json"),
     ]
 
 

@@ -53,6 +53,19 @@ def test_python_reads_them_too(home: Path) -> None:
     assert len(g2ard.load_views(home / "runs" / "a")) == 16
 
 
+def test_the_views_of_the_table_can_be_scored_again(
+    home: Path, tmp_path: Path, command_line: CommandLine
+) -> None:
+    ask = ("distill", "ball.ply", "-r", 4, "--steps", 2, "--size", 48, "--no-view", "-o", tmp_path / "run")
+    succeeds(command_line, home, *ask)
+    report = json.loads((tmp_path / "run" / "report.json").read_text())
+    again = ("evaluate", tmp_path / "run", "--teacher", "ball.ply", "--views", tmp_path / "run/scored.json")
+    out = succeeds(command_line, home, *again, "--json", "-").out
+    scored = {view["name"]: view["psnr"] for view in json.loads(out)["scenes"][0]["views"]}
+    views = [*report["scores"]["recovered"]["views"], *report["apart"]["recovered"]["views"]]
+    assert scored == pytest.approx({view["name"]: view["psnr"] for view in views})
+
+
 def test_the_size_is_the_scene_files(home: Path, command_line: CommandLine) -> None:
     ask = ("evaluate", "runs/a", "--teacher", "ball.ply", "--size", 48, "--json", "-")
     (row,) = json.loads(command_line(*ask, cwd=home)[1])["scenes"]
