@@ -195,7 +195,7 @@ class Console:
         from rich.console import Console as Rich
         from rich.table import Table
 
-        table = Table(title=title, title_justify="left", show_header=any(columns))
+        table = Table(show_header=any(columns))
         for i, name in enumerate(columns):
             number = bool(i and name)
             table.add_column(name, justify="right" if number else "left", overflow="fold", no_wrap=number)
@@ -206,13 +206,12 @@ class Console:
         first, *others = (max(map(len, column)) for column in zip(columns, *rows, strict=True))
         with self._lock:
             self._clear()
+            screen.print(title, markup=False, highlight=False, soft_wrap=not stream.isatty())
             if table.show_header and min(first, _NAME) + sum(others) + 3 * len(columns) + 1 > screen.width:
-                lines = [title]
                 for row in rows:
                     figures = zip(columns[1:], row[1:], strict=True)
                     told = [_figure(name, cell) for name, cell in figures if cell]
-                    lines.append(f"{row[0]}: {', '.join(told)}")
-                screen.print("\n".join(lines), markup=False, highlight=False)
+                    screen.print(f"{row[0]}: {', '.join(told)}", markup=False, highlight=False)
             else:
                 screen.print(table, markup=False, highlight=False)
 
