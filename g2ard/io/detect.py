@@ -59,9 +59,12 @@ _BY_SUFFIX: dict[str, Format] = {
 
 _CONVERTERS = {
     ".lcc": "`splat-transform scene.lcc scene.ply` (npm: @playcanvas/splat-transform) converts it",
+    **dict.fromkeys(
+        (".zip", ".7z", ".rar", ".tar", ".gz", ".tgz"), "unpack the archive and give the file or folder in it"
+    ),
     ".rad": "convert the scene that it was built from; Spark builds .rad files from .ply, .spz or .sog",
 }
-"""Advice for scenes of other programs."""
+"""Advice for scenes of other programs and for archives."""
 
 MANIFEST, JOURNAL, POINTS = "tiles.json", "journal.json", ".points"
 """Files of finished and unfinished folders of tiles, and their folder of points to lift."""
@@ -86,6 +89,8 @@ def file_format(path: str | Path) -> Format:
     if not path.exists():
         if path.is_symlink():
             raise InputError("is a broken link", path=path)
+        if re.match(r"(https?|s3|gs):/", str(path)):
+            raise InputError("g2ard reads local files; download it first", path=path)
         raise InputError(f"no such file or folder{_near(path)}", path=path)
     check_regular(path)
     state = path.stat()

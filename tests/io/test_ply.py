@@ -205,6 +205,10 @@ def test_missing_and_unknown_files(tmp_path: Path) -> None:
     (tmp_path / "a.obj").write_text("v 0 0 0")
     with pytest.raises(InputError, match=r"unknown format '\.obj'"):
         kind(tmp_path / "a.obj")
+    (tmp_path / "a.zip").write_bytes(b"PK\x03\x04")
+    for path, advice in ((tmp_path / "a.zip", "unpack the archive"), ("https://a.org/a.ply", "download it")):
+        with pytest.raises(InputError, match=advice):
+            kind(path)
 
 
 def test_cloud_is_not_a_scene(tmp_path: Path) -> None:
