@@ -72,12 +72,15 @@ def loss(
         return f"recovery lost {-ssim:.3f} SSIM and gained {kind.psnr.gain:.2f} dB in {what}"
     if kind.psnr.gain < -_REPORTED_PSNR_LOSS or ssim < -_REPORTED_SSIM_LOSS:
         how = f"{-kind.psnr.gain:.2f} dB" if kind.psnr.gain < -_REPORTED_PSNR_LOSS else f"{-ssim:.3f} SSIM"
-        worst = f"{kind.worst}: {kind.worst_psnr.before:.2f} → {kind.worst_psnr.after:.2f} dB"
-        return f"warning: recovery lost {how} in {what} (worst view {worst}); {hint}"
+        where = f"{kind.lost} of {kind.views} views lost PSNR"
+        if kind.worst_psnr.gain < 0:
+            where = f"worst view {kind.worst}: {kind.worst_psnr.before:.2f} → {kind.worst_psnr.after:.2f} dB"
+        return f"warning: recovery lost {how} in {what} ({where}); {hint}"
     if not kind.lost:
         return None
     lost = f"{kind.lost} of {kind.views} {what} lost PSNR"
-    return f"{lost}; the mean of all {kind.views} gained {kind.psnr.gain:.2f} dB"
+    how = "gained" if kind.psnr.gain > 0 else "lost"
+    return f"{lost}; the mean of all {kind.views} {how} {abs(kind.psnr.gain):.2f} dB"
 
 
 def say_views(run: Run, views: dict[str, Any] | None, chosen: bool) -> None:

@@ -120,7 +120,9 @@ class TiledCommand:
         run.say(
             f"{folder.path}: {len(small):,} of {store.count:,} Gaussians; over all pixels "
             f"{scores.simplified:.2f} → {scores.recovered:.2f} dB; "
-            f"{plural(scores.steps, 'step')} in all tiles together"
+            f"{plural(scores.steps, 'step')} in all tiles together\n"
+            f"scene: {folder.scene} ({folder.scene.stat().st_size / 1e6:.2f} MB)\n"
+            f"report: {folder.path / 'report.html'}, {folder.path / 'report.json'}"
         )
         run.kept.append(f"{folder.path} is finished")
         return report

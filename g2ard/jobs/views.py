@@ -290,7 +290,7 @@ def views_or_pool(
             say=say,
         )
         return _with_apart(_generated(planned, None, None, mix, "distil", say))
-    say(f"views: {len(planned.cameras)}, {_of(planned, planned.cameras)}")
+    say(f"views: {len(planned.cameras)} generated; {_of(planned, planned.cameras)}")
     return ViewSet(planned.cameras, splits=splits_of(None, planned.cameras.names))
 
 

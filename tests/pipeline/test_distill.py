@@ -84,7 +84,9 @@ def test_command_on_a_trained_scene(command_line: CommandLine, tmp_path: Path) -
     )
     assert re.search(r"│ near +│", error)
     left = sorted(p.name for p in (tmp_path / "run").iterdir())
-    assert left == ["preview.png", "report.html", "report.json", "scene.ply", "view.html", "views.json"]
+    assert left == [
+        *("preview.png", "report.html", "report.json", "scene.ply", "scored.json", "view.html", "views.json")
+    ]
     assert report["bytes"]["view"] == (tmp_path / "run" / "view.html").stat().st_size
     assert "view: run/view.html" in error
     status, _, error = command_line(*ask, cwd=tmp_path)
@@ -94,7 +96,7 @@ def test_command_on_a_trained_scene(command_line: CommandLine, tmp_path: Path) -
 
 
 def test_a_loss_in_any_kind_of_view_is_reported() -> None:
-    from g2ard.cli.run_result import told
+    from g2ard.cli.run_result import loss, told
     from g2ard.report.kinds import by_kind
 
     def said(usual: float, near: float | None, unseen: float | None, ssim: float = 0.0) -> list[str]:
@@ -114,6 +116,9 @@ def test_a_loss_in_any_kind_of_view_is_reported() -> None:
     mixed = said(0.3, 0.3, 0.0, ssim=-0.004)[0]
     assert mixed == "recovery lost 0.004 SSIM and gained 0.30 dB in usual views"
     assert said(0.0, None, 0.0, ssim=-0.004)[0].startswith("warning: recovery lost 0.004 SSIM")
+    before = [{"name": name, "psnr": psnr} for name, psnr in (("a", 15.0), ("b", 30.0))]
+    line = loss(by_kind(before, [{**before[0], "psnr": 15.5}, {**before[1], "psnr": 29.0}])[0])
+    assert "recovery lost 0.25 dB in usual views (1 of 2 views lost PSNR)" in line  # the worst view gained
     lines = said(-0.2, -0.3, 0.25)
     assert "lost 0.20 dB in usual views" in lines[0]
     assert "25% of the scene is in no view" in lines[2]

@@ -266,7 +266,7 @@ def _distil(
         folder.write_scene(result.splats)
         folder.write_simplified(result.simplified if run.config["keep"] else None)
         folder.write_views(job.views)
-        folder.write_scored(job.held_out.cameras, job.apart and job.apart.cameras)
+        folder.write_scored(job.held_out.cameras, None if job.apart is None else job.apart.cameras)
         with run.finishing("scoring"):
             report = _scored(run, job, result, folder)
         report["seconds"] = _seconds(before, report["seconds"], time.monotonic() - began)

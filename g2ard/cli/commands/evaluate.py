@@ -138,7 +138,8 @@ def evaluate(
             }
         )
     protocol = f"{convention}'s conventions, {'8-bit' if eight_bit else 'float'} renders"
-    _table(run, f"{plural(len(cameras), 'view')}, against {kinds_of(targets)}; {protocol}", rows)
+    name = "view" if split == "all" else f"{split} view"
+    _table(run, f"{plural(len(cameras), name)}, against {kinds_of(targets)}; {protocol}", rows)
     counts = Counter(view["against"] for view in rows[0]["views"])
     single = {"photo": "photos", "teacher": "teacher"}
     against = counts if len(counts) > 1 else single[next(iter(counts))]
