@@ -60,8 +60,8 @@ _COARSE_STRIDE = 8
 """Every n-th row in Morton order becomes a coarse Gaussian, widened to represent the rest."""
 
 _SAMPLE = 250_000, COARSE[0]
-"""Rows that stand for the scene where views are planned, as many as without tiles; and the most Gaussians
-that a row of a larger scene stands for."""
+"""Least number of rows on which views are planned, more than without tiles; and the most Gaussians that a row
+of a larger scene stands for."""
 
 GONE = np.uint32(0xFFFFFFFF)
 """Cluster number of a dropped row."""

@@ -36,11 +36,11 @@ class Trials:
         self._began = time.monotonic()
 
     def search(self, guess: float) -> float:
-        """Search `MULTIPLIERS` downwards from the one nearest to `guess`, and upwards if that gained nothing.
+        """Search `MULTIPLIERS` downwards from the one nearest to `guess`, then upwards.
 
-        Earlier trials are forgotten. The largest multiplier whose gain is within 5 % of the best is chosen.
-        Trials are too short to show the benefit of larger rates, and a long run decays its rates towards the
-        end.
+        Nothing larger is tried once a smaller one has clearly beaten the guess. Earlier trials are forgotten.
+        The largest multiplier whose gain is within 5 % of the best is chosen. Trials are too short to show
+        the benefit of larger rates, and a long run decays its rates towards the end.
 
         >>> Trials(lambda m, end: -abs(m - 1), 0, None).search(0.2)
         1.0
