@@ -26,7 +26,7 @@ fn simplify(scene: &Splats, backend: &dyn Backend) -> Outcome<PaperRound> {
         .unwrap()
 }
 
-/// A device that takes any adapter, or `None` on a machine without one where GPU tests are switched off.
+/// A device that takes any adapter, or `None` on a machine without one, where tests skip.
 fn device(options: Options) -> Option<Device> {
     gpu().map(|_| Device::new(Choice::Gpu, options))
 }
