@@ -10,6 +10,8 @@ import pytest
 import torch
 
 from g2ard import io
+from g2ard.cli.frame import Run
+from g2ard.cli.options import choose_engine
 from g2ard.errors import InputError, MissingDependencyError
 from g2ard.rendering import cuda
 from g2ard.rendering.cuda import renderer_on
@@ -114,6 +116,25 @@ def test_without_cuda_the_error_is_one_line(tmp_path: Path, command_line: Comman
     assert "--engine: torch finds no CUDA device; " in error
     assert "and gsplat; --engine fused needs none" in error
     assert not (tmp_path / "o.ply").exists()
+
+
+@pytest.mark.parametrize("device", ["cuda", "cpu"])
+@pytest.mark.parametrize("engine", [None, "gsplat", "fused"])
+def test_cuda_warns_that_the_cpu_is_usually_faster(
+    device: str, engine: str | None, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    monkeypatch.setattr(cuda, "check_cuda", lambda asked: None)
+    common = dict.fromkeys(("overwrite", "verbose", "quiet", "json", "config")) | {"seed": 0, "threads": 0}
+    run = Run("recover", {**common, "device": device}, {})
+    settings = {} if engine is None else {"recover.engine": engine}
+    choose_engine(run, settings, "recover.engine")
+    told = capsys.readouterr().err
+    if settings.get("recover.engine") == "gsplat":
+        flag = "--device cuda" if engine is None else "--engine gsplat"
+        assert told.startswith(f"warning: {flag}: the CPU is usually faster")
+        assert told.count("\n") == 1
+    else:
+        assert told == ""
 
 
 def test_a_missing_gsplat_is_named(monkeypatch: pytest.MonkeyPatch) -> None:

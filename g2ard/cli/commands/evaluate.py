@@ -86,7 +86,7 @@ def evaluate(
             check_teacher(views, teacher)
     device = "cuda" if run.device == "cuda" else "cpu"
     if device == "cuda":
-        opt.use_cuda()
+        opt.use_cuda(run)
     views = opt.with_images(views, images, alpha)
     for path in scenes:
         check_scene(path)
