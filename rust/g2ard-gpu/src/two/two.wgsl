@@ -1,7 +1,8 @@
 // Numbers as sums of two f32, the second at most half the last digit of the first: about 46 bits.
 //
-// A sum or product and its rounding error are found by f32 operations that a compiler could cancel by algebra, or round
-// otherwise by fusing them. `opaque` hides their results from it.
+// Compilers may fuse a product into a sum, reorder sums, or cancel a rounding error by algebra. Each operation that rounds
+// therefore hides its result behind `opaque`, and every device computes the same bits. Only division and sqrt may
+// differ, by a few units in the last place; `div` and `root` correct that. twin.rs repeats this file for tests.
 
 alias Two = vec2<f32>;
 
@@ -13,49 +14,62 @@ var<private> hidden: u32;
 
 fn opaque(x: f32) -> f32 { return bitcast<f32>(bitcast<u32>(x) ^ hidden); }
 
+fn plus(a: f32, b: f32) -> f32 { return opaque(a + b); }
+fn times(a: f32, b: f32) -> f32 { return opaque(a * b); }
+fn over(a: f32, b: f32) -> f32 { return opaque(a / b); }
+
 // a + b where |a| ≥ |b|.
 fn ordered_sum(a: f32, b: f32) -> Two {
-    let s = opaque(a + b);
-    return Two(s, b - opaque(s - a));
+    let s = plus(a, b);
+    return Two(s, plus(b, -plus(s, -a)));
 }
 
 fn exact_sum(a: f32, b: f32) -> Two {
-    let s = opaque(a + b);
-    let from_b = opaque(s - a);
-    return Two(s, opaque(a - opaque(s - from_b)) + opaque(b - from_b));
+    let s = plus(a, b);
+    let from_b = plus(s, -a);
+    return Two(s, plus(plus(a, -plus(s, -from_b)), plus(b, -from_b)));
 }
 
+// Dekker's product: in this order, every partial sum is exact.
 fn exact_product(a: f32, b: f32) -> Two {
-    let p = opaque(a * b);
-    // Halves of 12 bits, whose products are exact.
+    let p = times(a, b);
+    // Halves of 12 bits, whose products are exact, fused or not.
     let high = bitcast<vec2<f32>>(bitcast<vec2<u32>>(vec2(a, b)) & vec2(0xfffff000u));
     let low = vec2(a, b) - high;
-    return Two(p, opaque(high.x * high.y - p) + (high.x * low.y + low.x * high.y) + low.x * low.y);
+    var lost = opaque(high.x * high.y - p);
+    lost = opaque(lost + high.x * low.y);
+    lost = opaque(lost + low.x * high.y);
+    return Two(p, opaque(lost + low.x * low.y));
 }
 
 fn single(x: f32) -> Two { return Two(x, 0.0); }
 
 fn add(a: Two, b: Two) -> Two {
     let s = exact_sum(a.x, b.x);
-    return ordered_sum(s.x, s.y + (a.y + b.y));
+    return ordered_sum(s.x, plus(s.y, plus(a.y, b.y)));
 }
 
 fn sub(a: Two, b: Two) -> Two { return add(a, -b); }
 
 fn mul(a: Two, b: Two) -> Two {
     let p = exact_product(a.x, b.x);
-    return ordered_sum(p.x, p.y + (a.x * b.y + a.y * b.x));
+    return ordered_sum(p.x, plus(p.y, plus(times(a.x, b.y), times(a.y, b.x))));
 }
 
+// a − p where p is near a.
+fn rest(a: f32, p: Two) -> f32 { return plus(plus(a, -p.x), -p.y); }
+
 fn div(a: Two, b: Two) -> Two {
-    let q = opaque(a.x / b.x);
-    return ordered_sum(q, sub(a, mul(b, single(q))).x / b.x);
+    var q = over(a.x, b.x);
+    q = plus(q, over(rest(a.x, exact_product(q, b.x)), b.x));
+    return ordered_sum(q, over(sub(a, mul(b, single(q))).x, b.x));
 }
 
 fn root(a: Two) -> Two {
     if !(a.x > 0.0) { return ZERO; }
-    let r = opaque(sqrt(a.x));
-    return ordered_sum(r, 0.5 * sub(a, exact_product(r, r)).x / r);
+    var r = opaque(sqrt(a.x));
+    r = plus(r, over(0.5 * rest(a.x, exact_product(r, r)), r));
+    return ordered_sum(r, over(0.5 * sub(a, exact_product(r, r)).x, r));
 }
 
 fn lt(a: Two, b: Two) -> bool { return a.x < b.x || (a.x == b.x && a.y < b.y); }
@@ -121,6 +135,9 @@ struct Eigen {
 // An entry this small beside the diagonal's is zero.
 const VANISHING = 2.8e-17; // 2^-55
 
+// So is one this small, because devices may flush its error, or its quotient, to zero.
+const TINY = 1e-36;
+
 // Cyclic Jacobi, as g2ard_core::linalg::symmetric_eigen.
 fn symmetric_eigen(m: array<Two, 6>) -> Eigen {
     var a = array<array<Two, 3>, 3>(
@@ -142,7 +159,7 @@ fn symmetric_eigen(m: array<Two, 6>) -> Eigen {
         let apq = a[p][q];
         a[p][q] = ZERO;
         a[q][p] = ZERO;
-        if abs(apq.x) <= VANISHING * max(abs(a[p][p].x), abs(a[q][q].x)) { continue; }
+        if abs(apq.x) <= max(TINY, VANISHING * max(abs(a[p][p].x), abs(a[q][q].x))) { continue; }
         let theta = div(sub(a[q][q], a[p][p]), 2.0 * apq);
         let by = add(mag(theta), root(add(mul(theta, theta), ONE)));
         let t = div(single(select(1.0, -1.0, theta.x < 0.0)), by);

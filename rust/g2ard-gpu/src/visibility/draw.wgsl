@@ -27,7 +27,8 @@ fn alpha_of(s: Splat, pixel: vec2<u32>) -> f32 {
     let dy = f32(pixel.y) + 0.5 - s.y;
     let u = s.a * dx + s.b * dy;
     let v = s.c * dy;
-    let alpha = min(s.opacity * exp2(-(u * u + v * v)), view.alpha_max);
+    let power = min(u * u + v * v, 126.0); // a finite number, and no subnormal result
+    let alpha = min(s.opacity * exp2(-power), view.alpha_max);
     return select(alpha, 0.0, alpha < ALPHA_MIN);
 }
 

@@ -50,7 +50,8 @@ fn project(i: u32) -> Splat {
     let yy = dot(my, my);
     // Cauchy–Binet: xx·yy − xy² would lose every digit on a needle.
     let det = dot(minors, minors) + DILATION * (xx + yy) + DILATION * DILATION;
-    if !(reach >= 0.0 && det < 1e33) { return s; }
+    if !(reach >= 0.0 && bounded(det, 1e33)) { return s; }
+    if !(bounded(abs(at.x), 1e30) && bounded(abs(at.y), 1e30)) { return s; }
     s.columns = span(at.x, sqrt(reach * (xx + DILATION)), view.size.x);
     s.rows = span(at.y, sqrt(reach * (yy + DILATION)), view.size.y);
     if s.columns == 0u { s.rows = 0u; }

@@ -16,6 +16,7 @@ struct View {
     tolerance: f32, // share of its depth that a cell may lie off the depths
     alpha_max: f32,
     light_min: f32, // a pixel ends before its light would fall to this
+    zero: u32,
 }
 
 @group(0) @binding(0) var<uniform> view: View;
@@ -37,10 +38,18 @@ struct Splat {
     row: u32,
 }
 
+// Compilers may reorder sums, but not across this.
+fn opaque(v: vec3<f32>) -> vec3<f32> {
+    return bitcast<vec3<f32>>(bitcast<vec3<u32>>(v) ^ vec3(view.zero));
+}
+
+// Whether 0 ≤ x < most, by the bits: compilers may assume that no number is infinite or NaN.
+fn bounded(x: f32, most: f32) -> bool { return bitcast<u32>(x) < bitcast<u32>(most); }
+
 // About the camera first, so that a far origin costs no digits.
 fn to_camera(p: vec3<f32>) -> vec3<f32> {
     let r = view.rotation;
-    let d = (p - view.eye.xyz) - vec3(r[0].w, r[1].w, r[2].w);
+    let d = opaque(p - view.eye.xyz) - vec3(r[0].w, r[1].w, r[2].w);
     return vec3(dot(r[0].xyz, d), dot(r[1].xyz, d), dot(r[2].xyz, d));
 }
 
@@ -51,15 +60,19 @@ fn pixel_of(t: vec3<f32>) -> u32 {
     if !(at.x >= 0.0 && at.y >= 0.0 && at.x < f32(view.size.x) && at.y < f32(view.size.y)) {
         return 0xffffffffu;
     }
-    return u32(at.y) * view.size.x + u32(at.x);
+    let pixel = min(vec2<u32>(at), view.size - 1u);
+    return pixel.y * view.size.x + pixel.x;
 }
 
 fn tiles_across() -> u32 { return (view.size.x + TILE - 1u) / TILE; }
 
-// First tile along an axis, and how many, of a packed span of pixels.
+fn tiles_down() -> u32 { return (view.size.y + TILE - 1u) / TILE; }
+
+// First tile along an axis, and how many, of a packed span of pixels, which may be empty.
 fn tile_span(span: u32) -> vec2<u32> {
     let first = (span & 0xffffu) / TILE;
-    return vec2(first, ((span >> 16u) - 1u) / TILE + 1u - first);
+    let end = ((span >> 16u) + TILE - 1u) / TILE;
+    return vec2(first, end - min(first, end));
 }
 
 fn tile_count(s: Splat) -> u32 { return tile_span(s.columns).y * tile_span(s.rows).y; }

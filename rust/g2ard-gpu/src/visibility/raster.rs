@@ -201,3 +201,48 @@ impl Drawing<'_> {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use bytemuck::Zeroable;
+
+    use super::*;
+    use crate::testing::gpu;
+
+    #[test]
+    fn pairs_beyond_a_splats_tiles_go_to_none() {
+        let Some(gpu) = gpu() else { return };
+        // One splat on two of four tiles, then one that ends up on none; `mark` counted five tiles.
+        let splat = |[columns, rows]: [u32; 2]| [0, 0, 0, 0, 0, 0, 0, columns, rows, 0];
+        let splats = [[20 << 16, 10 << 16], [0, 0]].map(splat);
+        let view = View {
+            size: [32, 32],
+            count: 2,
+            all_pairs: 5,
+            ..View::zeroed()
+        };
+        let mut work = Work::new(&gpu);
+        let records = gpu.upload("splats", &splats).unwrap();
+        let order = gpu.upload("order", &[0u32, 1]).unwrap();
+        let before = gpu.buffer("tiles before", 2).unwrap();
+        let buffers = [&records, &order, &before];
+        work.run(&COUNT, 1, view.words(), &buffers).unwrap();
+        scan::exclusive(&gpu, &mut work, &before, 2).unwrap();
+        let light = gpu.buffer("light", view.pixels()).unwrap();
+        let depths = gpu.buffer("depth", view.pixels()).unwrap();
+        let drawing = Drawing {
+            gpu: &gpu,
+            view,
+            light: &light,
+            records,
+            order,
+            before,
+            bounds: gpu.buffer("tile bounds", 2 * view.tiles(TILE)).unwrap(),
+        };
+        let goal = Goal::Depths(&depths);
+        drawing.pass(&mut work, goal, 0, 5).unwrap();
+        let reads = [(&drawing.before, 2), (&drawing.bounds, 8)];
+        let found = work.submit(&reads).unwrap().take().unwrap();
+        assert_eq!(found, [vec![0, 2], vec![0, 1, 1, 2, 0, 0, 0, 0]]);
+    }
+}

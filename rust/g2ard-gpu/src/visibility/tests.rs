@@ -2,7 +2,9 @@ use std::collections::HashSet;
 use std::sync::Arc;
 
 use super::*;
+use crate::runtime::Kernel;
 use crate::testing::{WHOLE, borrowed, compare_on_gpu, gpu, scenes};
+use g2ard_core::random::Lcg;
 use g2ard_core::scene::Ordered;
 use g2ard_core::select::ViewKernels;
 use g2ard_core::visibility::VisibilityKernels;
@@ -162,4 +164,48 @@ fn a_crowded_tile_is_drawn_to_its_end() {
         view_statistics(&gpu, &scene, &[camera], &control).unwrap(),
         want
     );
+}
+
+#[test]
+fn points_near_a_far_camera_keep_their_digits() {
+    let Some(gpu) = gpu() else { return };
+    let camera = Camera {
+        viewmat: cameras([691_234.567, 5_334_567.891, 512.3], 5.0)[0].viewmat,
+        ..cameras([0.0; 3], 5.0)[0]
+    };
+    let view = View::of(&camera, &MEDIAN).unwrap();
+    let mut random = Lcg(6);
+    let eye = camera.position();
+    let points: Vec<_> = (0..1000)
+        .map(|_| eye.map(|v| (v + 9.0 * random.centred()) as f32))
+        .collect();
+    let body = "
+        @group(0) @binding(1) var<storage, read> points: array<array<f32, 3>>;
+        @group(0) @binding(2) var<storage, read_write> found: array<array<f32, 3>>;
+
+        @compute @workgroup_size(64)
+        fn each(@builtin(global_invocation_id) id: vec3<u32>) {
+            if id.x >= arrayLength(&points) { return; }
+            let p = points[id.x];
+            let t = to_camera(vec3(p[0], p[1], p[2]));
+            found[id.x] = array(t.x, t.y, t.z);
+        }";
+    let sources = Vec::leak(vec![include_str!("pinhole.wgsl"), body]);
+    let kernel = Kernel::new("test.to_camera", sources, "each");
+    let input = gpu.upload("points", &points).unwrap();
+    let found = gpu.buffer("found", 3 * points.len()).unwrap();
+    let mut work = Work::new(&gpu);
+    let groups = points.len().div_ceil(64);
+    work.run(&kernel, groups, view.words(), &[&input, &found])
+        .unwrap();
+    let words = work.submit(&[(&found, 3 * points.len())]).unwrap().take();
+    for (point, got) in points.iter().zip(words.unwrap()[0].chunks(3)) {
+        for (row, &got) in camera.viewmat.iter().zip(got) {
+            let want: f64 = (0..3)
+                .map(|k| row[k] * (f64::from(point[k]) - eye[k]))
+                .sum();
+            let apart = (f64::from(f32::from_bits(got)) - want).abs();
+            assert!(apart < 1e-5, "{point:?}: {apart}");
+        }
+    }
 }

@@ -33,8 +33,13 @@ fn expand(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_workgroups)
     let s = splats[order[low]];
     let columns = tile_span(s.columns);
     let nth = pair - before[low];
-    let row = tile_span(s.rows).x + nth / columns.y;
-    keys[i] = vec2(row * tiles_across() + columns.x + nth % columns.y, 0u);
+    let rows = tile_span(s.rows);
+    // Two kernels project a splat, and may round its span differently: a pair beyond its tiles goes to none.
+    var tile = tiles_across() * tiles_down();
+    if nth < columns.y * rows.y {
+        tile = (rows.x + nth / columns.y) * tiles_across() + columns.x + nth % columns.y;
+    }
+    keys[i] = vec2(tile, 0u);
     numbers[i] = i;
     drawn[i] = order[low];
 }
@@ -44,6 +49,7 @@ fn ranges(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_workgroups)
     let i = thread_of(id, groups, 64u);
     if i >= view.pairs { return; }
     let tile = keys[i].x;
+    if tile >= arrayLength(&bounds) { return; }
     if i == 0u || keys[i - 1u].x != tile { bounds[tile].x = i; }
     if i + 1u == view.pairs || keys[i + 1u].x != tile { bounds[tile].y = i + 1u; }
 }

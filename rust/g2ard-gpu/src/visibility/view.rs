@@ -32,8 +32,8 @@ pub struct View {
     /// Upper limit of α; the transmittance at which a pixel ends.
     pub alpha_max: f32,
     pub light_min: f32,
-    /// A uniform's size is a multiple of four words.
-    pub padding: u32,
+    /// Hides results from the compiler.
+    pub zero: u32,
 }
 
 impl View {
