@@ -1,13 +1,20 @@
-"""Atomic outputs: written under a temporary name, then renamed."""
+"""Atomic outputs: written under a temporary name, then renamed.
 
+Links stay, and their targets are replaced. Devices, pipes and open files such as /dev/stdout are written to.
+"""
+
+import errno
 import os
 import shutil
+import sys
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from uuid import uuid4
 
 from g2ard.errors import OutputError
+from g2ard.io.paths import real_path
 
 
 def check_output(path: str | Path, overwrite: bool = False, *, folder: bool = False) -> Path:
@@ -18,8 +25,11 @@ def check_output(path: str | Path, overwrite: bool = False, *, folder: bool = Fa
     """
     path = Path(path)
     try:
+        if is_stream(path) and not folder:
+            _check_stream(path)
+            return path
         _refuse_existing(path, overwrite, folder)
-        parent = path.absolute().parent
+        parent = _target(path).absolute().parent
         there = next(folder for folder in (parent, *parent.parents) if folder.exists())
         if not there.is_dir():
             raise OutputError(f"{there} is a file, not a folder", path=path)
@@ -46,6 +56,60 @@ def _refuse_existing(path: Path, overwrite: bool, folder: bool) -> None:
         raise _exists(path)
 
 
+def is_taken(path: Path) -> bool:
+    """Return whether a file or folder exists that an output would replace."""
+    return path.exists() and not is_stream(path)
+
+
+def is_stream(path: Path) -> bool:
+    """Return whether a path is a device, a pipe or an open file of this process, so that it is written to."""
+    return _descriptor(path) is not None or (path.exists() and not (path.is_file() or path.is_dir()))
+
+
+def _descriptor(path: Path) -> int | None:
+    """Return the open file of this process that a path or link names, such as 1 for /dev/stdout."""
+    for _ in range(_MOST_LINKS):
+        folder, name = os.path.split(os.path.abspath(path))
+        if folder == "/dev" and name in _STREAMS:
+            return _STREAMS[name]
+        if folder in ("/dev/fd", "/proc/self/fd", f"/proc/{os.getpid()}/fd") and name.isdecimal():
+            return int(name)
+        if not os.path.islink(path):
+            break
+        path = Path(folder, os.readlink(path))
+    return None
+
+
+_STREAMS = {"stdout": 1, "stderr": 2}
+_MOST_LINKS = 40  # as Linux follows
+
+
+def _check_stream(path: Path) -> None:
+    if path.is_block_device() or path.is_socket():
+        raise OutputError("is a block device or socket", path=path, hint="give the name of a file")
+    descriptor = _descriptor(path)
+    if descriptor is not None:
+        os.fstat(descriptor)
+    elif not os.access(path, os.W_OK):
+        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+
+
+def _opened(path: Path) -> int:
+    """Open a device or pipe for writing; an open file keeps its position."""
+    descriptor = _descriptor(path)
+    return os.open(path, os.O_WRONLY) if descriptor is None else os.dup(descriptor)
+
+
+def _target(path: Path) -> Path:
+    """Return where a link leads, which need not exist."""
+    if not path.is_symlink():
+        return path
+    target = real_path(path)
+    if target.is_symlink():
+        raise OutputError("is a link to itself", path=path, hint="give another output")
+    return target
+
+
 def _exists(path: Path) -> OutputError:
     return OutputError("exists", path=path, hint="{overwrite=True} replaces it")
 
@@ -59,6 +123,8 @@ def _beside(path: Path) -> Path:
 def atomic_output(path: str | Path, overwrite: bool = False) -> AbstractContextManager[Path]:
     """Yield a temporary path with the same suffix, and rename it to `path` on success.
 
+    A link is kept, and its target replaced. A device or pipe is written to.
+
     On failure or Ctrl-C, the temporary file is removed and an existing `path` is kept. Without `overwrite`,
     so is a `path` that another process made in the meantime.
 
@@ -69,7 +135,8 @@ def atomic_output(path: str | Path, overwrite: bool = False) -> AbstractContextM
     >>> [p.name for p in folder.iterdir()]
     ['a.txt']
     """
-    return _renamed(check_output(path, overwrite), overwrite, folder=False)
+    path = check_output(path, overwrite)
+    return _copied(path) if is_stream(path) else _renamed(path, overwrite, folder=False)
 
 
 def atomic_folder(path: str | Path, overwrite: bool = False) -> AbstractContextManager[Path]:
@@ -82,30 +149,55 @@ def atomic_folder(path: str | Path, overwrite: bool = False) -> AbstractContextM
 
 @contextmanager
 def _renamed(path: Path, overwrite: bool, *, folder: bool) -> Iterator[Path]:
-    temporary, made = _beside(path), parents_made(path)
+    target = _target(path)
+    temporary, made = _beside(target), parents_made(target)
     try:
         if folder:
             temporary.mkdir()
         yield temporary
         if folder:
             _refuse_existing(path, overwrite, folder)
-            if not path.exists():
+            if not target.exists():
                 with suppress(FileExistsError):
-                    path.mkdir()
-            _move_into(temporary, path, overwrite)
+                    target.mkdir()
+            _move_into(temporary, target, overwrite)
         else:
-            _move(temporary, path, overwrite)
+            _move(temporary, target, overwrite)
     except OSError as error:
-        elsewhere = error.filename is not None and not str(error.filename).startswith(str(temporary))
-        if elsewhere or isinstance(error, OutputError):
-            raise
-        raise OutputError(f"cannot write: {error.strerror or error}", path=path) from error
+        raise _failure(error, path, temporary) from error
     finally:
         if folder:
             shutil.rmtree(temporary, ignore_errors=True)
         else:
             temporary.unlink(missing_ok=True)
         drop_empty(made)
+
+
+@contextmanager
+def _copied(path: Path) -> Iterator[Path]:
+    """Yield a temporary path, and copy its content into the device, pipe or open file `path` on success."""
+    with TemporaryDirectory(prefix="g2ard-") as folder:
+        temporary = Path(folder, path.name)
+        try:
+            yield temporary
+            _pour(temporary, path)
+        except OSError as error:
+            raise _failure(error, path, temporary) from error
+
+
+def _failure(error: OSError, path: Path, temporary: Path) -> OSError:
+    """Return the `OutputError` of a failed output, or the error itself if it is about another file."""
+    elsewhere = error.filename is not None and not str(error.filename).startswith((str(temporary), str(path)))
+    if elsewhere or isinstance(error, OutputError):
+        return error
+    return OutputError(f"cannot write: {error.strerror or error}", path=path)
+
+
+def _pour(source: Path, stream: Path) -> None:
+    for text in filter(None, (sys.stdout, sys.stderr)):
+        text.flush()  # they may be the stream
+    with source.open("rb") as content, open(_opened(stream), "wb") as target:
+        shutil.copyfileobj(content, target)
 
 
 def parents_made(path: Path) -> list[Path]:
@@ -124,8 +216,12 @@ def drop_empty(folders: list[Path]) -> None:
 
 def _move(source: Path, target: Path, overwrite: bool) -> None:
     """Rename a file; without `overwrite`, raise an `OutputError` if the target exists at that moment."""
+    if is_stream(target):
+        _pour(source, target)
+        return
+    target = _target(target)
     if overwrite:
-        os.replace(source, target)
+        _replace(source, target)
         return
     try:
         try:
@@ -134,11 +230,22 @@ def _move(source: Path, target: Path, overwrite: bool) -> None:
             raise
         except OSError:  # a file system without hard links
             target.touch(exist_ok=False)
-            os.replace(source, target)
+            _replace(source, target)
         else:
             source.unlink()
     except FileExistsError:
         raise _exists(target) from None
+
+
+def _replace(source: Path, target: Path) -> None:
+    """Rename a file, also to another file system, where a link may lead."""
+    try:
+        os.replace(source, target)
+    except OSError as error:
+        if error.errno != errno.EXDEV:
+            raise
+        with atomic_output(target, overwrite=True) as temporary:
+            shutil.copyfile(source, temporary)
 
 
 def _move_into(source: Path, target: Path, overwrite: bool) -> None:

@@ -1,13 +1,18 @@
 """An output is there whole or not at all."""
 
 import os
+import socket
+import stat
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
 
 from g2ard.errors import OutputError
-from g2ard.io import atomic_folder, atomic_output, check_output
-from helpers.systems import needs_modes
+from g2ard.io import atomic_folder, atomic_output, check_output, write_splats
+from g2ard.io.scene_formats import FORMATS
+from helpers.scenes import checkered_ball
+from helpers.systems import needs_links, needs_modes
 
 
 def test_whole_file_appears(tmp_path: Path) -> None:
@@ -139,3 +144,133 @@ def test_what_another_process_made_meanwhile_is_kept(
     with output(path.with_name("c")) as own:
         (own / "b" if folder else own).write_text("new")
     assert sorted(file.name for file in tmp_path.iterdir()) == ["a", "c"]
+
+
+@needs_links
+@pytest.mark.parametrize("folder", [False, True])
+@pytest.mark.parametrize("there", [False, True])
+def test_a_link_stays_and_its_target_is_replaced(tmp_path: Path, folder: bool, there: bool) -> None:
+    target, link = tmp_path / "elsewhere" / "a", tmp_path / "out" / "link"
+    target.parent.mkdir()
+    link.parent.mkdir()
+    if there:
+        target.write_text("old")
+    link.symlink_to("../elsewhere/a")
+    if there and not folder:
+        with pytest.raises(OutputError, match="exists; overwrite=True"):
+            check_output(link)
+    with atomic_folder(link.parent, True) if folder else atomic_output(link, there) as temporary:
+        (temporary / "link" if folder else temporary).write_text("new")
+        assert target.exists() == there
+    assert (os.readlink(link), target.read_text()) == ("../elsewhere/a", "new")
+    assert sorted(path.name for path in tmp_path.rglob("*")) == ["a", "elsewhere", "link", "out"]
+
+
+@needs_links
+def test_a_link_to_a_folder_stays(tmp_path: Path) -> None:
+    (tmp_path / "there").mkdir()
+    (tmp_path / "link").symlink_to("there")
+    with atomic_folder(tmp_path / "link") as temporary:
+        (temporary / "a").write_text("new")
+    assert (tmp_path / "link").is_symlink()
+    assert [path.name for path in (tmp_path / "there").iterdir()] == ["a"]
+
+
+@needs_links
+def test_a_link_to_itself_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "a").symlink_to("a")
+    for overwrite in (False, True):
+        with pytest.raises(OutputError, match="a: is a link to itself"):
+            check_output(tmp_path / "a", overwrite)
+    assert (tmp_path / "a").is_symlink()
+
+
+def null_device(path: Path) -> None:
+    """Make a device that takes everything, or skip the test."""
+    try:
+        os.mknod(path, 0o666 | stat.S_IFCHR, os.makedev(1, 3))
+        path.write_bytes(b"")
+    except (AttributeError, OSError):
+        pytest.skip("this system or user cannot make devices")
+
+
+@pytest.mark.parametrize("overwrite", [False, True])
+@pytest.mark.parametrize("within", ["a", "link", "folder"])
+def test_a_device_is_written_to_and_stays(tmp_path: Path, within: str, overwrite: bool) -> None:
+    out = tmp_path / "out"
+    out.mkdir()
+    null_device(out / "a")
+    (tmp_path / "link").symlink_to("out/a")
+    if within == "folder":
+        with atomic_folder(out, overwrite=True) as temporary:
+            (temporary / "a").write_text("new")
+    else:
+        path = out / "a" if within == "a" else tmp_path / "link"
+        with atomic_output(check_output(path, overwrite), overwrite) as temporary:
+            temporary.write_text("new")
+    assert stat.S_ISCHR((out / "a").stat().st_mode)
+    assert (tmp_path / "link").is_symlink()
+    assert sorted(path.name for path in tmp_path.rglob("*")) == ["a", "link", "out"]
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="this system has no pipes with names")
+@pytest.mark.parametrize("overwrite", [False, True])
+@pytest.mark.parametrize("fails", [False, True])
+def test_the_reader_of_a_pipe_gets_the_whole_output_or_nothing(
+    tmp_path: Path, overwrite: bool, fails: bool
+) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    descriptor = os.open(tmp_path / "pipe", os.O_RDONLY | os.O_NONBLOCK)
+    with suppress(ValueError), atomic_output(tmp_path / "pipe", overwrite) as temporary:
+        temporary.write_text("new")
+        if fails:
+            raise ValueError
+    assert os.read(descriptor, 100) == (b"" if fails else b"new")
+    os.close(descriptor)
+    assert stat.S_ISFIFO((tmp_path / "pipe").stat().st_mode)
+    assert [path.name for path in tmp_path.iterdir()] == ["pipe"]
+
+
+@pytest.mark.skipif(not Path("/dev/fd").exists(), reason="this system has no names for open files")
+@pytest.mark.parametrize("linked", [False, True])
+def test_an_open_file_is_continued(tmp_path: Path, linked: bool) -> None:
+    with (tmp_path / "log").open("w") as log:
+        log.write("before, ")
+        log.flush()
+        path = Path("/dev/fd", str(log.fileno()))
+        if linked:
+            (tmp_path / "link").symlink_to(path)
+            path = tmp_path / "link"
+        with atomic_output(path) as temporary:
+            temporary.write_text("within, ")
+        log.write("after")
+    assert (tmp_path / "log").read_text() == "before, within, after"
+    assert (tmp_path / "link").is_symlink() == linked
+
+
+@pytest.mark.skipif(not hasattr(socket, "AF_UNIX"), reason="this system has no sockets with names")
+def test_a_socket_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)  # its path may be long
+    with socket.socket(socket.AF_UNIX) as own:
+        own.bind("a")
+        with pytest.raises(OutputError, match="a: is a block device or socket"):
+            check_output("a", overwrite=True)
+    assert stat.S_ISSOCK(Path("a").stat().st_mode)
+
+
+@needs_links
+@pytest.mark.parametrize("name", [f"a.{name}" for name in FORMATS] + ["a.csv", "a/meta.json"])
+def test_every_writer_keeps_links(tmp_path: Path, name: str) -> None:
+    from g2ard.io import table
+
+    if name.endswith("usdc"):
+        pytest.importorskip("pxr")
+    (tmp_path / "out").mkdir()
+    link = tmp_path / name
+    link.parent.mkdir(exist_ok=True)
+    link.symlink_to(tmp_path / "out" / link.name)
+    write = table.write if name == "a.csv" else write_splats
+    for again in (False, True):
+        write(link, checkered_ball(20), overwrite=again or link.name == "meta.json")
+        assert link.is_symlink()
+        assert (tmp_path / "out" / link.name).stat().st_size
