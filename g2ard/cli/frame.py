@@ -10,7 +10,7 @@ import inspect
 import json
 import os
 import traceback
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from itertools import combinations
 from pathlib import Path
@@ -30,11 +30,11 @@ from g2ard.cli.usage import flags_of, in_flags, typed
 from g2ard.config.choices import RenderModel, ViewFormat
 from g2ard.config.paths import full_paths, parse_settings
 from g2ard.errors import G2ardError, InputError
-from g2ard.io import write_splats, write_views
+from g2ard.io import check_scene_output, check_views_output, write_splats, write_views
 from g2ard.io.atomic import atomic_output, check_output
 from g2ard.io.detect import run_scene
 from g2ard.io.paths import real_path
-from g2ard.io.scene_formats import axes_note, lost_in
+from g2ard.io.scene_formats import axes_note, files_of, lost_in
 from g2ard.pipeline.presets import configured
 from g2ard.progress import plural
 from g2ard.system import devices, interrupt
@@ -109,6 +109,7 @@ class Run:
         common: dict[str, Any],
         options: dict[str, Any],
         flags: Mapping[str, str] = MappingProxyType({}),
+        outputs: Collection[str] = ("output",),
     ) -> None:
         self.name = name
         self.flags = flags  # parameter → flag
@@ -129,8 +130,9 @@ class Run:
         self._failed: str | None = None  # what an error ended after the scene was written
         given = (*options.values(), common["config"])
         paths = [p for value in given for p in (value if isinstance(value, list) else [value])]
-        written = (options.get("output"), common.get("work"))
+        written = (*map(options.get, outputs), common.get("work"))
         self._inputs = [p for p in paths if isinstance(p, Path) and all(p is not w for w in written)]
+        self._outputs: dict[Path, tuple[str, bool]] = {}  # real path → option, whether all below is its own
         unrecorded = _COMMON_OPTIONS.keys() - {"seed", "threads", "device"}
         told = {**options, **{name: value for name, value in common.items() if name not in unrecorded}}
         self.config = {name: _flat(value) for name, value in told.items()}
@@ -302,12 +304,44 @@ class Run:
         if lost := lost_views(cameras, view_format(path, format), splits, weights is not None):
             self.say(f"note: {path}: without {', '.join(lost)}")
 
-    def spare_inputs(self, *outputs: Path) -> None:
+    def claim(self, flag: str, *outputs: Path, folder: bool = False) -> None:
+        """Record what an option writes, before any work.
+
+        Args:
+            flag: the option, or the name of what is written beside an output.
+            folder: whether the outputs are folders of which every file belongs to the option.
+
+        Raises:
+            BadParameter: an output is also an input, even with --overwrite, or another option writes there.
+        """
+        self.spare_inputs(*outputs, flag=flag)
+        for output in outputs:
+            place = real_path(output)
+            for other, (owner, whole) in self._outputs.items():
+                inside = (whole and other in place.parents) or (folder and place in other.parents)
+                if owner != flag and (inside or place == other):
+                    taken = f"{flag}: {output} is written by {owner} too"
+                    raise typer.BadParameter(f"{taken}; name another output")
+            self._outputs[place] = flag, folder
+
+    def claim_scene(self, flag: str, path: Path) -> None:
+        """Record a scene that an option writes, and check that it can be written."""
+        self.claim(flag, *files_of(path))
+        check_scene_output(path, self.overwrite)
+
+    def claim_views(self, path: Path, format: ViewFormat | None) -> None:
+        """Record the views that a command writes, and check that they can be written."""
+        self.claim("--output", path, folder=path.suffix == "")
+        check_views_output(path, self.overwrite, format)
+
+    def spare_inputs(self, *outputs: Path, flag: str = "--output") -> None:
         """Raise a usage error if an output is also an input, even with --overwrite."""
         taken = {real_path(place) for path in self._inputs for place in (path, run_scene(path))}
         for output in outputs:
             if real_path(output) in taken:
-                raise typer.BadParameter(f"{output} is both an input and the output; name another output")
+                raise typer.BadParameter(
+                    f"{flag}: {output} is both an input and the output; name another output"
+                )
 
     def input_newer_than(self, output: Path) -> Path | None:
         """Return an input file that was modified after an output, or None."""
@@ -318,18 +352,10 @@ class Run:
         """Return the inputs that are files, or runs with a scene's file."""
         return [path for path in map(run_scene, self._inputs) if path.is_file()]
 
-    def check_extra(self, flag: str, path: Path, given: Path | None = None) -> None:
-        """Check a further output, whose option is `given`: it must be no other path of the command."""
-        others = [p for p in (*self._inputs, self.config.get("output")) if p and p is not (given or path)]
-        if real_path(path) in map(real_path, others):
-            raise typer.BadParameter(f"{flag}: {path} is also an input or output; name another file")
-        check_output(path, self.overwrite)
-
     def reads(self, scenes: list[Path], output: Path) -> None:
-        """Record that the last positional path is the output, and check it with `spare_inputs`."""
+        """Record that the last positional path is the output."""
         self.config |= {"scenes": scenes, "output": output}
         self._inputs = [path for path in self._inputs if path is not output]
-        self.spare_inputs(output)
 
     def unmet(self, requirement: str) -> NoReturn:
         """Exit with status 3: outputs are written, but a requirement is not met."""
@@ -358,6 +384,7 @@ def command(
     scenes: bool = False,
     budgets: bool = False,
     tiles: bool = False,
+    outputs: Collection[str] = ("output",),
 ) -> Callable[[Any], Any]:
     """Register `fn(run, **options)` as a command.
 
@@ -369,6 +396,7 @@ def command(
         scenes: whether it reads scenes and takes --render-model, see `Run.load`.
         budgets: whether it takes budgets, see `g2ard.cli.outputs.budgets_of`.
         tiles: whether it works on scenes in tiles, see `g2ard.cli.tiling.tiling_of`.
+        outputs: parameters that are paths to write, all of which it passes to `Run.claim`.
     """
 
     def register(fn: Callable[..., None]) -> Callable[..., None]:
@@ -394,7 +422,7 @@ def command(
                 typed_last = [*(ctx.default_map or {}).get("set", []), *shared_values["set"]]
                 shared_values["set"] = typed_last
             printing = shared_values.pop("print_config")
-            run = Run(name, shared_values, dict(values), flags_of(ctx.command))
+            run = Run(name, shared_values, dict(values), flags_of(ctx.command), outputs)
             run.typed = frozenset(name for name in values if typed(ctx, name))
             if printing:
                 if settings and run.config["set"]:
@@ -430,14 +458,8 @@ def _check_settings(run: Run, config: str) -> None:
 def _execute(run: Run, fn: Callable[..., None], options: dict[str, Any], cuda: bool) -> None:
     if run.device not in ("auto", "cpu", "gpu", "cuda"):
         raise typer.BadParameter(f"--device: expected auto, cpu, gpu or cuda, got {run.device!r}")
-
-    outputs = [Path(o) for o in (options.get("output"), run.json) if o not in (None, "-")]
-    if len({real_path(output) for output in outputs}) < len(outputs):
-        raise typer.BadParameter(f"--json and --output are the same file {run.json}; name another one")
-    work = run.shared.get("work")
-    if work is not None and real_path(work) in {real_path(output) for output in outputs}:
-        raise typer.BadParameter(f"--work: {work} is an output; name another folder")
-    run.spare_inputs(*outputs)
+    if run.json not in (None, "-"):
+        run.claim("--json", Path(str(run.json)))
     if run.device == "cuda" and not cuda:
         run.say("--device cuda: this command does not use CUDA; it runs on the CPU")
     try:

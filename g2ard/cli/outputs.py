@@ -29,11 +29,20 @@ class Outputs:
     """Outputs of a command, one per budget; `{ratio}` and `{count}` in the pattern are the budget's.
 
     Args:
+        check: called with each path before work begins: records it with `Run.claim` and checks it.
         name: flag of the pattern, for messages.
     """
 
-    def __init__(self, run: Run, pattern: Path, budgets: Sequence[Budget], *, name: str = "--output") -> None:
-        self._run, self._pattern, self._budgets = run, str(pattern), budgets
+    def __init__(
+        self,
+        run: Run,
+        pattern: Path,
+        budgets: Sequence[Budget],
+        check: Callable[[Path, Budget], object],
+        *,
+        name: str = "--output",
+    ) -> None:
+        self._run, self._pattern, self._budgets, self._check = run, str(pattern), budgets, check
         self._checked: set[Path] = set()
         if strange := set(re.findall(r"{[^{}]*}", self._pattern)) - {"{ratio}", "{count}"}:
             raise typer.BadParameter(
@@ -70,11 +79,11 @@ class Outputs:
             )
         return found
 
-    def check(self, check: Callable[[Path, Budget], object], total: int | None = None) -> None:
-        """Run `check` on each path once, as soon as the paths are known."""
+    def check(self, total: int | None = None) -> None:
+        """Check each path once, as soon as the paths are known."""
         for path, budget in zip(self.paths(total), self._budgets, strict=False):
             if path not in self._checked:
-                check(path, budget)
+                self._check(path, budget)
                 self._checked.add(path)
 
     def _needs_total(self) -> bool:

@@ -10,8 +10,9 @@ import typer
 from g2ard.cli.frame import Run
 from g2ard.errors import InputError, OutputError
 from g2ard.io import check_scene_output
-from g2ard.io.atomic import drop_empty, parents_made
+from g2ard.io.atomic import drop_empty, is_taken, parents_made
 from g2ard.io.lock import check_unlocked, locked
+from g2ard.io.scene_formats import files_of
 
 OPTIONS = "options.json"
 """File in a folder of checkpoints with the options of their run."""
@@ -19,7 +20,7 @@ OPTIONS = "options.json"
 
 def is_finished(run: Run, place: Path, resume: bool, output: Path) -> bool:
     """Return whether --resume finds `output` finished; raise an error if an input changed since then."""
-    if not resume or run.overwrite or left_at(place) or not output.exists():
+    if not resume or run.overwrite or left_at(place) or not is_taken(output):
         return False
     if changed := run.input_newer_than(output):
         raise finished_before(output, changed)
@@ -35,6 +36,8 @@ def finished_before(output: Path, changed: Path) -> OutputError:
 
 def check_scene_run(run: Run, place: Path, resume: bool, output: Path) -> None:
     """Check that the command may write the scene `output`, or resume from the checkpoints at `place`."""
+    run.claim("--output", *files_of(output))
+    run.claim("--resume", place, folder=True)
     if not is_finished(run, place, resume, output):
         check_scene_output(output, run.overwrite)
     check_stopped(run, place, resume, output)
@@ -62,7 +65,7 @@ def stoppable(run: Run, place: Path, resume: bool, output: Path) -> Iterator[Non
     made = parents_made(place)
     try:
         with locked(place.parent, _locked_name(place, output)):
-            if output.exists() and not run.overwrite:  # another run wrote it since it was checked
+            if is_taken(output) and not run.overwrite:  # another run wrote it since it was checked
                 raise OutputError("exists", path=output, hint="{overwrite=True} replaces it")
             with _kept(run, place, resume):
                 yield

@@ -57,6 +57,7 @@ class TiledCommand:
                 up=up,
                 seed=run.seed,
                 render_model=run.render_model,
+                counted=self.outputs.check,
                 **run.callbacks,
             )
             for at, (store, small) in enumerate(made):
@@ -90,7 +91,12 @@ class TiledCommand:
             reports = {at: folder.tell_finished() for at, folder in enumerate(folders) if folder.is_done}
             left = [at for at in range(len(self.budgets)) if at not in reports]
             made = distill_in_tiles(
-                self.scene, [self.budgets[at] for at in left], self.tiling, options, **run.callbacks
+                self.scene,
+                [self.budgets[at] for at in left],
+                self.tiling,
+                options,
+                counted=self.outputs.check,
+                **run.callbacks,
             )
             for at, (store, small, scores, views) in zip(left, made, strict=True):
                 folder = folder_at(self.outputs.paths(store.count)[at])

@@ -28,6 +28,7 @@ def tiling_of(run: Run, scene: Path | None, output: Path) -> Tiling:
     if scheduler is not None and scheduler != "local" and "://" not in scheduler:
         raise typer.BadParameter(f"--scheduler: expected tcp://HOST:PORT or local, got {scheduler!r}")
     folder = work or _beside(output)
+    run.claim("--work", folder, folder=True)
     return Tiling(rows, size, workers, run.threads or None, scheduler, folder, keep=work is not None)
 
 

@@ -72,6 +72,14 @@ def check_format(name: str) -> None:
     require("format", repr(name), name.lower() in known, f"one of {', '.join(known)}")
 
 
+def files_of(path: Path) -> list[Path]:
+    """Return the files that writing a scene may create: the path, or a meta.json and its images."""
+    return [path, *(path.with_name(f"{name}.webp") for name in _FOLDER_IMAGES * (path.name == "meta.json"))]
+
+
+_FOLDER_IMAGES = ("means_l", "means_u", "scales", "quats", "sh0", "shN_centroids", "shN_labels")
+
+
 def written_bytes(path: Path) -> int:
     """Return the size of a written scene: of its file, or of all files beside a meta.json."""
     files = path.parent.iterdir() if path.name == "meta.json" else [path]

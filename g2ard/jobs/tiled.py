@@ -65,10 +65,10 @@ def working(tiling: Tiling, *views: Views | None) -> Iterator[None]:
         with locked(folder):
             try:
                 yield
-            except G2ardError as error:
+            except Exception as error:  # usage errors too, which the command line raises
                 if made and not _worth_keeping(folder, error):
                     shutil.rmtree(folder, ignore_errors=True)
-                elif not tiling.keep:
+                elif not tiling.keep and isinstance(error, G2ardError):
                     raise type(error)(f"{error}; finished work is kept in {folder}") from error
                 raise
             if not tiling.keep:
@@ -107,7 +107,7 @@ def _check_given(tiling: Tiling, views: tuple[Views | None, ...]) -> None:
             pass
 
 
-def _worth_keeping(folder: Path, error: G2ardError) -> bool:
+def _worth_keeping(folder: Path, error: Exception) -> bool:
     """Return whether a command that resumes after this error finds something done."""
     if any((folder / "steps").glob("[!.]*.npz")):
         return True
@@ -161,6 +161,7 @@ def simplify_in_tiles(
     up: Sequence[float] | None = None,
     seed: int = 0,
     render_model: RenderModel | None = None,
+    counted: Callable[[int], object] | None = None,
     progress: Progress = silent,
     say: Say = unsaid,
 ) -> Iterator[tuple[TileStore, TiledScene]]:
@@ -168,9 +169,12 @@ def simplify_in_tiles(
 
     Args:
         tiling: how; `folder` keeps finished steps, so that the same call resumes.
+        counted: called with the scene's count before work on its tiles.
     """
     config = config or SimplifyConfig()
     with _tiles_and_workers(scene, tiling, 1.0, render_model, progress, say) as (store, workers):
+        if counted is not None:
+            counted(store.count)
         counts = [budget.of(store.count, str(scene)) for budget in budgets]
         run, cameras = TiledRun(store, workers, config), None
         if not blind and min(counts) < store.count:
@@ -197,6 +201,7 @@ def distill_in_tiles(
     tiling: Tiling,
     options: DistillOptions,
     *,
+    counted: Callable[[int], object] | None = None,
     progress: Progress = silent,
     say: Say = unsaid,
 ) -> Iterator[tuple[TileStore, TiledScene, TiledScores, RunViews]]:
@@ -206,9 +211,12 @@ def distill_in_tiles(
 
     Args:
         options: as for `g2ard.distill`, without those that `whole_options` returns.
+        counted: called with the scene's count before work on its tiles.
     """
 
     def smallest(total: int) -> int:
+        if counted is not None:
+            counted(total)
         return min(budget.of(total, str(scene)) for budget in budgets)
 
     with _job(scene, tiling, options, smallest, True, progress, say) as job:

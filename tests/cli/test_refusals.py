@@ -39,7 +39,7 @@ USAGE = [
     ("simplify ball.ply -ratio 5 -o o.ply", "-ratio: long options need two dashes; write "),
     ("simplify ball.ply -n 5 -o o.ply --up 0,0,0", "a direction such as 0,0,1"),
     ("simplify ball.ply -r 2 -o o.ply --views v --no-views", "; give one"),
-    ("simplify ball.ply -r 2 -o o.ply --json o.ply", "name another one"),
+    ("simplify ball.ply -r 2 -o o.ply --json o.ply", "is written by --json too"),
     ("simplify ball.ply -r 4 -o {foo}_{ratio}.ply", "unknown placeholder {foo}; use {ratio} or {count}"),
     (
         "simplify ball.ply -n 200,100 -o s.ply",

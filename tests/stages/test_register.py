@@ -183,7 +183,7 @@ def test_the_command_writes_and_scores_views(site: Path, command_line: CommandLi
             2,
             "--matcher: expected matched features",
         ),
-        ("--photos views.json --report scene.ply -w", 2, "is also an input or output"),
+        ("--photos views.json --report scene.ply -w", 2, "is both an input and the output"),
         ("--photos views.json --pool absent.json", 1, "absent.json"),
         ("--photos views.json --poses away.txt", 1, "none of 4 photos was registered"),
     ],

@@ -10,7 +10,7 @@ import typer
 from g2ard.cli.frame import Run, command
 from g2ard.cli.options import SceneArgument, picture
 from g2ard.errors import InputError
-from g2ard.io import check_scene_output
+from g2ard.io import check_output
 from g2ard.progress import plural
 
 if TYPE_CHECKING:
@@ -29,7 +29,12 @@ _COLORS = {
 """Colour of each kind of clutter in the picture, and its name."""
 
 
-@command("clean", example="g2ard clean garden.ply -o garden_clean.ply --preview found.png", scenes=True)
+@command(
+    "clean",
+    example="g2ard clean garden.ply -o garden_clean.ply --preview found.png",
+    scenes=True,
+    outputs=("output", "split_sky", "preview"),
+)
 def clean(
     run: Run,
     scene: SceneArgument,
@@ -83,12 +88,11 @@ def clean(
     if output is None and not dry_run:
         raise typer.BadParameter("give an output with -o, or --dry-run")
     if preview is not None:
-        run.check_extra("--preview", preview)
-    if split_sky is not None:
-        run.check_extra("--split-sky", split_sky)
-    if not dry_run:
-        for path in filter(None, (output, split_sky)):
-            check_scene_output(path, run.overwrite)
+        run.claim("--preview", preview)
+        check_output(preview, run.overwrite)
+    for flag, path in (("--output", output), ("--split-sky", split_sky)):
+        if path is not None and not dry_run:
+            run.claim_scene(flag, path)
     run.console.expect([("visibility", 11), ("depths", 16), ("clutter", 19), ("preview", 1)])  # showroom, s
     run.begin("read")
     done = remove_clutter(

@@ -51,8 +51,8 @@ def compare(
         run.refuse_typed("on given views", "count")
     paths = run_scene(first), run_scene(second)
     if output is not None:
+        run.claim("--output", output)
         check_page_output(output, run.overwrite)
-        run.spare_inputs(output)
     page = [] if output is None else [("page", 1.0), ("sog", 2.0), ("sog", 0.5)]
     run.console.expect([("poses", 1.0), ("teacher", 2.0), ("evaluate", 3.0), *page])
     reference, other = (run.load(path) for path in paths)

@@ -163,10 +163,11 @@ def _check_output(run: Run, output: Path, options: dict[str, Any]) -> None:
     """Check the output and the options of its format."""
     if output.suffix.lower() != ".csv":
         check_options(output, options)
-        io.check_scene_output(output, run.overwrite)
+        run.claim_scene("--output", output)
         return
     if options:
         raise OutputError(f".csv has no option {next(iter(options))!r}", path=output)
+    run.claim("--output", output)
     io.check_output(output, run.overwrite)
 
 

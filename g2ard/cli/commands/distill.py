@@ -126,16 +126,17 @@ def distill(
     opt.choose_engine(run, settings, "recover.engine")
     if output == opt.UNWRITTEN and len(budgets) > 1:
         output = Path("{count}")
-    outputs = Outputs(run, output, budgets)
 
     def folder_at(path: Path) -> RunFolder:
         return RunFolder(run, path, f"scene.{format}", resume)
 
     def check(path: Path, budget: Budget) -> None:
+        run.claim("--output", path, folder=True)
         if not dry_run:
             folder_at(path).check(budget)
 
-    outputs.check(check)
+    outputs = Outputs(run, output, budgets, check)
+    outputs.check()
     early = [folder_at(path) for path in outputs.paths()]
     if early and not dry_run and all(folder.is_done for folder in early):
         run.results([folder.tell_finished() for folder in early])
@@ -158,7 +159,7 @@ def distill(
     if scene is not None and is_tiled(scene, tiling):
         TiledCommand(run, scene, outputs, tiling, budgets).distill(options, folder_at)
         return
-    job = prepare(scene, budgets, options, counted=lambda total: outputs.check(check, total), **run.callbacks)
+    job = prepare(scene, budgets, options, counted=outputs.check, **run.callbacks)
     folders = [folder_at(path) for path in outputs.paths(len(job.prior))]
     if dry_run:
         _tell_estimates(run, job, folders)

@@ -44,6 +44,7 @@ def ingest(
     from g2ard.tiles.ingest import TILE_ROWS
     from g2ard.tiles.ingest import ingest as into_tiles
 
+    run.claim("--output", output, folder=True)
     if resume and not (output.is_dir() and any(output.iterdir())):
         run.say(f"{output}: nothing to resume, starting over")
     config = LiftConfig()

@@ -31,7 +31,7 @@ def lift(
     """Turn a coloured point cloud into surface-aligned Gaussian discs, without training."""
     from g2ard.stages.lift import lift as lift_points
 
-    io.check_scene_output(output, run.overwrite)
+    run.claim_scene("--output", output)
     began = time.perf_counter()
     run.begin("read")
     found = io.read_cloud(cloud)

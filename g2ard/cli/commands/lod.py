@@ -142,8 +142,10 @@ def lod(
         raise typer.BadParameter("--environment needs a scene that fits into memory")
     views, colour = opt.with_images(views, images), background or BLACK
     writer = _Writer(run, scene, output, kind, rule, spot, up, views, colour)
-    run.spare_inputs(writer.meta)
     stopped = output.with_name(f".{output.name}.unfinished")
+    run.spare_inputs(writer.meta)
+    run.claim("--output", output, folder=True)
+    run.claim("--resume", stopped, folder=True)
     finished = not dry_run and is_finished(run, stopped, resume, writer.meta)
     if dry_run:
         if tiled:

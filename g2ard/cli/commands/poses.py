@@ -8,7 +8,6 @@ import typer
 from g2ard.cli.frame import Run, command
 from g2ard.cli.options import OutputOption, SceneArgument, UpOption, ViewFormatOption
 from g2ard.config.choices import PoolKind
-from g2ard.io import check_views_output
 from g2ard.progress import direction, plural
 
 _LEAST_REPORTED_SHARE = 0.005
@@ -60,7 +59,7 @@ def poses(
     from g2ard.io.splits import splits_of
     from g2ard.poses import plan_pool
 
-    check_views_output(output, run.overwrite, format)
+    run.claim_views(output, format)
     splats = run.load(scene)
     pool = plan_pool(
         splats,

@@ -12,7 +12,6 @@ from g2ard.cli.frame import Run, command
 from g2ard.config.choices import Keep, Refinement
 from g2ard.config.paths import listed
 from g2ard.errors import InputError
-from g2ard.io import check_views_output
 from g2ard.progress import plural
 
 if TYPE_CHECKING:
@@ -24,6 +23,7 @@ if TYPE_CHECKING:
     example="g2ard register small.ply --photos new/ --focal 1200 --poses coarse.txt -o poses.json",
     settings="g2ard.stages.register:RegisterConfig",
     scenes=True,
+    outputs=("output", "report"),
 )
 def register(
     run: Run,
@@ -125,9 +125,9 @@ def register(
         raise typer.BadParameter("--metres-per-unit goes with --truth")
     if intrinsics is not None and focal is not None:
         raise typer.BadParameter("--intrinsics and --focal exclude each other; give one")
-    check_views_output(output, run.overwrite, format)
+    run.claim_views(output, format)
     if report is not None:
-        run.check_extra("--report", report)
+        run.claim("--report", report)
         check_page_output(report, run.overwrite)
     planned = [] if pool is None else [("poses", 5.0), ("pool", 5.0)]
     run.console.expect([*planned, ("register", 30.0), *([("report", 2.0)] if report else [])])

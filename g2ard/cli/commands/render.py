@@ -31,7 +31,12 @@ _NO_FOLDER = (".png", ".jpg", ".jpeg", ".avi", ".mov", ".mkv", ".webm")
 Color = Literal["scene", "flags", "cells", "parents"]
 
 
-@command("render", example="g2ard render scene.ply -n 4 --sheet look.png", scenes=True)
+@command(
+    "render",
+    example="g2ard render scene.ply -n 4 --sheet look.png",
+    scenes=True,
+    outputs=("output", "sheet"),
+)
 def render(
     run: Run,
     scene: opt.SceneArgument,
@@ -98,6 +103,7 @@ def render(
         run.refuse_typed("without --color parents and -n or -r", "method")
     views = opt.with_images(views, images)
     if sheet is not None:
+        run.claim("--sheet", sheet)
         check_output(sheet, run.overwrite)
     splats = run.load(scene)
     if parents is not None:
@@ -122,6 +128,8 @@ def render(
     cameras = load_views(found, split, size, run.say)
     warn_of_sight(splats, cameras, run.say)
     places = output_names(cameras.source or str(views), cameras.names) if output is not None else []
+    if output is not None:
+        run.claim("--output", *(file for place in places for file in _files(output / place, depth)))
     shown: list[NDArray[np.uint8]] = []
     wanted = sheet is not None or animation is not None
     colour = opt.background_of(run, background, scene) or BLACK
@@ -152,6 +160,7 @@ def _folder_or_animation(run: Run, output: Path | None, depth: bool) -> tuple[Pa
 
     if output is None:
         return None, None
+    run.claim("--output", output)
     if output.suffix.lower() not in SUFFIXES:
         if output.suffix.lower() in _NO_FOLDER:
             raise typer.BadParameter(f"-o: expected a folder, .gif, .webp or .mp4, got {output.name!r}")
@@ -164,16 +173,22 @@ def _folder_or_animation(run: Run, output: Path | None, depth: bool) -> tuple[Pa
     return None, output
 
 
+def _files(stem: Path, depth: bool) -> list[Path]:
+    """Return the files of one view: STEM.png and, with `depth`, STEM.depth.npy."""
+    return [stem.with_name(stem.name + suffix) for suffix in (".png", ".depth.npy")[: 1 + depth]]
+
+
 def _write_view(stem: Path, rendered: Rendered, depth: bool) -> None:
-    """Write one view as STEM.png and, with `depth`, STEM.depth.npy."""
+    """Write the files of one view."""
     import numpy as np
 
     from g2ard.io.images import write_png
 
-    stem.parent.mkdir(parents=True, exist_ok=True)
-    write_png(stem.with_name(stem.name + ".png"), rendered.image)
-    if depth:
-        np.save(stem.with_name(stem.name + ".depth.npy"), rendered.depth)
+    picture, *depths = _files(stem, depth)
+    picture.parent.mkdir(parents=True, exist_ok=True)
+    write_png(picture, rendered.image)
+    for path in depths:
+        np.save(path, rendered.depth)
 
 
 def _write_sheet(

@@ -11,7 +11,6 @@ from g2ard.cli import options as opt
 from g2ard.cli.budget_options import Count
 from g2ard.cli.frame import Run, command
 from g2ard.config.paths import listed
-from g2ard.io import check_views_output
 from g2ard.pipeline.presets import configured
 from g2ard.progress import plural
 
@@ -65,7 +64,7 @@ def select(
         config.check_used(config.policy)
     if config.views_count is None:
         raise typer.BadParameter("give the number of views with -k K")
-    check_views_output(output, run.overwrite, format)
+    run.claim_views(output, format)
     splats = run.load(scene)
     pool, candidates = load_split_views(opt.with_images(views, images), split, run.say)
     cameras = pool.cameras.take(candidates)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -17,7 +17,7 @@ from g2ard.cli.run_result import say_weight, tell_quality
 from g2ard.cli.tiling import tiling_of
 from g2ard.config.choices import is_made
 from g2ard.config.paths import listed
-from g2ard.io.atomic import atomic_output
+from g2ard.io.atomic import atomic_output, check_output
 from g2ard.io.scene_formats import written_bytes
 from g2ard.pipeline.presets import configured
 from g2ard.progress import plural
@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     scenes=True,
     budgets=True,
     tiles=True,
+    outputs=("output", "parents"),
 )
 def simplify(
     run: Run,
@@ -82,17 +83,17 @@ def simplify(
     if given_views or no_views or config.method == "paper" or (config.method == "fast" and views is None):
         run.refuse_typed("without generated views", "up")
     tiling = tiling_of(run, scene, output)
-    outputs = Outputs(run, output, budgets)
-    outputs.check(lambda path, _: io.check_scene_output(path, run.overwrite))
+    outputs = Outputs(run, output, budgets, lambda path, _: run.claim_scene("--output", path))
+    outputs.check()
     given = opt.with_images(views, images)
     if is_tiled(scene, tiling):
         _refuse_whole(scene, budgets, config, preset, parents)
         TiledCommand(run, scene, outputs, tiling, budgets).simplify(config, given, no_views, up)
         return
     check_whole_memory(scene, tiling, WHOLE_TIMES)
-    maps = None if parents is None else Outputs(run, parents, budgets, name="--parents")
+    maps = None if parents is None else Outputs(run, parents, budgets, _parents_file(run), name="--parents")
     if maps is not None:
-        maps.check(lambda path, _: run.check_extra("--parents", path, parents))
+        maps.check()
     seen = [("read", 0.2), ("poses", 1.0), ("visibility", 2.0)]  # seconds for playbot
     run.console.expect([*seen, *[("simplify", 1.2), ("visibility", 0.5), ("write", 0.1)] * len(budgets)])
     began = time.perf_counter()
@@ -100,7 +101,8 @@ def simplify(
     found = io.read_scene(scene, render_model=run.render_model)
     say_notes(scene, found.notes, run.say)
     splats, total = found.splats, len(found.splats)
-    outputs.check(lambda path, _: io.check_scene_output(path, run.overwrite), total)
+    for named in filter(None, (outputs, maps)):
+        named.check(total)
     started = time.perf_counter()
     reading = started - began  # shared by all budgets
     common: dict[str, Any] = {"seed": run.seed, "progress": run.progress, "say": run.say}
@@ -125,6 +127,14 @@ def simplify(
             run.say(f"{place}: {written_bytes(place):,} of {aim.bytes:,} bytes")
     run.results(reports)
     tell_quality(run, aims[0], small.splats)
+
+
+def _parents_file(run: Run) -> Callable[[Path, Budget], None]:
+    def check(path: Path, _: Budget) -> None:
+        run.claim("--parents", path)
+        check_output(path, run.overwrite)
+
+    return check
 
 
 def _refuse_whole(

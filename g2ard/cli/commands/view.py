@@ -43,9 +43,9 @@ def view(
     from g2ard.viewer import check_page_output, write_page
 
     views = opt.with_images(views, images)
+    run.claim("--output", output)
     check_page_output(output, run.overwrite)
     paths = [run_scene(path) for path in (scene, other) if path is not None]
-    run.spare_inputs(output)
     loaded = [run.load(path) for path in paths]
     if views is None and scene.is_dir() and (scene / "views.json").is_file():
         views = scene / "views.json"
