@@ -149,7 +149,7 @@ class _Fit:
     """A fit in stretches, whose state is kept in `work`, if given.
 
     Args:
-        key: fingerprint that checkpoints must have.
+        key: fingerprint that checkpoints must have; unused without `work`.
     """
 
     splats: Splats
@@ -183,7 +183,7 @@ class _Fit:
             seed=config.seed + len(self.stretches),
             engine=config.engine,
         )
-        within = self.work / "steps.npz" if self.work else None
+        within = self._steps(len(self.stretches))
         before = sum(stretch["steps"] for stretch in self.stretches)
 
         def progress(stage: str, done: int, total: int, info: Mapping[str, Any] | None = None) -> None:
@@ -202,7 +202,17 @@ class _Fit:
             meta = {name: getattr(self, name) for name in ("seconds", "converged", "stretches")}
             arrays = {name: getattr(self.splats, name) for name in ("logit_opacities", "sh0", "shN")}
             checkpoint.save(self.work / "stretches.npz", self.key, meta, arrays)
-            (self.work / "steps.npz").unlink(missing_ok=True)
+            self._drop_steps()
+
+    def _steps(self, stretch: int) -> Path | None:
+        """Return the file for the steps within a stretch."""
+        return self.work / f"steps-{stretch + 1}.npz" if self.work else None
+
+    def _drop_steps(self) -> None:
+        """Remove the steps of finished stretches, also if a run ended before it did so."""
+        for stretch in range(len(self.stretches)):
+            if path := self._steps(stretch):
+                path.unlink(missing_ok=True)
 
     def _restore(self) -> None:
         if self.work and (self.work / "stretches.npz").exists():
@@ -210,6 +220,7 @@ class _Fit:
             self.splats = replace(self.splats, **arrays)
             self.seconds, self.converged = meta["seconds"], meta["converged"]
             self.stretches = meta["stretches"]
+            self._drop_steps()
 
 
 @checks_arguments
@@ -261,8 +272,7 @@ def adapt(
         change = colour_change(given, targets, config.background)
         change = change if change.gain >= config.colour_worth else None
         start = given if change is None else recoloured(given, change)
-    parts = (repr(config), compact.fingerprint(), fingerprint_of(targets))
-    key = hashlib.sha256("\n".join(parts).encode()).hexdigest()
+    key = "" if work is None else _key(config, compact, targets)
     fit = _Fit(start, targets, config, key, work, progress)
     fit.run()
     if config.schedule == "default" and config.prior_views:
@@ -280,6 +290,12 @@ def adapt(
         prior_share=float(1 - share.mean()),
     )
     return Adapted(result, report)
+
+
+def _key(config: AdaptConfig, compact: Splats, targets: Targets) -> str:
+    """Return the fingerprint that checkpoints of an adaptation must have."""
+    parts = (repr(config), compact.fingerprint(), fingerprint_of(targets))
+    return hashlib.sha256("\n".join(parts).encode()).hexdigest()
 
 
 def appearance_only(schedule: Schedule) -> Schedule:

@@ -74,7 +74,17 @@ def fingerprint_of(targets: Targets) -> str:
 
 
 def _source(targets: Targets) -> str:
-    return str(getattr(targets, "source", type(targets).__name__))
+    """Return the identity of the images' sources, or a hash of the images if their class is the user's."""
+    own = type(targets).__module__ == __name__
+    return str(targets.source) if own else _content(targets)  # type: ignore[attr-defined]
+
+
+def _content(targets: Targets) -> str:
+    digest = hashlib.sha256()
+    for view in range(len(targets.cameras)):
+        for array in (targets[view], mask_of(targets, view)):
+            digest.update(b"" if array is None else np.ascontiguousarray(array).tobytes())
+    return f"images {digest.hexdigest()}"
 
 
 def checked_targets(targets: Targets, parameter: str = "targets") -> Targets:
@@ -154,9 +164,12 @@ class _Chosen:
 
     @property
     def source(self) -> str:
-        """Sources of the other targets."""
+        """Sources of the other targets, and the rows taken from each."""
+        rows: dict[int, list[int]] = {}
+        for targets, row in self._places:
+            rows.setdefault(id(targets), []).append(row)
         parts = {id(targets): targets for targets, _ in self._places}
-        return " | ".join(map(_source, parts.values()))
+        return " | ".join(f"{_source(targets)} {rows[key]}" for key, targets in parts.items())
 
     def __getitem__(self, view: int) -> NDArray[np.float32]:
         targets, row = self._places[view]
@@ -186,6 +199,11 @@ class _Converted(_Chosen):
         cameras = targets.cameras
         super().__init__(cameras, [(targets, view) for view in range(len(cameras))])
         self._parameter = parameter
+
+    @cached_property
+    def source(self) -> str:
+        """Hash of the converted images."""
+        return _content(self)
 
     def __getitem__(self, view: int) -> NDArray[np.float32]:
         try:

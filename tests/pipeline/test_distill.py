@@ -4,6 +4,7 @@ import json
 import re
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -56,8 +57,17 @@ def test_an_interrupted_run_resumes_to_the_same_bits(targets: TeacherRenders, tm
     assert whole.report.seconds.resumed is None
     assert resumed.report.seconds.resumed == pytest.approx(sum(earlier))
     assert_same_bits(whole.splats, resumed.splats)
-    with pytest.raises(InputError, match="belongs to a run with another scene"):
-        distill(PRIOR, 1000, targets, changed(config, {"recover.seed": 1}), work=tmp_path)
+    given: dict[str, Any] = {"prior": PRIOR, "budget": 1000, "targets": targets, "config": config}
+    brighter = replace(PRIOR, sh0=PRIOR.sh0 + np.float32(0.1))
+    for other in (
+        {"config": changed(config, {"recover.seed": 1})},
+        {"weights": np.arange(1.0, 1 + len(targets.cameras))},
+        {"prior": brighter},
+        {"targets": TeacherRenders(brighter, around())},
+        {"budget": 999},
+    ):
+        with pytest.raises(InputError, match="belongs to a run with another scene"):
+            distill(**{**given, **other}, work=tmp_path)
 
 
 def test_command_on_a_trained_scene(command_line: CommandLine, tmp_path: Path) -> None:

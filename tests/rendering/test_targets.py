@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from g2ard.rendering.renderer import Renderer
-from g2ard.rendering.targets import Photos, TeacherRenders, fingerprint_of
+from g2ard.rendering.targets import Photos, Subset, TeacherRenders, checked_targets, fingerprint_of
 from helpers.photos import photographed
 from helpers.scenes import around, checkered_ball
 from helpers.view_files import photo
@@ -57,3 +57,60 @@ def test_a_replaced_photo_or_mask_changes_the_fingerprint(tmp_path: Path) -> Non
         after = fingerprint_of(Photos(views))
         assert after != before
         before = after
+
+
+class Plain:
+    """Images of a class that knows nothing of this package."""
+
+    def __init__(self, images: np.ndarray, masks: np.ndarray | None = None) -> None:
+        self.cameras, self.images, self.masks = around(3, (32, 24)), images, masks
+
+    def __getitem__(self, view: int) -> np.ndarray:
+        return self.images[view]
+
+
+class Masked(Plain):
+    def mask(self, view: int) -> np.ndarray | None:
+        return None if self.masks is None else self.masks[view]
+
+
+class Darker(TeacherRenders):
+    """Renders whose class has their `source` and changes the images."""
+
+    share = 0.5
+
+    def __getitem__(self, view: int) -> np.ndarray:
+        return super().__getitem__(view) * np.float32(self.share)
+
+
+class Darkest(Darker):
+    share = 0.25
+
+
+def test_the_fingerprint_of_any_class_is_that_of_its_images() -> None:
+    ball, views = checkered_ball(400), around(3, (32, 24))
+    images = np.random.default_rng(0).random((3, 24, 32, 3)).astype(np.float32)
+    other = images.copy()
+    other[2, 23, 31, 2] = 0
+    holes = np.ones((3, 24, 32), bool)
+    holes[1, 0, 0] = False
+    twins = replace(views, viewmats=views.viewmats[[0, 0, 0]])  # only their images differ
+    made = {
+        "images": lambda: Plain(images),
+        "one value": lambda: Plain(other),
+        "bytes": lambda: Plain((images * 255).astype(np.uint8)),
+        "all valid": lambda: Masked(images, np.ones_like(holes)),
+        "one hole": lambda: Masked(images, holes),
+        "darker": lambda: Darker(ball, views),
+        "darkest": lambda: Darkest(ball, views),
+        "renders": lambda: TeacherRenders(ball, views),
+        "photos": lambda: Photos(views, list(images)),
+        "other photos": lambda: Photos(views, list(other)),
+        **{f"part {row}": lambda row=row: Subset(Photos(twins, list(images)), [row]) for row in range(3)},
+        **{f"own {row}": lambda row=row: Subset(checked_targets(Plain(images)), [row]) for row in (0, 1)},
+    }
+    first, again = ([fingerprint_of(checked_targets(make())) for make in made.values()] for _ in range(2))
+    assert first == again
+    for i, name in enumerate(made):
+        same = [other for other, key in zip(made, first, strict=True) if key == first[i]]
+        assert same == [name]

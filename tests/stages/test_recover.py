@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from g2ard.errors import InputError
 from g2ard.rendering.renderer import Renderer
-from g2ard.rendering.targets import TeacherRenders
+from g2ard.rendering.targets import Subset, TeacherRenders
 from g2ard.rendering.visibility import visibility
 from g2ard.scene.splats import Splats
 from g2ard.stages.evaluate import evaluate
@@ -143,6 +143,14 @@ def test_resume_refuses_other_options(student: Splats, targets: TeacherRenders, 
         recover(student, targets, config, checkpoint=checkpoint, anchors=Anchors.of(moved))
     with pytest.raises(InputError, match="other options"):
         recover(student, targets, config, checkpoint=checkpoint, weights=UNEVEN)
+    for other in (
+        {"frozen": np.arange(len(student)) < 250},
+        {"validation": TeacherRenders(TEACHER, around(3))},
+        {"student": replace(student, sh0=student.sh0 + np.float32(0.1))},
+        {"targets": Subset(targets, range(len(VIEWS) - 1))},
+    ):
+        with pytest.raises(InputError, match="other options"):
+            recover(**{"student": student, "targets": targets, **other}, config=config, checkpoint=checkpoint)
 
 
 def test_trials_choose_rates_that_suit_the_scene(student: Splats, targets: TeacherRenders) -> None:
