@@ -1,5 +1,6 @@
 """Photos become what their pinhole cameras would have taken; images come out as they went in."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,9 +9,10 @@ from PIL import Image
 
 from g2ard.errors import InputError, OutputError
 from g2ard.io import read_views
-from g2ard.io.images import contact_sheet, load_image, to_bytes, write_png
+from g2ard.io.images import contact_sheet, load_image, load_mask, to_bytes, write_png
 from g2ard.scene.cameras import Cameras
 from helpers.realdata import real
+from helpers.scenes import around
 
 
 def camera(
@@ -189,3 +191,15 @@ def test_float_photos_are_within_0_and_1(tmp_path: Path, value: float) -> None:
     pixels[2, 3] = value
     with pytest.raises(InputError, match=r"b\.tiff: expected values in \[0, 1\]"):
         load_image(camera(save(tmp_path / "b.tiff", pixels), (8, 6)), 0)
+
+
+@pytest.mark.parametrize("own", [False, True])
+def test_a_mask_holds_from_half_on(tmp_path: Path, own: bool) -> None:
+    """Of every grey, as the brightness of a mask or as the alpha of a photo that is its own mask."""
+    levels = np.arange(256, dtype=np.uint8).reshape(16, 16)
+    photo, mask = tmp_path / "a.png", tmp_path / ("a.png" if own else "m.png")
+    Image.fromarray(np.dstack([levels, levels, levels, levels])).save(photo)
+    if not own:
+        Image.fromarray(levels).save(mask)
+    views = replace(around(1, (16, 16)), image_paths=(photo,), mask_paths=(mask,))
+    np.testing.assert_array_equal(load_mask(views, 0), levels > 127)

@@ -174,8 +174,8 @@ def test_spz(tmp_path: Path, version: int, degree: int) -> None:
     truth = in_order(scene(700, degree))
     path = saved(tmp_path, "spz", truth, spz_version=version)
     found = read_splats(path)
-    bits = fraction_bits(path, truth.means.astype(float), truth)
-    np.testing.assert_allclose(found.means, truth.means, atol=0.5 / (1 << bits) + 1e-6)
+    fine = np.percentile(np.sort(truth.scales, axis=1)[:, 1], 1)
+    np.testing.assert_allclose(found.means, truth.means, atol=fine / 8 + 1e-6)  # half of a step of fine / 4
     np.testing.assert_allclose(found.log_scales, truth.log_scales, atol=0.5 / 16 + 1e-5)
     np.testing.assert_allclose(found.opacities, truth.opacities, atol=0.5 / 255 + 1e-6)
     np.testing.assert_allclose(found.sh0, truth.sh0, atol=0.5 / 255 / 0.15 + 1e-6)
@@ -191,6 +191,31 @@ def test_spz_version_3_is_the_default_and_holds_what_version_4_does(tmp_path: Pa
     three, four = saved(tmp_path, "spz", truth), saved(tmp_path, "4.spz", truth, spz_version=4)
     assert three.read_bytes()[:2] == b"\x1f\x8b"
     assert_same_bits(read_splats(three), read_splats(four))
+
+
+@pytest.mark.parametrize("fine", [2e-2, 1e-3, 2e-5])
+def test_spz_steps_suit_the_finest_gaussians(tmp_path: Path, fine: float) -> None:
+    truth = scene(700, 0)
+    scales = np.full((700, 3), 0.1, np.float32)
+    scales[:14] = fine  # two in a hundred
+    truth = in_order(replace(truth, means=np.clip(truth.means, -7, 7), scales=scales))
+    found = read_splats(saved(tmp_path, "spz", truth))
+    error = np.abs(found.means.astype(float) - truth.means).max()
+    assert error <= max(min(fine / 4, 2.0**-12), 2.0**-20) / 2 + 1e-6
+
+
+def test_sog_palette_favours_what_shows(tmp_path: Path) -> None:
+    truth = scene(3000, 1)
+    shown = np.arange(3000) < 1000
+    truth = replace(
+        truth,
+        scales=np.where(shown[:, None], np.float32(0.5), np.float32(0.005)).repeat(3, 1),
+        logit_opacities=np.where(shown, np.float32(4), np.float32(-4)),
+    )
+    truth = in_order(truth)
+    found = read_splats(saved(tmp_path, "sog", truth))
+    error = ((found.shN - truth.shN) ** 2).mean((1, 2))
+    assert error[truth.opacities > 0.5].mean() < 0.5 * error[truth.opacities < 0.5].mean()
 
 
 def test_spz_bits_follow_the_extent(tmp_path: Path) -> None:
