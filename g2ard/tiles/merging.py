@@ -23,6 +23,9 @@ from g2ard.tiles.tasks import load, small_scene
 
 _HALF = 1 << 16
 
+_PLAN_DEPTH_SHARE = 0.6
+"""Plans of merges go down to this share of the Gaussians that a tile is expected to keep."""
+
 
 @dataclass(frozen=True, eq=False)
 class TiledScene:
@@ -110,27 +113,32 @@ def _merged(
 ) -> tuple[list[Path], tuple[int, ...]]:
     """Merge all tiles to exactly `budget` Gaussians; return the results of `merge` and their counts."""
     tiles = len(run.sizes)
+    if budget < tiles:
+        raise _unreached(tiles, budget, tiles, "one per tile")
     visibility: list[dict[str, Any]] = (
         [{"visibility": path} for path in sights.visibility] if sights else [{}] * tiles
     )
     costs = run.each("run_costs", "costs", frame=frame, inputs=visibility)
-    runs_left = _runs(run, costs, budget)
-    share_kept = budget / sum(runs_left)
+    runs_left, faint = _runs(run, costs, budget)
+    ends = plan_ends(runs_left, budget)
     plans = run.each(
         "pair_plan",
         "plans",
         frame=frame,
-        per_tile=[{"runs": n, "expected": share_kept * n} for n in runs_left],
+        per_tile=[{"runs": n, "last": end} for n, end in zip(runs_left, ends, strict=True)],
         inputs=[{"costs": path, **seen} for path, seen in zip(costs, visibility, strict=True)],
     )
-    merges = cheapest([_costs_of(path) for path in plans], sum(runs_left) - budget)
-    counts = tuple(n - m for n, m in zip(runs_left, merges, strict=True))
-    _check_reached(sum(counts), budget, tiles)
+    merges = cheapest([_costs_of(path) for path in plans], sum(runs_left) + sum(faint) - budget)
+    counts = tuple(n - m + f for n, m, f in zip(runs_left, merges, faint, strict=True))
+    if sum(counts) != budget:
+        raise _unreached(sum(counts), budget, tiles, "what merging leaves of them")
     merged = run.each(
         "merge",
         "merge",
         frame=frame,
-        per_tile=[{"runs": n, "merges": m} for n, m in zip(runs_left, merges, strict=True)],
+        per_tile=[
+            {"runs": n, "merges": m, "faint": f} for n, m, f in zip(runs_left, merges, faint, strict=True)
+        ],
         inputs=[{"plan": path, **seen} for path, seen in zip(plans, visibility, strict=True)],
     )
     return merged, counts
@@ -162,30 +170,47 @@ def finished(small: Splats, sh_degree: int) -> Splats:
     return replace(small.with_sh_degree(sh_degree), quats=unit_quats(small.quats))
 
 
-def _runs(run: TiledRun, costs: list[Path], budget: int) -> list[int]:
-    """Return the number of Morton runs that each tile keeps."""
+def plan_ends(runs: Sequence[int], budget: int) -> list[int]:
+    """Return the counts down to which tiles plan merges: at least 1 each, and at most `budget` in all.
+
+    >>> plan_ends([100, 200], 100), plan_ends([8, 1, 1], 4)
+    ([20, 40], [2, 1, 1])
+    """
+    share = _PLAN_DEPTH_SHARE * min(1.0, budget / sum(runs))
+    ends = [max(1, round(share * n)) for n in runs]
+    if sum(ends) > budget:  # few Gaussians per tile: all have one, and shares of the rest are rounded down
+        share = _PLAN_DEPTH_SHARE * (budget - len(runs)) / max(1, sum(runs) - len(runs))
+        ends = [1 + int(share * (n - 1)) for n in runs]
+    return ends
+
+
+def _runs(run: TiledRun, costs: list[Path], budget: int) -> tuple[list[int], list[int]]:
+    """Return the number of Morton runs that each tile keeps, and of its rows that no renderer draws.
+
+    Such rows are kept only if the others are fewer than the budget.
+    """
     kept = [len(load(path, "costs")[0]) + 1 for path in costs]
-    if sum(kept) < budget:
-        raise InputError(
-            f"expected at most {sum(kept):,} (the visible Gaussians), got {budget:,}", parameter="budget"
-        )
+    if sum(kept) <= budget:
+        missing, faint = budget - sum(kept), []
+        for size, drawn in zip(run.sizes, kept, strict=True):
+            faint.append(min(missing, size - drawn))
+            missing -= faint[-1]
+        return kept, faint
     target = min(sum(kept), int(run.config["morton_premerge_ratio"] * budget))
     closed = cheapest([_costs_of(path) for path in costs], sum(kept) - max(target, len(kept)))
-    return [n - c for n, c in zip(kept, closed, strict=True)]
+    return [n - c for n, c in zip(kept, closed, strict=True)], [0] * len(kept)
 
 
 def _costs_of(path: Path) -> Callable[[], NDArray[np.float32]]:
     return lambda: load(path, "costs")[0]
 
 
-def _check_reached(count: int, budget: int, tiles: int) -> None:
-    if count != budget:
-        each = "one per tile" if count == tiles else "at least one per tile"
-        raise InputError(
-            f"the {tiles:,} tiles keep at least {count:,} Gaussians ({each}), got "
-            f"{budget:,}; raise --tile-rows to get fewer tiles",
-            parameter="budget",
-        )
+def _unreached(count: int, budget: int, tiles: int, why: str) -> InputError:
+    return InputError(
+        f"the {tiles:,} tiles keep at least {count:,} Gaussians ({why}), got "
+        f"{budget:,}; raise --tile-rows to get fewer tiles",
+        parameter="budget",
+    )
 
 
 def cheapest(costs: Sequence[Callable[[], NDArray[np.float32]]], count: int) -> list[int]:

@@ -53,9 +53,6 @@ from g2ard.tiles.tasks import (
 COARSE = (32, 512)
 """Reduction of a tile's coarse Gaussians for use near the rendered tile, and far from it."""
 
-_PLAN_DEPTH_SHARE = 0.6
-"""Plans of merges go down to this share of the Gaussians that a tile is expected to keep."""
-
 _COARSE_STRIDE = 8
 """Every n-th row in Morton order becomes a coarse Gaussian, widened to represent the rest."""
 
@@ -210,8 +207,8 @@ def pair_plan(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
     """Plan merges to runs of Morton order, then of neighbouring pairs, beyond what the budget needs.
 
     Args:
-        arguments: `tile`, `config`, `frame`; `runs`, the number of runs; `expected`, the Gaussians that the
-            budget is expected to leave in this tile.
+        arguments: `tile`, `config`, `frame`; `runs`, the number of runs; `last`, the Gaussians that remain
+            after all merges.
         inputs: `visibility`; `costs`, the output of `run_costs`.
         places: `store`.
 
@@ -222,8 +219,7 @@ def pair_plan(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
     """
     scene = tile_of(arguments, inputs, places)
     config = _config(arguments).resolved("default")
-    runs, expected = arguments["runs"], arguments["expected"]
-    last = max(1, min(runs, round(_PLAN_DEPTH_SHARE * expected)))
+    runs, last = arguments["runs"], arguments["last"]
     counts = round_counts(runs, last, config.retention_of("default"), config.fold)
     tile = _seen_tile(scene, arguments, inputs)
     of, a, b, costs = tile.plan(runs, counts, load(inputs["costs"], "costs")[0])
@@ -234,14 +230,15 @@ def merge(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
     """Apply the first merges of a tile's plan.
 
     Args:
-        arguments: `tile`, `config`, `frame`; `runs`, as for `pair_plan`; `merges`, the number to apply.
+        arguments: `tile`, `config`, `frame`; `runs`, as for `pair_plan`; `merges`, the number to apply;
+            `faint`, the number of rows to keep that no renderer draws.
         inputs: `plan`, the output of `pair_plan`; `visibility`.
         places: `store`.
 
     Returns:
-        `scene`, n = runs − merges Gaussians (`scene_of`) with unfitted opacities; `members`, (n,) rows merged
-        into each; `clamped`, the number of clamped opacities; with views also `wanted`, (n,) Σ αT² of the
-        members, and `unseen`, the number of rows that no view sees.
+        `scene`, n = runs − merges + faint Gaussians (`scene_of`), opacities unfitted; `members`, (n,) rows
+        merged into each; `clamped`, the number of clamped opacities; with views also `wanted`, (n,) Σ αT² of
+        the members, and `unseen`, the number of rows that no view sees.
     """
     scene = tile_of(arguments, inputs, places)
     runs, merges = arguments["runs"], arguments["merges"]
@@ -255,6 +252,9 @@ def merge(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
     of = np.where(dropped, GONE, name[np.where(dropped, 0, of)]).astype(np.uint32)
     out = _seen_tile(scene, arguments, inputs).assemble(of, len(clusters))
     small = splats_of(scene, out)
+    if faint := np.flatnonzero(dropped)[: arguments["faint"]].tolist():
+        of[faint], dropped[faint] = np.arange(len(small), len(small) + len(faint)), False
+        small = join([small, scene.take(scene.core.order[faint])])
     kept, made = ~dropped, arrays_of(small, "scene")
     made["members"] = np.bincount(of[kept], minlength=len(small))
     if "visibility" in inputs:

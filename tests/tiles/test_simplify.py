@@ -22,7 +22,7 @@ from g2ard.stages.evaluate import evaluate
 from g2ard.stages.simplify import SimplifyConfig, round_counts, simplify
 from g2ard.tiles.executor import Workers, executor
 from g2ard.tiles.ingest import ingest
-from g2ard.tiles.merging import cheapest
+from g2ard.tiles.merging import cheapest, plan_ends, simplify_tiles
 from g2ard.tiles.steps import GONE, TiledRun
 from g2ard.tiles.tasks import Task
 from helpers.systems import needs_proc, workers_of
@@ -216,14 +216,46 @@ def test_an_order_found_before_is_checked(scene: Path) -> None:
 def test_budgets_out_of_reach_are_refused(store: TileStore, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"expected 1 to 9,000"):
         reduced(store, tmp_path, budget=9001)
-    faint = town(600)
-    faint.logit_opacities[::6] = -9
-    write_splats(tmp_path / "faint.ply", faint)
-    some = ingest(tmp_path / "faint.ply", tmp_path / "faint", tile_rows=250)
-    with pytest.raises(InputError, match=r"expected at most 500 "):
-        reduced(some, tmp_path, budget=550)
     with pytest.raises(InputError, match=r"the 4 tiles keep at least 4 Gaussians \(one per tile\), got 2"):
         reduced(store, tmp_path, budget=2)
+
+
+@pytest.mark.parametrize("uneven", [False, True])
+def test_every_count_from_one_per_tile_to_all_is_met(tmp_path: Path, uneven: bool) -> None:
+    """Also where tiles differ in what their Gaussians are worth, and where some are not drawn."""
+    small = town(120)
+    faint = np.arange(120) % 6 == 0
+    small.logit_opacities[:] = np.where(faint, -9, 2 + 0.2 * small.means[:, 0] * uneven)
+    if uneven:
+        small.scales[:] *= np.exp(0.3 * small.means[:, :1])
+    write_splats(tmp_path / "a.ply", small)
+    tiles = ingest(tmp_path / "a.ply", tmp_path / "tiles", tile_rows=20)
+    count = len(tiles.tiles)
+    assert count >= 6
+    with executor() as runs:
+        run = TiledRun(tiles, Workers(runs, tmp_path), SimplifyConfig())
+        for budget in range(1, count):
+            with pytest.raises(
+                InputError, match=rf"at least {count} Gaussians \(one per tile\), got {budget};"
+            ):
+                simplify_tiles(run, budget)
+        for budget in [*range(count, 3 * count), *range(96, 121, 3), 99, 101, 119]:
+            result = simplify_tiles(run, budget)
+            made = result.whole()
+            assert len(made) == len(result) == budget
+            drawn = (made.logit_opacities > -8).sum()
+            assert drawn == min(budget, 100)
+
+
+@pytest.mark.parametrize("tiles", range(1, 9))
+def test_plans_reach_every_budget(tiles: int) -> None:
+    rng = np.random.default_rng(tiles)
+    for _ in range(50):
+        runs = rng.integers(1, 40, tiles).tolist()
+        for budget in range(tiles, sum(runs) + 3):
+            ends = plan_ends(runs, budget)
+            assert sum(ends) <= budget
+            assert all(1 <= end <= n for end, n in zip(ends, runs, strict=True))
 
 
 @pytest.mark.parametrize("workers", [1, 2])
