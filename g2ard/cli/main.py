@@ -29,6 +29,7 @@ def run_program(app: typer.Typer, name: str) -> None:
     """
     # BLAS threads would only spin (3 % of a short command), since kernels use their own threads.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    _open_streams()
     sys.stdout, sys.stderr = _Outliving(sys.stdout), _Outliving(sys.stderr)
     gc.set_threshold(50_000)  # imports create no garbage; looking for it takes 5 % of a short command
     try:
@@ -44,6 +45,19 @@ def run_program(app: typer.Typer, name: str) -> None:
     gc.freeze()  # skip the final collection
     sys.stdout.flush()
     sys.exit(status)
+
+
+def _open_streams() -> None:
+    """Send to nowhere what goes to a closed stream, as after `>&-`, and keep files off its number."""
+    for number, name in enumerate(("stdin", "stdout", "stderr")):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)  # the lowest free number, which is this one
+            os.set_inheritable(number, True)
+        if getattr(sys, name) is None:
+            stream = os.fdopen(number, "w" if number else "r", encoding="utf-8", closefd=False)
+            setattr(sys, name, stream)
 
 
 def _name_shell(words: list[str]) -> None:

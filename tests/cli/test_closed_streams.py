@@ -1,0 +1,64 @@
+"""Programs whose stdout or stderr is closed (`>&-`, `2>&-`) do their work all the same."""
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from helpers.project import environment
+from helpers.writing_commands import COMMANDS, TRAIN, write_inputs
+
+pytestmark = pytest.mark.skipif(os.name == "nt", reason="needs a POSIX shell")
+
+BOTH = ">&- 2>&-"
+
+
+@pytest.fixture(scope="module")
+def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("inputs")
+    write_inputs(folder)
+    return folder
+
+
+def run(folder: Path, words: str, closed: str) -> tuple[int, str]:
+    """Return the exit status and all that the open streams get."""
+    command = f'exec "$0" -m g2ard {words} {closed}'
+    done = subprocess.run(
+        ["sh", "-c", command, sys.executable], cwd=folder, env=environment(), capture_output=True, text=True
+    )
+    return done.returncode, done.stdout + done.stderr
+
+
+@pytest.mark.parametrize("output", COMMANDS)
+def test_every_command_writes_its_result(output: str, inputs: Path, tmp_path: Path) -> None:
+    folder = shutil.copytree(inputs, tmp_path / "a")
+    assert run(folder, f"{COMMANDS[output]} --json told.json", BOTH) == (0, "")
+    assert (folder / output).exists()
+    assert (folder / "told.json").read_text()[0] == "{"
+
+
+@pytest.mark.parametrize("closed", [">&-", "<&- 2>&-"])
+@pytest.mark.parametrize(
+    ("words", "status"),
+    [
+        ("--version", 0),
+        ("simplify --help", 0),
+        ("simplify ball.ply -r 8 --no-views -o small.ply -w", 0),
+        ("info ball.ply", 0),
+        ("info ball.ply --json -", 0),
+        (f"evaluate ball.ply {TRAIN.replace('--steps 2 ', '')}", 0),
+        ("info missing.ply", 1),
+        ("simplify missing.ply -r 8 -o small.ply", 1),
+        ("simplify", 2),
+        ("unknown", 2),
+    ],
+)
+def test_the_status_does_not_depend_on_the_streams(
+    words: str, status: int, closed: str, inputs: Path
+) -> None:
+    found, said = run(inputs, words, closed)
+    assert found == status, said
+    assert "Traceback" not in said
