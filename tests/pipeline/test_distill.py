@@ -44,6 +44,11 @@ def test_views_of_another_kind_are_handed_on(targets: TeacherRenders, tmp_path: 
         distill(PRIOR, 300, targets, config, work=tmp_path)
 
 
+def test_one_step_per_round_makes_rounds(targets: TeacherRenders) -> None:
+    rounds = changed(PAPER_ROUNDS, {"recover.schedule.round_steps": 1, "recover.schedule.steps": 2})
+    assert len(distill(PRIOR, 1000, targets, rounds).report.rounds) == 4
+
+
 def test_an_interrupted_run_resumes_to_the_same_bits(targets: TeacherRenders, tmp_path: Path) -> None:
     config = PAPER_ROUNDS
     whole = distill(PRIOR, 1000, targets, config)
