@@ -195,14 +195,19 @@ ViewsFormatOption = Annotated[
         help="Also write generated views as cameras.json (inria), transforms.json (nerfstudio) or colmap/.",
     ),
 ]
-UNWRITTEN = Path("dry-run")
-"""Output of a dry run without -o."""
+_UNWRITTEN = Path("dry-run")
+"""Output of a dry run without -o; see `is_unnamed`."""
 
 
 def _need_no_output(ctx: typer.Context, dry_run: bool) -> bool:
     if dry_run:
-        ctx.default_map = {"output": str(UNWRITTEN), **(ctx.default_map or {})}
+        ctx.default_map = {"output": str(_UNWRITTEN), **(ctx.default_map or {})}
     return dry_run
+
+
+def is_unnamed(run: Run, output: Path) -> bool:
+    """Return whether a dry run has no -o; a folder may have the name of its stand-in."""
+    return bool(run.config["dry_run"]) and output == _UNWRITTEN and "output" not in run.typed
 
 
 DryRunOption = Annotated[

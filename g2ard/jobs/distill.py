@@ -318,8 +318,10 @@ def _read(
     from g2ard.io import kind
 
     if isinstance(scene, Splats):
+        options.check_trained()
         return _Read(scene, False, options.beside, "scene", len(scene))
     if isinstance(scene, str | Path) and kind(scene) == "splats":
+        options.check_trained()
         splats = load_scene(scene, say, options.render_model)
         return _Read(splats, False, options.beside or scene, str(scene), len(splats))
     views, recover = options.views, options.config.recover

@@ -10,12 +10,13 @@ from typing import Any
 
 from g2ard.config.checks import check_fields
 from g2ard.config.choices import Focus, RenderModel
-from g2ard.config.paths import full_paths
-from g2ard.errors import require
+from g2ard.config.paths import full_paths, values_of
+from g2ard.errors import InputError, require
 from g2ard.io.scene_formats import check_format
 from g2ard.jobs.inputs import Views
 from g2ard.pipeline.config import DistillConfig
 from g2ard.pipeline.presets import PRESETS, configured
+from g2ard.stages.lift import LiftConfig
 from g2ard.stages.recover.anchors import Regularizers
 
 
@@ -79,6 +80,12 @@ class DistillOptions:
         if regularizers is not None:
             settings["recover.regularizers"] = regularizers
         return configured(DistillConfig(), self.preset, settings)
+
+    def check_trained(self) -> None:
+        """Reject settings that only point clouds use, because the scene is a trained one."""
+        for path, default in values_of(LiftConfig()).items():
+            if self._full.get(path, default) != default:
+                raise InputError("has no effect on a trained scene, only on point clouds", parameter=path)
 
     def named(self, path: str) -> Any:
         """Return the value of a path in the settings or the preset, or None."""

@@ -7,8 +7,10 @@ import shutil
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+
+import numpy as np
 
 from g2ard.config.choices import RenderModel, is_made
 from g2ard.errors import G2ardError, InputError, OutputError
@@ -16,6 +18,7 @@ from g2ard.io.atomic import drop_empty, parents_made
 from g2ard.io.detect import MANIFEST
 from g2ard.io.lock import locked
 from g2ard.io.tile_store import StoredScene, TileStore
+from g2ard.io.types import ViewSet
 from g2ard.jobs.budget import Budget
 from g2ard.jobs.distill_options import DistillOptions
 from g2ard.jobs.inputs import Views, load_view_sets, say_regions
@@ -31,6 +34,7 @@ from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
 from g2ard.stages.recover.auto_preset import regularizers_for
 from g2ard.stages.recover.schedule import steps_for
+from g2ard.stages.select import select
 from g2ard.stages.simplify import SimplifyConfig
 from g2ard.tiles.executor import Workers, executor
 from g2ard.tiles.ingest import ingest
@@ -303,6 +307,18 @@ def _level(
     return level, merged, around, LevelReport(count, ratio, longest, seconds, scores.simplified, recovered)
 
 
+def _weighted(views: ViewSet, sample: Splats, config: DistillConfig, progress: Progress) -> ViewSet:
+    """Return training views with the sampling weights that a distillation in one piece would use."""
+    weights = views.weights
+    if not config.select.weighted:
+        weights = None
+    elif weights is None:
+        chosen = select(sample, views.cameras, len(views.cameras), options=config.select, progress=progress)
+        weights = np.zeros(len(views.cameras))
+        weights[chosen.order] = chosen.weights
+    return replace(views, weights=weights)
+
+
 @dataclass(frozen=True, eq=False)
 class _Job:
     """A distillation in tiles with everything decided.
@@ -359,6 +375,7 @@ def _job(
 
     `smallest` returns the smallest budget from the scene's count.
     """
+    options.check_trained()
     model = options.render_model
     with _tiles_and_workers(scene, tiling, RECOVERY_TIMES, model, progress, say) as (store, workers):
         sample = TiledRun(store, workers, options.config.simplify).sample()
@@ -374,7 +391,8 @@ def _job(
             say=say,
         )
         regularizers, why, _ = regularizers_for(options.named("recover.regularizers"), sample)
+        config = options.configured(regularizers)
         if learn:
             say(f"regularisers: {why}")
-        config = options.configured(regularizers)
+            views = replace(views, train=_weighted(views.train, sample, config, progress))
         yield _Job(store, sample, views, config, learn, workers, tiling)

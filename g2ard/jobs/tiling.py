@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,6 +16,7 @@ from g2ard.io.tile_store import TileStore
 if TYPE_CHECKING:
     from g2ard.jobs.budget import Budget
     from g2ard.jobs.distill_options import DistillOptions
+    from g2ard.stages.simplify import SimplifyConfig
 
 _LEAST_FILE_ROW_BYTES = 4
 """Least bytes per Gaussian in a file: a smaller file is known to be small without opening it."""
@@ -138,6 +139,16 @@ def whole_method(method: str | None, preset: str | None) -> list[str]:
     return [f"--method {method}"] if method not in (None, "default") else []
 
 
+def whole_settings(config: SimplifyConfig) -> list[str]:
+    """Return the settings of simplification that need the whole scene, as options.
+
+    All tiles merge along Morton order together, in one step.
+    """
+    steps = config.morton_premerge_steps
+    usual = replace(config, morton_premerge_steps=None).resolved("default").morton_premerge_steps
+    return ["--set simplify.morton_premerge_steps"] if steps not in (None, usual) else []
+
+
 def whole_options(options: DistillOptions) -> list[str]:
     """Return the options of a distillation that need the whole scene.
 
@@ -151,8 +162,8 @@ def whole_options(options: DistillOptions) -> list[str]:
         "--schedule paper": config.recover.schedule.round_steps > 0,
         "--clean": options.clean,
         "--photos": bool(options.photos),
-        "--set select.reselect": config.select.reselect,
         "--recovery-time": config.recover.recovery_time is not None,
         "--engine": config.recover.engine != "fused",
     }
-    return whole_method(config.simplify.method, None) + [name for name, there in given.items() if there]
+    named = [name for name, there in given.items() if there]
+    return [*whole_method(config.simplify.method, None), *named, *whole_settings(config.simplify)]

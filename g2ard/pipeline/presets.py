@@ -84,13 +84,13 @@ def configured(config: Config, preset: str = "auto", settings: Mapping[str, Any]
 
 def _check_used(config: Any, preset: Collection[str]) -> None:
     """Reject settings that have no effect on the method or policy, except for the paths set by a preset."""
-    from g2ard.pipeline.config import DistillConfig
+    from g2ard.pipeline.config import DistillConfig, SelectConfig
     from g2ard.stages.simplify.config import SimplifyConfig
 
     joined = isinstance(config, DistillConfig)
     simplify = config.simplify if joined else config
+    rounds = joined and config.recover.schedule.round_steps > 0
     if isinstance(simplify, SimplifyConfig):
-        rounds = joined and config.recover.schedule.round_steps > 0
         apart = {path.rpartition(".")[2] for path in preset if path.startswith("simplify.")}
         try:
             simplify.check_used(rounds=rounds, apart=apart)
@@ -100,6 +100,10 @@ def _check_used(config: Any, preset: Collection[str]) -> None:
         chosen = config.select.views_count is not None
         if config.select.policy != "auto" and not chosen and "select.policy" not in preset:
             raise InputError("has no effect without views_count", parameter="select.policy")
+        if config.select.reselect and not rounds:
+            raise InputError("has no effect on a schedule without rounds", parameter="select.reselect")
+        if config.select.focus in (None, "far") and config.select.focus_share != SelectConfig.focus_share:
+            raise InputError("has no effect without focus", parameter="select.focus_share")
         try:
             config.select.check_used(config.select.policy if chosen else "auto")
         except InputError as error:

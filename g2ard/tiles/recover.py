@@ -20,6 +20,7 @@ from g2ard.scene.splats import SH_C0, Splats
 from g2ard.scene.transform import join
 from g2ard.stages.recover import RecoverConfig, recover
 from g2ard.stages.recover.anchors import Anchors
+from g2ard.stages.recover.draw import checked_weights
 from g2ard.tiles.executor import Workers
 from g2ard.tiles.merging import TiledScene, finished, key_of
 from g2ard.tiles.sights import Surroundings, in_sight, light_of, written
@@ -82,15 +83,18 @@ class TiledScores:
 
 
 class TileTargets(TeacherRenders):
-    """Renders of the dense scene, masked to the pixels that one tile owns."""
+    """Renders of the dense scene, masked to the pixels that one tile owns.
+
+    `shown` are the indices of the given cameras that are used, because the tile owns enough of them.
+    """
 
     def __init__(
         self, teacher: Splats, own: int, cameras: Cameras, background: tuple[float, float, float]
     ) -> None:
         masks = _masks(teacher, own, cameras)
-        shown = [view for view, mask in enumerate(masks) if mask.sum() >= _FEWEST_OWNED_PIXELS]
-        self._masks = [masks[view] for view in shown]
-        super().__init__(teacher, cameras.take(shown), background=background, lazy=True)
+        self.shown = [view for view, mask in enumerate(masks) if mask.sum() >= _FEWEST_OWNED_PIXELS]
+        self._masks = [masks[view] for view in self.shown]
+        super().__init__(teacher, cameras.take(self.shown), background=background, lazy=True)
 
     def mask(self, view: int) -> NDArray[np.bool_]:
         """Return the (H, W) mask of owned pixels."""
@@ -111,7 +115,8 @@ def recover_tile(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays
 
     Args:
         arguments: `tile`; `levels`, see `g2ard.tiles.steps`; `steps`, 0 to only score; `config`, recovery's
-            constants by path; `train`, `test` and `apart`, the views of these inputs that see the tile.
+            constants by path; `train`, `test` and `apart`, the views of these inputs that see the tile;
+            `weights`, the sampling weight of each view of `train`.
         inputs: `coarse`, the output of `coarse` for each tile; `own`, for this tile; `train`, `test` and
             `apart`, cameras in world coordinates.
         places: `store`, the folder of the dense tiles; `student`, of the tiles to recover, in the same boxes.
@@ -147,6 +152,7 @@ def recover_tile(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays
         student,
         train,
         replace(config, steps=steps),
+        weights=np.array(arguments["weights"])[train.shown],
         anchors=Anchors.of(student, config.regularizers.in_plane),
         validation=apart,
         frozen=frozen,
@@ -197,12 +203,13 @@ def recover_tiles(
 
     A tile's Gaussians are trained. Those of other tiles within the margin, and coarse Gaussians of all other
     tiles, are frozen around it, so that occlusion is right. Images are cropped to the tile and masked to the
-    pixels it owns in the dense scene. A tile's share of `steps` is the share of views that see it.
+    pixels it owns in the dense scene. A tile's share of `steps` is the share of views that see it, by weight.
 
     Args:
         student: the scene to recover, in the same boxes (`ingest(…, like=store)`).
         around: placement of the dense tiles, from `simplify_tiles` with views.
-        views: views for training, for scoring, and of another kind for validation.
+        views: views for training with their sampling weights, for scoring, and of another kind for
+            validation.
         config: constants of recovery; its steps are ignored.
         steps: steps of a recovery of the whole scene; 0 only scores.
     """
@@ -214,16 +221,21 @@ def recover_tiles(
             ("apart", views.apart or views.test.take([])),
         )
     }
-    steps_a_view = steps / max(1, len(views.train.cameras))
+    count = len(views.train.cameras)
+    weights = checked_weights(views.train.weights, count)
+    weights = np.ones(count) if weights is None else weights
     tasks = []
     for tile in range(len(store.tiles)):
         seen = {name: by_tile[tile] for name, (_, by_tile) in sight.items()}
+        seen["train"] = [view for view in seen["train"] if weights[view] > 0]
+        drawn = weights[seen["train"]]
         arguments = {
             "store": store.key,
             "student": student.key,
             "tile": tile,
             "levels": around.levels[tile],
-            "steps": round(steps_a_view * len(seen["train"])),
+            "steps": round(steps / max(1, count) * float(drawn.sum())),
+            "weights": drawn.tolist(),
             "config": values_of(config),
             **seen,
         }

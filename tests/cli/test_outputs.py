@@ -3,6 +3,7 @@
 import json
 from pathlib import Path
 
+import pytest
 from PIL import Image
 
 import g2ard
@@ -35,3 +36,17 @@ def test_a_pictures_suffix_is_of_any_case(command_line: CommandLine, folder: Pat
     succeeds(command_line, folder, "render", "ball.ply", "-n", 1, "--size", 32, "--sheet", "a.PNG")
     with Image.open(folder / "a.PNG") as picture:
         assert picture.format == "PNG"
+
+
+@pytest.mark.parametrize("dry", [(), ("--dry-run",)])
+def test_a_folder_may_be_called_like_any_stand_in(
+    command_line: CommandLine, folder: Path, dry: tuple[str, ...]
+) -> None:
+    """Several budgets in one folder are rejected whatever its name; a dry run without -o has none."""
+    ask = ("distill", "ball.ply", "-n", "90,45", "--steps", "2", "--size", "48", "--views", "views.json")
+    for name in ("dry-run", "run"):
+        assert "2 budgets need {ratio} or {count}" in refused(command_line, folder, *ask, "-o", name, *dry)
+    assert {path.name for path in folder.iterdir()} == {"ball.ply", "views.json"}
+    if not dry:
+        succeeds(command_line, folder, *ask[:3], "90", *ask[4:], "-o", "dry-run")
+        assert (folder / "dry-run" / "scene.ply").is_file()

@@ -14,11 +14,17 @@ import pytest
 import g2ard
 from g2ard.config.choices import POLICIES
 from g2ard.config.paths import values_of
+from g2ard.io.types import ViewSet
+from g2ard.jobs.budget import Budget
+from g2ard.jobs.distill_options import DistillOptions
+from g2ard.jobs.tiled import distill_in_tiles, simplify_in_tiles
+from g2ard.jobs.tiling import Tiling, refuse_whole, whole_options, whole_settings
 from g2ard.pipeline.adapt import appearance_only
 from g2ard.pipeline.presets import configured
 from g2ard.scene.splats import SH_C0
 from g2ard.stages.lift import LiftConfig
 from g2ard.stages.recover.schedule import Schedule
+from g2ard.tiles.ingest import ingest
 from helpers.feature_scenes import blotched
 from helpers.photos import photographed
 from helpers.registration import off
@@ -192,16 +198,68 @@ def _registered(settings: Mapping[str, Any]) -> object:
     return [repr(replace(photo, seconds=0.0)) for photo in done.photos]
 
 
+DISTILL: dict[str, Any] = {
+    **{f"simplify.{name}": value for name, value in SIMPLIFY.items()},
+    **{f"recover.{name}": value for name, value in RECOVER.items()},
+    **{f"lift.{name}": value for name, value in LIFT.items()},
+    **{f"select.{name}": value for name, value in SELECT.items()},
+    "select.views_count": 5,
+    "select.policy": "coverage",
+    "select.weighted": False,
+    "select.reselect": True,
+    "select.focus": "near",
+    "select.focus_share": 0.25,
+}
+UNEVEN = ViewSet(VIEWS, splits=("train",) * 7 + ("test",), weights=np.arange(8.0) ** 2)
+BUDGET = 80
+
+
+FAR = {"select.focus": "far"}  # plans no views of other kinds to train on, which takes longest
+
+
+def _distilled(settings: Mapping[str, Any]) -> object:
+    settings = {**FAR, **settings}
+    return g2ard.distill(SCENE, count=BUDGET, views=UNEVEN, size=48, settings=settings).splats.fingerprint()
+
+
+@cache
+def _tiles() -> tuple[Path, Tiling]:
+    folder = Path(mkdtemp())
+    g2ard.save(folder / "scene.ply", SCENE)
+    ingest(folder / "scene.ply", folder / "tiles", tile_rows=len(SCENE) // 2)
+    return folder / "tiles", Tiling(workers=1, folder=folder / "work")
+
+
+def _simplified_in_tiles(settings: Mapping[str, Any]) -> object:
+    scene, tiling = _tiles()
+    config = configured(g2ard.SimplifyConfig(), settings=settings)
+    refuse_whole(scene, whole_settings(config))
+    budgets = [Budget(count=BUDGET)]
+    ((_, small),) = simplify_in_tiles(scene, budgets, tiling, views=UNEVEN, config=config)
+    return small.whole().fingerprint()
+
+
+def _distilled_in_tiles(settings: Mapping[str, Any]) -> object:
+    scene, tiling = _tiles()
+    options = DistillOptions(views=UNEVEN, size=48, settings={**FAR, **settings})
+    refuse_whole(scene, whole_options(options))
+    ((_, small, _, _),) = distill_in_tiles(scene, [Budget(count=BUDGET)], tiling, options)
+    return small.whole().fingerprint()
+
+
 PRIORS = ("trained", "lift", "noisy")
 RUNS: dict[str, tuple[Callable[[Mapping[str, Any]], object], dict[str, Any]]] = {
     **{method: (_simplified(method, views=VIEWS), SIMPLIFY) for method in ("default", "fast")},
     **{f"{method} blind": (_simplified(method, blind=True), SIMPLIFY) for method in ("default", "fast")},
     "paper": (_simplified("paper"), SIMPLIFY),
+    "default in tiles": (_simplified_in_tiles, SIMPLIFY),
     **{f"recover {kind}": (_recovered, RECOVER) for kind in PRIORS},
     **{policy: (_selected(policy), SELECT) for policy in POLICIES},
     "lift": (_lifted, LIFT),
     **dict.fromkeys(("adapt", "adapt paper"), (_adapted, ADAPT)),
     **dict.fromkeys(("register sift", "register direct"), (_registered, REGISTER)),
+    "distill": (_distilled, DISTILL),
+    "distill in tiles": (_distilled_in_tiles, DISTILL),
 }
 RECOVERY: dict[str, Any] = {"steps": 6, "regularizers.period": 1, "regularizers.shape": 1.0}
 RECOVERY_BESIDE: dict[str, dict[str, Any]] = {
@@ -218,6 +276,15 @@ BESIDE: dict[str, dict[str, Any]] = {
     "adapt paper: schedule": {"schedule": "default"},
     "register sift": {"matcher": "sift", "size": 160, "align_size": 96},
     "register direct": {"matcher": "direct", "size": 160, "align_size": 128},
+    **{
+        f"{run}{of}": {f"recover.{name}": value for name, value in beside.items()}
+        for run in ("distill", "distill in tiles")
+        for of, beside in {
+            "": {**RECOVERY, "regularizers": "trained", "schedule.guarded": False},
+            **{f": recover.{name}": beside for name, beside in RECOVERY_BESIDE.items()},
+            ": recover.schedule.guarded": {**RECOVERY_BESIDE["schedule.guarded"], "schedule.guarded": True},
+        }.items()
+    },
     "paper: max_energy": {"color_bin": 1.0},
     "paper: protection": {"flag_threshold": 0.1},
 }
@@ -242,8 +309,8 @@ def test_a_setting_changes_the_result_or_is_refused(run: str, setting: str) -> N
         result = function({**_beside(run, setting), setting: table[setting]})
     except g2ard.InputError as error:
         result = str(error)
-    if isinstance(result, str) and setting in result:
-        assert re.search("has no effect|needs views", result)
+    if isinstance(result, str) and setting.rpartition(".")[2] in result.replace("-", "_"):
+        assert re.search("has no effect|needs views|needs? the whole scene in memory", result)
     else:
         assert result != _usual(run, setting if f"{run}: {setting}" in BESIDE else "")
 
@@ -270,24 +337,24 @@ def test_values_of_a_preset_may_have_no_effect() -> None:
         configured(g2ard.SimplifyConfig(), "paper", {"method": "fast", "fold": 0.5})
 
 
+_BESIDES = "method engine matcher schedule.steps schedule.round_steps schedule.means_in_scales"
+"""Settings that choose a run, or that only its schedule sets."""
+
+
 def test_the_tables_hold_every_setting() -> None:
-    for config, table in (
-        (g2ard.SimplifyConfig(), SIMPLIFY),
-        (g2ard.RecoverConfig(), RECOVER),
-        (g2ard.CoverageOptions(), SELECT),
-        (LiftConfig(), LIFT),
-        (g2ard.AdaptConfig(), ADAPT),
-        (g2ard.RegisterConfig(), REGISTER),
+    for root, config, table in (
+        ("simplify.", g2ard.SimplifyConfig(), SIMPLIFY),
+        ("recover.", g2ard.RecoverConfig(), RECOVER),
+        ("select.", g2ard.CoverageOptions(), SELECT),
+        ("lift.", LiftConfig(), LIFT),
+        ("adapt.", g2ard.AdaptConfig(), ADAPT),
+        ("register.", g2ard.RegisterConfig(), REGISTER),
+        ("", g2ard.DistillConfig(), DISTILL),
     ):
-        named = {path.partition(".")[2] for path in values_of(config)}
-        assert named - {
-            "method",
-            "engine",
-            "matcher",
-            "schedule.steps",
-            "schedule.round_steps",
-            "schedule.means_in_scales",
-        } == set(table)
+        besides = tuple(f".{name}" for name in _BESIDES.split())
+        named = {path for path in values_of(config) if not path.endswith(besides)}
+        named = {f"{root}{path.partition('.')[2]}" for path in named} if root else named
+        assert named == {f"{root}{name}" for name in table}
 
 
 def test_given_weights_of_regularisers_are_used() -> None:

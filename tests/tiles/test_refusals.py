@@ -36,7 +36,8 @@ _DISTILL = ("distill", "-r", "10", "-o", "x", "--views", "views.json")
         (_DISTILL, "--photos", "--photos"),
         (_DISTILL, "--set views_count=10", "--set select.views_count"),
         (_DISTILL, "--clean", "--clean"),
-        (_DISTILL, "--set reselect=true", "--set select.reselect"),
+        (_SIMPLIFY, "--set morton_premerge_steps=3", "--set simplify.morton_premerge_steps"),
+        (_DISTILL, "--set morton_premerge_steps=3", "--set simplify.morton_premerge_steps"),
         (_DISTILL, "--recovery-time 5m", "--recovery-time"),
         (_DISTILL, "--dry-run", "--dry-run"),
         (_DISTILL, "--keep", "--keep"),
@@ -52,6 +53,15 @@ def test_options_that_need_one_piece_are_named_as_typed(
     end = "but it is processed in tiles; use --tile-rows 3,000 for one piece"
     assert told == f"g2ard: town.ply: {named} needs the whole scene in memory, {end}\n"
     assert not (folder / "x").exists()
+
+
+@pytest.mark.parametrize("rows", [(), ("--tile-rows", "1500")])
+def test_a_trained_scene_is_not_lifted(
+    command_line: CommandLine, folder: Path, rows: tuple[str, ...]
+) -> None:
+    told = refused(command_line, folder, *_DISTILL, "town.ply", "--set", "lift.spread=2", *rows, status=1)
+    assert "lift.spread: has no effect on a trained scene" in told
+    assert {path.name for path in folder.iterdir()} == {"town.ply", "views.json", "tiles"}
 
 
 def test_several_whole_options_are_named_together(command_line: CommandLine, folder: Path) -> None:

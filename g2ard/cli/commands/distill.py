@@ -124,7 +124,7 @@ def distill(
     if scene is None or photos:
         run.refuse_typed("without generated views", "up")
     opt.choose_engine(run, settings, "recover.engine")
-    if output == opt.UNWRITTEN and len(budgets) > 1:
+    if opt.is_unnamed(run, output) and len(budgets) > 1:
         output = Path("{count}")
 
     def folder_at(path: Path) -> RunFolder:
@@ -203,7 +203,7 @@ def _tell_estimates(run: Run, job: DistillJob, folders: Sequence[RunFolder]) -> 
         one = estimate(job, budget, page=run.config["view"])
         parts = ", ".join(f"{stage} {_rounded(seconds)} s" for stage, seconds in one.seconds.items())
         about = f"about {max(1, one.total):.0f} s ({parts}) and {one.bytes / 1e6:,.0f} MB"
-        place = "" if folder.path == opt.UNWRITTEN else f"{folder.path}: "
+        place = "" if opt.is_unnamed(run, folder.path) else f"{folder.path}: "
         run.answer(
             f"{place}{plural(budget, 'Gaussian')}, {plural(one.views, 'target image')} "
             f"of {one.pixels:,} pixels, {plural(one.steps, 'step')}: {about}"

@@ -141,10 +141,11 @@ def _refuse_whole(
     scene: Path, budgets: Sequence[Budget], config: SimplifyConfig, preset: str | None, parents: Path | None
 ) -> None:
     """Reject options that a scene in tiles does not support."""
-    from g2ard.jobs.tiling import refuse_whole, whole_budgets, whole_method
+    from g2ard.jobs.tiling import refuse_whole, whole_budgets, whole_method, whole_settings
 
     rows = ["--parents"] if parents else []
-    refuse_whole(scene, [*whole_method(config.method, preset), *rows, *whole_budgets(budgets)])
+    settings = whole_settings(config)
+    refuse_whole(scene, [*whole_method(config.method, preset), *rows, *whole_budgets(budgets), *settings])
 
 
 def _report(
