@@ -11,6 +11,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from benchmarks.baselines import mcmc
 from benchmarks.rows import Row
 from benchmarks.runner import Cell
 from benchmarks.score import figures, score
@@ -47,12 +48,14 @@ class Variant:
         preset: preset of a whole distillation, from selection on; None only recovers, from a simplification
             that all such variants share.
         settings: settings of the distillation by full path. Without `recover.steps`, the study's are taken.
+        retrains: whether to train anew by gsplat's MCMC instead, from points of the prior.
     """
 
     name: str
     each: bool = key(False)
     preset: str | None = key(None, choices=tuple(PRESETS))
     settings: Mapping[str, Any] = key({})
+    retrains: bool = key(False)
 
 
 @dataclass(frozen=True)
@@ -197,6 +200,8 @@ class _Run:
         self.found: list[Row] = []
         self.before = self.now = 0.0  # seconds of finished recoveries and of the current one
         self.cpu = 0.0
+        if self.variant.retrains:
+            return self._retrained()
         alone = self.variant.preset is None and not self.rounds
         done, started, reports, simplify_s = (self._recovered if alone else self._distilled)()
         self._count_cpu()
@@ -210,6 +215,25 @@ class _Run:
             "skipped": sum(report.skipped["non_finite"] for report in reports),
         }
         return [*self.found, *({**row, **end} for row in self._looks(done, steps, spent, 1))]
+
+    def _retrained(self) -> list[Row]:
+        """Train anew; return a row per score and kind of views."""
+        place = self.place
+        targets, colour = place.train_targets, place.scene.background
+        self.cpu_began = time.process_time()
+        done, seconds = mcmc.train(
+            place.splats,
+            self.budget,
+            targets,
+            self.steps,
+            engine=place.study.engine,
+            background=colour,
+            seed=self.seed,
+            watch=self._watch,
+        )
+        self._count_cpu()
+        _check_finite(done, [])
+        return [*self.found, *self._looks(done, self.steps, seconds, 1)]
 
     def _recovered(self) -> tuple[Splats, Splats, list[RecoverReport], float]:
         """Recover once; return the scene, its start, the report and the seconds of simplification."""

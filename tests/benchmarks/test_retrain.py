@@ -1,0 +1,175 @@
+"""Training anew by MCMC: over g2ard's rasteriser, and over stand-ins for gsplat."""
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, ClassVar
+
+import numpy as np
+import pytest
+import torch
+
+from benchmarks.baselines import mcmc
+from g2ard.errors import InputError
+from g2ard.rendering import cuda
+from g2ard.rendering.targets import TeacherRenders
+from g2ard.scene.transform import transform
+from g2ard.stages.evaluate import evaluate
+from helpers.scenes import around, checkered_ball
+from helpers.studies import ball_of, measured
+from reference import raster as reference
+
+BALL, VIEWS = checkered_ball(400), around(6, (24, 18))
+TARGETS = TeacherRenders(BALL, VIEWS)
+
+
+class Strategy:
+    """Stand-in for gsplat's MCMCStrategy that records its calls; its noise has the covariance's units."""
+
+    made: ClassVar[list["Strategy"]] = []
+
+    def __init__(self, cap_max: int, refine_stop_iter: int, **others: float) -> None:
+        assert set(others) <= {"noise_lr", "refine_start_iter", "refine_every", "min_opacity"}
+        self.cap_max, self.refine_stop_iter = cap_max, refine_stop_iter
+        self.rates: list[float] = []
+        Strategy.made.append(self)
+
+    def check_sanity(self, params: Any, optimizers: dict[str, torch.optim.Optimizer]) -> None:
+        assert set(params.keys()) == set(optimizers) >= {"means", "scales", "quats", "opacities"}
+        for name, optimizer in optimizers.items():
+            (group,) = optimizer.param_groups
+            (parameter,) = group["params"]
+            assert parameter is params[name]
+
+    def initialize_state(self) -> dict[str, Any]:
+        return {"steps": []}
+
+    def step_post_backward(
+        self, params: Any, optimizers: Any, state: dict[str, Any], step: int, info: Any, lr: float
+    ) -> None:
+        state["steps"].append(step)
+        assert state["steps"] == list(range(step + 1))
+        assert len(params["means"]) <= self.cap_max
+        assert all(parameter.grad is None for parameter in params.values())
+        self.rates.append(lr)
+        with torch.no_grad():
+            params["means"] += 5e5 * lr * 1e-3 * (2 * params["scales"]).exp()
+
+
+def oracle(**given: Any) -> tuple[torch.Tensor, None, None]:
+    """Render gsplat's documented arguments with the naive oracle."""
+    out = reference.render(
+        *(given[k].double() for k in ("means", "quats")),
+        given["scales"].double().log(),
+        torch.logit(given["opacities"].double()),
+        given["colors"][:, :1].double(),
+        given["colors"][:, 1:].double(),
+        viewmat=given["viewmats"][0].double(),
+        K=given["Ks"][0].double(),
+        width=given["width"],
+        height=given["height"],
+        background=tuple(given["backgrounds"][0].tolist()),
+    )
+    return out.image[None].float(), None, None
+
+
+@pytest.fixture
+def gsplat(monkeypatch: pytest.MonkeyPatch) -> list[Strategy]:
+    monkeypatch.setitem(sys.modules, "gsplat", SimpleNamespace(rasterization=oracle, MCMCStrategy=Strategy))
+    monkeypatch.setattr(cuda, "check_cuda", lambda: None)
+    monkeypatch.setattr(cuda, "DEVICE", "cpu")
+    monkeypatch.setattr(Strategy, "made", [])
+    return Strategy.made
+
+
+def test_the_study_scores_training_like_recovery(tmp_path: Path) -> None:
+    options = {"ratios": "10", "steps": "30", "protocol": "pool", "size": "40"}
+    rows = measured("retrain", ball_of(tmp_path, 400), tmp_path / "run", **options)
+    assert [row.get("error") for row in rows if row["variant"] == "g2ard"][-1] is None
+    trained = [row for row in rows if row["variant"] == "mcmc@30"]
+    assert [(row["step"], row["count"], row["final"]) for row in trained] == [(25, 40, 0), (30, 40, 1)]
+    assert 0 < trained[0]["seconds"] <= trained[1]["seconds"]
+
+
+def test_gsplat_is_called_as_documented(gsplat: list[Strategy]) -> None:
+    """With the same noise and without relocation, the rasteriser is the only difference."""
+    first, _ = mcmc.train(BALL, 30, TARGETS, 1, engine="gsplat")
+    done, seconds = mcmc.train(BALL, 30, TARGETS, 18, engine="gsplat")
+    assert (gsplat[-1].cap_max, gsplat[-1].refine_stop_iter) == (30, 15)
+    assert (len(done), done.sh_degree) == (30, 3)
+    assert seconds > 0
+    assert evaluate(done, TARGETS).psnr > evaluate(first, TARGETS).psnr
+    rates = gsplat[-1].rates
+    assert rates[-1] == pytest.approx(0.01 * 1.76e-4)
+    assert np.allclose(np.diff(np.log(rates)), np.log(0.01) / 18)
+
+
+def test_both_rasterisers_train_alike(gsplat: list[Strategy], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(mcmc, "_strategy", lambda gpu, count, last: Strategy(count, last))
+    a, b = (mcmc.train(BALL, 30, TARGETS, 3, engine=engine)[0] for engine in ("fused", "gsplat"))
+    np.testing.assert_allclose(a.means, b.means, atol=1e-4)
+    np.testing.assert_allclose(a.sh0, b.sh0, atol=1e-3)
+
+
+@pytest.mark.parametrize("copies", [1, 2, 3, 7, 51])
+@pytest.mark.parametrize("opacity", [0.01, 0.3, 0.9, 0.999])
+def test_relocated_copies_take_the_light_of_one(copies: int, opacity: float) -> None:
+    """One behind another, they absorb at the centre and summed over a line what the one did."""
+    table = mcmc._Strategy(0).initialize_state()["coefficients"]
+    found, shrink = mcmc.relocated(torch.tensor([opacity]), torch.tensor([copies]), table)
+    x = np.linspace(-12, 12, 20_001)
+    one = opacity * np.exp(-(x**2) / 2)
+    many = 1 - (1 - found.item() * np.exp(-((x / shrink.item()) ** 2) / 2)) ** copies
+    assert many.max() == pytest.approx(opacity, rel=1e-5)
+    assert many.sum() == pytest.approx(one.sum(), rel=1e-3)
+
+
+def test_dead_gaussians_move_onto_living_ones() -> None:
+    start = {"opacities": torch.tensor([-9.0, 2.0, -9.0]), "scales": torch.zeros(3, 3), "means": torch.eye(3)}
+    values = torch.nn.ParameterDict({name: torch.nn.Parameter(value) for name, value in start.items()})
+    optimizers = {name: torch.optim.Adam([value]) for name, value in values.items()}
+    sum(value.sum() for value in values.values()).backward()
+    for optimizer in optimizers.values():
+        optimizer.step()
+    strategy = mcmc._Strategy(9999)
+    with torch.no_grad():
+        mcmc._relocate(values, optimizers, strategy.initialize_state()["coefficients"])
+        assert values["means"].detach().numpy().tolist() == [values["means"][1].tolist()] * 3
+    assert torch.all(values["opacities"] == values["opacities"][0])
+    moments = optimizers["means"].state[values["means"]]["exp_avg"]
+    assert moments[1].abs().sum() == 0
+    assert moments[0].abs().sum() > 0
+
+
+class Fixed(TeacherRenders):
+    """Targets of other cameras with the images of `TARGETS`."""
+
+    def __getitem__(self, view: int) -> Any:
+        return TARGETS[view]
+
+
+@pytest.mark.parametrize("engine", ["fused", "gsplat"])
+@pytest.mark.parametrize(("scale", "shift"), [(8.0, (40.0, -24.0, 16.0)), (1 / 64, (0.0, 1.0, 0.0))])
+def test_it_is_the_same_at_any_place_and_scale(
+    gsplat: list[Strategy], scale: float, shift: tuple[float, float, float], engine: str
+) -> None:
+    """Rates, noise and weights of MCMC are for cameras within a unit sphere."""
+    world = np.diag([scale, scale, scale, 1.0])
+    world[:3, 3] = shift
+    viewmats = VIEWS.viewmats.copy()
+    viewmats[:, :3, 3] = scale * viewmats[:, :3, 3] - viewmats[:, :3, :3] @ world[:3, 3]
+    there = transform(BALL, world)
+    here, _ = mcmc.train(BALL, 30, TARGETS, 4, engine=engine)
+    done, _ = mcmc.train(there, 30, Fixed(there, replace(VIEWS, viewmats=viewmats)), 4, engine=engine)
+    expected = scale * here.means.astype(np.float64) + world[:3, 3]
+    np.testing.assert_allclose(done.means + done.offset, expected, rtol=0, atol=1e-3 * scale)
+    np.testing.assert_allclose(done.scales, scale * here.scales, rtol=1e-3)
+
+
+def test_the_start_is_points_and_colours_alone() -> None:
+    wild = replace(BALL, scales=BALL.scales * 3, logit_opacities=BALL.logit_opacities - 2)
+    a, b = (mcmc.train(scene, 50, TARGETS, 2)[0] for scene in (BALL, wild))
+    np.testing.assert_array_equal(a.means, b.means)
+    with pytest.raises(InputError, match="count: expected 1 to 400"):
+        mcmc.train(BALL, 401, TARGETS, 2)
