@@ -6,8 +6,10 @@ import io
 import os
 import subprocess
 import sys
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 from unittest.mock import patch
 
 import pytest
@@ -19,6 +21,25 @@ from helpers.project import environment
 from helpers.scenes import around, checkered_ball
 
 Said = tuple[int, str, str]
+
+
+def pytest_terminal_summary(terminalreporter: Any) -> None:
+    """Count the skipped tests by reason. `.ci/run` repeats these lines at its end."""
+    stats = terminalreporter.stats
+    tests = sum(
+        len(stats.get(kind, [])) for kind in ("passed", "failed", "skipped", "error", "xfailed", "xpassed")
+    )
+    reasons = Counter(_reason(report) for report in stats.get("skipped", []))
+    terminalreporter.line("")
+    terminalreporter.line(f"skipped: {reasons.total():,} of {tests:,} tests")
+    for reason, count in sorted(reasons.items(), key=lambda item: (-item[1], item[0])):
+        terminalreporter.line(f"skipped: {count:5,} {reason}")
+
+
+def _reason(report: pytest.TestReport | pytest.CollectReport) -> str:
+    told = report.longrepr[2] if isinstance(report.longrepr, tuple) else str(report.longrepr)
+    return " ".join(told.removeprefix("Skipped: ").split()) or "no reason"
+
 
 os.environ.pop(
     "CI", None

@@ -1,24 +1,21 @@
 """Report pages: what the page of a run says, and that pages work in a browser."""
 
 import re
-import shutil
 import subprocess
 from pathlib import Path
 
 import numpy as np
-import pytest
 
 from g2ard.report.distilled import _worst, verdict
 from g2ard.report.kinds import by_kind
 from g2ard.report.page import Comparison, Page, Shown
+from helpers.browser import chromium
 from helpers.commands import CommandLine, succeeds
 from helpers.studies import check_page, study
 
 
 def test_the_page_works_in_a_browser(tmp_path: Path) -> None:
-    browser = shutil.which("chromium") or shutil.which("google-chrome")
-    if browser is None:
-        pytest.skip("no chromium on PATH")
+    browser = chromium()
     page = Page("A page")
     target = np.zeros((30, 40, 3), np.uint8)
     shown = [Shown(name, np.full_like(target, shade), "9 dB") for name, shade in (("one", 90), ("two", 200))]
