@@ -25,6 +25,7 @@ NOT_RUN = {
     r"make \S+.*": "builds or measures for minutes; tests/test_docs.py knows the targets",
     r"rustup target add .*": "downloads a toolchain",
     r"colmap .*": "another program",
+    r"\.venv/bin/python tests/goldens\.py .*": "takes minutes; tests/test_goldens.py runs a slice",
     r"python -m http\.server .*": "a server that does not end",
     r"dask (scheduler|worker)\b.*": "a server that does not end; tests/tiles starts one",
     r"python -m benchmarks synth .*": "takes a minute; tests/benchmarks/test_synth.py makes a small one",
