@@ -14,14 +14,14 @@ pub struct Rules {
     pub root: f64,
 }
 
-/// IEEE arithmetic.
+/// IEEE arithmetic, as on lavapipe.
 pub const EXACT: Rules = Rules {
     flush: false,
     quotient: 0.5,
     root: 0.5,
 };
 
-/// Lavapipe on x86: IEEE arithmetic without subnormals.
+/// IEEE arithmetic without subnormals.
 pub const FLUSHED: Rules = Rules {
     flush: true,
     ..EXACT
