@@ -9,6 +9,7 @@ from __future__ import annotations
 import inspect
 import json
 import os
+import re
 import traceback
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -337,8 +338,11 @@ class Run:
     def spare_inputs(self, *outputs: Path, flag: str = "--output") -> None:
         """Raise a usage error if an output is also an input, even with --overwrite."""
         taken = {real_path(place) for path in self._inputs for place in (path, run_scene(path))}
+        folders = {place for place in taken if place.is_dir()}
         for output in outputs:
-            if real_path(output) in taken:
+            place = real_path(output)
+            inside = _DATA_FILES.fullmatch(place.name) and not folders.isdisjoint(place.parents)
+            if place in taken or (inside and place.exists()):
                 raise typer.BadParameter(
                     f"{flag}: {output} is both an input and the output; name another output"
                 )
@@ -361,6 +365,12 @@ class Run:
         """Exit with status 3: outputs are written, but a requirement is not met."""
         self.console.error(requirement)
         raise typer.Exit(3)
+
+
+_DATA_FILES = re.compile(
+    r"(cameras|images|points3D|frames|rigs)\.(txt|bin)|(cameras|transforms.*|(lod-)?meta|tiles)\.json|poses_bounds\.npy"
+)
+"""Files that commands read in a folder given to them."""
 
 
 def _flat(value: Any) -> Any:

@@ -63,7 +63,7 @@ REDUCE = "simplify ball.ply --no-views"
         "clean sky.ply --dry-run --preview c.png --json c.png",
         "render ball.ply --views views.json -o c --sheet c/view_003.png",
         "render ball.ply --views views.json -o c --depth --json c/view_003.depth.npy",
-        "poses ball.ply -n 4 -o model --json model/cameras.bin",
+        "poses ball.ply -n 4 -o model --json model/sparse/0/cameras.txt",
         "register ball.ply --photos photos.json --matcher direct -o poses.json --report a.html --json a.html",
         pytest.param(f"{REDUCE} -r 8 -o c.ply --json link", marks=needs_links),
         pytest.param(f"{REDUCE} -r 8 -o linked/c.ply --json c.ply", marks=needs_links),
@@ -79,6 +79,31 @@ def test_two_options_with_one_path_are_refused(
     before = contents(folder)
     status, _, error = command_line(*command.split(), "-w", cwd=folder)
     assert (status, " is written by " in error.splitlines()[-1]) == (2, True), error
+    assert contents(folder) == before
+
+
+@pytest.mark.parametrize(
+    ("made", "command"),
+    [
+        ("convert ball.ply c/meta.json", "convert c -o c/meta.json"),
+        (
+            "ingest ball.ply --tile-rows 150 -o c",
+            f"{REDUCE.replace('ball.ply', 'c')} -r 8 -o a.ply --json c/tiles.json",
+        ),
+        ("poses ball.ply -n 4 -o c", "select ball.ply --views c -k 2 -o a.json --json c/sparse/0/images.txt"),
+        (
+            "poses ball.ply -n 4 -o c/transforms.json",
+            "render ball.ply --views c -o a --json c/transforms.json",
+        ),
+    ],
+)
+def test_a_file_in_an_input_folder_is_kept(
+    made: str, command: str, inputs: Path, tmp_path: Path, command_line: CommandLine
+) -> None:
+    folder = shutil.copytree(inputs, tmp_path / "a")
+    succeeds(command_line, folder, *made.split())
+    before = contents(folder)
+    assert "is both an input and the output" in refused(command_line, folder, *command.split(), "-w")
     assert contents(folder) == before
 
 
