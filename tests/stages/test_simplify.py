@@ -11,7 +11,7 @@ from g2ard.errors import InputError
 from g2ard.scene.splats import ARRAYS, Splats
 from g2ard.stages.simplify import SimplifyConfig, round_counts, simplify
 from helpers.scenes import assert_same_bits
-from helpers.simplify_cases import all_alike, assert_sound, scene
+from helpers.simplify_cases import Views, all_alike, assert_sound, scene
 from helpers.threads import on_threads
 
 
@@ -83,6 +83,8 @@ def odd_scenes():
     huge = base.scales.astype(np.float64)
     huge[5] = np.exp(43)  # files' clamp of e^100
     logits = np.where(rng.random(500) < 0.5, 1e4, -1e4)
+    points, dots, most = (base.scales.copy() for _ in range(3))
+    points[:], dots[:], most[rng.random(500) < 0.6] = 0, np.exp(-30), np.exp(-30)
     endless = np.where(np.arange(500) % 3 == 0, np.inf, np.where(np.arange(500) % 3 == 1, -np.inf, 0.3))
     return {
         "identical": base.take(one),
@@ -94,19 +96,31 @@ def odd_scenes():
         "tiny": replace(base, scales=scales),
         "huge": replace(base, scales=huge.astype(np.float32)),
         "too large to square": replace(base, scales=np.full((500, 3), 1e30, np.float32)),
+        "points of size zero": replace(base, scales=points),
+        "points": replace(base, scales=dots),
+        "mostly points": replace(base, scales=most),
+        "spread out": replace(base, means=1e11 * base.means),
+        "as far as float32 goes": replace(base, means=np.float32(8e37) * base.means),
         "logits": replace(base, logit_opacities=logits.astype(np.float32)),
         "infinite": replace(base, logit_opacities=endless.astype(np.float32)),
         "transparent": replace(base, logit_opacities=np.full(500, -np.inf, np.float32)),
     }
 
 
+def near_and_far(splats):
+    """Visibility from views whose pixels have very different sizes."""
+    rows = np.arange(len(splats))
+    return Views(np.where(rows % 5, 1.0, 1e30), np.choose(rows % 4, [0.01, 1e-30, 1e30, np.inf]))
+
+
 @pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("seen", [None, near_and_far], ids=["unseen", "seen"])
 @pytest.mark.parametrize("name", odd_scenes())
-def test_odd_scenes(method, name):
+def test_odd_scenes(method, seen, name):
     prior = odd_scenes()[name]
     for budget in {1, max(1, len(prior) // 10), len(prior)}:
-        out = simplify(prior, budget, method=method)
-        assert_sound(out, len(prior), budget)
+        out = simplify(prior, budget, method=method, visibility=seen)
+        assert_sound(out, len(prior), budget, least=0 if name == "points of size zero" else 1e-45)
         infinite = int(np.isinf(prior.logit_opacities).sum())
         assert out.report.infinite_logits == infinite
 

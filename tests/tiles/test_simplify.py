@@ -6,6 +6,7 @@ import signal
 import threading
 import time
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -121,6 +122,24 @@ def test_exact_count_and_quality(store: TileStore, scene: Path, tmp_path: Path, 
     targets = TeacherRenders(dense, ring(5))
     tiled_db, whole_db = (evaluate(splats, targets).psnr for splats in (small, whole))
     assert tiled_db > whole_db - 0.4  # tiles of 2,300 rows have many borders
+
+
+@pytest.mark.parametrize(
+    ("log_scale", "share", "spread"), [(-np.inf, 1, 1), (-30, 1, 1), (-30, 0.6, 1), (0, 0, 1e11)]
+)
+@pytest.mark.parametrize("blind", [False, True])
+def test_sizes_and_spreads_of_any_magnitude(
+    tmp_path: Path, log_scale: float, share: float, spread: float, blind: bool
+) -> None:
+    scene = town(3000)
+    scales = scene.scales.copy()
+    scales[np.random.default_rng(5).random(len(scene)) < share] = np.exp(log_scale)
+    scene = replace(scene, scales=scales, means=(spread * scene.means).astype(np.float32))
+    write_splats(tmp_path / "scene.ply", scene)
+    tiles = ingest(tmp_path / "scene.ply", tmp_path / "tiles", tile_rows=1000)
+    small = reduced(tiles, tmp_path / "work", 300, views=None if blind else ring())
+    assert len(small) == 300
+    assert small.finite_rows().all()
 
 
 def test_tiles_that_no_view_sees_keep_their_share(store: TileStore, tmp_path: Path) -> None:

@@ -24,6 +24,9 @@ pub enum Error {
         count: usize,
         first_index: usize,
     },
+    /// A loop would never end: what should hold of its input does not.
+    #[error("{0}: this is a bug in g2ard")]
+    Stuck(&'static str),
     /// The caller asked to stop (see [`crate::Control`]).
     #[error("interrupted")]
     Interrupted,

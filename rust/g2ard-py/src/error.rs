@@ -5,13 +5,15 @@ use pyo3::exceptions::{PyKeyboardInterrupt, PyRuntimeError};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 
-/// `InvalidInput` and `NonFinite` → `g2ard.errors.InputError`; `Interrupted` → `KeyboardInterrupt`.
+/// `InvalidInput` and `NonFinite` → `g2ard.errors.InputError`; `Interrupted` → `KeyboardInterrupt`; others →
+/// `RuntimeError`.
 pub fn to_py(error: Error) -> PyErr {
     if error == Error::Interrupted {
         return PyKeyboardInterrupt::new_err(());
     }
     Python::attach(|py| {
-        input_error(py, &error).unwrap_or_else(|_| PyRuntimeError::new_err(error.to_string()))
+        let input = input_error(py, &error).ok().flatten();
+        input.unwrap_or_else(|| PyRuntimeError::new_err(error.to_string()))
     })
 }
 
@@ -25,7 +27,7 @@ pub fn invalid(
 }
 
 /// An `InputError` whose `parameter` is the field at fault, and whose `index` its first row that is not finite.
-fn input_error(py: Python<'_>, error: &Error) -> PyResult<PyErr> {
+fn input_error(py: Python<'_>, error: &Error) -> PyResult<Option<PyErr>> {
     let fields = PyDict::new(py);
     let message = match error {
         Error::InvalidInput {
@@ -45,8 +47,10 @@ fn input_error(py: Python<'_>, error: &Error) -> PyResult<PyErr> {
             fields.set_item("index", first_index)?;
             format!("is the first of {count} with a non-finite value")
         }
-        Error::Interrupted => error.to_string(),
+        Error::Stuck(_) | Error::Interrupted => return Ok(None),
     };
     let class = py.import("g2ard.errors")?.getattr("InputError")?;
-    Ok(PyErr::from_value(class.call((message,), Some(&fields))?))
+    Ok(Some(PyErr::from_value(
+        class.call((message,), Some(&fields))?,
+    )))
 }

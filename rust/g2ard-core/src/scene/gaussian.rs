@@ -41,6 +41,11 @@ impl Gaussian {
         }
     }
 
+    /// Scales as f32, finite.
+    pub fn stored_scales(&self) -> [f32; 3] {
+        self.scales.map(|v| v.min(f64::from(f32::MAX)) as f32)
+    }
+
     pub fn quat(&self) -> [f32; 4] {
         quat_from_rotation(&self.rotation).map(|v| v as f32)
     }

@@ -6,6 +6,7 @@ mod ordered;
 
 pub use gaussian::Gaussian;
 pub use ordered::Ordered;
+pub(crate) use ordered::power_of_two_below;
 
 use std::cmp::Ordering;
 

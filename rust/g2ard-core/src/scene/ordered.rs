@@ -118,7 +118,8 @@ impl Ordered {
     }
 }
 
-fn power_of_two_below(x: f64) -> f64 {
+/// The power of two at or below a positive number; 0 for 0.
+pub fn power_of_two_below(x: f64) -> f64 {
     f64::from_bits(x.to_bits() & (0x7ff << 52))
 }
 

@@ -139,7 +139,7 @@ fn make(scene: &SceneRef, ordered: &Ordered, members: &[u32], growth: f64, blur:
     Made {
         mean: ordered.on_grid(mean),
         quat: gaussian.quat(),
-        scales: gaussian.scales.map(|v| v as f32),
+        scales: gaussian.stored_scales(),
         logit: logit_of(alpha.min(MAX_OPACITY)),
         weights: parts.iter().map(|p| p.0 / total).collect(),
         clamped: alpha > MAX_OPACITY,

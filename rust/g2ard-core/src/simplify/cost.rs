@@ -382,6 +382,43 @@ mod tests {
     }
 
     #[test]
+    fn light_is_not_spread_too_thin_to_be_drawn() {
+        let (mut kept, mut lost) = ([0; 2], [0; 2]);
+        for (p, q) in [
+            (0.5, 0.5),
+            (0.02, 0.001),
+            (0.001, 0.02),
+            (0.0035, 0.0035),
+            (MIN_ALPHA, 0.001),
+        ] {
+            for step in 0..60 {
+                let node = |x: f32, alpha: f32| {
+                    let mut node = Node {
+                        mean: [x, 0.0, 0.0],
+                        cov: [1.0, 0.0, 0.0, 1.0, 0.0, 1.0],
+                        blur: 0.1,
+                        alpha,
+                        ..Node::default()
+                    }
+                    .weighed();
+                    node.visibility = node.mass;
+                    node
+                };
+                let (a, b) = (node(0.0, p), node(1.3f32.powi(step) - 1.0, q));
+                let shown = p.max(q) >= MIN_ALPHA;
+                let fades = shown && a.merged(&b).alpha < MIN_ALPHA;
+                let cost = a.cost(&b, 0.1, 0.03);
+                assert_eq!(cost == f32::MAX, fades, "{p} {q} {step}: {cost}");
+                [&mut kept, &mut lost][usize::from(fades)][usize::from(shown)] += 1;
+            }
+        }
+        assert!(
+            kept[0] >= 60 && kept[1] > 30 && lost[1] > 30,
+            "{kept:?} {lost:?}"
+        );
+    }
+
+    #[test]
     fn color_distance_is_the_mean_over_directions() {
         let (a, b): (Vec<f32>, Vec<f32>) = (0..27).map(|i| (i as f32, i as f32 * 0.5)).unzip();
         let want: f32 = a

@@ -9,14 +9,19 @@ use super::moments::sigmoid;
 use super::pairwise::Visibility;
 use super::rows::Rows;
 use super::tile::Frame;
-use crate::scene::{Ordered, SceneRef};
+use crate::linalg::sub;
+use crate::scene::{Ordered, SceneRef, power_of_two_below};
 
 /// Gaussians that a few views do not see keep this share of their mass, because other views will see some of them.
 const UNSEEN: f32 = 0.2;
 
-/// Largest scale and coordinate in typical sizes: beyond, f32 products of four of them would overflow.
+/// Largest scale in units.
 const MAX_SCALE: f64 = 1e6;
-const MAX_COORDINATE: f64 = 1e15;
+/// Largest coordinate, and deviation of the dilation, in units. A cost multiplies four lengths, each at most a few times
+/// as large, so everything it forms is finite.
+const MAX_LENGTH: f64 = (1 << 29) as f64;
+/// Largest Σ αT² of a row: all 2³² rows together stay within f32.
+const MAX_VISIBILITY: f32 = f32::MAX / (1u64 << 32) as f32;
 
 /// Rows of the scene. At 13 million their nodes would take more than the scene itself.
 pub struct Leaves<'a> {
@@ -51,7 +56,7 @@ impl<'a> Leaves<'a> {
             kept,
             blur,
             visibility,
-            unit: frame.map_or_else(|| typical_size(scene), |f| f.unit),
+            unit: frame.map_or_else(|| unit(scene, ordered, blur), |f| f.unit),
             floor: frame.map_or(0.0, |f| f.floor),
             importance: frame.map_or_else(Importance::default, |f| f.importance),
         };
@@ -131,19 +136,21 @@ impl Rows for Leaves<'_> {
         let row = self.ordered.rows[at] as usize;
         let mut g = self.ordered.gaussian(self.scene, row);
         g.scales = g.scales.map(|s| (s / self.unit).min(MAX_SCALE));
-        let coordinate = |v: f64| (v / self.unit).clamp(-MAX_COORDINATE, MAX_COORDINATE) as f32;
+        let coordinate = |v: f64| (v / self.unit).clamp(-MAX_LENGTH, MAX_LENGTH) as f32;
+        let blur = f64::from(self.blur[at]) / (self.unit * self.unit);
         let mut node = Node {
             mean: g.mean.map(coordinate),
             cov: g.covariance().map(|v| v as f32),
-            blur: (f64::from(self.blur[at]) / (self.unit * self.unit)) as f32,
+            blur: blur.min(MAX_LENGTH * MAX_LENGTH) as f32,
             alpha: (sigmoid(f64::from(self.scene.logit(row))) as f32).min(MAX_ALPHA),
             ..Node::default()
         }
         .weighed();
-        node.visibility = match self.visibility {
+        let visibility = match self.visibility {
             Some(visibility) => self.weight(visibility, at as u32) + self.floor * node.mass,
             None => self.importance.of(&node),
         };
+        node.visibility = visibility.min(MAX_VISIBILITY);
         node
     }
 
@@ -163,15 +170,28 @@ impl Rows for Leaves<'_> {
 /// Σ αT² that a unit of mass counts for though no view sees it.
 pub fn floor(weight: f64, mass: f64) -> f32 {
     UNSEEN
-        * if weight > 0.0 {
-            (weight / mass) as f32
+        * if weight > 0.0 && mass > 0.0 {
+            (weight / mass).min(f64::from(f32::MAX)) as f32
         } else {
             1.0
         }
 }
 
-/// A power of two near the median of the middle scale, so that dividing by it is exact.
-pub fn typical_size(scene: &SceneRef) -> f64 {
+/// The unit of lengths, a power of two so that dividing by it is exact: the typical size, or more where a scene or a
+/// pixel is more than `MAX_LENGTH` times as large.
+pub fn unit(scene: &SceneRef, ordered: &Ordered, blur: &[f32]) -> f64 {
+    let far = |&row: &u32| {
+        let from = sub(scene.means.get(row as usize), ordered.bounds.origin);
+        from.iter().fold(0.0, |far: f64, v| far.max(v.abs()))
+    };
+    let extent = ordered.rows.par_iter().map(far).reduce(|| 0.0, f64::max);
+    let widest = blur.iter().fold(0.0f32, |a, &b| a.max(b));
+    let least = extent.max(f64::from(widest).sqrt()) / MAX_LENGTH;
+    typical_size(scene).max(2.0 * power_of_two_below(least))
+}
+
+/// A power of two near the median of the middle scale.
+fn typical_size(scene: &SceneRef) -> f64 {
     let middle = |s: &[f32; 3]| s[0].max(s[1]).min(s[2]).max(s[0].min(s[1]));
     let positive = scene
         .scales
@@ -179,6 +199,5 @@ pub fn typical_size(scene: &SceneRef) -> f64 {
         .map(middle)
         .filter(|s| *s > 0.0)
         .collect();
-    let size = f64::from(median(positive).unwrap_or(1.0));
-    f64::from_bits(size.to_bits() & (0x7ff << 52))
+    power_of_two_below(f64::from(median(positive).unwrap_or(1.0)))
 }

@@ -141,11 +141,16 @@ impl Pairwise {
         mut on_pairs: impl FnMut(&[Pair], &[u32]),
     ) -> Result<()> {
         for &target in schedule {
-            // The cheapest candidate of all always matches, so each turn merges at least one pair.
+            // Costs are finite, so the cheapest candidate of all matches, and each turn merges at least one pair.
             while nodes.len() > target {
                 let lists = candidates(nodes, self.neighbors, geometric_weight, control)?;
                 let pairs = matched(&lists, self.neighbors, nodes.len() - target);
                 drop(lists);
+                if pairs.is_empty() {
+                    return Err(Error::Stuck(
+                        "simplify: no two of the Gaussians have neighbours",
+                    ));
+                }
                 let new_index = merge(nodes, &pairs);
                 on_pairs(&pairs, &new_index);
                 control.advance(pairs.len() as u64);
@@ -232,7 +237,7 @@ impl Pairwise {
                 .filter(|p| p.is_finite() && *p > 0.0)
                 .unwrap_or(usual);
             let e = self.dilation * f64::from(p);
-            (e * e) as f32
+            (e * e).min(f64::from(f32::MAX)) as f32
         };
         (0..scene.len()).into_par_iter().map(of).collect()
     }
@@ -338,3 +343,225 @@ fn merge(nodes: &mut Nodes, pairs: &[Pair]) -> Vec<u32> {
 /// Shifts of the Morton lattice per step, along x, y and z, as shares of the bounds' radius: incommensurable, so that
 /// no plane that separates cells in one step does so in the next.
 const LATTICES: [[f64; 3]; 3] = [[0.0; 3], [0.31, 0.17, 0.43], [0.13, 0.41, 0.23]];
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::random::Lcg;
+    use crate::scene::Means;
+    use crate::simplify::cost::Node;
+    use crate::simplify::{Frame, Tile};
+
+    const ROWS: usize = 40;
+    const KEPT: usize = 3;
+
+    /// Every magnitude of f32: nothing, the least, subnormal, ordinary and the largest numbers.
+    const MAGNITUDES: [f32; 12] = [
+        0.0,
+        1e-45,
+        1e-38,
+        1e-24,
+        9.4e-14, // e^-30
+        1e-6,
+        1.0,
+        1e6,
+        1e11,
+        1e19,
+        1e30,
+        f32::MAX,
+    ];
+
+    /// Gaussians of size `scale`, but every third of size `other`, spread over a cube of half-width `spread`.
+    struct Scene {
+        means: Vec<[f32; 3]>,
+        scales: Vec<[f32; 3]>,
+        quats: Vec<[f32; 4]>,
+        logits: Vec<f32>,
+        sh0: Vec<[f32; 3]>,
+    }
+
+    impl Scene {
+        fn new(scale: f32, other: f32, spread: f32) -> Self {
+            let mut random = Lcg(17);
+            let mut next = || 2.0 * random.centred() as f32;
+            Self {
+                means: (0..ROWS)
+                    .map(|_| [spread * next(), spread * next(), spread * next()])
+                    .collect(),
+                scales: (0..ROWS)
+                    .map(|i| {
+                        [[scale, 0.5 * scale, 0.1 * scale], [other; 3]][usize::from(i % 3 == 2)]
+                    })
+                    .collect(),
+                quats: (0..ROWS)
+                    .map(|_| [next(), next(), next(), next()])
+                    .collect(),
+                logits: (0..ROWS).map(|_| 3.0 * next()).collect(),
+                sh0: (0..ROWS).map(|_| [next(), next(), next()]).collect(),
+            }
+        }
+
+        fn borrow(&self) -> SceneRef<'_> {
+            SceneRef {
+                means: Means::F32(&self.means),
+                quats: &self.quats,
+                scales: &self.scales,
+                logit_opacities: &self.logits,
+                sh0: &self.sh0,
+                sh_rest: &[],
+                rest: 0,
+            }
+        }
+    }
+
+    fn finite(node: &Node) -> bool {
+        let Node {
+            mean,
+            cov,
+            blur,
+            alpha,
+            mass,
+            visibility,
+            areas,
+        } = node;
+        let values = mean.iter().chain(cov).chain(areas);
+        values
+            .chain([blur, alpha, mass, visibility])
+            .all(|v| v.is_finite())
+    }
+
+    /// Merges the scene whole and as a tile; checks the counts, and that everything on the way is finite.
+    fn check(scene: &Scene, visibility: Option<Visibility>, what: &str) {
+        let (scene, control) = (scene.borrow(), Control::default());
+        let ordered = Ordered::new(&scene).unwrap();
+        let policy = Pairwise::default();
+        let blur = policy.blurs(&scene, &ordered, visibility, None);
+        let rows = (0..ROWS as u32).collect();
+        let mut nodes = Leaves::new(&scene, &ordered, rows, &blur, visibility, None).nodes();
+        while nodes.len() > KEPT {
+            assert!(nodes.geometry.iter().all(finite), "{what}");
+            let lists = candidates(&nodes, policy.neighbors, 0.03, &control).unwrap();
+            let partners = lists.iter().filter(|c| c.1 != GONE);
+            assert!(partners.clone().count() >= nodes.len(), "{what}");
+            assert!(partners.clone().all(|c| c.0.is_finite() && c.0 >= 0.0));
+            let pairs = matched(&lists, policy.neighbors, nodes.len() - KEPT);
+            assert!(!pairs.is_empty(), "{what}");
+            merge(&mut nodes, &pairs);
+        }
+        let sound = |splats: &crate::Splats| {
+            let means = splats.means.as_flattened().iter().all(|v| v.is_finite());
+            let quats = splats.quats.as_flattened().iter().all(|v| v.is_finite());
+            let scales = splats.scales.as_flattened();
+            let logits = splats.logit_opacities.iter().all(|v| v.is_finite());
+            means && quats && logits && scales.iter().all(|v| v.is_finite() && *v >= 0.0)
+        };
+        for policy in [policy, Pairwise::fast()] {
+            let schedule = [20, KEPT];
+            let out = policy.run(&scene, &ordered, visibility, None, &schedule, &control);
+            let out = out.unwrap().splats;
+            assert_eq!(out.len(), KEPT, "{what}");
+            assert!(sound(&out), "{what}: {out:?}");
+        }
+        let mut frame = Frame::of_sample(&policy, &scene, &ordered);
+        let mut tile = Tile {
+            policy,
+            scene: &scene,
+            ordered: &ordered,
+            visibility,
+            frame,
+        };
+        if visibility.is_some() {
+            let (weight, mass) = tile.sums().unwrap();
+            frame = frame.with_views(0.01, weight, mass);
+            tile.frame = frame;
+        }
+        let runs = 20;
+        let costs = tile.run_costs().unwrap();
+        let plan = tile.plan(runs, &[KEPT], &costs, &control).unwrap();
+        assert_eq!(plan.merges.len(), runs - KEPT, "{what}");
+        assert!(plan.merges.iter().all(|p| p.cost.is_finite()), "{what}");
+    }
+
+    #[test]
+    fn sizes_and_spreads_of_any_magnitude_merge_to_the_count() {
+        for scale in MAGNITUDES {
+            for spread in MAGNITUDES {
+                for other in [scale, 1.0] {
+                    let scene = Scene::new(scale, other, spread);
+                    check(&scene, None, &format!("{scale:e} {other:e} {spread:e}"));
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn pixels_and_weights_of_any_magnitude_merge_to_the_count() {
+        for scale in [0.0, 9.4e-14, 0.1, 1e19] {
+            let scene = Scene::new(scale, scale, 1.0);
+            for size in MAGNITUDES {
+                for weight in MAGNITUDES {
+                    let mut pixel_size = vec![size; ROWS];
+                    pixel_size[..4].fill(f32::INFINITY);
+                    pixel_size[4..6].fill(0.01);
+                    let mut weights = vec![weight; ROWS];
+                    weights[2..9].fill(1.0);
+                    let seen = Visibility {
+                        weight: &weights,
+                        pixel_size: &pixel_size,
+                    };
+                    check(
+                        &scene,
+                        Some(seen),
+                        &format!("{scale:e} {size:e} {weight:e}"),
+                    );
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn a_round_that_merges_nothing_is_an_error() {
+        let lost = Node {
+            mean: [f32::NAN; 3],
+            ..Node::default()
+        };
+        let mut nodes = Nodes {
+            geometry: vec![lost; 9],
+            sh: vec![0.0; 27],
+            width: 3,
+        };
+        let control = Control::default();
+        let ended = Pairwise::default().merge_rounds(&mut nodes, 0.03, &[3], &control, |_, _| ());
+        assert!(matches!(ended, Err(Error::Stuck(_))), "{ended:?}");
+    }
+
+    #[test]
+    fn the_unit_moves_no_bit_of_a_cost() {
+        let scene = Scene::new(0.1, 0.03, 1.0);
+        let (scene, control) = (scene.borrow(), Control::default());
+        let ordered = Ordered::new(&scene).unwrap();
+        let policy = Pairwise::default();
+        let seen = Visibility {
+            weight: &[1.0; ROWS],
+            pixel_size: &[0.01; ROWS],
+        };
+        let frame = Frame::of_sample(&policy, &scene, &ordered);
+        let costs = |unit: f64| {
+            let mut tile = Tile {
+                policy,
+                scene: &scene,
+                ordered: &ordered,
+                visibility: Some(seen),
+                frame: Frame { unit, ..frame },
+            };
+            let (weight, mass) = tile.sums().unwrap();
+            tile.frame = tile.frame.with_views(0.01, weight, mass);
+            let costs = tile.run_costs().unwrap();
+            (tile.plan(30, &[5], &costs, &control).unwrap(), costs)
+        };
+        let usual = costs(frame.unit);
+        for times in [1.0 / 1024.0, 0.5, 4096.0] {
+            assert_eq!(costs(times * frame.unit), usual, "{times}");
+        }
+    }
+}

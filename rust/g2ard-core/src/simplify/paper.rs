@@ -338,7 +338,7 @@ fn push_merged(out: &mut Splats, merged: Merged, grid: f64) {
     out.means
         .push(merged.gaussian.mean.map(|v| (v / grid).round() * grid));
     out.quats.push(merged.gaussian.quat());
-    out.scales.push(merged.gaussian.scales.map(|v| v as f32));
+    out.scales.push(merged.gaussian.stored_scales());
     out.logit_opacities.push(merged.logit as f32);
     out.sh.extend(merged.sh);
 }

@@ -8,7 +8,7 @@
 
 use super::clusters::{Pair, Partition};
 use super::importance::Importance;
-use super::leaves::{Leaves, floor, typical_size};
+use super::leaves::{Leaves, floor, unit};
 use super::morton_tree::{cut, merge_costs};
 use super::pairwise::PairwiseRound;
 use super::rows::Rows;
@@ -37,7 +37,7 @@ impl Frame {
         let rows = (0..scene.len() as u32).collect();
         let leaves = Leaves::new(scene, ordered, rows, &blur, None, None);
         Self {
-            unit: typical_size(scene),
+            unit: unit(scene, ordered, &blur),
             pixel_size,
             floor: 0.0,
             importance: leaves.importance(),

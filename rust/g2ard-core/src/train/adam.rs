@@ -19,9 +19,12 @@ pub(super) const GRADIENT_MAX: f32 = 1e18;
 #[derive(Debug, Default)]
 pub struct Biases(Vec<[f32; 2]>);
 
+/// From this count on both are 1 in f32.
+const UNBIASED: usize = 1 << 15;
+
 impl Biases {
     pub fn extend_to(&mut self, steps: usize) {
-        while self.0.len() <= steps {
+        while self.0.len() <= steps.min(UNBIASED) {
             let t = self.0.len().max(1) as f64;
             let bias = |beta: f64| -(t * beta.ln()).exp_m1();
             self.0.push([
@@ -32,7 +35,7 @@ impl Biases {
     }
 
     pub(super) fn of(&self, steps: usize) -> [f32; 2] {
-        self.0[steps]
+        self.0[steps.min(UNBIASED)]
     }
 }
 
@@ -154,7 +157,7 @@ impl Update<'_> {
         for l in 0..LANES {
             if good >> l & 1 == 1 {
                 block.steps[l] += 1;
-                let pair = self.biases.0[block.steps[l] as usize];
+                let pair = self.biases.of(block.steps[l] as usize);
                 bias[0].0[l] = pair[0];
                 bias[1].0[l] = pair[1];
             }
@@ -233,5 +236,39 @@ impl<F: Lanes> Step<F> {
         F::select(self.good, moved, value).store(&mut block.values[attribute]);
         F::select(self.good, m_new, m).store(first);
         F::select(self.good, v_new, v).store(second);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn biases_of_any_count_are_those_of_f64() {
+        let exact = |steps: usize| {
+            let left = |beta: f64| 1.0 - (steps as f64 * beta.ln()).exp();
+            [
+                (1.0 / left(BETA1)) as f32,
+                (1.0 / left(BETA2).sqrt()) as f32,
+            ]
+        };
+        let mut biases = Biases::default();
+        biases.extend_to(usize::MAX);
+        for steps in [
+            1,
+            2,
+            100,
+            9999,
+            UNBIASED - 1,
+            UNBIASED,
+            UNBIASED + 1,
+            1 << 40,
+        ] {
+            for (got, want) in biases.of(steps).iter().zip(exact(steps)) {
+                assert!((got - want).abs() <= 1e-6 * want, "{steps}: {got} {want}");
+            }
+        }
+        assert_eq!(exact(UNBIASED), [1.0; 2]);
+        assert_eq!(biases.of(UNBIASED - 1), [1.0; 2]);
     }
 }
