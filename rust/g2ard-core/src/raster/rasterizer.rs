@@ -99,7 +99,7 @@ impl Rasterizer {
         camera.validate()?;
         settings.validate()?;
         image.validate(camera)?;
-        self.prepare(*params, camera, settings, background, TileGrid::of(camera));
+        self.prepare(*params, camera, settings, background, TileGrid::of(camera))?;
         if image.depth.is_some() || image.median.is_some() {
             self.forward_tiles::<true>(image);
         } else {
@@ -163,9 +163,10 @@ impl Rasterizer {
         settings: &Settings,
         background: [f32; 3],
         image: &mut Image,
-    ) {
-        self.prepare(source, camera, settings, background, TileGrid::of(camera));
+    ) -> Result<()> {
+        self.prepare(source, camera, settings, background, TileGrid::of(camera))?;
         self.forward_tiles::<false>(image);
+        Ok(())
     }
 
     /// Fill the slots, then call `finish(chunk, slots of the chunk's splats)` for every chunk of rows in parallel;
@@ -202,7 +203,7 @@ impl Rasterizer {
         })
     }
 
-    /// Projects, sorts and bins.
+    /// Projects, sorts and bins. After an error no backward pass is possible.
     pub(crate) fn prepare<S: Source>(
         &mut self,
         source: S,
@@ -210,16 +211,9 @@ impl Rasterizer {
         settings: &Settings,
         background: [f32; 3],
         grid: TileGrid,
-    ) {
-        let view = View::new(camera, settings);
-        self.state = Some(ForwardState {
-            camera: *camera,
-            settings: *settings,
-            grid,
-            view,
-            background,
-            rows: source.len(),
-        });
+    ) -> Result<()> {
+        let (view, rows) = (View::new(camera, settings), source.len());
+        self.state = None;
         self.project(&view, source, grid);
         self.collect_keys();
         depth_sort::sort(&mut self.order, &mut self.spare);
@@ -229,7 +223,7 @@ impl Rasterizer {
             &self.intersectors,
             CHUNK * LANES,
             grid,
-        );
+        )?;
         self.batches.clear();
         let mut first = 0;
         for tile in self.bins.starts.windows(2) {
@@ -237,6 +231,15 @@ impl Rasterizer {
             first += ((tile[1] - tile[0]) as usize).div_ceil(BATCH);
         }
         self.block_masks.resize(first, [0; MOST_BLOCKS]);
+        self.state = Some(ForwardState {
+            camera: *camera,
+            settings: *settings,
+            grid,
+            view,
+            background,
+            rows,
+        });
+        Ok(())
     }
 
     fn project<S: Source>(&mut self, view: &View, source: S, grid: TileGrid) {

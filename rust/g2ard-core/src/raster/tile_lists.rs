@@ -130,8 +130,8 @@ pub struct TileIntersector {
     pub list: Vec<u32>,
     /// The ends of sixteen ellipses in one row of tiles after another.
     ends: Vec<[Lanes16; 2]>,
-    /// Slots numbered so far.
-    pub slots: u32,
+    /// Slots numbered so far; [`super::tiles::Bins::fill`] refuses more than a u32 counts.
+    pub slots: u64,
 }
 
 impl TileIntersector {
@@ -199,8 +199,8 @@ impl<F: Lanes> Ellipses<F> {
                     let first = ((row - grid.first_row) * grid.columns) as u32;
                     first + whole(e[0].0[l]) as u32..first + whole(e[1].0[l]) as u32
                 });
-            tile_list.set(*slots, whole(counts.0[l]) as u32, narrow, rows, list);
-            *slots += tile_list.tiles;
+            tile_list.set(*slots as u32, whole(counts.0[l]) as u32, narrow, rows, list);
+            *slots += u64::from(tile_list.tiles);
         }
     }
 

@@ -9,11 +9,15 @@ use super::disjoint::DisjointSlice;
 use super::grid::TileGrid;
 use super::memory::prefetch;
 use super::tile_lists::{TileIntersector, TileList};
+use crate::Result;
 
 /// Number of stretches of the depth order: fixed, so that work is split equally for any number of threads.
 const STRETCHES: usize = 16;
 /// Number of keys that a stretch prefetches ahead, because their splats are scattered in memory.
 const AHEAD: usize = 16;
+/// Number of pairs that a u32 counts.
+const MOST_PAIRS: u64 = u32::MAX as u64;
+
 /// A splat in a tile, and the slot this pair's gradient goes to.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct Pair {
@@ -52,12 +56,15 @@ impl Bins {
         intersectors: &[TileIntersector],
         chunk: usize,
         grid: TileGrid,
-    ) {
+    ) -> Result<()> {
         self.slots.clear();
-        self.slots.push(0);
-        for (i, intersector) in intersectors.iter().enumerate() {
-            self.slots.push(self.slots[i] + intersector.slots);
+        let mut total = 0;
+        for intersector in intersectors {
+            self.slots.push(total as u32);
+            total += intersector.slots;
         }
+        self.slots.push(total as u32);
+        refuse!(total > MOST_PAIRS => "view", format!("at most {MOST_PAIRS} pairs of a Gaussian and a tile of 16×16 pixels"), total);
         let (total_tiles, narrow) = (grid.tiles(), grid.narrow());
         let stretch = order.len().div_ceil(STRETCHES).max(1);
         self.counts.clear();
@@ -91,12 +98,14 @@ impl Bins {
                 let first = slots[splat / chunk];
                 tile_lists[splat].for_each(list, first, narrow, |tile, slot| {
                     let splat = key.splat;
-                    // SAFETY: the prefix sums give every stretch its own places in every tile.
+                    // SAFETY: the prefix sums give every stretch its own places in every tile, and do not overflow: there
+                    // are as many pairs as slots.
                     unsafe { out.write(next[tile] as usize, Pair { splat, slot }) };
                     next[tile] += 1;
                 });
             }
         });
+        Ok(())
     }
 
     /// Turns the counts into each stretch's first place in each tile; returns how many pairs there are.
@@ -114,5 +123,37 @@ impl Bins {
         }
         self.starts.push(at);
         at as usize
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn more_pairs_than_a_u32_counts_are_an_error() {
+        let grid = TileGrid {
+            columns: 3,
+            first_row: 0,
+            rows: 2,
+        };
+        let most = u64::from(u32::MAX);
+        for (chunks, fits) in [
+            (vec![most], true),
+            (vec![most - 1, 0, 1], true),
+            (vec![most + 1], false),
+            (vec![most, 0, 1], false),
+            (vec![1 << 31; 2], false),
+            (vec![1 << 32], false),
+            (vec![most; 9], false),
+        ] {
+            let mut intersectors = Vec::new();
+            intersectors.resize_with(chunks.len(), TileIntersector::default);
+            for (intersector, &slots) in intersectors.iter_mut().zip(&chunks) {
+                intersector.slots = slots;
+            }
+            let filled = Bins::default().fill(&[], &[], &intersectors, 1, grid);
+            assert_eq!(filled.is_ok(), fits, "{chunks:?}: {filled:?}");
+        }
     }
 }

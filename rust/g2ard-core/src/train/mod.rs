@@ -213,7 +213,7 @@ impl Trainer {
             &input.settings,
             input.background,
             &mut image,
-        );
+        )?;
         let pixels = camera.width * camera.height;
         let mask = input.mask.map(|m| Mask::new(m, pixels)).transpose()?;
         if let Some(mask) = &mask {

@@ -142,7 +142,7 @@ impl VisibilityAccumulator {
                 .filter(|group| group.tile_rows[0] <= last && group.tile_rows[1] >= first)
                 .map(|group| group.number)
                 .collect();
-            self.add_band(&camera, settings, grid.with_rows(rows), &in_band);
+            self.add_band(&camera, settings, grid.with_rows(rows), &in_band)?;
         }
         Ok(())
     }
@@ -164,8 +164,16 @@ impl VisibilityAccumulator {
     }
 
     /// Adds what the rows of tiles in `grid` show of the groups `in_band`, ascending.
-    fn add_band(&mut self, camera: &Camera, settings: &Settings, grid: TileGrid, in_band: &[u32]) {
-        let Some(&last) = in_band.last() else { return };
+    fn add_band(
+        &mut self,
+        camera: &Camera,
+        settings: &Settings,
+        grid: TileGrid,
+        in_band: &[u32],
+    ) -> Result<()> {
+        let Some(&last) = in_band.last() else {
+            return Ok(());
+        };
         let past_end = (LANES * (last as usize + 1)).saturating_sub(self.weight.len());
         let source = VisibleGroups {
             groups: &self.groups,
@@ -179,7 +187,7 @@ impl VisibilityAccumulator {
             unsafe { *weight.at(row) += total.weight };
         };
         self.rasterizer
-            .accumulate_from::<SQUARED, _>(source, camera, settings, grid, add);
+            .accumulate_from::<SQUARED, _>(source, camera, settings, grid, add)
     }
 
     /// Rows that some view saw.
@@ -341,7 +349,9 @@ mod tests {
                 unsafe { *sums.at(row) += total.weight };
             };
             let grid = TileGrid::of(&camera);
-            rasterizer.accumulate_from::<SQUARED, _>(params, &camera, &settings, grid, add);
+            rasterizer
+                .accumulate_from::<SQUARED, _>(params, &camera, &settings, grid, add)
+                .unwrap();
             let frustum = Frustum::of(&camera);
             let alone = views.bounds.iter().map(|b| b.tile_rows(&frustum).is_some());
             let visible: Vec<usize> = (0..).zip(alone).filter(|g| g.1).map(|g| g.0).collect();

@@ -41,7 +41,7 @@ impl Rasterizer {
                 // SAFETY: the call comes once for every row.
                 unsafe { rows.add(row, &total) };
             },
-        );
+        )?;
         smallest_pixels(params, camera, &mut sums.pixel_size);
         Ok(())
     }
@@ -54,8 +54,8 @@ impl Rasterizer {
         settings: &Settings,
         grid: TileGrid,
         visit: impl Fn(usize, Total) + Sync,
-    ) {
-        self.prepare(source, camera, settings, [0.0; 3], grid);
+    ) -> Result<()> {
+        self.prepare(source, camera, settings, [0.0; 3], grid)?;
         self.accumulate_tiles::<KINDS>();
         let shares = self.shares.as_chunks::<KINDS>().0;
         self.visible().for_each(|(splats, slots)| {
@@ -65,6 +65,7 @@ impl Rasterizer {
             }
         });
         self.state = None; // no state that a backward pass could use
+        Ok(())
     }
 
     fn accumulate_tiles<const KINDS: usize>(&mut self) {
