@@ -42,19 +42,49 @@ pub struct Device {
     served: AtomicU64,
 }
 
-#[derive(Debug, Clone, Default)]
+#[derive(Debug, Default)]
 enum State {
     #[default]
     Untried,
-    Open(Arc<Gpu>),
+    Open(Opened),
     Off,
 }
 
 impl State {
     fn gpu(&self) -> Option<Arc<Gpu>> {
         match self {
-            Self::Open(gpu) => Some(gpu.clone()),
+            Self::Open(opened) if !opened.inherited() => opened.gpu.clone(),
             _ => None,
+        }
+    }
+}
+
+/// A device and the process that opened it. In a forked child the driver has neither its threads nor its connections, so
+/// the child does not even close the device.
+#[derive(Debug)]
+struct Opened {
+    gpu: Option<Arc<Gpu>>,
+    process: u32,
+}
+
+impl Opened {
+    fn new(gpu: Gpu) -> Self {
+        Self {
+            gpu: Some(Arc::new(gpu)),
+            process: std::process::id(),
+        }
+    }
+
+    /// Whether the device is a forked child's parent's.
+    fn inherited(&self) -> bool {
+        self.process != std::process::id()
+    }
+}
+
+impl Drop for Opened {
+    fn drop(&mut self) {
+        if self.inherited() {
+            std::mem::forget(self.gpu.take());
         }
     }
 }
@@ -86,6 +116,10 @@ impl Device {
     /// The device for work on `rows` rows; opened on first use if the work is large enough.
     fn ready(&self, rows: usize) -> Option<Arc<Gpu>> {
         let mut state = lock(&self.state);
+        if matches!(&*state, State::Open(opened) if opened.inherited()) {
+            self.note(&Error::Forked);
+            *state = State::Off;
+        }
         if matches!(*state, State::Untried) {
             let opened = match self.choice {
                 Choice::Cpu => return None,
@@ -98,7 +132,7 @@ impl Device {
                 }),
             };
             *state = match opened {
-                Ok(Some(gpu)) => State::Open(Arc::new(gpu)),
+                Ok(Some(gpu)) => State::Open(Opened::new(gpu)),
                 Ok(None) => State::Off,
                 Err(error) => {
                     self.note(&error);

@@ -35,11 +35,11 @@ impl PyFrame {
     #[staticmethod]
     fn of_sample(py: Python<'_>, scene: &PyScene, config: Config<Pairwise>) -> PyResult<Self> {
         let (splats, ordered) = (scene.splats(py)?, &scene.ordered);
-        Ok(Self(Frame::of_sample(
-            &config.0,
-            &splats.borrow()?,
-            ordered,
-        )))
+        let scene = splats.borrow()?;
+        let frame = long(py, None, |_| {
+            Ok(Frame::of_sample(&config.0, &scene, ordered))
+        })?;
+        Ok(Self(frame))
     }
 
     /// The frame with views: the usual size of a pixel, and `sums` added up over all tiles.

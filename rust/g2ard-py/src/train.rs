@@ -272,15 +272,17 @@ pub fn adam_rows(
     attributes: Vec<PyAttribute<'_>>,
     mut counts: PyReadwriteArray1<'_, i64>,
 ) -> PyResult<usize> {
+    /// What earlier calls worked out. Locked only with the GIL held: see `work::POOL`.
     static BIASES: Mutex<Option<Biases>> = Mutex::new(None);
+    let kept = || BIASES.lock().unwrap_or_else(PoisonError::into_inner);
     let mut attributes = attributes;
     let mut all = (attributes.iter_mut())
         .map(PyAttribute::attribute)
         .collect::<PyResult<Vec<_>>>()?;
     let counts = (counts.as_slice_mut())
         .map_err(|_| invalid("counts", "a C-contiguous array", "strides"))?;
-    work::quick(py, || {
-        let mut biases = BIASES.lock().unwrap_or_else(PoisonError::into_inner);
-        step_rows(&mut all, counts, biases.get_or_insert_default())
-    })
+    let mut biases = kept().take().unwrap_or_default();
+    let skipped = work::quick(py, || step_rows(&mut all, counts, &mut biases));
+    *kept() = Some(biases);
+    skipped
 }

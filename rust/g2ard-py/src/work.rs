@@ -12,16 +12,27 @@ use rayon::{ThreadPool, ThreadPoolBuilder};
 
 use crate::error::to_py;
 
-static POOL: RwLock<Option<Arc<ThreadPool>>> = RwLock::new(None);
+/// A pool and the process that made it: a forked child has the pool without its threads.
+struct Pool {
+    threads: Arc<ThreadPool>,
+    process: u32,
+}
+
+/// Locked only with the GIL held, which a thread that forks holds too: a child finds it unlocked.
+static POOL: RwLock<Option<Pool>> = RwLock::new(None);
 
 /// Interval at which long work checks for Ctrl-C and reports progress.
 const POLL: Duration = Duration::from_millis(50);
 
 fn pool() -> PyResult<Arc<ThreadPool>> {
+    let mut threads = 0;
     if let Some(pool) = POOL.read().map_err(poisoned)?.as_ref() {
-        return Ok(pool.clone());
+        if pool.process == std::process::id() {
+            return Ok(pool.threads.clone());
+        }
+        threads = pool.threads.current_num_threads();
     }
-    set_num_threads(0)?;
+    set_num_threads(threads)?;
     pool()
 }
 
@@ -40,7 +51,15 @@ pub fn set_num_threads(threads: usize) -> PyResult<()> {
         .num_threads(threads)
         .build()
         .map_err(|e| PyRuntimeError::new_err(e.to_string()))?;
-    *POOL.write().map_err(poisoned)? = Some(Arc::new(built));
+    let process = std::process::id();
+    let new = Pool {
+        threads: Arc::new(built),
+        process,
+    };
+    let old = POOL.write().map_err(poisoned)?.replace(new);
+    if let Some(inherited) = old.filter(|old| old.process != process) {
+        std::mem::forget(inherited); // dropping it would wait for threads that are not there
+    }
     Ok(())
 }
 

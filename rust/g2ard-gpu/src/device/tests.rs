@@ -188,6 +188,26 @@ fn what_is_too_large_for_one_kernel_is_no_reason_to_leave() {
 }
 
 #[test]
+fn a_forked_process_leaves_its_parents_device_alone() {
+    let Some(device) = device(Options::default()) else {
+        return;
+    };
+    assert_eq!(device.either(1, |_| Ok(8), || Ok(7)).unwrap(), 8);
+    let opened = Arc::downgrade(&device.gpu().expect("an open device"));
+    if let State::Open(opened) = &mut *lock(&device.state) {
+        opened.process ^= 1;
+    }
+    assert!(device.gpu().is_none());
+    for _ in 0..2 {
+        assert_eq!(device.either(1, |_| Ok(8), || Ok(7)).unwrap(), 7);
+    }
+    let notes = device.notes();
+    assert_eq!(notes.len(), 1, "{notes:?}");
+    assert!(notes[0].contains("spawn"), "{notes:?}");
+    assert!(opened.upgrade().is_some(), "closed");
+}
+
+#[test]
 fn a_stop_is_no_failure() {
     let Some(device) = device(Options::default()) else {
         return;

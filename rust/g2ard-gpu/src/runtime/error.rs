@@ -32,6 +32,8 @@ pub enum Error {
     Refused(String),
     #[error("the driver panicked ({0})")]
     Panicked(String),
+    #[error("a forked process cannot use the device of its parent; start processes by spawn")]
+    Forked,
     /// A kernel's answers differ from the CPU's on the probe.
     #[error("{0} computes wrongly: its answers differ from the CPU's")]
     Wrong(String),
