@@ -160,6 +160,8 @@ class Rendered:
 class Renderer:
     """Renderer for many views of one scene; prepares the scene once and reuses buffers.
 
+    Several threads may use one renderer: their calls take turns.
+
     Args:
         splats: the scene, SH degree 0–3.
         background: RGB in [0, 1] behind the scene.
@@ -220,7 +222,7 @@ class Renderer:
 
     def pose_gradient(self, gradient: _Floats) -> NDArray[np.float64]:
         """Return the (6,) gradient dL/d(v, ω) of the last render's pose T, where T ← exp(v, ω)·T in the
-        camera's axes.
+        camera's axes. That render must be the same thread's.
 
         g_v = Σ W·dL/dμ and g_ω = Σ X × dL/dX + Σᵢ W·(dL/djwᵢ × jwᵢ), with X = Wμ + t, dL/dX without the view
         dependence of colours, and jwᵢ the rows of the projection's J·W. Gaussians crossing α = 1/255
@@ -228,6 +230,9 @@ class Renderer:
 
         Args:
             gradient: (H, W, 3) float32 dL/d(image).
+
+        Raises:
+            InputError: no render before, or another thread's.
         """
         return np.array(self._rasterizer.pose_gradient(self._arrays, np.ascontiguousarray(gradient)))
 

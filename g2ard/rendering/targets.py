@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -234,6 +235,10 @@ def with_pixels(targets: Targets) -> Targets:
     return targets if len(rows) == len(targets.cameras) else Subset(targets, rows)
 
 
+_KEEPING = threading.Lock()
+"""Held while targets change what they keep; one for all, so that targets can be pickled."""
+
+
 class _Cached(ABC):
     """Cache of what `_make` returns, up to `limit` bytes, first come first kept."""
 
@@ -257,9 +262,12 @@ class _Cached(ABC):
             return kept[view]
         made = make(view)
         size = 0 if made is None else made.nbytes
-        if self._bytes + size <= self._limit:
-            kept[view] = made
-            self._bytes += size
+        with _KEEPING:
+            if view in kept:  # another thread was faster
+                return kept[view]
+            if self._bytes + size <= self._limit:
+                kept[view] = made
+                self._bytes += size
         return made
 
     def fill(self, value_bytes: int, progress: Progress, stage: str) -> None:
@@ -442,13 +450,18 @@ class TeacherRenders(_Cached):
         return f"teacher {self._teacher.fingerprint()} {self._background}{conventions}"
 
     def _make(self, view: int) -> NDArray[np.float32 | np.uint16]:
-        if self._renderer is None:
-            self._renderer = Renderer(self._teacher, background=self._background, settings=self._settings)
-        image = self._renderer.clipped(self.cameras[view])
+        image = self._shared_renderer().clipped(self.cameras[view])
         if not self._rounded:
             return image
         image *= _RENDER_LEVELS
         return np.rint(image, out=image).astype(np.uint16)
+
+    def _shared_renderer(self) -> Renderer:
+        with _KEEPING:
+            if self._renderer is None:
+                teacher, background = self._teacher, self._background
+                self._renderer = Renderer(teacher, background=background, settings=self._settings)
+            return self._renderer
 
     def against(self, view: int) -> str:
         """Return the kind, see `against_of`."""

@@ -9,6 +9,8 @@ use numpy::{IntoPyArray, PyArray1, PyArrayMethods, PyReadonlyArrayDyn, PyUntyped
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use rayon::prelude::*;
+use std::sync::Mutex;
+use std::thread::{self, ThreadId};
 
 use crate::arrays::{flat, optional};
 use crate::error::{invalid, to_py};
@@ -62,11 +64,14 @@ pub fn instruction_sets() -> Vec<&'static str> {
     Isa::available().into_iter().map(Isa::name).collect()
 }
 
-#[pyclass(name = "Rasterizer", module = "g2ard._core")]
-pub struct PyRasterizer {
+/// Buffers of one view; calls from several threads take turns.
+#[pyclass(name = "Rasterizer", module = "g2ard._core", frozen)]
+pub struct PyRasterizer(Mutex<Rendering>);
+
+struct Rendering {
     inner: Rasterizer,
-    /// Height and width of the last forward pass.
-    shape: [usize; 2],
+    /// The thread of the last forward pass.
+    thread: ThreadId,
 }
 
 type Array<'py, D> = Bound<'py, numpy::PyArray<f32, D>>;
@@ -86,10 +91,10 @@ impl PyRasterizer {
     #[new]
     #[pyo3(signature = (isa = None))]
     fn new(isa: Option<&str>) -> PyResult<Self> {
-        Ok(Self {
+        Ok(Self(Mutex::new(Rendering {
             inner: Rasterizer::new(isa_named(isa)?),
-            shape: [0, 0],
-        })
+            thread: thread::current().id(),
+        })))
     }
 
     /// Return image (H, W, 3), alpha (H, W), depth (H, W) and median depth (H, W); the first `depths` of the two
@@ -97,7 +102,7 @@ impl PyRasterizer {
     #[pyo3(signature = (arrays, view, options, background, depths = 1))]
     #[allow(clippy::type_complexity)]
     fn forward<'py>(
-        &mut self,
+        &self,
         py: Python<'py>,
         arrays: Arrays<'py>,
         view: View,
@@ -114,7 +119,8 @@ impl PyRasterizer {
         let (camera, settings) = (view.camera(), options.settings()?);
         camera.validate().map_err(to_py)?;
         let (height, width) = (camera.height, camera.width);
-        let inner = &mut self.inner;
+        let mut rendering = work::locked(py, &self.0);
+        let inner = &mut rendering.inner;
         let (rgb, alpha, depth, median) = work::quick(py, || {
             let zeros = || vec![0f32; height * width];
             let (mut rgb, mut alpha) = (vec![0f32; 3 * height * width], zeros());
@@ -128,19 +134,20 @@ impl PyRasterizer {
             inner.forward(&params, &camera, &settings, background, &mut image)?;
             Ok((rgb, alpha, depth, median))
         })?;
-        self.shape = [height, width];
+        rendering.thread = thread::current().id();
+        let shape = [height, width];
         Ok((
             PyArray1::from_vec(py, rgb).reshape([height, width, 3])?,
             PyArray1::from_vec(py, alpha).reshape([height, width])?,
-            plane(py, depth, self.shape)?,
-            plane(py, median, self.shape)?,
+            plane(py, depth, shape)?,
+            plane(py, median, shape)?,
         ))
     }
 
     /// Return gradients of the six arrays, each in its array's shape.
     #[pyo3(signature = (arrays, image, alpha = None, depth = None))]
     fn backward<'py>(
-        &mut self,
+        &self,
         py: Python<'py>,
         arrays: Arrays<'py>,
         image: Floats<'py>,
@@ -153,7 +160,8 @@ impl PyRasterizer {
             alpha: optional("alpha gradient", &alpha)?,
             depth: optional("depth gradient", &depth)?,
         };
-        let inner = &mut self.inner;
+        let mut rendering = work::locked(py, &self.0);
+        let inner = &mut rendering.inner;
         let out = work::quick(py, || {
             let mut out = [
                 params.means,
@@ -187,7 +195,7 @@ impl PyRasterizer {
 
     /// Return dL/d(v, ω) of the last forward pass's pose T, T ← exp(v, ω)·T, from dL/d(image).
     fn pose_gradient<'py>(
-        &mut self,
+        &self,
         py: Python<'py>,
         arrays: Arrays<'py>,
         image: Floats<'py>,
@@ -198,7 +206,12 @@ impl PyRasterizer {
             alpha: None,
             depth: None,
         };
-        let inner = &mut self.inner;
+        let mut rendering = work::locked(py, &self.0);
+        if rendering.thread != thread::current().id() {
+            let expected = "a render before it in the same thread";
+            return Err(invalid("pose gradient", expected, "another thread's"));
+        }
+        let inner = &mut rendering.inner;
         work::quick(py, || inner.pose_gradient(&params, &gradients))
     }
 }

@@ -64,12 +64,17 @@ struct PyObjective {
     ssim_weight: f32,
 }
 
-#[pyclass(name = "Trainer", module = "g2ard._core")]
+/// Calls from several threads take turns.
+#[pyclass(name = "Trainer", module = "g2ard._core", frozen)]
 pub struct PyTrainer {
-    inner: Trainer,
+    trained: Mutex<Trained>,
     settings: Settings,
     background: [f32; 3],
     ssim_weight: f32,
+}
+
+struct Trained {
+    inner: Trainer,
     skipped: usize,
 }
 
@@ -106,17 +111,17 @@ impl PyTrainer {
         let units = optional("units", &units)?;
         let inner = Trainer::new(&arrays.params()?, units, isa).map_err(to_py)?;
         Ok(Self {
-            inner,
+            trained: Mutex::new(Trained { inner, skipped: 0 }),
             settings: objective.settings.settings()?,
             background: objective.background,
             ssim_weight: objective.ssim_weight,
-            skipped: 0,
         })
     }
 
     /// Freeze the anchors: means (N, 3), frames (N, 3, 3) with columns t1, t2, n, and the two radii (N,).
     fn anchor(
-        &mut self,
+        &self,
+        py: Python<'_>,
         means: Floats<'_>,
         frames: Floats<'_>,
         r_parallel: Floats<'_>,
@@ -127,22 +132,24 @@ impl PyTrainer {
             flat("anchor frames", &frames)?,
         );
         let (r_parallel, r_perp) = (flat("r_parallel", &r_parallel)?, flat("r_perp", &r_perp)?);
-        self.inner
+        work::locked(py, &self.trained)
+            .inner
             .set_anchors(means, frames, r_parallel, r_perp)
             .map_err(to_py)
     }
 
     /// Freeze rows, given as an (N,) mask: no step changes them.
-    fn freeze(&mut self, frozen: PyReadonlyArray1<'_, bool>) -> PyResult<()> {
+    fn freeze(&self, py: Python<'_>, frozen: PyReadonlyArray1<'_, bool>) -> PyResult<()> {
         let frozen = flat("frozen", &frozen)?;
-        self.inner.freeze(frozen).map_err(to_py)
+        let mut trained = work::locked(py, &self.trained);
+        trained.inner.freeze(frozen).map_err(to_py)
     }
 
     /// Take one step; return (photometric loss before it, Gaussians moved). `mask`: where the loss counts.
     #[pyo3(signature = (view, target, rates, regularizers = None, mask = None, relative = None))]
     #[expect(clippy::too_many_arguments, reason = "Python's signature")]
     fn step(
-        &mut self,
+        &self,
         py: Python<'_>,
         view: View,
         target: PyReadonlyArray3<'_, f32>,
@@ -162,15 +169,17 @@ impl PyTrainer {
             regularizers: regularizers.map(|r| r.0),
             ..self.input(&camera, target)
         };
-        let inner = &mut self.inner;
+        let mut trained = work::locked(py, &self.trained);
+        let inner = &mut trained.inner;
         let report = work::quick(py, || inner.step(&input))?;
-        self.skipped += report.skipped;
+        trained.skipped += report.skipped;
         Ok((report.loss, report.updated))
     }
 
     /// Return the six parameter arrays, rows in the caller's order.
     fn arrays<'py>(&self, py: Python<'py>) -> PyResult<Vec<Bound<'py, PyArrayDyn<f32>>>> {
-        let store = self.inner.store();
+        let trained = work::locked(py, &self.trained);
+        let store = trained.inner.store();
         let (n, rest) = (store.len(), store.sh_coeffs() - 1);
         let shapes = [
             vec![n, 3],
@@ -190,7 +199,7 @@ impl PyTrainer {
 
     /// Return everything that a bitwise resume needs: a dict of arrays.
     fn state<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
-        let state = self.inner.store().export();
+        let state = work::locked(py, &self.trained).inner.store().export();
         let dict = [
             ("values", state.values.into_pyarray(py)),
             ("first", state.first.into_pyarray(py)),
@@ -204,7 +213,7 @@ impl PyTrainer {
     }
 
     /// Restore a `state`; anchors must be set again.
-    fn load(&mut self, state: &Bound<'_, PyDict>) -> PyResult<()> {
+    fn load(&self, py: Python<'_>, state: &Bound<'_, PyDict>) -> PyResult<()> {
         let state = Exported {
             values: vector(state, "values")?,
             first: vector(state, "first")?,
@@ -213,13 +222,14 @@ impl PyTrainer {
             steps: vector(state, "steps")?,
             order: vector(state, "order")?,
         };
-        self.inner.import(&state).map_err(to_py)
+        let mut trained = work::locked(py, &self.trained);
+        trained.inner.import(&state).map_err(to_py)
     }
 
     /// Number of Gaussian steps skipped since the start because a gradient was not finite.
     #[getter]
-    fn skipped(&self) -> usize {
-        self.skipped
+    fn skipped(&self, py: Python<'_>) -> usize {
+        work::locked(py, &self.trained).skipped
     }
 }
 

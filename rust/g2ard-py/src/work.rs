@@ -2,12 +2,13 @@
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::mpsc::{RecvTimeoutError, channel};
-use std::sync::{Arc, RwLock};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError, RwLock};
 use std::time::Duration;
 
 use g2ard_core::{Control, Result};
 use pyo3::exceptions::PyRuntimeError;
 use pyo3::prelude::*;
+use pyo3::sync::MutexExt;
 use rayon::{ThreadPool, ThreadPoolBuilder};
 
 use crate::error::to_py;
@@ -66,6 +67,13 @@ pub fn set_num_threads(threads: usize) -> PyResult<()> {
 #[pyfunction]
 pub fn num_threads() -> PyResult<usize> {
     Ok(pool()?.current_num_threads())
+}
+
+/// Lock what an object's calls share; the GIL is released while others have it.
+pub fn locked<'a, T>(py: Python<'_>, shared: &'a Mutex<T>) -> MutexGuard<'a, T> {
+    shared
+        .lock_py_attached(py)
+        .unwrap_or_else(PoisonError::into_inner)
 }
 
 /// Run a kernel of a few milliseconds: GIL released, no Ctrl-C check.
