@@ -383,7 +383,7 @@ class Photos(_Cached):
             photo = np.ascontiguousarray(photo @ undo[:, :3].T + undo[:, 3], dtype=np.float32)
             photo = np.clip(photo, 0, 1, out=photo)
         mask = self.mask(view)
-        if mask is not None:  # SSIM's window reaches across the mask's edge
+        if mask is not None:
             photo[~mask] = 0
         return photo
 

@@ -3,6 +3,8 @@
 import numpy as np
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from g2ard import _core
@@ -11,7 +13,7 @@ from g2ard.errors import InputError
 from g2ard.rendering.metrics import edge_psnr, psnr, ssim
 from g2ard.rendering.renderer import Renderer
 from g2ard.scene.cameras import Cameras
-from g2ard.stages.recover.losses import l1_ssim
+from g2ard.stages.recover.losses import l1_ssim, l1_ssim_anywhere
 from g2ard.stages.recover.probe import Probe
 from helpers.scenes import around, checkered_ball
 from reference import ssim as reference
@@ -64,6 +66,117 @@ def test_metrics_are_the_twin_s(shape: tuple[int, int, int], kind: str) -> None:
     assert abs(_core.psnr(a, b) - -10 * np.log10(np.mean((a64 - b64) ** 2))) < 1e-9
     assert abs(_core.ssim(a, a) - 1) < 1e-12
     assert _core.psnr(a, a) == np.inf
+
+
+def masked(shape: tuple[int, ...], kind: str) -> NDArray[np.bool_]:
+    """A mask of an image's (height, width)."""
+    rng = np.random.default_rng(sum(shape))
+    mask = np.zeros(shape[:2], bool)
+    height, width = shape[:2]
+    if kind == "one pixel":
+        mask[height // 2, width // 3] = True
+    elif kind == "block":
+        mask[height // 4 : -(height // 5) or None, width // 3 :] = True
+    elif kind == "all but a block":
+        mask[:] = True
+        mask[height // 3 : height // 2, : width // 2] = False
+    else:
+        mask[:] = rng.random(mask.shape) < {"few": 0.02, "most": 0.95, "all": 2}[kind]
+        mask[0, -1] = True
+    return mask
+
+
+MASKS = ("one pixel", "block", "all but a block", "few", "most", "all")
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("mask_kind", MASKS)
+@pytest.mark.parametrize("shape", [(5, 7, 3), (33, 100, 1), (130, 95, 3)])
+def test_masked_loss_gradient_and_metric_are_the_twin_s(
+    shape: tuple[int, int, int], mask_kind: str, kind: str
+) -> None:
+    a, b = images(shape, kind)
+    mask = masked(shape, mask_kind)
+    counts = torch.from_numpy(mask)
+    a64, b64 = (torch.from_numpy(image.astype(np.float64)) for image in (a, b))
+    few = mask.sum() < 100  # float32's rounding of variances does not average out
+    want = float(reference.ssim(a64, b64, counts))
+    assert ssim(a, b, mask) == pytest.approx(want, abs=3e-4 if few else 1e-5)
+    if mask.all():
+        assert ssim(a, b, mask) == ssim(a, b)
+    for loss_of in (l1_ssim, l1_ssim_anywhere):
+        x = torch.from_numpy(a).requires_grad_()
+        loss = loss_of(x, torch.from_numpy(b), 0.7, counts)
+        loss.backward()
+        x64 = a64.clone().requires_grad_()
+        twin = reference.l1_ssim(x64, b64, 0.7, counts)
+        twin.backward()
+        rough = few or loss_of is l1_ssim_anywhere  # which cancels where images are flat
+        assert loss.item() == pytest.approx(twin.item(), abs=3e-4 if rough else 1e-5)
+        assert not x.grad[~counts].any()
+        if loss_of is l1_ssim:  # the other cancels where images agree
+            error = float((x.grad - x64.grad).norm() / x64.grad.norm().clamp(min=1e-9))
+            assert error < (5e-3 if few else 3e-4)
+
+
+@pytest.mark.parametrize("mask_kind", MASKS)
+def test_masked_gradients_are_those_of_finite_differences(mask_kind: str) -> None:
+    rng = np.random.default_rng(3)
+    a, b = rng.random((2, 14, 17, 3))
+    mask = masked(a.shape, mask_kind)
+    _, gradient = _core.l1_ssim(a.astype(np.float32), b.astype(np.float32), 0.6, mask)
+    counts, target = torch.from_numpy(mask), torch.from_numpy(b)
+    for place in (
+        rng.permutation(np.argwhere(np.ones_like(mask)))[:30].tolist() + np.argwhere(mask)[:5].tolist()
+    ):
+        step = np.zeros_like(a)
+        step[place[0], place[1], 1] = 1e-6
+        up, down = (
+            reference.l1_ssim(torch.from_numpy(a + sign * step), target, 0.6, counts).item()
+            for sign in (1, -1)
+        )
+        assert gradient[(*place, 1)] == pytest.approx(
+            (up - down) / 2e-6, abs=2e-3 * float(np.abs(gradient).max())
+        )
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    st.tuples(st.integers(1, 30), st.integers(1, 30), st.sampled_from([1, 3])),
+    st.integers(0, 2**32 - 1),
+    st.floats(0, 1),
+    st.sampled_from(["noise", "inverse", "steps"]),
+)
+def test_masked_ssim_is_between_minus_one_and_one_and_sees_the_mask_alone(
+    shape: tuple[int, int, int], seed: int, share: float, kind: str
+) -> None:
+    rng = np.random.default_rng(seed)
+    a = rng.random(shape).astype(np.float32)
+    b = rng.random(shape).astype(np.float32)
+    if kind != "noise":
+        a = (a > rng.random()).astype(np.float32) if kind == "steps" else a
+        b = 1 - a
+    mask = rng.random(shape[:2]) < share
+    found = ssim(a, b, mask)
+    assert -1 <= found <= 1
+    assert ssim(a, a, mask) == 1
+    loss, gradient = _core.l1_ssim(a, b, 1.0, mask)
+    assert loss == 1 - found
+    assert 0 <= _core.l1_ssim(a, b, 0.2, mask)[0] <= 1.8
+    for spoilt in (np.nan, 1e30, 0.5):
+        other_a, other_b = (np.where(mask[..., None], image, np.float32(spoilt)) for image in (a, b))
+        assert ssim(other_a, b, mask) == ssim(a, other_b, mask) == found
+        again, other_gradient = _core.l1_ssim(other_a, other_b, 1.0, mask)
+        assert again == loss
+        np.testing.assert_array_equal(other_gradient, gradient)
+
+
+@pytest.mark.parametrize("size", [0, 1, 2, 24, 40])
+def test_black_against_white_in_a_mask_is_as_without_one(size: int) -> None:
+    black, white = np.zeros((48, 48, 3), np.float32), np.ones((48, 48, 3), np.float32)
+    mask = np.zeros((48, 48), bool)
+    mask[4 : 4 + size, 4 : 4 + size] = True
+    assert ssim(black, white, mask) == pytest.approx(1e-4 if size else 1, abs=2e-5)
 
 
 def test_edges_are_the_twin_s() -> None:

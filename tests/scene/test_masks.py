@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from PIL import Image
 
 from g2ard import io
 from g2ard.errors import InputError
@@ -128,9 +129,28 @@ def test_metrics_use_unmasked_pixels_only() -> None:
     b = np.where(mask[..., None], np.clip(a + 0.1, 0, 2), a).astype(np.float32)
     assert psnr(b, a, mask) == pytest.approx(20, abs=0.01)
     assert psnr(b, a) > 20.5
-    assert ssim(b, a, mask) < ssim(b, a)
-    assert ssim(a, a, mask) == pytest.approx(1)
-    assert ssim(b, a, np.ones_like(mask)) == pytest.approx(ssim(b, a))
+    inner = np.s_[5:35, 10:40]
+    assert ssim(b, a, mask) == pytest.approx(ssim(b[inner], a[inner]), abs=0.02)
+    assert ssim(b, a, mask) < ssim(b, a) - 0.005
+    assert ssim(a, a, mask) == 1
+    assert ssim(b, a, np.ones_like(mask)) == ssim(b, a)
+
+
+@pytest.mark.parametrize("alpha", [False, True])
+def test_a_pixel_counts_where_its_mask_is_above_half(tmp_path: Path, alpha: bool) -> None:
+    """Greys of a mask, and the alpha of a photo that is its own mask."""
+    levels = np.arange(256, dtype=np.uint8).reshape(16, 16)
+    folder = tmp_path / "images"
+    folder.mkdir()
+    photo = np.full((16, 16, 3), 128, np.uint8)
+    path = folder / "a.png"
+    Image.fromarray(np.dstack([photo, levels]) if alpha else photo).save(path)
+    mask_path = path if alpha else tmp_path / "mask.png"
+    if not alpha:
+        Image.fromarray(levels).save(mask_path)
+    camera = replace(VIEWS.take([0]), widths=np.array([16]), heights=np.array([16]))
+    cameras = replace(camera, image_paths=(path,), mask_paths=(mask_path,))
+    np.testing.assert_array_equal(load_mask(cameras, 0), levels >= 128)
 
 
 def test_exposures_are_undone(tmp_path: Path) -> None:

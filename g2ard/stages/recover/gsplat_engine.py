@@ -22,5 +22,5 @@ class GsplatEngine(TorchEngine):
         objective, parameters = self._objective, {**self._parameters, "means": means}
         return rasterized(parameters, objective.cameras, view, objective.background, self._settings)
 
-    def _loss(self, image: Tensor, target: Tensor) -> Tensor:
-        return l1_ssim_anywhere(image, target, self._objective.ssim_weight)
+    def _loss(self, image: Tensor, target: Tensor, mask: Tensor | None) -> Tensor:
+        return l1_ssim_anywhere(image, target, self._objective.ssim_weight, mask)

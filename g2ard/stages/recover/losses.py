@@ -17,27 +17,29 @@ _SSIM_C1, _SSIM_C2 = 0.01**2, 0.03**2
 
 class _L1Ssim(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, image: Tensor, target: Tensor, ssim_weight: float) -> Tensor:
+    def forward(ctx: Any, image: Tensor, target: Tensor, ssim_weight: float, mask: Tensor | None) -> Tensor:
         a, b = (t.detach().contiguous().numpy() for t in (image, target))
-        loss, gradient = _core.l1_ssim(a, b, ssim_weight)
+        counts = None if mask is None else mask.contiguous().numpy()
+        loss, gradient = _core.l1_ssim(a, b, ssim_weight, counts)
         ctx.save_for_backward(torch.from_numpy(gradient))
         return image.new_tensor(loss)
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
         (gradient,) = ctx.saved_tensors
-        return gradient * grads[0], None, None
+        return gradient * grads[0], None, None, None
 
 
-def l1_ssim(image: Tensor, target: Tensor, ssim_weight: float = 0.2) -> Tensor:
+def l1_ssim(image: Tensor, target: Tensor, ssim_weight: float = 0.2, mask: Tensor | None = None) -> Tensor:
     """Return (1 − λ)·L1 + λ·(1 − SSIM), means over pixels and channels (3DGS's loss with its λ = 0.2).
 
-    SSIM has an 11×11 Gaussian window, σ 1.5, zero-padded, and values in 0–1. Sums have a fixed order.
+    SSIM is that of `g2ard.rendering.metrics.ssim`. Sums have a fixed order.
 
     Args:
         image: (H, W, C) float32 on the CPU; the loss is differentiated with respect to it.
         target: (H, W, C) float32 on the CPU.
         ssim_weight: λ in [0, 1].
+        mask: (H, W) bool, True for pixels that count in both means; others have no part. None means all.
 
     Returns:
         The loss, a scalar.
@@ -54,11 +56,13 @@ def l1_ssim(image: Tensor, target: Tensor, ssim_weight: float = 0.2) -> Tensor:
         fits = tensor.dtype == torch.float32 and tensor.device.type == "cpu" and tensor.ndim == 3
         given = f"{tuple(tensor.shape)} {tensor.dtype} on {tensor.device}"
         require(name, given, fits, "(H, W, C) float32 on the CPU")
-    loss: Tensor = _L1Ssim.apply(image, target, ssim_weight)
+    loss: Tensor = _L1Ssim.apply(image, target, ssim_weight, mask)
     return loss
 
 
-def l1_ssim_anywhere(image: Tensor, target: Tensor, ssim_weight: float = 0.2) -> Tensor:
+def l1_ssim_anywhere(
+    image: Tensor, target: Tensor, ssim_weight: float = 0.2, mask: Tensor | None = None
+) -> Tensor:
     """Compute `l1_ssim` with torch operations, on any device.
 
     >>> import torch
@@ -66,14 +70,21 @@ def l1_ssim_anywhere(image: Tensor, target: Tensor, ssim_weight: float = 0.2) ->
     >>> bool((l1_ssim_anywhere(x, y) - l1_ssim(x, y)).abs() < 1e-5)
     True
     """
-    x, y = (t.permute(2, 0, 1)[:, None] for t in (image, target))
+    counts = torch.ones_like(image[..., 0], dtype=torch.bool) if mask is None else mask
+    x, y = (torch.where(counts, t.permute(2, 0, 1), 0.0)[:, None] for t in (image, target))
     offsets = torch.arange(_SSIM_WINDOW, device=image.device, dtype=image.dtype) - _SSIM_WINDOW // 2
     weights = torch.exp(-(offsets**2) / (2 * _SSIM_SIGMA**2))
     weights = weights / weights.sum()
 
-    def blurred(t: Tensor) -> Tensor:
+    def summed(t: Tensor) -> Tensor:
         t = conv2d(t, weights.view(1, 1, 1, -1), padding=(0, _SSIM_WINDOW // 2))
         return conv2d(t, weights.view(1, 1, -1, 1), padding=(_SSIM_WINDOW // 2, 0))
+
+    inside = 1 - summed((~counts).to(image.dtype)[None, None])
+    inside = torch.where(counts, inside, 1.0)
+
+    def blurred(t: Tensor) -> Tensor:
+        return summed(t) / inside
 
     mean_x, mean_y = blurred(x), blurred(y)
     var_x = (blurred(x * x) - mean_x**2).clamp_min(0)
@@ -81,7 +92,8 @@ def l1_ssim_anywhere(image: Tensor, target: Tensor, ssim_weight: float = 0.2) ->
     both = blurred(x * y) - mean_x * mean_y
     above = (2 * mean_x * mean_y + _SSIM_C1) * (2 * both + _SSIM_C2)
     ssim = above / ((mean_x**2 + mean_y**2 + _SSIM_C1) * (var_x + var_y + _SSIM_C2))
-    return (1 - ssim_weight) * (x - y).abs().mean() + ssim_weight * (1 - ssim.mean())
+    loss = (1 - ssim_weight) * (x - y).abs() + ssim_weight * (1 - ssim)
+    return torch.where(counts, loss, 0.0).sum() / (counts.sum().clamp_min(1) * len(x))
 
 
 class TorchAnchors:

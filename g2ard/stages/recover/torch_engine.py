@@ -77,11 +77,8 @@ class TorchEngine:
         p = self._parameters
         means = self._base + self._unit * p["means"]
         image = self._render(means, view)
-        wanted, share = torch.from_numpy(target).to(self.device), 1.0
-        if mask is not None:  # no difference outside the mask
-            image = torch.where(torch.from_numpy(mask).to(self.device)[..., None], image, wanted)
-            share = mask.size / max(1, int(mask.sum()))
-        loss = share * self._loss(image, wanted)
+        counts = None if mask is None else torch.from_numpy(mask).to(self.device)
+        loss = self._loss(image, torch.from_numpy(target).to(self.device), counts)
         total = loss
         if self._objective.relative:
             total = total * (TYPICAL_LOSS / max(float(loss.detach()), LEAST_LOSS))
@@ -123,8 +120,8 @@ class TorchEngine:
         )
         return image
 
-    def _loss(self, image: Tensor, target: Tensor) -> Tensor:
-        return l1_ssim(image, target, self._objective.ssim_weight)
+    def _loss(self, image: Tensor, target: Tensor, mask: Tensor | None) -> Tensor:
+        return l1_ssim(image, target, self._objective.ssim_weight, mask)
 
     def splats(self) -> Splats:
         p = {name: value.detach().cpu() for name, value in self._parameters.items()}

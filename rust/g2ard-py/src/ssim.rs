@@ -1,10 +1,12 @@
 //! `_core.l1_ssim`, `_core.ssim`, `_core.psnr`.
 
-use g2ard_core::ssim::{self, Loss, Shape};
-use numpy::{PyArray1, PyArray3, PyArrayMethods, PyReadonlyArray3, PyUntypedArrayMethods};
+use g2ard_core::ssim::{self, Loss, Mask, Shape};
+use numpy::{
+    PyArray1, PyArray3, PyArrayMethods, PyReadonlyArray2, PyReadonlyArray3, PyUntypedArrayMethods,
+};
 use pyo3::prelude::*;
 
-use crate::arrays::flat;
+use crate::arrays::{flat, optional};
 use crate::error::invalid;
 use crate::work;
 
@@ -28,18 +30,23 @@ fn pair<'a>(
     Ok((flat("image", image)?, flat("target", target)?, shape))
 }
 
-/// Return (loss, dloss/dimage) of (1 − λ)·L1 + λ·(1 − SSIM).
+/// Return (loss, dloss/dimage) of (1 − λ)·L1 + λ·(1 − SSIM). `mask`: (H, W), where it counts.
 #[pyfunction]
+#[pyo3(signature = (image, target, ssim_weight, mask = None))]
 pub fn l1_ssim<'py>(
     py: Python<'py>,
     image: Image<'py>,
     target: Image<'py>,
     ssim_weight: f32,
+    mask: Option<PyReadonlyArray2<'py, bool>>,
 ) -> PyResult<(f64, Bound<'py, PyArray3<f32>>)> {
     let (a, b, shape) = pair(&image, &target)?;
+    let counts = optional("mask", &mask)?;
     let (loss, gradient) = work::quick(py, || {
         let mut gradient = vec![0.0; shape.values()];
-        let loss = Loss::default().l1_ssim(a, b, shape, ssim_weight, &mut gradient)?;
+        let mask = counts.map(|counts| Mask::new(counts, shape)).transpose()?;
+        let loss =
+            Loss::default().l1_ssim(a, b, shape, mask.as_ref(), ssim_weight, &mut gradient)?;
         Ok((loss, gradient))
     })?;
     let gradient =
@@ -47,12 +54,21 @@ pub fn l1_ssim<'py>(
     Ok((loss, gradient))
 }
 
-/// Return the mean SSIM of two (H, W, C) images in 0–1.
+/// Return the mean SSIM of two (H, W, C) images in 0–1. `mask`: (H, W), pixels that count.
 #[pyfunction]
-#[pyo3(name = "ssim")]
-pub fn ssim_metric(py: Python<'_>, image: Image<'_>, target: Image<'_>) -> PyResult<f64> {
+#[pyo3(name = "ssim", signature = (image, target, mask = None))]
+pub fn ssim_metric(
+    py: Python<'_>,
+    image: Image<'_>,
+    target: Image<'_>,
+    mask: Option<PyReadonlyArray2<'_, bool>>,
+) -> PyResult<f64> {
     let (a, b, shape) = pair(&image, &target)?;
-    work::quick(py, || ssim::ssim(a, b, shape))
+    let counts = optional("mask", &mask)?;
+    work::quick(py, || {
+        let mask = counts.map(|counts| Mask::new(counts, shape)).transpose()?;
+        ssim::ssim(a, b, shape, mask.as_ref())
+    })
 }
 
 /// Return the PSNR in dB of two (H, W, C) images in 0–1.

@@ -9,10 +9,10 @@ mod tile;
 
 use rayon::prelude::*;
 
-use super::{Shape, window};
-use crate::Result;
+use super::{Mask, Shape, window};
 use crate::raster::disjoint::DisjointSlice;
 use crate::raster::simd::{Isa, dispatch};
+use crate::{Error, Result};
 use tile::{Tile, scratch_len};
 
 /// Rows and values along a row of a tile: fixed, so that sums are split equally for any number of threads.
@@ -34,24 +34,30 @@ impl Loss {
         }
     }
 
-    /// The loss; `gradient` receives dloss/d(image).
+    /// The loss; `gradient` receives dloss/d(image), which is 0 outside the mask.
     pub fn l1_ssim(
         &mut self,
         image: &[f32],
         target: &[f32],
         shape: Shape,
+        mask: Option<&Mask>,
         ssim_weight: f32,
         gradient: &mut [f32],
     ) -> Result<f64> {
         shape.check("image", image)?;
         shape.check("target", target)?;
         shape.check("gradient", gradient)?;
+        let factors = mask.map(|mask| &mask.factors[..]);
+        if let Some(factors) = factors {
+            Error::unless_equal("mask", factors.len(), shape.values(), "values")?;
+        }
         let (isa, row) = (self.isa, shape.row());
         let across = row.div_ceil(COLUMNS);
         self.sums
             .resize(shape.height.div_ceil(ROWS) * across, [0.0; 2]);
         let weights = window().map(|w| w as f32);
-        let count = shape.values() as f32;
+        let values = mask.map_or(shape.values(), |mask| mask.values(shape.channels));
+        let count = values as f32;
         let scale = [(1.0 - ssim_weight) / count, -ssim_weight / count];
         let gradient = DisjointSlice::new(gradient);
         self.sums.par_iter_mut().enumerate().for_each_init(
@@ -62,6 +68,7 @@ impl Loss {
                     image,
                     target,
                     shape,
+                    factors,
                     weights,
                     scale,
                     rows: y..shape.height.min(y + ROWS),
@@ -76,7 +83,7 @@ impl Loss {
             .sums
             .iter()
             .fold([0.0; 2], |t, s| [t[0] + s[0], t[1] + s[1]]);
-        let (count, weight) = (shape.values() as f64, f64::from(ssim_weight));
+        let (count, weight) = (values as f64, f64::from(ssim_weight));
         Ok((1.0 - weight) * total[0] / count + weight * total[1] / count)
     }
 }

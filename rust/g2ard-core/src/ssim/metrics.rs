@@ -2,13 +2,13 @@
 
 use rayon::prelude::*;
 
-use super::{Loss, Shape};
+use super::{Loss, Mask, Shape};
 use crate::Result;
 
-/// Mean SSIM over pixels and channels.
-pub fn ssim(a: &[f32], b: &[f32], shape: Shape) -> Result<f64> {
+/// Mean SSIM over the pixels that count and channels.
+pub fn ssim(a: &[f32], b: &[f32], shape: Shape, mask: Option<&Mask>) -> Result<f64> {
     let mut gradient = vec![0.0; shape.values()];
-    Ok(1.0 - Loss::default().l1_ssim(a, b, shape, 1.0, &mut gradient)?)
+    Ok(1.0 - Loss::default().l1_ssim(a, b, shape, mask, 1.0, &mut gradient)?)
 }
 
 /// −10·log10 of the mean squared difference, for values in 0–1; infinite for equal images.

@@ -2,11 +2,14 @@
 //!
 //! SSIM of Wang et al. (2004): 11×11 Gaussian window, σ 1.5, zero-padded as 3DGS does, values in 0–1, C₁ = 0.01²,
 //! C₂ = 0.03². Images are row-major with interleaved channels, so one channel's neighbour is `channels` values away.
+//! With a mask, windows are weighted by it ([`Mask`]), and both losses are means over the pixels that count.
 
 mod loss;
+mod mask;
 mod metrics;
 
 pub use loss::Loss;
+pub use mask::Mask;
 pub use metrics::{psnr, ssim};
 
 use crate::Result;

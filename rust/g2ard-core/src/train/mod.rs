@@ -7,7 +7,6 @@
 
 mod adam;
 mod anchors;
-mod mask;
 mod row_major;
 mod store;
 #[cfg(test)]
@@ -23,10 +22,9 @@ use rayon::prelude::*;
 use crate::raster::rasterizer::ChunkSums;
 use crate::raster::simd::{LANES, dispatch};
 use crate::raster::{Camera, Image, ImageGradients, Isa, Params, Rasterizer, Settings};
-use crate::ssim::{Loss, Shape};
+use crate::ssim::{Loss, Mask, Shape};
 use crate::{Error, Result};
 use adam::Update;
-use mask::Mask;
 
 /// Smaller losses, about 40 dB, are hardly visible.
 const LEAST_LOSS: f32 = 0.005;
@@ -214,19 +212,15 @@ impl Trainer {
             input.background,
             &mut image,
         )?;
-        let pixels = camera.width * camera.height;
-        let mask = input.mask.map(|m| Mask::new(m, pixels)).transpose()?;
-        if let Some(mask) = &mask {
-            mask.cover(&mut self.image, input.target);
-        }
-        let (image, gradient) = (&self.image, &mut self.gradient);
-        let mut loss =
-            self.loss
-                .l1_ssim(image, input.target, shape, input.ssim_weight, gradient)?;
-        if let Some(mask) = &mask {
-            mask.clear(&mut self.gradient);
-            loss *= f64::from(mask.share);
-        }
+        let mask = input.mask.map(|m| Mask::new(m, shape)).transpose()?;
+        let loss = self.loss.l1_ssim(
+            &self.image,
+            input.target,
+            shape,
+            mask.as_ref(),
+            input.ssim_weight,
+            &mut self.gradient,
+        )?;
         if let Some(typical) = input.relative {
             let factor = typical / (loss as f32).max(LEAST_LOSS);
             self.gradient.par_iter_mut().for_each(|g| *g *= factor);

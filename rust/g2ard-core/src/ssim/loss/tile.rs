@@ -163,6 +163,8 @@ pub struct Tile<'a> {
     pub image: &'a [f32],
     pub target: &'a [f32],
     pub shape: Shape,
+    /// Those of a [`Mask`](crate::ssim::Mask).
+    pub factors: Option<&'a [f32]>,
     pub weights: [f32; TAPS],
     /// Weights of |e| and SSIM per value.
     pub scale: [f32; 2],
@@ -259,12 +261,8 @@ impl Tile<'_> {
         let last = self.shape.row().min(self.columns.end + reach);
         let first = self.rows.start + group * GROUP;
         for y in first.saturating_sub(GROUP)..self.shape.height.min(first) {
-            let (image, target) = self.images(y);
             for at in (self.columns.start.saturating_sub(reach)..last).step_by(LANES) {
-                let (p, q) = (
-                    load::<F>(image, at as isize),
-                    load::<F>(target, at as isize),
-                );
+                let (p, q) = self.images::<F>(y, at as isize);
                 if p.ge(q).and(q.ge(p)).bits() != u16::MAX {
                     return true;
                 }
@@ -273,11 +271,26 @@ impl Tile<'_> {
         false
     }
 
-    /// Row y of the image and of the target.
+    /// Sixteen values of row y of the image and of the target; 0 outside the mask.
     #[inline(always)]
-    fn images(&self, y: usize) -> (&[f32], &[f32]) {
+    fn images<F: Lanes>(&self, y: usize, at: isize) -> (F, F) {
         let row = y * self.shape.row()..(y + 1) * self.shape.row();
-        (&self.image[row.clone()], &self.target[row])
+        let image = load::<F>(&self.image[row.clone()], at);
+        let target = load::<F>(&self.target[row], at);
+        match self.factors::<F>(y, at) {
+            None => (image, target),
+            Some(factors) => {
+                let counts = factors.gt(F::zero());
+                (image.only(counts), target.only(counts))
+            }
+        }
+    }
+
+    /// The mask's factors of sixteen values of row y.
+    #[inline(always)]
+    fn factors<F: Lanes>(&self, y: usize, at: isize) -> Option<F> {
+        let row = y * self.shape.row()..(y + 1) * self.shape.row();
+        self.factors.map(|factors| load::<F>(&factors[row], at))
     }
 
     /// Blurs a group of products along their rows.
@@ -293,10 +306,8 @@ impl Tile<'_> {
                 }
                 continue;
             }
-            let (image, target) = self.images(y);
             for at in (0..rows.span).step_by(LANES) {
-                let x = left + at as isize;
-                let (p, q) = (load::<F>(image, x), load::<F>(target, x));
+                let (p, q) = self.images::<F>(y, left + at as isize);
                 let e = p - q;
                 let values = [p, e, p.fma(p, q * q), e * e];
                 for m in 0..FORWARD {
@@ -330,8 +341,15 @@ impl Tile<'_> {
                 let y = (self.rows.start + group * GROUP + i).wrapping_sub(RADIUS);
                 let (mut loss, mut d) = (F::zero(), [F::zero(); BACK]);
                 if y < self.shape.height {
-                    let means = [blurred[0][i], blurred[1][i], blurred[2][i], blurred[3][i]];
+                    let mut means = [blurred[0][i], blurred[1][i], blurred[2][i], blurred[3][i]];
+                    let factors = self.factors::<F>(y, left + at as isize);
+                    if let Some(factors) = factors {
+                        means = means.map(|mean| mean * factors);
+                    }
                     (loss, d) = derivatives_of(&means);
+                    if let Some(factors) = factors {
+                        d = d.map(|slope| slope * factors);
+                    }
                 }
                 if mine && self.rows.contains(&y) {
                     lost = lost + loss.only(columns);
@@ -367,14 +385,17 @@ impl Tile<'_> {
             let x = self.columns.start + at;
             let count = LANES.min(self.columns.end - x);
             for (i, y) in self.rows_of(group).enumerate() {
-                let (image, target) = self.images(y);
-                let p = load::<F>(image, x as isize);
-                let e = p - load::<F>(target, x as isize);
+                let (p, q) = self.images::<F>(y, x as isize);
+                let e = p - q;
                 differences = differences + e.abs();
                 let slope = blurred[0][i] + two * (p * blurred[1][i] + e * blurred[2][i]);
                 let sign = l1.only(e.gt(F::zero())) - l1.only(F::zero().gt(e));
                 let mut lanes = Lanes16::default();
-                slope.fma(F::splat(self.scale[1]), sign).store(&mut lanes);
+                let mut slope = slope.fma(F::splat(self.scale[1]), sign);
+                if let Some(factors) = self.factors::<F>(y, x as isize) {
+                    slope = slope.only(factors.gt(F::zero()));
+                }
+                slope.store(&mut lanes);
                 // SAFETY: these values are the tile's own.
                 let out = unsafe { self.gradient.slice(y * self.shape.row() + x, count) };
                 match out.first_chunk_mut() {
