@@ -31,11 +31,12 @@ from g2ard.cli.usage import flags_of, in_flags, typed
 from g2ard.config.choices import RenderModel, ViewFormat
 from g2ard.config.paths import full_paths, parse_settings
 from g2ard.errors import G2ardError, InputError
-from g2ard.io import check_scene_output, check_views_output, write_splats, write_views
+from g2ard.io import check_scene_output, check_views_output, write_views
 from g2ard.io.atomic import atomic_output, check_output
 from g2ard.io.detect import run_scene
 from g2ard.io.paths import real_path
-from g2ard.io.scene_formats import axes_note, files_of, lost_in
+from g2ard.io.scene_formats import axes_note, files_of
+from g2ard.io.scenes import write_scene
 from g2ard.pipeline.presets import configured
 from g2ard.progress import plural
 from g2ard.system import devices, interrupt
@@ -272,9 +273,9 @@ class Run:
         """Write a scene, and report what its format cannot hold and, with `compare`, a large loss."""
         self.begin("write")
         replaced = self.overwrite or overwrite
-        write_splats(path, splats, overwrite=replaced, progress=self.progress, **options)
+        notes = write_scene(path, splats, overwrite=replaced, progress=self.progress, **options)
         self.kept.append(f"{path} is written")
-        for note in lost_in(path, splats, **options):
+        for note in notes:
             self.say(f"note: {path}: {note}")
         if about_axes := axes_note(path, options):
             self.say(f"note: {path}: {about_axes}")

@@ -19,6 +19,7 @@ from g2ard.io.packing import (
     from_smallest_three,
     log_scales,
     morton_order,
+    rounding,
     smallest_three,
     unit_quats,
     writable,
@@ -117,16 +118,17 @@ def _coefficient(codes: NDArray[Any]) -> NDArray[np.float64]:
     return (np.select([codes == 0, codes == 255], [0.0, 1.0], t) - 0.5) * 8
 
 
-def write(path: Path, splats: Splats, *, overwrite: bool = False) -> None:
+def write(path: Path, splats: Splats, *, overwrite: bool = False) -> float:
     """Write a .compressed.ply: 16 bytes per Gaussian, plus one per harmonic past band 0.
 
     Gaussians are written in Morton order, which keeps the bounds of chunks tight. An `offset` and the render
-    model are stored in comments, as in .ply.
+    model are stored in comments, as in .ply. Return the largest change of a position by rounding.
     """
     from plyfile import PlyData, PlyElement
 
-    splats = writable(path, splats)
-    splats = splats.take(morton_order(splats.means))
+    given = writable(path, splats)
+    given = given.take(morton_order(given.means))
+    splats = given.narrowed()
     bounds: dict[str, NDArray[np.float32]] = {}
     words = np.empty(len(splats), [(name, "<u4") for name in _PACKED])
     words["packed_position"] = _packed(_within(bounds, "", "xyz", splats.means), _VECTOR_BITS)
@@ -146,6 +148,9 @@ def write(path: Path, splats: Splats, *, overwrite: bool = False) -> None:
     comments = plyfiles.comments_of(splats.offset, splats.render_model)
     with atomic_output(path, overwrite) as temporary, temporary.open("wb") as file:
         PlyData(elements, byte_order="<", comments=comments).write(file)
+    low, high = (np.stack([chunk[f"{end}_{axis}"] for axis in "xyz"], axis=1) for end in ("min", "max"))
+    of, shares = np.arange(len(splats)) // _CHUNK_ROWS, _unpacked(words["packed_position"], _VECTOR_BITS)
+    return rounding(given, low[of] * (1 - shares) + high[of] * shares + splats.offset)
 
 
 def _within(

@@ -32,7 +32,7 @@ from g2ard.io.jsonfile import (
     text,
     whole,
 )
-from g2ard.io.packing import morton_order, unit_quats, writable
+from g2ard.io.packing import morton_order, rounding, unit_quats, writable
 from g2ard.io.sanitize import Raw, cleaned
 from g2ard.io.types import Note, Scene
 from g2ard.progress import plural
@@ -51,18 +51,26 @@ _SH_FLIPS = np.array([-1, 1, -1, 1, -1, 1, -1, 1, -1, 1, -1, 1, -1, 1, -1], np.f
 _GLTF_TURN = np.array([-1.0, -1, 1])
 
 
-def write(path: Path, splats: Splats, *, overwrite: bool = False, compress: str | None = None) -> None:
+def write(path: Path, splats: Splats, *, overwrite: bool = False, compress: str | None = None) -> float:
     """Write a .glb with KHR_gaussian_splatting; equal scenes give equal bytes.
 
     SCALE and OPACITY are linear, ROTATION is x y z w. COLOR_0 is for viewers that only draw points: the base
     colour clipped to [0, 1] and decoded from sRGB, and α. `offset` is the node's translation.
     `compress="spz"` writes an SPZ of version 3 instead of attributes, for CesiumJS.
+
+    Return the largest change of a position by rounding.
     """
     require("compress", repr(compress), compress in (None, "spz"), "spz")
-    splats = writable(path, splats)
-    content = _plain(path, splats) if compress is None else spz_glb(path, splats)
+    given, splats = splats, writable(path, splats).narrowed()
+    error = rounding(given, splats)
+    if compress is None:
+        content = _plain(path, splats)
+    else:
+        content = spz_glb(path, splats)
+        error += spz.rounding(splats.means, spz.fraction_bits(path, splats.means.astype(np.float64), splats))
     with atomic_output(path, overwrite) as temporary, temporary.open("wb") as file:
         file.writelines(content)
+    return error
 
 
 def _plain(path: Path, splats: Splats) -> list[bytes]:

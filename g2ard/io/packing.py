@@ -26,10 +26,26 @@ def writable(path: Path, splats: Splats) -> Splats:
     return splats
 
 
+def rounding(splats: Splats, stored: Splats | NDArray[np.float64]) -> float:
+    """Return the largest difference of a coordinate from its stored value, in scene units.
+
+    Args:
+        splats: the scene.
+        stored: the scene as stored, or its (N, 3) world coordinates; rows in the same order.
+    """
+    if stored is splats or not len(splats):
+        return 0.0
+    if isinstance(stored, Splats):
+        world = stored.means + (stored.offset - splats.offset)
+    else:
+        world = stored - splats.offset
+    return float(np.nanmax(np.abs(world - splats.means)))
+
+
 def world_means(path: Path, splats: Splats, what: str) -> NDArray[np.float64]:
     """Return (N, 3) means + offset for a float32 format `what` without an offset."""
     means = splats.means.astype(np.float64) + splats.offset
-    if splats.offset.any():
+    if splats.narrowed().offset.any():
         step = float(np.spacing(np.abs(means).max().astype(np.float32)))
         thin = float(np.median(splats.scales.min(axis=1)))
         if step > thin:

@@ -12,11 +12,12 @@ from numpy.typing import NDArray
 from g2ard.config.choices import PlyLayout, RenderModel
 from g2ard.errors import InputError, require
 from g2ard.io import plyfiles
+from g2ard.io.packing import rounding
 from g2ard.io.sanitize import BLOCK, LOG_SCALE_LIMIT, Raw
 from g2ard.io.stream import RawStream, SceneStream
 from g2ard.io.types import Note
 from g2ard.progress import plural
-from g2ard.scene.splats import Splats, unit_quats
+from g2ard.scene.splats import Splats, far_middle, unit_quats
 
 _MEANS = ["x", "y", "z"]
 _DC = ["f_dc_0", "f_dc_1", "f_dc_2"]
@@ -45,7 +46,10 @@ class Stream(RawStream):
         rest = sorted((p for p in properties if re.fullmatch(r"f_rest_\d{1,3}", p)), key=lambda p: int(p[7:]))
         stored, kept = _bands(path, rest)
         (rows,) = plyfiles.read_element(path, header, "vertex")
-        shift = _recentre(plyfiles.spread_rows(rows)) if rows.dtype["x"].itemsize == 8 else np.zeros(3)
+        shift = np.zeros(3)
+        if rows.dtype["x"].itemsize == 8:
+            sample = plyfiles.spread_rows(rows)
+            shift = far_middle(np.stack([sample[name] for name in _MEANS], axis=1))
         offset = plyfiles.offset_of(path, header) + shift
         notes = _ignored(properties, rest, stored, kept)
         if flat:
@@ -108,20 +112,6 @@ def _ignored(properties: list[str], rest: list[str], stored: int, kept: int) -> 
     return notes
 
 
-def _recentre(sample: NDArray[Any]) -> NDArray[np.float64]:
-    """Return the whole-unit shift for which float32 can represent float64 positions; zero if not needed.
-
-    Percentiles of a sample of rows decide, so that outliers have no effect.
-    """
-    positions = np.stack([sample[name] for name in _MEANS], axis=1)
-    positions = positions[np.isfinite(positions).all(1)]
-    if not len(positions):
-        return np.zeros(3)
-    low, middle, high = np.percentile(positions, (1, 50, 99), axis=0)
-    far = np.abs(middle) > 16 * np.linalg.norm(high - low)
-    return np.where(far.any(), np.rint(middle), 0.0)
-
-
 def _means(block: NDArray[Any], shift: NDArray[np.float64]) -> NDArray[np.float32]:
     means = structured_to_unstructured(block[_MEANS])
     return np.asarray(means - shift if shift.any() else means, np.float32)
@@ -134,18 +124,23 @@ def write(
     overwrite: bool = False,
     normals: bool = False,
     layout: PlyLayout | None = None,
-) -> None:
+) -> float:
     """Write a binary little-endian 3DGS .ply: x y z, f_dc, f_rest, opacity, scale, rot.
 
     A non-zero `offset` and an antialiased render model are stored in comments, which `Stream` restores.
     `normals` adds zero nx ny nz after x y z. The layout "inria" is that of INRIA's trainer, for programs that
     go by position: normals, and SH degree 3 padded with zeros, 248 bytes per Gaussian. A stream is written
     block by block.
+
+    Returns:
+        The largest change of a position by rounding.
     """
     require("layout", repr(layout), layout in (None, "inria"), "'inria' or None")
     normals, degree = normals or layout == "inria", 3 if layout == "inria" else scene.sh_degree
+    error = 0.0
     if isinstance(scene, Splats):
-        count, parts = len(scene), iter([scene])
+        given, scene = scene, scene.narrowed()
+        count, parts, error = len(scene), iter([scene]), rounding(given, scene)
     else:
         count, parts = scene.count, scene.blocks(BLOCK)
     if not count:
@@ -158,6 +153,7 @@ def write(
     if layout == "inria":
         comments = comments[1:]  # those that carry values: importers by position may count lines
     plyfiles.write_rows(path, dict.fromkeys(names, "<f4"), count, blocks, overwrite, comments)
+    return error
 
 
 def _blocks(

@@ -47,6 +47,9 @@ FORMATS: dict[FormatName, SceneFormat] = {
 }
 """Formats by name, longer suffixes first."""
 
+_VISIBLE_ROUNDING = 0.01
+"""Rounding of positions that can be visible, as a share of a typical Gaussian's scale."""
+
 _FOLDER = SceneFormat("meta.json", "sog_write", "write_folder", lossy=True, tells=True)
 
 
@@ -100,6 +103,21 @@ def lost_in(path: str | Path, splats: Splats, **options: object) -> list[Note]:
         f"{output_format.suffix} cannot say that the scene is antialiased; other programs draw it too opaque"
     )
     return [Note("lost_render_model", 1, text)]
+
+
+def rounded_by(error: float, splats: Splats) -> list[Note]:
+    """Return a note on positions that change by up to `error` when written, if it can be visible."""
+    from g2ard.io.types import Note
+
+    largest = splats.scales.max(axis=1)
+    largest.partition(len(largest) // 2)
+    typical = float(largest[len(largest) // 2])
+    if not error > _VISIBLE_ROUNDING * typical:
+        return []
+    text = (
+        f"positions are rounded by up to {error:.2g} units; a typical Gaussian has a scale of {typical:.2g}"
+    )
+    return [Note("rounded_positions", len(splats), text)]
 
 
 def axes_note(path: str | Path, options: dict[str, Any]) -> str | None:

@@ -12,7 +12,7 @@ from g2ard.config.checks import check_type, checks_arguments
 from g2ard.errors import InputError
 from g2ard.io.atomic import check_output
 from g2ard.io.detect import KINDS, file_format, run_scene
-from g2ard.io.scene_formats import check_options, lost_in, scene_format
+from g2ard.io.scene_formats import check_options, lost_in, rounded_by, scene_format
 from g2ard.progress import Progress, silent
 
 if TYPE_CHECKING:
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     from g2ard.config.choices import RenderModel
     from g2ard.io.stream import SceneStream
-    from g2ard.io.types import Scene
+    from g2ard.io.types import Note, Scene
     from g2ard.scene.splats import Splats
 
 
@@ -132,7 +132,8 @@ def write_splats(
             inside of a .glb.
 
     Warns:
-        UserWarning: an antialiased scene in a format that cannot say so (.glb, .splat, OpenUSD).
+        UserWarning: positions rounded by more than 1 % of a typical Gaussian's size; an antialiased scene in
+            a format that cannot say so (.glb, .splat, OpenUSD).
 
     Raises:
         OutputError: the file exists or cannot be written, or the extension or an option is unsupported.
@@ -145,12 +146,19 @@ def write_splats(
     >>> len(g2ard.load(path))
     1
     """
+    for note in write_scene(path, splats, overwrite=overwrite, progress=progress, **options):
+        warnings.warn(f"{path}: {note}", stacklevel=3)  # past `checks_arguments`
+
+
+def write_scene(
+    path: str | Path, splats: Splats, *, overwrite: bool = False, progress: Progress = silent, **options: Any
+) -> list[Note]:
+    """Write a scene like `write_splats`, and return notes on what the file does not hold."""
     from g2ard.scene.splats import Splats
 
     check_type("splats", splats, Splats)
     output_format = check_options(path, options)
     writer = getattr(import_module(f"g2ard.io.{output_format.module}"), output_format.function)
     told = {"progress": progress} if output_format.tells else {}
-    writer(Path(path), splats, overwrite=overwrite, **told, **options)
-    for note in lost_in(path, splats, **options):
-        warnings.warn(f"{path}: {note}", stacklevel=3)  # past `checks_arguments`
+    error = writer(Path(path), splats, overwrite=overwrite, **told, **options)
+    return [*rounded_by(error, splats), *lost_in(path, splats, **options)]

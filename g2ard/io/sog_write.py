@@ -23,7 +23,7 @@ from g2ard import _core
 from g2ard._core import __version__
 from g2ard.errors import InputError
 from g2ard.io.atomic import atomic_folder, atomic_output
-from g2ard.io.packing import coded, log_scales, morton_order, smallest_three, unit_quats, writable
+from g2ard.io.packing import coded, log_scales, morton_order, rounding, smallest_three, unit_quats, writable
 from g2ard.progress import Progress, silent
 from g2ard.scene.shape import longer_axes
 from g2ard.scene.splats import Splats
@@ -38,10 +38,14 @@ _KMEANS_STEPS = 6
 """Steps of k-means after the split; 10 more gain 0.01 dB."""
 
 
-def write(path: Path, splats: Splats, *, overwrite: bool = False, progress: Progress = silent) -> None:
-    """Write a .sog: the files of `sog_files`, zipped without compression; equal scenes give equal bytes."""
+def write(path: Path, splats: Splats, *, overwrite: bool = False, progress: Progress = silent) -> float:
+    """Write a .sog: the files of `sog_files`, zipped without compression; equal scenes give equal bytes.
+
+    Return the largest change of a position by rounding.
+    """
     with atomic_output(path, overwrite) as temporary:
         temporary.write_bytes(sog_bytes(path, splats, progress))
+    return largest_rounding(splats)
 
 
 def sog_bytes(path: Path, splats: Splats, progress: Progress = silent) -> bytes:
@@ -53,11 +57,22 @@ def sog_bytes(path: Path, splats: Splats, progress: Progress = silent) -> bytes:
     return room.getvalue()
 
 
-def write_folder(path: Path, splats: Splats, *, overwrite: bool = False, progress: Progress = silent) -> None:
-    """Write `path`, a meta.json, and its images beside it."""
+def write_folder(
+    path: Path, splats: Splats, *, overwrite: bool = False, progress: Progress = silent
+) -> float:
+    """Write `path`, a meta.json, and its images beside it; return what `write` returns."""
     with atomic_folder(path.parent, overwrite) as temporary:
         for name, content in sog_files(path, splats, progress=progress).items():
             (temporary / name).write_bytes(content)
+    return largest_rounding(splats)
+
+
+def largest_rounding(splats: Splats) -> float:
+    """Return the largest change of a position by rounding."""
+    near = splats.narrowed()
+    low, high, codes = _means(near)
+    logs = low + codes / 65535 * (high - low)
+    return rounding(splats, np.sign(logs) * np.expm1(np.abs(logs)) + near.offset)
 
 
 def palette_size(count: int) -> int:
@@ -76,7 +91,7 @@ def sog_files(
 
     An `offset` is stored under "g2ard" in meta.json; other programs show the recentred scene.
     """
-    splats = writable(path, splats)
+    splats = writable(path, splats).narrowed()
     if not ordered:
         splats = splats.take(morton_order(splats.means))
     width, height = _size(path, len(splats))

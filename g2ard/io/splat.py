@@ -40,19 +40,24 @@ class Stream(RawStream):
             yield raw
 
 
-def write(path: Path, splats: Splats, *, overwrite: bool = False) -> None:
-    """Write a .splat, largest and most opaque first as its viewers expect; bands past 0 are dropped."""
+def write(path: Path, splats: Splats, *, overwrite: bool = False) -> float:
+    """Write a .splat, largest and most opaque first as its viewers expect; bands past 0 are dropped.
+
+    Return the largest change of a position by rounding.
+    """
     splats = writable(path, splats)
     weight = splats.scales.astype(np.float64).prod(1) * splats.opacities
     splats = splats.take(np.argsort(-weight, kind="stable"))
     rows = np.empty(len(splats), _ROW)
-    rows["mean"] = world_means(path, splats, ".splat")
+    means = world_means(path, splats, ".splat")
+    rows["mean"] = means
     rows["scale"] = splats.scales
     rows["rgba"][:, :3] = _bytes(splats.colors * 255)
     rows["rgba"][:, 3] = _bytes(splats.opacities * 255)
     rows["quat"] = _bytes(unit_quats(splats.quats) * 128 + 128)
     with atomic_output(path, overwrite) as temporary:
         temporary.write_bytes(rows.tobytes())
+    return float(np.abs(rows["mean"] - means).max())
 
 
 def _bytes(values: NDArray[Any]) -> NDArray[np.uint8]:

@@ -241,14 +241,14 @@ def write(
     spz_version: int = 3,
     axes: Axes = "RUB",
     progress: Progress = silent,
-) -> None:
+) -> float:
     """Write an .spz; equal scenes give equal bytes.
 
     Scales are clamped to e^−10 … e^5.94, harmonics to ±1, colours to slightly more than [0, 1].
     Version 3 uses gzip, 4 Zstandard (smaller files), 2 gzip with coarser rotations. Version 4 can store other
     `axes`, which it names; readers that ignore extensions show such a scene turned or mirrored. Versions 2
     and 3 store right-up-back, or with RDF the coordinates of a .ply, against the definition and unnamed, as
-    splat-transform and SuperSplat read every .spz.
+    splat-transform and SuperSplat read every .spz. Return the largest change of a position by rounding.
     """
     require("spz_version", spz_version, spz_version in (2, 3, 4), "2, 3 or 4")
     if axes != "RUB":
@@ -263,9 +263,17 @@ def write(
     splats = splats.take(packing.morton_order(splats.means))
     means = packing.world_means(path, splats, ".spz")
     named: Axes = axes if spz_version == 4 else "RUB"
-    content = encoded(path, splats, means, fraction_bits(path, means, splats), spz_version, named, progress)
+    bits = fraction_bits(path, means, splats)
+    content = encoded(path, splats, means, bits, spz_version, named, progress)
     with atomic_output(path, overwrite) as temporary:
         temporary.write_bytes(content)
+    return rounding(means, bits)
+
+
+def rounding(means: NDArray[Any], bits: int) -> float:
+    """Return the largest change of a coordinate in `bits` fractional bits."""
+    scaled = np.asarray(means, np.float64) * (1 << bits)
+    return float(np.abs(np.rint(scaled) - scaled).max()) / (1 << bits)
 
 
 def encoded(

@@ -11,9 +11,9 @@ from typing import Any, TextIO
 import numpy as np
 from numpy.typing import NDArray
 
-from g2ard.errors import InputError, missing
+from g2ard.errors import InputError, OutputError, missing
 from g2ard.io.atomic import atomic_output
-from g2ard.io.packing import unit_quats, writable
+from g2ard.io.packing import rounding, unit_quats, writable
 from g2ard.io.sanitize import Raw, cleaned
 from g2ard.io.spz import FLIPS
 from g2ard.io.types import Scene
@@ -31,20 +31,26 @@ _EXTENT_SIGMAS = 3.0
 """Extent of a Gaussian, as a multiple of its largest scale."""
 
 
-def write(path: Path, splats: Splats, *, overwrite: bool = False, progress: Progress = silent) -> None:
+def write(path: Path, splats: Splats, *, overwrite: bool = False, progress: Progress = silent) -> float:
     """Write a .usda, or a .usdc if usd-core is installed; equal scenes give equal text.
 
-    `offset` becomes the prim's translation. Units are metres.
+    `offset` becomes the prim's translation. Units are metres. Return the largest change of a position by
+    rounding.
     """
-    splats = writable(path, splats)
+    given, splats = splats, writable(path, splats).narrowed()
     binary = path.suffix.lower() != ".usda"
     pxr = _pxr(path) if binary else None
     with atomic_output(path, overwrite) as temporary:
         if pxr is not None:
-            _save(pxr, temporary, splats, progress)
+            try:
+                _save(pxr, temporary, splats, progress)
+            except (pxr.Tf.ErrorException, RuntimeError) as error:
+                reason = str(error).strip().splitlines()[-1].strip()
+                raise OutputError(f"cannot write: {reason}", path=path) from error
         else:
             with temporary.open("w", encoding="utf-8", newline="\n") as file:
                 _print(file, splats, progress)
+    return rounding(given, splats)
 
 
 def _attributes(splats: Splats) -> dict[str, tuple[str, NDArray[np.float32]]]:

@@ -319,7 +319,7 @@ def _read(
 
     if isinstance(scene, Splats):
         options.check_trained()
-        return _Read(scene, False, options.beside, "scene", len(scene))
+        return _Read(scene.narrowed(), False, options.beside, "scene", len(scene))
     if isinstance(scene, str | Path) and kind(scene) == "splats":
         options.check_trained()
         splats = load_scene(scene, say, options.render_model)

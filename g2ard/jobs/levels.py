@@ -204,6 +204,8 @@ def prepare_levels(
     check_ratios(ratios)
     check_trained(scene)
     sky = None
+    if isinstance(scene, Splats):
+        scene = scene.narrowed()  # levels and sky then have one offset
     if split_sky:
         if not isinstance(scene, Splats):
             beside = beside or scene

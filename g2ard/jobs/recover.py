@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from g2ard.config.checks import checks_arguments
 from g2ard.config.choices import RenderModel
 from g2ard.config.paths import changed, full_paths
-from g2ard.errors import InputError
+from g2ard.errors import InputError, require
 from g2ard.io.types import ViewSet
 from g2ard.jobs.causes import likely_causes
 from g2ard.jobs.inputs import Views, load_scene
@@ -246,6 +246,7 @@ def prepare(
     """Read the inputs of `recover` without `targets`, and decide everything."""
     check_teacher(views, teacher)
     given = full_paths(settings or {}, RecoverConfig())
+    require("preset", repr(preset), preset in PRESETS, f"one of {', '.join(PRESETS)}")
     named = {**PRESETS[preset], **given}
     config = configured(RecoverConfig(), preset, given)
     start = _scene(student, render_model, say)
@@ -299,7 +300,7 @@ def prepare(
 
 
 def _scene(scene: Splats | str | Path, render_model: RenderModel | None, say: Say) -> Splats:
-    return scene if isinstance(scene, Splats) else load_scene(scene, say, render_model)
+    return scene.narrowed() if isinstance(scene, Splats) else load_scene(scene, say, render_model)
 
 
 def _built(
@@ -314,4 +315,4 @@ def _built(
             parameter="anchors" if isinstance(anchors, Splats) else None,
             hint="anchors are the student before any recovery",
         )
-    return scene.recentred(student.offset)
+    return scene.narrowed(student.offset)

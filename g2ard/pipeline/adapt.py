@@ -192,7 +192,8 @@ class _Fit:
         told = silent if self.progress is silent else progress
         recovered = recover(self.splats, self.targets, how, checkpoint=within, progress=told, stage="adapt")
         gain, old = recovered.report.psnr, self.splats
-        self.splats = replace(recovered.splats, means=old.means, quats=old.quats, scales=old.scales)
+        new = recovered.splats
+        self.splats = replace(old, logit_opacities=new.logit_opacities, sh0=new.sh0, shN=new.shN)
         self.stretches.append({"steps": steps, "psnr": gain.after})
         self.seconds += recovered.report.seconds
         self.converged = gain.after - gain.before < config.tolerance

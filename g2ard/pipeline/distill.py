@@ -93,7 +93,7 @@ def distill(
         InputError: the budget does not fit, no view sees the prior, or `work` belongs to another run.
         KeyboardInterrupt: after Ctrl-C; the same call resumes from `work`.
     """
-    config, targets = config or DistillConfig(), checked_targets(targets)
+    config, targets, prior = config or DistillConfig(), checked_targets(targets), prior.narrowed()
     if validation is not None:
         validation = checked_targets(validation, "validation")
     counts = [budget]

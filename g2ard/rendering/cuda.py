@@ -83,6 +83,7 @@ class CudaRenderer:
     ) -> None:
         import torch
 
+        splats = splats.narrowed()
         self._offset, self._background = splats.offset, [float(c) for c in background]
         self._settings = settings_for(splats.means, settings, antialiased=splats.antialiased)
         names = ("means", "quats", "log_scales", "logit_opacities", "sh0", "shN")

@@ -15,7 +15,7 @@ from g2ard.config.choices import BLACK, CONVENTIONS, Convention
 from g2ard.errors import InputError, require
 from g2ard.scene.cameras import Camera, Cameras
 from g2ard.scene.prepared import DRAWN_LOG_SCALES, DRAWN_LOGITS, MAX_OPACITY
-from g2ard.scene.splats import Splats
+from g2ard.scene.splats import Splats, unit_quats
 
 _Floats = NDArray[np.float32]
 View = tuple[list[list[float]], list[float], tuple[int, int], float]
@@ -106,32 +106,20 @@ def arrays_of(splats: Splats) -> tuple[_Floats, _Floats, _Floats, _Floats, _Floa
     """Return the six float32 arrays that `_core` takes, in stored form.
 
     Logits and log-scales are clamped to what float32 can represent: a byte opacity of 255 decodes to +∞.
+    Quaternions are normalised, since the squares of long and short ones overflow or vanish.
     """
     with np.errstate(divide="ignore"):
         log_scales = np.clip(splats.log_scales, *DRAWN_LOG_SCALES)
     logits = np.clip(splats.logit_opacities, *DRAWN_LOGITS)
-    arrays = (splats.means, splats.quats, log_scales, logits, splats.sh0, splats.shN)
+    arrays = (splats.means, unit_quats(splats.quats), log_scales, logits, splats.sh0, splats.shN)
     a, b, c, d, e, f = (np.ascontiguousarray(array, dtype=np.float32) for array in arrays)
     return a, b, c, d, e, f
 
 
-def middle_of(splats: Splats) -> NDArray[np.float64] | None:
-    """Return the (3,) median of float64 means, or None if they are float32.
-
-    Float64 means may be map coordinates; relative to the median they fit float32.
-    """
-    if splats.means.dtype == np.float32 or not len(splats):
-        return None
-    return np.median(splats.means, axis=0)
-
-
 def centred(splats: Splats, cameras: Cameras) -> tuple[Splats, Cameras]:
-    """Recentre the scene and cameras on `middle_of` the scene."""
-    cameras = cameras.recentred(splats.offset)
-    middle = middle_of(splats)
-    if middle is None:
-        return splats, cameras
-    return splats.recentred(splats.offset + middle), cameras.recentred(middle)
+    """Return the scene `narrowed`, and the cameras relative to its offset."""
+    splats = splats.narrowed()
+    return splats, cameras.recentred(splats.offset)
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,9 +173,8 @@ class Renderer:
         self.background = [float(c) for c in background]
         if settings is not None and not isinstance(settings.near, int | float | None):
             raise InputError("expected one distance for all views", parameter="near")
-        self._offset, self._middle = splats.offset, middle_of(splats)
-        if self._middle is not None:
-            splats = splats.recentred(splats.offset + self._middle)
+        splats = splats.narrowed()
+        self._offset = splats.offset
         self._settings = settings_for(splats.means, settings, antialiased=splats.antialiased)
         self._arrays = arrays_of(splats)
         self._rasterizer = _core.Rasterizer()
@@ -240,8 +227,6 @@ class Renderer:
         self, camera: Camera, depths: int
     ) -> tuple[_Floats, _Floats, _Floats | None, _Floats | None]:
         here = Cameras.of([camera]).recentred(self._offset)
-        if self._middle is not None:
-            here = here.recentred(self._middle)
         view = view_of(here, 0, self._settings)
         return self._rasterizer.forward(self._arrays, view, self._settings, self.background, depths)
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from g2ard import _core
 from g2ard.errors import InputError
-from g2ard.scene.splats import Splats
+from g2ard.scene.splats import Splats, unit_quats
 
 _LIMITS = _core.defaults()["limits"]
 
@@ -46,10 +46,14 @@ class PreparedScene(Splats):
 
 
 def as_prepared(splats: Splats) -> PreparedScene:
-    """Return a prepared scene of the same arrays, which must be C-contiguous and finite."""
+    """Return a prepared scene of the same arrays, which must be C-contiguous and finite.
+
+    Quaternions are normalised.
+    """
     if isinstance(splats, PreparedScene):
         return splats
-    return PreparedScene(**{f.name: getattr(splats, f.name) for f in fields(splats)})
+    values = {f.name: getattr(splats, f.name) for f in fields(splats)}
+    return PreparedScene(**values | {"quats": unit_quats(splats.quats)})
 
 
 def finite_rows_of(splats: Splats) -> tuple[PreparedScene, NDArray[np.bool_] | slice]:

@@ -23,6 +23,15 @@ DRAWN_LOGIT = -5.54
 _UNIT_SLACK = 1e-6
 """Deviation of a quaternion's length from 1 that counts as rounding: a few ulps of float32."""
 
+_FINE_STEP = 1e-4
+"""Rounding of positions that nothing shows, as a share of a Gaussian's scale."""
+
+_COLOR_SLACK = 1e-5
+"""Excess of a colour over [0, 1] that counts as rounding."""
+
+_FAR_SPREADS, _SAMPLE = 16.0, 65_536
+"""Distance from the origin, in spreads, beyond which points are far; number of points that decide."""
+
 ARRAYS = ("means", "quats", "scales", "logit_opacities", "sh0", "shN")
 """Names of the arrays with a row per Gaussian."""
 
@@ -34,7 +43,8 @@ class Splats:
     """N Gaussians as a structure of arrays.
 
     Args:
-        means: (N, 3) float32 or float64, scene units, relative to `offset`.
+        means: (N, 3) float32 or float64, scene units, relative to `offset`. Kernels and files take float32;
+            see `narrowed`.
         quats: (N, 4) float32 wxyz of any nonzero length; g2ard returns and writes unit quaternions.
         scales: (N, 3) float32, linear standard deviations along the rotated axes.
         logit_opacities: (N,) float32; opacity = sigmoid(logit).
@@ -44,8 +54,11 @@ class Splats:
         render_model: the rendering that the scene was trained for: "classic", or "antialiased" with
             Mip-Splatting's factor on opacities. All renders follow it.
 
+    Other arrays of numbers are converted to these types.
+
     Raises:
-        InputError: mismatched array shapes, or an unknown render model.
+        InputError: values that are not numbers, mismatched array shapes, an invalid offset, or an unknown
+            render model.
 
     >>> s = Splats.create(means=np.zeros((2, 3)), scales=np.ones((2, 3)))
     >>> len(s), s.sh_degree, s.opacities
@@ -62,6 +75,11 @@ class Splats:
     render_model: RenderModel = "classic"
 
     def __post_init__(self) -> None:
+        for name in ARRAYS:
+            object.__setattr__(self, name, _as_floats(name, getattr(self, name)))
+        offset = _as_floats("offset", self.offset, np.float64)
+        require("offset", self.offset, offset.shape == (3,) and np.isfinite(offset).all(), "3 finite numbers")
+        object.__setattr__(self, "offset", offset)
         require("means", self.means.shape, self.means.ndim == 2 and self.means.shape[1] == 3, "shape (N, 3)")
         n = len(self.means)
         rest = self.shN.shape[1] if self.shN.ndim == 3 else -1
@@ -195,12 +213,119 @@ class Splats:
         means = self.means if not shift.any() else (self.means.astype(np.float64) + shift)
         return replace(self, means=means.astype(self.means.dtype), offset=target)
 
+    def narrowed(self, offset: ArrayLike | None = None) -> Splats:
+        """Return the scene with float32 means, which kernels and files take.
+
+        The `far_middle` of means that float32 would round goes into `offset`, so that it holds the rest.
+
+        Args:
+            offset: the resulting offset; None chooses it, and keeps that of float32 means.
+
+        >>> far = Splats.create(np.array([[5.4e6, 0, 0], [5.4e6 + 0.1, 0, 0]]), scales=np.ones((2, 3)))
+        >>> near = far.narrowed()
+        >>> near.means.round(3).tolist(), near.offset.tolist()
+        ([[0.0, 0.0, 0.0], [0.10000000149011612, 0.0, 0.0]], [5400000.0, 0.0, 0.0])
+        """
+        if offset is None:
+            if self.means.dtype == np.float32:
+                return self
+            with np.errstate(over="ignore"):
+                exact = self.means.astype(np.float32)
+            if np.array_equal(exact, self.means, equal_nan=True):
+                return replace(self, means=exact)
+            finite = self.scales[np.isfinite(self.scales).all(1)]
+            shift = far_middle(self.means, float(np.median(finite.max(1))) if len(finite) else 0.0)
+            offset = self.offset + shift if shift.any() else self.offset
+        moved = self.recentred(offset)
+        return replace(moved, means=np.ascontiguousarray(moved.means, np.float32))
+
     def finite_rows(self) -> NDArray[np.bool_]:
         """Return the (N,) mask of rows with finite values; infinite logits count as finite (α = 0 or 1)."""
         ok = np.isfinite(self.means).all(1) & ~np.isnan(self.logit_opacities)
         for name in ("quats", "scales", "sh0", "shN"):
             ok &= np.isfinite(getattr(self, name)).reshape(len(self), -1).all(1)
         return ok
+
+
+def _as_floats(name: str, values: Any, kind: type[Any] | None = None) -> NDArray[Any]:
+    """Return an array as float32; as `kind`, if given; means of more than 24 bits as float64."""
+    dtype = getattr(values, "dtype", None)
+    if kind is None:
+        kind = np.float64 if name == "means" and dtype not in (np.float32, np.float16) else np.float32
+    if isinstance(values, np.ndarray) and dtype == kind:
+        return values
+    try:
+        found = np.asarray(values)
+        if found.dtype.kind not in "biuf":
+            raise TypeError
+        with np.errstate(over="ignore"):  # becomes infinite, which is reported as not finite
+            return found.astype(kind)
+    except (TypeError, ValueError):
+        text = f"expected an array of numbers, got a value of type {type(values).__name__}"
+        raise InputError(text, parameter=name) from None
+
+
+def check_finite(splats: Splats, parameter: str) -> None:
+    """Raise an `InputError` with the first row that is not finite."""
+    bad = np.flatnonzero(~splats.finite_rows())
+    if len(bad):
+        text = f"is the first of {len(bad)} with a non-finite value"
+        raise InputError(text, parameter=parameter, index=int(bad[0]))
+
+
+def unit_colors(colors: ArrayLike, parameter: str = "colors") -> NDArray[np.float64]:
+    """Return colours in [0, 1]: bytes divided by 255, 16-bit integers by 65,535, others as they are.
+
+    Raises:
+        InputError: a finite value outside [0, 1], with the row.
+
+    >>> unit_colors(np.uint8([[255, 51, 0]])).tolist()
+    [[1.0, 0.2, 0.0]]
+    """
+    given = np.asarray(colors)
+    values = given.astype(np.float64)
+    if given.dtype in (np.uint8, np.uint16):
+        return values / np.iinfo(given.dtype).max
+    with np.errstate(invalid="ignore"):
+        wrong = (values < -_COLOR_SLACK) | (values > 1 + _COLOR_SLACK)
+    wrong &= np.isfinite(values)
+    if wrong.any():
+        row = np.argwhere(wrong)[0]
+        raise InputError(
+            f"has {values[tuple(row)]:g}, expected 0 to 1",
+            parameter=parameter,
+            index=int(row[0]),
+            hint="divide by the largest value, or pass uint8",
+        )
+    return values
+
+
+def far_middle(points: NDArray[Any], size: float = 0.0) -> NDArray[np.float64]:
+    """Return the median of (N, 3) points far from the origin, in whole units; zero for others.
+
+    Points are far if it exceeds 16 times their spread: float32 then loses 4 bits and more. For points less
+    than a unit apart, it is a multiple of a smaller power of two. Percentiles of a sample decide, so that
+    outliers have no effect. Points are not far if float32's steps there are below 1e-4 of `size`, that of a
+    Gaussian.
+
+    >>> far_middle(np.array([[6.5e6, 0.2, 0], [6.5e6 + 3, 0.4, 0]])).tolist()
+    [6500002.0, 0.0, 0.0]
+    >>> far_middle(np.array([[30, 0.2, 0], [33, 0.4, 0]])).tolist()
+    [0.0, 0.0, 0.0]
+    """
+    sample = points[:: max(1, len(points) // _SAMPLE)].astype(np.float64)
+    sample = sample[np.isfinite(sample).all(1)]
+    if not len(sample):
+        return np.zeros(3)
+    low, middle, high = np.percentile(sample, (1, 50, 99), axis=0)
+    spread = float(np.linalg.norm(high - low))
+    if not (np.abs(middle) > _FAR_SPREADS * spread).any():
+        return np.zeros(3)
+    if np.spacing(np.float32(np.abs(middle).max())) <= _FINE_STEP * size:
+        return np.zeros(3)
+    unit = 2.0 ** np.floor(np.log2(spread)) if spread > 0 else 1.0
+    unit = min(1.0, max(unit, float(np.spacing(np.abs(middle).max()))))
+    return np.rint(middle / unit) * unit
 
 
 def unit_quats(quats: NDArray[np.float32]) -> NDArray[np.float32]:

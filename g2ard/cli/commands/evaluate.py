@@ -155,7 +155,8 @@ def _drift(frozen: Splats, splats: Splats, path: Path) -> float:
         raise InputError(
             f"expected the {len(splats):,} Gaussians of {path}, got {len(frozen):,}", parameter="anchors"
         )
-    return drift95(Anchors.of(frozen), splats.means)
+    splats = splats.narrowed()
+    return drift95(Anchors.of(frozen.narrowed(splats.offset)), splats.means)
 
 
 def _table(run: Run, title: str, rows: list[dict[str, Any]]) -> None:

@@ -126,7 +126,12 @@ class Anchors:
 
     @classmethod
     def of(cls, splats: Splats, in_plane: float = 3.0) -> Anchors:
-        """Freeze a scene's geometry; `in_plane` as in `Regularizers`."""
+        """Freeze the geometry of a scene whose means are float32, see `Splats.narrowed`.
+
+        Args:
+            splats: the scene, with the offset of the scene that the anchors are for.
+            in_plane: as in `Regularizers`.
+        """
         order = np.argsort(-splats.scales, axis=1, kind="stable")
         frames = np.take_along_axis(rotation_matrices(splats.quats), order[:, None, :], axis=2)
         scales = np.take_along_axis(splats.scales, order, axis=1).astype(np.float64)

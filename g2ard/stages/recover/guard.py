@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from g2ard.rendering.renderer import arrays_of
-from g2ard.scene.splats import ARRAYS, Splats
+from g2ard.scene.splats import ARRAYS, Splats, unit_quats
 
 LOOKS = (0.1, 0.3, 0.5, 0.75)
 """Shares of the horizon at which the scene is scored."""
@@ -228,8 +228,10 @@ def blended(start: Splats, end: Splats, share: ArrayLike) -> Splats:
     >>> half.means.tolist(), half.scales.tolist()
     ([[1.0, 0.0, 0.0]], [[2.0, 1.0, 1.0]])
     """
+    end = end.narrowed()
+    start = start.narrowed(end.offset)
     (m0, q0, l0, o0, d0, n0), (m1, q1, l1, o1, d1, n1) = (arrays_of(scene) for scene in (start, end))
-    q0, q1 = (q / np.maximum(np.linalg.norm(q, axis=1, keepdims=True), 1e-30) for q in (q0, q1))
+    q0, q1 = unit_quats(q0), unit_quats(q1)
     q0 = q0 * np.where((q0 * q1).sum(1, keepdims=True) < 0, -1, 1)
     pairs = (m0, m1), (q0, q1), (l0, l1), (o0, o1), (d0, d1), (n0, n1)
     weight = np.broadcast_to(np.asarray(share, np.float32), (len(start),))

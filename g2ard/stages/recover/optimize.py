@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +14,7 @@ from g2ard.progress import Progress, plural, silent
 from g2ard.rendering.targets import Targets, fingerprint_of
 from g2ard.scene.cameras import unseeing
 from g2ard.scene.shape import needle_share
-from g2ard.scene.splats import Splats
+from g2ard.scene.splats import Splats, unit_quats
 from g2ard.stages.recover.anchors import Anchors, drift95
 from g2ard.stages.recover.config import RecoverConfig
 from g2ard.stages.recover.draw import checked_weights
@@ -78,6 +78,7 @@ def recover(
     unchanged. A schedule that is not `guarded`, such as the paper's, always takes all its steps.
 
     Args:
+        student: the scene; the result has the offset and float32 means of `student.narrowed()`.
         weights: (C,) sampling weight of each view; None draws all equally often.
         anchors: frozen geometry; None takes the student's. For a student that was recovered before, pass the
             anchors of its construction.
@@ -92,7 +93,9 @@ def recover(
 
     Other arguments, results and errors are those of `g2ard.recover`.
     """
-    config = config or RecoverConfig()
+    config, student = config or RecoverConfig(), student.narrowed()
+    unit = unit_quats(student.quats)
+    student = student if unit is student.quats else replace(student, quats=unit)
     if not len(student) or not len(targets.cameras):
         raise InputError(f"nothing to recover: got {len(student)} Gaussians and {len(targets.cameras)} views")
     if not targets.cameras.facing(student.means.astype(np.float64) + student.offset).any():
