@@ -9,6 +9,7 @@ import typer
 
 from g2ard.cli.frame import Run
 from g2ard.cli.tile_options import TILES
+from g2ard.io.atomic import hidden_name
 
 if TYPE_CHECKING:
     from g2ard.jobs.tiling import Tiling
@@ -43,7 +44,7 @@ def _beside(output: Path) -> Path:
     while "{" in str(output.parent):
         output = output.parent
     name = output.name.replace("{", "").replace("}", "")
-    return output.with_name(f".{name}.tiles")
+    return output.with_name(hidden_name(name, ".tiles"))
 
 
 def _check_rows(scene: Path, rows: int) -> None:

@@ -9,12 +9,16 @@ import shutil
 import sys
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager, suppress
+from hashlib import sha256
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from uuid import uuid4
 
 from g2ard.errors import OutputError
 from g2ard.io.paths import real_path
+
+_LONGEST_NAME = 255
+"""Bytes of the longest file name of usual file systems."""
 
 
 def check_output(path: str | Path, overwrite: bool = False, *, folder: bool = False) -> Path:
@@ -117,7 +121,22 @@ def _exists(path: Path) -> OutputError:
 def _beside(path: Path) -> Path:
     """Return a hidden name in the same folder, so that renaming is atomic, with the same suffix."""
     path = path.absolute()  # "." has no name
-    return path.with_name(f".{path.stem}.{uuid4().hex[:12]}{path.suffix}")
+    return path.with_name(hidden_name(path.stem, f".{uuid4().hex[:12]}{path.suffix}"))
+
+
+def hidden_name(name: str, ending: str) -> str:
+    """Return `.NAME` + `ending`, which file systems accept if they accept `name`.
+
+    A name that would exceed 255 bytes is shortened, and a hash of the whole name keeps it unique.
+
+    >>> hidden_name("a.ply", ".tiles"), len(hidden_name(250 * "a", ".tiles"))
+    ('.a.ply.tiles', 255)
+    """
+    room = _LONGEST_NAME - len(f".{ending}".encode())
+    if len(name.encode()) > room:
+        digest = sha256(name.encode()).hexdigest()[:16]
+        name = name.encode()[: max(0, room - len(digest))].decode(errors="ignore") + digest
+    return f".{name}{ending}"
 
 
 def atomic_output(path: str | Path, overwrite: bool = False) -> AbstractContextManager[Path]:

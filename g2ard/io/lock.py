@@ -7,6 +7,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from g2ard.errors import OutputError
+from g2ard.io.atomic import hidden_name
 
 LOCK = ".lock"
 """Lock file with the holder's process id. The holder removes it; one left by a killed process is reused."""
@@ -73,7 +74,7 @@ def check_unlocked(folder: Path, output: str | None = None) -> None:
 
 
 def _lock_file(folder: Path, output: str | None) -> Path:
-    return folder / (LOCK if output is None else f".{output}{LOCK}")
+    return folder / (LOCK if output is None else hidden_name(output, LOCK))
 
 
 def _opened(path: Path) -> int:

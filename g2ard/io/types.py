@@ -12,7 +12,7 @@ from g2ard.config.choices import Alpha
 from g2ard.errors import InputError
 from g2ard.progress import plural
 from g2ard.scene.cameras import Cameras
-from g2ard.scene.splats import Splats
+from g2ard.scene.splats import Splats, unit_colors
 
 
 @dataclass(frozen=True)
@@ -38,10 +38,10 @@ class Points:
 
     Args:
         positions: (N, 3) float64, world units.
-        colors: (N, 3) float32 in [0, 1].
+        colors: (N, 3) float32 in [0, 1]; uint8 and uint16 are divided by their largest value.
 
     Raises:
-        InputError: the shapes do not match.
+        InputError: the shapes do not match, or a colour is outside [0, 1].
     """
 
     positions: NDArray[np.float64]
@@ -54,6 +54,7 @@ class Points:
             raise InputError(
                 f"expected shape {self.positions.shape}, got {self.colors.shape}", parameter="colors"
             )
+        object.__setattr__(self, "colors", unit_colors(self.colors).astype(np.float32))
 
     def __repr__(self) -> str:
         return f"Points({plural(len(self), 'point')})"

@@ -17,7 +17,7 @@ from g2ard.progress import Progress, Say, plural, silent, unsaid
 from g2ard.rendering.visibility import visibility
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.sky import sky_mask
-from g2ard.scene.splats import Splats
+from g2ard.scene.splats import Splats, check_finite
 from g2ard.stages.clean import FLOATING, KINDS, Cleaning, compare_depths, find_clutter
 
 _CLUTTER_VIEWS, _CLUTTER_SIDE = 96, 400
@@ -97,6 +97,8 @@ def clean(
     """
     kinds = kinds_of(only, strength)
     splats = scene if isinstance(scene, Splats) else load_scene(scene, say, render_model)
+    if kinds:
+        check_finite(splats, "scene")
     sky = None
     if split_sky:
         far = sky_mask(splats)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from g2ard.errors import InputError, require
 from g2ard.io.tile_store import StoredScene
-from g2ard.scene.splats import Splats
+from g2ard.scene.splats import Splats, check_finite
 from g2ard.scene.transform import rotation_matrices
 
 Level = Splats | StoredScene
@@ -100,6 +100,12 @@ def cut(levels: Sequence[Level], rule: Cut | None = None, scratch: Path | None =
         raise InputError("expected at least one level, none of them empty", parameter="levels")
     if any((level.offset != levels[0].offset).any() for level in levels):
         raise InputError("the levels have different offsets", parameter="levels")
+    for number, level in enumerate(levels):
+        if isinstance(level, Splats):
+            try:
+                check_finite(level, "levels")
+            except InputError as error:
+                raise error.at(message=f"of level {number} {error.message}") from None
     tree = _Tree(levels, rule or Cut(), scratch)
     rows = tree.room(len(tree.means))
     for at in _blocks(len(rows)):

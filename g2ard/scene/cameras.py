@@ -24,6 +24,9 @@ LARGEST_IMAGE = 160_000_000
 _LARGEST_CAMERA_VALUE = 1e12
 """Largest value of poses and intrinsics; larger ones are damaged data and overflow when squared."""
 
+_POSE_SLACK = 1e-3
+"""Deviation of a pose from a rigid transform that counts as rounding."""
+
 _MEDIAN_VIEWS = 16
 """Views used for medians over all views."""
 
@@ -142,8 +145,8 @@ class Cameras:
             views alone, as does the number of recovery steps. Validation and reports score each kind apart.
 
     Raises:
-        InputError: mismatched shapes, a non-finite pose, an empty image, or one of more than 160 million
-            pixels.
+        InputError: mismatched shapes, a pose that is not finite or not rigid, an empty image, or one of more
+            than 160 million pixels.
     """
 
     viewmats: NDArray[np.float64]
@@ -181,6 +184,8 @@ class Cameras:
                 raise self._error(i, "has a pose or intrinsics that are not finite")
             if max(np.abs(values).max() for values in given) > _LARGEST_CAMERA_VALUE:
                 raise self._error(i, f"has a pose or intrinsics above {_LARGEST_CAMERA_VALUE:.0e}")
+            if fault := _not_rigid(self.viewmats[i]):
+                raise self._error(i, f"has a pose that {fault}; expected a rotation and a translation")
             if self.widths[i] < 1 or self.heights[i] < 1:
                 raise self._error(i, f"has an empty image, {self.widths[i]}×{self.heights[i]}")
             check_image(int(self.widths[i]), int(self.heights[i]), index=i, item="view")
@@ -352,6 +357,20 @@ class Cameras:
             mask_paths=tuple(mask_paths),
             kinds=tuple(kinds),
         )
+
+
+def _not_rigid(viewmat: NDArray[np.float64]) -> str | None:
+    """Return how a finite 4×4 matrix differs from a rigid transform, beyond rounding; None if it does not."""
+    R = viewmat[:3, :3]
+    square = R @ R.T
+    if np.abs(viewmat[3] - (0, 0, 0, 1)).max() > _POSE_SLACK:
+        return "has another last row than 0 0 0 1"
+    scale = float(np.sqrt(np.trace(square) / 3))
+    if np.abs(square - scale**2 * np.eye(3)).max() > 2 * _POSE_SLACK * scale**2 or not scale > 0:
+        return "skews"
+    if abs(scale - 1) > _POSE_SLACK:
+        return f"scales by {scale:.4g}"
+    return "mirrors" if np.linalg.det(R) < 0 else None
 
 
 def rows_by_kind(kinds: Sequence[str]) -> dict[str, list[int]]:

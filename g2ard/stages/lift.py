@@ -14,7 +14,7 @@ from g2ard import _core
 from g2ard.config.checks import check_fields, checks_arguments
 from g2ard.errors import InputError, require
 from g2ard.progress import Progress, counter, silent
-from g2ard.scene.splats import SH_C0, Splats
+from g2ard.scene.splats import SH_C0, Splats, unit_colors
 
 _CORE = _core.defaults()["lift"]
 """Defaults of the Rust core, which are the paper's."""
@@ -56,7 +56,7 @@ def lift(
 
     Args:
         points: (N, 3), any unit and origin; pass float64 to keep map coordinates exact.
-        colors: (N, 3) in [0, 1].
+        colors: (N, 3) in [0, 1], or uint8 or uint16, which are divided by their largest value.
         neighbors: number of neighbours for the PCA (10 in the paper).
         spread: tangential scale over the neighbourhood's standard deviation (not stated in the paper).
         normal_ratio: normal over tangential scale (0.1 in the paper).
@@ -70,7 +70,7 @@ def lift(
         otherwise.
 
     Raises:
-        InputError: mismatched shapes, no finite point, or a parameter out of range.
+        InputError: mismatched shapes, no finite point, a colour outside [0, 1], or a parameter out of range.
 
     >>> grid = np.stack(np.meshgrid(range(8), range(8), [0]), -1).reshape(-1, 3)
     >>> discs = lift(grid + [5.4e6, 0, 0], np.full((64, 3), 0.5))
@@ -78,7 +78,7 @@ def lift(
     (64, 5400003.0, True)
     """
     xyz = np.ascontiguousarray(points, np.float64)
-    rgb = np.asarray(colors, np.float64)
+    rgb = unit_colors(colors)
     require("points", xyz.shape, xyz.ndim == 2 and xyz.shape[1] == 3, "shape (N, 3)")
     require("colors", rgb.shape, rgb.shape == xyz.shape, f"shape {xyz.shape}")
     require("opacity", opacity, 0 < opacity < 1, "a number between 0 and 1")

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard.errors import InputError, OutputError
+from g2ard.io.atomic import hidden_name
 from g2ard.io.detect import JOURNAL, MANIFEST, POINTS
 from g2ard.io.jsonfile import read_json
 from g2ard.io.tile_store import FORMAT, VERSION, halo_name, tile_name
@@ -39,7 +40,7 @@ def clear(folder: Path) -> None:
 
 def _write_json(path: Path, content: dict[str, Any]) -> None:
     """Write JSON atomically."""
-    temporary = path.with_name(f".{path.name}.new")
+    temporary = path.with_name(hidden_name(path.name, ".new"))
     temporary.write_text(json.dumps(content) + "\n", encoding="utf-8", newline="\n")
     os.replace(temporary, path)
 

@@ -16,6 +16,7 @@ from g2ard.cli.frame import Run, command
 from g2ard.cli.tiling import tiling_of
 from g2ard.config.choices import BLACK, Colour
 from g2ard.errors import OutputError
+from g2ard.io.atomic import hidden_name
 from g2ard.progress import plural
 
 if TYPE_CHECKING:
@@ -142,7 +143,7 @@ def lod(
         raise typer.BadParameter("--environment needs a scene that fits into memory")
     views, colour = opt.with_images(views, images), background or BLACK
     writer = _Writer(run, scene, output, kind, rule, spot, up, views, colour)
-    stopped = output.with_name(f".{output.name}.unfinished")
+    stopped = output.with_name(hidden_name(output.name, ".unfinished"))
     run.spare_inputs(writer.meta)
     run.claim("--output", output, folder=True)
     run.claim("--resume", stopped, folder=True)

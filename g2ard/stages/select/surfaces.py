@@ -15,7 +15,7 @@ from g2ard.errors import InputError, require
 from g2ard.progress import Progress, counter, silent
 from g2ard.rendering.renderer import View, settings_for, view_of
 from g2ard.scene.cameras import Cameras
-from g2ard.scene.splats import Splats
+from g2ard.scene.splats import Splats, check_finite, unit_quats
 
 Float = NDArray[np.float64]
 Order = NDArray[np.int64]
@@ -160,9 +160,10 @@ def core_scene(splats: Splats) -> tuple[tuple[Any, ...], Float]:
     """Return the arrays that `_core` takes, and the world point they are relative to."""
     if not len(splats):
         raise InputError("the scene is empty")
+    check_finite(splats, "splats")
     means = splats.means.astype(np.float64)
     middle = np.median(means, axis=0)
-    arrays = (means - middle, splats.quats, splats.scales, splats.opacities)
+    arrays = (means - middle, unit_quats(splats.quats), splats.scales, splats.opacities)
     return tuple(np.ascontiguousarray(a) for a in arrays), middle + splats.offset
 
 
