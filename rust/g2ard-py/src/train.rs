@@ -102,6 +102,7 @@ impl PyTrainer {
     #[new]
     #[pyo3(signature = (arrays, objective, units = None, isa = None))]
     fn new(
+        py: Python<'_>,
         arrays: Arrays<'_>,
         objective: PyObjective,
         units: Option<Floats<'_>>,
@@ -109,7 +110,8 @@ impl PyTrainer {
     ) -> PyResult<Self> {
         let isa = isa_named(isa)?;
         let units = optional("units", &units)?;
-        let inner = Trainer::new(&arrays.params()?, units, isa).map_err(to_py)?;
+        let params = arrays.params()?;
+        let inner = work::quick(py, || Trainer::new(&params, units, isa))?;
         Ok(Self {
             trained: Mutex::new(Trained { inner, skipped: 0 }),
             settings: objective.settings.settings()?,
