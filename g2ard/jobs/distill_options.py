@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +17,7 @@ from g2ard.pipeline.config import DistillConfig
 from g2ard.pipeline.presets import PRESETS, configured
 from g2ard.stages.lift import LiftConfig
 from g2ard.stages.recover.anchors import Regularizers
+from g2ard.system.cached import cached_property
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -1,7 +1,6 @@
 """A fully prepared distillation and its run."""
 
 from dataclasses import dataclass, replace
-from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +18,7 @@ from g2ard.rendering.targets import Targets, kinds_of
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
 from g2ard.stages.recover.auto_preset import PriorMeasures
+from g2ard.system.cached import cached_property
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,7 +7,7 @@ import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from functools import cached_property, partial
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +30,7 @@ from g2ard.scene.cameras import Cameras
 from g2ard.scene.samples import evenly_spaced
 from g2ard.scene.splats import Splats
 from g2ard.stages.simplify import Simplified, SimplifyConfig, Visibility, VisibilitySource, simplify
+from g2ard.system.cached import cached_property
 
 _QUALITY_VIEWS, _QUALITY_SIDE = 12, 400
 """Number of views in which quality is measured, and their longer side in pixels."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +28,7 @@ from g2ard.stages.recover import recover as optimize
 from g2ard.stages.recover.anchors import Anchors
 from g2ard.stages.recover.auto_preset import PriorMeasures, regularizers_for
 from g2ard.stages.recover.optimize import Watch
+from g2ard.system.cached import cached_property
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import time
 from dataclasses import dataclass, replace
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +25,7 @@ from g2ard.stages.recover.draw import checked_weights
 from g2ard.stages.recover.optimize import Watch
 from g2ard.stages.select import select
 from g2ard.stages.simplify import round_counts, simplify
+from g2ard.system.cached import cached_property
 
 __all__ = ["DistillConfig", "Distilled", "SelectConfig", "distill"]
 

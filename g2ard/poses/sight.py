@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -16,6 +15,7 @@ from g2ard.poses.numbers import Floats, canonical_order, norms, quantile
 from g2ard.poses.site import Inside, Site
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
+from g2ard.system.cached import cached_property
 
 _RAYS = (24, 18)
 """Columns and rows of the rays that represent a frame."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -12,6 +11,7 @@ from g2ard.poses.matter import Grid, Matter, Sample
 from g2ard.poses.numbers import Floats, along, between, fibonacci, halton, middle, moments, quantile, turned
 from g2ard.poses.up import Up, estimate_up, facing, given_up
 from g2ard.scene.splats import Splats
+from g2ard.system.cached import cached_property
 
 _EXTENT = (0.01, 0.99)
 """Quantiles of the matter along each axis that bound the scene: floaters lie outside."""

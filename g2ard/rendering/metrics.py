@@ -88,8 +88,9 @@ def ssim(image: _Image, target: _Image, mask: NDArray[np.bool_] | None = None) -
     Raises:
         InputError: shapes that differ.
 
-    >>> black, white = np.zeros((16, 16, 1)), np.ones((16, 16, 1))
-    >>> round(ssim(black, white, np.eye(16) > 0), 4)
+    >>> black, white, mask = np.zeros((16, 16, 1)), np.ones((16, 16, 1)), np.zeros((16, 16), bool)
+    >>> mask[6:10, 6:10] = True
+    >>> round(ssim(black, white, mask), 4)
     0.0001
     >>> round(ssim(np.eye(16)[:, :, None], np.eye(16)[:, :, None]), 6)
     1.0

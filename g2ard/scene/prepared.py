@@ -1,7 +1,6 @@
 """Scenes in the form that kernels take: finite, contiguous, within float32's range, sorted once."""
 
 from dataclasses import fields, replace
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -10,6 +9,7 @@ from numpy.typing import NDArray
 from g2ard import _core
 from g2ard.errors import InputError
 from g2ard.scene.splats import Splats, unit_quats
+from g2ard.system.cached import cached_property
 
 _LIMITS = _core.defaults()["limits"]
 

@@ -31,7 +31,7 @@ def _results() -> Iterator[NDArray[Any]]:
     frame = _core.TileFrame.of_sample(scene.core, config)
     yield np.array(frame.values())
     yield _core.TileMerging(scene.core, frame, config).run_costs()
-    yield lift(ball.means, ball.sh0[:, 0]).scales
+    yield lift(ball.means, np.full((len(ball), 3), 0.5)).scales
     yield select(ball, views, 3).order
     yield visibility(ball, views).weight
     renderer = Renderer(ball)

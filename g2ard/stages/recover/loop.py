@@ -5,7 +5,6 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -27,6 +26,7 @@ from g2ard.stages.recover.probe import Probe
 from g2ard.stages.recover.schedule import multiplier_for, reach_for
 from g2ard.stages.recover.sizes import typical_share
 from g2ard.stages.recover.trials import MULTIPLIERS, Trials, trial_steps
+from g2ard.system.cached import cached_property
 
 _SHORTEST_WITH_GUARD = 20
 """Fewest steps for going back to an earlier scene; shorter recoveries have no steps left to repeat."""
