@@ -51,7 +51,7 @@ MOMENTS = (0.2, 0.7)
 """Shares of a command's renamed files, or of a call's progress, after which it is interrupted."""
 
 SAME = "same"
-"""How an interrupted run should end."""
+"""Expected outcome of an interrupted run."""
 
 Found = dict[str, Any]
 

@@ -93,7 +93,7 @@ def test_the_study_scores_training_like_recovery(tmp_path: Path) -> None:
 
 
 def test_gsplat_is_called_as_documented(gsplat: list[Strategy]) -> None:
-    """With the same noise and without relocation, the rasteriser is the only difference."""
+    """Only the rasteriser differs, given the same noise and no relocation."""
     first, _ = mcmc.train(BALL, 30, TARGETS, 1, engine="gsplat")
     done, seconds = mcmc.train(BALL, 30, TARGETS, 18, engine="gsplat")
     assert (gsplat[-1].cap_max, gsplat[-1].refine_stop_iter) == (30, 15)

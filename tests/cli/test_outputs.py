@@ -42,7 +42,7 @@ def test_a_pictures_suffix_is_of_any_case(command_line: CommandLine, folder: Pat
 def test_a_folder_may_be_called_like_any_stand_in(
     command_line: CommandLine, folder: Path, dry: tuple[str, ...]
 ) -> None:
-    """Several budgets in one folder are rejected whatever its name; a dry run without -o has none."""
+    """Several budgets in one folder are rejected, whatever its name. A dry run without -o needs no folder."""
     ask = ("distill", "ball.ply", "-n", "90,45", "--steps", "2", "--size", "48", "--views", "views.json")
     for name in ("dry-run", "run"):
         assert "2 budgets need {ratio} or {count}" in refused(command_line, folder, *ask, "-o", name, *dry)

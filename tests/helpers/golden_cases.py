@@ -16,7 +16,7 @@ from plyfile import PlyData, PlyElement
 
 SIZE = (48, 36)
 MAP = np.array([542_300.0, 6_589_200.0, 30.0])
-"""Where the LAS cloud lies."""
+"""Origin of the LAS cloud."""
 
 TEXTS = {
     "bad.toml": "[simplify]\nratoi = 4\n",
@@ -263,7 +263,7 @@ def _moved(pose: np.ndarray) -> np.ndarray:
 
 
 def _photo(pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """What the camera sees of the coloured unit sphere, and where: rays by plain algebra."""
+    """Return a photo of the coloured unit sphere and its mask, by intersecting rays."""
     (width, height), focal = SIZE, SIZE[0]
     u, v = np.meshgrid(np.arange(width) + 0.5 - width / 2, np.arange(height) + 0.5 - height / 2)
     rays = np.stack([u / focal, v / focal, np.ones_like(u)], -1) @ pose[:3, :3]

@@ -195,7 +195,7 @@ def test_float_photos_are_within_0_and_1(tmp_path: Path, value: float) -> None:
 
 @pytest.mark.parametrize("own", [False, True])
 def test_a_mask_holds_from_half_on(tmp_path: Path, own: bool) -> None:
-    """Of every grey, as the brightness of a mask or as the alpha of a photo that is its own mask."""
+    """Test every grey, in a mask and as the alpha of a photo that is its own mask."""
     levels = np.arange(256, dtype=np.uint8).reshape(16, 16)
     photo, mask = tmp_path / "a.png", tmp_path / ("a.png" if own else "m.png")
     Image.fromarray(np.dstack([levels, levels, levels, levels])).save(photo)

@@ -74,7 +74,7 @@ impl Steps<'_> {
 mod tests {
     use super::*;
 
-    /// An empty box, but for one full cell in its far corner.
+    /// Cast a ray through a box that is empty except for one full cell in its far corner.
     fn cast(shape: [usize; 3], eye: [f64; 3], direction: [f64; 3]) -> f64 {
         let mut steps = Vec::new();
         for x in 0..shape[0] {
