@@ -22,7 +22,7 @@ class _Focal(NamedTuple):
     radial: float
 
 
-def is_cambridge(folder: Path) -> bool:
+def holds(folder: Path) -> bool:
     """Return whether a folder holds a scene of the data set."""
     return (folder / _NVM_FILE).is_file() and any((folder / name).is_file() for name in _SPLIT_FILES.values())
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from g2ard.errors import InputError
 from g2ard.io.plyfiles import read_element, read_header, require, row_blocks, spread_rows, write_rows
-from g2ard.io.point_stream import PointStream, RawPoints, cloud_middle
+from g2ard.io.stream import PointStream, RawPoints
 from g2ard.io.types import Points
 
 _POSITION = ["x", "y", "z"]
@@ -29,7 +29,7 @@ class Stream(PointStream):
             at = np.stack([sample[name].astype(np.float64) for name in _POSITION], axis=1)
         at = at[np.isfinite(at).all(1)]
         low, high = np.percentile(at, (1, 99), axis=0) if len(at) else np.zeros((2, 3))
-        super().__init__(path, len(self._vertices), cloud_middle(low, high))
+        super().__init__(path, len(self._vertices), low, high)
 
     def raw(self, rows: int, start: int) -> Iterator[RawPoints]:
         for _, block in row_blocks(self.path, self._vertices, rows, start):
@@ -39,7 +39,7 @@ class Stream(PointStream):
 def _vertices(path: Path) -> tuple[NDArray[Any], list[str]]:
     """Return the rows and the names of their colour properties."""
     header = read_header(path)
-    properties = header.properties.get("vertex", [])
+    properties = header.properties("vertex")
     require(path, properties, _POSITION, "a point cloud")
     names = next((n for n in _COLOR_NAMES if set(n) <= set(properties)), _COLOR_NAMES[0])
     require(path, properties, names, "a coloured point cloud")

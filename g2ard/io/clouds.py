@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from g2ard.config.checks import checks_arguments
 from g2ard.errors import InputError, OutputError
-from g2ard.io.detect import file_format, kind
+from g2ard.io.detect import reader
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from g2ard.io.point_stream import PointStream
+    from g2ard.io.stream import PointStream
     from g2ard.io.types import Cloud, Points
 
 
@@ -55,21 +54,15 @@ def open_point_stream(path: str | Path | Sequence[str | Path]) -> PointStream:
     Memory holds one block of a .ply, .las or .laz, or the whole file of other formats. Several clouds get
     the offset of the first.
     """
-    from g2ard.io.point_stream import JoinedClouds
+    from g2ard.io.stream import JoinedClouds
 
     if not isinstance(path, str | Path):
         streams = [open_point_stream(part) for part in path]
         if not streams:
             raise InputError("no point cloud given")
         return streams[0] if len(streams) == 1 else JoinedClouds(streams)
-    path, format_name = Path(path), file_format(path)
-    modules = {"cloud_ply": "cloud_ply", "las": "las", "points3d": "points3d", "colmap": "points3d"}
-    if format_name not in modules:
-        scene = kind(path) == "splats"
-        what = "a Gaussian scene" if scene else format_name
-        hint = "run `simplify` or `distill` on it" if scene else "give the point cloud's file"
-        raise InputError(f"expected a coloured point cloud, found {what}", path=path, hint=hint)
-    stream: PointStream = import_module(f"g2ard.io.{modules[format_name]}").Stream(path)
+    path, module = reader(path, "points")
+    stream: PointStream = module.Stream(path)
     return stream
 
 

@@ -33,6 +33,11 @@ class _Image(NamedTuple):
     translation: tuple[float, ...]
 
 
+def holds(folder: Path) -> bool:
+    """Return whether a folder holds a model, or photos beside one."""
+    return model_folder(folder) is not None or photos_beside(folder) is not None
+
+
 def model_folder(path: Path) -> Path | None:
     """Return the model's folder: `path`, or sparse/0, sparse or colmap/sparse/0 in it, or None."""
     path = path.parent if path.is_file() else path
@@ -130,35 +135,39 @@ def _photo_folder(path: Path, model: Path) -> Path | None:
     return next((root / "images" for root in roots if (root / "images").is_dir()), None)
 
 
-class Record:
-    """Layout of little-endian columns without padding.
+class Table:
+    """A binary table: little-endian values without padding, read one after the other."""
 
-    >>> Record(("ID", "X", "Y"), "Qdd").size
-    24
-    """
+    def __init__(self, path: Path) -> None:
+        self.path, self.data, self.at = path, path.read_bytes(), 0
+        (self.count,) = self.take("table", 0, _COUNT, ["COUNT"])
 
-    def __init__(self, names: Sequence[str], letters: str) -> None:
-        self._names = tuple(names)
-        self._layout = struct.Struct(f"<{letters}")
-        self._ends = [struct.calcsize(f"<{letters[: i + 1]}") for i in range(len(letters))]
-        self.size = self._layout.size
-
-    def read(self, path: Path, entry: str, i: int, data: bytes, at: int) -> tuple[Any, ...]:
-        """Return the values at byte `at`; `entry` and `i`, such as "camera" and 3, are for errors."""
+    def take(self, item: str, i: int, layout: struct.Struct, names: Sequence[str]) -> tuple[Any, ...]:
+        """Return the next values, which errors call by these names of entry `i`, such as camera 3."""
         try:
-            return self._layout.unpack_from(data, at)
+            values = layout.unpack_from(self.data, self.at)
         except struct.error:
-            ends = zip(self._names, self._ends, strict=True)
-            name = next(name for name, end in ends if at + end > len(data))
-            raise damaged("is cut off", path=path, property=name, index=i, item=entry) from None
-
-    def read_finite(self, path: Path, entry: str, i: int, data: bytes, at: int) -> tuple[Any, ...]:
-        """Return the values as `read` does, or raise an `InputError` if one is not finite."""
-        values = self.read(path, entry, i, data, at)
-        for name, value in zip(self._names, values, strict=True):
-            if not math.isfinite(value):
-                raise InputError(f"is {value}", path=path, property=name, index=i, item=entry)
+            ends = (self.at + struct.calcsize(layout.format[: k + 2]) for k in range(len(names)))
+            raise self.cut_off(item, i, names[sum(end <= len(self.data) for end in ends)]) from None
+        self.at += layout.size
         return values
+
+    def finite(self, item: str, i: int, layout: struct.Struct, names: Sequence[str]) -> tuple[Any, ...]:
+        """Return the next values as `take` does, or raise an `InputError` if one is not finite."""
+        values = self.take(item, i, layout, names)
+        for name, value in zip(names, values, strict=True):
+            if not math.isfinite(value):
+                raise InputError(f"is {value}", path=self.path, property=name, index=i, item=item)
+        return values
+
+    def skip(self, item: str, i: int, size: int, name: str) -> None:
+        """Move past bytes, which errors call by this name."""
+        self.at += size
+        if self.at > len(self.data):
+            raise self.cut_off(item, i, name)
+
+    def cut_off(self, item: str, i: int, name: str) -> InputError:
+        return damaged("is cut off", path=self.path, property=name, index=i, item=item)
 
 
 def _camera(path: Path, model: str, size: tuple[int, int], p: tuple[float, ...]) -> Lens:
@@ -180,47 +189,37 @@ def _camera(path: Path, model: str, size: tuple[int, int], p: tuple[float, ...])
 
 
 _POSE = ("QW", "QX", "QY", "QZ", "TX", "TY", "TZ")
-_COUNT = Record(["COUNT"], "Q")
-_CAMERA = Record(["CAMERA_ID", "MODEL", "WIDTH", "HEIGHT"], "iiQQ")
-_IMAGE = Record(["IMAGE_ID", *_POSE, "CAMERA_ID"], "IdddddddI")
-_POINTS = Record(["POINTS2D"], "Q")
+_CAMERA_NAMES = ("CAMERA_ID", "MODEL", "WIDTH", "HEIGHT")
+_COUNT, _CAMERA, _IMAGE = struct.Struct("<Q"), struct.Struct("<iiQQ"), struct.Struct("<IdddddddI")
 
 
 def _cameras_bin(path: Path) -> dict[int, Lens]:
-    data = path.read_bytes()
-    (count,) = _COUNT.read(path, "table", 0, data, 0)
-    cameras, at = {}, _COUNT.size
-    for i in range(count):
-        key, model, width, height = _CAMERA.read(path, "camera", i, data, at)
+    table, cameras = Table(path), {}
+    for i in range(table.count):
+        key, model, width, height = table.take("camera", i, _CAMERA, _CAMERA_NAMES)
         name = _MODELS[model] if 0 <= model < len(_MODELS) else f"number {model}"
-        many = _PARAMETERS.get(name, 0)
-        layout = Record([f"PARAMS[{k}]" for k in range(many)], many * "d")
-        values = layout.read_finite(path, "camera", i, data, at + _CAMERA.size)
+        names = [f"PARAMS[{k}]" for k in range(_PARAMETERS.get(name, 0))]
+        values = table.finite("camera", i, struct.Struct(f"<{len(names) * 'd'}"), names)
         cameras[key] = _camera(path, name, (width, height), values)
-        at += _CAMERA.size + layout.size
     return cameras
 
 
 def _images_bin(path: Path) -> list[_Image]:
-    data = path.read_bytes()
-    (count,) = _COUNT.read(path, "table", 0, data, 0)
+    table = Table(path)
     images: list[_Image] = []
-    at = _COUNT.size
-    for i in range(count):
-        _key, *pose, camera = _IMAGE.read_finite(path, "image", i, data, at)
-        start = at + _IMAGE.size
-        end = data.find(b"\0", start)
+    for i in range(table.count):
+        _key, *pose, camera = table.finite("image", i, _IMAGE, ("IMAGE_ID", *_POSE, "CAMERA_ID"))
+        end = table.data.find(b"\0", table.at)
         if end < 0:
-            raise damaged("is cut off", path=path, property="NAME", index=i, item="image")
+            raise table.cut_off("image", i, "NAME")
         try:
-            name = data[start:end].decode()
+            name = table.data[table.at : end].decode()
         except UnicodeDecodeError:
             raise InputError("is not UTF-8", path=path, property="NAME", index=i, item="image") from None
-        (points,) = _POINTS.read(path, "image", i, data, end + 1)
+        table.at = end + 1
+        (points,) = table.take("image", i, _COUNT, ["POINTS2D"])
+        table.skip("image", i, 24 * points, "POINTS2D")
         images.append(_Image(name, camera, tuple(pose[:4]), tuple(pose[4:])))
-        at = end + 1 + _POINTS.size + 24 * points
-        if at > len(data):
-            raise damaged("is cut off", path=path, property="POINTS2D", index=i, item="image")
     return images
 
 

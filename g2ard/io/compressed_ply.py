@@ -44,8 +44,8 @@ class Stream(RawStream):
 
     def __init__(self, path: Path) -> None:
         header = plyfiles.read_header(path)
-        plyfiles.require(path, header.properties.get("vertex", []), _PACKED, "a compressed scene")
-        chunk_properties = header.properties.get("chunk", [])
+        plyfiles.require(path, header.properties("vertex"), _PACKED, "a compressed scene")
+        chunk_properties = header.properties("chunk")
         bounds = [f"{end}_{axis}" for end in ("min", "max") for axis in ("x", "y", "z")]
         bounds += [f"{end}_scale_{axis}" for end in ("min", "max") for axis in ("x", "y", "z")]
         if "min_r" in chunk_properties:
@@ -53,7 +53,7 @@ class Stream(RawStream):
         missing = [name for name in bounds if name not in chunk_properties]
         if missing:
             raise InputError(f"element 'chunk' lacks {', '.join(map(repr, missing))}", path=path)
-        rest = [p for p in header.properties.get("sh", []) if re.fullmatch(r"f_rest_\d+", p)]
+        rest = [p for p in header.properties("sh") if re.fullmatch(r"f_rest_\d+", p)]
         if len(rest) not in (0, 9, 24, 45) or set(rest) != {f"f_rest_{k}" for k in range(len(rest))}:
             raise InputError(f"element 'sh' has {len(rest)} coefficients; expected 9, 24 or 45", path=path)
 
@@ -66,7 +66,7 @@ class Stream(RawStream):
         for name in _PACKED:
             if vertex.dtype[name] != np.uint32:
                 raise InputError(f"has type {vertex.dtype[name]}, expected uint", path=path, property=name)
-        offset, mode = plyfiles.offset_of(path, header), plyfiles.render_model_of(header)
+        offset, mode = plyfiles.offset_of(path, header), plyfiles.render_model_of(header.comments)
         model: RenderModel = "antialiased" if mode == "antialiased" else "classic"
         super().__init__(path, len(vertex), len(rest) // 3, offset, render_model=model)
         self._vertex, self._sh, self._rest = vertex, sh[0] if sh else None, len(rest) // 3

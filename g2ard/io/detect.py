@@ -2,60 +2,72 @@
 
 import os
 import re
-from collections.abc import Callable
+from collections.abc import Iterator
 from contextlib import suppress
 from difflib import get_close_matches
 from functools import lru_cache
+from importlib import import_module
 from itertools import islice
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 from g2ard.config.choices import BLACK, Colour
 from g2ard.errors import InputError
 from g2ard.io.paths import check_regular, is_photo
 
-SceneFile = Literal["ply", "compressed_ply", "sog", "spz", "glb", "splat", "ksplat", "usd", "tiles"]
-CloudFile = Literal["cloud_ply", "las", "points3d"]
-ViewsFile = Literal[
-    "colmap",
-    "transforms",
-    "cambridge",
-    "inria",
-    "llff",
-    "nerfstudio",
-    "nerfstudio_export",
-    "gsplat_run",
-    "polycam",
-    "views",
-]
-Format = SceneFile | CloudFile | ViewsFile
 Kind = Literal["splats", "points", "views"]
 
-KINDS: dict[str, Kind] = {
-    **dict.fromkeys(get_args(SceneFile), "splats"),
-    **dict.fromkeys(get_args(CloudFile), "points"),
-    **dict.fromkeys(get_args(ViewsFile), "views"),
-}
-"""Format, which is the name of the module that reads it, → its kind."""
-
-_BY_NAME: dict[str, Format] = {
-    **{"meta.json": "sog", "lod-meta.json": "sog", "config.yml": "nerfstudio", "cfg.yml": "gsplat_run"},
-    "poses_bounds.npy": "llff",
-    **dict.fromkeys(("points3d.bin", "points3d.txt"), "points3d"),
-    **dict.fromkeys(("cameras.bin", "cameras.txt", "images.bin", "images.txt"), "colmap"),
-}
-_BY_SUFFIX: dict[str, Format] = {
-    **{
-        ".sog": "sog",
-        ".spz": "spz",
-        ".glb": "glb",
-        ".splat": "splat",
-        ".ksplat": "ksplat",
-        ".las": "las",
-        ".laz": "las",
+READERS: dict[Kind, dict[str, tuple[str, ...]]] = {
+    "splats": {
+        "ply": (),
+        "compressed_ply": (),
+        "sog": (".sog", "meta.json", "lod-meta.json"),
+        "spz": (".spz",),
+        "glb": (".glb",),
+        "splat": (".splat",),
+        "ksplat": (".ksplat",),
+        "usd": (".usda", ".usdc", ".usd", ".usdz"),
+        "tiles": (),
     },
-    **dict.fromkeys((".usda", ".usdc", ".usd", ".usdz"), "usd"),
+    "points": {
+        "cloud_ply": (),
+        "las": (".las", ".laz"),
+        "points3d": ("points3d.bin", "points3d.txt"),
+    },
+    "views": {
+        "views": (),
+        "nerfstudio": ("config.yml",),  # before its data, which are in another world
+        "colmap": ("cameras.bin", "cameras.txt", "images.bin", "images.txt"),
+        "nerfstudio_export": (),
+        "transforms": (),
+        "cambridge": (),
+        "llff": ("poses_bounds.npy",),
+        "polycam": (),
+        "inria": (),
+        "gsplat_run": ("cfg.yml",),
+    },
 }
+"""Formats of each kind: the module that reads it, and suffixes or names of its files.
+
+Modules of views are asked in this order which folders (`holds`) and which content of a .json (`describes`)
+they read.
+"""
+
+KINDS: dict[str, Kind] = {name: kind for kind, formats in READERS.items() for name in formats}
+_BY_NAME = {end: name for formats in READERS.values() for name, ends in formats.items() for end in ends}
+
+_NAMES: dict[Kind, str] = {
+    "splats": "a Gaussian scene",
+    "points": "a coloured point cloud",
+    "views": "views (a COLMAP folder, transforms.json, g2ard's .json)",
+}
+_OTHER_KINDS: dict[tuple[Kind, Kind], str] = {
+    ("splats", "points"): "`g2ard lift` turns it into a scene",
+    ("splats", "views"): "give the scene's file",
+    ("points", "splats"): "run `simplify` or `distill` on it",
+    ("points", "views"): "give the point cloud's file",
+}
+"""Hints by the expected and the found kind of a file."""
 
 _CONVERTERS = {
     ".lcc": "`splat-transform scene.lcc scene.ply` (npm: @playcanvas/splat-transform) converts it",
@@ -81,7 +93,7 @@ def kind(path: str | Path) -> Kind:
     return KINDS[file_format(path)]
 
 
-def file_format(path: str | Path) -> Format:
+def file_format(path: str | Path) -> str:
     """Return the format of a file or folder; raise an `InputError` if it is missing or unsupported."""
     path = run_scene(path)
     if path.is_dir():
@@ -97,11 +109,29 @@ def file_format(path: str | Path) -> Format:
     return _of_file(path, state.st_mtime_ns, state.st_size)
 
 
+def reader(path: str | Path, expected: Kind) -> tuple[Path, Any]:
+    """Return the file or folder of a kind, and the module that reads it.
+
+    Raises:
+        InputError: it is missing, unsupported, or of another kind.
+    """
+    path = run_scene(path) if expected == "splats" else Path(path)
+    name = file_format(path)
+    found = KINDS[name]
+    if expected == "points" and name == "colmap":
+        name = "points3d"
+    elif found != expected:
+        what = _NAMES[found] if found != "views" else name
+        hint = _OTHER_KINDS.get((expected, found))
+        raise InputError(f"expected {_NAMES[expected]}, found {what}", path=path, hint=hint)
+    return path, import_module(f"g2ard.io.{name}")
+
+
 @lru_cache(maxsize=64)
-def _of_file(path: Path, modified: int, size: int) -> Format:
+def _of_file(path: Path, modified: int, size: int) -> str:
     """Return the format of a file, looked into once until it is modified or has another size."""
     suffix = path.suffix.lower()
-    if found := _BY_NAME.get(path.name.lower()) or _BY_SUFFIX.get(suffix):
+    if found := _BY_NAME.get(path.name.lower()) or _BY_NAME.get(suffix):
         _check_content(path, suffix)
         return found
     if suffix == ".ply":
@@ -151,16 +181,14 @@ def run_views(path: str | Path) -> Path:
 
 def run_background(path: str | Path) -> Colour | None:
     """Return the background that a `distill` run in a folder was made with, or None."""
-    from g2ard.io.jsonfile import fields_of, numbers, object_of, read_json
+    from g2ard.io.jsonfile import Place, Within1, checked, read_json
 
     if run_scene(path) == Path(path):
         return None
     report = Path(path) / "report.json"
-    settings = object_of(fields_of(report, {"settings": {}, **read_json(report)}), "settings")
-    if "recover.background" not in settings:
-        return BLACK
-    red, green, blue = numbers(settings, "recover.background", 3, most=1)
-    return red, green, blue
+    settings = checked(read_json(report).get("settings", {}), dict[str, Any], Place(report).to("settings"))
+    place = Place(report).to("settings", "recover.background")
+    return checked(settings.get("recover.background", BLACK), tuple[Within1, Within1, Within1], place)
 
 
 def find_views(scene: str | Path) -> Path | None:
@@ -180,67 +208,50 @@ def find_views(scene: str | Path) -> Path | None:
     Returns:
         A file, or a folder of lists; relative if `scene` is.
     """
-    from g2ard.io import gsplat_run, inria, nerfstudio, nerfstudio_export
-
     scene = Path(scene)
     own = (scene if scene.is_dir() else scene.parent).absolute()
+    found = next(_cameras_of(own), None)
+    return found if found is None or scene.is_absolute() else Path(os.path.relpath(found))
+
+
+def _cameras_of(own: Path) -> Iterator[Path]:
+    """Yield the cameras of a scene in a folder, the best first."""
+    from g2ard.io import gsplat_run, inria, nerfstudio, nerfstudio_export
+
     iteration = re.fullmatch(r"iteration_\d+", own.name) and own.parent.name == "point_cloud"
     places = [own / inria.NAME, *([own.parent.parent / inria.NAME] if iteration else ())]
-    cameras_file = next((file for file in places if _holds(file, inria.is_inria)), None)
-    if cameras_file is None and (own / nerfstudio.NAME).is_file():
-        cameras_file = own / nerfstudio.NAME
-    if cameras_file is None and any(
-        _holds(own / name, nerfstudio_export.is_export) for name in nerfstudio_export.LISTS
-    ):
-        cameras_file = own
-    run = own.parent / gsplat_run.NAME
+    files = [file for file in places if file.is_file()]
+    yield from (file for file in files if _describes(inria, file))
+    if (own / nerfstudio.NAME).is_file():
+        yield own / nerfstudio.NAME
+    if any(_describes(nerfstudio_export, own / name) for name in nerfstudio_export.LISTS):
+        yield own
     with suppress(InputError):  # a cfg.yml that cannot be read is some other program's
-        if cameras_file is None and own.name == "ply" and gsplat_run.is_run(run):
-            cameras_file = run
-    if cameras_file is None:  # a cameras.json without cameras is damaged: its reader raises the error
-        cameras_file = next((file for file in places if file.is_file()), None)
-    return (
-        cameras_file if cameras_file is None or scene.is_absolute() else Path(os.path.relpath(cameras_file))
-    )
+        if own.name == "ply" and gsplat_run.holds(own.parent):
+            yield own.parent / gsplat_run.NAME
+    yield from files  # without cameras it is damaged: its reader raises the error
 
 
-def _holds(file: Path, test: Callable[[Any], bool]) -> bool:
-    """Return whether a JSON file exists and passes `test`."""
+def _describes(module: Any, file: Path) -> bool:
+    """Return whether a JSON file exists and is of a module's format."""
     from g2ard.io.jsonfile import read_any_json
 
     with suppress(InputError):
-        return file.is_file() and test(read_any_json(file))
+        return file.is_file() and module.describes(read_any_json(file))
     return False
 
 
-def _folder_format(path: Path) -> Format:
+def _folder_format(path: Path) -> str:
+    from g2ard.io.colmap import incomplete
     from g2ard.io.sog import chunks_of
 
     if (path / MANIFEST).is_file():
         return "tiles"
     if chunks_of(path):
         return "sog"
-
-    from g2ard.io import gsplat_run, inria, llff, nerfstudio, polycam
-    from g2ard.io.cambridge import is_cambridge
-    from g2ard.io.colmap import incomplete, model_folder, photos_beside
-    from g2ard.io.nerfstudio_export import exported
-    from g2ard.io.transforms import files_of
-
-    tests: tuple[tuple[Format, Callable[[Path], object]], ...] = (
-        ("nerfstudio", lambda path: (path / nerfstudio.NAME).is_file()),  # before its data in another world
-        ("colmap", model_folder),
-        ("nerfstudio_export", exported),
-        ("transforms", files_of),
-        ("cambridge", is_cambridge),
-        ("llff", lambda path: (path / llff.NAME).is_file()),
-        ("polycam", polycam.cameras_in),
-        ("colmap", photos_beside),
-        ("inria", lambda path: (path / inria.NAME).is_file()),
-        ("gsplat_run", lambda path: gsplat_run.is_run(path / gsplat_run.NAME)),
-    )
-    if found := next((name for name, holds in tests if holds(path)), None):
-        return found
+    for name in READERS["views"]:
+        if import_module(f"g2ard.io.{name}").holds(path):
+            return name
     if any((path / journal).is_file() for journal in (JOURNAL, f"{POINTS}/{JOURNAL}")):
         raise InputError("has unfinished tiles", path=path, hint="run the same `g2ard ingest` to continue")
     if error := incomplete(path):
@@ -262,7 +273,7 @@ def _instead(path: Path) -> str:
     files = (
         file
         for file in sorted(path.iterdir())
-        if file.suffix.lower() in (".ply", ".json", *_BY_SUFFIX) and file.is_file()
+        if file.suffix.lower() in (".ply", ".json", *_BY_NAME) and file.is_file()
     )
     for file in islice(files, _MOST_INSPECTED_FILES):
         with suppress(InputError):
@@ -292,23 +303,21 @@ def _instead(path: Path) -> str:
 
 def _poses_above(path: Path) -> Path | None:
     """Return the transforms.json, or the folder of another file of poses, beside a folder of photos."""
-    from g2ard.io import inria
-    from g2ard.io.colmap import model_folder
-    from g2ard.io.transforms import files_of
+    from g2ard.io import colmap, inria, transforms
 
     above = path.parent
-    files = files_of(above)
+    files = transforms.files_of(above)
     if len(files) == 1:
         return next(iter(files))
-    return above if files or model_folder(above) or (above / inria.NAME).is_file() else None
+    return above if files or colmap.model_folder(above) or inria.holds(above) else None
 
 
-def _ply_format(path: Path) -> Format:
+def _ply_format(path: Path) -> str:
     from g2ard.io.plyfiles import read_header
 
     header = read_header(path)
-    properties = header.properties.get("vertex")
-    if properties is None:
+    properties = header.properties("vertex")
+    if "vertex" not in header.counts:
         raise InputError("has no 'vertex' element", path=path)
     if "packed_position" in properties:
         return "compressed_ply"
@@ -316,24 +325,16 @@ def _ply_format(path: Path) -> Format:
     return "ply" if any(name.startswith(scene_words) for name in properties) else "cloud_ply"
 
 
-def _json_format(path: Path) -> Format:
-    from g2ard.io.inria import is_inria
+def _json_format(path: Path) -> str:
     from g2ard.io.jsonfile import read_any_json
-    from g2ard.io.nerfstudio_export import is_export
 
     content = read_any_json(path)
-    if is_inria(content):
-        return "inria"
-    if is_export(content):
-        return "nerfstudio_export"
+    for name in READERS["views"]:
+        module = import_module(f"g2ard.io.{name}")
+        if hasattr(module, "describes") and module.describes(content):
+            return name
     if not isinstance(content, dict):
         raise InputError(
             "is a JSON list, but not cameras of INRIA's trainer or of nerfstudio's ns-export", path=path
         )
-    if isinstance(content.get("views"), list) or ("views" in content and "format" in content):
-        return "views"
-    if "frames" in content:
-        return "transforms"
-    if {"transform", "scale"} <= set(content):
-        return "nerfstudio"
     raise InputError("is neither a transforms.json ('frames') nor g2ard's views ('views')", path=path)

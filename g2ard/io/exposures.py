@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from g2ard.io.jsonfile import fields_of, numbers, read_json
+from g2ard.io.jsonfile import Place, Row, checked, read_json
 from g2ard.scene.cameras import Cameras
 
 _EXPOSURE_FILE = "exposure.json"
@@ -23,8 +23,11 @@ def find_exposures(cameras: Cameras) -> dict[str, NDArray[np.float64]]:
             continue
         path = photo.parent.parent / _EXPOSURE_FILE
         if path not in tables:
-            content = fields_of(path, read_json(path) if path.is_file() else {})
-            tables[path] = {key: np.array(numbers(content, key, 3, 4)) for key in content}
+            content = read_json(path) if path.is_file() else {}
+            tables[path] = {
+                key: np.array(checked(rows, tuple[Row, Row, Row], Place(path).to(key)))
+                for key, rows in content.items()
+            }
         table = tables[path]
         for key in (name, photo.name, photo.stem):
             if key in table:

@@ -9,29 +9,18 @@ The draft asks for SPZ's own axes, which differ by half a turn about y.
 
 import json
 import struct
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, TypeVar
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from g2ard.errors import InputError, damaged, require
 from g2ard.io import spz
 from g2ard.io.atomic import atomic_output
-from g2ard.io.jsonfile import (
-    Fields,
-    fields_of,
-    index_of,
-    listed,
-    numbers,
-    object_of,
-    objects,
-    parse_json,
-    text,
-    whole,
-)
+from g2ard.io.jsonfile import Number, Place, Row, Vector, Whole, checked, parse_json
 from g2ard.io.packing import morton_order, rounding, unit_quats, writable
 from g2ard.io.sanitize import Raw, cleaned
 from g2ard.io.types import Note, Scene
@@ -216,10 +205,70 @@ def _document(
     }
 
 
+_Entry = TypeVar("_Entry")
+
+
+class _Primitive(msgspec.Struct):
+    attributes: dict[str, Any] = {}
+    extensions: dict[str, Any] = {}
+
+
+class _Splatting(msgspec.Struct, rename="camel"):
+    """The extension of a primitive of splats."""
+
+    kernel: Any = "ellipse"
+    color_space: Any = None
+    extensions: dict[str, Any] = {}
+
+
+class _Mesh(msgspec.Struct):
+    primitives: list[_Primitive] = []
+
+
+class _Node(msgspec.Struct):
+    mesh: Any = None
+    children: list[Whole] = []
+    matrix: Annotated[list[Number], msgspec.Meta(min_length=16, max_length=16)] | None = None
+    translation: Vector = (0.0, 0.0, 0.0)
+    rotation: Row = (0.0, 0.0, 0.0, 1.0)
+    scale: Vector = (1.0, 1.0, 1.0)
+
+
+class _Accessor(msgspec.Struct, rename="camel"):
+    component_type: Whole
+    count: Whole
+    type: str
+    buffer_view: Whole | None = None
+    byte_offset: Whole = Whole(0)
+    normalized: Any = False
+    sparse: Any = None
+
+
+class _View(msgspec.Struct, rename="camel"):
+    byte_length: Whole
+    buffer: Whole | None = None
+    byte_offset: Whole = Whole(0)
+    byte_stride: Whole | None = None
+
+
+class _Compressed(msgspec.Struct, rename="camel"):
+    """The extension of an SPZ."""
+
+    buffer_view: Whole
+
+
+class _Document(msgspec.Struct, rename="camel"):
+    meshes: list[_Mesh] = []
+    nodes: list[_Node] = []
+    accessors: list[_Accessor] = []
+    buffer_views: list[_View] = []
+    buffers: list[dict[str, Any]] = []
+
+
 def read(path: Path) -> Scene:
     """Read the splat primitive of a .glb as its nodes place it; a mere translation becomes the `offset`."""
     content, binary = _chunks(path)
-    return _scene(path, fields_of(path, content), binary)
+    return _scene(path, checked(content, _Document, Place(path)), binary)
 
 
 def _chunks(path: Path) -> tuple[Any, bytes]:
@@ -240,45 +289,54 @@ def _chunks(path: Path) -> tuple[Any, bytes]:
     return parse_json(path, found[_JSON]), found.get(_BIN, b"")
 
 
-def _scene(path: Path, document: Fields, binary: bytes) -> Scene:
-    primitives = [objects(mesh, "primitives") for mesh in objects(document, "meshes")]
-    splatting = [(at, p) for at, held in enumerate(primitives) for p in held if EXTENSION in _extensions(p)]
+def _scene(path: Path, document: _Document, binary: bytes) -> Scene:
+    primitives = [mesh.primitives for mesh in document.meshes]
+    splatting = [
+        (mesh, at, primitive)
+        for mesh, held in enumerate(primitives)
+        for at, primitive in enumerate(held)
+        if EXTENSION in primitive.extensions
+    ]
     if len(splatting) != 1:
         raise InputError(f"has {len(splatting)} primitives with {EXTENSION}, expected 1", path=path)
-    mesh, primitive = splatting[0]
-    splats = object_of(_extensions(primitive), EXTENSION)
-    packed = _extensions(splats)
-    if unknown := sorted(set(packed) - {SPZ_EXTENSION}):
+    mesh, at, primitive = splatting[0]
+    within = Place(path).to("meshes", mesh, "primitives", at)
+    place = within.to("extensions", EXTENSION)
+    splats = checked(primitive.extensions[EXTENSION], _Splatting, place)
+    if unknown := sorted(set(splats.extensions) - {SPZ_EXTENSION}):
         raise InputError(f"unsupported extension {unknown[0]!r}", path=path)
-    if splats.get("kernel", "ellipse") != "ellipse":
+    if splats.kernel != "ellipse":
         raise InputError("unsupported kernel; expected 'ellipse'", path=path)
     notes = []
     if others := sum(map(len, primitives)) - 1:
         notes.append(Note("ignored_meshes", others, f"{plural(others, 'other primitive')} ignored"))
-    if splats.get("colorSpace") == "lin_rec709_display":
+    if splats.color_space == "lin_rec709_display":
         notes.append(Note("linear_colors", 1, "linear colours are taken as sRGB, so renders are too dark"))
-    place = _placement(path, document, mesh)
-    if packed:
-        view, start = _view(path, document, object_of(packed, SPZ_EXTENSION), "the SPZ")
-        scene = spz.decoded(path, binary[start : start + whole(view, "byteLength")])
+    placement = _placement(path, document.nodes, mesh)
+    if splats.extensions:
+        place = place.to("extensions", SPZ_EXTENSION)
+        packed = checked(splats.extensions[SPZ_EXTENSION], _Compressed, place)
+        view = _view(document, packed.buffer_view, place, "the SPZ")
+        scene = spz.decoded(path, binary[view.byte_offset : view.byte_offset + view.byte_length])
         scene = replace(scene, splats=_about_y(scene.splats))
     else:
-        scene = _attributes_of(path, document, binary, primitive)
+        scene = _attributes_of(within.to("attributes"), document, binary, primitive.attributes)
     try:
-        moved = placed(scene.splats, place)
+        moved = placed(scene.splats, placement)
     except InputError as error:
         raise error.at(path=path, parameter=None, message=f"a node {error.message}") from None
     return replace(scene, splats=moved, notes=(*notes, *scene.notes))
 
 
-def _attributes_of(path: Path, document: Fields, binary: bytes, primitive: Fields) -> Scene:
+def _attributes_of(place: Place, document: _Document, binary: bytes, names: dict[str, Any]) -> Scene:
     """Read the float or integer attributes of a primitive, in the axes of a .ply."""
-    names = object_of(primitive, "attributes")
 
     def values(name: str, width: int) -> NDArray[np.float32]:
         if name not in names:
-            raise InputError(f"attribute {name!r} is missing", path=path)
-        return _accessor(path, document, binary, names, name, width)
+            raise InputError(f"attribute {name!r} is missing", path=place.path)
+        return _accessor(
+            place.to(name), document, binary, checked(names[name], Whole, place.to(name)), name, width
+        )
 
     degree = max(d for d in range(4) if d == 0 or f"{EXTENSION}:SH_DEGREE_{d}_COEF_0" in names)
     means = values("POSITION", 3)
@@ -290,61 +348,60 @@ def _attributes_of(path: Path, document: Fields, binary: bytes, primitive: Field
         raw.sh0[:, 0] = values(f"{EXTENSION}:SH_DEGREE_0_COEF_0", 3)
         for name, k in _harmonics(degree):
             raw.shN[:, k] = values(name, 3) * _SH_FLIPS[k]
-    return cleaned(path, raw)
+    return cleaned(place.path, raw)
 
 
-def _extensions(of: Fields) -> Fields:
-    return object_of(of, "extensions") if "extensions" in of else Fields({})
+def _entry(table: list[_Entry], index: int | None, place: Place) -> _Entry:
+    """Return the entry of a table whose index stands at `place`."""
+    if index is None or index >= len(table):
+        raise place.error(f"is {index}, expected an index below {len(table)}")
+    return table[index]
 
 
-def _pointed(document: Fields, table: str, holder: Fields, name: str) -> Fields:
-    """Return the entry of a table whose index is a property of `holder`."""
-    entries = listed(document, table)
-    return object_of(entries, index_of(holder, name, len(entries)))
-
-
-def _view(path: Path, document: Fields, holder: Fields, what: str) -> tuple[Fields, int]:
-    """Return the buffer view that `holder` points to, and its start in the binary chunk."""
-    view = _pointed(document, "bufferViews", holder, "bufferView")
-    if view["buffer"] != 0 or "uri" in _pointed(document, "buffers", view, "buffer"):
-        raise InputError(f"{what} lies outside the file", path=path)
-    return view, whole(view, "byteOffset", 0)
+def _view(document: _Document, index: int | None, place: Place, what: str) -> _View:
+    """Return the buffer view whose index is a property of `place`; it must lie in the binary chunk."""
+    view = _entry(document.buffer_views, index, place.to("bufferView"))
+    within = Place(place.path).to("bufferViews", index or 0, "buffer")
+    buffer = _entry(document.buffers, view.buffer, within)
+    if view.buffer or "uri" in buffer:
+        raise InputError(f"{what} lies outside the file", path=place.path)
+    return view
 
 
 def _accessor(
-    path: Path, document: Fields, binary: bytes, names: Fields, name: str, width: int
+    place: Place, document: _Document, binary: bytes, index: int, name: str, width: int
 ) -> NDArray[np.float32]:
     """Return the (count, width) values of an accessor; normalised integers become fractions."""
-    accessor = _pointed(document, "accessors", names, name)
-    kind = whole(accessor, "componentType")
-    if kind not in _DTYPES or _TYPES.get(text(accessor, "type")) != width or "sparse" in accessor:
+    path = place.path
+    accessor = _entry(document.accessors, index, place)
+    dtype = np.dtype(_DTYPES.get(accessor.component_type, "V1"))
+    if dtype.kind == "V" or _TYPES.get(accessor.type) != width or accessor.sparse is not None:
         raise InputError(f"attribute {name!r} has an unsupported type", path=path)
-    view, start = _view(path, document, accessor, f"attribute {name!r}")
-    dtype, count = np.dtype(_DTYPES[kind]), whole(accessor, "count")
-    step = whole(view, "byteStride", width * dtype.itemsize)
-    start += whole(accessor, "byteOffset", 0)
-    if step < width * dtype.itemsize:
+    view = _view(document, accessor.buffer_view, Place(path).to("accessors", index), f"attribute {name!r}")
+    row = width * dtype.itemsize
+    step = row if view.byte_stride is None else view.byte_stride
+    start = view.byte_offset + accessor.byte_offset
+    if step < row:
         raise InputError(
             f"attribute {name!r} has a stride of {step} bytes, less than its elements", path=path
         )
-    if count and start + step * (count - 1) + width * dtype.itemsize > len(binary):
+    if accessor.count and start + step * (accessor.count - 1) + row > len(binary):
         raise damaged(f"truncated: attribute {name!r} ends past the file", path=path)
-    rows = np.ndarray((count, width), dtype, binary, start, (step, dtype.itemsize))
-    if not accessor.get("normalized"):
+    rows = np.ndarray((accessor.count, width), dtype, binary, start, (step, dtype.itemsize))
+    if not accessor.normalized:
         return rows.astype(np.float32)
     top = np.iinfo(dtype).max
     return np.maximum(rows.astype(np.float32) / np.float32(top), np.float32(-1))
 
 
-def _placement(path: Path, document: Fields, mesh: int) -> NDArray[np.float64]:
+def _placement(path: Path, nodes: list[_Node], mesh: int) -> NDArray[np.float64]:
     """Return the (4, 4) placement by the mesh's only node and its ancestors, in the axes of a .ply."""
-    nodes = objects(document, "nodes")
     parents: dict[int, list[int]] = {}
     for i, node in enumerate(nodes):
-        children = listed(node, "children")
-        for k in range(len(children)):
-            parents.setdefault(index_of(children, k, len(nodes)), []).append(i)
-    at = [i for i, node in enumerate(nodes) if node.get("mesh") == mesh]
+        for k, child in enumerate(node.children):
+            _entry(nodes, child, Place(path).to("nodes", i, "children", k))
+            parents.setdefault(child, []).append(i)
+    at = [i for i, node in enumerate(nodes) if node.mesh == mesh]
     if len(at) > 1:
         raise InputError(f"{len(at)} nodes show the splats, expected 1", path=path)
     total = np.eye(4)
@@ -363,18 +420,12 @@ def _placement(path: Path, document: Fields, mesh: int) -> NDArray[np.float64]:
     return total * np.outer((*_GLTF_TURN, 1), (*_GLTF_TURN, 1))
 
 
-def _local(node: Fields) -> NDArray[np.float64]:
+def _local(node: _Node) -> NDArray[np.float64]:
     """Return a node's (4, 4) matrix, given as such or as translation, rotation and scale."""
-    if "matrix" in node:
-        return _numbers(node, "matrix", np.eye(4).ravel()).reshape(4, 4).T
+    if node.matrix is not None:
+        return np.array(node.matrix).reshape(4, 4).T
     matrix = np.eye(4)
-    matrix[:3, 3] = _numbers(node, "translation", (0, 0, 0))
-    if "rotation" in node or "scale" in node:
-        quat = _numbers(node, "rotation", (0, 0, 0, 1))[[3, 0, 1, 2]]
-        matrix[:3, :3] = rotation_matrices(quat[None])[0] * _numbers(node, "scale", (1, 1, 1))
+    matrix[:3, 3] = node.translation
+    quat = np.array(node.rotation)[[3, 0, 1, 2]]
+    matrix[:3, :3] = rotation_matrices(quat[None])[0] * node.scale
     return matrix
-
-
-def _numbers(node: Fields, key: str, default: Sequence[float] | NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return a node's vector or matrix, of the same length as its default."""
-    return np.array(numbers(node, key, len(default)) if key in node else default, np.float64)

@@ -11,9 +11,10 @@ from g2ard.io.types import ViewSet
 NAME = "cfg.yml"
 
 
-def is_run(path: Path) -> bool:
-    """Return whether a file has the settings of such a run."""
-    return path.is_file() and path.name == NAME and read_settings(path).word("data_dir") is not None
+def holds(folder: Path) -> bool:
+    """Return whether a folder has the settings of such a run."""
+    file = folder / NAME
+    return file.is_file() and read_settings(file).word("data_dir") is not None
 
 
 def read(path: Path, images: Path | None = None) -> ViewSet:

@@ -4,9 +4,10 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 
-from g2ard.io.jsonfile import fields_of, number, numbers, read_json_list, text, whole
+from g2ard.io.jsonfile import Matrix, Number, Place, Vector, Whole, checked, read_any_json
 from g2ard.io.photos import ASPECT_SLACK, Frame, Lens, find_photo, inverse, photo_size, rigid, view_set
 from g2ard.io.types import ViewSet
 from g2ard.progress import plural
@@ -14,7 +15,22 @@ from g2ard.progress import plural
 NAME = "cameras.json"
 
 
-def is_inria(content: Any) -> bool:
+class _Camera(msgspec.Struct):
+    img_name: str
+    width: Whole
+    height: Whole
+    position: Vector
+    rotation: Matrix
+    fx: Number
+    fy: Number
+    id: Any = None
+
+
+def holds(folder: Path) -> bool:
+    return (folder / NAME).is_file()
+
+
+def describes(content: Any) -> bool:
     """Return whether JSON content is a list of such cameras."""
     first = content[0] if isinstance(content, list) and content else None
     return isinstance(first, dict) and {"position", "rotation"} <= set(first)
@@ -28,14 +44,14 @@ def read(path: Path, images: Path | None = None) -> ViewSet:
     scenes. Without `images`, photos are in `images` beside the file. Cameras are scaled to resized photos.
     """
     file = path / NAME if path.is_dir() else path
-    listed = read_json_list(file)
+    listed = checked(read_any_json(file), list[_Camera], Place(file), entries="camera")
     if images is None and (file.parent / "images").is_dir():
         images = file.parent / "images"
-    frames = [_frame(file, i, camera, images) for i, camera in enumerate(listed)]
+    frames = [_frame(Place(file, i, "camera"), camera, images) for i, camera in enumerate(listed)]
     times = Counter(frame.name for frame in frames)
     for i, frame in enumerate(frames):
         if times[frame.name] > 1:
-            frames[i] = frame._replace(name=f"{frame.name}_{listed[i].get('id', i)}")
+            frames[i] = frame._replace(name=f"{frame.name}_{i if listed[i].id is None else listed[i].id}")
     views = view_set(file, frames)
     repeated = sum(count for count in times.values() if count > 1)
     if not repeated:
@@ -44,24 +60,20 @@ def read(path: Path, images: Path | None = None) -> ViewSet:
     return views.noted("repeated_names", repeated, text)
 
 
-def _frame(path: Path, index: int, entry: Any, images: Path | None) -> Frame:
-    camera = fields_of(path, entry, index, "camera")
-    name = text(camera, "img_name")
-    world_from_camera = np.eye(4)
-    world_from_camera[:3, :3] = numbers(camera, "rotation", 3, 3)
-    world_from_camera[:3, 3] = numbers(camera, "position", 3)
-    width, height = whole(camera, "width"), whole(camera, "height")
-    fx, fy = number(camera, "fx"), number(camera, "fy")
-    photo = find_photo(images / Path(name).name) if images else None
+def _frame(place: Place, camera: _Camera, images: Path | None) -> Frame:
+    world_from_camera = np.column_stack([camera.rotation, camera.position])
+    fx, fy = camera.fx, camera.fy
+    width, height = int(camera.width), int(camera.height)
+    photo = find_photo(images / Path(camera.img_name).name) if images else None
     # The file has the size of the full photos; the trainer may have used and kept smaller ones.
     if photo is not None and photo.is_file() and width and height:
-        (shown_width, shown_height), full = photo_size(photo, path), (width, height)
+        (shown_width, shown_height), full = photo_size(photo, place.path), (width, height)
         if abs(shown_width * height - shown_height * width) <= ASPECT_SLACK * shown_height * width:
             width, height = shown_width, shown_height
             fx, fy = fx * width / full[0], fy * height / full[1]
     return Frame(
-        name=name,
-        viewmat=inverse(rigid(world_from_camera, camera.place.to("rotation"))),
+        name=camera.img_name,
+        viewmat=inverse(rigid(world_from_camera, place.to("rotation"))),
         lens=Lens((width, height), np.array([[fx, 0, width / 2], [0, fy, height / 2], [0, 0, 1]])),
         photo=photo,
     )

@@ -10,7 +10,7 @@ import numpy as np
 
 from g2ard.errors import InputError, damaged, missing
 from g2ard.io.limits import check_unpacked
-from g2ard.io.point_stream import PointStream, RawPoints, cloud_middle
+from g2ard.io.stream import PointStream, RawPoints
 from g2ard.io.types import Note
 
 _LARGEST_CHUNK = 1 << 30
@@ -27,13 +27,13 @@ class Stream(PointStream):
         with _opened(path) as reader:
             header = reader.header
             low, high = np.array(header.mins, np.float64), np.array(header.maxs, np.float64)
-            super().__init__(path, header.point_count, cloud_middle(low, high))
+            super().__init__(path, header.point_count, low, high)
 
     @property
     def divisor(self) -> float:
         return 65535.0 if self.tally.brightest > 255 else 255.0
 
-    def notes(self) -> tuple[Note, ...]:
+    def header_notes(self) -> tuple[Note, ...]:
         if self.divisor > 255:
             return ()
         return (Note("eight_bit_colors", self.tally.rows, "8-bit colours in 16-bit fields"),)

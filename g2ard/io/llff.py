@@ -17,6 +17,10 @@ _LLFF_AXES = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 """Columns that turn down, right, backwards into right, down, forward."""
 
 
+def holds(folder: Path) -> bool:
+    return (folder / NAME).is_file()
+
+
 def read(path: Path, images: Path | None = None) -> ViewSet:
     """Read the poses of all photos of a folder, in the order of their names.
 

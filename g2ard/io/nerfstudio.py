@@ -3,13 +3,15 @@
 import math
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from g2ard.errors import InputError
 from g2ard.io import colmap, transforms
-from g2ard.io.jsonfile import Fields, fields_of, matrix, number, read_json
+from g2ard.io.jsonfile import Place, Pose, Positive, checked, read_json
 from g2ard.io.photos import Frame, inverse, rigid, view_set
 from g2ard.io.settings import Settings, below, read_settings
 from g2ard.io.types import ViewSet
@@ -21,6 +23,25 @@ CONFIG = "config.yml"
 
 _PARSERS = ("NerfstudioDataParser", "ColmapDataParser", "BlenderDataParser")
 _EYE = np.eye(4)
+
+
+class _Trained(msgspec.Struct):
+    transform: Pose
+    scale: Positive
+
+
+class _Applied(msgspec.Struct):
+    applied_transform: Pose | None = None
+    applied_scale: Positive = 1.0
+
+
+def holds(folder: Path) -> bool:
+    return (folder / NAME).is_file()
+
+
+def describes(content: Any) -> bool:
+    """Return whether JSON content is that of `NAME`."""
+    return isinstance(content, dict) and {"transform", "scale"} <= set(content) and "frames" not in content
 
 
 def read(path: Path, images: Path | None = None) -> ViewSet:
@@ -35,12 +56,13 @@ def read(path: Path, images: Path | None = None) -> ViewSet:
     """
     folder = path if path.is_dir() else path.parent
     file = folder / NAME
-    fields = fields_of(file, read_json(file))
-    D, scale = _affine(fields, "transform"), _scale(fields, "scale")
+    place = Place(file)
+    trained = checked(read_json(file), _Trained, place)
+    D = _affine(trained.transform, place.to("transform"))
     settings = read_settings(folder / CONFIG) if (folder / CONFIG).is_file() else None
     frames, A, applied_scale = _data(folder, settings, images)
-    scale /= applied_scale
-    trained_from_saved = rigid(D @ np.linalg.inv(A), fields.place.to("transform"))
+    scale = trained.scale / applied_scale
+    trained_from_saved = rigid(D @ np.linalg.inv(A), place.to("transform"))
     views = view_set(file, [_moved(frame, trained_from_saved, scale) for frame in frames])
     mode = _optimized(settings)
     if mode is None:
@@ -94,19 +116,18 @@ def _saved(
     frames = transforms.frames(file, images)
     if not frames:
         raise InputError("no transforms.json in the run's data", path=data)
-    content = fields_of(file, read_json(file) if file.is_file() else {})
-    given = content.get("applied_transform")
+    place = Place(file).to("applied_transform")
+    content = checked(read_json(file) if file.is_file() else {}, _Applied, Place(file))
+    given = content.applied_transform
     if given is None and options is not None and (file.parent / "colmap" / "sparse" / "0").is_dir():
-        raise content.place.to("applied_transform").error(
-            "is missing, and its default differs between versions of nerfstudio"
-        )
-    A = _EYE if given is None else _affine(content, "applied_transform")
+        raise place.error("is missing, and its default differs between versions of nerfstudio")
+    A = _EYE if given is None else _affine(given, place)
     if options is not None and not any(frame.split for frame in frames):
         try:
             frames = _split(frames, options)
         except (ValueError, OverflowError) as error:
             raise InputError(f"invalid split in the run's {CONFIG} ({error})", path=data) from error
-    return frames, A, _scale(content, "applied_scale", 1.0)
+    return frames, A, content.applied_scale
 
 
 def _split(frames: Sequence[Frame], options: Settings) -> list[Frame]:
@@ -147,17 +168,10 @@ def _moved(frame: Frame, transform: NDArray[np.float64], scale: float) -> Frame:
     return frame._replace(viewmat=inverse(world_from_camera))
 
 
-def _affine(holder: Fields, key: str) -> NDArray[np.float64]:
+def _affine(rows: Pose, place: Place) -> NDArray[np.float64]:
     """Return a 3×4 or 4×4 list as a (4, 4) rotation and translation."""
     out = np.eye(4)
-    out[:3] = matrix(holder, key)[:3]
+    out[:3] = rows[:3]
     if not 0.99 < abs(np.linalg.det(out[:3, :3])) < 1.01:
-        raise holder.place.to(key).error("is not a rotation")
+        raise place.error("is not a rotation")
     return out
-
-
-def _scale(holder: Fields, key: str, default: float | None = None) -> float:
-    scale = number(holder, key, default)
-    if not scale > 0:
-        raise holder.place.to(key).unexpected(scale, "a number > 0")
-    return scale

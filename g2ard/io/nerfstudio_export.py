@@ -3,9 +3,12 @@
 from pathlib import Path
 from typing import Any
 
+import msgspec
+import numpy as np
+
 from g2ard.errors import InputError
 from g2ard.io import colmap, transforms
-from g2ard.io.jsonfile import Fields, fields_of, matrix, read_any_json, read_json_list, text
+from g2ard.io.jsonfile import Place, Pose, checked, read_any_json
 from g2ard.io.photos import Frame, Lens, photo_size, rigid, view_set
 from g2ard.io.settings import below
 from g2ard.io.types import ViewSet
@@ -14,7 +17,16 @@ LISTS = {"transforms_train.json": "train", "transforms_eval.json": "test"}
 """File → its split."""
 
 
-def is_export(content: Any) -> bool:
+class _Camera(msgspec.Struct):
+    file_path: str
+    transform: Pose
+
+
+def holds(folder: Path) -> bool:
+    return bool(exported(folder))
+
+
+def describes(content: Any) -> bool:
     """Return whether JSON content is such a list."""
     first = content[0] if isinstance(content, list) and content else None
     return isinstance(first, dict) and {"file_path", "transform"} <= set(first)
@@ -22,7 +34,7 @@ def is_export(content: Any) -> bool:
 
 def exported(folder: Path) -> list[Path]:
     lists = [folder / name for name in LISTS if (folder / name).is_file()]
-    return [file for file in lists if is_export(read_any_json(file))]
+    return [file for file in lists if describes(read_any_json(file))]
 
 
 def read(path: Path, images: Path | None = None) -> ViewSet:
@@ -35,20 +47,19 @@ def read(path: Path, images: Path | None = None) -> ViewSet:
     lenses: dict[Path, dict[str, Lens]] = {}
     frames = []
     for file in files:
-        for i, entry in enumerate(read_json_list(file)):
-            frames.append(_frame(file, i, entry, images, lenses))
+        listed = checked(read_any_json(file), list[_Camera], Place(file), entries="camera")
+        frames += [
+            _frame(Place(file, i, "camera"), camera, images, lenses) for i, camera in enumerate(listed)
+        ]
     return view_set(path, frames)
 
 
-def _frame(
-    path: Path, index: int, entry: Any, images: Path | None, lenses: dict[Path, dict[str, Lens]]
-) -> Frame:
-    camera = fields_of(path, entry, index, "camera")
-    file_path = Path(text(camera, "file_path"))
-    world_from_camera = rigid(matrix(camera, "transform"), camera.place.to("transform"))
+def _frame(place: Place, camera: _Camera, images: Path | None, lenses: dict[Path, dict[str, Lens]]) -> Frame:
+    path, file_path = place.path, Path(camera.file_path)
+    world_from_camera = rigid(np.array(camera.transform), place.to("transform"))
     there = below(path, file_path)
     ups = (below(path, up) for up in file_path.parents[:3] if up.parts)
-    lens = _lens(camera, file_path, there or next(filter(None, ups), None), lenses)
+    lens = _lens(place, file_path, there or next(filter(None, ups), None), lenses)
     photo = images / file_path.name if images else there
     if photo is not None and photo.is_file():
         lens = lens.at(photo_size(photo, path))
@@ -61,14 +72,14 @@ def _frame(
     )
 
 
-def _lens(camera: Fields, named: Path, place: Path | None, known: dict[Path, dict[str, Lens]]) -> Lens:
+def _lens(listed: Place, named: Path, place: Path | None, known: dict[Path, dict[str, Lens]]) -> Lens:
     """Return a photo's intrinsics by file name, from the nearest folder above it that has them."""
     for folder in () if place is None else (place, *place.parents[:3]):
         if folder not in known:
             known[folder] = _lenses(folder)
         if named.name in known[folder]:
             return known[folder][named.name]
-    error = camera.place.error(
+    error = listed.error(
         f"has no intrinsics in a transforms.json or COLMAP model above {named.as_posix()}, "
         "and ns-export does not write them"
     )

@@ -38,8 +38,8 @@ class Stream(RawStream):
 
     def __init__(self, path: Path) -> None:
         header = plyfiles.read_header(path)
-        properties = header.properties.get("vertex", [])
-        mode = plyfiles.render_model_of(header)
+        properties = header.properties("vertex")
+        mode = plyfiles.render_model_of(header.comments)
         flat = mode == "2dgs" or ("scale_1" in properties and "scale_2" not in properties)
         needed = [name for name in _REQUIRED_PROPERTIES if not flat or name != "scale_2"]
         plyfiles.require(path, properties, needed, "a 3DGS scene")

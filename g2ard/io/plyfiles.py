@@ -1,13 +1,15 @@
 """Helpers for PLY readers: headers, rows and errors that name the file."""
 
+import io
 import re
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from plyfile import PlyData, PlyElement, PlyElementParseError, PlyListProperty, PlyParseError
 
 from g2ard.config.choices import RenderModel
 from g2ard.errors import InputError, damaged
@@ -26,17 +28,23 @@ _RENDER_MODES: dict[str, RenderModel | Literal["2dgs"]] = {
 _HEADER_LIMIT = 1 << 20
 """Longest header, bytes."""
 
-_END_HEADER = re.compile(rb"^end_header[ \t]*[\r\n]", re.MULTILINE)
+_END_HEADER = re.compile(rb"(?<=[\r\n])end_header[ \t]*[\r\n]")
+_COUNT = re.compile(rb"(?<=[\r\n])(element[ \t]+(\S+)[ \t]+)(\d{1,4000})\b")  # Python reads no longer ones
 
 
-@dataclass
+@dataclass(frozen=True)
 class PlyHeader:
-    """A PLY header: row counts and properties per element, and comments."""
+    """A PLY header: plyfile's elements, without rows, row counts per element, and all comments."""
 
-    counts: dict[str, int] = field(default_factory=dict)
-    properties: dict[str, list[str]] = field(default_factory=dict)
-    lists: dict[str, list[str]] = field(default_factory=dict)
-    comments: list[str] = field(default_factory=list)
+    elements: PlyData
+    counts: dict[str, int]
+    comments: list[str]
+
+    def properties(self, element: str) -> list[str]:
+        """Return the properties of an element that are no lists; none if there is no such element."""
+        if element not in self.elements:
+            return []
+        return [p.name for p in self.elements[element].properties if not isinstance(p, PlyListProperty)]
 
 
 def read_header(path: Path) -> PlyHeader:
@@ -56,30 +64,17 @@ def read_header(path: Path) -> PlyHeader:
     end = _END_HEADER.search(head)  # on a line of its own, since comments may contain it
     if end is None:
         raise damaged("broken PLY header: no end_header line", path=path)
-    header = PlyHeader()
-    for number, line in enumerate(re.split(r"\r\n|\r|\n", head[: end.start()].decode("latin-1")), 1):
-        if not line.isascii():  # required by plyfile
-            raise InputError(f"PLY header, line {number}: a character that is not ASCII", path=path)
-        try:
-            _header_line(header, line.split())
-        except (IndexError, ValueError, KeyError) as error:
-            raise damaged(f"broken PLY header, line {number}: {line.strip()[:80]!r}", path=path) from error
-    return header
-
-
-def _header_line(header: PlyHeader, words: list[str]) -> None:
-    if not words:
-        return
-    if words[0] == "comment":
-        header.comments.append(" ".join(words[1:]))
-    elif words[0] == "element":
-        if not words[2].isdecimal():
-            raise ValueError("no count")
-        header.counts[words[1]] = int(words[2])
-        header.properties[words[1]], header.lists[words[1]] = [], []
-    elif words[0] == "property":
-        owner = list(header.properties)[-1]
-        (header.lists if words[1] == "list" else header.properties)[owner].append(words[-1])
+    head = head[: end.end()]
+    foreign = next((n for n, line in enumerate(head.splitlines(), 1) if not line.isascii()), None)
+    if foreign is not None:
+        raise InputError("is not ASCII", path=path, index=foreign, item="header line")
+    try:
+        counts = {name.decode(): int(count) for _, name, count in _COUNT.findall(head)}
+        ply = PlyData.read(io.BytesIO(_COUNT.sub(rb"\g<1>0", head)), mmap=False)
+    except (PlyParseError, ValueError) as error:
+        raise damaged(f"broken PLY header, {error}", path=path) from error
+    comments = [*ply.comments, *(text for element in ply for text in element.comments)]
+    return PlyHeader(ply, counts, [" ".join(text.split()) for text in comments])
 
 
 def offset_of(path: Path, header: PlyHeader) -> NDArray[np.float64]:
@@ -96,15 +91,15 @@ def offset_of(path: Path, header: PlyHeader) -> NDArray[np.float64]:
     return np.zeros(3)
 
 
-def render_model_of(header: PlyHeader) -> RenderModel | Literal["2dgs"]:
+def render_model_of(comments: Sequence[str]) -> RenderModel | Literal["2dgs"]:
     """Return the rendering of the last comment that names one: brush's spelling, or Postshot's.
 
-    >>> render_model_of(PlyHeader(comments=["antialiased 1"]))
+    >>> render_model_of(["antialiased 1"])
     'antialiased'
-    >>> render_model_of(PlyHeader(comments=["Exported from Brush", "SplatRenderMode: default"]))
+    >>> render_model_of(["Exported from Brush", "SplatRenderMode: default"])
     'classic'
     """
-    modes = [_RENDER_MODES[text] for c in header.comments if (text := c.lower()) in _RENDER_MODES]
+    modes = [_RENDER_MODES[text] for c in comments if (text := c.lower()) in _RENDER_MODES]
     return modes[-1] if modes else "classic"
 
 
@@ -122,22 +117,30 @@ def read_element(path: Path, header: PlyHeader, *names: str) -> list[NDArray[Any
     Lists are first read as triangles, since lists of a known length can be mapped; if a polygon has another
     number of corners, the file is read again, more slowly.
     """
-    from plyfile import PlyData, PlyElementParseError, PlyParseError
-
     size = path.stat().st_size
     for name, count in header.counts.items():  # before allocating memory: a row has at least a byte
         if count > size:
             raise damaged(f"truncated: {count:,} rows of {name!r} in {size:,} bytes", path=path)
-    triangles = {name: dict.fromkeys(lists, 3) for name, lists in header.lists.items() if lists}
+    triangles = {
+        element.name: {p.name: 3 for p in element.properties if isinstance(p, PlyListProperty)}
+        for element in header.elements
+    }
     try:
         try:
             ply = PlyData.read(path, mmap="r", known_list_len=triangles)
         except PlyElementParseError:
-            if not triangles:
+            if not any(triangles.values()):
                 raise
             ply = PlyData.read(path, mmap="r")
     except PlyElementParseError as error:
-        raise _parse_error(path, header, error) from error
+        name = error.element.name
+        raise damaged(
+            f"of {header.counts.get(name, 0)} cannot be read ({error.message})",
+            path=path,
+            property=error.prop and error.prop.name,
+            index=error.row,
+            item=f"{name} row",
+        ) from error
     except (PlyParseError, ValueError, OSError, OverflowError, MemoryError) as error:
         raise InputError(f"cannot be read as a PLY: {error}", path=path) from error
     return [ply[name].data for name in names]
@@ -152,8 +155,6 @@ def write_rows(
     comments: Sequence[str] = (),
 ) -> None:
     """Write a binary .ply of `count` vertices, which arrive in blocks, with properties of these types."""
-    from plyfile import PlyData, PlyElement
-
     every = np.broadcast_to(np.zeros(1, list(types.items())), count)  # costs no memory
     elements = [PlyElement.describe(every, "vertex")]
     header = PlyData(elements, byte_order="<", comments=comments).header
@@ -199,17 +200,6 @@ def spread_rows(rows: NDArray[Any]) -> NDArray[Any]:
             file.seek(rows.offset + row * rows.itemsize)
             parts.append(file.read(rows.itemsize))
     return np.frombuffer(b"".join(parts), rows.dtype)
-
-
-def _parse_error(path: Path, header: PlyHeader, error: Any) -> InputError:
-    name = error.element.name
-    return damaged(
-        f"of {header.counts.get(name, 0)} cannot be read ({error.message})",
-        path=path,
-        property=error.prop and error.prop.name,
-        index=error.row,
-        item=f"{name} row",
-    )
 
 
 def require(path: Path, present: list[str], wanted: list[str], what: str) -> None:

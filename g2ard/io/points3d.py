@@ -1,18 +1,19 @@
 """Reader for COLMAP's sparse points as a coloured point cloud."""
 
+import struct
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from g2ard.errors import InputError, damaged
-from g2ard.io.colmap import Record, model_folder, number, parsing, text_lines
+from g2ard.io.colmap import Table, model_folder, number, parsing, text_lines
 from g2ard.io.jsonfile import Place
-from g2ard.io.point_stream import WholeCloud
+from g2ard.io.stream import WholeCloud
 
-_COUNT = Record(["COUNT"], "Q")
 _COLUMNS = tuple((name, at) for at, name in enumerate("XYZRGB", 1))
-_POINT = Record(["POINT3D_ID", *"XYZRGB", "ERROR", "TRACK"], "QdddBBBdQ")
+_POINT = struct.Struct("<QdddBBBdQ")
+_NAMES = ("POINT3D_ID", *"XYZRGB", "ERROR", "TRACK")
 
 
 class Stream(WholeCloud):
@@ -32,17 +33,15 @@ class Stream(WholeCloud):
 
 def _binary(path: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
     """Read rows of id, x y z, r g b, error and a track of variable length."""
-    data = path.read_bytes()
-    (count,) = _COUNT.read(path, "table", 0, data, 0)
-    if count * _POINT.size > len(data):
-        raise damaged(f"truncated: {count:,} points in {len(data):,} bytes", path=path)
-    positions, rgb, at = np.empty((count, 3)), np.empty((count, 3), np.uint8), _COUNT.size
+    table = Table(path)
+    count, size = table.count, len(table.data)
+    if count * _POINT.size > size:
+        raise damaged(f"truncated: {count:,} points in {size:,} bytes", path=path)
+    positions, rgb = np.empty((count, 3)), np.empty((count, 3), np.uint8)
     for i in range(count):
-        _key, x, y, z, r, g, b, _error, track = _POINT.read(path, "point", i, data, at)
+        _key, x, y, z, r, g, b, _error, track = table.take("point", i, _POINT, _NAMES)
         positions[i], rgb[i] = (x, y, z), (r, g, b)
-        at += _POINT.size + 8 * track
-        if at > len(data):
-            raise damaged("is cut off", path=path, property="TRACK", index=i, item="point")
+        table.skip("point", i, 8 * track, "TRACK")
     return positions, rgb
 
 

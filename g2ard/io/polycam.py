@@ -2,16 +2,28 @@
 
 from pathlib import Path
 
+import msgspec
 import numpy as np
 
 from g2ard.errors import InputError
-from g2ard.io.jsonfile import fields_of, number, read_json, whole
+from g2ard.io.jsonfile import Number, Place, Whole, checked, read_json
 from g2ard.io.photos import Frame, Lens, rigid, view_set
 from g2ard.io.transforms import opencv_view
 from g2ard.io.types import ViewSet
 
 _FOLDERS = (("corrected_cameras", "corrected_images"), ("cameras", "images"))
 """Folders of cameras and photos: after Polycam's optimisation, and as ARKit tracked them."""
+
+
+_POSE = [f"t_{row}{column}" for row in range(3) for column in range(4)]
+_Keyframe = msgspec.defstruct(
+    "_Keyframe",
+    [*((name, Number) for name in (*_POSE, "fx", "fy", "cx", "cy")), ("width", Whole), ("height", Whole)],
+)
+
+
+def holds(folder: Path) -> bool:
+    return cameras_in(folder) is not None
 
 
 def cameras_in(path: Path) -> tuple[Path, Path] | None:
@@ -40,12 +52,10 @@ def read(path: Path, images: Path | None = None) -> ViewSet:
 
 
 def _frame(file: Path, photos: Path) -> Frame:
-    fields = fields_of(file, read_json(file))
-    rows = [[number(fields, f"t_{row}{column}") for column in range(4)] for row in range(3)]
-    fx, fy, cx, cy = (number(fields, key) for key in ("fx", "fy", "cx", "cy"))
-    size = whole(fields, "width"), whole(fields, "height")
-    if not (fx > 0 and fy > 0 and min(size) > 0):
-        raise fields.place.error(f"has focal lengths {fx}, {fy} and {size[0]}×{size[1]} pixels")
+    place = Place(file)
+    *pose, fx, fy, cx, cy, width, height = msgspec.structs.astuple(checked(read_json(file), _Keyframe, place))
+    if not (fx > 0 and fy > 0 and min(width, height) > 0):
+        raise place.error(f"has focal lengths {fx}, {fy} and {width}×{height} pixels")
     photo = photos / f"{file.stem}.jpg"
-    lens = Lens(size, np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]))
-    return Frame(photo.name, opencv_view(rigid(np.array(rows), fields.place)), lens, photo)
+    lens = Lens((width, height), np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]))
+    return Frame(photo.name, opencv_view(rigid(np.array(pose).reshape(3, 4), place)), lens, photo)

@@ -123,6 +123,24 @@ class RowTally:
 
 
 @dataclass
+class PointTally(RowTally):
+    """Counts of points that are not finite, and the brightest colour, over the blocks of a cloud."""
+
+    brightest: float = 0.0
+
+    def finite(self, positions: NDArray[Any], colors: NDArray[Any]) -> NDArray[np.bool_]:
+        """Return an (n,) mask of the finite rows, and count them."""
+        good = np.all(np.isfinite(positions), axis=1) & np.all(np.isfinite(colors), axis=1)
+        self.count(good)
+        self.brightest = max(self.brightest, float(np.max(colors, where=good[:, None], initial=0.0)))
+        return good
+
+    def notes(self, path: Path) -> list[Note]:
+        """Return a note on dropped points; raise an `InputError` if none remains."""
+        return self.dropped_notes(path, "point")
+
+
+@dataclass
 class Tally(RowTally):
     """Counts of dropped, clamped and repaired values over the blocks of a scene."""
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from g2ard.config.checks import check_type, checks_arguments
 from g2ard.errors import InputError
 from g2ard.io.atomic import check_output
-from g2ard.io.detect import KINDS, file_format, run_scene
+from g2ard.io.detect import file_format, reader
 from g2ard.io.scene_formats import check_options, lost_in, rounded_by, scene_format
 from g2ard.progress import Progress, silent
 
@@ -50,8 +50,7 @@ def read_splats(path: str | Path, *, render_model: RenderModel | None = None) ->
 
 def read_scene(path: str | Path, *, render_model: RenderModel | None = None) -> Scene:
     """Read a Gaussian scene with notes on dropped rows, clamped values and ignored properties."""
-    path, format_name = check_scene(path)
-    module = import_module(f"g2ard.io.{format_name}")
+    path, module = reader(path, "splats")
     scene: Scene = module.Stream(path).whole() if hasattr(module, "Stream") else module.read(path)
     if render_model is None:
         return scene
@@ -75,8 +74,7 @@ def open_stream(
         if not streams:
             raise InputError("no scene given")
         return streams[0] if len(streams) == 1 else JoinedScenes(streams)
-    path, format_name = check_scene(path)
-    module = import_module(f"g2ard.io.{format_name}")
+    path, module = reader(path, "splats")
     if hasattr(module, "Stream"):
         stream: SceneStream = module.Stream(path)
     else:
@@ -90,14 +88,8 @@ def open_stream(
 
 def check_scene(path: str | Path) -> tuple[Path, str]:
     """Return a scene's file or folder and its format; raise an `InputError` if it is not a scene."""
-    path = run_scene(path)
-    format_name = file_format(path)
-    if KINDS[format_name] != "splats":
-        is_cloud = KINDS[format_name] == "points"
-        what = "a point cloud (no f_dc, scale, rot)" if is_cloud else format_name
-        hint = "`g2ard lift` turns it into a scene" if is_cloud else "give the scene's file"
-        raise InputError(f"expected a Gaussian scene, found {what}", path=path, hint=hint)
-    return path, format_name
+    path, _ = reader(path, "splats")
+    return path, file_format(path)
 
 
 def check_scene_output(path: str | Path, overwrite: bool = False) -> Path:

@@ -13,33 +13,44 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
+from msgspec import UNSET, UnsetType
 from numpy.typing import NDArray
 
 from g2ard.errors import InputError, damaged
-from g2ard.io.jsonfile import (
-    Fields,
-    fields_of,
-    index_of,
-    listed,
-    names_of,
-    numbers,
-    object_of,
-    objects,
-    optional_text,
-    parse_json,
-    read_json,
-)
+from g2ard.io.jsonfile import FileName, Place, Whole, checked, parse_json, read_json
 from g2ard.io.limits import check_unpacked
 from g2ard.io.paths import check_regular, file_identity
 from g2ard.io.sanitize import Raw
-from g2ard.io.sog_chunk import Chunk, Decoder, count_of, means_of, render_model_of, rest_of
+from g2ard.io.sog_chunk import Chunk, Decoder, Meta, count_of, means_of, rest_of
 from g2ard.io.stream import RawStream, from_row
 from g2ard.io.types import Note
 from g2ard.progress import plural
 from g2ard.scene.transform import one_model
 
 _CHUNK_NAME = re.compile(r"(\d+)_(\d+)")
+
+
+class _Lod(msgspec.Struct):
+    file: Whole
+
+
+class _Lods(msgspec.Struct):
+    finest: _Lod | UnsetType = msgspec.field(default=UNSET, name="0")
+
+
+class _Node(msgspec.Struct):
+    children: list["_Node"] = []
+    lods: _Lods = msgspec.field(default_factory=_Lods)
+
+
+class _Levels(msgspec.Struct):
+    """Content of a lod-meta.json."""
+
+    tree: _Node
+    filenames: list[FileName]
+    environment: str | None = None
 
 
 def chunks_of(path: Path) -> list[Path]:
@@ -63,24 +74,27 @@ def chunks_of(path: Path) -> list[Path]:
 
 def _listed(index: Path) -> list[Path]:
     """Return the chunks that lod-meta.json's tree uses at level 0, in the order of its list, and the sky."""
-    content = fields_of(index, read_json(index))
-    names = names_of(content, "filenames", len(listed(content, "filenames")))
-    sky = optional_text(content, "environment")
+    content = checked(read_json(index), _Levels, Place(index))
+    names, sky = content.filenames, content.environment
     files = [index.parent / Path(name).parent for name in names]
     used: set[int] = set()
-    nodes = [object_of(content, "tree")]
+    nodes = [(content.tree, Place(index).to("tree"))]
     while nodes:
-        node = nodes.pop()
-        nodes.extend(objects(node, "children"))
-        if "lods" in node and "0" in (levels := object_of(node, "lods")):
-            used.add(index_of(object_of(levels, "0"), "file", len(files)))
+        node, place = nodes.pop()
+        nodes.extend((child, place.to("children", i)) for i, child in enumerate(node.children))
+        if node.lods.finest is not UNSET:
+            at = node.lods.finest.file
+            if at >= len(files):
+                raise place.to("lods", "0", "file").error(f"is {at}, but there are {len(files)} filenames")
+            used.add(at)
     for i in sorted(used):
+        place = Place(index).to("filenames", i)
         try:
             there = (files[i] / "meta.json").is_file()
         except OSError as error:  # a name too long
-            raise content.place.to("filenames").to(i).error(f"cannot be found ({error.strerror})") from error
+            raise place.error(f"cannot be found ({error.strerror})") from error
         if not there:
-            raise content.place.to("filenames").to(i).error(f"is {names[i]}, which does not exist")
+            raise place.error(f"is {names[i]}, which does not exist")
     chunks = [files[i] for i in sorted(used)]
     if sky and (index.parent / sky).is_file():
         chunks.append((index.parent / sky).parent)
@@ -89,10 +103,7 @@ def _listed(index: Path) -> list[Path]:
 
 def _offset(chunks: list[Chunk]) -> NDArray[np.float64]:
     """Return the offset that g2ard stored under "g2ard"; zeros if it is missing or chunks differ."""
-    found = set()
-    for chunk in chunks:
-        own = object_of(chunk.meta, "g2ard") if "g2ard" in chunk.meta else Fields({})
-        found.add(tuple(numbers(own, "offset", 3)) if "offset" in own else (0.0, 0.0, 0.0))
+    found = {chunk.meta.g2ard.offset for chunk in chunks}
     return np.array(found.pop() if len(found) == 1 else (0, 0, 0), np.float64)
 
 
@@ -117,7 +128,10 @@ class Stream(RawStream):
         with _opened(path) as chunks:
             self._counts = [count_of(chunk) for chunk in chunks]
             self._rest = max(map(rest_of, chunks), default=0)
-            offset, model = _offset(chunks), one_model([*map(render_model_of, chunks)] or ["classic"])
+            offset, model = (
+                _offset(chunks),
+                one_model([chunk.meta.render_model for chunk in chunks] or ["classic"]),
+            )
         notes = tuple(_left_out(path, len(chunks)))
         super().__init__(path, sum(self._counts), self._rest, offset, notes, model)
 
@@ -147,8 +161,8 @@ class Stream(RawStream):
 def _opened(path: Path) -> Iterator[list[Chunk]]:
     if path.suffix.lower() != ".sog":
         yield [
-            Chunk(f, fields_of(f / "meta.json", read_json(f / "meta.json")), _folder_loader(f))
-            for f in chunks_of(path)
+            _chunk(folder, read_json(folder / "meta.json"), _folder_loader(folder))
+            for folder in chunks_of(path)
         ]
         return
     try:
@@ -158,12 +172,15 @@ def _opened(path: Path) -> Iterator[list[Chunk]]:
                 raise InputError("has no meta.json", path=path)
             prefix = min(inside, key=len).removesuffix("meta.json")
             load = _bundle_loader(path, bundle, prefix)
-            file = path / "meta.json"
-            yield [Chunk(path, fields_of(file, parse_json(file, load("meta.json"))), load)]
+            yield [_chunk(path, parse_json(path / "meta.json", load("meta.json")), load)]
     except InputError:
         raise
     except (zipfile.BadZipFile, EOFError, OSError, ValueError, struct.error, OverflowError) as error:
         raise damaged(f"is not a complete .sog archive ({error})", path=path) from error
+
+
+def _chunk(place: Path, content: Any, load: Callable[[str], bytes]) -> Chunk:
+    return Chunk(place, checked(content, Meta, Place(place / "meta.json")), load)
 
 
 def _bundle_loader(path: Path, bundle: zipfile.ZipFile, prefix: str) -> Callable[[str], bytes]:

@@ -5,15 +5,17 @@ import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
+import msgspec
 import numpy as np
+from msgspec import UNSET, UnsetType
 from numpy.typing import NDArray
 from PIL.Image import Image
 
 from g2ard.config.choices import RenderModel
 from g2ard.errors import InputError
-from g2ard.io.jsonfile import Fields, listed, names_of, numbers, object_of, whole
+from g2ard.io.jsonfile import FileName, Place, Vector, Whole
 from g2ard.io.limits import opened_image
 from g2ard.io.sanitize import BLOCK, Raw, logits_of
 
@@ -24,22 +26,79 @@ _LARGEST_LOG = math.log1p(_LARGEST_FLOAT32)
 _PALETTE_COLUMNS = 64
 """Entries of the SH palette per row of its image."""
 
+_Float32 = Annotated[float, msgspec.Meta(ge=-_LARGEST_FLOAT32, le=_LARGEST_FLOAT32)]
+_Log = Annotated[float, msgspec.Meta(ge=-_LARGEST_LOG, le=_LARGEST_LOG)]
+_Bound = _Float32 | Annotated[list[_Float32], msgspec.Meta(min_length=3, max_length=4)]
+"""A bound of all channels, or one of each: three, and opacity as the fourth."""
+
+_OneFile = Annotated[list[FileName], msgspec.Meta(min_length=1)]
+_TwoFiles = Annotated[list[FileName], msgspec.Meta(min_length=2)]
+
+
+class _Means(msgspec.Struct):
+    files: _TwoFiles
+    mins: _Log | Annotated[list[_Log], msgspec.Meta(min_length=3, max_length=4)]
+    maxs: _Log | Annotated[list[_Log], msgspec.Meta(min_length=3, max_length=4)]
+    shape: list[Whole] = []
+
+
+class _Part(msgspec.Struct):
+    files: _OneFile
+    codebook: list[float | None] | UnsetType = UNSET
+    mins: _Bound | None = None
+    maxs: _Bound | None = None
+
+
+class _Rest(_Part):
+    files: _TwoFiles
+    bands: Annotated[int, msgspec.Meta(ge=0, le=3)] | UnsetType = UNSET
+
+
+class _Own(msgspec.Struct):
+    offset: Vector = (0.0, 0.0, 0.0)
+
+
+class Meta(msgspec.Struct):
+    """Content of a meta.json; version 1 has mins and maxs in place of codebooks."""
+
+    means: _Means
+    scales: _Part
+    quats: _Part
+    sh0: _Part
+    shN: _Rest | UnsetType = UNSET
+    version: Literal[1, 2] = 1
+    count: Whole | None = None
+    model: Any = None
+    antialias: Any = False
+    g2ard: _Own = msgspec.field(default_factory=_Own)
+
+    @property
+    def render_model(self) -> RenderModel:
+        """The render model: `model`, or in older files `antialias`."""
+        states = self.model == "antialiased" if self.model is not None else self.antialias is True
+        return "antialiased" if states else "classic"
+
 
 class Chunk(NamedTuple):
     """A meta.json, its folder or archive, and a function that reads files beside it."""
 
     place: Path
-    meta: Fields
+    meta: Meta
     load: Callable[[str], bytes]
+
+    @property
+    def file(self) -> Place:
+        """Place of meta.json, for errors."""
+        return Place(self.place / "meta.json")
 
 
 def count_of(chunk: Chunk) -> int:
-    version = chunk.meta.get("version", 1)
-    if version not in (1, 2):
-        raise chunk.meta.place.to("version").unexpected(version, "1 or 2")
-    means = object_of(chunk.meta, "means")
-    (first,) = names_of(means, "files", 1)
-    count = whole(chunk.meta, "count") if version == 2 else whole(listed(means, "shape"), 0)
+    meta = chunk.meta
+    count = meta.count if meta.version == 2 else next(iter(meta.means.shape), None)
+    if count is None:
+        place = chunk.file.to("count") if meta.version == 2 else chunk.file.to("means", "shape", 0)
+        raise place.error("is missing")
+    first = meta.means.files[0]
     with _opened_image(chunk, first) as image:  # before allocating memory
         if image.width * image.height < count:
             pixels = image.width * image.height
@@ -47,29 +106,22 @@ def count_of(chunk: Chunk) -> int:
     return count
 
 
-def render_model_of(chunk: Chunk) -> RenderModel:
-    """Return the render model: "model", or in older files "antialias"."""
-    model_name = chunk.meta.get("model", "antialiased" if chunk.meta.get("antialias") is True else "default")
-    return "antialiased" if model_name == "antialiased" else "classic"
-
-
 def rest_of(chunk: Chunk) -> int:
     """Return the number of coefficients past band 0; version 1 only implies it by the palette's width."""
-    if "shN" not in chunk.meta:
+    part = chunk.meta.shN
+    if part is UNSET:
         return 0
-    if "bands" in (part := object_of(chunk.meta, "shN")):
-        if (bands := whole(part, "bands")) not in _COEFFICIENTS:
-            raise part.place.to("bands").unexpected(bands, "0 to 3")
-        return _COEFFICIENTS[bands]
-    file = _sh_files(chunk)[0]
+    if part.bands is not UNSET:
+        return _COEFFICIENTS[part.bands]
+    file = _sh_files(part)[0]
     rest, left = divmod(_image(chunk, file).shape[1], _PALETTE_COLUMNS)
     if left or rest not in _COEFFICIENTS.values():
         raise InputError("does not have the width of a palette of SH degree 1 to 3", path=chunk.place / file)
     return rest
 
 
-def _sh_files(chunk: Chunk) -> tuple[str, str]:
-    files = names_of(object_of(chunk.meta, "shN"), "files", 2)
+def _sh_files(part: _Rest) -> tuple[str, str]:
+    files = part.files[:2]
     centroids = next((f for f in files if "centroids" in f), files[0])
     return centroids, next((f for f in files if f != centroids), files[1])
 
@@ -109,18 +161,16 @@ class Decoder:
 
     def __init__(self, chunk: Chunk, count: int) -> None:
         meta, self.chunk = chunk.meta, chunk
-        self._low, self._high, self._quats, self._scales, self._base = (
-            _rows(chunk, name, count)
-            for part, files in (("means", 2), ("quats", 1), ("scales", 1), ("sh0", 1))
-            for name in names_of(object_of(meta, part), "files", files)
-        )
-        self._positions = _positions(object_of(meta, "means"))
-        scales, base = object_of(meta, "scales"), object_of(meta, "sh0")
-        self._log_scales, self._colors = _Values(scales), _Values(base)
-        self._logits = _logits(base)
+        names = [*meta.means.files[:2], meta.quats.files[0], meta.scales.files[0], meta.sh0.files[0]]
+        self._low, self._high, self._quats, self._scales, self._base = (_rows(chunk, n, count) for n in names)
+        self._positions = _positions(meta.means)
+        self._log_scales = _Values(chunk.file.to("scales"), meta.scales)
+        self._colors = _Values(chunk.file.to("sh0"), meta.sh0)
+        self._logits = _logits(chunk.file.to("sh0"), meta.sh0)
         self._rest = rest_of(chunk)
-        if self._rest:
-            self._palette, self._labels = _palette(chunk, self._rest, count)
+        if meta.shN is not UNSET and self._rest:
+            self._labels_file = _sh_files(meta.shN)[1]
+            self._palette, self._labels = _palette(chunk, meta.shN, self._rest, count)
 
     def fill(self, rows: slice, raw: Raw) -> None:
         """Decode the Gaussians `rows` into `raw` in blocks that fit into the cache."""
@@ -145,7 +195,7 @@ class Decoder:
             row = int(np.argmax(index >= len(self._palette)))
             raise InputError(
                 f"has palette entry {index[row]} of {len(self._palette)}",
-                path=self.chunk.place / _sh_files(self.chunk)[1],
+                path=self.chunk.place / self._labels_file,
                 index=rows.start + row,
                 item="Gaussian",
             )
@@ -154,10 +204,9 @@ class Decoder:
 
 def means_of(chunk: Chunk, count: int) -> NDArray[np.float32]:
     """Decode only the (count, 3) means."""
-    part = object_of(chunk.meta, "means")
-    low, high = (_rows(chunk, name, count) for name in names_of(part, "files", 2))
+    low, high = (_rows(chunk, name, count) for name in chunk.meta.means.files[:2])
     means = np.empty((count, 3), np.float32)
-    _fill_means(means, low, high, _positions(part))
+    _fill_means(means, low, high, _positions(chunk.meta.means))
     return means
 
 
@@ -169,34 +218,44 @@ def _fill_means(
         out[:, axis] = positions[axis][low[:, axis] + (high[:, axis].astype(int) << 8)]
 
 
-def _positions(part: Fields) -> NDArray[Any]:
+def _positions(part: _Means) -> NDArray[Any]:
     """Return the (3, 65536) values of codes per axis, which are stored as sign(x)·ln(|x| + 1)."""
-    low, high = (_bound(part, end, slice(3), _LARGEST_LOG) for end in ("mins", "maxs"))
+    low, high = (np.broadcast_to(np.atleast_1d(bound)[:3], 3) for bound in (part.mins, part.maxs))
     logs = low + (high - low) * (np.arange(65536)[:, None] / 65535)
     return (np.sign(logs) * np.expm1(np.abs(logs))).T.astype(np.float32)
 
 
-def _logits(part: Fields) -> NDArray[Any]:
+def _logits(place: Place, part: _Part) -> NDArray[Any]:
     """Return the (256,) logits of opacity bytes, which are α in version 2 and logits in version 1."""
     alpha = np.arange(256) / 255
-    if "codebook" not in part:
-        low, high = (_bound(part, end, 3) for end in ("mins", "maxs"))
+    if part.codebook is UNSET:
+        low, high = (_bound(place.to(name), getattr(part, name), slice(3, 4)) for name in ("mins", "maxs"))
         return low + (high - low) * alpha
     return logits_of(alpha)
+
+
+def _bound(place: Place, bound: _Bound | None, channels: slice) -> NDArray[Any]:
+    """Return a bound of channels, of a list or for all."""
+    if bound is None or (isinstance(bound, list) and len(bound) < channels.stop):
+        raise (place if bound is None else place.to(3)).error("is missing")
+    return np.asarray(bound[channels] if isinstance(bound, list) else bound)
 
 
 class _Values:
     """Values of bytes: from a codebook (version 2), or between mins and maxs (version 1)."""
 
-    def __init__(self, part: Fields) -> None:
-        self._place = part.place.to("codebook")
+    def __init__(self, place: Place, part: _Part) -> None:
+        self._place = place.to("codebook")
         self._book: NDArray[Any] | None = None
-        if "codebook" in part:
-            count = len(listed(part, "codebook"))
-            book = numbers(part, "codebook", count, most=_LARGEST_FLOAT32, gaps=True)
-            self._book = np.asarray(book, np.float32)
-        else:
-            self._low, self._high = (_bound(part, end, slice(3)) for end in ("mins", "maxs"))
+        if part.codebook is not UNSET:
+            book = np.array(part.codebook, np.float64)
+            wrong = np.isfinite(book) & (np.abs(book) > _LARGEST_FLOAT32)
+            if wrong.any():
+                raise self._place.to(int(np.argmax(wrong))).error("is beyond the range of float32")
+            self._book = book.astype(np.float32)
+            return
+        low, high = (_bound(place.to(name), getattr(part, name), slice(3)) for name in ("mins", "maxs"))
+        self._low, self._high = low, high
 
     def of(self, codes: NDArray[np.uint8]) -> NDArray[Any]:
         if self._book is None:
@@ -205,15 +264,6 @@ class _Values:
         if len(self._book) < 256 and codes.size and (top := int(codes.max())) >= len(self._book):
             raise self._place.error(f"has {len(self._book)} numbers, expected at least {top + 1}")
         return self._book[codes]
-
-
-def _bound(part: Fields, key: str, channels: slice | int, most: float = _LARGEST_FLOAT32) -> NDArray[Any]:
-    """Return a bound: one number for all channels, or a list per channel with opacity as the fourth."""
-    if not isinstance(value := part[key], list):
-        return np.asarray(numbers(part, key, most=most))
-    wanted = 4 if channels == 3 or len(value) == 4 else 3
-    bound: NDArray[Any] = np.asarray(numbers(part, key, wanted, most=most))[channels]
-    return bound
 
 
 def _quats(codes: NDArray[np.uint8]) -> NDArray[Any]:
@@ -230,14 +280,16 @@ def _quats(codes: NDArray[np.uint8]) -> NDArray[Any]:
     return quats
 
 
-def _palette(chunk: Chunk, rest: int, count: int) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+def _palette(
+    chunk: Chunk, part: _Rest, rest: int, count: int
+) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
     """Return the (entries, K−1, 3) coefficients of the palette, and the labels."""
-    centroids, labels = _sh_files(chunk)
+    centroids, labels = _sh_files(part)
     image = _image(chunk, centroids)
     if image.shape[1] != _PALETTE_COLUMNS * rest:
         raise InputError(
             f"has width {image.shape[1]}, expected {_PALETTE_COLUMNS * rest}", path=chunk.place / centroids
         )
-    values = _Values(object_of(chunk.meta, "shN"))
+    values = _Values(chunk.file.to("shN"), part)
     palette = values.of(image[:, :, :3].reshape(-1, rest, 3)).astype(np.float32)
     return palette, _rows(chunk, labels, count)

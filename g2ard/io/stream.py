@@ -1,35 +1,76 @@
-"""Scenes in blocks, for scenes larger than memory."""
+"""Scenes and coloured point clouds in blocks, for files larger than memory."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from g2ard.config.choices import RenderModel
 from g2ard.io.paths import file_identity
-from g2ard.io.sanitize import BLOCK, Raw, Tally
-from g2ard.io.types import Note, Scene
+from g2ard.io.sanitize import BLOCK, PointTally, Raw, Tally
+from g2ard.io.types import Cloud, Note, Points, Scene
 from g2ard.scene.splats import Splats
 from g2ard.scene.transform import one_model
 
 _DEGREE_OF_REST = {0: 0, 3: 1, 8: 2, 15: 3}
+_POINTS_AT_ONCE = 1 << 20
+
+RawPoints = tuple[NDArray[np.float64], NDArray[np.float32]]
+"""(n, 3) positions, world units, and (n, 3) colours; colours / `divisor` are in [0, 1]."""
+
+Block = TypeVar("Block", Splats, RawPoints)
 
 
-class SceneStream(ABC):
-    """Scene that can be read from any row.
+class Stream(ABC, Generic[Block]):
+    """Source of Gaussians or points that can be read from any row.
 
     Attributes:
         path: path for messages.
         count: rows in the source, including those that will be dropped.
-        sh_degree: 0–3.
-        offset: (3,) float64, world = means + offset.
+        offset: (3,) float64, world = position + offset, where float32 can represent the positions.
         notes: notes on the header.
-        render_model: see `Splats`; may be changed before reading.
         tally: counts over the rows that `blocks` has read.
+    """
+
+    tally: Any
+
+    def __init__(
+        self, path: Path, count: int, offset: NDArray[np.float64] | None, notes: tuple[Note, ...] = ()
+    ) -> None:
+        self.path, self.count, self.notes = path, count, notes
+        self.offset = np.zeros(3) if offset is None else offset
+
+    def identity(self) -> list[Any]:
+        """Return JSON that identifies this source, see `file_identity`."""
+        return file_identity([self.path])
+
+    @abstractmethod
+    def positions(self, rows: int) -> Iterator[NDArray[np.float32]]:
+        """Yield the (n, 3) positions of all rows in blocks, relative to `offset`, without cleaning."""
+
+    @abstractmethod
+    def blocks(self, rows: int, start: int = 0) -> Iterator[Block]:
+        """Yield rows from `start` in blocks of at most `rows`, without those that are not finite."""
+
+    def header_notes(self) -> tuple[Note, ...]:
+        """Return notes other than on rows, known once `blocks` has finished."""
+        return self.notes
+
+    def all_notes(self) -> tuple[Note, ...]:
+        """Return all notes once `blocks` has finished; raise an `InputError` if no row is finite."""
+        return (*self.header_notes(), *self.tally.notes(self.path))
+
+
+class SceneStream(Stream[Splats]):
+    """Scene in blocks, which are cleaned as in `g2ard.io.read_scene`.
+
+    Attributes:
+        sh_degree: 0–3.
+        render_model: see `Splats`; may be changed before reading.
     """
 
     def __init__(
@@ -41,26 +82,8 @@ class SceneStream(ABC):
         notes: tuple[Note, ...] = (),
         render_model: RenderModel = "classic",
     ) -> None:
-        self.path, self.count, self.notes, self.tally = path, count, notes, Tally()
-        self.render_model = render_model
-        self.sh_degree = _DEGREE_OF_REST[rest]
-        self.offset = np.zeros(3) if offset is None else offset
-
-    def identity(self) -> list[Any]:
-        """Return JSON that identifies this source, see `file_identity`."""
-        return file_identity([self.path])
-
-    @abstractmethod
-    def positions(self, rows: int) -> Iterator[NDArray[np.float32]]:
-        """Yield the (n, 3) means of all rows in blocks, without cleaning."""
-
-    @abstractmethod
-    def blocks(self, rows: int, start: int = 0) -> Iterator[Splats]:
-        """Yield rows from `start` in blocks of at most `rows`, cleaned as in `g2ard.io.read_scene`."""
-
-    def all_notes(self) -> tuple[Note, ...]:
-        """Return all notes once `blocks` has finished; raise an `InputError` if no row is finite."""
-        return (*self.notes, *self.tally.notes(self.path))
+        super().__init__(path, count, offset, notes)
+        self.tally, self.render_model, self.sh_degree = Tally(), render_model, _DEGREE_OF_REST[rest]
 
     def whole(self) -> Scene:
         """Read all rows into memory."""
@@ -131,28 +154,92 @@ class PartsStream(SceneStream):
         return self.notes
 
 
-class JoinedScenes(SceneStream):
-    """Several scenes as one."""
+class PointStream(Stream[RawPoints]):
+    """Coloured point cloud in blocks."""
 
-    def __init__(self, streams: list[SceneStream]) -> None:
-        rest = (max(stream.sh_degree for stream in streams) + 1) ** 2 - 1
-        count = sum(stream.count for stream in streams)
-        notes = [replace(n, text=f"{s.path}: {n.text}") for s in streams for n in s.notes]
-        model = one_model([stream.render_model for stream in streams])
-        super().__init__(streams[0].path, count, rest, streams[0].offset, tuple(notes), model)
-        self._streams, self._rest = streams, rest
+    def __init__(self, path: Path, count: int, low: NDArray[np.float64], high: NDArray[np.float64]) -> None:
+        """Open a cloud with these bounds, whose centre becomes the offset if it is far from the origin."""
+        middle = (low + high) / 2
+        far = np.isfinite(middle).all() and (np.abs(middle) > np.linalg.norm(high - low)).any()
+        super().__init__(path, count, np.rint(middle) if far else None)
+        self.tally: PointTally = PointTally()
 
-    def identity(self) -> list[Any]:
-        return [stream.identity() for stream in self._streams]
+    @abstractmethod
+    def raw(self, rows: int, start: int) -> Iterator[RawPoints]:
+        """Yield the source's points from `start`, at most `rows` at a time."""
+
+    @property
+    def divisor(self) -> float:
+        """The divisor of colours, known once `blocks` has finished."""
+        return 1.0
+
+    def near(self, positions: NDArray[np.float64]) -> NDArray[np.float32]:
+        """Return positions relative to `offset`."""
+        with np.errstate(over="ignore", invalid="ignore"):
+            return (positions - self.offset).astype(np.float32)
 
     def positions(self, rows: int) -> Iterator[NDArray[np.float32]]:
-        for stream in self._streams:
+        return (self.near(positions) for positions, _ in self.raw(rows, 0))
+
+    def blocks(self, rows: int, start: int = 0) -> Iterator[RawPoints]:
+        for points in self.raw(rows, start):
+            good = self.tally.finite(*points)
+            yield points if good.all() else (points[0][good], points[1][good])
+
+    def whole(self) -> Cloud:
+        """Read all points, with colours in [0, 1]."""
+        positions, colors, kept = np.empty((self.count, 3)), np.empty((self.count, 3), np.float32), 0
+        for block in self.blocks(_POINTS_AT_ONCE):
+            rows = slice(kept, kept := kept + len(block[0]))
+            positions[rows], colors[rows] = block
+        notes = self.all_notes()
+        return Cloud(Points(positions[:kept], np.clip(colors[:kept] / np.float32(self.divisor), 0, 1)), notes)
+
+
+class WholeCloud(PointStream):
+    """Point cloud in memory."""
+
+    def __init__(self, path: Path, positions: NDArray[np.float64], colors: NDArray[np.float32]) -> None:
+        self._positions, self._colors = positions, colors
+        at = positions[np.isfinite(positions).all(axis=1)]
+        bounds = (at.min(axis=0), at.max(axis=0)) if len(at) else np.zeros((2, 3))
+        super().__init__(path, len(positions), *bounds)
+
+    def raw(self, rows: int, start: int) -> Iterator[RawPoints]:
+        for first in range(start, self.count, rows):
+            yield self._positions[first : first + rows], self._colors[first : first + rows]
+
+
+class Joined(Stream[Block]):
+    """Several sources as one, with the offset of the first."""
+
+    streams: Sequence[Stream[Block]]
+
+    def identity(self) -> list[Any]:
+        return [stream.identity() for stream in self.streams]
+
+    def header_notes(self) -> tuple[Note, ...]:
+        return tuple(replace(n, text=f"{s.path}: {n.text}") for s in self.streams for n in s.header_notes())
+
+
+class JoinedScenes(Joined[Splats], SceneStream):
+    """Several scenes as one, with the highest of their SH degrees."""
+
+    streams: Sequence[SceneStream]
+
+    def __init__(self, streams: Sequence[SceneStream]) -> None:
+        self.streams, self._rest = streams, (max(stream.sh_degree for stream in streams) + 1) ** 2 - 1
+        count, model = sum(s.count for s in streams), one_model([s.render_model for s in streams])
+        SceneStream.__init__(self, streams[0].path, count, self._rest, streams[0].offset, render_model=model)
+
+    def positions(self, rows: int) -> Iterator[NDArray[np.float32]]:
+        for stream in self.streams:
             for means in stream.positions(rows):
                 yield self._moved(means, stream.offset)
 
     def blocks(self, rows: int, start: int = 0) -> Iterator[Splats]:
-        for number, begin in from_row([stream.count for stream in self._streams], start):
-            stream = self._streams[number]
+        for number, begin in from_row([stream.count for stream in self.streams], start):
+            stream = self.streams[number]
             stream.tally = self.tally
             for block in stream.blocks(rows, begin):
                 shN = np.zeros((len(block), self._rest, 3), np.float32)
@@ -163,6 +250,33 @@ class JoinedScenes(SceneStream):
     def _moved(self, means: NDArray[np.float32], offset: NDArray[np.float64]) -> NDArray[np.float32]:
         shift = offset - self.offset
         return (means + shift).astype(np.float32) if shift.any() else means
+
+
+class JoinedClouds(Joined[RawPoints], PointStream):
+    """Several point clouds as one, with colours scaled to [0, 1]."""
+
+    streams: Sequence[PointStream]
+
+    def __init__(self, streams: Sequence[PointStream]) -> None:
+        self.streams, self._divisors = streams, dict[int, float]()
+        Stream.__init__(self, streams[0].path, sum(s.count for s in streams), streams[0].offset)
+        self.tally = PointTally()
+
+    def raw(self, rows: int, start: int) -> Iterator[RawPoints]:
+        for number, begin in from_row([stream.count for stream in self.streams], start):
+            divisor = self._divisor(number, rows)
+            for positions, colors in self.streams[number].raw(rows, begin):
+                yield positions, colors / np.float32(divisor)
+
+    def _divisor(self, number: int, rows: int) -> float:
+        """Return a file's divisor, which takes an additional pass over its points."""
+        if number not in self._divisors:
+            stream = self.streams[number]
+            stream.tally = PointTally()
+            for points in stream.raw(rows, 0):
+                stream.tally.finite(*points)
+            self._divisors[number] = stream.divisor
+        return self._divisors[number]
 
 
 def from_row(counts: Sequence[int], start: int) -> Iterator[tuple[int, int]]:

@@ -11,15 +11,16 @@ import zlib
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from g2ard.config.choices import RENDER_MODELS, RenderModel
+from g2ard.config.choices import RenderModel
 from g2ard.errors import InputError
 from g2ard.io.detect import MANIFEST
-from g2ard.io.jsonfile import read_json
+from g2ard.io.jsonfile import Number, Place, Vector, Whole, checked, read_json
 from g2ard.io.types import Note
 from g2ard.scene.kdtree import KdTree
 from g2ard.scene.splats import Splats
@@ -55,8 +56,7 @@ def packed(splats: Splats) -> NDArray[np.float32]:
     return rows
 
 
-@dataclass(frozen=True)
-class Tile:
+class Tile(msgspec.Struct, frozen=True):
     """Manifest entry of a tile.
 
     Args:
@@ -64,14 +64,28 @@ class Tile:
         halo: number of Gaussians of other tiles within the margin around the box.
         low, high: corners of the box, clipped to the bounds of the scene's means, relative to the offset.
         checks: CRC-32 of both files.
+        index: its number, by the order of the manifest.
     """
 
-    index: int
-    rows: int
-    halo: int
-    low: tuple[float, float, float]
-    high: tuple[float, float, float]
-    checks: tuple[int, int]
+    rows: Whole
+    halo: Whole
+    low: Vector
+    high: Vector
+    checks: tuple[int, int] = msgspec.field(name="crc32")
+    index: int = -1
+
+
+class _Manifest(msgspec.Struct):
+    tiles: list[Tile]
+    count: int
+    sh_degree: Annotated[int, msgspec.Meta(ge=0, le=3)]
+    offset: Vector
+    margin: Number
+    cells: Any
+    notes: tuple[Note, ...]
+    key: str
+    settings: dict[str, Any]
+    render_model: RenderModel = "classic"
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,44 +135,32 @@ class TileStore:
             raise InputError("not a manifest of tiles", path=path)
         if content.get("version") != VERSION:
             raise InputError(f"unsupported version {content.get('version')!r}; expected {VERSION}", path=path)
+        place = Place(path)
+        manifest = checked(content, _Manifest, place)
         try:
-            store = cls._parsed(folder, content)
-        except (LookupError, TypeError, ValueError, AttributeError, OverflowError, RecursionError) as error:
-            raise InputError(f"malformed manifest ({error!r})", path=path) from error
+            tree = KdTree.from_json(manifest.cells)
+        except (TypeError, ValueError, RecursionError) as error:
+            raise place.to("cells").error(f"is not a tree ({error})") from error
+        if tree.leaves != len(manifest.tiles):
+            raise place.to("cells").error(f"has {tree.leaves} leaves for {len(manifest.tiles)} tiles")
+        if sum(tile.rows for tile in manifest.tiles) != manifest.count:
+            raise place.to("count").error(f"is {manifest.count}, which is not the sum of the tiles' rows")
+        store = cls(
+            folder,
+            tuple(msgspec.structs.replace(tile, index=i) for i, tile in enumerate(manifest.tiles)),
+            manifest.count,
+            manifest.sh_degree,
+            np.array(manifest.offset),
+            manifest.margin,
+            tree,
+            manifest.notes,
+            manifest.key,
+            manifest.settings,
+            manifest.render_model,
+        )
         for tile in store.tiles:
             store._check_size(tile_name(tile.index), tile.rows)
             store._check_size(halo_name(tile.index), tile.halo)
-        return store
-
-    @classmethod
-    def _parsed(cls, folder: Path, content: dict[str, Any]) -> TileStore:
-        tiles = []
-        for index, tile in enumerate(content["tiles"]):
-            rows, halo = int(tile["rows"]), int(tile["halo"])
-            (x, y, z), (X, Y, Z) = map(float, tile["low"]), map(float, tile["high"])
-            first, second = map(int, tile["crc32"])
-            tiles.append(Tile(index, rows, halo, (x, y, z), (X, Y, Z), (first, second)))
-        offset = np.array(content["offset"], np.float64)
-        tree = KdTree.from_json(content["cells"])
-        notes = tuple(Note(str(n["code"]), int(n["count"]), str(n["text"])) for n in content["notes"])
-        store = cls(
-            folder,
-            tuple(tiles),
-            int(content["count"]),
-            int(content["sh_degree"]),
-            offset,
-            float(content["margin"]),
-            tree,
-            notes,
-            str(content["key"]),
-            dict(content["settings"]),
-            content.get("render_model", "classic"),
-        )
-        fits = offset.shape == (3,) and store.sh_degree in range(4) and tree.leaves == len(tiles)
-        fits = fits and store.render_model in RENDER_MODELS
-        finite = np.isfinite([*offset.ravel(), store.margin, *(x for t in tiles for x in (*t.low, *t.high))])
-        if not fits or not finite.all() or sum(tile.rows for tile in tiles) != store.count:
-            raise ValueError("inconsistent counts or values that are not finite")
         return store
 
     def _check_size(self, name: str, rows: int) -> None:

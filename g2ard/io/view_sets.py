@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
-from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,7 +11,7 @@ from g2ard.config.checks import check_type, checks_arguments
 from g2ard.config.choices import ViewFormat
 from g2ard.errors import InputError
 from g2ard.io.atomic import atomic_folder, atomic_output, check_output
-from g2ard.io.detect import KINDS, file_format, run_views
+from g2ard.io.detect import reader, run_views
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -78,17 +77,12 @@ def read_view_set(
 
     if not isinstance(path, ViewFiles):
         path = ViewFiles(Path(path), Path(images) if images else None, alpha)
-    images, alpha, path = path.images, path.alpha, run_views(path.path)
-    format_name = file_format(path)
-    if KINDS[format_name] != "views":
-        what = "a Gaussian scene" if KINDS[format_name] == "splats" else "a point cloud"
-        raise InputError(
-            f"expected views (a COLMAP folder, transforms.json, g2ard's .json), found {what}", path=path
-        )
+    images, alpha = path.images, path.alpha
+    path, module = reader(run_views(path.path), "views")
     if images is not None and not images.is_dir():
         raise InputError("no such folder of photos", path=images)
     try:
-        views = import_module(f"g2ard.io.{format_name}").read(path, images)
+        views = module.read(path, images)
     except OSError as error:  # invalid photo name, unreadable folder
         raise InputError(error.strerror or str(error), path=path) from error
     views = views if unpictured else pictured(views)

@@ -7,13 +7,14 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from g2ard.errors import InputError
-from g2ard.io import jsonfile
 from g2ard.io.atomic import atomic_output
 from g2ard.io.camera_files import beside
+from g2ard.io.jsonfile import Matrix, Number, Place, Pose, Weight, Whole, checked, read_json
 from g2ard.io.photos import Frame, Lens, rigid, view_set
 from g2ard.io.types import ViewSet
 from g2ard.progress import plural
@@ -23,44 +24,66 @@ _FORMAT = "g2ard-views"
 _VERSION = 1
 
 
+class _View(msgspec.Struct):
+    name: str
+    width: Whole
+    height: Whole
+    K: Matrix
+    camera_from_world: Pose
+    distortion: list[Number] = []
+    image: str | None = None
+    mask: str | None = None
+    split: str | None = None
+    weight: Weight | None = None
+    kind: str | None = None
+
+
+class _File(msgspec.Struct):
+    views: list[_View] = []
+
+
+def holds(folder: Path) -> bool:
+    """Return False: the file has any name."""
+    return False
+
+
+def describes(content: Any) -> bool:
+    views = content.get("views") if isinstance(content, dict) else None
+    return isinstance(views, list) or (isinstance(content, dict) and {"views", "format"} <= set(content))
+
+
 def read(path: Path, images: Path | None = None) -> ViewSet:
     """Read views; photo paths are relative to the file unless `images`, a folder of photos, is given."""
-    content = jsonfile.read_json(path)
-    if content.get("format") != _FORMAT:
-        raise InputError(f"is {content.get('format')!r}, expected {_FORMAT!r}", path=path, property="format")
-    if content.get("version") != _VERSION:
-        raise InputError(f"unsupported version {content.get('version')!r}; expected {_VERSION}", path=path)
-    views = content.get("views")
-    if not isinstance(views, list) or not views:
+    content = read_json(path)
+    head = content.get("format"), content.get("version")
+    if head[0] != _FORMAT:
+        raise InputError(f"is {head[0]!r}, expected {_FORMAT!r}", path=path, property="format")
+    if head[1] != _VERSION:
+        raise InputError(f"unsupported version {head[1]!r}; expected {_VERSION}", path=path)
+    views = checked(content, _File, Place(path), entries="view").views
+    if not views:
         raise InputError("no views found ('views' is empty)", path=path)
-    return view_set(path, [_frame(path, i, view, images) for i, view in enumerate(views)])
+    return view_set(path, [_frame(Place(path, i, "view"), view, images) for i, view in enumerate(views)])
 
 
-def _frame(path: Path, index: int, entry: Any, images: Path | None) -> Frame:
-    view = jsonfile.fields_of(path, entry, index, "view")
-    photo, mask = jsonfile.optional_text(view, "image"), jsonfile.optional_text(view, "mask")
-    weight = None if view.get("weight") is None else jsonfile.number(view, "weight")
-    if weight is not None and weight < 0:
-        raise view.place.to("weight").unexpected(weight, "a number ≥ 0")
-    size = jsonfile.whole(view, "width"), jsonfile.whole(view, "height")
-    count = len(jsonfile.listed(view, "distortion"))
-    distortion = *(jsonfile.numbers(view, "distortion", count) if count else ()), *[0.0] * 5
+def _frame(place: Place, view: _View, images: Path | None) -> Frame:
+    folder, photo = place.path.parent, view.image
+    distortion = *view.distortion, *[0.0] * 5
     return Frame(
-        name=jsonfile.text(view, "name"),
-        viewmat=_exact(view),
-        lens=Lens(size, np.array(jsonfile.numbers(view, "K", 3, 3)), distortion[:5]),
-        photo=None if photo is None else images / Path(photo).name if images else path.parent / photo,
-        mask=None if mask is None else path.parent / mask,
-        split=jsonfile.optional_text(view, "split"),
-        weight=weight,
-        kind=jsonfile.optional_text(view, "kind") or USUAL,
+        name=view.name,
+        viewmat=_exact(np.array(view.camera_from_world), place.to("camera_from_world")),
+        lens=Lens((view.width, view.height), np.array(view.K), distortion[:5]),
+        photo=None if photo is None else images / Path(photo).name if images else folder / photo,
+        mask=None if view.mask is None else folder / view.mask,
+        split=view.split,
+        weight=view.weight,
+        kind=view.kind or USUAL,
     )
 
 
-def _exact(view: jsonfile.Fields) -> NDArray[np.float64]:
+def _exact(stored: NDArray[np.float64], place: Place) -> NDArray[np.float64]:
     """Return the pose as stored if it is rigid to rounding, so that writing and reading change no bit."""
-    stored = jsonfile.matrix(view, "camera_from_world")
-    nearest = rigid(stored, view.place.to("camera_from_world"))
+    nearest = rigid(stored, place)
     return stored if len(stored) == 4 and np.allclose(nearest, stored, rtol=0, atol=1e-9) else nearest
 
 

@@ -22,7 +22,9 @@ from numpy.typing import NDArray
 
 from g2ard._core import __version__
 from g2ard.config.checks import checks_arguments
+from g2ard.errors import InputError
 from g2ard.io.atomic import atomic_folder
+from g2ard.io.jsonfile import read_json
 from g2ard.io.packing import morton_order
 from g2ard.io.sog_write import sog_files
 from g2ard.levels.tree import Cut, Leaf, Level, Node
@@ -234,10 +236,9 @@ def _names(content: dict[str, Any], key: str, pattern: re.Pattern[str]) -> list[
 def read_object(file: Path) -> dict[str, Any]:
     """Return a file's JSON object, or {} if the file is missing or holds something else."""
     try:
-        content = json.loads(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        return read_json(file)
+    except InputError:
         return {}
-    return content if isinstance(content, dict) else {}
 
 
 def write_json(file: Path, content: dict[str, Any]) -> None:

@@ -15,6 +15,7 @@ from g2ard.config.choices import RenderModel
 from g2ard.errors import InputError, OutputError, require
 from g2ard.io import kind, open_point_stream, open_stream
 from g2ard.io.detect import JOURNAL, MANIFEST, POINTS
+from g2ard.io.jsonfile import Place, checked, read_json
 from g2ard.io.lock import LOCK, locked
 from g2ard.io.stream import SceneStream
 from g2ard.io.tile_store import VERSION, TileStore
@@ -209,8 +210,8 @@ def _check_tiles(folder: Path, key: str, settings: dict[str, Any], overwrite: bo
 def _differing(found: Sequence[Path], settings: dict[str, Any]) -> str:
     """Return the settings that differ from a manifest's or journal's, in brackets, or ""."""
     for path in found:
-        with suppress(OSError, ValueError, LookupError, TypeError, RecursionError):
-            theirs = dict(json.loads(path.read_text(encoding="utf-8"))["settings"])
+        with suppress(InputError, LookupError):
+            theirs = checked(read_json(path)["settings"], dict[str, Any], Place(path))
             names = [name for name in {**theirs, **settings} if theirs.get(name) != settings.get(name)]
             told = [f"{name} {theirs.get(name)} instead of {settings.get(name)}" for name in names]
             return f" ({'; '.join(told)})" if told else ""
@@ -222,8 +223,8 @@ def _key_in(path: Path) -> str | None:
     if not path.is_file():
         return None
     try:
-        return str(json.loads(path.read_text(encoding="utf-8"))["key"])
-    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        return str(read_json(path)["key"])
+    except (InputError, KeyError):
         return ""
 
 

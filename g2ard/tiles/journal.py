@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from g2ard.errors import InputError, OutputError
 from g2ard.io.atomic import hidden_name
 from g2ard.io.detect import JOURNAL, MANIFEST, POINTS
-from g2ard.io.jsonfile import read_json
+from g2ard.io.jsonfile import Place, checked, read_json
 from g2ard.io.tile_store import FORMAT, VERSION, halo_name, tile_name
 from g2ard.scene.kdtree import KdTree, Points
 
@@ -54,6 +54,22 @@ class _Files:
 
 
 @dataclass
+class _Saved:
+    """Content of a journal.json."""
+
+    key: str
+    cells: Any
+    margin: float
+    next_row: int
+    tally: dict[str, Any]
+    low: list[float]
+    high: list[float]
+    tiles: _Files
+    halos: _Files
+    settings: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass
 class Journal:
     """The tiles of a scene while they are written.
 
@@ -85,26 +101,30 @@ class Journal:
         self.tiles, self.halos = (_Files([0] * count, [0] * count) for _ in range(2))
 
     @classmethod
-    def open(cls, folder: Path, row_bytes: int, tally: type) -> Journal | None:
+    def open(cls, folder: Path, row_bytes: int, tally: type[Any]) -> Journal | None:
         """Read the journal of a folder, or return None without one."""
         path = folder / JOURNAL
         if not path.is_file():
             return None
-        content = read_json(path)
+        place = Place(path)
+        saved = checked(read_json(path), _Saved, place)
         try:
-            tree = KdTree.from_json(content["cells"])
-            key, margin = str(content["key"]), float(content["margin"])
-            counts, settings = tally(**content["tally"]), dict(content.get("settings", {}))
-            journal = cls(folder, key, tree, margin, row_bytes, counts, settings)
-            journal.next_row = int(content["next_row"])
-            journal.low, journal.high = content["low"], content["high"]
-            for kind in ("tiles", "halos"):
-                files = _Files(**content[kind])
-                if len(files.rows) != tree.leaves or len(files.checks) != tree.leaves:
-                    raise ValueError(f"{len(files.rows)} {kind} of {tree.leaves}")
-                setattr(journal, kind, files)
-        except (LookupError, TypeError, ValueError, AttributeError, OverflowError, RecursionError) as error:
-            raise InputError(f"malformed journal ({error!r})", path=path) from error
+            tree = KdTree.from_json(saved.cells)
+        except (TypeError, ValueError, RecursionError) as error:
+            raise place.to("cells").error(f"is not a tree ({error})") from error
+        counts = checked(saved.tally, tally, place.to("tally"))
+        journal = cls(
+            folder, saved.key, tree, saved.margin, row_bytes, counts, saved.settings, saved.next_row
+        )
+        journal.low, journal.high, journal.tiles, journal.halos = (
+            saved.low,
+            saved.high,
+            saved.tiles,
+            saved.halos,
+        )
+        for name, files in (("tiles", saved.tiles), ("halos", saved.halos)):
+            if not len(files.rows) == len(files.checks) == tree.leaves:
+                raise place.to(name).error(f"has {len(files.rows)} of {tree.leaves}")
         return journal
 
     def cut(self) -> None:

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from g2ard.config.choices import RenderModel
 from g2ard.errors import OutputError
 from g2ard.io.detect import POINTS
-from g2ard.io.point_stream import PointStream, PointTally
-from g2ard.io.stream import SceneStream
+from g2ard.io.sanitize import PointTally
+from g2ard.io.stream import PointStream, SceneStream
 from g2ard.io.tile_store import TileStore, halo_name, packed, row_width, tile_name
 from g2ard.progress import Progress, Say, plural
 from g2ard.scene.kdtree import KdTree, Points, Sampler, cut_tree, margin_of
@@ -51,10 +51,6 @@ class Feed(ABC):
     settings: dict[str, Any]
 
     @abstractmethod
-    def positions(self, rows: int) -> Iterator[Points]:
-        """Yield the (n, 3) positions of all rows, in blocks."""
-
-    @abstractmethod
     def rows(self, rows: int, start: int) -> Iterator[tuple[NDArray[Any], Points]]:
         """Yield the rows to keep from the source's row `start` on, with their positions."""
 
@@ -66,9 +62,6 @@ class SceneFeed(Feed):
         self.stream: SceneStream = stream
         self.row_bytes = self.room = 4 * row_width(stream.sh_degree)
         self.sh_degree, self.render_model = stream.sh_degree, stream.render_model
-
-    def positions(self, rows: int) -> Iterator[Points]:
-        return self.stream.positions(rows)
 
     def rows(self, rows: int, start: int) -> Iterator[tuple[NDArray[Any], Points]]:
         return ((packed(splats), splats.means) for splats in self.stream.blocks(rows, start))
@@ -84,18 +77,11 @@ class PointFeed(Feed):
         self.stream: PointStream = stream
         self.config = config
 
-    def positions(self, rows: int) -> Iterator[Points]:
-        return (self._near(far) for far, _ in self.stream.raw(rows, 0))
-
     def rows(self, rows: int, start: int) -> Iterator[tuple[NDArray[Any], Points]]:
         for far, colors in self.stream.blocks(rows, start):
             block = np.empty(len(far), _POINT_DTYPE)
-            block["near"], block["rgb"], block["far"] = self._near(far), colors, far
+            block["near"], block["rgb"], block["far"] = self.stream.near(far), colors, far
             yield block, np.ascontiguousarray(block["near"])
-
-    def _near(self, far: NDArray[np.float64]) -> Points:
-        with np.errstate(over="ignore", invalid="ignore"):
-            return (far - self.stream.offset).astype(np.float32)
 
 
 def pour(
@@ -171,7 +157,7 @@ def _empty(folder: Path, key: str, tree: KdTree, margin: float, feed: Feed) -> J
 
 def _sampled(feed: Feed, rows: int, progress: Progress) -> tuple[Points, float]:
     sampler, done = Sampler(feed.stream.count, _TREE_SAMPLE), 0
-    for points in feed.positions(rows):
+    for points in feed.stream.positions(rows):
         sampler.add(points)
         done += len(points)
         progress("sample", done, feed.stream.count)

@@ -1,6 +1,7 @@
 """Views of public data sets, on small files of their true form."""
 
 import json
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +9,7 @@ import pytest
 
 from g2ard import io
 from g2ard.errors import InputError
+from g2ard.io.detect import KINDS
 from g2ard.io.images import load_image
 from helpers.dataset_files import POSES, cambridge, llff, mip_nerf_360, opengl, polycam
 from helpers.view_files import photo
@@ -161,3 +163,12 @@ def test_a_colmap_model_without_a_table_says_which(part: str, tmp_path: Path) ->
             InputError, match=f"COLMAP model without {Path(part).name}; found .*copy the whole model"
         ):
             io.read_views(path)
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_every_line_of_the_table_names_a_reader(name: str, tmp_path: Path) -> None:
+    module = import_module(f"g2ard.io.{name}")
+    assert hasattr(module, "read") or (hasattr(module, "Stream") and KINDS[name] != "views")
+    if KINDS[name] == "views":
+        assert not module.holds(tmp_path)
+        assert not getattr(module, "describes", bool)([])

@@ -249,7 +249,7 @@ def test_an_index_in_a_glb_names_an_entry(table: str, index: Any, tmp_path: Path
         fault = ("accessors[0].bufferView", None)
     else:
         document["bufferViews"][0]["buffer"] = index
-        fault = "lies outside the file"
+        fault = ("bufferViews[0].buffer", None)
     with faulty(tmp_path / "a.glb", fault):
         read_scene(node_tree(tmp_path / "a.glb", document["nodes"], document))
 

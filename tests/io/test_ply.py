@@ -215,7 +215,7 @@ def test_cloud_is_not_a_scene(tmp_path: Path) -> None:
     path = save(tmp_path / "a.ply", {n: np.zeros(2) for n in ("x", "y", "z", "red", "green", "blue")})
     assert kind(path) == "points"
     for read in (read_splats, open_stream):
-        with pytest.raises(InputError, match="expected a Gaussian scene, found a point cloud"):
+        with pytest.raises(InputError, match="expected a Gaussian scene, found a coloured point cloud"):
             read(path)
 
 

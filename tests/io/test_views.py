@@ -53,7 +53,7 @@ def test_own_views_name_photos_splits_and_weights(tmp_path: Path) -> None:
     [
         (lambda c: c.update(version=2), "version 2"),
         (lambda c: c["views"][0].pop("K"), ("K", 0)),
-        (lambda c: c["views"][1].update(K=[1, 2]), ("K[0]", 1)),
+        (lambda c: c["views"][1].update(K=[1, 2]), ("K[2]", 1)),
         (lambda c: c["views"][1].update(weight=-1), ("weight", 1)),
         (lambda c: c["views"][1].update(width=80.5), ("width", 1)),
         (lambda c: c["views"][0].update(height=math.inf), ("height", 0)),

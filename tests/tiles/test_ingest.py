@@ -239,10 +239,10 @@ def test_damage_is_named(tmp_path: Path) -> None:
     for change, message in (
         ({"format": "other"}, "not a manifest of tiles"),
         ({"version": 99}, "unsupported version 99"),
-        ({"count": 3}, "inconsistent"),
-        ({"sh_degree": 7}, "malformed"),
-        ({"tiles": 5}, "malformed"),
-        ({"cells": [4, 0, None, None]}, "malformed"),
+        ({"count": 3}, "property 'count'"),
+        ({"sh_degree": 7}, "property 'sh_degree'"),
+        ({"tiles": 5}, "property 'tiles'"),
+        ({"cells": [4, 0, None, None]}, "property 'cells'"),
     ):
         manifest.write_text(json.dumps(content | change))
         with pytest.raises(InputError, match=message):
