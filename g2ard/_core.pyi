@@ -12,7 +12,7 @@ from g2ard.stages.lift import LiftConfig
 from g2ard.stages.recover.anchors import Regularizers
 from g2ard.stages.recover.engine import Photometric
 from g2ard.stages.recover.schedule import Rates
-from g2ard.stages.select.surfaces import CoverageOptions
+from g2ard.stages.select.surfaces import SurfaceOptions
 from g2ard.stages.simplify.config import SimplifyConfig
 from g2ard.stages.simplify.pairs import Visibility
 
@@ -201,7 +201,7 @@ def select_greedy(
     views: tuple[NDArray[np.uint64], NDArray[np.uint32], _F64],
     k: int,
     directional: bool,
-    config: CoverageOptions,
+    config: SurfaceOptions,
     progress: Callable[[int, int], None] | None = None,
 ) -> tuple[NDArray[np.uint32], _F64, int]: ...
 def select_light(

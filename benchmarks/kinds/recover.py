@@ -30,7 +30,7 @@ from g2ard.stages.recover import recover
 from g2ard.stages.recover.anchors import Anchors, drift95
 from g2ard.stages.recover.auto_preset import regularizers_for
 from g2ard.stages.recover.report import RecoverReport
-from g2ard.stages.simplify import round_counts, simplify
+from g2ard.stages.simplify import simplify
 
 __all__ = ["Recover", "Variant"]
 
@@ -170,9 +170,8 @@ class _Workspace(Workspace):
         config = configured(DistillConfig(), preset, values)
         if config.recover.steps is not None:
             return config
-        schedule, simplification = config.recover.schedule, config.simplify
-        kept = simplification.retention_of("paper")
-        rounds = round_counts(len(self.splats), budget, kept, simplification.fold)
+        schedule = config.recover.schedule
+        rounds = config.simplify.rounds(len(self.splats), budget, recovered=True)
         early = len(rounds) if schedule.round_steps else 0
         share = schedule.steps / (schedule.steps + early * schedule.round_steps)
         schedule = schedule.scaled(round(share * steps))

@@ -18,7 +18,7 @@ from benchmarks.study import SceneSpec, Study, key
 from benchmarks.workspace import Workspace, reduced
 from g2ard import io
 from g2ard.config.choices import Keep
-from g2ard.config.paths import changed
+from g2ard.config.schema import changed
 from g2ard.errors import InputError
 from g2ard.jobs.register import photos_of, poses_for
 from g2ard.pipeline.presets import GS_CPR

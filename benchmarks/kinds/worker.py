@@ -10,7 +10,6 @@ import json
 import math
 import sys
 import time
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -86,15 +85,13 @@ def _reduce(job: Job) -> dict[str, Any]:
         return {"count": len(small), "seconds": seconds}
     flags = np.load(job["flags"]) if job.get("flags") else None
     looks = job["method"] in ("default", "fast")
-    config = SimplifyConfig()
+    constants = {} if job["protection"] is None else {"protection": job["protection"]}
     if job["method"] == "paper":
-        config = replace(config, retention=1e-9)  # one reduction; the cell runs rounds
-    if job["protection"] is not None:
-        config = replace(config, protection=job["protection"])
+        constants["retention"] = 1e-9  # one reduction; the cell runs rounds
+    config = SimplifyConfig("default" if job["method"] == "no-views" else job["method"], **constants)
     done = simplify(
         splats,
         job["count"],
-        method="default" if job["method"] == "no-views" else job["method"],
         visibility=visibility_source(cameras) if looks else None,
         protected=flags,
         final_budget=job["budget"],

@@ -29,7 +29,7 @@ from g2ard.cli.panels import COMMON, GROUPED, into_panels
 from g2ard.cli.tile_options import TILES
 from g2ard.cli.usage import flags_of, in_flags, typed
 from g2ard.config.choices import RenderModel, ViewFormat
-from g2ard.config.paths import full_paths, parse_settings
+from g2ard.config.schema import Config, full_paths, parse_settings
 from g2ard.errors import G2ardError, InputError
 from g2ard.io import check_scene_output, check_views_output, write_views
 from g2ard.io.atomic import atomic_output, check_output
@@ -145,12 +145,18 @@ class Run:
         return {"progress": self.progress, "say": self.say}
 
     def settings(self, config: Any, *names: str, preset: str | None = None) -> dict[str, Any]:
-        """Collect config values by path from options and --set, which wins.
+        """Return config values by path, as `settled` checks them."""
+        return self.settled(config, *names, preset=preset)[0]
+
+    def settled(
+        self, config: Config, *names: str, preset: str | None = None
+    ) -> tuple[dict[str, Any], Config]:
+        """Merge options and --set, which wins, into values by path and the config that they make.
 
         Args:
             config: the defaults.
             names: options named like a field or like the end of its path.
-            preset: preset to check the values of --set with.
+            preset: preset that the values override.
         """
         given = {name: self.config[name] for name in names if self.config[name] not in (None, [], ())}
         try:
@@ -163,14 +169,13 @@ class Run:
                 flag = "--recovery-time" if "time" in other else f"--set {other}"
                 raise typer.BadParameter(f"--steps and {flag} exclude each other; give one")
         try:
-            configured(config, preset or "auto", values)
+            return values, configured(config, preset or "auto", values)
         except InputError as e:
             name = e.parameter or ""
             if not name or any(f".{path}".endswith(f".{name}") for path in typed):
                 raise typer.BadParameter(f"--set: {e}") from None
             option = e.at(parameter=name.rpartition(".")[2])
             raise typer.BadParameter(in_flags(option, self.flags)) from None
-        return values
 
     @contextmanager
     def usage(self) -> Iterator[None]:

@@ -10,7 +10,7 @@ from g2ard.cli.frame import Run
 from g2ard.cli.outputs import Outputs
 from g2ard.cli.run_folder import RunFolder
 from g2ard.cli.run_result import loss
-from g2ard.config.paths import listed
+from g2ard.config.schema import listed
 from g2ard.io import ply
 from g2ard.io.scene_formats import scene_format
 from g2ard.io.tile_store import TileStore
@@ -69,7 +69,7 @@ class TiledCommand:
                     "views": small.views,
                     "unseen": small.unseen,
                     "method": "default",
-                    "settings": listed(config.resolved("default", antialiased=antialiased)),
+                    "settings": listed(config.turned("default").resolved(antialiased=antialiased)),
                 }
                 seconds = report["seconds"]["total"]
                 run.say(f"{place}: {len(small):,} of {store.count:,} Gaussians in {seconds:.1f} s")

@@ -6,10 +6,10 @@ import inspect
 import math
 import types
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import fields
+from dataclasses import dataclass, fields
 from functools import cache, wraps
 from numbers import Integral, Real
-from typing import Any, Literal, ParamSpec, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, ParamSpec, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from g2ard.errors import InputError, require
 
@@ -20,6 +20,45 @@ _UNIONS = (Union, types.UnionType)
 _SCALARS = (bool, int, float, str, type(None))
 _LONGEST = 60
 """Longest text of a value in a message; a longer one is described by its type."""
+
+
+@dataclass(frozen=True)
+class Within:
+    """Limits of a number as an interval: `Annotated[float, Within("[0, 1)")]`.
+
+    >>> str(Within("(0, inf)")), str(Within("[1, inf)")), str(Within("[0, 1)"))
+    ('above 0', 'of at least 1', 'in [0, 1)')
+    """
+
+    interval: str
+
+    def __contains__(self, value: float) -> bool:
+        low, high = _ends(self.interval)
+        above = value >= low if self.interval[0] == "[" else value > low
+        return above and (value <= high if self.interval[-1] == "]" else value < high)
+
+    def __str__(self) -> str:
+        low, high = _ends(self.interval)
+        if math.isfinite(high):
+            return f"in {self.interval}"
+        if math.isinf(low):
+            return "that is finite"
+        return f"of at least {low:g}" if self.interval[0] == "[" else f"above {low:g}"
+
+
+@cache
+def _ends(interval: str) -> tuple[float, float]:
+    low, high = interval[1:-1].split(",")
+    return float(low), float(high)
+
+
+Share = Annotated[float, Within("[0, 1]")]
+Positive = Annotated[float, Within("(0, inf)")]
+AboveZero = Annotated[float, Within("(0, inf]")]
+Finite = Annotated[float, Within("(-inf, inf)")]
+Degree = Annotated[int, Within("[0, 3]")]
+NotNegative = Annotated[float, Within("[0, inf)")]
+AtLeastOne = Annotated[int, Within("[1, inf)")]
 
 
 def check_fields(config: Any) -> None:
@@ -52,7 +91,7 @@ def check_type(name: str, value: Any, kind: Any) -> None:
         got = repr(value)
         if len(got) > _LONGEST or "\n" in got:
             got = f"a value of type {type(value).__name__}"
-        one = isinstance(value, list | tuple) and all(option in _SCALARS for option in options_of(kind))
+        one = isinstance(value, list | tuple) and all(bare(option) in _SCALARS for option in options_of(kind))
         wanted, hint = ("one value", "call once per value") if one else (described(kind), None)
         raise InputError(f"expected {wanted}, got {got}", parameter=name, hint=hint)
 
@@ -122,6 +161,16 @@ def checks_arguments(function: Callable[P, Result]) -> Callable[P, Result]:
     return checked
 
 
+def signature_of(other: Callable[P, Any]) -> Callable[[Callable[..., Result]], Callable[P, Result]]:
+    """Give a function that passes its arguments on the signature of the function that takes them."""
+
+    def decorated(function: Any) -> Any:
+        function.__wrapped__ = other
+        return function
+
+    return decorated
+
+
 def described(kind: Any) -> str:
     """Describe a type in an error message.
 
@@ -130,6 +179,8 @@ def described(kind: Any) -> str:
     """
     if get_origin(kind) in _UNIONS:
         return " or ".join(dict.fromkeys(map(described, options_of(kind))))
+    if get_origin(kind) is Annotated:
+        return " ".join([described(bare(kind)), *map(str, kind.__metadata__)])
     if get_origin(kind) is Literal:
         return f"one of {', '.join(map(str, get_args(kind)))}"
     if get_origin(kind) is tuple:
@@ -154,6 +205,11 @@ def options_of(kind: Any) -> tuple[Any, ...]:
     return get_args(kind) if get_origin(kind) in _UNIONS else (kind,)
 
 
+def bare(kind: Any) -> Any:
+    """Return a type without its limits."""
+    return get_args(kind)[0] if get_origin(kind) is Annotated else kind
+
+
 class _Array:
     """Type of arrays, and of what numpy makes arrays of."""
 
@@ -168,12 +224,12 @@ _ARRAY_NAMES = {"ArrayLike": _Array, "NDArray": _Array}
 def _hints(owner: Any) -> dict[str, Any]:
     """Return the types of fields or arguments; `object` for names imported for type checkers only."""
     if isinstance(owner, type):
-        return get_type_hints(owner, localns=_ARRAY_NAMES)
+        return get_type_hints(owner, localns=_ARRAY_NAMES, include_extras=True)
     hints: dict[str, Any] = {}
     for name, kind in owner.__annotations__.items():
         alone: Any = types.SimpleNamespace(__annotations__={name: kind})
         try:
-            hints |= get_type_hints(alone, owner.__globals__, _ARRAY_NAMES)
+            hints |= get_type_hints(alone, owner.__globals__, _ARRAY_NAMES, include_extras=True)
         except NameError:
             hints[name] = object
     return hints
@@ -185,6 +241,8 @@ def _fits(value: Any, kind: Any) -> bool:
     origin, inner = get_origin(kind), get_args(kind)
     if origin in _UNIONS:
         return any(_fits(value, option) for option in inner)
+    if origin is Annotated:
+        return _fits(value, inner[0]) and all(value in limits for limits in kind.__metadata__)
     if origin is Literal:
         return isinstance(value, str) and value in inner
     if origin is tuple or origin is Sequence:

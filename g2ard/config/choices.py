@@ -47,7 +47,6 @@ ADAPT_SCHEDULES: tuple[AdaptSchedule, ...] = get_args(AdaptSchedule)
 
 Refinement = Literal["auto", "none", "photometric", "exact"]
 """Refinements of a photo's pose after feature matching (`g2ard.stages.register`)."""
-REFINEMENTS: tuple[Refinement, ...] = get_args(Refinement)
 
 Keep = Literal["registered", "uncertain", "all"]
 """Photos whose poses registration keeps."""

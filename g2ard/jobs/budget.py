@@ -3,9 +3,11 @@
 import math
 import re
 from dataclasses import dataclass
-from numbers import Integral, Real
+from typing import Annotated
 
-from g2ard.errors import InputError, require
+from g2ard.config.checks import AtLeastOne, Positive, Within
+from g2ard.config.schema import Settings
+from g2ard.errors import InputError
 from g2ard.progress import plural
 
 DEVICES = {
@@ -30,7 +32,7 @@ _UNITS = {"k": 1e3, "m": 1e6, "g": 1e9}
 
 
 @dataclass(frozen=True)
-class Budget:
+class Budget(Settings):
     """Number of Gaussians to keep, given in one of several ways.
 
     Args:
@@ -48,29 +50,18 @@ class Budget:
     (1500000, 400000)
     """
 
-    count: int | None = None
-    ratio: float | None = None
-    share: float | None = None
+    count: AtLeastOne | None = None
+    ratio: Annotated[float, Within("[1, inf)")] | None = None
+    share: Annotated[float, Within("(0, 1]")] | None = None
     fit: str | None = None
-    min_psnr: float | None = None
-    min_ssim: float | None = None
+    min_psnr: Positive | None = None
+    min_ssim: Annotated[float, Within("(0, 1)")] | None = None
 
     def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            if isinstance(value, list | tuple):
-                raise InputError(f"expected one value, got {value!r}; call once per value", parameter=name)
-            if name != "fit" and value is not None and not isinstance(value, Real):
-                raise InputError(f"expected a number, got {value!r}", parameter=name)
-        require("count", self.count, isinstance(self.count, Integral | None), "a whole number")
+        super().__post_init__()
         quality = self.min_psnr if self.min_ssim is None else self.min_ssim
         if (self.count, self.ratio, self.share, self.fit, quality).count(None) != 4:
             raise InputError("expected exactly one kind of budget: count, ratio, fit, min_psnr or min_ssim")
-        count, ratio, share, psnr, ssim = self.count, self.ratio, self.share, self.min_psnr, self.min_ssim
-        require("count", count, count is None or count >= 1, "at least 1")
-        require("ratio", ratio, ratio is None or 1 <= ratio < math.inf, "at least 1")
-        require("share", share, share is None or 0 < share <= 1, "a number in (0, 1]")
-        require("min_psnr", psnr, psnr is None or 0 < psnr < math.inf, "decibels above 0")
-        require("min_ssim", ssim, ssim is None or 0 < ssim < 1, "a number in (0, 1)")
         if self.fit is not None and self.fit.lower() not in DEVICES and not self.bytes:
             raise InputError(
                 f"expected bytes such as 5MB or 800kB, or {', '.join(DEVICES)}, got {self.fit!r}",

@@ -10,8 +10,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from g2ard.config.checks import checks_arguments
+from g2ard.config.checks import Degree, Positive, checks_arguments
 from g2ard.config.choices import Axes, RenderModel
+from g2ard.config.schema import Settings
 from g2ard.errors import InputError, require
 from g2ard.io import check_scene, spz
 from g2ard.io.scene_formats import FORMATS
@@ -34,7 +35,7 @@ Scene = Splats | str | Path
 
 
 @dataclass(frozen=True, eq=False)
-class Changes:
+class Changes(Settings):
     """Changes to a scene, checked when they are made; fields are arguments of `convert`."""
 
     box: Sequence[float] | None = None
@@ -42,22 +43,21 @@ class Changes:
     invert: bool = False
     where: str | None = None
     transform: ArrayLike | None = None
-    scale: float | None = None
+    scale: Positive | None = None
     rotate: Sequence[float] | None = None
     translate: Sequence[float] | None = None
     recentre: bool = False
     to_axes: Axes | None = None
-    sh_degree: int | None = None
+    sh_degree: Degree | None = None
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         for name, count in (("box", 6), ("sphere", 4), ("rotate", 3), ("translate", 3)):
             values = getattr(self, name)
             fits = values is None or (np.shape(values) == (count,) and all(map(math.isfinite, values)))
             require(name, values, fits, f"{count} numbers")
         if self.invert and self.box is None and self.sphere is None:
             raise InputError("has nothing to invert", parameter="invert", hint="give {box} or {sphere}")
-        require("scale", self.scale, self.scale is None or 0 < self.scale < math.inf, "a number above 0")
-        require("sh_degree", self.sh_degree, self.sh_degree in (None, 0, 1, 2, 3), "0 to 3")
         if self.where is not None:
             Condition(self.where)
         if self.transform is not None:

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from g2ard.config.checks import checks_arguments
-from g2ard.config.choices import RenderModel, is_made
+from g2ard.config.checks import AtLeastOne, checks_arguments
+from g2ard.config.choices import FormatName, RenderModel, is_made
 from g2ard.errors import InputError
 from g2ard.io.paths import real_path
 from g2ard.io.types import Points
@@ -54,10 +54,10 @@ def distill(
     held_out: Views | None = None,
     beside: str | Path | None = None,
     up: Sequence[float] | None = None,
-    size: int | None = None,
+    size: AtLeastOne | None = None,
     clean: bool = False,
     render_model: RenderModel | None = None,
-    format: str = "ply",
+    format: FormatName = "ply",
     preset: str = "auto",
     settings: Mapping[str, Any] | None = None,
     work: Path | None = None,

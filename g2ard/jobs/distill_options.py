@@ -7,11 +7,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from g2ard.config.checks import check_fields
-from g2ard.config.choices import Focus, RenderModel
-from g2ard.config.paths import full_paths, values_of
-from g2ard.errors import InputError, require
-from g2ard.io.scene_formats import check_format
+from g2ard.config.checks import AtLeastOne
+from g2ard.config.choices import Focus, FormatName, RenderModel
+from g2ard.config.schema import Settings, full_paths, values_of
+from g2ard.errors import InputError
 from g2ard.jobs.inputs import Views
 from g2ard.pipeline.config import DistillConfig
 from g2ard.pipeline.presets import PRESETS, configured
@@ -21,7 +20,7 @@ from g2ard.system.cached import cached_property
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class DistillOptions:
+class DistillOptions(Settings):
     """Inputs and settings of a distillation.
 
     Args:
@@ -42,17 +41,12 @@ class DistillOptions:
     held_out: Views | None = None
     beside: str | Path | None = None
     up: Sequence[float] | None = None
-    size: int | None = None
+    size: AtLeastOne | None = None
     clean: bool = False
     render_model: RenderModel | None = None
-    format: str = "ply"
+    format: FormatName = "ply"
     preset: str = "auto"
     settings: Mapping[str, Any] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        check_fields(self)
-        check_format(self.format)
-        require("size", self.size, self.size is None or self.size >= 1, "at least 1 pixel")
 
     @cached_property
     def config(self) -> DistillConfig:

@@ -12,7 +12,7 @@ from g2ard.scene.samples import evenly_spaced
 from g2ard.scene.splats import Splats
 from g2ard.stages.recover import recover
 from g2ard.stages.recover.schedule import steps_from_points
-from g2ard.stages.simplify import round_counts, simplify
+from g2ard.stages.simplify import simplify
 from g2ard.system.peak_memory import peak_rss
 
 _TRIAL_VIEWS, _TRIAL_STEPS = 4, 8
@@ -158,6 +158,5 @@ def _steps(job: DistillJob, student: Splats) -> int:
     last = config.recover.final_steps(student, job.views.train.cameras, photos=photos)
     if not config.recover.schedule.round_steps:
         return last
-    kept, fold = config.simplify.retention_of("paper"), config.simplify.fold
-    rounds = len(round_counts(len(job.prior), len(student), kept, fold))
-    return last + rounds * config.recover.schedule.round_steps
+    rounds = config.simplify.rounds(len(job.prior), len(student), recovered=True)
+    return last + len(rounds) * config.recover.schedule.round_steps

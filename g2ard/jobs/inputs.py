@@ -49,7 +49,9 @@ def say_notes(path: str | Path, notes: Sequence[Note], say: Say) -> None:
 
 def say_regions(splats: Splats, config: SimplifyConfig, name: str, say: Say) -> None:
     """Say how many Gaussians lie in the regions to keep; raise InputError if none do."""
-    if config.keep_region:
+    from g2ard.stages.simplify import Pairs
+
+    if isinstance(config, Pairs) and config.keep_region:
         inside = int(in_any(splats, config.keep_region).sum())
         if not inside:
             raise InputError(

@@ -29,7 +29,7 @@ from g2ard.rendering.visibility import visibility_source
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.samples import evenly_spaced
 from g2ard.scene.splats import Splats
-from g2ard.stages.simplify import Simplified, SimplifyConfig, Visibility, VisibilitySource, simplify
+from g2ard.stages.simplify import Pairs, Simplified, SimplifyConfig, Visibility, VisibilitySource, simplify
 from g2ard.system.cached import cached_property
 
 _QUALITY_VIEWS, _QUALITY_SIDE = 12, 400
@@ -84,10 +84,11 @@ class Reduction:
         if self.views is not None and self.config.method == "paper":
             raise InputError("has no effect on the method paper", parameter="views")
         weighed = self.cameras is not None or self.views is not None or self.config.method == "default"
-        if self.config.pixel_scale != SimplifyConfig.pixel_scale and weighed and not self.blind:
-            raise InputError("has no effect with views", parameter="simplify.pixel_scale")
-        if self.config.dilation != SimplifyConfig.dilation and self.splats.antialiased:
-            raise InputError("has no effect on antialiased scenes", parameter="simplify.dilation")
+        if isinstance(self.config, Pairs):
+            if self.config.pixel_scale != Pairs.pixel_scale and weighed and not self.blind:
+                raise InputError("has no effect with views", parameter="simplify.pixel_scale")
+            if self.config.dilation != Pairs.dilation and self.splats.antialiased:
+                raise InputError("has no effect on antialiased scenes", parameter="simplify.dilation")
         say_regions(self.splats, self.config, "the scene", self.say)
 
     def __call__(self, count: int) -> Simplified:

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from g2ard.config.checks import checks_arguments
 from g2ard.config.choices import RenderModel
-from g2ard.config.paths import changed, full_paths
+from g2ard.config.schema import changed, full_paths
 from g2ard.errors import InputError, require
 from g2ard.io.types import ViewSet
 from g2ard.jobs.causes import likely_causes

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from g2ard.config.checks import checks_arguments
 from g2ard.config.choices import BLACK, Alpha, Colour, Keep, RenderModel
-from g2ard.config.paths import changed, full_paths
+from g2ard.config.schema import changed, full_paths
 from g2ard.errors import InputError, require
 from g2ard.io import ace, read_view_set
 from g2ard.io.detect import file_format

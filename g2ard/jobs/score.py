@@ -4,7 +4,7 @@ from dataclasses import replace
 from typing import Any
 
 from g2ard.config.choices import Colour
-from g2ard.config.paths import listed
+from g2ard.config.schema import listed
 from g2ard.jobs.causes import likely_causes
 from g2ard.jobs.job import DistillJob
 from g2ard.pipeline.distill import Distilled

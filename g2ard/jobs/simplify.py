@@ -7,8 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from g2ard.config.checks import checks_arguments
-from g2ard.config.choices import RenderModel
-from g2ard.io.scene_formats import check_format
+from g2ard.config.choices import FormatName, RenderModel
 from g2ard.jobs.budget import Budget
 from g2ard.jobs.inputs import Views, load_scene
 from g2ard.jobs.measured_budget import Reduction, aim_of
@@ -27,7 +26,7 @@ def simplify(
     fit: str | None = None,
     min_psnr: float | None = None,
     min_ssim: float | None = None,
-    format: str = "ply",
+    format: FormatName = "ply",
     views: Views | None = None,
     blind: bool = False,
     method: str | None = None,
@@ -84,7 +83,6 @@ def simplify(
     >>> len(small.splats), small.parents.shape, small.report.output_count
     (90, (900,), 90)
     """
-    check_format(format)
     fields = {"method": method, "keep_region": keep_region}
     given = {name: value for name, value in fields.items() if value is not None}
     config = configured(config or SimplifyConfig(), settings=given | dict(settings or {}))

@@ -313,7 +313,7 @@ def _weighted(views: ViewSet, sample: Splats, config: DistillConfig, progress: P
     if not config.select.weighted:
         weights = None
     elif weights is None:
-        chosen = select(sample, views.cameras, len(views.cameras), options=config.select, progress=progress)
+        chosen = select(sample, views.cameras, len(views.cameras), progress=progress)
         weights = np.zeros(len(views.cameras))
         weights[chosen.order] = chosen.weights
     return replace(views, weights=weights)

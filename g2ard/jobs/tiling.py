@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -144,9 +144,11 @@ def whole_settings(config: SimplifyConfig) -> list[str]:
 
     All tiles merge along Morton order together, in one step.
     """
-    steps = config.morton_premerge_steps
-    usual = replace(config, morton_premerge_steps=None).resolved("default").morton_premerge_steps
-    return ["--set simplify.morton_premerge_steps"] if steps not in (None, usual) else []
+    from g2ard.stages.simplify import Default
+
+    usual = Default().resolved().morton_premerge_steps
+    own = isinstance(config, Default) and config.morton_premerge_steps not in (None, usual)
+    return ["--set simplify.morton_premerge_steps"] if own else []
 
 
 def whole_options(options: DistillOptions) -> list[str]:

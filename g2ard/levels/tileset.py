@@ -9,14 +9,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from g2ard._core import __version__
-from g2ard.config.checks import check_fields
-from g2ard.errors import InputError, missing, require
+from g2ard.config.checks import Finite, Within
+from g2ard.config.schema import Settings
+from g2ard.errors import InputError, missing
 from g2ard.io.atomic import atomic_folder
 from g2ard.io.glb import EXTENSION, SPZ_EXTENSION, spz_glb
 from g2ard.io.packing import writable
@@ -40,7 +41,7 @@ _WGS84_RADIUS, _WGS84_FLATTENING = 6378137.0, 1 / 298.257223563
 
 
 @dataclass(frozen=True)
-class Georeference:
+class Georeference(Settings):
     """Place of the scene's local origin, its `offset`, on the ellipsoid WGS 84.
 
     Args:
@@ -52,17 +53,10 @@ class Georeference:
         InputError: a value out of range.
     """
 
-    longitude: float
-    latitude: float
-    height: float
-    heading: float = 0.0
-
-    def __post_init__(self) -> None:
-        check_fields(self)
-        require("longitude", self.longitude, abs(self.longitude) <= 180, "-180 to 180 degrees")
-        require("latitude", self.latitude, abs(self.latitude) <= 90, "-90 to 90 degrees")
-        for name in ("height", "heading"):
-            require(name, getattr(self, name), bool(np.isfinite(getattr(self, name))), "a finite number")
+    longitude: Annotated[float, Within("[-180, 180]")]
+    latitude: Annotated[float, Within("[-90, 90]")]
+    height: Finite
+    heading: Finite = 0.0
 
     @classmethod
     def of_map(cls, system: Any, offset: ArrayLike) -> Georeference:

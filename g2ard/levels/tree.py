@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from g2ard.errors import InputError, require
+from g2ard.config.checks import AtLeastOne, Positive
+from g2ard.config.schema import Settings
+from g2ard.errors import InputError
 from g2ard.io.tile_store import StoredScene
 from g2ard.scene.splats import Splats, check_finite
 from g2ard.scene.transform import rotation_matrices
@@ -28,7 +29,7 @@ _ROWS_AT_ONCE = 1 << 20
 
 
 @dataclass(frozen=True)
-class Cut:
+class Cut(Settings):
     """Rule for splitting a node: it holds more than `most` Gaussians of all levels, or is wider than `extent`
     and holds more than `least`. The defaults are those of PlayCanvas' writer.
 
@@ -39,14 +40,9 @@ class Cut:
             become thousands of leaves.
     """
 
-    most: int = 512 * 1024
-    extent: float = 16.0
-    least: int = 8 * 1024
-
-    def __post_init__(self) -> None:
-        require("most", self.most, self.most >= 1, "at least 1")
-        require("extent", self.extent, 0 < self.extent < math.inf, "a finite number above 0")
-        require("least", self.least, self.least >= 1, "at least 1")
+    most: AtLeastOne = 512 * 1024
+    extent: Positive = 16.0
+    least: AtLeastOne = 8 * 1024
 
 
 @dataclass(frozen=True, eq=False)

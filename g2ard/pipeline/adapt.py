@@ -6,13 +6,13 @@ import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import numpy as np
 
-from g2ard.config.checks import checks_arguments
-from g2ard.config.choices import ADAPT_SCHEDULES, AdaptSchedule
-from g2ard.errors import InputError, require
+from g2ard.config.checks import AtLeastOne, NotNegative, Within, checks_arguments
+from g2ard.config.choices import AdaptSchedule
+from g2ard.errors import InputError
 from g2ard.io.reports import Report
 from g2ard.pipeline.recolour import blended_appearance, colour_change, recoloured, views_seeing
 from g2ard.progress import Progress, plural, silent
@@ -26,63 +26,45 @@ from g2ard.stages.recover.report import Gain
 from g2ard.stages.recover.schedule import PAPER, TUNED, Schedule
 
 
+def appearance_only(schedule: Schedule) -> Schedule:
+    """Return the schedule with the rates of geometry set to 0."""
+    return replace(schedule, rates=replace(schedule.rates, means=0.0, log_scales=0.0, quats=0.0))
+
+
+_TUNED, _PAPER = appearance_only(TUNED), appearance_only(PAPER)
+
+
 @dataclass(frozen=True)
-class AdaptConfig(FitConfig):
-    """Options of adaptation, in addition to `FitConfig`.
+class AdaptConfig(FitConfig, tag="schedule"):
+    """Settings of adaptation, in addition to `FitConfig`; the schedule `default` has more.
 
     Args:
-        steps: maximum number of steps; 7,000 as in the paper.
-        tolerance: gain on the training views, dB, below which fitting stops after a stretch; 0 takes all
-            steps.
         schedule: "default" takes stretches of 500, 1,000, 2,000 … steps with cosine decay; "paper" takes all
             steps at once, with rates that decay to a tenth, without colour change or blending.
-        prior_views: weight of the appearance before the fit, in views. A Gaussian seen by v views moves v/(v
-            + prior_views) of the way to its fit. 0 keeps the fit.
-        first_stretch: steps of the first stretch.
-        colour_worth: smallest gain on the images, dB, for which all colours are changed at once.
-        recovery: rates and decay of a stretch with frozen geometry, see `appearance_only`; None means those
-            of `schedule`.
+        steps: maximum number of steps; 7,000 as in the paper.
+        recovery: rates and decay of a stretch with frozen geometry, see `appearance_only`.
 
     Raises:
         InputError: a value out of range.
     """
 
-    steps: int = 7000
-    tolerance: float = 0.05
     schedule: AdaptSchedule = "default"
-    prior_views: float = 1.0
-    first_stretch: int = 500
-    colour_worth: float = 0.3
-    recovery: Schedule | None = None
+    steps: AtLeastOne = 7000
+    recovery: Schedule = _TUNED
+
+    if TYPE_CHECKING:  # the settings of a schedule are those of its class
+        tolerance: ClassVar[float]
+        prior_views: ClassVar[float]
+
+        def __init__(self, **settings: Any) -> None: ...
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        views, known = self.prior_views, self.schedule in ADAPT_SCHEDULES
-        require("steps", self.steps, self.steps >= 1, "at least 1")
-        require("tolerance", self.tolerance, self.tolerance >= 0, "at least 0")
-        require("prior_views", views, 0 <= views < float("inf"), "a number of views, at least 0")
-        require("schedule", repr(self.schedule), known, " or ".join(ADAPT_SCHEDULES))
-        require("colour_worth", self.colour_worth, self.colour_worth >= 0, "at least 0")
-        require("first_stretch", self.first_stretch, self.first_stretch >= 1, "at least 1")
-        for name in ("tolerance", "prior_views", "first_stretch", "colour_worth"):
-            value = getattr(self, name)
-            if self.schedule == "paper" and value not in (0, getattr(AdaptConfig, name)):
-                raise InputError("has no effect on the schedule paper", parameter=name)
-        if self.recovery is not None and self.recovery != appearance_only(self.recovery):
+        if self.recovery != appearance_only(self.recovery):
             raise InputError(
                 "expected rates of 0 for means, log_scales and quats, because geometry is frozen",
                 parameter="recovery",
             )
-
-    @classmethod
-    def scheduled(cls, schedule: AdaptSchedule) -> AdaptConfig:
-        """Return the config of a schedule, including rates and decay.
-
-        >>> AdaptConfig.scheduled("paper").prior_views
-        0.0
-        """
-        rates = appearance_only(PAPER if schedule == "paper" else TUNED)
-        return cls(schedule=schedule, prior_views=0.0 if schedule == "paper" else 1.0, recovery=rates)
 
     def stretches(self) -> list[int]:
         """Return the steps of each stretch, doubling; the remainder joins the last one.
@@ -90,7 +72,7 @@ class AdaptConfig(FitConfig):
         >>> AdaptConfig().stretches(), AdaptConfig(steps=600).stretches()
         ([500, 1000, 2000, 3500], [600])
         """
-        if self.schedule == "paper":
+        if not isinstance(self, Stretched):
             return [self.steps]
         out, length, left = [], self.first_stretch, self.steps
         while left >= 2 * length:
@@ -98,6 +80,35 @@ class AdaptConfig(FitConfig):
             left -= length
             length *= 2
         return [*out, left]
+
+
+@dataclass(frozen=True)
+class Stretched(AdaptConfig, variants=("default",)):
+    """Settings of the schedule `default`.
+
+    Args:
+        tolerance: gain on the training views, dB, below which fitting stops after a stretch; 0 takes all
+            steps.
+        prior_views: weight of the appearance before the fit, in views. A Gaussian seen by v views moves v/(v
+            + prior_views) of the way to its fit. 0 keeps the fit.
+        first_stretch: steps of the first stretch.
+        colour_worth: smallest gain on the images, dB, for which all colours are changed at once.
+    """
+
+    tolerance: Annotated[float, Within("[0, inf]")] = 0.05  # type: ignore[misc]
+    prior_views: NotNegative = 1.0  # type: ignore[misc]
+    first_stretch: AtLeastOne = 500
+    colour_worth: Annotated[float, Within("[0, inf]")] = 0.3
+
+
+@dataclass(frozen=True)
+class AtOnce(AdaptConfig, variants=("paper",)):
+    """Settings of the schedule `paper`: those of `AdaptConfig`."""
+
+    schedule: Literal["paper"] = "paper"
+    recovery: Schedule = _PAPER
+    tolerance: ClassVar[float] = 0.0
+    prior_views: ClassVar[float] = 0.0
 
 
 @dataclass(frozen=True)
@@ -175,7 +186,7 @@ class _Fit:
     def _stretch(self, steps: int) -> None:
         config = self.config
         how = RecoverConfig(
-            schedule=config.recovery or appearance_only(PAPER if config.schedule == "paper" else TUNED),
+            schedule=config.recovery,
             steps=steps,
             regularizers=FREE,  # geometry is frozen
             ssim_weight=config.ssim_weight,
@@ -269,14 +280,14 @@ def adapt(
     given = compact if config.sh_degree is None else compact.with_sh_degree(config.sh_degree)
     probe = Probe(targets, config.background)
     change, start, share = None, given, np.ones(len(given))
-    if config.schedule == "default" and len(given) and len(targets.cameras):
+    if isinstance(config, Stretched) and len(given) and len(targets.cameras):
         change = colour_change(given, targets, config.background)
         change = change if change.gain >= config.colour_worth else None
         start = given if change is None else recoloured(given, change)
     key = "" if work is None else _key(config, compact, targets)
     fit = _Fit(start, targets, config, key, work, progress)
     fit.run()
-    if config.schedule == "default" and config.prior_views:
+    if config.prior_views:
         seen = views_seeing(start, targets.cameras)
         share = seen / (seen + config.prior_views)
     result = blended_appearance(start, fit.splats, share)
@@ -297,8 +308,3 @@ def _key(config: AdaptConfig, compact: Splats, targets: Targets) -> str:
     """Return the fingerprint that checkpoints of an adaptation must have."""
     parts = (repr(config), compact.fingerprint(), fingerprint_of(targets))
     return hashlib.sha256("\n".join(parts).encode()).hexdigest()
-
-
-def appearance_only(schedule: Schedule) -> Schedule:
-    """Return the schedule with the rates of geometry set to 0."""
-    return replace(schedule, rates=replace(schedule.rates, means=0.0, log_scales=0.0, quats=0.0))

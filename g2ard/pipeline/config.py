@@ -4,25 +4,26 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from g2ard.config.checks import check_fields
+from g2ard.config.checks import AtLeastOne, Within
 from g2ard.config.choices import UNMEASURED, Focus, Policy
-from g2ard.errors import InputError, require
+from g2ard.config.schema import Settings
+from g2ard.errors import InputError
 from g2ard.stages.lift import LiftConfig
 from g2ard.stages.recover.config import RecoverConfig
-from g2ard.stages.select.surfaces import CoverageOptions
+from g2ard.stages.select.surfaces import CoverageOptions, SurfaceOptions
 from g2ard.stages.simplify.config import SimplifyConfig
 
 
 @dataclass(frozen=True)
-class SelectConfig(CoverageOptions):
-    """Options for selecting and weighting training views, in addition to `CoverageOptions`.
+class SelectConfig(Settings, tag="policy"):
+    """Settings for selecting and weighting training views; `directional` and `coverage` have more.
 
     Args:
+        policy: selection policy, see `g2ard.stages.select.select`.
         views_count: number of views, best first: a count, a share in (0, 1] rounded up, "auto" to stop where
             the curve of gains flattens, or None for all that see the scene.
-        policy: selection policy, see `g2ard.stages.select.select`.
         weighted: draw views by weight, so that crowded poses do not dominate. On a crowded pool this beats
             uniform draws, and any selection of a tenth of the views.
         reselect: select again from every round's scene instead of once from the prior.
@@ -32,24 +33,26 @@ class SelectConfig(CoverageOptions):
         focus_share: their share of the training views.
     """
 
-    views_count: int | float | Literal["auto"] | None = None
     policy: Policy = "auto"
+    views_count: AtLeastOne | Annotated[float, Within("(0, 1]")] | Literal["auto"] | None = None
     weighted: bool = True
     reselect: bool = False
     focus: Focus | None = None
-    focus_share: float = 0.5
+    focus_share: Annotated[float, Within("[0, 1)")] = 0.5
+
+    if TYPE_CHECKING:  # the settings of a policy are those of its class
+
+        def __init__(self, policy: Policy = "auto", **settings: Any) -> None: ...
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        share = not isinstance(self.views_count, float) or 0 < self.views_count <= 1
-        share = share and not (isinstance(self.views_count, int) and self.views_count < 1)
-        require("views_count", self.views_count, share, "a count, auto, none, or a share in (0, 1]")
-        require("focus_share", self.focus_share, 0 <= self.focus_share < 1, "a share in [0, 1)")
         if self.views_count == "auto" and self.policy in UNMEASURED:
             raise InputError(
                 f"policy {self.policy} does not measure gains; pass a count instead of auto",
                 parameter="views_count",
             )
+        if self.focus in (None, "far") and self.focus_share != SelectConfig.focus_share:
+            raise InputError("has no effect without focus", parameter="focus_share")
 
     def count_of(self, candidates: int) -> int | Literal["auto"]:
         """Return the number of candidates to take, or "auto".
@@ -62,7 +65,26 @@ class SelectConfig(CoverageOptions):
 
 
 @dataclass(frozen=True)
-class DistillConfig:
+class Poses(SelectConfig, variants=("auto", "pose-diverse", "random", "uniform")):
+    """Settings of policies that need no surface: those of `SelectConfig`."""
+
+
+@dataclass(frozen=True)
+class Coverage(SurfaceOptions, SelectConfig, variants=("coverage",)):
+    """Settings of the policy `coverage`: those of `SurfaceOptions`."""
+
+    policy: Literal["coverage"] = "coverage"
+
+
+@dataclass(frozen=True)
+class Directional(CoverageOptions, SelectConfig, variants=("directional",)):
+    """Settings of the policy `directional`: those of `CoverageOptions`."""
+
+    policy: Literal["directional"] = "directional"
+
+
+@dataclass(frozen=True)
+class DistillConfig(Settings):
     """Configuration of a distillation; the paper's is `g2ard.preset("paper")`.
 
     Args:
@@ -84,4 +106,6 @@ class DistillConfig:
     lift: LiftConfig = field(default_factory=LiftConfig)
 
     def __post_init__(self) -> None:
-        check_fields(self)
+        super().__post_init__()
+        if self.select.reselect and not self.recover.schedule.round_steps:
+            raise InputError("has no effect on a schedule without rounds", parameter="select.reselect")

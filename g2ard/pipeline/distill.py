@@ -23,8 +23,8 @@ from g2ard.stages.recover import recover
 from g2ard.stages.recover.anchors import Anchors
 from g2ard.stages.recover.draw import checked_weights
 from g2ard.stages.recover.optimize import Watch
-from g2ard.stages.select import select
-from g2ard.stages.simplify import round_counts, simplify
+from g2ard.stages.select import SurfaceOptions, select
+from g2ard.stages.simplify import simplify
 from g2ard.system.cached import cached_property
 
 __all__ = ["DistillConfig", "Distilled", "SelectConfig", "distill"]
@@ -98,8 +98,7 @@ def distill(
         validation = checked_targets(validation, "validation")
     counts = [budget]
     if config.recover.schedule.round_steps > 0:
-        kept, fold = config.simplify.retention_of("paper"), config.simplify.fold
-        counts = round_counts(len(prior), budget, kept, fold)
+        counts = config.simplify.rounds(len(prior), budget, recovered=True)
     rounds = _Rounds(
         prior,
         budget,
@@ -144,7 +143,7 @@ class _Supervision:
             how.count_of(len(cameras)),
             policy=policy,
             seed=config.recover.seed,
-            options=how,
+            options=how if isinstance(how, SurfaceOptions) else None,
             progress=progress,
         )
         rows = np.argsort(chosen.order)

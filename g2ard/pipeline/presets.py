@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from dataclasses import is_dataclass
 from typing import Any, TypeVar
 
 from g2ard.config.checks import checks_arguments
-from g2ard.config.paths import changed, full_paths
+from g2ard.config.schema import changed, full_paths
 from g2ard.errors import InputError, require
 
 Config = TypeVar("Config")
@@ -22,8 +22,6 @@ _PAPER: dict[str, Any] = {
     "recover.schedule": "paper",
     "recover.sh_degree": 3,
     "adapt.schedule": "paper",
-    "adapt.tolerance": 0.0,
-    "adapt.prior_views": 0.0,
     "adapt.sh_degree": 3,
 }
 
@@ -73,41 +71,16 @@ def configured(config: Config, preset: str = "auto", settings: Mapping[str, Any]
     values = {**PRESETS[preset], **given}
     schedule, steps = values.get("recover.schedule", "default"), values.get("recover.steps")
     if isinstance(schedule, str):
+        given = dict(given)
         if schedule == "paper":
-            values.setdefault("recover.sh_degree", 3)
+            given.setdefault("recover.sh_degree", 3)
         named = Schedule.named(schedule)
-        values["recover.schedule"] = named if steps is None else named.scaled(steps)
-    made = changed(config, values)
-    _check_used(made, {path for path in PRESETS[preset] if path not in given})
+        given["recover.schedule"] = named if steps is None else named.scaled(steps)
+    made = changed(changed(config, PRESETS[preset]), given)
+    select = getattr(made, "select", None)
+    if select and select.views_count is None and select.policy != "auto" and "select.policy" in given:
+        raise InputError("has no effect without views_count", parameter="select.policy")
     return made
-
-
-def _check_used(config: Any, preset: Collection[str]) -> None:
-    """Reject settings that have no effect on the method or policy, except for the paths set by a preset."""
-    from g2ard.pipeline.config import DistillConfig, SelectConfig
-    from g2ard.stages.simplify.config import SimplifyConfig
-
-    joined = isinstance(config, DistillConfig)
-    simplify = config.simplify if joined else config
-    rounds = joined and config.recover.schedule.round_steps > 0
-    if isinstance(simplify, SimplifyConfig):
-        apart = {path.rpartition(".")[2] for path in preset if path.startswith("simplify.")}
-        try:
-            simplify.check_used(rounds=rounds, apart=apart)
-        except InputError as error:
-            raise error.at(parameter=f"simplify.{error.parameter}") from None
-    if joined:
-        chosen = config.select.views_count is not None
-        if config.select.policy != "auto" and not chosen and "select.policy" not in preset:
-            raise InputError("has no effect without views_count", parameter="select.policy")
-        if config.select.reselect and not rounds:
-            raise InputError("has no effect on a schedule without rounds", parameter="select.reselect")
-        if config.select.focus in (None, "far") and config.select.focus_share != SelectConfig.focus_share:
-            raise InputError("has no effect without focus", parameter="select.focus_share")
-        try:
-            config.select.check_used(config.select.policy if chosen else "auto")
-        except InputError as error:
-            raise error.at(parameter=f"select.{error.parameter}") from None
 
 
 @checks_arguments

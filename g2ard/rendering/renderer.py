@@ -4,15 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from g2ard import _core
-from g2ard.config.checks import check_fields, checks_arguments
-from g2ard.config.choices import BLACK, CONVENTIONS, Convention
-from g2ard.errors import InputError, require
+from g2ard.config.checks import AboveZero, Within, checks_arguments
+from g2ard.config.choices import BLACK, Convention
+from g2ard.config.schema import Settings
+from g2ard.errors import InputError
 from g2ard.scene.cameras import Camera, Cameras
 from g2ard.scene.prepared import DRAWN_LOG_SCALES, DRAWN_LOGITS, MAX_OPACITY
 from g2ard.scene.splats import Splats, unit_quats
@@ -22,7 +23,7 @@ View = tuple[list[list[float]], list[float], tuple[int, int], float]
 
 
 @dataclass(frozen=True)
-class RasterSettings:
+class RasterSettings(Settings):
     """Conventions of the rasteriser.
 
     Args:
@@ -43,16 +44,8 @@ class RasterSettings:
 
     convention: Convention = "gsplat"
     antialiased: bool | None = None
-    alpha_max: float = MAX_OPACITY
-    near: float | Sequence[float] | None = None
-
-    def __post_init__(self) -> None:
-        check_fields(self)
-        known = self.convention in CONVENTIONS
-        require("convention", repr(self.convention), known, " or ".join(CONVENTIONS))
-        require("alpha_max", self.alpha_max, 1 / 255 <= self.alpha_max < 1, "a value in [1/255, 1)")
-        if isinstance(self.near, int | float):
-            require("near", self.near, self.near > 0, "a positive distance")
+    alpha_max: Annotated[float, Within(f"[{1 / 255}, 1)")] = MAX_OPACITY
+    near: AboveZero | Sequence[float] | None = None
 
     def near_of(self, index: int) -> float:
         """Return the near plane of camera `index`."""

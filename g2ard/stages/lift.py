@@ -6,12 +6,14 @@ Distil *from* this prior, with photos as targets; rendered as it is, it looks fl
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from g2ard import _core
-from g2ard.config.checks import check_fields, checks_arguments
+from g2ard.config.checks import Within, checks_arguments
+from g2ard.config.schema import Settings
 from g2ard.errors import InputError, require
 from g2ard.progress import Progress, counter, silent
 from g2ard.scene.splats import SH_C0, Splats, unit_colors
@@ -21,18 +23,14 @@ _CORE = _core.defaults()["lift"]
 
 
 @dataclass(frozen=True)
-class LiftConfig:
+class LiftConfig(Settings):
     """Constants of `lift`, for callers that keep them together: `lift(points, colors, **vars(config))`."""
 
-    neighbors: int = _CORE["neighbors"]
+    neighbors: Annotated[int, Within("[3, inf)")] = _CORE["neighbors"]
     spread: float = _CORE["spread"]
     normal_ratio: float = _CORE["normal_ratio"]
     max_anisotropy: float = _CORE["max_anisotropy"]
     opacity: float = 0.5
-
-    def __post_init__(self) -> None:
-        check_fields(self)
-        require("neighbors", self.neighbors, self.neighbors >= 3, "at least 3")
 
 
 @checks_arguments

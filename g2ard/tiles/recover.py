@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from g2ard.config.paths import changed, values_of
+from g2ard.config.schema import changed, values_of
 from g2ard.io.tile_store import TileStore
 from g2ard.pipeline.run_views import RunViews
 from g2ard.rendering.renderer import RasterSettings, Renderer, settings_for

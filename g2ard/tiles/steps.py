@@ -4,7 +4,7 @@
 Between steps the tiles agree on a common frame for costs and on how many Gaussians each keeps
 (`g2ard.tiles.merging`). Common parameters:
 
-- arguments: `tile`, its number; `config`, the fields of a `SimplifyConfig`; `frame`, the values of the common
+- arguments: `tile`, its number; `config`, the fields of `Default`; `frame`, the values of the common
   `_core.TileFrame`; `levels`, per tile the coarse scene ("near", "far") that represents it around this tile,
   None for this tile.
 - inputs: `own`, the output of `coarse` for this tile (not for `coarse` itself); `coarse`, the same for every
@@ -32,7 +32,7 @@ from g2ard.scene.cameras import Cameras
 from g2ard.scene.prepared import PreparedScene, as_prepared, finite_rows_of
 from g2ard.scene.splats import Splats
 from g2ard.scene.transform import join
-from g2ard.stages.simplify import SimplifyConfig, round_counts, simplify
+from g2ard.stages.simplify import Default, SimplifyConfig, simplify
 from g2ard.stages.simplify.pairs import emphasised, splats_of
 from g2ard.tiles.executor import Workers
 from g2ard.tiles.tasks import (
@@ -80,7 +80,8 @@ def coarse(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
         the `bounds` of that order.
     """
     scene = tile_of(arguments, inputs, places)
-    config = replace(_config(arguments), keep_region=())  # regions do not matter for other tiles' views
+    # Regions to keep do not matter for other tiles' views.
+    config = replace(_config(arguments), keep_region=(), keep_times=Default.keep_times)
     some = _widened(scene.take(scene.core.order[::_COARSE_STRIDE]), _COARSE_STRIDE)
     near = simplify(some, max(1, len(scene) // COARSE[0]), method="fast", config=config).splats
     far = simplify(near, max(1, len(scene) // COARSE[1]), method="fast", config=config).splats
@@ -218,9 +219,9 @@ def pair_plan(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
         order.
     """
     scene = tile_of(arguments, inputs, places)
-    config = _config(arguments).resolved("default")
+    config = _config(arguments)
     runs, last = arguments["runs"], arguments["last"]
-    counts = round_counts(runs, last, config.retention_of("default"), config.fold)
+    counts = config.rounds(runs, last)
     tile = _seen_tile(scene, arguments, inputs)
     of, a, b, costs = tile.plan(runs, counts, load(inputs["costs"], "costs")[0])
     return {"of": of, "a": a, "b": b, "costs": np.maximum.accumulate(costs) if len(costs) else costs}
@@ -286,14 +287,13 @@ def merged_visibility(arguments: Arguments, inputs: Inputs, places: Places) -> A
     return {"weight": sums.by_row()[0][: len(core)] / np.float32(share)}
 
 
-def _config(arguments: Arguments) -> SimplifyConfig:
-    return SimplifyConfig(**arguments["config"])
+def _config(arguments: Arguments) -> Default:
+    return Default(**arguments["config"])
 
 
 def _merging(
-    scene: PreparedScene, config: SimplifyConfig, frame: _core.TileFrame, visibility: SampledVisibility | None
+    scene: PreparedScene, config: Default, frame: _core.TileFrame, visibility: SampledVisibility | None
 ) -> _core.TileMerging:
-    config = config.resolved("default")
     seen = None if visibility is None else emphasised(scene, visibility, config)
     return _core.TileMerging(scene.core, frame, config, seen)
 
@@ -327,7 +327,7 @@ class TiledRun:
         self.store, self.workers = store, workers
         workers.folder.mkdir(parents=True, exist_ok=True)
         model = store.render_model
-        self.config = asdict(config.resolved("default", antialiased=model == "antialiased"))
+        self.config = asdict(config.turned("default").resolved(antialiased=model == "antialiased"))
         self.sizes = [tile.rows for tile in store.tiles]
         self.coarse: list[Path] = []
         rows, most = _SAMPLE
@@ -372,6 +372,4 @@ class TiledRun:
         sample = self.sample().with_sh_degree(0)
         every = -(-len(sample) // _FRAME_SAMPLE)
         scene, _ = finite_rows_of(sample.take(slice(None, None, every)))
-        return _core.TileFrame.of_sample(
-            scene.core, SimplifyConfig(**self.config).resolved("default")
-        ).values()
+        return _core.TileFrame.of_sample(scene.core, Default(**self.config)).values()

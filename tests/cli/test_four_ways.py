@@ -151,7 +151,7 @@ def _python(command: str, values: dict[str, Any], folder: Path) -> bytes:
     elif command == "adapt":
         background = values.get("background", (0.0, 0.0, 0.0))
         targets = g2ard.TeacherRenders(g2ard.load(folder / "ball.ply"), VIEWS, background=background)
-        made = g2ard.adapt(small, targets, replace(g2ard.AdaptConfig.scheduled("default"), **values)).splats
+        made = g2ard.adapt(small, targets, g2ard.AdaptConfig(**values)).splats
     elif command == "convert":
         if "transform" in values:
             values = {**values, "transform": np.reshape(values["transform"], (4, 4))}

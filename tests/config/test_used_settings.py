@@ -13,7 +13,7 @@ import pytest
 
 import g2ard
 from g2ard.config.choices import POLICIES
-from g2ard.config.paths import values_of
+from g2ard.config.schema import values_of
 from g2ard.io.types import ViewSet
 from g2ard.jobs.budget import Budget
 from g2ard.jobs.distill_options import DistillOptions
@@ -24,6 +24,7 @@ from g2ard.pipeline.presets import configured
 from g2ard.scene.splats import SH_C0
 from g2ard.stages.lift import LiftConfig
 from g2ard.stages.recover.schedule import Schedule
+from g2ard.stages.simplify import Default, Fast, Paper
 from g2ard.tiles.ingest import ingest
 from helpers.feature_scenes import blotched
 from helpers.photos import photographed
@@ -342,19 +343,38 @@ _BESIDES = "method engine matcher schedule.steps schedule.round_steps schedule.m
 
 
 def test_the_tables_hold_every_setting() -> None:
-    for root, config, table in (
-        ("simplify.", g2ard.SimplifyConfig(), SIMPLIFY),
-        ("recover.", g2ard.RecoverConfig(), RECOVER),
-        ("select.", g2ard.CoverageOptions(), SELECT),
-        ("lift.", LiftConfig(), LIFT),
-        ("adapt.", g2ard.AdaptConfig(), ADAPT),
-        ("register.", g2ard.RegisterConfig(), REGISTER),
-        ("", g2ard.DistillConfig(), DISTILL),
+    paper = g2ard.DistillConfig(g2ard.SelectConfig("directional"), Paper())
+    for root, configs, table in (
+        ("simplify.", (Default(), Fast(), Paper()), SIMPLIFY),
+        ("recover.", (g2ard.RecoverConfig(),), RECOVER),
+        ("select.", (g2ard.CoverageOptions(),), SELECT),
+        ("lift.", (LiftConfig(),), LIFT),
+        ("adapt.", (g2ard.AdaptConfig(),), ADAPT),
+        ("register.", (g2ard.RegisterConfig(),), REGISTER),
+        ("", (g2ard.DistillConfig(), paper), DISTILL),
     ):
         besides = tuple(f".{name}" for name in _BESIDES.split())
-        named = {path for path in values_of(config) if not path.endswith(besides)}
+        named = {path for config in configs for path in values_of(config) if not path.endswith(besides)}
         named = {f"{root}{path.partition('.')[2]}" for path in named} if root else named
         assert named == {f"{root}{name}" for name in table}
+
+
+@pytest.mark.parametrize("root", [g2ard.SimplifyConfig, g2ard.SelectConfig])
+def test_a_variant_has_only_its_own_settings(root: Any) -> None:
+    tag, path = root._tag, root.__name__.removesuffix("Config").lower()
+    every = {name: value for kind in root._variants.values() for name, value in vars(kind()).items()}
+    for variant in root._variants:
+        own = root(variant)
+        for name in every.keys() - vars(own).keys():
+            for make in (
+                lambda: root(**{tag: variant, name: every[name]}),  # noqa: B023
+                lambda: configured(root(), settings={f"{path}.{tag}": variant, name: every[name]}),  # noqa: B023
+            ):
+                with pytest.raises(
+                    g2ard.InputError, match=rf"{name}: has no effect on the {tag} {variant}, only"
+                ):
+                    make()
+        assert own.turned("paper" if tag == "method" else "directional").turned(variant) == own
 
 
 def test_given_weights_of_regularisers_are_used() -> None:

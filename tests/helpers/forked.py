@@ -27,7 +27,7 @@ def _results() -> Iterator[NDArray[Any]]:
         yield simplify(ball, 60, method=method).splats.means
     yield simplify(ball, 60, visibility=visibility_source(views)).splats.means
     scene, _ = finite_rows_of(ball)
-    config = SimplifyConfig().resolved("default")
+    config = SimplifyConfig().resolved()
     frame = _core.TileFrame.of_sample(scene.core, config)
     yield np.array(frame.values())
     yield _core.TileMerging(scene.core, frame, config).run_costs()

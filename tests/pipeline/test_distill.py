@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import g2ard
-from g2ard.config.paths import changed
+from g2ard.config.schema import changed
 from g2ard.errors import InputError
 from g2ard.io import read_splats, write_splats
 from g2ard.pipeline.config import DistillConfig, SelectConfig

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import g2ard
-from g2ard.config.paths import changed, listed
+from g2ard.config.schema import changed, listed
 from g2ard.errors import InputError
 from g2ard.io import read_splats, write_splats, write_views
 from g2ard.pipeline.config import SelectConfig
@@ -124,7 +124,7 @@ def test_the_other_commands_know_it(folder: Path, command_line: CommandLine) -> 
     rates = {**vars(PAPER.rates), **dict.fromkeys(("means", "log_scales", "quats"), 0.0)}
     for name in ("means", "log_scales", "quats", "logit_opacities", "sh0", "shN"):
         assert done["settings"][f"adapt.recovery.rates.{name}"] == rates[name]
-    assert (done["steps"], done["settings"]["adapt.tolerance"], done["colour_change"]) == (6, 0.0, None)
+    assert (done["steps"], done["settings"]["adapt.schedule"], done["colour_change"]) == (6, "paper", None)
 
 
 def test_in_python() -> None:
@@ -133,7 +133,7 @@ def test_in_python() -> None:
     assert g2ard.preset("paper", g2ard.AdaptConfig()).stretches() == [7000]
     with pytest.raises(InputError, match="expected"):
         preset("peer")
-    with pytest.raises(InputError, match="share"):
+    with pytest.raises(InputError, match=r"views_count: .* in \(0, 1\]"):
         SelectConfig(views_count=1.5)
 
 

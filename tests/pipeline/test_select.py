@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from g2ard.config.paths import changed
+from g2ard.config.schema import changed
 from g2ard.errors import InputError
 from g2ard.io import write_splats, write_views
 from g2ard.pipeline.config import DistillConfig

@@ -156,7 +156,7 @@ def test_bands_of_zeros_are_not_stored():
 
 
 def test_the_constants_are_the_core_s() -> None:
-    default, fast = (SimplifyConfig().resolved(method) for method in ("default", "fast"))
+    default, fast = (SimplifyConfig(method).resolved() for method in ("default", "fast"))
     assert (default.morton_premerge_ratio, default.morton_premerge_steps) == (3.0, 1)
     assert (fast.morton_premerge_ratio, fast.morton_premerge_steps) == (1.0, 2)
     core = _core.defaults()["default"]

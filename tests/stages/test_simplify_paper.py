@@ -11,7 +11,7 @@ from reference import simplify as naive
 
 
 def one_round(prior, budget, flags=None, **options):
-    config = SimplifyConfig(retention=1e-9, **options)
+    config = SimplifyConfig("paper", retention=1e-9, **options)
     return simplify(prior, budget, method="paper", protected=flags, config=config)
 
 
@@ -75,7 +75,7 @@ def test_flag_residual_equals_the_naive_twin():
         prior = Splats.create(points, scales=np.ones((n, 3)), sh0=colors[:, None] / naive.C0)
         energy = naive.affine_energy(prior.means.astype(np.float64), naive.color(prior), n)
         for factor, want in ((0.98, True), (1.02, False)):
-            config = SimplifyConfig(flag_threshold=factor * energy)
+            config = SimplifyConfig("paper", flag_threshold=factor * energy)
             assert flag(prior, 1, config=config).all() == want, n
 
 
@@ -133,7 +133,7 @@ def test_one_cell_for_each_retained_primitive_in_every_round():
 
 def test_a_round_on_the_way_has_the_cells_of_the_final_budget():
     prior = discs(sheet(60))
-    config = SimplifyConfig(retention=1e-9)
+    config = SimplifyConfig("paper", retention=1e-9)
     out = simplify(prior, 2700, method="paper", final_budget=360, config=config)
     assert abs(out.report.rounds[0].cells - 360) <= 0.03 * 360
 

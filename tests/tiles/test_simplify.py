@@ -20,7 +20,7 @@ from g2ard.rendering.targets import TeacherRenders
 from g2ard.scene.cameras import Cameras, look_at
 from g2ard.scene.prepared import finite_rows_of
 from g2ard.stages.evaluate import evaluate
-from g2ard.stages.simplify import SimplifyConfig, round_counts, simplify
+from g2ard.stages.simplify import SimplifyConfig, simplify
 from g2ard.tiles.executor import Workers, executor
 from g2ard.tiles.ingest import ingest
 from g2ard.tiles.merging import cheapest, plan_ends, simplify_tiles
@@ -67,7 +67,7 @@ def clusters(of: np.ndarray, a: np.ndarray, b: np.ndarray, runs: int) -> np.ndar
 def test_one_tile_is_the_whole_to_the_bit(seen: bool) -> None:
     prepared, _ = finite_rows_of(town(2500))
     rng = np.random.default_rng(1)
-    budget, config = 250, SimplifyConfig().resolved("default")
+    budget, config = 250, SimplifyConfig().resolved()
 
     class Seen:
         weight = rng.gamma(1, 1, len(prepared)).astype(np.float32)
@@ -84,7 +84,7 @@ def test_one_tile_is_the_whole_to_the_bit(seen: bool) -> None:
         frame = frame.with_views(0.01, *tile(frame).sums())
     here = tile(frame)
     assert len(here.run_costs()) < len(prepared)  # the transparent are not among them
-    rounds = round_counts(len(prepared), budget, config.retention_of("default"))
+    rounds = config.rounds(len(prepared), budget)
     counts = [n for n in rounds if n < 3 * budget]
     of, a, b, costs = here.plan(3 * budget, counts, here.run_costs())
     assert len(a) == 2 * budget

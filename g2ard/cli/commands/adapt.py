@@ -9,8 +9,8 @@ from g2ard.cli import options as opt
 from g2ard.cli.frame import Run, command
 from g2ard.cli.resume import check_scene_run, stoppable
 from g2ard.config.choices import AdaptSchedule
-from g2ard.config.paths import listed
-from g2ard.pipeline.presets import PRESETS, configured
+from g2ard.config.schema import listed
+from g2ard.pipeline.presets import configured
 from g2ard.progress import plural
 
 
@@ -59,15 +59,11 @@ def adapt(
 
     if teacher is not None and not photos:
         run.refuse_typed("with --teacher, unless --photos is given", "images", "alpha")
-    schedule = schedule or PRESETS[preset or "auto"].get("adapt.schedule", "default")
-    if schedule == "paper" and prior_views:
-        raise typer.BadParameter("--prior-views and the paper's schedule exclude each other; give one")
-    start = AdaptConfig.scheduled(schedule)
     background = opt.background_of(run, background, compact)
     names = ("steps", "tolerance", "schedule", "prior_views", "sh_degree", "engine", "background", "seed")
-    settings = run.settings(start, *names, preset=preset)
+    settings = run.settings(AdaptConfig(), *names, preset=preset)
     opt.choose_engine(run, settings, "adapt.engine")
-    config = configured(start, preset or "auto", settings)
+    config = configured(AdaptConfig(), preset or "auto", settings)
     work = output.parent / f".{output.name}.work"
     check_scene_run(run, work, resume, output)
     splats = run.load(compact)

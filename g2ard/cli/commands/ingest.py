@@ -9,7 +9,6 @@ import typer
 from g2ard.cli.budget_options import Count
 from g2ard.cli.frame import Run, command
 from g2ard.cli.options import ResumeOption
-from g2ard.config.paths import changed
 from g2ard.progress import plural
 from g2ard.system.peak_memory import peak_rss
 
@@ -47,15 +46,13 @@ def ingest(
     run.claim("--output", output, folder=True)
     if resume and not (output.is_dir() and any(output.iterdir())):
         run.say(f"{output}: nothing to resume, starting over")
-    config = LiftConfig()
-    config = changed(config, run.settings(config))
     run.unfinished = f"finished tiles are in {output}; run the same command to continue"
     began = time.perf_counter()
     store = into_tiles(
         scenes,
         output,
         tile_rows=TILE_ROWS if tile_rows is None else int(tile_rows.value),
-        lift=config,
+        lift=run.settled(LiftConfig())[1],
         render_model=run.render_model,
         overwrite=run.overwrite,
         **run.callbacks,

@@ -11,7 +11,7 @@ from g2ard.cli import options as opt
 from g2ard.cli.frame import Run, command
 from g2ard.cli.resume import check_scene_run, stoppable
 from g2ard.cli.run_result import loss
-from g2ard.config.paths import listed
+from g2ard.config.schema import listed
 from g2ard.progress import plural
 
 if TYPE_CHECKING:

@@ -10,7 +10,7 @@ import typer
 from g2ard.cli import options as opt
 from g2ard.cli.frame import Run, command
 from g2ard.config.choices import Keep, Refinement
-from g2ard.config.paths import listed
+from g2ard.config.schema import listed
 from g2ard.errors import InputError
 from g2ard.progress import plural
 

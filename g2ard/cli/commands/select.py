@@ -10,7 +10,7 @@ import typer
 from g2ard.cli import options as opt
 from g2ard.cli.budget_options import Count
 from g2ard.cli.frame import Run, command
-from g2ard.config.paths import listed
+from g2ard.config.schema import listed
 from g2ard.pipeline.presets import configured
 from g2ard.progress import plural
 
@@ -52,6 +52,7 @@ def select(
     from g2ard.jobs.inputs import load_split_views
     from g2ard.jobs.view_checks import warn_of_sight
     from g2ard.pipeline.config import SelectConfig
+    from g2ard.stages.select import SurfaceOptions
     from g2ard.stages.select import select as choose
 
     settings = run.settings(SelectConfig(), "policy", preset=preset)
@@ -61,7 +62,6 @@ def select(
         raise typer.BadParameter("give the candidates with --views VIEWS")
     with run.usage():
         config = configured(SelectConfig(), preset or "auto", settings)
-        config.check_used(config.policy)
     if config.views_count is None:
         raise typer.BadParameter("give the number of views with -k K")
     run.claim_views(output, format)
@@ -75,7 +75,7 @@ def select(
         config.count_of(len(cameras)),
         policy=config.policy,
         seed=run.seed,
-        options=config,
+        options=config if isinstance(config, SurfaceOptions) else None,
         progress=run.progress,
     )
     run.begin("write")

@@ -16,10 +16,9 @@ from g2ard.cli.outputs import Outputs, budgets_of
 from g2ard.cli.run_result import say_weight, tell_quality
 from g2ard.cli.tiling import tiling_of
 from g2ard.config.choices import is_made
-from g2ard.config.paths import listed
+from g2ard.config.schema import listed
 from g2ard.io.atomic import atomic_output, check_output
 from g2ard.io.scene_formats import written_bytes
-from g2ard.pipeline.presets import configured
 from g2ard.progress import plural
 from g2ard.system.peak_memory import peak_rss
 
@@ -70,8 +69,7 @@ def simplify(
     from g2ard.jobs.tiling import is_tiled
     from g2ard.stages.simplify import SimplifyConfig
 
-    settings = run.settings(SimplifyConfig(), "method", "keep_region", preset=preset)
-    config = configured(SimplifyConfig(), preset or "auto", settings)
+    config = run.settled(SimplifyConfig(), "method", "keep_region", preset=preset)[1]
     budgets = budgets_of(run)
     if views is not None and no_views:
         raise typer.BadParameter("--views and --no-views exclude each other; give one")

@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 
-from g2ard.config.checks import check_fields
+from g2ard.config.checks import AtLeastOne, NotNegative, Positive, Within
+from g2ard.config.schema import Settings
 from g2ard.errors import require
 from g2ard.scene.splats import Splats
 from g2ard.scene.transform import rotation_matrices
 
 
 @dataclass(frozen=True)
-class Regularizers:
+class Regularizers(Settings):
     """The paper's `eq:objective`: λ_a·L_anchor + λ_s·L_shape, added every `period` steps.
 
     Args:
@@ -31,22 +33,13 @@ class Regularizers:
         InputError: a value out of range.
     """
 
-    anchor: float
-    shape: float
+    anchor: NotNegative
+    shape: NotNegative
     effective_rank: bool
-    thickness: float = 1.0
-    rank_offset: float = 1e-6
-    period: int = 100
-    in_plane: float = 3.0
-
-    def __post_init__(self) -> None:
-        check_fields(self)
-        for name in ("anchor", "shape", "thickness"):
-            value = getattr(self, name)
-            require(name, value, 0 <= value < float("inf"), "a weight, at least 0")
-        require("rank_offset", self.rank_offset, 0 < self.rank_offset < 1, "a number in (0, 1)")
-        require("period", self.period, self.period >= 1, "at least 1")
-        require("in_plane", self.in_plane, 0 < self.in_plane < float("inf"), "more than 0")
+    thickness: NotNegative = 1.0
+    rank_offset: Annotated[float, Within("(0, 1)")] = 1e-6
+    period: AtLeastOne = 100
+    in_plane: Positive = 3.0
 
     @classmethod
     def of(cls, prior: str, *, paper: bool = False) -> Regularizers:

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from g2ard.config.checks import check_fields
+from g2ard.config.checks import AtLeastOne, Degree, Positive, Share
 from g2ard.config.choices import BLACK, Colour, Engine
-from g2ard.errors import InputError, require
+from g2ard.config.schema import Settings
+from g2ard.errors import InputError
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
 from g2ard.stages.recover.anchors import REGULARIZERS, Regularizers
@@ -14,7 +15,7 @@ from g2ard.stages.recover.schedule import TUNED, Schedule, steps_for, steps_from
 
 
 @dataclass(frozen=True)
-class FitConfig:
+class FitConfig(Settings):
     """Options of every fit to images.
 
     Args:
@@ -29,16 +30,11 @@ class FitConfig:
         InputError: a value out of range.
     """
 
-    sh_degree: int | None = None
-    ssim_weight: float = 0.2
+    sh_degree: Degree | None = None
+    ssim_weight: Share = 0.2
     background: Colour = BLACK
     seed: int = 0
     engine: Engine = "fused"
-
-    def __post_init__(self) -> None:
-        check_fields(self)
-        require("sh_degree", self.sh_degree, self.sh_degree in (None, 0, 1, 2, 3), "0 to 3")
-        require("ssim_weight", self.ssim_weight, 0 <= self.ssim_weight <= 1, "a value in [0, 1]")
 
 
 @dataclass(frozen=True)
@@ -58,18 +54,15 @@ class RecoverConfig(FitConfig):
     """
 
     schedule: Schedule = TUNED
-    steps: int | None = None
-    recovery_time: float | None = None
+    steps: AtLeastOne | None = None
+    recovery_time: Positive | None = None
     regularizers: Regularizers = REGULARIZERS["trained"]
     from_points: bool = field(default=False, metadata={"setting": False})
     final: bool = field(default=True, metadata={"setting": False})
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require("steps", self.steps, self.steps is None or self.steps >= 1, "at least 1")
-        limit = self.recovery_time
-        require("recovery_time", limit, limit is None or 0 < limit < float("inf"), "more than 0 seconds")
-        if self.steps is not None and limit is not None:
+        if self.steps is not None and self.recovery_time is not None:
             raise InputError("steps and recovery_time exclude each other; give one", parameter="steps")
 
     @property

@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
+from typing import Annotated
 
 import numpy as np
 
-from g2ard.config.checks import check_fields
+from g2ard.config.checks import AboveZero, AtLeastOne, NotNegative, Share, Within
+from g2ard.config.schema import Settings
 from g2ard.errors import require
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.samples import evenly_spaced
 from g2ard.scene.splats import Splats
+
+_Decay = Annotated[float, Within("(0, 1]")]
 
 _DEFAULT_REACH = 0.01
 """Default `reach`: Gaussians larger than a hundredth of the image hardly move, unless that is typical."""
@@ -38,7 +42,7 @@ _MOST_STEPS_FACTOR = 3.0
 
 
 @dataclass(frozen=True)
-class Rates:
+class Rates(Settings):
     """Adam's learning rate of each attribute, in the space it is optimised in.
 
     Large Gaussians hardly move: with σ the largest standard deviation in the view as a share of the image's
@@ -64,22 +68,14 @@ class Rates:
         InputError: a value out of range.
     """
 
-    means: float
-    log_scales: float
-    quats: float
-    logit_opacities: float
-    sh0: float
-    shN: float
-    reach: float = field(default=math.inf, metadata={"setting": False})
-    finest: float = field(default=0.0, metadata={"setting": False})
-
-    def __post_init__(self) -> None:
-        check_fields(self)
-        for name in ("means", "log_scales", "quats", "logit_opacities", "sh0", "shN"):
-            value = getattr(self, name)
-            require(name, value, 0 <= value < math.inf, "a rate, at least 0")
-        require("reach", self.reach, self.reach > 0, "more than 0")
-        require("finest", self.finest, 0 <= self.finest < math.inf, "pixels, at least 0")
+    means: NotNegative
+    log_scales: NotNegative
+    quats: NotNegative
+    logit_opacities: NotNegative
+    sh0: NotNegative
+    shN: NotNegative
+    reach: AboveZero = field(default=math.inf, metadata={"setting": False})
+    finest: NotNegative = field(default=0.0, metadata={"setting": False})
 
     def scaled(self, geometry: float, appearance: float) -> Rates:
         """Multiply rates of means, scales and rotations by `geometry`, of opacity and SH by `appearance`."""
@@ -96,7 +92,7 @@ class Rates:
 
 
 @dataclass(frozen=True)
-class Schedule:
+class Schedule(Settings):
     """Rates and their decay over a fixed number of steps.
 
     Args:
@@ -120,28 +116,16 @@ class Schedule:
     """
 
     rates: Rates
-    steps: int
-    round_steps: int = 0
+    steps: AtLeastOne
+    round_steps: Annotated[int, Within("[0, inf)")] = 0
     means_in_scales: bool = True
-    cosine_floor: float | None = 0.01
-    appearance_decay: tuple[float, float] = (1.0, 1.0)
-    multiplier: float | None = None
-    reach: float | None = None
-    finest: float = _DEFAULT_FINEST
-    reference_extent: float | None = None
+    cosine_floor: Share | None = 0.01
+    appearance_decay: tuple[_Decay, _Decay] = (1.0, 1.0)
+    multiplier: AboveZero | None = None
+    reach: AboveZero | None = None
+    finest: NotNegative = _DEFAULT_FINEST
+    reference_extent: AboveZero | None = None
     guarded: bool = True
-
-    def __post_init__(self) -> None:
-        check_fields(self)
-        require("steps", self.steps, self.steps >= 1, "at least 1")
-        require("round_steps", self.round_steps, self.round_steps >= 0, "at least 0")
-        floor, decay = self.cosine_floor, self.appearance_decay
-        require("cosine_floor", floor, floor is None or 0 <= floor <= 1, "a value in [0, 1], or none")
-        require("appearance_decay", decay, all(0 < d <= 1 for d in decay), "two values in (0, 1]")
-        for name in ("multiplier", "reach", "reference_extent"):
-            value = getattr(self, name)
-            require(name, value, value is None or value > 0, "more than 0, or none")
-        require("finest", self.finest, 0 <= self.finest < math.inf, "pixels, at least 0")
 
     @classmethod
     def named(cls, name: str) -> Schedule:

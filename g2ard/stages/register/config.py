@@ -3,25 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
-from g2ard.config.checks import check_fields
-from g2ard.config.choices import REFINEMENTS, Refinement
+from g2ard.config.checks import AboveZero, AtLeastOne, Share, Within
+from g2ard.config.choices import Refinement
+from g2ard.config.schema import Settings
 from g2ard.errors import InputError, require
 
-_POSITIVE_FIELDS = (
-    "max_angle_sigma",
-    "max_position_sigma",
-    "max_edge",
-    "correlated",
-    "max_reprojection",
-    "alike",
-)
+_Side = Annotated[int, Within("[32, inf)")]
+_SmallSide = Annotated[int, Within("[16, inf)")]
+_Part = Annotated[float, Within("(0, 1]")]
 
 _FEATURE_FIELDS = ("passes", "features", "ratio", "max_reprojection", "min_inliers", "alike")
 
 
 @dataclass(frozen=True)
-class RegisterConfig:
+class RegisterConfig(Settings):
     """Options of registration.
 
     Args:
@@ -60,48 +57,34 @@ class RegisterConfig:
         InputError: a value out of range.
     """
 
-    size: int = 1000
-    align_size: int = 500
+    size: _Side = 1000
+    align_size: _Side = 500
     matcher: str = "auto"
     refine: Refinement = "auto"
-    passes: int = 3
-    coarsest: int = 32
-    iterations: int = 12
-    still: float = 0.01
-    accept: float = 0.6
-    doubt: float = 0.35
-    max_angle_sigma: float = 0.7
-    max_position_sigma: float = 0.03
-    min_alpha: float = 0.5
-    max_edge: float = 0.1
-    min_overlap: float = 0.1
-    window: int = 15
-    candidates: int = 5
-    pool_size: int = 64
-    correlated: float = 2000.0
-    features: int = 4096
-    ratio: float = 0.85
-    max_reprojection: float = 3.0
-    min_inliers: int = 30
+    passes: AtLeastOne = 3
+    coarsest: _SmallSide = 32
+    iterations: AtLeastOne = 12
+    still: AboveZero = 0.01
+    accept: _Part = 0.6
+    doubt: Share = 0.35
+    max_angle_sigma: AboveZero = 0.7
+    max_position_sigma: AboveZero = 0.03
+    min_alpha: _Part = 0.5
+    max_edge: AboveZero = 0.1
+    min_overlap: _Part = 0.1
+    window: Annotated[int, Within("[3, inf)")] = 15
+    candidates: AtLeastOne = 5
+    pool_size: _SmallSide = 64
+    correlated: AboveZero = 2000.0
+    features: AtLeastOne = 4096
+    ratio: _Part = 0.85
+    max_reprojection: AboveZero = 3.0
+    min_inliers: Annotated[int, Within("[6, inf)")] = 30
     fallback: bool = True
-    alike: float = 10.0
+    alike: AboveZero = 10.0
 
     def __post_init__(self) -> None:
-        check_fields(self)
-        for name in ("size", "align_size"):
-            require(name, getattr(self, name), getattr(self, name) >= 32, "at least 32 pixels")
-        require("refine", self.refine, self.refine in REFINEMENTS, f"one of {', '.join(REFINEMENTS)}")
-        for name in ("coarsest", "pool_size"):
-            require(name, getattr(self, name), getattr(self, name) >= 16, "at least 16 pixels")
-        require("still", self.still, self.still > 0, "a positive number of pixels")
-        for name in ("accept", "ratio", "min_alpha", "min_overlap"):
-            require(name, getattr(self, name), 0 < getattr(self, name) <= 1, "a value in (0, 1]")
-        require("doubt", self.doubt, 0 <= self.doubt <= 1, "a value in [0, 1]")
-        for name in ("passes", "features", "iterations", "candidates"):
-            require(name, getattr(self, name), getattr(self, name) >= 1, "at least 1")
-        require("min_inliers", self.min_inliers, self.min_inliers >= 6, "at least 6")
-        for name in _POSITIVE_FIELDS:
-            require(name, getattr(self, name), getattr(self, name) > 0, "a positive number")
+        super().__post_init__()
         if self.matcher == "direct":
             unused = [
                 name for name in _FEATURE_FIELDS if getattr(self, name) != getattr(RegisterConfig, name)
@@ -109,7 +92,7 @@ class RegisterConfig:
             unused += ["refine"] if self.refine in ("none", "photometric") else []
             if unused:
                 raise InputError("has no effect on the matcher direct", parameter=unused[0])
-        require("window", self.window, self.window >= 3 and self.window % 2 == 1, "an odd number from 3 on")
+        require("window", self.window, self.window % 2 == 1, "an odd number")
 
     def levels(self) -> list[int]:
         """Return longer sides in pixels, coarse to fine, halving `align_size` down to about `coarsest`.

@@ -16,7 +16,7 @@ from g2ard.progress import Progress, plural, silent
 from g2ard.scene.cameras import Cameras, unseeing
 from g2ard.scene.splats import Splats
 from g2ard.stages.select import poses
-from g2ard.stages.select.surfaces import CoverageOptions, greedy, surface
+from g2ard.stages.select.surfaces import SurfaceOptions, greedy, surface
 
 Float = NDArray[np.float64]
 Order = NDArray[np.int64]
@@ -68,7 +68,7 @@ def select(
     *,
     policy: str = "auto",
     seed: int = 0,
-    options: CoverageOptions | None = None,
+    options: SurfaceOptions | None = None,
     progress: Progress = silent,
 ) -> Selection:
     """Choose `k` of the candidate views.

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, fields
-from typing import Any
+from dataclasses import dataclass
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from g2ard import _core
-from g2ard.config.checks import check_fields
+from g2ard.config.checks import AtLeastOne, NotNegative, Positive, Within
+from g2ard.config.schema import Settings
 from g2ard.errors import InputError, require
 from g2ard.progress import Progress, counter, silent
 from g2ard.rendering.renderer import View, settings_for, view_of
@@ -24,61 +25,38 @@ _CORE = _core.defaults()["coverage"]
 
 
 @dataclass(frozen=True)
-class CoverageOptions:
+class SurfaceOptions(Settings):
     """Options of the surface-based policies (the paper, eq. `view_selection`; `tab:s_avs`).
 
     Args:
         cells: number M of surface cells (adaptive voxels).
-        kappa: sharpness of the observation kernel and of the targets.
         alpha: exponent of the fair utility u(x) = x^(1−α)/(1−α).
         offset: g(x) = u(offset + x); the paper's λ.
-        anchors: directions on the sphere, at most 64, at which targets and observations are evaluated.
         epsilon: ε of the coverage ratio C_jk / (P_jk + ε).
         depth_tolerance: a cell is visible if its depth differs from the pixel's by at most this share, or by
             a cell's size.
-
-    Raises:
-        InputError: a value out of range.
     """
 
-    cells: int = 300_000
-    kappa: float = _CORE["kappa"]
-    alpha: float = _CORE["alpha"]
-    offset: float = _CORE["offset"]
-    anchors: int = _CORE["anchors"]
-    epsilon: float = _CORE["epsilon"]
-    depth_tolerance: float = 0.01
-
-    def __post_init__(self) -> None:
-        check_fields(self)
-        require("cells", self.cells, self.cells >= 1, "at least 1")
-        for name in ("kappa", "offset", "epsilon"):
-            value = getattr(self, name)
-            require(name, value, 0 < value < float("inf"), "more than 0")
-        require(
-            "depth_tolerance", self.depth_tolerance, 0 <= self.depth_tolerance < float("inf"), "at least 0"
-        )
-        require("anchors", self.anchors, 1 <= self.anchors <= 64, "1 to 64")
-        require("alpha", self.alpha, 0 <= self.alpha < float("inf"), "at least 0")
-
-    def check_used(self, policy: str) -> None:
-        """Reject options that were changed but that the policy does not use.
-
-        >>> CoverageOptions(kappa=5.0).check_used("coverage")
-        Traceback (most recent call last):
-        g2ard.errors.InputError: kappa: has no effect on the policy coverage, only on directional
-        """
-        for option in fields(CoverageOptions):
-            only = ("directional",) if option.name in _OF_DIRECTIONS else ("directional", "coverage")
-            if policy not in only and getattr(self, option.name) != option.default:
-                raise InputError(
-                    f"has no effect on the policy {policy}, only on {' and '.join(only)}",
-                    parameter=option.name,
-                )
+    kappa: ClassVar[float] = _CORE["kappa"]
+    anchors: ClassVar[int] = _CORE["anchors"]
+    cells: AtLeastOne = 300_000
+    alpha: NotNegative = _CORE["alpha"]
+    offset: Positive = _CORE["offset"]
+    epsilon: Positive = _CORE["epsilon"]
+    depth_tolerance: NotNegative = 0.01
 
 
-_OF_DIRECTIONS = ("kappa", "anchors")
-"""Options of directions, which only the policy directional measures."""
+@dataclass(frozen=True)
+class CoverageOptions(SurfaceOptions):
+    """Options of the policy `directional`, and of `coverage` except for directions.
+
+    Args:
+        kappa: sharpness of the observation kernel and of the targets.
+        anchors: directions on the sphere, at most 64, at which targets and observations are evaluated.
+    """
+
+    kappa: Positive = _CORE["kappa"]  # type: ignore[misc]
+    anchors: Annotated[int, Within("[1, 64]")] = _CORE["anchors"]  # type: ignore[misc]
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,7 +115,7 @@ def visible_cells(
     cells: Surface,
     cameras: Cameras,
     *,
-    depth_tolerance: float = CoverageOptions.depth_tolerance,
+    depth_tolerance: float = SurfaceOptions.depth_tolerance,
     progress: Progress = silent,
 ) -> Visible:
     """Compute the visibility ν_jv of a scene's cells in C views, world coordinates, from its median depth.
@@ -177,7 +155,7 @@ def greedy(
     splats: Splats,
     cameras: Cameras,
     policy: str,
-    options: CoverageOptions | None,
+    options: SurfaceOptions | None,
     progress: Progress,
     seconds: dict[str, float],
 ) -> tuple[Order, Float, int]:

@@ -15,7 +15,7 @@ from g2ard.rendering.visibility import SampledVisibility
 from g2ard.scene.prepared import MAX_OPACITY, PreparedScene
 from g2ard.scene.regions import in_any
 from g2ard.scene.splats import DRAWN_LOGIT, Splats
-from g2ard.stages.simplify.config import SimplifyConfig, round_counts
+from g2ard.stages.simplify.config import Pairs
 
 _OPACITY_FIT_EXPONENT = 1 / 4
 """Exponent of the ratio of wanted to current visibility: ½ fits the given views by up to 0.1 dB better, and
@@ -57,7 +57,7 @@ def rows_of(visibility: Visibility, count: int, finite: NDArray[np.bool_] | slic
     return SampledVisibility(np.ascontiguousarray(weight), np.ascontiguousarray(pixel))
 
 
-def emphasised(scene: Splats, visibility: Visibility, config: SimplifyConfig) -> Visibility:
+def emphasised(scene: Splats, visibility: Visibility, config: Pairs) -> Visibility:
     """Emphasise the regions to keep, as if views were √keep_times times closer.
 
     Inside them, weights are multiplied by keep_times and pixel sizes divided by √keep_times.
@@ -73,17 +73,16 @@ def emphasised(scene: Splats, visibility: Visibility, config: SimplifyConfig) ->
 def merge(
     scene: PreparedScene,
     budget: int,
-    method: str,
     visibility: Visibility | None,
     protected: NDArray[np.bool_] | None,
-    config: SimplifyConfig,
+    config: Pairs,
     progress: Progress,
 ) -> dict[str, Any]:
     """Merge by `default` or `fast`; `visibility` has one row per Gaussian of the scene."""
-    config = config.resolved(method, antialiased=scene.antialiased)
+    config = config.resolved(antialiased=scene.antialiased)
     return _core.simplify_pairwise(
         scene.core,
-        round_counts(len(scene), budget, config.retention_of(method), config.fold),
+        config.rounds(len(scene), budget),
         config,
         protected=protected,
         visibility=None if visibility is None else emphasised(scene, visibility, config),
@@ -94,16 +93,15 @@ def merge(
 def merge_and_fit(
     scene: PreparedScene,
     budget: int,
-    method: str,
     source: VisibilitySource,
     protected: NDArray[np.bool_] | None,
-    config: SimplifyConfig,
+    config: Pairs,
     progress: Progress,
 ) -> dict[str, Any]:
     """Merge by visibility, then fit each merged Gaussian's opacity so that views see as much of it as of its
     members."""
     visibility = rows_of(source(scene), len(scene), slice(None))
-    out = merge(scene, budget, method, visibility, protected, config, progress)
+    out = merge(scene, budget, visibility, protected, config, progress)
     merged, parents = splats_of(scene, out), out["parents"]
     order = scene.core.order  # sums in this order do not depend on the order of the scene's rows
     row, weight = parents[order], visibility.weight[order]

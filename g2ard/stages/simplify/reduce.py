@@ -10,12 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard import _core
-from g2ard.config.choices import METHODS
 from g2ard.errors import InputError, require
 from g2ard.progress import Progress, counter, plural, silent
 from g2ard.scene.prepared import PreparedScene, finite_rows_of, with_some_opacity
 from g2ard.scene.splats import DRAWN_LOGIT, Splats, unit_quats
-from g2ard.stages.simplify.config import SimplifyConfig, round_counts
+from g2ard.stages.simplify.config import Pairs, SimplifyConfig
 from g2ard.stages.simplify.pairs import Visibility, VisibilitySource, merge, merge_and_fit, rows_of, splats_of
 from g2ard.stages.simplify.report import SimplifyReport, SimplifyRound
 
@@ -72,7 +71,8 @@ def flag(
     """
     require("budget", budget, budget >= 1, "at least 1")
     scene, finite = finite_rows_of(splats)
-    flagged = _core.simplify_flags(scene.core, budget, config.resolved("paper"), counter(progress, "flag"))
+    paper = config.turned("paper").resolved()
+    flagged = _core.simplify_flags(scene.core, budget, paper, counter(progress, "flag"))
     flags = np.zeros(len(splats), bool)
     flags[finite] = flagged
     return flags
@@ -112,7 +112,7 @@ def simplify(
         splats: the scene. Infinite logits mean α = 0 or 1, scales are limited to e⁴³; rows with other
             non-finite values are dropped and counted.
         budget: Gaussians to keep, at most those of the scene.
-        method: overrides the config's.
+        method: turns the config into this method's.
         visibility: for `default` and `fast`: visibility of each Gaussian (`g2ard.rendering.visibility`), or a
             function scene → visibility, also called on the result to fit its opacities.
         protected: (N,) bool flags to inherit. If None, `paper` computes them (see `flag`); the other methods
@@ -135,8 +135,7 @@ def simplify(
     >>> len(small.splats), small.parents.shape, int(small.parents.max())
     (100, (1000,), 99)
     """
-    method = config.method if method is None else method
-    require("method", repr(method), method in METHODS, f"one of {', '.join(METHODS)}")
+    config = config.turned(method)
     scene, finite = finite_rows_of(splats)
     require("budget", budget, budget >= 1, "at least 1")
     require("budget", budget, budget <= len(scene), f"at most {len(scene)} (the scene's Gaussians)")
@@ -146,19 +145,17 @@ def simplify(
         given = f"{protected.dtype} {protected.shape}"
         require("protected", given, fits, f"bool of shape ({len(splats)},)")
         protected = np.ascontiguousarray(protected[finite])
-    if not (scene.opacities >= (config.resolved(method).min_opacity or 0.0)).any():
+    if not (scene.opacities >= (config.resolved().min_opacity or 0.0)).any():
         scene, config = with_some_opacity(scene), replace(config, min_opacity=0.0)
-    if config.keep_region and (method == "paper" or visibility is None):
-        raise InputError(
-            "needs views; `paper` uses none, and `fast` only given ones", parameter="keep_region"
-        )
-    if method == "paper":
+    if not isinstance(config, Pairs):
         out = _paper(scene, budget, protected, final_budget or budget, config, progress)
+    elif config.keep_region and visibility is None:
+        raise InputError("needs views; `fast` uses only given ones", parameter="keep_region")
     elif callable(visibility):
-        out = merge_and_fit(scene, budget, method, visibility, protected, config, progress)
+        out = merge_and_fit(scene, budget, visibility, protected, config, progress)
     else:
         seen = None if visibility is None else rows_of(visibility, len(splats), finite)
-        out = merge(scene, budget, method, seen, protected, config, progress)
+        out = merge(scene, budget, seen, protected, config, progress)
     return _simplified(splats, finite, out)
 
 
@@ -172,9 +169,9 @@ def _paper(
 ) -> dict[str, Any]:
     return _core.simplify_paper(
         scene.core,
-        round_counts(len(scene), budget, config.retention_of("paper"), config.fold),
+        config.rounds(len(scene), budget),
         cells,
-        config.resolved("paper"),
+        config.resolved(),
         protected=protected,
         progress=counter(progress, "simplify"),
     )

@@ -1,26 +1,90 @@
-"""Fields of nested config dataclasses by dotted path, as used by `--set`, config files, presets and reports.
+"""Settings by dotted path: one schema for flags, `--set`, config files, presets, keywords and reports.
 
-A config is a frozen dataclass whose fields are values or other configs. A stage's config roots its paths:
-`RecoverConfig` → `recover`. A config that only joins others, such as `DistillConfig`, adds no prefix.
-Any unambiguous tail names a path: `rates.means` is `recover.schedule.rates.means`. If several paths end
-alike, the one nearest the root wins: `steps` is `recover.steps`.
+`Settings` is the base of frozen dataclasses whose fields are values or other settings. Values are checked
+when they are made: by type, by the limits of an annotated type, and by name. What depends on a choice, such
+as the method, is a variant of its own, so that a setting without effect cannot be given.
 
-A config with a classmethod `named` can be set as a whole by name: `recover.schedule=fast`. Fields marked
+A stage's settings root their paths: `RecoverConfig` → `recover`. Settings that only join others, such as
+`DistillConfig`, add no prefix. Any unambiguous tail names a path: `rates.means` is
+`recover.schedule.rates.means`. If several paths end alike, the one nearest the root wins: `steps` is
+`recover.steps`.
+
+Settings with a classmethod `named` can be set as a whole by name: `recover.schedule=fast`. Fields marked
 `setting=False` are computed and cannot be set.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
 from difflib import get_close_matches
-from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
+from typing import Any, ClassVar, Literal, Self, TypeVar, get_args, get_origin, get_type_hints
 
-from g2ard.config.checks import check_type, described, options_of
+from g2ard.config.checks import bare, check_fields, check_type, described, options_of
 from g2ard.errors import InputError
 
 Config = TypeVar("Config")
+
+
+class Settings:
+    """Base of settings: frozen dataclasses whose values are checked.
+
+    `class SimplifyConfig(Settings, tag="method")` is made as the variant that its field `method` names, and
+    `class Paper(SimplifyConfig, variants=("paper",))` is one.
+    """
+
+    _tag: ClassVar[str | None] = None
+    _variants: ClassVar[dict[str, Any]] = {}
+
+    def __init_subclass__(cls, tag: str | None = None, variants: Sequence[str] = ()) -> None:
+        if tag is not None:
+            cls._tag, cls._variants = tag, {}
+        cls._variants.update(dict.fromkeys(variants, cls))
+
+    def __new__(cls, *first: Any, **values: Any) -> Self:
+        kind, name = cls, None
+        if cls._tag is not None and cls not in cls._variants.values():
+            given = dict(zip(_names(cls), first, strict=False)) | values
+            name = given.get(cls._tag, next(iter(cls._variants)))
+            kind = cls._variant(name)
+        for other in values.keys() - _names(kind).keys():
+            raise kind._unknown(other, name)
+        return object.__new__(kind)
+
+    def __post_init__(self) -> None:
+        check_fields(self)
+
+    @classmethod
+    def _variant(cls, name: Any) -> Any:
+        if not isinstance(name, str) or name not in cls._variants:
+            expected = f"expected one of {', '.join(cls._variants)}, got {name!r}"
+            raise InputError(expected, parameter=cls._tag)
+        return cls._variants[name]
+
+    @classmethod
+    def _unknown(cls, name: str, own: str | None) -> InputError:
+        """Return the error for a field that does not exist, or exists in variants other than `own` only."""
+        others = [other for other, kind in cls._variants.items() if name in _names(kind)]
+        if not others:
+            return InputError("is no setting", parameter=name, hint=f"there are {', '.join(_names(cls))}")
+        own = own or next(variant for variant, kind in cls._variants.items() if kind is cls)
+        reason = f"has no effect on the {cls._tag} {own}, only on {' and '.join(others)}"
+        return InputError(reason, parameter=name)
+
+    def turned(self, name: str | None) -> Self:
+        """Return the settings as another variant: those that differ from the default, if it has them."""
+        tag = str(self._tag)
+        if name in (None, getattr(self, tag)):
+            return self
+        kind, usual = self._variant(name), type(self)(**{tag: getattr(self, tag)})
+        changed = {field: value for field, value in vars(self).items() if value != getattr(usual, field)}
+        kept = {field: value for field, value in changed.items() if field in _names(kind)}
+        return kind(**{**kept, tag: name})
+
+
+def _names(kind: Any) -> dict[str, None]:
+    return dict.fromkeys(f.name for f in fields(kind))
 
 
 def parse_settings(texts: Iterable[str], config: Any) -> dict[str, Any]:
@@ -39,7 +103,7 @@ def parse_settings(texts: Iterable[str], config: Any) -> dict[str, Any]:
     >>> parse_settings(["regularizers.anchor=1e-3", "period=50", "schedule=fast"], RecoverConfig())
     {'recover.regularizers.anchor': 0.001, 'recover.regularizers.period': 50, 'recover.schedule': 'fast'}
     """
-    known = {leaf.path: leaf for leaf in _leaves(config)}
+    known = {leaf.path: leaf for leaf in _leaves(config, every=True)}
     values: dict[str, Any] = {}
     for text in texts:
         name, equals, value = text.partition("=")
@@ -60,7 +124,7 @@ def full_paths(values: Mapping[str, Any], config: Any) -> dict[str, Any]:
     >>> full_paths({"rates.means": 1e-3, "steps": 100}, RecoverConfig())
     {'recover.schedule.rates.means': 0.001, 'recover.steps': 100}
     """
-    known = {leaf.path: leaf for leaf in _leaves(config)}
+    known = {leaf.path: leaf for leaf in _leaves(config, every=True)}
     found = {}
     for name, value in values.items():
         path = _full(name, known)
@@ -124,23 +188,31 @@ class _Leaf:
     value: Any
 
 
-def _leaves(config: Any, root: str | None = None) -> Iterator[_Leaf]:
+def _leaves(config: Any, root: str | None = None, every: bool = False) -> Iterator[_Leaf]:
+    """List what can be set; with `every`, also in other variants."""
     root = _root(config) if root is None else root
-    kinds = get_type_hints(type(config))
+    kinds = get_type_hints(type(config), include_extras=True)
     for f in fields(config):
         path, value = _joined(root, f.name), getattr(config, f.name)
         if is_dataclass(value):
             if hasattr(value, "named"):
                 yield _Leaf(path, str, value)
-            yield from _leaves(value, path)
+            yield from _leaves(value, path, every)
         elif f.metadata.get("setting", True):
-            yield _Leaf(path, kinds[f.name], value)
+            chosen = every and f.name == getattr(config, "_tag", None)
+            yield _Leaf(path, Literal[tuple(config._variants)] if chosen else kinds[f.name], value)
+    for kind in getattr(config, "_variants", {}).values() if every else ():
+        kinds = get_type_hints(kind, include_extras=True)
+        for f in fields(kind):
+            if f.name not in _names(config):
+                yield _Leaf(_joined(root, f.name), kinds[f.name], f.default)
 
 
 def _root(config: Any) -> str:
     if all(is_dataclass(getattr(config, f.name)) for f in fields(config)):
         return ""
-    return type(config).__name__.removesuffix("Config").lower()
+    kinds = [kind for kind in type(config).__mro__ if vars(kind).get("_tag")] or [type(config)]
+    return kinds[0].__name__.removesuffix("Config").lower()
 
 
 def _joined(root: str, name: str) -> str:
@@ -149,6 +221,16 @@ def _joined(root: str, name: str) -> str:
 
 def _changed(config: Any, root: str, values: Mapping[str, Any]) -> Any:
     new: dict[str, Any] = {}
+    if isinstance(config, Settings) and config._tag is not None:
+        try:
+            chosen = values.get(_joined(root, config._tag), getattr(config, config._tag))
+            config = config.turned(chosen)
+            for kind in config._variants.values():
+                for name in _names(kind):
+                    if name not in _names(config) and _joined(root, name) in values:
+                        raise config._unknown(name, chosen)
+        except InputError as error:
+            raise error.at(parameter=_joined(root, str(error.parameter))) from None
     for f in fields(config):
         path, held = _joined(root, f.name), getattr(config, f.name)
         if is_dataclass(held) and not isinstance(held, type):
@@ -208,6 +290,7 @@ def _read(path: str, text: str, kind: Any) -> Any:
 
 def _as(kind: Any, text: str) -> Any:
     """Parse `text` as one type, or raise ValueError."""
+    kind = bare(kind)
     if get_origin(kind) is Literal and text in get_args(kind):
         return text
     if get_origin(kind) is tuple:
