@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from g2ard.config.checks import checks_arguments
+from g2ard.config.checks import AtLeastOne, checks_arguments, signature_of
 from g2ard.config.choices import BLACK, Colour, RenderModel
 from g2ard.errors import InputError
 from g2ard.io.detect import kind
@@ -89,8 +89,41 @@ class Levels:
         return f"Levels({', '.join(f'{len(level):,}' for level in self.splats)} Gaussians)"
 
 
+@dataclass(frozen=True, eq=False)
+class LevelsJob:
+    """Prepared levels: inputs are read and everything is decided. Other fields are arguments of `lod`.
+
+    Args:
+        job: the distillation that levels are steps of.
+        sky: sky and far background, kept apart; None without.
+    """
+
+    job: DistillJob
+    sky: Splats | None
+    ratios: Sequence[float]
+    recover: bool
+    work: Path | None
+
+    def run(self) -> Levels:
+        """Make the levels."""
+        splats: list[Splats] = []
+        reports: list[LevelReport] = []
+        finer = self.job.prior
+        for ratio, aim in zip(self.ratios, self.job.aims, strict=True):
+            if ratio == 1:
+                level = self.job.prior
+                report = LevelReport(len(level), 1.0, level_size(self.job.views.train.cameras, 1), 0.0)
+            else:
+                place = None if self.work is None else self.work / f"level-{len(splats)}"
+                level, finer, report = _level(self.job, finer, aim.count, ratio, self.recover, place)
+            self.job.say(report.line(len(splats)))
+            splats.append(level)
+            reports.append(report)
+        return Levels(tuple(splats), tuple(reports), self.sky)
+
+
 @checks_arguments
-def lod(
+def prepare_levels(
     scene: Splats | str | Path,
     *,
     ratios: Sequence[float] = RATIOS,
@@ -98,7 +131,7 @@ def lod(
     views: Views | None = None,
     photos: bool | None = False,
     steps: int | None = None,
-    size: int | None = None,
+    size: AtLeastOne | None = None,
     background: Colour = BLACK,
     beside: str | Path | None = None,
     up: Sequence[float] | None = None,
@@ -108,7 +141,43 @@ def lod(
     work: Path | None = None,
     progress: Progress = silent,
     say: Say = unsaid,
-) -> Levels:
+) -> LevelsJob:
+    """Read the scene and decide everything for `lod`, whose arguments these are."""
+    check_ratios(ratios)
+    check_trained(scene)
+    sky = None
+    if isinstance(scene, Splats):
+        scene = scene.narrowed()  # levels and sky then have one offset
+    if split_sky:
+        if not isinstance(scene, Splats):
+            beside = beside or scene
+            scene = load_scene(scene, say, render_model)
+        if (far := sky_mask(scene)).any():
+            say(f"sky: {plural(int(far.sum()), 'Gaussian')}, kept whole")
+            scene, sky = scene.take(~far), scene.take(far)
+        else:
+            say("sky: none found, so nothing is kept apart")
+    job = prepare(
+        scene,
+        [Budget(ratio=ratio) for ratio in ratios],
+        DistillOptions(
+            views=views,
+            photos=photos,
+            size=size,
+            beside=beside,
+            up=up,
+            render_model=render_model,
+            settings=recovery_settings(steps, background, seed),
+        ),
+        use="levels" if recover else "merging",
+        progress=progress,
+        say=say,
+    )
+    return LevelsJob(job, sky, ratios, recover, work)
+
+
+@signature_of(prepare_levels)
+def lod(*scene: Any, **options: Any) -> Levels:
     """Make levels of detail of a trained scene, exactly like the command `g2ard lod`.
 
     Each level is merged from the previous one, so its Gaussians are unions of finer ones. At √r times the
@@ -149,89 +218,7 @@ def lod(
     >>> [len(level) for level in lod(ball, ratios=(1, 4, 8), steps=3, size=48).splats]
     [800, 200, 100]
     """
-    job, sky = prepare_levels(
-        scene,
-        ratios,
-        views=views,
-        photos=photos,
-        steps=steps,
-        size=size,
-        background=background,
-        beside=beside,
-        up=up,
-        render_model=render_model,
-        split_sky=split_sky,
-        recover=recover,
-        seed=seed,
-        progress=progress,
-        say=say,
-    )
-    splats: list[Splats] = []
-    reports: list[LevelReport] = []
-    finer = job.prior
-    for ratio, aim in zip(ratios, job.aims, strict=True):
-        if ratio == 1:
-            level = job.prior
-            report = LevelReport(len(level), 1.0, level_size(job.views.train.cameras, 1), 0.0)
-        else:
-            place = None if work is None else work / f"level-{len(splats)}"
-            level, finer, report = _level(job, finer, aim.count, ratio, recover, place)
-        say(report.line(len(splats)))
-        splats.append(level)
-        reports.append(report)
-    return Levels(tuple(splats), tuple(reports), sky)
-
-
-def prepare_levels(
-    scene: Splats | str | Path,
-    ratios: Sequence[float],
-    *,
-    views: Views | None = None,
-    photos: bool | None = False,
-    steps: int | None = None,
-    size: int | None = None,
-    background: Colour = BLACK,
-    beside: str | Path | None = None,
-    up: Sequence[float] | None = None,
-    render_model: RenderModel | None = None,
-    split_sky: bool = False,
-    recover: bool = True,
-    seed: int = 0,
-    progress: Progress = silent,
-    say: Say = unsaid,
-) -> tuple[DistillJob, Splats | None]:
-    """Read the scene and decide everything for `lod`, whose arguments these are; return the sky too."""
-    check_ratios(ratios)
-    check_trained(scene)
-    sky = None
-    if isinstance(scene, Splats):
-        scene = scene.narrowed()  # levels and sky then have one offset
-    if split_sky:
-        if not isinstance(scene, Splats):
-            beside = beside or scene
-            scene = load_scene(scene, say, render_model)
-        if (far := sky_mask(scene)).any():
-            say(f"sky: {plural(int(far.sum()), 'Gaussian')}, kept whole")
-            scene, sky = scene.take(~far), scene.take(far)
-        else:
-            say("sky: none found, so nothing is kept apart")
-    job = prepare(
-        scene,
-        [Budget(ratio=ratio) for ratio in ratios],
-        DistillOptions(
-            views=views,
-            photos=photos,
-            size=size,
-            beside=beside,
-            up=up,
-            render_model=render_model,
-            settings=recovery_settings(steps, background, seed),
-        ),
-        use="levels" if recover else "merging",
-        progress=progress,
-        say=say,
-    )
-    return job, sky
+    return prepare_levels(*scene, **options).run()
 
 
 def estimate_level(job: DistillJob, count: int, ratio: float, *, recover: bool) -> Estimate:

@@ -11,7 +11,7 @@ from typing import Any, Literal, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from g2ard.config.checks import checks_arguments
+from g2ard.config.checks import AboveZero, checks_arguments, signature_of
 from g2ard.config.choices import BLACK, Alpha, Colour, Keep, RenderModel
 from g2ard.config.schema import changed, full_paths
 from g2ard.errors import InputError, require
@@ -55,7 +55,7 @@ class RegisterJob:
 
 
 @checks_arguments
-def register(
+def prepare(
     scene: Splats | str | Path,
     photos: Cameras | str | Path,
     *,
@@ -68,14 +68,39 @@ def register(
     protocol: Literal["gs-cpr"] | None = None,
     split: str = "all",
     intrinsics: str | Path | None = None,
-    focal: float | None = None,
+    focal: AboveZero | None = None,
     alpha: Alpha = "composite",
     background: Colour | None = None,
     render_model: RenderModel | None = None,
     seed: int = 0,
     progress: Progress = silent,
     say: Say = unsaid,
-) -> Registered:
+) -> RegisterJob:
+    """Read the inputs of `register`, whose arguments these are, and decide everything."""
+    config, keep = configured(config or RegisterConfig(), settings or {}, protocol, keep)
+    taken, posed = photos, True
+    if isinstance(taken, Cameras):
+        stated = {"intrinsics": intrinsics, "focal": focal, "split": split, "alpha": alpha}
+        for name, value in stated.items():
+            require(name, value, value in (None, "all", "composite"), "photos by their path, not cameras")
+    else:
+        path = Path(taken)
+        posed = not _photos_in(path)
+        lens = None if intrinsics is None else Path(intrinsics)
+        taken = photos_of(path, split=split, intrinsics=lens, focal=focal, alpha=alpha, say=say)
+    if poses is None and pool is None and not posed:
+        raise InputError("photos have no initial pose", path=path, hint="give {poses} or {pool}")
+    if poses is None:
+        poses = dict(zip(taken.names, taken.viewmats, strict=True)) if pool is None else {}
+    starts, true = (_named(given, taken.names) for given in (poses, truth or {}))
+    splats = scene if isinstance(scene, Splats) else load_scene(scene, say, render_model)
+    propose_background(taken, background or BLACK, background is not None, say)
+    places = pool if pool is None or isinstance(pool, Cameras) else pool_of(splats, pool, seed, progress, say)
+    return RegisterJob(splats, taken, starts, places, true, config, keep, background or BLACK, progress)
+
+
+@signature_of(prepare)
+def register(*inputs: Any, **options: Any) -> Registered:
     """Estimate camera poses of photos against a scene, exactly like the command `g2ard register`.
 
     A photo starts from its pose in `poses`, or from the most similar view of `pool`. Features matched with a
@@ -120,71 +145,7 @@ def register(
     >>> report.photos[0].status, report.photos[0].reason
     ('refused', 'view 0 (a.png) has no photo; pass views with photos')
     """
-    return prepare(
-        scene,
-        photos,
-        poses=poses,
-        pool=pool,
-        truth=truth,
-        config=config,
-        settings=settings,
-        keep=keep,
-        protocol=protocol,
-        split=split,
-        intrinsics=intrinsics,
-        focal=focal,
-        alpha=alpha,
-        background=background,
-        render_model=render_model,
-        seed=seed,
-        progress=progress,
-        say=say,
-    ).run()
-
-
-def prepare(
-    scene: Splats | str | Path,
-    photos: Cameras | str | Path,
-    *,
-    poses: Poses | str | Path | None = None,
-    pool: Cameras | str | Path | int | None = None,
-    truth: Poses | str | Path | None = None,
-    config: RegisterConfig | None = None,
-    settings: Mapping[str, Any] | None = None,
-    keep: Keep = "registered",
-    protocol: Literal["gs-cpr"] | None = None,
-    split: str = "all",
-    intrinsics: str | Path | None = None,
-    focal: float | None = None,
-    alpha: Alpha = "composite",
-    background: Colour | None = None,
-    render_model: RenderModel | None = None,
-    seed: int = 0,
-    progress: Progress = silent,
-    say: Say = unsaid,
-) -> RegisterJob:
-    """Read the inputs of `register`, whose arguments these are, and decide everything."""
-    config, keep = configured(config or RegisterConfig(), settings or {}, protocol, keep)
-    taken, posed = photos, True
-    require("focal", focal, focal is None or focal > 0, "more than 0 pixels")
-    if isinstance(taken, Cameras):
-        stated = {"intrinsics": intrinsics, "focal": focal, "split": split, "alpha": alpha}
-        for name, value in stated.items():
-            require(name, value, value in (None, "all", "composite"), "photos by their path, not cameras")
-    else:
-        path = Path(taken)
-        posed = not _photos_in(path)
-        lens = None if intrinsics is None else Path(intrinsics)
-        taken = photos_of(path, split=split, intrinsics=lens, focal=focal, alpha=alpha, say=say)
-    if poses is None and pool is None and not posed:
-        raise InputError("photos have no initial pose", path=path, hint="give {poses} or {pool}")
-    if poses is None:
-        poses = dict(zip(taken.names, taken.viewmats, strict=True)) if pool is None else {}
-    starts, true = (_named(given, taken.names) for given in (poses, truth or {}))
-    splats = scene if isinstance(scene, Splats) else load_scene(scene, say, render_model)
-    propose_background(taken, background or BLACK, background is not None, say)
-    places = pool if pool is None or isinstance(pool, Cameras) else pool_of(splats, pool, seed, progress, say)
-    return RegisterJob(splats, taken, starts, places, true, config, keep, background or BLACK, progress)
+    return prepare(*inputs, **options).run()
 
 
 def configured(

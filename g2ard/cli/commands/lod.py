@@ -206,7 +206,7 @@ def _tell_estimates(
 
     from g2ard.jobs.levels import estimate_level, prepare_levels
 
-    job, _ = prepare_levels(scene, ratios, recover=recover, **choices)
+    job = prepare_levels(scene, ratios=ratios, recover=recover, **choices).job
     told, seconds = [], job.seconds
     for number, (ratio, aim) in enumerate(zip(ratios, job.aims, strict=True)):
         if ratio == 1:
