@@ -143,7 +143,7 @@ def test_errors_speak_of_parameters(folder: Path) -> None:
         ({}, "expected exactly one kind of budget"),
         ({"count": 5, "ratio": 2}, "expected exactly one kind of budget"),
         ({"count": 1501}, "at most its 1,500 Gaussians, got 1,501"),
-        ({"ratio": 0.5}, "ratio: expected at least 1"),
+        ({"ratio": 0.5}, "ratio: expected a finite number of at least 1"),
         ({"ratio": 2, "method": "magic"}, "method: expected one of default, fast, paper"),
     ):
         for function in (g2ard.simplify, g2ard.distill):

@@ -25,6 +25,7 @@ from g2ard.cli.app import app
 from g2ard.cli.budget_options import BUDGETS, Counts, Ratios
 from g2ard.cli.config_file import load_config, printed
 from g2ard.cli.console import Console
+from g2ard.cli.fields import FIELDS
 from g2ard.cli.panels import COMMON, GROUPED, into_panels
 from g2ard.cli.tile_options import TILES
 from g2ard.cli.usage import flags_of, in_flags, typed
@@ -112,9 +113,11 @@ class Run:
         options: dict[str, Any],
         flags: Mapping[str, str] = MappingProxyType({}),
         outputs: Collection[str] = ("output",),
+        fields: Sequence[str] = (),
     ) -> None:
         self.name = name
         self.flags = flags  # parameter → flag
+        self.fields = fields  # paths of settings that have flags
         self.shared = common
         self.overwrite: bool = common["overwrite"]
         self.seed: int = common["seed"]
@@ -144,21 +147,15 @@ class Run:
         """Arguments of jobs that report progress and messages."""
         return {"progress": self.progress, "say": self.say}
 
-    def settings(self, config: Any, *names: str, preset: str | None = None) -> dict[str, Any]:
-        """Return config values by path, as `settled` checks them."""
-        return self.settled(config, *names, preset=preset)[0]
-
-    def settled(
-        self, config: Config, *names: str, preset: str | None = None
-    ) -> tuple[dict[str, Any], Config]:
-        """Merge options and --set, which wins, into values by path and the config that they make.
+    def settled(self, config: Config, preset: str | None = None) -> tuple[dict[str, Any], Config]:
+        """Merge flags of settings and --set, which wins, into values by path and the config that they make.
 
         Args:
             config: the defaults.
-            names: options named like a field or like the end of its path.
             preset: preset that the values override.
         """
-        given = {name: self.config[name] for name in names if self.config[name] not in (None, [], ())}
+        options = {path: self.config[path.rpartition(".")[2]] for path in self.fields}
+        given = {path: value for path, value in options.items() if value not in (None, [], ())}
         try:
             typed = parse_settings(self.config["set"] or [], config)
         except InputError as e:
@@ -397,6 +394,7 @@ def command(
     parent: typer.Typer = app,
     cuda: bool = False,
     settings: str | None = None,
+    fields: Sequence[str] = (),
     scenes: bool = False,
     budgets: bool = False,
     tiles: bool = False,
@@ -407,8 +405,9 @@ def command(
     Args:
         parent: group it belongs to.
         cuda: whether it supports --device cuda.
-        settings: config of --set as MODULE:CLASS, see `Run.settings`, or "" if the command checks it; None
+        settings: config of --set as MODULE:CLASS, see `Run.settled`, or "" if the command checks it; None
             takes no --set.
+        fields: paths of its settings that flags set: those of `FIELDS`, or options named like them.
         scenes: whether it reads scenes and takes --render-model, see `Run.load`.
         budgets: whether it takes budgets, see `g2ard.cli.outputs.budgets_of`.
         tiles: whether it works on scenes in tiles, see `g2ard.cli.tiling.tiling_of`.
@@ -418,13 +417,19 @@ def command(
     def register(fn: Callable[..., None]) -> Callable[..., None]:
         own = list(inspect.signature(fn, eval_str=True).parameters.values())[1:]
         given = BUDGETS if budgets else {}
+        set_by_flags = {
+            path.rpartition(".")[2]: (kind | None, option)
+            for path, (kind, option) in FIELDS.items()
+            if path in fields
+        }
         taken = {**(TILES if tiles else {}), **_COMMON_OPTIONS}
         taken |= {**(_SETTINGS if settings is not None else {}), **(_SCENE_OPTIONS if scenes else {})}
-        shared_options = {**given, **taken}
-        first, last = (
-            [_parameter(key, *options) for key, options in part.items()] for part in (given, taken)
+        shared_options = {**given, **set_by_flags, **taken}
+        first, middle, last = (
+            [_parameter(key, *options) for key, options in part.items()]
+            for part in (given, set_by_flags, taken)
         )
-        all_parameters = [*first, *own, *last]
+        all_parameters = [*first, *own, *middle, *last]
         for p in all_parameters:
             if p.name in (*_COMMON_OPTIONS, *_SETTINGS, *_SCENE_OPTIONS):
                 into_panels(p.name, p.annotation, COMMON)
@@ -438,11 +443,11 @@ def command(
                 typed_last = [*(ctx.default_map or {}).get("set", []), *shared_values["set"]]
                 shared_values["set"] = typed_last
             printing = shared_values.pop("print_config")
-            run = Run(name, shared_values, dict(values), flags_of(ctx.command), outputs)
+            run = Run(name, shared_values, dict(values), flags_of(ctx.command), outputs, fields)
             run.typed = frozenset(name for name in values if typed(ctx, name))
             if printing:
                 if settings and run.config["set"]:
-                    _check_settings(run, settings)
+                    run.settled(resolve_name(settings)(), run.config.get("preset"))
                 typer.echo(printed(ctx, {**values, **shared_values, **run.config}), nl=False)
                 return
             with interrupt.RaisesInterrupt():
@@ -463,12 +468,6 @@ def command(
 def _parameter(name: str, kind: Any, option: Any, default: Any = None) -> inspect.Parameter:
     annotation = Annotated[kind, option]
     return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
-
-
-def _check_settings(run: Run, config: str) -> None:
-    """Check the values of --set for a config, given as MODULE:CLASS."""
-    names = [name for name in ("steps", "recovery_time") if name in run.config]
-    run.settings(resolve_name(config)(), *names, preset=run.config.get("preset"))
 
 
 def _execute(run: Run, fn: Callable[..., None], options: dict[str, Any], cuda: bool) -> None:

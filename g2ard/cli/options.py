@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -14,17 +13,13 @@ from g2ard.config.choices import (
     BLACK,
     Alpha,
     Convention,
-    Engine,
     FormatName,
-    Method,
     PaperPresetName,
-    Policy,
     PresetName,
-    ScheduleName,
     ViewFormat,
     is_made,
 )
-from g2ard.errors import InputError, require_torch
+from g2ard.errors import require_torch
 
 if TYPE_CHECKING:
     from g2ard.cli.frame import Run
@@ -145,39 +140,9 @@ UpOption = Annotated[
 ]
 
 
-class Spot(tuple[float, ...]):
-    """Sphere or box as typed."""
-
-    def __str__(self) -> str:
-        return ",".join(f"{number:.17g}" for number in self)
-
-
-def _spot(text: str) -> Spot:
-    from g2ard.scene.regions import check_region
-
-    try:
-        return Spot(check_region([float(word) for word in text.replace(",", " ").split()]))
-    except InputError as error:
-        raise typer.BadParameter(error.message) from None
-    except ValueError:
-        raise typer.BadParameter(f"expected X,Y,Z,R or X,Y,Z,X,Y,Z, got {text!r}") from None
-
-
-KeepRegionOption = Annotated[
-    list[Spot] | None,
-    typer.Option(
-        parser=_spot,
-        metavar="X,Y,Z,R|X,Y,Z,X,Y,Z",
-        help="Keep more detail in a sphere or box, scene units; repeatable. "
-        "--set keep_times=N changes how much (4).",
-    ),
-]
 SplitOption = Annotated[
     str,
     typer.Option(metavar="train|test|all", help="Views to use; every 8th is test unless a split is given."),
-]
-ShDegreeOption = Annotated[
-    int | None, typer.Option(min=0, max=3, help="SH degree of the result; by default that of the scene.")
 ]
 FormatOption = Annotated[FormatName, typer.Option(case_sensitive=False, help="Format of the scene in RUN.")]
 ViewFormatOption = Annotated[
@@ -232,7 +197,7 @@ BackgroundOption = Annotated[
 
 
 def background_of(run: Run, given: Triple | None, *scenes: Path | None) -> Triple | None:
-    """Return --background, otherwise that of the first run among the scenes, for `run.settings` as well.
+    """Return --background, otherwise that of the first run among the scenes, for `run.settled` as well.
 
     None means the default.
     """
@@ -281,48 +246,11 @@ PaperOption = Annotated[
         metavar="[paper|paper-…]",
     ),
 ]
-ScheduleOption = Annotated[
-    ScheduleName | None,
-    typer.Option(
-        help="Recovery schedule: fast, default or best (at least 300, 1,000 or 6,000 steps, more for photos "
-        "and rooms), or paper (in rounds)."
-    ),
-]
-StepsOption = Annotated[
-    int | None,
-    typer.Option(min=1, help="Steps of the last recovery; by default as many as the schedule needs."),
-]
-MethodOption = Annotated[Method | None, typer.Option(help="Simplification method.")]
-
-
-def _duration(text: str) -> float:
-    match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*(s|m|min|h)?", text.strip())
-    if match is None or not float(match[1]) > 0:
-        raise typer.BadParameter(f"expected a time such as 90s, 2m or 1h, got {text!r}")
-    return float(match[1]) * {"s": 1, "m": 60, "min": 60, "h": 3600}[match[2] or "s"]
-
-
-RecoveryTimeOption = Annotated[
-    float | None,
-    typer.Option(parser=_duration, metavar="TIME", help="Time limit for recovery alone: 90s, 2m or 1h."),
-]
 
 
 def views_count(text: str) -> Count | str:
     """Read K: a count, a share, or auto."""
     return "auto" if text.strip() == "auto" else Count.parse(text)
-
-
-PolicyOption = Annotated[Policy | None, typer.Option(help="Selection criterion.")]
-
-
-EngineOption = Annotated[
-    Engine | None,
-    typer.Option(
-        help="Engine of the steps, with equal results up to rounding: fused (Rust, the default), torch "
-        "(autograd; needs the extra `torch`) or gsplat (NVIDIA GPU, as --device cuda; extra `cuda`)."
-    ),
-]
 
 
 def choose_engine(run: Run, settings: dict[str, Any], path: str) -> None:

@@ -42,7 +42,7 @@ class Within:
         if math.isfinite(high):
             return f"in {self.interval}"
         if math.isinf(low):
-            return "that is finite"
+            return ""
         return f"of at least {low:g}" if self.interval[0] == "[" else f"above {low:g}"
 
 
@@ -180,7 +180,9 @@ def described(kind: Any) -> str:
     if get_origin(kind) in _UNIONS:
         return " or ".join(dict.fromkeys(map(described, options_of(kind))))
     if get_origin(kind) is Annotated:
-        return " ".join([described(bare(kind)), *map(str, kind.__metadata__)])
+        limits = kind.__metadata__[0]
+        finite = bare(kind) is float and limits.interval.endswith("inf)")
+        return f"{'a finite number' if finite else described(bare(kind))} {limits}".rstrip()
     if get_origin(kind) is Literal:
         return f"one of {', '.join(map(str, get_args(kind)))}"
     if get_origin(kind) is tuple:
@@ -242,7 +244,7 @@ def _fits(value: Any, kind: Any) -> bool:
     if origin in _UNIONS:
         return any(_fits(value, option) for option in inner)
     if origin is Annotated:
-        return _fits(value, inner[0]) and all(value in limits for limits in kind.__metadata__)
+        return _fits(value, inner[0]) and value in kind.__metadata__[0]
     if origin is Literal:
         return isinstance(value, str) and value in inner
     if origin is tuple or origin is Sequence:

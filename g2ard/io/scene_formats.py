@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, get_args
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from g2ard.config.choices import FormatName
-from g2ard.errors import OutputError, require
+from g2ard.errors import OutputError
 
 if TYPE_CHECKING:
     from g2ard.io.types import Note
@@ -67,12 +67,6 @@ def scene_format(path: str | Path) -> SceneFormat:
             return output_format
     known = ", ".join(f.suffix for f in FORMATS.values())
     raise OutputError(f"scenes are written as {known}, or as a SOG folder (NAME/meta.json)", path=path)
-
-
-def check_format(name: str) -> None:
-    """Reject a name that is no format of scenes, such as `ply` or `sog`."""
-    known = get_args(FormatName)
-    require("format", repr(name), name.lower() in known, f"one of {', '.join(known)}")
 
 
 def files_of(path: Path) -> list[Path]:

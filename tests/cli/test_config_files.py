@@ -18,7 +18,7 @@ def test_a_config_file_is_written_and_read_by_flags_names(command_line: CommandL
         assert line in out
     wrong = command_line(*ask, "--set", "steps=-3", "--print-config", cwd=folder)
     assert wrong[0] == 2
-    assert "--set: steps: expected at least 1, got -3" in wrong[2]
+    assert "--set: recover.steps: expected a whole number of at least 1 or none, got -3" in wrong[2]
     (folder / "c.toml").write_text(out)
     again = command_line("distill", "ball.ply", "--config", "c.toml", "--print-config", cwd=folder)
     assert again == (0, out, "")
@@ -91,4 +91,4 @@ def test_settings_are_checked_without_running_the_command(command_line: CommandL
     (folder / "run" / "report.json").write_text('{"settings": {"recover.background": [1, 1, 1]}}')
     ask = ("recover", "run", "--views", "views.json", "-o", "out.ply", "--print-config")
     assert succeeds(command_line, folder, *ask, "--set", "steps=3").err == ""
-    assert "--set: steps: expected" in refused(command_line, folder, *ask, "--set", "steps=-3")
+    assert "--set: recover.steps: expected" in refused(command_line, folder, *ask, "--set", "steps=-3")

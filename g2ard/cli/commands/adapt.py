@@ -8,10 +8,11 @@ import typer
 from g2ard.cli import options as opt
 from g2ard.cli.frame import Run, command
 from g2ard.cli.resume import check_scene_run, stoppable
-from g2ard.config.choices import AdaptSchedule
 from g2ard.config.schema import listed
 from g2ard.pipeline.presets import configured
 from g2ard.progress import plural
+
+_FIELDS = "steps tolerance schedule prior_views sh_degree engine background seed"
 
 
 @command(
@@ -19,6 +20,7 @@ from g2ard.progress import plural
     example="g2ard adapt small.ply --views winter/ -o winter.ply",
     cuda=True,
     settings="g2ard.pipeline.adapt:AdaptConfig",
+    fields=tuple(f"adapt.{name}" for name in _FIELDS.split()),
     scenes=True,
 )
 def adapt(
@@ -30,22 +32,6 @@ def adapt(
     alpha: opt.AlphaOption = "composite",
     teacher: opt.TeacherOption = None,
     photos: opt.PhotosOption = False,
-    steps: Annotated[int | None, typer.Option(min=1, help="Maximum steps; 7,000 by default.")] = None,
-    tolerance: Annotated[
-        float | None,
-        typer.Option(
-            min=0, help="Stop when PSNR gains less than this, dB; 0.05 by default, 0 runs all steps."
-        ),
-    ] = None,
-    schedule: Annotated[AdaptSchedule | None, typer.Option(help="Learning rates and decay.")] = None,
-    prior_views: Annotated[
-        float | None,
-        typer.Option(
-            min=0, help="Weight of the old appearance, as a number of views; 1 by default, 0 in the paper."
-        ),
-    ] = None,
-    sh_degree: opt.ShDegreeOption = None,
-    engine: opt.EngineOption = None,
     resume: opt.ResumeOption = False,
     split: opt.SplitOption = "train",
     size: opt.SizeOption = None,
@@ -60,8 +46,7 @@ def adapt(
     if teacher is not None and not photos:
         run.refuse_typed("with --teacher, unless --photos is given", "images", "alpha")
     background = opt.background_of(run, background, compact)
-    names = ("steps", "tolerance", "schedule", "prior_views", "sh_degree", "engine", "background", "seed")
-    settings = run.settings(AdaptConfig(), *names, preset=preset)
+    settings, _ = run.settled(AdaptConfig(), preset)
     opt.choose_engine(run, settings, "adapt.engine")
     config = configured(AdaptConfig(), preset or "auto", settings)
     work = output.parent / f".{output.name}.work"

@@ -9,8 +9,9 @@ from typing import Annotated, Any, Literal
 import typer
 
 from g2ard import io
+from g2ard.cli.fields import ShDegreeOption
 from g2ard.cli.frame import Run, command
-from g2ard.cli.options import ShDegreeOption, numbers
+from g2ard.cli.options import numbers
 from g2ard.config.choices import Axes, PlyLayout
 from g2ard.errors import InputError, OutputError
 from g2ard.io.scene_formats import SceneFormat, check_options, scene_format, written_bytes

@@ -15,7 +15,7 @@ from g2ard.cli.frame import Run, command
 from g2ard.cli.outputs import Outputs, budgets_of
 from g2ard.cli.run_result import say_views, say_weight, tell_quality, told, why_large, write_table
 from g2ard.cli.tiling import tiling_of
-from g2ard.config.choices import Focus, is_made
+from g2ard.config.choices import is_made
 from g2ard.io import kind
 from g2ard.progress import plural
 
@@ -31,6 +31,13 @@ if TYPE_CHECKING:
     example="g2ard distill scene.ply -r 10 -o run/",
     cuda=True,
     settings="g2ard.pipeline.config:DistillConfig",
+    fields=(
+        *("simplify.method", "simplify.keep_region", "select.focus"),
+        *(
+            f"recover.{name}"
+            for name in ("schedule", "steps", "recovery_time", "engine", "background", "seed")
+        ),
+    ),
     scenes=True,
     budgets=True,
     tiles=True,
@@ -60,13 +67,7 @@ def distill(
         Path | None,
         typer.Option(metavar="VIEWS", help="Views to score on. --views is then used for training only."),
     ] = None,
-    method: opt.MethodOption = None,
-    keep_region: opt.KeepRegionOption = None,
     preset: opt.PresetOption = "auto",
-    schedule: opt.ScheduleOption = None,
-    steps: opt.StepsOption = None,
-    recovery_time: opt.RecoveryTimeOption = None,
-    engine: opt.EngineOption = None,
     keep: Annotated[
         bool, typer.Option("--keep", help="Keep the simplified scene too, in RUN/simplified.")
     ] = False,
@@ -82,10 +83,6 @@ def distill(
     ] = True,
     resume: opt.ResumeOption = False,
     size: opt.SizeOption = None,
-    focus: Annotated[
-        Focus | None,
-        typer.Option(help="Make half of the training views of this kind; far: only the usual ones."),
-    ] = None,
     background: opt.BackgroundOption = None,
     up: opt.UpOption = None,
     dry_run: opt.DryRunOption = False,
@@ -104,18 +101,7 @@ def distill(
     from g2ard.pipeline.config import DistillConfig
 
     began = time.monotonic()
-    names = (
-        "method",
-        "keep_region",
-        "schedule",
-        "steps",
-        "recovery_time",
-        "engine",
-        "focus",
-        "background",
-        "seed",
-    )
-    settings = run.settings(DistillConfig(), *names, preset=preset)
+    settings, _ = run.settled(DistillConfig(), preset)
     budgets = budgets_of(run)
     given = views is not None and not is_made(views)
     _check_options(scene, views, held_out, photos)

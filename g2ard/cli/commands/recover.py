@@ -19,12 +19,15 @@ if TYPE_CHECKING:
     from g2ard.report.kinds import KindScore
     from g2ard.stages.recover import Recovered
 
+_FIELDS = "schedule steps recovery_time sh_degree engine background seed"
+
 
 @command(
     "recover",
     example="g2ard recover small.ply --views poses.json --teacher scene.ply -o better.ply",
     cuda=True,
     settings="g2ard.stages.recover:RecoverConfig",
+    fields=tuple(f"recover.{name}" for name in _FIELDS.split()),
     scenes=True,
 )
 def recover(
@@ -41,11 +44,6 @@ def recover(
         typer.Option(metavar="SCENE", help="The student before any recovery, if it was recovered before."),
     ] = None,
     preset: opt.PresetOption = "auto",
-    schedule: opt.ScheduleOption = None,
-    steps: opt.StepsOption = None,
-    recovery_time: opt.RecoveryTimeOption = None,
-    sh_degree: opt.ShDegreeOption = None,
-    engine: opt.EngineOption = None,
     resume: opt.ResumeOption = False,
     split: opt.SplitOption = "train",
     weighted: Annotated[
@@ -63,8 +61,7 @@ def recover(
     if teacher is not None and not photos:
         run.refuse_typed("with --teacher, unless --photos is given", "alpha")
     background = opt.background_of(run, background, student)
-    names = ("schedule", "steps", "recovery_time", "sh_degree", "engine", "background", "seed")
-    settings = run.settings(RecoverConfig(), *names, preset=preset)
+    settings, _ = run.settled(RecoverConfig(), preset)
     with run.usage():
         check_teacher(views, teacher)
     checkpoint = output.parent / f".{output.name}.checkpoint.npz"

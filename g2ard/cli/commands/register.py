@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     "register",
     example="g2ard register small.ply --photos new/ --focal 1200 --poses coarse.txt -o poses.json",
     settings="g2ard.stages.register:RegisterConfig",
+    fields=tuple(f"register.{name}" for name in ("size", "matcher", "refine", "passes", "accept")),
     scenes=True,
     outputs=("output", "report"),
 )
@@ -115,7 +116,7 @@ def register(
     from g2ard.stages.register.report import summarize
     from g2ard.viewer import check_page_output
 
-    settings = run.settings(RegisterConfig(), "size", "matcher", "refine", "passes", "accept")
+    settings = run.settled(RegisterConfig())[0]
     with run.usage():
         config, keep = configured(RegisterConfig(), settings, protocol, keep)
     if config.matcher == "direct":

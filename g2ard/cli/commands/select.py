@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     "select",
     example="g2ard select scene.ply --views poses.json -k 100 -o chosen.json",
     settings="g2ard.pipeline.config:SelectConfig",
+    fields=("select.policy",),
     scenes=True,
 )
 def select(
@@ -41,7 +42,6 @@ def select(
     ] = None,
     views: opt.ViewsOption = None,
     images: opt.ImagesOption = None,
-    policy: opt.PolicyOption = None,
     split: opt.SplitOption = "train",
     preset: opt.PaperOption = None,
 ) -> None:
@@ -55,7 +55,7 @@ def select(
     from g2ard.stages.select import SurfaceOptions
     from g2ard.stages.select import select as choose
 
-    settings = run.settings(SelectConfig(), "policy", preset=preset)
+    settings = run.settled(SelectConfig(), preset)[0]
     if k is not None:
         settings["select.views_count"] = k.value if isinstance(k, Count) else k
     if views is None:

@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     "simplify",
     example="g2ard simplify garden.ply -r 10 -o garden_10x.ply",
     settings="g2ard.stages.simplify:SimplifyConfig",
+    fields=("simplify.method", "simplify.keep_region"),
     scenes=True,
     budgets=True,
     tiles=True,
@@ -47,8 +48,6 @@ def simplify(
         bool, typer.Option("--no-views", help="Use no cameras, neither found nor generated.")
     ] = False,
     preset: opt.PaperOption = None,
-    method: opt.MethodOption = None,
-    keep_region: opt.KeepRegionOption = None,
     up: opt.UpOption = None,
     output: opt.OutputOption,
     parents: Annotated[
@@ -69,11 +68,11 @@ def simplify(
     from g2ard.jobs.tiling import is_tiled
     from g2ard.stages.simplify import SimplifyConfig
 
-    config = run.settled(SimplifyConfig(), "method", "keep_region", preset=preset)[1]
+    config = run.settled(SimplifyConfig(), preset)[1]
     budgets = budgets_of(run)
     if views is not None and no_views:
         raise typer.BadParameter("--views and --no-views exclude each other; give one")
-    if keep_region and no_views:
+    if run.config["keep_region"] and no_views:
         raise typer.BadParameter("--keep-region needs views; remove --no-views")
     if config.method == "paper":
         run.refuse_typed("on the method paper", "views", "images")

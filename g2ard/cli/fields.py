@@ -1,0 +1,91 @@
+"""Flags of settings, by the paths of the settings; `g2ard.cli.frame.command` adds them to commands."""
+
+import re
+from typing import Annotated, Any
+
+import typer
+
+from g2ard.config.choices import AdaptSchedule, Engine, Focus, Method, Policy, ScheduleName
+from g2ard.errors import InputError
+
+
+class Spot(tuple[float, ...]):
+    """Sphere or box as typed."""
+
+    def __str__(self) -> str:
+        return ",".join(f"{number:.17g}" for number in self)
+
+
+def _spot(text: str) -> Spot:
+    from g2ard.scene.regions import check_region
+
+    try:
+        return Spot(check_region([float(word) for word in text.replace(",", " ").split()]))
+    except InputError as error:
+        raise typer.BadParameter(error.message) from None
+    except ValueError:
+        raise typer.BadParameter(f"expected X,Y,Z,R or X,Y,Z,X,Y,Z, got {text!r}") from None
+
+
+def _duration(text: str) -> float:
+    match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*(s|m|min|h)?", text.strip())
+    if match is None or not float(match[1]) > 0:
+        raise typer.BadParameter(f"expected a time such as 90s, 2m or 1h, got {text!r}")
+    return float(match[1]) * {"s": 1, "m": 60, "min": 60, "h": 3600}[match[2] or "s"]
+
+
+_SH_DEGREE = typer.Option(min=0, max=3, help="SH degree of the result; by default that of the scene.")
+ShDegreeOption = Annotated[int | None, _SH_DEGREE]
+_ENGINE = typer.Option(
+    help="Engine of the steps, with equal results up to rounding: fused (Rust, the default), torch "
+    "(autograd; needs the extra `torch`) or gsplat (NVIDIA GPU, as --device cuda; extra `cuda`)."
+)
+FIELDS: dict[str, tuple[Any, Any]] = {
+    "simplify.method": (Method, typer.Option(help="Simplification method.")),
+    "simplify.keep_region": (
+        list[Spot],
+        typer.Option(
+            parser=_spot,
+            metavar="X,Y,Z,R|X,Y,Z,X,Y,Z",
+            help="Keep more detail in a sphere or box, scene units; repeatable. "
+            "--set keep_times=N changes how much (4).",
+        ),
+    ),
+    "select.policy": (Policy, typer.Option(help="Selection criterion.")),
+    "select.focus": (
+        Focus,
+        typer.Option(help="Make half of the training views of this kind; far: only the usual ones."),
+    ),
+    "recover.schedule": (
+        ScheduleName,
+        typer.Option(
+            help="Recovery schedule: fast, default or best (at least 300, 1,000 or 6,000 steps, more for "
+            "photos and rooms), or paper (in rounds)."
+        ),
+    ),
+    "recover.steps": (
+        int,
+        typer.Option(min=1, help="Steps of the last recovery; by default as many as the schedule needs."),
+    ),
+    "recover.recovery_time": (
+        float,
+        typer.Option(parser=_duration, metavar="TIME", help="Time limit for recovery alone: 90s, 2m or 1h."),
+    ),
+    **{f"{stage}.sh_degree": (int, _SH_DEGREE) for stage in ("recover", "adapt")},
+    **{f"{stage}.engine": (Engine, _ENGINE) for stage in ("recover", "adapt")},
+    "adapt.steps": (int, typer.Option(min=1, help="Maximum steps; 7,000 by default.")),
+    "adapt.tolerance": (
+        float,
+        typer.Option(
+            min=0, help="Stop when PSNR gains less than this, dB; 0.05 by default, 0 runs all steps."
+        ),
+    ),
+    "adapt.schedule": (AdaptSchedule, typer.Option(help="Learning rates and decay.")),
+    "adapt.prior_views": (
+        float,
+        typer.Option(
+            min=0, help="Weight of the old appearance, as a number of views; 1 by default, 0 in the paper."
+        ),
+    ),
+}
+"""Path of a setting → type and option of its flag."""
