@@ -18,7 +18,7 @@ from g2ard.io.packing import (
     coded,
     from_smallest_three,
     log_scales,
-    morton_order,
+    packing_order,
     rounding,
     smallest_three,
     unit_quats,
@@ -121,13 +121,13 @@ def _coefficient(codes: NDArray[Any]) -> NDArray[np.float64]:
 def write(path: Path, splats: Splats, *, overwrite: bool = False) -> float:
     """Write a .compressed.ply: 16 bytes per Gaussian, plus one per harmonic past band 0.
 
-    Gaussians are written in Morton order, which keeps the bounds of chunks tight. An `offset` and the render
+    Gaussians are written in `packing_order`, which keeps the bounds of chunks tight. An `offset` and the render
     model are stored in comments, as in .ply. Return the largest change of a position by rounding.
     """
     from plyfile import PlyData, PlyElement
 
     given = writable(path, splats)
-    given = given.take(morton_order(given.means))
+    given = given.take(packing_order(given.means, _CHUNK_ROWS))
     splats = given.narrowed()
     bounds: dict[str, NDArray[np.float32]] = {}
     words = np.empty(len(splats), [(name, "<u4") for name in _PACKED])

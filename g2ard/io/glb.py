@@ -21,7 +21,7 @@ from g2ard.errors import InputError, damaged, require
 from g2ard.io import spz
 from g2ard.io.atomic import atomic_output
 from g2ard.io.jsonfile import Number, Place, Row, Vector, Whole, checked, parse_json
-from g2ard.io.packing import morton_order, rounding, unit_quats, writable
+from g2ard.io.packing import packing_order, rounding, unit_quats, writable
 from g2ard.io.sanitize import Raw, cleaned
 from g2ard.io.types import Note, Scene
 from g2ard.progress import plural
@@ -99,10 +99,10 @@ def spz_glb(path: Path, splats: Splats, centre: NDArray[np.float64] | None = Non
         splats: the scene, whose `offset` is the node's translation.
         centre: (3,) moved from the means to the node's translation, so that coordinates are fine.
     """
-    splats = splats.take(morton_order(splats.means))
     centre = np.zeros(3) if centre is None else centre
+    bits = spz.fraction_bits(path, splats.means.astype(np.float64) - centre, splats)
+    splats = splats.take(packing_order(splats.means))
     means = (splats.means.astype(np.float64) - centre) * (-1, 1, -1)
-    bits = spz.fraction_bits(path, means, splats)
     blob = spz.encoded(path, _about_y(splats), means, bits, _SPZ_VERSION)
     stored = np.rint(means * (1, -1, -1) * (1 << bits)) / (1 << bits)
     ends = {end: getattr(stored, end)(axis=0).tolist() for end in ("min", "max")}

@@ -1,5 +1,6 @@
 """Helpers for writers of packed formats: checks, row order, quaternions."""
 
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,9 @@ from g2ard.io.sanitize import LOG_SCALE_LIMIT
 from g2ard.scene.splats import Splats
 
 _MORTON_BITS = 21
+
+_NEAR = 4.0
+"""Distance of near rows from the median, as a multiple of the 75th percentile of all distances."""
 
 _OTHER_COMPONENTS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
 """Indices of the components of a quaternion other than one."""
@@ -58,12 +62,30 @@ def world_means(path: Path, splats: Splats, what: str) -> NDArray[np.float64]:
     return means
 
 
-def morton_order(means: NDArray[Any]) -> NDArray[np.intp]:
-    """Return rows in Morton order (2²¹ cells per axis, ties by row), which packs better.
+def packing_order(means: NDArray[Any], chunk: int = 1) -> NDArray[np.intp]:
+    """Return rows by shells of distance from the median, and in Morton order within a shell.
 
-    >>> morton_order(np.array([[1.0, 1, 1], [0, 0, 0], [0.9, 1, 1]])).tolist()
+    Rows up to four times the 75th percentile of the distances are one shell, and each doubling beyond is
+    another, so that a few far rows coarsen neither the cells of the others nor the bounds of their chunks.
+    The farthest rows of a shell that do not fill a chunk of `chunk` rows belong to the next one.
+
+    >>> packing_order(np.array([[1.0, 1, 1], [0, 0, 0], [0.9, 1, 1]])).tolist()
     [1, 2, 0]
     """
+    away = np.linalg.norm(means.astype(np.float64) - np.median(means, axis=0), axis=1)
+    near = _NEAR * np.percentile(away, 75)
+    if not near > 0 or away.max() < near:
+        return morton_order(means)
+    shells = 1 + np.floor(np.log2(np.maximum(away / near, 0.5))).astype(np.intp)
+    outwards = np.argsort(away, kind="stable")
+    ends = np.cumsum(np.bincount(shells)) // chunk * chunk
+    ends = np.unique([0, *ends[:-1], len(means)])
+    groups = (np.sort(outwards[a:b]) for a, b in pairwise(ends))
+    return np.concatenate([rows[morton_order(means[rows])] for rows in groups])
+
+
+def morton_order(means: NDArray[Any]) -> NDArray[np.intp]:
+    """Return rows in Morton order (2²¹ cells per axis, ties by row)."""
     low, high = means.min(axis=0).astype(np.float64), means.max(axis=0).astype(np.float64)
     size = max(float((high - low).max()), np.finfo(float).tiny)
     cells = ((means - low) / size * ((1 << _MORTON_BITS) - 1)).astype(np.uint64)

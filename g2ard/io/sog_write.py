@@ -23,7 +23,7 @@ from g2ard import _core
 from g2ard._core import __version__
 from g2ard.errors import InputError
 from g2ard.io.atomic import atomic_folder, atomic_output
-from g2ard.io.packing import coded, log_scales, morton_order, rounding, smallest_three, unit_quats, writable
+from g2ard.io.packing import coded, log_scales, packing_order, rounding, smallest_three, unit_quats, writable
 from g2ard.progress import Progress, silent
 from g2ard.scene.shape import longer_axes
 from g2ard.scene.splats import Splats
@@ -87,13 +87,13 @@ def palette_size(count: int) -> int:
 def sog_files(
     path: Path, splats: Splats, *, ordered: bool = False, progress: Progress = silent
 ) -> dict[str, bytes]:
-    """Return the files of a scene by name, meta.json last; rows in Morton order unless already `ordered`.
+    """Return the files of a scene by name, meta.json last; rows in `packing_order` unless already `ordered`.
 
     An `offset` is stored under "g2ard" in meta.json; other programs show the recentred scene.
     """
     splats = writable(path, splats).narrowed()
     if not ordered:
-        splats = splats.take(morton_order(splats.means))
+        splats = splats.take(packing_order(splats.means))
     width, height = _size(path, len(splats))
     files, meta = {}, {"version": 2, "asset": {"generator": f"g2ard {__version__}"}, "count": len(splats)}
     meta["antialias"] = splats.antialiased

@@ -23,7 +23,7 @@ from g2ard.io.atomic import atomic_output
 from g2ard.io.limits import check_unpacked
 from g2ard.io.sanitize import Raw, cleaned, logits_of
 from g2ard.io.types import Note, Scene
-from g2ard.progress import Progress, silent
+from g2ard.progress import Progress, plural, silent
 from g2ard.scene.splats import Splats
 from g2ard.scene.transform import change_of_axes, with_axes
 
@@ -251,19 +251,19 @@ def write(
     splat-transform and SuperSplat read every .spz. Return the largest change of a position by rounding.
     """
     require("spz_version", spz_version, spz_version in (2, 3, 4), "2, 3 or 4")
-    if axes != "RUB":
-        if spz_version != 4 and axes != "RDF":
-            raise InputError(
-                f"version {spz_version} has RUB axes, or RDF for programs that expect those of a .ply",
-                path=path,
-                hint="{spz_version=4} can name others",
-            )
-        splats = with_axes(splats, change_of_axes("RUB", "RDF") @ change_of_axes("RDF", axes))
+    if axes not in ("RUB", "RDF") and spz_version != 4:
+        raise InputError(
+            f"version {spz_version} has RUB axes, or RDF for programs that expect those of a .ply",
+            path=path,
+            hint="{spz_version=4} can name others",
+        )
     splats = packing.writable(path, splats)
-    splats = splats.take(packing.morton_order(splats.means))
+    bits = fraction_bits(path, packing.world_means(path, splats, ".spz"), splats)
+    if axes != "RUB":
+        splats = with_axes(splats, change_of_axes("RUB", "RDF") @ change_of_axes("RDF", axes))
+    splats = splats.take(packing.packing_order(splats.means))
     means = packing.world_means(path, splats, ".spz")
     named: Axes = axes if spz_version == 4 else "RUB"
-    bits = fraction_bits(path, means, splats)
     content = encoded(path, splats, means, bits, spz_version, named, progress)
     with atomic_output(path, overwrite) as temporary:
         temporary.write_bytes(content)
@@ -322,23 +322,44 @@ def fraction_bits(path: Path, means: NDArray[np.float64], splats: Splats) -> int
     Usually 12. More, as far as the extent allows, if a step of 2^−12 exceeds a quarter of the 1st percentile
     of the Gaussians' middle scales.
 
+    Args:
+        path: file for messages.
+        means: (N, 3) coordinates to store.
+        splats: the Gaussians, in the same order.
+
     Raises:
-        InputError: steps exceed both 2^−12 and the median middle scale.
+        InputError: steps exceed both 2^−12 and the median middle scale; if that is due to a few Gaussians, it
+            names them and the box of the others.
     """
-    farthest = float(np.abs(means).max())
+    reach = np.abs(means).max(axis=1)
+    farthest = float(reach.max())
     # 23 bits beside the sign; the margin keeps what is just below a power of two from rounding up to 2^23
     room = 23 - math.ceil(math.log2(max(farthest, 2.0**-20) * (1 + 2**-20)))
     middle = np.sort(splats.scales, axis=1)[:, 1].astype(np.float64)
     fine_scale = max(float(np.percentile(middle, 1)), 1e-12)
     bits_for_fine_scale = math.ceil(-math.log2(fine_scale / 4))
     bits = min(max(_USUAL_BITS, bits_for_fine_scale), _MOST_BITS, room)
-    if bits < 0 or 2.0**-bits > max(float(np.median(middle)), 2.0**-_USUAL_BITS):
+    coarsest = max(float(np.median(middle)), 2.0**-_USUAL_BITS)
+    if bits >= 0 and 2.0**-bits <= coarsest:
+        return bits
+    far = np.flatnonzero(reach * (1 + 2**-20) > 2.0 ** (23 - max(0, math.ceil(-math.log2(coarsest)))))
+    steps = f"(steps of {2.0**-bits:g})"
+    if 2 * len(far) > len(means):
         raise InputError(
-            f".spz is too coarse at {farthest:g} from the origin (steps of {2.0**-bits:g})",
+            f".spz is too coarse at {farthest:g} from the origin {steps}",
             path=path,
             hint="write another format, or drop the offset with `g2ard convert --recentre`",
         )
-    return bits
+    near = np.delete(splats.means, far, axis=0).astype(np.float64) + splats.offset
+    ends = [*np.floor(near.min(axis=0)), *np.ceil(near.max(axis=0))]
+    first = ", ".join(map(str, far[:3].tolist())) + (", …" if len(far) > 3 else "")
+    raise InputError(
+        f".spz is too coarse at {farthest:g} from the origin {steps}, where {plural(len(far), 'Gaussian')} "
+        f"of {len(means):,} lie (row {first})",
+        path=path,
+        hint=f"crop the scene with `g2ard convert --box={','.join(f'{v:.0f}' for v in ends)}`, or write "
+        "another format",
+    )
 
 
 def _streams(splats: Splats, means: NDArray[np.float64], bits: int, version: int) -> list[bytes]:

@@ -25,7 +25,7 @@ from g2ard.config.checks import checks_arguments
 from g2ard.errors import InputError
 from g2ard.io.atomic import atomic_folder
 from g2ard.io.jsonfile import read_json
-from g2ard.io.packing import morton_order
+from g2ard.io.packing import packing_order
 from g2ard.io.sog_write import sog_files
 from g2ard.levels.tree import Cut, Leaf, Level, Node
 from g2ard.levels.tree import cut as cut_tree
@@ -188,7 +188,7 @@ class _Files:
         leaves = self.parts[name]
         splats = self.levels[self.level_of[name]].take(np.concatenate(leaves))
         starts = np.cumsum([0, *map(len, leaves)])
-        order = [a + morton_order(splats.means[a:b]) for a, b in pairwise(starts)]
+        order = [a + packing_order(splats.means[a:b]) for a, b in pairwise(starts)]
         return splats.take(np.concatenate(order))
 
 

@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,9 +13,10 @@ from g2ard import _core
 from g2ard.errors import InputError, OutputError
 from g2ard.io import check_scene_output, read_scene, read_splats, write_splats
 from g2ard.io.glb import EXTENSION, SPZ_EXTENSION
-from g2ard.io.packing import morton_order, unit_quats
+from g2ard.io.packing import packing_order, unit_quats
 from g2ard.io.sog_write import nearest, palette_size, sog_files
 from g2ard.io.spz import fraction_bits
+from g2ard.jobs.convert import convert
 from g2ard.scene.splats import Splats
 from g2ard.scene.transform import transform
 from helpers.glb_files import glb_parts, write_glb
@@ -42,7 +44,7 @@ def scene(count: int = 700, degree: int = 2, seed: int = 0) -> Splats:
 
 
 def in_order(splats: Splats) -> Splats:
-    return splats.take(morton_order(splats.means))
+    return splats.take(packing_order(splats.means))
 
 
 def turned(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -232,6 +234,70 @@ def test_spz_bits_follow_the_extent(tmp_path: Path) -> None:
     fine = Splats.create([[1e7, 0, 0], [0, 0, 0]], scales=np.full((2, 3), 0.01))
     with pytest.raises(InputError, match=r"at 1e\+07 from the origin \(steps of 2\)"):
         write_splats(tmp_path / "fine.spz", fine)
+
+
+def with_far(count: int, times: float, unit: float, seed: int, around: int = 400) -> Splats:
+    """A dense ball of 4,000 rows, `around` rows up to 60 radii away, and `count` rows at `times` radii."""
+    rng = np.random.default_rng(seed)
+    ways = rng.normal(size=(4000 + around + count, 3))
+    ways /= np.linalg.norm(ways, axis=1, keepdims=True)
+    away = [rng.uniform(0, 1, 4000), np.exp(rng.uniform(1, 4, around)), np.full(count, times)]
+    means = (ways * np.concatenate(away)[:, None] * unit)[rng.permutation(len(ways))]
+    sizes = 0.02 * unit * rng.uniform(0.5, 2, (len(ways), 3))
+    return Splats.create(means.astype(np.float32), scales=sizes, logit_opacities=np.full(len(ways), 2.0))
+
+
+@pytest.mark.parametrize("name", ["compressed.ply", "sog", "spz", "glb", "splat"])
+@pytest.mark.parametrize(
+    ("count", "times", "unit"), [(1, 3e3, 1.0), (10, 3e3, 0.02), (10, 100.0, 30.0), (300, 1000.0, 1.0)]
+)
+def test_far_rows_leave_the_others_precise(
+    tmp_path: Path, name: str, count: int, times: float, unit: float
+) -> None:
+    """Of three quarters of the rows, positions keep 60 dB of the ball's size."""
+    truth = with_far(count, times, unit, seed=count)
+    found = read_splats(saved(tmp_path, name, truth, **({"compress": "spz"} if name == "glb" else {})))
+    near = truth.means[np.linalg.norm(truth.means, axis=1) < 0.8 * unit]
+    near, stored = near[::10].astype(float), found.means.astype(float)
+    off = np.linalg.norm(near[:, None] - stored, axis=2).min(axis=1)
+    steps = {"spz": 2.0**-12, "glb": 2.0**-12, "sog": 2 * np.log1p(times * unit) / 65535}  # of all rows
+    assert np.sqrt((off**2).mean()) < max(1e-3 * unit, 2 * steps.get(name, 0.0))
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("chunk", [1, 7, 256])
+def test_packing_order_keeps_shells_apart(seed: int, chunk: int) -> None:
+    """Each row occurs once; fewer rows than a chunk per shell are in chunks with rows of outer shells."""
+    rng = np.random.default_rng(seed)
+    means = rng.normal(size=(3000, 3)) * np.exp(rng.exponential(1 + seed, (3000, 1)))
+    order = packing_order(means, chunk)
+    assert sorted(order) == list(range(3000))
+    away = np.linalg.norm(means - np.median(means, axis=0), axis=1)
+    shells = np.floor(np.log2(np.maximum(away / np.percentile(away, 75) / 4, 0.5)))[order]
+    parts = [shells[at : at + chunk] for at in range(0, 3000, chunk)]
+    inner = sum(np.count_nonzero(part < part.max()) for part in parts)
+    assert inner <= (chunk - 1) * (len(np.unique(shells)) - 1)
+    if chunk == 1:
+        assert (np.diff(shells) >= 0).all()
+
+
+@pytest.mark.parametrize("name", ["a.spz", "a.glb"])
+@pytest.mark.parametrize(("count", "times", "shift"), [(1, 1e6, 0.0), (10, 3e5, -40.0), (600, 1e7, 7.0)])
+def test_what_is_too_far_for_an_spz_is_named_with_a_box(
+    tmp_path: Path, name: str, count: int, times: float, shift: float
+) -> None:
+    options = {"compress": "spz"} if name == "a.glb" else {}
+    truth = with_far(count, times, 1.0, seed=count)
+    truth = replace(truth, means=truth.means + np.float32(shift))
+    first = np.flatnonzero(np.abs(truth.means).max(1) > 1e5)[0]
+    with pytest.raises(
+        InputError, match=rf"{count} Gaussians? of [\d,]+ lie \(row {first}\b.*--box="
+    ) as error:
+        write_splats(tmp_path / name, truth, **options)
+    box = [float(v) for v in re.search(r"--box=([-\d.,]+\d)", str(error.value))[1].split(",")]
+    cropped = convert(truth, box=box)
+    assert len(cropped) == len(truth) - count
+    write_splats(tmp_path / name, cropped, **options)
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
