@@ -15,6 +15,7 @@ from g2ard.io import ply
 from g2ard.io.scene_formats import scene_format
 from g2ard.io.tile_store import TileStore
 from g2ard.jobs.budget import Budget
+from g2ard.jobs.causes import say_gaps
 from g2ard.jobs.distill_options import DistillOptions
 from g2ard.jobs.tiled import distill_in_tiles, simplify_in_tiles, working
 from g2ard.jobs.tiling import Tiling, refuse_whole, whole_budgets, whole_options
@@ -68,10 +69,13 @@ class TiledCommand:
                     **self._report(store, small),
                     "views": small.views,
                     "unseen": small.unseen,
+                    "growth": small.growth,
+                    "opacity_lost": small.opacity_lost,
                     "method": "default",
                     "settings": listed(config.turned("default").resolved(antialiased=antialiased)),
                 }
                 seconds = report["seconds"]["total"]
+                say_gaps(small.opacity_lost, run.say)
                 run.say(f"{place}: {len(small):,} of {store.count:,} Gaussians in {seconds:.1f} s")
                 reports.append(report)
         run.results(reports)

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from g2ard.config.choices import Colour
 from g2ard.io.images import colour_text, photo_traits
-from g2ard.progress import plural
+from g2ard.progress import Say, plural
 from g2ard.rendering.metrics import psnr
 from g2ard.rendering.renderer import Renderer
 from g2ard.rendering.targets import Targets, against_of, mask_of
@@ -47,6 +47,27 @@ _COARSE_GAUSSIAN_SHARE = 0.01
 
 _FAR_CAMERA_DISTANCES = 2.0
 """Distance of held-out cameras to the next training camera, in distances between training cameras."""
+
+
+_GAPS = 0.02
+"""Least share of opacity lost that shows as gaps."""
+
+
+def say_gaps(lost: float | None, say: Say) -> None:
+    """Warn if a simplified scene lets light through where the dense one did not.
+
+    Args:
+        lost: `opacity_lost` of its report.
+
+    >>> say_gaps(0.031, print)  # doctest: +ELLIPSIS
+    gaps: surfaces let 3.1 % of the light through that they stopped before; ...
+    >>> say_gaps(0.001, print)
+    """
+    if lost is not None and lost >= _GAPS:
+        say(
+            f"gaps: surfaces let {100 * lost:.1f} % of the light through that they stopped before; keep more "
+            "Gaussians, or close them by recovery (g2ard distill)"
+        )
 
 
 def likely_causes(

@@ -19,6 +19,7 @@ from g2ard.errors import InputError
 from g2ard.io.detect import kind
 from g2ard.io.reports import Report
 from g2ard.jobs.budget import Budget
+from g2ard.jobs.causes import say_gaps
 from g2ard.jobs.distill import prepare
 from g2ard.jobs.distill_options import DistillOptions
 from g2ard.jobs.estimate import Estimate, estimate
@@ -293,7 +294,9 @@ def _level(
 def _merged(job: DistillJob, finer: Splats, count: int) -> Splats:
     """Merge to the next level, weighted by visibility in the training views."""
     visibility = visibility_source(job.views.train.cameras, progress=job.progress)
-    return simplify(finer, count, visibility=visibility, progress=job.progress).splats
+    merged = simplify(finer, count, visibility=visibility, compare=True, progress=job.progress)
+    say_gaps(merged.report.opacity_lost, job.say)
+    return merged.splats
 
 
 @checks_arguments

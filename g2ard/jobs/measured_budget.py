@@ -97,6 +97,7 @@ class Reduction:
                 self.splats,
                 count,
                 visibility=self._visibility if count < len(self.splats) else None,
+                compare=True,
                 config=self.config,
                 progress=self.progress,
             )
@@ -119,22 +120,26 @@ class Reduction:
                 progress=self.progress,
                 say=self.say,
             )
-        return None if cameras is None else _remembering(visibility_source(cameras, progress=self.progress))
+        if cameras is None:
+            return None
+        source = visibility_source(cameras, progress=self.progress)
+        return _Remembering(source, source.views)
 
 
-def _remembering(source: VisibilitySource) -> VisibilitySource:
-    """Cache the visibility of the first scene, which every reduction starts with."""
-    first: list[tuple[Splats, Visibility]] = []
+class _Remembering:
+    """A source of visibility that keeps that of its first scene, with which every reduction starts."""
 
-    def remembered(scene: Splats) -> Visibility:
-        if first and _same(first[0][0], scene):
-            return first[0][1]
-        seen = source(scene)
-        if not first:
-            first.append((scene, seen))
+    def __init__(self, source: VisibilitySource, views: Cameras) -> None:
+        self.source, self.views = source, views
+        self.first: tuple[Splats, Visibility] | None = None
+
+    def __call__(self, scene: Splats) -> Visibility:
+        if self.first is not None and _same(self.first[0], scene):
+            return self.first[1]
+        seen = self.source(scene)
+        if self.first is None:
+            self.first = scene, seen
         return seen
-
-    return remembered
 
 
 def _same(a: Splats, b: Splats) -> bool:

@@ -9,6 +9,7 @@ from typing import Any
 from g2ard.config.checks import checks_arguments
 from g2ard.config.choices import FormatName, RenderModel
 from g2ard.jobs.budget import Budget
+from g2ard.jobs.causes import say_gaps
 from g2ard.jobs.inputs import Views, load_scene
 from g2ard.jobs.measured_budget import Reduction, aim_of
 from g2ard.pipeline.presets import configured
@@ -101,6 +102,7 @@ def simplify(
     )
     aim = aim_of(wanted, reduce, name, f"scene.{format}")
     small = reduce(aim.count)
+    say_gaps(small.report.opacity_lost, say)
     if judgement := aim.judge(small.splats):
         say(judgement[1])
     return small

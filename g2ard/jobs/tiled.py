@@ -20,6 +20,7 @@ from g2ard.io.lock import locked
 from g2ard.io.tile_store import StoredScene, TileStore
 from g2ard.io.types import ViewSet
 from g2ard.jobs.budget import Budget
+from g2ard.jobs.causes import say_gaps
 from g2ard.jobs.distill_options import DistillOptions
 from g2ard.jobs.inputs import Views, load_view_sets, say_regions
 from g2ard.jobs.levels import LevelReport, check_ratios, level_size
@@ -196,7 +197,8 @@ def simplify_in_tiles(
                 say=say,
             )
         for count in counts:
-            yield store, simplify_tiles(run, count, cameras if count < store.count else None)
+            seen = cameras if count < store.count else None
+            yield store, simplify_tiles(run, count, seen, compare=True)
 
 
 def distill_in_tiles(
@@ -282,7 +284,7 @@ def lod_in_tiles(
                 level, report = job.store, LevelReport(job.store.count, 1.0, size, 0.0)
             else:
                 count = Budget(ratio=ratio).of(job.store.count, str(scene))
-                level, finer, around, report = _level(job, finer, around, count, ratio)
+                level, finer, around, report = _level(job, finer, around, count, ratio, say)
             say(report.line(number))
             levels.append(StoredScene(level))
             reports.append(report)
@@ -290,13 +292,14 @@ def lod_in_tiles(
 
 
 def _level(
-    job: _Job, finer: TileStore, around: Surroundings | None, count: int, ratio: float
+    job: _Job, finer: TileStore, around: Surroundings | None, count: int, ratio: float, say: Say
 ) -> tuple[TileStore, TileStore, Surroundings, LevelReport]:
     """Return the level, its unrecovered version, the placement of the dense tiles and a report."""
     began = time.perf_counter()
     longest = level_size(job.views.train.cameras, ratio)
     views = job.views.resized(longest)
     small = job.simplified(finer, count, (views if job.learn else job.views).train.cameras)
+    say_gaps(small.opacity_lost, say)
     around = around or small.surroundings  # the first level is merged from the dense scene itself
     assert around is not None  # views are given
     merged = job.stored(small, "merged")
@@ -337,7 +340,8 @@ class _Job:
 
     def simplified(self, store: TileStore, count: int, cameras: Cameras) -> TiledScene:
         """Simplify a scene in tiles: the dense one, or one derived from it."""
-        return simplify_tiles(TiledRun(store, self.workers, self.config.simplify), count, cameras)
+        run = TiledRun(store, self.workers, self.config.simplify)
+        return simplify_tiles(run, count, cameras, compare=not self.learn)
 
     def recovered(
         self, small: TiledScene, around: Surroundings, views: RunViews

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -119,9 +118,7 @@ class SampledVisibility:
     pixel_size: _Floats
 
 
-def visibility_source(
-    cameras: Cameras, *, longest: int = LONGEST, progress: Progress = silent
-) -> Callable[[Splats], SampledVisibility]:
+def visibility_source(cameras: Cameras, *, longest: int = LONGEST, progress: Progress = silent) -> _Sampler:
     """Return a function that samples a scene's visibility from a few small renders, for `simplify`.
 
     Views are rendered in rounds of sixteen until a round finds under 1 % more of the Gaussians, and at least
@@ -136,14 +133,15 @@ def visibility_source(
         progress: called after each view.
 
     Returns:
-        scene → `SampledVisibility`. The scene's arrays are C-contiguous and float32, except its means. A
-        `g2ard.scene.prepared.PreparedScene` is not sorted again.
+        scene → `SampledVisibility`, with the attribute `views`, the usual views at this size. The scene's
+        arrays are C-contiguous and float32, except its means. A `g2ard.scene.prepared.PreparedScene` is not
+        sorted again.
     """
     return _Sampler(cameras, longest, progress)
 
 
 class _Sampler:
-    """Function of `visibility_source`: `rounds` of usual views, of which the first `used` are rendered, and
+    """Function of `visibility_source`: `rounds` of usual `views`, of which the first `used` are rendered, and
     `others`."""
 
     def __init__(self, cameras: Cameras, longest: int, progress: Progress) -> None:
@@ -152,10 +150,10 @@ class _Sampler:
         other = np.setdiff1d(every, usual)
         self.others = cameras.take(other[evenly_spaced(len(other), _OTHER_VIEWS)]).resized(longest)
         full = cameras.take(usual[evenly_spaced(len(usual), MOST_VIEWS)])
-        self.cameras = full.resized(longest)
-        self.shrunk = np.float32((self.cameras.widths / full.widths).mean())
-        apart = max(1, math.ceil(len(self.cameras) / ROUND))
-        self.rounds = [range(first, len(self.cameras), apart) for first in spread(apart)]
+        self.views = full.resized(longest)
+        self.shrunk = np.float32((self.views.widths / full.widths).mean())
+        apart = max(1, math.ceil(len(self.views) / ROUND))
+        self.rounds = [range(first, len(self.views), apart) for first in spread(apart)]
         self.used = 0  # until the first scene decides it
         self.settings = RasterSettings()
         self.progress = progress
@@ -163,7 +161,7 @@ class _Sampler:
     def __call__(self, scene: Splats) -> SampledVisibility:
         core = as_prepared(scene).core
         sums = _core.VisibilityAccumulator(core)
-        here = self.cameras.recentred(scene.offset)
+        here = self.views.recentred(scene.offset)
         if self.used:
             for views in self.rounds[: self.used]:
                 self._add(sums, here, views)

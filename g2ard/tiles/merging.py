@@ -17,6 +17,7 @@ from g2ard.io.tile_store import TileStore
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats, unit_quats
 from g2ard.scene.transform import join
+from g2ard.stages.simplify.growth import GROWTHS, best_growth
 from g2ard.tiles.sights import Sights, Surroundings
 from g2ard.tiles.steps import TiledRun
 from g2ard.tiles.tasks import load, small_scene
@@ -36,6 +37,9 @@ class TiledScene:
         tiles: reads the Gaussians of a tile, with fitted opacities.
         key: hash of the names of its files.
         unseen: Gaussians of the dense scene that no view sees; None without views.
+        growth: largest growth of merged Gaussians; None if nothing was merged.
+        opacity_lost: share of the light that opaque pixels stop but let through in the merged scene, before
+            opacities are fitted; None if not measured.
         surroundings: placement of the dense tiles, for recovery; None without views.
     """
 
@@ -46,6 +50,8 @@ class TiledScene:
     key: str
     views: int = 0
     unseen: int | None = None
+    growth: float | None = None
+    opacity_lost: float | None = None
     surroundings: Surroundings | None = None
     render_model: RenderModel = "classic"
 
@@ -66,7 +72,9 @@ class TiledScene:
         return join(list(self))
 
 
-def simplify_tiles(run: TiledRun, budget: int, views: Cameras | None = None) -> TiledScene:
+def simplify_tiles(
+    run: TiledRun, budget: int, views: Cameras | None = None, *, compare: bool = False
+) -> TiledScene:
     """Reduce a tiled scene to exactly `budget` Gaussians with method `default`.
 
     If `budget` is the scene's count, the scene is returned unchanged. Otherwise:
@@ -77,7 +85,9 @@ def simplify_tiles(run: TiledRun, budget: int, views: Cameras | None = None) -> 
     3. Each tile computes the costs of merging along Morton order. The cheapest merges of all tiles are done,
        down to three times the budget. Then each tile plans more merges of pairs than needed, and the cheapest
        of all plans are done, down to the budget (`_merged`).
-    4. Opacities are fitted to what the same views see of the result.
+    4. If `compare` is true, a common growth of merged Gaussians is chosen as in one piece, by comparing
+       renders of each tile in these views, or without views from outside (`_growth`).
+    5. Opacities are fitted to what the same views see of the result.
 
     Every step is a task with a file in the folder of the run's workers, so the same call resumes. The result
     depends only on the scene, the tiles and the views, not on where, in which order or how often tasks ran.
@@ -92,20 +102,38 @@ def simplify_tiles(run: TiledRun, budget: int, views: Cameras | None = None) -> 
     if budget == store.count:
         return _scene(store, run.sizes, store.read, key_of(store.key), sights)
     merged, counts = _merged(run, budget, frame if sights is None else sights.frame, sights)
+    growth, lost = _growth(run, merged, sights, compare=compare)
     if sights is None:
         files, mean = [{"merged": path} for path in merged], None
     else:
-        seen = sights.again(merged)
+        seen = sights.again(merged, growth)
         files = [{"merged": one, "visibility": other} for one, other in zip(merged, seen, strict=True)]
         mean = sum(float(load(path, "wanted")[0].sum()) for path in merged) / budget
 
     def tile(i: int) -> Splats:
-        return finished(small_scene(files[i], mean), store.sh_degree)
+        return finished(small_scene(files[i], growth, mean), store.sh_degree)
 
-    scene = _scene(store, counts, tile, key_of(files), sights)
+    scene = _scene(store, counts, tile, key_of([files, growth]), sights)
+    scene = replace(scene, growth=growth, opacity_lost=lost)
     if sights is None:
         return scene
     return replace(scene, unseen=sum(int(load(path, "unseen")[0]) for path in merged))
+
+
+def _growth(
+    run: TiledRun, merged: list[Path], sights: Sights | None, *, compare: bool
+) -> tuple[float, float | None]:
+    """Return the growth of merged Gaussians, and if renders were compared the share of opacity lost."""
+    growth = run.max_growth
+    if not compare or growth is not None:
+        return growth or GROWTHS[0], None
+    levels = None if sights is None else sights.levels()
+    inputs = [{"merged": path} for path in merged] if sights is None else sights.beside(merged)
+    done = run.each("growths", "growth", per_tile=levels, inputs=inputs)
+    errors, lost, opaque = np.sum([load(path, "compared")[0] for path in done], axis=0).T
+    growth = best_growth(lambda growth: errors[GROWTHS.index(growth)])
+    at = GROWTHS.index(growth)
+    return growth, float(lost[at] / opaque[at]) if opaque[at] else 0.0
 
 
 def _merged(

@@ -80,14 +80,23 @@ class Sights:
         """Placement of the tiles."""
         return Surroundings(self.run.coarse, [given["levels"] for given in self.arguments])
 
-    def again(self, merged: list[Path]) -> list[Path]:
-        """Measure what the same views see of the merged tiles."""
-        inputs = [
+    def again(self, merged: list[Path], growth: float) -> list[Path]:
+        """Measure what the same views see of the merged tiles, widened by up to `growth`."""
+        given = [{**levels, "growth": growth} for levels in self.levels()]
+        return self.run.each(
+            "merged_visibility", "merged visibility", per_tile=given, inputs=self.beside(merged)
+        )
+
+    def levels(self) -> list[dict[str, Any]]:
+        """Return the coarse level of all tiles around each, as argument of its tasks."""
+        return [{"levels": given["levels"]} for given in self.arguments]
+
+    def beside(self, merged: list[Path]) -> list[dict[str, Any]]:
+        """Return the inputs of tasks that see the merged tiles."""
+        return [
             {**given, "merged": path, "visibility": seen}
             for given, path, seen in zip(self._inputs(), merged, self.visibility, strict=True)
         ]
-        levels = [{"levels": given["levels"]} for given in self.arguments]
-        return self.run.each("merged_visibility", "merged visibility", per_tile=levels, inputs=inputs)
 
     def _inputs(self) -> list[dict[str, Any]]:
         return [{"coarse": self.run.coarse, "views": self.views} for _ in self.run.coarse]

@@ -26,6 +26,7 @@ from g2ard.scene.cameras import Cameras
 from g2ard.scene.prepared import PreparedScene, as_prepared, finite_rows_of
 from g2ard.scene.splats import Splats
 from g2ard.scene.transform import join
+from g2ard.stages.simplify.growth import widened
 from g2ard.stages.simplify.pairs import fit_opacities
 
 Arrays = dict[str, NDArray[Any]]
@@ -46,7 +47,7 @@ _TELL_SECONDS = 0.5
 _CROP_SAMPLE, _CROP_MARGIN = 20_000, 8
 """Number of means that outline a tile for cropping, and the pixels kept around them."""
 
-_OUTPUT_VERSION = 4
+_OUTPUT_VERSION = 5
 """Version of the functions' output; raise it when a change makes earlier files unusable."""
 
 _CORRUPT_FILE_ERRORS = (zipfile.BadZipFile, zlib.error, ValueError, EOFError, LookupError, RuntimeError)
@@ -168,14 +169,20 @@ def load(path: Path, *names: str) -> list[NDArray[Any]]:
         ) from error
 
 
-def small_scene(files: Mapping[str, Path], mean: float | None) -> Splats:
-    """Return a tile's merged Gaussians, with views with opacities fitted to what these see.
+def merged_scene(path: Path, growth: float) -> Splats:
+    """Read the output of `merge`, its Gaussians widened by up to `growth`."""
+    return widened(scene_of(path, "scene"), load(path, "needed")[0], growth)
+
+
+def small_scene(files: Mapping[str, Path], growth: float, mean: float | None) -> Splats:
+    """Return a tile's merged Gaussians, widened, and with views with opacities fitted to what these see.
 
     Args:
         files: "merged", and with views "visibility" from `merged_visibility`.
+        growth: their largest growth.
         mean: mean weight in the views over all tiles; None without views.
     """
-    small = scene_of(files["merged"], "scene")
+    small = merged_scene(files["merged"], growth)
     if mean is None:
         return small
     members, wanted = load(files["merged"], "members", "wanted")
@@ -207,10 +214,18 @@ def tile_of(arguments: Arguments, inputs: Inputs, places: Places, *, sh: bool = 
 
 def with_surroundings(core: Splats, arguments: Arguments, inputs: Inputs, places: Places) -> PreparedScene:
     """Join a tile's Gaussians with its halo and the coarse Gaussians of all other tiles beyond the halo."""
+    return as_prepared(amid(core, surroundings(arguments, inputs, places)))
+
+
+def surroundings(arguments: Arguments, inputs: Inputs, places: Places) -> list[Splats]:
+    """Return a tile's halo and the coarse Gaussians of all other tiles beyond it."""
     store = TileStore.open(places["store"])
-    halo = store.read_halo(arguments["tile"], sh=False)
-    parts = [core, halo, *far_around(store, arguments, inputs)]
-    return as_prepared(join([part.with_sh_degree(0) for part in parts if len(part)]))
+    return [store.read_halo(arguments["tile"], sh=False), *far_around(store, arguments, inputs)]
+
+
+def amid(core: Splats, around: list[Splats]) -> Splats:
+    """Join a tile's Gaussians with others, all of SH degree 0."""
+    return join([part.with_sh_degree(0) for part in [core, *around] if len(part)])
 
 
 def far_around(store: TileStore, arguments: Arguments, inputs: Inputs) -> list[Splats]:

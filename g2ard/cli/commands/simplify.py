@@ -168,12 +168,15 @@ def _write_parents(run: Run, path: Path, small: Simplified) -> None:
 
 
 def _tell(run: Run, scene: Path, small: Simplified, output: Path, seconds: float) -> None:
+    from g2ard.jobs.causes import say_gaps
+
     if run.verbose:
         _table(run, small)
     total = small.report.input_count
     share = (small.report.unseen or 0) / total
     if share >= 0.02:
         run.say(f"note: no view sees {share:.0%} of the Gaussians; they are weighted by size only")
+    say_gaps(small.report.opacity_lost, run.say)
     say_weight(run, scene, output, small.splats)
     run.say(f"{output}: {len(small.splats):,} of {plural(total, 'Gaussian')} in {seconds:.1f} s")
 

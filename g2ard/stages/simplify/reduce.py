@@ -15,7 +15,16 @@ from g2ard.progress import Progress, counter, plural, silent
 from g2ard.scene.prepared import PreparedScene, finite_rows_of, with_some_opacity
 from g2ard.scene.splats import DRAWN_LOGIT, Splats, unit_quats
 from g2ard.stages.simplify.config import Pairs, SimplifyConfig
-from g2ard.stages.simplify.pairs import Visibility, VisibilitySource, merge, merge_and_fit, rows_of, splats_of
+from g2ard.stages.simplify.growth import Renders, outside_views, some_views
+from g2ard.stages.simplify.pairs import (
+    Visibility,
+    VisibilitySource,
+    merge,
+    merge_and_fit,
+    rows_of,
+    splats_of,
+    widen,
+)
 from g2ard.stages.simplify.report import SimplifyReport, SimplifyRound
 
 _DEFAULTS = SimplifyConfig()
@@ -86,6 +95,7 @@ def simplify(
     visibility: Visibility | VisibilitySource | None = None,
     protected: NDArray[np.bool_] | None = None,
     final_budget: int | None = None,
+    compare: bool = False,
     config: SimplifyConfig = _DEFAULTS,
     progress: Progress = silent,
 ) -> Simplified:
@@ -119,6 +129,9 @@ def simplify(
             do not use them.
         final_budget: for `paper`: N_S, if this call is one round on the way to a smaller count; it sets the
             size of cells. None means `budget`.
+        compare: for `default` and `fast`: compare small renders with the dense scene's, to choose
+            `max_growth` unless the config does, and to measure the opacity lost; for results that are not
+            recovered. Views are those of `visibility`, if it has the attribute `views`, or six from outside.
         config: the constants.
         progress: called with the number of Gaussians removed.
 
@@ -147,16 +160,22 @@ def simplify(
         protected = np.ascontiguousarray(protected[finite])
     if not (scene.opacities >= (config.resolved().min_opacity or 0.0)).any():
         scene, config = with_some_opacity(scene), replace(config, min_opacity=0.0)
+    renders = None
+    if compare and isinstance(config, Pairs) and budget < len(scene):
+        views = getattr(visibility, "views", None)
+        ordered = scene.take(scene.core.order)  # ties in depth go by row
+        renders = Renders.of(ordered, outside_views(scene) if views is None else some_views(views))
     if not isinstance(config, Pairs):
         out = _paper(scene, budget, protected, final_budget or budget, config, progress)
     elif config.keep_region and visibility is None:
         raise InputError("needs views; `fast` uses only given ones", parameter="keep_region")
     elif callable(visibility):
-        out = merge_and_fit(scene, budget, visibility, protected, config, progress)
+        out = merge_and_fit(scene, budget, visibility, protected, renders, config, progress)
     else:
         seen = None if visibility is None else rows_of(visibility, len(splats), finite)
-        out = merge(scene, budget, seen, protected, config, progress)
-    return _simplified(splats, finite, out)
+        out = widen(scene, merge(scene, budget, seen, protected, config, progress), renders, config)
+    lost = None if renders is None else _share_lost(renders, splats_of(scene, out))
+    return _simplified(splats, finite, out, lost)
 
 
 def _paper(
@@ -177,7 +196,15 @@ def _paper(
     )
 
 
-def _simplified(splats: Splats, finite: NDArray[np.bool_] | slice, out: dict[str, Any]) -> Simplified:
+def _share_lost(renders: Renders, small: Splats) -> float:
+    """Return the share of the light that the scene's opaque pixels stop but the result lets through."""
+    _, lost, opaque = renders.compare(small)
+    return lost / opaque if opaque else 0.0
+
+
+def _simplified(
+    splats: Splats, finite: NDArray[np.bool_] | slice, out: dict[str, Any], lost: float | None
+) -> Simplified:
     parents = np.full(len(splats), -1, np.int64)
     parents[finite] = out["parents"]
     small = splats_of(splats, out).with_sh_degree(splats.sh_degree)
@@ -202,6 +229,8 @@ def _simplified(splats: Splats, finite: NDArray[np.bool_] | slice, out: dict[str
             "sh_bands": splats.sh_degree - math.isqrt(out["sh"].shape[1]) + 1,
             **_spared(out["rounds"]),
         },
+        growth=out.get("growth"),
+        opacity_lost=lost,
     )
     return Simplified(small, parents, protected, report)
 

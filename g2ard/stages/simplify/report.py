@@ -41,6 +41,9 @@ class SimplifyReport(Report):
         nonfinite_rows: input rows dropped because they are not finite.
         infinite_logits: infinite logits, taken as α = 0 or 1.
         clamped_opacities: merged rows whose α was limited to 0.99, losing what `max_growth` could not absorb.
+        growth: `default`, `fast`: the largest growth of a merged row's area, see `SimplifyConfig.max_growth`.
+        opacity_lost: share of the light that the scene's opaque pixels stop but the result lets through, if
+            it was measured.
         fitted: rows whose opacity (or area, at full opacity) was fitted to visibility.
         unseen: kept input rows that no view sees; None without views.
         faded: merged rows with α < 1/255 although a member's was not.
@@ -61,4 +64,6 @@ class SimplifyReport(Report):
     unseen: int | None
     faded: int
     skipped: dict[str, int]
+    growth: float | None = field(default=None, metadata=LEFT_OUT)
+    opacity_lost: float | None = field(default=None, metadata=LEFT_OUT)
     seconds: float | None = field(default=None, metadata=LEFT_OUT)

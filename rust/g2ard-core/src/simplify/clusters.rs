@@ -79,6 +79,7 @@ impl Partition {
             step.splats.quats.push(made.quat);
             step.splats.scales.push(made.scales);
             step.splats.logit_opacities.push(made.logit);
+            step.needed.push(made.needed);
             average_sh(
                 scene,
                 ordered,
@@ -100,6 +101,8 @@ struct Made {
     /// Share of each member in the mass; empty for a copy.
     weights: Vec<f64>,
     clamped: bool,
+    /// See [`Step::needed`].
+    needed: f32,
 }
 
 /// Merges a cluster's `members`; parameters are those of [`Partition::assemble`].
@@ -113,6 +116,7 @@ fn make(scene: &SceneRef, ordered: &Ordered, members: &[u32], growth: f64, blur:
             logit: scene.logit(row),
             weights: Vec::new(),
             clamped: false,
+            needed: 1.0,
         };
     }
     let mut least_blur = f64::INFINITY;
@@ -143,6 +147,7 @@ fn make(scene: &SceneRef, ordered: &Ordered, members: &[u32], growth: f64, blur:
         logit: logit_of(alpha.min(MAX_OPACITY)),
         weights: parts.iter().map(|p| p.0 / total).collect(),
         clamped: alpha > MAX_OPACITY,
+        needed: (alpha / MAX_OPACITY).max(1.0) as f32,
     }
 }
 

@@ -15,6 +15,8 @@ pub struct Outcome<R> {
     pub rounds: Vec<R>,
     /// See [`Step::clamped`].
     pub clamped_opacities: usize,
+    /// See [`Step::needed`].
+    pub needed: Vec<f32>,
     /// Infinite logits, clamped.
     pub infinite_logits: usize,
 }
@@ -25,7 +27,7 @@ impl Step {
         Self {
             parents: (0..splats.len() as u32).collect(),
             splats,
-            clamped: 0,
+            ..Self::default()
         }
     }
 
@@ -85,6 +87,7 @@ impl Step {
             protected,
             rounds,
             clamped_opacities: self.clamped,
+            needed: self.needed,
             infinite_logits: ordered.infinite_logits,
         }
     }

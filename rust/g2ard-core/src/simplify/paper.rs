@@ -265,7 +265,7 @@ impl Paper {
         let trimmed = Step {
             splats: take(&built.splats, &stay),
             parents: to,
-            clamped: 0,
+            ..Step::default()
         };
         built.then(trimmed)
     }

@@ -1,0 +1,135 @@
+"""How far merged Gaussians widen where α ≤ 0.99 cannot hold their mass: measured in a few small renders.
+
+A surface of one layer, such as a lifted point cloud, needs wide Gaussians to stay closed. In a trained scene
+the same growth only blurs, because other layers are behind each gap. Mass cannot tell the two apart, an image
+can.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from g2ard.rendering.renderer import RasterSettings, Renderer, settings_for
+from g2ard.scene.cameras import Camera, Cameras
+from g2ard.scene.samples import evenly_spaced
+from g2ard.scene.splats import Splats
+
+GROWTHS = (1.25, 1.6, 2.0, 2.5, 3.2, 4.0)
+"""Growths to choose from; the first is for what recovery improves afterwards, and for planning."""
+
+_VIEWS = 12
+"""Most views that are compared."""
+
+_SIDE, _FOV, _DISTANCE = 256, 44.0, 2.2
+"""Width of views from outside, pixels, their field of view, degrees, and distance in radii of the scene."""
+
+_LARGEST_RADIUS = 1e11
+"""Radius up to which cameras are accepted."""
+
+_GOLDEN = (1 + 5**0.5) / 2
+_AXES = np.array([[0, 1, _GOLDEN], [1, _GOLDEN, 0], [_GOLDEN, 0, 1]]) / np.hypot(1, _GOLDEN)
+"""Three axes of an icosahedron, each seen from both sides by `outside_views`."""
+
+_OPAQUE = 0.9
+"""Least opacity of a pixel that counts as opaque."""
+
+_LEAST_ERROR = 1e-9
+"""Added to squared errors of images, whose logarithms are compared."""
+
+
+def widened(scene: Splats, needed: NDArray[np.float32], growth: float) -> Splats:
+    """Widen merged rows from the first of `GROWTHS` to what they need, at most `growth`.
+
+    >>> disc = Splats.create([[0, 0, 0]] * 2, scales=[[4, 4, 1]] * 2)
+    >>> widened(disc, np.array([1, 2], np.float32), 2.0).scales.round(2).tolist()
+    [[4.0, 4.0, 1.0], [5.059999942779541, 5.059999942779541, 1.0]]
+    """
+    needed = needed.astype(np.float64)
+    area = np.clip(needed, 1, growth) / np.clip(needed, 1, GROWTHS[0])
+    longer = np.arange(3) != np.argmin(scene.scales, axis=1)[:, None]
+    scales = np.where(longer, scene.scales * np.sqrt(area)[:, None], scene.scales)
+    return replace(scene, scales=scales.astype(np.float32))
+
+
+def best_growth(error: Callable[[float], float]) -> float:
+    """Return the growth from which the next one is no better.
+
+    >>> best_growth(lambda growth: abs(growth - 2.2)), best_growth(lambda growth: growth)
+    (2.0, 1.25)
+    """
+    best, least = GROWTHS[0], error(GROWTHS[0])
+    for growth in GROWTHS[1:]:
+        if (now := error(growth)) >= least:
+            break
+        best, least = growth, now
+    return best
+
+
+def outside_views(scene: Splats) -> list[Camera]:
+    """Return six views of a scene from outside, for scenes without views; none if float64 cannot hold them."""
+    means = scene.means.astype(np.float64)
+    low, high = np.quantile(means, [0.01, 0.99], axis=0)
+    middle = (low + high) / 2 + scene.offset
+    radius = float(np.linalg.norm(high - low) / 2 + np.median(scene.scales.max(axis=1)))
+    if not 1e-9 * np.abs(middle).max() < radius < _LARGEST_RADIUS:
+        return []
+    return [
+        Camera.facing(middle + side * _DISTANCE * radius * axis, middle, width=_SIDE, height=_SIDE, fov=_FOV)
+        for axis in _AXES
+        for side in (1, -1)
+    ]
+
+
+def some_views(cameras: Cameras) -> list[Camera]:
+    """Return a few evenly spaced views."""
+    return [cameras[i] for i in evenly_spaced(len(cameras), _VIEWS)]
+
+
+@dataclass(frozen=True, eq=False)
+class Renders:
+    """Small renders of a dense scene, which simplified ones are compared to.
+
+    Args:
+        views: the views.
+        settings: how all scenes are rendered.
+        images: per view (H, W, 4) colours and opacity.
+    """
+
+    views: list[Camera]
+    settings: RasterSettings
+    images: list[NDArray[np.float32]]
+
+    @classmethod
+    def of(cls, scene: Splats, views: Iterable[Camera], settings: RasterSettings | None = None) -> Renders:
+        if settings is None:
+            settings = settings_for(scene.means, antialiased=scene.antialiased)
+        views = list(views)
+        return cls(views, settings, _images(scene, views, settings))
+
+    def compare(self, scene: Splats) -> tuple[float, float, float]:
+        """Return the error of a simplified scene, and the light lost in pixels where the dense one is opaque.
+
+        Opacity is a fourth channel of the error, so that gaps count before every background.
+
+        Returns:
+            The logarithms of the views' mean squared errors, summed over pixels; the light that opaque pixels
+            let through though the dense scene stops it; and all that the dense scene stops there.
+        """
+        error = lost = opaque = 0.0
+        for image, dense in zip(_images(scene, self.views, self.settings), self.images, strict=True):
+            squared = np.square(np.subtract(image, dense, dtype=np.float64)).mean()
+            error += dense[..., 0].size * float(np.log(squared + _LEAST_ERROR))
+            there = dense[..., 3] > _OPAQUE
+            opaque += float(dense[there, 3].sum(dtype=np.float64))
+            lost += float(np.maximum(dense - image, 0)[there, 3].sum(dtype=np.float64))
+        return error, lost, opaque
+
+
+def _images(scene: Splats, views: list[Camera], settings: RasterSettings) -> list[NDArray[np.float32]]:
+    renderer = Renderer(scene, settings=settings)
+    made = (renderer.render(view) for view in views)
+    return [np.dstack([np.clip(one.image, 0, 1), one.alpha]) for one in made]
