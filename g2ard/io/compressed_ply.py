@@ -121,8 +121,8 @@ def _coefficient(codes: NDArray[Any]) -> NDArray[np.float64]:
 def write(path: Path, splats: Splats, *, overwrite: bool = False) -> float:
     """Write a .compressed.ply: 16 bytes per Gaussian, plus one per harmonic past band 0.
 
-    Gaussians are written in `packing_order`, which keeps the bounds of chunks tight. An `offset` and the render
-    model are stored in comments, as in .ply. Return the largest change of a position by rounding.
+    Gaussians are written in `packing_order`, which keeps the bounds of chunks tight. An `offset` and the
+    render model are stored in comments, as in .ply. Return the largest change of a position by rounding.
     """
     from plyfile import PlyData, PlyElement
 
