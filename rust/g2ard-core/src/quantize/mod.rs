@@ -4,6 +4,8 @@ mod cells;
 mod codebook;
 mod near;
 mod palette;
+#[cfg(test)]
+mod tests;
 
 pub use codebook::codebook;
 pub use palette::{Palette, palette};

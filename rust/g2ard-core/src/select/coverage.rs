@@ -214,3 +214,108 @@ fn sphere(count: usize) -> Vec<[f64; 3]> {
         })
         .collect()
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn directions_are_spread_evenly() {
+        for count in [8, 32, 64] {
+            let all = sphere(count);
+            let mean = |k: usize| all.iter().map(|a| a[k]).sum::<f64>() / count as f64;
+            assert!((0..3).all(|k| mean(k).abs() < 0.06), "{count}");
+            let closest = 1.0 - 3.0 / count as f64; // of caps that would fill the sphere: 1 − 2/n
+            for (i, a) in all.iter().enumerate() {
+                assert!((dot(*a, *a) - 1.0).abs() < 1e-12);
+                assert!(
+                    all[..i].iter().all(|b| dot(*a, *b) < closest),
+                    "{count} {i}"
+                );
+            }
+        }
+    }
+
+    #[test]
+    fn utilities_have_the_slope_that_their_exponent_says() {
+        for alpha in [0.0, 0.5, 1.0, 2.0, 3.0] {
+            let coverage = Coverage {
+                alpha,
+                ..Coverage::default()
+            };
+            for x in [0.0, 0.3, 4.0] {
+                let slope = (coverage.g(x + 1e-5) - coverage.g(x)) / 1e-5;
+                let want = (coverage.offset + x).powf(-alpha);
+                assert!((slope - want).abs() < 1e-4, "{alpha} {x}: {slope} {want}");
+            }
+        }
+    }
+
+    #[test]
+    fn a_gain_is_what_f_grows_by() {
+        let surface = Surface {
+            centers: vec![[0.0; 3], [1.0, 0.0, 0.0], [0.0, 2.0, 1.0]],
+            normals: vec![[0.0, 0.0, 1.0], [0.6, 0.0, 0.8], [0.0, 1.0, 0.0]],
+            confidence: vec![1.0, 0.3, 0.0],
+            weights: vec![0.5, 0.3, 0.2],
+            size: 0.1,
+        };
+        let positions = [[0.0, 0.0, 5.0], [4.0, 1.0, 1.0], [-1.0, -3.0, 2.0]];
+        let visible = [vec![0, 1, 2], vec![1, 2], vec![0, 2]];
+        let problem = Problem {
+            surface: &surface,
+            visible: &visible,
+            positions: &positions,
+            directional: true,
+        };
+        let coverage = Coverage::default();
+        let anchors = sphere(coverage.anchors);
+        // C of every (cell, anchor): incidence spread over the anchors near the direction to the view.
+        let evidence = |views: &[usize]| {
+            let mut c = vec![[0.0; 32]; 3];
+            for &view in views {
+                for &cell in &visible[view] {
+                    let j = cell as usize;
+                    let to = sub(positions[view], surface.centers[j]);
+                    let d = to.map(|v| v / dot(to, to).sqrt());
+                    let trust = surface.confidence[j];
+                    let incidence = 1.0 - trust + trust * dot(d, surface.normals[j]).abs();
+                    let near = |a: [f64; 3]| {
+                        let away = coverage.kappa * (dot(a, d) - 1.0);
+                        if away > -3.0 { away.exp() } else { 0.0 }
+                    };
+                    let total: f64 = anchors.iter().map(|&a| near(a)).sum();
+                    for (c, &a) in c[j].iter_mut().zip(&anchors) {
+                        *c += incidence * near(a) / total;
+                    }
+                }
+            }
+            c
+        };
+        let value = |views: &[usize]| -> f64 {
+            let c = evidence(views);
+            let cell = |j: usize| {
+                let p = target(&anchors, surface.normals[j], coverage.kappa);
+                let own = p.iter().zip(&c[j]);
+                surface.weights[j]
+                    * own
+                        .map(|(p, c)| p * coverage.g(c / (p + coverage.epsilon)))
+                        .sum::<f64>()
+            };
+            (0..3).map(cell).sum()
+        };
+        let chosen = problem.greedy(3, &coverage, &Control::default()).unwrap();
+        let (mut views, mut before) = (Vec::new(), value(&[]));
+        for (&view, &gain) in chosen.views.iter().zip(&chosen.gains) {
+            let others = (0..3).filter(|v| !views.contains(v));
+            let best = others
+                .map(|v| value(&[&views[..], &[v]].concat()))
+                .fold(f64::MIN, f64::max);
+            views.push(view as usize);
+            let after = value(&views);
+            assert!((after - before - gain).abs() < 1e-9, "{views:?}");
+            assert!(after >= best - 1e-12);
+            before = after;
+        }
+    }
+}

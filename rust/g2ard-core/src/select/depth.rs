@@ -113,7 +113,7 @@ fn sort_by_high_half(keys: &mut Vec<u64>, spare: &mut Vec<u64>) {
 mod tests {
     use super::*;
     use crate::random::Lcg;
-    use crate::raster::Camera;
+    use crate::raster::{Camera, DILATION};
     use crate::select::Gaussians;
 
     /// Median depths of one camera, row by row.
@@ -180,6 +180,114 @@ mod tests {
                 assert_eq!(scratch.depth[at], if at % step == 0 { depth } else { 0.0 });
             }
         }
+    }
+
+    #[test]
+    fn no_splat_that_a_pixel_can_show_is_refused() {
+        let mut random = Lcg(6);
+        let mut uniform = |low, high| random.between(low, high);
+        let (mut shown, mut outside) = (0, 0);
+        for _ in 0..3000 {
+            let (a, b) = (uniform(-3.0, 3.0), uniform(-1.5, 1.5));
+            let ((sa, ca), (sb, cb)) = (a.sin_cos(), b.sin_cos());
+            let turn = [
+                [ca, 0.0, -sa],
+                [sa * sb, cb, ca * sb],
+                [sa * cb, -sb, ca * cb],
+            ];
+            let camera = Camera {
+                viewmat: turn.map(|r| [r[0], r[1], r[2], uniform(-2.0, 4.0)]),
+                fx: 40.0,
+                fy: 44.0,
+                cx: 15.5,
+                cy: 11.0,
+                width: 32,
+                height: 24,
+                near: 0.1,
+            };
+            let view = Pinhole::of(&camera);
+            let mean = [0; 3].map(|_| uniform(-2.0, 2.0));
+            let at = camera.in_camera(mean);
+            let scene = Gaussians {
+                means: &[mean],
+                quats: &[[uniform(-1.0, 1.0) as f32, 0.3, -0.2, 0.5]],
+                scales: &[[0; 3].map(|_| uniform(-6.0, -1.5).exp() as f32)],
+                opacities: &[uniform(0.1, 1.0) as f32],
+            };
+            let row = Occluders::of(&scene).rows[0];
+            if at[2] <= 0.1 {
+                assert!(view.project(&row).is_none());
+                continue;
+            }
+            let centre = [
+                camera.fx * at[0] / at[2] + camera.cx,
+                camera.fy * at[1] / at[2] + camera.cy,
+            ];
+            // Without anisotropy or perspective of the extent: α on the least circle around the centre is a lower bound.
+            let near = |v: f64, size: f64| v.clamp(0.5, size - 0.5) - v;
+            let gap = near(centre[0], 32.0).abs().max(near(centre[1], 24.0).abs()) + 0.5;
+            let spread = f64::from(DILATION).sqrt();
+            let alpha = f64::from(row.opacity) * (-(gap / spread).powi(2)).exp();
+            let projected = view.project(&row);
+            if let Some((z, splat)) = &projected {
+                shown += 1;
+                assert!((f64::from(*z) - at[2]).abs() < 1e-4);
+                assert!((f64::from(splat.x) - centre[0]).abs() < 1e-2 + 1e-4 * centre[0].abs());
+                assert!((f64::from(splat.y) - centre[1]).abs() < 1e-2 + 1e-4 * centre[1].abs());
+            }
+            if alpha > 2.0 * f64::from(ALPHA_MIN) {
+                assert!(projected.is_some(), "{centre:?} {alpha}");
+                outside += i32::from(gap > 0.6);
+            }
+        }
+        assert!(shown > 150 && outside > 10, "{shown} {outside}");
+    }
+
+    #[test]
+    fn cells_in_front_of_or_behind_the_surface_are_not_seen() {
+        use crate::select::{Surface, ViewKernels};
+        use crate::{Control, Cpu};
+        let (mut means, mut centers) = (Vec::new(), Vec::new());
+        for i in 0..30 {
+            for j in 0..30 {
+                means.push([f64::from(i) * 0.1 - 1.5, f64::from(j) * 0.1 - 1.5, 0.0]);
+            }
+        }
+        for z in [0.0, 0.5, -0.5, 0.02] {
+            centers.push([0.1, 0.2, z]);
+        }
+        let n = means.len();
+        let scene = Gaussians {
+            means: &means,
+            quats: &vec![[1.0, 0.0, 0.0, 0.0]; n],
+            scales: &vec![[0.1, 0.1, 0.001]; n],
+            opacities: &vec![0.99; n],
+        };
+        let surface = Surface {
+            normals: vec![[0.0, 0.0, 1.0]; 4],
+            confidence: vec![1.0; 4],
+            weights: vec![0.25; 4],
+            size: 0.05,
+            centers,
+        };
+        let camera = Camera {
+            viewmat: [
+                [1.0, 0.0, 0.0, 0.0],
+                [0.0, 1.0, 0.0, 0.0],
+                [0.0, 0.0, 1.0, 4.0],
+            ],
+            fx: 60.0,
+            fy: 60.0,
+            cx: 31.0,
+            cy: 24.0,
+            width: 63,
+            height: 47,
+            near: 0.01,
+        };
+        let seen = Cpu
+            .visible_cells(&scene, &surface, 0.01, &[camera], &Control::default())
+            .unwrap();
+        assert_eq!(seen, [vec![0, 3]]);
     }
 
     #[test]

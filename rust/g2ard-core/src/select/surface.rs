@@ -192,6 +192,33 @@ mod tests {
     }
 
     #[test]
+    fn weights_sum_to_one_and_the_largest_hundredth_is_cut() {
+        let mut weights: Vec<f64> = (1..=1001).map(f64::from).collect();
+        weights[1000] = 1e9;
+        normalise(&mut weights);
+        assert!((weights.iter().sum::<f64>() - 1.0).abs() < 1e-12);
+        assert_eq!(weights[990], weights[1000]);
+        assert!(weights[989] < weights[990]);
+        let mut few = [0.0, 0.0, 3.0];
+        normalise(&mut few);
+        assert_eq!(few, [0.0, 0.0, 1.0]);
+        let mut none = [0.0; 4];
+        normalise(&mut none);
+        assert_eq!(none, [0.25; 4]);
+    }
+
+    #[test]
+    fn a_footprint_is_opacity_times_the_two_longer_scales() {
+        let scene = Gaussians {
+            means: &[[0.0; 3]],
+            quats: &[[1.0, 0.0, 0.0, 0.0]],
+            scales: &[[2.0, 0.5, 3.0]],
+            opacities: &[0.25],
+        };
+        assert_eq!(scene.footprint(0), 1.5);
+    }
+
+    #[test]
     fn names_what_is_wrong() {
         let scene = Gaussians {
             means: &[[0.0; 3]],

@@ -116,6 +116,21 @@ mod tests {
     use super::*;
 
     #[test]
+    fn the_points_part_the_disc_evenly() {
+        let points = disc();
+        let mean =
+            |f: fn(f64, f64) -> f64| points.iter().map(|p| f(p[0], p[1])).sum::<f64>() / 16.0;
+        assert!(mean(|x, _| x).abs() < 0.05 && mean(|_, y| y).abs() < 0.05);
+        assert!(
+            (mean(|x, _| x * x) - 0.25).abs() < 0.03 && (mean(|_, y| y * y) - 0.25).abs() < 0.03
+        );
+        for (i, a) in points.iter().enumerate() {
+            let gap = |b: &[f64; 2]| (a[0] - b[0]).hypot(a[1] - b[1]);
+            assert!(points[..i].iter().all(|b| gap(b) > 0.3), "{i}");
+        }
+    }
+
+    #[test]
     fn without_area_nothing_is_uncovered() {
         let needle = Gaussian {
             mean: [0.0; 3],

@@ -152,6 +152,31 @@ mod tests {
     }
 
     #[test]
+    fn sizes_follow_the_distance_whatever_the_opacities() {
+        let exponent = |faint: f32| {
+            let mut nodes = line(500, |i| 0.01 * (i as f32 + 1.0));
+            for (i, node) in nodes.iter_mut().enumerate() {
+                node.alpha = if i % 2 == 0 { 0.9 } else { faint };
+                *node = node.weighed();
+            }
+            Importance::of_scene(&nodes).exponent
+        };
+        assert_eq!(exponent(0.9), 1.0);
+        assert_eq!(exponent(0.000_1), 1.0);
+    }
+
+    #[test]
+    fn sizes_unlike_the_distance_count_by_number() {
+        // Size falls with the distance: no unbounded scene.
+        let falling = line(500, |i| 0.01 * (10.0 - i as f32 / 50.0).exp());
+        assert_eq!(Importance::of_scene(&falling).exponent, 0.0);
+        let pairs = [(1.0, 2.0), (2.0, 4.5), (3.0, 5.5), (4.0, 9.0), (5.0, 7.0)];
+        let moments = Moments::of(pairs.into_iter());
+        assert!((moments.deviation() - 2f64.sqrt()).abs() < 1e-12);
+        assert!((moments.correlation() - 14.5 / (10.0 * 27.7f64).sqrt()).abs() < 1e-12);
+    }
+
+    #[test]
     fn counted_alike_a_row_weighs_what_the_median_does() {
         let nodes = line(501, |i| 0.01 * ((i * 7919 % 501) as f32 / 60.0).exp());
         let by = Importance::of_scene(&nodes);

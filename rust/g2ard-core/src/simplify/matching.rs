@@ -325,6 +325,44 @@ mod tests {
     }
 
     #[test]
+    fn many_nodes_at_one_place_find_different_partners() {
+        let geometry: Vec<Node> = (0..40)
+            .map(|i| {
+                Node {
+                    mean: [if i < 20 { 0.0 } else { i as f32 }, 0.0, 0.0],
+                    cov: [1.0, 0.0, 0.0, 1.0, 0.0, 1.0],
+                    alpha: 0.5,
+                    visibility: 1.0,
+                    ..Node::default()
+                }
+                .weighed()
+            })
+            .collect();
+        let nodes = Nodes {
+            sh: vec![0.0; 3 * geometry.len()],
+            geometry,
+            width: 3,
+        };
+        let k = 4;
+        let lists = candidates(&nodes, k, 0.03, &Control::default()).unwrap();
+        for i in 0..20 {
+            let mut own: Vec<u32> = lists[i * k..(i + 1) * k].iter().map(|c| c.1).collect();
+            own.sort_unstable();
+            let first = i.saturating_sub(2).min(35);
+            let want: Vec<u32> = (first as u32..)
+                .filter(|&j| j != i as u32)
+                .take(k)
+                .collect();
+            assert_eq!(own, want, "{i}");
+        }
+        for i in 25..35 {
+            let near = |c: &Candidate| c.1.abs_diff(i as u32) <= 2;
+            assert!(lists[i * k..(i + 1) * k].iter().all(near), "{i}");
+        }
+        assert!(matched(&lists, k, 40).len() >= 18);
+    }
+
+    #[test]
     fn equals_the_naive_greedy_matching() {
         let mut random = Lcg(3);
         let mut next = || random.integer();

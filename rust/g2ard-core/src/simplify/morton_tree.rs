@@ -180,6 +180,25 @@ mod tests {
     }
 
     #[test]
+    fn a_gap_costs_what_all_merges_below_it_do() {
+        let (codes, rows) = ((0..16).collect::<Vec<u64>>(), nodes(16));
+        let costs = merge_costs(&codes, &rows, 0.03);
+        let (left, right) = (&costs[..7], &costs[8..]);
+        let alike = |a: f32, b: f32| (a - b).abs() <= 1e-5 * b;
+        let pair = costs[0];
+        assert!(
+            pair > 0.0 && left.iter().step_by(2).all(|&c| alike(c, pair)),
+            "{costs:?}"
+        );
+        for four in [left[1], left[5], right[1]] {
+            assert!(four > 2.0 * pair);
+        }
+        assert!(left[3] > left[1] + left[5] && alike(left[3], right[3]));
+        assert!(costs[7] > left[3] + right[3]);
+        assert_eq!(costs.iter().copied().fold(0.0, f32::max), costs[7]);
+    }
+
+    #[test]
     fn one_place_and_one_row() {
         assert_eq!(cut(&merge_costs(&[5; 9], &nodes(9), 0.03), 4).count, 4);
         assert_eq!(cut(&merge_costs(&[5], &nodes(1), 0.03), 1).count, 1);

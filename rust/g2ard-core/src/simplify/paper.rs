@@ -360,3 +360,168 @@ fn take(splats: &Splats, rows: &[u32]) -> Splats {
         .for_each(|&i| push_copy(&mut out, splats, i as usize));
     out
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::random::Lcg;
+    use crate::scene::Means;
+    use crate::simplify::merge;
+    use crate::{Cpu, linalg};
+
+    /// Rows at random places; every fourth hardly visible.
+    fn splats(count: usize) -> Splats {
+        let mut random = Lcg(31);
+        let mut next = || random.centred();
+        Splats {
+            means: (0..count)
+                .map(|_| [next(), next(), 0.01 * next()])
+                .collect(),
+            quats: vec![[1.0, 0.0, 0.0, 0.0]; count],
+            scales: (0..count)
+                .map(|_| [0.05 + 0.04 * next() as f32, 0.05, 0.002])
+                .collect(),
+            logit_opacities: (0..count)
+                .map(|i| if i % 4 == 0 { -6.0 } else { next() as f32 })
+                .collect(),
+            sh: (0..count).map(|_| [0.5 * next() as f32; 3]).collect(),
+            sh_coeffs: 1,
+        }
+    }
+
+    #[test]
+    fn the_fewest_and_costliest_merges_are_undone() {
+        let splats = splats(13);
+        let groups = [
+            vec![0, 1, 2, 3, 4],
+            vec![5, 6, 7, 8],
+            vec![9, 10, 11],
+            vec![12],
+        ];
+        let costs = [1.0, 9.0, 5.0];
+        for (budget, undone) in [
+            (1, 0),
+            (4, 0),
+            (5, 1),
+            (7, 1),
+            (8, 2),
+            (9, 2),
+            (10, 3),
+            (13, 3),
+        ] {
+            let mut merges: Vec<_> = groups
+                .iter()
+                .zip(costs)
+                .map(|(rows, cost)| {
+                    let merged = merge(&splats, rows);
+                    Some(Box::new(Candidate { merged, cost }))
+                })
+                .chain([None])
+                .collect();
+            let mut report = PaperRound::default();
+            undo_costliest(&groups, &mut merges, budget, &mut report);
+            assert_eq!(report.undone_groups, undone, "{budget}");
+            let left: Vec<usize> = (0..3).filter(|&g| merges[g].is_some()).collect();
+            assert_eq!(
+                left,
+                [[0, 1, 2].as_slice(), &[0, 2], &[0], &[]][undone],
+                "{budget}"
+            );
+        }
+    }
+
+    #[test]
+    fn the_counts_of_rounds_add_up() {
+        let rows = splats(400);
+        let scene = SceneRef {
+            means: Means::F64(&rows.means),
+            quats: &rows.quats,
+            scales: &rows.scales,
+            logit_opacities: &rows.logit_opacities,
+            sh0: &rows.sh,
+            sh_rest: &[],
+            rest: 0,
+        };
+        let ordered = Ordered::new(&scene).unwrap();
+        let plan = PaperPlan {
+            schedule: &[290, 200, 60],
+            cells: 60,
+        };
+        let (policy, control) = (Paper::default(), Control::default());
+        let out = policy
+            .run(&scene, &ordered, None, plan, &Cpu, &control)
+            .unwrap();
+        let mut before = 400;
+        for (round, (r, &after)) in out.rounds.iter().zip(plan.schedule).enumerate() {
+            assert_eq!((r.before, r.after), (before, after));
+            assert_eq!(r.dropped, if round == 0 { 100 } else { 0 });
+            let merged = r.merged_members - r.merged_groups;
+            assert_eq!(before - r.dropped - merged - r.trimmed, after, "{r:?}");
+            before = after;
+        }
+        assert!(out.rounds.iter().any(|r| r.merged_groups > 0));
+        assert_eq!(out.parents.iter().filter(|&&p| p < 0).count(), {
+            let gone = out.rounds.iter().map(|r| r.dropped).sum::<usize>();
+            let gone_later = out.parents.iter().filter(|&&p| p < 0).count();
+            assert!(gone_later >= gone);
+            gone_later
+        });
+    }
+
+    #[test]
+    fn optical_mass_is_depth_times_area() {
+        for alpha in [0.01, 0.5, 0.9, 0.999] {
+            let logit = f64::ln(alpha / (1.0 - alpha));
+            let depth = -f64::ln(1.0 - alpha.min(0.99));
+            for scales in [[2.0, 3.0, 0.1], [0.1, 2.0, 3.0], [3.0, 0.1, 2.0]] {
+                let got = optical_mass(logit, scales);
+                assert!((got - 6.0 * depth).abs() < 1e-9, "{alpha}: {got}");
+            }
+        }
+    }
+
+    #[test]
+    fn coverage_is_the_covered_share_of_tilted_and_stretched_members() {
+        use crate::scene::Gaussian;
+        use crate::simplify::coverage;
+        let mut random = Lcg(32);
+        let mut next = || random.centred();
+        let (mut off, mut partly) = (0.0, 0);
+        for _ in 0..300 {
+            // In one plane, so that a member's shadow is its own ellipse.
+            let turned = |angle: f64, mean: [f64; 3], scales: [f64; 3]| Gaussian {
+                mean,
+                rotation: linalg::rotation_from_quat([
+                    (angle / 2.0).cos(),
+                    0.0,
+                    0.0,
+                    (angle / 2.0).sin(),
+                ]),
+                scales,
+            };
+            let merged = turned(3.0 * next(), [0.0; 3], [1.5, 1.0, 0.01]);
+            let shift = [9.0 * next(), 9.0 * next(), 0.0];
+            let member = turned(6.0 * next(), shift, [0.9 + next(), 0.3, 0.01]);
+            let axis = |g: &Gaussian, k: usize| g.axis(k);
+            let inside = (0..4000).filter(|i| {
+                let (r, a) = ((f64::from(*i) / 4000.0).sqrt(), 2.399_963 * f64::from(*i));
+                let along = [
+                    3.0 * r * a.cos() * member.scales[0],
+                    3.0 * r * a.sin() * member.scales[1],
+                ];
+                let point = [0, 1, 2].map(|k| {
+                    shift[k] + along[0] * axis(&member, 0)[k] + along[1] * axis(&member, 1)[k]
+                });
+                let u = linalg::dot(point, axis(&merged, 0)) / (3.0 * merged.scales[0]);
+                let v = linalg::dot(point, axis(&merged, 1)) / (3.0 * merged.scales[1]);
+                u * u + v * v <= 1.0
+            });
+            let want = inside.count() as f64 / 4000.0;
+            let got = coverage(&[member], &merged, 3.0);
+            off += (got - want).abs();
+            partly += i32::from(want > 0.05 && want < 0.95);
+            assert!((got - want).abs() < 0.16, "{got} {want}");
+        }
+        assert!(partly > 40 && off < 300.0 * 0.03, "{partly} {off}");
+    }
+}
