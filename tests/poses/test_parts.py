@@ -50,6 +50,15 @@ def test_grid_equals_its_naive_twin(monkeypatch) -> None:
     assert (got[hit] > want[hit] - 0.02 * grid.cell).all()
 
 
+def test_samples_say_how_many_gaussians_a_row_stands_for() -> None:
+    scene = naive.statue()
+    whole = Matter.of(scene, represents=2.0)
+    some = Matter.of(scene, limit=len(whole.points) // 4, represents=2.0)
+    assert whole.represents == 2.0
+    visible = np.count_nonzero(scene.opacities > 1 / 255)
+    assert some.represents == pytest.approx(2.0 * visible / (len(whole.points) // 4))
+
+
 _CAST = """
 import sys
 import numpy as np
