@@ -84,7 +84,8 @@ def distill(
             found beside the scene, or generates views; "made" always generates them. Every 8th view, or the
             test split of the views, is held out for scoring.
         photos: training images. True takes photos and skips views without one, False renders the scene, None
-            takes the photo of each view and a render if it has none. A point cloud needs photos.
+            takes the photo of each view and a render if it has none. A point cloud given with views needs
+            photos; without views it is lifted, and the lift renders the training images.
         size: longer side of the views in pixels, if they are larger.
         preset: settings by name: "auto" measures the scene; "trained", "lift" or "noisy" names its kind;
             "paper" is the method of the paper, see `g2ard.preset`.
@@ -204,6 +205,7 @@ def prepare(
         blind=simplify.method == "paper",
         config=simplify,
         seed=recover.seed,
+        recovered=recovers,
         progress=progress,
         say=say,
     )
@@ -314,7 +316,7 @@ class _Read:
 def _read(
     scene: Scene, budgets: Sequence[Budget], options: DistillOptions, progress: Progress, say: Say
 ) -> _Read:
-    """Read the dense scene, or lift points, which need views with photos, and are topped up to the budget."""
+    """Read the dense scene, or lift points; with photos they are topped up to the budget."""
     from g2ard.io import kind
 
     if isinstance(scene, Splats):
@@ -328,10 +330,7 @@ def _read(
     if views is None or is_made(views):
         if scene is None:
             raise InputError("missing; without a scene, pass photos with poses as views", parameter="scene")
-        path = "cloud" if isinstance(scene, Points) else str(scene)
-        raise InputError(
-            "a point cloud cannot render training images", path=path, hint="give its photos with {views}"
-        )
+        return _lifted_alone(scene, options, progress, say)
     points, name, of_photos = _points(scene, views, say)
     given = 0 if points is None or scene is None else len(points)
     wanted = max((budget.count for budget in budgets if budget.count is not None), default=0)
@@ -358,14 +357,26 @@ def _read(
     return _Read(lifted, True, options.beside, name, given, of_photos)
 
 
-def _points(scene: Points | str | Path | None, views: Views, say: Say) -> tuple[Points | None, str, bool]:
+def _lifted_alone(scene: Points | str | Path, options: DistillOptions, progress: Progress, say: Say) -> _Read:
+    """Lift points without photos; the lift is then the dense scene that renders training images."""
+    points, name, _ = _points(scene, None, say)
+    assert points is not None
+    say("no photos: the lifted points render the training images; photos, given as views, show more")
+    lift_config = vars(options.config.lift)
+    lifted = lift(points.positions, points.colors, **lift_config, progress=progress)
+    return _Read(lifted, False, options.beside, name, len(lifted))
+
+
+def _points(
+    scene: Points | str | Path | None, views: Views | None, say: Say
+) -> tuple[Points | None, str, bool]:
     """Return the points of a cloud or stored with the views, their name in errors, and whether they were
     found in photos."""
     from g2ard.io import read_cloud
 
     if isinstance(scene, Points):
         return scene, "cloud", False
-    sparse = sparse_file(views)
+    sparse = None if views is None else sparse_file(views)
     if scene is None:
         return sparse_points(sparse), "cloud", True
     cloud = read_cloud(scene)

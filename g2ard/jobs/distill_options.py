@@ -25,8 +25,8 @@ class DistillOptions(Settings):
 
     Args:
         photos: targets: True for photos, skipping views without one; False for renders of the scene; None for
-            each view's photo, or a render if it has none (sec. 3.1). A point cloud needs photos, because its
-            lift cannot render training images.
+            each view's photo, or a render if it has none (sec. 3.1). A point cloud given with views needs
+            their photos; without views, its lift renders the training images.
         format: file format for a budget in bytes: ply, compressed.ply, sog, spz, glb, splat, usda or usdc.
         settings: values of `DistillConfig` by path, which override the preset.
 

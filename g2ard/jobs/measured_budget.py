@@ -63,6 +63,7 @@ class Reduction:
 
     Args:
         cameras: cameras that give visibility weights to every method, instead of `views`.
+        recovered: whether the results are recovered afterwards, so that their growth is not measured.
     """
 
     splats: Splats
@@ -73,6 +74,7 @@ class Reduction:
     beside: str | Path | None = None
     up: Sequence[float] | None = None
     seed: int = 0
+    recovered: bool = False
     progress: Progress = silent
     say: Say = unsaid
     _made: dict[int, Simplified] = field(default_factory=dict)
@@ -97,7 +99,7 @@ class Reduction:
                 self.splats,
                 count,
                 visibility=self._visibility if count < len(self.splats) else None,
-                compare=True,
+                compare=not self.recovered,
                 config=self.config,
                 progress=self.progress,
             )

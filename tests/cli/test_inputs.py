@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 from PIL import Image
 
@@ -82,6 +83,27 @@ def test_views_without_photos_name_the_substitute(command_line: CommandLine, fol
         status, _, error = command_line(*ask, cwd=folder)
         last = error.splitlines()[-1]
         assert (status, "has no" in last or "has none" in last, words in last) == (1, True, True), error
+
+
+def test_a_cloud_without_photos_is_its_own_teacher(command_line: CommandLine, folder: Path) -> None:
+    (folder / "alone").mkdir(exist_ok=True)
+    cloud_of(folder / "alone" / "cloud.ply", BALL)
+    ask = ("distill", "alone/cloud.ply", "-n", 100, "-o", "alone/run", "--steps", 5, "--size", 48)
+    status, _, error = command_line(*ask, cwd=folder)
+    assert (status, "no photos: the lifted points render the training images" in error) == (0, True), error
+    assert len(g2ard.load(folder / "alone" / "run" / "scene.ply")) == 100
+
+
+def test_gaps_are_told(command_line: CommandLine, folder: Path) -> None:
+    x, y = np.meshgrid(np.arange(40.0), np.arange(40.0))
+    g2ard.save(
+        folder / "floor.ply", g2ard.lift(np.stack([x, y, 0 * x], 2).reshape(-1, 3), np.full((1600, 3), 0.5))
+    )
+    for ratio, told in ((2, False), (100, True)):
+        status, _, error = command_line(
+            "simplify", "floor.ply", "-r", ratio, "-o", f"{ratio}.ply", cwd=folder
+        )
+        assert (status, "gaps: " in error) == (0, told), error
 
 
 def test_an_input_of_the_wrong_kind_is_named(folder: Path) -> None:

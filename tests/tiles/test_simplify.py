@@ -16,14 +16,18 @@ from g2ard import _core
 from g2ard.errors import InputError
 from g2ard.io import read_splats, write_splats
 from g2ard.io.tile_store import TileStore
+from g2ard.progress import silent
 from g2ard.rendering.targets import TeacherRenders
+from g2ard.rendering.visibility import visibility_source
 from g2ard.scene.cameras import Cameras, look_at
 from g2ard.scene.prepared import finite_rows_of
 from g2ard.stages.evaluate import evaluate
+from g2ard.stages.lift import lift
 from g2ard.stages.simplify import SimplifyConfig, simplify
+from g2ard.stages.simplify.growth import GROWTHS
 from g2ard.tiles.executor import Workers, executor
 from g2ard.tiles.ingest import ingest
-from g2ard.tiles.merging import cheapest, plan_ends, simplify_tiles
+from g2ard.tiles.merging import TiledScene, cheapest, plan_ends, simplify_tiles
 from g2ard.tiles.steps import GONE, TiledRun
 from g2ard.tiles.tasks import Task
 from helpers.systems import needs_proc, workers_of
@@ -295,3 +299,30 @@ def test_progress_moves_within_a_task(tmp_path: Path, workers: int) -> None:
 def test_a_sample_for_views_has_enough_rows(store: TileStore, tmp_path: Path) -> None:
     with executor() as runs:
         assert len(TiledRun(store, Workers(runs, tmp_path), SimplifyConfig()).sample()) == store.count
+
+
+@pytest.mark.parametrize("seen", [True, False])
+def test_tiles_share_a_growth_and_it_is_that_of_the_whole(tmp_path: Path, seen: bool) -> None:
+    rng = np.random.default_rng(5)
+    points = rng.uniform([-8, -4, 0], [8, 4, 0], (4000, 3))
+    lifted = lift(points, 0.5 + 0.4 * np.sin(points @ rng.normal(size=(3, 3))))
+    write_splats(tmp_path / "floor.ply", lifted)
+    store = ingest(tmp_path / "floor.ply", tmp_path / "tiles", tile_rows=1500)
+    assert len(store.tiles) > 2
+    views = ring() if seen else None
+
+    def tiled(config: SimplifyConfig, *, compare: bool) -> TiledScene:
+        with executor(threads=1) as runs:
+            run = TiledRun(store, Workers(runs, tmp_path / "work", silent), config)
+            return simplify_tiles(run, 250, views, compare=compare)
+
+    measured = tiled(SimplifyConfig(), compare=True)
+    source = None if views is None else visibility_source(views)
+    whole = simplify(lifted, 250, visibility=source, compare=True).report
+    assert measured.growth is not None
+    assert measured.growth == whole.growth > GROWTHS[0]
+    assert measured.opacity_lost == pytest.approx(whole.opacity_lost, abs=0.03)
+    given = tiled(SimplifyConfig(max_growth=measured.growth), compare=True)
+    assert given.opacity_lost is None
+    assert given.whole().fingerprint() == measured.whole().fingerprint()
+    assert tiled(SimplifyConfig(), compare=False).growth == GROWTHS[0]

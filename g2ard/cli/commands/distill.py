@@ -128,7 +128,7 @@ def distill(
         run.results([folder.tell_finished() for folder in early])
         return
     if scene is not None:
-        _check_kind(scene, given)
+        _check_kind(scene)
     options = DistillOptions(
         views=opt.with_images(views, images, alpha),
         photos=photos,
@@ -169,15 +169,12 @@ def _check_options(
         raise typer.BadParameter("--renders needs a SCENE to render; give one or remove --renders")
 
 
-def _check_kind(scene: Path, given: bool) -> None:
-    """Reject a file of views as the scene, and a point cloud without `given` views."""
-    found = kind(scene)
-    if found == "views":
+def _check_kind(scene: Path) -> None:
+    """Reject a file of views as the scene."""
+    if kind(scene) == "views":
         raise typer.BadParameter(
             f"{scene} holds views, not a scene; to start from photos, pass it as --views with -n COUNT"
         )
-    if found != "splats" and not given:
-        raise typer.BadParameter("a point cloud cannot render training images; give photos with --views")
 
 
 def _tell_estimates(run: Run, job: DistillJob, folders: Sequence[RunFolder]) -> None:

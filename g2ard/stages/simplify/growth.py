@@ -70,7 +70,7 @@ def best_growth(error: Callable[[float], float]) -> float:
 
 
 def outside_views(scene: Splats) -> list[Camera]:
-    """Return six views from outside, for scenes without views; none if float64 cannot hold them."""
+    """Return six views of a scene from outside, or none if float64 cannot hold them."""
     means = scene.means.astype(np.float64)
     low, high = np.quantile(means, [0.01, 0.99], axis=0)
     middle = (low + high) / 2 + scene.offset
