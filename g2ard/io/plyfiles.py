@@ -31,14 +31,31 @@ _HEADER_LIMIT = 1 << 20
 _END_HEADER = re.compile(rb"(?<=[\r\n])end_header[ \t]*[\r\n]")
 _COUNT = re.compile(rb"(?<=[\r\n])(element[ \t]+(\S+)[ \t]+)(\d{1,4000})\b")  # Python reads no longer ones
 
+_ASCII = bytes(range(128)) + b"?" * 128
+"""Translation of names and comments of other character sets, byte by byte."""
+
+
+class _AsciiHeader(io.BufferedReader):
+    """A file whose header reads as ASCII, as plyfile requires."""
+
+    def __init__(self, path: Path, length: int) -> None:
+        super().__init__(io.FileIO(path))
+        self._length = length
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        header = max(0, self._length - self.tell())
+        data = super().read(size)
+        return data[:header].translate(_ASCII) + data[header:] if header else data
+
 
 @dataclass(frozen=True)
 class PlyHeader:
-    """A PLY header: plyfile's elements, without rows, row counts per element, and all comments."""
+    """A PLY header: plyfile's elements, without rows, row counts per element, all comments, its length."""
 
     elements: PlyData
     counts: dict[str, int]
     comments: list[str]
+    bytes: int
 
     def properties(self, element: str) -> list[str]:
         """Return the properties of an element that are no lists; none if there is no such element."""
@@ -64,17 +81,14 @@ def read_header(path: Path) -> PlyHeader:
     end = _END_HEADER.search(head)  # on a line of its own, since comments may contain it
     if end is None:
         raise damaged("broken PLY header: no end_header line", path=path)
-    head = head[: end.end()]
-    foreign = next((n for n, line in enumerate(head.splitlines(), 1) if not line.isascii()), None)
-    if foreign is not None:
-        raise InputError("is not ASCII", path=path, index=foreign, item="header line")
+    head = head[: end.end()].translate(_ASCII)
     try:
         counts = {name.decode(): int(count) for _, name, count in _COUNT.findall(head)}
         ply = PlyData.read(io.BytesIO(_COUNT.sub(rb"\g<1>0", head)), mmap=False)
     except (PlyParseError, ValueError) as error:
         raise damaged(f"broken PLY header, {error}", path=path) from error
     comments = [*ply.comments, *(text for element in ply for text in element.comments)]
-    return PlyHeader(ply, counts, [" ".join(text.split()) for text in comments])
+    return PlyHeader(ply, counts, [" ".join(text.split()) for text in comments], end.end())
 
 
 def offset_of(path: Path, header: PlyHeader) -> NDArray[np.float64]:
@@ -127,11 +141,11 @@ def read_element(path: Path, header: PlyHeader, *names: str) -> list[NDArray[Any
     }
     try:
         try:
-            ply = PlyData.read(path, mmap="r", known_list_len=triangles)
+            ply = _read(path, header, triangles)
         except PlyElementParseError:
             if not any(triangles.values()):
                 raise
-            ply = PlyData.read(path, mmap="r")
+            ply = _read(path, header, {})
     except PlyElementParseError as error:
         name = error.element.name
         raise damaged(
@@ -144,6 +158,11 @@ def read_element(path: Path, header: PlyHeader, *names: str) -> list[NDArray[Any
     except (PlyParseError, ValueError, OSError, OverflowError, MemoryError) as error:
         raise InputError(f"cannot be read as a PLY: {error}", path=path) from error
     return [ply[name].data for name in names]
+
+
+def _read(path: Path, header: PlyHeader, lengths: dict[str, dict[str, int]]) -> PlyData:
+    with _AsciiHeader(path, header.bytes) as file:
+        return PlyData.read(file, mmap="r", known_list_len=lengths)
 
 
 def write_rows(

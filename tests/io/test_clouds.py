@@ -29,6 +29,27 @@ def test_ply(tmp_path: Path, position: str, color: str, top: float) -> None:
     assert kind(path) == "points"
 
 
+@pytest.mark.parametrize("text", ["测试/Prüfstand", "naïve", "日本語.ply", "\x85 end_header", "µm²"])
+@pytest.mark.parametrize("word", ["comment", "obj_info", "property float"])
+@pytest.mark.parametrize("encoding", ["utf-8", "latin-1", "gb18030"])
+def test_headers_of_other_character_sets(tmp_path: Path, text: str, word: str, encoding: str) -> None:
+    raw = text.encode(encoding, "replace")
+    if word.startswith("property"):
+        raw = raw.replace(b" ", b"")
+    rows = np.arange(12.0).reshape(2, 6)
+    data = ply(tmp_path / "a.ply", columns("f4", "u1"), rows).read_bytes()
+    head, body = data.split(b"end_header\n", 1)
+    line = word.encode() + b" " + raw + b"\n"
+    if word.startswith("property"):
+        head, body = head + line, b"".join(body[at : at + 15] + bytes(4) for at in (0, 15))
+    else:
+        head = head.replace(b"element", line + b"element", 1)
+    (tmp_path / "b.ply").write_bytes(head + b"end_header\n" + body)
+    points = read_points(tmp_path / "b.ply")
+    np.testing.assert_array_equal(points.positions, rows[:, :3])
+    np.testing.assert_allclose(points.colors * 255, rows[:, 3:], atol=1e-4)
+
+
 def test_ply_with_other_color_names(tmp_path: Path) -> None:
     names = ("diffuse_red", "diffuse_green", "diffuse_blue")
     rows = np.array([[0, 0, 0, 255, 0, 51.0]])
