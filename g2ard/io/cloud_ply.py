@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from g2ard.errors import InputError
 from g2ard.io.plyfiles import read_element, read_header, require, row_blocks, spread_rows, write_rows
-from g2ard.io.stream import PointStream, RawPoints
+from g2ard.io.stream import MarkedPoints, PointStream, full_scales
 from g2ard.io.types import Points
 
 _POSITION = ["x", "y", "z"]
@@ -17,23 +17,26 @@ _COLOR_NAMES = (["red", "green", "blue"], ["r", "g", "b"], ["diffuse_red", "diff
 
 
 class Stream(PointStream):
-    """Rows of x y z and red green blue: integers, scaled by their range, or floats in [0, 1].
+    """Rows of x y z and red green blue, of any type.
 
     Text files and those with leading lists are read whole.
     """
 
     def __init__(self, path: Path) -> None:
         self._vertices, self._names = _vertices(path)
-        sample = spread_rows(self._vertices)
-        with np.errstate(invalid="ignore"):
-            at = np.stack([sample[name].astype(np.float64) for name in _POSITION], axis=1)
-        at = at[np.isfinite(at).all(1)]
-        low, high = np.percentile(at, (1, 99), axis=0) if len(at) else np.zeros((2, 3))
-        super().__init__(path, len(self._vertices), low, high)
+        kinds = [self._vertices.dtype[name] for name in self._names]
+        widest = max((full_scales(kind) for kind in kinds), key=lambda scales: scales[-1])
+        super().__init__(path, len(self._vertices), _positions(spread_rows(self._vertices)), widest)
 
-    def raw(self, rows: int, start: int) -> Iterator[RawPoints]:
+    def raw(self, rows: int, start: int) -> Iterator[MarkedPoints]:
         for _, block in row_blocks(self.path, self._vertices, rows, start):
-            yield _points(self.path, block, self._names)
+            colors = [_color(self.path, block[name], name) for name in self._names]
+            yield _positions(block), np.stack(colors, axis=1), np.zeros(len(block), bool)
+
+
+def _positions(rows: NDArray[Any]) -> NDArray[np.float64]:
+    with np.errstate(invalid="ignore"):  # a signalling NaN
+        return np.stack([rows[name].astype(np.float64) for name in _POSITION], axis=1)
 
 
 def _vertices(path: Path) -> tuple[NDArray[Any], list[str]]:
@@ -47,23 +50,13 @@ def _vertices(path: Path) -> tuple[NDArray[Any], list[str]]:
     return rows, names
 
 
-def _points(path: Path, rows: NDArray[Any], names: list[str]) -> RawPoints:
-    with np.errstate(invalid="ignore"):  # a signalling NaN
-        positions = np.stack([rows[name].astype(np.float64) for name in _POSITION], axis=1)
-    return positions, np.stack([_unit(path, rows[name], name) for name in names], axis=1)
-
-
-def _unit(path: Path, values: NDArray[Any], name: str) -> NDArray[np.float32]:
-    if values.dtype.kind in "iu":
-        least, most = int(values.min(initial=0)), int(np.iinfo(values.dtype).max)
-        if least < 0:
-            raise InputError(f"has a value of {least}, expected [0, {most}]", path=path, property=name)
-        return (values / np.float32(most)).astype(np.float32)
-    finite = values[np.isfinite(values)]
-    low, top = float(finite.min(initial=0.0)), float(finite.max(initial=0.0))
-    if low < -0.5 or top > 1.5:
-        beyond = top if top > 1.5 else low
-        raise InputError(f"has a value of {beyond:g}, expected floats in [0, 1]", path=path, property=name)
+def _color(path: Path, values: NDArray[Any], name: str) -> NDArray[np.float32]:
+    finite = values[np.isfinite(values)] if values.dtype.kind == "f" else values
+    scales = full_scales(values.dtype)
+    low, top = float(finite.min(initial=0)), float(finite.max(initial=0))
+    if low < (-0.5 if values.dtype.kind == "f" else 0) or top > scales[-1] * 1.001:
+        beyond = low if low < 0 else top
+        raise InputError(f"has a value of {beyond:g}, expected [0, {scales[-1]:g}]", path=path, property=name)
     with np.errstate(invalid="ignore"):  # a signalling NaN
         return values.astype(np.float32)
 

@@ -10,35 +10,36 @@ import numpy as np
 
 from g2ard.errors import InputError, damaged, missing
 from g2ard.io.limits import check_unpacked
-from g2ard.io.stream import PointStream, RawPoints
-from g2ard.io.types import Note
+from g2ard.io.stream import MarkedPoints, PointStream, full_scales
 
 _LARGEST_CHUNK = 1 << 30
 """Largest chunk, in bytes of unpacked points, of a file with fewer points than a chunk holds."""
 
 
+_SAMPLES, _SAMPLE_ROWS = 20, 5000
+"""Number and length of the runs of points that tell where a file's points are."""
+
+_NOISE = (7, 18)
+"""Classes of low and high noise."""
+
+
 class Stream(PointStream):
-    """Positions and colours; colours up to 255 are treated as 8-bit, with a note.
+    """Positions and colours, without points of the classes of noise and withheld ones.
 
     One chunk of a .laz is unpacked at a time.
     """
 
     def __init__(self, path: Path) -> None:
         with _opened(path) as reader:
-            header = reader.header
-            low, high = np.array(header.mins, np.float64), np.array(header.maxs, np.float64)
-            super().__init__(path, header.point_count, low, high)
+            count, sample = reader.header.point_count, []
+            for first in sorted({count * part // _SAMPLES for part in range(_SAMPLES)}):
+                reader.seek(first)
+                positions, _, noise = _points(reader.read_points(min(_SAMPLE_ROWS, count - first)))
+                sample.append(positions[~noise])
+        at = np.concatenate(sample)
+        super().__init__(path, count, at, full_scales(np.dtype(np.uint16)))
 
-    @property
-    def divisor(self) -> float:
-        return 65535.0 if self.tally.brightest > 255 else 255.0
-
-    def header_notes(self) -> tuple[Note, ...]:
-        if self.divisor > 255:
-            return ()
-        return (Note("eight_bit_colors", self.tally.rows, "8-bit colours in 16-bit fields"),)
-
-    def raw(self, rows: int, start: int) -> Iterator[RawPoints]:
+    def raw(self, rows: int, start: int) -> Iterator[MarkedPoints]:
         with _opened(self.path) as reader:
             if start:
                 reader.seek(start)
@@ -50,10 +51,11 @@ class Stream(PointStream):
                 yield _points(las)
 
 
-def _points(las: Any) -> RawPoints:
+def _points(las: Any) -> MarkedPoints:
     positions = np.stack([np.asarray(las[name], np.float64) for name in ("x", "y", "z")], axis=1)
     rgb = np.stack([np.asarray(las[name], np.float32) for name in ("red", "green", "blue")], axis=1)
-    return positions, rgb
+    noise = np.isin(np.asarray(las["classification"]), _NOISE) | np.asarray(las["withheld"], bool)
+    return positions, rgb, noise
 
 
 @contextmanager

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from g2ard.errors import InputError, damaged
 from g2ard.io.colmap import Table, model_folder, number, parsing, text_lines
 from g2ard.io.jsonfile import Place
-from g2ard.io.stream import WholeCloud
+from g2ard.io.stream import WholeCloud, full_scales
 
 _COLUMNS = tuple((name, at) for at, name in enumerate("XYZRGB", 1))
 _POINT = struct.Struct("<QdddBBBdQ")
@@ -28,7 +28,7 @@ class Stream(WholeCloud):
             path = file
         with parsing(path):
             positions, rgb = (_binary if path.suffix == ".bin" else _text)(path)
-        super().__init__(path, positions, (rgb / 255).astype(np.float32))
+        super().__init__(path, positions, rgb.astype(np.float32), full_scales(np.dtype(np.uint8)))
 
 
 def _binary(path: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:

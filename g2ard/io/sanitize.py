@@ -124,20 +124,31 @@ class RowTally:
 
 @dataclass
 class PointTally(RowTally):
-    """Counts of points that are not finite, and the brightest colour, over the blocks of a cloud."""
+    """Counts of points that are not finite or noise, and the brightest colour, over the blocks of a cloud."""
 
     brightest: float = 0.0
+    noise: int = 0
 
-    def finite(self, positions: NDArray[Any], colors: NDArray[Any]) -> NDArray[np.bool_]:
-        """Return an (n,) mask of the finite rows, and count them."""
+    def keep(
+        self, positions: NDArray[Any], colors: NDArray[Any], noise: NDArray[np.bool_]
+    ) -> NDArray[np.bool_]:
+        """Return an (n,) mask of the finite rows that are not noise, and count all."""
         good = np.all(np.isfinite(positions), axis=1) & np.all(np.isfinite(colors), axis=1)
         self.count(good)
+        self.noise += int(np.count_nonzero(good & noise))
+        good &= ~noise
         self.brightest = max(self.brightest, float(np.max(colors, where=good[:, None], initial=0.0)))
         return good
 
     def notes(self, path: Path) -> list[Note]:
-        """Return a note on dropped points; raise an `InputError` if none remains."""
-        return self.dropped_notes(path, "point")
+        """Return notes on dropped points; raise an `InputError` if none remains."""
+        notes = self.dropped_notes(path, "point")
+        if self.noise == self.rows - self.dropped:
+            raise InputError(f"all of its {plural(self.noise, 'point')} are marked as noise", path=path)
+        if self.noise:
+            text = f"{plural(self.noise, 'point')} dropped that the file marks as noise or withheld"
+            notes.append(Note("noise", self.noise, text))
+        return notes
 
 
 @dataclass

@@ -22,6 +22,18 @@ _POINTS_AT_ONCE = 1 << 20
 RawPoints = tuple[NDArray[np.float64], NDArray[np.float32]]
 """(n, 3) positions, world units, and (n, 3) colours; colours / `divisor` are in [0, 1]."""
 
+MarkedPoints = tuple[NDArray[np.float64], NDArray[np.float32], NDArray[np.bool_]]
+"""Positions, colours, and an (n,) mask of points that the file marks as noise."""
+
+_FULL = (255.0, 65535.0)
+"""Largest colours of 8 and 16 bits."""
+
+_FAR = 10.0
+"""Distance from the origin, in extents, beyond which coordinates may be those of a map."""
+
+_STEEP = 20.0
+"""Extent in z over that in x and y beyond which x and y may be degrees."""
+
 Block = TypeVar("Block", Splats, RawPoints)
 
 
@@ -154,24 +166,60 @@ class PartsStream(SceneStream):
         return self.notes
 
 
-class PointStream(Stream[RawPoints]):
-    """Coloured point cloud in blocks."""
+def full_scales(kind: np.dtype[Any]) -> tuple[float, ...]:
+    """Return the values, ascending, that colours stored as a type may have at full brightness.
 
-    def __init__(self, path: Path, count: int, low: NDArray[np.float64], high: NDArray[np.float64]) -> None:
-        """Open a cloud with these bounds, whose centre becomes the offset if it is far from the origin."""
-        middle = (low + high) / 2
-        far = np.isfinite(middle).all() and (np.abs(middle) > np.linalg.norm(high - low)).any()
-        super().__init__(path, count, np.rint(middle) if far else None)
+    >>> full_scales(np.dtype("u1")), full_scales(np.dtype("i4")), full_scales(np.dtype("f8"))
+    ((255.0,), (255.0, 65535.0, 2147483647.0), (1.0, 255.0, 65535.0))
+    """
+    if kind.kind == "f":
+        return (1.0, *_FULL)
+    most = float(np.iinfo(kind).max)
+    return (*(full for full in _FULL if full < most), most)
+
+
+class PointStream(Stream[RawPoints]):
+    """Coloured point cloud in blocks.
+
+    Colours are divided by the smallest of `full_scales` that holds the brightest, whatever their type.
+    """
+
+    def __init__(
+        self, path: Path, count: int, sample: NDArray[np.float64], scales: Sequence[float] = (1.0,)
+    ) -> None:
+        """Open a cloud, whose centre becomes the offset if it is far from the origin.
+
+        Args:
+            sample: (n, 3) positions from all parts of the cloud. Files' own bounds may be wrong.
+            scales: see `full_scales`.
+        """
+        low, high = _robust_bounds(sample)
+        middle, extent = (low + high) / 2, high - low
+        far = np.isfinite(middle).all() and (np.abs(middle) > np.linalg.norm(extent)).any()
+        notes = (_DEGREES,) if _in_degrees(middle, extent) else ()
+        super().__init__(path, count, np.rint(middle) if far else None, notes)
         self.tally: PointTally = PointTally()
+        self.scales = scales
 
     @abstractmethod
-    def raw(self, rows: int, start: int) -> Iterator[RawPoints]:
+    def raw(self, rows: int, start: int) -> Iterator[MarkedPoints]:
         """Yield the source's points from `start`, at most `rows` at a time."""
 
     @property
     def divisor(self) -> float:
         """The divisor of colours, known once `blocks` has finished."""
-        return 1.0
+        brightest = self.tally.brightest
+        fits = (full for full in self.scales if brightest <= full * (1.5 if full == 1 else 1.001))
+        return next(fits, self.scales[-1])
+
+    def header_notes(self) -> tuple[Note, ...]:
+        notes, rows = list(self.notes), self.tally.rows
+        if rows and not self.tally.brightest:
+            text = "all colours are 0; add colours, for example with PDAL's filters.colorization"
+            notes.append(Note("black", rows, text))
+        elif rows and self.divisor == _FULL[0] < self.scales[-1]:
+            notes.append(Note("eight_bit_colors", rows, "colours up to 255 in fields of a larger range"))
+        return tuple(notes)
 
     def near(self, positions: NDArray[np.float64]) -> NDArray[np.float32]:
         """Return positions relative to `offset`."""
@@ -179,12 +227,12 @@ class PointStream(Stream[RawPoints]):
             return (positions - self.offset).astype(np.float32)
 
     def positions(self, rows: int) -> Iterator[NDArray[np.float32]]:
-        return (self.near(positions) for positions, _ in self.raw(rows, 0))
+        return (self.near(positions) for positions, _, _ in self.raw(rows, 0))
 
     def blocks(self, rows: int, start: int = 0) -> Iterator[RawPoints]:
-        for points in self.raw(rows, start):
-            good = self.tally.finite(*points)
-            yield points if good.all() else (points[0][good], points[1][good])
+        for positions, colors, noise in self.raw(rows, start):
+            good = self.tally.keep(positions, colors, noise)
+            yield (positions, colors) if good.all() else (positions[good], colors[good])
 
     def whole(self) -> Cloud:
         """Read all points, with colours in [0, 1]."""
@@ -199,15 +247,43 @@ class PointStream(Stream[RawPoints]):
 class WholeCloud(PointStream):
     """Point cloud in memory."""
 
-    def __init__(self, path: Path, positions: NDArray[np.float64], colors: NDArray[np.float32]) -> None:
+    def __init__(
+        self,
+        path: Path,
+        positions: NDArray[np.float64],
+        colors: NDArray[np.float32],
+        scales: Sequence[float] = (1.0,),
+    ) -> None:
         self._positions, self._colors = positions, colors
-        at = positions[np.isfinite(positions).all(axis=1)]
-        bounds = (at.min(axis=0), at.max(axis=0)) if len(at) else np.zeros((2, 3))
-        super().__init__(path, len(positions), *bounds)
+        super().__init__(path, len(positions), positions, scales)
 
-    def raw(self, rows: int, start: int) -> Iterator[RawPoints]:
+    def raw(self, rows: int, start: int) -> Iterator[MarkedPoints]:
         for first in range(start, self.count, rows):
-            yield self._positions[first : first + rows], self._colors[first : first + rows]
+            part = slice(first, first + rows)
+            positions, colors = self._positions[part], self._colors[part]
+            yield positions, colors, np.zeros(len(positions), bool)
+
+
+_DEGREES = Note(
+    "degrees",
+    1,
+    "x and y look like degrees of longitude and latitude, and z like metres; project them to metres, for "
+    "example with `pdal translate IN OUT reprojection --filters.reprojection.out_srs=EPSG:32633`",
+)
+
+
+def _robust_bounds(sample: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the 1st and 99th percentiles of finite positions; zeros without any."""
+    at = sample[np.isfinite(sample).all(axis=1)]
+    bounds: NDArray[np.float64] = np.percentile(at, (1, 99), axis=0) if len(at) else np.zeros((2, 3))
+    return bounds
+
+
+def _in_degrees(middle: NDArray[np.float64], extent: NDArray[np.float64]) -> bool:
+    """Return whether x and y may be degrees, z metres: far from 0, and of much smaller extent than z."""
+    wide = float(extent[:2].max())
+    on_globe = (np.abs(middle[:2]) <= 180).all() and np.abs(middle[:2]).min() <= 90
+    return bool(on_globe and np.abs(middle[:2]).max() > _FAR * wide and extent[2] > _STEEP * wide)
 
 
 class Joined(Stream[Block]):
@@ -262,11 +338,11 @@ class JoinedClouds(Joined[RawPoints], PointStream):
         Stream.__init__(self, streams[0].path, sum(s.count for s in streams), streams[0].offset)
         self.tally = PointTally()
 
-    def raw(self, rows: int, start: int) -> Iterator[RawPoints]:
+    def raw(self, rows: int, start: int) -> Iterator[MarkedPoints]:
         for number, begin in from_row([stream.count for stream in self.streams], start):
             divisor = self._divisor(number, rows)
-            for positions, colors in self.streams[number].raw(rows, begin):
-                yield positions, colors / np.float32(divisor)
+            for positions, colors, noise in self.streams[number].raw(rows, begin):
+                yield positions, colors / np.float32(divisor), noise
 
     def _divisor(self, number: int, rows: int) -> float:
         """Return a file's divisor, which takes an additional pass over its points."""
@@ -274,9 +350,13 @@ class JoinedClouds(Joined[RawPoints], PointStream):
             stream = self.streams[number]
             stream.tally = PointTally()
             for points in stream.raw(rows, 0):
-                stream.tally.finite(*points)
+                stream.tally.keep(*points)
             self._divisors[number] = stream.divisor
         return self._divisors[number]
+
+    @property
+    def divisor(self) -> float:
+        return 1.0
 
 
 def from_row(counts: Sequence[int], start: int) -> Iterator[tuple[int, int]]:

@@ -26,12 +26,22 @@ def columns(position: str, color: str, names: tuple[str, ...] = ("red", "green",
     return dict.fromkeys("xyz", position) | dict.fromkeys(names, color)
 
 
-def las(path: Path, positions: np.ndarray, rgb: np.ndarray | None) -> Path:
-    header = laspy.LasHeader(point_format=1 if rgb is None else 2, version="1.2")
-    header.offsets, header.scales = positions.min(0), np.full(3, 0.001)
+def las(
+    path: Path,
+    positions: np.ndarray,
+    rgb: np.ndarray | None,
+    point_format: int = 2,
+    scales: tuple[float, ...] = (0.001,) * 3,
+    **fields: np.ndarray,
+) -> Path:
+    point_format = 1 if rgb is None else point_format
+    header = laspy.LasHeader(point_format=point_format, version="1.4" if point_format > 5 else "1.2")
+    header.offsets, header.scales = positions.min(0), np.array(scales)
     data = laspy.LasData(header)
     data.x, data.y, data.z = positions.T
     if rgb is not None:
         data.red, data.green, data.blue = rgb.T
+    for name, values in fields.items():
+        data[name] = values
     data.write(str(path))
     return path
