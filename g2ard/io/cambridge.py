@@ -7,6 +7,8 @@ import numpy as np
 
 from g2ard.errors import InputError, damaged
 from g2ard.io.colmap import parsing
+from g2ard.io.finding import Finder
+from g2ard.io.paths import read_text
 from g2ard.io.photos import Frame, Lens, photo_size, posed, view_set
 from g2ard.io.types import ViewSet
 
@@ -36,14 +38,14 @@ def read(path: Path, images: Path | None = None) -> ViewSet:
     """
     lenses = _lenses(path / _NVM_FILE)
     median = _Focal(float(np.median([lens.focal for lens in lenses.values()])), 0.0)
-    frames, guessed = [], 0
+    frames, guessed, finder = [], 0, Finder(images or path)
     for split, name in _SPLIT_FILES.items():
         if not (path / name).is_file():
             continue
         for photo_name, pose in _poses(path / name):
             lens = lenses.get(_stem(photo_name))
             guessed += lens is None
-            photo = (images or path) / photo_name
+            photo = finder.photo(photo_name)
             frames.append(_frame(path / name, photo_name, pose, lens or median, photo, split))
     views = view_set(path, frames)
     if not guessed:
@@ -58,7 +60,9 @@ def _frame(where: Path, name: str, pose: list[float], lens: _Focal, photo: Path,
     view[:3, 3] = -view[:3, :3] @ np.array(pose[:3])
     focal = lens.focal * width / _PHOTO_SIZE[0]
     K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
-    return Frame(name, view, Lens((width, height), K, (-lens.radial, 0.0, 0.0, 0.0, 0.0)), photo, split)
+    return Frame(
+        name, view, Lens((width, height), K, (-lens.radial, 0.0, 0.0, 0.0, 0.0)), photo, split, listed=name
+    )
 
 
 def _stem(name: str) -> str:
@@ -69,7 +73,7 @@ def _stem(name: str) -> str:
 def _lenses(path: Path) -> dict[str, _Focal]:
     """Read the lenses of an NVM file's first model: name, focal, quaternion, centre, radial, 0 per line."""
     with parsing(path):
-        lines = path.read_text(encoding="utf-8").splitlines()
+        lines = read_text(path).splitlines()
         if not lines or not lines[0].startswith("NVM_V3"):
             raise InputError("not VisualSFM's NVM_V3", path=path)
         at = next((i for i, line in enumerate(lines[1:], 1) if line.strip()), None)
@@ -86,7 +90,7 @@ def _poses(path: Path) -> list[tuple[str, list[float]]]:
     """Read poses, one per line after three lines of heading."""
     out = []
     with parsing(path):
-        for number, line in enumerate(path.read_text(encoding="utf-8").splitlines()[3:], 4):
+        for number, line in enumerate(read_text(path).splitlines()[3:], 4):
             words = line.split()
             if not words:
                 continue

@@ -1,6 +1,7 @@
 """Reader for COLMAP models: cameras and images, binary or text. Rigs and frames (COLMAP 4) are ignored."""
 
 import math
+import re
 import struct
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -10,8 +11,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from g2ard.errors import InputError, damaged
+from g2ard.io.finding import Finder
+from g2ard.io.paths import decoded
 from g2ard.io.photos import Frame, Lens, photo_size, posed, view_set
 from g2ard.io.types import ViewSet
+from g2ard.progress import plural
 
 _MODELS = (
     *("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV"),
@@ -39,24 +43,77 @@ def holds(folder: Path) -> bool:
 
 
 def model_folder(path: Path) -> Path | None:
-    """Return the model's folder: `path`, or sparse/0, sparse or colmap/sparse/0 in it, or None."""
+    """Return the model's folder, or None: that of `path` itself, otherwise the one with the most images in
+    sparse, colmap/sparse or a numbered folder in these.
+    """
+    found = _models(path)
+    return found[0] if found else None
+
+
+def _models(path: Path) -> list[Path]:
+    """Return the folders of models, that of `path` or otherwise the one with the most images first."""
     path = path.parent if path.is_file() else path
-    places = (path, path / "sparse" / "0", path / "sparse", path / "colmap" / "sparse" / "0")
-    return next((folder for folder in places if _tables(folder)), None)
+    if _tables(path):
+        return [path, *(folder for folder in _numbered(path.parent) if folder != path)]
+    for sparse in (path / "sparse", path / "colmap" / "sparse"):
+        folders = [folder for folder in (*_numbered(sparse), sparse) if _tables(folder)]
+        if folders:
+            return sorted(folders, key=_count, reverse=len(folders) > 1)
+    return sorted(_numbered(path), key=_count, reverse=True)
+
+
+def _numbered(folder: Path) -> list[Path]:
+    """Return the models in the numbered folders of one, as COLMAP's mapper writes them."""
+    if not folder.is_dir():
+        return []
+    numbered = sorted((p for p in folder.iterdir() if p.name.isdecimal()), key=lambda p: int(p.name))
+    return [place for place in numbered if _tables(place)]
+
+
+def _count(folder: Path) -> int:
+    """Return the number of images of a model, 0 if they cannot be read."""
+    tables = _tables(folder)
+    try:
+        if tables is None or tables[1].suffix.lower() == ".txt":
+            return 0 if tables is None else len(_images_txt(tables[1])[0])
+        with tables[1].open("rb") as file:
+            (count,) = _COUNT.unpack(file.read(_COUNT.size))
+            return int(count)
+    except (InputError, OSError, ValueError, struct.error):
+        return 0
 
 
 def photos_beside(path: Path) -> tuple[Path, Path] | None:
     """Return (project, photos) if `path` is a folder of photos beside a model, such as images_4."""
-    if not path.is_dir() or model_folder(path) is not None or not path.name.startswith("images"):
+    if not path.is_dir() or not path.name.startswith("images") or model_folder(path) is not None:
         return None
     return (path.parent, path) if model_folder(path.parent) is not None else None
 
 
+def points_file(path: Path) -> Path | None:
+    """Return the file of points of the model that `read` takes for `path`, which may not exist, or None."""
+    beside = photos_beside(path)
+    folder = model_folder(beside[0] if beside else path)
+    if folder is None:
+        return None
+    held = _held(folder)
+    return next((held[name] for name in _POINT_FILES if name in held), folder / "points3D.bin")
+
+
+_POINT_FILES = ("points3d.bin", "points3d.txt")
+
+
+def _held(folder: Path) -> dict[str, Path]:
+    """Return the files of a folder by name in small letters."""
+    return {p.name.lower(): p for p in sorted(folder.iterdir()) if p.is_file()} if folder.is_dir() else {}
+
+
 def _tables(folder: Path) -> tuple[Path, Path] | None:
     """Return the files of cameras and images, binary before text; None if either is missing."""
+    held = _held(folder)
     for suffix in (".bin", ".txt"):
-        cameras, images = folder / f"cameras{suffix}", folder / f"images{suffix}"
-        if cameras.is_file() and images.is_file():
+        cameras, images = held.get(f"cameras{suffix}"), held.get(f"images{suffix}")
+        if cameras and images:
             return cameras, images
     return None
 
@@ -64,14 +121,20 @@ def _tables(folder: Path) -> tuple[Path, Path] | None:
 def incomplete(path: Path) -> InputError | None:
     """Return the error for a model without cameras or images, or None if there is no part of one."""
     folder = path.parent if path.is_file() else path
-    for place in (folder, folder / "sparse" / "0", folder / "sparse", folder / "colmap" / "sparse" / "0"):
-        held = [name for name in _MODEL_FILES if (place / name).is_file()]
+    above = [folder / "sparse", folder / "colmap" / "sparse"]
+    for place in (folder, *above, *(p for up in above if up.is_dir() for p in sorted(up.iterdir()))):
+        names = _held(place)
+        held = [name for name in _MODEL_FILES if name.lower() in names]
         if held and _tables(place) is None:
             suffix = Path(held[0]).suffix
             lacking = [f"{part}{suffix}" for part in ("cameras", "images") if f"{part}{suffix}" not in held]
             text = f"COLMAP model without {' and '.join(lacking)}; found {', '.join(held)}"
             return InputError(text, path=place, hint="copy the whole model: cameras (lenses), images (poses)")
     return None
+
+
+class NotFinite(InputError):
+    """A number that is not finite; its view is left out."""
 
 
 @contextmanager
@@ -91,13 +154,28 @@ def read(path: Path, images: Path | None = None) -> ViewSet:
     """Read the registered images of a COLMAP model as views, sorted by name.
 
     `path` is the project folder, the model's folder, one of its files, or a folder of photos beside the
-    model, such as images_4. Cameras are scaled to resized photos (Mip-NeRF 360's images_2, images_4).
+    model, such as images_4. Cameras are scaled to resized photos (Mip-NeRF 360's images_2, images_4). Of
+    several models in numbered folders, the one with the most images is read, unless `path` is one.
     """
-    return view_set(*frames(path, images))
+    left_out: list[tuple[str, InputError]] = []
+    folder, listed = frames(path, images, left_out)
+    views = view_set(folder, listed, left_out)
+    beside = photos_beside(path)
+    others = [other for other in _models(beside[0] if beside else path) if other != folder]
+    if not others:
+        return views
+    largest = max(others, key=_count)
+    text = f"read {folder} of {len(others) + 1} models; {largest} has {plural(_count(largest), 'image')}"
+    return views.noted("other_models", len(others), text)
 
 
-def frames(path: Path, images: Path | None = None) -> tuple[Path, list[Frame]]:
-    """Return the model's folder and its frames, with or without photos."""
+def frames(
+    path: Path, images: Path | None = None, left_out: list[tuple[str, InputError]] | None = None
+) -> tuple[Path, list[Frame]]:
+    """Return the model's folder and its frames, with or without photos.
+
+    Views with numbers that are not finite are appended to `left_out`; None raises their error.
+    """
     if images is None and (beside := photos_beside(path)):
         path, images = beside
     folder = model_folder(path)
@@ -105,34 +183,44 @@ def frames(path: Path, images: Path | None = None) -> tuple[Path, list[Frame]]:
     if folder is None or tables is None:
         error = incomplete(path)
         raise error or InputError("has no COLMAP model (cameras and images, .bin or .txt)", path=path)
-    binary = tables[0].suffix == ".bin"
+    binary = tables[0].suffix.lower() == ".bin"
     with parsing(tables[0]):
         cameras = (_cameras_bin if binary else _cameras_txt)(tables[0])
     with parsing(tables[1]):
-        images_read = (_images_bin if binary else _images_txt)(tables[1])
-    if not images_read:
+        images_read, faults = (_images_bin if binary else _images_txt)(tables[1])
+    if not images_read and not faults:
         raise InputError("has no images", path=tables[1])
-    photos = images or _photo_folder(path, folder)
+    finder = Finder(images) if images else Finder(*_photo_folders(path, folder))
     listed = []
     sizes: dict[int, tuple[int, int]] = {}
     for image in sorted(images_read, key=lambda i: i.name):
         if image.camera not in cameras:
             raise InputError(f"{image.name!r} has the unknown camera {image.camera}", path=tables[1])
         camera = cameras[image.camera]
-        photo = photos / image.name if photos else None
-        if images is not None and photo is not None and photo.is_file():
+        if isinstance(camera, NotFinite):
+            faults.append((image.name, camera))
+            continue
+        photo = finder.photo(image.name)
+        if images is not None and photo.is_file():
             if image.camera not in sizes:  # one lens, one size
-                sizes[image.camera] = photo_size(photo, tables[1])
+                sizes[image.camera] = photo_size(photo, tables[1], camera.size)
             camera = camera.at(sizes[image.camera])
         if not any(image.quat):
             raise InputError(f"{image.name!r}: its quaternion is zero", path=tables[1])
-        listed.append(Frame(image.name, posed(image.quat, image.translation), camera, photo))
+        pose = posed(image.quat, image.translation)
+        listed.append(Frame(image.name, pose, camera, photo, listed=image.name))
+    if faults and left_out is None:
+        raise faults[0][1]
+    if left_out is not None:
+        left_out += faults
     return folder, listed
 
 
-def _photo_folder(path: Path, model: Path) -> Path | None:
+def _photo_folders(path: Path, model: Path) -> list[Path]:
+    """Return folders of photos: `images` beside `path`, the model or up to three folders above it."""
     roots = (path, model, model.parent, model.parent.parent, model.parent.parent.parent)
-    return next((root / "images" for root in roots if (root / "images").is_dir()), None)
+    found = [root / "images" for root in roots if (root / "images").is_dir()]
+    return found[:1] or [path / "images"]
 
 
 class Table:
@@ -157,7 +245,7 @@ class Table:
         values = self.take(item, i, layout, names)
         for name, value in zip(names, values, strict=True):
             if not math.isfinite(value):
-                raise InputError(f"is {value}", path=self.path, property=name, index=i, item=item)
+                raise NotFinite(f"is {value}", path=self.path, property=name, index=i, item=item)
         return values
 
     def skip(self, item: str, i: int, size: int, name: str) -> None:
@@ -193,22 +281,30 @@ _CAMERA_NAMES = ("CAMERA_ID", "MODEL", "WIDTH", "HEIGHT")
 _COUNT, _CAMERA, _IMAGE = struct.Struct("<Q"), struct.Struct("<iiQQ"), struct.Struct("<IdddddddI")
 
 
-def _cameras_bin(path: Path) -> dict[int, Lens]:
-    table, cameras = Table(path), {}
+def _cameras_bin(path: Path) -> dict[int, Lens | NotFinite]:
+    table, cameras = Table(path), dict[int, Lens | NotFinite]()
     for i in range(table.count):
         key, model, width, height = table.take("camera", i, _CAMERA, _CAMERA_NAMES)
         name = _MODELS[model] if 0 <= model < len(_MODELS) else f"number {model}"
         names = [f"PARAMS[{k}]" for k in range(_PARAMETERS.get(name, 0))]
-        values = table.finite("camera", i, struct.Struct(f"<{len(names) * 'd'}"), names)
-        cameras[key] = _camera(path, name, (width, height), values)
+        try:
+            values = table.finite("camera", i, struct.Struct(f"<{len(names) * 'd'}"), names)
+            cameras[key] = _camera(path, name, (width, height), values)
+        except NotFinite as error:
+            cameras[key] = error
     return cameras
 
 
-def _images_bin(path: Path) -> list[_Image]:
+def _images_bin(path: Path) -> tuple[list[_Image], list[tuple[str, NotFinite]]]:
     table = Table(path)
     images: list[_Image] = []
+    faults: list[tuple[str, NotFinite]] = []
     for i in range(table.count):
-        _key, *pose, camera = table.finite("image", i, _IMAGE, ("IMAGE_ID", *_POSE, "CAMERA_ID"))
+        at, fault = table.at, None
+        try:
+            _key, *pose, camera = table.finite("image", i, _IMAGE, ("IMAGE_ID", *_POSE, "CAMERA_ID"))
+        except NotFinite as error:
+            fault, table.at = error, at + _IMAGE.size
         end = table.data.find(b"\0", table.at)
         if end < 0:
             raise table.cut_off("image", i, "NAME")
@@ -219,8 +315,11 @@ def _images_bin(path: Path) -> list[_Image]:
         table.at = end + 1
         (points,) = table.take("image", i, _COUNT, ["POINTS2D"])
         table.skip("image", i, 24 * points, "POINTS2D")
-        images.append(_Image(name, camera, tuple(pose[:4]), tuple(pose[4:])))
-    return images
+        if fault is None:
+            images.append(_Image(name, camera, tuple(pose[:4]), tuple(pose[4:])))
+        else:
+            faults.append((name, fault))
+    return images, faults
 
 
 _CAMERA_COLUMNS = (("CAMERA_ID", 0), ("WIDTH", 2), ("HEIGHT", 3))
@@ -229,18 +328,22 @@ _POSE_COLUMNS = tuple((name, at) for at, name in enumerate(_POSE, 1))
 
 def text_lines(path: Path) -> list[str]:
     """Return the lines of a COLMAP text table without comments; empty lines may be rows."""
-    return [line for line in path.read_text(encoding="utf-8").splitlines() if not line.startswith("#")]
+    return [line for line in decoded(path.read_bytes()).splitlines() if not line.startswith("#")]
 
 
-def _cameras_txt(path: Path) -> dict[int, Lens]:
-    cameras = {}
+def _cameras_txt(path: Path) -> dict[int, Lens | NotFinite]:
+    cameras: dict[int, Lens | NotFinite] = {}
     rows = [words for line in text_lines(path) if (words := line.split())]
     for i, words in enumerate(rows):
         key, width, height = (number(path, "camera", i, words, name, at) for name, at in _CAMERA_COLUMNS)
-        params = tuple(
-            number(path, "camera", i, words, f"PARAMS[{at - 4}]", at, _finite) for at in range(4, len(words))
-        )
-        cameras[int(key)] = _camera(path, words[1], (int(width), int(height)), params)
+        try:
+            params = tuple(
+                number(path, "camera", i, words, f"PARAMS[{at - 4}]", at, _finite)
+                for at in range(4, len(words))
+            )
+            cameras[int(key)] = _camera(path, words[1], (int(width), int(height)), params)
+        except NotFinite as error:
+            cameras[int(key)] = error
     return cameras
 
 
@@ -251,6 +354,8 @@ def number(
     if at >= len(words):
         raise InputError("is missing", path=path, property=name, index=i, item=item)
     word = words[at]
+    if kind is _finite and _NOT_FINITE.fullmatch(word):
+        raise NotFinite(f"is {word!r}", path=path, property=name, index=i, item=item)
     try:
         if "_" in word or not word.isascii():  # float() accepts both
             raise ValueError(word)
@@ -266,19 +371,40 @@ def _finite(word: str) -> float:
     return value
 
 
-def _images_txt(path: Path) -> list[_Image]:
+_NOT_FINITE = re.compile(r"[+-]?(nan(\(.*\))?|inf(inity)?|\d\.#\w+)", re.IGNORECASE)
+"""Numbers that are not finite, as C and C++ write them on any system."""
+
+
+def _images_txt(path: Path) -> tuple[list[_Image], list[tuple[str, NotFinite]]]:
     """Read images.txt: per image a line with its pose (wxyz and translation, camera from world), camera
-    and name, then a line with its points, which may be empty and is skipped.
+    and name, then a line with its points, which is skipped and may be empty or missing.
     """
-    lines = text_lines(path)
-    while lines and not lines[0].strip():  # before the first image: would swap poses and points
-        lines.pop(0)
-    images = []
-    for i, line in enumerate(lines[::2]):
-        if words := line.split(maxsplit=9):  # otherwise an empty line at the end of the file
-            pose = tuple(number(path, "image", i, words, name, at, _finite) for name, at in _POSE_COLUMNS)
+    images: list[_Image] = []
+    faults: list[tuple[str, NotFinite]] = []
+    points = False
+    for line in text_lines(path):
+        if not line.strip() or (points and _is_points(line)):
+            points = False
+            continue
+        i, words, points = len(images) + len(faults), line.split(maxsplit=9), True
+        name = words[9].strip() if len(words) > 9 else ""
+        try:
+            pose = tuple(number(path, "image", i, words, key, at, _finite) for key, at in _POSE_COLUMNS)
             camera = int(number(path, "image", i, words, "CAMERA_ID", 8))
-            if len(words) < 10:
-                raise InputError("is missing", path=path, property="NAME", index=i, item="image")
-            images.append(_Image(words[9].strip(), camera, pose[:4], pose[4:]))
-    return images
+        except NotFinite as error:
+            faults.append((name, error))
+            continue
+        if len(words) < 10:
+            raise InputError("is missing", path=path, property="NAME", index=i, item="image")
+        images.append(_Image(name, camera, pose[:4], pose[4:]))
+    return images, faults
+
+
+def _is_points(line: str) -> bool:
+    """Return whether a line of images.txt has triples x, y, POINT3D_ID, unlike the line of an image."""
+    words = line.split()
+    ids = words[2::3]
+    return len(words) % 3 == 0 and all(map(_WHOLE.fullmatch, ids)) and all(map(_NUMBER.fullmatch, words[:30]))
+
+
+_WHOLE, _NUMBER = re.compile(r"-?\d+"), re.compile(r"[+-]?(nan|inf|[\d.]+(e[+-]?\d+)?)", re.IGNORECASE)

@@ -13,7 +13,7 @@ from typing import Any, Literal
 
 from g2ard.config.choices import BLACK, Colour
 from g2ard.errors import InputError
-from g2ard.io.paths import check_regular, is_photo
+from g2ard.io.paths import check_regular
 
 Kind = Literal["splats", "points", "views"]
 
@@ -269,6 +269,9 @@ def _near(path: Path) -> str:
 
 def _instead(path: Path) -> str:
     """Suggest what to do with an unsupported folder."""
+    from g2ard.io.finding import is_a_photo
+    from g2ard.io.photos import unreadable
+
     held: dict[Kind, list[str]] = {"splats": [], "points": [], "views": []}
     files = (
         file
@@ -284,15 +287,17 @@ def _instead(path: Path) -> str:
         return f"; give one of its files: {', '.join(held_kinds)}"
     if runs := [folder.name for folder in sorted(path.iterdir()) if run_scene(folder) != folder]:
         return f"; give one of its runs: {', '.join(runs[:5])}"
-    photos = next(
-        (p for p in (path, path / "images") if p.is_dir() and any(map(is_photo, p.iterdir()))), None
-    )
-    if photos is not None:
+    for place in (path, path / "images"):
+        photos = [file for file in sorted(place.iterdir()) if is_a_photo(file)] if place.is_dir() else []
+        if not photos:
+            continue
         if (poses := _poses_above(path)) is not None:
             return f"; give {poses}, which has the poses of its photos"
+        unread = [what for file in photos[:_MOST_INSPECTED_FILES] if (what := unreadable(file))]
+        first = f"convert its {unread[0]} photos to JPEG, then " if unread else ""
         return (
-            "; it has photos without poses: estimate them with `colmap automatic_reconstructor "
-            f"--workspace_path project --image_path {photos}` and give project"
+            f"; it has photos without poses: {first}estimate them with `colmap automatic_reconstructor "
+            f"--workspace_path project --image_path {place}` and give project"
         )
     return (
         " (looked for SOG's meta.json, `ingest`'s tiles.json, a COLMAP sparse/0, transforms.json, "

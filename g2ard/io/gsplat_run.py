@@ -17,6 +17,13 @@ def holds(folder: Path) -> bool:
     return file.is_file() and read_settings(file).word("data_dir") is not None
 
 
+def data_of(path: Path) -> Path | None:
+    """Return the folder of a run's data, or None if it does not exist."""
+    file = path / NAME if path.is_dir() else path
+    named = read_settings(file).path("data_dir")
+    return None if named is None else below(file, named)
+
+
 def read(path: Path, images: Path | None = None) -> ViewSet:
     """Read a run's cameras with their splits: every `test_every`th in order of names is test.
 
@@ -36,8 +43,7 @@ def read(path: Path, images: Path | None = None) -> ViewSet:
             path=file,
             hint="train with --no-normalize-world-space, or give cameras in the scene's world",
         )
-    named = settings.path("data_dir")
-    data = below(file, named) if named is not None else None
+    named, data = settings.path("data_dir"), data_of(path)
     if named is None or data is None:
         raise InputError(f"data_dir {named and named.as_posix()} does not exist", path=file)
     smaller = data / f"images_{settings.word('data_factor')}"

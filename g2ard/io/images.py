@@ -12,13 +12,13 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from PIL import Image, ImageDraw, ImageFont
+from PIL import Image, ImageDraw, ImageFont, ImageOps
 
 from g2ard.config.choices import BLACK, Colour
 from g2ard.errors import InputError
 from g2ard.io.atomic import atomic_output
 from g2ard.io.limits import opened_image
-from g2ard.io.photos import ASPECT_SLACK
+from g2ard.io.photos import fits, turns
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.samples import evenly_spaced
 
@@ -35,7 +35,8 @@ def load_image(cameras: Cameras, index: int, background: Sequence[float] = BLACK
     """Read the photo of a view as an image of its pinhole camera.
 
     A distorted photo is undistorted at its own resolution, then resized by area. Beyond the photo's edge, the
-    edge is repeated. EXIF orientation is ignored, because poses refer to stored pixels. Grey becomes three
+    edge is repeated. EXIF orientation counts only where the view's size
+    needs it, because poses usually refer to stored pixels. Grey becomes three
     equal channels; alpha is composited over the background.
 
     Args:
@@ -65,12 +66,12 @@ def load_premultiplied(cameras: Cameras, index: int) -> NDArray[np.float32]:
         raise InputError(f"({name}) has no photo", index=index, item="view", hint="pass views with photos")
     named = None if cameras.source is None else f"{cameras.source} names it as view {name!r}"
     try:
-        image = _open(path)
+        target = int(cameras.widths[index]), int(cameras.heights[index])
+        image = _open(path, target)
     except InputError as error:
         raise error.at(hint="; ".join(filter(None, (error.hint, named))) or None) from error
     height, width = image.shape[:2]
-    target = int(cameras.widths[index]), int(cameras.heights[index])
-    if abs(width * target[1] - height * target[0]) > ASPECT_SLACK * height * target[0]:
+    if not fits((width, height), target):
         raise InputError(
             f"the photo is {width}×{height}, its view {target[0]}×{target[1]}: the aspects differ",
             path=path,
@@ -151,10 +152,11 @@ def load_mask(cameras: Cameras, index: int) -> NDArray[np.bool_] | None:
     return np.ascontiguousarray(image.mean(2) > 0.5)
 
 
-def _open(path: Path) -> NDArray[np.float32]:
-    """Decode a photo as (H, W, 3) RGB, or as (H, W, 4) RGBA with RGB premultiplied."""
+def _open(path: Path, like: tuple[int, int] | None = None) -> NDArray[np.float32]:
+    """Decode a photo as (H, W, 3) RGB, or as premultiplied (H, W, 4) RGBA; for `like` see `turns`."""
     try:
-        with opened_image(path) as image:
+        with opened_image(path) as stored:
+            image = ImageOps.exif_transpose(stored) if turns(stored, like) else stored
             if image.mode.startswith("I") or image.mode == "F":  # 16-bit grey has several modes
                 values = np.asarray(image, np.float32)
                 values = values / np.float32(1.0 if image.mode == "F" else 65535.0)

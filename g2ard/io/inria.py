@@ -7,8 +7,9 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from g2ard.io.finding import Finder
 from g2ard.io.jsonfile import Matrix, Number, Place, Vector, Whole, checked, read_any_json
-from g2ard.io.photos import ASPECT_SLACK, Frame, Lens, find_photo, inverse, photo_size, rigid, view_set
+from g2ard.io.photos import Frame, Lens, fits, inverse, photo_size, rigid, view_set
 from g2ard.io.types import ViewSet
 from g2ard.progress import plural
 
@@ -47,7 +48,8 @@ def read(path: Path, images: Path | None = None) -> ViewSet:
     listed = checked(read_any_json(file), list[_Camera], Place(file), entries="camera")
     if images is None and (file.parent / "images").is_dir():
         images = file.parent / "images"
-    frames = [_frame(Place(file, i, "camera"), camera, images) for i, camera in enumerate(listed)]
+    finder = Finder(images) if images else None
+    frames = [_frame(Place(file, i, "camera"), camera, finder) for i, camera in enumerate(listed)]
     times = Counter(frame.name for frame in frames)
     for i, frame in enumerate(frames):
         if times[frame.name] > 1:
@@ -60,15 +62,15 @@ def read(path: Path, images: Path | None = None) -> ViewSet:
     return views.noted("repeated_names", repeated, text)
 
 
-def _frame(place: Place, camera: _Camera, images: Path | None) -> Frame:
+def _frame(place: Place, camera: _Camera, finder: Finder | None) -> Frame:
     world_from_camera = np.column_stack([camera.rotation, camera.position])
     fx, fy = camera.fx, camera.fy
     width, height = int(camera.width), int(camera.height)
-    photo = find_photo(images / Path(camera.img_name).name) if images else None
+    photo = finder.photo(camera.img_name) if finder else None
     # The file has the size of the full photos; the trainer may have used and kept smaller ones.
     if photo is not None and photo.is_file() and width and height:
-        (shown_width, shown_height), full = photo_size(photo, place.path), (width, height)
-        if abs(shown_width * height - shown_height * width) <= ASPECT_SLACK * shown_height * width:
+        (shown_width, shown_height), full = photo_size(photo, place.path, (width, height)), (width, height)
+        if fits((shown_width, shown_height), full):
             width, height = shown_width, shown_height
             fx, fy = fx * width / full[0], fy * height / full[1]
     return Frame(
@@ -76,4 +78,5 @@ def _frame(place: Place, camera: _Camera, images: Path | None) -> Frame:
         viewmat=inverse(rigid(world_from_camera, place.to("rotation"))),
         lens=Lens((width, height), np.array([[fx, 0, width / 2], [0, fy, height / 2], [0, 0, 1]])),
         photo=photo,
+        listed=camera.img_name,
     )

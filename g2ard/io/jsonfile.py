@@ -13,6 +13,7 @@ import msgspec
 from msgspec import Meta
 
 from g2ard.errors import InputError
+from g2ard.io.paths import decoded
 
 _LARGEST_NUMBER = sys.float_info.max
 _LONGEST_SHOWN_VALUE = 40
@@ -85,7 +86,7 @@ def read_any_json(path: Path) -> Any:
 def parse_json(path: Path, data: bytes) -> Any:
     """Return the content of JSON text; `path` is for errors."""
     try:
-        return json.loads(data.decode("utf-8-sig"))
+        return json.loads(decoded(data))
     except UnicodeDecodeError as error:
         raise InputError("not a text file", path=path) from error
     except json.JSONDecodeError as error:

@@ -60,7 +60,7 @@ def _frame(place: Place, matrix: np.ndarray, photo: Path | None) -> Frame:
     size = round(width), round(height)
     lens = Lens(size, np.array([[focal, 0, size[0] / 2], [0, focal, size[1] / 2], [0, 0, 1]]))
     if photo is not None:
-        lens = lens.at(photo_size(photo, place.path))
+        lens = lens.at(photo_size(photo, place.path, lens.size))
     name = f"{place.index:05d}" if photo is None else photo.name
     return Frame(name, inverse(pose), lens, photo)
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from g2ard.errors import InputError
 from g2ard.io import colmap, transforms
+from g2ard.io.finding import Finder
 from g2ard.io.jsonfile import Place, Pose, checked, read_any_json
 from g2ard.io.photos import Frame, Lens, photo_size, rigid, view_set
 from g2ard.io.settings import below
@@ -45,30 +46,33 @@ def read(path: Path, images: Path | None = None) -> ViewSet:
     """
     files = exported(path) if path.is_dir() else [path]
     lenses: dict[Path, dict[str, Lens]] = {}
-    frames = []
+    frames, finder = [], Finder(images) if images else None
     for file in files:
         listed = checked(read_any_json(file), list[_Camera], Place(file), entries="camera")
         frames += [
-            _frame(Place(file, i, "camera"), camera, images, lenses) for i, camera in enumerate(listed)
+            _frame(Place(file, i, "camera"), camera, finder, lenses) for i, camera in enumerate(listed)
         ]
     return view_set(path, frames)
 
 
-def _frame(place: Place, camera: _Camera, images: Path | None, lenses: dict[Path, dict[str, Lens]]) -> Frame:
+def _frame(
+    place: Place, camera: _Camera, finder: Finder | None, lenses: dict[Path, dict[str, Lens]]
+) -> Frame:
     path, file_path = place.path, Path(camera.file_path)
     world_from_camera = rigid(np.array(camera.transform), place.to("transform"))
     there = below(path, file_path)
     ups = (below(path, up) for up in file_path.parents[:3] if up.parts)
     lens = _lens(place, file_path, there or next(filter(None, ups), None), lenses)
-    photo = images / file_path.name if images else there
+    photo = finder.photo(camera.file_path) if finder else there
     if photo is not None and photo.is_file():
-        lens = lens.at(photo_size(photo, path))
+        lens = lens.at(photo_size(photo, path, lens.size))
     return Frame(
         name=file_path.name,
         viewmat=transforms.opencv_view(world_from_camera),
         lens=lens,
         photo=photo or file_path,
         split=LISTS.get(path.name),
+        listed=camera.file_path,
     )
 
 

@@ -1,5 +1,6 @@
 """Checks for paths: links, special files, names that leave their folder."""
 
+import codecs
 import hashlib
 import os
 from collections import Counter
@@ -15,6 +16,18 @@ _HASHED_END_BYTES = 1 << 16
 _LONGEST_NAME = 200
 """Longest file name, bytes; systems allow 255, including suffixes and temporary names."""
 
+_PHOTO_SUFFIXES = (".png", ".jpg", ".jpeg", ".jfif", ".webp", ".tif", ".tiff", ".bmp")
+
+_RAW = ".dng .cr2 .cr3 .nef .arw .raf .orf .rw2 .raw"
+_OTHER_PHOTOS = {
+    **dict.fromkeys((".heic", ".heif", ".hif"), "HEIC"),
+    ".exr": "OpenEXR",
+    ".hdr": "Radiance HDR",
+    ".jxl": "JPEG XL",
+    **{suffix: f"raw ({suffix[1:].upper()})" for suffix in _RAW.split()},
+}
+"""Suffixes of photos that cannot be read, and their formats."""
+
 
 def real_path(path: str | Path) -> Path:
     """Return the path with links resolved; circular links are kept (`Path.resolve` would raise)."""
@@ -27,9 +40,15 @@ def check_regular(path: Path) -> None:
         raise InputError("not a regular file", path=path)
 
 
+def decoded(data: bytes) -> str:
+    """Decode text in UTF-8, or in UTF-16 with a byte order mark, which is removed."""
+    wide = data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+    return data.decode("utf-16" if wide else "utf-8-sig")
+
+
 def read_text(path: Path) -> str:
     try:
-        return path.read_text(encoding="utf-8")
+        return decoded(path.read_bytes())
     except OSError as error:
         raise InputError(f"{error.strerror}", path=path) from error
     except UnicodeDecodeError as error:
@@ -78,8 +97,13 @@ def _inside(path: str | Path, i: int, name: str) -> PurePosixPath:
 
 
 def is_photo(path: Path) -> bool:
-    """Return whether a name has the suffix of a photo."""
-    return path.suffix.lower() in (".png", ".jpg", ".jpeg", ".webp")
+    """Return whether a name has the suffix of a photo that can be read."""
+    return path.suffix.lower() in _PHOTO_SUFFIXES
+
+
+def other_photo(path: Path) -> str | None:
+    """Return the format of a photo that cannot be read, by its suffix, or None."""
+    return _OTHER_PHOTOS.get(path.suffix.lower())
 
 
 def file_identity(files: Iterable[Path]) -> list[Any]:

@@ -8,18 +8,23 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from g2ard.errors import InputError
+from g2ard.io.finding import find_mask, is_a_photo, is_end, mask_folders, plain_parts
 from g2ard.io.jsonfile import Place
 from g2ard.io.limits import opened_image
+from g2ard.io.paths import is_photo, other_photo
 from g2ard.io.types import Note, ViewSet
 from g2ard.progress import plural
 from g2ard.scene.cameras import USUAL, Cameras
 from g2ard.scene.transform import rotation_matrices
+
+if TYPE_CHECKING:
+    from PIL import Image
 
 ASPECT_SLACK = 0.02
 """Relative difference in aspect ratio that rounding may cause; more means another photo."""
@@ -33,8 +38,6 @@ _UNITS = {2: 25.4, 3: 10.0, 4: 1.0, 5: 1e-3}
 
 _FILM_DIAGONAL = math.hypot(36, 24)
 """Diagonal of 35 mm film, mm."""
-
-_SUFFIXES = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG", ".webp")
 
 
 class Lens(NamedTuple):
@@ -55,7 +58,7 @@ class Lens(NamedTuple):
 
 
 class Frame(NamedTuple):
-    """A view as listed in a file; its `photo` may be missing."""
+    """A view as listed in a file; its `photo` may be missing, and `listed` is what the file calls it."""
 
     name: str
     viewmat: NDArray[np.float64]
@@ -65,23 +68,56 @@ class Frame(NamedTuple):
     weight: float | None = None
     mask: Path | None = None
     kind: str = USUAL
+    listed: str = ""
 
 
-def find_photo(path: Path) -> Path:
-    """Return `path`, or an existing photo with a suffix added, as for NeRF's synthetic scenes."""
-    if path.is_file() or path.suffix in _SUFFIXES:
-        return path
-    tried = (path.with_name(path.name + suffix) for suffix in _SUFFIXES)
-    return next((p for p in tried if p.is_file()), path)
+def photo_size(
+    path: Path, listed_in: Path | None = None, like: tuple[float, float] | None = None
+) -> tuple[int, int]:
+    """Read width and height from a photo's header, upright by EXIF if only that fits the size `like`.
 
-
-def photo_size(path: Path, listed_in: Path | None = None) -> tuple[int, int]:
-    """Read width and height from a photo's header; `listed_in`, the file that names it, is for errors."""
+    `listed_in`, the file that names the photo, is for errors.
+    """
     try:
         with opened_image(path) as image:
-            return image.size
+            return turned(image.size) if turns(image, like) else image.size
     except InputError as error:
         raise error if listed_in is None else error.at(hint=f"it is listed in {listed_in}") from None
+
+
+def turned(size: tuple[int, int]) -> tuple[int, int]:
+    return size[1], size[0]
+
+
+def turns(image: Image.Image, like: tuple[float, float] | None) -> bool:
+    """Return whether EXIF turns an image by a quarter, and only then it has the aspect of `like`.
+
+    Poses refer to stored pixels, unless the size of their views shows that they refer to upright photos.
+    """
+    if like is None or fits(image.size, like) or not fits(turned(image.size), like):
+        return False
+    return int(image.getexif().get(_ORIENTATION, 1)) in (5, 6, 7, 8)
+
+
+def fits(size: tuple[float, float], like: tuple[float, float]) -> bool:
+    """Return whether two sizes have the same aspect."""
+    return abs(size[0] * like[1] - size[1] * like[0]) <= ASPECT_SLACK * size[1] * like[0]
+
+
+def _orientation(photo: Path) -> int:
+    """Return a photo's EXIF orientation, 1 without one."""
+    with suppress(Exception):
+        with photo.open("rb") as file:
+            if file.read(4) not in _OFTEN_TURNED:
+                return 1
+        with opened_image(photo) as image:
+            return int(image.getexif().get(_ORIENTATION, 1))
+    return 1
+
+
+_ORIENTATION = 0x0112
+_OFTEN_TURNED = (b"\xff\xd8\xff\xe1", b"\xff\xd8\xff\xe0", b"RIFF", b"II*\0", b"MM\0*", b"\x89PNG")
+"""First bytes of formats that cameras write."""
 
 
 def exif_focal(path: Path) -> float | None:
@@ -157,36 +193,49 @@ def _cameras(path: Path, frames: Sequence[Frame]) -> Cameras:
 
 
 def _mask(frame: Frame) -> Path | None:
-    """Return the frame's mask, or one named like its photo in `masks` beside the folder of photos."""
+    """Return the frame's mask, or that of its photo in a folder of masks."""
     if frame.mask is not None or frame.photo is None:
         return frame.mask
-    folder = frame.photo.parent.parent / "masks"
-    names = (frame.photo.name, f"{frame.photo.name}.png", f"{frame.photo.stem}.png")
-    return next((folder / name for name in names if (folder / name).is_file()), None)
+    return find_mask(frame.photo, len(plain_parts(frame.listed or frame.name)))
 
 
-def view_set(path: Path, frames: Sequence[Frame]) -> ViewSet:
-    """Stack frames with unique names; frames whose photo is missing keep their pose only."""
+def view_set(path: Path, frames: Sequence[Frame], left_out: Sequence[tuple[str, InputError]] = ()) -> ViewSet:
+    """Stack frames with unique names; frames whose photo is missing keep their pose only.
+
+    Args:
+        left_out: names of views with numbers that are not finite, and what is wrong; the first is raised if
+            there are no others.
+    """
     if not frames:
-        raise InputError("no views found", path=path)
+        raise left_out[0][1] if left_out else InputError("no views found", path=path)
     name, times = Counter(frame.name for frame in frames).most_common(1)[0]
     if times > 1:
         raise InputError(f"{times} views are named {name!r}; names must be unique", path=path)
+    notes = []
+    if left_out:
+        name, fault = left_out[0]
+        text = (
+            f"{plural(len(left_out), 'view')} left out, which numbers that are not finite describe: {fault}"
+        )
+        notes.append(Note("not_finite", len(left_out), f"{text} (view {name!r})"))
+    frames, found_notes = _checked_photos(frames)
+    notes += found_notes
     listed = [frame for frame in frames if frame.photo is not None]
     present = [frame for frame in frames if frame.photo is not None and frame.photo.is_file()]
-    notes = []
     if present and len(present) < len(frames):
         there = {frame.name for frame in present}
         frames = [f if f.name in there else f._replace(photo=None, mask=None) for f in frames]
     elif not present and listed:
-        notes.append(
-            Note("no_photos", len(listed), f"none of {plural(len(listed), 'photo')} found; using poses only")
-        )
+        text = f"none of {plural(len(listed), 'photo')} found; using poses only"
+        notes.append(Note("no_photos", len(listed), f"{text} (the first is {listed[0].photo})"))
         frames = [frame._replace(photo=None) for frame in frames]
     cameras = replace(_cameras(path, frames), source=path)
     masked = sum(mask is not None for mask in cameras.mask_paths)
     if masked:
         notes.append(Note("masks", masked, f"{plural(masked, 'photo')} of {len(present)} have masks"))
+    elif present and (folders := _idle_masks(present)):
+        text = f"no mask in {folders[0]} is named like a photo, as {present[0].name}.png would be"
+        notes.append(Note("unused_masks", 1, text))
     splits = tuple(f.split for f in frames)
     weights = [f.weight for f in frames]
     return ViewSet(
@@ -195,6 +244,79 @@ def view_set(path: Path, frames: Sequence[Frame]) -> ViewSet:
         splits if any(splits) else (),
         None if set(weights) == {None} else np.array([1.0 if w is None else w for w in weights]),
     )
+
+
+def _idle_masks(present: Sequence[Frame]) -> list[Path]:
+    """Return folders of masks for the first photo that hold images."""
+    photo, name = present[0].photo, present[0].listed or present[0].name
+    folders = mask_folders(photo, len(plain_parts(name))) if photo else []
+    return [folder for folder, _ in folders if any(is_photo(file) for file in folder.rglob("*"))]
+
+
+def _checked_photos(frames: Sequence[Frame]) -> tuple[list[Frame], list[Note]]:
+    """Drop photos that cannot be read, and photos that names of several folders were shortened to.
+
+    Returns:
+        The frames, and notes on these and on photos found with another suffix.
+    """
+    out, notes = list(frames), list[Note]()
+    bad, shared, renamed, exif = list[str](), list[str](), list[str](), list[Path]()
+    times = Counter(frame.photo for frame in frames)
+    for i, frame in enumerate(frames):
+        photo = frame.photo
+        if photo is None or not photo.is_file():
+            continue
+        if (what := unreadable(photo)) is not None:
+            bad.append(f"{frame.name} is {what}")
+            out[i] = frame._replace(photo=None, mask=None)
+            continue
+        if frame.listed and times[photo] > 1 and not is_end(frame.listed, photo):
+            shared.append(f"{frame.name} is not {photo}, which another view has")
+            out[i] = frame._replace(photo=None, mask=None)
+            continue
+        wanted = Path(frame.listed)
+        if is_a_photo(wanted) and photo.suffix.lower() != wanted.suffix.lower():
+            renamed.append(f"{frame.listed} is {photo.name}")
+        if _orientation(photo) != 1:
+            exif.append(photo)
+    if bad:
+        text = (
+            f"{plural(len(bad), 'photo')} of {len(frames)} cannot be read: {bad[0]}; convert to JPEG or PNG"
+        )
+        notes.append(Note("unreadable_photos", len(bad), text))
+    if shared:
+        text = f"{plural(len(shared), 'photo')} not found among equal names in folders: {shared[0]}"
+        notes.append(Note("equal_names", len(shared), text))
+    if renamed:
+        text = f"{plural(len(renamed), 'photo')} found with another suffix: {renamed[0]}"
+        notes.append(Note("other_suffix", len(renamed), text))
+    if exif:
+        text = (
+            f"{plural(len(exif), 'photo')} with an EXIF orientation (the first is {exif[0].name}): turned "
+            "where only that fits the size of the view, otherwise read as stored"
+        )
+        notes.append(Note("exif_orientation", len(exif), text))
+    return out, notes
+
+
+def unreadable(photo: Path) -> str | None:
+    """Return the format of a photo that cannot be read, by its suffix and first bytes, or None."""
+    if (by_suffix := other_photo(photo)) is not None:
+        return by_suffix
+    with suppress(OSError), photo.open("rb") as file:
+        head = file.read(40)
+        if head[4:8] == b"ftyp" and head[8:12] in _HEIF_BRANDS:
+            return "HEIC"
+        return next((what for start, what in _OTHER_STARTS.items() if head.startswith(start)), None)
+    return None
+
+
+_HEIF_BRANDS = (b"heic", b"heix", b"heim", b"heis", b"hevc", b"mif1", b"msf1")
+_OTHER_STARTS = {
+    b"v/1\x01": "OpenEXR",
+    b"\0\0\0\x0cJXL ": "JPEG XL",
+    b"version https://git-lfs": "a pointer of Git LFS (`git lfs pull` gets the photos)",
+}
 
 
 def pictured(found: ViewSet) -> ViewSet:

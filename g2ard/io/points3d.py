@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard.errors import InputError, damaged
-from g2ard.io.colmap import Table, model_folder, number, parsing, text_lines
+from g2ard.io.colmap import Table, model_folder, number, parsing, points_file, text_lines
 from g2ard.io.jsonfile import Place
 from g2ard.io.stream import WholeCloud, full_scales
 
@@ -21,13 +21,12 @@ class Stream(WholeCloud):
 
     def __init__(self, path: Path) -> None:
         if path.is_dir() or path.stem.lower() != "points3d":
-            folder = model_folder(path) or path
-            file = next((p for s in (".bin", ".txt") if (p := folder / f"points3D{s}").is_file()), None)
-            if file is None:
-                raise InputError("has no points3D.bin or points3D.txt", path=folder)
+            file = points_file(path)
+            if file is None or not file.is_file():
+                raise InputError("has no points3D.bin or points3D.txt", path=model_folder(path) or path)
             path = file
         with parsing(path):
-            positions, rgb = (_binary if path.suffix == ".bin" else _text)(path)
+            positions, rgb = (_binary if path.suffix.lower() == ".bin" else _text)(path)
         super().__init__(path, positions, rgb.astype(np.float32), full_scales(np.dtype(np.uint8)))
 
 

@@ -6,6 +6,7 @@ import msgspec
 import numpy as np
 
 from g2ard.errors import InputError
+from g2ard.io.finding import Finder
 from g2ard.io.jsonfile import Number, Place, Whole, checked, read_json
 from g2ard.io.photos import Frame, Lens, rigid, view_set
 from g2ard.io.transforms import opencv_view
@@ -44,18 +45,21 @@ def read(path: Path, images: Path | None = None) -> ViewSet:
         raise InputError("has no keyframes/cameras with .json files", path=path)
     cameras, photos = folders
     files = sorted(cameras.glob("*.json"), key=lambda file: (len(file.stem), file.stem))
-    views = view_set(path, [_frame(file, images or photos) for file in files])
+    finder = Finder(images or photos)
+    views = view_set(path, [_frame(file, finder) for file in files])
     if cameras.name == "corrected_cameras":
         return views
     text = "the capture has no corrected_cameras; these are ARKit's poses as tracked"
     return views.noted("tracked_poses", len(files), text)
 
 
-def _frame(file: Path, photos: Path) -> Frame:
+def _frame(file: Path, finder: Finder) -> Frame:
     place = Place(file)
     *pose, fx, fy, cx, cy, width, height = msgspec.structs.astuple(checked(read_json(file), _Keyframe, place))
     if not (fx > 0 and fy > 0 and min(width, height) > 0):
         raise place.error(f"has focal lengths {fx}, {fy} and {width}×{height} pixels")
-    photo = photos / f"{file.stem}.jpg"
+    name = f"{file.stem}.jpg"
     lens = Lens((width, height), np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]))
-    return Frame(photo.name, opencv_view(rigid(np.array(pose).reshape(3, 4), place)), lens, photo)
+    return Frame(
+        name, opencv_view(rigid(np.array(pose).reshape(3, 4), place)), lens, finder.photo(name), listed=name
+    )

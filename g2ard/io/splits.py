@@ -118,10 +118,10 @@ def _masks(
 
 
 def _read_split(views: Path) -> dict[str, list[str]] | None:
-    """Read split.json from the views' folder; for a COLMAP model in sparse/ or sparse/0 also from the folders
+    """Read split.json from the views' folder; for a COLMAP model in sparse/ or sparse/N also from the folders
     above it, up to that of sparse/."""
     folder = views if views.is_dir() else views.parent
-    above = {"sparse": 1, "0": 2}.get(folder.name, 0)
+    above = 2 if folder.name.isdecimal() and folder.parent.name == "sparse" else int(folder.name == "sparse")
     places = [folder, *folder.parents[:above]]
     path = next((p for place in places if (p := place / "split.json").is_file()), None)
     if path is None:

@@ -10,8 +10,9 @@ from msgspec import UNSET, UnsetType
 from numpy.typing import NDArray
 
 from g2ard.errors import InputError
+from g2ard.io.finding import Finder, is_end
 from g2ard.io.jsonfile import Number, Place, Pose, Vector, Whole, checked, read_json
-from g2ard.io.photos import Frame, Lens, find_photo, inverse, photo_size, rigid, view_set
+from g2ard.io.photos import Frame, Lens, inverse, photo_size, rigid, view_set
 from g2ard.io.types import ViewSet
 
 _MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
@@ -21,12 +22,18 @@ _LEAST_ANGLE = 1e-6
 
 _TRAIN, _TEST = "transforms_train.json", "transforms_test.json"
 
+_APART = {"test_frames": "test", "val_frames": "val", "eval_frames": "test"}
+"""Further lists of frames, as of ScanNet++, and their splits."""
+
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 """OpenGL camera axes (y up, looking along −z) to OpenCV's (y down, looking along z)."""
 
 
 class _Content(msgspec.Struct):
     frames: list[Any] = []
+    test_frames: list[Any] = []
+    val_frames: list[Any] = []
+    eval_frames: list[Any] = []
     train_filenames: list[Any] = []
     val_filenames: list[Any] = []
     test_filenames: list[Any] = []
@@ -55,6 +62,7 @@ class _Frame(msgspec.Struct):
     p1: Number = 0.0
     p2: Number = 0.0
     k3: Number = 0.0
+    k4: Number = 0.0
     K: Any = None
     intrinsics: Any = None
 
@@ -78,20 +86,23 @@ def read(path: Path, images: Path | None = None) -> ViewSet:
     `path` is the JSON, or a folder with transforms.json, or with transforms_train.json and
     transforms_test.json, which then are the splits. transforms_train.json finds the other beside it.
     """
+    left_out: list[tuple[str, InputError]] = []
     if path.name != _TRAIN:
-        return view_set(path, frames(path, images))
+        return view_set(path, frames(path, images, left_out), left_out)
     if (path.parent / _TEST).is_file():
-        both = [*_frames(path, images, "train"), *_frames(path.parent / _TEST, images, "test")]
-        return view_set(path, both).noted("test_beside", 1, f"{_TEST} beside it has the test views")
+        files = {path: "train", path.parent / _TEST: "test"}
+        both = [frame for file, split in files.items() for frame in _frames(file, images, left_out, split)]
+        return view_set(path, both, left_out).noted("test_beside", 1, f"{_TEST} beside it has the test views")
     text = f"no {_TEST} beside it; every 8th of its views is held out"
-    return view_set(path, frames(path, images)).noted("no_test_beside", 1, text)
+    return view_set(path, frames(path, images, left_out), left_out).noted("no_test_beside", 1, text)
 
 
-def frames(path: Path, images: Path | None = None) -> list[Frame]:
-    """Return the frames of `read`, with or without photos."""
-    if path.is_file():
-        return _frames(path, images)
-    return [frame for file, split in files_of(path).items() for frame in _frames(file, images, split)]
+def frames(
+    path: Path, images: Path | None = None, left_out: list[tuple[str, InputError]] | None = None
+) -> list[Frame]:
+    """Return the frames of `read`, with or without photos; see `_frames` for `left_out`."""
+    files = {path: None} if path.is_file() else files_of(path)
+    return [frame for file, split in files.items() for frame in _frames(file, images, left_out, split)]
 
 
 def files_of(folder: Path) -> dict[Path, str | None]:
@@ -103,23 +114,47 @@ def files_of(folder: Path) -> dict[Path, str | None]:
     return {file: split for file, split in named.items() if file.is_file()}
 
 
-def _frames(path: Path, images: Path | None, split: str | None = None) -> list[Frame]:
-    """Read the frames of a transforms.json.
+def _frames(
+    path: Path, images: Path | None, left_out: list[tuple[str, InputError]] | None, split: str | None = None
+) -> list[Frame]:
+    """Read the frames of a transforms.json, and append views with numbers that are not finite to
+    `left_out`, which None does not allow.
 
-    If it lists the names of its splits, these count (None for an unlisted frame), otherwise `split`.
+    If it lists the names of its splits, these count (None for an unlisted frame), otherwise `split`. Frames
+    of `test_frames`, `val_frames` and `eval_frames` (as test) are in these splits, the others then in train.
     """
     shared = read_json(path)
     content = checked(shared, _Content, Place(path))
     if not content.frames:
         raise InputError("no views found ('frames' is empty)", path=path)
-    parsed = [
-        _frame(Place(path, i, "frame"), shared, frame, images) for i, frame in enumerate(content.frames)
-    ]
+    folder, above = path.parent, path.parent.parent
+    finder = Finder(images) if images else Finder(folder, folder / "images", above / "resized_images")
+    masks = Finder(folder, folder / "masks", above / "resized_anon_masks")
+    apart = [(key, word) for key, word in _APART.items() if getattr(content, key)]
+    frames: list[Frame] = []
+    for key, word in [("frames", "train" if apart else split), *apart]:
+        item = "frame" if key == "frames" else f"{key} entry"
+        for i, entry in enumerate(getattr(content, key)):
+            place = Place(path, i, item)
+            try:
+                frames.append(_frame(place, shared, entry, finder, masks)._replace(split=word))
+            except InputError as error:
+                if left_out is None or not isinstance(entry, dict) or _finite(entry):
+                    raise
+                left_out.append((str(entry.get("file_path")), error))
     split_of = _stated(path, content)
     if not split_of:
-        return [frame._replace(split=split) for frame in parsed]
-    names = [Path(str(frame.get("file_path"))).as_posix() for frame in content.frames]
-    return [frame._replace(split=split_of.get(name)) for frame, name in zip(parsed, names, strict=True)]
+        return frames
+    return [frame._replace(split=split_of.get(Path(frame.listed).as_posix())) for frame in frames]
+
+
+def _finite(value: Any) -> bool:
+    """Return whether all numbers of JSON content are finite."""
+    if isinstance(value, dict):
+        return all(map(_finite, value.values()))
+    if isinstance(value, list):
+        return all(map(_finite, value))
+    return not isinstance(value, float) or math.isfinite(value)
 
 
 def _stated(path: Path, content: _Content) -> dict[str, str]:
@@ -133,26 +168,26 @@ def _stated(path: Path, content: _Content) -> dict[str, str]:
     return stated
 
 
-def _frame(place: Place, shared: dict[str, Any], entry: Any, images: Path | None) -> Frame:
+def _frame(place: Place, shared: dict[str, Any], entry: Any, finder: Finder, masks: Finder) -> Frame:
     content, folder = {**shared, **checked(entry, dict[str, Any], place)}, place.path.parent
     if "rot_mat" in content:
         content |= _from_matrix_city(folder, checked(content, _Numbered, place))
     frame = checked(content, _Frame, place)
-    mask = None if frame.mask_path is None else folder / frame.mask_path
-    if mask is not None and not mask.is_file():
-        raise place.to("mask_path").error(f"is {mask}, which does not exist")
     file_path = frame.file_path
     world_from_camera = rigid(np.array(frame.transform_matrix), place.to("transform_matrix"))
-    photo = find_photo(images / Path(file_path).name if images else folder / file_path)
-    if images is None and not photo.is_file():  # photos beside the file that names them in a folder
-        beside = find_photo(folder / Path(file_path).name)
-        photo = beside if beside.is_file() else photo
+    photo = finder.photo(file_path)
+    mask = None
+    if frame.mask_path is not None:
+        mask = masks.find(frame.mask_path)
+        if mask is None or (mask.parent == photo.parent and not is_end(frame.mask_path, mask)):
+            raise place.to("mask_path").error(f"is {folder / frame.mask_path}, which does not exist")
     return Frame(
         name=file_path.removeprefix("./").removeprefix("images/"),
         viewmat=opencv_view(world_from_camera),
         photo=photo,
         mask=mask,
         lens=_intrinsics(place, frame, photo),
+        listed=file_path,
     )
 
 
@@ -223,6 +258,7 @@ def _size(place: Place, frame: _Frame, photo: Path) -> tuple[int, int]:
         if width is not UNSET and height is not UNSET:
             return width, height
     if photo.is_file():
-        return photo_size(photo, place.path)
+        centred = None if frame.cx is None or frame.cy is None else (2 * frame.cx, 2 * frame.cy)
+        return photo_size(photo, place.path, centred)
     error = place.error(f"has neither w and h nor a photo {photo}")
     raise error.at(hint="{images=DIR} names the folder of photos that are elsewhere")

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from g2ard.errors import InputError
 from g2ard.io.atomic import atomic_output
 from g2ard.io.camera_files import beside
+from g2ard.io.finding import Finder
 from g2ard.io.jsonfile import Matrix, Number, Place, Pose, Weight, Whole, checked, read_json
 from g2ard.io.photos import Frame, Lens, rigid, view_set
 from g2ard.io.types import ViewSet
@@ -63,21 +64,23 @@ def read(path: Path, images: Path | None = None) -> ViewSet:
     views = checked(content, _File, Place(path), entries="view").views
     if not views:
         raise InputError("no views found ('views' is empty)", path=path)
-    return view_set(path, [_frame(Place(path, i, "view"), view, images) for i, view in enumerate(views)])
+    finder, masks = Finder(images or path.parent), Finder(path.parent)
+    parsed = [_frame(Place(path, i, "view"), view, finder, masks) for i, view in enumerate(views)]
+    return view_set(path, parsed)
 
 
-def _frame(place: Place, view: _View, images: Path | None) -> Frame:
-    folder, photo = place.path.parent, view.image
+def _frame(place: Place, view: _View, finder: Finder, masks: Finder) -> Frame:
     distortion = *view.distortion, *[0.0] * 5
     return Frame(
         name=view.name,
         viewmat=_exact(np.array(view.camera_from_world), place.to("camera_from_world")),
         lens=Lens((view.width, view.height), np.array(view.K), distortion[:5]),
-        photo=None if photo is None else images / Path(photo).name if images else folder / photo,
-        mask=None if view.mask is None else folder / view.mask,
+        photo=None if view.image is None else finder.photo(view.image),
+        mask=None if view.mask is None else masks.photo(view.mask),
         split=view.split,
         weight=view.weight,
         kind=view.kind or USUAL,
+        listed=view.image or "",
     )
 
 

@@ -372,14 +372,15 @@ def _points(
 ) -> tuple[Points | None, str, bool]:
     """Return the points of a cloud or stored with the views, their name in errors, and whether they were
     found in photos."""
-    from g2ard.io import read_cloud
+    from g2ard.io import kind, read_cloud
 
     if isinstance(scene, Points):
         return scene, "cloud", False
     sparse = None if views is None else sparse_file(views)
     if scene is None:
-        return sparse_points(sparse), "cloud", True
+        return sparse_points(sparse, say), "cloud", True
     cloud = read_cloud(scene)
     for note in cloud.notes:
         say(f"{scene}: {note}")
-    return cloud.points, str(scene), sparse is not None and real_path(sparse) == real_path(Path(scene))
+    given = (kind(scene) == "views" and sparse_file(scene)) or Path(scene)
+    return cloud.points, str(scene), sparse is not None and real_path(given) == real_path(sparse)

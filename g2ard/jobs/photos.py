@@ -14,13 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard.config.choices import BLACK, Colour
-from g2ard.errors import InputError
+from g2ard.errors import G2ardError, InputError
 from g2ard.io.images import composited, load_premultiplied
 from g2ard.io.splits import for_training
-from g2ard.io.types import Points
+from g2ard.io.types import Points, ViewSet
 from g2ard.jobs.hull import VisualHull, visual_hull
-from g2ard.jobs.inputs import Views, load_view_sets
-from g2ard.progress import Progress, Say, plural, silent
+from g2ard.jobs.inputs import Split, Views, load_view_sets
+from g2ard.progress import Progress, Say, plural, silent, unsaid
 from g2ard.scene.cameras import Cameras
 
 _PHOTO_SIDE = 240
@@ -71,7 +71,15 @@ def topped_up(
     parts = [] if points is None else [points]
     told = [plural(sparse, "sparse point")] if sparse else []
     if (missing := count - sparse) > 0:
-        (train,) = load_view_sets(views, ["train" if held_out is None else for_training], _PHOTO_SIDE)
+        which: list[Split] = ["train" if held_out is None else for_training, "all"]
+        train, every = load_view_sets(views, which, _PHOTO_SIDE)
+        if len(train.cameras) < 3:
+            found = f"{len(train.cameras)} of {plural(len(every.cameras), 'view')}"
+            raise InputError(
+                f"points along camera rays need 3 training views; there are {found}",
+                path=None if isinstance(views, Cameras | ViewSet) else str(views),
+                hint="pass more photos, a point cloud or a scene",
+            )
         parts.append(
             points_along_rays(train.cameras, missing, background=background, seed=seed, progress=progress)
         )
@@ -82,20 +90,27 @@ def topped_up(
     )
 
 
-def sparse_points(file: Path | None) -> Points | None:
-    """Read the points of `sparse_file`; return None if no file exists or it cannot be read."""
+def sparse_points(file: Path | None, say: Say = unsaid) -> Points | None:
+    """Read the points of `sparse_file`; return None, and say why, if they cannot be used."""
     from g2ard.io import read_points
 
     try:
-        return None if file is None else read_points(file)
-    except InputError:
+        points = None if file is None else read_points(file)
+    except G2ardError as error:
+        say(f"warning: no starting points from photos: {error}")
         return None
+    if points is None or len(points):
+        return points
+    say(f"warning: no starting points from photos: {file}: has no points")
+    return None
 
 
 def sparse_file(views: Views) -> Path | None:
-    """Return the path of a COLMAP model, of a transforms.json's `ply_file_path`, or of the input.ply beside
-    INRIA's cameras.json, which may not exist; None for other views."""
+    """Return the file of points of a COLMAP model, of a gsplat run's, of a transforms.json's `ply_file_path`,
+    or the input.ply beside INRIA's cameras.json, which may not exist; None for other views."""
+    from g2ard.io import colmap, gsplat_run, transforms
     from g2ard.io.detect import file_format
+    from g2ard.io.finding import Finder
     from g2ard.io.jsonfile import read_json
     from g2ard.io.types import ViewFiles
 
@@ -105,12 +120,18 @@ def sparse_file(views: Views) -> Path | None:
     path = Path(given)
     found, folder = file_format(path), path if path.is_dir() else path.parent
     if found == "colmap":
-        return folder
+        return colmap.points_file(path)
+    if found == "gsplat_run":
+        data = gsplat_run.data_of(path)
+        return data and colmap.points_file(data)
     if found == "inria":
-        return folder / "input.ply"
-    file = path / "transforms.json" if path.is_dir() else path
-    listed = read_json(file).get("ply_file_path") if found == "transforms" and file.is_file() else None
-    return file.parent / str(listed) if listed else None
+        input_file = folder / "input.ply"
+        return input_file if input_file.is_file() else None
+    if found != "transforms":
+        return None
+    file = path if path.is_file() else next(iter(transforms.files_of(path)))
+    listed = read_json(file).get("ply_file_path")
+    return Finder(file.parent).photo(str(listed)) if listed else None
 
 
 def points_along_rays(

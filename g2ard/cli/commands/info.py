@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -76,7 +77,7 @@ def _described(path: Path, images: Path | None) -> tuple[dict[str, Any], list[li
         if figures["kind"] == "views":
             from g2ard.jobs.photos import sparse_file, sparse_points
 
-            points = sparse_points(sparse_file(path))
+            points = sparse_points(sparse_file(path), partial(_noted, figures))
             figures["sparse_points"] = 0 if points is None else len(points)
         return figures, _rows(figures)
     figures, report = describe(scene, _overdraw), read_json(path / "report.json")
@@ -90,6 +91,10 @@ def _described(path: Path, images: Path | None) -> tuple[dict[str, Any], list[li
         ssim = f", SSIM {found['ssim']:.4f}" if "ssim" in found else ""
         rows.append([name, f"{found['psnr']:.2f} dB{ssim} against {against}"])
     return figures, [*_rows(figures), *rows]
+
+
+def _noted(figures: dict[str, Any], text: str) -> None:
+    figures["notes"].append({"code": "no_points", "count": 1, "text": text.removeprefix("warning: ")})
 
 
 def _overdraw(splats: Splats) -> dict[str, Any]:
