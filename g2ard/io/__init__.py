@@ -3,7 +3,7 @@
 | reads | from |
 |---|---|
 | `read_splats`, `read_scene` | .ply (3DGS), .compressed.ply, SOG, .spz, .glb, .splat, .ksplat, OpenUSD |
-| `read_points`, `read_cloud` | .ply, .las, .laz, COLMAP points3D |
+| `read_points`, `read_cloud` | .ply, .las, .laz, .e57, COLMAP points3D |
 | `read_views`, `read_view_set` | COLMAP, transforms.json, trainers' cameras, data sets, g2ard's own |
 
 The first function of each row returns data; the second also returns notes about the file (`Note`).

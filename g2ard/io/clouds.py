@@ -21,14 +21,15 @@ def read_points(path: str | Path) -> Points:
     """Read a coloured point cloud.
 
     Args:
-        path: .ply with x y z red green blue, .las, .laz, COLMAP's points3D.bin or .txt, or a COLMAP folder.
+        path: .ply with x y z red green blue, .las, .laz, .e57, COLMAP's points3D.bin or .txt, or a COLMAP
+            folder.
 
     Returns:
         Positions in float64, world units; colours in [0, 1].
 
     Raises:
         InputError: the file is missing, damaged, has no colours, or no finite point.
-        MissingDependencyError: .las or .laz without laspy and lazrs.
+        MissingDependencyError: .las or .laz without laspy and lazrs, .e57 without pye57.
 
     >>> import tempfile, g2ard
     >>> path = Path(tempfile.mkdtemp()) / "cloud.ply"
@@ -51,8 +52,8 @@ def read_cloud(path: str | Path) -> Cloud:
 def open_point_stream(path: str | Path | Sequence[str | Path]) -> PointStream:
     """Open a coloured point cloud, or several as one, for reading in blocks.
 
-    Memory holds one block of a .ply, .las or .laz, or the whole file of other formats. Several clouds get
-    the offset of the first.
+    Memory holds one block of a .ply, .las, .laz or .e57, or the whole file of other formats. Several clouds
+    get the offset of the first.
     """
     from g2ard.io.stream import JoinedClouds
 

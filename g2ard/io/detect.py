@@ -32,6 +32,7 @@ READERS: dict[Kind, dict[str, tuple[str, ...]]] = {
     "points": {
         "cloud_ply": (),
         "las": (".las", ".laz"),
+        "e57": (".e57",),
         "points3d": ("points3d.bin", "points3d.txt"),
     },
     "views": {
@@ -74,6 +75,10 @@ _CONVERTERS = {
     **dict.fromkeys(
         (".zip", ".7z", ".rar", ".tar", ".gz", ".tgz"), "unpack the archive and give the file or folder in it"
     ),
+    **{
+        suffix: f"`pdal translate cloud{suffix} cloud.ply` (pdal.io) converts it"
+        for suffix in (".pcd", ".pts", ".ptx", ".xyz", ".asc")
+    },
     ".rad": "convert the scene that it was built from; Spark builds .rad files from .ply, .spz or .sog",
 }
 """Advice for scenes of other programs and for archives."""
@@ -142,7 +147,7 @@ def _of_file(path: Path, modified: int, size: int) -> str:
         raise InputError(f"{suffix[1:].upper()} files are not supported", path=path, hint=_CONVERTERS[suffix])
     raise InputError(
         f"unknown format {path.suffix!r} (scenes: .ply .sog .spz .glb .splat .ksplat .usda .usdc; point "
-        "clouds: .ply .las .laz; views: a COLMAP folder, a .json, or a training run)",
+        "clouds: .ply .las .laz .e57; views: a COLMAP folder, a .json, or a training run)",
         path=path,
     )
 

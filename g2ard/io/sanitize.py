@@ -144,9 +144,11 @@ class PointTally(RowTally):
         """Return notes on dropped points; raise an `InputError` if none remains."""
         notes = self.dropped_notes(path, "point")
         if self.noise == self.rows - self.dropped:
-            raise InputError(f"all of its {plural(self.noise, 'point')} are marked as noise", path=path)
+            raise InputError(
+                f"all of its {plural(self.noise, 'point')} are marked as noise or invalid", path=path
+            )
         if self.noise:
-            text = f"{plural(self.noise, 'point')} dropped that the file marks as noise or withheld"
+            text = f"{plural(self.noise, 'point')} dropped that the file marks as noise, withheld or invalid"
             notes.append(Note("noise", self.noise, text))
         return notes
 

@@ -227,7 +227,10 @@ class PointStream(Stream[RawPoints]):
             return (positions - self.offset).astype(np.float32)
 
     def positions(self, rows: int) -> Iterator[NDArray[np.float32]]:
-        return (self.near(positions) for positions, _, _ in self.raw(rows, 0))
+        for positions, _, noise in self.raw(rows, 0):
+            near = self.near(positions)
+            near[noise] = np.nan
+            yield near
 
     def blocks(self, rows: int, start: int = 0) -> Iterator[RawPoints]:
         for positions, colors, noise in self.raw(rows, start):

@@ -17,7 +17,7 @@ from g2ard.progress import plural
 def lift(
     run: Run,
     cloud: Annotated[
-        Path, typer.Argument(metavar="CLOUD", help="Coloured points: .ply, .las, .laz or COLMAP.")
+        Path, typer.Argument(metavar="CLOUD", help="Coloured points: .ply, .las, .laz, .e57 or COLMAP.")
     ],
     output: OutputOption,
     neighbors: Annotated[int, typer.Option(help="Nearest points to fit each disc's plane to.")] = 10,
