@@ -50,7 +50,9 @@ def lift(
     A PCA of the point and its nearest neighbours gives two tangents and the normal. With the
     neighbourhood's variances λ₁ ≥ λ₂ along the tangents, s₁ = spread·√λ₁,
     s₂ = max(spread·√λ₂, s₁/max_anisotropy) and the normal scale s₃ = normal_ratio·√(s₁s₂), in the points'
-    unit. If all neighbours coincide, the disc gets the median size around it.
+    unit. Where neighbours lie on a line, as along a scanner's rings, lines are thinned until a neighbourhood
+    spans the surface, which gives the normal and the variance across the line. Points of one position are
+    merged into one with their mean colour.
 
     Args:
         points: (N, 3), any unit and origin; pass float64 to keep map coordinates exact.
@@ -63,9 +65,9 @@ def lift(
         progress: called with the number of points done.
 
     Returns:
-        N discs of SH degree 0 in the order of the points; points that are not finite are skipped. Means are
-        float32, relative to `offset`, which is the median point if float32 cannot hold the coordinates and 0
-        otherwise.
+        Discs of SH degree 0, one per position, in the order of the points; points that are not finite are
+        skipped. Means are float32, relative to `offset`, which is the median point if float32 cannot hold the
+        coordinates and 0 otherwise.
 
     Raises:
         InputError: mismatched shapes, no finite point, a colour outside [0, 1], or a parameter out of range.
@@ -75,6 +77,15 @@ def lift(
     >>> len(discs), float(discs.offset[0]), bool((discs.scales[:, 2] < discs.scales[:, 1]).all())
     (64, 5400003.0, True)
     """
+    config = LiftConfig(neighbors, spread, normal_ratio, max_anisotropy, opacity)
+    return lift_rows(points, colors, config, progress)[0]
+
+
+def lift_rows(
+    points: ArrayLike, colors: ArrayLike, config: LiftConfig, progress: Progress = silent
+) -> tuple[Splats, NDArray[np.intp]]:
+    """Lift points as `lift` does; also return the row of each disc's point, ascending."""
+    opacity = config.opacity
     xyz = np.ascontiguousarray(points, np.float64)
     rgb = unit_colors(colors)
     require("points", xyz.shape, xyz.ndim == 2 and xyz.shape[1] == 3, "shape (N, 3)")
@@ -83,15 +94,20 @@ def lift(
     finite = np.isfinite(xyz).all(1) & np.isfinite(rgb).all(1)
     if not finite.any():
         raise InputError(f"none of the {len(xyz)} points is finite", parameter="points")
+    rows = np.flatnonzero(finite)
     if not finite.all():
         xyz, rgb = xyz[finite], rgb[finite]
     middle = _middle(xyz)
     centered = xyz - middle
-    config = LiftConfig(neighbors, spread, normal_ratio, max_anisotropy, opacity)
-    quats, scales = _core.lift_points(centered, config, counter(progress, "lift"))
+    firsts, group = _positions(centered)
+    if len(firsts) < len(xyz):
+        totals = [np.bincount(group, channel) for channel in rgb.T]
+        rgb = np.stack(totals, axis=1) / np.bincount(group)[:, None]
+        xyz, centered, rows = xyz[firsts], centered[firsts], rows[firsts]
+    quats, scales = _core.lift_points(xyz - _anchor(xyz), config, counter(progress, "lift"))
     n = len(centered)
     near = _fits_float32(xyz, scales)
-    return Splats.create(
+    splats = Splats.create(
         (xyz if near else centered).astype(np.float32),
         quats=quats,
         scales=scales,
@@ -99,12 +115,42 @@ def lift(
         sh0=((rgb - 0.5) / SH_C0)[:, None],
         offset=np.zeros(3) if near else middle,
     )
+    return splats, rows
+
+
+def _positions(points: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Return the first row of each position, ascending, and the number of each row's position.
+
+    Positions are equal if their float32 values are, which is all that a scene can hold.
+    """
+    with np.errstate(over="ignore"):
+        x, y, z = (points.astype(np.float32) + np.float32(0)).T  # -0 is 0
+    order = np.lexsort((z, y, x))
+    new = np.ones(len(points), bool)
+    new[1:] = np.any([axis[order[1:]] != axis[order[:-1]] for axis in (x, y, z)], axis=0)
+    firsts = order[new]
+    number = np.empty(len(firsts), np.intp)
+    number[np.argsort(firsts)] = np.arange(len(firsts))
+    group = np.empty(len(points), np.intp)
+    group[order] = number[np.cumsum(new) - 1]
+    return np.sort(firsts), group
 
 
 def _fits_float32(points: NDArray[np.float64], scales: NDArray[np.float32]) -> bool:
     """Return whether float32 holds the coordinates to 1 % of a disc; other programs ignore offsets."""
     step = np.spacing(np.float32(np.abs(points).max()))
     return bool(step <= 0.01 * np.median(scales[:, 0]))
+
+
+def _anchor(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return a point amid others, a multiple of a power of two that is larger than the cells of lines.
+
+    So cells are the same in tiles as in the whole cloud.
+    """
+    low, high = np.percentile(points, (1, 99), axis=0, method="lower")
+    step = np.exp2(np.frexp(np.max(high - low) or 1.0)[1] - 2)
+    anchor: NDArray[np.float64] = np.rint(low / step) * step
+    return anchor
 
 
 def _middle(points: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -19,7 +19,7 @@ from g2ard.io.tile_store import TileStore, halo_name, packed, row_width, tile_na
 from g2ard.progress import Progress, Say, plural
 from g2ard.scene.kdtree import KdTree, Points, Sampler, cut_tree, margin_of
 from g2ard.scene.splats import Splats
-from g2ard.stages.lift import LiftConfig, lift
+from g2ard.stages.lift import LiftConfig, lift_rows
 from g2ard.tiles.journal import Journal, clear
 
 _TREE_SAMPLE = 1 << 20
@@ -201,7 +201,7 @@ def lift_tiles(
             journal.add(packed(part), part.means)
         journal.next_row = index + 1
         journal.save()
-        progress("lift", sum(journal.tiles.rows), total)
+        progress("lift", sum(points.tiles.rows[: index + 1]), total)
     shutil.rmtree(within)
     return journal
 
@@ -214,8 +214,10 @@ def _lifted(points: Journal, index: int, feed: PointFeed) -> Splats:
     halo = _read(points.folder / halo_name(index), points.halos.rows[index])
     both = np.concatenate([core, halo])
     colors = np.clip(both["rgb"] / np.float32(feed.stream.divisor), 0, 1)
-    discs = lift(both["far"], colors, **vars(feed.config)).take(slice(0, len(core)))
-    return replace(discs, means=np.ascontiguousarray(core["near"]), offset=feed.stream.offset)
+    discs, rows = lift_rows(both["far"], colors, feed.config)
+    rows = rows[rows < len(core)]
+    means = np.ascontiguousarray(core["near"][rows])
+    return replace(discs.take(slice(0, len(rows))), means=means, offset=feed.stream.offset)
 
 
 def _read(path: Path, count: int) -> NDArray[Any]:

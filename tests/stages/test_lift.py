@@ -7,7 +7,7 @@ import pytest
 
 from g2ard.errors import InputError
 from g2ard.scene.splats import SH_C0
-from g2ard.stages.lift import lift
+from g2ard.stages.lift import _anchor, lift
 from helpers.commands import succeeds
 from helpers.threads import on_threads
 from reference.lift import discs
@@ -27,7 +27,7 @@ def normals(splats):
 def test_equals_the_naive_twin():
     points = surface()
     got = lift(points, np.full_like(points, 0.25))
-    want_normals, want_scales = discs(points - np.median(points, 0))
+    want_normals, want_scales = discs(points - _anchor(points))
     np.testing.assert_allclose(got.scales, want_scales, rtol=1e-5)
     np.testing.assert_allclose(np.abs((normals(got) * want_normals).sum(1)), 1, atol=1e-5)
     np.testing.assert_allclose(0.5 + SH_C0 * got.sh0[:, 0], 0.25, atol=1e-6)
@@ -38,7 +38,7 @@ def test_equals_the_naive_twin():
 def test_spread_is_an_option():
     points = surface(100)
     got = lift(points, np.full_like(points, 0.25), spread=0.6)
-    _, want_scales = discs(points - np.median(points, 0), spread=0.6)
+    _, want_scales = discs(points - _anchor(points), spread=0.6)
     np.testing.assert_allclose(got.scales, want_scales, rtol=1e-5)
 
 
@@ -75,10 +75,96 @@ def test_threads_do_not_matter():
 )
 def test_degenerate_clouds_give_sensible_discs(points):
     got = lift(points, np.full(points.shape, 0.5))
-    assert len(got) == len(points)
+    assert len(got) == len(np.unique(points.astype(np.float32), axis=0))
     assert got.finite_rows().all()
     assert (got.scales > 0).all()
     assert (got.scales[:, 0] <= 4.0001 * got.scales[:, 1]).all()
+
+
+def lines(count, each, noise=0.004, seed=0):
+    """A plane of 6 × 6 scanned in lines: points and the distance of lines."""
+    x, y = np.tile(np.linspace(-3, 3, each), count), np.repeat(np.linspace(-3, 3, count), each)
+    return np.column_stack([x, y, np.random.default_rng(seed).normal(0, noise, len(x))]), 6 / (count - 1)
+
+
+def turn(seed):
+    """A random rotation."""
+    return np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))[0]
+
+
+@pytest.mark.parametrize(("count", "each"), [(12, 30), (9, 60), (6, 150), (5, 240)])
+def test_lines_equal_the_naive_twin(count, each):
+    points = lines(count, each)[0] @ turn(count).T
+    got = lift(points, np.full_like(points, 0.25))
+    want_normals, want_scales = discs(points - _anchor(points))
+    np.testing.assert_allclose(got.scales, want_scales, rtol=1e-5)
+    np.testing.assert_allclose(np.abs((normals(got) * want_normals).sum(1)), 1, atol=1e-5)
+
+
+@pytest.mark.parametrize("ratio", [3, 10, 34, 60])
+@pytest.mark.parametrize("noise", [0.05, 0.3])
+def test_discs_of_scan_lines_lie_along_the_surface(ratio, noise):
+    """Their width is that of the distance of lines. Noise is a share of the spacing within lines."""
+    points, gap = lines(24, 23 * ratio + 1, noise * 6 / (23 * ratio))
+    rotation = turn(ratio)
+    got = lift(points @ rotation.T, np.full_like(points, 0.5))
+    off = np.degrees(np.arccos(np.clip(np.abs(normals(got) @ rotation[:, 2]), 0, 1)))
+    assert np.percentile(off, 95) < 12
+    np.testing.assert_allclose(np.median(got.scales[:, 0]) / gap, 0.7, atol=0.3)
+    assert np.percentile(got.scales[:, 0], 99) < 1.5 * gap
+
+
+def rings(count, turns, low=-30, high=10, room=(8, 8, 8, 8, 1.7, 9)):
+    """Points of a scanner with rings of elevations and 1 cm of noise in a box, its normals, and its walls."""
+    up, around = np.meshgrid(
+        np.radians(np.linspace(low, high, count)), np.arange(turns) * 2 * np.pi / turns, indexing="ij"
+    )
+    d = np.stack([np.cos(up) * np.cos(around), np.cos(up) * np.sin(around), np.sin(up)], -1).reshape(-1, 3)
+    sides = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, -1], [0, 0, 1]])
+    far = np.where(d @ sides.T > 0, np.array(room) / np.maximum(d @ sides.T, 1e-9), np.inf)
+    reach = far.min(1) + np.random.default_rng(0).normal(0, 0.01, len(d))
+    return d * reach[:, None], sides[far.argmin(1)], far.argmin(1) < 4
+
+
+@pytest.mark.parametrize(("count", "turns"), [(16, 900), (16, 2400), (32, 1800), (64, 1024)])
+def test_discs_of_rings_lie_along_the_surface(count, turns):
+    points, truth, wall = rings(count, turns)
+    got = lift(points, np.full_like(points, 0.5))
+    off = np.degrees(np.arccos(np.clip(np.abs((normals(got) * truth).sum(1)), 0, 1)))
+    assert max(np.median(off[wall]), np.median(off[~wall])) < 15
+
+
+def test_a_wire_over_the_ground_stays_thin():
+    rng = np.random.default_rng(0)
+    ground = np.column_stack([rng.uniform(-5, 5, (4000, 2)), rng.normal(0, 0.01, 4000)])
+    wire = np.column_stack([np.linspace(-5, 5, 400), rng.normal(0, 0.005, 400), np.full(400, 3.0)])
+    got = lift(np.concatenate([ground, wire]), np.full((4400, 3), 0.5))
+    assert got.scales[4000:].max() < 0.2
+
+
+@pytest.mark.parametrize("copies", [2, 3, 11, 12, 40])
+@pytest.mark.parametrize("shuffled", [False, True])
+def test_copies_of_points_give_the_discs_of_points(copies, shuffled):
+    """Copies are merged in the order of the first ones, and their colours averaged."""
+    points, rng = surface(300), np.random.default_rng(1)
+    colors = rng.random((copies, 300, 3))
+    once = lift(points, colors.mean(0))
+    every, tints = np.tile(points, (copies, 1)), colors.reshape(-1, 3)
+    order = np.arange(300)
+    if shuffled:
+        at = rng.permutation(len(every))
+        every, tints = every[at], tints[at]
+        order = np.array(list(dict.fromkeys(at % 300)))
+    got = lift(every, tints)
+    np.testing.assert_array_equal(got.means, once.means[order])
+    np.testing.assert_array_equal(got.scales, once.scales[order])
+    np.testing.assert_allclose(got.sh0, once.sh0[order], atol=1e-5)
+
+
+def test_threads_do_not_matter_in_lines():
+    points = lines(24, 500)[0]
+    found = on_threads(lambda: lift(points, np.full_like(points, 0.5)).fingerprint())
+    assert len(set(found)) == 1
 
 
 def test_non_finite_points_are_left_out():

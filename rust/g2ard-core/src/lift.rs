@@ -1,9 +1,11 @@
 //! Coloured points → surface-aligned discs (supplement, "Dense Prior Construction").
 
+mod lines;
+
 use rayon::prelude::*;
 
 use crate::constants::constants;
-use crate::linalg::{Sym3, outer, quat_from_rotation, sub, symmetric_eigen};
+use crate::linalg::{Eigen, Sym3, outer, quat_from_rotation, sub, symmetric_eigen};
 use crate::spatial::{Neighbor, Tree};
 use crate::{Control, Result};
 
@@ -48,8 +50,24 @@ pub struct Discs {
 /// Tangential standard deviations (descending) and orientation of one neighbourhood.
 #[derive(Clone, Copy)]
 struct Patch {
-    tangential: [f64; 2],
+    sigmas: [f64; 2],
     quat: [f64; 4],
+}
+
+impl Patch {
+    /// `quat_from_rotation` flips a left-handed normal; `discs` handles an extent of zero.
+    fn of(e: &Eigen) -> Self {
+        let [t1, t2, n] = e.vectors;
+        Self {
+            sigmas: [0, 1].map(|k| e.values[k].max(0.0).sqrt()),
+            quat: quat_from_rotation(&[0, 1, 2].map(|r| [t1[r], t2[r], n[r]])),
+        }
+    }
+
+    fn tangential(&self, config: &LiftConfig) -> [f64; 2] {
+        let [wide, narrow] = self.sigmas.map(|s| config.spread * s);
+        [wide, narrow.max(wide / config.max_anisotropy)]
+    }
 }
 
 /// Rows between two checks of the control.
@@ -67,18 +85,19 @@ pub fn lift(points: &[[f64; 3]], config: &LiftConfig, control: &Control) -> Resu
             let here = chunk * CHUNK..((chunk + 1) * CHUNK).min(points.len());
             let mut patches = Vec::with_capacity(here.len());
             tree.nearest(here.clone(), config.neighbors, |at, near| {
-                patches.push(patch(points, tree.rows()[at], near, config));
+                patches.push(Patch::of(&extent(points, tree.rows()[at], near)));
             });
             control.advance(here.len() as u64);
             Ok(patches)
         })
         .collect::<Result<_>>()?;
-    Ok(discs(&tree, &chunks.concat(), config))
+    let mut patches = chunks.concat();
+    lines::widen(points, tree.rows(), &mut patches, config.neighbors, control)?;
+    Ok(discs(&tree, &patches, config))
 }
 
-/// PCA of the point and its neighbours about their mean. `quat_from_rotation` flips a left-handed normal; `discs` handles
-/// an extent of zero.
-fn patch(points: &[[f64; 3]], row: u32, near: &[Neighbor<f64>], config: &LiftConfig) -> Patch {
+/// PCA of the point and its neighbours about their mean.
+fn extent(points: &[[f64; 3]], row: u32, near: &[Neighbor<f64>]) -> Eigen {
     let here = points[row as usize];
     let share = 1.0 / (near.len() + 1) as f64;
     let offsets = || near.iter().map(|n| sub(points[n.1 as usize], here));
@@ -95,45 +114,38 @@ fn patch(points: &[[f64; 3]], row: u32, near: &[Neighbor<f64>], config: &LiftCon
             cov[k] += o[k] * share;
         }
     }
-    let e = symmetric_eigen(&cov);
-    let [t1, t2, n] = e.vectors;
-    let wide = config.spread * e.values[0].max(0.0).sqrt();
-    let narrow = config.spread * e.values[1].max(0.0).sqrt();
-    Patch {
-        tangential: [wide, narrow.max(wide / config.max_anisotropy)],
-        quat: quat_from_rotation(&[0, 1, 2].map(|r| [t1[r], t2[r], n[r]])),
-    }
+    symmetric_eigen(&cov)
 }
 
 /// Sizes in the order of the points. A patch without extent (all neighbours at one place) takes the median extent of
 /// the nearest patches that have one, or 1 if none has.
 fn discs(tree: &Tree, patches: &[Patch], config: &LiftConfig) -> Discs {
     let sized: Vec<usize> = (0..patches.len())
-        .filter(|&at| patches[at].tangential[0] > 0.0)
+        .filter(|&at| patches[at].sigmas[0] > 0.0)
         .collect();
     let mut out = Discs {
         quats: vec![[0.0; 4]; patches.len()],
         scales: vec![[0.0; 3]; patches.len()],
     };
     for (at, &row) in tree.rows().iter().enumerate() {
-        let Patch { tangential, quat } = patches[at];
-        let [a, b] = if tangential[0] > 0.0 {
-            tangential
+        let [a, b] = if patches[at].sigmas[0] > 0.0 {
+            patches[at].tangential(config)
         } else {
-            [local_median(patches, &sized, at, config.neighbors); 2]
+            [local_median(patches, &sized, at, config); 2]
         };
-        out.quats[row as usize] = quat.map(|v| v as f32);
+        out.quats[row as usize] = patches[at].quat.map(|v| v as f32);
         out.scales[row as usize] = [a, b, config.normal_ratio * (a * b).sqrt()].map(|v| v as f32);
     }
     out
 }
 
-/// Median extent of those of the `count` patches around `at` in Morton order that have one.
-fn local_median(patches: &[Patch], sized: &[usize], at: usize, count: usize) -> f64 {
-    let middle = sized.partition_point(|&s| s < at);
+/// Median width of those of the `neighbors` patches around `at` in Morton order that have an extent.
+fn local_median(patches: &[Patch], sized: &[usize], at: usize, config: &LiftConfig) -> f64 {
+    let (count, middle) = (config.neighbors, sized.partition_point(|&s| s < at));
     let window =
         &sized[middle.saturating_sub(count / 2)..(middle + count.div_ceil(2)).min(sized.len())];
-    let mut extents: Vec<f64> = window.iter().map(|&s| patches[s].tangential[0]).collect();
-    extents.sort_by(f64::total_cmp);
-    extents.get(extents.len() / 2).copied().unwrap_or(1.0)
+    let mut sigmas: Vec<f64> = window.iter().map(|&s| patches[s].sigmas[0]).collect();
+    sigmas.sort_by(f64::total_cmp);
+    let median = sigmas.get(sigmas.len() / 2);
+    median.map_or(1.0, |sigma| config.spread * sigma)
 }
