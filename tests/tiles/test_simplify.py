@@ -302,7 +302,7 @@ def test_a_sample_for_views_has_enough_rows(store: TileStore, tmp_path: Path) ->
 
 
 @pytest.mark.parametrize("seen", [True, False])
-def test_tiles_share_a_growth_and_it_is_that_of_the_whole(tmp_path: Path, seen: bool) -> None:
+def test_tiles_share_a_growth_about_that_of_the_whole(tmp_path: Path, seen: bool) -> None:
     rng = np.random.default_rng(5)
     points = rng.uniform([-8, -4, 0], [8, 4, 0], (4000, 3))
     lifted = lift(points, 0.5 + 0.4 * np.sin(points @ rng.normal(size=(3, 3))))
@@ -320,8 +320,11 @@ def test_tiles_share_a_growth_and_it_is_that_of_the_whole(tmp_path: Path, seen: 
     source = None if views is None else visibility_source(views)
     whole = simplify(lifted, 250, visibility=source, compare=True).report
     assert measured.growth is not None
-    assert measured.growth == whole.growth > GROWTHS[0]
-    assert measured.opacity_lost == pytest.approx(whole.opacity_lost, abs=0.03)
+    assert whole.growth is not None
+    assert min(measured.growth, whole.growth) > GROWTHS[0]
+    steps = GROWTHS.index(measured.growth) - GROWTHS.index(whole.growth)
+    assert abs(steps) <= 1  # tiles see themselves alone, or in the part of the images that they fill
+    assert measured.opacity_lost == pytest.approx(whole.opacity_lost, abs=0.05)
     given = tiled(SimplifyConfig(max_growth=measured.growth), compare=True)
     assert given.opacity_lost is None
     assert given.whole().fingerprint() == measured.whole().fingerprint()
