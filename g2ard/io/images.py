@@ -18,7 +18,7 @@ from g2ard.config.choices import BLACK, Colour
 from g2ard.errors import InputError
 from g2ard.io.atomic import atomic_output
 from g2ard.io.limits import opened_image
-from g2ard.io.photos import fits, turns
+from g2ard.io.photos import fits, photo_size, turns
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.samples import evenly_spaced
 
@@ -35,7 +35,7 @@ def load_image(cameras: Cameras, index: int, background: Sequence[float] = BLACK
     """Read the photo of a view as an image of its pinhole camera.
 
     A distorted photo is undistorted at its own resolution, then resized by area. Beyond the photo's edge, the
-    edge is repeated. EXIF orientation counts only where the view's size
+    edge is repeated; `load_mask` hides it. EXIF orientation counts only where the view's size
     needs it, because poses usually refer to stored pixels. Grey becomes three
     equal channels; alpha is composited over the background.
 
@@ -139,17 +139,47 @@ def load_mask(cameras: Cameras, index: int) -> NDArray[np.bool_] | None:
     """Read the mask of a view's photo, in the pixels of `load_image`.
 
     Returns:
-        (H, W), True if the mask is brighter than half, or, for a photo that is its own mask, if its alpha is
-        above half; None if the view has no mask.
+        (H, W), True if the photo holds the pixel, and its mask is brighter than half, or, for a photo that is
+        its own mask, its alpha is above half; None if all are.
     """
-    path = cameras.mask_paths[index]
+    held, path = _held(cameras, index), cameras.mask_paths[index]
     if path is None:
-        return None
+        return held
     if path == cameras.image_paths[index]:
         own = load_premultiplied(cameras, index)
-        return own[..., 3] > 0.5 if own.shape[2] == 4 else None
-    image = load_image(replace(cameras, image_paths=cameras.mask_paths), index)
-    return np.ascontiguousarray(image.mean(2) > 0.5)
+        mask = own[..., 3] > 0.5 if own.shape[2] == 4 else None
+    else:
+        image = load_image(replace(cameras, image_paths=cameras.mask_paths), index)
+        mask = image.mean(2) > 0.5
+    if mask is None or held is None:
+        return held if mask is None else np.ascontiguousarray(mask)
+    return np.ascontiguousarray(mask & held)
+
+
+def _held(cameras: Cameras, index: int) -> NDArray[np.bool_] | None:
+    """Return the pixels of a view that its undistorted photo holds in full, or None if all are."""
+    photo, distortion = cameras.image_paths[index], cameras.distortions[index]
+    if photo is None or not distortion.any():
+        return None
+    target = int(cameras.widths[index]), int(cameras.heights[index])
+    width, height = photo_size(photo, cameras.source, target)
+    K = cameras.Ks[index] * np.array([[width / target[0]], [height / target[1]], [1.0]])
+    held = _held_at(width, height, tuple(K.ravel()), tuple(distortion), target)
+    return None if held.all() else held
+
+
+@lru_cache(maxsize=2)
+def _held_at(
+    width: int, height: int, K: tuple[float, ...], distortion: tuple[float, ...], target: tuple[int, int]
+) -> NDArray[np.bool_]:
+    held = _lookup(width, height, K, distortion)[-1].reshape(height, width, 1)
+    found = resized(held.astype(np.float32), target)[..., 0] > _WHOLE
+    found.flags.writeable = False
+    return found
+
+
+_WHOLE = 0.999
+"""Share of a pixel above which it counts as whole."""
 
 
 def _open(path: Path, like: tuple[int, int] | None = None) -> NDArray[np.float32]:
@@ -177,7 +207,7 @@ def _undistorted(
 ) -> NDArray[np.float32]:
     """Sample the distorted photo for each pixel of the pinhole image, bilinearly."""
     height, width = image.shape[:2]
-    rows, columns, down, right = _lookup(width, height, tuple(K.ravel()), tuple(distortion))
+    rows, columns, down, right, _ = _lookup(width, height, tuple(K.ravel()), tuple(distortion))
     flat = image.reshape(height * width, -1)
     at = rows * width + columns
     top = flat[at] * (1 - right) + flat[at + 1] * right
@@ -187,7 +217,9 @@ def _undistorted(
 
 @lru_cache(maxsize=2)  # usually all photos share one lens
 def _lookup(width: int, height: int, K: tuple[float, ...], distortion: tuple[float, ...]) -> tuple[Any, ...]:
-    """Return row, column and fractions of each pixel's source: OpenCV's model, pixel centres at +0.5.
+    """Return row, column and fractions of each pixel's source, and whether the photo holds it.
+
+    OpenCV's model, pixel centres at +0.5:
 
     x' = x·(1 + k1 r² + k2 r⁴ + k3 r⁶) + 2 p1 x y + p2 (r² + 2 x²), y' likewise with p1 and p2 exchanged.
     """
@@ -211,7 +243,15 @@ def _lookup(width: int, height: int, K: tuple[float, ...], distortion: tuple[flo
     row = np.clip(source[1], 0, height - 1)
     left, above = np.minimum(column.astype(int), width - 2), np.minimum(row.astype(int), height - 2)
     fractions = ((row - above)[:, None].astype(np.float32), (column - left)[:, None].astype(np.float32))
-    return above, left, *fractions
+    held = (source[0] >= -0.5) & (source[0] <= width - 0.5) & (r2 < _fold(k1, k2, k3))
+    held &= (source[1] >= -0.5) & (source[1] <= height - 0.5)
+    return above, left, *fractions, held
+
+
+def _fold(k1: float, k2: float, k3: float) -> float:
+    """Return r² where r·(1 + k1 r² + k2 r⁴ + k3 r⁶) stops growing, where the lens model ends."""
+    roots = np.roots([7 * k3, 5 * k2, 3 * k1, 1])
+    return min((root.real for root in roots if abs(root.imag) < 1e-9 and root.real > 0), default=np.inf)
 
 
 def resized(image: NDArray[np.float32], size: tuple[int, int]) -> NDArray[np.float32]:

@@ -212,6 +212,12 @@ def _intrinsics(place: Place, frame: _Frame, photo: Path) -> Lens:
         lens = "fisheye" if frame.is_fisheye else frame.camera_model
         error = place.error(f"has an unsupported {lens} lens; expected {known}")
         raise error.at(hint="undistort the photos")
+    if frame.k4:
+        raise (
+            place.to("k4")
+            .error(f"is {frame.k4}; lenses have k1, k2, k3, p1 and p2")
+            .at(hint="undistort the photos")
+        )
     width, height = _size(place, frame, photo)
     distortion = (frame.k1, frame.k2, frame.p1, frame.p2, frame.k3)
     if (K := _matrix(place, frame)) is not None:

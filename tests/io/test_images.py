@@ -203,3 +203,42 @@ def test_a_mask_holds_from_half_on(tmp_path: Path, own: bool) -> None:
         Image.fromarray(levels).save(mask)
     views = replace(around(1, (16, 16)), image_paths=(photo,), mask_paths=(mask,))
     np.testing.assert_array_equal(load_mask(views, 0), levels > 127)
+
+
+@pytest.mark.parametrize(
+    "k",
+    [
+        (0.3, 0, 0, 0, 0),
+        (0, 0.4, 0, 0, 0),
+        (-0.5, 0, 0, 0, 0),
+        (0.1, -0.2, 0.05, -0.05, 0.3),
+        (0, 0, 0, 0, -2),
+    ],
+)
+@pytest.mark.parametrize("size", [(80, 60), (40, 30)])
+def test_pixels_that_a_photo_does_not_hold_are_masked(
+    tmp_path: Path, k: tuple[float, ...], size: tuple[int, int]
+) -> None:
+    """A pixel counts if the lens maps its centre into the photo before the model folds back."""
+    path = save(tmp_path / "a.png", np.full((60, 80, 3), 99, np.uint8))
+    f = 0.75 * size[0]
+    mask = load_mask(camera(path, size, [f, f, size[0] / 2, size[1] / 2], k), 0)
+    v, u = np.mgrid[0 : size[1], 0 : size[0]] + 0.5
+    x, y = (u - size[0] / 2) / f, (v - size[1] / 2) / f
+    xd, yd = bend(x, y, k)
+    radii = np.linspace(0, 3, 30001)
+    radial = radii * (1 + k[0] * radii**2 + k[1] * radii**4 + k[4] * radii**6)
+    falls = np.flatnonzero(np.diff(radial) <= 0)
+    fold = radii[falls[0]] if len(falls) else np.inf
+    u, v = xd * f + size[0] / 2, yd * f + size[1] / 2
+    held = (u >= 0) & (u <= size[0]) & (v >= 0) & (v <= size[1]) & (np.hypot(x, y) < fold)
+    assert not held.all()
+    assert mask is not None
+    assert not mask[~held].any()
+    assert mask[held].mean() > 0.9
+
+
+@pytest.mark.parametrize("k", [(0, 0, 0, 0, 0), (-0.05, 0, 0, 0, 0)])
+def test_a_photo_that_holds_every_pixel_has_no_mask(tmp_path: Path, k: tuple[float, ...]) -> None:
+    path = save(tmp_path / "a.png", np.full((60, 80, 3), 99, np.uint8))
+    assert load_mask(camera(path, (80, 60), [60, 60, 40, 30], k), 0) is None

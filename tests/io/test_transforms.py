@@ -80,6 +80,8 @@ BAD: list[tuple[Callable[[dict[str, Any]], Any], Fault]] = [
     (lambda c: c["frames"][1]["transform_matrix"][2].pop(), ("transform_matrix[2][3]", 1)),
     (entry(1, 2, 1, []), ("transform_matrix[2][1]", 1)),
     (frame(0, k1=[]), ("k1", 0)),
+    (frame(1, k4=0.1), ("k4", 1)),
+    (lambda c: c.update(k4=-2), ("k4", 0)),
     (frame(0, k1="x"), ("k1", 0)),
     (lambda c: c["frames"].__setitem__(0, 7), (None, 0)),
     (lambda c: c.pop("fl_x"), (None, 0)),
