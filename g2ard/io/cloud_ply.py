@@ -8,12 +8,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard.errors import InputError
-from g2ard.io.plyfiles import read_element, read_header, require, row_blocks, spread_rows, write_rows
+from g2ard.io.plyfiles import (
+    COLOR_NAMES,
+    read_element,
+    read_header,
+    require,
+    row_blocks,
+    spread_rows,
+    write_rows,
+)
 from g2ard.io.stream import MarkedPoints, PointStream, full_scales
 from g2ard.io.types import Points
 
 _POSITION = ["x", "y", "z"]
-_COLOR_NAMES = (["red", "green", "blue"], ["r", "g", "b"], ["diffuse_red", "diffuse_green", "diffuse_blue"])
 
 
 class Stream(PointStream):
@@ -44,7 +51,7 @@ def _vertices(path: Path) -> tuple[NDArray[Any], list[str]]:
     header = read_header(path)
     properties = header.properties("vertex")
     require(path, properties, _POSITION, "a point cloud")
-    names = next((n for n in _COLOR_NAMES if set(n) <= set(properties)), _COLOR_NAMES[0])
+    names = next((n for n in COLOR_NAMES if set(n) <= set(properties)), COLOR_NAMES[0])
     require(path, properties, names, "a coloured point cloud")
     (rows,) = read_element(path, header, "vertex")
     return rows, names
@@ -68,7 +75,7 @@ def write(path: Path, points: Points, *, overwrite: bool = False) -> None:
 
 def write_blocks(path: Path, count: int, blocks: Iterable[Points], *, overwrite: bool = False) -> None:
     """Write `count` points that arrive in blocks, as `write` does."""
-    types = dict.fromkeys(_POSITION, "<f8") | dict.fromkeys(_COLOR_NAMES[0], "u1")
+    types = dict.fromkeys(_POSITION, "<f8") | dict.fromkeys(COLOR_NAMES[0], "u1")
 
     def rows_of(points: Points) -> NDArray[Any]:
         if not (np.isfinite(points.positions).all() and np.isfinite(points.colors).all()):
@@ -76,7 +83,7 @@ def write_blocks(path: Path, count: int, blocks: Iterable[Points], *, overwrite:
         rows = np.empty(len(points), list(types.items()))
         for axis in range(3):
             rows[_POSITION[axis]] = points.positions[:, axis]
-            rows[_COLOR_NAMES[0][axis]] = np.rint(np.clip(points.colors[:, axis], 0, 1) * 255)
+            rows[COLOR_NAMES[0][axis]] = np.rint(np.clip(points.colors[:, axis], 0, 1) * 255)
         return rows
 
     if not count:

@@ -69,6 +69,7 @@ class Stream(RawStream):
         offset, mode = plyfiles.offset_of(path, header), plyfiles.render_model_of(header.comments)
         model: RenderModel = "antialiased" if mode == "antialiased" else "classic"
         super().__init__(path, len(vertex), len(rest) // 3, offset, render_model=model)
+        self.up = plyfiles.up_of(header.comments)
         self._vertex, self._sh, self._rest = vertex, sh[0] if sh else None, len(rest) // 3
         self._chunk, self._colored = np.array(chunk), "min_r" in chunk_properties
 
@@ -121,8 +122,9 @@ def _coefficient(codes: NDArray[Any]) -> NDArray[np.float64]:
 def write(path: Path, splats: Splats, *, overwrite: bool = False) -> float:
     """Write a .compressed.ply: 16 bytes per Gaussian, plus one per harmonic past band 0.
 
-    Gaussians are written in `packing_order`, which keeps the bounds of chunks tight. An `offset` and the
-    render model are stored in comments, as in .ply. Return the largest change of a position by rounding.
+    Gaussians are written in `packing_order`, which keeps the bounds of chunks tight. An `offset`, the render
+    model and the up direction are stored in comments, as in .ply. Return the largest change of a position by
+    rounding.
     """
     from plyfile import PlyData, PlyElement
 
@@ -145,7 +147,7 @@ def write(path: Path, splats: Splats, *, overwrite: bool = False) -> float:
     elements = [PlyElement.describe(chunk, "chunk"), PlyElement.describe(words, "vertex")]
     if splats.sh_degree:
         elements.append(PlyElement.describe(_harmonics(splats), "sh"))
-    comments = plyfiles.comments_of(splats.offset, splats.render_model)
+    comments = plyfiles.comments_of(splats.offset, splats.render_model, splats.up)
     with atomic_output(path, overwrite) as temporary, temporary.open("wb") as file:
         PlyData(elements, byte_order="<", comments=comments).write(file)
     low, high = (np.stack([chunk[f"{end}_{axis}"] for axis in "xyz"], axis=1) for end in ("min", "max"))

@@ -23,7 +23,7 @@ READERS: dict[Kind, dict[str, tuple[str, ...]]] = {
         "compressed_ply": (),
         "sog": (".sog", "meta.json", "lod-meta.json"),
         "spz": (".spz",),
-        "glb": (".glb",),
+        "glb": (".glb", ".gltf"),
         "splat": (".splat",),
         "ksplat": (".ksplat",),
         "usd": (".usda", ".usdc", ".usd", ".usdz"),
@@ -146,14 +146,16 @@ def _of_file(path: Path, modified: int, size: int) -> str:
     if suffix in _CONVERTERS:
         raise InputError(f"{suffix[1:].upper()} files are not supported", path=path, hint=_CONVERTERS[suffix])
     raise InputError(
-        f"unknown format {path.suffix!r} (scenes: .ply .sog .spz .glb .splat .ksplat .usda .usdc; point "
-        "clouds: .ply .las .laz .e57; views: a COLMAP folder, a .json, or a training run)",
+        f"unknown format {path.suffix!r} (scenes: .ply .sog .spz .glb .gltf .splat .ksplat .usda .usdc; "
+        "point clouds: .ply .las .laz .e57; views: a COLMAP folder, a .json, or a training run)",
         path=path,
     )
 
 
 def _check_content(path: Path, suffix: str) -> None:
     """Reject a file of another format than its name says, if its first bytes tell."""
+    if path.name.lower() == "meta.json":
+        _by_gsplat(path.parent)
     with path.open("rb") as file:
         held = _BY_CONTENT.get(file.read(4))
     if held is not None and suffix in (".sog", ".spz", ".glb", ".splat", ".ksplat") and held != suffix:
@@ -252,7 +254,7 @@ def _folder_format(path: Path) -> str:
 
     if (path / MANIFEST).is_file():
         return "tiles"
-    if chunks_of(path):
+    if (chunks := chunks_of(path)) and not _by_gsplat(chunks[0]):
         return "sog"
     for name in READERS["views"]:
         if import_module(f"g2ard.io.{name}").holds(path):
@@ -262,6 +264,21 @@ def _folder_format(path: Path) -> str:
     if error := incomplete(path):
         raise error
     raise InputError(f"is not a supported folder{_instead(path)}", path=path)
+
+
+def _by_gsplat(folder: Path) -> bool:
+    """Raise an error if a meta.json is that of gsplat's PNGs, which lists no files."""
+    from g2ard.io.jsonfile import read_any_json
+
+    content = read_any_json(folder / "meta.json")
+    means = content.get("means") if isinstance(content, dict) else None
+    if not isinstance(means, dict) or "files" in means or "shape" not in means:
+        return False
+    raise InputError(
+        "holds PNG images of gsplat's compression, not SOG",
+        path=folder,
+        hint="export the scene as .ply with gsplat's `export_splats`",
+    )
 
 
 def _near(path: Path) -> str:
@@ -292,6 +309,9 @@ def _instead(path: Path) -> str:
         return f"; give one of its files: {', '.join(held_kinds)}"
     if runs := [folder.name for folder in sorted(path.iterdir()) if run_scene(folder) != folder]:
         return f"; give one of its runs: {', '.join(runs[:5])}"
+    foreign = [file for file in sorted(path.iterdir()) if file.suffix.lower() in _CONVERTERS]
+    if foreign:
+        return f"; it has {foreign[0].name}: {_CONVERTERS[foreign[0].suffix.lower()]}"
     for place in (path, path / "images"):
         photos = [file for file in sorted(place.iterdir()) if is_a_photo(file)] if place.is_dir() else []
         if not photos:
@@ -323,12 +343,12 @@ def _poses_above(path: Path) -> Path | None:
 
 
 def _ply_format(path: Path) -> str:
-    from g2ard.io.plyfiles import read_header
+    from g2ard.io.plyfiles import read_header, scene_names
 
     header = read_header(path)
-    properties = header.properties("vertex")
     if "vertex" not in header.counts:
         raise InputError("has no 'vertex' element", path=path)
+    properties = scene_names(header.properties("vertex"))
     if "packed_position" in properties:
         return "compressed_ply"
     scene_words = ("f_dc_", "rot_", "scale_", "opacity")
@@ -343,6 +363,12 @@ def _json_format(path: Path) -> str:
         module = import_module(f"g2ard.io.{name}")
         if hasattr(module, "describes") and module.describes(content):
             return name
+    if isinstance(content, dict) and {"geometricError", "root"} <= set(content):
+        raise InputError(
+            "is a tileset of 3D Tiles, for viewers such as CesiumJS",
+            path=path,
+            hint="give the scene that it was made of, or one of its .glb tiles",
+        )
     if not isinstance(content, dict):
         raise InputError(
             "is a JSON list, but not cameras of INRIA's trainer or of nerfstudio's ns-export", path=path

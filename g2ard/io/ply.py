@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ from g2ard.io.sanitize import BLOCK, LOG_SCALE_LIMIT, Raw
 from g2ard.io.stream import RawStream, SceneStream
 from g2ard.io.types import Note
 from g2ard.progress import plural
-from g2ard.scene.splats import Splats, far_middle, unit_quats
+from g2ard.scene.splats import SH_C0, Splats, far_middle, unit_quats
 
 _MEANS = ["x", "y", "z"]
 _DC = ["f_dc_0", "f_dc_1", "f_dc_2"]
@@ -25,6 +26,9 @@ _SCALES = ["scale_0", "scale_1", "scale_2"]
 _QUATS = ["rot_0", "rot_1", "rot_2", "rot_3"]
 _REQUIRED_PROPERTIES = [*_MEANS, *_DC, "opacity", *_SCALES, *_QUATS]
 _NORMALS = ["nx", "ny", "nz"]
+_FILTER = "filter_3d"
+_FEWEST_JUDGED = 3 * 16
+"""Scales, three of a Gaussian, that suffice to tell whether they are logarithms."""
 _FLAT_LOG_RATIO = np.log(np.float32(1e-3))
 """Logarithm of the thickness of 2D Gaussians over their shorter scale."""
 
@@ -32,38 +36,54 @@ _FLAT_LOG_RATIO = np.log(np.float32(1e-3))
 class Stream(RawStream):
     """3DGS .ply of any SH degree, property order, scalar type and byte order, or ascii.
 
-    float64 positions that float32 cannot represent are recentred; the shift is stored in `offset`. Text files
-    and those with leading lists are read whole.
+    Also read: RGB instead of `f_dc`; one or two scales; names with the prefix `scalar_` of CloudCompare; the
+    3D filter of Mip-Splatting, as wider Gaussians. float64 positions that float32 cannot represent are
+    recentred; the shift is stored in `offset`. Text files and those with leading lists are read whole.
     """
 
     def __init__(self, path: Path) -> None:
         header = plyfiles.read_header(path)
-        properties = header.properties("vertex")
+        names = plyfiles.scene_names(header.properties("vertex"))
         mode = plyfiles.render_model_of(header.comments)
-        flat = mode == "2dgs" or ("scale_1" in properties and "scale_2" not in properties)
-        needed = [name for name in _REQUIRED_PROPERTIES if not flat or name != "scale_2"]
-        plyfiles.require(path, properties, needed, "a 3DGS scene")
-        rest = sorted((p for p in properties if re.fullmatch(r"f_rest_\d{1,3}", p)), key=lambda p: int(p[7:]))
+        rgb = next((names_ for names_ in plyfiles.COLOR_NAMES if set(names_) <= set(names)), None)
+        self._rgb = rgb if rgb and not any(name in names for name in _DC) else None
+        if "scale" in names:
+            names.setdefault("scale_0", names["scale"])
+        flat = mode == "2dgs" or ("scale_1" in names and "scale_2" not in names)
+        one = "scale_0" in names and not {"scale_1", "scale_2"} & set(names)
+        self._scales = _SCALES[: 2 if flat else 1 if one else 3]
+        round_ones = len(self._scales) == 1 and not any(name in names for name in _QUATS)
+        self._quats = [] if round_ones else _QUATS
+        needed = [*_MEANS, *(self._rgb or _DC), "opacity", *self._scales, *self._quats]
+        plyfiles.require(path, list(names), needed, "a 3DGS scene")
+        rest = sorted((p for p in names if re.fullmatch(r"f_rest_\d{1,3}", p)), key=lambda p: int(p[7:]))
         stored, kept = _bands(path, rest)
         (rows,) = plyfiles.read_element(path, header, "vertex")
+        self._names, self._path, self._rows = names, path, rows
         shift = np.zeros(3)
-        if rows.dtype["x"].itemsize == 8:
+        if rows.dtype[names["x"]].itemsize == 8:
             sample = plyfiles.spread_rows(rows)
-            shift = far_middle(np.stack([sample[name] for name in _MEANS], axis=1))
+            shift = far_middle(np.stack([sample[names[name]] for name in _MEANS], axis=1))
         offset = plyfiles.offset_of(path, header) + shift
-        notes = _ignored(properties, rest, stored, kept)
+        notes = [*_frames(header), *_ignored([n for n in names if n not in needed], rest, stored, kept)]
         if flat:
             text = "2DGS scene read as flat Gaussians; renders differ where surfaces are seen at a slant"
             notes.append(Note("flat_gaussians", len(rows), text))
+        if _FILTER in names:
+            text = "the 3D filter of Mip-Splatting is applied to scales and opacities"
+            notes.append(Note("mip_filter", len(rows), text))
         model: RenderModel = "antialiased" if mode == "antialiased" and not flat else "classic"
         super().__init__(path, len(rows), kept, offset, tuple(notes), model)
-        self._rows, self._shift, self._flat = rows, shift, flat
+        self.up = plyfiles.up_of(header.comments)
+        self._shift, self._flat = shift, flat
         self._rest, self._stored, self._kept = rest, stored, kept
+        self._stated = _Stated()
+        self._white = 1.0 if self._rgb is None else self._brightest()
 
     def positions(self, rows: int) -> Iterator[NDArray[np.float32]]:
         for _, block in plyfiles.row_blocks(self.path, self._rows, rows):
             with np.errstate(over="ignore", invalid="ignore"):
-                means = _means(block, self._shift)
+                means = self._means(block)
             yield means
 
     def raw(self, rows: int, start: int) -> Iterator[Raw]:
@@ -75,20 +95,105 @@ class Stream(RawStream):
                     self._decode(block[part], raw.take(part))
             yield raw
 
+    def header_notes(self) -> tuple[Note, ...]:
+        return (*self.notes, *self._stated.notes())
+
+    def _columns(self, block: NDArray[Any], names: list[str]) -> NDArray[Any]:
+        return structured_to_unstructured(block[[self._names[name] for name in names]])
+
+    def _means(self, block: NDArray[Any]) -> NDArray[np.float32]:
+        means = self._columns(block, _MEANS)
+        return np.asarray(means - self._shift if self._shift.any() else means, np.float32)
+
+    def _brightest(self) -> float:
+        """Return the number that means white: 1, 255 or 65,535, by the values rather than their type."""
+        assert self._rgb is not None
+        top = 0.0
+        for _, block in plyfiles.row_blocks(self._path, self._rows, BLOCK):
+            values = self._columns(block, self._rgb)
+            top = max(top, float(np.max(values, where=np.isfinite(values), initial=0.0)))
+        whole = all(self._rows.dtype[self._names[name]].kind in "iu" for name in self._rgb)
+        return 1.0 if top <= 1 and not whole else 255.0 if top <= 255 else 65535.0
+
     def _decode(self, block: NDArray[Any], raw: Raw) -> None:
-        raw.means[:] = _means(block, self._shift)
-        raw.sh0[:, 0] = structured_to_unstructured(block[_DC])
-        if self._flat:
-            raw.log_scales[:, :2] = structured_to_unstructured(block[_SCALES[:2]])
-            raw.log_scales[:, 2] = raw.log_scales[:, :2].min(axis=1) + _FLAT_LOG_RATIO
+        raw.means[:] = self._means(block)
+        if self._rgb is None:
+            raw.sh0[:, 0] = self._columns(block, _DC)
         else:
-            raw.log_scales[:] = structured_to_unstructured(block[_SCALES])
-        raw.quats[:] = structured_to_unstructured(block[_QUATS])
-        raw.logit_opacities[:] = block["opacity"]
+            raw.sh0[:, 0] = (self._columns(block, self._rgb) / self._white - 0.5) / SH_C0
+        raw.log_scales[:, : len(self._scales)] = self._columns(block, self._scales)
+        if self._flat:
+            raw.log_scales[:, 2] = raw.log_scales[:, :2].min(axis=1) + _FLAT_LOG_RATIO
+        elif len(self._scales) == 1:
+            raw.log_scales[:, 1:] = raw.log_scales[:, :1]
+        raw.quats[:] = self._columns(block, self._quats) if self._quats else (1, 0, 0, 0)
+        raw.logit_opacities[:] = block[self._names["opacity"]]
+        self._stated.see(raw)
+        if _FILTER in self._names:
+            _widen(raw, np.asarray(block[self._names[_FILTER]], np.float64))
         if self._rest:  # channel-major: all of red's coefficients, then green's, then blue's
-            bands = structured_to_unstructured(block[self._rest]).reshape(-1, 3, self._stored)
+            bands = self._columns(block, self._rest).reshape(-1, 3, self._stored)
             for channel in range(3):  # three times as fast as a transposed copy
                 raw.shN[:, :, channel] = bands[:, channel, : self._kept]
+
+
+def _widen(raw: Raw, size: NDArray[np.float64]) -> None:
+    """Apply the 3D filter of Mip-Splatting of (n,) sizes f: σ² + f², and α·√(Πσ² / Π(σ² + f²))."""
+    before = 2 * raw.log_scales.astype(np.float64)
+    with np.errstate(divide="ignore"):
+        after = np.logaddexp(before, 2 * np.log(np.abs(size))[:, None])
+    fading = 0.5 * (before - after).sum(axis=1)
+    logits = raw.logit_opacities.astype(np.float64)
+    lit, dark = -np.logaddexp(0, -logits), -np.logaddexp(0, logits)  # logarithms of α and 1 − α
+    with np.errstate(divide="ignore"):
+        faded = np.logaddexp(dark, lit + np.log(-np.expm1(fading)))
+    raw.log_scales[:], raw.logit_opacities[:] = after / 2, lit + fading - faded
+
+
+@dataclass
+class _Stated:
+    """Ranges of the stored scales and opacities, which tell whether they are logarithms and logits."""
+
+    scales: tuple[float, float] = (np.inf, -np.inf)
+    opacities: tuple[float, float] = (np.inf, -np.inf)
+    total: float = 0.0
+    count: int = 0
+
+    def see(self, raw: Raw) -> None:
+        finite = raw.log_scales[np.isfinite(raw.log_scales)]
+        self.scales = _range(self.scales, finite)
+        self.opacities = _range(self.opacities, raw.logit_opacities[np.isfinite(raw.logit_opacities)])
+        self.total, self.count = self.total + float(finite.sum(dtype=np.float64)), self.count + finite.size
+
+    def notes(self) -> list[Note]:
+        """Return a note if all scales are positive and 1 at most on average, or all opacities in [0, 1]."""
+        (least, most), (faint, solid) = self.scales, self.opacities
+        enough = self.count >= _FEWEST_JUDGED
+        linear = enough and 0 < least < most and self.total < self.count
+        activated = enough and 0 <= faint < solid <= 1
+        if not (linear or activated):
+            return []
+        what = [f"scales ({least:.3g} to {most:.3g}) look linear, not logarithms"] * linear
+        what += [f"opacities ({faint:.3g} to {solid:.3g}) look activated, not logits"] * activated
+        return [Note("activated", 1, " and ".join(what) + "; they are read as a 3DGS .ply defines them")]
+
+
+def _range(seen: tuple[float, float], values: NDArray[Any]) -> tuple[float, float]:
+    return (
+        min(seen[0], float(values.min(initial=np.inf))),
+        max(seen[1], float(values.max(initial=-np.inf))),
+    )
+
+
+def _frames(header: plyfiles.PlyHeader) -> list[Note]:
+    """Return a note on elements with changes of the Gaussians over time."""
+    count = header.counts["vertex"]
+    moving = [name for name, rows in header.counts.items() if name != "vertex" and rows == count > 1]
+    if not moving:
+        return []
+    names = ", ".join(moving[:3]) + (", …" if len(moving) > 3 else "")
+    text = f"animated scene: frame 0 is read, {plural(len(moving), 'further element')} ({names}) ignored"
+    return [Note("ignored_frames", len(moving), text)]
 
 
 def _bands(path: Path, rest: list[str]) -> tuple[int, int]:
@@ -100,8 +205,9 @@ def _bands(path: Path, rest: list[str]) -> tuple[int, int]:
     return len(rest) // 3, min(len(rest) // 3, 15)
 
 
-def _ignored(properties: list[str], rest: list[str], stored: int, kept: int) -> list[Note]:
-    extra = [p for p in properties if p not in _REQUIRED_PROPERTIES and p not in _NORMALS and p not in rest]
+def _ignored(unused: list[str], rest: list[str], stored: int, kept: int) -> list[Note]:
+    known = {*_REQUIRED_PROPERTIES, *_NORMALS, *rest, _FILTER}
+    extra = [name for name in unused if name not in known]
     notes = []
     if extra:
         names = ", ".join(extra[:4]) + (", …" if len(extra) > 4 else "")
@@ -110,11 +216,6 @@ def _ignored(properties: list[str], rest: list[str], stored: int, kept: int) -> 
     if stored > kept:
         notes.append(Note("ignored_bands", 1, "spherical harmonics past degree 3 ignored"))
     return notes
-
-
-def _means(block: NDArray[Any], shift: NDArray[np.float64]) -> NDArray[np.float32]:
-    means = structured_to_unstructured(block[_MEANS])
-    return np.asarray(means - shift if shift.any() else means, np.float32)
 
 
 def write(
@@ -149,7 +250,7 @@ def write(
     names += [f"f_rest_{k}" for k in range(3 * ((degree + 1) ** 2 - 1))]
     names += ["opacity", *_SCALES, *_QUATS]
     blocks = _blocks(path, (part.with_sh_degree(degree) for part in parts), names, normals)
-    comments = plyfiles.comments_of(scene.offset, scene.render_model)
+    comments = plyfiles.comments_of(scene.offset, scene.render_model, scene.up)
     if layout == "inria":
         comments = comments[1:]  # those that carry values: importers by position may count lines
     plyfiles.write_rows(path, dict.fromkeys(names, "<f4"), count, blocks, overwrite, comments)

@@ -3,6 +3,7 @@
 import io
 import re
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -16,6 +17,7 @@ from g2ard.errors import InputError, damaged
 from g2ard.io.atomic import atomic_output
 
 _OFFSET_COMMENT = re.compile(r"g2ard offset (\S+) (\S+) (\S+)$")
+_VERTICAL_AXIS = re.compile(r"vertical (a)xis\s*[:=]?\s*(.+)", re.IGNORECASE)
 _RENDER_MODES: dict[str, RenderModel | Literal["2dgs"]] = {
     "splatrendermode: default": "classic",
     "splatrendermode: mip": "antialiased",
@@ -25,37 +27,29 @@ _RENDER_MODES: dict[str, RenderModel | Literal["2dgs"]] = {
 }
 """Comments of brush and Postshot, in lower case."""
 
+COLOR_NAMES = (["red", "green", "blue"], ["r", "g", "b"], ["diffuse_red", "diffuse_green", "diffuse_blue"])
+"""Names of colours."""
+
 _HEADER_LIMIT = 1 << 20
 """Longest header, bytes."""
 
-_END_HEADER = re.compile(rb"(?<=[\r\n])end_header[ \t]*[\r\n]")
-_COUNT = re.compile(rb"(?<=[\r\n])(element[ \t]+(\S+)[ \t]+)(\d{1,4000})\b")  # Python reads no longer ones
+_MARK = b"\xef\xbb\xbf"
+"""Byte order mark of UTF-8."""
 
 _ASCII = bytes(range(128)) + b"?" * 128
-"""Translation of names and comments of other character sets, byte by byte."""
-
-
-class _AsciiHeader(io.BufferedReader):
-    """A file whose header reads as ASCII, as plyfile requires."""
-
-    def __init__(self, path: Path, length: int) -> None:
-        super().__init__(io.FileIO(path))
-        self._length = length
-
-    def read(self, size: int | None = -1, /) -> bytes:
-        header = max(0, self._length - self.tell())
-        data = super().read(size)
-        return data[:header].translate(_ASCII) + data[header:] if header else data
+_REMARKS = (b"comment", b"obj_info")
+_END_HEADER = re.compile(rb"(?<=[\r\n])end_header[ \t]*(\r\n|\r|\n)")
+_COUNT = re.compile(rb"(?<=[\r\n])(element[ \t]+(\S+)[ \t]+)(\d{1,4000})\b")  # Python reads no longer ones
 
 
 @dataclass(frozen=True)
 class PlyHeader:
-    """A PLY header: plyfile's elements, without rows, row counts per element, all comments, its length."""
+    """A PLY header: plyfile's elements, without rows, row counts per element, all comments, and its bytes."""
 
     elements: PlyData
     counts: dict[str, int]
     comments: list[str]
-    bytes: int
+    span: range
 
     def properties(self, element: str) -> list[str]:
         """Return the properties of an element that are no lists; none if there is no such element."""
@@ -72,6 +66,8 @@ def read_header(path: Path) -> PlyHeader:
         raise InputError(f"{error.strerror}", path=path) from error
     if not head:
         raise InputError("is empty", path=path)
+    start = len(_MARK) if head.startswith(_MARK) else 0
+    head = head[start:]
     if head[:3] != b"ply" or head[3:4] not in b"\r\n":
         raise InputError(
             f"is not a PLY file (begins with {head[:8]!r}, expected 'ply')",
@@ -81,14 +77,45 @@ def read_header(path: Path) -> PlyHeader:
     end = _END_HEADER.search(head)  # on a line of its own, since comments may contain it
     if end is None:
         raise damaged("broken PLY header: no end_header line", path=path)
-    head = head[: end.end()].translate(_ASCII)
+    eol = b"\r\n" if head[3:5] == b"\r\n" else head[3:4]
+    head = head[: end.start(1) + len(eol)]  # rows may begin with a newline
+    lines = enumerate(head.splitlines(), 1)
+    foreign = next((n for n, line in lines if not line.isascii() and not line.startswith(_REMARKS)), None)
+    if foreign is not None:
+        raise InputError("is not ASCII", path=path, index=foreign, item="header line")
+    span, head = range(start, start + len(head)), head.translate(_ASCII)
     try:
         counts = {name.decode(): int(count) for _, name, count in _COUNT.findall(head)}
         ply = PlyData.read(io.BytesIO(_COUNT.sub(rb"\g<1>0", head)), mmap=False)
     except (PlyParseError, ValueError) as error:
         raise damaged(f"broken PLY header, {error}", path=path) from error
     comments = [*ply.comments, *(text for element in ply for text in element.comments)]
-    return PlyHeader(ply, counts, [" ".join(text.split()) for text in comments], end.end())
+    return PlyHeader(ply, counts, [" ".join(text.split()) for text in comments], span)
+
+
+class _Plain(io.BufferedReader):
+    """A PLY file from its header on, whose comments read as ASCII."""
+
+    def __init__(self, path: Path, span: range) -> None:
+        super().__init__(io.FileIO(str(path)))
+        self._end = span.stop
+        self.seek(span.start)
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        data, within = super().read(size), self.tell() <= self._end
+        return data.translate(_ASCII) if within else data
+
+
+def scene_names(properties: Sequence[str]) -> dict[str, str]:
+    """Return the properties of a Gaussian scene by their usual names, without CloudCompare's prefix.
+
+    >>> scene_names(["x", "scalar_f_dc_0", "filter_3D", "red"])
+    {'x': 'x', 'f_dc_0': 'scalar_f_dc_0', 'filter_3d': 'filter_3D', 'red': 'red'}
+    """
+    found: dict[str, str] = {}
+    for name in sorted(properties, key=lambda name: name.lower().startswith("scalar_")):
+        found.setdefault(name.lower().removeprefix("scalar_"), name)
+    return found
 
 
 def offset_of(path: Path, header: PlyHeader) -> NDArray[np.float64]:
@@ -117,11 +144,47 @@ def render_model_of(comments: Sequence[str]) -> RenderModel | Literal["2dgs"]:
     return modes[-1] if modes else "classic"
 
 
-def comments_of(offset: NDArray[np.float64], render_model: RenderModel) -> list[str]:
+def up_of(comments: Sequence[str]) -> tuple[float, float, float] | None:
+    """Return the up direction that a comment states, as a unit vector.
+
+    Brush writes the direction, or a letter of which y and z mean −y and −z; nerfstudio's letters mean the
+    axis itself. Brush is the writer if a comment names it, or if none names nerfstudio and `axis` is in
+    lower case.
+
+    >>> up_of(["Generated by Nerfstudio 1.1.5", "Vertical Axis: z"])
+    (0.0, 0.0, 1.0)
+    >>> up_of(["Exported from Brush", "Vertical axis: z"])
+    (0.0, 0.0, -1.0)
+    """
+    found = next((m for c in reversed(comments) if (m := _VERTICAL_AXIS.match(c))), None)
+    if found is None:
+        return None
+    axis, letter = np.zeros(3), re.fullmatch(r"([+-]?)([xyz])", found[2].lower())
+    if letter:
+        writers = " ".join(comments).lower()
+        named = "brush" in writers or not re.search("nerf?studio", writers)
+        by_brush = named and ("brush" in writers or found[1] == "a")
+        down = by_brush and letter[2] != "x"
+        axis["xyz".index(letter[2])] = -1 if down != (letter[1] == "-") else 1
+    else:
+        with suppress(ValueError):
+            axis[:] = [float(word) for word in re.split(r"[\s,]+", found[2].strip("[]() "))]
+    length = float(np.linalg.norm(axis))
+    if not 0 < length < np.inf:
+        return None
+    x, y, z = (axis / length).tolist()
+    return x, y, z
+
+
+def comments_of(
+    offset: NDArray[np.float64], render_model: RenderModel, up: Sequence[float] | None = None
+) -> list[str]:
     """Return the comments of a scene that is written, which readers restore."""
     comments = ["generated by g2ard"]
     if offset.any():
         comments.append("g2ard offset " + " ".join(repr(float(v)) for v in offset))
+    if up is not None:
+        comments.append("Vertical axis: " + " ".join(repr(float(v)) for v in up))
     return comments + (["SplatRenderMode: mip"] if render_model == "antialiased" else [])
 
 
@@ -160,9 +223,9 @@ def read_element(path: Path, header: PlyHeader, *names: str) -> list[NDArray[Any
     return [ply[name].data for name in names]
 
 
-def _read(path: Path, header: PlyHeader, lengths: dict[str, dict[str, int]]) -> PlyData:
-    with _AsciiHeader(path, header.bytes) as file:
-        return PlyData.read(file, mmap="r", known_list_len=lengths)
+def _read(path: Path, header: PlyHeader, list_lengths: dict[str, dict[str, int]]) -> PlyData:
+    with _Plain(path, header.span) as file:
+        return PlyData.read(file, mmap="r", known_list_len=list_lengths)
 
 
 def write_rows(

@@ -82,6 +82,7 @@ def open_stream(
         splats = scene.splats
         parts = [len(splats)], lambda _: splats, splats.sh_degree, splats.offset
         stream = PartsStream(path, *parts, file_identity([path]), scene.notes, splats.render_model)
+        stream.up = splats.up
     stream.render_model = render_model or stream.render_model
     return stream
 

@@ -83,6 +83,7 @@ class SceneStream(Stream[Splats]):
     Attributes:
         sh_degree: 0–3.
         render_model: see `Splats`; may be changed before reading.
+        up: the up direction that the source states.
     """
 
     def __init__(
@@ -96,6 +97,7 @@ class SceneStream(Stream[Splats]):
     ) -> None:
         super().__init__(path, count, offset, notes)
         self.tally, self.render_model, self.sh_degree = Tally(), render_model, _DEGREE_OF_REST[rest]
+        self.up: tuple[float, float, float] | None = None
 
     def whole(self) -> Scene:
         """Read all rows into memory."""
@@ -103,7 +105,8 @@ class SceneStream(Stream[Splats]):
         for block in self.blocks(BLOCK):
             raw.take(slice(kept, kept := kept + len(block))).fill(block)
         notes = self.all_notes()
-        return Scene(raw.take(slice(kept)).activated(self.render_model, self.offset), notes)
+        splats = raw.take(slice(kept)).activated(self.render_model, self.offset)
+        return Scene(replace(splats, up=self.up), notes)
 
 
 class RawStream(SceneStream):
@@ -310,6 +313,8 @@ class JoinedScenes(Joined[Splats], SceneStream):
         self.streams, self._rest = streams, (max(stream.sh_degree for stream in streams) + 1) ** 2 - 1
         count, model = sum(s.count for s in streams), one_model([s.render_model for s in streams])
         SceneStream.__init__(self, streams[0].path, count, self._rest, streams[0].offset, render_model=model)
+        ups = {stream.up for stream in streams}
+        self.up = ups.pop() if len(ups) == 1 else None
 
     def positions(self, rows: int) -> Iterator[NDArray[np.float32]]:
         for stream in self.streams:

@@ -86,6 +86,7 @@ class _Manifest(msgspec.Struct):
     key: str
     settings: dict[str, Any]
     render_model: RenderModel = "classic"
+    up: Vector | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,7 +104,7 @@ class TileStore:
         notes: notes from ingestion.
         key: SHA-256 of everything that determines the content: source and settings.
         settings: the settings of ingestion.
-        render_model: see `Splats`.
+        render_model, up: see `Splats`.
     """
 
     folder: Path
@@ -117,6 +118,7 @@ class TileStore:
     key: str
     settings: Mapping[str, Any]
     render_model: RenderModel = "classic"
+    up: Vector | None = None
 
     @classmethod
     def open(cls, folder: str | Path) -> TileStore:
@@ -157,6 +159,7 @@ class TileStore:
             manifest.key,
             manifest.settings,
             manifest.render_model,
+            manifest.up,
         )
         for tile in store.tiles:
             store._check_size(tile_name(tile.index), tile.rows)
@@ -266,14 +269,14 @@ class TileStore:
             logits[at], sh0[at, 0] = rows[:, 10], rows[:, 11:14]
             shN[at] = rows[:, 14 : 14 + 3 * rest].reshape(len(rows), rest, 3)
             start += len(rows)
-        return Splats(means, quats, scales, logits, sh0, shN, self.offset.copy(), self.render_model)
+        return Splats(means, quats, scales, logits, sh0, shN, self.offset.copy(), self.render_model, self.up)
 
 
 class StoredScene:
     """Random access to all tiles' own rows, numbered tile after tile."""
 
     def __init__(self, store: TileStore) -> None:
-        self.store, self.offset = store, store.offset
+        self.store, self.offset, self.up = store, store.offset, store.up
         self._starts = np.cumsum([0, *(tile.rows for tile in store.tiles)])
 
     def __len__(self) -> int:

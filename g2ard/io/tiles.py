@@ -14,3 +14,4 @@ class Stream(PartsStream):
         counts = [tile.rows for tile in store.tiles]
         parts = counts, store.read, store.sh_degree, store.offset
         super().__init__(path, *parts, [store.key], store.notes, store.render_model)
+        self.up = store.up

@@ -365,7 +365,7 @@ def tileset_up(
 ) -> NDArray[np.float64]:
     """Return the (3,) up direction for 3D Tiles: `up`, z in map coordinates, or an estimate."""
     coarse = levels[-1]
-    if up is None and coarse.offset.any():
+    if up is None and coarse.up is None and coarse.offset.any():
         axis = np.array([0.0, 0, 1])
     else:
         rows = np.array(evenly_spaced(len(coarse), _UP_SAMPLE, floor=True))

@@ -138,6 +138,7 @@ def frame_with(
     scene: Splats, cameras: Cameras, *, start: str | None = None, up: Sequence[float] | None = None
 ) -> ViewerFrame:
     """Choose a frame and an initial camera from given cameras, like `frame_of`."""
+    up = scene.up if up is None else up
     axis = _level(cameras) if up is None else None
     stand = ViewerFrame(_turn(up_of(scene, up) if axis is None else axis), _middle(scene))
     points = opaque_points(scene)
@@ -158,12 +159,12 @@ def _level(cameras: Cameras) -> NDArray[np.float64] | None:
 
 @checks_arguments
 def up_of(scene: Splats, up: Sequence[float] | None = None) -> NDArray[np.float64]:
-    """Return a scene's up direction, which is not stored in its file.
+    """Return a scene's up direction.
 
     Args:
         scene: the scene.
-        up: (3,) the direction, if it is known. None estimates it from floors and surfaces, with −y as a
-            fallback.
+        up: (3,) the direction, if it is known. None means the one that the scene's file states, or else
+            estimates it from floors and surfaces, with −y as a fallback.
 
     Returns:
         (3,) float64 unit vector in world coordinates, for `Camera.facing` and `look_at`.
@@ -176,6 +177,7 @@ def up_of(scene: Splats, up: Sequence[float] | None = None) -> NDArray[np.float6
     >>> np.abs(up_of(Splats.create(floor, scales=flat, logit_opacities=np.full(400, 4)))).round(3).tolist()
     [0.0, 1.0, 0.0]
     """
+    up = scene.up if up is None else up
     if up is not None:
         return unit_up(up)
     try:

@@ -101,6 +101,7 @@ class Site:
         """
         matter = Matter.of(splats, rows, represents)
         some = matter.sample()
+        up = splats.up if up is None else up
         found = estimate_up(some) if up is None else given_up(some, up)
         axes = _axes(some, found.axis)
         points = turned(some.points, axes)

@@ -53,6 +53,7 @@ class Splats:
         offset: (3,) float64, world = means + offset. Large map coordinates (UTM) go here.
         render_model: the rendering that the scene was trained for: "classic", or "antialiased" with
             Mip-Splatting's factor on opacities. All renders follow it.
+        up: (3,) direction away from the ground, if the scene's file states it.
 
     Other arrays of numbers are converted to these types.
 
@@ -73,6 +74,7 @@ class Splats:
     shN: NDArray[np.float32]
     offset: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
     render_model: RenderModel = "classic"
+    up: tuple[float, float, float] | None = None
 
     def __post_init__(self) -> None:
         for name in ARRAYS:

@@ -68,6 +68,7 @@ def transform(splats: Splats, matrix: ArrayLike) -> Splats:
         scales=(splats.scales * scale).astype(np.float32),
         shN=rotate_harmonics(splats.shN, rotation),
         offset=offset,
+        up=None if splats.up is None else tuple((rotation @ splats.up).tolist()),
     )
 
 
@@ -93,6 +94,76 @@ def placed(splats: Splats, matrix: NDArray[np.float64]) -> Splats:
     if (matrix[:3, :3] == np.eye(3)).all():
         return replace(splats, offset=splats.offset + matrix[:3, 3])
     return transform(splats, matrix)
+
+
+def deformed(splats: Splats, matrix: NDArray[np.float64]) -> tuple[Splats, bool]:
+    """Apply any invertible 4×4 affine map like `placed`; return whether harmonics follow it exactly.
+
+    Covariances become MΣMᵀ. Harmonics follow rotations and mirrors exactly; for other maps, bands 1 to 3 are
+    fitted to the colours that c(M⁻¹·d) has, and the base colour stays.
+
+    Raises:
+        InputError: the map flattens the scene, or is not finite.
+    """
+    linear = matrix[:3, :3]
+    if not np.isfinite(matrix).all() or abs(det := float(np.linalg.det(linear))) < np.finfo(float).tiny:
+        raise InputError("flattens the scene, or is not finite", parameter="transform")
+    turn = linear / np.cbrt(det)
+    exact = bool(np.allclose(turn @ turn.T, np.eye(3), atol=1e-4))
+    if exact and det > 0:
+        return placed(splats, matrix), True
+    axes = rotation_matrices(splats.quats) * splats.scales.astype(np.float64)[:, None, :]
+    frames, scales, _ = np.linalg.svd(linear @ axes)
+    frames *= np.sign(np.linalg.det(frames))[:, None, None]
+    moved = placed(replace(splats, up=None), _shift(matrix, splats))
+    if exact:
+        shN = rotate_harmonics(splats.shN, np.sign(det) * turn)
+    else:
+        shN = _warped(splats.shN, linear)
+    return replace(
+        moved,
+        means=(splats.means.astype(np.float64) @ linear.T).astype(splats.means.dtype),
+        quats=_quaternions(frames),
+        scales=scales.astype(np.float32),
+        shN=shN,
+    ), exact
+
+
+def _shift(matrix: NDArray[np.float64], splats: Splats) -> NDArray[np.float64]:
+    """Return the translation that `offset` takes when a map is applied to means and offset."""
+    shift = np.eye(4)
+    shift[:3, 3] = matrix[:3, :3] @ splats.offset + matrix[:3, 3] - splats.offset
+    return shift
+
+
+def _warped(shN: NDArray[np.float32], linear: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Fit coefficients of bands 1 to 3 to c'(d) = c(M⁻¹·d) over many directions."""
+    directions = np.random.default_rng(0).normal(size=(512, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    before = directions @ np.linalg.inv(linear).T
+    before /= np.linalg.norm(before, axis=1, keepdims=True)
+    rest = shN.shape[1]
+    here, there = _basis(directions)[:, :rest], _basis(before)[:, :rest]
+    turn = np.linalg.lstsq(here, there, rcond=None)[0]
+    return np.einsum("kj,njc->nkc", turn, shN.astype(np.float64)).astype(np.float32)
+
+
+def _quaternions(rotations: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Return (N, 4) wxyz of (N, 3, 3) rotations, by the largest of the four components."""
+    r = rotations
+    trace = r[:, 0, 0] + r[:, 1, 1] + r[:, 2, 2]
+    squares = np.stack([trace, *(2 * r[:, i, i] - trace for i in range(3))], axis=1) + 1
+    rows, largest = np.arange(len(r)), squares.argmax(axis=1)
+    products = np.empty((len(r), 4, 4))
+    for i in range(4):
+        products[:, i, i] = squares[:, i]
+    for a, b, i, j, sign in (
+        *((0, 1, 2, 1, -1), (0, 2, 0, 2, -1), (0, 3, 1, 0, -1)),
+        *((1, 2, 0, 1, 1), (1, 3, 0, 2, 1), (2, 3, 1, 2, 1)),
+    ):
+        products[:, a, b] = products[:, b, a] = r[:, i, j] + sign * r[:, j, i]
+    quats = products[rows, largest]
+    return (quats / np.linalg.norm(quats, axis=1, keepdims=True)).astype(np.float32)
 
 
 def similarity(matrix: ArrayLike) -> tuple[float, NDArray[np.float64], NDArray[np.float64]]:
@@ -227,7 +298,8 @@ def with_axes(splats: Splats, matrix: NDArray[np.float64]) -> Splats:
     if sign > 0:
         return turned
     odd = _SH_PARITY[: splats.shN.shape[1], None]
-    return replace(turned, means=-turned.means, offset=-turned.offset, shN=turned.shN * odd)
+    up = None if turned.up is None else (-turned.up[0], -turned.up[1], -turned.up[2])
+    return replace(turned, means=-turned.means, offset=-turned.offset, shN=turned.shN * odd, up=up)
 
 
 def join(scenes: Sequence[Splats]) -> Splats:
@@ -247,7 +319,9 @@ def join(scenes: Sequence[Splats]) -> Splats:
     degree = max(scene.sh_degree for scene in scenes)
     parts = [scene.recentred(scenes[0].offset).with_sh_degree(degree) for scene in scenes]
     together = {name: np.concatenate([getattr(part, name) for part in parts]) for name in ARRAYS}
-    return Splats(**together, offset=scenes[0].offset, render_model=model)
+    ups = {scene.up for scene in scenes}
+    up = ups.pop() if len(ups) == 1 else None
+    return Splats(**together, offset=scenes[0].offset, render_model=model, up=up)
 
 
 def one_model(models: Sequence[RenderModel]) -> RenderModel:

@@ -134,6 +134,8 @@ def ingest(
             "settings": settings,
             "notes": [asdict(note) for note in notes],
         }
+        if isinstance(feed, SceneFeed) and feed.stream.up is not None:
+            manifest["up"] = feed.stream.up
         journal.finish(manifest)
     return TileStore.open(folder)
 

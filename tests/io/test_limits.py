@@ -170,6 +170,10 @@ CLAIMS: dict[str, tuple[Callable[[Path], Path], str]] = {
     "ply of 2**62 rows": (lambda f: header(f / "a.ply", "vertex 9", b"vertex %d" % 2**62), "truncated"),
     "ply of 10**30 rows": (lambda f: header(f / "a.ply", "vertex 9", b"vertex 1" + b"0" * 30), "truncated"),
     "ply of 10**5000 rows": (lambda f: header(f / "a.ply", "vertex 9", b"vertex 1" + b"0" * 5000), "line 4"),
+    "ply not in ascii": (
+        lambda f: header(f / "a.ply", "float opacity", "float opacité".encode()),
+        "not ASCII",
+    ),
     "views of 4e9 pixels a side": (lambda f: huge_views(f / "a.json"), "4,000,000,000×4,000,000,000"),
     "colmap of 4e9 pixels a side": (huge_colmap, "4,000,000,000×4,000,000,000"),
     "inria of 4e9 pixels a side": (lambda f: huge_inria(f / "cameras.json"), "4,000,000,000×4,000,000,000"),

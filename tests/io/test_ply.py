@@ -7,12 +7,17 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from plyfile import PlyData
+from plyfile import PlyData, PlyElement
 
 from g2ard.errors import InputError
 from g2ard.io import kind, open_stream, read_scene, read_splats, write_splats
 from g2ard.io.sanitize import LOG_SCALE_LIMIT, LOGIT_LIMIT
+from g2ard.jobs.convert import convert
+from g2ard.jobs.viewer_frame import up_of
+from g2ard.poses.site import Site
 from g2ard.scene.splats import ARRAYS, DRAWN_LOGIT, Splats
+from g2ard.stages.simplify import SimplifyConfig, simplify
+from g2ard.tiles.ingest import ingest
 from helpers.ply_files import columns, save, scene
 
 
@@ -225,3 +230,173 @@ def test_broken_scene_is_not_written(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="'f_dc_1' of Gaussian 3"):
         write_splats(tmp_path / "a.ply", splats)
     assert list(tmp_path.iterdir()) == []
+
+
+# ── as other programs write it ───────────────────────────────────────────────────────────────────────
+
+
+def with_header(path: Path, change: Any) -> Path:
+    """Change the bytes of a file's header."""
+    head, end, body = path.read_bytes().partition(b"end_header\n")
+    path.write_bytes(change(head + end) + body)
+    return path
+
+
+REMARKS = ["Prüfstand – Büro", "导出", "\U0001f600 ok", "a\u2028b", "end_header é"]
+
+
+@pytest.mark.parametrize("keyword", ["comment", "obj_info"])
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-16-le", "latin-1"])
+@pytest.mark.parametrize("options", [{"byte_order": "<"}, {"byte_order": ">"}, {"text": True}])
+def test_remarks_in_any_language(tmp_path: Path, keyword: str, encoding: str, options: dict) -> None:
+    truth = scene(count=7)
+    remarks = [r.encode(encoding, "replace").replace(b"\n", b"").replace(b"\r", b"") for r in REMARKS]
+    lines = b"".join(keyword.encode() + b" " + remark + b"\n" for remark in remarks)
+    path = save(tmp_path / "a.ply", columns(truth), **options)
+    with_header(path, lambda head: head.replace(b"element vertex", lines + b"element vertex"))
+    assert_same(read_splats(path), truth)
+    assert_same(next(iter(open_stream(path).blocks(99))), truth)
+
+
+@pytest.mark.parametrize("mark", [b"", b"\xef\xbb\xbf"])
+@pytest.mark.parametrize("eol", [b"\n", b"\r\n", b"\r"])
+def test_line_ends_and_byte_order_marks(tmp_path: Path, mark: bytes, eol: bytes) -> None:
+    truth = scene(count=7)
+    truth.means[0, 0] = np.frombuffer(b"\n\r\n\x3f", "<f4")[0]  # rows may begin like a line's end
+    path = save(tmp_path / "a.ply", columns(truth), byte_order="<")
+    with_header(path, lambda head: mark + head.replace(b"\n", eol))
+    assert_same(read_splats(path), truth)
+
+
+@pytest.mark.parametrize("dtype", ["u1", "u2", "i4", "f4", "f8"])
+@pytest.mark.parametrize("names", [("red", "green", "blue"), ("r", "g", "b"), ("Red", "Green", "Blue")])
+@pytest.mark.parametrize("white", [1, 255, 65535])
+def test_colours_in_place_of_harmonics(tmp_path: Path, dtype: str, names: tuple, white: int) -> None:
+    """Values tell what white is, not types; bytes hold no more than 255, fractions need a real type."""
+    if (white == 1) == (dtype[0] != "f") or (white > 255 and dtype == "u1"):
+        return
+    truth, rng = scene(degree=0), np.random.default_rng(1)
+    rgb = np.vstack([rng.uniform(0, 1, (19, 3)), np.ones((1, 3))])
+    cols = {name: v for name, v in columns(truth).items() if not name.startswith("f_dc")}
+    rows = np.empty(20, [(name, "f4") for name in cols] + [(name, dtype) for name in names])
+    for name, values in cols.items():
+        rows[name] = values
+    for channel, name in enumerate(names):
+        rows[name] = np.rint(rgb[:, channel] * white) if dtype[0] != "f" else rgb[:, channel] * white
+    PlyData([PlyElement.describe(rows, "vertex")]).write(str(tmp_path / "a.ply"))
+    found = read_splats(tmp_path / "a.ply")
+    np.testing.assert_allclose(found.colors, rgb, atol=0.6 / white if dtype[0] != "f" else 1e-6)
+    np.testing.assert_allclose(found.scales, truth.scales, rtol=1e-5)
+
+
+@pytest.mark.parametrize("degree", [0, 2])
+@pytest.mark.parametrize("prefix", ["scalar_", "Scalar_"])
+def test_names_of_cloudcompare(tmp_path: Path, degree: int, prefix: str) -> None:
+    truth = scene(degree=degree)
+    cols = {name if name in "xyz" else prefix + name: v for name, v in columns(truth).items()}
+    path = save(tmp_path / "a.ply", cols | {"red": np.zeros(20), "green": np.zeros(20), "blue": np.zeros(20)})
+    assert kind(path) == "splats"
+    assert_same(read_splats(path), truth)
+
+
+@pytest.mark.parametrize("name", ["scale_0", "scale"])
+@pytest.mark.parametrize("turned", [True, False])
+def test_one_scale_for_three(tmp_path: Path, name: str, turned: bool) -> None:
+    truth = scene()
+    cols = columns(truth)
+    cols = {
+        key: v for key, v in cols.items() if not key.startswith("scale") and (turned or "rot_" not in key)
+    }
+    found = read_splats(save(tmp_path / "a.ply", cols | {name: np.log(truth.scales[:, 1])}))
+    np.testing.assert_allclose(found.scales, truth.scales[:, [1, 1, 1]], rtol=1e-5)
+    np.testing.assert_allclose(found.quats, truth.quats if turned else [[1, 0, 0, 0]] * 20, atol=1e-6)
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("name", ["filter_3D", "filter_3d"])
+def test_the_mip_filter_is_applied(tmp_path: Path, seed: int, name: str) -> None:
+    truth, f = scene(seed=seed), np.random.default_rng(seed).uniform(0, 0.3, 20).astype(np.float32)
+    truth.logit_opacities[:2] = 15, -9
+    f[3] = 0
+    found = read_scene(save(tmp_path / "a.ply", columns(truth) | {name: f}))
+    before = truth.scales.astype(float) ** 2
+    after = before + f[:, None].astype(float) ** 2
+    alphas = 1 / (1 + np.exp(-truth.logit_opacities.astype(float)))
+    np.testing.assert_allclose(found.splats.scales, np.sqrt(after), rtol=1e-5)
+    faded = alphas * np.sqrt(before.prod(1) / after.prod(1))
+    np.testing.assert_allclose(found.splats.opacities, faded, rtol=2e-5)
+    assert [note.code for note in found.notes] == ["mip_filter"]
+
+
+@pytest.mark.parametrize("names", [["delta_vertex_0"], ["frame_1", "frame_2", "frame_3", "frame_4"]])
+def test_animated_scenes_are_read_at_frame_0(tmp_path: Path, names: list[str]) -> None:
+    truth = scene()
+    rows = save(tmp_path / "a.ply", columns(truth)) and PlyData.read(str(tmp_path / "a.ply"))["vertex"].data
+    moves = np.zeros(20, [(axis, "f4") for axis in "xyz"])
+    other = np.zeros(1, [("time", "f4")])
+    elements = [
+        PlyElement.describe(np.array(rows), "vertex"),
+        *(PlyElement.describe(moves, n) for n in names),
+    ]
+    PlyData([PlyElement.describe(other, "clock"), *elements]).write(str(tmp_path / "b.ply"))
+    found = read_scene(tmp_path / "b.ply")
+    assert_same(found.splats, truth)
+    assert [(note.code, note.count) for note in found.notes] == [("ignored_frames", len(names))]
+    assert "frame 0" in found.notes[0].text
+
+
+@pytest.mark.parametrize("unit", [0.05, 1.0])
+@pytest.mark.parametrize("what", ["scales", "opacities", "both", "neither"])
+def test_activated_values_are_noted(tmp_path: Path, what: str, unit: float) -> None:
+    truth = scene(count=60, seed=4)
+    cols = columns(truth)
+    if what in ("scales", "both"):
+        cols |= {f"scale_{i}": truth.scales[:, i] * unit for i in range(3)}
+    if what in ("opacities", "both"):
+        cols |= {"opacity": truth.opacities}
+    notes = read_scene(save(tmp_path / "a.ply", cols)).notes
+    assert [note.code for note in notes] == ["activated"] * (what != "neither")
+    assert all(
+        (word in notes[0].text) == (what in (word, "both")) for word in ("scales", "opacities") if notes
+    )
+
+
+UP = [
+    (["Generated by Nerstudio 1.1.5", "Vertical Axis: z"], (0, 0, 1)),
+    (["Vertical Axis: y"], (0, 1, 0)),
+    (["vertical axis: X", "written by nerfstudio"], (1, 0, 0)),
+    (["Exported from Brush", "Vertical axis: 1 0 0"], (1, 0, 0)),
+    (["Vertical axis: 0, -2.0, 0"], (0, -1, 0)),
+    (["Exported from Brush", "Vertical axis: y"], (0, -1, 0)),
+    (["Exported from Brush", "Vertical Axis: Z"], (0, 0, -1)),
+    (["Exported from Brush", "Vertical axis: x"], (1, 0, 0)),
+    (["Vertical axis: z"], (0, 0, -1)),
+    (["Exported from Brush", "Vertical axis: 0.6 -0.8 0"], (0.6, -0.8, 0)),
+    (["Vertical axis: up"], None),
+    (["Vertical axis: 0 0 0"], None),
+    (["Vertical axis: nan 0 1"], None),
+    ([], None),
+]
+
+
+@pytest.mark.parametrize(("comments", "up"), UP)
+@pytest.mark.parametrize("name", ["b.ply", "b.compressed.ply"])
+def test_the_up_direction_of_comments(tmp_path: Path, comments: list[str], up: Any, name: str) -> None:
+    """It is read, used, turned with the scene, and written."""
+    path = save(tmp_path / "a.ply", columns(scene(200)), comments=comments)
+    found = read_splats(path)
+    assert found.up == (up if up is None else pytest.approx(up))
+    write_splats(tmp_path / name, found)
+    again = read_splats(tmp_path / name)
+    assert again.up == found.up
+    if up is None:
+        return
+    np.testing.assert_allclose(up_of(again), up, atol=1e-12)
+    np.testing.assert_allclose(Site.of(again).up.axis, up, atol=1e-12)
+    turned = convert(path, rotate=(90, 0, 0))
+    np.testing.assert_allclose(up_of(turned), (up[0], -up[2], up[1]), atol=1e-12)
+    mirrored = convert(path, to_axes="LDF")
+    np.testing.assert_allclose(up_of(mirrored), (-up[0], *up[1:]), atol=1e-12)
+    assert simplify(found, 50, config=SimplifyConfig(method="fast")).splats.up == found.up
+    ingest(path, tmp_path / "tiles")
+    assert read_splats(tmp_path / "tiles").up == pytest.approx(up)

@@ -290,9 +290,7 @@ def test_what_is_too_far_for_an_spz_is_named_with_a_box(
     truth = with_far(count, times, 1.0, seed=count)
     truth = replace(truth, means=truth.means + np.float32(shift))
     first = np.flatnonzero(np.abs(truth.means).max(1) > 1e5)[0]
-    with pytest.raises(
-        InputError, match=rf"{count} Gaussians? of [\d,]+ lie \(row {first}\b.*--box="
-    ) as error:
+    with pytest.raises(InputError, match=rf"{count} Gaussians? of .* \(row {first}\b.*--box=") as error:
         write_splats(tmp_path / name, truth, **options)
     box = [float(v) for v in re.search(r"--box=([-\d.,]+\d)", str(error.value))[1].split(",")]
     cropped = convert(truth, box=box)

@@ -185,4 +185,5 @@ def splats_of(like: Splats, out: dict[str, Any]) -> Splats:
         shN=np.ascontiguousarray(sh[:, 1:]),
         offset=like.offset,
         render_model=like.render_model,
+        up=like.up,
     )
