@@ -7,11 +7,13 @@ The values of an SPZ (KHR_gaussian_splatting_compression_spz_2) are glTF coordin
 The draft asks for SPZ's own axes, which differ by half a turn about y.
 """
 
+import base64
 import json
 import struct
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
+from urllib.parse import unquote
 
 import msgspec
 import numpy as np
@@ -22,14 +24,20 @@ from g2ard.io import spz
 from g2ard.io.atomic import atomic_output
 from g2ard.io.jsonfile import Number, Place, Row, Vector, Whole, checked, parse_json
 from g2ard.io.packing import packing_order, rounding, unit_quats, writable
+from g2ard.io.paths import check_regular
 from g2ard.io.sanitize import Raw, cleaned
 from g2ard.io.types import Note, Scene
 from g2ard.progress import plural
 from g2ard.scene.splats import Splats
-from g2ard.scene.transform import placed, rotation_matrices
+from g2ard.scene.transform import deformed, join, rotation_matrices
 
 EXTENSION = "KHR_gaussian_splatting"
 SPZ_EXTENSION = f"{EXTENSION}_compression_spz_2"
+_SPZ_ALONE = "KHR_spz_gaussian_splats_compression"
+_SPZ_EXTENSIONS = (SPZ_EXTENSION, f"{EXTENSION}_compression_spz", _SPZ_ALONE)
+"""The extension of an SPZ, and its earlier names: within the splats' extension, and without it."""
+
+LINEAR_NOTE = Note("linear_colors", 1, "linear colours are taken as sRGB, so renders are too dark")
 _SPZ_VERSION = 3
 _MAGIC, _JSON, _BIN = 0x46546C67, 0x4E4F534A, 0x004E4942
 _FLOAT, _USHORT, _UBYTE = 5126, 5123, 5121
@@ -274,6 +282,8 @@ def read(path: Path) -> Scene:
 def _chunks(path: Path) -> tuple[Any, bytes]:
     """Return the JSON document and the binary chunk."""
     data = path.read_bytes()
+    if path.suffix.lower() == ".gltf":
+        return _with_buffer(path, parse_json(path, data))
     if len(data) < 20 or struct.unpack_from("<II", data) != (_MAGIC, 2):
         raise InputError(f"not a .glb of glTF 2.0 (begins with {data[:4]!r})", path=path)
     found: dict[int, bytes] = {}
@@ -289,43 +299,84 @@ def _chunks(path: Path) -> tuple[Any, bytes]:
     return parse_json(path, found[_JSON]), found.get(_BIN, b"")
 
 
+def _with_buffer(path: Path, document: Any) -> tuple[Any, bytes]:
+    """Return the document of a .gltf and its only buffer, which it holds in base64 or names beside it."""
+    buffers = document.get("buffers") if isinstance(document, dict) else None
+    uri = buffers[0].get("uri") if isinstance(buffers, list) and len(buffers) == 1 else None
+    if not isinstance(buffers, list) or not isinstance(uri, str):
+        raise InputError("expected one buffer with a uri", path=path, hint="export it as .glb")
+    document = {**document, "buffers": [{**buffers[0], "uri": None}]}
+    if uri.startswith("data:"):
+        try:
+            return document, base64.b64decode(uri.partition(",")[2], validate=True)
+        except ValueError as error:
+            raise damaged(f"broken base64 in a buffer ({error})", path=path) from error
+    file = path.parent / unquote(uri)
+    check_regular(file)
+    return document, file.read_bytes()
+
+
 def _scene(path: Path, document: _Document, binary: bytes) -> Scene:
-    primitives = [mesh.primitives for mesh in document.meshes]
-    splatting = [
-        (mesh, at, primitive)
-        for mesh, held in enumerate(primitives)
-        for at, primitive in enumerate(held)
-        if EXTENSION in primitive.extensions
-    ]
-    if len(splatting) != 1:
-        raise InputError(f"has {len(splatting)} primitives with {EXTENSION}, expected 1", path=path)
-    mesh, at, primitive = splatting[0]
-    within = Place(path).to("meshes", mesh, "primitives", at)
+    """Read all splat primitives, each as often as nodes show it."""
+    notes: list[Note] = []
+    parts: list[Splats] = []
+    others = uneven = 0
+    for index, mesh in enumerate(document.meshes):
+        placements = None
+        for at, primitive in enumerate(mesh.primitives):
+            within = Place(path).to("meshes", index, "primitives", at)
+            if not {EXTENSION, _SPZ_ALONE} & set(primitive.extensions):
+                others += 1
+                continue
+            scene = _primitive(within, document, binary, primitive)
+            notes += [note for note in scene.notes if note not in notes]
+            placements = _placements(path, document.nodes, index) if placements is None else placements
+            for placement in placements:
+                try:
+                    moved, exact = deformed(scene.splats, placement)
+                except InputError as error:
+                    raise error.at(path=path, parameter=None, message=f"a node {error.message}") from None
+                parts.append(moved)
+                uneven += not exact
+    if not parts:
+        raise InputError(f"has no primitive with {EXTENSION}", path=path)
+    if others:
+        notes.insert(0, Note("ignored_meshes", others, f"{plural(others, 'other primitive')} ignored"))
+    if uneven:
+        notes.append(uneven_note(uneven))
+    splats = parts[0] if len(parts) == 1 else join(parts)
+    return Scene(splats, tuple(notes))
+
+
+def uneven_note(count: int) -> Note:
+    """Return the note on placements that colours by direction cannot follow exactly."""
+    text = f"{plural(count, 'part')} scaled unevenly: colours by direction follow approximately"
+    return Note("uneven_placement", count, text)
+
+
+def _primitive(within: Place, document: _Document, binary: bytes, primitive: _Primitive) -> Scene:
+    """Read a primitive of splats, in the axes of a .ply, without its placement."""
+    path = within.path
     place = within.to("extensions", EXTENSION)
-    splats = checked(primitive.extensions[EXTENSION], _Splatting, place)
-    if unknown := sorted(set(splats.extensions) - {SPZ_EXTENSION}):
+    splats = checked(primitive.extensions.get(EXTENSION, {}), _Splatting, place)
+    inside = splats.extensions
+    if _SPZ_ALONE in primitive.extensions:
+        inside, place = primitive.extensions, within
+    if unknown := sorted(set(splats.extensions) - set(_SPZ_EXTENSIONS)):
         raise InputError(f"unsupported extension {unknown[0]!r}", path=path)
     if splats.kernel != "ellipse":
         raise InputError("unsupported kernel; expected 'ellipse'", path=path)
-    notes = []
-    if others := sum(map(len, primitives)) - 1:
-        notes.append(Note("ignored_meshes", others, f"{plural(others, 'other primitive')} ignored"))
-    if splats.color_space == "lin_rec709_display":
-        notes.append(Note("linear_colors", 1, "linear colours are taken as sRGB, so renders are too dark"))
-    placement = _placement(path, document.nodes, mesh)
-    if splats.extensions:
-        place = place.to("extensions", SPZ_EXTENSION)
-        packed = checked(splats.extensions[SPZ_EXTENSION], _Compressed, place)
+    notes = [LINEAR_NOTE] if splats.color_space == "lin_rec709_display" else []
+    name = next((name for name in _SPZ_EXTENSIONS if name in inside), None)
+    if name is None:
+        scene = _attributes_of(within.to("attributes"), document, binary, primitive.attributes)
+    else:
+        place = place.to("extensions", name)
+        packed = checked(inside[name], _Compressed, place)
         view = _view(document, packed.buffer_view, place, "the SPZ")
         scene = spz.decoded(path, binary[view.byte_offset : view.byte_offset + view.byte_length])
         scene = replace(scene, splats=_about_y(scene.splats))
-    else:
-        scene = _attributes_of(within.to("attributes"), document, binary, primitive.attributes)
-    try:
-        moved = placed(scene.splats, placement)
-    except InputError as error:
-        raise error.at(path=path, parameter=None, message=f"a node {error.message}") from None
-    return replace(scene, splats=moved, notes=(*notes, *scene.notes))
+    return replace(scene, notes=(*notes, *scene.notes))
 
 
 def _attributes_of(place: Place, document: _Document, binary: bytes, names: dict[str, Any]) -> Scene:
@@ -341,14 +392,18 @@ def _attributes_of(place: Place, document: _Document, binary: bytes, names: dict
     degree = max(d for d in range(4) if d == 0 or f"{EXTENSION}:SH_DEGREE_{d}_COEF_0" in names)
     means = values("POSITION", 3)
     raw = Raw.empty(len(means), (degree + 1) ** 2 - 1)
-    raw.set_linear(values(f"{EXTENSION}:SCALE", 3), values(f"{EXTENSION}:OPACITY", 1)[:, 0])
+    scales, notes = values(f"{EXTENSION}:SCALE", 3), []
+    raw.set_linear(scales, values(f"{EXTENSION}:OPACITY", 1)[:, 0])
+    if (scales < 0).any():
+        notes.append(Note("log_scales", len(scales), "scales are below 0, so all are taken as logarithms"))
+        raw.log_scales[:] = scales
     with np.errstate(invalid="ignore"):  # a signalling NaN
         raw.means[:] = means * _GLTF_TURN
         raw.quats[:] = values(f"{EXTENSION}:ROTATION", 4)[:, [3, 0, 1, 2]] * (1, *_GLTF_TURN)
         raw.sh0[:, 0] = values(f"{EXTENSION}:SH_DEGREE_0_COEF_0", 3)
         for name, k in _harmonics(degree):
             raw.shN[:, k] = values(name, 3) * _SH_FLIPS[k]
-    return cleaned(place.path, raw)
+    return cleaned(place.path, raw, notes)
 
 
 def _entry(table: list[_Entry], index: int | None, place: Place) -> _Entry:
@@ -363,7 +418,7 @@ def _view(document: _Document, index: int | None, place: Place, what: str) -> _V
     view = _entry(document.buffer_views, index, place.to("bufferView"))
     within = Place(place.path).to("bufferViews", index or 0, "buffer")
     buffer = _entry(document.buffers, view.buffer, within)
-    if view.buffer or "uri" in buffer:
+    if view.buffer or buffer.get("uri") is not None:
         raise InputError(f"{what} lies outside the file", path=place.path)
     return view
 
@@ -394,30 +449,29 @@ def _accessor(
     return np.maximum(rows.astype(np.float32) / np.float32(top), np.float32(-1))
 
 
-def _placement(path: Path, nodes: list[_Node], mesh: int) -> NDArray[np.float64]:
-    """Return the (4, 4) placement by the mesh's only node and its ancestors, in the axes of a .ply."""
-    parents: dict[int, list[int]] = {}
+def _placements(path: Path, nodes: list[_Node], mesh: int) -> list[NDArray[np.float64]]:
+    """Return the (4, 4) placements by a mesh's nodes and their ancestors, in the axes of a .ply."""
+    parents: dict[int, int] = {}
     for i, node in enumerate(nodes):
         for k, child in enumerate(node.children):
             _entry(nodes, child, Place(path).to("nodes", i, "children", k))
-            parents.setdefault(child, []).append(i)
-    at = [i for i, node in enumerate(nodes) if node.mesh == mesh]
-    if len(at) > 1:
-        raise InputError(f"{len(at)} nodes show the splats, expected 1", path=path)
-    total = np.eye(4)
-    seen: set[int] = set()
-    while at:
-        if at[0] in seen:
-            raise InputError(f"node {at[0]} is its own ancestor", path=path)
-        seen.add(at[0])
-        with np.errstate(over="ignore", invalid="ignore"):
-            total = _local(nodes[at[0]]) @ total
-        at = parents.get(at[0], [])
-        if len(at) > 1:
-            raise InputError(f"a node has {len(at)} parents", path=path)
-    if not np.isfinite(total[:3, 3]).all():
-        raise InputError(f"invalid translation {tuple(total[:3, 3].tolist())}", path=path)
-    return total * np.outer((*_GLTF_TURN, 1), (*_GLTF_TURN, 1))
+            if parents.setdefault(child, i) != i:
+                raise InputError(f"node {child} has 2 parents", path=path)
+    found = []
+    for shown in (i for i, node in enumerate(nodes) if node.mesh == mesh):
+        at: int | None = shown
+        total, seen = np.eye(4), set[int]()
+        while at is not None:
+            if at in seen:
+                raise InputError(f"node {at} is its own ancestor", path=path)
+            seen.add(at)
+            with np.errstate(over="ignore", invalid="ignore"):
+                total = _local(nodes[at]) @ total
+            at = parents.get(at)
+        if not np.isfinite(total[:3, 3]).all():
+            raise InputError(f"invalid translation {tuple(total[:3, 3].tolist())}", path=path)
+        found.append(total * np.outer((*_GLTF_TURN, 1), (*_GLTF_TURN, 1)))
+    return found or [np.eye(4)]
 
 
 def _local(node: _Node) -> NDArray[np.float64]:

@@ -1,4 +1,4 @@
-"""Reader for .ksplat of GaussianSplats3D: sections of rows at one of three compression levels, SH 0–2."""
+"""Reader for .ksplat of GaussianSplats3D: sections of rows at one of three compression levels, SH 0–3."""
 
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,7 +14,7 @@ from g2ard.scene.splats import SH_C0
 _HEADER, _SECTION = 4096, 1024
 """Bytes of the file's header and of a section's."""
 
-_SH_COUNTS = {0: 0, 1: 9, 2: 24}
+_SH_COUNTS = {0: 0, 1: 9, 2: 24, 3: 45}
 _SH_RANGE = (-1.5, 1.5)
 """Range of 8-bit harmonics if the header gives none."""
 
@@ -80,7 +80,7 @@ def _section(path: Path, data: bytes, i: int) -> _Section:
     block = float(np.frombuffer(data, "<f4", 1, at + 16)[0])
     degree = words[10] & 0xFFFF
     if degree not in _SH_COUNTS:
-        text = f"has the unsupported SH degree {degree}; expected 0, 1 or 2"
+        text = f"has the unsupported SH degree {degree}; expected 0 to 3"
         raise InputError(text, path=path, index=i, item="section")
     count, capacity, size, buckets = words[:4]
     return _Section(
@@ -126,7 +126,7 @@ def _rows(
     values = rows["sh"].astype(np.float64)
     if level == 2:
         values = values / 255 * (limits[1] - limits[0]) + limits[0]
-    for first, last in ((0, 9), (9, 24))[: section.degree]:
+    for first, last in ((0, 9), (9, 24), (24, 45))[: section.degree]:
         band = values[:, first:last].reshape(section.rows, 3, -1)
         raw.shN[:, first // 3 : last // 3] = band.transpose(0, 2, 1)
     return raw, end

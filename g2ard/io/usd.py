@@ -4,7 +4,7 @@ The written stage has y up and z back, as SPZ: y and z change sign, as do the qu
 harmonic odd in them. Scales and opacities are linear. Band 0 precedes the other bands, as in a .ply.
 """
 
-from dataclasses import replace
+import re
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -13,17 +13,19 @@ from numpy.typing import NDArray
 
 from g2ard.errors import InputError, OutputError, missing
 from g2ard.io.atomic import atomic_output
+from g2ard.io.glb import LINEAR_NOTE, uneven_note
 from g2ard.io.packing import rounding, unit_quats, writable
 from g2ard.io.sanitize import Raw, cleaned
 from g2ard.io.spz import FLIPS
-from g2ard.io.types import Scene
-from g2ard.progress import Progress, silent
-from g2ard.scene.splats import Splats
-from g2ard.scene.transform import placed
+from g2ard.io.types import Note, Scene
+from g2ard.progress import Progress, plural, silent
+from g2ard.scene.splats import SH_C0, Splats
+from g2ard.scene.transform import deformed, join
 
 _SCHEMA = "ParticleField3DGaussianSplat"
 _NAME = "Splats"
 _SH = "radiance:sphericalHarmonics"
+_COLOR = "primvars:displayColor"
 _USD_TURN, _QUAT_TURN = np.array([1.0, -1, -1]), np.array([1.0, 1, -1, -1])
 _TEXT_ROWS = 8192
 """Rows formatted together as text."""
@@ -124,50 +126,123 @@ def _save(pxr: Any, path: Path, splats: Splats, progress: Progress) -> None:
 
 
 def read(path: Path) -> Scene:
-    """Read the only ParticleField3DGaussianSplat of a stage, in the axes of a .ply; needs usd-core."""
+    """Read all visible ParticleField3DGaussianSplat of a stage, in the axes of a .ply; needs usd-core.
+
+    Instances are read as often as they occur. Of time samples, the earliest count.
+    """
     pxr = _pxr(path)
     try:
         stage = pxr.Usd.Stage.Open(str(path))
     except pxr.Tf.ErrorException as error:
-        raise InputError(
-            f"not an OpenUSD stage ({str(error).strip().splitlines()[-1]})", path=path
-        ) from error
-    prims = [prim for prim in stage.Traverse() if prim.GetTypeName() == _SCHEMA]
-    if len(prims) != 1:
-        raise InputError(f"has {len(prims)} prims of type {_SCHEMA}, expected 1", path=path)
-    means = _values(path, prims[0], "positions", 3, None)
-    count = len(means)
-    degree = int(prims[0].GetAttribute(f"{_SH}Degree").Get())
+        raise InputError(f"not an OpenUSD stage ({_reason(error)})", path=path) from error
+    held = list(stage.Traverse(pxr.Usd.TraverseInstanceProxies(pxr.Usd.PrimDefaultPredicate)))
+    fields = [prim for prim in held if prim.GetTypeName() == _SCHEMA]
+    shown = [prim for prim in fields if _visible(pxr, prim)]
+    if not shown:
+        raise InputError(_nothing(held, len(fields)), path=path)
+    parts, notes, uneven = [], list[Note](), 0
+    for prim in shown:
+        scene = _read_prim(path, pxr, prim)
+        notes += [note for note in scene.notes if note not in notes]
+        moved, exact = deformed(scene.splats, _to_ply(pxr, stage, prim))
+        parts.append(moved)
+        uneven += not exact
+    if hidden := len(fields) - len(shown):
+        notes.append(Note("invisible_prims", hidden, f"{plural(hidden, 'invisible prim')} ignored"))
+    if uneven:
+        notes.append(uneven_note(uneven))
+    return Scene(parts[0] if len(parts) == 1 else join(parts), tuple(notes))
+
+
+def _reason(error: Exception) -> str:
+    """Return the cause in an error of OpenUSD, with its line if it states one."""
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    return next((line for line in lines if re.search(r"\bline \d+", line)), lines[-1])
+
+
+def _visible(pxr: Any, prim: Any) -> bool:
+    time = pxr.Usd.TimeCode.EarliestTime()
+    return bool(pxr.UsdGeom.Imageable(prim).ComputeVisibility(time) != pxr.UsdGeom.Tokens.invisible)
+
+
+def _nothing(held: list[Any], fields: int) -> str:
+    """Return why a stage has no splats that can be read: what it holds instead."""
+    if fields:
+        return f"has {plural(fields, 'prim')} of type {_SCHEMA}, all invisible"
+    words = [str(word) for prim in held for word in (prim.GetTypeName(), *prim.GetPropertyNames())]
+    if any("nurec" in word.lower() for word in words):
+        return "holds a NuRec volume, which only Omniverse reads; export the scene as .ply or ParticleField"
+    types = sorted({str(prim.GetTypeName()) for prim in held} - {"", "Xform", "Scope"})
+    return f"has no prim of type {_SCHEMA}" + (f", only {', '.join(types[:4])}" if types else "")
+
+
+def _read_prim(path: Path, pxr: Any, prim: Any) -> Scene:
+    """Read a prim without its placement."""
+    means = _values(path, pxr, prim, "positions", 3, None)
+    count, notes = len(means), []
+    degree = _earliest(pxr, prim.GetAttribute(f"{_SH}Degree"))
+    coefficients = any(_given(pxr, prim, f"{_SH}Coefficients{half}") is not None for half in ("", "h"))
+    degree = int(degree) if degree is not None and coefficients else 0
     if not 0 <= degree <= 3:
         raise InputError(f"unsupported SH degree {degree}; expected 0 to 3", path=path)
     size = (degree + 1) ** 2
     raw = Raw.empty(count, size - 1)
     raw.means[:] = means * _USD_TURN
-    raw.quats[:] = _values(path, prims[0], "orientations", 4, count)[:, [3, 0, 1, 2]] * _QUAT_TURN
-    alphas = _values(path, prims[0], "opacities", 1, count)[:, 0]
-    raw.set_linear(_values(path, prims[0], "scales", 3, count), alphas)
-    bands = _values(path, prims[0], f"{_SH}Coefficients", 3, count * size).reshape(count, size, 3)
-    raw.sh0[:] = bands[:, :1]
-    raw.shN[:] = bands[:, 1:] * FLIPS[: size - 1, None]
-    scene = cleaned(path, raw)
-    return replace(scene, splats=placed(scene.splats, _to_ply(pxr, stage, prims[0])))
+    raw.quats[:] = _values(path, pxr, prim, "orientations", 4, count)[:, [3, 0, 1, 2]] * _QUAT_TURN
+    alphas = _values(path, pxr, prim, "opacities", 1, count)[:, 0]
+    raw.set_linear(_values(path, pxr, prim, "scales", 3, count), alphas)
+    if coefficients:
+        bands = _values(path, pxr, prim, f"{_SH}Coefficients", 3, count * size).reshape(count, size, 3)
+        raw.sh0[:] = bands[:, :1]
+        raw.shN[:] = bands[:, 1:] * FLIPS[: size - 1, None]
+    else:
+        rgb = _values(path, pxr, prim, _COLOR, 3, None)
+        if len(rgb) not in (1, count):
+            raise InputError(f"has {len(rgb):,} values, expected {count:,}", path=path, property=_COLOR)
+        raw.sh0[:, 0] = (rgb - 0.5) / SH_C0
+        notes.append(Note("display_color", count, "colours are those of displayColor, taken as sRGB"))
+    space = _color_space(pxr, prim)
+    if space.startswith("lin_"):
+        notes.append(LINEAR_NOTE)
+    return cleaned(path, raw, notes)
 
 
-def _values(path: Path, prim: Any, name: str, width: int, count: int | None) -> NDArray[np.float32]:
+def _color_space(pxr: Any, prim: Any) -> str:
+    """Return the colour space that a prim or its closest ancestor names, or an empty string."""
+    while prim:
+        if name := _earliest(pxr, prim.GetAttribute("colorSpace:name")):
+            return str(name)
+        prim = prim.GetParent()
+    return ""
+
+
+def _earliest(pxr: Any, attribute: Any) -> Any:
+    """Return the earliest value of an attribute, or None."""
+    return attribute.Get(pxr.Usd.TimeCode.EarliestTime()) if attribute else None
+
+
+def _given(pxr: Any, prim: Any, name: str) -> Any:
+    """Return the earliest value of an attribute with a value in it, or None."""
+    values = _earliest(pxr, prim.GetAttribute(name))
+    return values if values is not None and len(values) else None
+
+
+def _values(path: Path, pxr: Any, prim: Any, name: str, width: int, count: int | None) -> NDArray[np.float32]:
     """Return the (count, width) values of an attribute in float, or in half with an h after its name."""
-    for found in (prim.GetAttribute(name), prim.GetAttribute(f"{name}h")):
-        values = found.Get() if found else None
-        if values is not None and len(values):
+    for found in (name, f"{name}h"):
+        if (values := _given(pxr, prim, found)) is not None:
             rows = np.asarray(values, np.float32).reshape(-1, width)
             if count is not None and len(rows) != count:
                 raise InputError(f"has {len(rows):,} values, expected {count:,}", path=path, property=name)
             return rows
-    raise InputError(f"attribute {name!r} is missing or empty", path=path)
+    raise InputError(f"attribute {name!r} of {prim.GetPath()} is missing or empty", path=path)
 
 
 def _to_ply(pxr: Any, stage: Any, prim: Any) -> NDArray[np.float64]:
     """Return the (4, 4) matrix from the prim's flipped axes to the axes of a .ply."""
-    world = np.array(pxr.UsdGeom.XformCache().GetLocalToWorldTransform(prim)).T  # USD multiplies rows
+    world = np.array(
+        pxr.UsdGeom.XformCache(pxr.Usd.TimeCode.EarliestTime()).GetLocalToWorldTransform(prim)
+    ).T  # USD multiplies rows
     flip = np.diag([*_USD_TURN, 1.0])
     upright = np.eye(4)
     if pxr.UsdGeom.GetStageUpAxis(stage) == pxr.UsdGeom.Tokens.z:

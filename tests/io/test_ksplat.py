@@ -42,7 +42,7 @@ def test_ksplat(name: str, degree: int, place: float, size: float, harmonics: fl
         (lambda data: data[:-1], "section 0 is cut off"),
         (lambda data: b"\1" + data[1:], "unsupported version 1.1"),
         (lambda data: data[:20] + b"\7" + data[21:], "unsupported compression level 7"),
-        (lambda data: data[:4136] + b"\3" + data[4137:], "section 0 has the unsupported SH degree 3"),
+        (lambda data: data[:4136] + b"\4" + data[4137:], "section 0 has the unsupported SH degree 4"),
         (lambda data: data[:4128] + b"\xff" + data[4129:], "section 0 has inconsistent buckets"),
         (lambda data: data[:5120] + bytes(4) + data[5124:], "section 0 has more rows than its buckets hold"),
     ],

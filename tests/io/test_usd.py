@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from g2ard.io import read_splats, write_splats
+from g2ard.errors import InputError
+from g2ard.io import read_scene, read_splats, write_splats
 from g2ard.io.packing import unit_quats
 from g2ard.rendering.renderer import Renderer
 from g2ard.scene.cameras import Camera
@@ -87,3 +88,76 @@ def test_a_stage_with_z_up_and_a_turned_parent_looks_the_same(tmp_path: Path) ->
     camera = Camera.facing([0.5, 0.3, -6], [0, 0, 0], width=64, height=64, fov=50)
     wanted, got = (Renderer(s).render(camera).image for s in (truth, read_splats(tmp_path / "b.usda")))
     np.testing.assert_allclose(got, wanted, atol=1e-4)
+
+
+def prims(folder: Path, *fields: str, world: str = "") -> Path:
+    head = '#usda 1.0\n(\n    defaultPrim = "W"\n    upAxis = "Y"\n)\ndef Xform "W"\n{\n'
+    (folder / "b.usda").write_text(head + world + "".join(fields) + "}\n")
+    return folder / "b.usda"
+
+
+def prim(folder: Path, name: str, truth: Splats, more: str = "", word: str = "def", meta: str = "") -> str:
+    write_splats(folder / "one.usda", truth, overwrite=True)
+    body = (folder / "one.usda").read_text().partition("\n{\n")[2].rstrip().removesuffix("}")
+    return f'{word} ParticleField3DGaussianSplat "{name}" {meta}\n{{\n{body}{more}}}\n'
+
+
+def op(kind: str, *values: float) -> str:
+    listed = f"({', '.join(map(str, values))})"
+    return f'double3 xformOp:{kind} = {listed}\nuniform token[] xformOpOrder = ["xformOp:{kind}"]\n'
+
+
+HIDDEN = 'token visibility = "invisible"\n'
+
+
+@pytest.mark.parametrize("count", [2, 3])
+@pytest.mark.parametrize("hidden", [0, 1])
+def test_all_visible_prims_are_joined(tmp_path: Path, count: int, hidden: int) -> None:
+    pytest.importorskip("pxr")
+    parts = [scene(k) for k in range(count)]
+    text = [prim(tmp_path, f"p{k}", part, op("translate", 4 * k, 0, 0)) for k, part in enumerate(parts)]
+    text += [prim(tmp_path, f"h{k}", scene(1), HIDDEN) for k in range(hidden)]
+    found = read_scene(prims(tmp_path, *text))
+    assert [note.code for note in found.notes] == ["invisible_prims"] * hidden
+    whole = np.concatenate([part.means + np.array([4.0 * k, 0, 0]) for k, part in enumerate(parts)])
+    np.testing.assert_allclose(found.splats.means + found.splats.offset, whole, atol=1e-5)
+    assert found.splats.sh_degree == max(part.sh_degree for part in parts)
+
+
+def test_instances_and_the_earliest_time_are_read(tmp_path: Path) -> None:
+    pytest.importorskip("pxr")
+    truth = scene(1)
+    proto = f'class "proto"\n{{\n{prim(tmp_path, "a", truth)}}}\n'
+    meta = "(\n instanceable = true\n references = </W/proto>\n)"
+    places = [f'def Xform "i{k}" {meta}\n{{\n{op("translate", 3 + k, 0, 0)}}}\n' for k in range(2)]
+    found = read_splats(prims(tmp_path, *places, world=proto))
+    whole = np.concatenate([truth.means + np.array([3.0 + k, 0, 0]) for k in range(2)])
+    np.testing.assert_allclose(found.means + found.offset, whole, atol=1e-5)
+    late = replace(truth, means=truth.means + 5)
+    values = [re.search(r"positions = (\[.*\])", prim(tmp_path, "a", s))[1] for s in (truth, late)]
+    text = prim(tmp_path, "a", truth).replace(
+        f"positions = {values[0]}", f"positions.timeSamples = {{ 2: {values[0]}, 7: {values[1]} }}"
+    )
+    np.testing.assert_allclose(read_splats(prims(tmp_path, text)).means, truth.means, atol=1e-6)
+
+
+@pytest.mark.parametrize("space", ["lin_rec709_scene", "lin_rec2020_scene", "srgb_rec709_scene"])
+def test_linear_colours_are_noted(tmp_path: Path, space: str) -> None:
+    pytest.importorskip("pxr")
+    named = f'uniform token colorSpace:name = "{space}"\n'
+    text = prim(tmp_path, "a", scene(1), named, meta='( prepend apiSchemas = ["ColorSpaceAPI"] )')
+    codes = [note.code for note in read_scene(prims(tmp_path, text)).notes]
+    assert codes == ["linear_colors"] * space.startswith("lin")
+
+
+def test_what_a_stage_holds_instead_is_named(tmp_path: Path) -> None:
+    pytest.importorskip("pxr")
+    nurec = 'def Volume "v"\n{\n custom asset omni:nurec:data = @m.nurec@\n}\n'
+    for text, message in ((nurec, "NuRec"), ('def Mesh "m"\n{\n}\n', "only Mesh")):
+        with pytest.raises(InputError, match=message):
+            read_scene(prims(tmp_path, text))
+    with pytest.raises(InputError, match="all invisible"):
+        read_scene(prims(tmp_path, prim(tmp_path, "a", scene(0), HIDDEN)))
+    (tmp_path / "c.usda").write_text('#usda 1.0\ndef Xform "W"\n{\n    float[] a = [1, 2\n}\n')
+    with pytest.raises(InputError, match=r"line \d|:\d"):
+        read_scene(tmp_path / "c.usda")
