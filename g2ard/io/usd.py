@@ -134,7 +134,7 @@ def read(path: Path) -> Scene:
     try:
         stage = pxr.Usd.Stage.Open(str(path))
     except pxr.Tf.ErrorException as error:
-        raise InputError(f"not an OpenUSD stage ({_reason(error)})", path=path) from error
+        raise _not_a_stage(path, error) from error
     held = list(stage.Traverse(pxr.Usd.TraverseInstanceProxies(pxr.Usd.PrimDefaultPredicate)))
     fields = [prim for prim in held if prim.GetTypeName() == _SCHEMA]
     shown = [prim for prim in fields if _visible(pxr, prim)]
@@ -154,10 +154,13 @@ def read(path: Path) -> Scene:
     return Scene(parts[0] if len(parts) == 1 else join(parts), tuple(notes))
 
 
-def _reason(error: Exception) -> str:
-    """Return the cause in an error of OpenUSD, with its line if it states one."""
-    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-    return next((line for line in lines if re.search(r"\bline \d+", line)), lines[-1])
+def _not_a_stage(path: Path, error: Exception) -> InputError:
+    """Return the error for a file that OpenUSD cannot open, with the line if it states one."""
+    text = str(error).strip()
+    at = re.search(r":(\d+):\d+: |\bon line (\d+)\b", text)
+    if at is None:
+        return InputError(f"not an OpenUSD stage ({text.splitlines()[-1].strip()})", path=path)
+    return InputError("is not valid OpenUSD text", path=path, index=int(at[1] or at[2]), item="line")
 
 
 def _visible(pxr: Any, prim: Any) -> bool:

@@ -159,5 +159,5 @@ def test_what_a_stage_holds_instead_is_named(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="all invisible"):
         read_scene(prims(tmp_path, prim(tmp_path, "a", scene(0), HIDDEN)))
     (tmp_path / "c.usda").write_text('#usda 1.0\ndef Xform "W"\n{\n    float[] a = [1, 2\n}\n')
-    with pytest.raises(InputError, match=r"line \d|:\d"):
+    with pytest.raises(InputError, match="line 5"):
         read_scene(tmp_path / "c.usda")
