@@ -61,6 +61,8 @@ def lost_views(
         lost.append(f"{what} of {plural(int(bent.sum()), 'view')}")
     if format != "nerfstudio" and any(word not in (None, "train") for word in splits):
         lost.append("splits")
+    photos = sum(lens is not None for lens in cameras.lenses)
+    lost += [f"photos of {plural(photos, 'view')} that other lenses took"] if photos else []
     kinds = sum(kind != USUAL for kind in cameras.kinds)
     lost += [f"kinds of {plural(kinds, 'view')}"] if kinds else []
     return lost + (["sampling weights"] if weighted else [])
@@ -98,7 +100,9 @@ def write_nerfstudio(path: Path, cameras: Cameras, place: Path, splits: Sequence
     shared = lenses[0] if all(lens == lenses[0] for lens in lenses) else {}
     frames: list[dict[str, Any]] = []
     for i, viewmat in enumerate(cameras.viewmats):
-        photo, mask = cameras.image_paths[i], cameras.mask_paths[i]
+        photo, mask = (
+            (cameras.image_paths[i], cameras.mask_paths[i]) if cameras.lenses[i] is None else (None, None)
+        )
         pose = np.asarray(inverse(viewmat) @ FLIP)
         frame = {"file_path": beside(photo, place) or f"images/{cameras.names[i]}"}
         if (covered := beside(mask, place)) is not None:

@@ -16,6 +16,7 @@ from g2ard.io.paths import decoded
 from g2ard.io.photos import Frame, Lens, photo_size, posed, view_set
 from g2ard.io.types import ViewSet
 from g2ard.progress import plural
+from g2ard.scene.lenses import PARAMETERS, PhotoLens
 
 _MODELS = (
     *("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV"),
@@ -261,13 +262,20 @@ class Table:
 
 
 def _camera(path: Path, model: str, size: tuple[int, int], p: tuple[float, ...]) -> Lens:
-    if model not in _PARAMETERS:
-        known = ", ".join(_PARAMETERS)
+    known = _PARAMETERS | PARAMETERS
+    if model not in known:
         raise InputError(
-            f"unsupported camera model {model}; expected {known}", path=path, hint="undistort with COLMAP"
+            f"unsupported camera model {model}; expected {', '.join(known)}",
+            path=path,
+            hint="undistort with COLMAP",
         )
-    if len(p) != _PARAMETERS[model]:
-        raise InputError(f"{model} takes {_PARAMETERS[model]} parameters, got {len(p)}", path=path)
+    if len(p) != known[model] and model != "EQUIRECTANGULAR":
+        raise InputError(f"{model} takes {known[model]} parameters, got {len(p)}", path=path)
+    if model in PARAMETERS:
+        lens = PhotoLens(model, size, p)
+        if min(size) < 1 or min(lens.focal) <= 0:
+            raise InputError(f"invalid camera of {size[0]:,}×{size[1]:,} pixels", path=path)
+        return Lens.of(lens)
     single_focal = model in ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
     fx, fy, cx, cy, *k = (p[0], *p) if single_focal else p
     if min(size) < 1 or min(fx, fy) <= 0:
@@ -288,7 +296,7 @@ def _cameras_bin(path: Path) -> dict[int, Lens | NotFinite]:
     for i in range(table.count):
         key, model, width, height = table.take("camera", i, _CAMERA, _CAMERA_NAMES)
         name = _MODELS[model] if 0 <= model < len(_MODELS) else f"number {model}"
-        names = [f"PARAMS[{k}]" for k in range(_PARAMETERS.get(name, 0))]
+        names = [f"PARAMS[{k}]" for k in range((_PARAMETERS | PARAMETERS).get(name, 0))]
         try:
             values = table.finite("camera", i, struct.Struct(f"<{len(names) * 'd'}"), names)
             cameras[key] = _camera(path, name, (width, height), values)

@@ -20,6 +20,7 @@ from g2ard.io.atomic import atomic_output
 from g2ard.io.limits import opened_image
 from g2ard.io.photos import fits, photo_size, turns
 from g2ard.scene.cameras import Cameras
+from g2ard.scene.lenses import PhotoLens
 from g2ard.scene.samples import evenly_spaced
 
 _BORDER_PHOTOS = 5
@@ -67,11 +68,14 @@ def load_premultiplied(cameras: Cameras, index: int) -> NDArray[np.float32]:
     named = None if cameras.source is None else f"{cameras.source} names it as view {name!r}"
     try:
         target = int(cameras.widths[index]), int(cameras.heights[index])
-        image = _open(path, target)
+        lens = cameras.lenses[index]
+        image = _open(path, target) if lens is None else _opened(path, path.stat().st_mtime_ns, lens.size)
     except InputError as error:
         raise error.at(hint="; ".join(filter(None, (error.hint, named))) or None) from error
     height, width = image.shape[:2]
-    if not fits((width, height), target):
+    if lens is not None and fits((width, height), lens.size):
+        return _through(image, lens, cameras.Ks[index], target)
+    if not fits((width, height), target if lens is None else lens.size):
         raise InputError(
             f"the photo is {width}×{height}, its view {target[0]}×{target[1]}: the aspects differ",
             path=path,
@@ -158,9 +162,13 @@ def load_mask(cameras: Cameras, index: int) -> NDArray[np.bool_] | None:
 
 def _held(cameras: Cameras, index: int) -> NDArray[np.bool_] | None:
     """Return the pixels of a view that its undistorted photo holds in full, or None if all are."""
-    photo, distortion = cameras.image_paths[index], cameras.distortions[index]
-    if photo is None or not distortion.any():
+    photo, distortion, lens = cameras.image_paths[index], cameras.distortions[index], cameras.lenses[index]
+    if photo is None or (lens is None and not distortion.any()):
         return None
+    if lens is not None:
+        size = int(cameras.widths[index]), int(cameras.heights[index])
+        held = _lens_lookup(lens, tuple(cameras.Ks[index].ravel()), size, 1)[1].reshape(size[::-1])
+        return None if held.all() else held.copy()
     target = int(cameras.widths[index]), int(cameras.heights[index])
     width, height = photo_size(photo, cameras.source, target)
     K = cameras.Ks[index] * np.array([[width / target[0]], [height / target[1]], [1.0]])
@@ -246,6 +254,48 @@ def _lookup(width: int, height: int, K: tuple[float, ...], distortion: tuple[flo
     held = (source[0] >= -0.5) & (source[0] <= width - 0.5) & (r2 < _fold(k1, k2, k3))
     held &= (source[1] >= -0.5) & (source[1] <= height - 0.5)
     return above, left, *fractions, held
+
+
+@lru_cache(maxsize=1)  # several views of a photo follow each other
+def _opened(path: Path, modified: int, like: tuple[int, int]) -> NDArray[np.float32]:
+    return _open(path, like)
+
+
+def _through(
+    image: NDArray[np.float32], lens: PhotoLens, K: NDArray[np.float64], size: tuple[int, int]
+) -> NDArray[np.float32]:
+    """Sample a photo through its lens for each pixel of a pinhole view: bilinearly at as many points a pixel
+    as the photo is finer, which are averaged."""
+    height, width = image.shape[:2]
+    finer = width / lens.size[0] * max(lens.focal) / min(K[0, 0], K[1, 1])
+    times = int(np.clip(np.ceil(finer - 0.01), 1, _MOST_SAMPLES))
+    pixels, _ = _lens_lookup(lens, tuple(K.ravel()), size, times)
+    u = pixels[:, 0] * (width / lens.size[0]) - 0.5
+    v = np.clip(pixels[:, 1] * (height / lens.size[1]) - 0.5, 0, height - 1)
+    around = lens.model == "EQUIRECTANGULAR"
+    u = u if around else np.clip(u, 0, width - 1)
+    left, above = np.floor(u).astype(int), np.floor(v).astype(int)
+    right, down = (u - left)[:, None].astype(np.float32), (v - above)[:, None].astype(np.float32)
+    columns = [left % width, (left + 1) % width] if around else [left, np.minimum(left + 1, width - 1)]
+    below = np.minimum(above + 1, height - 1)
+    top = image[above, columns[0]] * (1 - right) + image[above, columns[1]] * right
+    bottom = image[below, columns[0]] * (1 - right) + image[below, columns[1]] * right
+    shape = (size[1] * times, size[0] * times, image.shape[2])
+    return resized((top * (1 - down) + bottom * down).reshape(shape), size)
+
+
+_MOST_SAMPLES = 8
+"""Most samples of a photo along each side of a pixel."""
+
+
+@lru_cache(maxsize=6)  # the faces of a cube
+def _lens_lookup(
+    lens: PhotoLens, K: tuple[float, ...], size: tuple[int, int], times: int
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Return the pixel of a lens for each sample of a pinhole view, and whether its photo holds it."""
+    v, u = (np.mgrid[0 : size[1] * times, 0 : size[0] * times] + 0.5) / times
+    rays = np.stack([u.ravel(), v.ravel(), np.ones(u.size)], 1) @ np.linalg.inv(np.array(K).reshape(3, 3)).T
+    return lens.project(rays)
 
 
 def _fold(k1: float, k2: float, k3: float) -> float:

@@ -21,6 +21,7 @@ from g2ard.io.paths import is_photo, other_photo
 from g2ard.io.types import Note, ViewSet
 from g2ard.progress import plural
 from g2ard.scene.cameras import USUAL, Cameras
+from g2ard.scene.lenses import PhotoLens
 from g2ard.scene.transform import rotation_matrices
 
 if TYPE_CHECKING:
@@ -41,11 +42,14 @@ _FILM_DIAGONAL = math.hypot(36, 24)
 
 
 class Lens(NamedTuple):
-    """Size, pinhole matrix and OpenCV distortion k1 k2 p1 p2 k3 of a camera."""
+    """Size, pinhole matrix and OpenCV distortion k1 k2 p1 p2 k3 of a camera, or the lens of a photo that
+    pinhole views are to be made from, or that this is such a view of (`made`)."""
 
     size: tuple[int, int]
     K: NDArray[np.float64]
     distortion: tuple[float, ...] = (0.0,) * 5
+    photo: PhotoLens | None = None
+    made: bool = False
 
     def at(self, size: tuple[int, int]) -> Lens:
         """Return the lens for resized photos."""
@@ -55,6 +59,11 @@ class Lens(NamedTuple):
         K[0] *= size[0] / self.size[0]
         K[1] *= size[1] / self.size[1]
         return self._replace(size=size, K=K)
+
+    @classmethod
+    def of(cls, photo: PhotoLens) -> Lens:
+        """Return the lens of a photo, from which `view_set` makes views."""
+        return cls(photo.size, np.diag([*photo.focal, 1.0]), photo=photo)
 
 
 class Frame(NamedTuple):
@@ -185,6 +194,7 @@ def _cameras(path: Path, frames: Sequence[Frame]) -> Cameras:
             [f.lens.distortion for f in frames],
             [_mask(f) for f in frames],
             [f.kind for f in frames],
+            [f.lens.photo for f in frames],
         )
     except InputError as error:
         raise error.at(path=path) from error
@@ -220,6 +230,12 @@ def view_set(path: Path, frames: Sequence[Frame], left_out: Sequence[tuple[str, 
         notes.append(Note("not_finite", len(left_out), f"{text} (view {name!r})"))
     frames, found_notes = _checked_photos(frames)
     notes += found_notes
+    if bent := [frame for frame in frames if frame.lens.photo is not None and not frame.lens.made]:
+        frames = [view for frame in frames for view in _pinholes(frame)]
+        models = ", ".join(sorted({frame.lens.photo.model for frame in bent if frame.lens.photo}))
+        made = sum(frame.lens.photo is not None for frame in frames)
+        text = f"{plural(len(bent), 'photo')} ({models}) resampled to {plural(made, 'pinhole view')}"
+        notes.append(Note("resampled", made, text))
     listed = [frame for frame in frames if frame.photo is not None]
     present = [frame for frame in frames if frame.photo is not None and frame.photo.is_file()]
     if present and len(present) < len(frames):
@@ -244,6 +260,21 @@ def view_set(path: Path, frames: Sequence[Frame], left_out: Sequence[tuple[str, 
         splits if any(splits) else (),
         None if set(weights) == {None} else np.array([1.0 if w is None else w for w in weights]),
     )
+
+
+def _pinholes(frame: Frame) -> list[Frame]:
+    """Return the pinhole views of a frame, which is its only one unless its lens needs several."""
+    lens = frame.lens.photo
+    if lens is None or frame.lens.made:
+        return [frame]
+    views = []
+    for face in lens.faces(frame.lens.size[0] / lens.size[0]):
+        viewmat = np.eye(4)
+        viewmat[:3] = face.turn.T @ frame.viewmat[:3]
+        name = f"{frame.name}#{face.name}" if face.name else frame.name
+        own = Lens(face.size, face.K, photo=lens.turned(face.turn), made=True)
+        views.append(frame._replace(name=name, viewmat=viewmat, lens=own))
+    return views
 
 
 def _idle_masks(present: Sequence[Frame]) -> list[Path]:

@@ -11,6 +11,7 @@ from g2ard.errors import InputError
 from g2ard.io.jsonfile import read_json
 from g2ard.io.paths import real_path
 from g2ard.scene.cameras import Cameras
+from g2ard.scene.lenses import photo_of
 
 HOLD_OUT = 8
 """Without a split file every 8th name is in the test split, as in Mip-NeRF 360's and INRIA's evaluations."""
@@ -106,7 +107,9 @@ def _masks(
     listed = None if views is None else _read_split(Path(views))
     if listed is None:
         test = np.zeros(len(names), bool)
-        test[sorted(range(len(names)), key=lambda i: names[i])[::HOLD_OUT]] = True
+        photos = [photo_of(name) for name in names]
+        held = set(sorted(set(photos))[::HOLD_OUT])
+        test[:] = [photo in held for photo in photos]
         return {"train": ~test, "test": test}
     masks = {word: _listed(names, wanted) for word, wanted in listed.items()}
     both = masks["train"] & masks["test"] if {"train", "test"} <= set(masks) else np.zeros(len(names), bool)
@@ -135,10 +138,13 @@ def _read_split(views: Path) -> dict[str, list[str]] | None:
 
 def _listed(names: Sequence[str], wanted: Sequence[str]) -> NDArray[np.bool_]:
     """Match names by stem, so that suffix and folder may differ, unless stems are ambiguous."""
-    stems = [PurePosixPath(name).stem for name in names]
-    if len(set(stems)) < len(stems):
+    photos = [photo_of(name) for name in names]
+    stems = [PurePosixPath(name).stem for name in photos]
+    if len(set(stems)) < len(set(photos)):
         exact = set(wanted)
-        return np.array([name in exact for name in names], bool)
+        return np.array(
+            [name in exact or photo in exact for name, photo in zip(names, photos, strict=True)], bool
+        )
     chosen = {PurePosixPath(name).stem for name in wanted}
     return np.array([stem in chosen for stem in stems], bool)
 

@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 from g2ard.errors import InputError
 from g2ard.io.finding import Finder, is_end
 from g2ard.io.jsonfile import Number, Place, Pose, Vector, Whole, checked, read_json
-from g2ard.io.photos import Frame, Lens, inverse, photo_size, rigid, view_set
+from g2ard.io.photos import Frame, Lens, fits, inverse, photo_size, rigid, view_set
 from g2ard.io.types import ViewSet
+from g2ard.scene.lenses import PhotoLens
 
 _MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
 
@@ -207,19 +208,28 @@ def opencv_view(world_from_camera: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _intrinsics(place: Place, frame: _Frame, photo: Path) -> Lens:
-    if frame.camera_model not in _MODELS or frame.is_fisheye:
-        known = ", ".join(_MODELS)
-        lens = "fisheye" if frame.is_fisheye else frame.camera_model
-        error = place.error(f"has an unsupported {lens} lens; expected {known}")
+    model = "OPENCV_FISHEYE" if frame.is_fisheye else frame.camera_model
+    if model not in (*_MODELS, "OPENCV_FISHEYE", "EQUIRECTANGULAR"):
+        known = ", ".join((*_MODELS, "OPENCV_FISHEYE", "EQUIRECTANGULAR"))
+        error = place.error(f"has an unsupported {model} lens; expected {known}")
         raise error.at(hint="undistort the photos")
-    if frame.k4:
-        raise (
-            place.to("k4")
-            .error(f"is {frame.k4}; lenses have k1, k2, k3, p1 and p2")
-            .at(hint="undistort the photos")
-        )
+    if frame.k4 and model in _MODELS:
+        error = place.to("k4").error(f"is {frame.k4}; lenses have k1, k2, k3, p1 and p2")
+        raise error.at(hint="undistort the photos")
     width, height = _size(place, frame, photo)
-    distortion = (frame.k1, frame.k2, frame.p1, frame.p2, frame.k3)
+    if model == "EQUIRECTANGULAR":
+        if not fits((width, height), (2, 1)):
+            raise place.error(f"is a panorama of {width}×{height} pixels, expected twice as wide as high")
+        return Lens.of(PhotoLens(model, (width, height), ()))
+    lens = _pinhole(place, frame, (width, height))
+    if model in _MODELS:
+        return lens
+    K, k = lens.K, (frame.k1, frame.k2, frame.k3, frame.k4)
+    return Lens.of(PhotoLens(model, lens.size, (K[0, 0], K[1, 1], K[0, 2], K[1, 2], *k)))
+
+
+def _pinhole(place: Place, frame: _Frame, size: tuple[int, int]) -> Lens:
+    (width, height), distortion = size, (frame.k1, frame.k2, frame.p1, frame.p2, frame.k3)
     if (K := _matrix(place, frame)) is not None:
         return Lens((width, height), K, distortion)
     if frame.fl_x is UNSET:

@@ -20,9 +20,17 @@ from g2ard.io.photos import Frame, Lens, rigid, view_set
 from g2ard.io.types import ViewSet
 from g2ard.progress import plural
 from g2ard.scene.cameras import USUAL, Cameras
+from g2ard.scene.lenses import PARAMETERS, PhotoLens
 
 _FORMAT = "g2ard-views"
 _VERSION = 1
+
+
+class _PhotoLens(msgspec.Struct):
+    model: str
+    size: tuple[Whole, Whole]
+    params: list[Number]
+    turn: Matrix
 
 
 class _View(msgspec.Struct):
@@ -37,6 +45,7 @@ class _View(msgspec.Struct):
     split: str | None = None
     weight: Weight | None = None
     kind: str | None = None
+    lens: _PhotoLens | None = None
 
 
 class _File(msgspec.Struct):
@@ -74,7 +83,13 @@ def _frame(place: Place, view: _View, finder: Finder, masks: Finder) -> Frame:
     return Frame(
         name=view.name,
         viewmat=_exact(np.array(view.camera_from_world), place.to("camera_from_world")),
-        lens=Lens((view.width, view.height), np.array(view.K), distortion[:5]),
+        lens=Lens(
+            (view.width, view.height),
+            np.array(view.K),
+            distortion[:5],
+            _photo_lens(view.lens, place),
+            made=True,
+        ),
         photo=None if view.image is None else finder.photo(view.image),
         mask=None if view.mask is None else masks.photo(view.mask),
         split=view.split,
@@ -84,10 +99,26 @@ def _frame(place: Place, view: _View, finder: Finder, masks: Finder) -> Frame:
     )
 
 
+def _photo_lens(lens: _PhotoLens | None, place: Place) -> PhotoLens | None:
+    if lens is None:
+        return None
+    if PARAMETERS.get(lens.model) != len(lens.params) or min(lens.size) < 1:
+        raise place.to("lens").error(f"is not a lens of the model {lens.model!r}")
+    turn = tuple(np.array(lens.turn).ravel().tolist())
+    return PhotoLens(lens.model, (lens.size[0], lens.size[1]), tuple(lens.params), turn)
+
+
 def _exact(stored: NDArray[np.float64], place: Place) -> NDArray[np.float64]:
     """Return the pose as stored if it is rigid to rounding, so that writing and reading change no bit."""
     nearest = rigid(stored, place)
     return stored if len(stored) == 4 and np.allclose(nearest, stored, rtol=0, atol=1e-9) else nearest
+
+
+def _written(lens: PhotoLens | None) -> dict[str, Any] | None:
+    if lens is None:
+        return None
+    turn = np.array(lens.turn).reshape(3, 3).tolist()
+    return {"model": lens.model, "size": lens.size, "params": lens.params, "turn": turn}
 
 
 def write(
@@ -116,6 +147,7 @@ def write(
             "K": cameras.Ks[i].tolist(),
             "camera_from_world": cameras.viewmats[i].tolist(),
             "distortion": cameras.distortions[i].tolist() if cameras.distortions[i].any() else None,
+            "lens": _written(cameras.lenses[i]),
             "image": beside(cameras.image_paths[i], path),
             "mask": beside(cameras.mask_paths[i], path),
             "split": parts[i],

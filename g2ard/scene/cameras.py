@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from g2ard.config.checks import check_direction, check_fields, check_vector
 from g2ard.errors import InputError, require
 from g2ard.progress import plural
+from g2ard.scene.lenses import PhotoLens
 from g2ard.scene.samples import evenly_spaced
 
 USUAL = "usual"
@@ -32,7 +33,7 @@ _MEDIAN_VIEWS = 16
 
 _ARRAY_SHAPES = {"viewmats": (4, 4), "Ks": (3, 3), "widths": (), "heights": (), "distortions": (5,)}
 """Arrays of `Cameras` and their shapes per view."""
-_TUPLE_FIELDS = ("names", "image_paths", "mask_paths", "kinds")
+_TUPLE_FIELDS = ("names", "image_paths", "mask_paths", "kinds", "lenses")
 
 
 def check_image(width: int, height: int, **fields: Any) -> None:
@@ -55,6 +56,7 @@ class Camera:
         mask_path: mask of its valid pixels; None if all are.
         distortion: (5,) float64, OpenCV k1 k2 p1 p2 k3 of the photo.
         kind: kind of view, see `Cameras`.
+        lens: lens of a photo that the view is resampled from, see `Cameras`.
 
     Types are checked here, shapes and values by `Cameras`.
 
@@ -72,6 +74,7 @@ class Camera:
     mask_path: Path | None = None
     distortion: NDArray[np.float64] = field(default_factory=lambda: np.zeros(5))
     kind: str = USUAL
+    lens: PhotoLens | None = None
 
     def __post_init__(self) -> None:
         check_fields(self)
@@ -143,6 +146,8 @@ class Cameras:
         source: the file or folder that lists the views, for messages; None for views created in memory.
         kinds: C kinds of views, such as "near" or "anywhere"; () for "usual" ones. Simplification uses usual
             views alone, as does the number of recovery steps. Validation and reports score each kind apart.
+        lenses: C lenses of fisheye photos, panoramas and the like, which the views are resampled from on
+            loading, or None; () for none.
 
     Raises:
         InputError: mismatched shapes, a pose that is not finite or not rigid, an empty image, or one of more
@@ -159,6 +164,7 @@ class Cameras:
     mask_paths: tuple[Path | None, ...] = ()
     source: Path | None = None
     kinds: tuple[str, ...] = ()
+    lenses: tuple[PhotoLens | None, ...] = ()
 
     def __post_init__(self) -> None:
         n = len(self.viewmats)
@@ -166,6 +172,8 @@ class Cameras:
             object.__setattr__(self, "image_paths", (None,) * n)
         if not self.mask_paths:
             object.__setattr__(self, "mask_paths", (None,) * n)
+        if not self.lenses:
+            object.__setattr__(self, "lenses", (None,) * n)
         if not self.kinds:
             object.__setattr__(self, "kinds", (USUAL,) * n)
         if not len(self.distortions):
@@ -214,6 +222,7 @@ class Cameras:
             self.mask_paths[i],
             self.distortions[i],
             self.kinds[i],
+            self.lenses[i],
         )
 
     def __iter__(self) -> Iterator[Camera]:
@@ -237,6 +246,7 @@ class Cameras:
             [v.distortion for v in listed],
             [v.mask_path for v in listed],
             [v.kind for v in listed],
+            [v.lens for v in listed],
         )
 
     @property
@@ -341,6 +351,7 @@ class Cameras:
         distortions: Sequence[Any] = (),
         mask_paths: Sequence[Path | None] = (),
         kinds: Sequence[str] = (),
+        lenses: Sequence[PhotoLens | None] = (),
     ) -> Cameras:
         """Stack per-view lists; `sizes` holds (width, height)."""
         n = len(viewmats)
@@ -356,6 +367,7 @@ class Cameras:
             distortions=np.asarray(distortions, np.float64).reshape(-1, 5),
             mask_paths=tuple(mask_paths),
             kinds=tuple(kinds),
+            lenses=tuple(lenses),
         )
 
 

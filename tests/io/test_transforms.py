@@ -89,8 +89,8 @@ BAD: list[tuple[Callable[[dict[str, Any]], Any], Fault]] = [
     (lambda c: c.update(w=8.5), ("w", 0)),
     (frame(1, h=6.25), ("h", 1)),
     (lambda c: c.update(fl_x=-3), (None, 0)),
-    (lambda c: c.update(camera_model="OPENCV_FISHEYE"), "OPENCV_FISHEYE"),
-    (lambda c: c.update(is_fisheye=True), "fisheye"),
+    (lambda c: c.update(camera_model="ORTHOPHOTO"), "ORTHOPHOTO"),
+    (lambda c: c.update(camera_model="EQUIRECTANGULAR"), (None, 0)),
     (frame(1, file_path="images/000.png"), "2 views are named '000.png'"),
 ]
 

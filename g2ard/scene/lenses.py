@@ -1,0 +1,195 @@
+"""Lenses of photos that pinhole views are resampled from: fisheyes, panoramas and rational lenses."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+Float = NDArray[np.float64]
+
+_SINGLE_FOCAL = ("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "SIMPLE_FISHEYE")
+
+PARAMETERS = {
+    "OPENCV_FISHEYE": 8,
+    "FULL_OPENCV": 12,
+    "FOV": 5,
+    "SIMPLE_RADIAL_FISHEYE": 4,
+    "RADIAL_FISHEYE": 5,
+    "THIN_PRISM_FISHEYE": 12,
+    "SIMPLE_FISHEYE": 3,
+    "FISHEYE": 4,
+    "EQUIRECTANGULAR": 0,
+}
+"""Number of parameters of each model, in COLMAP's order; a panorama has none."""
+
+FACES: dict[str, Float] = {
+    "front": np.eye(3),
+    "right": np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]]),
+    "back": np.diag([-1.0, 1, -1]),
+    "left": np.array([[0.0, 0, -1], [0, 1, 0], [1, 0, 0]]),
+    "up": np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]),
+    "down": np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]),
+}
+"""Faces of a cube: rotations from a face's camera axes to the photo's."""
+
+_ONE_VIEW = np.radians(50)
+"""Largest angle from the axis to the middle of an edge of a photo that one pinhole view shows."""
+_LEAST_SEEN = 0.05
+"""Least share of a face that the photo must hold."""
+
+
+_CORNER = np.radians(95)
+"""Largest angle in the corners of photos without an image circle: beyond it, and beyond the middle of each
+edge, fisheyes see nothing."""
+
+
+class Face(NamedTuple):
+    """A pinhole view of a photo; `name` is empty if it is the only one."""
+
+    name: str
+    turn: Float
+    K: Float
+    size: tuple[int, int]
+
+
+@dataclass(frozen=True)
+class PhotoLens:
+    """Lens of a photo, and the rotation of a pinhole view that is resampled from it.
+
+    Args:
+        model: a key of `PARAMETERS`.
+        size: width and height that the parameters refer to, pixels.
+        params: focal lengths, principal point and coefficients as COLMAP orders them.
+        turn: 9 numbers, row by row: rotation from the view's camera axes to the photo's.
+    """
+
+    model: str
+    size: tuple[int, int]
+    params: tuple[float, ...]
+    turn: tuple[float, ...] = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
+
+    @property
+    def focal(self) -> tuple[float, float]:
+        """Pixels per radian, or per unit of the pinhole plane, in the middle."""
+        if self.model == "EQUIRECTANGULAR":
+            return self.size[0] / (2 * np.pi), self.size[1] / np.pi
+        return (self.params[0], self.params[0 if self.model in _SINGLE_FOCAL else 1])
+
+    @property
+    def _centre_and_rest(self) -> tuple[float, float, tuple[float, ...]]:
+        first = 1 if self.model in _SINGLE_FOCAL else 2
+        return self.params[first], self.params[first + 1], self.params[first + 2 :]
+
+    def turned(self, turn: Float) -> PhotoLens:
+        return replace(self, turn=tuple(turn.ravel().tolist()))
+
+    def project(self, rays: Float) -> tuple[Float, NDArray[np.bool_]]:
+        """Map (N, 3) rays in the view's axes to (N, 2) pixels, and say which of them the photo holds."""
+        x, y, z = np.array(self.turn).reshape(3, 3) @ rays.T
+        across = np.hypot(x, y)
+        angle = np.arctan2(across, z)
+        width, height = self.size
+        if self.model == "EQUIRECTANGULAR":
+            u = (np.arctan2(x, z) / (2 * np.pi) + 0.5) * width
+            v = (np.arctan2(y, np.hypot(x, z)) / np.pi + 0.5) * height
+            return np.stack([u, v], 1), np.ones(len(u), bool)
+        inside = angle < _end(self)
+        angle = np.where(inside, angle, 0.0)
+        away = self._plane_radius(angle)
+        aim = np.where(across > 0, across, 1.0)
+        u, v = self._bent(x / aim * away, y / aim * away)
+        cx, cy, _ = self._centre_and_rest
+        u, v = self.focal[0] * u + cx, self.focal[1] * v + cy
+        inside &= (u >= 0) & (u <= width) & (v >= 0) & (v <= height)
+        return np.stack([u, v], 1), inside
+
+    def _plane_radius(self, angle: Float) -> Float:
+        """Return the radius before distortion: the angle of fisheyes, otherwise its tangent."""
+        return np.tan(angle) if self.model in ("FULL_OPENCV", "FOV") else angle
+
+    def _bent(self, u: Float, v: Float) -> tuple[Float, Float]:
+        """Distort points of the plane."""
+        _, _, rest = self._centre_and_rest
+        r2 = u * u + v * v
+        if self.model == "FOV":
+            r = np.sqrt(r2)
+            (omega,) = rest
+            if abs(omega) < 1e-6:
+                return u, v
+            wide = np.arctan(2 * r * np.tan(omega / 2)) / omega
+            factor = np.where(r > 1e-9, wide / np.maximum(r, 1e-9), 2 * np.tan(omega / 2) / omega)
+            return u * factor, v * factor
+        k = np.zeros(6)
+        p1 = p2 = s1 = s2 = 0.0
+        if self.model == "FULL_OPENCV":
+            k[:2], p1, p2, k[2:] = rest[:2], rest[2], rest[3], rest[4:]
+        elif self.model == "THIN_PRISM_FISHEYE":
+            k[:2], p1, p2, k[2:4], s1, s2 = rest[:2], rest[2], rest[3], rest[4:6], rest[6], rest[7]
+        else:
+            k[: len(rest)] = rest
+        if self.model == "FULL_OPENCV":
+            above = 1 + r2 * (k[0] + r2 * (k[1] + r2 * k[2]))
+            radial = above / (1 + r2 * (k[3] + r2 * (k[4] + r2 * k[5])))
+        else:
+            radial = 1 + r2 * (k[0] + r2 * (k[1] + r2 * (k[2] + r2 * k[3])))
+        return (
+            u * radial + 2 * p1 * u * v + p2 * (r2 + 2 * u * u) + s1 * r2,
+            v * radial + 2 * p2 * u * v + p1 * (r2 + 2 * v * v) + s2 * r2,
+        )
+
+    def faces(self, scale: float = 1.0) -> list[Face]:
+        """Return the pinhole views of a photo of `scale` times the size: one of a narrow lens, otherwise the
+        faces of a cube that it holds enough of."""
+        size = (round(self.size[0] * scale), round(self.size[1] * scale))
+        if self.model == "FULL_OPENCV":
+            fx, fy, cx, cy = (scale * value for value in self.params[:4])
+            return [Face("", np.eye(3), np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), size)]
+        focal = scale * float(np.sqrt(self.focal[0] * self.focal[1]))
+        if self.model != "EQUIRECTANGULAR":
+            cx, cy, _ = self._centre_and_rest
+            angles = np.linspace(0, _end(self), 20001)[:-1]
+            radii = np.hypot(*self._bent(self._plane_radius(angles), np.zeros(len(angles))))
+            ends = np.array([cx, self.size[0] - cx, cy, self.size[1] - cy]) / np.repeat(self.focal, 2)
+            left, right, top, bottom = np.interp(ends, radii, angles)
+            if max(left, right, top, bottom) <= _ONE_VIEW:
+                a, b, c, d = (focal * np.tan(edge) for edge in (left, right, top, bottom))
+                K = np.array([[focal, 0, a], [0, focal, c], [0, 0, 1]])
+                return [Face("", np.eye(3), K, (max(1, round(a + b)), max(1, round(c + d))))]
+        side = max(2, round(2 * focal))
+        K = np.array([[side / 2, 0, side / 2], [0, side / 2, side / 2], [0, 0, 1]])
+        steps = (np.arange(32) + 0.5) / 16 - 1
+        grid = np.stack([*(a.ravel() for a in np.meshgrid(steps, steps)), np.ones(32 * 32)], 1)
+        held = {name: self.turned(turn).project(grid)[1].mean() for name, turn in FACES.items()}
+        return [Face(name, FACES[name], K, (side, side)) for name in FACES if held[name] >= _LEAST_SEEN]
+
+
+@lru_cache(maxsize=64)
+def _end(lens: PhotoLens) -> float:
+    """Return the angle from the axis where a lens ends: its radius stops growing, or the corners of a
+    photo that shows the whole image circle begin."""
+    planar = lens.model in ("FULL_OPENCV", "FOV")
+    angles = np.linspace(0, np.pi / 2 if planar else np.pi, 20001)[:-1]
+    radii, _ = lens._bent(lens._plane_radius(angles), np.zeros(len(angles)))
+    falls = np.flatnonzero(np.diff(radii) <= 0)
+    most = int(falls[0]) + 1 if len(falls) else len(angles)
+    end = float(angles[most - 1])
+    if planar:
+        return end
+    cx, cy, _ = lens._centre_and_rest
+    ends = np.array([cx, lens.size[0] - cx, cy, lens.size[1] - cy]) / np.repeat(lens.focal, 2)
+    edge = float(np.interp(ends.max(), radii[:most], angles[:most]))
+    return min(end, max(edge, _CORNER))
+
+
+def photo_of(name: str) -> str:
+    """Return the name of the photo that a view of several was made from.
+
+    >>> photo_of("a.jpg#left"), photo_of("b#1.jpg")
+    ('a.jpg', 'b#1.jpg')
+    """
+    photo, _, face = name.rpartition("#")
+    return photo if face in FACES else name

@@ -1,0 +1,156 @@
+"""Fisheye photos and panoramas become the pinhole views that they show."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import g2ard
+from g2ard.io import read_views, write_views
+from g2ard.io.images import load_image, load_mask
+from g2ard.io.view_sets import read_view_set
+from g2ard.scene.lenses import FACES, PhotoLens
+from helpers.view_files import colmap, edit, orbit, transforms
+
+LENSES = {
+    "OPENCV_FISHEYE": (60, 61, 100, 74, 0.02, -0.01, 0.004, -0.001),
+    "FULL_OPENCV": (120, 121, 100, 74, 0.1, -0.05, 0.01, -0.02, 0.01, 0.05, -0.02, 0.003),
+    "FOV": (120, 121, 100, 74, 0.9),
+    "SIMPLE_RADIAL_FISHEYE": (60, 100, 74, 0.03),
+    "RADIAL_FISHEYE": (60, 100, 74, 0.03, -0.005),
+    "THIN_PRISM_FISHEYE": (60, 61, 100, 74, 0.02, -0.01, 0.01, -0.02, 0.004, -0.001, 0.01, -0.02),
+    "SIMPLE_FISHEYE": (60, 100, 74),
+    "FISHEYE": (60, 61, 100, 74),
+}
+SIZE = (200, 150)
+
+
+def rays(count: int = 300, most: float = 0.8) -> np.ndarray:
+    rng = np.random.default_rng(0)
+    angle, turn = rng.uniform(0, most, count), rng.uniform(0, 2 * np.pi, count)
+    return np.stack([np.sin(angle) * np.cos(turn), np.sin(angle) * np.sin(turn), np.cos(angle)], 1)
+
+
+@pytest.mark.parametrize("model", LENSES)
+def test_models_are_those_of_colmap(model: str) -> None:
+    pycolmap = pytest.importorskip("pycolmap")
+    camera = pycolmap.Camera(model=model, width=SIZE[0], height=SIZE[1], params=LENSES[model])
+    seen, inside = PhotoLens(model, SIZE, LENSES[model]).project(rays())
+    assert inside.sum() > 100
+    np.testing.assert_allclose(seen, camera.img_from_cam(rays()), atol=1e-9)
+
+
+@pytest.mark.parametrize("model", LENSES)
+def test_faces_turn_rays(model: str) -> None:
+    lens = PhotoLens(model, SIZE, LENSES[model])
+    for turn in FACES.values():
+        own, inside = lens.turned(turn).project(rays() @ turn)
+        np.testing.assert_allclose(own[inside], lens.project(rays())[0][inside], atol=1e-9)
+        assert np.linalg.det(turn) == pytest.approx(1)
+
+
+def pattern(d: np.ndarray) -> np.ndarray:
+    """A smooth picture on the sphere of directions."""
+    d = d / np.linalg.norm(d, axis=-1, keepdims=True)
+    return 0.5 + 0.4 * np.sin(3 * d + np.roll(d, 1, axis=-1))
+
+
+def panorama(width: int) -> np.ndarray:
+    """nerfstudio's equirectangular photo: the middle looks ahead, right is right, the top is up."""
+    v, u = (np.mgrid[0 : width // 2, 0:width] + 0.5) / width
+    around, down = 2 * np.pi * (u - 0.5), 2 * np.pi * (v - 0.25)
+    return pattern(np.stack([np.sin(around) * np.cos(down), np.sin(down), np.cos(around) * np.cos(down)], -1))
+
+
+def fisheye(width: int, focal: float) -> np.ndarray:
+    """An equidistant photo; black beyond 109° from its axis."""
+    v, u = np.mgrid[0:width, 0:width] + 0.5 - width / 2
+    angle = np.hypot(u, v) / focal
+    sine = np.sin(angle) / np.maximum(angle, 1e-9) / focal
+    image = pattern(np.stack([u * sine, v * sine, np.cos(angle)], -1))
+    return np.where((angle < 1.9)[..., None], image, 0)
+
+
+def captured(folder: Path, image: np.ndarray, count: int = 9, **top: object) -> Path:
+    path = transforms(folder / "transforms.json", orbit(count), **top)
+    (folder / "images").mkdir(exist_ok=True)
+    for i in range(count):
+        Image.fromarray(np.rint(image * 255).astype(np.uint8)).save(folder / "images" / f"{i:03d}.png")
+    edit(
+        path,
+        lambda c: [frame.update(file_path=f"images/{i:03d}.png") for i, frame in enumerate(c["frames"])],
+    )
+    return path
+
+
+def check_faces(views: g2ard.Cameras, poses: list[np.ndarray], least: float) -> None:
+    """Compare views of one photo with the picture in the directions of their pixels."""
+    shown = 0
+    for i, view in enumerate(views):
+        v, u = np.mgrid[0 : view.height, 0 : view.width] + 0.5
+        local = np.stack([u, v, np.ones_like(u)], -1) @ np.linalg.inv(view.K).T
+        world = local @ view.viewmat[:3, :3]
+        expected = pattern(world @ poses[0][:3, :3].T)
+        np.testing.assert_allclose(view.position, -poses[0][:3, :3].T @ poses[0][:3, 3], atol=1e-9)
+        mask = load_mask(views, i)
+        mask = np.ones(u.shape, bool) if mask is None else mask
+        shown += mask.sum()
+        assert np.abs(load_image(views, i) - expected)[mask].max() < 0.03
+    assert shown >= least
+
+
+@pytest.mark.parametrize("longest", [None, 60])
+def test_a_panorama_becomes_six_faces(tmp_path: Path, longest: int | None) -> None:
+    path = captured(tmp_path, panorama(512), camera_model="EQUIRECTANGULAR", w=512, h=256)
+    found = read_view_set(path)
+    assert len(found.cameras) == 6 * 9
+    assert any(note.code == "resampled" and "54 pinhole views" in str(note) for note in found.notes)
+    assert {name.rpartition("#")[2] for name in found.cameras.names} == set(FACES)
+    check_faces(found.cameras.take(range(6)).resized(longest), orbit(9), 6 * min(longest or 163, 163) ** 2)
+
+
+@pytest.mark.parametrize("how", [{"camera_model": "OPENCV_FISHEYE"}, {"is_fisheye": True}])
+def test_a_fisheye_becomes_the_faces_that_it_saw(tmp_path: Path, how: dict) -> None:
+    focal = 80.0
+    lens = {"fl_x": focal, "fl_y": focal, "cx": 150, "cy": 150, "w": 300, "h": 300}
+    path = captured(tmp_path, fisheye(300, focal), **lens, **how)
+    views = read_views(path)
+    first = views.take([i for i, name in enumerate(views.names) if name.startswith("000.png")])
+    assert [name.rpartition("#")[2] for name in first.names] == ["front", "right", "left", "up", "down"]
+    masks = [load_mask(first, i) for i in range(5)]
+    assert masks[0] is None
+    assert all(mask is not None and 0.3 < mask.mean() < 0.9 for mask in masks[1:])
+    check_faces(first, orbit(9), 3 * 160 * 160)
+
+
+def test_a_narrow_fisheye_becomes_one_view(tmp_path: Path) -> None:
+    colmap(tmp_path, orbit(1), text=True)
+    cameras = tmp_path / "sparse" / "0" / "cameras.txt"
+    cameras.write_text("7 SIMPLE_FISHEYE 120 120 90 60 60\n")
+    (tmp_path / "images").mkdir()
+    picture = np.rint(fisheye(120, 90.0) * 255).astype(np.uint8)
+    Image.fromarray(picture).save(tmp_path / "images" / "photo 0.png")
+    views = read_views(tmp_path)
+    assert views.names == ("photo 0.png",)
+    check_faces(views, orbit(1), 100 * 100)
+
+
+def test_a_photo_is_held_out_as_a_whole(tmp_path: Path) -> None:
+    path = captured(tmp_path, panorama(64), camera_model="EQUIRECTANGULAR", w=64, h=32)
+    test = read_views(path, split="test")
+    assert len(test) == 2 * 6
+    assert {name.partition("#")[0] for name in test.names} == {"000.png", "008.png"}
+    (tmp_path / "split.json").write_text('{"train": ["000"], "test": ["003.png"]}')
+    assert {name.partition("#")[0] for name in read_views(path, split="test").names} == {"003.png"}
+
+
+def test_views_of_lenses_survive_writing(tmp_path: Path) -> None:
+    path = captured(tmp_path, panorama(64), 1, camera_model="EQUIRECTANGULAR", w=64, h=32)
+    views = read_views(path)
+    write_views(tmp_path / "v.json", views)
+    again = read_views(tmp_path / "v.json")
+    assert (again.names, again.lenses) == (views.names, views.lenses)
+    np.testing.assert_array_equal(load_image(again, 3), load_image(views, 3))
+    with pytest.warns(UserWarning, match="photos of 6 views"):
+        write_views(tmp_path / "transforms_2.json", views)
