@@ -34,7 +34,7 @@ def discs(points, neighbors=10, normal_ratio=0.1, max_anisotropy=4.0, spread=0.9
             along = axes[row, 0] - (axes[row, 0] @ n) * n
             across = np.cross(n, along / np.linalg.norm(along)) if np.linalg.norm(along) > 1e-6 else t1
             normals[row] = n
-            narrow[row] = np.sqrt((a * (across @ t1)) ** 2 + (b * (across @ t2)) ** 2)
+            narrow[row] = 0.8 * np.sqrt((a * (across @ t1)) ** 2 + (b * (across @ t2)) ** 2)
     wide, narrow = spread * np.maximum(wide, narrow), spread * np.minimum(wide, narrow)
     narrow = np.maximum(narrow, wide / max_anisotropy)
     return normals, np.stack([wide, narrow, normal_ratio * np.sqrt(wide * narrow)], 1)

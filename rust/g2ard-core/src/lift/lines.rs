@@ -18,6 +18,10 @@ const CELLS: [f64; 2] = [0.5, 8.0];
 /// Distance of the farthest neighbour of a thinned line, in cells.
 const REACH: f64 = 5.0;
 
+/// Extent of a disc across its line over the standard deviation of the wider neighbourhood: along a line many discs
+/// overlap, so that narrower ones cover the surface and blur less.
+const ACROSS: f64 = 0.8;
+
 /// A point whose neighbours are nearly on a line.
 struct Line {
     /// Its place in the order of the tree, and its row.
@@ -157,7 +161,7 @@ fn turn(patch: &mut Patch, e: &Eigen) {
     };
     let along = cross(across, n);
     let share = [0, 1].map(|k| e.values[k].max(0.0) * dot(across, e.vectors[k]).powi(2));
-    let (wide, narrow) = ((share[0] + share[1]).sqrt(), patch.sigmas[0]);
+    let (wide, narrow) = (ACROSS * (share[0] + share[1]).sqrt(), patch.sigmas[0]);
     let [t1, t2] = if wide >= narrow {
         [across, along]
     } else {
