@@ -520,6 +520,55 @@ mod tests {
     }
 
     #[test]
+    fn blurs_are_variances_of_a_share_of_the_pixel() {
+        let scene = Scene::new(0.1, 0.3, 1.0);
+        let scene = scene.borrow();
+        let ordered = Ordered::new(&scene).unwrap();
+        let policy = Pairwise::default();
+        let mut pixel_size = vec![0.05; ROWS];
+        pixel_size[7] = 2.0;
+        pixel_size[8] = f32::INFINITY;
+        let seen = Visibility {
+            weight: &[1.0; ROWS],
+            pixel_size: &pixel_size,
+        };
+        let variance = |pixel: f64| (policy.dilation * pixel).powi(2);
+        let blur = policy.blurs(&scene, &ordered, Some(seen), None);
+        for (&row, &got) in ordered.rows.iter().zip(&blur) {
+            let want = variance(if row == 7 { 2.0 } else { 0.05 });
+            assert!((f64::from(got) - want).abs() < 1e-6 * want, "{row}");
+        }
+        let unseen = policy.blurs(&scene, &ordered, None, None);
+        let want = variance(policy.pixel_scale * 0.1);
+        assert!(
+            unseen
+                .iter()
+                .all(|&b| (f64::from(b) - want).abs() < 1e-5 * want)
+        );
+    }
+
+    #[test]
+    fn runs_merge_alike_in_any_place_in_memory() {
+        let scene = Scene::new(0.1, 0.3, 1.0);
+        let scene = scene.borrow();
+        let ordered = Ordered::new(&scene).unwrap();
+        let rows: Vec<u32> = (0..ROWS as u32).collect();
+        let blur = [0.01; ROWS];
+        let leaves = Leaves::new(&scene, &ordered, rows.clone(), &blur, None, None);
+        let runs = Partition {
+            of: rows.iter().map(|row| row / 4).collect(),
+            count: ROWS / 4,
+        };
+        let want = leaves.merged(&runs);
+        let mut nodes = leaves.nodes();
+        nodes.gather(&rows.iter().rev().copied().collect::<Vec<_>>());
+        let at = rows.iter().rev().copied().collect();
+        let got = Shuffled { nodes, at }.merged(&runs);
+        assert_eq!(got.geometry, want.geometry);
+        assert_eq!((got.sh, got.width), (want.sh, 3));
+    }
+
+    #[test]
     fn a_round_that_merges_nothing_is_an_error() {
         let lost = Node {
             mean: [f32::NAN; 3],

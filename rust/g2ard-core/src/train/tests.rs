@@ -46,3 +46,39 @@ fn steps_give_the_same_bits_on_any_number_of_threads_and_learn() {
         loss(losses.len() - 1)
     );
 }
+
+/// How far the means go in one step with a `finest` size.
+fn moved(finest: f32) -> f32 {
+    let (scene, camera) = (Small::new(), camera());
+    let target = noise(3 * camera.width * camera.height, 9);
+    let mut trainer = Trainer::new(&scene.params(), None, Isa::detect()).unwrap();
+    let before = trainer.store().columns(0, 3);
+    let input = StepInput {
+        camera: &camera,
+        settings: Settings::default(),
+        background: [0.0; 3],
+        target: &target,
+        mask: None,
+        ssim_weight: 0.2,
+        relative: None,
+        rates: Rates {
+            means: 1e-3,
+            ..Rates::default()
+        },
+        reach: None,
+        finest,
+        regularizers: None,
+    };
+    trainer.step(&input).unwrap();
+    let after = trainer.store().columns(0, 3);
+    before.iter().zip(&after).map(|(a, b)| (a - b).abs()).sum()
+}
+
+#[test]
+fn what_is_below_the_finest_size_hardly_moves() {
+    let free = moved(0.0);
+    assert!(free > 0.0);
+    // σ²/(σ² + finest²): everything if finest is far below a pixel, next to nothing far above.
+    assert!((moved(1e-4) - free).abs() < 0.02 * free);
+    assert!(moved(1e4) < 0.02 * free);
+}
