@@ -274,7 +274,7 @@ def _size(place: Place, frame: _Frame, photo: Path) -> tuple[int, int]:
         if width is not UNSET and height is not UNSET:
             return width, height
     if photo.is_file():
-        centred = None if frame.cx is None or frame.cy is None else (2 * frame.cx, 2 * frame.cy)
-        return photo_size(photo, place.path, centred)
+        stated = None if frame.cx is UNSET or frame.cy is UNSET else (2 * frame.cx, 2 * frame.cy)
+        return photo_size(photo, place.path, stated)
     error = place.error(f"has neither w and h nor a photo {photo}")
     raise error.at(hint="{images=DIR} names the folder of photos that are elsewhere")
