@@ -169,6 +169,5 @@ def test_exposures_are_undone(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="exposure of view_001: expected an invertible"):
         Photos(cameras, exposures={"view_001": np.zeros((3, 4))})
     (tmp_path / "exposure.json").write_text('{"view_001": [1, 2]}')
-    with pytest.raises(InputError, match="list of 4") as caught:
+    with pytest.raises(InputError, match=r"exposure.json: property 'view_001\[2\]'"):
         find_exposures(cameras)
-    assert caught.value.property == "view_001[0]"
