@@ -47,7 +47,7 @@ TARGETS = g2ard.TeacherRenders(SCENE, VIEWS)
 
 SIMPLIFY: dict[str, Any] = {
     "retention": 0.5,
-    "fold": 0.5,
+    "fold": 0.9,
     "min_opacity": 0.3,
     "morton_premerge_ratio": 1.5,
     "morton_premerge_steps": 3,
