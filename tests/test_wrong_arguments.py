@@ -1,14 +1,16 @@
 """Public functions and configs refuse wrong types, fractions, NaN and negative numbers by argument."""
 
 import inspect
+import re
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, get_origin
 
 import numpy as np
 import pytest
 
 import g2ard
+from g2ard.config import checks
 from helpers.scenes import around, checkered_ball
 
 BALL, VIEWS = checkered_ball(60), around(4, (24, 18))
@@ -59,9 +61,16 @@ VECTORS = ("up", "position", "target", "background")
 NAN = float("nan")
 
 
+def _bare(kind: str) -> str:
+    """Return the name of a type without its limits."""
+    kind = re.sub(r"Annotated\[(\w+).*", r"\1", kind)
+    limited = getattr(checks, kind, None)
+    return limited.__origin__.__name__ if get_origin(limited) is Annotated else kind
+
+
 def _wrong(name: str, parameter: str, annotation: str) -> Iterator[Any]:
     """Yield values that an argument of this type must not have."""
-    kinds = [kind.strip() for kind in annotation.split("|")]
+    kinds = [_bare(kind.strip()) for kind in annotation.split("|")]
     yield object()
     if {"int", "float"} & {*kinds}:
         yield from (NAN, True)

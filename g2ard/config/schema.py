@@ -10,7 +10,7 @@ A stage's settings root their paths: `RecoverConfig` → `recover`. Settings tha
 `recover.steps`.
 
 Settings with a classmethod `named` can be set as a whole by name: `recover.schedule=fast`. Fields marked
-`setting=False` are computed and cannot be set.
+`setting=False` are computed and cannot be set; of those marked `whole=True` no single field can be.
 """
 
 from __future__ import annotations
@@ -197,7 +197,8 @@ def _leaves(config: Any, root: str | None = None, every: bool = False) -> Iterat
         if is_dataclass(value):
             if hasattr(value, "named"):
                 yield _Leaf(path, str, value)
-            yield from _leaves(value, path, every)
+            if not (every and f.metadata.get("whole")):
+                yield from _leaves(value, path, every)
         elif f.metadata.get("setting", True):
             chosen = every and f.name == getattr(config, "_tag", None)
             yield _Leaf(path, Literal[tuple(config._variants)] if chosen else kinds[f.name], value)

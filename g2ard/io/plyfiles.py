@@ -37,7 +37,8 @@ _MARK = b"\xef\xbb\xbf"
 """Byte order mark of UTF-8."""
 
 _ASCII = bytes(range(128)) + b"?" * 128
-_REMARKS = (b"comment", b"obj_info")
+"""Translation of names and comments of other character sets, byte by byte."""
+
 _END_HEADER = re.compile(rb"(?<=[\r\n])end_header[ \t]*(\r\n|\r|\n)")
 _COUNT = re.compile(rb"(?<=[\r\n])(element[ \t]+(\S+)[ \t]+)(\d{1,4000})\b")  # Python reads no longer ones
 
@@ -79,10 +80,6 @@ def read_header(path: Path) -> PlyHeader:
         raise damaged("broken PLY header: no end_header line", path=path)
     eol = b"\r\n" if head[3:5] == b"\r\n" else head[3:4]
     head = head[: end.start(1) + len(eol)]  # rows may begin with a newline
-    lines = enumerate(head.splitlines(), 1)
-    foreign = next((n for n, line in lines if not line.isascii() and not line.startswith(_REMARKS)), None)
-    if foreign is not None:
-        raise InputError("is not ASCII", path=path, index=foreign, item="header line")
     span, head = range(start, start + len(head)), head.translate(_ASCII)
     try:
         counts = {name.decode(): int(count) for _, name, count in _COUNT.findall(head)}
@@ -94,7 +91,7 @@ def read_header(path: Path) -> PlyHeader:
 
 
 class _Plain(io.BufferedReader):
-    """A PLY file from its header on, whose comments read as ASCII."""
+    """A PLY file from its header on, whose header reads as ASCII."""
 
     def __init__(self, path: Path, span: range) -> None:
         super().__init__(io.FileIO(str(path)))

@@ -50,7 +50,7 @@ class AdaptConfig(FitConfig, tag="schedule"):
 
     schedule: AdaptSchedule = "default"
     steps: AtLeastOne = 7000
-    recovery: Schedule = _TUNED
+    recovery: Schedule = field(default=_TUNED, metadata={"whole": True})
 
     if TYPE_CHECKING:  # the settings of a schedule are those of its class
         tolerance: ClassVar[float]
@@ -106,7 +106,7 @@ class AtOnce(AdaptConfig, variants=("paper",)):
     """Settings of the schedule `paper`: those of `AdaptConfig`."""
 
     schedule: Literal["paper"] = "paper"
-    recovery: Schedule = _PAPER
+    recovery: Schedule = field(default=_PAPER, metadata={"whole": True})
     tolerance: ClassVar[float] = 0.0
     prior_views: ClassVar[float] = 0.0
 

@@ -552,8 +552,13 @@ def test_nodes_of_a_glb_turn_scale_and_move(tmp_path: Path, compress: str | None
     np.testing.assert_allclose(got, want, rtol=1e-4, atol=1e-6)
     np.testing.assert_allclose(found.shN, wanted.shN, atol=1e-5)
     write_glb(path, {**document, "nodes": [document["nodes"][0], above | {"scale": [1, 2, 1]}]}, binary)
-    with pytest.raises(InputError, match="a node shears, or scales differently"):
-        read_splats(path)
+    uneven = read_splats(path)
+    moved = turn @ cycle @ np.diag([0.5, 1, 0.5, 1]) @ turn
+    linear, shift = moved[:3, :3], moved[:3, 3]
+    means = (plain.means + plain.offset) @ linear.T + shift
+    np.testing.assert_allclose(uneven.means + uneven.offset, means, atol=1e-5)
+    got, want = (covariances(s.quats, s.scales) for s in (uneven, plain))
+    np.testing.assert_allclose(got, linear @ want @ linear.T, rtol=1e-4, atol=1e-6)
 
 
 STORED = {"ROTATION": "quats", "SCALE": "scales", "OPACITY": "opacities"}
