@@ -30,7 +30,7 @@ from g2ard.progress import Progress, Say, plural, silent, unsaid
 from g2ard.rendering.targets import kinds_told
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
-from g2ard.stages.lift import lift
+from g2ard.stages.lift import lift, lift_rows, merged
 from g2ard.stages.recover.anchors import FREE, Regularizers
 from g2ard.stages.recover.auto_preset import PriorMeasures, measure_prior, regularizers_for
 
@@ -332,6 +332,7 @@ def _read(
             raise InputError("missing; without a scene, pass photos with poses as views", parameter="scene")
         return _lifted_alone(scene, options, progress, say)
     points, name, of_photos = _points(scene, views, say)
+    points = points and _without_repeats(points)
     given = 0 if points is None or scene is None else len(points)
     wanted = max((budget.count for budget in budgets if budget.count is not None), default=0)
     if points is None and not wanted:
@@ -353,7 +354,9 @@ def _read(
             progress=progress,
             say=say,
         )
-    lifted = lift(points.positions, points.colors, **vars(options.config.lift), progress=progress)
+    # Points along rays may repeat, but are as many as were asked for.
+    config = options.config.lift
+    lifted, _ = lift_rows(points.positions, points.colors, config, progress, merge=False)
     return _Read(lifted, True, options.beside, name, given, of_photos)
 
 
@@ -365,6 +368,13 @@ def _lifted_alone(scene: Points | str | Path, options: DistillOptions, progress:
     lift_config = vars(options.config.lift)
     lifted = lift(points.positions, points.colors, **lift_config, progress=progress)
     return _Read(lifted, False, options.beside, name, len(lifted))
+
+
+def _without_repeats(points: Points) -> Points:
+    """Merge points of one position, as lifting does, so that what is missing can be counted."""
+    middle = np.median(points.positions, axis=0)
+    rows, colors = merged(points.positions - middle, points.colors)
+    return Points(points.positions[rows], np.ascontiguousarray(colors, points.colors.dtype))
 
 
 def _points(

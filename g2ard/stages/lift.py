@@ -6,7 +6,7 @@ Distil *from* this prior, with photos as targets; rendered as it is, it looks fl
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -82,9 +82,17 @@ def lift(
 
 
 def lift_rows(
-    points: ArrayLike, colors: ArrayLike, config: LiftConfig, progress: Progress = silent
+    points: ArrayLike,
+    colors: ArrayLike,
+    config: LiftConfig,
+    progress: Progress = silent,
+    *,
+    merge: bool = True,
 ) -> tuple[Splats, NDArray[np.intp]]:
-    """Lift points as `lift` does; also return the row of each disc's point, ascending."""
+    """Lift points as `lift` does; also return the row of each disc's point, ascending.
+
+    With `merge` false, points of one position become a disc each.
+    """
     opacity = config.opacity
     xyz = np.ascontiguousarray(points, np.float64)
     rgb = unit_colors(colors)
@@ -99,10 +107,8 @@ def lift_rows(
         xyz, rgb = xyz[finite], rgb[finite]
     middle = _middle(xyz)
     centered = xyz - middle
-    firsts, group = _positions(centered)
-    if len(firsts) < len(xyz):
-        totals = [np.bincount(group, channel) for channel in rgb.T]
-        rgb = np.stack(totals, axis=1) / np.bincount(group)[:, None]
+    if merge:
+        firsts, rgb = merged(centered, rgb)
         xyz, centered, rows = xyz[firsts], centered[firsts], rows[firsts]
     quats, scales = _core.lift_points(xyz - _anchor(xyz), config, counter(progress, "lift"))
     n = len(centered)
@@ -116,6 +122,19 @@ def lift_rows(
         offset=np.zeros(3) if near else middle,
     )
     return splats, rows
+
+
+def merged(points: NDArray[np.float64], colors: NDArray[Any]) -> tuple[NDArray[np.intp], NDArray[Any]]:
+    """Return the first row of each position, ascending, and the mean colour there.
+
+    Args:
+        points: (N, 3) relative to a point amid them.
+    """
+    firsts, group = _positions(points)
+    if len(firsts) == len(points):
+        return firsts, colors
+    totals = [np.bincount(group, channel) for channel in colors.T]
+    return firsts, np.stack(totals, axis=1) / np.bincount(group)[:, None]
 
 
 def _positions(points: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:

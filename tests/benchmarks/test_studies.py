@@ -123,7 +123,10 @@ def test_the_report_shows_rows_seeds_and_failures(tmp_path: Path) -> None:
         (("ratios", "rations"), "no key 'rations'"),
         (('"pup"', '"pop"'), "no 'pop'"),
         (('base = "g2ard-paper"', 'base = "x"'), "method rounds: base"),
-        (("protection = 0.0", "regularizers.period = 0"), "method rounds: period: expected a whole number of at least 1"),
+        (
+            ("protection = 0.0", "regularizers.period = 0"),
+            "method rounds: period: expected a whole number of at least 1",
+        ),
         (("protection = 0.0", 'rounds = "many"'), "rounds: expected one of one, paper, pup"),
         (("protection = 0.0", "shared_start = 3"), "method rounds: shared_start: expected true or false"),
         (('name = "ball"', 'nam = "ball"'), "lacks 'name'"),

@@ -184,7 +184,7 @@ STAND_INS: dict[str, Callable[[Path], None]] = {
     **dict.fromkeys(("scene.ply", "scan.ply", "dense.ply", "city.ply", "room.ply", "tree.spz"), _scene),
     **dict.fromkeys(("guitar.compressed.ply", "park24.ply"), _scene),
     "cloud.ply": _cloud,
-    **dict.fromkeys(("city.laz", "east.laz", "west.laz"), _map_cloud),
+    **dict.fromkeys(("city.laz", "map.laz", "east.laz", "west.laz"), _map_cloud),
     **dict.fromkeys(("photos", "fox"), _photos),
     **dict.fromkeys(("project", "caliterra"), _colmap),
     "chair": _photos_with_alpha,
@@ -218,6 +218,7 @@ PLACEHOLDERS = {
 OF_PAGE: dict[str, dict[str, Callable[[Path], None]]] = {
     "README.md": {"scene.ply": _small, "new": _new_with_lenses},
     "docs/how-to/web-delivery.md": {"project": _map_colmap},
+    "docs/how-to/lidar-map.md": {"project": _map_colmap},
     "docs/how-to/clean-floaters.md": {"scene.ply": _sky},
     "docs/how-to/own-views.md": {"views.json": _views},
     "docs/how-to/rasteriser.md": {"small.ply": _simplified},

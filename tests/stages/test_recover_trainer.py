@@ -310,7 +310,7 @@ def test_bad_input_is_named() -> None:
         step(trainer_of(p), cameras[0], targets[0][:5])
     with pytest.raises(InputError, match="anchors set before"):
         step(trainer_of(p), cameras[0], targets[0], Regularizers(1.0, 1.0, True))
-    with pytest.raises(InputError, match="reach: .* above 0"):
+    with pytest.raises(InputError, match=r"reach: .* above 0"):
         step(trainer_of(p), cameras[0], targets[0], reach=0.0)
     with pytest.raises(InputError, match="units: expected 10 values"):
         trainer_of(p, np.ones(9, np.float32))

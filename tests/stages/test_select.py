@@ -181,7 +181,7 @@ def test_directions_and_epsilon_are_options():
     np.testing.assert_allclose(gains, value, rtol=1e-6, atol=1e-12)
     _, usual, _ = run_greedy(made, seen, positions, 6)
     assert abs(usual[0] - gains[0]) > 1e-3 * abs(usual[0])
-    with pytest.raises(InputError, match="anchors: .*1, 64"):
+    with pytest.raises(InputError, match=r"anchors: .*1, 64"):
         run_greedy(made, seen, positions, 6, anchors=65)
 
 
