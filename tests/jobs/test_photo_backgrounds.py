@@ -79,7 +79,7 @@ def test_a_run_is_drawn_on_its_own_background(command_line: CommandLine, rgba: P
         ),
         (
             {"settings": {"recover.background": [0, 2, 0]}},
-            "property 'settings.recover.background[1]' is 2, expected a number within ±1",
+            "property 'settings.recover.background[1]' is 2, expected a number",
         ),
     ],
 )
