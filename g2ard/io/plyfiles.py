@@ -107,7 +107,7 @@ def scene_names(properties: Sequence[str]) -> dict[str, str]:
     """Return the properties of a Gaussian scene by their usual names, without CloudCompare's prefix.
 
     >>> scene_names(["x", "scalar_f_dc_0", "filter_3D", "red"])
-    {'x': 'x', 'f_dc_0': 'scalar_f_dc_0', 'filter_3d': 'filter_3D', 'red': 'red'}
+    {'x': 'x', 'filter_3d': 'filter_3D', 'red': 'red', 'f_dc_0': 'scalar_f_dc_0'}
     """
     found: dict[str, str] = {}
     for name in sorted(properties, key=lambda name: name.lower().startswith("scalar_")):

@@ -172,7 +172,6 @@ def test_command_on_a_cloud_with_photos(command_line: CommandLine, tmp_path: Pat
     assert recovered > max(21.5, simplified)
     result = read_splats(tmp_path / "run" / "scene.ply")
     assert (len(result), result.sh_degree) == (400, 3)
-    assert "--views" in refused(command_line, tmp_path, *ask, "-w")
 
 
 def test_a_scanned_cloud_and_photos_are_distilled(command_line: CommandLine, tmp_path: Path) -> None:
