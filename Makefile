@@ -116,7 +116,7 @@ release-check: $(VENV)/.maturin
 
 # Unsafe code of the core under Miri, on the portable lanes, in minutes. Needs a nightly toolchain with miri. Tree Borrows, for
 # rayon's own crates break Stacked Borrows; rayon's threads never end.
-MIRI ?= raster::depth_sort raster::rasterizer train::
+MIRI ?= raster::depth_sort raster::rasterizer raster::visibility train::
 miri:
 	MIRIFLAGS="-Zmiri-disable-isolation -Zmiri-tree-borrows -Zmiri-permissive-provenance -Zmiri-ignore-leaks" \
 		RAYON_NUM_THREADS=2 cargo +nightly miri test -p g2ard-core --lib -- $(MIRI)

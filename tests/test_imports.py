@@ -1,8 +1,11 @@
 """Imports: packages only import packages before them, and there are no cycles within a package."""
 
 import ast
+import re
 from collections.abc import Iterator
 from pathlib import Path
+
+import pytest
 
 import g2ard
 
@@ -64,12 +67,54 @@ def test_architecture_lists_the_layers() -> None:
     assert ", ".join(f"`{layer}`" for layer in LAYERS) in text
 
 
-def test_no_import_cycles() -> None:
-    known = modules()
+def rust_modules(source: Path) -> dict[str, Path]:
+    """Every module of a crate by its path from the crate's root; the root itself is ''."""
+    found = {}
+    for path in source.rglob("*.rs"):
+        *folder, name = path.relative_to(source).with_suffix("").parts
+        if name != "tests":
+            found["::".join(folder if name in ("mod", "lib") else [*folder, name])] = path
+    return found
+
+
+def rust_paths(text: str) -> Iterator[str]:
+    """Return the paths of a file from `crate` or `super` on, without those of its tests."""
+    text = re.sub(r"//[^\n]*", "", text.split("#[cfg(test)]\nmod tests {")[0])
+    pending = re.findall(r"\b(?:crate|super)::(?:[\w:]+|\{)[^;]*;", text)
+    while pending:
+        path = re.sub(r"\s", "", pending.pop())
+        if opened := re.match(r"([\w:]*)\{(.*)\}", path):
+            pending += [opened[1] + part for part in re.findall(r"(?:[^,{}]|\{[^}]*\})+", opened[2])]
+        else:
+            yield path.partition(";")[0]
+    yield from re.findall(r"\b(?:crate|super)(?:::\w+)+", text)
+
+
+def rust_imports(known: dict[str, Path], module: str) -> set[str]:
+    """Return the modules that a module uses, without those around it."""
+    found = set()
+    for path in rust_paths(known[module].read_text(encoding="utf-8")):
+        at = [] if path.startswith("crate") else module.split("::")
+        for word in path.split("::"):
+            if word == "super":
+                at = at[:-1]
+            elif word != "crate" and "::".join([*at, word]) in known:
+                at = [*at, word]
+        found.add("::".join(at))
+    return {name for name in found if not f"{module}::".startswith(f"{name}::") and name}
+
+
+@pytest.mark.parametrize("crate", ["python", "g2ard-core", "g2ard-gpu", "g2ard-py"])
+def test_no_import_cycles(crate: str) -> None:
     edges: dict[str, set[str]] = {}
+    known = modules() if crate == "python" else rust_modules(ROOT.parent / "rust" / crate / "src")
+    assert len(known) > 5
     for module, path in known.items():
-        targets = {name if name in known else name.rpartition(".")[0] for name in imported(path)}
-        edges[module] = targets & known.keys() - {module, "g2ard"}
+        if crate == "python":
+            targets = {name if name in known else name.rpartition(".")[0] for name in imported(path)}
+            edges[module] = targets & known.keys() - {module, "g2ard"}
+        else:
+            edges[module] = rust_imports(known, module)
     tops = [module for module in edges if not edges[module]]
     while tops:  # remove modules that import nothing, until none is left
         edges = {module: targets - set(tops) for module, targets in edges.items() if module not in tops}

@@ -3,9 +3,9 @@
 //! Stages know only the traits of their own kernels; this module alone knows both.
 
 use crate::Cpu;
+use crate::raster::visibility::VisibilityKernels;
 use crate::select::ViewKernels;
 use crate::simplify::GroupKernels;
-use crate::visibility::VisibilityKernels;
 
 /// All kernels that have more than one implementation. Those of a device may differ from [`Cpu`]'s within a stated
 /// tolerance, and are the same from run to run.

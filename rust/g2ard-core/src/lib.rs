@@ -1,6 +1,6 @@
 //! Geometry kernels of g2ard, in pure Rust.
 //!
-//! Data flows one way: points → [`lift`] → [`splats`] → [`scene`] → [`raster`] → [`visibility`] → [`simplify`], [`select`]
+//! Data flows one way: points → [`lift`] → [`splats`] → [`scene`] → [`raster`] → [`simplify`], [`select`]
 //! and [`train`]; [`quantize`] serves file formats, [`register`] photos. [`backend`] alone knows the stages whose kernels a device may run.
 //! Results never depend on the number of threads: every reduction has a fixed order.
 
@@ -25,7 +25,6 @@ pub mod spatial;
 pub mod splats;
 pub mod ssim;
 pub mod train;
-pub mod visibility;
 
 pub use backend::Backend;
 pub use control::Control;

@@ -3,11 +3,11 @@
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
 
+use g2ard_core::raster::visibility::{VisibilityAccumulator, VisibilityKernels};
 use g2ard_core::raster::{Camera, Settings};
 use g2ard_core::select::{Gaussians, Surface, ViewKernels};
 use g2ard_core::simplify::{Group, GroupKernels, Merged};
 use g2ard_core::spatial::Cells;
-use g2ard_core::visibility::{VisibilityAccumulator, VisibilityKernels};
 use g2ard_core::{Backend, Control, Cpu, Result, Splats};
 
 use crate::rows::{Rows, Run};

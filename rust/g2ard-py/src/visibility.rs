@@ -2,7 +2,7 @@
 
 use std::sync::{Arc, Mutex};
 
-use g2ard_core::visibility::{VisibilityAccumulator, VisibilityKernels};
+use g2ard_core::raster::visibility::{VisibilityAccumulator, VisibilityKernels};
 use numpy::PyArray1;
 use pyo3::prelude::*;
 

@@ -2,7 +2,7 @@
 
 use rayon::prelude::*;
 
-use super::palette::Rows;
+use super::rows::Rows;
 
 /// Steps of 2-means after a cut.
 const STEPS: usize = 4;

@@ -4,6 +4,7 @@ mod cells;
 mod codebook;
 mod near;
 mod palette;
+mod rows;
 #[cfg(test)]
 mod tests;
 

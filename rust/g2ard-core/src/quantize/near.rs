@@ -2,7 +2,7 @@
 
 use rayon::prelude::*;
 
-use super::palette::distance;
+use super::rows::distance;
 
 /// Entries of a group: consecutive ones, which lie near each other.
 const GROUP: usize = 64;

@@ -2,12 +2,14 @@
 
 use rayon::prelude::*;
 
+use super::BATCH;
 use super::blocks::{MOST_BLOCKS, blocks, by_pair, row_and_part};
 use super::disjoint::DisjointSlice;
+use super::grid::TileRect;
 use super::params::Params;
 use super::project::Splat;
 use super::simd::{Kernel, LANES, Lanes, Lanes16, Mask, Real, Vector};
-use super::tile_batch::{BATCH, TileBatch, TileRect, alpha, block_coordinates, log2_alpha};
+use super::tile_batch::{TileBatch, alpha, block_coordinates, log2_alpha};
 use super::tiles::Pair;
 use super::{ALPHA_MIN, Camera, ROWS, Settings};
 
@@ -44,16 +46,16 @@ impl Accumulated {
 
 /// Sums that threads add to, each to its own rows.
 #[derive(Clone, Copy)]
-pub(super) struct SharedSums {
-    weight: DisjointSlice<f64>,
-    transmittance: DisjointSlice<f64>,
-    hits: DisjointSlice<u64>,
-    dominant: DisjointSlice<u64>,
-    peak: DisjointSlice<f32>,
+pub(super) struct SharedSums<'a> {
+    weight: DisjointSlice<'a, f64>,
+    transmittance: DisjointSlice<'a, f64>,
+    hits: DisjointSlice<'a, u64>,
+    dominant: DisjointSlice<'a, u64>,
+    peak: DisjointSlice<'a, f32>,
 }
 
-impl SharedSums {
-    pub fn new(sums: &mut Accumulated) -> Self {
+impl<'a> SharedSums<'a> {
+    pub fn new(sums: &'a mut Accumulated) -> Self {
         Self {
             weight: DisjointSlice::new(&mut sums.weight),
             transmittance: DisjointSlice::new(&mut sums.transmittance),
@@ -99,8 +101,8 @@ pub struct Accumulate<'a, const KINDS: usize> {
     pub rect: TileRect,
     pub settings: &'a Settings,
     pub tile_batch: &'a mut TileBatch,
-    pub slots: DisjointSlice<[f32; KINDS]>,
-    pub written: DisjointSlice<u8>,
+    pub slots: DisjointSlice<'a, [f32; KINDS]>,
+    pub written: DisjointSlice<'a, u8>,
 }
 
 impl<const KINDS: usize> Kernel for Accumulate<'_, KINDS> {

@@ -1,13 +1,14 @@
 //! One tile from back to front, Gaussian by Gaussian. Every pair's ten sums go to its own slot.
 
+use super::BATCH;
 use super::blocks::{BlockMasks, MOST_BLOCKS, blocks, by_pair, row_and_part};
 use super::disjoint::DisjointSlice;
+use super::grid::TileRect;
 use super::memory::prefetch;
 use super::project::Splat;
 use super::simd::{Kernel, Lanes, Lanes16, Mask, Real, Vector};
 use super::tile_batch::{
-    BATCH, TileRect, TileSplat, TileSplats, alpha, block_coordinates, for_stretches, load_batch,
-    log2_alpha,
+    TileSplat, TileSplats, alpha, block_coordinates, for_stretches, load_batch, log2_alpha,
 };
 use super::tiles::Pair;
 use super::{ALPHA_MIN, ROWS, Settings, TILE};
@@ -95,9 +96,9 @@ pub struct Backward<'a, const WITH_DEPTH: bool> {
     pub incoming: &'a mut Incoming,
     pub batch: &'a mut TileSplats,
     /// Sums of each pair.
-    pub slots: DisjointSlice<[f32; SUMS]>,
+    pub slots: DisjointSlice<'a, [f32; SUMS]>,
     /// 1 if a slot was written; other slots hold stale values.
-    pub written: DisjointSlice<u8>,
+    pub written: DisjointSlice<'a, u8>,
 }
 
 impl<const WITH_DEPTH: bool> Kernel for Backward<'_, WITH_DEPTH> {

@@ -1,8 +1,7 @@
 //! The blocks of pixels that a tile is worked on in: the 4×4 of a row of sixteen lanes, or the 4×2 of either half.
 
 use super::simd::{LANES, Vector};
-use super::tile_batch::BATCH;
-use super::{ROWS, TILE};
+use super::{BATCH, ROWS, TILE};
 
 /// Blocks of a tile at most: 4×2 pixels, eight lanes, each.
 pub const MOST_BLOCKS: usize = 2 * ROWS;

@@ -37,7 +37,7 @@ impl Gradients<'_> {
         Ok(())
     }
 
-    pub(crate) fn row_major(&mut self, sh_coeffs: usize) -> RowMajor {
+    pub(crate) fn row_major(&mut self, sh_coeffs: usize) -> RowMajor<'_> {
         RowMajor {
             means: DisjointSlice::new(self.means),
             quats: DisjointSlice::new(self.quats),
@@ -52,20 +52,20 @@ impl Gradients<'_> {
 
 /// Writes rows out as torch holds them.
 #[derive(Clone, Copy)]
-pub(crate) struct RowMajor {
-    means: DisjointSlice<f32>,
-    quats: DisjointSlice<f32>,
-    log_scales: DisjointSlice<f32>,
-    logit_opacities: DisjointSlice<f32>,
-    sh0: DisjointSlice<f32>,
-    sh_n: DisjointSlice<f32>,
+pub(crate) struct RowMajor<'a> {
+    means: DisjointSlice<'a, f32>,
+    quats: DisjointSlice<'a, f32>,
+    log_scales: DisjointSlice<'a, f32>,
+    logit_opacities: DisjointSlice<'a, f32>,
+    sh0: DisjointSlice<'a, f32>,
+    sh_n: DisjointSlice<'a, f32>,
     sh_coeffs: usize,
 }
 
 /// Writes the `touched` lanes of a group's value to `offset` in its rows of `stride` values.
 #[inline(always)]
 fn scatter<F: Lanes>(
-    out: DisjointSlice<f32>,
+    out: DisjointSlice<'_, f32>,
     group: usize,
     touched: u16,
     stride: usize,
@@ -83,7 +83,7 @@ fn scatter<F: Lanes>(
     }
 }
 
-impl RowMajor {
+impl RowMajor<'_> {
     /// Writes sixteen Gaussians' gradients. Only the lanes in `touched` have one; the others' values are meaningless.
     #[inline(always)]
     fn take<F: Lanes>(&self, group: usize, touched: u16, g: &RowGradients<F>) {
@@ -116,7 +116,7 @@ impl RowMajor {
 pub(crate) struct Gather<'a, S: Source> {
     pub view: &'a View,
     pub source: S,
-    pub out: RowMajor,
+    pub out: RowMajor<'a>,
     /// One chunk's visible splats, in row order.
     pub splats: &'a [Splat],
     pub slots: &'a [[f32; SUMS]],

@@ -2,8 +2,8 @@
 
 use std::ops::Range;
 
-use super::tile_batch::TileRect;
-use super::{Camera, TILE};
+use super::simd::{LANES, Lanes, Lanes16, Mask};
+use super::{Camera, ROWS, TILE};
 
 /// Whole rows of an image's tiles, numbered row by row from the first of them.
 #[derive(Debug, Clone, Copy)]
@@ -48,4 +48,54 @@ impl TileGrid {
         let tile = tile + self.first_row * self.columns;
         TileRect::of(tile, self.columns, camera.width, camera.height)
     }
+}
+
+/// A tile's rect in the image.
+#[derive(Debug, Clone, Copy)]
+pub struct TileRect {
+    /// Its first pixel.
+    pub x: usize,
+    pub y: usize,
+    /// Number of its 16 columns and rows that are on the image.
+    pub columns: usize,
+    pub rows: usize,
+}
+
+impl TileRect {
+    pub fn of(tile: usize, tiles_x: usize, width: usize, height: usize) -> Self {
+        let (x, y) = (tile % tiles_x * TILE, tile / tiles_x * TILE);
+        Self {
+            x,
+            y,
+            columns: (width - x).min(TILE),
+            rows: (height - y).min(TILE),
+        }
+    }
+
+    /// The light of every row's pixels before the first splat: 1, but 0 off the image.
+    #[inline(always)]
+    pub fn light<F: Lanes>(&self) -> [Lanes16; ROWS] {
+        let mut light = [Lanes16::default(); ROWS];
+        for (row, light) in light.iter_mut().enumerate() {
+            let on_image = F::Mask::from_bits(self.lanes(row));
+            F::splat(1.0).only(on_image).store(light);
+        }
+        light
+    }
+
+    /// The lanes of a row that are on the image.
+    pub fn lanes(&self, row: usize) -> u16 {
+        let mut bits = 0;
+        for l in 0..LANES {
+            let (x, y) = pixel_of(row, l);
+            bits |= u16::from(x < self.columns && y < self.rows) << l;
+        }
+        bits
+    }
+}
+
+/// The pixel of a row's lane, relative to the tile.
+#[inline(always)]
+pub const fn pixel_of(row: usize, lane: usize) -> (usize, usize) {
+    (row % 4 * 4 + lane % 4, row / 4 * 4 + lane / 4)
 }

@@ -29,11 +29,10 @@ pub(crate) mod small;
 mod tile_batch;
 mod tile_lists;
 mod tiles;
+pub mod visibility;
 
 pub use accumulate::Accumulated;
-pub(crate) use frustum::Frustum;
 pub use gradients::Gradients;
-pub(crate) use grid::TileGrid;
 pub use params::Params;
 pub use pose::PoseGradient;
 pub use rasterizer::{Image, ImageGradients, Rasterizer};
@@ -46,6 +45,8 @@ use crate::scene::limits::MAX_OPACITY;
 pub const TILE: usize = 16;
 /// Sixteen-lane rows that hold a value for every pixel of a tile: 4×4 pixels each.
 pub(crate) const ROWS: usize = 16;
+/// Pairs of a tile that are processed together: a bit each in a block's mask.
+pub(crate) const BATCH: usize = 64;
 /// Below this a Gaussian does not touch a pixel.
 pub const ALPHA_MIN: f32 = 1.0 / 255.0;
 /// Added to both variances of the projected covariance, px².

@@ -11,6 +11,7 @@ use std::ops::Range;
 
 use rayon::prelude::*;
 
+use super::BATCH;
 use super::backward::SUMS;
 use super::blocks::{BlockMasks, MOST_BLOCKS};
 use super::depth_sort::{self, Key};
@@ -20,7 +21,6 @@ use super::grid::TileGrid;
 use super::params::{Params, Source};
 use super::project::{Project, Splat, View};
 use super::simd::{Isa, LANES, Lanes16, dispatch};
-use super::tile_batch::BATCH;
 use super::tile_lists::{TileIntersector, TileList};
 use super::tiles::Bins;
 use super::{Camera, ROWS, Settings};

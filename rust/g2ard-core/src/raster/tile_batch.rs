@@ -1,14 +1,12 @@
 //! Sixty-four of a tile's pairs in the tile's own coordinates, and the blocks of pixels each of them reaches.
 
 use super::blocks::{BlockMasks, blocks, row_and_part};
+use super::grid::{TileRect, pixel_of};
 use super::memory::prefetch;
 use super::project::Splat;
 use super::simd::{LANES, Lanes, Lanes16, Mask, Vector};
 use super::tiles::Pair;
-use super::{ALPHA_MIN, ROWS, TILE};
-
-/// Pairs processed together: a bit each in a block's mask.
-pub const BATCH: usize = 64;
+use super::{ALPHA_MIN, BATCH, ROWS, TILE};
 
 /// A tile's splats lie scattered in memory: each is prefetched this many pairs before it is needed.
 const AHEAD: usize = 24;
@@ -90,56 +88,6 @@ impl Default for TileBatch {
             centre_y: zero,
         }
     }
-}
-
-/// A tile's rect in the image.
-#[derive(Debug, Clone, Copy)]
-pub struct TileRect {
-    /// Its first pixel.
-    pub x: usize,
-    pub y: usize,
-    /// Number of its 16 columns and rows that are on the image.
-    pub columns: usize,
-    pub rows: usize,
-}
-
-impl TileRect {
-    pub fn of(tile: usize, tiles_x: usize, width: usize, height: usize) -> Self {
-        let (x, y) = (tile % tiles_x * TILE, tile / tiles_x * TILE);
-        Self {
-            x,
-            y,
-            columns: (width - x).min(TILE),
-            rows: (height - y).min(TILE),
-        }
-    }
-
-    /// The light of every row's pixels before the first splat: 1, but 0 off the image.
-    #[inline(always)]
-    pub fn light<F: Lanes>(&self) -> [Lanes16; ROWS] {
-        let mut light = [Lanes16::default(); ROWS];
-        for (row, light) in light.iter_mut().enumerate() {
-            let on_image = F::Mask::from_bits(self.lanes(row));
-            F::splat(1.0).only(on_image).store(light);
-        }
-        light
-    }
-
-    /// The lanes of a row that are on the image.
-    pub fn lanes(&self, row: usize) -> u16 {
-        let mut bits = 0;
-        for l in 0..LANES {
-            let (x, y) = pixel_of(row, l);
-            bits |= u16::from(x < self.columns && y < self.rows) << l;
-        }
-        bits
-    }
-}
-
-/// The pixel of a row's lane, relative to the tile.
-#[inline(always)]
-pub const fn pixel_of(row: usize, lane: usize) -> (usize, usize) {
-    (row % 4 * 4 + lane % 4, row / 4 * 4 + lane / 4)
 }
 
 /// The pixels' coordinates within the tile, row by row.

@@ -116,10 +116,13 @@ fn square_span<F: Lanes>(centre: F, radius: Option<F>, tiles: Range<usize>) -> [
     ]
 }
 
-/// Whole numbers that [`span`] made, which lie between its bounds (a NaN became one of them).
+/// A whole number as an integer, without the several instructions of a checked cast.
+///
+/// # Safety
+/// `value` is at least 0 and fits an i32, as what [`span`] makes: it lies between bounds (a NaN became one of them).
 #[inline(always)]
-fn whole(value: f32) -> usize {
-    // SAFETY: see above; a checked cast costs several instructions.
+unsafe fn whole(value: f32) -> usize {
+    // SAFETY: the caller's promise.
     unsafe { value.to_int_unchecked::<i32>() as usize }
 }
 
@@ -171,7 +174,9 @@ impl<F: Lanes> Ellipses<F> {
         let mut tallest = 0;
         for l in 0..LANES {
             if bits >> l & 1 == 1 {
-                tallest = tallest.max(whole(to.0[l]).saturating_sub(whole(from.0[l])));
+                // SAFETY: `span` made both.
+                let (from, to) = unsafe { (whole(from.0[l]), whole(to.0[l])) };
+                tallest = tallest.max(to.saturating_sub(from));
             }
         }
         let TileIntersector { list, ends, slots } = intersector;
@@ -193,6 +198,8 @@ impl<F: Lanes> Ellipses<F> {
         for tile_list in out {
             let l = todo.trailing_zeros() as usize;
             todo &= todo - 1;
+            // SAFETY: `span` made all ends, and a count is a sum of their differences, at most the tiles of the grid.
+            let whole = |value| unsafe { whole(value) };
             let rows = (whole(from.0[l])..whole(to.0[l]))
                 .zip(&*ends)
                 .map(|(row, e)| {

@@ -2,7 +2,8 @@
 //! its values.
 
 use super::occluders::Occluders;
-use super::pinhole::{ALPHA_MIN, Pinhole, Splat};
+use super::pinhole::{Pinhole, Splat};
+use crate::raster::ALPHA_MIN;
 use crate::scene::limits::MAX_OPACITY;
 
 /// Upper limit of α, as in gsplat.

@@ -3,7 +3,8 @@
 use rayon::prelude::*;
 
 use super::Gaussians;
-use super::pinhole::{ALPHA_MIN, Pinhole};
+use super::pinhole::{Block, Occluder, Pinhole};
+use crate::raster::ALPHA_MIN;
 use crate::spatial::{RobustBounds, codes, order};
 
 /// Rows per block: few enough that blocks are small, enough that testing blocks is cheap.
@@ -14,29 +15,6 @@ const BLOCK: usize = 64;
 pub struct Occluders {
     pub rows: Vec<Occluder>,
     pub(super) blocks: Vec<Block>,
-}
-
-/// A Gaussian as `Pinhole` projects it.
-#[derive(Debug, Clone, Copy)]
-#[repr(C)]
-pub struct Occluder {
-    pub mean: [f32; 3],
-    pub opacity: f32,
-    pub covariance: [f32; 6],
-    /// No direction has more variance.
-    pub trace: f32,
-    /// (distance/σ)² at which α falls to 1/255.
-    pub reach: f32,
-}
-
-/// Bounds of `BLOCK` rows.
-#[derive(Debug, Clone, Copy)]
-pub(super) struct Block {
-    pub center: [f32; 3],
-    pub half: [f32; 3],
-    /// Largest trace × reach, and largest reach.
-    pub spread: f32,
-    pub reach: f32,
 }
 
 impl Occluders {

@@ -3,12 +3,33 @@
 //! [`crate::raster`] projects sixteen at a time from stored parameters, with f64 positions and exact minors; depth for
 //! selection reads covariances made once for all views, and wants no colours, so the two share constants only.
 
-use super::occluders::{Block, Occluder};
-pub(super) use crate::raster::ALPHA_MIN;
 use crate::raster::{Camera, DILATION};
 
 /// Relative rounding error of a coordinate in the camera's frame in float32.
 const ROUNDING: f32 = 1e-6;
+
+/// A Gaussian as `Pinhole` projects it.
+#[derive(Debug, Clone, Copy)]
+#[repr(C)]
+pub struct Occluder {
+    pub mean: [f32; 3],
+    pub opacity: f32,
+    pub covariance: [f32; 6],
+    /// No direction has more variance.
+    pub trace: f32,
+    /// (distance/σ)² at which α falls to 1/255.
+    pub reach: f32,
+}
+
+/// Bounds of neighbouring rows.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Block {
+    pub center: [f32; 3],
+    pub half: [f32; 3],
+    /// Largest trace × reach, and largest reach.
+    pub spread: f32,
+    pub reach: f32,
+}
 
 /// A splat on the image.
 pub(super) struct Splat {

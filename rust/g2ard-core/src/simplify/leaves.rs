@@ -6,9 +6,7 @@ use super::cost::{MAX_ALPHA, Node};
 use super::importance::{Importance, median};
 use super::matching::Nodes;
 use super::moments::sigmoid;
-use super::pairwise::Visibility;
 use super::rows::Rows;
-use super::tile::Frame;
 use crate::linalg::sub;
 use crate::scene::{Ordered, SceneRef, power_of_two_below};
 
@@ -22,6 +20,28 @@ const MAX_SCALE: f64 = 1e6;
 const MAX_LENGTH: f64 = (1 << 29) as f64;
 /// Largest Σ αT² of a row: all 2³² rows together stay within f32.
 const MAX_VISIBILITY: f32 = f32::MAX / (1u64 << 32) as f32;
+
+/// Visibility of each input row.
+#[derive(Debug, Clone, Copy)]
+pub struct Visibility<'a> {
+    /// Σ αT² over the pixels of the views.
+    pub weight: &'a [f32],
+    /// Size of a pixel at the row, scene units; infinite where no view shows it.
+    pub pixel_size: &'a [f32],
+}
+
+/// Units that tiles share so that their costs compare.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Frame {
+    /// Unit of lengths.
+    pub unit: f64,
+    /// Pixel size of rows that no view sees.
+    pub pixel_size: f32,
+    /// Σ αT² that a unit of mass counts for though no view sees it.
+    pub floor: f32,
+    /// Estimates Σ αT² without views.
+    pub importance: Importance,
+}
 
 /// Rows of the scene. At 13 million their nodes would take more than the scene itself.
 pub struct Leaves<'a> {

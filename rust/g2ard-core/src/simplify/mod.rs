@@ -24,12 +24,13 @@ pub use clusters::Pair;
 pub use guards::{coverage, disc};
 pub use importance::Importance;
 pub use kernels::{Group, GroupKernels, means_of};
+pub use leaves::{Frame, Visibility};
 pub use moments::{Merged, merge, optical_mass, pool, weights};
 pub use outcome::Outcome;
-pub use pairwise::{Pairwise, PairwiseRound, Visibility};
+pub use pairwise::{Pairwise, PairwiseRound};
 pub use paper::{Paper, PaperPlan, PaperRound};
 pub use residual::{color, protection_flags};
-pub use tile::{Frame, Tile, TilePlan};
+pub use tile::{Tile, TilePlan};
 
 use crate::Splats;
 

@@ -8,7 +8,7 @@ use rayon::prelude::*;
 
 use super::clusters::{Pair, Partition};
 use super::importance::median;
-use super::leaves::Leaves;
+use super::leaves::{Leaves, Visibility};
 use super::matching::{Nodes, candidates, matched};
 use super::moments::sigmoid;
 use super::morton_tree::{cut, merge_costs};
@@ -40,15 +40,6 @@ constants! {
         /// Largest growth of a cluster's area over its moments, where α alone cannot hold its mass.
         pub max_growth: f64 = 1.25,
     }
-}
-
-/// Visibility of each input row.
-#[derive(Debug, Clone, Copy)]
-pub struct Visibility<'a> {
-    /// Σ αT² over the pixels of the views.
-    pub weight: &'a [f32],
-    /// Size of a pixel at the row, scene units; infinite where no view shows it.
-    pub pixel_size: &'a [f32],
 }
 
 /// Counts of one round, in rows.

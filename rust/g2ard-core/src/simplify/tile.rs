@@ -7,27 +7,13 @@
 //! many of those a tile does, [`Tile::assemble`] makes its Gaussians.
 
 use super::clusters::{Pair, Partition};
-use super::importance::Importance;
-use super::leaves::{Leaves, floor, unit};
+use super::leaves::{Frame, Leaves, Visibility, floor, unit};
 use super::morton_tree::{cut, merge_costs};
 use super::pairwise::PairwiseRound;
 use super::rows::Rows;
-use super::{GONE, Outcome, Pairwise, Visibility};
+use super::{GONE, Outcome, Pairwise};
 use crate::scene::{Ordered, SceneRef};
 use crate::{Control, Error, Result};
-
-/// Units that tiles share so that their costs compare.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Frame {
-    /// Unit of lengths.
-    pub unit: f64,
-    /// Pixel size of rows that no view sees.
-    pub pixel_size: f32,
-    /// Σ αT² that a unit of mass counts for though no view sees it.
-    pub floor: f32,
-    /// Estimates Σ αT² without views.
-    pub importance: Importance,
-}
 
 impl Frame {
     /// The frame of a scene without views, from all of it or a fair sample.

@@ -24,9 +24,9 @@ pub struct Attribute<'a> {
 
 /// An [`Attribute`] as the threads share it.
 struct Shared<'a> {
-    values: DisjointSlice<f32>,
-    first: DisjointSlice<f32>,
-    second: DisjointSlice<f32>,
+    values: DisjointSlice<'a, f32>,
+    first: DisjointSlice<'a, f32>,
+    second: DisjointSlice<'a, f32>,
     gradients: &'a [f32],
     rate: f32,
     share: Option<&'a [f32]>,

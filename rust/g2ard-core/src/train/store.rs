@@ -251,10 +251,10 @@ impl ParameterView<'_> {
 /// A store while threads step it, each its own blocks.
 #[derive(Clone, Copy)]
 pub(crate) struct Blocks<'a> {
-    values: DisjointSlice<Lanes16>,
-    first: DisjointSlice<Lanes16>,
-    second: DisjointSlice<Lanes16>,
-    steps: DisjointSlice<u32>,
+    values: DisjointSlice<'a, Lanes16>,
+    first: DisjointSlice<'a, Lanes16>,
+    second: DisjointSlice<'a, Lanes16>,
+    steps: DisjointSlice<'a, u32>,
     units: &'a [Lanes16],
     pub rows: usize,
     sh_coeffs: usize,

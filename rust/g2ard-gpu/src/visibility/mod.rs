@@ -1,5 +1,5 @@
 //! GPU kernels for visibility: the median depths and cells of `g2ard_core::select`, and each Gaussian's Σ αT² of
-//! `g2ard_core::visibility`.
+//! `g2ard_core::raster::visibility`.
 //!
 //! A view takes two submissions. The first projects all rows, marks those that the image may show and counts the tiles
 //! they touch. With the counts known, the second sorts the marked rows by depth, distributes them over their tiles and
@@ -14,9 +14,9 @@ mod tests;
 mod view;
 
 use g2ard_core::Control;
+use g2ard_core::raster::visibility::VisibilityAccumulator;
 use g2ard_core::raster::{Camera, Convention, Settings};
 use g2ard_core::select::{Gaussians, Surface, statistics_of};
-use g2ard_core::visibility::VisibilityAccumulator;
 
 use crate::runtime::{Buffer, Gpu, Pending, Result, Work};
 use cells::Cells;

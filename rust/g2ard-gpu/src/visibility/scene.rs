@@ -2,9 +2,9 @@
 
 use g2ard_core::linalg::rotation_from_quat;
 use g2ard_core::raster::ALPHA_MIN;
+use g2ard_core::raster::visibility::VisibilityAccumulator;
 use g2ard_core::select::Gaussians;
 use g2ard_core::spatial::{RobustBounds, codes, order};
-use g2ard_core::visibility::VisibilityAccumulator;
 use rayon::prelude::*;
 
 use crate::runtime::{Buffer, Gpu, Result};

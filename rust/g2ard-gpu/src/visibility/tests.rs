@@ -5,9 +5,9 @@ use super::*;
 use crate::runtime::Kernel;
 use crate::testing::{WHOLE, borrowed, compare_on_gpu, gpu, scenes};
 use g2ard_core::random::Lcg;
+use g2ard_core::raster::visibility::VisibilityKernels;
 use g2ard_core::scene::Ordered;
 use g2ard_core::select::ViewKernels;
-use g2ard_core::visibility::VisibilityKernels;
 use g2ard_core::{Cpu, Splats};
 
 /// Cameras all around, within, and far away.

@@ -3,12 +3,13 @@
 use rayon::prelude::*;
 
 use super::{Image, ImageGradients, Rasterizer};
+use crate::raster::BATCH;
 use crate::raster::ROWS;
 use crate::raster::backward::{self, Backward, Incoming, SUMS};
 use crate::raster::disjoint::DisjointSlice;
 use crate::raster::forward::{Forward, Pixels};
 use crate::raster::simd::{Lanes16, dispatch};
-use crate::raster::tile_batch::{BATCH, TileBatch, for_stretches};
+use crate::raster::tile_batch::{TileBatch, for_stretches};
 
 #[derive(Default)]
 struct Scratch {

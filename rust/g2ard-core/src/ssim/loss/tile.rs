@@ -174,7 +174,7 @@ pub struct Tile<'a> {
     /// At least [`scratch_len`] values, of any content.
     pub scratch: &'a mut [f32],
     /// The gradient of the whole image.
-    pub gradient: DisjointSlice<f32>,
+    pub gradient: DisjointSlice<'a, f32>,
 }
 
 /// What a tile's steps leave for the next, in scratch memory.

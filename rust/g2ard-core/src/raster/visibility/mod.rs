@@ -10,9 +10,11 @@ use rayon::prelude::*;
 
 use crate::raster::accumulate::{SQUARED, Total};
 use crate::raster::disjoint::DisjointSlice;
+use crate::raster::frustum::Frustum;
+use crate::raster::grid::TileGrid;
 use crate::raster::params::check_count;
 use crate::raster::simd::LANES;
-use crate::raster::{Camera, Frustum, Rasterizer, Settings, TileGrid};
+use crate::raster::{Camera, Rasterizer, Settings};
 use crate::scene::{Means, Ordered, SceneRef};
 use crate::{Control, Cpu, Result};
 use groups::{Bounds, Group, VisibleGroup, VisibleGroups};

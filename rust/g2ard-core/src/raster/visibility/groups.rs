@@ -1,6 +1,6 @@
 //! The scene in groups of sixteen rows, and the groups that a view can see.
 
-use crate::raster::Frustum;
+use crate::raster::frustum::Frustum;
 use crate::raster::params::Source;
 use crate::raster::simd::{LANES, Lanes, Lanes16};
 use crate::scene::{SceneRef, limits};
