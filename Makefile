@@ -35,7 +35,7 @@ demo: $(if $(wildcard $(VENV)/.built),setup,$(VENV)/.plain)
 TEST_PROCESSES ?= 2
 test: setup
 	cargo test --quiet --workspace --profile bench
-	RAYON_NUM_THREADS=2 $(BIN)/python -m pytest --numprocesses $(TEST_PROCESSES) --dist loadfile
+	OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 RAYON_NUM_THREADS=2 $(BIN)/python -m pytest --numprocesses $(TEST_PROCESSES) --dist loadfile
 
 # The part of `make test` that needs what a fresh machine has not (an adapter, a browser, Node packages): it must skip there.
 test-fresh: setup

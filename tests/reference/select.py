@@ -26,8 +26,9 @@ def median_depth(splats, viewmat, K, pixels):
         )
         R = rotations(splats.quats[i].astype(np.float64))
         cov = J @ R @ np.diag(splats.scales[i].astype(np.float64) ** 2) @ R.T @ J.T + 0.3 * np.eye(2)
-        d = pixels - [K[0, 0] * x / z + K[0, 2], K[1, 1] * y / z + K[1, 2]]
-        power = 0.5 * np.einsum("ni,ij,nj->n", d, np.linalg.inv(cov), d)
+        dx, dy = (pixels - [K[0, 0] * x / z + K[0, 2], K[1, 1] * y / z + K[1, 2]]).T
+        (a, b), (_, c) = np.linalg.inv(cov)
+        power = 0.5 * (a * dx * dx + c * dy * dy) + b * dx * dy
         alpha = np.minimum(float(splats.opacities[i]) * np.exp(-power), 0.99)
         alpha[alpha < 1 / 255] = 0
         before = light.copy()
