@@ -5,6 +5,7 @@ use super::*;
 use crate::runtime::Kernel;
 use crate::testing::{WHOLE, borrowed, compare_on_gpu, gpu, scenes};
 use g2ard_core::random::Lcg;
+use g2ard_core::raster::ALPHA_MIN;
 use g2ard_core::raster::visibility::VisibilityKernels;
 use g2ard_core::scene::Ordered;
 use g2ard_core::select::ViewKernels;
@@ -207,5 +208,89 @@ fn points_near_a_far_camera_keep_their_digits() {
             let apart = (f64::from(f32::from_bits(got)) - want).abs();
             assert!(apart < 1e-5, "{point:?}: {apart}");
         }
+    }
+}
+
+/// `bounded` of `pinhole.wgsl`.
+fn bounded(x: f32, most: f32) -> bool {
+    x.to_bits() < most.to_bits()
+}
+
+#[test]
+fn bounds_by_bits_refuse_what_is_negative_infinite_or_no_number() {
+    for most in [1e30_f32, 1e33] {
+        for x in [0.0, f32::MIN_POSITIVE / 2.0, 1.0, 0.999_999 * most] {
+            assert!(bounded(x, most), "{x}");
+        }
+        for x in [
+            most,
+            f32::MAX,
+            f32::INFINITY,
+            f32::NAN,
+            -f32::NAN,
+            -0.0,
+            -1.0,
+        ] {
+            assert!(!bounded(x, most), "{x}");
+        }
+    }
+}
+
+/// `span` of `mark.wgsl`, with conversions that must be in range.
+fn span(at: f32, reach: f32, count: u32) -> Option<[u32; 2]> {
+    let whole = |x: f32| {
+        assert!(
+            (0.0..=32769.0).contains(&x),
+            "{x} is no u32 on every device"
+        );
+        x as u32
+    };
+    let last = count as f32;
+    let low = (at - reach - 0.5).max(-1.0).min(last);
+    let high = (at + reach - 0.5).max(-1.0).min(last);
+    let start = whole(low.ceil().max(0.0));
+    let end = whole((high.floor() + 1.0).max(0.0)).min(count);
+    (start < end).then_some([start, end])
+}
+
+#[test]
+fn spans_are_the_pixels_within_reach() {
+    let mut random = Lcg(7);
+    let sizes = [1, 16, 150, 32768];
+    for case in 0..20_000 {
+        let count = sizes[case % sizes.len()];
+        let at = (2.0 * random.uniform() - 0.5) as f32 * count as f32;
+        let reach = (10.0_f64.powf(6.0 * random.uniform() - 3.0)) as f32;
+        let inside = |p: u32, slack: f64| {
+            (f64::from(p) + 0.5 - f64::from(at)).abs() <= f64::from(reach) + slack
+        };
+        let slack = 1e-2 + 1e-6 * f64::from(at.abs() + reach);
+        let [start, end] = span(at, reach, count).unwrap_or([0, 0]);
+        assert!((start..end).all(|p| inside(p, slack)), "{at} ± {reach}");
+        let beside = [
+            start.checked_sub(1),
+            Some(end).filter(|&p| p < count && start < end),
+        ];
+        let outside = beside.into_iter().flatten();
+        assert!(
+            outside.into_iter().all(|p| !inside(p, -slack)),
+            "{at} ± {reach}"
+        );
+    }
+    for at in [-1e30, -1e9, 1e9, 1e30] {
+        assert_eq!(span(at, 1.0, 100), None);
+        assert_eq!(span(at, 4e30, 100), Some([0, 100]));
+    }
+}
+
+#[test]
+fn the_limit_of_exponents_is_below_what_counts() {
+    let least = 2.0_f32.powi(-126);
+    assert!(least.is_normal());
+    for off in [1.0 - 2e-6, 1.0, 1.0 + 2e-6] {
+        assert!(0.999 * least * off < ALPHA_MIN);
+    }
+    for power in [126.0, 200.0, 1e30, f32::INFINITY] {
+        assert_eq!((-power.min(126.0_f32)).exp2(), least);
     }
 }
