@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Any
 
 import typer
 
@@ -155,29 +155,3 @@ BUDGETS: dict[str, tuple[Any, ...]] = {
     ),
 }
 """Options of commands with budgets, see `g2ard.cli.frame.command`: name → type and option."""
-
-LooksOption = Annotated[
-    Count | None,
-    typer.Option(
-        "-n",
-        "--count",
-        parser=Count.parse,
-        metavar="COUNT",
-        help="Views to generate. With --color flags, cells or parents: Gaussians to keep.",
-    ),
-]
-RatioOption = Annotated[
-    float | None,
-    typer.Option(
-        "-r", "--ratio", parser=parse_ratio, metavar="RATIO", help="Reduction ratio: 10 keeps a tenth."
-    ),
-]
-
-
-def one_budget(count: Count | None, ratio: float | None) -> Budget:
-    """Return the budget of -n or -r, and check that exactly one is given."""
-    if (count is None) == (ratio is None):
-        raise typer.BadParameter("give the budget as either -n COUNT or -r RATIO")
-    if count is None:
-        return Budget(ratio=ratio)
-    return count.budget()

@@ -234,6 +234,11 @@ class Run:
         self.tell_notes()
         self.console.say(text, asked=True)
 
+    def say_dry(self) -> None:
+        """Say what a dry run writes."""
+        to_file = self.json not in (None, "-")
+        self.say(f"dry run: only {self.json} is written" if to_file else "dry run: nothing is written")
+
     def result(self, data: dict[str, Any]) -> None:
         """Write the result and the resolved options to --json."""
         if self.json is None:

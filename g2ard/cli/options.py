@@ -161,7 +161,7 @@ ViewsFormatOption = Annotated[
     ),
 ]
 _UNWRITTEN = Path("dry-run")
-"""Output of a dry run without -o; see `is_unnamed`."""
+"""Output of a dry run without -o."""
 
 
 def _need_no_output(ctx: typer.Context, dry_run: bool) -> bool:
@@ -170,18 +170,13 @@ def _need_no_output(ctx: typer.Context, dry_run: bool) -> bool:
     return dry_run
 
 
-def is_unnamed(run: Run, output: Path) -> bool:
-    """Return whether a dry run has no -o; a folder may have the name of its stand-in."""
-    return bool(run.config["dry_run"]) and output == _UNWRITTEN and "output" not in run.typed
-
-
 DryRunOption = Annotated[
     bool,
     typer.Option(
         "--dry-run",
         callback=_need_no_output,
         is_eager=True,
-        help="Estimate time and memory, then exit; needs no -o.",
+        help="Print the counts and rough time and memory, then exit; needs no -o.",
     ),
 ]
 ResumeOption = Annotated[bool, typer.Option("--resume", help="Continue an interrupted run.")]

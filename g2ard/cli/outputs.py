@@ -25,6 +25,17 @@ def budgets_of(run: Run) -> list[Budget]:
     return [Budget(ratio=ratio) for several in ratios or [] for ratio in several]
 
 
+def budget_of(run: Run) -> Budget:
+    """Return the budget of the options, and check that it is the only one."""
+    first, *others = budgets_of(run)
+    if others:
+        raise typer.BadParameter(
+            "give one budget, and run the command once for each; commas separate counts, so write a single "
+            "one as 10_000"
+        )
+    return first
+
+
 class Outputs:
     """Outputs of a command, one per budget; `{ratio}` and `{count}` in the pattern are the budget's.
 

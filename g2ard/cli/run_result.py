@@ -44,7 +44,7 @@ def write_table(run: Run, report: dict[str, Any], larger: str = "") -> None:
 
 
 def told(report: dict[str, Any], *, verbose: bool = False) -> list[str]:
-    """Return lines on recovery, losses, likely causes, unseen parts and packing; `verbose` adds idle
+    """Return lines on recovery, losses, unseen parts and packing; `verbose` adds idle
     regularisers."""
     from g2ard.jobs.packing import score_lines
     from g2ard.report.kinds import KindScore
@@ -54,7 +54,6 @@ def told(report: dict[str, Any], *, verbose: bool = False) -> list[str]:
     lines = [outcome(one) for entry in rounds for one in entry]
     lines += [unregularized(rounds)] if verbose else []
     lines += [loss(KindScore.of(kind)) for kind in report["kinds"]]
-    lines += report["causes"]
     if report["unseen"] and report["unseen"] > _LEAST_REPORTED_SHARE:
         lines.append(f"{report['unseen']:.0%} of the scene is in no view: simplified but not recovered")
     if packed := report.get("packed"):

@@ -1,7 +1,7 @@
 """`simplify` and `distill` on scenes in tiles: outputs, reports and messages."""
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,6 @@ from g2ard.io import ply
 from g2ard.io.scene_formats import scene_format
 from g2ard.io.tile_store import TileStore
 from g2ard.jobs.budget import Budget
-from g2ard.jobs.causes import say_gaps
 from g2ard.jobs.distill_options import DistillOptions
 from g2ard.jobs.tiled import distill_in_tiles, simplify_in_tiles, working
 from g2ard.jobs.tiling import Tiling, refuse_whole, whole_budgets, whole_options
@@ -24,6 +23,7 @@ from g2ard.progress import plural
 from g2ard.report.distilled import tiled_report
 from g2ard.report.kinds import COLUMNS, cells
 from g2ard.stages.simplify import SimplifyConfig
+from g2ard.stages.simplify.growth import say_gaps
 from g2ard.system.peak_memory import peak_rss_of_all
 from g2ard.tiles.merging import TiledScene
 from g2ard.tiles.recover import TiledScores
@@ -37,20 +37,26 @@ class TiledCommand:
     Finished steps stay in the work folder until the command succeeds, or longer if the user named it.
     """
 
-    def __init__(
-        self, run: Run, scene: Path, outputs: Outputs, tiling: Tiling, budgets: Sequence[Budget]
-    ) -> None:
-        self.run, self.scene, self.outputs, self.tiling, self.budgets = run, scene, outputs, tiling, budgets
+    def __init__(self, run: Run, scene: Path, tiling: Tiling) -> None:
+        self.run, self.scene, self.tiling = run, scene, tiling
         self.began = time.perf_counter()
 
-    def simplify(self, config: SimplifyConfig, views: Any, blind: bool, up: Sequence[float] | None) -> None:
+    def simplify(
+        self,
+        outputs: Outputs,
+        budgets: Sequence[Budget],
+        config: SimplifyConfig,
+        views: Any,
+        blind: bool,
+        up: Sequence[float] | None,
+    ) -> None:
         """Run `g2ard simplify`."""
         run, reports = self.run, []
         run.unfinished = f"finished steps are in {self.tiling.folder}; run the same command to continue"
         with working(self.tiling, views):
             made = simplify_in_tiles(
                 self.scene,
-                self.budgets,
+                budgets,
                 self.tiling,
                 views=views,
                 blind=blind,
@@ -58,11 +64,11 @@ class TiledCommand:
                 up=up,
                 seed=run.seed,
                 render_model=run.render_model,
-                counted=self.outputs.check,
+                counted=outputs.check,
                 **run.callbacks,
             )
             for at, (store, small) in enumerate(made):
-                place = self.outputs.paths(store.count)[at]
+                place = outputs.paths(store.count)[at]
                 self._write(place, small)
                 antialiased = small.render_model == "antialiased"
                 report = {
@@ -80,32 +86,17 @@ class TiledCommand:
                 reports.append(report)
         run.results(reports)
 
-    def distill(self, options: DistillOptions, folder_at: Callable[[Path], RunFolder]) -> None:
-        """Run `g2ard distill`: write the scene, its views and the report into each run's folder.
-
-        Finished folders are skipped.
-        """
+    def distill(self, budget: Budget, options: DistillOptions, folder: RunFolder) -> None:
+        """Run `g2ard distill`: write the scene, its views and the report into the run's folder."""
         run = self.run
         with working(self.tiling, options.views, options.held_out):
             own = [f"--{name.replace('_', '-')}" for name in ("dry_run", "keep") if run.config[name]]
-            refuse_whole(self.scene, [*whole_options(options), *whole_budgets(self.budgets), *own])
+            refuse_whole(self.scene, [*whole_options(options), *whole_budgets([budget]), *own])
             again = "run the same command with --resume to continue"
             run.unfinished = f"finished steps are in {self.tiling.folder}; {again}"
-            folders = [folder_at(path) for path in self.outputs.paths()]
-            reports = {at: folder.tell_finished() for at, folder in enumerate(folders) if folder.is_done}
-            left = [at for at in range(len(self.budgets)) if at not in reports]
-            made = distill_in_tiles(
-                self.scene,
-                [self.budgets[at] for at in left],
-                self.tiling,
-                options,
-                counted=self.outputs.check,
-                **run.callbacks,
-            )
-            for at, (store, small, scores, views) in zip(left, made, strict=True):
-                folder = folder_at(self.outputs.paths(store.count)[at])
-                reports[at] = self._write_run(folder, store, small, scores, views)
-        run.results([reports[at] for at in sorted(reports)])
+            made = distill_in_tiles(self.scene, budget, self.tiling, options, **run.callbacks)
+            report = self._write_run(folder, *made)
+        run.result(report)
 
     def _write_run(
         self, folder: RunFolder, store: TileStore, small: TiledScene, scores: TiledScores, views: RunViews

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 def tiling_of(run: Run, scene: Path | None, output: Path) -> Tiling:
     """Check the options and return them as a `Tiling`."""
-    from g2ard.jobs.memory_limit import bytes_of
+    from g2ard.jobs.cost import bytes_of
     from g2ard.jobs.tiling import Tiling
 
     tile_rows, memory, workers, scheduler, work = (run.shared[name] for name in TILES)

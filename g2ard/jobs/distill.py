@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -20,7 +19,7 @@ from g2ard.jobs.clean import clean as remove_clutter
 from g2ard.jobs.distill_options import DistillOptions
 from g2ard.jobs.inputs import Views, load_scene
 from g2ard.jobs.job import DistillJob
-from g2ard.jobs.measured_budget import Aim, Reduction, aim_of
+from g2ard.jobs.measured_budget import Reduction, aim_of
 from g2ard.jobs.photos import sparse_file, sparse_points, topped_up
 from g2ard.jobs.view_checks import check_photos, propose_background
 from g2ard.jobs.views import Use, views_of
@@ -150,48 +149,43 @@ def distill(
         preset=preset,
         settings={name: value for name, value in fields.items() if value is not None} | dict(settings or {}),
     )
-    job = prepare(scene, [budget], options, progress=progress, say=say)
-    done = job.run(work=work)
-    if judgement := job.aims[0].judge(done.splats):
+    job = prepare(scene, budget, options, progress=progress, say=say)
+    done = job.run(work)
+    if judgement := job.aim.judge(done.splats):
         say(judgement[1])
     return done
 
 
 def prepare(
     scene: Scene,
-    budgets: Sequence[Budget],
+    budget: Budget,
     options: DistillOptions,
     *,
-    counted: Callable[[int], object] | None = None,
     use: Use = "distil",
     progress: Progress = silent,
     say: Say = unsaid,
 ) -> DistillJob:
-    """Read inputs and decide everything that a distillation needs, for one or more budgets.
+    """Read inputs and decide everything that a distillation needs.
 
-    `counted` is called with the number of Gaussians to reduce, before budgets and views are computed; its
-    exceptions propagate. With the use `merging`, messages leave out what only recovery uses.
-    Other arguments and errors are those of `distill`.
+    With the use `merging`, messages leave out what only recovery uses. Other arguments and errors are those
+    of `distill`.
     """
     recovers = use != "merging"
-    began = time.monotonic()
     recover = options.config.recover  # rejects invalid settings before anything is read
     if not isinstance(scene, Splats):
         progress("read", 0, 0)
-    read = _read(scene, budgets, options, progress, say)
+    read = _read(scene, budget, options, progress, say)
     prior, cleaned = read.prior, None
     if options.clean:
         done = remove_clutter(prior, seed=recover.seed, progress=progress, say=say)
         prior, cleaned = done.splats, done.clutter.counts
-    if counted is not None:
-        counted(len(prior))
     default_degree = 3 if read.lifted else None  # points have one colour each, photos show more
     degree = options.configured(sh_degree=default_degree).recover.sh_degree
-    counts = [budget.of(len(prior), read.name) for budget in budgets if not budget.is_measured]
+    usual = max(1, len(prior) // _USUAL_RATIO)
     views = views_of(
         prior,
         options,
-        min(counts, default=max(1, len(prior) // _USUAL_RATIO)),
+        usual if budget.is_measured else budget.of(len(prior), read.name),
         beside=read.beside,
         teach=not read.lifted and options.photos is not True,
         use=use,
@@ -210,7 +204,7 @@ def prepare(
         say=say,
     )
     file = f"scene.{options.format}"
-    aims = [aim_of(each, reduce, read.name, file, recovered=True, sh_degree=degree) for each in budgets]
+    aim = aim_of(budget, reduce, read.name, file, recovered=True, sh_degree=degree)
     photos, renders = _sources(views, options.photos, read.lifted)
     choice = _regularizers(options, read, prior, cameras if photos else None)
     regularizers, preset_label, measured = choice
@@ -221,8 +215,8 @@ def prepare(
             shown = read.prior.take(np.arange(read.given)) if read.lifted else prior
             insisted, renders_too = options.photos is True, not read.lifted
             check_photos(shown, cameras, recover.background, say, insisted=insisted, renders=renders_too)
-    say(_task(prior, aims, cameras if recovers else None, photos))
-    if not read.from_photos and all(aim.count == len(prior) for aim in aims):
+    say(_task(prior, aim.count, cameras if recovers else None, photos))
+    if not read.from_photos and aim.count == len(prior):
         say(f"nothing to simplify: the scene has {plural(len(prior), 'Gaussian')}")
     if recovers:
         say(f"regularisers: {preset_label}")
@@ -230,7 +224,7 @@ def prepare(
     config = replace(config, recover=replace(config.recover, from_points=read.from_photos))
     return DistillJob(
         prior=prior,
-        aims=tuple(aims),
+        aim=aim,
         views=replace(views, apart=None) if photos else views,  # photos exist only for given poses
         teacher=prior if renders else None,
         photos_over_renders=photos and renders,
@@ -238,7 +232,6 @@ def prepare(
         lifted=read.lifted,
         preset=preset_label,
         measured=measured,
-        seconds=time.monotonic() - began,
         cleaned=cleaned,
         progress=progress,
         say=say,
@@ -285,14 +278,14 @@ def _regularizers(
     return regularizers_for(kind, prior, photos, paper=paper)
 
 
-def _task(prior: Splats, aims: Sequence[Aim], train: Cameras | None, photos: bool) -> str:
+def _task(prior: Splats, count: int, train: Cameras | None, photos: bool) -> str:
     """Describe the task in one line; `train` are the views of recovery, if any."""
-    counts = ", ".join([*(f"{aim.count:,}" for aim in aims[:-1]), plural(aims[-1].count, "Gaussian")])
+    counts = f"{len(prior):,} → {plural(count, 'Gaussian')}"
     if train is None:
-        return f"{len(prior):,} → {counts}"
+        return counts
     pictured = sum(path is not None for path in train.image_paths) if photos else 0
     against = kinds_told(pictured, len(train) - pictured)
-    return f"{len(prior):,} → {counts}; {plural(len(train), 'training view')} against {against}"
+    return f"{counts}; {plural(len(train), 'training view')} against {against}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -313,9 +306,7 @@ class _Read:
     from_photos: bool = False
 
 
-def _read(
-    scene: Scene, budgets: Sequence[Budget], options: DistillOptions, progress: Progress, say: Say
-) -> _Read:
+def _read(scene: Scene, budget: Budget, options: DistillOptions, progress: Progress, say: Say) -> _Read:
     """Read the dense scene, or lift points; with photos they are topped up to the budget."""
     from g2ard.io import kind
 
@@ -334,11 +325,11 @@ def _read(
     points, name, of_photos = _points(scene, views, say)
     points = points and _without_repeats(points)
     given = 0 if points is None or scene is None else len(points)
-    wanted = max((budget.count for budget in budgets if budget.count is not None), default=0)
+    wanted = budget.count or 0
     if points is None and not wanted:
         raise InputError(
             "needs sparse points, and there are none",
-            parameter=budgets[0].kind,
+            parameter=budget.kind,
             path=str(views),
             hint="give {count=COUNT}",
         )

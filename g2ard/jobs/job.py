@@ -27,17 +27,16 @@ class DistillJob:
 
     Args:
         prior: the dense scene, or a lifted point cloud.
-        aims: one or more resolved budgets; shared work is done once.
+        aim: the resolved budget.
         teacher: the scene rendered for targets; None if all targets are photos.
         photos_over_renders: use photos where views have them and renders for the rest; always False without a
             teacher.
         preset: the regularisers chosen, and why.
-        seconds: time of preparation, including reading.
         cleaned: number of Gaussians removed by kind of clutter; None without cleaning.
     """
 
     prior: Splats
-    aims: tuple[Aim, ...]
+    aim: Aim
     views: RunViews
     teacher: Splats | None
     photos_over_renders: bool
@@ -45,15 +44,9 @@ class DistillJob:
     lifted: bool
     preset: str
     measured: PriorMeasures
-    seconds: float = 0.0
     cleaned: dict[str, int] | None = None
     progress: Progress = silent
     say: Say = unsaid
-
-    @property
-    def budgets(self) -> tuple[int, ...]:
-        """Counts to distil to."""
-        return tuple(aim.count for aim in self.aims)
 
     @property
     def reads_photos(self) -> bool:
@@ -70,12 +63,12 @@ class DistillJob:
         """(C,) sampling weight per training view, if the views state them."""
         return self.views.train.weights if self.config.select.weighted else None
 
-    def is_kept(self, budget: int) -> bool:
+    def is_kept(self, count: int) -> bool:
         """Return whether the scene already is the result: it fits, and its renders are the targets."""
         degree = self.config.recover.sh_degree
         return (
             not self.reads_photos
-            and budget == len(self.prior)
+            and count == len(self.prior)
             and (degree is None or degree >= self.prior.sh_degree)
             and self.config.recover.schedule.guarded
         )
@@ -83,7 +76,7 @@ class DistillJob:
     @cached_property
     def targets(self) -> Targets:
         """Training targets."""
-        few = self.config.select.views_count is not None or all(map(self.is_kept, self.budgets))
+        few = self.config.select.views_count is not None or self.is_kept(self.aim.count)
         return self.targets_for(self.views.train.cameras, self._renderer, lazy=few)
 
     @cached_property
@@ -105,7 +98,7 @@ class DistillJob:
         cameras = self.views.apart
         if cameras is None or self.teacher is None or len(cameras) < 2:
             return None
-        unused = first == 0 and all(map(self.is_kept, self.budgets))
+        unused = first == 0 and self.is_kept(self.aim.count)
         return self.targets_for(cameras.take(range(first, len(cameras), 2)), self._renderer, lazy=unused)
 
     def render_targets(self) -> None:
@@ -134,21 +127,12 @@ class DistillJob:
             say=self.say,
         )
 
-    def run(self, budget: int | None = None, *, work: Path | None = None) -> Distilled:
-        """Distil to one of the budgets, by default the first.
-
-        Args:
-            budget: one of `budgets`.
-            work: folder for resuming, see `g2ard.pipeline.distill`.
-
-        Returns:
-            The result of `g2ard.distill`.
-        """
-        aim = next(aim for aim in self.aims if budget in (None, aim.count))
+    def run(self, work: Path | None = None) -> Distilled:
+        """Distil the scene; `work` is the folder for resuming, see `g2ard.pipeline.distill`."""
         self.render_targets()
         done = pipeline(
             self.prior,
-            aim.count,
+            self.aim.count,
             self.targets,
             self.config,
             weights=self.weights,
@@ -156,4 +140,4 @@ class DistillJob:
             work=work,
             progress=self.progress,
         )
-        return replace(done, splats=aim.shrink(done.splats, self.say), held_out=self.held_out)
+        return replace(done, splats=self.aim.shrink(done.splats, self.say), held_out=self.held_out)

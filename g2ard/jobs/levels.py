@@ -19,10 +19,9 @@ from g2ard.errors import InputError
 from g2ard.io.detect import kind
 from g2ard.io.reports import Report
 from g2ard.jobs.budget import Budget
-from g2ard.jobs.causes import say_gaps
+from g2ard.jobs.cost import Cost, cost_of
 from g2ard.jobs.distill import prepare
 from g2ard.jobs.distill_options import DistillOptions
-from g2ard.jobs.estimate import Estimate, estimate
 from g2ard.jobs.inputs import Views, load_scene, scorable
 from g2ard.jobs.job import DistillJob
 from g2ard.jobs.viewer_frame import up_of
@@ -38,6 +37,7 @@ from g2ard.scene.sky import sky_mask
 from g2ard.scene.splats import Splats
 from g2ard.stages.evaluate import evaluate
 from g2ard.stages.simplify import simplify
+from g2ard.stages.simplify.growth import say_gaps
 
 RATIOS = (1.0, 2.0, 4.0, 8.0, 16.0)
 """Reduction factors; each level has half the Gaussians of the previous one, as in viewers' own tools."""
@@ -105,18 +105,33 @@ class LevelsJob:
     recover: bool
     work: Path | None
 
+    @property
+    def counts(self) -> list[int]:
+        """Gaussians of each level."""
+        return [Budget(ratio=ratio).of(len(self.job.prior)) for ratio in self.ratios]
+
+    @property
+    def costs(self) -> list[Cost]:
+        """Cost of each level, nothing for the scene itself."""
+        costs = []
+        for ratio, count in zip(self.ratios, self.counts, strict=True):
+            views = self.job.views.resized(level_size(self.job.views.train.cameras, ratio))
+            job = replace(self.job, views=views)
+            costs.append(cost_of(job, count, recover=self.recover, page=False))
+        return costs
+
     def run(self) -> Levels:
         """Make the levels."""
         splats: list[Splats] = []
         reports: list[LevelReport] = []
         finer = self.job.prior
-        for ratio, aim in zip(self.ratios, self.job.aims, strict=True):
+        for ratio, count in zip(self.ratios, self.counts, strict=True):
             if ratio == 1:
                 level = self.job.prior
                 report = LevelReport(len(level), 1.0, level_size(self.job.views.train.cameras, 1), 0.0)
             else:
                 place = None if self.work is None else self.work / f"level-{len(splats)}"
-                level, finer, report = _level(self.job, finer, aim.count, ratio, self.recover, place)
+                level, finer, report = _level(self.job, finer, count, ratio, self.recover, place)
             self.job.say(report.line(len(splats)))
             splats.append(level)
             reports.append(report)
@@ -160,7 +175,7 @@ def prepare_levels(
             say("sky: none found, so nothing is kept apart")
     job = prepare(
         scene,
-        [Budget(ratio=ratio) for ratio in ratios],
+        Budget(ratio=ratios[-1]),
         DistillOptions(
             views=views,
             photos=photos,
@@ -220,15 +235,6 @@ def lod(*scene: Any, **options: Any) -> Levels:
     [800, 200, 100]
     """
     return prepare_levels(*scene, **options).run()
-
-
-def estimate_level(job: DistillJob, count: int, ratio: float, *, recover: bool) -> Estimate:
-    """Estimate time and memory of one level; merging alone takes no recovery."""
-    longest = level_size(job.views.train.cameras, ratio)
-    found = estimate(replace(job, views=job.views.resized(longest), seconds=0.0), count, page=False)
-    if recover:
-        return found
-    return replace(found, steps=0, seconds={**found.seconds, "targets": 0.0, "recover": 0.0})
 
 
 def recovery_settings(steps: int | None, background: Colour, seed: int) -> dict[str, Any]:

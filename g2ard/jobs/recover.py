@@ -14,7 +14,6 @@ from g2ard.config.choices import RenderModel
 from g2ard.config.schema import changed, full_paths
 from g2ard.errors import InputError, require
 from g2ard.io.types import ViewSet
-from g2ard.jobs.causes import likely_causes
 from g2ard.jobs.inputs import Views, load_scene
 from g2ard.jobs.score import scores_by_kind
 from g2ard.jobs.teaching import Teaching, check_teacher
@@ -78,20 +77,12 @@ class RecoverJob:
         """Held-out targets for scoring; None without such views."""
         return None if self.scored is None else self.teaching.held_out(self.scored, self.size)
 
-    def score(self, result: Recovered) -> tuple[tuple[KindScore, ...], list[str]]:
-        """Score student and result in held-out views.
-
-        Returns:
-            The scores by kind of view, and lines with likely causes of a poor result; both empty without
-            held-out views.
-        """
+    def score(self, result: Recovered) -> tuple[KindScore, ...]:
+        """Score student and result in held-out views, by kind of view; empty without such views."""
         if self.held_out is None:
-            return (), []
+            return ()
         background = self.config.background
-        kinds = scores_by_kind(self.student, result.splats, self.held_out, background, self.progress)
-        mean = sum(kind.views * kind.psnr.after for kind in kinds) / len(self.held_out.cameras)
-        trained = self.views.cameras
-        return kinds, likely_causes(result.splats, self.held_out, trained, result.report, mean, background)
+        return scores_by_kind(self.student, result.splats, self.held_out, background, self.progress)
 
 
 @checks_arguments

@@ -5,7 +5,6 @@ from typing import Any
 
 from g2ard.config.choices import Colour
 from g2ard.config.schema import listed
-from g2ard.jobs.causes import likely_causes
 from g2ard.jobs.job import DistillJob
 from g2ard.pipeline.distill import Distilled
 from g2ard.progress import Progress
@@ -22,8 +21,8 @@ def report_of(job: DistillJob, done: Distilled) -> dict[str, Any]:
 
     Returns:
         Counts, bytes, scores in held-out views (`scores`) and in views of other kinds (`apart`, or None),
-        their summary by kind (`kinds`), likely causes of a poor result (`causes`), Gaussians per pixel
-        (`overdraw`), rounds, seconds by stage, and every setting by path.
+        their summary by kind (`kinds`), Gaussians per pixel (`overdraw`), rounds, seconds by
+        stage, and every setting by path.
     """
     scenes, background = (done.simplified, done.splats), job.config.recover.background
     scores = _scores(*scenes, job.held_out, background, job.progress)
@@ -33,7 +32,6 @@ def report_of(job: DistillJob, done: Distilled) -> dict[str, Any]:
         for name in ("simplified", "recovered")
     )
     made = job.views.pool is not None and "test" in job.views.pool.splits
-    recoveries = [recovery for entry in done.report.rounds for recovery in entry.recover]
     config = replace(job.config, simplify=job.config.simplify.resolved(antialiased=job.prior.antialiased))
     report = done.report.as_dict()
     return {
@@ -45,14 +43,6 @@ def report_of(job: DistillJob, done: Distilled) -> dict[str, Any]:
         "scores": scores,
         "apart": apart,
         "kinds": [kind.as_dict() for kind in by_kind(before, after, USUAL if made else "given")],
-        "causes": likely_causes(
-            done.splats,
-            job.held_out,
-            job.views.train.cameras,
-            recoveries[-1],
-            scores["recovered"]["psnr"],
-            background,
-        ),
         "unseen": _unseen(job, done),
         "overdraw": overdraw(done.splats, job.held_out.cameras),
         "against": job.against,

@@ -9,13 +9,13 @@ from typing import Any
 from g2ard.config.checks import checks_arguments
 from g2ard.config.choices import FormatName, RenderModel
 from g2ard.jobs.budget import Budget
-from g2ard.jobs.causes import say_gaps
 from g2ard.jobs.inputs import Views, load_scene
 from g2ard.jobs.measured_budget import Reduction, aim_of
 from g2ard.pipeline.presets import configured
 from g2ard.progress import Progress, Say, silent, unsaid
 from g2ard.scene.splats import Splats
 from g2ard.stages.simplify import Simplified, SimplifyConfig
+from g2ard.stages.simplify.growth import say_gaps
 
 
 @checks_arguments

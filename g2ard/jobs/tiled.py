@@ -20,11 +20,10 @@ from g2ard.io.lock import locked
 from g2ard.io.tile_store import StoredScene, TileStore
 from g2ard.io.types import ViewSet
 from g2ard.jobs.budget import Budget
-from g2ard.jobs.causes import say_gaps
+from g2ard.jobs.cost import RECOVERY_TIMES, workers_for
 from g2ard.jobs.distill_options import DistillOptions
 from g2ard.jobs.inputs import Views, load_view_sets, say_regions
 from g2ard.jobs.levels import LevelReport, check_ratios, level_size
-from g2ard.jobs.memory_limit import RECOVERY_TIMES, workers_for
 from g2ard.jobs.tiling import Tiling, refuse_whole, whole_options
 from g2ard.jobs.views import cameras_for_weights, pool_times, views_of
 from g2ard.levels import Cut
@@ -37,6 +36,7 @@ from g2ard.stages.recover.auto_preset import regularizers_for
 from g2ard.stages.recover.schedule import steps_for
 from g2ard.stages.select import select
 from g2ard.stages.simplify import SimplifyConfig
+from g2ard.stages.simplify.growth import say_gaps
 from g2ard.tiles.executor import Workers, executor
 from g2ard.tiles.ingest import ingest
 from g2ard.tiles.journal import is_tile_file
@@ -203,35 +203,25 @@ def simplify_in_tiles(
 
 def distill_in_tiles(
     scene: Path,
-    budgets: Sequence[Budget],
+    budget: Budget,
     tiling: Tiling,
     options: DistillOptions,
     *,
-    counted: Callable[[int], object] | None = None,
     progress: Progress = silent,
     say: Say = unsaid,
-) -> Iterator[tuple[TileStore, TiledScene, TiledScores, RunViews]]:
-    """Distil a scene larger than memory to several budgets, each computed when it is requested.
+) -> tuple[TileStore, TiledScene, TiledScores, RunViews]:
+    """Distil a scene larger than memory.
 
     Targets are the dense scene's own renders, in views that are given, found beside it or generated.
 
     Args:
         options: as for `g2ard.distill`, without those that `whole_options` returns.
-        counted: called with the scene's count before work on its tiles.
     """
-
-    def smallest(total: int) -> int:
-        if counted is not None:
-            counted(total)
-        return min(budget.of(total, str(scene)) for budget in budgets)
-
-    with _job(scene, tiling, options, smallest, True, progress, say) as job:
-        for budget in budgets:
-            count = budget.of(job.store.count, str(scene))
-            small = job.simplified(job.store, count, job.views.train.cameras)
-            assert small.surroundings is not None  # views are given
-            done, scores = job.recovered(small, small.surroundings, job.views)
-            yield job.store, done, scores, job.views
+    with _job(scene, tiling, options, budget, True, progress, say) as job:
+        small = job.simplified(job.store, job.count, job.views.train.cameras)
+        assert small.surroundings is not None  # views are given
+        done, scores = job.recovered(small, small.surroundings, job.views)
+        return job.store, done, scores, job.views
 
 
 @dataclass(frozen=True, eq=False)
@@ -272,11 +262,7 @@ def lod_in_tiles(
     levels: list[StoredScene] = []
     reports: list[LevelReport] = []
     around: Surroundings | None = None
-
-    def smallest(total: int) -> int:
-        return Budget(ratio=ratios[-1]).of(total, str(scene))
-
-    with _job(scene, tiling, options, smallest, recover, progress, say) as job:
+    with _job(scene, tiling, options, Budget(ratio=ratios[-1]), recover, progress, say) as job:
         finer = job.store
         for number, ratio in enumerate(ratios):
             if ratio == 1:
@@ -331,6 +317,7 @@ class _Job:
     """
 
     store: TileStore
+    count: int
     sample: Splats
     views: RunViews
     config: DistillConfig
@@ -370,24 +357,22 @@ def _job(
     scene: Path,
     tiling: Tiling,
     options: DistillOptions,
-    smallest: Callable[[int], int],
+    budget: Budget,
     learn: bool,
     progress: Progress,
     say: Say,
 ) -> Iterator[_Job]:
-    """Open the tiles, start workers, and decide views and constants of a distillation.
-
-    `smallest` returns the smallest budget from the scene's count.
-    """
+    """Open the tiles, start workers, and decide views and constants of a distillation."""
     options.check_trained()
     model = options.render_model
     with _tiles_and_workers(scene, tiling, RECOVERY_TIMES, model, progress, say) as (store, workers):
+        count = budget.of(store.count, str(scene))
         sample = TiledRun(store, workers, options.config.simplify).sample()
         say_regions(sample, options.config.simplify, "a sample of the scene", unsaid)
         views = views_of(
             sample,
             options,
-            smallest(store.count),
+            count,
             beside=options.beside or scene,
             use="tiles" if learn else "merging",
             represents=store.count / len(sample),
@@ -399,4 +384,4 @@ def _job(
         if learn:
             say(f"regularisers: {why}")
             views = replace(views, train=_weighted(views.train, sample, config, progress))
-        yield _Job(store, sample, views, config, learn, workers, tiling)
+        yield _Job(store, count, sample, views, config, learn, workers, tiling)

@@ -1,7 +1,6 @@
 """Budgets on the command line: counts, ratios, and several in one call."""
 
 import json
-import shutil
 from pathlib import Path
 
 import pytest
@@ -12,9 +11,7 @@ from helpers.commands import CommandLine, refused, succeeds
 from helpers.scenes import checkered_ball
 
 
-def test_several_budgets_equal_single_runs(
-    command_line: CommandLine, folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_several_budgets_equal_single_runs(command_line: CommandLine, folder: Path) -> None:
     several = ("simplify", "ball.ply", "-r", "4,5", "-r", 10, "-o", "s_{ratio}x_{count}.ply", "--json", "-")
     out = succeeds(command_line, folder, *several).out
     assert [run["output_count"] for run in json.loads(out)["runs"]] == [100, 80, 40]
@@ -22,22 +19,6 @@ def test_several_budgets_equal_single_runs(
         command_line("simplify", "ball.ply", "-r", ratio, "-o", f"one_{ratio}.ply", cwd=folder)
         one = (folder / f"one_{ratio}.ply").read_bytes()
         assert (folder / f"s_{ratio}x_{count}.ply").read_bytes() == one
-    ask = ("distill", "ball.ply", "--steps", 8, "--size", 48)
-    succeeds(command_line, folder, *ask, "-n", "200,100", "-o", "runs/{count}")
-    command_line(*ask, "-n", "100", "-o", "alone", "--no-view", cwd=folder)
-    assert (folder / "runs/100/scene.ply").read_bytes() == (folder / "alone/scene.ply").read_bytes()
-    assert (folder / "runs/200/report.html").exists()
-    assert (folder / "runs/100/view.html").exists()
-    assert not (folder / "alone/view.html").exists()
-
-    judged: list[tuple[int, int]] = []
-    monkeypatch.setattr(
-        "g2ard.cli.commands.distill.tell_quality",
-        lambda run, aim, splats: judged.append((aim.count, len(splats))),
-    )
-    shutil.rmtree(folder / "runs/200")
-    succeeds(command_line, folder, *ask, "-n", "200,100", "-o", "runs/{count}", "--resume")
-    assert judged == [(200, 200)]  # the last budget was finished before
 
 
 @pytest.mark.parametrize(
@@ -75,8 +56,13 @@ def test_counts_that_could_be_others_are_refused(text: str, words: str) -> None:
 
 
 def test_budgets_that_share_an_output_are_rejected(command_line: CommandLine, folder: Path) -> None:
-    ask = ("distill", "ball.ply", "--json", "-")
+    ask = ("simplify", "ball.ply", "--json", "-")
     for budgets, name in (("20,20", "{ratio}"), ("20,20", "{count}"), ("20,20.01", "{count}")):
         error = refused(command_line, folder, *ask, "-r", budgets, "-o", name)
         assert "given twice" in error or "the same output" in error
     assert "poses" not in error
+
+
+@pytest.mark.parametrize("budgets", [("-r", "4,5"), ("-n", "9,20"), ("-r", "4", "-r", "5"), ("-n", "5,4")])
+def test_distill_takes_one_budget(budgets: tuple[str, ...], command_line: CommandLine, folder: Path) -> None:
+    assert "give one budget" in refused(command_line, folder, "distill", "ball.ply", *budgets, "-o", "run")

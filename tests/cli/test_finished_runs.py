@@ -78,21 +78,6 @@ def test_a_finished_run_is_not_taken_for_another(command_line: CommandLine, fold
     assert "run: exists; -w (--overwrite)" in refused(command_line, folder, *ask, "--resume", status=1)
 
 
-def test_several_budgets_skip_finished_folders(command_line: CommandLine, folder: Path) -> None:
-    succeeds(command_line, folder, *SHORT, "-r", 10, "-o", "{ratio}x")
-    before = (folder / "10x" / "scene.ply").stat().st_mtime_ns
-    ask = (*SHORT, "-r", "5,10", "-o", "{ratio}x", "--resume")
-    assert "10x: finished with other options (seed)" in refused(
-        command_line, folder, *ask, "--seed", 1, status=1
-    )
-    assert not (folder / "5x").exists()
-    out, error = succeeds(command_line, folder, *ask, "--json", "-")
-    assert "10x: already finished" in error
-    assert "5x: nothing to resume" in error
-    assert [run["output_count"] for run in json.loads(out)["runs"]] == [80, 40]
-    assert (folder / "10x" / "scene.ply").stat().st_mtime_ns == before
-
-
 @needs_signals
 def test_a_stopped_run_rejects_other_options(command_line: CommandLine, folder: Path) -> None:
     ask = ("distill", "ball.ply", "-r", 4, "-o", "run", "--size", 48)

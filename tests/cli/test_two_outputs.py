@@ -54,7 +54,7 @@ REDUCE = "simplify ball.ply --no-views"
         f"{REDUCE} -r 8 -o c.ply --work w --json w/tiles/tiles.json",
         f"{REDUCE} -r 8 -o c.ply --work c.ply",
         f"{REDUCE} -r 8 -o c.ply --json .c.ply.tiles",
-        f"distill ball.ply -r 8 {VIEWED} -o c_{{count}} --json c_50/a.json",
+        f"distill ball.ply -r 8 {VIEWED} -o c --json c/a.json",
         f"distill ball.ply -r 8 {VIEWED} -o run --dry-run --json run/a.json",
         f"recover ball.ply {TRAIN} -o c.ply --json .c.ply.checkpoint.npz",
         f"adapt ball.ply {TRAIN} -o c.ply --json .c.ply.work/steps.npz",

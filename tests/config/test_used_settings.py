@@ -244,7 +244,7 @@ def _distilled_in_tiles(settings: Mapping[str, Any]) -> object:
     scene, tiling = _tiles()
     options = DistillOptions(views=UNEVEN, size=48, settings={**FAR, **settings})
     refuse_whole(scene, whole_options(options))
-    ((_, small, _, _),) = distill_in_tiles(scene, [Budget(count=BUDGET)], tiling, options)
+    _, small, _, _ = distill_in_tiles(scene, Budget(count=BUDGET), tiling, options)
     return small.whole().fingerprint()
 
 

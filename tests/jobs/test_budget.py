@@ -111,8 +111,8 @@ def test_quest3_bounds_overdraw(recovered: bool, monkeypatch: pytest.MonkeyPatch
 def test_distill_measures_the_simplification_that_it_makes(settings: dict[str, Any]) -> None:
     said: list[str] = []
     options = DistillOptions(views=around(16, (48, 36)), settings={"steps": 1, **settings})
-    job = prepare(checkered_ball(800), [Budget(min_psnr=24)], options, say=said.append)
-    judged = job.aims[0].judge(job.run().simplified)
+    job = prepare(checkered_ball(800), Budget(min_psnr=24), options, say=said.append)
+    judged = job.aim.judge(job.run().simplified)
     assert judged is not None
     kept = judged[1].partition(" in the 12 views")[0]
     assert f"{kept} before recovery, in 12 views generated to choose the count" in said

@@ -87,7 +87,7 @@ def test_more_gaussians_of_photos_take_more_steps(tmp_path: Path, command_line: 
     ask = ("distill", "--views", "photos", "--dry-run", "-o", "run", "--json", "-", "--schedule", "fast")
 
     def steps(*budget: object) -> int:
-        return int(json.loads(succeeds(command_line, tmp_path, *ask, *budget).out)["runs"][0]["steps"])
+        return int(json.loads(succeeds(command_line, tmp_path, *ask, *budget).out)["steps"])
 
     assert [steps("-n", count) for count in (500, 5_000)] == [300, 600]
     assert steps("-n", 5_000, "--steps", 50) == 50

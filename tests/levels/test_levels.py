@@ -126,17 +126,17 @@ def test_ratios_are_numbers() -> None:
         lod(checkered_ball(50), ratios=(1, float("nan")))
 
 
-def test_a_dry_run_estimates_every_level_and_writes_nothing(tmp_path: Path, command_line) -> None:
+def test_a_dry_run_tells_the_cost_of_every_level_and_writes_nothing(tmp_path: Path, command_line) -> None:
     g2ard.save(tmp_path / "ball.ply", checkered_ball(400))
     g2ard.save_views(tmp_path / "v.json", around(8, (32, 24)))
     ask = ("lod", "ball.ply", "-r", "1,4,8", "--views", "v.json", "-o", "lod", "--dry-run")
     told = succeeds(command_line, tmp_path, *ask, "--steps", "90", "--json", "-")
     levels = json.loads(told.out)["levels"]
     assert [(one["level"], one["count"], one["steps"]) for one in levels] == [(1, 100, 90), (2, 50, 90)]
-    lines = [line for line in told.err.splitlines() if "about" in line]
+    lines = [line for line in told.err.splitlines() if "roughly" in line]
     assert [line.partition(":")[0] for line in lines] == ["level 1", "level 2", "all levels"]
     merged = succeeds(command_line, tmp_path, *ask, "--merge-only", "-q").err
-    assert re.search(r"^level 2: 50 Gaussians: about \d+ s$", merged, re.MULTILINE)
+    assert re.search(r"^level 2: 50 Gaussians: roughly \d+ s on two cores$", merged, re.MULTILINE)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["ball.ply", "v.json"]
     succeeds(command_line, tmp_path, *ask[:-1], "--merge-only")
     succeeds(command_line, tmp_path, *ask)  # also beside a finished output

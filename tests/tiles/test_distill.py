@@ -14,7 +14,7 @@ import pytest
 
 from g2ard.errors import InputError
 from g2ard.io import read_splats, write_splats
-from g2ard.jobs.memory_limit import workers_for
+from g2ard.jobs.cost import workers_for
 from g2ard.jobs.tiling import Tiling
 from g2ard.rendering.targets import TeacherRenders
 from g2ard.scene.splats import Splats

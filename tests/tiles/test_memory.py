@@ -9,7 +9,7 @@ from g2ard.errors import InputError
 from g2ard.io import write_splats
 from g2ard.io.tile_store import TileStore
 from g2ard.jobs import tiling as policy
-from g2ard.jobs.memory_limit import (
+from g2ard.jobs.cost import (
     LEVELS_TIMES,
     RECOVERY_TIMES,
     TileMemory,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -12,7 +11,7 @@ import typer
 
 from g2ard.cli import options as opt
 from g2ard.cli.frame import Run, command
-from g2ard.cli.outputs import Outputs, budgets_of
+from g2ard.cli.outputs import budget_of
 from g2ard.cli.run_result import say_views, say_weight, tell_quality, told, why_large, write_table
 from g2ard.cli.tiling import tiling_of
 from g2ard.config.choices import is_made
@@ -21,7 +20,7 @@ from g2ard.progress import plural
 
 if TYPE_CHECKING:
     from g2ard.cli.run_folder import RunFolder
-    from g2ard.jobs.budget import Budget
+    from g2ard.jobs.cost import Cost
     from g2ard.jobs.job import DistillJob
     from g2ard.pipeline.distill import Distilled
 
@@ -95,6 +94,7 @@ def distill(
     """
     from g2ard.cli.run_folder import RunFolder
     from g2ard.cli.tiled import TiledCommand
+    from g2ard.jobs.cost import check_job_memory, cost_of
     from g2ard.jobs.distill import prepare
     from g2ard.jobs.distill_options import DistillOptions
     from g2ard.jobs.tiling import is_tiled
@@ -102,7 +102,7 @@ def distill(
 
     began = time.monotonic()
     settings, _ = run.settled(DistillConfig(), preset)
-    budgets = budgets_of(run)
+    budget = budget_of(run)
     given = views is not None and not is_made(views)
     _check_options(scene, views, held_out, photos)
     if given:
@@ -110,23 +110,13 @@ def distill(
     if scene is None or photos:
         run.refuse_typed("without generated views", "up")
     opt.choose_engine(run, settings, "recover.engine")
-    if opt.is_unnamed(run, output) and len(budgets) > 1:
-        output = Path("{count}")
-
-    def folder_at(path: Path) -> RunFolder:
-        return RunFolder(run, path, f"scene.{format}", resume)
-
-    def check(path: Path, budget: Budget) -> None:
-        run.claim("--output", path, folder=True)
-        if not dry_run:
-            folder_at(path).check(budget)
-
-    outputs = Outputs(run, output, budgets, check)
-    outputs.check()
-    early = [folder_at(path) for path in outputs.paths()]
-    if early and not dry_run and all(folder.is_done for folder in early):
-        run.results([folder.tell_finished() for folder in early])
-        return
+    run.claim("--output", output, folder=True)
+    folder = RunFolder(run, output, f"scene.{format}", resume)
+    if not dry_run:
+        folder.check(budget)
+        if folder.is_done:
+            run.result(folder.tell_finished())
+            return
     if scene is not None:
         _check_kind(scene)
     options = DistillOptions(
@@ -143,14 +133,22 @@ def distill(
     )
     tiling = tiling_of(run, scene, output)
     if scene is not None and is_tiled(scene, tiling):
-        TiledCommand(run, scene, outputs, tiling, budgets).distill(options, folder_at)
+        TiledCommand(run, scene, tiling).distill(budget, options, folder)
         return
-    job = prepare(scene, budgets, options, counted=outputs.check, **run.callbacks)
-    folders = [folder_at(path) for path in outputs.paths(len(job.prior))]
+    job = prepare(scene, budget, options, **run.callbacks)
+    cost = cost_of(job, job.aim.count, page=view)
     if dry_run:
-        _tell_estimates(run, job, folders)
-    else:
-        _distil_all(run, scene or Path(str(views)), job, folders, tiling.memory, began)
+        _tell_cost(run, job, cost)
+        return
+    check_job_memory(job, tiling.memory, cost.bytes)
+    run.console.expect(cost.stages)
+    prepared = time.monotonic()
+    job.render_targets()
+    before = {"prepare": prepared - began, "targets": time.monotonic() - prepared}
+    result, report = _distil(run, scene or Path(str(views)), job, folder, before)
+    run.kept = [f"{folder.path} is finished"]
+    run.result(report)
+    tell_quality(run, job.aim, result.splats)
 
 
 def _check_options(
@@ -177,76 +175,29 @@ def _check_kind(scene: Path) -> None:
         )
 
 
-def _tell_estimates(run: Run, job: DistillJob, folders: Sequence[RunFolder]) -> None:
-    """Print the estimated time and memory of each budget, and the total of several."""
-    from g2ard.jobs.estimate import estimate, total
-
-    found, told = [], []
-    for folder, budget in zip(folders, job.budgets, strict=True):
-        one = estimate(job, budget, page=run.config["view"])
-        parts = ", ".join(f"{stage} {_rounded(seconds)} s" for stage, seconds in one.seconds.items())
-        about = f"about {max(1, one.total):.0f} s ({parts}) and {one.bytes / 1e6:,.0f} MB"
-        place = "" if opt.is_unnamed(run, folder.path) else f"{folder.path}: "
-        run.answer(
-            f"{place}{plural(budget, 'Gaussian')}, {plural(one.views, 'target image')} "
-            f"of {one.pixels:,} pixels, {plural(one.steps, 'step')}: {about}"
-        )
-        found.append(one)
-        told.append({"output": str(folder.path), "count": budget, **asdict(one), "total_seconds": one.total})
-    seconds, size = total(found)
-    if len(found) > 1:
-        run.answer(f"all {len(found)} with shared targets: about {seconds:.0f} s and {size / 1e6:,.0f} MB")
-    to_file = run.json not in (None, "-")
-    run.say(f"dry run: only {run.json} is written" if to_file else "dry run: nothing is written")
-    run.result({"runs": told, "total": {"seconds": seconds, "bytes": size}})
-
-
-def _rounded(seconds: float) -> str:
-    return f"{seconds:.1f}" if seconds < 10 else f"{seconds:.0f}"
-
-
-def _distil_all(
-    run: Run, source: Path, job: DistillJob, folders: Sequence[RunFolder], memory: int | None, began: float
-) -> None:
-    """Distil to every budget whose folder is not finished, and check the last result's quality."""
-    from g2ard.jobs.estimate import expected
-    from g2ard.jobs.memory_limit import check_job_memory
-
-    finished = {folder.path: folder.tell_finished() for folder in folders if folder.is_done}
-    if len(finished) == len(folders):
-        run.results(list(finished.values()))
-        return
-    check_job_memory(job, memory, page=run.config["view"])
-    run.console.expect(expected(job))
-    prepared = time.monotonic()
-    job.render_targets()
-    before_runs = {"prepare": prepared - began, "targets": time.monotonic() - prepared}
-    reports, others = [], " (--resume continues with the rest)" if len(folders) > 1 else ""
-    for aim, folder in zip(job.aims, folders, strict=True):
-        if folder.path in finished:
-            reports.append(finished[folder.path])
-            continue
-        before = run.kept
-        result, report = _distil(run, source, job, aim.count, folder, before_runs)
-        before_runs = {}  # shared by all budgets
-        reports.append(report)
-        run.kept = [*before, f"{folder.path} is finished{others}"]
-        judged = aim, result.splats
-    run.results(reports)
-    tell_quality(run, *judged)
+def _tell_cost(run: Run, job: DistillJob, cost: Cost) -> None:
+    """Print what a distillation would do, and its rough time and memory."""
+    count = job.aim.count
+    run.answer(
+        f"{plural(count, 'Gaussian')}, {plural(cost.views, 'target image')} of {cost.pixels:,} pixels, "
+        f"{plural(cost.steps, 'step')}: roughly {max(1, cost.seconds):.0f} s on two cores and "
+        f"{cost.bytes / 1e6:,.0f} MB"
+    )
+    run.say_dry()
+    run.result({"count": count, **asdict(cost), "seconds": cost.seconds})
 
 
 def _distil(
-    run: Run, source: Path, job: DistillJob, budget: int, folder: RunFolder, before: dict[str, float]
+    run: Run, source: Path, job: DistillJob, folder: RunFolder, before: dict[str, float]
 ) -> tuple[Distilled, dict[str, Any]]:
-    """Distil to one budget, write the run's folder and print a summary.
+    """Distil, write the run's folder and print a summary.
 
     Args:
-        before: seconds of the stages before this call, which count as this budget's.
+        before: seconds of the stages before this call.
     """
     began, page = time.monotonic(), ""
-    with folder.working(len(job.prior), budget, _photos(job)):
-        result = job.run(budget, work=folder.work)
+    with folder.working(len(job.prior), job.aim.count, _photos(job)):
+        result = job.run(folder.work)
         folder.write_scene(result.splats)
         folder.write_simplified(result.simplified if run.config["keep"] else None)
         folder.write_views(job.views)

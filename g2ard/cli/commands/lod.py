@@ -20,7 +20,7 @@ from g2ard.io.atomic import hidden_name
 from g2ard.progress import plural
 
 if TYPE_CHECKING:
-    from g2ard.jobs.levels import Levels
+    from g2ard.jobs.levels import Levels, LevelsJob
     from g2ard.jobs.tiled import TiledLevels
     from g2ard.jobs.tiling import Tiling
     from g2ard.levels import Cut, Georeference
@@ -120,9 +120,8 @@ def lod(
     """
     from g2ard.cli.resume import check_stopped, is_finished, stoppable
     from g2ard.io.atomic import check_output
-    from g2ard.jobs.levels import check_ratios, check_trained
-    from g2ard.jobs.levels import lod as levels_of
-    from g2ard.jobs.memory_limit import LEVELS_TIMES, RECOVERY_TIMES, check_whole_memory
+    from g2ard.jobs.cost import LEVELS_TIMES, RECOVERY_TIMES, check_whole_memory
+    from g2ard.jobs.levels import check_ratios, check_trained, prepare_levels
     from g2ard.jobs.tiling import is_tiled
     from g2ard.levels import Cut
 
@@ -174,55 +173,37 @@ def lod(
         "say": run.say,
     }
     if dry_run:
-        _tell_estimates(run, scene, ratios, recover, choices)
+        _tell_costs(run, prepare_levels(scene, ratios=ratios, recover=recover, **choices))
         return
-    run.console.expect(_expected(ratios, recover, steps))
     with stoppable(run, stopped, resume, writer.meta):
         stopped.mkdir(parents=True, exist_ok=True)
-        levels = levels_of(scene, ratios=ratios, recover=recover, work=stopped, **choices)
+        job = prepare_levels(scene, ratios=ratios, recover=recover, work=stopped, **choices)
+        stages = [stage for cost in job.costs for stage in cost.stages]
+        run.console.expect([*stages, ("write", 3.0), ("the page", 1.0)])
+        levels = job.run()
         written = writer.save(levels.splats, sky=levels.sky)
     _tell(run, output, levels, written)
 
 
-def _expected(ratios: Sequence[float], recover: bool, steps: int | None) -> list[tuple[str, float]]:
-    """Return the stages to come with rough relative times, seconds for playbot; views shrink by √√ratio."""
-    stages = [("poses", 1.0)]
-    for ratio in ratios:
-        share = ratio**-0.5
-        if ratio > 1:
-            recovery = (
-                [("teacher", 4 * share), ("recover", 0.02 * (steps or 1000) * share)] if recover else []
-            )
-            stages += [*recovery[:1], ("visibility", 1.5 * share), ("simplify", 1.2), *recovery[1:]]
-            stages.append(("evaluate", share))
-    return [*stages, ("write", 3.0), ("the page", 1.0)]
-
-
-def _tell_estimates(
-    run: Run, scene: Path, ratios: Sequence[float], recover: bool, choices: dict[str, Any]
-) -> None:
-    """Print the estimated time and memory of each level and of all."""
+def _tell_costs(run: Run, job: LevelsJob) -> None:
+    """Print the rough time and memory of each level and of all."""
     from dataclasses import asdict
 
-    from g2ard.jobs.levels import estimate_level, prepare_levels
-
-    job = prepare_levels(scene, ratios=ratios, recover=recover, **choices).job
-    told, seconds = [], job.seconds
-    for number, (ratio, aim) in enumerate(zip(ratios, job.aims, strict=True)):
+    levels = []
+    for number, (ratio, count, cost) in enumerate(zip(job.ratios, job.counts, job.costs, strict=True)):
         if ratio == 1:
             continue
-        run.begin("estimate")
-        one = estimate_level(job, aim.count, ratio, recover=recover)
-        seconds += one.total
-        steps = f", {plural(one.steps, 'step')}" if recover else ""
-        count = plural(aim.count, "Gaussian")
-        run.answer(f"level {number}: {count}{steps}: about {max(1, one.total):.0f} s")
-        told.append({"level": number, "count": aim.count, **asdict(one), "total_seconds": one.total})
-    most = max((one["bytes"] for one in told), default=0)
-    run.answer(f"all levels: about {max(1, seconds):.0f} s and {most / 1e6:,.0f} MB")
-    to_file = run.json not in (None, "-")
-    run.say(f"dry run: only {run.json} is written" if to_file else "dry run: nothing is written")
-    run.result({"levels": told, "total": {"seconds": seconds, "bytes": most}})
+        steps = f", {plural(cost.steps, 'step')}" if job.recover else ""
+        run.answer(
+            f"level {number}: {plural(count, 'Gaussian')}{steps}: "
+            f"roughly {max(1, cost.seconds):.0f} s on two cores"
+        )
+        levels.append({"level": number, "count": count, **asdict(cost), "seconds": cost.seconds})
+    seconds = sum(one["seconds"] for one in levels)
+    most = max((one["bytes"] for one in levels), default=0)
+    run.answer(f"all levels: roughly {max(1, seconds):.0f} s and {most / 1e6:,.0f} MB")
+    run.say_dry()
+    run.result({"levels": levels, "total": {"seconds": seconds, "bytes": most}})
 
 
 def _in_tiles(

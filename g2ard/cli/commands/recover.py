@@ -106,14 +106,14 @@ def _tell_outcome(run: Run, result: Recovered) -> None:
 
 
 def _score(run: Run, job: RecoverJob, result: Recovered) -> tuple[KindScore, ...]:
-    """Score held-out views, and print the table, losses and likely causes of a poor result."""
+    """Score held-out views, and print the table and losses."""
     from g2ard.rendering.targets import kinds_of
     from g2ard.report.kinds import COLUMNS, cells
 
-    kinds, causes = job.score(result)
+    kinds = job.score(result)
     if job.held_out is not None:
         title = f"held-out views against {kinds_of(job.held_out)}, before → after:"
         run.console.table(title, list(COLUMNS), cells(kinds))
-    for line in filter(None, [*(loss(kind, "the student is better there") for kind in kinds), *causes]):
+    for line in filter(None, (loss(kind, "the student is better there") for kind in kinds)):
         run.say(line)
     return kinds

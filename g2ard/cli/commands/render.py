@@ -5,15 +5,14 @@ from __future__ import annotations
 import math
 from contextlib import nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from g2ard.cli import options as opt
-from g2ard.cli.budget_options import Count, LooksOption, RatioOption, one_budget
+from g2ard.cli.budget_options import Count
 from g2ard.cli.frame import Run, command
-from g2ard.config.choices import BLACK, Method, is_made
-from g2ard.errors import InputError
+from g2ard.config.choices import BLACK, is_made
 from g2ard.io.atomic import atomic_folder, check_output
 from g2ard.io.paths import output_names
 from g2ard.progress import plural
@@ -23,12 +22,9 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from g2ard.rendering.renderer import Rendered
-    from g2ard.scene.splats import Splats
 
 _NO_FOLDER = (".png", ".jpg", ".jpeg", ".avi", ".mov", ".mkv", ".webm")
 """Suffixes of files that `render` does not write as -o."""
-
-Color = Literal["scene", "flags", "cells", "parents"]
 
 
 @command(
@@ -63,16 +59,11 @@ def render(
     depth: Annotated[
         bool, typer.Option("--depth", help="Also write NAME.depth.npy, in scene units.")
     ] = False,
-    color: Annotated[
-        Color,
-        typer.Option(help="Colour by scene, or by simplification to -n or -r: flags, cells or parents."),
-    ] = "scene",
-    count: LooksOption = None,
-    ratio: RatioOption = None,
-    method: Annotated[Method, typer.Option(help="Method of --color parents.")] = "default",
-    parents: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE.npy", help="With --color parents: file from `simplify --parents`."),
+    count: Annotated[
+        Count | None,
+        typer.Option(
+            "-n", "--count", parser=Count.parse_absolute, metavar="COUNT", help="Views to generate."
+        ),
     ] = None,
     convention: opt.ConventionOption = "gsplat",
     split: opt.SplitOption = "all",
@@ -80,7 +71,7 @@ def render(
     background: opt.BackgroundOption = None,
     up: opt.UpOption = None,
 ) -> None:
-    """Render views of a scene as PNG, or show how it would be simplified."""
+    """Render views of a scene as PNG or as an animation."""
     from g2ard.io.animation import write_animation
     from g2ard.io.images import to_bytes
     from g2ard.jobs.inputs import load_views
@@ -94,32 +85,25 @@ def render(
     if turn is not None and (views is not None or count is not None):
         raise typer.BadParameter("--orbit generates its views, so it excludes --views and -n")
     output, animation = _folder_or_animation(run, output, depth)
-    looks = _looks(color, count, ratio, parents, views)
+    generated = _views_count(count, views)
     if views is not None and not is_made(views):
         run.refuse_typed("without generated views", "up")
     if animation is None:
         run.refuse_typed("without an animation", "fps")
-    if color != "parents" or parents is not None:
-        run.refuse_typed("without --color parents and -n or -r", "method")
     views = opt.with_images(views, images)
     if sheet is not None:
         run.claim("--sheet", sheet)
         check_output(sheet, run.overwrite)
     splats = run.load(scene)
-    if parents is not None:
-        splats = _by_parents(run, splats, _read_parents(parents, len(splats)))
-    elif color != "scene":
-        budget = one_budget(count, ratio).of(len(splats), str(scene))
-        splats = _painted(run, splats, color, budget, method)
     found: Any
     if turn is not None:
         found = turntable(splats, turn, up=up, seed=run.seed, progress=run.progress, say=run.say)
     else:
         found = views_or_pool(
             splats,
-            "made" if looks is not None else views,
+            "made" if generated is not None else views,
             beside=scene,
-            count=looks,
+            count=generated,
             up=up,
             seed=run.seed,
             progress=run.progress,
@@ -203,63 +187,10 @@ def _write_sheet(
     write_png(path, contact_sheet(rows, [""] * columns, row_labels=captions), overwrite=overwrite)
 
 
-def _looks(
-    color: Color, count: Count | None, ratio: float | None, parents: Path | None, views: Path | None
-) -> int | None:
-    """Check -n and -r, and return the number of views to generate if -n gives it."""
-    if parents is not None and color != "parents":
-        raise typer.BadParameter("--parents goes with --color parents")
-    if color != "scene" and parents is None:
-        one_budget(count, ratio)
-        return None
-    if ratio is not None or (parents is not None and count is not None):
-        raise typer.BadParameter("-n and -r go with --color flags, cells or parents (without --parents)")
+def _views_count(count: Count | None, views: Path | None) -> int | None:
+    """Check -n, and return the number of views to generate if it gives it."""
     if count is None:
         return None
     if views is not None and not is_made(views):
         raise typer.BadParameter("-n generates views, so it excludes --views; give one")
-    if count.is_share:
-        raise typer.BadParameter(
-            "-n: expected a number of views to generate; a budget needs --color flags, cells or parents"
-        )
     return int(count.value)
-
-
-def _painted(run: Run, splats: Splats, color: Color, budget: int, method: Method) -> Splats:
-    """Colour the scene by protection flags, cells, or the rows that simplification merges."""
-    from g2ard.report.paint import cell_labels, flag_colors, label_colors, painted
-    from g2ard.stages.simplify import flag, simplify
-
-    if color == "flags":
-        flags = flag(splats, budget, progress=run.progress)
-        run.say(
-            f"flags: {flags.mean():.1%} of {plural(len(splats), 'Gaussian')} are protected, "
-            f"over {plural(budget, 'cell')}"
-        )
-        return painted(splats, flag_colors(flags))
-    if color == "cells":
-        labels = cell_labels(splats, budget)
-        run.say(f"cells: {labels.max() + 1:,}")
-        return painted(splats, label_colors(labels))
-    return _by_parents(run, splats, simplify(splats, budget, method=method, progress=run.progress).parents)
-
-
-def _by_parents(run: Run, splats: Splats, parents: NDArray[np.int64]) -> Splats:
-    """Colour each Gaussian by its row in the simplified scene."""
-    from g2ard.report.paint import label_colors, painted
-
-    gone = int((parents < 0).sum())
-    run.say(f"parents: {plural(parents.max() + 1, 'Gaussian')} of {len(splats):,}; {gone:,} dropped (black)")
-    return painted(splats, label_colors(parents))
-
-
-def _read_parents(path: Path, count: int) -> NDArray[np.int64]:
-    import numpy as np
-
-    try:
-        labels = np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
-        raise InputError(f"not a NumPy array ({error})", path=path) from None
-    if not isinstance(labels, np.ndarray) or labels.dtype.kind not in "iu" or labels.shape != (count,):
-        raise InputError(f"expected {count} whole numbers, one per Gaussian of the scene", path=path)
-    return labels.astype(np.int64)

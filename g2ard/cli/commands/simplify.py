@@ -62,9 +62,9 @@ def simplify(
     Scenes larger than memory and folders of tiles are simplified tile by tile to the same exact budget.
     """
     from g2ard.cli.tiled import TiledCommand
+    from g2ard.jobs.cost import WHOLE_TIMES, check_whole_memory
     from g2ard.jobs.inputs import say_notes
     from g2ard.jobs.measured_budget import Reduction, aim_of
-    from g2ard.jobs.memory_limit import WHOLE_TIMES, check_whole_memory
     from g2ard.jobs.tiling import is_tiled
     from g2ard.stages.simplify import SimplifyConfig
 
@@ -85,7 +85,7 @@ def simplify(
     given = opt.with_images(views, images)
     if is_tiled(scene, tiling):
         _refuse_whole(scene, budgets, config, preset, parents)
-        TiledCommand(run, scene, outputs, tiling, budgets).simplify(config, given, no_views, up)
+        TiledCommand(run, scene, tiling).simplify(outputs, budgets, config, given, no_views, up)
         return
     check_whole_memory(scene, tiling, WHOLE_TIMES)
     maps = None if parents is None else Outputs(run, parents, budgets, _parents_file(run), name="--parents")
@@ -160,7 +160,7 @@ def _report(
 
 
 def _write_parents(run: Run, path: Path, small: Simplified) -> None:
-    """Write the parents, (N,) int64 in the scene's row order, for `render --color parents`."""
+    """Write the parents, (N,) int64 in the scene's row order."""
     import numpy as np
 
     with atomic_output(path, overwrite=run.overwrite) as temporary, temporary.open("wb") as file:
@@ -168,7 +168,7 @@ def _write_parents(run: Run, path: Path, small: Simplified) -> None:
 
 
 def _tell(run: Run, scene: Path, small: Simplified, output: Path, seconds: float) -> None:
-    from g2ard.jobs.causes import say_gaps
+    from g2ard.stages.simplify.growth import say_gaps
 
     if run.verbose:
         _table(run, small)

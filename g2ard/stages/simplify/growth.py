@@ -13,10 +13,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from g2ard.progress import Say
 from g2ard.rendering.renderer import RasterSettings, Renderer, settings_for
 from g2ard.scene.cameras import Camera, Cameras
 from g2ard.scene.samples import evenly_spaced
 from g2ard.scene.splats import Splats
+
+_GAPS = 0.02
+"""Least share of opacity lost that shows as gaps."""
 
 GROWTHS = (1.25, 1.6, 2.0, 2.5, 3.2, 4.0)
 """Growths to choose from; the first is for what recovery improves afterwards, and for planning."""
@@ -133,3 +137,20 @@ def _images(scene: Splats, views: list[Camera], settings: RasterSettings) -> lis
     renderer = Renderer(scene, settings=settings)
     made = (renderer.render(view) for view in views)
     return [np.dstack([np.clip(one.image, 0, 1), one.alpha]) for one in made]
+
+
+def say_gaps(lost: float | None, say: Say) -> None:
+    """Warn if a simplified scene lets light through where the dense one did not.
+
+    Args:
+        lost: `opacity_lost` of its report.
+
+    >>> say_gaps(0.031, print)  # doctest: +ELLIPSIS
+    gaps: surfaces let 3.1 % of the light through that they stopped before; ...
+    >>> say_gaps(0.001, print)
+    """
+    if lost is not None and lost >= _GAPS:
+        say(
+            f"gaps: surfaces let {100 * lost:.1f} % of the light through that they stopped before; keep more "
+            "Gaussians, or close them by recovery (g2ard distill)"
+        )

@@ -1,4 +1,7 @@
-"""Memory that scenes, tiles and distillations take, and the refusal of what exceeds `--memory`."""
+"""Rough time and memory of commands, from counts alone.
+
+They serve remaining times, `--dry-run`, `--memory` and the number of workers.
+"""
 
 from __future__ import annotations
 
@@ -8,14 +11,35 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from g2ard.errors import InputError, require
 from g2ard.io import open_stream
 from g2ard.io.tile_store import TileStore, row_width
 from g2ard.jobs.tiling import Tiling, cut_into, folder_of_tiles
 from g2ard.progress import plural
+from g2ard.rendering.targets import CACHE_BYTES
+from g2ard.scene.samples import evenly_spaced
 
 if TYPE_CHECKING:
     from g2ard.jobs.job import DistillJob
+
+_USUAL_PIXELS = 480_000
+"""Pixels of a generated view."""
+_RENDER, _VISIBILITY, _SCORE = 0.03, 0.01, 0.06
+"""Seconds per view of these pixels: a target, a small render for visibility, and a score. These and the next
+were measured on playbot, 500,000 → 50,000 Gaussians on two cores."""
+_SIMPLIFY, _STEP, _REPORT, _PAGE = 1.2 / 500_000, 0.02, 1.5, 1.0
+"""Seconds per Gaussian of simplification, per step of recovery, of the report, and of the viewer page."""
+
+_PAGE_BYTES, _PAGE_FULL = 170, 130_000
+"""Memory of packing the viewer page: bytes per Gaussian and SH coefficient above degree 0, and the count from
+which it stops growing. Measured on playbot: 113 MB for 25,000 Gaussians, 511 for 125,000, 538 for 250,000.
+"""
+_PROGRAM_BYTES = 150_000_000
+"""Bytes of the interpreter and loaded libraries."""
+_TRAINER_BYTES = 983
+"""Bytes per Gaussian in recovery: parameters, Adam's moments, buffers (`docs/benchmarks.md`)."""
 
 WHOLE_TIMES, LEVELS_TIMES = 3.6, 7.0
 """Memory in one piece as a multiple of the scene's arrays: simplification, and levels without recovery."""
@@ -35,6 +59,76 @@ _HALO_TIMES = 1.5
 """Rows of the largest tile, halo included, relative to `--tile-rows`, at most."""
 
 _MEMORY_SIZE = re.compile(r"(\d+(?:\.\d+)?)\s*([kKmMgGtT]?)(?:i?[bB])?")
+
+
+@dataclass(frozen=True)
+class Cost:
+    """Rough cost of a distillation.
+
+    Args:
+        views: number of views that need a target, including those for scoring.
+        pixels: mean of the training views.
+        steps: of all recoveries.
+        stages: stages to come, in order, with their seconds on two cores.
+        bytes: peak memory.
+    """
+
+    views: int
+    pixels: int
+    steps: int
+    stages: tuple[tuple[str, float], ...]
+    bytes: int
+
+    @property
+    def seconds(self) -> float:
+        """Seconds of all stages."""
+        return sum(seconds for _, seconds in self.stages)
+
+
+def cost_of(job: DistillJob, count: int, *, recover: bool = True, page: bool = True) -> Cost:
+    """Return the cost of distilling a prepared job's scene to `count` Gaussians.
+
+    Args:
+        recover: whether the merged scene is recovered.
+        page: whether pages with the result are written.
+    """
+    train, test = job.views.train.cameras, job.views.test
+    apart = 0 if job.views.apart is None or job.teacher is None else len(job.views.apart)
+    pixels = int(np.mean(train.widths.astype(np.int64) * train.heights))
+    kept, size = job.is_kept(count), pixels / _USUAL_PIXELS
+    steps = 0 if kept or not recover else _steps(job, count)
+    views = len(test) + apart + (len(train) if recover else 0)
+    stages = [("teacher", _RENDER * size * (views if steps else len(test) + apart))]
+    if not kept:
+        stages += [("visibility", _VISIBILITY * len(train)), ("simplify", _SIMPLIFY * len(job.prior))]
+        stages += [("recover", job.config.recover.recovery_time or _STEP * size * steps)] if recover else []
+    stages.append(("scoring", _SCORE * size * len(test)))
+    stages += [("report.html", _REPORT), ("view.html", _PAGE)] if page else []
+    return Cost(views, pixels, steps, tuple(stages), _peak_bytes(job, count, views * pixels, page))
+
+
+def _peak_bytes(job: DistillJob, count: int, pixels: int, page: bool) -> int:
+    """Return the peak memory: of simplification, of recovery, or of packing the page."""
+    given = job.config.recover.sh_degree
+    degree = job.prior.sh_degree if given is None else given
+    scene, small = job.prior.nbytes, 4 * row_width(degree) * count
+    packing = _PAGE_BYTES * 3 * ((degree + 1) ** 2 - 1) * min(count, _PAGE_FULL)
+    targets = min(CACHE_BYTES, pixels * (12 if job.teacher is not None else 3))
+    trained = targets + scene + _TRAINER_BYTES * count
+    written = targets + 2 * scene + (packing if page else 0)
+    # The recovered scene and its rows come on top.
+    return _PROGRAM_BYTES + int(max(targets + WHOLE_TIMES * scene, trained, written)) + 2 * small
+
+
+def _steps(job: DistillJob, count: int) -> int:
+    """Return the steps of all recoveries: after each round, if the schedule has rounds, and of the last."""
+    config, photos = job.config, job.photos_over_renders or job.teacher is None
+    like = job.prior.take(np.array(evenly_spaced(len(job.prior), count)))
+    last = config.recover.final_steps(like, job.views.train.cameras, photos=photos)
+    if not config.recover.schedule.round_steps:
+        return last
+    rounds = config.simplify.rounds(len(job.prior), count, recovered=True)
+    return last + len(rounds) * config.recover.schedule.round_steps
 
 
 @dataclass(frozen=True)
@@ -135,21 +229,17 @@ def check_whole_memory(scene: Path, tiling: Tiling, times: float, tile_times: fl
         )
 
 
-def check_job_memory(job: DistillJob, most: int | None, *, page: bool = True) -> None:
-    """Reject a job whose estimated memory exceeds `most` bytes at any budget; None means no limit."""
-    if most is None:
+def check_job_memory(job: DistillJob, most: int | None, need: int) -> None:
+    """Reject a job that needs more than `most` bytes; None means no limit."""
+    if most is None or need <= most:
         return
-    from g2ard.jobs.estimate import estimate
-
-    need = max(estimate(job, budget, page=page).bytes for budget in job.budgets)
-    if need > most:
-        count = len(job.prior)
-        told = f"--memory: {plural(count, 'Gaussian')} in one piece take about {amount(need, up=True)}, "
-        told += f"more than {amount(most)}; smaller views, --size, take less"
-        if job.teacher is not None and not job.lifted:  # tiles support this job
-            tiles = TileMemory(count, 4 * row_width(job.prior.sh_degree), RECOVERY_TIMES)
-            told += f"; in tiles {tiles.advice(most, max(1, count // 2))}"
-        raise InputError(told)
+    count = len(job.prior)
+    message = f"--memory: {plural(count, 'Gaussian')} in one piece take about {amount(need, up=True)}, "
+    message += f"more than {amount(most)}; smaller views, --size, take less"
+    if job.teacher is not None and not job.lifted:  # tiles support this job
+        tiles = TileMemory(count, 4 * row_width(job.prior.sh_degree), RECOVERY_TIMES)
+        message += f"; in tiles {tiles.advice(most, max(1, count // 2))}"
+    raise InputError(message)
 
 
 def workers_for(store: TileStore, tiling: Tiling, times: float = 1.0) -> int:
