@@ -83,7 +83,7 @@ _CONVERTERS = {
 }
 """Advice for scenes of other programs and for archives."""
 
-MANIFEST, JOURNAL, POINTS = "tiles.json", "journal.json", ".points"
+MANIFEST, POINTS = "tiles.json", ".points"
 """Files of finished and unfinished folders of tiles, and their folder of points to lift."""
 
 _MOST_INSPECTED_FILES = 64
@@ -259,8 +259,8 @@ def _folder_format(path: Path) -> str:
     for name in READERS["views"]:
         if import_module(f"g2ard.io.{name}").holds(path):
             return name
-    if any((path / journal).is_file() for journal in (JOURNAL, f"{POINTS}/{JOURNAL}")):
-        raise InputError("has unfinished tiles", path=path, hint="run the same `g2ard ingest` to continue")
+    if any(path.glob("tile-*.f32")) or (path / POINTS).is_dir():
+        raise InputError("has unfinished tiles", path=path, hint="run the same `g2ard ingest` again")
     if error := incomplete(path):
         raise error
     raise InputError(f"is not a supported folder{_instead(path)}", path=path)

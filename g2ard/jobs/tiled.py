@@ -39,8 +39,8 @@ from g2ard.stages.simplify import SimplifyConfig
 from g2ard.stages.simplify.growth import say_gaps
 from g2ard.tiles.executor import Workers, executor
 from g2ard.tiles.ingest import ingest
-from g2ard.tiles.journal import is_tile_file
 from g2ard.tiles.merging import TiledScene, key_of, simplify_tiles
+from g2ard.tiles.pour import is_tile_file
 from g2ard.tiles.recover import TiledScores, recover_tiles
 from g2ard.tiles.sights import Surroundings
 from g2ard.tiles.steps import TiledRun

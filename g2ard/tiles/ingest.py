@@ -14,7 +14,8 @@ from g2ard.config.checks import checks_arguments
 from g2ard.config.choices import RenderModel
 from g2ard.errors import InputError, OutputError, require
 from g2ard.io import kind, open_point_stream, open_stream
-from g2ard.io.detect import JOURNAL, MANIFEST, POINTS
+from g2ard.io.atomic import drop_empty, parents_made
+from g2ard.io.detect import MANIFEST
 from g2ard.io.jsonfile import Place, checked, read_json
 from g2ard.io.lock import LOCK, locked
 from g2ard.io.stream import SceneStream
@@ -22,8 +23,7 @@ from g2ard.io.tile_store import VERSION, TileStore
 from g2ard.io.types import Note
 from g2ard.progress import Progress, Say, plural, silent, unsaid
 from g2ard.stages.lift import LiftConfig
-from g2ard.tiles.journal import Journal, clear, is_tile_file
-from g2ard.tiles.pour import PointFeed, SceneFeed, lift_tiles, pour
+from g2ard.tiles.pour import PointFeed, SceneFeed, TileWriter, clear, is_tile_file, lift_tiles, pour
 
 TILE_ROWS = 5_000_000
 """Default largest number of rows per tile."""
@@ -59,13 +59,12 @@ def ingest(
     Points of a point cloud are assigned in the same way and lifted tile by tile, together with the halo, so
     that points at a border have all their neighbours.
 
-    After an interruption the same call resumes from the last block. If the tiles are complete, it returns at
-    once.
+    If the tiles are complete, the call returns at once; an interrupted one leaves none.
 
     Args:
         source: one or more scenes as accepted by `g2ard.io.open_stream`, one or more coloured point clouds as
             accepted by `g2ard.io.open_point_stream`, or a scene stream.
-        folder: output folder: absent, empty, or with these tiles, complete or partial.
+        folder: output folder: absent, empty, or with these tiles.
         tile_rows: maximum Gaussians per tile; exceeded only if more of them share one position.
         block_rows: rows in memory at a time; None means 16 MiB of rows.
         lift: constants for lifting points; None means `LiftConfig()`.
@@ -108,36 +107,56 @@ def ingest(
         settings["lift"] = asdict(feed.config)
     if feed.render_model != "classic":
         settings["render_model"] = feed.render_model
-    feed.settings, key = settings, _key(feed.stream.identity(), settings)
+    key = _key(feed.stream.identity(), settings)
     done = _done(folder, key, overwrite)
     if done is not None:
         say(f"{folder}: already holds these {plural(done.count, 'Gaussian')}; skipped")
         return done
-    _check_foreign(folder)
-    with locked(folder):
-        _check_tiles(folder, key, settings, overwrite, say)
-        rows = block_rows or max(1, _BLOCK_BYTES // feed.row_bytes)
-        try:
-            if isinstance(feed, PointFeed):
-                journal = lift_tiles(folder, key, feed, tile_rows, rows, progress, say)
-            else:
-                journal = pour(folder, key, feed, tile_rows, rows, progress, say, like)
-        except InputError:
+    made = _made(folder)
+    try:
+        with locked(folder):
+            _check_tiles(folder, key, settings, overwrite, say)
             clear(folder)
-            raise
-        notes = [*feed.stream.all_notes(), *([] if like else _overfull_note(journal, tile_rows))]
-        manifest = {
-            "sh_degree": feed.sh_degree,
-            "render_model": feed.render_model,
-            "offset": feed.stream.offset.tolist(),
-            "source": sources,
-            "settings": settings,
-            "notes": [asdict(note) for note in notes],
-        }
-        if isinstance(feed, SceneFeed) and feed.stream.up is not None:
-            manifest["up"] = feed.stream.up
-        journal.finish(manifest)
+            try:
+                _write(folder, key, feed, sources, settings, tile_rows, block_rows, like, progress, say)
+            except BaseException:
+                clear(folder)
+                raise
+    finally:
+        drop_empty(made)
     return TileStore.open(folder)
+
+
+def _write(
+    folder: Path,
+    key: str,
+    feed: SceneFeed | PointFeed,
+    sources: list[str],
+    settings: dict[str, Any],
+    tile_rows: int,
+    block_rows: int | None,
+    like: TileStore | None,
+    progress: Progress,
+    say: Say,
+) -> None:
+    """Write the tiles and their manifest into an empty folder."""
+    rows = block_rows or max(1, _BLOCK_BYTES // feed.row_bytes)
+    if isinstance(feed, PointFeed):
+        writer = lift_tiles(folder, feed, tile_rows, rows, progress, say)
+    else:
+        writer = pour(folder, feed, tile_rows, rows, progress, say, like)
+    notes = [*feed.stream.all_notes(), *([] if like else _overfull_note(writer, tile_rows))]
+    manifest = {
+        "sh_degree": feed.sh_degree,
+        "render_model": feed.render_model,
+        "offset": feed.stream.offset.tolist(),
+        "source": sources,
+        "settings": settings,
+        "notes": [asdict(note) for note in notes],
+    }
+    if isinstance(feed, SceneFeed) and feed.stream.up is not None:
+        manifest["up"] = feed.stream.up
+    writer.finish(key, manifest)
 
 
 def _feed(
@@ -176,12 +195,12 @@ def _done(folder: Path, key: str, overwrite: bool) -> TileStore | None:
     return store if store.key == key else None
 
 
-def _check_foreign(folder: Path) -> None:
-    """Create the folder; reject one that holds anything but tiles."""
+def _made(folder: Path) -> list[Path]:
+    """Create the folder, or reject one that holds anything but tiles; return the new folders."""
     if folder.is_file():
         raise OutputError("is a file; expected a folder", path=folder)
     try:
-        folder.mkdir(parents=True, exist_ok=True)
+        made = parents_made(folder / MANIFEST)
         names = {path.name for path in folder.iterdir()}
     except OSError as error:
         raise OutputError(f"cannot write: {error.strerror}", path=folder) from error
@@ -190,38 +209,34 @@ def _check_foreign(folder: Path) -> None:
         raise OutputError(
             f"holds {foreign[0]}, which does not belong to tiles; choose another folder", path=folder
         )
+    return made
 
 
 def _check_tiles(folder: Path, key: str, settings: dict[str, Any], overwrite: bool, say: Say) -> None:
-    """Reject tiles of another scene or other settings, and clear tiles that cannot be resumed."""
-    markers = (folder / MANIFEST, folder / JOURNAL, folder / POINTS / JOURNAL)
-    manifest, *begun = [_key_in(path) for path in markers]
-    known = {each for each in (manifest, *begun) if each is not None}
-    if known - {key} and not overwrite:
+    """Reject tiles of another scene or other settings, unless they are replaced."""
+    known = _key_in(folder / MANIFEST)
+    if known not in (None, key) and not overwrite:
         raise OutputError(
-            f"holds tiles of another scene or with other settings{_differing(markers, settings)}",
+            f"holds tiles of another scene or with other settings{_differing(folder / MANIFEST, settings)}",
             path=folder,
             hint="{overwrite=True} replaces it",
         )
-    if manifest == key:
+    if known == key:
         say(f"{folder}: its tiles are damaged; writing them again")
-    if manifest is not None or known != {key}:
-        clear(folder)
 
 
-def _differing(found: Sequence[Path], settings: dict[str, Any]) -> str:
-    """Return the settings that differ from a manifest's or journal's, in brackets, or ""."""
-    for path in found:
-        with suppress(InputError, LookupError):
-            theirs = checked(read_json(path)["settings"], dict[str, Any], Place(path))
-            names = [name for name in {**theirs, **settings} if theirs.get(name) != settings.get(name)]
-            told = [f"{name} {theirs.get(name)} instead of {settings.get(name)}" for name in names]
-            return f" ({'; '.join(told)})" if told else ""
+def _differing(manifest: Path, settings: dict[str, Any]) -> str:
+    """Return the settings that differ from a manifest's, in brackets, or ""."""
+    with suppress(InputError, LookupError):
+        theirs = checked(read_json(manifest)["settings"], dict[str, Any], Place(manifest))
+        names = [name for name in {**theirs, **settings} if theirs.get(name) != settings.get(name)]
+        differing = [f"{name} {theirs.get(name)} instead of {settings.get(name)}" for name in names]
+        return f" ({'; '.join(differing)})" if differing else ""
     return ""
 
 
 def _key_in(path: Path) -> str | None:
-    """Return the key in a manifest or journal: "" if unreadable, None if there is no file."""
+    """Return the key in a manifest: "" if unreadable, None if there is no file."""
     if not path.is_file():
         return None
     try:
@@ -230,7 +245,7 @@ def _key_in(path: Path) -> str | None:
         return ""
 
 
-def _overfull_note(journal: Journal, tile_rows: int) -> list[Note]:
-    over = sum(count > tile_rows for count in journal.tiles.rows)
+def _overfull_note(writer: TileWriter, tile_rows: int) -> list[Note]:
+    over = sum(count > tile_rows for count in writer.tiles.rows)
     text = f"{plural(over, 'tile')} of more than {tile_rows:,} Gaussians: many share one position"
     return [Note("overfull_tiles", over, text)] if over else []

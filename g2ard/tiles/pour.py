@@ -1,9 +1,12 @@
 """Writing rows of scenes and point clouds to tile files."""
 
+import json
+import re
 import shutil
+import zlib
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,15 +15,14 @@ from numpy.typing import NDArray
 
 from g2ard.config.choices import RenderModel
 from g2ard.errors import OutputError
-from g2ard.io.detect import POINTS
-from g2ard.io.sanitize import PointTally
+from g2ard.io.atomic import atomic_output
+from g2ard.io.detect import MANIFEST, POINTS
 from g2ard.io.stream import PointStream, SceneStream
-from g2ard.io.tile_store import TileStore, halo_name, packed, row_width, tile_name
+from g2ard.io.tile_store import FORMAT, VERSION, TileStore, halo_name, packed, row_width, tile_name
 from g2ard.progress import Progress, Say, plural
 from g2ard.scene.kdtree import KdTree, Points, Sampler, cut_tree, margin_of
 from g2ard.scene.splats import Splats
 from g2ard.stages.lift import LiftConfig, lift_rows
-from g2ard.tiles.journal import Journal, clear
 
 _TREE_SAMPLE = 1 << 20
 """Size of the sample of positions that determines the tiles (12 MB)."""
@@ -30,6 +32,21 @@ _POINT_DTYPE = np.dtype([("near", "<f4", 3), ("rgb", "<f4", 3), ("far", "<f8", 3
 
 _ROWS_AT_ONCE = 1 << 16
 """Rows of a lifted tile written at a time."""
+_TILE_FILE = re.compile(r"(tile|halo)-\d{5,}\.f32|tiles\.json|\.tiles\.json\.\w+|\.points")
+
+
+def is_tile_file(name: str) -> bool:
+    """Return whether a file or folder of this name belongs to tiles, complete or partial."""
+    return _TILE_FILE.fullmatch(name) is not None
+
+
+def clear(folder: Path) -> None:
+    """Remove all files that belong to tiles, the manifest first."""
+    for path in sorted(folder.iterdir(), key=lambda path: path.name != MANIFEST):
+        if path.is_dir() and path.name == POINTS:
+            shutil.rmtree(path)
+        elif is_tile_file(path.name):
+            path.unlink()
 
 
 class Feed(ABC):
@@ -39,7 +56,6 @@ class Feed(ABC):
         stream: the source.
         row_bytes: bytes per row; a row begins with its float32 position.
         room: bytes on disk per row in the end, including all copies.
-        settings: settings stored in the journal; `ingest` sets them.
         render_model: see `Splats`.
     """
 
@@ -48,11 +64,10 @@ class Feed(ABC):
     room: int
     sh_degree = 0
     render_model: RenderModel = "classic"
-    settings: dict[str, Any]
 
     @abstractmethod
-    def rows(self, rows: int, start: int) -> Iterator[tuple[NDArray[Any], Points]]:
-        """Yield the rows to keep from the source's row `start` on, with their positions."""
+    def rows(self, rows: int) -> Iterator[tuple[NDArray[Any], Points]]:
+        """Yield the rows to keep with their positions, reading `rows` at a time."""
 
 
 class SceneFeed(Feed):
@@ -63,8 +78,8 @@ class SceneFeed(Feed):
         self.row_bytes = self.room = 4 * row_width(stream.sh_degree)
         self.sh_degree, self.render_model = stream.sh_degree, stream.render_model
 
-    def rows(self, rows: int, start: int) -> Iterator[tuple[NDArray[Any], Points]]:
-        return ((packed(splats), splats.means) for splats in self.stream.blocks(rows, start))
+    def rows(self, rows: int) -> Iterator[tuple[NDArray[Any], Points]]:
+        return ((packed(splats), splats.means) for splats in self.stream.blocks(rows))
 
 
 class PointFeed(Feed):
@@ -77,82 +92,148 @@ class PointFeed(Feed):
         self.stream: PointStream = stream
         self.config = config
 
-    def rows(self, rows: int, start: int) -> Iterator[tuple[NDArray[Any], Points]]:
-        for far, colors in self.stream.blocks(rows, start):
+    def rows(self, rows: int) -> Iterator[tuple[NDArray[Any], Points]]:
+        for far, colors in self.stream.blocks(rows):
             block = np.empty(len(far), _POINT_DTYPE)
             block["near"], block["rgb"], block["far"] = self.stream.near(far), colors, far
             yield block, np.ascontiguousarray(block["near"])
 
 
+@dataclass
+class _Files:
+    """Row counts and checksums of the written files of one kind."""
+
+    rows: list[int]
+    checks: list[int]
+
+
+@dataclass
+class TileWriter:
+    """The tiles of a scene while they are written; the manifest comes last.
+
+    Args:
+        row_bytes: bytes per row.
+    """
+
+    folder: Path
+    tree: KdTree
+    margin: float
+    row_bytes: int
+    low: list[float] = field(default_factory=lambda: [np.inf] * 3)
+    high: list[float] = field(default_factory=lambda: [-np.inf] * 3)
+
+    def __post_init__(self) -> None:
+        count = self.tree.leaves
+        self.tiles, self.halos = (_Files([0] * count, [0] * count) for _ in range(2))
+        for index in range(count):
+            for name in (tile_name(index), halo_name(index)):
+                (self.folder / name).write_bytes(b"")
+
+    def positions(self, name: str, count: int) -> Points:
+        """Return the (count, 3) float32 positions in a file, the first three numbers of each row."""
+        rows = np.memmap(self.folder / name, "u1", "r", shape=(count, self.row_bytes))
+        return np.ascontiguousarray(rows[:, :12]).view("<f4")
+
+    def add(self, rows: NDArray[Any], means: Points) -> None:
+        """Append rows to their tiles and to the halos of tiles nearby."""
+        if not len(rows):
+            return
+        self.low = np.minimum(self.low, means.min(axis=0).astype(np.float64)).tolist()
+        self.high = np.maximum(self.high, means.max(axis=0).astype(np.float64)).tolist()
+        for index, (core, halo) in enumerate(self.tree.route(means, self.margin)):
+            self._append(self.tiles, index, tile_name(index), rows, core)
+            self._append(self.halos, index, halo_name(index), rows, halo)
+
+    def _append(
+        self, files: _Files, index: int, name: str, rows: NDArray[Any], chosen: NDArray[np.intp]
+    ) -> None:
+        if not len(chosen):
+            return
+        data = (rows if len(chosen) == len(rows) else rows[chosen]).view(np.uint8).data
+        try:
+            with (self.folder / name).open("ab") as file:
+                file.write(data)
+        except OSError as error:
+            raise OutputError(f"cannot write: {error.strerror or error}", path=self.folder / name) from error
+        files.rows[index] += len(chosen)
+        files.checks[index] = zlib.crc32(data, files.checks[index])
+
+    def finish(self, key: str, manifest: dict[str, Any]) -> None:
+        """Write the manifest, which makes the folder a store."""
+        low, high = np.array(self.low), np.array(self.high)
+        tiles = [
+            {
+                "rows": self.tiles.rows[i],
+                "halo": self.halos.rows[i],
+                "low": np.clip(box[0], low, high).tolist(),
+                "high": np.clip(box[1], low, high).tolist(),
+                "crc32": [self.tiles.checks[i], self.halos.checks[i]],
+            }
+            for i, box in enumerate(self.tree.boxes())
+        ]
+        content = {
+            "format": FORMAT,
+            "version": VERSION,
+            "key": key,
+            "count": sum(self.tiles.rows),
+            **manifest,
+            "margin": self.margin,
+            "cells": self.tree.to_json(),
+            "tiles": tiles,
+        }
+        with atomic_output(self.folder / MANIFEST, overwrite=True) as temporary:
+            temporary.write_text(json.dumps(content) + "\n", encoding="utf-8", newline="\n")
+
+
 def pour(
     folder: Path,
-    key: str,
     feed: Feed,
     tile_rows: int,
     rows: int,
     progress: Progress,
     say: Say,
     like: TileStore | None = None,
-) -> Journal:
-    """Write all tiles and halos of a feed, resuming an interrupted call.
+) -> TileWriter:
+    """Write all tiles and halos of a feed into an existing folder.
 
     Args:
-        folder: an existing folder: empty, or with a journal of the same key.
-        key: hash of everything that determines the content.
         rows: rows in memory at a time.
         like: reuse the tree and margin of these tiles, ignoring `tile_rows`.
     """
     stream: Any = feed.stream
-    journal = Journal.open(folder, feed.row_bytes, type(feed.stream.tally))
-    if journal is None:
-        journal = _started(folder, key, feed, tile_rows, rows, progress, like)
-    else:
-        journal.cut()
-        say(f"{folder}: resuming after row {journal.next_row:,}")
+    tree, margin = _planned(folder, feed, tile_rows, rows, progress, like)
     while True:
-        stream.tally = journal.tally
-        for block, positions in feed.rows(rows, journal.next_row):
-            journal.add(block, positions)
-            journal.next_row = stream.tally.rows
-            journal.save()
-            progress("tiles", journal.next_row, stream.count)
+        writer = TileWriter(folder, tree, margin, feed.row_bytes)
+        stream.tally = type(stream.tally)()
+        for block, positions in feed.rows(rows):
+            writer.add(block, positions)
+            progress("tiles", stream.tally.rows, stream.count)
         stream.all_notes()
-        parts = {} if like else _overfull(journal, tile_rows)
+        parts = {} if like else _overfull(writer, tile_rows)
         if not parts:
-            return journal
+            return writer
         say(f"{plural(len(parts), 'tile')} hold more than {tile_rows:,} rows; cutting again")
-        tree = journal.tree.refined(parts)
-        points, _ = _sampled(feed, rows, progress)
-        clear(folder)
-        journal = _empty(folder, key, tree, margin_of(tree, points), feed)
-        journal.cut()
-        journal.save()
+        tree = writer.tree.refined(parts)
+        margin = margin_of(tree, _sampled(feed, rows, progress)[0])
 
 
-def _started(
-    folder: Path, key: str, feed: Feed, tile_rows: int, rows: int, progress: Progress, like: TileStore | None
-) -> Journal:
-    """Plan the tiles, check that the disk has room, and start a journal."""
+def _planned(
+    folder: Path, feed: Feed, tile_rows: int, rows: int, progress: Progress, like: TileStore | None
+) -> tuple[KdTree, float]:
+    """Return the tree of tiles and their margin; check that the disk has room."""
     tree, points, each = like.tree if like else KdTree(), np.empty((0, 3), np.float32), 1.0
     if like or feed.stream.count > tile_rows:
         points, each = _sampled(feed, rows, progress)
     if not like:
         tree = cut_tree(points, each, tile_rows)
     margin = like.margin if like else margin_of(tree, points)
-    journal = _empty(folder, key, tree, margin, feed)
-    around = each * sum(len(halo) for _, halo in tree.route(points, journal.margin))
+    around = each * sum(len(halo) for _, halo in tree.route(points, margin))
     needed, free = int((feed.stream.count + around) * feed.room), shutil.disk_usage(folder).free
     if needed > free:
         raise OutputError(
             f"the tiles need {needed / 1e9:,.1f} GB, the disk has {free / 1e9:,.1f} GB free", path=folder
         )
-    journal.cut()
-    journal.save()
-    return journal
-
-
-def _empty(folder: Path, key: str, tree: KdTree, margin: float, feed: Feed) -> Journal:
-    return Journal(folder, key, tree, margin, feed.row_bytes, type(feed.stream.tally)(), feed.settings)
+    return tree, margin
 
 
 def _sampled(feed: Feed, rows: int, progress: Progress) -> tuple[Points, float]:
@@ -164,49 +245,41 @@ def _sampled(feed: Feed, rows: int, progress: Progress) -> tuple[Points, float]:
     return sampler.result()
 
 
-def _overfull(journal: Journal, tile_rows: int) -> dict[int, KdTree]:
+def _overfull(writer: TileWriter, tile_rows: int) -> dict[int, KdTree]:
     """Plan cuts of the tiles that exceed `tile_rows`."""
     parts = {}
-    for index, count in enumerate(journal.tiles.rows):
+    for index, count in enumerate(writer.tiles.rows):
         if count > tile_rows:
-            tree = cut_tree(journal.positions(tile_name(index), count), 1.0, tile_rows)
+            tree = cut_tree(writer.positions(tile_name(index), count), 1.0, tile_rows)
             if tree.leaves > 1:
                 parts[index] = tree
     return parts
 
 
 def lift_tiles(
-    folder: Path, key: str, feed: PointFeed, tile_rows: int, rows: int, progress: Progress, say: Say
-) -> Journal:
+    folder: Path, feed: PointFeed, tile_rows: int, rows: int, progress: Progress, say: Say
+) -> TileWriter:
     """Write points to tiles in a subfolder, then lift each tile with its halo and write the result.
 
     Arguments are those of `pour`.
     """
-    within, row_bytes = folder / POINTS, 4 * row_width(0)
+    within = folder / POINTS
     within.mkdir(exist_ok=True)
-    points = pour(within, key, feed, tile_rows, rows, progress, say)
-    feed.stream.tally = points.tally
-    journal = Journal.open(folder, row_bytes, PointTally)
-    if journal is None:
-        journal = Journal(folder, key, points.tree, points.margin, row_bytes, points.tally, feed.settings)
-        journal.save()
-    else:
-        say(f"{folder}: resuming after tile {journal.next_row:,}")
-    journal.cut()
-    total = sum(points.tiles.rows)
-    for index in range(journal.next_row, points.tree.leaves):
+    points = pour(within, feed, tile_rows, rows, progress, say)
+    writer = TileWriter(folder, points.tree, points.margin, 4 * row_width(0))
+    total, done = sum(points.tiles.rows), 0
+    for index, count in enumerate(points.tiles.rows):
         splats = _lifted(points, index, feed)
         for start in range(0, len(splats), _ROWS_AT_ONCE):
             part = splats.take(slice(start, start + _ROWS_AT_ONCE))
-            journal.add(packed(part), part.means)
-        journal.next_row = index + 1
-        journal.save()
-        progress("lift", sum(points.tiles.rows[: index + 1]), total)
+            writer.add(packed(part), part.means)
+        done += count
+        progress("lift", done, total)
     shutil.rmtree(within)
-    return journal
+    return writer
 
 
-def _lifted(points: Journal, index: int, feed: PointFeed) -> Splats:
+def _lifted(points: TileWriter, index: int, feed: PointFeed) -> Splats:
     """Lift a tile's points with those of its halo as neighbours."""
     core = _read(points.folder / tile_name(index), points.tiles.rows[index])
     if not len(core):

@@ -36,7 +36,7 @@ rates.means = 1e-3
 
 FAR = {"select.focus": "far"}
 TILES = ("--tile-rows", "700", "--workers", "1")
-RESUMED = ("adapt", "distill", "ingest", "lod", "recover")
+RESUMED = ("adapt", "distill", "lod", "recover")
 """Commands that continue an interrupted run with --resume; the others need no option."""
 
 

@@ -9,7 +9,7 @@ from g2ard.jobs.distill_options import DistillOptions
 from g2ard.jobs.tiling import whole_options
 from g2ard.levels import Cut
 from g2ard.tiles.ingest import ingest
-from helpers.commands import CommandLine, refused, succeeds
+from helpers.commands import CommandLine, refused
 from helpers.tiled_scenes import town_in
 
 
@@ -102,9 +102,3 @@ def test_extents_are_finite(
 def test_ratios_that_do_not_rise_are_usage(command_line: CommandLine, folder: Path) -> None:
     told = refused(command_line, folder, "lod", "town.ply", "-o", "x", "-r", "2,1")
     assert "--ratios: expected rising numbers of at least 1, got 2, 1" in told
-
-
-def test_ingest_goes_on_with_resume_too(command_line: CommandLine, folder: Path, tmp_path: Path) -> None:
-    words = ("ingest", folder / "town.ply", "-o", "tiles", "--resume")
-    for said in ("tiles: nothing to resume, starting over", "already holds these 3,000 Gaussians"):
-        assert said in succeeds(command_line, tmp_path, *words).err

@@ -8,7 +8,6 @@ import typer
 
 from g2ard.cli.budget_options import Count
 from g2ard.cli.frame import Run, command
-from g2ard.cli.options import ResumeOption
 from g2ard.progress import plural
 from g2ard.system.peak_memory import peak_rss
 
@@ -33,20 +32,13 @@ def ingest(
             parser=Count.parse_absolute, metavar="COUNT", help="Maximum Gaussians per tile; 5M by default."
         ),
     ] = None,
-    resume: ResumeOption = False,
 ) -> None:
-    """Split a scene of any size into tiles.
-
-    Run the same command again to continue after an interruption.
-    """
+    """Split a scene of any size into tiles."""
     from g2ard.stages.lift import LiftConfig
     from g2ard.tiles.ingest import TILE_ROWS
     from g2ard.tiles.ingest import ingest as into_tiles
 
     run.claim("--output", output, folder=True)
-    if resume and not (output.is_dir() and any(output.iterdir())):
-        run.say(f"{output}: nothing to resume, starting over")
-    run.unfinished = f"finished tiles are in {output}; run the same command to continue"
     began = time.perf_counter()
     store = into_tiles(
         scenes,
