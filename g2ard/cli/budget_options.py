@@ -1,10 +1,11 @@
-"""Budget options: -n 250k, -r 10, --fit 5MB, --fit quest3, --min-psnr 38."""
+"""Options of budgets (-n 250k, -r 10, --fit 5MB, --min-psnr 38) and of scenes larger than memory."""
 
 from __future__ import annotations
 
 import math
 import re
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import typer
@@ -155,3 +156,38 @@ BUDGETS: dict[str, tuple[Any, ...]] = {
     ),
 }
 """Options of commands with budgets, see `g2ard.cli.frame.command`: name → type and option."""
+
+TILES: dict[str, tuple[Any, ...]] = {
+    "tile_rows": (
+        Count | None,
+        typer.Option(
+            parser=Count.parse_absolute,
+            metavar="COUNT",
+            help="Maximum Gaussians per tile; larger scenes are processed in tiles. 5M by default.",
+        ),
+    ),
+    "memory": (
+        str | None,
+        typer.Option(metavar="SIZE", help="Memory limit for all workers together, such as 4GB."),
+    ),
+    "workers": (
+        int | None,
+        typer.Option(min=1, help="Processes for tiles; by default as many as cores and memory allow."),
+    ),
+    "scheduler": (
+        str | None,
+        typer.Option(
+            metavar="ADDRESS",
+            help="Dask scheduler for tiles: tcp://HOST:PORT or local (needs the extra `distributed`).",
+        ),
+    ),
+    "work": (
+        Path | None,
+        typer.Option(
+            metavar="DIR",
+            help="Keep tiles and finished steps here, for other budgets; by default in .NAME.tiles beside "
+            "the output, until the command succeeds.",
+        ),
+    ),
+}
+"""Options of commands that work in tiles, see `g2ard.cli.frame.command`: name → type and option."""

@@ -22,12 +22,11 @@ from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 import typer
 
 from g2ard.cli.app import app
-from g2ard.cli.budget_options import BUDGETS, Counts, Ratios
+from g2ard.cli.budget_options import BUDGETS, TILES, Counts, Ratios
 from g2ard.cli.config_file import load_config, printed
 from g2ard.cli.console import Console
 from g2ard.cli.fields import FIELDS
 from g2ard.cli.panels import COMMON, GROUPED, into_panels
-from g2ard.cli.tile_options import TILES
 from g2ard.cli.usage import flags_of, in_flags, typed
 from g2ard.config.choices import RenderModel, ViewFormat
 from g2ard.config.schema import Config, full_paths, parse_settings
@@ -36,7 +35,7 @@ from g2ard.io import check_scene_output, check_views_output, write_views
 from g2ard.io.atomic import atomic_output, check_output
 from g2ard.io.detect import run_scene
 from g2ard.io.paths import real_path
-from g2ard.io.scene_formats import axes_note, files_of
+from g2ard.io.scene_formats import axes_note, files_of, scene_format
 from g2ard.io.scenes import write_scene
 from g2ard.pipeline.presets import configured
 from g2ard.progress import plural
@@ -45,6 +44,7 @@ from g2ard.system import devices, interrupt
 if TYPE_CHECKING:
     from g2ard.scene.cameras import Cameras
     from g2ard.scene.splats import Splats
+    from g2ard.tiles.merging import TiledScene
 
 __all__ = ["Run", "app", "command", "one_line"]
 
@@ -275,11 +275,29 @@ class Run:
         return load_scene(path, self.say, self.render_model)
 
     def write(
-        self, path: Path, splats: Splats, *, overwrite: bool = False, compare: bool = False, **options: Any
+        self,
+        path: Path,
+        splats: Splats | TiledScene,
+        *,
+        overwrite: bool = False,
+        compare: bool = False,
+        **options: Any,
     ) -> None:
-        """Write a scene, and report what its format cannot hold and, with `compare`, a large loss."""
+        """Write a scene, and report what its format cannot hold and, with `compare`, a large loss.
+
+        Tiles are written to .ply one after the other; other formats need them all in memory.
+        """
+        from g2ard.io.ply import write as write_ply
+        from g2ard.scene.splats import Splats
+
         self.begin("write")
         replaced = self.overwrite or overwrite
+        if not isinstance(splats, Splats):
+            if scene_format(path).suffix == ".ply":
+                write_ply(path, splats.stream(), overwrite=replaced)
+                self.kept.append(f"{path} is written")
+                return
+            splats = splats.whole()
         notes = write_scene(path, splats, overwrite=replaced, progress=self.progress, **options)
         self.kept.append(f"{path} is written")
         for note in notes:

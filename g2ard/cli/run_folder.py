@@ -1,18 +1,20 @@
 """The folder of a `distill` run: its files, and earlier runs in it."""
 
+from __future__ import annotations
+
 import json
 import shutil
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from g2ard.cli.frame import Run
 from g2ard.cli.resume import OPTIONS, check_stopped, finished_before, is_finished, left_at
 from g2ard.config.choices import Colour, ViewFormat
 from g2ard.errors import InputError, OutputError
-from g2ard.io import write_splats, write_views
+from g2ard.io import write_views
 from g2ard.io.atomic import atomic_output, check_output
 from g2ard.io.jsonfile import read_json
 from g2ard.io.lock import check_unlocked, locked
@@ -26,6 +28,9 @@ from g2ard.progress import plural
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
 from g2ard.viewer import write_page
+
+if TYPE_CHECKING:
+    from g2ard.tiles.merging import TiledScene
 
 _WORK_FOLDER = ".unfinished"
 """Folder in a run's folder for finished rounds and checkpoints."""
@@ -105,10 +110,11 @@ class RunFolder:
         return read_json(self._report)
 
     @contextmanager
-    def working(self, input_count: int, output_count: int, photos: Iterable[Path]) -> Iterator[None]:
-        """Create the folder for checkpoints; after an error or Ctrl-C, keep what it holds.
+    def writing(self, photos: Iterable[Path] = ()) -> Iterator[bool]:
+        """Create the folder and yield whether it is new; no other run may write here meanwhile.
 
-        No other run may write here meanwhile.
+        Args:
+            photos: files that the run reads, besides those of its options.
         """
         files = [*self._run.input_files(), *photos]
         self._inputs = dict(zip(map(str, files), file_identity(files), strict=True))
@@ -117,8 +123,13 @@ class RunFolder:
         with locked(self.path):
             if self.scene.exists() and not (self._run.overwrite or left_at(self.work)):
                 raise OutputError("exists", path=self.path, hint="{overwrite=True} replaces it")
-            with self._working(input_count, output_count, made=made):
-                yield
+            yield made
+
+    @contextmanager
+    def working(self, input_count: int, output_count: int, photos: Iterable[Path]) -> Iterator[None]:
+        """Create the folder for checkpoints; after an error or Ctrl-C, keep what it holds."""
+        with self.writing(photos) as made, self._working(input_count, output_count, made=made):
+            yield
 
     @contextmanager
     def _working(self, input_count: int, output_count: int, *, made: bool) -> Iterator[None]:
@@ -145,20 +156,23 @@ class RunFolder:
             raise
         shutil.rmtree(self.work)
 
-    def write_scene(self, splats: Splats) -> None:
-        """Write the scene, and remove an earlier run's scenes in other formats and the pages about them."""
-        self._run.write(self.scene, splats, overwrite=True)
+    def write_scene(self, splats: Splats | TiledScene, *, compare: bool = False) -> None:
+        """Write the scene, and remove an earlier run's scenes in other formats and the pages about them.
+
+        `compare` is that of `Run.write`.
+        """
+        self._run.write(self.scene, splats, overwrite=True, compare=compare)
         pages = (self.path / name for name in ("report.json", "report.html", "preview.png", "view.html"))
         for other in (*self._other_scenes(), *pages):
             other.unlink(missing_ok=True)
 
-    def write_simplified(self, splats: Splats | None) -> None:
+    def write_simplified(self, splats: Splats | TiledScene | None) -> None:
         """Write the simplified scene; without one, remove an earlier run's."""
         if splats is None:
             self._simplified.unlink(missing_ok=True)
             return
         self._simplified.parent.mkdir(exist_ok=True)
-        write_splats(self._simplified, splats, overwrite=True)
+        self._run.write(self._simplified, splats, overwrite=True)
 
     def write_views(self, views: RunViews) -> None:
         """Write the run's views with their splits, generated ones also in the format of --views-format."""

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import typer
 
+from g2ard.cli.budget_options import TILES
 from g2ard.cli.frame import Run
-from g2ard.cli.tile_options import TILES
 from g2ard.io.atomic import hidden_name
 
 if TYPE_CHECKING:

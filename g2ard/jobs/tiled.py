@@ -24,7 +24,7 @@ from g2ard.jobs.cost import RECOVERY_TIMES, workers_for
 from g2ard.jobs.distill_options import DistillOptions
 from g2ard.jobs.inputs import Views, load_view_sets, say_regions
 from g2ard.jobs.levels import LevelReport, check_ratios, level_size
-from g2ard.jobs.tiling import Tiling, refuse_whole, whole_options
+from g2ard.jobs.tiling import Tiling, needs_whole, refuse_whole
 from g2ard.jobs.views import cameras_for_weights, pool_times, views_of
 from g2ard.levels import Cut
 from g2ard.pipeline.config import DistillConfig
@@ -201,6 +201,17 @@ def simplify_in_tiles(
             yield store, simplify_tiles(run, count, seen, compare=True)
 
 
+@dataclass(frozen=True, eq=False)
+class TiledDistilled:
+    """A distilled scene in tiles: the dense one, before and after recovery, its scores and its views."""
+
+    store: TileStore
+    simplified: TiledScene
+    recovered: TiledScene
+    scores: TiledScores
+    views: RunViews
+
+
 def distill_in_tiles(
     scene: Path,
     budget: Budget,
@@ -209,19 +220,19 @@ def distill_in_tiles(
     *,
     progress: Progress = silent,
     say: Say = unsaid,
-) -> tuple[TileStore, TiledScene, TiledScores, RunViews]:
+) -> TiledDistilled:
     """Distil a scene larger than memory.
 
     Targets are the dense scene's own renders, in views that are given, found beside it or generated.
 
     Args:
-        options: as for `g2ard.distill`, without those that `whole_options` returns.
+        options: as for `g2ard.distill`, without what `needs_whole` returns.
     """
     with _job(scene, tiling, options, budget, True, progress, say) as job:
         small = job.simplified(job.store, job.count, job.views.train.cameras)
         assert small.surroundings is not None  # views are given
         done, scores = job.recovered(small, small.surroundings, job.views)
-        return job.store, done, scores, job.views
+        return TiledDistilled(job.store, small, done, scores, job.views)
 
 
 @dataclass(frozen=True, eq=False)
@@ -258,7 +269,7 @@ def lod_in_tiles(
         The levels, of exactly round(N/r) Gaussians each.
     """
     check_ratios(ratios)
-    refuse_whole(scene, whole_options(options))
+    refuse_whole(scene, needs_whole(options.config))
     levels: list[StoredScene] = []
     reports: list[LevelReport] = []
     around: Surroundings | None = None

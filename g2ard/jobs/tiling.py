@@ -15,7 +15,7 @@ from g2ard.io.tile_store import TileStore
 
 if TYPE_CHECKING:
     from g2ard.jobs.budget import Budget
-    from g2ard.jobs.distill_options import DistillOptions
+    from g2ard.pipeline.config import DistillConfig
     from g2ard.stages.simplify import SimplifyConfig
 
 _LEAST_FILE_ROW_BYTES = 4
@@ -100,7 +100,7 @@ def folder_of_tiles(scene: Path) -> Path | None:
 
 
 def refuse_whole(scene: Path, options: Sequence[str]) -> None:
-    """Reject options that need the whole scene in memory."""
+    """Reject options, such as those of `needs_whole`, for a scene in tiles."""
     if not options:
         return
 
@@ -113,59 +113,48 @@ def refuse_whole(scene: Path, options: Sequence[str]) -> None:
     )
 
 
-def whole_budgets(budgets: Sequence[Budget]) -> list[str]:
-    """Return the budgets that need the whole scene, as options: bytes and qualities.
+def needs_whole(
+    config: SimplifyConfig | DistillConfig,
+    preset: str | None = None,
+    budgets: Sequence[Budget] = (),
+    **options: object,
+) -> list[str]:
+    """Return what needs the whole scene in memory, as options.
+
+    Tiles merge by the method `default`, all together along Morton order in one step, and learn from renders.
+
+    Args:
+        config: of a simplification or a distillation.
+        preset: from which the config may come.
+        options: options of the command that need the whole scene if they are given.
 
     >>> from g2ard.jobs.budget import Budget
-    >>> whole_budgets([Budget(fit="web")]), whole_budgets([Budget(min_psnr=30, min_ssim=0.9)])
-    ([], ['--min-psnr 30', '--min-ssim 0.9'])
+    >>> from g2ard.stages.simplify import SimplifyConfig
+    >>> needs_whole(SimplifyConfig(), budgets=[Budget(fit="web")], clean=False)
+    []
+    >>> needs_whole(SimplifyConfig("fast"), budgets=[Budget(min_psnr=30, min_ssim=0.9)], dry_run=True)
+    ['--method fast', '--min-psnr 30', '--min-ssim 0.9', '--dry-run']
     """
-    given = {
-        name: value
-        for budget in budgets
-        for name, value in (
-            ("--fit", budget.fit if budget.bytes else None),
-            ("--min-psnr", budget.min_psnr),
-            ("--min-ssim", budget.min_ssim),
-        )
-    }
-    return [f"{name} {value}" for name, value in given.items() if value is not None]
-
-
-def whole_method(method: str | None, preset: str | None) -> list[str]:
-    """Return the option for a method other than `default`, or the preset that sets it."""
-    if preset is not None and preset.startswith("paper"):
-        return [f"--preset {preset}"]
-    return [f"--method {method}"] if method not in (None, "default") else []
-
-
-def whole_settings(config: SimplifyConfig) -> list[str]:
-    """Return the settings of simplification that need the whole scene, as options.
-
-    All tiles merge along Morton order together, in one step.
-    """
+    from g2ard.pipeline.config import DistillConfig
     from g2ard.stages.simplify import Default
 
-    usual = Default().resolved().morton_premerge_steps
-    own = isinstance(config, Default) and config.morton_premerge_steps not in (None, usual)
-    return ["--set simplify.morton_premerge_steps"] if own else []
-
-
-def whole_options(options: DistillOptions) -> list[str]:
-    """Return the options of a distillation that need the whole scene.
-
-    Tiles learn from renders, so `photos=False` is fine.
-    """
-    if options.preset.startswith("paper"):
-        return whole_method(None, options.preset)
-    config = options.config
-    given = {
-        "--set select.views_count": config.select.views_count is not None,
-        "--schedule paper": config.recover.schedule.round_steps > 0,
-        "--clean": options.clean,
-        "--photos": bool(options.photos),
-        "--recovery-time": config.recover.recovery_time is not None,
-        "--engine": config.recover.engine != "fused",
-    }
-    named = [name for name, there in given.items() if there]
-    return [*whole_method(config.simplify.method, None), *named, *whole_settings(config.simplify)]
+    simplify = config.simplify if isinstance(config, DistillConfig) else config
+    usual, given = Default().resolved().morton_premerge_steps, {}
+    if preset is not None and preset.startswith("paper"):
+        given[f"--preset {preset}"] = True
+    else:
+        given[f"--method {simplify.method}"] = simplify.method != "default"
+        if isinstance(config, DistillConfig):
+            given["--set select.views_count"] = config.select.views_count is not None
+            given["--schedule paper"] = config.recover.schedule.round_steps > 0
+            given["--recovery-time"] = config.recover.recovery_time is not None
+            given["--engine"] = config.recover.engine != "fused"
+        if isinstance(simplify, Default):
+            steps = simplify.morton_premerge_steps
+            given["--set simplify.morton_premerge_steps"] = steps not in (None, usual)
+    for budget in budgets:
+        given[f"--fit {budget.fit}"] = budget.bytes is not None
+        given[f"--min-psnr {budget.min_psnr}"] = budget.min_psnr is not None
+        given[f"--min-ssim {budget.min_ssim}"] = budget.min_ssim is not None
+    given |= {f"--{name.replace('_', '-')}": bool(value) for name, value in options.items()}
+    return [option for option, is_given in given.items() if is_given]

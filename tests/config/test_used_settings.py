@@ -18,7 +18,7 @@ from g2ard.io.types import ViewSet
 from g2ard.jobs.budget import Budget
 from g2ard.jobs.distill_options import DistillOptions
 from g2ard.jobs.tiled import distill_in_tiles, simplify_in_tiles
-from g2ard.jobs.tiling import Tiling, refuse_whole, whole_options, whole_settings
+from g2ard.jobs.tiling import Tiling, needs_whole, refuse_whole
 from g2ard.pipeline.adapt import appearance_only
 from g2ard.pipeline.presets import configured
 from g2ard.scene.splats import SH_C0
@@ -234,7 +234,7 @@ def _tiles() -> tuple[Path, Tiling]:
 def _simplified_in_tiles(settings: Mapping[str, Any]) -> object:
     scene, tiling = _tiles()
     config = configured(g2ard.SimplifyConfig(), settings=settings)
-    refuse_whole(scene, whole_settings(config))
+    refuse_whole(scene, needs_whole(config))
     budgets = [Budget(count=BUDGET)]
     ((_, small),) = simplify_in_tiles(scene, budgets, tiling, views=UNEVEN, config=config)
     return small.whole().fingerprint()
@@ -243,9 +243,9 @@ def _simplified_in_tiles(settings: Mapping[str, Any]) -> object:
 def _distilled_in_tiles(settings: Mapping[str, Any]) -> object:
     scene, tiling = _tiles()
     options = DistillOptions(views=UNEVEN, size=48, settings={**FAR, **settings})
-    refuse_whole(scene, whole_options(options))
-    _, small, _, _ = distill_in_tiles(scene, Budget(count=BUDGET), tiling, options)
-    return small.whole().fingerprint()
+    refuse_whole(scene, needs_whole(options.config))
+    done = distill_in_tiles(scene, Budget(count=BUDGET), tiling, options)
+    return done.recovered.whole().fingerprint()
 
 
 PRIORS = ("trained", "lift", "noisy")

@@ -177,13 +177,14 @@ def test_distill_in_tiles_recovers(command_line: CommandLine, folder: Path, tmp_
         command_line,
         tmp_path,
         *("distill", folder / "town.ply", "-r", 10, "-o", tmp_path / "run", "--views", folder / "views.json"),
-        *("--tile-rows", 4000, "--steps", 60, "--size", 120, "--workers", 1),
+        *("--tile-rows", 4000, "--steps", 60, "--size", 120, "--workers", 1, "--keep"),
     )
     report = json.loads((tmp_path / "run" / "report.json").read_text())
     assert report["scores"]["recovered"] > report["scores"]["simplified"] + 0.2
     assert report["config"]["ratio"] == [10.0]
     small = read_splats(tmp_path / "run" / "scene.ply")
-    assert len(small) == 900
+    assert len(small) == len(read_splats(tmp_path / "run" / "simplified" / "scene.ply")) == 900
+    assert list(report["inputs"]) == [str(folder / "town.ply"), str(folder / "views.json")]
     held_out = TeacherRenders(read_splats(folder / "town.ply"), ring(8).take([6, 7]))
     assert evaluate(small, held_out).psnr > report["scores"]["simplified"]
     tiles = report["scores"]["tiles"]

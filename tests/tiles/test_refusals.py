@@ -6,7 +6,7 @@ import pytest
 
 from g2ard.errors import InputError
 from g2ard.jobs.distill_options import DistillOptions
-from g2ard.jobs.tiling import whole_options
+from g2ard.jobs.tiling import needs_whole
 from g2ard.levels import Cut
 from g2ard.tiles.ingest import ingest
 from helpers.commands import CommandLine, refused
@@ -40,7 +40,6 @@ _DISTILL = ("distill", "-r", "10", "-o", "x", "--views", "views.json")
         (_DISTILL, "--set morton_premerge_steps=3", "--set simplify.morton_premerge_steps"),
         (_DISTILL, "--recovery-time 5m", "--recovery-time"),
         (_DISTILL, "--dry-run", "--dry-run"),
-        (_DISTILL, "--keep", "--keep"),
         (("simplify", "-o", "x.ply"), "--min-ssim 0.9", "--min-ssim 0.9"),
         (("distill", "-o", "x"), "--fit 50kB", "--fit 50kB"),
     ],
@@ -68,8 +67,8 @@ def test_several_whole_options_are_named_together(command_line: CommandLine, fol
     told = refused(command_line, folder, *_DISTILL, "tiles", "--clean", "--photos", status=1)
     assert "tiles: --clean and --photos need the whole scene in memory" in told
     assert "use `g2ard ingest tiles -o DIR --tile-rows 3,000` for one piece" in told
-    assert whole_options(DistillOptions(photos=False)) == []
-    assert whole_options(DistillOptions(settings={"engine": "gsplat"})) == ["--engine"]
+    assert needs_whole(DistillOptions().config) == []
+    assert needs_whole(DistillOptions(settings={"engine": "gsplat"}).config) == ["--engine"]
 
 
 def test_rows_of_tiles_that_lie_in_a_folder_are_theirs(command_line: CommandLine, folder: Path) -> None:

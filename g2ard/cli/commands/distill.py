@@ -93,11 +93,11 @@ def distill(
     Scenes larger than memory and folders of tiles are distilled tile by tile.
     """
     from g2ard.cli.run_folder import RunFolder
-    from g2ard.cli.tiled import TiledCommand
+    from g2ard.cli.tiled import distill_in_tiles
     from g2ard.jobs.cost import check_job_memory, cost_of
     from g2ard.jobs.distill import prepare
     from g2ard.jobs.distill_options import DistillOptions
-    from g2ard.jobs.tiling import is_tiled
+    from g2ard.jobs.tiling import is_tiled, needs_whole, refuse_whole
     from g2ard.pipeline.config import DistillConfig
 
     began = time.monotonic()
@@ -133,7 +133,9 @@ def distill(
     )
     tiling = tiling_of(run, scene, output)
     if scene is not None and is_tiled(scene, tiling):
-        TiledCommand(run, scene, tiling).distill(budget, options, folder)
+        whole = {"clean": clean, "photos": photos, "dry_run": dry_run}
+        refuse_whole(scene, needs_whole(options.config, preset, [budget], **whole))
+        distill_in_tiles(run, scene, tiling, budget, options, folder)
         return
     job = prepare(scene, budget, options, **run.callbacks)
     cost = cost_of(job, job.aim.count, page=view)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -61,11 +61,11 @@ def simplify(
     generated views. The fast method uses views only if --views is given; the paper's method uses none.
     Scenes larger than memory and folders of tiles are simplified tile by tile to the same exact budget.
     """
-    from g2ard.cli.tiled import TiledCommand
+    from g2ard.cli.tiled import simplify_in_tiles
     from g2ard.jobs.cost import WHOLE_TIMES, check_whole_memory
     from g2ard.jobs.inputs import say_notes
     from g2ard.jobs.measured_budget import Reduction, aim_of
-    from g2ard.jobs.tiling import is_tiled
+    from g2ard.jobs.tiling import is_tiled, needs_whole, refuse_whole
     from g2ard.stages.simplify import SimplifyConfig
 
     config = run.settled(SimplifyConfig(), preset)[1]
@@ -84,8 +84,8 @@ def simplify(
     outputs.check()
     given = opt.with_images(views, images)
     if is_tiled(scene, tiling):
-        _refuse_whole(scene, budgets, config, preset, parents)
-        TiledCommand(run, scene, tiling).simplify(outputs, budgets, config, given, no_views, up)
+        refuse_whole(scene, needs_whole(config, preset, budgets, parents=parents))
+        simplify_in_tiles(run, scene, tiling, outputs, budgets, config, given, no_views, up)
         return
     check_whole_memory(scene, tiling, WHOLE_TIMES)
     maps = None if parents is None else Outputs(run, parents, budgets, _parents_file(run), name="--parents")
@@ -132,17 +132,6 @@ def _parents_file(run: Run) -> Callable[[Path, Budget], None]:
         check_output(path, run.overwrite)
 
     return check
-
-
-def _refuse_whole(
-    scene: Path, budgets: Sequence[Budget], config: SimplifyConfig, preset: str | None, parents: Path | None
-) -> None:
-    """Reject options that a scene in tiles does not support."""
-    from g2ard.jobs.tiling import refuse_whole, whole_budgets, whole_method, whole_settings
-
-    rows = ["--parents"] if parents else []
-    settings = whole_settings(config)
-    refuse_whole(scene, [*whole_method(config.method, preset), *rows, *whole_budgets(budgets), *settings])
 
 
 def _report(
