@@ -39,7 +39,7 @@ def write_table(run: Run, report: dict[str, Any], larger: str = "") -> None:
         f"{before} → {plural(report['output_count'], 'Gaussian')}, "
         f"{size['input'] / 1e6:.2f} → {size['output'] / 1e6:.2f} MB as .ply{why}; {times}"
     )
-    title = f"held-out views against {report['against']}, simplified → recovered:"
+    title = f"held-out views against {report['against']}, {report['size']}, simplified → recovered:"
     run.console.table(title, list(COLUMNS), cells(map(KindScore.of, report["kinds"])))
 
 
@@ -57,8 +57,26 @@ def told(report: dict[str, Any], *, verbose: bool = False) -> list[str]:
     if report["unseen"] and report["unseen"] > _LEAST_REPORTED_SHARE:
         lines.append(f"{report['unseen']:.0%} of the scene is in no view: simplified but not recovered")
     if packed := report.get("packed"):
-        lines += score_lines(packed, report["bytes"]["file"], report["scores"]["recovered"]["psnr"])
+        lines += score_lines(
+            packed, report["bytes"]["file"], report["scores"]["recovered"]["psnr"], report["size"]
+        )
+    if full := report.get("own_size"):
+        lines.append(own_size_line(full))
     return [line for line in lines if line is not None]
+
+
+def own_size_line(scores: dict[str, Any]) -> str:
+    """Describe the scores at the views' own size.
+
+    >>> score = {"psnr": 25.5, "ssim": 0.8, "scored_in": "7 photos, 960×540 px"}
+    >>> own_size_line({"simplified": score, "recovered": score | {"psnr": 27.0}})
+    "at the views' own size (7 photos, 960×540 px): 25.50 → 27.00 dB, SSIM 0.8000 → 0.8000"
+    """
+    before, after = scores["simplified"], scores["recovered"]
+    return (
+        f"at the views' own size ({after['scored_in']}): {before['psnr']:.2f} → {after['psnr']:.2f} dB, "
+        f"SSIM {before['ssim']:.4f} → {after['ssim']:.4f}"
+    )
 
 
 def loss(

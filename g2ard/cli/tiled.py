@@ -87,6 +87,7 @@ def distill_in_tiles(
             report = {
                 **_report(store, small, began),
                 "scores": asdict(scores),
+                "size": done.views.test.size_text,
                 "views": {"train": len(done.views.train.cameras), "test": len(done.views.test)},
             }
             folder.write_scene(small, compare=True)
@@ -96,7 +97,7 @@ def distill_in_tiles(
             with run.finishing("report.html"):
                 tiled_report(folder.path / "report.html", title, report)
             folder.write_report(report)
-    title = "held-out views against teacher renders, simplified → recovered:"
+    title = f"held-out views against teacher renders, {done.views.test.size_text}, simplified → recovered:"
     run.console.table(title, list(COLUMNS), cells(scores.kinds))
     for line in filter(None, map(loss, scores.kinds)):
         run.say(line)

@@ -16,9 +16,13 @@ from g2ard.progress import Progress, Say, silent, unsaid
 from g2ard.rendering.renderer import Renderer
 from g2ard.rendering.targets import Targets, kinds_of
 from g2ard.scene.cameras import Cameras
+from g2ard.scene.samples import evenly_spaced
 from g2ard.scene.splats import Splats
 from g2ard.stages.recover.auto_preset import PriorMeasures
 from g2ard.system.cached import cached_property
+
+_FULL_PIXELS = 32_000_000
+"""Pixels of the views that are scored at their own size after a requested one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,6 +97,19 @@ class DistillJob:
     def apart(self) -> Targets | None:
         """The others of these views, for scoring; None without such views or a teacher to render them."""
         return self._every_second_apart(1)
+
+    @cached_property
+    def full_size(self) -> Targets | None:
+        """Held-out targets at the views' own size, made on access; None if no size shrank them.
+
+        Of large views there are only as many as `_FULL_PIXELS` hold, evenly spaced.
+        """
+        cameras = self.views.full
+        if cameras is None:
+            return None
+        largest = int((cameras.widths * cameras.heights).max())
+        some = evenly_spaced(len(cameras), max(1, _FULL_PIXELS // largest))
+        return scorable(self.targets_for(cameras.take(some), lazy=True))
 
     def _every_second_apart(self, first: int) -> Targets | None:
         cameras = self.views.apart

@@ -34,17 +34,18 @@ def score_file(path: Path, targets: Targets, background: Colour, progress: Progr
     return {"file": path.name, "psnr": scores.psnr, "ssim": scores.ssim}
 
 
-def score_lines(packed: dict[str, Any], size: int, unpacked: float) -> list[str]:
+def score_lines(packed: dict[str, Any], size: int, unpacked: float, pixels: str) -> list[str]:
     """Return a packed file's size in bytes and score beside that of the unpacked scene, and a warning if its
-    loss is large and visible.
+    loss is large and visible. `pixels` is the size of the views.
 
-    >>> score_lines({"file": "scene.sog", "psnr": 37.86}, 1_310_000, 37.94)
-    ['scene.sog: 1.31 MB, 37.9 dB in held-out views (37.9 as .ply)']
-    >>> len(score_lines({"file": "scene.sog", "psnr": 58.6}, 1_310_000, 62.6))
+    >>> score_lines({"file": "scene.sog", "psnr": 37.86}, 1_310_000, 37.94, "800×600 px")
+    ['scene.sog: 1.31 MB, 37.9 dB in held-out views, 800×600 px (37.9 as .ply)']
+    >>> len(score_lines({"file": "scene.sog", "psnr": 58.6}, 1_310_000, 62.6, "800×600 px"))
     1
     """
     name, psnr = packed["file"], packed["psnr"]
-    lines = [f"{name}: {size / 1e6:.2f} MB, {psnr:.1f} dB in held-out views ({unpacked:.1f} as .ply)"]
+    scores = f"{psnr:.1f} dB in held-out views, {pixels} ({unpacked:.1f} as .ply)"
+    lines = [f"{name}: {size / 1e6:.2f} MB, {scores}"]
     if unpacked - psnr > _WARNED_LOSS and psnr < _INVISIBLE_LOSS_PSNR:
         lines.append(f"warning: {name}: the format costs {unpacked - psnr:.1f} dB; {_better(name)}")
     return lines

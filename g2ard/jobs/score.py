@@ -21,8 +21,9 @@ def report_of(job: DistillJob, done: Distilled) -> dict[str, Any]:
 
     Returns:
         Counts, bytes, scores in held-out views (`scores`) and in views of other kinds (`apart`, or None),
-        their summary by kind (`kinds`), Gaussians per pixel (`overdraw`), rounds, seconds by
-        stage, and every setting by path.
+        their image size (`size`), means at the views' own size if a requested one shrank them (`own_size`, or
+        None), their summary by kind (`kinds`), Gaussians per pixel (`overdraw`),
+        rounds, seconds by stage, and every setting by path.
     """
     scenes, background = (done.simplified, done.splats), job.config.recover.background
     scores = _scores(*scenes, job.held_out, background, job.progress)
@@ -31,6 +32,8 @@ def report_of(job: DistillJob, done: Distilled) -> dict[str, Any]:
         [*scores[name]["views"], *(apart[name]["views"] if apart else [])]
         for name in ("simplified", "recovered")
     )
+    full = job.full_size
+    own_size = None if full is None else _scores(*scenes, full, background, job.progress)
     made = job.views.pool is not None and "test" in job.views.pool.splits
     config = replace(job.config, simplify=job.config.simplify.resolved(antialiased=job.prior.antialiased))
     report = done.report.as_dict()
@@ -42,6 +45,8 @@ def report_of(job: DistillJob, done: Distilled) -> dict[str, Any]:
         "bytes": {"input": job.prior.nbytes, "output": done.splats.nbytes},
         "scores": scores,
         "apart": apart,
+        "size": job.held_out.cameras.size_text,
+        "own_size": own_size and {name: _means(scores) for name, scores in own_size.items()},
         "kinds": [kind.as_dict() for kind in by_kind(before, after, USUAL if made else "given")],
         "unseen": _unseen(job, done),
         "overdraw": overdraw(done.splats, job.held_out.cameras),
@@ -66,6 +71,10 @@ def _scores(
         ).as_dict()
         for name, splats in scenes.items()
     }
+
+
+def _means(scores: dict[str, Any]) -> dict[str, Any]:
+    return {name: scores[name] for name in ("psnr", "ssim", "edge_psnr", "scored_in")}
 
 
 def scores_by_kind(

@@ -1,13 +1,10 @@
 """Views and targets of the commands that train on images or score against them."""
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from g2ard.config.choices import Colour, RenderModel, is_made
 from g2ard.errors import InputError
-from g2ard.io.detect import run_scene, run_views
-from g2ard.io.jsonfile import read_json
 from g2ard.io.types import ViewSet
 from g2ard.jobs.inputs import Views, load_scene, load_split_views, load_trained, make_targets, scorable
 from g2ard.jobs.view_checks import check_photos, propose_background, warn_of_sight
@@ -24,24 +21,6 @@ def check_teacher(views: Views | None, teacher: Splats | str | Path | None) -> N
         raise InputError("generated views have no photos", parameter="views", hint="give {teacher=SCENE}")
     if teacher is None and views is None:
         raise InputError("there are no targets", hint="give {views}, or a {teacher} to generate views of")
-
-
-def teaching_of_run(scenes: Sequence[Path]) -> tuple[Path, Path | None, bool, int | None] | None:
-    """Return --views, --teacher, --photos and --size of the first run among the scenes, or None."""
-    runs = (path for path in scenes if run_scene(path) != path and run_views(path) != path)
-    folder = next(runs, None)
-    if folder is None:
-        return None
-    report = read_json(folder / "report.json")
-    against = report.get("against", "teacher renders")
-    if against == "photos":
-        return folder, None, False, report["config"]["size"]
-    teacher = Path(report["config"]["scene"])
-    if not teacher.exists():
-        raise InputError(
-            f"was made from {teacher}, which is not there", path=folder, hint="give {teacher=SCENE}"
-        )
-    return folder, teacher, "photo" in against, report["config"]["size"]
 
 
 class Teaching:

@@ -92,7 +92,7 @@ def views_of(
         represents=represents,
         progress=progress,
     )
-    load = partial(load_view_sets, size=options.size, say=say, unpictured=teach)
+    load = partial(load_view_sets, size=None, say=say, unpictured=teach)
     select = replace(options.config.select, focus=options.focus)
     mix = partial(
         _mixed, prior=prior, count=count, represents=represents, size=options.size, progress=progress, say=say
@@ -118,20 +118,28 @@ def views_of(
         train = drop_held_out(train, test.cameras, say)
     if not views_beside:
         check_sight(prior, train.cameras, say)
-    elif not options.size:
+    else:
         train, test = (replace(part, cameras=as_pool(part.cameras)) for part in (train, test))
+    full = _shrunk(test.cameras, options.size)
+    train, test = train.resized(options.size), test.resized(options.size)
     if not teach or any(train.cameras.image_paths):
         if options.config.select.focus:
             say("warning: --focus has no effect on views with photos")
         select = replace(select, focus="far")
     if not teach:
-        return RunViews(train, test.cameras)
+        return RunViews(train, test.cameras, full=full)
     try:
         planned = plan(_OFFERED_VIEWS)
     except InputError:  # the scene has no room for poses
-        return RunViews(train, test.cameras)
+        return RunViews(train, test.cameras, full=full)
     train, apart, _ = mix(train, planned, select=select)
-    return RunViews(train, test.cameras, apart)
+    return RunViews(train, test.cameras, apart, full=full)
+
+
+def _shrunk(cameras: Cameras, size: int | None) -> Cameras | None:
+    """Return the views if `size` shrinks any of them, otherwise None."""
+    larger = size is not None and bool((np.maximum(cameras.widths, cameras.heights) > size).any())
+    return cameras if larger else None
 
 
 def _generated(
@@ -149,10 +157,11 @@ def _generated(
     )
     counts = _uses(use, len(train.cameras), len(test if held_out is None else held_out), len(apart or ()))
     say(f"views: {counts}; {_of(planned, pool.cameras)}")
-    train, test = train.resized(size), test.resized(size)
+    train, scored = train.resized(size), test
     if held_out is not None:
-        train, test = drop_held_out(train, held_out, say), held_out
-    return RunViews(train, test, apart and apart.resized(size), pool, unseen)
+        train, scored = drop_held_out(train, held_out, say), held_out
+    full = _shrunk(scored, size)
+    return RunViews(train, scored.resized(size), apart and apart.resized(size), pool, unseen, full)
 
 
 def _uses(use: Use, train: int, test: int, apart: int) -> str:

@@ -296,7 +296,7 @@ def adapt(
         steps=sum(s["steps"] for s in fit.stretches),
         seconds=fit.seconds,
         converged=fit.converged,
-        psnr=Gain(probe.all_of(given), probe.all_of(result)),
+        psnr=Gain(probe.all_of(given), probe.all_of(result), probe.scored_in),
         stretches=tuple(map(Stretch.of, fit.stretches)),
         colour_change=changed,
         prior_share=float(1 - share.mean()),

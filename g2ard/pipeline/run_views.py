@@ -17,6 +17,7 @@ class RunViews:
         test: usual views for scoring.
         apart: views of other kinds; None if there are none.
         pool: the whole generated pool, written beside the result.
+        full: the usual views for scoring at their own size, if a requested size shrank them.
         unseen: share of the sampled matter that no view of the pool sees.
     """
 
@@ -25,6 +26,7 @@ class RunViews:
     apart: Cameras | None = None
     pool: ViewSet | None = None
     unseen: float | None = None
+    full: Cameras | None = None
 
     def resized(self, longest: int) -> RunViews:
         """Shrink all views for training and scoring."""

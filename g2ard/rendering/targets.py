@@ -66,6 +66,20 @@ def kinds_told(photos: int, renders: int) -> str:
     return "photos" if photos else "teacher renders"
 
 
+def scored_in(targets: Targets, split: str = "") -> str:
+    """Describe the views of a score: their number, split, kind of target and size.
+
+    >>> from g2ard.scene.cameras import Camera
+    >>> views = Cameras.of([Camera.facing([0, -3, 0], [0, 0, 0], width=64, height=48)])
+    >>> scored_in(Photos(views, [np.zeros((48, 64, 3), np.uint8)]), "test")
+    '1 test photo, 64×48 px'
+    """
+    count, kinds = len(targets.cameras), kinds_of(targets)
+    name = f"{split} {'photo' if kinds == 'photos' else 'view'}".strip()
+    against = "" if kinds == "photos" else f" against {kinds}"
+    return f"{plural(count, name)}{against}, {targets.cameras.size_text}"
+
+
 def fingerprint_of(targets: Targets) -> str:
     """Return a hash of the views, their kinds and the source of their images, for checkpoints."""
     cameras = targets.cameras

@@ -72,7 +72,8 @@ def distill_report(
             Shown(stage, to_bytes(renderer.image(camera)), f"{scores[stage][view]['psnr']:.2f} dB")
             for stage, renderer in renderers
         ]
-        page.comparison(Comparison(part.cameras.names[row], to_bytes(part[row]), shown))
+        title = f"{part.cameras.names[row]}, {camera.width}×{camera.height} px"
+        page.comparison(Comparison(title, to_bytes(part[row]), shown))
     size, seconds = report["bytes"], report["seconds"]
     page.paragraph(
         f"{size['input'] / 1e6:.2f} → {size['output'] / 1e6:.2f} MB as .ply, in {seconds['total']:,.0f} s. "
@@ -126,6 +127,7 @@ def verdict(report: dict[str, Any]) -> str:
     views = sum(kind.views for kind in kinds)
     mean = sum(kind.views * kind.psnr.after for kind in kinds) / views
     over = f"the mean of {views} held-out views" if views > 1 else "in one held-out view"
+    over += f" of {report['size']}" if "size" in report else ""
     return f"{count} reproduce the {what} at {mean:.1f} dB, {over}; {last}."
 
 

@@ -287,13 +287,33 @@ class Cameras:
         """Return the views with their longer side shrunk to at most `longest` pixels (None keeps them)."""
         if longest is None:
             return self
-        factor = np.minimum(1.0, longest / np.maximum(self.widths, self.heights))
+        return self._by(np.minimum(1.0, longest / np.maximum(self.widths, self.heights)))
+
+    def scaled(self, longest: int) -> Cameras:
+        """Return the views with a longer side of `longest` pixels, also if they are smaller."""
+        return self._by(longest / np.maximum(self.widths, self.heights))
+
+    def _by(self, factor: NDArray[np.float64]) -> Cameras:
+        """Return the views with a factor on the size of each."""
         widths = np.maximum(1, np.rint(self.widths * factor)).astype(np.int64)
         heights = np.maximum(1, np.rint(self.heights * factor)).astype(np.int64)
         Ks = self.Ks.copy()
         Ks[:, 0] *= (widths / self.widths)[:, None]
         Ks[:, 1] *= (heights / self.heights)[:, None]
         return replace(self, Ks=Ks, widths=widths, heights=heights)
+
+    @property
+    def size_text(self) -> str:
+        """Image size of the views for messages, such as 800×600 px; a range of longer sides if they differ.
+
+        >>> Cameras.of([Camera.facing([0, -2, 0], [0, 0, 0], width=64, height=48)]).size_text
+        '64×48 px'
+        """
+        sizes = {(int(w), int(h)) for w, h in zip(self.widths, self.heights, strict=True)}
+        if len(sizes) == 1:
+            return "×".join(map(str, next(iter(sizes)))) + " px"
+        sides = sorted({max(size) for size in sizes})
+        return f"{sides[0]}–{sides[-1]} px" if len(sides) > 1 else "".join(f"{side} px" for side in sides)
 
     def cropped(self, low: ArrayLike, high: ArrayLike) -> Cameras:
         """Return the parts of the views from pixel `low` up to `high`, each (C, 2) or (2,), x before y.

@@ -17,7 +17,7 @@ from g2ard.rendering.cuda import renderer_on
 from g2ard.rendering.lpips import Lpips
 from g2ard.rendering.metrics import edge_psnr, psnr, ssim
 from g2ard.rendering.renderer import RasterSettings
-from g2ard.rendering.targets import Targets, against_of, checked_targets, mask_of
+from g2ard.rendering.targets import Targets, against_of, checked_targets, mask_of, scored_in
 from g2ard.scene.cameras import USUAL
 from g2ard.scene.splats import Splats
 
@@ -27,7 +27,8 @@ class ViewScore:
     """Scores of one view: PSNR and that of gradients in dB, SSIM in [−1, 1], LPIPS by network (empty without
     weights).
 
-    `against` is "photo" or "teacher" if the targets say so, `kind` the kind of view (`Cameras.kinds`).
+    `against` is "photo" or "teacher" if the targets say so, `kind` the kind of view (`Cameras.kinds`),
+    `size` the width and height of the images in pixels.
     """
 
     name: str
@@ -37,6 +38,7 @@ class ViewScore:
     lpips: Mapping[str, float] = field(default_factory=dict)
     against: str | None = None
     kind: str = USUAL
+    size: tuple[int, int] = (0, 0)
 
 
 @dataclass(frozen=True)
@@ -47,15 +49,17 @@ class Evaluation:
         count: number of Gaussians.
         bytes: size as float32 arrays, as in a .ply.
         views: one score per view, in camera order.
+        scored_in: number, kind and size of the views, such as "7 photos, 800×600 px".
     """
 
     count: int
     bytes: int
     views: tuple[ViewScore, ...]
+    scored_in: str
 
     def __repr__(self) -> str:
         scores = f"PSNR {self.psnr:.2f} dB, SSIM {self.ssim:.4f}"
-        return f"Evaluation({plural(self.count, 'Gaussian')}, {plural(len(self.views), 'view')}: {scores})"
+        return f"Evaluation({plural(self.count, 'Gaussian')}, {self.scored_in}: {scores})"
 
     @property
     def psnr(self) -> float:
@@ -86,8 +90,15 @@ class Evaluation:
             "ssim": self.ssim,
             "edge_psnr": self.edge_psnr,
             "lpips": self.lpips or None,
+            "scored_in": self.scored_in,
             "views": [
-                {"name": v.name, "psnr": v.psnr, "ssim": v.ssim, "edge_psnr": v.edge_psnr}
+                {
+                    "name": v.name,
+                    "size": list(v.size),
+                    "psnr": v.psnr,
+                    "ssim": v.ssim,
+                    "edge_psnr": v.edge_psnr,
+                }
                 | ({"against": v.against} if v.against else {})
                 | ({"kind": v.kind} if v.kind != USUAL else {})
                 for v in self.views
@@ -163,7 +174,8 @@ def evaluate(
                 perceived,
                 against_of(targets, view),
                 cameras.kinds[view],
+                (int(cameras.widths[view]), int(cameras.heights[view])),
             )
         )
         progress(stage, view + 1, len(cameras))
-    return Evaluation(len(splats), splats.nbytes, tuple(scores))
+    return Evaluation(len(splats), splats.nbytes, tuple(scores), scored_in(targets))

@@ -71,6 +71,6 @@ def adapt(
     gain, end = result.report.psnr, "converged" if result.report.converged else "all steps taken"
     run.say(
         f"{output}: {plural(len(splats), 'Gaussian')}, {plural(result.report.steps, 'step')} ({end}), "
-        f"{opt.trained_on(split)} {gain.before:.2f} → {gain.after:.2f} dB"
+        f"{opt.trained_on(split)} {targets.cameras.size_text}: {gain.before:.2f} → {gain.after:.2f} dB"
     )
     run.result({**result.report.as_dict(), "output": str(output), "settings": listed(config)})

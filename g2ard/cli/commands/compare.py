@@ -1,16 +1,21 @@
 """`g2ard compare`: how far a scene is from another."""
 
+from __future__ import annotations
+
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from g2ard.cli import options as opt
 from g2ard.cli.frame import Run, command
-from g2ard.config.choices import BLACK, is_made
+from g2ard.config.choices import BLACK, Colour, is_made
 from g2ard.io.detect import run_scene
-from g2ard.io.paths import short_names
+from g2ard.io.paths import real_path, short_names
 from g2ard.progress import plural
+
+if TYPE_CHECKING:
+    from g2ard.scene.splats import Splats
 
 _WORST_VIEWS = 3
 """Views that the table names."""
@@ -72,7 +77,7 @@ def compare(
     worst = sorted(scores.views, key=lambda view: view.psnr)[:_WORST_VIEWS]
     psnr = {view.name: view.psnr for view in scores.views}
     run.console.table(
-        f"{second} against {first}: {plural(len(cameras), 'view')}",
+        f"{second} against {first}: {plural(len(cameras), 'view')}, {cameras.size_text}",
         ["", "Gaussians", "PSNR, dB", "SSIM"],
         [
             ["mean", f"{len(other):,} of {len(reference):,}", f"{scores.psnr:.2f}", f"{scores.ssim:.4f}"],
@@ -109,4 +114,40 @@ def compare(
             )
         run.kept.append(f"{output} is written")
         run.say(f"{output}: opens at {stand.name}; the arrows below lead to the worst views")
-    run.result({**scores.as_dict(), "output": None if output is None else str(output)})
+    closer = _closer(run, first, second, reference, other, colour)
+    if closer is not None:
+        run.say(closer)
+    run.result({**scores.as_dict(), "closer": closer, "output": None if output is None else str(output)})
+
+
+def _closer(
+    run: Run, first: Path, second: Path, reference: Splats, other: Splats, colour: Colour
+) -> str | None:
+    """Say which of two results is closer to the scene that both show; None if one is that scene.
+
+    Only runs know what they were made of.
+    """
+    from g2ard.errors import InputError
+    from g2ard.jobs.common import better_line, common_of, is_run, source_of
+    from g2ard.jobs.inputs import load_views, scorable
+    from g2ard.jobs.teaching import Teaching
+    from g2ard.stages.evaluate import evaluate
+
+    if real_path(first) == source_of(second) or real_path(second) == source_of(first):
+        return None
+    if not (is_run(first) and is_run(second)):
+        return "which of the two is closer to the scene that they show is only known of two runs of `distill`"
+    try:
+        common = common_of([first, second], background=True)
+    except InputError as error:
+        return f"which of the two is closer to the scene is unknown: {error}"
+    assert common is not None
+    teaching = Teaching(common.teacher, colour, chosen=True, photos=common.photos, **run.callbacks)
+    cameras = load_views(common.views, "test", common.size, unpictured=teaching.dense is not None)
+    targets = scorable(teaching.targets(cameras))
+    scores = [
+        evaluate(splats, targets, background=colour, progress=run.progress) for splats in (reference, other)
+    ]
+    line = better_line(short_names([first, second]), scores, targets, "test")
+    original = "the photos" if common.teacher is None else str(common.teacher)
+    return f"to {original}: {line}"

@@ -14,7 +14,6 @@ from g2ard.config.choices import BLACK, LpipsInput
 from g2ard.errors import InputError
 from g2ard.io import check_scene
 from g2ard.io.paths import short_names
-from g2ard.progress import plural
 
 if TYPE_CHECKING:
     from g2ard.scene.splats import Splats
@@ -60,34 +59,39 @@ def evaluate(
 ) -> None:
     """Score scenes against photos or a teacher's renders: PSNR, SSIM, edges, size, needles, overdraw.
 
+    Several runs are scored in one set of views at one size: those that one held out and none trained on.
+
     Edges is the PSNR of the images' gradients: how well wires, text and outlines are kept.
 
     For the evaluation of the original 3DGS, use --convention inria --8bit --lpips-input unscaled.
     """
     from g2ard.io.describe import bytes_of
+    from g2ard.jobs.common import better_line, common_of
     from g2ard.jobs.inputs import load_views, scorable
-    from g2ard.jobs.teaching import Teaching, check_teacher, teaching_of_run
+    from g2ard.jobs.teaching import Teaching, check_teacher
     from g2ard.jobs.view_checks import check_sight
     from g2ard.rendering.lpips import load_lpips
     from g2ard.rendering.renderer import RasterSettings
-    from g2ard.rendering.targets import kinds_of
+    from g2ard.rendering.targets import scored_in
     from g2ard.rendering.visibility import overdraw
     from g2ard.scene.shape import needle_share
     from g2ard.stages.evaluate import evaluate as score
 
     if lpips_input != "scaled" and lpips is None:
         raise typer.BadParameter("--lpips-input goes with --lpips; give --lpips DIR")
-    own = teaching_of_run(scenes) if views is None and teacher is None else None
+    own = None
+    if views is None and teacher is None:
+        own = common_of(scenes, background=background is not None)
     if own is not None:
-        views, teacher, photos, made_at = own
-        size = size or made_at
+        teacher, photos = own.teacher, own.photos
+        size = size or own.size
     else:
         with run.usage():
             check_teacher(views, teacher)
     device = "cuda" if run.device == "cuda" else "cpu"
     if device == "cuda":
         opt.use_cuda(run)
-    views = opt.with_images(views, images, alpha)
+    given = opt.with_images(views, images, alpha) if own is None else own.views
     for path in scenes:
         check_scene(path)
     chosen, settings = opt.background_of(run, background, *scenes), RasterSettings(convention=convention)
@@ -105,11 +109,12 @@ def evaluate(
     of_scenes = [stage for path in scenes for stage in ((path.name, 4.0), ("visibility", 1.0))]
     run.console.expect([*teacher_stage, *of_scenes])
     frozen = run.load(anchors) if anchors else None
-    cameras = load_views(teaching.views(views), split, size, run.say, unpictured=teaching.dense is not None)
+    cameras = load_views(teaching.views(given), split, size, run.say, unpictured=teaching.dense is not None)
     targets = scorable(teaching.targets(cameras, settings=settings), run.say)
     cameras = targets.cameras
     networks = load_lpips(lpips, scaled=lpips_input == "scaled", device=device) if lpips else None
     rows: list[dict[str, Any]] = []
+    found = []
     for path in scenes:
         splats = run.load(path)
         check_sight(splats, cameras, run.say)
@@ -126,6 +131,7 @@ def evaluate(
             progress=run.progress,
             stage=path.name,
         )
+        found.append(scored)
         drift = None if frozen is None else _drift(frozen, splats, path)
         rows.append(
             {
@@ -138,13 +144,17 @@ def evaluate(
             }
         )
     protocol = f"{convention}'s conventions, {'8-bit' if eight_bit else 'float'} renders"
-    name = "view" if split == "all" else f"{split} view"
-    _table(run, f"{plural(len(cameras), name)}, against {kinds_of(targets)}; {protocol}", rows)
+    name = "" if split == "all" else split
+    _table(run, f"{scored_in(targets, name)}; {protocol}", rows)
+    better = better_line(short_names(scenes), found, targets, name)
+    if better:
+        run.say(better)
     counts = Counter(view["against"] for view in rows[0]["views"])
     single = {"photo": "photos", "teacher": "teacher"}
     against = counts if len(counts) > 1 else single[next(iter(counts))]
     followed = {"convention": convention, "8bit": eight_bit, "lpips_input": lpips_input if lpips else None}
-    run.result({"against": against, "protocol": followed, "scenes": rows})
+    told = {"against": against, "scored_in": scored_in(targets, name), "better": better}
+    run.result({**told, "protocol": followed, "scenes": rows})
 
 
 def _drift(frozen: Splats, splats: Splats, path: Path) -> float:

@@ -89,7 +89,8 @@ def _described(path: Path, images: Path | None) -> tuple[dict[str, Any], list[li
         rows.append(["Gaussians per pixel, held-out", f"{report['overdraw']:.1f}"])
     for name, found in scores.items():
         ssim = f", SSIM {found['ssim']:.4f}" if "ssim" in found else ""
-        rows.append([name, f"{found['psnr']:.2f} dB{ssim} against {against}"])
+        size = f", {report['size']}" if "size" in report else ""
+        rows.append([name, f"{found['psnr']:.2f} dB{ssim} against {against}{size}"])
     return figures, [*_rows(figures), *rows]
 
 

@@ -90,7 +90,8 @@ def recover(
     with run.finishing("scoring"):
         kinds = _score(run, job, result)
     gain, count = result.report.psnr, plural(len(job.student), "Gaussian")
-    run.say(f"{output}: {count}, {opt.trained_on(split)} {gain.before:.2f} → {gain.after:.2f} dB")
+    where = f"{opt.trained_on(split)} {job.views.cameras.size_text}"
+    run.say(f"{output}: {count}, {where}: {gain.before:.2f} → {gain.after:.2f} dB")
     report = {**result.report.as_dict(), "preset": job.preset, "prior": job.measures.as_dict()}
     report |= {"kinds": [kind.as_dict() for kind in kinds], "settings": listed(job.config)}
     run.result({**report, "output": str(output)})
@@ -112,7 +113,8 @@ def _score(run: Run, job: RecoverJob, result: Recovered) -> tuple[KindScore, ...
 
     kinds = job.score(result)
     if job.held_out is not None:
-        title = f"held-out views against {kinds_of(job.held_out)}, before → after:"
+        size = job.held_out.cameras.size_text
+        title = f"held-out views against {kinds_of(job.held_out)}, {size}, before → after:"
         run.console.table(title, list(COLUMNS), cells(kinds))
     for line in filter(None, (loss(kind, "the student is better there") for kind in kinds)):
         run.say(line)

@@ -142,7 +142,7 @@ def recover(
             steps=loop.done,
             seconds=loop.seconds,
             loss=loop.curve(),
-            psnr=Gain(before, after),
+            psnr=Gain(before, after, probe.scored_in),
             multiplier=loop.multiplier,
             reach=finite(loop.reach),
             extent=targets.cameras.extent,

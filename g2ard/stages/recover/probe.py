@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from g2ard import _core
 from g2ard.rendering.metrics import psnr
 from g2ard.rendering.renderer import Renderer, arrays_of, centred, settings_for, view_of
-from g2ard.rendering.targets import Subset, Targets, mask_of, with_pixels
+from g2ard.rendering.targets import Subset, Targets, mask_of, scored_in, with_pixels
 from g2ard.scene.cameras import rows_by_kind
 from g2ard.scene.samples import evenly_spaced
 from g2ard.scene.splats import Splats
@@ -44,6 +44,11 @@ class Probe:
         self._targets, self._background, self._most = targets, background, most
         self._next = 0.0
         self._latest = (float("nan"), 0)
+
+    @property
+    def scored_in(self) -> str:
+        """Number, kind and size of the views."""
+        return scored_in(Subset(self._targets, self._views), "training")
 
     def all_of(self, splats: Splats) -> float:
         """Return the mean PSNR over the views."""

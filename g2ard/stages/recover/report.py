@@ -10,13 +10,15 @@ from g2ard.scene.cameras import USUAL
 
 @dataclass(frozen=True)
 class Gain(Report):
-    """PSNR before and after, on a sample of the training views, dB."""
+    """PSNR before and after, on a sample of the training views, dB; `views` describes the sample."""
 
     before: float
     after: float
+    views: str | None = field(default=None, metadata=LEFT_OUT)
 
     def __str__(self) -> str:
-        return f"PSNR {self.before:.2f} → {self.after:.2f} dB"
+        where = f" in {self.views}" if self.views else ""
+        return f"PSNR {self.before:.2f} → {self.after:.2f} dB{where}"
 
 
 @dataclass(frozen=True)
