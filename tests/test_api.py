@@ -85,7 +85,10 @@ def test_results_print_as_one_short_line() -> None:
         (g2ard.select(BALL, views, 2), "Selection(2 views, policy="),
         (done, "Distilled(150 Gaussians, PSNR "),
         (recovered, "Recovered(1,500 Gaussians, PSNR "),
-        (g2ard.evaluate(BALL, done.held_out), "Evaluation(1,500 Gaussians, 1 view against teacher renders, 64×48 px: PSNR "),
+        (
+            g2ard.evaluate(BALL, done.held_out),
+            "Evaluation(1,500 Gaussians, 1 view against teacher renders, 64×48 px: PSNR ",
+        ),
         (g2ard.render(BALL, views[0]), "Rendered(64 × 48)"),
     ):
         assert repr(result).startswith(expected)

@@ -63,7 +63,7 @@ def command_options() -> dict[str, set[str]]:
 
     def walk(command: Any, path: str) -> None:
         options = {o for p in command.params for o in (*p.opts, *p.secondary_opts) if o.startswith("-")}
-        found[path] = options | {"-h", "--help"}
+        found[path] = options | {"-h", "--help", "--help-all"}
         for name, inner in getattr(command, "commands", {}).items():
             walk(inner, f"{path} {name}".strip())
 

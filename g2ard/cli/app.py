@@ -5,26 +5,26 @@ from typing import Annotated
 
 import typer
 
-COMMANDS = (
-    "distill",
-    "simplify",
-    "recover",
-    "adapt",
-    "register",
-    "lift",
-    "ingest",
-    "convert",
-    "clean",
-    "poses",
-    "select",
-    "render",
-    "view",
-    "lod",
-    "evaluate",
-    "compare",
-    "info",
-)
-"""Names of commands in the order of `g2ard --help`; each is a module of `g2ard.cli.commands`."""
+COMMANDS = {
+    "distill": "Distil a dense scene, or a point cloud with photos, into a compact scene.",
+    "simplify": "Reduce a scene to an exact number of Gaussians; no images needed.",
+    "recover": "Optimise a fixed set of Gaussians against photos or a teacher's renders.",
+    "adapt": "Refit colours and opacities to new images; means, rotations and scales stay fixed.",
+    "register": "Estimate camera poses of photos by matching them with renders of a scene.",
+    "lift": "Turn a coloured point cloud into surface-aligned Gaussian discs, without training.",
+    "ingest": "Split a scene of any size into tiles.",
+    "convert": "Convert scenes to another format or other axes, and merge, crop or move them.",
+    "clean": "Remove clutter: invisible Gaussians, giants, needles, floaters; haze on request.",
+    "poses": "Generate views for a scene: poses in free space that see it well.",
+    "select": "Select the most useful views, best first, each with a sampling weight.",
+    "render": "Render views of a scene as PNG, or show how it would be simplified.",
+    "view": "Write an HTML page that shows one scene, or compares two, in any browser.",
+    "lod": "Write levels of detail as streamed SOG or 3D Tiles.",
+    "evaluate": "Score scenes against photos or a teacher's renders: PSNR, SSIM, edges, needles, overdraw.",
+    "compare": "Compare renders of two scenes: PSNR, SSIM, the worst views, and a page to look at.",
+    "info": "Show what a file holds: counts, extents, SH degree, opacities, overdraw, invalid values.",
+}
+"""Command → its line in `g2ard --help`, in that order; each is a module of `g2ard.cli.commands`."""
 
 app = typer.Typer(
     help="Distil dense 3D Gaussian scenes into compact, standard 3DGS scenes of an exact size.",
@@ -50,6 +50,16 @@ def _root(
     ] = False,
 ) -> None:
     pass
+
+
+def list_commands() -> None:
+    """Register the names and lines of all commands, for `g2ard --help` alone."""
+    for name, line in COMMANDS.items():
+        app.command(name, help=line)(_listed)
+
+
+def _listed() -> None:
+    """Stand for a command that is only listed."""
 
 
 def register_commands(asked: str | None = None) -> None:

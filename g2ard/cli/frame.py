@@ -26,7 +26,7 @@ from g2ard.cli.budget_options import BUDGETS, TILES, Counts, Ratios
 from g2ard.cli.config_file import load_config, printed
 from g2ard.cli.console import Console
 from g2ard.cli.fields import FIELDS
-from g2ard.cli.panels import COMMON, GROUPED, into_panels
+from g2ard.cli.panels import Command, in_panel, ordered
 from g2ard.cli.usage import flags_of, in_flags, typed
 from g2ard.config.choices import RenderModel, ViewFormat
 from g2ard.config.schema import Config, full_paths, parse_settings
@@ -422,6 +422,7 @@ def command(
     budgets: bool = False,
     tiles: bool = False,
     outputs: Collection[str] = ("output",),
+    without: Collection[str] = (),
 ) -> Callable[[Any], Any]:
     """Register `fn(run, **options)` as a command.
 
@@ -435,6 +436,7 @@ def command(
         budgets: whether it takes budgets, see `g2ard.cli.outputs.budgets_of`.
         tiles: whether it works on scenes in tiles, see `g2ard.cli.tiling.tiling_of`.
         outputs: parameters that are paths to write, all of which it passes to `Run.claim`.
+        without: common options that have no effect on it.
     """
 
     def register(fn: Callable[..., None]) -> Callable[..., None]:
@@ -445,7 +447,8 @@ def command(
             for path, (kind, option) in FIELDS.items()
             if path in fields
         }
-        taken = {**(TILES if tiles else {}), **_COMMON_OPTIONS}
+        common = {key: value for key, value in _COMMON_OPTIONS.items() if key not in without}
+        taken = {**(TILES if tiles else {}), **common}
         taken |= {**(_SETTINGS if settings is not None else {}), **(_SCENE_OPTIONS if scenes else {})}
         shared_options = {**given, **set_by_flags, **taken}
         first, middle, last = (
@@ -453,15 +456,13 @@ def command(
             for part in (given, set_by_flags, taken)
         )
         all_parameters = [*first, *own, *middle, *last]
-        for p in all_parameters:
-            if p.name in (*_COMMON_OPTIONS, *_SETTINGS, *_SCENE_OPTIONS):
-                into_panels(p.name, p.annotation, COMMON)
-            elif name in GROUPED:
-                into_panels(p.name, p.annotation)
+        if parent is app:
+            all_parameters = [in_panel(name, p) for p in ordered(name, all_parameters)]
 
         def call(ctx: typer.Context, **values: Any) -> None:
             _flags_win(ctx, values, {p.name: p.default for p in all_parameters})
             shared_values = {key: values.pop(key) for key in shared_options}
+            shared_values |= {key: _COMMON_OPTIONS[key][2] for key in without}
             if typed(ctx, "set"):  # after the config file's, since the last value wins
                 typed_last = [*(ctx.default_map or {}).get("set", []), *shared_values["set"]]
                 shared_values["set"] = typed_last
@@ -482,7 +483,7 @@ def command(
         call.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
         call.__annotations__ = {p.name: p.annotation for p in parameters}
         call.__doc__ = fn.__doc__
-        parent.command(name, epilog=f"Example: {example}")(call)
+        parent.command(name, cls=Command, epilog=f"Example: {example}")(call)
         return fn
 
     return register

@@ -7,9 +7,8 @@ from typing import TextIO
 
 import typer
 
-from g2ard.cli.app import app, register_commands
+from g2ard.cli.app import app, list_commands, register_commands
 from g2ard.cli.console import wrapped
-from g2ard.cli.usage import usage_line
 from g2ard.system import interrupt
 
 _COMPLETION = ("--show-completion", "--install-completion")
@@ -18,7 +17,10 @@ _COMPLETION = ("--show-completion", "--install-completion")
 def main() -> None:
     """Run the `g2ard` program."""
     _name_shell(sys.argv[1:])
-    register_commands(next(iter(sys.argv[1:]), None))  # importing the others takes time
+    if sys.argv[1:] in ([], ["-h"], ["--help"]) and "_G2ARD_COMPLETE" not in os.environ:
+        list_commands()  # importing the commands takes time
+    else:
+        register_commands(next(iter(sys.argv[1:]), None))
     run_program(app, "g2ard")
 
 
@@ -37,6 +39,8 @@ def run_program(app: typer.Typer, name: str) -> None:
     except typer.Abort:
         status = interrupt.status()
     except typer.TyperException as e:
+        from g2ard.cli.usage import usage_line
+
         message = usage_line(e)
         where = getattr(getattr(e, "ctx", None), "command_path", name)
         if message:  # empty when a group without arguments has already shown its help

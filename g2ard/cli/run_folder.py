@@ -43,7 +43,7 @@ _VIEW_FILES: dict[ViewFormat, str] = {
 """Names of generated views for other programs, beside views.json."""
 
 _CALL_OPTIONS = (
-    *("output", "resume", "keep", "view", "dry_run", "threads", "device"),
+    *("output", "resume", "keep", "page", "dry_run", "threads", "device"),
     *("memory", "workers", "scheduler", "work", "views_format"),
 )
 """Options that may change when a run is resumed. `device` may change except to or from CUDA."""

@@ -41,14 +41,14 @@ and a matcher that finds no features gives way to direct alignment; evaluate use
 
 TRAIN = "--views photos.json --size 24 --steps 3"
 BASES = {
-    "distill": f"distill ball.ply -r 8 {TRAIN} --renders --no-view -o out",
+    "distill": f"distill ball.ply -r 8 {TRAIN} --renders --no-page -o out",
     "simplify": "simplify ball.ply -r 8 --views photos.json -o out.ply",
     "recover": f"recover small.ply {TRAIN} --teacher ball.ply -o out.ply",
     "adapt": f"adapt small.ply {TRAIN} --teacher ball.ply -o out.ply",
     "lift": "lift cloud.ply -o out.ply",
     "convert": "convert ball.ply out.ply",
     "clean": "clean stray.ply -o out.ply",
-    "poses": "poses ball.ply -n 8 -o out.json",
+    "poses": "poses ball.ply -k 8 -o out.json",
     "select": "select ball.ply --views photos.json -k 4 -o out.json",
     "render": "render ball.ply --views photos.json --size 24 -o out",
     "view": "view ball.ply -o out.html",
@@ -57,7 +57,7 @@ BASES = {
     "compare": "compare ball.ply small.ply --views photos.json --size 24 --json out.json",
     "ingest": "ingest ball.ply -o out",
     "register": (
-        "register ball.ply --photos two.json --poses moved.json --matcher direct --keep all -o out.json"
+        "register ball.ply --images two.json --poses moved.json --matcher direct --keep all -o out.json"
     ),
     "info": "info ball.ply --json -",
 }
@@ -176,8 +176,8 @@ OPTIONS: dict[str, dict[str, str]] = {
     "poses": {
         "format": "--format inria",
         "kind": "--kind aerial",
-        "count": "-n 9",
-        "size": "--size 64x48",
+        "looks": "-k 9",
+        "resolution": "--resolution 64x48",
         "fov": "--fov 30",
         "up": "--up 1,0,0",
     },
@@ -197,7 +197,7 @@ OPTIONS: dict[str, dict[str, str]] = {
         "fps": "--fps 9",
         "sheet": "--sheet look.png",
         "depth": "--depth",
-        "count": "-n 40",
+        "looks": "-k 9",
         "convention": "--convention inria",
         "split": "--split test",
         "size": "--size 20",
@@ -248,7 +248,7 @@ OPTIONS: dict[str, dict[str, str]] = {
         "output": "-o page.html",
         "views": "--views few.json",
         "images": "--images nowhere",
-        "count": "-n 5",
+        "looks": "-k 5",
         "size": "--size 20",
         "background": "--background 1,1,1",
         "render_model": "--render-model antialiased",

@@ -32,7 +32,7 @@ def test_resuming_a_finished_run_says_so(command_line: CommandLine, folder: Path
 @pytest.mark.parametrize(
     ("words", "names"),
     [
-        ("distill ball.ply -r 10 --no-view -o run", ("ball.ply", "photos.json", "view_003.png")),
+        ("distill ball.ply -r 10 --no-page -o run", ("ball.ply", "photos.json", "view_003.png")),
         ("recover ball.ply -o out.ply", ("ball.ply", "photos.json")),
     ],
 )

@@ -34,7 +34,7 @@ FIELDS: dict[str, tuple[str, dict[str, st.SearchStrategy[Any]], set[str]]] = {
         {"method", "keep_region"},
     ),
     "distill": (
-        "distill ball.ply -r 8 --views views.json --size 32 --no-view",
+        "distill ball.ply -r 8 --views views.json --size 32 --no-page",
         {**RECOVERY, "method": st.sampled_from(["fast", "paper"])},
         {*RECOVERY, "method"},
     ),

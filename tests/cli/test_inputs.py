@@ -57,7 +57,7 @@ def test_an_unreadable_folder_names_readable_contents(command_line: CommandLine,
         assert "photos without poses: estimate them with `colmap automatic_recon" in error
         assert f"--image_path {photos}` and give project" in error
     assert "looked for SOG's meta.json" in refused(command_line, folder, "info", "empty", status=1)
-    ask = ("distill", "ball.ply", "-r", 10, "-o", "run", "--steps", 3, "--size", 32, "--no-view")
+    ask = ("distill", "ball.ply", "-r", 10, "-o", "run", "--steps", 3, "--size", 32, "--no-page")
     assert command_line(*ask, cwd=folder)[0] == 0
     (folder / "run" / "report.json").unlink()  # a folder as `distill` leaves none
     held = "run: is not a supported folder; give one of its files: scene.ply (a scene), scored.json, views"
@@ -132,7 +132,7 @@ def test_a_damaged_file_comes_with_advice(suffix: str, command_line: CommandLine
 @pytest.mark.parametrize(
     "words",
     [
-        "distill ball.ply -r 8 --views views.json --steps 2 --no-view -o run",
+        "distill ball.ply -r 8 --views views.json --steps 2 --no-page -o run",
         "lod ball.ply -r 4,8 --merge-only --views views.json -o levels",
         "simplify ball.ply -r 8 --views views.json -o small.ply",
     ],

@@ -80,7 +80,7 @@ def test_a_run_whose_scores_failed_is_resumed(
     inputs: Path, tmp_path: Path, command_line: CommandLine, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder = shutil.copytree(inputs, tmp_path / "inputs")
-    ask = ("distill", "ball.ply", "-r", 8, "--steps", 2, "--views", "views.json", "--no-view", "-o", "run")
+    ask = ("distill", "ball.ply", "-r", 8, "--steps", 2, "--views", "views.json", "--no-page", "-o", "run")
     with stages_after(folder / "run" / "scene.ply", failing="g2ard.jobs.score.report_of"):
         line = refused(command_line, folder, *ask, "-q", status=1)
     assert line == (
@@ -95,7 +95,7 @@ def test_a_run_whose_scores_failed_is_resumed(
 
 
 @pytest.mark.parametrize(
-    "command", ["distill ball.ply -r 8 --no-view", "recover ball.ply", "evaluate ball.ply"]
+    "command", ["distill ball.ply -r 8 --no-page", "recover ball.ply", "evaluate ball.ply"]
 )
 def test_a_photo_without_valid_pixels_is_not_scored(
     command: str, tmp_path: Path, command_line: CommandLine

@@ -32,7 +32,7 @@ def test_a_folder_has_one_scene(command_line: CommandLine, folder: Path) -> None
 
 
 def test_a_pictures_suffix_is_of_any_case(command_line: CommandLine, folder: Path) -> None:
-    succeeds(command_line, folder, "render", "ball.ply", "-n", 1, "--size", 32, "--sheet", "a.PNG")
+    succeeds(command_line, folder, "render", "ball.ply", "-k", 1, "--size", 32, "--sheet", "a.PNG")
     with Image.open(folder / "a.PNG") as picture:
         assert picture.format == "PNG"
 

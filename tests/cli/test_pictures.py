@@ -54,7 +54,7 @@ def test_compare_prints_scores_and_opens_at_a_typical_view(tmp_path: Path, comma
     ball = checkered_ball(800)
     write_splats(tmp_path / "a.ply", ball)
     write_splats(tmp_path / "b.ply", ball.take(np.arange(800) % 2 == 0))
-    ask = ("compare", "a.ply", "b.ply", "-n", 4, "--size", 64)
+    ask = ("compare", "a.ply", "b.ply", "-k", 4, "--size", 64)
     out = succeeds(command_line, tmp_path, *ask, "--json", "-", "-o", "page.html").out
     found = json.loads(out)
     assert len(found["views"]) == 4

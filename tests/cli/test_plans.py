@@ -13,7 +13,7 @@ from helpers.scenes import around, checkered_ball
 TRAIN = "--views views.json --size 24 --steps 3"
 COMMANDS = [
     "simplify ball.ply -r 4,8 -o small_{ratio}.ply",
-    "compare ball.ply ball.ply -o page.html --size 48 -n 4",
+    "compare ball.ply ball.ply -o page.html --size 48 -k 4",
     f"lod ball.ply -r 1,2,4 {TRAIN} -o lod",
     "lod ball.ply -r 2,4 --views views.json --size 24 --merge-only -o lod",
     f"distill ball.ply -r 8 {TRAIN} -o run",

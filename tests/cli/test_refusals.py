@@ -22,10 +22,10 @@ USAGE = [
     ("render x.ply --views v.json -o out --threads -1", "--threads"),
     ("render x.ply --views v.json -o out --background 2,0,0", "--background"),
     ("render x.ply --views v.json -o out --device abacus", "abacus"),
-    ("render ball.ply -n 4 --views views.json --sheet a.png", "-n generates views, so it excludes --views"),
-    ("render ball.ply --orbit 2 -n 3 -o a", "--orbit"),
-    ("render ball.ply -n 1 -o ball.ply", "name another output"),
-    ("render ball.ply -n 1 -o turn.avi", "expected a folder, .gif, .webp or .mp4, got 'turn.avi'"),
+    ("render ball.ply -k 4 --views views.json --sheet a.png", "-k generates views, so it excludes --views"),
+    ("render ball.ply --orbit 2 -k 3 -o a", "--orbit"),
+    ("render ball.ply -k 1 -o ball.ply", "name another output"),
+    ("render ball.ply -k 1 -o turn.avi", "expected a folder, .gif, .webp or .mp4, got 'turn.avi'"),
     ("render ball.ply -o x --sheet a.jpg", "ends in .png, got 'a.jpg'"),
     ("clean ball.ply --dry-run --preview a.jpg", "ends in .png, got 'a.jpg'"),
     ("convert ball.ply", "SCENE… OUT, or SCENE… -o OUT"),
@@ -77,9 +77,9 @@ INPUT = [
     ("recover ball.ply --views views.json -o ball.ply/out.ply", "ball.ply is a file"),
     ("adapt absent.ply --views v.json -o out.obj", "out.obj: scenes are written as"),
     ("select absent.ply --views v.json -k 2 -o out.txt", "out.txt: views are written"),
-    ("poses absent.ply -n 2 -o out.txt", "out.txt: views are written"),
-    ("register ball.ply --photos bare -o o.json --pool 8", "--focal PIXELS"),
-    ("render ball.ply -n 1 -o views.json", "give the name of a folder"),
+    ("poses absent.ply -k 2 -o out.txt", "out.txt: views are written"),
+    ("register ball.ply --images bare -o o.json --pool 8", "--focal PIXELS"),
+    ("render ball.ply -k 1 -o views.json", "give the name of a folder"),
     ("render ball.ply --views none.json -o out", "none.json"),
     ("render views.json --views views.json -o out", "views.json"),
     ("evaluate ball.ply --views views.json --split val", "there are test, train"),
@@ -118,7 +118,7 @@ def test_all_missing_options_are_named_at_once(command_line: CommandLine, folder
     for ask, missing in (
         ("simplify ball.ply", ("-o OUT", "a budget (-n COUNT")),
         ("distill ball.ply -n 9", ("-o RUN",)),
-        ("register ball.ply", ("--photos", "-o OUT")),
+        ("register ball.ply", ("--images", "-o OUT")),
     ):
         error = refused(command_line, folder, *ask.split())
         assert all(f"{option}" in error for option in missing), error

@@ -122,7 +122,7 @@ def test_the_total_of_a_resumed_run_holds_what_was_done_before(
         return replace(done, report=replace(done.report, seconds=seconds))
 
     monkeypatch.setattr(DistillJob, "run", resumed)
-    ask = ("distill", "a.ply", "-r", 2, "--steps", 2, "--size", 32, "--no-view", "-o", "run", "--json", "-")
+    ask = ("distill", "a.ply", "-r", 2, "--steps", 2, "--size", 32, "--no-page", "-o", "run", "--json", "-")
     out, error = succeeds(command_line, folder, *ask)
     seconds = json.loads(out)["seconds"]
     assert seconds["total"] > seconds["resumed"] == 50.0

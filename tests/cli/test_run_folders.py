@@ -29,7 +29,7 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.parametrize(
     "ask",
     [
-        ("render", "runs/a", "-n", 2, "--sheet", "{}/look.png"),
+        ("render", "runs/a", "-k", 2, "--sheet", "{}/look.png"),
         ("render", "runs/a", "--views", "runs/a", "-o", "{}/looks"),
         ("evaluate", "runs/a", "runs/b", "--teacher", "ball.ply", "--size", 48),
         ("evaluate", "runs/b", "--teacher", "runs/a", "--views", "runs/a", "--split", "all"),
@@ -37,7 +37,7 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ("convert", "runs/a", "runs/b", "{}/both.spz"),
         ("view", "runs/a", "runs/b", "-o", "{}/page.html"),
         ("recover", "runs/a", "--teacher", "ball.ply", "--size", 48, "--steps", 2, "-o", "{}/better.ply"),
-        ("distill", "runs/a", "-r", 2, "--size", 48, "--steps", 2, "--no-view", "-o", "{}/again"),
+        ("distill", "runs/a", "-r", 2, "--size", 48, "--steps", 2, "--no-page", "-o", "{}/again"),
     ],
 )
 def test_commands_read_runs(
@@ -56,7 +56,7 @@ def test_python_reads_them_too(home: Path) -> None:
 def test_the_views_of_the_table_can_be_scored_again(
     home: Path, tmp_path: Path, command_line: CommandLine
 ) -> None:
-    ask = ("distill", "ball.ply", "-r", 4, "--steps", 2, "--size", 48, "--no-view", "-o", tmp_path / "run")
+    ask = ("distill", "ball.ply", "-r", 4, "--steps", 2, "--size", 48, "--no-page", "-o", tmp_path / "run")
     succeeds(command_line, home, *ask)
     report = json.loads((tmp_path / "run" / "report.json").read_text())
     again = ("evaluate", tmp_path / "run", "--teacher", "ball.ply", "--views", tmp_path / "run/scored.json")

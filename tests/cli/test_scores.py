@@ -138,7 +138,7 @@ def test_photos_of_two_worlds_are_refused(tmp_path: Path, command_line: CommandL
 
 
 def test_compare_says_which_run_is_closer_to_their_scene(runs: Path, command_line: CommandLine) -> None:
-    ask = ("compare", "-n", 2, "--size", 32)
+    ask = ("compare", "-k", 2, "--size", 32)
     for order in (("worse", "better"), ("better", "worse")):
         assert "to ball.ply: better is better: +" in succeeds(command_line, runs, *ask, *order).err
     g2ard.save("plain.ply", BALL.take(range(100)))
@@ -150,7 +150,7 @@ def test_compare_says_which_run_is_closer_to_their_scene(runs: Path, command_lin
 
 def test_every_score_has_its_size(runs: Path, command_line: CommandLine) -> None:
     g2ard.save_views("photos.json", photographed(runs / "better", BALL, around(8, (64, 48))))
-    ask = ("distill", "ball.ply", "-n", 40, "--views", "photos.json", "--photos", "--steps", 2, "--no-view")
+    ask = ("distill", "ball.ply", "-n", 40, "--views", "photos.json", "--photos", "--steps", 2, "--no-page")
     printed = succeeds(command_line, runs, *ask, "--size", 32, "-o", "run", "--format", "sog").err
     scored = [line for line in printed.splitlines() if "dB" in line or "held-out views against" in line]
     assert any("1 photo, 64×48 px" in line for line in scored)  # the views' own size
@@ -169,7 +169,7 @@ def test_every_score_has_its_size(runs: Path, command_line: CommandLine) -> None
 
 def test_no_second_score_without_a_size(runs: Path, command_line: CommandLine) -> None:
     g2ard.save_views("photos.json", photographed(runs / "better", BALL, around(8, (64, 48))))
-    ask = ("distill", "ball.ply", "-n", 40, "--views", "photos.json", "--photos", "--steps", 2, "--no-view")
+    ask = ("distill", "ball.ply", "-n", 40, "--views", "photos.json", "--photos", "--steps", 2, "--no-page")
     for size in ((), ("--size", 64)):
         assert "own size" not in succeeds(command_line, runs, *ask, *size, "-wo", "run").err
 

@@ -11,7 +11,7 @@ from helpers.commands import CommandLine
 
 TRAIN = "--views views.json --teacher ball.ply --steps 2"
 COMMANDS = {
-    "distill ball.ply -r 8 --views views.json --steps 2 --no-view -o run": "g2ard.jobs.job.DistillJob.run",
+    "distill ball.ply -r 8 --views views.json --steps 2 --no-page -o run": "g2ard.jobs.job.DistillJob.run",
     f"recover ball.ply {TRAIN} -o out.ply": "g2ard.jobs.recover.RecoverJob.run",
     f"adapt ball.ply {TRAIN} -o out.ply": "g2ard.pipeline.adapt.adapt",
     "lod ball.ply -r 4,8 --merge-only --views views.json -o levels": "g2ard.jobs.levels.lod",

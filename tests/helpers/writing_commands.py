@@ -26,11 +26,11 @@ COMMANDS = {
     "turn.webp": "render ball.ply --orbit 4 --size 32 -o turn.webp",
     "chosen.json": "select ball.ply --views views.json -k 4 -o chosen.json",
     "renders": "render ball.ply --views views.json --sheet look.png -o renders",
-    "pool.json": "poses ball.ply -n 4 -o pool.json",
+    "pool.json": "poses ball.ply -k 4 -o pool.json",
     "page.html": "view ball.ply --views views.json -o page.html",
     "two.html": "compare ball.ply other.ply --views views.json -o two.html",
     "tiles/tiles.json": "ingest ball.ply --tile-rows 150 -o tiles",
-    "poses.json": "register ball.ply --photos photos.json --matcher direct --report page.html -o poses.json",
+    "poses.json": "register ball.ply --images photos.json --matcher direct --report page.html -o poses.json",
 }
 """Main output → arguments."""
 

@@ -91,7 +91,7 @@ def test_transforms_keep_splits_and_photos(tmp_path: Path) -> None:
 
 def test_names_and_formats_of_outputs(command_line: CommandLine, tmp_path: Path) -> None:
     write_splats(tmp_path / "ball.ply", checkered_ball(500))
-    given = "poses", "ball.ply", "-n", "9", "-o"
+    given = "poses", "ball.ply", "-k", "9", "-o"
     for name in ("a.json", "cameras.json", "transforms.json", "project"):
         succeeds(command_line, tmp_path, *given, name)
     succeeds(command_line, tmp_path, *given, "other.json", "--format", "inria")
@@ -107,7 +107,7 @@ def test_names_and_formats_of_outputs(command_line: CommandLine, tmp_path: Path)
 
 def test_distill_writes_its_pool_in_another_format_too(command_line: CommandLine, tmp_path: Path) -> None:
     write_splats(tmp_path / "ball.ply", checkered_ball(800))
-    given = "distill", "ball.ply", "-r", "4", "--steps", "2", "--size", "32", "--no-view"
+    given = "distill", "ball.ply", "-r", "4", "--steps", "2", "--size", "32", "--no-page"
     succeeds(command_line, tmp_path, *given, "-o", "run", "--views-format", "inria")
     same(
         read_view_set(tmp_path / "run" / "cameras.json").cameras,

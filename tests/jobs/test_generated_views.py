@@ -26,7 +26,7 @@ def test_views_are_made_where_none_are_given(command_line: CommandLine, folder: 
     assert not (folder / "renders").exists()
     assert (
         "1 image in renders"
-        in succeeds(command_line, folder, "render", "ball.ply", "-n", 1, "-o", "renders", "--size", 32).err
+        in succeeds(command_line, folder, "render", "ball.ply", "-k", 1, "-o", "renders", "--size", 32).err
     )
     assert len(list((folder / "renders").iterdir())) == 1
     command_line("simplify", "ball.ply", "-r", 5, "-o", "small.ply", cwd=folder)

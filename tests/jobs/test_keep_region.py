@@ -100,7 +100,7 @@ def test_the_commands(command_line: CommandLine, tmp_path: Path) -> None:
         [2.5, 0, 0, 2]
     ]
     run("simplify", *common, *spot, "--tile-rows", 1000, "--workers", 1, "-o", "tiles.ply")
-    run("distill", *common, *spot, "--steps", 5, "--size", 48, "-o", "run", "--no-view")
+    run("distill", *common, *spot, "--steps", 5, "--size", 48, "-o", "run", "--no-page")
     plain = share(read_splats(tmp_path / "plain.ply"), BALL)
     for name in ("kept.ply", "tiles.ply", "run/scene.ply"):
         assert share(read_splats(tmp_path / name), BALL) > 1.3 * plain, name

@@ -13,7 +13,7 @@ from helpers.scenes import checkered_ball
 
 
 def test_distill_scores_the_packed_file(command_line: CommandLine, folder: Path) -> None:
-    ask = ("distill", "ball.ply", "-r", 4, "--steps", 20, "--size", 48, "--no-view", "--format", "splat")
+    ask = ("distill", "ball.ply", "-r", 4, "--steps", 20, "--size", 48, "--no-page", "--format", "splat")
     error = succeeds(command_line, folder, *ask, "-o", "run").err
     report = json.loads((folder / "run" / "report.json").read_text())
     packed, unpacked = report["packed"]["psnr"], report["scores"]["recovered"]["psnr"]
@@ -27,7 +27,9 @@ def test_a_costly_format_names_a_better_one() -> None:
     assert score_lines(packed, 1_000_000, 40.0, "64×48 px")[1:] == []
     (warning,) = score_lines(packed, 1_000_000, 48.05, "64×48 px")[1:]
     assert warning == "warning: scene.spz: the format costs 8.3 dB; .sog loses less, .ply nothing"
-    assert ".sog" not in score_lines({"file": "scene.SOG", "psnr": 30}, 1, 48, "64×48 px")[1].partition(";")[2]
+    assert (
+        ".sog" not in score_lines({"file": "scene.SOG", "psnr": 30}, 1, 48, "64×48 px")[1].partition(";")[2]
+    )
 
 
 def test_convert_warns_only_of_a_visible_loss(command_line: CommandLine, tmp_path: Path) -> None:

@@ -47,7 +47,7 @@ def test_alpha_is_composited_over_the_background(command_line: CommandLine, rgba
 
 
 def test_a_run_is_drawn_on_its_own_background(command_line: CommandLine, rgba: Path) -> None:
-    made = ("distill", "--views", "ball", "-n", 300, "--steps", 5, "--background", "white", "--no-view")
+    made = ("distill", "--views", "ball", "-n", 300, "--steps", 5, "--background", "white", "--no-page")
     succeeds(command_line, rgba, *made, "-o", "run")
     told = succeeds(command_line, rgba, "evaluate", "run", "--views", "ball")
     assert "background: white, as run was made with" in told.err
@@ -57,11 +57,11 @@ def test_a_run_is_drawn_on_its_own_background(command_line: CommandLine, rgba: P
     )
     for ask in (
         ("render", "run", "--orbit", 1, "-o", "pictures"),
-        ("compare", "run", "ball.ply", "-n", 1),
+        ("compare", "run", "ball.ply", "-k", 1),
         ("view", "run", "-o", "page.html"),
         ("adapt", "run", "--views", "ball", "--steps", 2, "-o", "adapted.ply"),
         ("recover", "run", "--views", "ball", "--steps", 2, "-o", "recovered.ply"),
-        ("register", "run", "--photos", "ball", "-o", "poses.json", "--matcher", "direct"),
+        ("register", "run", "--images", "ball", "-o", "poses.json", "--matcher", "direct"),
     ):
         _, _, error = command_line(*ask, cwd=rgba)
         assert "background: white, as run was made with" in error, error
@@ -136,7 +136,7 @@ def test_info_describes_the_photos(rgba: Path, tmp_path: Path) -> None:
 
 def test_distill_proposes_the_border_colour(command_line: CommandLine, tmp_path: Path) -> None:
     photos_of(tmp_path / "photos", points=True)
-    ask = ("distill", "--views", "photos", "-n", 200, "--steps", 2, "--no-view", "-o")
+    ask = ("distill", "--views", "photos", "-n", 200, "--steps", 2, "--no-page", "-o")
     assert "border" not in succeeds(command_line, tmp_path, *ask, "black").err
     error = succeeds(command_line, tmp_path, *ask, "white", "--background", "white").err
     assert "a constant border of black, but the background is white" in error
@@ -183,7 +183,7 @@ def test_images_beside_cameras_json_are_found_and_fitted(tmp_path: Path) -> None
 def test_a_cloud_is_topped_up_from_photos_elsewhere(command_line: CommandLine, tmp_path: Path) -> None:
     model(tmp_path / "toy", images="elsewhere")
     cloud_of(tmp_path / "toy" / "input.ply", BALL.take(np.arange(300)))
-    ask = ("distill", "toy/input.ply", "--views", "toy", "-n", 500, "--steps", 2, "--no-view", "--json", "-")
+    ask = ("distill", "toy/input.ply", "--views", "toy", "-n", 500, "--steps", 2, "--no-page", "--json", "-")
     assert "has no photo" in refused(command_line, tmp_path, *ask, "-o", "run", status=1)
     out, error = succeeds(command_line, tmp_path, *ask, "--images", "toy/elsewhere", "-o", "run")
     assert json.loads(out)["output_count"] == 500

@@ -184,7 +184,7 @@ def test_a_scanned_cloud_and_photos_are_distilled(command_line: CommandLine, tmp
     for name in ("a.las", "b.LAZ"):
         las(tmp_path / name, cloud.positions, (cloud.colors * 65535).astype(np.uint16))
         np.testing.assert_allclose(g2ard.load_points(tmp_path / name).positions, cloud.positions, atol=6e-4)
-    ask = ("distill", name, "--views", "city/train.json", "-n", 400, "-o", "run", "--steps", 3, "--no-view")
+    ask = ("distill", name, "--views", "city/train.json", "-n", 400, "-o", "run", "--steps", 3, "--no-page")
     assert (
         "10,000 → 400 Gaussians" in succeeds(command_line, tmp_path, *ask, "--held-out", "city/val.json").err
     )
@@ -213,7 +213,7 @@ def test_a_scene_that_fits_is_written_as_it_is(command_line: CommandLine, tmp_pa
         32,
         "--steps",
         4,
-        "--no-view",
+        "--no-page",
         "--json",
         "-",
         "-w",

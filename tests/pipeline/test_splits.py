@@ -188,7 +188,7 @@ def test_a_held_out_view_never_trains(folder: Path, g2ard: Program, watch: Watch
 
 def test_pools_state_their_splits(folder: Path, g2ard: Program, watch: Watch) -> None:
     (folder / "split.json").write_text(json.dumps({"train": ["a"], "test": ["b"]}))  # of something else
-    g2ard("poses", "ball.ply", "-n", 24, "-o", "poses.json")
+    g2ard("poses", "ball.ply", "-k", 24, "-o", "poses.json")
     g2ard("distill", "ball.ply", "-n", 200, "--steps", 4, "--size", 64, "-o", "run")
     for path, count in ((folder / "poses.json", 24), (folder / "run" / "views.json", 128)):
         found = read_view_set(path)

@@ -259,7 +259,7 @@ def test_invisible_scenes_are_refused(splats) -> None:
 
 def test_command(scenes, command_line: CommandLine, tmp_path: Path) -> None:
     write_splats(tmp_path / "scene.ply", scenes["statue"])
-    arguments = ("poses", "scene.ply", "--count", 12, "--size", "320x200", "--fov", 60, "-o", "p.json")
+    arguments = ("poses", "scene.ply", "-k", 12, "--resolution", "320x200", "--fov", 60, "-o", "p.json")
     status, out, error = command_line(*arguments, "--up", "0,0,1", "--json", "-", cwd=tmp_path)
     assert status == 0, error
     assert "orbit" in error
@@ -274,7 +274,7 @@ def test_command(scenes, command_line: CommandLine, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "wrong", [("--count", "0"), ("--kind", "spiral"), ("--size", "800"), ("--up", "0,0"), ("--up", "0,0,0")]
+    "wrong", [("-k", "0"), ("--kind", "spiral"), ("--resolution", "800"), ("--up", "0,0"), ("--up", "0,0,0")]
 )
 def test_command_usage(wrong, command_line: CommandLine, tmp_path: Path) -> None:
     status, _, error = command_line("poses", "scene.ply", "-o", "p.json", *wrong, cwd=tmp_path)

@@ -30,18 +30,18 @@ simplify scene.ply -r 4 -o tiny.ply
 distill scene.ply -r 4 --steps 3 --size 48 -o run
 recover tiny.ply --teacher scene.ply --views photos --steps 2 -o recovered.ply
 adapt tiny.ply --views photos --steps 2 -o adapted.ply
-register small.ply --photos new --focal 1200 --poses rough.json --keep uncertain -o poses.json
+register small.ply --images new --focal 1200 --poses rough.json --keep uncertain -o poses.json
 lift cloud.ply -o lifted.ply
 ingest scene.ply -o tiles
 convert scene.ply scene.sog
 clean scene.ply -o clean.ply
-poses scene.ply -n 4 -o pool.json
+poses scene.ply -k 4 -o pool.json
 select scene.ply --views pool.json -k 2 -o chosen.json
-render scene.ply -n 2 --size 48 --sheet sheet.png
+render scene.ply -k 2 --size 48 --sheet sheet.png
 view scene.ply -o view.html
 info scene.ply
 evaluate tiny.ply --teacher scene.ply --views photos
-compare scene.ply tiny.ply -n 2 --size 48 -o compare.html
+compare scene.ply tiny.ply -k 2 --size 48 -o compare.html
 lod scene.ply -r 1,4 --merge-only -o levels
 """
 

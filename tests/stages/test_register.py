@@ -140,7 +140,7 @@ def test_recalls_count_every_photo() -> None:
 
 
 def test_the_command_writes_and_scores_views(site: Path, command_line: CommandLine, tmp_path: Path) -> None:
-    common = ("--photos", site / "photos", "--intrinsics", site / "truth.json", "--size", 128, "--json", "-")
+    common = ("--images", site / "photos", "--intrinsics", site / "truth.json", "--size", 128, "--json", "-")
     common = (*common, "--report", "page.html", "--set", "register.coarsest=32", "-o", "poses.json")
     scored = ("--truth", site / "truth.json", "--metres-per-unit", "1")
     arguments = ("register", site / "scene.ply", *common, "--poses", site / "coarse.txt", *scored)
@@ -185,7 +185,7 @@ def test_the_command_writes_and_scores_views(site: Path, command_line: CommandLi
         ),
         ("--photos views.json --report scene.ply -w", 2, "is both an input and the output"),
         ("--photos views.json --pool absent.json", 1, "absent.json"),
-        ("--photos views.json --poses away.txt", 1, "none of 4 photos was registered"),
+        ("--images views.json --poses away.txt", 1, "none of 4 photos was registered"),
     ],
 )
 def test_errors_are_one_line(
@@ -246,7 +246,7 @@ def test_photos_to_poses_to_an_adapted_scene(site: Path, command_line: CommandLi
     """`adapt` and `recover` read the output of `register`, and the scene takes on the photos' light."""
     from g2ard.rendering.targets import Photos
 
-    photos = ("--photos", site / "photos", "--intrinsics", site / "views.json", "--size", "128")
+    photos = ("--images", site / "photos", "--intrinsics", site / "views.json", "--size", "128")
     ask = ("register", site / "scene.ply", *photos, "--poses", site / "coarse.txt", "-o", "poses.json")
     succeeds(command_line, tmp_path, *ask)
     views = ("--views", "poses.json", "--split", "all")
@@ -278,7 +278,7 @@ def test_keep_all_writes_the_start_of_photos_without_a_pose(site: Path) -> None:
 
 def test_the_protocol_of_gs_cpr(site: Path, command_line: CommandLine, tmp_path: Path) -> None:
     pytest.importorskip("pycolmap")
-    arguments = (*("--photos", site / "views.json", "--size", "128", "--protocol", "gs-cpr"),)
+    arguments = (*("--images", site / "views.json", "--size", "128", "--protocol", "gs-cpr"),)
     arguments = (*arguments, "--poses", site / "coarse.txt", "--report", "page.html", "-o", "poses.json")
     out = succeeds(command_line, tmp_path, "register", site / "scene.ply", *arguments, "--json", "-").out
     rows = json.loads(out)["photos"]
@@ -294,7 +294,7 @@ def test_broken_photos_are_refused_rows(site: Path, command_line: CommandLine, t
     (tmp_path / "photos/view_000.png").write_bytes(b"\x89PNG broken")
     for lens in (("--focal", "128"), ("--intrinsics", site / "truth.json")):
         status, out, err = command_line(
-            *("register", site / "scene.ply", "--photos", "photos", *lens, "--poses", site / "coarse.txt"),
+            *("register", site / "scene.ply", "--images", "photos", *lens, "--poses", site / "coarse.txt"),
             *("-o", "poses.json", "--report", "page.html", "--json", "-", "-w"),
             cwd=tmp_path,
         )
@@ -306,7 +306,7 @@ def test_broken_photos_are_refused_rows(site: Path, command_line: CommandLine, t
 
 def test_python_registers_as_the_command_does(site: Path, command_line: CommandLine, tmp_path: Path) -> None:
     ask = (
-        "--photos",
+        "--images",
         site / "views.json",
         "--poses",
         site / "coarse.txt",

@@ -277,7 +277,7 @@ def test_a_plugin_matches(command_line: CommandLine, tmp_path: Path) -> None:
 
 
 _CALL = [
-    *("register", "scene.ply", "--photos", "views.json", "--poses", "coarse.json"),
+    *("register", "scene.ply", "--images", "views.json", "--poses", "coarse.json"),
     *("--size", "400", "-o", "poses.json"),
 ]
 

@@ -73,7 +73,7 @@ def clean(
         bool, typer.Option("--dry-run", help="Report what would be removed, write no scene.")
     ] = False,
 ) -> None:
-    """Remove clutter: invisible Gaussians, giants, needles and floaters; haze and streaks on request.
+    """Remove clutter: invisible Gaussians, giants, needles, floaters; haze on request.
 
     Visibility is measured from generated views.
     """

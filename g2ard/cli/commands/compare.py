@@ -39,7 +39,7 @@ def compare(
     ] = None,
     views: opt.ViewsOrMadeOption = None,
     images: opt.ImagesOption = None,
-    count: Annotated[int, typer.Option("-n", "--count", min=1, help="Views to generate.")] = 24,
+    looks: Annotated[int, typer.Option("-k", min=1, metavar="K", help="Views to generate.")] = 24,
     size: opt.SizeOption = None,
     background: opt.BackgroundOption = None,
 ) -> None:
@@ -53,7 +53,7 @@ def compare(
     from g2ard.viewer import check_page_output, write_page
 
     if views is not None and not is_made(views):
-        run.refuse_typed("on given views", "count")
+        run.refuse_typed("on given views", "looks")
     paths = run_scene(first), run_scene(second)
     if output is not None:
         run.claim("--output", output)
@@ -66,7 +66,7 @@ def compare(
         reference,
         opt.with_images(views, images),
         beside=paths[0],
-        count=count,
+        count=looks,
         seed=run.seed,
         **run.callbacks,
     )

@@ -17,7 +17,12 @@ from g2ard.errors import InputError, OutputError
 from g2ard.io.scene_formats import SceneFormat, check_options, scene_format, written_bytes
 
 
-@command("convert", example="g2ard convert room.ply tree.spz --box -2,-2,-2,2,2,2 both.sog", scenes=True)
+@command(
+    "convert",
+    example="g2ard convert room.ply tree.spz --box -2,-2,-2,2,2,2 both.sog",
+    scenes=True,
+    without=("seed", "threads", "device"),
+)
 def convert(
     run: Run,
     scenes: Annotated[

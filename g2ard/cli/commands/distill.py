@@ -77,8 +77,8 @@ def distill(
         bool,
         typer.Option("--clean", help="First remove invisible and stray Gaussians, as `g2ard clean` does."),
     ] = False,
-    view: Annotated[
-        bool, typer.Option("--view/--no-view", help="Write view.html, a viewer page with the scene.")
+    page: Annotated[
+        bool, typer.Option("--page/--no-page", help="Write view.html, a viewer page with the scene.")
     ] = True,
     resume: opt.ResumeOption = False,
     size: opt.SizeOption = None,
@@ -208,7 +208,7 @@ def _distil(
             report = _scored(run, job, result, folder)
         report["seconds"] = _seconds(before, report["seconds"], time.monotonic() - began)
         _write_pages(run, source, job, result, report, folder.path)
-        if run.config["view"]:
+        if run.config["page"]:
             seen, colour = job.views.train.cameras, job.config.recover.background
             with run.finishing("view.html"):
                 report["bytes"]["view"], page = folder.write_view(result.splats, seen, colour)

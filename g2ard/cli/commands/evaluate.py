@@ -57,7 +57,7 @@ def evaluate(
     size: opt.SizeOption = None,
     background: opt.BackgroundOption = None,
 ) -> None:
-    """Score scenes against photos or a teacher's renders: PSNR, SSIM, edges, size, needles, overdraw.
+    """Score scenes against photos or a teacher's renders: PSNR, SSIM, edges, needles, overdraw.
 
     Several runs are scored in one set of views at one size: those that one held out and none trained on.
 

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from g2ard.scene.splats import Splats
 
 
-@command("info", example="g2ard info scene.ply --json -")
+@command("info", example="g2ard info scene.ply --json -", without=("seed", "threads", "device"))
 def info(
     run: Run,
     paths: Annotated[
@@ -34,7 +34,7 @@ def info(
         bool, typer.Option("--devices", help="List GPUs and which one --device would use.")
     ] = False,
 ) -> None:
-    """Show what a file holds: counts, extents, SH degree, opacities, scales, overdraw, invalid values.
+    """Show what a file holds: counts, extents, SH degree, opacities, overdraw, invalid values.
 
     Files that cannot be read are reported and skipped; the exit status is then 1.
     """

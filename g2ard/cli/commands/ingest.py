@@ -17,6 +17,7 @@ from g2ard.system.peak_memory import peak_rss
     example="g2ard ingest city.ply -o tiles/ --tile-rows 2M",
     settings="g2ard.stages.lift:LiftConfig",
     scenes=True,
+    without=("seed",),
 )
 def ingest(
     run: Run,

@@ -13,7 +13,7 @@ from g2ard.cli.run_result import say_weight
 from g2ard.progress import plural
 
 
-@command("lift", example="g2ard lift stadium.laz -o prior.ply")
+@command("lift", example="g2ard lift stadium.laz -o prior.ply", without=("seed",))
 def lift(
     run: Run,
     cloud: Annotated[

@@ -30,7 +30,7 @@ def _size(text: str) -> _Size:
     return _Size((int(match[1]), int(match[2])))
 
 
-@command("poses", example="g2ard poses scene.ply --count 128 -o poses.json", scenes=True)
+@command("poses", example="g2ard poses scene.ply -k 128 -o poses.json", scenes=True)
 def poses(
     run: Run,
     scene: SceneArgument,
@@ -42,8 +42,8 @@ def poses(
             help="Orbit the scene, walk through it, look from above, from inside, or at its sharpest part."
         ),
     ] = "auto",
-    count: Annotated[int, typer.Option("-n", "--count", min=1, help="Number of poses.")] = 128,
-    size: Annotated[
+    looks: Annotated[int, typer.Option("-k", min=1, metavar="K", help="Views to generate.")] = 128,
+    resolution: Annotated[
         _Size | None,
         typer.Option(parser=_size, metavar="WxH", help="Image size, pixels; 800x600 by default."),
     ] = None,
@@ -63,9 +63,9 @@ def poses(
     splats = run.load(scene)
     pool = plan_pool(
         splats,
-        count,
+        looks,
         kind=kind,
-        size=size or (800, 600),
+        size=resolution or (800, 600),
         fov=fov,
         up=up,
         seed=run.seed,
@@ -73,7 +73,7 @@ def poses(
     )
     splits = splits_of(None, pool.cameras.names)
     run.write_views(output, pool.cameras, format, splits)
-    run.say(f"{output}: {plural(count, 'pose')}, {pool.kind} ({pool.why}; up is {direction(pool.up)})")
+    run.say(f"{output}: {plural(looks, 'pose')}, {pool.kind} ({pool.why}; up is {direction(pool.up)})")
     shares = (("is in no view", pool.unseen), ("is smaller than a pixel in all views", pool.coarse))
     if told := [
         f"{share:.0%} of the scene {what}" for what, share in shares if share > _LEAST_REPORTED_SHARE
@@ -81,7 +81,7 @@ def poses(
         run.say("; ".join(told))
     run.result(
         {
-            "count": count,
+            "count": looks,
             "kind": pool.kind,
             "why": pool.why,
             "up": pool.up.tolist(),

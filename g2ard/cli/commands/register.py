@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 @command(
     "register",
-    example="g2ard register small.ply --photos new/ --focal 1200 --poses coarse.txt -o poses.json",
+    example="g2ard register small.ply --images new/ --focal 1200 --poses coarse.txt -o poses.json",
     settings="g2ard.stages.register:RegisterConfig",
     fields=tuple(f"register.{name}" for name in ("size", "matcher", "refine", "passes", "accept")),
     scenes=True,
@@ -32,6 +32,7 @@ def register(
     photos: Annotated[
         Path,
         typer.Option(
+            "--images",
             metavar="DIR|VIEWS",
             help="Photos to register: a folder, or views with photos and intrinsics. By default their own "
             "poses are the start.",
@@ -98,7 +99,7 @@ def register(
         float | None,
         typer.Option("--metres-per-unit", min=1e-9, help="With --truth: report errors in cm and recall."),
     ] = None,
-    split: Annotated[str, typer.Option(metavar="train|test|all", help="Split of --photos VIEWS.")] = "all",
+    split: Annotated[str, typer.Option(metavar="train|test|all", help="Split of --images VIEWS.")] = "all",
     report: Annotated[
         Path | None,
         typer.Option(metavar="FILE.html", help="Also write a page of renders overlaid on photos."),

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from g2ard.cli import options as opt
-from g2ard.cli.budget_options import Count
 from g2ard.cli.frame import Run, command
 from g2ard.config.choices import BLACK, is_made
 from g2ard.io.atomic import atomic_folder, check_output
@@ -29,7 +28,7 @@ _NO_FOLDER = (".png", ".jpg", ".jpeg", ".avi", ".mov", ".mkv", ".webm")
 
 @command(
     "render",
-    example="g2ard render scene.ply -n 4 --sheet look.png",
+    example="g2ard render scene.ply -k 4 --sheet look.png",
     scenes=True,
     outputs=("output", "sheet"),
 )
@@ -59,11 +58,8 @@ def render(
     depth: Annotated[
         bool, typer.Option("--depth", help="Also write NAME.depth.npy, in scene units.")
     ] = False,
-    count: Annotated[
-        Count | None,
-        typer.Option(
-            "-n", "--count", parser=Count.parse_absolute, metavar="COUNT", help="Views to generate."
-        ),
+    looks: Annotated[
+        int | None, typer.Option("-k", min=1, metavar="K", help="Views to generate; by default 128.")
     ] = None,
     convention: opt.ConventionOption = "gsplat",
     split: opt.SplitOption = "all",
@@ -82,10 +78,11 @@ def render(
 
     if output is None and sheet is None:
         raise typer.BadParameter("give -o DIR, --sheet FILE.png or both")
-    if turn is not None and (views is not None or count is not None):
-        raise typer.BadParameter("--orbit generates its views, so it excludes --views and -n")
+    if turn is not None and (views is not None or looks is not None):
+        raise typer.BadParameter("--orbit generates its views, so it excludes --views and -k")
     output, animation = _folder_or_animation(run, output, depth)
-    generated = _views_count(count, views)
+    if looks is not None and views is not None and not is_made(views):
+        raise typer.BadParameter("-k generates views, so it excludes --views; give one")
     if views is not None and not is_made(views):
         run.refuse_typed("without generated views", "up")
     if animation is None:
@@ -101,9 +98,9 @@ def render(
     else:
         found = views_or_pool(
             splats,
-            "made" if generated is not None else views,
+            "made" if looks is not None else views,
             beside=scene,
-            count=generated,
+            count=looks,
             up=up,
             seed=run.seed,
             progress=run.progress,
@@ -185,12 +182,3 @@ def _write_sheet(
     rows = [images[i : i + columns] for i in range(0, len(images), columns)]
     captions = [", ".join(names[i : i + columns]) for i in range(0, len(images), columns)]
     write_png(path, contact_sheet(rows, [""] * columns, row_labels=captions), overwrite=overwrite)
-
-
-def _views_count(count: Count | None, views: Path | None) -> int | None:
-    """Check -n, and return the number of views to generate if it gives it."""
-    if count is None:
-        return None
-    if views is not None and not is_made(views):
-        raise typer.BadParameter("-n generates views, so it excludes --views; give one")
-    return int(count.value)
