@@ -49,11 +49,13 @@ def told(report: dict[str, Any], *, verbose: bool = False) -> list[str]:
     from g2ard.jobs.packing import score_lines
     from g2ard.report.kinds import KindScore
     from g2ard.stages.recover.report import RecoverReport, outcome, unregularized
+    from g2ard.stages.simplify.growth import RECOVERED_GAPS, gaps_line
 
     rounds = [[RecoverReport.of(done) for done in entry.get("recover", [])] for entry in report["rounds"]]
     lines = [outcome(one) for entry in rounds for one in entry]
     lines += [unregularized(rounds)] if verbose else []
     lines += [loss(KindScore.of(kind)) for kind in report["kinds"]]
+    lines.append(gaps_line(report["opacity_lost"], RECOVERED_GAPS))
     if report["unseen"] and report["unseen"] > _LEAST_REPORTED_SHARE:
         lines.append(f"{report['unseen']:.0%} of the scene is in no view: simplified but not recovered")
     if packed := report.get("packed"):

@@ -37,7 +37,7 @@ from g2ard.scene.sky import sky_mask
 from g2ard.scene.splats import Splats
 from g2ard.stages.evaluate import evaluate
 from g2ard.stages.simplify import simplify
-from g2ard.stages.simplify.growth import say_gaps
+from g2ard.stages.simplify.growth import opacity_lost, say_gaps
 
 RATIOS = (1.0, 2.0, 4.0, 8.0, 16.0)
 """Reduction factors; each level has half the Gaussians of the previous one, as in viewers' own tools."""
@@ -283,6 +283,8 @@ def _level(
             progress=job.progress,
         )
         level, merged = done.splats, done.simplified
+        lost = opacity_lost(job.prior, level, held_out.cameras)
+        say_gaps(lost, job.say, f"give levels more Gaussians (--ratios), here {count:,}")
     else:
         level = merged = _merged(job, finer, count)
     scores = [

@@ -14,6 +14,7 @@ from g2ard.report.kinds import KindScore, by_kind
 from g2ard.scene.cameras import USUAL
 from g2ard.scene.splats import Splats
 from g2ard.stages.evaluate import evaluate
+from g2ard.stages.simplify.growth import opacity_lost
 
 
 def report_of(job: DistillJob, done: Distilled) -> dict[str, Any]:
@@ -22,8 +23,9 @@ def report_of(job: DistillJob, done: Distilled) -> dict[str, Any]:
     Returns:
         Counts, bytes, scores in held-out views (`scores`) and in views of other kinds (`apart`, or None),
         their image size (`size`), means at the views' own size if a requested one shrank them (`own_size`, or
-        None), their summary by kind (`kinds`), Gaussians per pixel (`overdraw`),
-        rounds, seconds by stage, and every setting by path.
+        None), their summary by kind (`kinds`), the share of the
+        light of opaque pixels that the result lets through (`opacity_lost`; None for points from photos),
+        Gaussians per pixel (`overdraw`), rounds, seconds by stage, and every setting by path.
     """
     scenes, background = (done.simplified, done.splats), job.config.recover.background
     scores = _scores(*scenes, job.held_out, background, job.progress)
@@ -49,6 +51,9 @@ def report_of(job: DistillJob, done: Distilled) -> dict[str, Any]:
         "own_size": own_size and {name: _means(scores) for name, scores in own_size.items()},
         "kinds": [kind.as_dict() for kind in by_kind(before, after, USUAL if made else "given")],
         "unseen": _unseen(job, done),
+        "opacity_lost": None
+        if job.config.recover.from_points
+        else opacity_lost(job.prior, done.splats, job.held_out.cameras),
         "overdraw": overdraw(done.splats, job.held_out.cameras),
         "against": job.against,
         "preset": job.preset,

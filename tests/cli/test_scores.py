@@ -158,6 +158,8 @@ def test_every_score_has_its_size(runs: Path, command_line: CommandLine) -> None
     report = json.loads((runs / "run" / "report.json").read_text())
     assert report["size"] == "32×24 px"
     assert report["own_size"]["recovered"]["scored_in"] == "1 photo, 64×48 px"
+    assert report["opacity_lost"] > 0.02
+    assert f"gaps: surfaces let {100 * report['opacity_lost']:.1f} %" in printed
     assert "32×24 px" in (runs / "run" / "report.html").read_text()
     assert "32×24 px" in succeeds(command_line, runs, "info", "run").out
     ask = ("--views", "photos.json", "--size", 32, "--steps", 2)

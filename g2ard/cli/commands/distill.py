@@ -138,7 +138,7 @@ def distill(
         distill_in_tiles(run, scene, tiling, budget, options, folder)
         return
     job = prepare(scene, budget, options, **run.callbacks)
-    cost = cost_of(job, job.aim.count, page=view)
+    cost = cost_of(job, job.aim.count, page=page)
     if dry_run:
         _tell_cost(run, job, cost)
         return

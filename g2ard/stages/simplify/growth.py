@@ -21,6 +21,10 @@ from g2ard.scene.splats import Splats
 
 _GAPS = 0.02
 """Least share of opacity lost that shows as gaps."""
+_GAP_VIEWS, _GAP_PIXELS = 8, 400
+"""Views in which it is measured, and their longer side."""
+RECOVERED_GAPS = "keep more Gaussians, or recover longer (--schedule best)"
+"""What to do about gaps that recovery left."""
 
 GROWTHS = (1.25, 1.6, 2.0, 2.5, 3.2, 4.0)
 """Growths to choose from; the first is for what recovery improves afterwards, and for planning."""
@@ -139,18 +143,45 @@ def _images(scene: Splats, views: list[Camera], settings: RasterSettings) -> lis
     return [np.dstack([np.clip(one.image, 0, 1), one.alpha]) for one in made]
 
 
-def say_gaps(lost: float | None, say: Say) -> None:
-    """Warn if a simplified scene lets light through where the dense one did not.
+def opacity_lost(dense: Splats, result: Splats, cameras: Cameras) -> float:
+    """Return the share of the light that the dense scene's opaque pixels stop but the result lets through.
+
+    Measured in up to eight of the views, at up to 400 pixels.
+
+    >>> from g2ard.scene.cameras import Camera
+    >>> rng = np.random.default_rng(0)
+    >>> ball = rng.normal(size=(900, 3))
+    >>> ball /= np.linalg.norm(ball, axis=1, keepdims=True)
+    >>> scene = Splats.create(ball, scales=np.full((900, 3), 0.05), logit_opacities=np.full(900, 4))
+    >>> views = Cameras.of([Camera.facing([0, -3, 0], [0, 0, 0], width=64, height=48)])
+    >>> opacity_lost(scene, scene, views), opacity_lost(scene, scene.take(range(300)), views) > 0.2
+    (0.0, True)
+    """
+    some = cameras.take(evenly_spaced(len(cameras), _GAP_VIEWS)).resized(_GAP_PIXELS)
+    _, lost, opaque = Renders.of(dense, some).compare(result)
+    return lost / opaque if opaque else 0.0
+
+
+def gaps_line(lost: float | None, hint: str) -> str | None:
+    """Return a warning if a result lets light through where the dense scene did not, otherwise None.
 
     Args:
-        lost: `opacity_lost` of its report.
+        lost: share of the light of opaque pixels.
 
-    >>> say_gaps(0.031, print)  # doctest: +ELLIPSIS
-    gaps: surfaces let 3.1 % of the light through that they stopped before; ...
-    >>> say_gaps(0.001, print)
+    >>> gaps_line(0.031, "keep more Gaussians")
+    'gaps: surfaces let 3.1 % of the light through that they stopped before; keep more Gaussians'
+    >>> gaps_line(0.001, "keep more Gaussians")
     """
-    if lost is not None and lost >= _GAPS:
-        say(
-            f"gaps: surfaces let {100 * lost:.1f} % of the light through that they stopped before; keep more "
-            "Gaussians, or close them by recovery (g2ard distill)"
-        )
+    if lost is None or lost < _GAPS:
+        return None
+    return f"gaps: surfaces let {100 * lost:.1f} % of the light through that they stopped before; {hint}"
+
+
+def say_gaps(
+    lost: float | None,
+    say: Say,
+    hint: str = "keep more Gaussians, or close them by recovery (g2ard distill)",
+) -> None:
+    """Warn of gaps, see `gaps_line`; `lost` is the `opacity_lost` of a report."""
+    if line := gaps_line(lost, hint):
+        say(line)
