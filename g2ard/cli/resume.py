@@ -67,6 +67,8 @@ def stoppable(run: Run, place: Path, resume: bool, output: Path) -> Iterator[Non
         with locked(place.parent, _locked_name(place, output)):
             if is_taken(output) and not run.overwrite:  # another run wrote it since it was checked
                 raise OutputError("exists", path=output, hint="{overwrite=True} replaces it")
+            if resume and left_at(place):
+                say_from(run, place, output)
             with _kept(run, place, resume):
                 yield
     finally:
@@ -93,6 +95,17 @@ def _kept(run: Run, place: Path, resume: bool) -> Iterator[None]:
     finally:
         if not left_at(place):
             _remove(place)
+
+
+def say_from(run: Run, place: Path, what: Path) -> None:
+    """Say where a resumed run continues: its finished stages, and the steps of a stage under way."""
+    from g2ard.stages.recover.checkpoint import steps_at
+
+    files = sorted(place.glob("[!.]*.npz")) if place.is_dir() else [place]
+    steps = [count for file in files if (count := steps_at(file)) is not None]
+    done = [file.stem for file in files if place.is_dir() and not file.stem.endswith(".checkpoint")]
+    parts = [f"after {', '.join(done)}"] * bool(done) + [f"from step {count:,}" for count in steps]
+    run.say(f"{what}: continues {' '.join(parts) or f'from {place}'}")
 
 
 def left_at(place: Path) -> bool:

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from g2ard.cli.frame import Run
-from g2ard.cli.resume import OPTIONS, check_stopped, finished_before, is_finished, left_at
+from g2ard.cli.resume import OPTIONS, check_stopped, finished_before, is_finished, left_at, say_from
 from g2ard.config.choices import Colour, ViewFormat
 from g2ard.errors import InputError, OutputError
 from g2ard.io import write_views
@@ -136,6 +136,8 @@ class RunFolder:
         run = self._run
         if self._resume and not left_at(self.work):
             run.say(f"{self.path}: nothing to resume, starting over")
+        elif self._resume:
+            say_from(run, self.work, self.path)
         if not self._resume:
             shutil.rmtree(self.work, ignore_errors=True)
         self.work.mkdir(parents=True, exist_ok=True)

@@ -6,10 +6,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from g2ard.cli.frame import Run
-from g2ard.io.scene_formats import written_bytes
+from g2ard.io.scene_formats import FORMATS, scene_format, written_bytes
 from g2ard.progress import plural
 
 if TYPE_CHECKING:
+    from g2ard.jobs.budget import Budget
     from g2ard.jobs.measured_budget import Aim
     from g2ard.report.kinds import KindScore
     from g2ard.scene.splats import Splats
@@ -21,12 +22,8 @@ _LEAST_REPORTED_SHARE = 0.005
 """Share of the scene too small to report."""
 
 
-def write_table(run: Run, report: dict[str, Any], larger: str = "") -> None:
-    """Print the scores by kind of view, under counts, sizes and times.
-
-    Args:
-        larger: why the result is larger than its source, if that is not said elsewhere.
-    """
+def write_table(run: Run, report: dict[str, Any]) -> None:
+    """Print the scores by kind of view, under counts, sizes and times."""
     from g2ard.report.kinds import COLUMNS, KindScore, cells
 
     size = report["bytes"]
@@ -34,11 +31,14 @@ def write_table(run: Run, report: dict[str, Any], larger: str = "") -> None:
     times = ", ".join(f"{name} {value:.1f} s" for name, value in seconds.items())
     count = report["input_count"]
     before = plural(count, "point") if report["lifted"] else f"{count:,}"
-    why = f" ({larger})" if larger and size["output"] > size["input"] else ""
-    run.say(
-        f"{before} → {plural(report['output_count'], 'Gaussian')}, "
-        f"{size['input'] / 1e6:.2f} → {size['output'] / 1e6:.2f} MB as .ply{why}; {times}"
-    )
+    made = f"{size['output'] / 1e6:.2f} MB as .ply"
+    if packed := report.get("packed"):
+        made = f"{size['file'] / 1e6:.2f} MB as .{packed['file'].partition('.')[2]}"
+    if report["photos"]:
+        before, sizes = plural(report["photos"], "photo"), made
+    else:
+        sizes = f"{size['input'] / 1e6:.2f} MB as .ply → {made}"
+    run.say(f"{before} → {plural(report['output_count'], 'Gaussian')}, {sizes}; {times}")
     title = f"held-out views against {report['against']}, {report['size']}, simplified → recovered:"
     run.console.table(title, list(COLUMNS), cells(map(KindScore.of, report["kinds"])))
 
@@ -116,6 +116,19 @@ def say_views(run: Run, views: dict[str, Any] | None, chosen: bool) -> None:
         )
 
 
+def say_fit(run: Run, source: Path, budget: Budget, name: str) -> None:
+    """Say that a file already has the bytes of a budget; `name` is that of the output."""
+    if budget.bytes is None or not source.is_file() or source.stat().st_size > budget.bytes:
+        return
+    fits = f"{source.name} has {source.stat().st_size / 1e6:.2f} MB, which already fits {budget.fit}"
+    ours = scene_format(name).suffix
+    suffixes = (known.suffix for known in FORMATS.values())
+    if next((suffix for suffix in suffixes if source.name.lower().endswith(suffix)), None) == ours:
+        run.say(f"nothing to do: {fits}")
+    else:
+        run.say(f"{fits}; as {ours} it is larger, and reduced to fit")
+
+
 def say_weight(run: Run, source: Path, output: Path, splats: Splats, *, lifted: Splats | None = None) -> None:
     """Print a hint if the output is larger than its source file, or than the `lifted` points."""
     inputs = [] if lifted is None else [(lifted.nbytes, "the lifted points have")]
@@ -134,7 +147,7 @@ def why_large(splats: Splats) -> str:
     share = splats.shN.nbytes / splats.nbytes
     if not share:
         return "packed formats are smaller than .ply"
-    return f"{share:.0%} of it is SH above degree 0; --set recover.sh_degree=0 removes it"
+    return f"{share:.0%} of it is SH above degree 0; --sh-degree 0 removes it"
 
 
 def tell_quality(run: Run, aim: Aim, splats: Splats) -> None:

@@ -112,7 +112,9 @@ def _missing(error: Any) -> list[str]:
         for p in options
         if p.required and not typed & {*p.opts, p.name}
     ]
+    named = {p.name for p in options}  # all of them, as some commands have a budget for one option alone
     budgets = {word for p in options if p.name in BUDGETS for word in (*p.opts, p.name)}
+    budgets = budgets if named >= BUDGETS.keys() else set()
     return [*found, *([f"a budget ({BUDGET_FLAGS})"] if budgets and not budgets & typed else [])]
 
 

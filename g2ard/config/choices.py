@@ -70,6 +70,9 @@ Axes = Literal[
 # fmt: on
 """Axes by the directions of x, y and z: left or right, down or up, back or forward."""
 AXES: tuple[Axes, ...] = get_args(Axes)
+AxesName = Literal[Axes, "y-up", "z-up"]
+"""Axes by directions, or by the usual right-handed system with that axis up."""
+NAMED_AXES: dict[str, Axes] = {"y-up": "RUB", "z-up": "RFU"}
 
 LpipsInput = Literal["scaled", "unscaled"]
 """Value range of the images passed to LPIPS's networks (`g2ard.rendering.lpips`)."""

@@ -151,6 +151,7 @@ def write_scene(
 
     check_type("splats", splats, Splats)
     output_format = check_options(path, options)
+    check_scene_output(path, overwrite)
     writer = getattr(import_module(f"g2ard.io.{output_format.module}"), output_format.function)
     told = {"progress": progress} if output_format.tells else {}
     error = writer(Path(path), splats, overwrite=overwrite, **told, **options)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from g2ard.config.checks import Degree, Positive, checks_arguments
-from g2ard.config.choices import Axes, RenderModel
+from g2ard.config.choices import AxesName, RenderModel
 from g2ard.config.schema import Settings
 from g2ard.errors import InputError, require
 from g2ard.io import check_scene, spz
@@ -47,7 +47,7 @@ class Changes(Settings):
     rotate: Sequence[float] | None = None
     translate: Sequence[float] | None = None
     recentre: bool = False
-    to_axes: Axes | None = None
+    to_axes: AxesName | None = None
     sh_degree: Degree | None = None
 
     def __post_init__(self) -> None:
@@ -114,8 +114,8 @@ def convert(
     rotate: Sequence[float] | None = None,
     translate: Sequence[float] | None = None,
     recentre: bool = False,
-    from_axes: Axes | None = None,
-    to_axes: Axes | None = None,
+    from_axes: AxesName | None = None,
+    to_axes: AxesName | None = None,
     sh_degree: int | None = None,
     render_model: RenderModel | None = None,
     say: Say = unsaid,
@@ -161,7 +161,7 @@ def convert(
 
 def read_merged(
     scenes: Scene | Sequence[Scene],
-    from_axes: Axes | None = None,
+    from_axes: AxesName | None = None,
     render_model: RenderModel | None = None,
     say: Say = unsaid,
 ) -> Splats:
@@ -170,7 +170,7 @@ def read_merged(
     return join([_loaded(scene, from_axes, render_model, say) for scene in several])
 
 
-def _loaded(scene: Scene, axes: Axes | None, render_model: RenderModel | None, say: Say) -> Splats:
+def _loaded(scene: Scene, axes: AxesName | None, render_model: RenderModel | None, say: Say) -> Splats:
     """Read a scene whose file may store other axes than its format defines."""
     splats = scene if isinstance(scene, Splats) else load_scene(scene, say, render_model)
     if axes is None:

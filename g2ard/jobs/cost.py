@@ -98,7 +98,7 @@ def cost_of(job: DistillJob, count: int, *, recover: bool = True, page: bool = T
     kept, size = job.is_kept(count), pixels / _USUAL_PIXELS
     steps = 0 if kept or not recover else _steps(job, count)
     views = len(test) + apart + (len(train) if recover else 0)
-    stages = [("teacher", _RENDER * size * (views if steps else len(test) + apart))]
+    stages = [("targets", _RENDER * size * (views if steps else len(test) + apart))]
     if not kept:
         stages += [("visibility", _VISIBILITY * len(train)), ("simplify", _SIMPLIFY * len(job.prior))]
         stages += [("recover", job.config.recover.recovery_time or _STEP * size * steps)] if recover else []

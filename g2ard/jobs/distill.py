@@ -215,7 +215,7 @@ def prepare(
             shown = read.prior.take(np.arange(read.given)) if read.lifted else prior
             insisted, renders_too = options.photos is True, not read.lifted
             check_photos(shown, cameras, recover.background, say, insisted=insisted, renders=renders_too)
-    say(_task(prior, aim.count, cameras if recovers else None, photos))
+    say(_task(prior, aim.count, cameras if recovers else None, photos, alone=read.from_photos))
     if not read.from_photos and aim.count == len(prior):
         say(f"nothing to simplify: the scene has {plural(len(prior), 'Gaussian')}")
     if recovers:
@@ -270,7 +270,7 @@ def _regularizers(
     if read.from_photos and kind == "auto" and not paper:
         return (
             FREE,
-            "none (recovery moves points from photos freely, because they are rough)",
+            "none; points from photos are rough, and move freely",
             measure_prior(prior),
         )
     if read.lifted and kind == "paper":
@@ -278,13 +278,15 @@ def _regularizers(
     return regularizers_for(kind, prior, photos, paper=paper)
 
 
-def _task(prior: Splats, count: int, train: Cameras | None, photos: bool) -> str:
-    """Describe the task in one line; `train` are the views of recovery, if any."""
+def _task(prior: Splats, count: int, train: Cameras | None, photos: bool, *, alone: bool) -> str:
+    """Describe the task in one line; `train` are the views of recovery, `alone` starts from photos."""
     counts = f"{len(prior):,} → {plural(count, 'Gaussian')}"
     if train is None:
         return counts
     pictured = sum(path is not None for path in train.image_paths) if photos else 0
     against = kinds_told(pictured, len(train) - pictured)
+    if alone:
+        return f"{plural(pictured, 'photo')} → {plural(count, 'Gaussian')}"
     return f"{counts}; {plural(len(train), 'training view')} against {against}"
 
 

@@ -408,7 +408,7 @@ def aim_of(
 
 
 def _all_fit(splats: Splats) -> str:
-    return f"all {plural(len(splats), 'Gaussian')} already fit"
+    return f"nothing to do, all {plural(len(splats), 'Gaussian')} already fit"
 
 
 def _aim_for_quality(reduce: Reduction, wanted: Quality, file: str, recovered: bool) -> Aim:

@@ -21,9 +21,9 @@ def report_of(job: DistillJob, done: Distilled) -> dict[str, Any]:
     """Score the simplified and the recovered scene in held-out views, and describe the run.
 
     Returns:
-        Counts, bytes, scores in held-out views (`scores`) and in views of other kinds (`apart`, or None),
-        their image size (`size`), means at the views' own size if a requested one shrank them (`own_size`, or
-        None), their summary by kind (`kinds`), the share of the
+        Counts (`photos` for a start from photos alone), bytes, scores in held-out views (`scores`) and in
+        views of other kinds (`apart`, or None), their image size (`size`), means at the views' own size if a
+        requested one shrank them (`own_size`, or None), their summary by kind (`kinds`), the share of the
         light of opaque pixels that the result lets through (`opacity_lost`; None for points from photos),
         Gaussians per pixel (`overdraw`), rounds, seconds by stage, and every setting by path.
     """
@@ -43,6 +43,7 @@ def report_of(job: DistillJob, done: Distilled) -> dict[str, Any]:
         "input_count": len(job.prior),
         "output_count": len(done.splats),
         "lifted": job.lifted,
+        "photos": len(job.views.train.cameras) if job.config.recover.from_points else None,
         "cleaned": job.cleaned,
         "bytes": {"input": job.prior.nbytes, "output": done.splats.nbytes},
         "scores": scores,

@@ -455,7 +455,7 @@ class TeacherRenders(_Cached):
         self._background, self._settings = background, settings
         self._renderer = renderer
         if not lazy:
-            self.fill(2 if self._rounded else 4, progress, "teacher")
+            self.fill(2 if self._rounded else 4, progress, "targets")
             self._renderer = None  # its buffers are larger than the scene
 
     @property

@@ -121,7 +121,9 @@ def verdict(report: dict[str, Any]) -> str:
     if len(kinds) > 1:
         last = f"{weakest.kind} views are weakest ({weakest.psnr.after:.1f} dB)"
     count = f"{report['output_count']:,} of {plural(report['input_count'], 'Gaussian')}"
-    if report.get("lifted"):
+    if report.get("photos"):
+        count = f"{plural(report['output_count'], 'Gaussian')} from {plural(report['photos'], 'photo')}"
+    elif report.get("lifted"):
         count = f"{plural(report['output_count'], 'Gaussian')} from {plural(report['input_count'], 'point')}"
     what = "photos" if "photo" in report.get("against", "") else "scene"
     views = sum(kind.views for kind in kinds)

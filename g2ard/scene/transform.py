@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from g2ard.config.choices import AXES, RenderModel
+from g2ard.config.choices import AXES, NAMED_AXES, RenderModel
 from g2ard.errors import InputError, require
 from g2ard.scene.splats import ARRAYS, Splats
 
@@ -279,9 +279,12 @@ def change_of_axes(source: str, target: str) -> NDArray[np.float64]:
 
     >>> change_of_axes("RUB", "RFU") @ [1, 2, 3]
     array([ 1., -3.,  2.])
+    >>> change_of_axes("y-up", "z-up") @ [1, 2, 3]
+    array([ 1., -3.,  2.])
     """
+    source, target = (NAMED_AXES.get(name, name) for name in (source, target))
     for name in (source, target):
-        require("axes", repr(name), name in AXES, f"one of {', '.join(AXES)}")
+        require("axes", repr(name), name in AXES, f"one of {', '.join((*NAMED_AXES, *AXES))}")
     there, here = (np.array([_DIRECTIONS[letter] for letter in name], float) for name in (target, source))
     return there @ here.T
 

@@ -65,8 +65,8 @@ ENDLESS = {
     "poses": ("poses", "-k 20000"),
     "select": ("read", "--views many.json"),
     "render": ("render", "-k 400 --size 400"),
-    "evaluate": ("teacher", "--views many.json"),
-    "compare": ("teacher", "--views many.json"),
+    "evaluate": ("targets", "--views many.json"),
+    "compare": ("targets", "--views many.json"),
 }
 """Long commands: a stage in which Ctrl-C is typed, and options that let it last."""
 BAR = re.compile("^[^┏┡]*[━╸╺]|ETA|: working")

@@ -52,7 +52,7 @@ def adapt(
     work = output.parent / f".{output.name}.work"
     check_scene_run(run, work, resume, output)
     splats = run.load(compact)
-    made = [] if teacher is None else [("teacher", 4.0)]
+    made = [] if teacher is None else [("targets", 4.0)]
     run.console.expect([*made, ("adapt", 0.02 * config.steps)])
     teaching = Teaching(
         teacher,

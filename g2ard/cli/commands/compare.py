@@ -59,7 +59,7 @@ def compare(
         run.claim("--output", output)
         check_page_output(output, run.overwrite)
     page = [] if output is None else [("page", 1.0), ("sog", 2.0), ("sog", 0.5)]
-    run.console.expect([("poses", 1.0), ("teacher", 2.0), ("evaluate", 3.0), *page])
+    run.console.expect([("poses", 1.0), ("targets", 2.0), ("evaluate", 3.0), *page])
     reference, other = (run.load(path) for path in paths)
     colour = opt.background_of(run, background, first, second) or BLACK
     found = views_or_pool(

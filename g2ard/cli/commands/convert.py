@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, cast
 
 import typer
 
@@ -12,7 +12,7 @@ from g2ard import io
 from g2ard.cli.fields import ShDegreeOption
 from g2ard.cli.frame import Run, command
 from g2ard.cli.options import numbers
-from g2ard.config.choices import Axes, PlyLayout
+from g2ard.config.choices import NAMED_AXES, Axes, AxesName, PlyLayout
 from g2ard.errors import InputError, OutputError
 from g2ard.io.scene_formats import SceneFormat, check_options, scene_format, written_bytes
 
@@ -80,7 +80,7 @@ def convert(
     ] = None,
     recentre: Annotated[bool, typer.Option("--recentre", help="Drop the offset to map coordinates.")] = False,
     from_axes: Annotated[
-        Axes | None,
+        AxesName | None,
         typer.Option(
             case_sensitive=False,
             metavar="NAME",
@@ -89,11 +89,11 @@ def convert(
         ),
     ] = None,
     to_axes: Annotated[
-        Axes | None,
+        AxesName | None,
         typer.Option(
             case_sensitive=False,
             metavar="NAME",
-            help="Store coordinates in these axes, such as RFU (right, forward, up); scenes are RDF.",
+            help="Store coordinates y-up, z-up, or in axes such as RFU (right, forward, up); scenes are RDF.",
         ),
     ] = None,
     sh_degree: ShDegreeOption = None,
@@ -138,7 +138,7 @@ def convert(
     _check_output(run, output, options)
     if to_axes is not None and not as_table and (defined := scene_format(output)).axes is not None:
         changes = replace(changes, to_axes=None)  # the format's writer makes the change
-        options = _with_axes(options, defined, output, to_axes)
+        options = _with_axes(options, defined, output, NAMED_AXES.get(to_axes) or cast("Axes", to_axes))
     run.begin("read")
     whole = read_merged(scenes, from_axes, run.render_model, run.say)
     splats, read = changes.apply(whole), len(whole)

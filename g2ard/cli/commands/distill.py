@@ -11,8 +11,8 @@ import typer
 
 from g2ard.cli import options as opt
 from g2ard.cli.frame import Run, command
-from g2ard.cli.outputs import budget_of
-from g2ard.cli.run_result import say_views, say_weight, tell_quality, told, why_large, write_table
+from g2ard.cli.outputs import budget_of, refuse_file
+from g2ard.cli.run_result import say_fit, say_views, say_weight, tell_quality, told, write_table
 from g2ard.cli.tiling import tiling_of
 from g2ard.config.choices import is_made
 from g2ard.io import kind
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
         *("simplify.method", "simplify.keep_region", "select.focus"),
         *(
             f"recover.{name}"
-            for name in ("schedule", "steps", "recovery_time", "engine", "background", "seed")
+            for name in ("schedule", "steps", "recovery_time", "sh_degree", "engine", "background", "seed")
         ),
     ),
     scenes=True,
@@ -110,6 +110,7 @@ def distill(
     if scene is None or photos:
         run.refuse_typed("without generated views", "up")
     opt.choose_engine(run, settings, "recover.engine")
+    refuse_file(output, f"the scene in it is scene.{format}")
     run.claim("--output", output, folder=True)
     folder = RunFolder(run, output, f"scene.{format}", resume)
     if not dry_run:
@@ -137,6 +138,8 @@ def distill(
         refuse_whole(scene, needs_whole(options.config, preset, [budget], **whole))
         distill_in_tiles(run, scene, tiling, budget, options, folder)
         return
+    if scene is not None:
+        say_fit(run, scene, budget, f"scene.{format}")
     job = prepare(scene, budget, options, **run.callbacks)
     cost = cost_of(job, job.aim.count, page=page)
     if dry_run:
@@ -214,7 +217,7 @@ def _distil(
                 report["bytes"]["view"], page = folder.write_view(result.splats, seen, colour)
         folder.write_report(report)
     of_photos = job.config.recover.from_points  # such points are no scene to compare with
-    write_table(run, report, why_large(result.splats) if of_photos else "")
+    write_table(run, report)
     for line in told(report, verbose=run.verbose):
         run.say(line)
     say_views(run, report["views"], job.config.select.views_count is not None)
@@ -268,7 +271,8 @@ def _write_pages(
     from g2ard.report.distilled import distill_report, preview
 
     scenes = [("simplified", result.simplified), ("recovered", result.splats)]
-    title = f"{source.name}: {len(job.prior):,} → {len(result.splats):,}"
+    before = plural(report["photos"], "photo") if report["photos"] else f"{len(job.prior):,}"
+    title = f"{source.name}: {before} → {plural(len(result.splats), 'Gaussian')}"
     targets = [job.held_out] if job.apart is None else [job.held_out, job.apart]
     colour = job.config.recover.background
     with run.finishing("report.html"):

@@ -105,9 +105,9 @@ def evaluate(
         seed=run.seed,
         **run.callbacks,
     )
-    teacher_stage = [] if teacher is None else [("teacher", 2.0)]
+    of_targets = [] if teacher is None else [("targets", 2.0)]
     of_scenes = [stage for path in scenes for stage in ((path.name, 4.0), ("visibility", 1.0))]
-    run.console.expect([*teacher_stage, *of_scenes])
+    run.console.expect([*of_targets, *of_scenes])
     frozen = run.load(anchors) if anchors else None
     cameras = load_views(teaching.views(given), split, size, run.say, unpictured=teaching.dense is not None)
     targets = scorable(teaching.targets(cameras, settings=settings), run.say)

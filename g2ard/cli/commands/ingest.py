@@ -8,6 +8,7 @@ import typer
 
 from g2ard.cli.budget_options import Count
 from g2ard.cli.frame import Run, command
+from g2ard.cli.outputs import refuse_file
 from g2ard.progress import plural
 from g2ard.system.peak_memory import peak_rss
 
@@ -39,6 +40,7 @@ def ingest(
     from g2ard.tiles.ingest import TILE_ROWS
     from g2ard.tiles.ingest import ingest as into_tiles
 
+    refuse_file(output, "tiles")
     run.claim("--output", output, folder=True)
     began = time.perf_counter()
     store = into_tiles(

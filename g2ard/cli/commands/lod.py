@@ -13,6 +13,7 @@ import typer
 from g2ard.cli import options as opt
 from g2ard.cli.budget_options import Ratios
 from g2ard.cli.frame import Run, command
+from g2ard.cli.outputs import refuse_file
 from g2ard.cli.tiling import tiling_of
 from g2ard.config.choices import BLACK, Colour
 from g2ard.errors import OutputError
@@ -125,6 +126,7 @@ def lod(
     from g2ard.jobs.tiling import is_tiled
     from g2ard.levels import Cut
 
+    refuse_file(output, "levels of detail")
     check_trained(scene)
     if not recover:
         run.refuse_typed("with --merge-only", "steps")

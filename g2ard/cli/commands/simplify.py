@@ -13,7 +13,7 @@ from g2ard import io
 from g2ard.cli import options as opt
 from g2ard.cli.frame import Run, command
 from g2ard.cli.outputs import Outputs, budgets_of
-from g2ard.cli.run_result import say_weight, tell_quality
+from g2ard.cli.run_result import say_fit, say_weight, tell_quality
 from g2ard.cli.tiling import tiling_of
 from g2ard.config.choices import is_made
 from g2ard.config.schema import listed
@@ -87,6 +87,7 @@ def simplify(
         refuse_whole(scene, needs_whole(config, preset, budgets, parents=parents))
         simplify_in_tiles(run, scene, tiling, outputs, budgets, config, given, no_views, up)
         return
+    say_fit(run, scene, budgets[0], output.name)
     check_whole_memory(scene, tiling, WHOLE_TIMES)
     maps = None if parents is None else Outputs(run, parents, budgets, _parents_file(run), name="--parents")
     if maps is not None:

@@ -52,6 +52,16 @@ def load(path: Path, key: str) -> tuple[dict[str, Any], dict[str, Any]]:
     return meta, arrays
 
 
+def steps_at(path: Path) -> int | None:
+    """Return the steps of a recovery's checkpoint, None if it is of a finished round or cannot be read."""
+    try:
+        with np.load(path) as file:
+            done = json.loads(str(file["meta"])).get("done")
+    except Exception:  # as `load`, which the resumed run calls
+        return None
+    return done if isinstance(done, int) else None
+
+
 def _plain(value: Any) -> Any:
     return value.tolist() if hasattr(value, "tolist") else str(value)
 

@@ -126,7 +126,7 @@ def recover(
     loop = Loop(student, targets, config, view_weights, anchors, probe, guard, validation_key, frozen)
     if not exact:
         if checkpoint is None or not checkpoint.exists():
-            progress("rates", 0, 0, {})
+            progress(stage, 0, 0, {})
             loop.choose_rates(before)
         loop.run(checkpoint, progress, stage, watch)
     end = student if exact else loop.engine.splats()
