@@ -107,8 +107,8 @@ def spz_glb(path: Path, splats: Splats, centre: NDArray[np.float64] | None = Non
         splats: the scene, whose `offset` is the node's translation.
         centre: (3,) moved from the means to the node's translation, so that coordinates are fine.
     """
-    centre = np.zeros(3) if centre is None else centre
-    bits = spz.fraction_bits(path, splats.means.astype(np.float64) - centre, splats)
+    movable, centre = centre is not None, np.zeros(3) if centre is None else centre
+    bits = spz.fraction_bits(path, splats.means.astype(np.float64) - centre, splats, movable=movable)
     splats = splats.take(packing_order(splats.means))
     means = (splats.means.astype(np.float64) - centre) * (-1, 1, -1)
     blob = spz.encoded(path, _about_y(splats), means, bits, _SPZ_VERSION)

@@ -99,6 +99,21 @@ def lost_in(path: str | Path, splats: Splats, **options: object) -> list[Note]:
     return [Note("lost_render_model", 1, text)]
 
 
+def check_positions(path: str | Path, splats: Splats, count: int | None = None) -> None:
+    """Raise the `InputError` of writing a scene whose positions the format cannot hold, before the work.
+
+    Args:
+        path: the output.
+        splats: the scene that the written one will be made from.
+        count: Gaussians that it is reduced to; those of surfaces widen with the root of the ratio.
+    """
+    if scene_format(path).module == "spz" and len(splats):
+        from g2ard.io.spz import check_far
+
+        means = splats.means.astype(float) + splats.offset
+        check_far(Path(path), splats, means, (len(splats) / (count or len(splats))) ** 0.5)
+
+
 def rounded_by(error: float, splats: Splats) -> list[Note]:
     """Return a note on positions that change by up to `error` when written, if it can be visible."""
     from g2ard.io.types import Note

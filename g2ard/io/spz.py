@@ -316,7 +316,15 @@ def _gzipped(content: bytes, progress: Progress) -> bytes:
     return b"".join([*parts, packer.flush()])
 
 
-def fraction_bits(path: Path, means: NDArray[np.float64], splats: Splats) -> int:
+def check_far(
+    path: Path, splats: Splats, means: NDArray[np.float64], widened: float = 1.0, movable: bool = False
+) -> None:
+    """Raise the error of `fraction_bits` for a scene whose Gaussians will be `widened` times as large."""
+    wide = replace(splats, scales=splats.scales * np.float32(widened))
+    fraction_bits(path, means, wide, movable=movable)
+
+
+def fraction_bits(path: Path, means: NDArray[np.float64], splats: Splats, *, movable: bool = False) -> int:
     """Return the fractional bits of 24-bit coordinates.
 
     Usually 12. More, as far as the extent allows, if a step of 2^−12 exceeds a quarter of the 1st percentile
@@ -326,6 +334,7 @@ def fraction_bits(path: Path, means: NDArray[np.float64], splats: Splats) -> int
         path: file for messages.
         means: (N, 3) coordinates to store.
         splats: the Gaussians, in the same order.
+        movable: whether the origin of the coordinates follows from them, so that far is far from the median.
 
     Raises:
         InputError: steps exceed both 2^−12 and the median middle scale; if that is due to a few Gaussians, it
@@ -342,7 +351,8 @@ def fraction_bits(path: Path, means: NDArray[np.float64], splats: Splats) -> int
     coarsest = max(float(np.median(middle)), 2.0**-_USUAL_BITS)
     if bits >= 0 and 2.0**-bits <= coarsest:
         return bits
-    far = np.flatnonzero(reach * (1 + 2**-20) > 2.0 ** (23 - max(0, math.ceil(-math.log2(coarsest)))))
+    away = np.abs(means - np.median(means, axis=0)).max(axis=1) if movable else reach
+    far = np.flatnonzero(away * (1 + 2**-20) > 2.0 ** (23 - max(0, math.ceil(-math.log2(coarsest)))))
     steps = f"(steps of {2.0**-bits:g})"
     if 2 * len(far) > len(means):
         raise InputError(

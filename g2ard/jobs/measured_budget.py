@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from g2ard.config.checks import check_seed
 from g2ard.errors import InputError
 from g2ard.io import read_splats, write_splats
-from g2ard.io.scene_formats import scene_format, written_bytes
+from g2ard.io.scene_formats import check_positions, scene_format, written_bytes
 from g2ard.jobs.budget import Budget
 from g2ard.jobs.close_up import close_up
 from g2ard.jobs.inputs import Views, say_regions
@@ -394,6 +394,7 @@ def aim_of(
         say(f"{budget.fit}: {_all_fit(splats) if found == len(splats) else about}")
         return Aim(found, bytes=budget.bytes, file=file)
     found = most = budget.of(len(splats), name)
+    check_positions(file, splats, found)
     if budget.layers is not None:
         made = partial(simplify, splats, method="fast") if recovered else reduce
         found, layers = count_for_layers(most, budget.layers, lambda count: made(count).splats)

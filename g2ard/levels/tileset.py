@@ -21,11 +21,13 @@ from g2ard.errors import InputError, missing
 from g2ard.io.atomic import atomic_folder
 from g2ard.io.glb import EXTENSION, SPZ_EXTENSION, spz_glb
 from g2ard.io.packing import writable
+from g2ard.io.spz import check_far
 from g2ard.levels.tree import Cut, Leaf, Level, Node
 from g2ard.levels.tree import cut as cut_tree
 from g2ard.levels.write import read_object, write_json
 from g2ard.progress import Progress, silent
 from g2ard.scene.shape import longer_axes
+from g2ard.scene.splats import Splats
 from g2ard.scene.transform import unit_up
 
 Float = NDArray[np.float64]
@@ -164,6 +166,18 @@ def save_tileset(
     for name in before - tiles.files.keys():
         (path / name).unlink(missing_ok=True)
     return written
+
+
+def check_tiles(path: Path, splats: Splats, ratio: float, cut: Cut | None = None) -> None:
+    """Raise the `InputError` of a tile with far rows, before the levels are made.
+
+    The coarsest level, reduced by `ratio`, is one tile of the whole scene unless it exceeds the rule.
+    """
+    if len(splats) > ratio * (cut or Cut()).most:
+        return
+    means = splats.means.astype(np.float64)
+    middle = np.rint((means.min(axis=0) + means.max(axis=0)) / 2)
+    check_far(path, splats, means - middle, ratio**0.5, movable=True)
 
 
 def _upright(up: ArrayLike) -> Float:

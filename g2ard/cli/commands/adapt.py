@@ -9,6 +9,7 @@ from g2ard.cli import options as opt
 from g2ard.cli.frame import Run, command
 from g2ard.cli.resume import check_scene_run, stoppable
 from g2ard.config.schema import listed
+from g2ard.io.scene_formats import check_positions
 from g2ard.pipeline.presets import configured
 from g2ard.progress import plural
 
@@ -52,6 +53,7 @@ def adapt(
     work = output.parent / f".{output.name}.work"
     check_scene_run(run, work, resume, output)
     splats = run.load(compact)
+    check_positions(output, splats)
     made = [] if teacher is None else [("targets", 4.0)]
     run.console.expect([*made, ("adapt", 0.02 * config.steps)])
     teaching = Teaching(

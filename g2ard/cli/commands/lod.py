@@ -177,9 +177,15 @@ def lod(
     if dry_run:
         _tell_costs(run, prepare_levels(scene, ratios=ratios, recover=recover, **choices))
         return
+    given: Path | Splats = scene
+    if kind == "3dtiles":
+        from g2ard.levels.tileset import check_tiles
+
+        given, choices["beside"] = run.load(scene), scene
+        check_tiles(output, given, max(ratios), rule)
     with stoppable(run, stopped, resume, writer.meta):
         stopped.mkdir(parents=True, exist_ok=True)
-        job = prepare_levels(scene, ratios=ratios, recover=recover, work=stopped, **choices)
+        job = prepare_levels(given, ratios=ratios, recover=recover, work=stopped, **choices)
         stages = [stage for cost in job.costs for stage in cost.stages]
         run.console.expect([*stages, ("write", 3.0), ("the page", 1.0)])
         levels = job.run()

@@ -12,6 +12,7 @@ from g2ard.cli.frame import Run, command
 from g2ard.cli.resume import check_scene_run, stoppable
 from g2ard.cli.run_result import loss
 from g2ard.config.schema import listed
+from g2ard.io.scene_formats import check_positions
 from g2ard.progress import plural
 
 if TYPE_CHECKING:
@@ -82,6 +83,7 @@ def recover(
         **run.callbacks,
     )
     scoring = 0.01 * len(job.views.cameras)
+    check_positions(output, job.student)
     run.console.expect([("recover", 0.02 * job.config.horizon), ("scoring", scoring)])
     with stoppable(run, checkpoint, resume, output):
         result = job.run(checkpoint)
