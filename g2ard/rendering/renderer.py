@@ -13,7 +13,7 @@ from g2ard import _core
 from g2ard.config.checks import AboveZero, Within, checks_arguments
 from g2ard.config.choices import BLACK, Convention
 from g2ard.config.schema import Settings
-from g2ard.errors import InputError
+from g2ard.errors import InputError, require
 from g2ard.scene.cameras import Camera, Cameras
 from g2ard.scene.prepared import DRAWN_LOG_SCALES, DRAWN_LOGITS, MAX_OPACITY
 from g2ard.scene.splats import Splats, unit_quats
@@ -199,6 +199,39 @@ class Renderer:
         image, alpha, depth, middle = self._forward(camera, 2 if median else 1)
         assert depth is not None
         return Rendered(image, alpha, depth, middle)
+
+    @checks_arguments
+    def panorama(self, camera: Camera, *, width: Annotated[int, Within("[4, inf)")] = 2048) -> Rendered:
+        """Render an equirectangular panorama: all directions around a camera.
+
+        Six pinhole renders, the faces of a cube at twice the resolution, are resampled.
+
+        Args:
+            camera: its pose, in world coordinates. Directions are those of nerfstudio's `EQUIRECTANGULAR`:
+                the image's middle looks ahead, its right is right of that, and its top is up.
+            width: pixels; the height is half of it.
+
+        Returns:
+            A `Rendered` whose depth is the distance from the camera.
+
+        Raises:
+            InputError: an invalid camera, or an odd width.
+
+        >>> from g2ard.scene.cameras import Camera
+        >>> dot = Splats.create([[0, 0, 0]], scales=[[0.1] * 3], logit_opacities=[9])
+        >>> out = Renderer(dot).panorama(Camera.facing([0, -2, 0], [0, 0, 0]), width=64)
+        >>> out.image.shape, [int(i) for i in np.unravel_index(out.alpha.argmax(), out.alpha.shape)]
+        ((32, 64, 3), [15, 31])
+        """
+        from g2ard.rendering.panorama import panorama
+
+        require("width", width, width % 2 == 0, "an even number of pixels")
+
+        def shown(view: Camera) -> tuple[_Floats, _Floats, _Floats]:
+            rendered = self.render(view)
+            return rendered.image, rendered.alpha, rendered.depth
+
+        return Rendered(*panorama(shown, camera, width))
 
     def pose_gradient(self, gradient: _Floats) -> NDArray[np.float64]:
         """Return the (6,) gradient dL/d(v, ω) of the last render's pose T, where T ← exp(v, ω)·T in the

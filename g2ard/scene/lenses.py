@@ -185,6 +185,14 @@ def _end(lens: PhotoLens) -> float:
     return min(end, max(edge, _CORNER))
 
 
+def panorama_rays(width: int, height: int, rows: slice) -> Float:
+    """Return unit rays (N, 3) of the pixels in some rows of a panorama, in its camera's axes."""
+    v, u = np.mgrid[rows, 0:width] + 0.5
+    around, down = 2 * np.pi * (u / width - 0.5), np.pi * (v / height - 0.5)
+    aside = np.cos(down)
+    return np.stack([np.sin(around) * aside, np.sin(down), np.cos(around) * aside], axis=-1).reshape(-1, 3)
+
+
 def photo_of(name: str) -> str:
     """Return the name of the photo that a view of several was made from.
 

@@ -25,6 +25,9 @@ if TYPE_CHECKING:
 _NO_FOLDER = (".png", ".jpg", ".jpeg", ".avi", ".mov", ".mkv", ".webm")
 """Suffixes of files that `render` does not write as -o."""
 
+_PANORAMA = 2048
+"""Width of a panorama in pixels."""
+
 
 @command(
     "render",
@@ -50,13 +53,23 @@ def render(
         int | None,
         typer.Option("--orbit", min=1, metavar="N", help="Render N views on a circle around the scene."),
     ] = None,
+    around: Annotated[
+        bool,
+        typer.Option(
+            "--panorama",
+            help="Render equirectangular panoramas from the views' poses, --size or 2,048 pixels wide.",
+        ),
+    ] = False,
     fps: Annotated[float, typer.Option(min=0.1, help="Images a second of an animation.")] = 25.0,
     sheet: Annotated[
         Path | None,
         typer.Option(parser=opt.picture, metavar="FILE.png", help="Write all views as one contact sheet."),
     ] = None,
     depth: Annotated[
-        bool, typer.Option("--depth", help="Also write NAME.depth.npy, in scene units.")
+        bool,
+        typer.Option(
+            "--depth", help="Also write NAME.depth.npy, in scene units (distances with --panorama)."
+        ),
     ] = False,
     looks: Annotated[
         int | None, typer.Option("-k", min=1, metavar="K", help="Views to generate; by default 128.")
@@ -74,6 +87,7 @@ def render(
     from g2ard.jobs.turntable import turntable
     from g2ard.jobs.view_checks import warn_of_sight
     from g2ard.jobs.views import views_or_pool
+    from g2ard.rendering.panorama import stations
     from g2ard.rendering.renderer import RasterSettings, Renderer
 
     if output is None and sheet is None:
@@ -106,8 +120,11 @@ def render(
             progress=run.progress,
             say=run.say,
         )
-    cameras = load_views(found, split, size, run.say)
-    warn_of_sight(splats, cameras, run.say)
+    cameras = load_views(found, split, None if around else size, run.say)
+    if around:
+        cameras = stations(cameras)
+    else:
+        warn_of_sight(splats, cameras, run.say)
     places = output_names(cameras.source or str(views), cameras.names) if output is not None else []
     if output is not None:
         run.claim("--output", *(file for place in places for file in _files(output / place, depth)))
@@ -117,7 +134,10 @@ def render(
     renderer = Renderer(splats, background=colour, settings=RasterSettings(convention=convention))
     with nullcontext() if output is None else atomic_folder(output, run.overwrite) as folder:
         for view in range(len(cameras)):
-            rendered = renderer.render(cameras[view])
+            if around:
+                rendered = renderer.panorama(cameras[view], width=2 * max(2, (size or _PANORAMA) // 2))
+            else:
+                rendered = renderer.render(cameras[view])
             if wanted:
                 shown.append(to_bytes(rendered.image))
             if folder is not None:
