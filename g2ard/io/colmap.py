@@ -1,4 +1,7 @@
-"""Reader for COLMAP models: cameras and images, binary or text. Rigs and frames (COLMAP 4) are ignored."""
+"""Reader for COLMAP models: cameras and images, binary or text.
+
+Rigs and frames (COLMAP 3.12 and later) give the poses of images that have none of their own.
+"""
 
 import math
 import re
@@ -9,6 +12,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from g2ard.errors import InputError, damaged
 from g2ard.io.finding import Finder
@@ -33,11 +37,18 @@ _MODEL_FILES = tuple(
 """Files of a model."""
 
 
+class NotFinite(InputError):
+    """A number that is not finite; its view is left out."""
+
+
 class _Image(NamedTuple):
+    """A row of the table of images; `fault` is what is wrong with its pose, if a number is not finite."""
+
+    key: int
     name: str
     camera: int
-    quat: tuple[float, ...]
-    translation: tuple[float, ...]
+    pose: tuple[float, ...]
+    fault: NotFinite | None = None
 
 
 def holds(folder: Path) -> bool:
@@ -136,10 +147,6 @@ def incomplete(path: Path) -> InputError | None:
     return None
 
 
-class NotFinite(InputError):
-    """A number that is not finite; its view is left out."""
-
-
 @contextmanager
 def parsing(path: Path) -> Iterator[None]:
     """Turn parsing errors into an `InputError` that names the file."""
@@ -190,11 +197,12 @@ def frames(
     with parsing(tables[0]):
         cameras = (_cameras_bin if binary else _cameras_txt)(tables[0])
     with parsing(tables[1]):
-        images_read, faults = (_images_bin if binary else _images_txt)(tables[1])
-    if not images_read and not faults:
+        images_read = (_images_bin if binary else _images_txt)(tables[1])
+    if not images_read:
         raise InputError("has no images", path=tables[1])
     finder = Finder(images) if images else Finder(*_photo_folders(path, folder))
-    listed = []
+    listed, faults = list[Frame](), list[tuple[str, InputError]]()
+    by_rig = None
     sizes: dict[int, tuple[int, int]] = {}
     for image in sorted(images_read, key=lambda i: i.name):
         if image.camera not in cameras:
@@ -208,9 +216,17 @@ def frames(
             if image.camera not in sizes:  # one lens, one size
                 sizes[image.camera] = photo_size(photo, tables[1], camera.size)
             camera = camera.at(sizes[image.camera])
-        if not any(image.quat):
-            raise InputError(f"{image.name!r}: its quaternion is zero", path=tables[1])
-        pose = posed(image.quat, image.translation)
+        pose = None
+        if image.fault is None and any(image.pose[:4]):
+            pose = posed(image.pose[:4], image.pose[4:])
+        else:
+            by_rig = _rig_poses(folder, binary) if by_rig is None else by_rig
+            pose = by_rig.get((image.key, image.camera))
+        if pose is None:
+            if image.fault is None:
+                raise InputError(f"{image.name!r}: its quaternion is zero", path=tables[1])
+            faults.append((image.name, image.fault))
+            continue
         listed.append(Frame(image.name, pose, camera, photo, listed=image.name))
     if faults and left_out is None:
         raise faults[0][1]
@@ -287,6 +303,7 @@ def _camera(path: Path, model: str, size: tuple[int, int], p: tuple[float, ...])
 
 
 _POSE = ("QW", "QX", "QY", "QZ", "TX", "TY", "TZ")
+_IMAGE_NAMES = ("IMAGE_ID", *_POSE, "CAMERA_ID")
 _CAMERA_NAMES = ("CAMERA_ID", "MODEL", "WIDTH", "HEIGHT")
 _COUNT, _CAMERA, _IMAGE = struct.Struct("<Q"), struct.Struct("<iiQQ"), struct.Struct("<IdddddddI")
 
@@ -305,16 +322,16 @@ def _cameras_bin(path: Path) -> dict[int, Lens | NotFinite]:
     return cameras
 
 
-def _images_bin(path: Path) -> tuple[list[_Image], list[tuple[str, NotFinite]]]:
+def _images_bin(path: Path) -> list[_Image]:
     table = Table(path)
     images: list[_Image] = []
-    faults: list[tuple[str, NotFinite]] = []
     for i in range(table.count):
         at, fault = table.at, None
         try:
-            _key, *pose, camera = table.finite("image", i, _IMAGE, ("IMAGE_ID", *_POSE, "CAMERA_ID"))
+            key, *pose, camera = table.finite("image", i, _IMAGE, _IMAGE_NAMES)
         except NotFinite as error:
-            fault, table.at = error, at + _IMAGE.size
+            fault, table.at = error, at
+            key, *pose, camera = table.take("image", i, _IMAGE, _IMAGE_NAMES)
         end = table.data.find(b"\0", table.at)
         if end < 0:
             raise table.cut_off("image", i, "NAME")
@@ -325,14 +342,103 @@ def _images_bin(path: Path) -> tuple[list[_Image], list[tuple[str, NotFinite]]]:
         table.at = end + 1
         (points,) = table.take("image", i, _COUNT, ["POINTS2D"])
         table.skip("image", i, 24 * points, "POINTS2D")
-        if fault is None:
-            images.append(_Image(name, camera, tuple(pose[:4]), tuple(pose[4:])))
-        else:
-            faults.append((name, fault))
-    return images, faults
+        images.append(_Image(key, name, camera, tuple(pose), fault))
+    return images
+
+
+_U32, _SENSOR, _SEVEN = struct.Struct("<I"), struct.Struct("<iI"), struct.Struct("<ddddddd")
+_FRAME, _DATA = struct.Struct("<IIddddddd"), struct.Struct("<iIQ")
+_IS_CAMERA = 0
+
+
+def _rig_poses(folder: Path, binary: bool) -> dict[tuple[int, int], NDArray[np.float64]]:
+    """Return camera_from_world by image and camera, as frames and rigs say; no poses without their files.
+
+    camera_from_world = sensor_from_rig · rig_from_world. Poses that are unknown or not finite are missing.
+    """
+    held, suffix = _held(folder), ".bin" if binary else ".txt"
+    rigs, frames = held.get(f"rigs{suffix}"), held.get(f"frames{suffix}")
+    if rigs is None or frames is None:
+        return {}
+    with parsing(rigs):
+        sensors = (_rigs_bin if binary else _rigs_txt)(rigs)
+    found: dict[tuple[int, int], NDArray[np.float64]] = {}
+    with parsing(frames):
+        for rig, numbers, images in (_frames_bin if binary else _frames_txt)(frames):
+            from_world = _known(numbers)
+            for camera, image in images:
+                in_rig = sensors.get(rig, {}).get(camera)
+                if from_world is not None and in_rig is not None:
+                    found[image, camera] = in_rig @ from_world
+    return found
+
+
+_Rigs = dict[int, dict[int, NDArray[np.float64] | None]]
+_RigFrames = Iterator[tuple[int, tuple[float, ...], list[tuple[int, int]]]]
+
+
+def _known(numbers: Sequence[float]) -> NDArray[np.float64] | None:
+    """Return the rigid transform of seven numbers, or None if it is not one."""
+    if not all(map(math.isfinite, numbers)) or not any(numbers[:4]):
+        return None
+    return posed(numbers[:4], numbers[4:])
+
+
+def _rigs_bin(path: Path) -> _Rigs:
+    table, rigs = Table(path), _Rigs()
+    for i in range(table.count):
+        (key,) = table.take("rig", i, _U32, ["RIG_ID"])
+        (count,) = table.take("rig", i, _U32, ["NUM_SENSORS"])
+        rigs[key] = {}
+        for number in range(count):
+            kind, sensor = table.take("rig", i, _SENSOR, ["SENSOR_TYPE", "SENSOR_ID"])
+            pose: NDArray[np.float64] | None = np.eye(4)
+            if number:
+                (has_pose,) = table.take("rig", i, struct.Struct("<B"), ["HAS_POSE"])
+                pose = _known(table.take("rig", i, _SEVEN, _POSE)) if has_pose else None
+            if kind == _IS_CAMERA:
+                rigs[key][sensor] = pose
+    return rigs
+
+
+def _frames_bin(path: Path) -> _RigFrames:
+    table = Table(path)
+    for i in range(table.count):
+        _key, rig, *pose = table.take("frame", i, _FRAME, ["FRAME_ID", "RIG_ID", *_POSE])
+        (count,) = table.take("frame", i, _U32, ["NUM_DATA_IDS"])
+        names = ["SENSOR_TYPE", "SENSOR_ID", "DATA_ID"]
+        data = [table.take("frame", i, _DATA, names) for _ in range(count)]
+        yield rig, tuple(pose), [(sensor, image) for kind, sensor, image in data if kind == _IS_CAMERA]
+
+
+def _rigs_txt(path: Path) -> _Rigs:
+    rigs = _Rigs()
+    for words in (iter(line.split()) for line in text_lines(path) if line.strip()):
+        key, count = int(next(words, "")), int(next(words, ""))
+        rigs[key] = {}
+        for number in range(count):
+            kind, sensor = next(words, ""), int(next(words, ""))
+            pose: NDArray[np.float64] | None = np.eye(4)
+            if number:
+                has_pose = int(next(words, ""))
+                pose = _known([float(next(words, "")) for _ in _POSE]) if has_pose else None
+            if kind == "CAMERA":
+                rigs[key][sensor] = pose
+    return rigs
+
+
+def _frames_txt(path: Path) -> _RigFrames:
+    for words in (iter(line.split()) for line in text_lines(path) if line.strip()):
+        _key, rig = int(next(words, "")), int(next(words, ""))
+        pose = tuple(float(next(words, "")) for _ in _POSE)
+        data = [
+            (next(words, ""), int(next(words, "")), int(next(words, ""))) for _ in range(int(next(words, "")))
+        ]
+        yield rig, pose, [(sensor, image) for kind, sensor, image in data if kind == "CAMERA"]
 
 
 _CAMERA_COLUMNS = (("CAMERA_ID", 0), ("WIDTH", 2), ("HEIGHT", 3))
+_KEY_COLUMNS = (("IMAGE_ID", 0), ("CAMERA_ID", 8))
 _POSE_COLUMNS = tuple((name, at) for at, name in enumerate(_POSE, 1))
 
 
@@ -385,29 +491,27 @@ _NOT_FINITE = re.compile(r"[+-]?(nan(\(.*\))?|inf(inity)?|\d\.#\w+)", re.IGNOREC
 """Numbers that are not finite, as C and C++ write them on any system."""
 
 
-def _images_txt(path: Path) -> tuple[list[_Image], list[tuple[str, NotFinite]]]:
+def _images_txt(path: Path) -> list[_Image]:
     """Read images.txt: per image a line with its pose (wxyz and translation, camera from world), camera
     and name, then a line with its points, which is skipped and may be empty or missing.
     """
     images: list[_Image] = []
-    faults: list[tuple[str, NotFinite]] = []
     points = False
     for line in text_lines(path):
         if not line.strip() or (points and _is_points(line)):
             points = False
             continue
-        i, words, points = len(images) + len(faults), line.split(maxsplit=9), True
-        name = words[9].strip() if len(words) > 9 else ""
+        i, words, points = len(images), line.split(maxsplit=9), True
+        pose, fault = tuple[float, ...](), None
         try:
             pose = tuple(number(path, "image", i, words, key, at, _finite) for key, at in _POSE_COLUMNS)
-            camera = int(number(path, "image", i, words, "CAMERA_ID", 8))
         except NotFinite as error:
-            faults.append((name, error))
-            continue
+            fault = error
+        key, camera = (int(number(path, "image", i, words, *column)) for column in _KEY_COLUMNS)
         if len(words) < 10:
             raise InputError("is missing", path=path, property="NAME", index=i, item="image")
-        images.append(_Image(name, camera, pose[:4], pose[4:]))
-    return images, faults
+        images.append(_Image(key, words[9].strip(), camera, pose, fault))
+    return images
 
 
 def _is_points(line: str) -> bool:

@@ -80,7 +80,7 @@ def colmap(folder: Path, viewmats: list[np.ndarray], text: bool, model: int = 1)
         data += struct.pack("<Q3d3BdQ", i, *p, *c, 0.5, track) + bytes(8 * track)
     (sparse / "points3D.bin").write_bytes(data)
     for extra in ("rigs.bin", "frames.bin"):
-        (sparse / extra).write_bytes(b"not read")
+        (sparse / extra).write_bytes(bytes(8))
     return folder
 
 

@@ -11,7 +11,7 @@ from g2ard.errors import InputError, damaged
 from g2ard.io import kind, read_points, read_views
 from helpers.faults import Fault, check_fault, faulty
 from helpers.realdata import real
-from helpers.view_files import MODELS, colmap, orbit, photo
+from helpers.view_files import MODELS, colmap, orbit, photo, quaternion
 
 
 @pytest.mark.parametrize("text", [False, True])
@@ -163,3 +163,86 @@ def test_caliterra() -> None:
     uv = (X[seen, :3] @ cameras.Ks[30].T) / X[seen, 2:3]
     inside = (uv[:, 0] > 0) & (uv[:, 0] < 1000) & (uv[:, 1] > 0) & (uv[:, 1] < 751)
     assert inside.sum() > 1000
+
+
+def rig_model(folder: Path, text: bool) -> Path:
+    """Write a model of three frames of a rig of three cameras with pycolmap."""
+    pycolmap = pytest.importorskip("pycolmap")
+    rng, model, rig = np.random.default_rng(0), pycolmap.Reconstruction(), pycolmap.Rig(rig_id=5)
+
+    def pose() -> object:
+        return pycolmap.Rigid3d(pycolmap.Rotation3d(quaternion(turn(rng))[[1, 2, 3, 0]]), rng.normal(size=3))
+
+    cameras = [
+        pycolmap.Camera(model="PINHOLE", width=8, height=6, params=[9, 9, 4, 3], camera_id=i)
+        for i in (7, 2, 4)
+    ]
+    for camera in cameras:
+        model.add_camera(camera)
+        added = [] if camera is cameras[0] else [pose()]
+        (rig.add_sensor if added else rig.add_ref_sensor)(camera.sensor_id, *added)
+    model.add_rig(rig)
+    for number in range(3):
+        frame, images = pycolmap.Frame(frame_id=10 + number, rig_id=5), []
+        for camera in cameras:
+            key = 20 + 10 * number + camera.camera_id
+            name = f"cam{camera.camera_id}/{number}.png"
+            images.append(
+                pycolmap.Image(name=name, camera_id=camera.camera_id, image_id=key, frame_id=10 + number)
+            )
+            frame.add_data_id(images[-1].data_id)
+        frame.rig_from_world = pose()
+        model.add_frame(frame)
+        for image in images:
+            model.add_image(image)
+        model.register_frame(10 + number)
+    folder.mkdir(parents=True)
+    (model.write_text if text else model.write_binary)(str(folder))
+    return folder
+
+
+def turn(rng: np.random.Generator) -> np.ndarray:
+    Q = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    return Q * np.linalg.det(Q)
+
+
+@pytest.mark.parametrize("text", [False, True])
+@pytest.mark.parametrize("value", [0.0, float("nan")])
+@pytest.mark.parametrize("lost", [[0], [4, 8], list(range(9))])
+def test_rigs_and_frames_give_poses_that_images_lack(
+    tmp_path: Path, text: bool, value: float, lost: list[int]
+) -> None:
+    folder = rig_model(tmp_path / "sparse" / "0", text)
+    known = read_views(tmp_path)
+    file = folder / f"images.{'txt' if text else 'bin'}"
+    if text:
+        lines = file.read_text().splitlines()
+        rows = [i for i, line in enumerate(lines) if line.endswith(".png")]
+        for row in (rows[k] for k in lost):
+            words = lines[row].split()
+            lines[row] = " ".join([words[0], *[str(value)] * 7, *words[8:]])
+        file.write_text("\n".join(lines) + "\n")
+    else:
+        data, at = bytearray(file.read_bytes()), 8
+        for k in range(9):
+            if k in lost:
+                data[at + 4 : at + 60] = struct.pack("<7d", *[value] * 7)
+            at = data.index(b"\0", at + 64) + 9
+        file.write_bytes(data)
+    found = read_views(tmp_path)
+    assert found.names == known.names
+    assert len(found) == 9
+    np.testing.assert_allclose(found.viewmats, known.viewmats, atol=1e-9)
+    for name in ("rigs", "frames"):
+        table = folder / f"{name}{file.suffix}"
+        whole = table.read_bytes()
+        table.write_bytes(whole[:-30])
+        with pytest.raises(InputError, match=rf"{table.name}"):
+            read_views(tmp_path)
+        table.write_bytes(whole)
+    (folder / f"frames{file.suffix}").unlink()
+    if len(lost) < 9 and value:
+        assert len(read_views(tmp_path)) == 9 - len(lost)
+    else:
+        with pytest.raises(InputError, match=r"images\."):
+            read_views(tmp_path)
