@@ -125,6 +125,8 @@ def reader(path: str | Path, expected: Kind) -> tuple[Path, Any]:
     found = KINDS[name]
     if expected == "points" and name == "colmap":
         name = "points3d"
+    elif expected == "views" and name == "e57":
+        name = "e57_photos"
     elif found != expected:
         what = _NAMES[found] if found != "views" else name
         hint = _OTHER_KINDS.get((expected, found))

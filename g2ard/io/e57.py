@@ -9,10 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from g2ard.errors import InputError, missing
+from g2ard.errors import G2ardError, InputError, missing
 from g2ard.io.limits import check_unpacked
 from g2ard.io.stream import MarkedPoints, PointStream, from_row, full_scales
 from g2ard.io.types import Note
+from g2ard.progress import plural
 from g2ard.scene.transform import rotation_matrices
 
 _CARTESIAN = ("cartesianX", "cartesianY", "cartesianZ")
@@ -45,8 +46,9 @@ class Stream(PointStream):
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        with _opened(path) as file:
+        with opened(path) as file:
             self._scans = [_scan(path, file, number) for number in range(file.scan_count)]
+            self._photos = posed_photos(file)
         count = sum(scan.count for scan in self._scans)
         check_unpacked(path, path.stat().st_size, 24 * count)
         sample = [np.zeros((0, 3))]
@@ -57,7 +59,11 @@ class Stream(PointStream):
         super().__init__(path, count, np.concatenate(sample), full_scales(np.dtype(np.float64)))
 
     def header_notes(self) -> tuple[Note, ...]:
-        return tuple(note for note in super().header_notes() if note.code != "eight_bit_colors")
+        notes = tuple(note for note in super().header_notes() if note.code != "eight_bit_colors")
+        if not self._photos:
+            return notes
+        text = f"{plural(self._photos, 'photo')} with poses inside; --views {self.path} uses them"
+        return (*notes, Note("photos", self._photos, text))
 
     def raw(self, rows: int, start: int) -> Iterator[MarkedPoints]:
         for number, begin in from_row([scan.count for scan in self._scans], start):
@@ -70,7 +76,7 @@ class Stream(PointStream):
             return
         from pye57 import libe57
 
-        with _opened(self.path) as file:
+        with opened(self.path) as file:
             fields = {name: np.empty(rows) for name in (*scan.place, *scan.color, *scan.invalid)}
             buffers = libe57.VectorSourceDestBuffer()
             for name, values in fields.items():
@@ -127,8 +133,21 @@ def _limits(header: Any) -> tuple[float, float]:
     return float(found["intensityMinimum"].value()), float(found["intensityMaximum"].value())
 
 
+def image_count(file: Any) -> int:
+    """Return the number of images of an open file."""
+    root = file.image_file.root()
+    return int(root["images2D"].childCount()) if root.isDefined("images2D") else 0
+
+
+def posed_photos(file: Any) -> int:
+    """Return the number of images of an open file that have a pose."""
+    images = range(image_count(file))
+    return sum(file.image_file.root()["images2D"][i].isDefined("pose") for i in images)
+
+
 @contextmanager
-def _opened(path: Path) -> Iterator[Any]:
+def opened(path: Path) -> Iterator[Any]:
+    """Open a file; errors of the library become an `InputError`."""
     try:
         import pye57
     except ImportError as error:
@@ -139,7 +158,7 @@ def _opened(path: Path) -> Iterator[Any]:
             yield file
         finally:
             file.close()
-    except (InputError, GeneratorExit):
+    except (G2ardError, GeneratorExit):
         raise
     except Exception as error:  # those of libE57Format have several lines
         text = (str(error).strip() or type(error).__name__).splitlines()[0]
