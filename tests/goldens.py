@@ -65,7 +65,9 @@ _MASKS = (
     (re.compile(r"\b\d[\d.,]* (?:k|M|G)B\b"), "<size>"),
     (re.compile(r"\.[0-9a-f]{12}\b"), ".<unique>"),
 )
-_MASKED_KEYS = re.compile(r"seconds|(^|_)(eta|peak|rss|time|date|version|resume|host|memory)(_|$)|^adapter$")
+_MASKED_KEYS = re.compile(
+    r"seconds|(^|_)(eta|peak|rss|time|date|version|resumed?|host|memory)(_|$)|^adapter$"
+)
 """Keys of JSON whose values vary from run to run."""
 _TEXTS = (".html", ".txt", ".toml", ".csv", ".md")
 

@@ -22,6 +22,7 @@ class FusedEngine:
         start, anchors = objective.start, objective.anchors
         units = radii(start) if objective.means_in_scales else None
         self._trainer = _core.Trainer(arrays_of(start), objective, units)
+        self._skipped_before = 0
         self._anchors = (
             anchors.means,
             np.ascontiguousarray(anchors.frames),
@@ -67,9 +68,10 @@ class FusedEngine:
         )
 
     def state(self) -> dict[str, NDArray[Any]]:
-        return self._trainer.state()
+        return {**self._trainer.state(), "skipped": np.array(self.skipped)}
 
     def load(self, state: dict[str, NDArray[Any]]) -> None:
+        self._skipped_before = int(state["skipped"]) - self._trainer.skipped
         self._trainer.load(state)
         self._trainer.anchor(*self._anchors)
 
@@ -79,4 +81,4 @@ class FusedEngine:
 
     @property
     def skipped(self) -> int:
-        return self._trainer.skipped
+        return self._skipped_before + self._trainer.skipped
