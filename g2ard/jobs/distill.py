@@ -20,7 +20,7 @@ from g2ard.jobs.distill_options import DistillOptions
 from g2ard.jobs.inputs import Views, load_scene
 from g2ard.jobs.job import DistillJob
 from g2ard.jobs.measured_budget import Reduction, aim_of
-from g2ard.jobs.photos import sparse_file, sparse_points, topped_up
+from g2ard.jobs.photos import distinct, sparse_file, sparse_points, topped_up
 from g2ard.jobs.view_checks import check_photos, propose_background
 from g2ard.jobs.views import Use, views_of
 from g2ard.pipeline.distill import Distilled
@@ -29,7 +29,7 @@ from g2ard.progress import Progress, Say, plural, silent, unsaid
 from g2ard.rendering.targets import kinds_told
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
-from g2ard.stages.lift import lift, lift_rows, merged
+from g2ard.stages.lift import lift, lift_rows
 from g2ard.stages.recover.anchors import FREE, Regularizers
 from g2ard.stages.recover.auto_preset import PriorMeasures, measure_prior, regularizers_for
 
@@ -325,7 +325,7 @@ def _read(scene: Scene, budget: Budget, options: DistillOptions, progress: Progr
             raise InputError("missing; without a scene, pass photos with poses as views", parameter="scene")
         return _lifted_alone(scene, options, progress, say)
     points, name, of_photos = _points(scene, views, say)
-    points = points and _without_repeats(points)
+    points = points and distinct(points)
     given = 0 if points is None or scene is None else len(points)
     wanted = budget.count or 0
     if points is None and not wanted:
@@ -347,7 +347,7 @@ def _read(scene: Scene, budget: Budget, options: DistillOptions, progress: Progr
             progress=progress,
             say=say,
         )
-    # Points along rays may repeat, but are as many as were asked for.
+    # Each point has its disc, for as many are needed, also where positions are equal about another middle.
     config = options.config.lift
     lifted, _ = lift_rows(points.positions, points.colors, config, progress, merge=False)
     return _Read(lifted, True, options.beside, name, given, of_photos)
@@ -361,13 +361,6 @@ def _lifted_alone(scene: Points | str | Path, options: DistillOptions, progress:
     lift_config = vars(options.config.lift)
     lifted = lift(points.positions, points.colors, **lift_config, progress=progress)
     return _Read(lifted, False, options.beside, name, len(lifted))
-
-
-def _without_repeats(points: Points) -> Points:
-    """Merge points of one position, as lifting does, so that what is missing can be counted."""
-    middle = np.median(points.positions, axis=0)
-    rows, colors = merged(points.positions - middle, points.colors)
-    return Points(points.positions[rows], np.ascontiguousarray(colors, points.colors.dtype))
 
 
 def _points(

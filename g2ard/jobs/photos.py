@@ -22,6 +22,7 @@ from g2ard.jobs.hull import VisualHull, visual_hull
 from g2ard.jobs.inputs import Split, Views, load_view_sets
 from g2ard.progress import Progress, Say, plural, silent, unsaid
 from g2ard.scene.cameras import Cameras
+from g2ard.stages.lift import merged
 
 _PHOTO_SIDE = 240
 """Longer side in pixels of the photos used to place points."""
@@ -90,6 +91,14 @@ def topped_up(
     )
 
 
+def distinct(points: Points) -> Points:
+    """Merge points of one position, as lifting does, so that what is missing can be counted."""
+    rows, colors = merged(points.positions - np.median(points.positions, axis=0), points.colors)
+    if len(rows) == len(points):
+        return points
+    return Points(points.positions[rows], np.ascontiguousarray(colors, np.float32))
+
+
 def sparse_points(file: Path | None, say: Say = unsaid) -> Points | None:
     """Read the points of `sparse_file`; return None, and say why, if they cannot be used."""
     from g2ard.io import read_points
@@ -149,10 +158,10 @@ def points_along_rays(
         background: RGB of empty pixels.
 
     Returns:
-        `count` points in world coordinates, with the colour of their ray's pixel.
+        `count` points at different positions in world coordinates, with the colour of their ray's pixel.
 
     Raises:
-        InputError: fewer than three views, a view without a photo, or no point seen by three views.
+        InputError: fewer than three views, a view without a photo, or too few points seen by three views.
     """
     if len(cameras) < 3:
         raise InputError(f"photos: expected at least 3 views, got {len(cameras)}; pass more, or a scene")
@@ -172,10 +181,13 @@ def points_along_rays(
     distances = np.linalg.norm(cameras.positions - centre, axis=1)
     near = [_neighbours(cameras, i) for i in range(len(cameras))]
     hull = visual_hull(cameras, outlines, centre)
-    positions, colors, tried = np.zeros((0, 3)), np.zeros((0, 3), np.float32), 0
-    while len(positions) < count:
+    found, tried = Points(np.zeros((0, 3)), np.zeros((0, 3), np.float32)), 0
+    while len(found) < count:
         if tried > 64 * max(count, _RAYS):
-            raise InputError("photos: no point was found that three views see; pass a point cloud")
+            raise InputError(
+                f"photos: found {plural(len(found), 'point')} that three views see, needed {count:,}",
+                hint="pass a point cloud" + (", or ask for fewer Gaussians" if len(found) else ""),
+            )
         view = int(rng.integers(len(cameras)))
         rays = min(_RAYS, max(64, -(-count // len(cameras))))
         pixels = _pixels(photos[view], outlines[view], rays, background, rng)
@@ -186,9 +198,9 @@ def points_along_rays(
         slack = 2.0 ** (tried // (_RAYS_PER_DOUBLING * max(count, _RAYS)))
         xyz, rgb = _swept(cameras, photos, view, near[view], pixels, depths, hull, slack)
         tried += rays
-        positions, colors = np.concatenate([positions, xyz]), np.concatenate([colors, rgb])
-        progress("points", min(len(positions), count), count)
-    return Points(positions[:count], np.ascontiguousarray(colors[:count]))
+        found = distinct(Points(np.concatenate([found.positions, xyz]), np.concatenate([found.colors, rgb])))
+        progress("points", min(len(found), count), count)
+    return Points(found.positions[:count], np.ascontiguousarray(found.colors[:count]))
 
 
 def _common_centre(cameras: Cameras) -> Float:

@@ -8,8 +8,10 @@ import pytest
 
 import g2ard
 from g2ard.io.images import load_premultiplied, write_png
+from g2ard.io.types import Points
 from g2ard.jobs.hull import visual_hull
-from g2ard.jobs.photos import points_along_rays
+from g2ard.jobs.photos import distinct, points_along_rays, topped_up
+from g2ard.progress import silent
 from helpers.commands import CommandLine, refused, succeeds
 from helpers.photos import photos_of, rgba_photos_of
 
@@ -24,7 +26,7 @@ def test_photos_alone_are_enough(points: bool, command_line: CommandLine, tmp_pa
     assert found["scores"]["recovered"]["psnr"] > max(17, found["scores"]["simplified"]["psnr"] + 1)
     said = "starting from 1,200 sparse points\n" if points else "starting from 500 points along camera rays\n"
     assert said in error
-    assert "regularisers: none (" in error
+    assert "regularisers: none;" in error
     ours = g2ard.distill(None, views=tmp_path / "photos", count=500, steps=150).splats
     g2ard.save(tmp_path / "ours.ply", ours)
     assert (tmp_path / "ours.ply").read_bytes() == (tmp_path / "run" / "scene.ply").read_bytes()
@@ -41,10 +43,10 @@ def test_sparse_points_given_as_a_cloud_are_known_and_other_clouds_are_surfaces(
     (tmp_path / "scan.ply").write_bytes((tmp_path / "photos" / "sparse.ply").read_bytes())
     ask = ("--views", "photos", "-n", 900, "--steps", 3)
     sparse = succeeds(command_line, tmp_path, "distill", "photos/sparse.ply", *ask, "-o", "run").err
-    assert "regularisers: none (" in sparse
+    assert "regularisers: none;" in sparse
     assert "sparse.ply has" not in sparse, sparse
     scan = succeeds(command_line, tmp_path, "distill", "scan.ply", *ask, "-o", "scan").err
-    assert "regularisers: none (" not in scan
+    assert "regularisers: none;" not in scan
     assert "MB, scan.ply has 0." in scan, scan
 
 
@@ -57,6 +59,28 @@ def test_points_along_rays_lie_on_the_surface(tmp_path: Path) -> None:
     away = np.abs(np.linalg.norm(found.positions[bright], axis=1) - 1)
     assert np.median(away) < 0.15
     np.testing.assert_array_equal(found.positions, points_along_rays(cameras, 600).positions)
+
+
+@pytest.mark.parametrize("repeated", [0, 300])
+def test_points_of_photos_are_at_as_many_places_as_asked(repeated: int, tmp_path: Path) -> None:
+    photos_of(tmp_path / "photos", points=bool(repeated))
+    cameras = g2ard.load_views(tmp_path / "photos")
+    points = None
+    if repeated:
+        spots = np.random.default_rng(1).normal(size=(500, 3))
+        spots = np.concatenate([spots, spots[:repeated]])
+        points = distinct(Points(spots, np.full((len(spots), 3), 0.5, np.float32)))
+    found = topped_up(
+        points,
+        cameras,
+        None,
+        8_000,  # of 73,728 pixels, so that some are drawn twice
+        background=(0.0, 0.0, 0.0),
+        seed=0,
+        progress=silent,
+        say=lambda text: None,
+    )
+    assert len(found) == len(g2ard.lift(found.positions, found.colors)) == 8_000
 
 
 def test_alpha_carves_the_start(tmp_path: Path) -> None:
