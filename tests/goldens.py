@@ -43,10 +43,9 @@ if __name__ == "__main__":
 import numpy as np
 
 from helpers import golden_cases as cases
+from helpers.killed import command, forked, killed
 
 RECORD, TABLE = (Path(__file__).with_suffix(suffix) for suffix in (".json", ".txt"))
-LIMIT = 300
-"""Seconds that a command may take."""
 MOMENTS = (0.2, 0.7)
 """Shares of a command's renamed files, or of a call's progress, after which it is interrupted."""
 
@@ -114,81 +113,6 @@ def content(path: Path, root: Path) -> bytes:
 
 def digest(data: bytes | str) -> str:
     return hashlib.sha256(data.encode() if isinstance(data, str) else data).hexdigest()[:16]
-
-
-# ── processes ─────────────────────────────────────────────────────────────────────────────────────────
-
-
-def forked(work: Callable[[], object], out: Path, err: Path, folder: Path) -> int:
-    """Run a function in a forked process with its own streams and folder; return the exit status."""
-    sys.stdout.flush()
-    sys.stderr.flush()
-    child = os.fork()
-    if child:
-        return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
-    status: object = 1
-    try:
-        signal.signal(signal.SIGINT, signal.default_int_handler)
-        signal.alarm(LIMIT)
-        os.chdir(folder)
-        for number, path in ((1, out), (2, err)):
-            file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
-            os.dup2(file, number)
-        sys.stdout, sys.stderr = (os.fdopen(n, "w", encoding="utf-8", closefd=False) for n in (1, 2))
-        work()
-        status = 0
-    except SystemExit as end:
-        status = end.code or 0
-        if isinstance(status, str):
-            print(status, file=sys.stderr)
-    except BaseException:
-        traceback.print_exc()
-    finally:
-        sys.stdout.flush()
-        sys.stderr.flush()
-        os._exit(status if isinstance(status, int) else 1)
-
-
-def command(words: list[str]) -> Callable[[], object]:
-    """Return a function that runs `g2ard …`."""
-
-    def run() -> None:
-        program = importlib.import_module("g2ard.__main__")
-        sys.modules["__main__"] = program  # workers import their parent's main module
-        sys.argv = ["g2ard", *words]
-        program.main()
-
-    return run
-
-
-def killed(work: Callable[[], object], after: int, count: Path | None = None) -> Callable[[], object]:
-    """Return a function that ends its process for good once it has put `after` files in place.
-
-    Args:
-        count: file for the number of files that were put in place, if it comes to its end.
-    """
-    done = 0
-
-    def counting(original: Callable[..., object]) -> Callable[..., object]:
-        def renamed(*args: Any, **more: Any) -> object:
-            nonlocal done
-            result = original(*args, **more)
-            done += 1
-            if done == after:
-                os.kill(os.getpid(), signal.SIGKILL)
-            return result
-
-        return renamed
-
-    def run() -> None:
-        os.replace, os.link, os.rename = map(counting, (os.replace, os.link, os.rename))  # type: ignore[assignment]
-        try:
-            work()
-        finally:
-            if count is not None:
-                count.write_text(str(done))
-
-    return run
 
 
 # ── cases ─────────────────────────────────────────────────────────────────────────────────────────────

@@ -10,8 +10,8 @@ import typer
 from g2ard.cli.frame import Run
 from g2ard.errors import InputError, OutputError
 from g2ard.io import check_scene_output
-from g2ard.io.atomic import drop_empty, is_taken, parents_made
-from g2ard.io.lock import check_unlocked, locked
+from g2ard.io.atomic import drop_empty, drop_temporaries, hidden_name, is_taken, parents_made
+from g2ard.io.lock import check_unlocked, lock_file, locked
 from g2ard.io.scene_formats import files_of
 
 OPTIONS = "options.json"
@@ -27,6 +27,35 @@ def is_finished(run: Run, place: Path, resume: bool, output: Path) -> bool:
     return True
 
 
+def began_output(place: Path, output: Path) -> bool:
+    """Return whether a killed run with checkpoints at `place` began to write `output`, a file or a folder.
+
+    It left its lock or checkpoints, and everything in the output is younger.
+    """
+    lock = lock_file(place.parent, _locked_name(place, output))
+    kept, written = (
+        [path.stat().st_mtime_ns for place in places for path in (place, *place.rglob("*")) if path.is_file()]
+        for places in ((place, lock), (output,))
+    )
+    return bool(kept and written) and min(kept) <= min(written)
+
+
+def drop_ended(run: Run, place: Path, resume: bool, last: Path) -> bool:
+    """Remove checkpoints of a run that was killed after its last output `last`, and return whether it was."""
+    ended = resume and not run.overwrite and began_output(place, last)
+    if ended:
+        check_unlocked(place.parent, _locked_name(place, last))
+        _remove(place)
+        _drop_temporaries(place, last)
+    return ended
+
+
+def checkpoint_beside(output: Path, ending: str) -> Path:
+    """Return the hidden place for checkpoints of a scene, beside its file or SOG folder."""
+    whole = output.parent if output.name == "meta.json" else output
+    return whole.with_name(hidden_name(whole.name, ending))
+
+
 def finished_before(output: Path, changed: Path) -> OutputError:
     """Return the error of a finished output whose input is another file now."""
     return OutputError(
@@ -38,7 +67,9 @@ def check_scene_run(run: Run, place: Path, resume: bool, output: Path) -> None:
     """Check that the command may write the scene `output`, or resume from the checkpoints at `place`."""
     run.claim("--output", *files_of(output))
     run.claim("--resume", place, folder=True)
+    drop_ended(run, place, resume, output)
     if not is_finished(run, place, resume, output):
+        run.overwrite |= resume and began_output(place, place.parent / _locked_name(place, output))
         check_scene_output(output, run.overwrite)
     check_stopped(run, place, resume, output)
 
@@ -67,6 +98,7 @@ def stoppable(run: Run, place: Path, resume: bool, output: Path) -> Iterator[Non
         with locked(place.parent, _locked_name(place, output)):
             if is_taken(output) and not run.overwrite:  # another run wrote it since it was checked
                 raise OutputError("exists", path=output, hint="{overwrite=True} replaces it")
+            _drop_temporaries(place, output)
             if resume and left_at(place):
                 say_from(run, place, output)
             with _kept(run, place, resume):
@@ -78,6 +110,13 @@ def stoppable(run: Run, place: Path, resume: bool, output: Path) -> Iterator[Non
 def _locked_name(place: Path, output: Path) -> str:
     """Return the name beside `place` of the output, or of the folder that holds it."""
     return output.name if output.parent == place.parent else output.parent.name
+
+
+def _drop_temporaries(place: Path, output: Path) -> None:
+    """Remove what a killed run left of checkpoints and outputs."""
+    drop_temporaries(place.parent, place.name, _locked_name(place, output))
+    if output.parent != place.parent:
+        drop_temporaries(output.parent)
 
 
 @contextmanager

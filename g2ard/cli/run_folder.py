@@ -15,7 +15,7 @@ from g2ard.cli.resume import OPTIONS, check_stopped, finished_before, is_finishe
 from g2ard.config.choices import Colour, ViewFormat
 from g2ard.errors import InputError, OutputError
 from g2ard.io import write_views
-from g2ard.io.atomic import atomic_output, check_output
+from g2ard.io.atomic import atomic_output, check_output, drop_temporaries
 from g2ard.io.jsonfile import read_json
 from g2ard.io.lock import check_unlocked, locked
 from g2ard.io.paths import file_identity
@@ -123,6 +123,7 @@ class RunFolder:
         with locked(self.path):
             if self.scene.exists() and not (self._run.overwrite or left_at(self.work)):
                 raise OutputError("exists", path=self.path, hint="{overwrite=True} replaces it")
+            drop_temporaries(self.path)
             yield made
 
     @contextmanager

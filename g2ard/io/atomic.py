@@ -5,6 +5,7 @@ Links stay, and their targets are replaced. Devices, pipes and open files such a
 
 import errno
 import os
+import re
 import shutil
 import sys
 from collections.abc import Iterator
@@ -121,7 +122,36 @@ def _exists(path: Path) -> OutputError:
 def _beside(path: Path) -> Path:
     """Return a hidden name in the same folder, so that renaming is atomic, with the same suffix."""
     path = path.absolute()  # "." has no name
-    return path.with_name(hidden_name(path.stem, f".{uuid4().hex[:12]}{path.suffix}"))
+    return path.with_name(_hidden(path, uuid4().hex[:12]))
+
+
+_ANY = 12 * "_"
+"""Stands for the random part of a hidden name."""
+
+
+def _hidden(path: Path, middle: str) -> str:
+    return hidden_name(path.stem, f".{middle}{path.suffix}")
+
+
+def drop_temporaries(folder: Path, *outputs: str) -> None:
+    """Remove what killed processes left of outputs in a folder, or of all outputs if none is named.
+
+    The caller holds the lock of the folder or of the outputs.
+    """
+    names = [re.escape(_hidden(Path(name), _ANY)).replace(_ANY, "[0-9a-f]{12}") for name in outputs]
+    pattern = re.compile("|".join(names) or r"\..*\.[0-9a-f]{12}(\.[^.]*)?", re.DOTALL)
+    for path in sorted(folder.iterdir()) if folder.is_dir() else []:
+        if pattern.fullmatch(path.name):
+            _remove(path)
+
+
+def _remove(path: Path) -> None:
+    """Remove a file or folder, or as much of it as possible."""
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        with suppress(OSError):
+            path.unlink()
 
 
 def hidden_name(name: str, ending: str) -> str:
@@ -185,10 +215,7 @@ def _renamed(path: Path, overwrite: bool, *, folder: bool) -> Iterator[Path]:
     except OSError as error:
         raise _failure(error, path, temporary) from error
     finally:
-        if folder:
-            shutil.rmtree(temporary, ignore_errors=True)
-        else:
-            temporary.unlink(missing_ok=True)
+        _remove(temporary)
         drop_empty(made)
 
 
@@ -268,9 +295,10 @@ def _replace(source: Path, target: Path) -> None:
 
 
 def _move_into(source: Path, target: Path, overwrite: bool) -> None:
-    for item in sorted(source.rglob("*")):
-        place = target / item.relative_to(source)
-        if item.is_dir():
-            place.mkdir(exist_ok=True)
-        else:
-            _move(item, place, overwrite)
+    """Move files, last those that name others, .json, those in subfolders first."""
+    items = sorted(source.rglob("*"))
+    for folder in filter(Path.is_dir, items):
+        (target / folder.relative_to(source)).mkdir(exist_ok=True)
+    files = (item for item in items if not item.is_dir())
+    for item in sorted(files, key=lambda item: (item.suffix == ".json", -len(item.parts))):
+        _move(item, target / item.relative_to(source), overwrite)

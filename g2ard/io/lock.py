@@ -52,7 +52,7 @@ def locked(folder: Path, output: str | None = None) -> Iterator[None]:
     >>> list(folder.iterdir())
     []
     """
-    path = _lock_file(folder, output)
+    path = lock_file(folder, output)
     file, shown = _opened(path), folder if output is None else folder / output
     while not _held(path, file, shown):  # removed by its holder after it was opened
         os.close(file)
@@ -68,12 +68,13 @@ def locked(folder: Path, output: str | None = None) -> Iterator[None]:
 
 def check_unlocked(folder: Path, output: str | None = None) -> None:
     """Raise an `OutputError` if another process holds the lock of a folder, or of one output in it."""
-    if _lock_file(folder, output).exists():
+    if lock_file(folder, output).exists():
         with locked(folder, output):
             pass
 
 
-def _lock_file(folder: Path, output: str | None) -> Path:
+def lock_file(folder: Path, output: str | None) -> Path:
+    """Return the lock file of a folder, or of one output in it."""
     return folder / (LOCK if output is None else hidden_name(output, LOCK))
 
 

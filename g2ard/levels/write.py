@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from g2ard._core import __version__
 from g2ard.config.checks import checks_arguments
 from g2ard.errors import InputError
-from g2ard.io.atomic import atomic_folder
+from g2ard.io.atomic import atomic_folder, drop_temporaries
 from g2ard.io.jsonfile import read_json
 from g2ard.io.packing import packing_order
 from g2ard.io.sog_write import sog_files
@@ -31,9 +31,6 @@ from g2ard.levels.tree import Cut, Leaf, Level, Node
 from g2ard.levels.tree import cut as cut_tree
 from g2ard.progress import Progress, silent
 from g2ard.scene.splats import Splats
-
-_HIDDEN_FOLDER_FILE = "beside.txt"
-"""File in the work folder that names the hidden folder of an unfinished output."""
 
 _ENVIRONMENT_META = "env/meta.json"
 
@@ -86,13 +83,13 @@ def save_levels(
     meta = _meta(levels, rule, _node(tree, files), list(files.parts), environment is not None)
     before = _named_in(path)
     if work is not None:
-        _sweep(work)
+        drop_temporaries(work)
+        drop_temporaries(path.parent, path.name)
         files.write(work, path, progress)
     with atomic_folder(path, overwrite) as folder:
         if work is None:
             files.write(folder, path, progress)
         else:
-            (work / _HIDDEN_FOLDER_FILE).write_text(str(folder), encoding="utf-8", newline="\n")
             for name in files.parts:  # linked, not moved: an interrupted call resumes from them
                 shutil.copytree((work / name).parent, (folder / name).parent, copy_function=_linked)
         if environment is not None:
@@ -105,7 +102,6 @@ def save_levels(
     if work is not None:
         for name in files.parts:
             shutil.rmtree((work / name).parent, ignore_errors=True)
-        (work / _HIDDEN_FOLDER_FILE).unlink()
     return sum(written.values())
 
 
@@ -136,16 +132,6 @@ def _write_part(meta: Path, files: dict[str, bytes]) -> None:
     with atomic_folder(meta.parent) as begun:
         for name, content in files.items():
             (begun / name).write_bytes(content)
-
-
-def _sweep(work: Path) -> None:
-    """Remove the leftovers of a killed call: partial folders in `work` and the hidden output folder."""
-    begun = [path for path in work.iterdir() if path.is_dir() and path.name.startswith(".")]
-    if (note := work / _HIDDEN_FOLDER_FILE).is_file():
-        beside = Path(note.read_text(encoding="utf-8"))
-        begun += [beside] if beside.name.startswith(".") else []
-    for path in begun:
-        shutil.rmtree(path, ignore_errors=True)
 
 
 def _linked(source: str, target: str) -> None:

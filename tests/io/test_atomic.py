@@ -10,6 +10,7 @@ import pytest
 
 from g2ard.errors import OutputError
 from g2ard.io import atomic_folder, atomic_output, check_output, write_splats
+from g2ard.io.atomic import drop_temporaries
 from g2ard.io.scene_formats import FORMATS
 from helpers.scenes import checkered_ball
 from helpers.systems import needs_links, needs_modes
@@ -274,3 +275,25 @@ def test_every_writer_keeps_links(tmp_path: Path, name: str) -> None:
         write(link, checkered_ball(20), overwrite=again or link.name == "meta.json")
         assert link.is_symlink()
         assert (tmp_path / "out" / link.name).stat().st_size
+
+
+def test_leftovers_are_those_of_the_named_outputs(tmp_path: Path) -> None:
+    """Hidden names of killed processes go; everything else stays."""
+    random = "0123456789ab"
+    ours = [f".a.{random}.ply", f".a.b.{random}.ply", f".out.{random}"]
+    kept = [
+        "a.ply",
+        f".a.{random}.txt",
+        f".b.{random}.ply",
+        ".a.012345.ply",
+        f"a.{random}.ply",
+        ".a.ply.lock",
+    ]
+    for name in [*ours, *kept]:
+        (tmp_path / name).mkdir() if name == ours[-1] else (tmp_path / name).touch()
+    (tmp_path / ours[-1] / "part").touch()
+    drop_temporaries(tmp_path, "a.ply", "a.b.ply", "out")
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(kept)
+    drop_temporaries(tmp_path)
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted({*kept} - {kept[1], kept[2]})
+    drop_temporaries(tmp_path / "absent")

@@ -7,7 +7,7 @@ import typer
 
 from g2ard.cli import options as opt
 from g2ard.cli.frame import Run, command
-from g2ard.cli.resume import check_scene_run, stoppable
+from g2ard.cli.resume import check_scene_run, checkpoint_beside, stoppable
 from g2ard.config.schema import listed
 from g2ard.io.scene_formats import check_positions
 from g2ard.pipeline.presets import configured
@@ -50,7 +50,7 @@ def adapt(
     settings, _ = run.settled(AdaptConfig(), preset)
     opt.choose_engine(run, settings, "adapt.engine")
     config = configured(AdaptConfig(), preset or "auto", settings)
-    work = output.parent / f".{output.name}.work"
+    work = checkpoint_beside(output, ".work")
     check_scene_run(run, work, resume, output)
     splats = run.load(compact)
     check_positions(output, splats)

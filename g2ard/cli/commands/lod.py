@@ -119,7 +119,7 @@ def lod(
     Each level is merged from the one before, then recovered.
     Scenes larger than memory and folders of tiles are processed tile by tile.
     """
-    from g2ard.cli.resume import check_stopped, is_finished, stoppable
+    from g2ard.cli.resume import began_output, check_stopped, drop_ended, is_finished, stoppable
     from g2ard.io.atomic import check_output
     from g2ard.jobs.cost import LEVELS_TIMES, RECOVERY_TIMES, check_whole_memory
     from g2ard.jobs.levels import check_ratios, check_trained, prepare_levels
@@ -148,16 +148,21 @@ def lod(
     run.spare_inputs(writer.meta)
     run.claim("--output", output, folder=True)
     run.claim("--resume", stopped, folder=True)
-    finished = not dry_run and is_finished(run, stopped, resume, writer.meta)
+    work = tiling.folder if tiled else stopped
+    assert work is not None
+    finished = not dry_run and is_finished(run, stopped, resume, writer.page)
+    if not (dry_run or (tiled and tiling.keep)):
+        finished |= drop_ended(run, work, resume or tiled, writer.page)
     if dry_run:
         if tiled:
             raise typer.BadParameter("--dry-run is for scenes that fit into memory")
     elif finished:
         _check_same(writer.meta, ratios)
     else:
+        run.overwrite |= (tiled or resume) and began_output(work, output) and not writer.page.exists()
         check_output(output, run.overwrite, folder=True)
     if finished or not (tiled or dry_run):
-        check_stopped(run, stopped, resume, writer.meta)
+        check_stopped(run, stopped, resume or finished, writer.meta)
     if tiled:
         _in_tiles(writer, scene, ratios, tiling, views, steps, size, colour, recover)
         return
@@ -270,6 +275,11 @@ class _Writer:
     def meta(self) -> Path:
         """File that lists the levels."""
         return self.output / ("lod-meta.json" if self.kind == "sog" else "tileset.json")
+
+    @property
+    def page(self) -> Path:
+        """Page that shows them, written last."""
+        return self.output / "index.html"
 
     def save(self, levels: Sequence[Level], work: Path | None = None, sky: Splats | None = None) -> int:
         """Write the levels and a page that shows them, and return their bytes."""

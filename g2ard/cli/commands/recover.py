@@ -9,7 +9,7 @@ import typer
 
 from g2ard.cli import options as opt
 from g2ard.cli.frame import Run, command
-from g2ard.cli.resume import check_scene_run, stoppable
+from g2ard.cli.resume import check_scene_run, checkpoint_beside, stoppable
 from g2ard.cli.run_result import loss
 from g2ard.config.schema import listed
 from g2ard.io.scene_formats import check_positions
@@ -65,7 +65,7 @@ def recover(
     settings, _ = run.settled(RecoverConfig(), preset)
     with run.usage():
         check_teacher(views, teacher)
-    checkpoint = output.parent / f".{output.name}.checkpoint.npz"
+    checkpoint = checkpoint_beside(output, ".checkpoint.npz")
     check_scene_run(run, checkpoint, resume, output)
     opt.choose_engine(run, settings, "recover.engine")
     job = prepare(
