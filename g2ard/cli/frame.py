@@ -36,7 +36,7 @@ from g2ard.io.atomic import atomic_output, check_output
 from g2ard.io.detect import run_scene
 from g2ard.io.paths import real_path
 from g2ard.io.scene_formats import axes_note, files_of, scene_format
-from g2ard.io.scenes import write_scene
+from g2ard.io.scenes import tell, write_scene
 from g2ard.pipeline.presets import configured
 from g2ard.progress import plural
 from g2ard.system import devices, interrupt
@@ -300,8 +300,7 @@ class Run:
             splats = splats.whole()
         notes = write_scene(path, splats, overwrite=replaced, progress=self.progress, **options)
         self.kept.append(f"{path} is written")
-        for note in notes:
-            self.say(f"note: {path}: {note}")
+        tell(path, notes, self.say)
         if about_axes := axes_note(path, options):
             self.say(f"note: {path}: {about_axes}")
         if compare:

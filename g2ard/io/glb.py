@@ -63,8 +63,8 @@ def write(path: Path, splats: Splats, *, overwrite: bool = False, compress: str 
     if compress is None:
         content = _plain(path, splats)
     else:
-        content = spz_glb(path, splats)
-        error += spz.rounding(splats.means, spz.fraction_bits(path, splats.means.astype(np.float64), splats))
+        content, packed = spz_glb(path, splats)
+        error += packed
     with atomic_output(path, overwrite) as temporary, temporary.open("wb") as file:
         file.writelines(content)
     return error
@@ -100,10 +100,13 @@ def _plain(path: Path, splats: Splats) -> list[bytes]:
     return _glb(path, document, blobs)
 
 
-def spz_glb(path: Path, splats: Splats, centre: NDArray[np.float64] | None = None) -> list[bytes]:
-    """Return the parts of a .glb that holds an SPZ; `path` names it in messages.
+def spz_glb(
+    path: Path, splats: Splats, centre: NDArray[np.float64] | None = None
+) -> tuple[list[bytes], float]:
+    """Return the parts of a .glb that holds an SPZ, and the largest change of a position by rounding.
 
     Args:
+        path: named in messages.
         splats: the scene, whose `offset` is the node's translation.
         centre: (3,) moved from the means to the node's translation, so that coordinates are fine.
     """
@@ -132,7 +135,7 @@ def spz_glb(path: Path, splats: Splats, centre: NDArray[np.float64] | None = Non
     splatting = document["meshes"][0]["primitives"][0]["extensions"][EXTENSION]
     splatting["extensions"] = {SPZ_EXTENSION: {"bufferView": 0}}
     document["extensionsUsed"] = document["extensionsRequired"] = [EXTENSION, SPZ_EXTENSION]
-    return _glb(path, document, [blob])
+    return _glb(path, document, [blob]), spz.rounding(means, bits)
 
 
 def _about_y(splats: Splats) -> Splats:

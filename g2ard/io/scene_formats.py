@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -114,19 +115,38 @@ def check_positions(path: str | Path, splats: Splats, count: int | None = None) 
         check_far(Path(path), splats, means, (len(splats) / (count or len(splats))) ** 0.5)
 
 
-def rounded_by(error: float, splats: Splats) -> list[Note]:
-    """Return a note on positions that change by up to `error` when written, if it can be visible."""
-    from g2ard.io.types import Note
+@dataclass
+class Rounding:
+    """Changes of positions by rounding in one file or in several of a scene.
 
-    largest = splats.scales.max(axis=1)
-    largest.partition(len(largest) // 2)
-    typical = float(largest[len(largest) // 2])
-    if not error > _VISIBLE_ROUNDING * typical:
-        return []
-    text = (
-        f"positions are rounded by up to {error:.2g} units; a typical Gaussian has a scale of {typical:.2g}"
-    )
-    return [Note("rounded_positions", len(splats), text)]
+    Args:
+        far: whether the scene was moved to fit float32, so that every change is told and not only those that
+            can be visible.
+    """
+
+    far: bool
+    _told: bool = False
+    _count: int = 0
+    _worst: tuple[float, float] = 0.0, 0.0
+
+    def add(self, error: float, splats: Splats) -> None:
+        """Add the largest change of a position in a file of these Gaussians."""
+        largest = splats.scales.max(axis=1)
+        largest.partition(len(largest) // 2)
+        typical = float(largest[len(largest) // 2])
+        self._told |= error > (0.0 if self.far else _VISIBLE_ROUNDING * typical)
+        self._count += len(splats)
+        self._worst = max(self._worst, (error, typical))
+
+    @property
+    def notes(self) -> list[Note]:
+        """A note on the largest change, if it is to be told."""
+        from g2ard.io.types import Note
+
+        error, typical = self._worst
+        size = f"a typical Gaussian has a scale of {typical:.2g}"
+        text = f"positions are rounded by up to {error:.2g} units; {size}"
+        return [Note("rounded_positions", self._count, text)] if self._told else []
 
 
 def axes_note(path: str | Path, options: dict[str, Any]) -> str | None:

@@ -12,11 +12,11 @@ from g2ard.config.checks import check_type, checks_arguments
 from g2ard.errors import InputError
 from g2ard.io.atomic import check_output
 from g2ard.io.detect import file_format, reader
-from g2ard.io.scene_formats import check_options, lost_in, rounded_by, scene_format
-from g2ard.progress import Progress, silent
+from g2ard.io.scene_formats import Rounding, check_options, lost_in, scene_format
+from g2ard.progress import Progress, Say, silent
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterable, Sequence
 
     from g2ard.config.choices import RenderModel
     from g2ard.io.stream import SceneStream
@@ -125,8 +125,9 @@ def write_splats(
             inside of a .glb.
 
     Warns:
-        UserWarning: positions rounded by more than 1 % of a typical Gaussian's size; an antialiased scene in
-            a format that cannot say so (.glb, .splat, OpenUSD).
+        UserWarning: positions rounded by more than 1 % of a typical Gaussian's size, or at all if float64
+            means far from the origin were moved to fit float32; an antialiased scene in a format that cannot
+            say so (.glb, .splat, OpenUSD).
 
     Raises:
         OutputError: the file exists or cannot be written, or the extension or an option is unsupported.
@@ -139,8 +140,7 @@ def write_splats(
     >>> len(g2ard.load(path))
     1
     """
-    for note in write_scene(path, splats, overwrite=overwrite, progress=progress, **options):
-        warnings.warn(f"{path}: {note}", stacklevel=3)  # past `checks_arguments`
+    tell(path, write_scene(path, splats, overwrite=overwrite, progress=progress, **options))
 
 
 def write_scene(
@@ -155,4 +155,18 @@ def write_scene(
     writer = getattr(import_module(f"g2ard.io.{output_format.module}"), output_format.function)
     told = {"progress": progress} if output_format.tells else {}
     error = writer(Path(path), splats, overwrite=overwrite, **told, **options)
-    return [*rounded_by(error, splats), *lost_in(path, splats, **options)]
+    rounding = Rounding(far=bool((splats.narrowed().offset != splats.offset).any()))
+    rounding.add(error, splats)
+    return [*rounding.notes, *lost_in(path, splats, **options)]
+
+
+def tell(path: str | Path, notes: Iterable[Note], say: Say | None = None) -> None:
+    """Say what a written file does not hold, or warn of it if nobody listens.
+
+    A public function calls this, so that warnings name its caller.
+    """
+    for note in notes:
+        if say is None:
+            warnings.warn(f"{path}: {note}", stacklevel=4)  # past `checks_arguments`
+        else:
+            say(f"note: {path}: {note}")

@@ -18,6 +18,7 @@ from g2ard.config.choices import BLACK, Colour, RenderModel
 from g2ard.errors import InputError
 from g2ard.io.detect import kind
 from g2ard.io.reports import Report
+from g2ard.io.scenes import tell
 from g2ard.jobs.budget import Budget
 from g2ard.jobs.cost import Cost, cost_of
 from g2ard.jobs.distill import prepare
@@ -27,7 +28,7 @@ from g2ard.jobs.job import DistillJob
 from g2ard.jobs.viewer_frame import up_of
 from g2ard.levels.tileset import Georeference, map_system
 from g2ard.levels.tileset import save_tileset as write_tileset
-from g2ard.levels.tree import Cut, Level
+from g2ard.levels.tree import Cut, Level, aligned
 from g2ard.pipeline.distill import distill as pipeline
 from g2ard.progress import Progress, Say, direction, plural, silent, unsaid
 from g2ard.rendering.visibility import visibility_source
@@ -318,7 +319,7 @@ def save_tileset(
     overwrite: bool = False,
     work: Path | None = None,
     progress: Progress = silent,
-    say: Say = unsaid,
+    say: Say | None = None,
 ) -> int:
     """Write levels of detail as 3D Tiles 1.1, exactly like the command `g2ard lod --format 3dtiles`.
 
@@ -335,7 +336,8 @@ def save_tileset(
         overwrite: replace files in the folder, and remove files of its previous `tileset.json`.
         work: folder for temporary files, which saves memory.
         progress: called for files written.
-        say: called with the place, and with an estimated up direction.
+        say: called with the place, with an estimated up direction, and with a note if positions are rounded
+            by as much as `g2ard.save` would warn of; None only warns of the latter.
 
     Returns:
         Bytes written.
@@ -353,19 +355,23 @@ def save_tileset(
     >>> sorted(path.suffix for path in folder.iterdir() if path.suffix == ".json")
     ['.json']
     """
+    told = say or unsaid
+    near, *_ = aligned(levels)
     if isinstance(place, str):
-        place = Georeference.of_map(map_system(place), levels[0].offset)
-        say(f"longitude {place.longitude:.6f}, latitude {place.latitude:.6f}, heading {place.heading:.3f}")
-    return write_tileset(
+        place = Georeference.of_map(map_system(place), near[0].offset)
+        told(f"longitude {place.longitude:.6f}, latitude {place.latitude:.6f}, heading {place.heading:.3f}")
+    size, notes = write_tileset(
         path,
         levels,
-        up=tileset_up(levels, None, say) if up is None else up,
+        up=tileset_up(near, None, told) if up is None else up,
         place=place,
         cut=cut,
         overwrite=overwrite,
         work=work,
         progress=progress,
     )
+    tell(path, notes, say)
+    return size
 
 
 def tileset_up(

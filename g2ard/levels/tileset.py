@@ -21,8 +21,10 @@ from g2ard.errors import InputError, missing
 from g2ard.io.atomic import atomic_folder
 from g2ard.io.glb import EXTENSION, SPZ_EXTENSION, spz_glb
 from g2ard.io.packing import writable
+from g2ard.io.scene_formats import Rounding
 from g2ard.io.spz import check_far
-from g2ard.levels.tree import Cut, Leaf, Level, Node
+from g2ard.io.types import Note
+from g2ard.levels.tree import Cut, Leaf, Level, Node, aligned
 from g2ard.levels.tree import cut as cut_tree
 from g2ard.levels.write import read_object, write_json
 from g2ard.progress import Progress, silent
@@ -129,12 +131,13 @@ def save_tileset(
     overwrite: bool = False,
     work: Path | None = None,
     progress: Progress = silent,
-) -> int:
+) -> tuple[int, list[Note]]:
     """Write `tileset.json` and `LEVEL_N.glb`; see `g2ard.jobs.levels.save_tileset`, with `up` and `place`
-    decided."""
+    decided. Return bytes and notes."""
     path, rule = Path(path), cut or Cut()
+    levels, error, moved = aligned(levels)
     tree = cut_tree(levels, rule, work)
-    tiles = _Tiles(levels, rule.most, path)
+    tiles = _Tiles(levels, rule.most, path, Rounding(moved), error)
     parts = tiles.of(tree, len(levels) - 1)
     size = float(np.linalg.norm(tree.high - tree.low))
     root = parts[0] if len(parts) == 1 else _tile(tree, size, parts)
@@ -165,7 +168,7 @@ def save_tileset(
         written += (folder / "tileset.json").stat().st_size
     for name in before - tiles.files.keys():
         (path / name).unlink(missing_ok=True)
-    return written
+    return written, tiles.rounding.notes
 
 
 def check_tiles(path: Path, splats: Splats, ratio: float, cut: Cut | None = None) -> None:
@@ -191,11 +194,18 @@ def _upright(up: ArrayLike) -> Float:
 
 @dataclass
 class _Tiles:
-    """The tiles of a tree, and the rows of their files."""
+    """The tiles of a tree, and the rows of their files.
+
+    Args:
+        rounding: changes of positions in the files.
+        error: largest change of a position before.
+    """
 
     levels: Sequence[Level]
     most: int
     path: Path
+    rounding: Rounding
+    error: float
     files: dict[str, tuple[int, list[NDArray[np.int64]], Float]] = field(default_factory=dict)
 
     def of(self, node: Node | Leaf, level: int) -> list[dict[str, Any]]:
@@ -222,7 +232,9 @@ class _Tiles:
         """Return the .glb of a tile, whose node is moved to the middle of its box."""
         level, rows, middle = self.files[name]
         splats = replace(self.levels[level].take(np.concatenate(rows)), offset=np.zeros(3))
-        return spz_glb(self.path / name, writable(self.path / name, splats), np.rint(middle))
+        parts, error = spz_glb(self.path / name, writable(self.path / name, splats), np.rint(middle))
+        self.rounding.add(self.error + error, splats)
+        return parts
 
 
 def _tile(node: Node | Leaf, error: float, children: list[dict[str, Any]]) -> dict[str, Any]:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from g2ard.config.checks import AtLeastOne, Positive
 from g2ard.config.schema import Settings
 from g2ard.errors import InputError
+from g2ard.io.packing import rounding
 from g2ard.io.tile_store import StoredScene
 from g2ard.scene.splats import Splats, check_finite
 from g2ard.scene.transform import rotation_matrices
@@ -76,6 +77,39 @@ class Node:
                 yield from child.leaves()
 
 
+def aligned(levels: Sequence[Level]) -> tuple[list[Level], float, bool]:
+    """Return levels with float32 means and one offset.
+
+    Returns:
+        The levels, the largest change of a position by rounding, and whether their offset changed.
+    """
+    check_levels(levels)
+    first = levels[0]
+    offset = first.narrowed().offset if isinstance(first, Splats) else first.offset
+    moved, found, error = bool((offset != first.offset).any()), [], 0.0
+    for level in levels:
+        near = level
+        if isinstance(level, Splats) and (moved or level.means.dtype == np.float64):
+            near = level.narrowed(offset)
+            error = max(error, rounding(level, near))
+        found.append(near)
+    return found, error, moved
+
+
+def check_levels(levels: Sequence[Level]) -> None:
+    """Raise an `InputError` for no levels, empty ones, different offsets, or rows that are not finite."""
+    if not levels or not all(len(level) for level in levels):
+        raise InputError("expected at least one level, none of them empty", parameter="levels")
+    if any((level.offset != levels[0].offset).any() for level in levels):
+        raise InputError("the levels have different offsets", parameter="levels")
+    for number, level in enumerate(levels):
+        if isinstance(level, Splats):
+            try:
+                check_finite(level, "levels")
+            except InputError as error:
+                raise error.at(message=f"of level {number} {error.message}") from None
+
+
 def cut(levels: Sequence[Level], rule: Cut | None = None, scratch: Path | None = None) -> Node | Leaf:
     """Cut space at medians of the means of all levels, along the longest side of their box.
 
@@ -92,16 +126,7 @@ def cut(levels: Sequence[Level], rule: Cut | None = None, scratch: Path | None =
     >>> [[len(rows) for rows in leaf.rows] for leaf in tree.leaves()], tree.low.tolist(), tree.high.tolist()
     ([[1, 0], [1, 1]], [-1.0, -1.0, -2.0], [10.0, 1.0, 2.0])
     """
-    if not levels or not all(len(level) for level in levels):
-        raise InputError("expected at least one level, none of them empty", parameter="levels")
-    if any((level.offset != levels[0].offset).any() for level in levels):
-        raise InputError("the levels have different offsets", parameter="levels")
-    for number, level in enumerate(levels):
-        if isinstance(level, Splats):
-            try:
-                check_finite(level, "levels")
-            except InputError as error:
-                raise error.at(message=f"of level {number} {error.message}") from None
+    check_levels(levels)
     tree = _Tree(levels, rule or Cut(), scratch)
     rows = tree.room(len(tree.means))
     for at in _blocks(len(rows)):

@@ -26,10 +26,12 @@ from g2ard.errors import InputError
 from g2ard.io.atomic import atomic_folder, drop_temporaries
 from g2ard.io.jsonfile import read_json
 from g2ard.io.packing import packing_order
-from g2ard.io.sog_write import sog_files
-from g2ard.levels.tree import Cut, Leaf, Level, Node
+from g2ard.io.scene_formats import Rounding
+from g2ard.io.scenes import tell
+from g2ard.io.sog_write import largest_rounding, sog_files
+from g2ard.levels.tree import Cut, Leaf, Level, Node, aligned
 from g2ard.levels.tree import cut as cut_tree
-from g2ard.progress import Progress, silent
+from g2ard.progress import Progress, Say, silent
 from g2ard.scene.splats import Splats
 
 _ENVIRONMENT_META = "env/meta.json"
@@ -48,6 +50,7 @@ def save_levels(
     overwrite: bool = False,
     work: Path | None = None,
     progress: Progress = silent,
+    say: Say | None = None,
 ) -> int:
     """Write levels of detail as a streamed SOG folder: `lod-meta.json` and `LEVEL_N/meta.json`.
 
@@ -61,6 +64,7 @@ def save_levels(
         work: folder for intermediate results; the same call on the same levels resumes from it and uses less
             memory.
         progress: called for leaves measured and files written.
+        say: called with a note if positions are rounded by as much as `g2ard.save` would warn of; None warns.
 
     Returns:
         Bytes written.
@@ -78,8 +82,11 @@ def save_levels(
     True
     """
     rule, path = cut or Cut(), Path(path)
+    levels, error, moved = aligned(levels)
+    if environment is not None:
+        environment = environment.narrowed(levels[0].offset)
     tree = cut_tree(levels, rule, work)
-    files = _Files(levels, rule.most, {})
+    files = _Files(levels, rule.most, {}, Rounding(moved), error)
     meta = _meta(levels, rule, _node(tree, files), list(files.parts), environment is not None)
     before = _named_in(path)
     if work is not None:
@@ -94,6 +101,7 @@ def save_levels(
                 shutil.copytree((work / name).parent, (folder / name).parent, copy_function=_linked)
         if environment is not None:
             _write_part(folder / _ENVIRONMENT_META, sog_files(path / _ENVIRONMENT_META, environment))
+            files.rounding.add(largest_rounding(environment), environment)
         write_json(folder / "lod-meta.json", meta)
         written = {
             file.relative_to(folder): file.stat().st_size for file in folder.rglob("*") if file.is_file()
@@ -102,6 +110,7 @@ def save_levels(
     if work is not None:
         for name in files.parts:
             shutil.rmtree((work / name).parent, ignore_errors=True)
+    tell(path, files.rounding.notes, say)
     return sum(written.values())
 
 
@@ -144,11 +153,18 @@ def _linked(source: str, target: str) -> None:
 
 @dataclass
 class _Files:
-    """Assignment of leaves to files: a level's leaves fill a file until it holds more than `most` rows."""
+    """Assignment of leaves to files: a level's leaves fill a file until it holds more than `most` rows.
+
+    Args:
+        rounding: changes of positions in the files.
+        error: largest change of a position before.
+    """
 
     levels: Sequence[Level]
     most: int
     parts: dict[str, list[NDArray[np.int64]]]
+    rounding: Rounding
+    error: float
     level_of: dict[str, int] = field(default_factory=dict)
     last: dict[int, tuple[str, int]] = field(default_factory=dict)
 
@@ -165,8 +181,10 @@ class _Files:
     def write(self, folder: Path, path: Path, progress: Progress) -> None:
         """Write all missing files, each atomically; `path` names them in messages."""
         for number, name in enumerate(self.parts, start=1):
+            rows = self._rows(name)
+            self.rounding.add(self.error + largest_rounding(rows), rows)
             if not (folder / name).exists():
-                _write_part(folder / name, sog_files(path / name, self._rows(name), ordered=True))
+                _write_part(folder / name, sog_files(path / name, rows, ordered=True))
             progress("write", number, len(self.parts))
 
     def _rows(self, name: str) -> Splats:

@@ -158,3 +158,55 @@ def test_writers_say_nothing_about_invisible_rounding(tmp_path: Path, suffix: st
     with warnings.catch_warnings():
         warnings.simplefilter("error", UserWarning)
         g2ard.save(tmp_path / f"a.{suffix}", plain)
+
+
+def test_writers_tell_every_rounding_of_far_scenes(tmp_path: Path) -> None:
+    """Coordinates of a map in float64, moved to fit float32, which still rounds what is finer."""
+    fine = np.random.default_rng(0).normal(scale=1e-8, size=BALL.means.shape)
+    far = far_of(replace(BALL, means=BALL.means + fine))
+    for suffix in ("ply", "glb", "usda", "sog", "compressed.ply"):
+        with pytest.warns(UserWarning, match="rounded by up to") as said:
+            g2ard.save(tmp_path / f"far.{suffix}", far)
+        assert len(said) == 1
+
+
+@pytest.mark.parametrize("kind", ["sog", "3dtiles"])
+def test_levels_of_map_coordinates_stand_where_they_belong(tmp_path: Path, kind: str) -> None:
+    """They get one offset, whatever their files would choose, and the rounding is told once."""
+    fine = np.random.default_rng(0).normal(scale=1e-8, size=BALL.means.shape)
+    far = far_of(replace(BALL, means=BALL.means + fine))
+    levels = [far, far.take(slice(0, 40)), far.take(slice(40, 60))]
+    near = [level.narrowed(levels[0].narrowed().offset) for level in levels]
+
+    def write(folder: Path, levels: list[Splats], say: Any = None) -> None:
+        if kind == "sog":
+            g2ard.save_levels(folder, levels, say=say)
+        else:
+            g2ard.save_tileset(folder, levels, up=(0, 0, 1), place="EPSG:32635", say=say)
+
+    with pytest.warns(UserWarning, match="rounded by up to") as said:
+        write(tmp_path / "far", levels)
+    assert len(said) == 1
+    assert said[0].filename == __file__
+    lines: list[str] = []
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        write(tmp_path / "told", levels, lines.append)
+        write(tmp_path / "near", near)
+    assert [line for line in lines if "rounded by up to" in line] == [
+        f"note: {said[0].message}".replace("far", "told")
+    ]
+    names = [path.relative_to(tmp_path / "near") for path in (tmp_path / "near").rglob("*") if path.is_file()]
+    for name in names:
+        assert (tmp_path / "far" / name).read_bytes() == (tmp_path / "near" / name).read_bytes()
+
+
+def test_levels_say_what_can_be_visible(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    means = rng.normal(size=(600, 3)) + np.where(np.arange(600)[:, None] % 2, 2e4, 0)
+    wide = Splats.create(means.astype(np.float32), scales=np.full((600, 3), 0.003))
+    with pytest.warns(UserWarning, match="rounded by up to"):
+        g2ard.save_levels(tmp_path / "wide", [wide])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        g2ard.save_levels(tmp_path / "ball", [BALL])

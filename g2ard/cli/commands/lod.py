@@ -288,12 +288,12 @@ class _Writer:
 
         run = self.run
         common: dict[str, Any] = {"cut": self.cut, "overwrite": run.overwrite, "work": work}
-        common["progress"] = run.progress
+        common |= {"progress": run.progress, "say": run.say}
         if self.kind == "sog":
             axis, written = self.up, save_levels(self.output, levels, environment=sky, **common)
         else:
             axis = tileset_up(levels, self.up, run.say).tolist()
-            written = save_tileset(self.output, levels, up=axis, place=self.spot, say=run.say, **common)
+            written = save_tileset(self.output, levels, up=axis, place=self.spot, **common)
         run.kept.append(f"{self.output} is written")
         with run.finishing("the page"):
             return written + self._page(levels, axis)
