@@ -12,7 +12,7 @@ import os
 import re
 import traceback
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from itertools import combinations
 from pathlib import Path
 from pkgutil import resolve_name
@@ -31,15 +31,16 @@ from g2ard.cli.usage import flags_of, in_flags, typed
 from g2ard.config.choices import RenderModel, ViewFormat
 from g2ard.config.schema import Config, full_paths, parse_settings
 from g2ard.errors import G2ardError, InputError
-from g2ard.io import check_scene_output, check_views_output, write_views
+from g2ard.io import check_scene_output, check_views_output, find_views, kind, read_view_set, write_views
 from g2ard.io.atomic import atomic_output, check_output
 from g2ard.io.detect import run_scene
-from g2ard.io.paths import real_path
+from g2ard.io.paths import is_photo, real_path
 from g2ard.io.scene_formats import axes_note, files_of, scene_format
 from g2ard.io.scenes import tell, write_scene
 from g2ard.pipeline.presets import configured
 from g2ard.progress import plural
 from g2ard.system import devices, interrupt
+from g2ard.system.cached import cached_property
 
 if TYPE_CHECKING:
     from g2ard.scene.cameras import Cameras
@@ -367,10 +368,38 @@ class Run:
         for output in outputs:
             place = real_path(output)
             inside = _DATA_FILES.fullmatch(place.name) and not folders.isdisjoint(place.parents)
-            if place in taken or (inside and place.exists()):
+            if place in taken or (place.exists() and (inside or place in self._read_beside(place))):
                 raise typer.BadParameter(
                     f"{flag}: {output} is both an input and the output; name another output"
                 )
+
+    def _read_beside(self, place: Path) -> Collection[Path]:
+        """Return files that inputs name or that are read beside them, if `place` may be one."""
+        if is_photo(place):
+            return self._photos
+        return self._cameras if place.suffix.lower() in (".json", ".yml") else ()
+
+    @cached_property
+    def _photos(self) -> frozenset[Path]:
+        """Photos and masks of views among the inputs or beside them, and all in input folders of photos."""
+        found: list[Path | None] = []
+        for path in [*self._inputs, *self._cameras]:
+            try:
+                what = kind(path)
+            except (G2ardError, OSError):
+                found += filter(is_photo, path.rglob("*")) if path.is_dir() else ()
+                continue
+            if what == "views":
+                with suppress(G2ardError, OSError):  # the command will say it
+                    cameras = read_view_set(path, unpictured=True).cameras
+                    found += [*cameras.image_paths, *cameras.mask_paths]
+        return frozenset(real_path(path) for path in found if path is not None)
+
+    @cached_property
+    def _cameras(self) -> frozenset[Path]:
+        """Cameras that are read because they are beside an input scene."""
+        found = (find_views(path) for path in self._inputs)
+        return frozenset(real_path(path) for path in found if path is not None)
 
     def input_newer_than(self, output: Path) -> Path | None:
         """Return an input file that was modified after an output, or None."""
@@ -394,6 +423,7 @@ class Run:
 
 _DATA_FILES = re.compile(
     r"(cameras|images|points3D|frames|rigs)\.(txt|bin)|(cameras|transforms.*|(lod-)?meta|tiles)\.json|poses_bounds\.npy"
+    r"|(tile|halo)-\d+\.f32|(means_[lu]|scales|quats|sh0|shN_(centroids|labels))\.webp"
 )
 """Files that commands read in a folder given to them."""
 

@@ -37,6 +37,7 @@ def test_json_replaces_nothing_that_the_command_writes(
     assert contents(folder) == after
 
 
+PHOTOS = "--views photos.json --steps 2 --size 24 --photos"
 REDUCE = "simplify ball.ply --no-views"
 
 
@@ -95,6 +96,21 @@ def test_two_options_with_one_path_are_refused(
             "poses ball.ply -k 4 -o c/transforms.json",
             "render ball.ply --views c -o a --json c/transforms.json",
         ),
+        (
+            "ingest ball.ply --tile-rows 150 -o c",
+            f"{REDUCE.replace('ball.ply', 'c')} -r 8 -o a.ply --json c/tile-00001.f32",
+        ),
+        ("convert ball.ply c/meta.json", "convert c a.ply --json c/means_l.webp"),
+        ("info ball.ply", "render ball.ply --views photos.json -o ."),
+        ("info ball.ply", f"recover ball.ply {PHOTOS} -o a.ply --json view_001.png"),
+        (
+            "render ball.ply --views views.json -o c",
+            "register ball.ply --photos c --matcher direct -o a.json --report c/view_000.png",
+        ),
+        (
+            "distill ball.ply -r 8 --steps 2 --size 24 --views-format inria --no-view -o c",
+            "clean c/scene.ply -o a.ply --json c/cameras.json",
+        ),
     ],
 )
 def test_a_file_in_an_input_folder_is_kept(
@@ -112,6 +128,7 @@ def test_a_file_in_an_input_folder_is_kept(
     [
         f"{REDUCE} -r 8 -o c/meta.json --json c/told.json",
         "render ball.ply --views views.json --size 16 -o c --sheet c/sheet.png --json c/told.json",
+        "render ball.ply --views photos.json -o pictures --json images.json",
         f"{REDUCE} -r 8,16 -o c_{{count}}.ply --parents c_{{count}}.npy --json c.json",
     ],
 )
@@ -119,4 +136,5 @@ def test_outputs_may_share_a_folder(
     command: str, inputs: Path, tmp_path: Path, command_line: CommandLine
 ) -> None:
     folder = shutil.copytree(inputs, tmp_path / "a")
-    succeeds(command_line, folder, *command.split())
+    for words in ((), ("-w",)):  # those of the first time are no inputs
+        succeeds(command_line, folder, *command.split(), *words)
