@@ -10,7 +10,7 @@
 | `ingest` | split a scene or point cloud of any size into tiles |
 | `lift` | turn coloured points into surface-aligned discs |
 | `simplify` | reduce a scene to an exact count, like `g2ard simplify` |
-| `make_pool`, `select` | generate views; select the most useful views |
+| `make_pool`, `orbit`, `select` | generate views; select the most useful views |
 | `recover` | optimise a fixed set of Gaussians against photos or a teacher's renders |
 | `adapt` | fit a new appearance on frozen geometry |
 | `register` | estimate poses of photos |
@@ -57,6 +57,7 @@ if TYPE_CHECKING:
     from g2ard.jobs.recover import recover
     from g2ard.jobs.register import register
     from g2ard.jobs.simplify import simplify
+    from g2ard.jobs.turntable import orbit
     from g2ard.jobs.viewer_frame import up_of
     from g2ard.levels import Georeference, save_levels
     from g2ard.pipeline.adapt import AdaptConfig, Adapted, adapt
@@ -130,6 +131,7 @@ __all__ = [
     "lod",
     "look_at",
     "make_pool",
+    "orbit",
     "preset",
     "rasterize",
     "recover",
@@ -161,6 +163,7 @@ _HOMES = {
     "jobs.recover": ("recover",),
     "jobs.register": ("register",),
     "jobs.simplify": ("simplify",),
+    "jobs.turntable": ("orbit",),
     "jobs.viewer_frame": ("up_of",),
     "poses": ("make_pool",),
     "pipeline.presets": ("preset",),

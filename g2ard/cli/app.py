@@ -18,7 +18,7 @@ COMMANDS = {
     "poses": "Generate views for a scene: poses in free space that see it well.",
     "select": "Select the most useful views, best first, each with a sampling weight.",
     "render": "Render views of a scene as PNG, or show how it would be simplified.",
-    "view": "Write an HTML page that shows one scene, or compares two, in any browser.",
+    "view": "Show one scene, or compare two, in the browser; -o writes an HTML page.",
     "lod": "Write levels of detail as streamed SOG or 3D Tiles.",
     "evaluate": "Score scenes against photos or a teacher's renders: PSNR, SSIM, edges, needles, overdraw.",
     "compare": "Compare renders of two scenes: PSNR, SSIM, the worst views, and a page to look at.",

@@ -44,6 +44,11 @@ _UPRIGHT_MEAN = 0.8
 _START_VIEWS, _START_SIDE = 12, 160
 """Number of typical views that are rendered to choose the opening one, and their longer side in pixels."""
 
+_SUBJECT_SHARE, _WHOLE_SUBJECT = 0.7, 0.995
+"""Share of the points in sight from which a view shows one subject, and at which it shows all of it."""
+_FARTHEST_STEP = 1.5
+"""Largest step back from the subject, in its distances."""
+
 
 @dataclass(frozen=True, eq=False)
 class ViewerFrame:
@@ -143,6 +148,8 @@ def frame_with(
     stand = ViewerFrame(_turn(up_of(scene, up) if axis is None else axis), _middle(scene))
     points = opaque_points(scene)
     view = cameras[_named(cameras, start)] if start else _typical(scene, cameras, stand.up, points)
+    if not start and len(cameras) > 1:
+        view = _with_subject(view, points)
     return replace(stand, start=stand.start_at(view, points), name=view.name)
 
 
@@ -222,6 +229,21 @@ def _typical(scene: Splats, cameras: Cameras, up: NDArray[np.float64], points: N
     order = np.argsort((away / np.where(spread > 0, spread, 1)).sum(axis=1), kind="stable")
     tried, renderer = cameras.take(order[:_START_VIEWS]), Renderer(scene)
     return tried[int(np.argmax([_detail(renderer.clipped(view)) for view in tried.resized(_START_SIDE)]))]
+
+
+def _with_subject(view: Camera, points: NDArray[np.float64]) -> Camera:
+    """Move a view back until the whole subject is in sight, if most of it is."""
+    if view.holds(points).mean() < _SUBJECT_SHARE:
+        return view  # inside, or before something larger
+    ahead = view.viewmat[2, :3]
+    depth = float(np.median((points[view.holds(points)] - view.position) @ ahead))
+    for step in np.arange(0.0, _FARTHEST_STEP, 0.05) * depth:
+        viewmat = view.viewmat.copy()
+        viewmat[2, 3] += step
+        moved = replace(view, viewmat=viewmat)
+        if moved.holds(points).mean() >= _WHOLE_SUBJECT:
+            return moved
+    return view
 
 
 def _traits(view: Camera, up: NDArray[np.float64], points: NDArray[np.float64]) -> tuple[float, float, float]:

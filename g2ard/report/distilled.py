@@ -38,7 +38,8 @@ def distill_report(
     background: Colour = BLACK,
     told: Sequence[str] = (),
 ) -> None:
-    """Write the HTML page of one run: a verdict, scores by kind of view, and pictures of the worst views.
+    """Write the HTML page of one run: a verdict, scores by kind of view, and pictures of a typical
+    view and of the worst ones.
 
     Args:
         scenes: (name, scene) of `simplified` and `recovered`, as `report["scores"]` names them.
@@ -59,13 +60,19 @@ def distill_report(
     lost = _below_start(scores[scenes[0][0]], scores[scenes[-1][0]])
     if lost:
         page.paragraph(f"Views that ended below their start: {', '.join(text for _, text in lost)}.")
-    page.heading("Worst views")
-    page.paragraph(
-        f"Left of the divider: the {'photo' if 'photo' in report['against'] else 'dense scene'}. "
-        "Right: the result. Below: its worst regions, magnified."
-    )
+    after = scores[scenes[-1][0]]
+    typical = sorted(range(len(after)), key=lambda row: after[row]["psnr"])[len(after) // 2]
+    worst = [row for row in _shown([row for row, _ in lost], _worst(after)) if row != typical]
     renderers = [(name, Renderer(splats, background=background)) for name, splats in reversed(scenes)]
-    for view in _shown([row for row, _ in lost], _worst(scores[scenes[-1][0]])):
+    for view in (typical, *worst):
+        if view == typical:
+            page.heading("A typical view")
+            page.paragraph(
+                f"Left of the divider: the {'photo' if 'photo' in report['against'] else 'dense scene'}. "
+                "Right: the result. Below: its worst regions, magnified."
+            )
+        elif view == worst[0]:
+            page.heading("Worst views")
         part, row = views[view]
         camera = part.cameras[row]
         shown = [

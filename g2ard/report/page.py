@@ -160,7 +160,8 @@ class Page:
         ]
         self._parts.append(
             f'<section class="view"><h4>{escape(view.title)}</h4><div class="pair">'
-            f'<div class="slider" style="aspect-ratio:{width}/{height}">'
+            f'<div class="slider" style="aspect-ratio:{width}/{height};'
+            f'max-width:calc(85vh*{width / height:.4f})">'
             f'<img data-i="{target}" alt="target"><img class="over" data-i="{numbers[0]}" alt="rendering">'
             f'{marks}<span class="tag left">target</span><span class="tag right"></span>'
             f'<input type="range" min="0" max="100" value="50" aria-label="target or rendering"></div>'

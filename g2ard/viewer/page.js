@@ -194,6 +194,14 @@ function divide(right, leader) {
   });
   divider.addEventListener('focus', () => { leader.state.inputEnabled = false; });
   divider.addEventListener('blur', () => { leader.state.inputEnabled = true; });
+  // A label shows its scene alone, and both again.
+  const labels = [...document.querySelectorAll('button.label')];
+  labels.forEach((label, index) => label.addEventListener('click', () => {
+    const alone = label.getAttribute('aria-pressed') !== 'true';
+    labels.forEach(other => other.setAttribute('aria-pressed', other === label && alone));
+    divider.hidden = alone;
+    place(alone ? 1 - index : 0.5);
+  }));
   place(0.5);
 }
 
@@ -202,6 +210,9 @@ async function main() {
     throw new Error('its levels are loaded over http. Run "python -m http.server" in their folder and open '
       + 'http://localhost:8000');
   }
+  try { // the list of controls is closed, unless it was opened in this browser
+    localStorage.setItem('controlsPanelOpen', localStorage.getItem('controlsPanelOpen') ?? 'false');
+  } catch { /* storage can be denied; the list is open then */ }
   const { createViewer } = await module(read('viewer'));
   const started = [await viewer(createViewer, 0, document.getElementById('scenes'))];
   if (files.length === 2) {

@@ -149,6 +149,14 @@ def _sog(path: Path, label: str, splats: Splats, progress: Progress) -> bytes:
     return packed
 
 
+def _label(text: str, *, switch: bool) -> str:
+    """Return a scene's label; of two scenes, it is a button that shows this one alone."""
+    if not switch:
+        return f'<p class="label">{escape(text)}</p>'
+    title = "Show this scene alone, or both"
+    return f'<button type="button" class="label" aria-pressed="false" title="{title}">{escape(text)}</button>'
+
+
 def _page(labels: Sequence[str], shown: object, packed: Sequence[bytes]) -> str:
     def part(name: str) -> str:
         return (_HERE / name).read_text(encoding="utf-8")
@@ -162,7 +170,7 @@ def _page(labels: Sequence[str], shown: object, packed: Sequence[bytes]) -> str:
         title=escape(" | ".join(labels)),
         notice=_NOTICE + part("supersplat/LICENSE"),
         style=part("supersplat/index.css") + part("page.css"),
-        labels="\n".join(f'<p class="label">{escape(label)}</p>' for label in labels),
+        labels="\n".join(_label(label, switch=len(labels) > 1) for label in labels),
         view=json.dumps(shown).replace("<", "\\u003c"),
         viewer=base64.b64encode((_HERE / "supersplat/index.js.gz").read_bytes()).decode(),
         scenes="\n".join(data),

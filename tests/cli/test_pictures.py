@@ -9,13 +9,13 @@ import pytest
 from PIL import Image
 
 from g2ard.io import write_splats
-from g2ard.jobs.turntable import turntable
+from g2ard.jobs.turntable import orbit
 from helpers.commands import CommandLine, refused, succeeds
 from helpers.scenes import checkered_ball
 
 
 def test_an_orbit_keeps_its_distance_and_turns_by_equal_angles() -> None:
-    views = turntable(checkered_ball(800), 8, size=(64, 48), up=(0, 0, 1))
+    views = orbit(checkered_ball(800), 8, size=(64, 48), up=(0, 0, 1))
     positions = views.positions
     middle = positions.mean(0)
     np.testing.assert_allclose(positions[:, 2], positions[0, 2], atol=1e-9)

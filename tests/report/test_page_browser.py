@@ -2,10 +2,11 @@
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from g2ard.report.kinds import COLUMNS
-from g2ard.report.page import Page
+from g2ard.report.page import Comparison, Page, Shown
 from helpers.browser import Browser
 
 ROW = ["anywhere", "128", "29.34 → 32.27", "pose_0113_anywhere 27.01", "0.7896 → 0.8607"]
@@ -25,3 +26,18 @@ def test_tables_fit_the_window_and_name_their_columns(width: int, tmp_path: Path
         assert max(browser.run(edges)) <= width
         heads = "getComputedStyle(document.querySelector('td'), '::before').content"
         assert (browser.run(heads) == f'"{COLUMNS[0]}"') == (width < 600)
+
+
+@pytest.mark.parametrize("shape", [(120, 67), (67, 120)])
+def test_pictures_are_no_taller_than_the_screen(shape: tuple[int, int], tmp_path: Path) -> None:
+    image = np.zeros((*shape, 3), np.uint8)
+    page = Page("a page")
+    page.comparison(Comparison("view", image, [Shown("recovered", image + np.uint8(9))]))
+    page.write(tmp_path / "report.html")
+    with Browser(1000, 640) as browser:
+        browser.open((tmp_path / "report.html").as_uri())
+        browser.run("new Promise(done => { onload = done; document.readyState === 'complete' && done() })")
+        heights = browser.run(
+            "[...document.querySelectorAll('img')].map(e => e.getBoundingClientRect().height)"
+        )
+        assert 0 < max(heights) <= 640

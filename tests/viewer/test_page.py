@@ -299,3 +299,25 @@ def test_bad_input_is_one_line_and_leaves_nothing(
     (tmp_path / "empty").mkdir()
     assert words in refused(command_line, tmp_path, "view", *arguments, status=1)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["dense.ply", "empty", "v.json"]
+
+
+@pytest.mark.parametrize("height", [0.5, 1.4])
+def test_a_page_opens_with_the_whole_subject_in_sight(height: float) -> None:
+    rng = np.random.default_rng(0)
+    tall = Splats.create(
+        rng.uniform(-1, 1, (3000, 3)) * [0.4, height, 0.4],
+        scales=np.full((3000, 3), 0.05),
+        logit_opacities=np.full(3000, 4.0),
+    )
+    eyes = [[3 * np.cos(a), 0.0, 3 * np.sin(a)] for a in np.linspace(0, 6, 8)]
+    views = Cameras.of(
+        [
+            Camera.facing(eye, [0, 0.1, 0], width=120, height=90, fov=60, up=(0, -1, 0), name=f"{i}")
+            for i, eye in enumerate(eyes)
+        ]
+    )
+    stand = frame_with(tall, views, up=(0, -1, 0))
+    assert stand.start is not None
+    eye, target = (stand.world(point) for point in (stand.start.position, stand.start.target))
+    opened = Camera.facing(eye, target, width=120, height=90, fov=stand.start.fov[0], up=(0, -1, 0))
+    assert opened.holds(tall.means).mean() >= 0.99

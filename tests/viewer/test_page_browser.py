@@ -175,3 +175,23 @@ def test_a_window_of_any_shape_shows_the_whole_view(tmp_path: Path, size: tuple[
         show(browser, page)
         expected = rendered(scene, replace(FRONT, K=K, width=width, height=height))
         assert_shows(browser, expected, 38)
+
+
+def test_a_narrow_page_opens_readable_and_shows_each_scene_alone(tmp_path: Path) -> None:
+    scene = scattered(400)
+    stand = frame_with(scene, Cameras.of([FRONT]), up=(0, 0, 1))
+    names = ["a_scene_with_a_long_name.ply: 1,234,567 Gaussians", "another_long_name.ply: 12,345 Gaussians"]
+    write_page(tmp_path / "two.html", [(name, stand.of(scene)) for name in names], start=stand.start)
+    with Browser(390, 700) as page:
+        show(page, tmp_path / "two.html")
+        labels = "[...document.querySelectorAll('.label')]"
+        boxes = labels + ".map(e => e.getBoundingClientRect()).map(box => [box.left, box.right])"
+        (left, first), (second, right) = page.run(boxes)
+        assert 0 <= left < first <= second < right <= 390
+        assert page.run("localStorage.getItem('controlsPanelOpen')") == "false"
+        clip = "document.getElementById('right').style.clipPath"
+        press = "document.querySelectorAll('.label')[{}].click(); " + clip
+        assert page.run(press.format(0)) == "inset(0px 0px 0px 100%)"
+        assert page.run(press.format(1)) == "inset(0px)"
+        assert page.run("document.getElementById('divider').hidden")
+        assert page.run(press.format(1)) == "inset(0px 0px 0px 50%)"

@@ -84,7 +84,7 @@ def render(
     from g2ard.io.animation import write_animation
     from g2ard.io.images import to_bytes
     from g2ard.jobs.inputs import load_views
-    from g2ard.jobs.turntable import turntable
+    from g2ard.jobs.turntable import orbit
     from g2ard.jobs.view_checks import warn_of_sight
     from g2ard.jobs.views import views_or_pool
     from g2ard.rendering.panorama import stations
@@ -108,7 +108,7 @@ def render(
     splats = run.load(scene)
     found: Any
     if turn is not None:
-        found = turntable(splats, turn, up=up, seed=run.seed, progress=run.progress, say=run.say)
+        found = orbit(splats, turn, up=up, seed=run.seed, progress=run.progress, say=run.say)
     else:
         found = views_or_pool(
             splats,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -17,17 +18,29 @@ from g2ard.progress import plural
 if TYPE_CHECKING:
     from g2ard.scene.splats import Splats
 
+_LARGEST_DENSE = 2_000_000
+"""Largest dense scene that is shown beside a run's result."""
+
 
 @command("view", example="g2ard view run/ dense.ply -o compare.html", scenes=True)
 def view(
     run: Run,
     scene: Annotated[
-        Path, typer.Argument(metavar="SCENE|RUN", help="A scene, or the folder of a `distill` run.")
+        Path,
+        typer.Argument(
+            metavar="SCENE|RUN|LEVELS",
+            help="A scene, the folder of a `distill` run (beside its dense scene), or levels of `lod`.",
+        ),
     ],
-    output: opt.OutputOption,
     other: Annotated[
         Path | None,
         typer.Argument(metavar="[SCENE|RUN]", help="Second scene to compare with, right of a divider."),
+    ] = None,
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            "-o", "--output", metavar="FILE.html", help="Write the page here, instead of opening the browser."
+        ),
     ] = None,
     views: opt.ViewsOrMadeOption = None,
     images: opt.ImagesOption = None,
@@ -38,11 +51,60 @@ def view(
     background: opt.BackgroundOption = None,
     up: opt.UpOption = None,
 ) -> None:
-    """Write an HTML page that shows one scene, or compares two, in any browser."""
+    """Show one scene, or compare two, in the browser; -o writes an HTML page.
+
+    Without -o, the page is served to this machine alone (127.0.0.1) until Ctrl-C.
+    """
+    if output is not None:
+        _write(run, scene, other, output, views, images, start, background, up)
+        return
+    from g2ard.cli.serving import show
+
+    if _is_levels(scene):
+        if other is not None:
+            raise typer.BadParameter(f"{scene}: levels of detail cannot be compared")
+        run.refuse_typed("on levels of detail", "views", "images", "start", "background", "up")
+        show(run, scene, "index.html")
+        return
+    with TemporaryDirectory(prefix="g2ard-") as folder:
+        page = Path(folder) / "view.html"
+        _write(run, scene, other or _dense_of(scene), page, views, images, start, background, up)
+        show(run, page.parent, page.name)
+
+
+def _is_levels(path: Path) -> bool:
+    """Return whether a folder holds levels of detail with their page."""
+    levels = ("lod-meta.json", "tileset.json")
+    return (path / "index.html").is_file() and any((path / name).is_file() for name in levels)
+
+
+def _dense_of(path: Path) -> Path | None:
+    """Return the scene that a run was made of, if it is there and browsers can show it."""
+    from g2ard.io.describe import describe
+    from g2ard.jobs.common import source_of
+
+    dense = source_of(path)
+    if dense is None or not dense.is_file():
+        return None
+    return dense if describe(dense)["count"] <= _LARGEST_DENSE else None
+
+
+def _write(
+    run: Run,
+    scene: Path,
+    other: Path | None,
+    output: Path,
+    given: Any,
+    images: Path | None,
+    start: str | None,
+    background: opt.Triple | None,
+    up: opt.Triple | None,
+) -> None:
+    """Write the page of one scene or two."""
     from g2ard.jobs.viewer_frame import frame_of
     from g2ard.viewer import check_page_output, write_page
 
-    views = opt.with_images(views, images)
+    views = opt.with_images(given, images)
     run.claim("--output", output)
     check_page_output(output, run.overwrite)
     paths = [run_scene(path) for path in (scene, other) if path is not None]
