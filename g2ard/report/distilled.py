@@ -48,31 +48,13 @@ def distill_report(
         told: summary lines that the command prints.
     """
     page = Page(title, verdict(report))
-    page.table(COLUMNS, cells(map(KindScore.of, report["kinds"])))
-    page.paragraph("PSNR and SSIM: simplified → recovered.")
-    if edges := edges_line(report):
-        page.paragraph(edges)
-    for line in told:
-        page.paragraph(line)
     views = [(part, row) for part in targets for row in range(len(part.cameras))]
     parts = [report["scores"], *([report["apart"]] if report["apart"] else [])]
     scores = {name: [view for part in parts for view in part[name]["views"]] for name, _ in scenes}
-    lost = _below_start(scores[scenes[0][0]], scores[scenes[-1][0]])
-    if lost:
-        page.paragraph(f"Views that ended below their start: {', '.join(text for _, text in lost)}.")
-    after = scores[scenes[-1][0]]
-    typical = sorted(range(len(after)), key=lambda row: after[row]["psnr"])[len(after) // 2]
-    worst = [row for row in _shown([row for row, _ in lost], _worst(after)) if row != typical]
+    before, after = scores[scenes[0][0]], scores[scenes[-1][0]]
     renderers = [(name, Renderer(splats, background=background)) for name, splats in reversed(scenes)]
-    for view in (typical, *worst):
-        if view == typical:
-            page.heading("A typical view")
-            page.paragraph(
-                f"Left of the divider: the {'photo' if 'photo' in report['against'] else 'dense scene'}. "
-                "Right: the result. Below: its worst regions, magnified."
-            )
-        elif view == worst[0]:
-            page.heading("Worst views")
+
+    def show(view: int) -> None:
         part, row = views[view]
         camera = part.cameras[row]
         shown = [
@@ -81,6 +63,29 @@ def distill_report(
         ]
         title = f"{part.cameras.names[row]}, {camera.width}×{camera.height} px"
         page.comparison(Comparison(title, to_bytes(part[row]), shown))
+
+    typical = sorted(range(len(after)), key=lambda row: after[row]["psnr"])[len(after) // 2]
+    page.heading("A typical view")
+    page.paragraph(
+        f"Left of the divider: the {'photo' if 'photo' in report['against'] else 'dense scene'}. "
+        "Right: the result. Below: its worst regions, magnified."
+    )
+    show(typical)
+    page.heading("Scores")
+    page.table(COLUMNS, cells(map(KindScore.of, report["kinds"])))
+    page.paragraph(f"PSNR and SSIM: simplified → recovered, in views of {report['size']}.")
+    if edges := edges_line(report):
+        page.paragraph(edges)
+    for line in told:
+        page.paragraph(line)
+    lost = _below_start(before, after)
+    if lost:
+        page.paragraph(f"Views that ended below their start: {', '.join(text for _, text in lost)}.")
+    worst = [view for view in _shown([row for row, _ in lost], _worst(after)) if view != typical]
+    if worst:
+        page.heading("Worst views")
+    for view in worst:
+        show(view)
     size, seconds = report["bytes"], report["seconds"]
     page.paragraph(
         f"{size['input'] / 1e6:.2f} → {size['output'] / 1e6:.2f} MB as .ply, in {seconds['total']:,.0f} s. "

@@ -192,6 +192,6 @@ def test_a_narrow_page_opens_readable_and_shows_each_scene_alone(tmp_path: Path)
         clip = "document.getElementById('right').style.clipPath"
         press = "document.querySelectorAll('.label')[{}].click(); " + clip
         assert page.run(press.format(0)) == "inset(0px 0px 0px 100%)"
-        assert page.run(press.format(1)) == "inset(0px)"
+        assert page.run(press.format(1)) == "inset(0px 0px 0px 0%)"
         assert page.run("document.getElementById('divider').hidden")
         assert page.run(press.format(1)) == "inset(0px 0px 0px 50%)"
