@@ -387,7 +387,7 @@ class Run:
             try:
                 what = kind(path)
             except (G2ardError, OSError):
-                found += filter(is_photo, path.rglob("*")) if path.is_dir() else ()
+                found += [p for p in path.rglob("*") if is_photo(p)] if path.is_dir() else []
                 continue
             if what == "views":
                 with suppress(G2ardError, OSError):  # the command will say it
