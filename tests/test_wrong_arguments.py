@@ -33,6 +33,7 @@ VALID: dict[str, dict[str, Any]] = {
     "look_at": {"position": (0, -3, 0), "target": (0, 0, 0)},
     "make_pool": {"splats": BALL, "count": 2},
     "preset": {},
+    "orbit": {"scene": BALL, "count": 2},
     "recover": {"student": BALL, "targets": TARGETS},
     "register": {"scene": BALL, "photos": VIEWS},
     "render": {"splats": BALL, "camera": VIEWS[0]},

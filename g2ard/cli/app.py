@@ -17,7 +17,7 @@ COMMANDS = {
     "clean": "Remove clutter: invisible Gaussians, giants, needles, floaters; haze on request.",
     "poses": "Generate views for a scene: poses in free space that see it well.",
     "select": "Select the most useful views, best first, each with a sampling weight.",
-    "render": "Render views of a scene as PNG, or show how it would be simplified.",
+    "render": "Render views of a scene as PNG or as an animation.",
     "view": "Show one scene, or compare two, in the browser; -o writes an HTML page.",
     "lod": "Write levels of detail as streamed SOG or 3D Tiles.",
     "evaluate": "Score scenes against photos or a teacher's renders: PSNR, SSIM, edges, needles, overdraw.",

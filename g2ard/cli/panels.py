@@ -19,7 +19,7 @@ USED: dict[str, tuple[str, ...]] = {
     "adapt": ("output", "views", "teacher", "images", "size", "steps", "background", "resume"),
     "register": ("output", "photos", "poses", "pool", "focal", "intrinsics", "size", "matcher", "report"),
     "lift": ("output", "overwrite"),
-    "ingest": ("output", "tile_rows", "resume"),
+    "ingest": ("output", "tile_rows", "overwrite"),
     "convert": (
         *("overwrite", "sh_degree", "box", "sphere", "where"),
         *("scale", "rotate", "translate", "from_axes", "to_axes"),
@@ -57,7 +57,7 @@ _PANELS = {
     "Output": (
         *("output", "format", "keep", "page", "parents", "resume", "dry_run", "report", "truth"),
         *("metres_per_unit", "environment", "most", "extent", "least", "layout", "spz_version", "compress"),
-        *("depth", "fps"),
+        *("depth", "around", "fps"),
     ),
     "Geometry": (
         *("box", "sphere", "invert", "where", "transform", "scale", "rotate", "translate", "recentre"),

@@ -199,6 +199,7 @@ OPTIONS: dict[str, dict[str, str]] = {
         "sheet": "--sheet look.png",
         "depth": "--depth",
         "looks": "-k 9",
+        "around": "--panorama",
         "convention": "--convention inria",
         "split": "--split test",
         "size": "--size 20",

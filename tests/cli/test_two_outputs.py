@@ -105,10 +105,10 @@ def test_two_options_with_one_path_are_refused(
         ("info ball.ply", f"recover ball.ply {PHOTOS} -o a.ply --json view_001.png"),
         (
             "render ball.ply --views views.json -o c",
-            "register ball.ply --photos c --matcher direct -o a.json --report c/view_000.png",
+            "register ball.ply --images c --matcher direct -o a.json --report c/view_000.png",
         ),
         (
-            "distill ball.ply -r 8 --steps 2 --size 24 --views-format inria --no-view -o c",
+            "distill ball.ply -r 8 --steps 2 --size 24 --views-format inria --no-page -o c",
             "clean c/scene.ply -o a.ply --json c/cameras.json",
         ),
     ],
