@@ -5,6 +5,8 @@ harmonic odd in them. Scales and opacities are linear. Band 0 precedes the other
 """
 
 import re
+import zipfile
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -23,6 +25,7 @@ from g2ard.scene.splats import SH_C0, Splats
 from g2ard.scene.transform import deformed, join
 
 _SCHEMA = "ParticleField3DGaussianSplat"
+_KERNEL = "ParticleFieldKernelGaussianEllipsoidAPI"
 _NAME = "Splats"
 _SH = "radiance:sphericalHarmonics"
 _COLOR = "primvars:displayColor"
@@ -136,10 +139,10 @@ def read(path: Path) -> Scene:
     except pxr.Tf.ErrorException as error:
         raise _not_a_stage(path, error) from error
     held = list(stage.Traverse(pxr.Usd.TraverseInstanceProxies(pxr.Usd.PrimDefaultPredicate)))
-    fields = [prim for prim in held if prim.GetTypeName() == _SCHEMA]
+    fields = [prim for prim in held if _is_field(prim)]
     shown = [prim for prim in fields if _visible(pxr, prim)]
     if not shown:
-        raise InputError(_nothing(held, len(fields)), path=path)
+        raise InputError(_nothing(path, held, len(fields)), path=path)
     parts, notes, uneven = [], list[Note](), 0
     for prim in shown:
         scene = _read_prim(path, pxr, prim)
@@ -163,18 +166,35 @@ def _not_a_stage(path: Path, error: Exception) -> InputError:
     return InputError("is not valid OpenUSD text", path=path, index=int(at[1] or at[2]), item="line")
 
 
+def _is_field(prim: Any) -> bool:
+    """Return whether a prim is a field of Gaussians, by its type or by its kernel."""
+    of_kernel = prim.GetTypeName() == "ParticleField" and _KERNEL in prim.GetAppliedSchemas()
+    return bool(prim.GetTypeName() == _SCHEMA or of_kernel)
+
+
 def _visible(pxr: Any, prim: Any) -> bool:
     time = pxr.Usd.TimeCode.EarliestTime()
     return bool(pxr.UsdGeom.Imageable(prim).ComputeVisibility(time) != pxr.UsdGeom.Tokens.invisible)
 
 
-def _nothing(held: list[Any], fields: int) -> str:
+def _nothing(path: Path, held: list[Any], fields: int) -> str:
     """Return why a stage has no splats that can be read: what it holds instead."""
     if fields:
         return f"has {plural(fields, 'prim')} of type {_SCHEMA}, all invisible"
-    words = [str(word) for prim in held for word in (prim.GetTypeName(), *prim.GetPropertyNames())]
-    if any("nurec" in word.lower() for word in words):
+    words = [
+        str(word).lower()
+        for prim in held
+        for word in (prim.GetTypeName(), *prim.GetPropertyNames(), *prim.GetAppliedSchemas())
+    ]
+    if path.suffix.lower() == ".usdz":
+        with suppress(zipfile.BadZipFile), zipfile.ZipFile(path) as archive:
+            words += [name.lower() for name in archive.namelist()]
+    if any("nurec" in word for word in words):
         return "holds a NuRec volume, which only Omniverse reads; export the scene as .ply or ParticleField"
+    if any(word in each for each in words for word in ("surfel", "surflet")):
+        return (
+            f"holds surfels (flat particles), which are not supported; export the scene as .ply or {_SCHEMA}"
+        )
     types = sorted({str(prim.GetTypeName()) for prim in held} - {"", "Xform", "Scope"})
     return f"has no prim of type {_SCHEMA}" + (f", only {', '.join(types[:4])}" if types else "")
 
@@ -204,14 +224,17 @@ def _read_prim(path: Path, pxr: Any, prim: Any) -> Scene:
             raise InputError(f"has {len(rgb):,} values, expected {count:,}", path=path, property=_COLOR)
         raw.sh0[:, 0] = (rgb - 0.5) / SH_C0
         notes.append(Note("display_color", count, "colours are those of displayColor, taken as sRGB"))
-    space = _color_space(pxr, prim)
-    if space.startswith("lin_"):
+    if _color_space(pxr, prim).lower().startswith("lin"):
         notes.append(LINEAR_NOTE)
     return cleaned(path, raw, notes)
 
 
 def _color_space(pxr: Any, prim: Any) -> str:
-    """Return the colour space that a prim or its closest ancestor names, or an empty string."""
+    """Return the colour space that the colours, the prim or its closest ancestor name, or an empty string."""
+    for name in (f"{_SH}Coefficients", f"{_SH}Coefficientsh", _COLOR):
+        attribute = prim.GetAttribute(name)
+        if attribute and attribute.HasColorSpace():
+            return str(attribute.GetColorSpace())
     while prim:
         if name := _earliest(pxr, prim.GetAttribute("colorSpace:name")):
             return str(name)

@@ -141,19 +141,29 @@ def test_instances_and_the_earliest_time_are_read(tmp_path: Path) -> None:
     np.testing.assert_allclose(read_splats(prims(tmp_path, text)).means, truth.means, atol=1e-6)
 
 
-@pytest.mark.parametrize("space", ["lin_rec709_scene", "lin_rec2020_scene", "srgb_rec709_scene"])
-def test_linear_colours_are_noted(tmp_path: Path, space: str) -> None:
+@pytest.mark.parametrize("space", ["lin_rec709_scene", "lin_rec2020_scene", "linear", "srgb_rec709_scene"])
+@pytest.mark.parametrize("of", ["prim", "parent", "colours"])
+def test_linear_colours_are_noted(tmp_path: Path, space: str, of: str) -> None:
     pytest.importorskip("pxr")
-    named = f'uniform token colorSpace:name = "{space}"\n'
-    text = prim(tmp_path, "a", scene(1), named, meta='( prepend apiSchemas = ["ColorSpaceAPI"] )')
+    named, api = f'uniform token colorSpace:name = "{space}"\n', '( prepend apiSchemas = ["ColorSpaceAPI"] )'
+    text = prim(tmp_path, "a", scene(1), *([named, "def", api] if of == "prim" else []))
+    if of == "parent":
+        text = f'def Xform "p" {api}\n{{\n{named}{text}}}\n'
+    elif of == "colours":
+        text = re.sub(r"(Coefficients = .*)", rf'\1 ( colorSpace = "{space}" )', text)
     codes = [note.code for note in read_scene(prims(tmp_path, text)).notes]
     assert codes == ["linear_colors"] * space.startswith("lin")
 
 
 def test_what_a_stage_holds_instead_is_named(tmp_path: Path) -> None:
     pytest.importorskip("pxr")
-    nurec = 'def Volume "v"\n{\n custom asset omni:nurec:data = @m.nurec@\n}\n'
-    for text, message in ((nurec, "NuRec"), ('def Mesh "m"\n{\n}\n', "only Mesh")):
+    surflet = '( prepend apiSchemas = ["ParticleFieldKernelGaussianSurfletAPI"] )'
+    for text, message in (
+        ('def Volume "v"\n{\n custom asset omni:nurec:data = @m.nurec@\n}\n', "NuRec"),
+        ('def Volume "v"\n{\n def OmniNuRecFieldAsset "f"\n {\n }\n}\n', "NuRec"),
+        (f'def ParticleField "f" {surflet}\n{{\n}}\n', "surfels"),
+        ('def Mesh "m"\n{\n}\n', "only Mesh"),
+    ):
         with pytest.raises(InputError, match=message):
             read_scene(prims(tmp_path, text))
     with pytest.raises(InputError, match="all invisible"):
@@ -161,3 +171,27 @@ def test_what_a_stage_holds_instead_is_named(tmp_path: Path) -> None:
     (tmp_path / "c.usda").write_text('#usda 1.0\ndef Xform "W"\n{\n    float[] a = [1, 2\n}\n')
     with pytest.raises(InputError, match="line 5"):
         read_scene(tmp_path / "c.usda")
+
+
+def test_a_nurec_archive_is_named(tmp_path: Path) -> None:
+    pytest.importorskip("pxr")
+    from pxr import Sdf, Usd
+
+    stage = Usd.Stage.CreateNew(str(tmp_path / "a.usda"))
+    stage.DefinePrim("/v", "Volume")
+    stage.GetRootLayer().Save()
+    (tmp_path / "model.nurec").write_bytes(b"x")
+    with Sdf.ZipFileWriter.CreateNew(str(tmp_path / "a.usdz")) as archive:
+        for name in ("a.usda", "model.nurec"):
+            archive.AddFile(str(tmp_path / name), name)
+    with pytest.raises(InputError, match="NuRec"):
+        read_scene(tmp_path / "a.usdz")
+
+
+def test_a_field_is_known_by_its_kernel(tmp_path: Path) -> None:
+    pytest.importorskip("pxr")
+    truth = scene(2)
+    kernel = "ParticleFieldKernelGaussianEllipsoidAPI"
+    text = prim(tmp_path, "a", truth, meta=f'( prepend apiSchemas = ["{kernel}"] )')
+    path = prims(tmp_path, text.replace("ParticleField3DGaussianSplat", "ParticleField"))
+    np.testing.assert_allclose(read_splats(path).shN, truth.shN, atol=1e-6)
