@@ -261,6 +261,8 @@ def _folder_format(path: Path) -> str:
     for name in READERS["views"]:
         if import_module(f"g2ard.io.{name}").holds(path):
             return name
+    if (path / "tileset.json").is_file():
+        return file_format(path / "tileset.json")
     if any(path.glob("tile-*.f32")) or (path / POINTS).is_dir():
         raise InputError("has unfinished tiles", path=path, hint="run the same `g2ard ingest` again")
     if error := incomplete(path):
