@@ -154,3 +154,44 @@ def test_views_of_lenses_survive_writing(tmp_path: Path) -> None:
     np.testing.assert_array_equal(load_image(again, 3), load_image(views, 3))
     with pytest.warns(UserWarning, match="photos of 6 views"):
         write_views(tmp_path / "transforms_2.json", views)
+
+
+@pytest.mark.parametrize("kind", ["panorama", "fisheye"])
+@pytest.mark.parametrize("place", ["masks/{}.png", "own"])
+def test_masks_go_through_the_lens(tmp_path: Path, kind: str, place: str) -> None:
+    """The left half of each photo is masked, by a file in a folder or one that the frame names."""
+    if kind == "panorama":
+        size, lens = (256, 128), {"camera_model": "EQUIRECTANGULAR", "w": 256, "h": 128}
+        path = captured(tmp_path, panorama(256), 1, **lens)
+    else:
+        lens = {
+            "camera_model": "OPENCV_FISHEYE",
+            "fl_x": 80,
+            "fl_y": 80,
+            "cx": 150,
+            "cy": 150,
+            "w": 300,
+            "h": 300,
+        }
+        size, path = (300, 300), captured(tmp_path, fisheye(300, 80.0), 1, **lens)
+    mask = Image.fromarray(
+        np.repeat(255 * (np.arange(size[0]) >= size[0] / 2), size[1]).reshape(size).T.astype(np.uint8)
+    )
+    file = tmp_path / (place.format("000.png") if "{" in place else "left.png")
+    file.parent.mkdir(exist_ok=True)
+    mask.save(file)
+    if place == "own":
+        edit(path, lambda c: c["frames"][0].update(mask_path="left.png"))
+    views = read_views(path)
+    kept = 0
+    for i, view in enumerate(views):
+        v, u = np.mgrid[0 : view.height, 0 : view.width] + 0.5
+        rays = np.stack([u, v, np.ones_like(u)], -1).reshape(-1, 3) @ np.linalg.inv(view.K).T
+        seen, held = view.lens.project(rays)
+        found = load_mask(views, i)
+        assert found is not None or (held & (seen[:, 0] > size[0] / 2)).all()
+        found = np.ones(u.size, bool) if found is None else found.ravel()
+        clear = held & (np.abs(seen[:, 0] - size[0] / 2) > 2) & (seen[:, 0] > 2) & (seen[:, 0] < size[0] - 2)
+        np.testing.assert_array_equal(found[clear], seen[clear, 0] > size[0] / 2)
+        kept += found.sum()
+    assert kept > 1000
