@@ -295,7 +295,6 @@ def _near(path: Path) -> str:
 
 def _instead(path: Path) -> str:
     """Suggest what to do with an unsupported folder."""
-    from g2ard.io.finding import is_a_photo
     from g2ard.io.photos import unreadable
 
     held: dict[Kind, list[str]] = {"splats": [], "points": [], "views": []}
@@ -317,7 +316,7 @@ def _instead(path: Path) -> str:
     if foreign:
         return f"; it has {foreign[0].name}: {_CONVERTERS[foreign[0].suffix.lower()]}"
     for place in (path, path / "images"):
-        photos = [file for file in sorted(place.iterdir()) if is_a_photo(file)] if place.is_dir() else []
+        photos = _photos_in(place)
         if not photos:
             continue
         if (poses := _poses_above(path)) is not None:
@@ -333,6 +332,18 @@ def _instead(path: Path) -> str:
         "cameras.json, LLFF's poses_bounds.npy, Polycam's keyframes, nerfstudio's and gsplat's runs, "
         "Cambridge's dataset_train.txt)"
     )
+
+
+def _photos_in(folder: Path) -> list[Path]:
+    """Return the photos in a folder, or otherwise in the first of its folders with photos."""
+    from g2ard.io.finding import is_a_photo
+
+    if not folder.is_dir():
+        return []
+    held = sorted(folder.iterdir())
+    inner = (sorted(sub.iterdir()) for sub in islice(filter(Path.is_dir, held), _MOST_INSPECTED_FILES))
+    found = ([file for file in files if is_a_photo(file)] for files in (held, *inner))
+    return next(filter(None, found), [])
 
 
 def _poses_above(path: Path) -> Path | None:

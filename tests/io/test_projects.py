@@ -297,7 +297,7 @@ def test_photos_that_cannot_be_read_are_named_at_once(tmp_path: Path, what: str)
 
 
 @pytest.mark.parametrize("suffix", [".TIF", ".heic", ".exr", ".bmp", ".dng", ".jpg"])
-@pytest.mark.parametrize("below", ["", "images/"])
+@pytest.mark.parametrize("below", ["", "images/", "cam0/", "images/cam 1/"])
 def test_folders_of_photos_without_poses_are_recognised(tmp_path: Path, suffix: str, below: str) -> None:
     _made(tmp_path / f"{below}a{suffix}").write_bytes(b"x")
     with pytest.raises(InputError, match="photos without poses") as caught:
