@@ -47,8 +47,8 @@ class Stream(RawStream):
         mode = plyfiles.render_model_of(header.comments)
         rgb = next((names_ for names_ in plyfiles.COLOR_NAMES if set(names_) <= set(names)), None)
         self._rgb = rgb if rgb and not any(name in names for name in _DC) else None
-        if "scale" in names:
-            names.setdefault("scale_0", names["scale"])
+        if "scale" in names and "scale_0" not in names:
+            names["scale_0"] = names.pop("scale")
         flat = mode == "2dgs" or ("scale_1" in names and "scale_2" not in names)
         one = "scale_0" in names and not {"scale_1", "scale_2"} & set(names)
         self._scales = _SCALES[: 2 if flat else 1 if one else 3]

@@ -307,7 +307,9 @@ def test_one_scale_for_three(tmp_path: Path, name: str, turned: bool) -> None:
     cols = {
         key: v for key, v in cols.items() if not key.startswith("scale") and (turned or "rot_" not in key)
     }
-    found = read_splats(save(tmp_path / "a.ply", cols | {name: np.log(truth.scales[:, 1])}))
+    read = read_scene(save(tmp_path / "a.ply", cols | {name: np.log(truth.scales[:, 1])}))
+    assert not [note for note in read.notes if note.code == "ignored_properties"]
+    found = read.splats
     np.testing.assert_allclose(found.scales, truth.scales[:, [1, 1, 1]], rtol=1e-5)
     np.testing.assert_allclose(found.quats, truth.quats if turned else [[1, 0, 0, 0]] * 20, atol=1e-6)
 
