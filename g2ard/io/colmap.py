@@ -97,6 +97,20 @@ def _count(folder: Path) -> int:
         return 0
 
 
+def models_below(path: Path) -> list[Path]:
+    """Return the folders of models up to three levels below a folder, the nearest first."""
+    level, found = [path], list[Path]()
+    for _ in range(3):
+        inner = [sorted(p for p in folder.iterdir() if p.is_dir())[:_MOST_FOLDERS] for folder in level]
+        level = [folder for folders in inner for folder in folders][:_MOST_FOLDERS]
+        found += [folder for folder in level if _tables(folder)]
+    return found
+
+
+_MOST_FOLDERS = 64
+"""Folders of a level to look into."""
+
+
 def photos_beside(path: Path) -> tuple[Path, Path] | None:
     """Return (project, photos) if `path` is a folder of photos beside a model, such as images_4."""
     if not path.is_dir() or not path.name.startswith("images") or model_folder(path) is not None:

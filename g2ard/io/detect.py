@@ -295,6 +295,7 @@ def _near(path: Path) -> str:
 
 def _instead(path: Path) -> str:
     """Suggest what to do with an unsupported folder."""
+    from g2ard.io.colmap import models_below
     from g2ard.io.photos import unreadable
 
     held: dict[Kind, list[str]] = {"splats": [], "points": [], "views": []}
@@ -312,6 +313,8 @@ def _instead(path: Path) -> str:
         return f"; give one of its files: {', '.join(held_kinds)}"
     if runs := [folder.name for folder in sorted(path.iterdir()) if run_scene(folder) != folder]:
         return f"; give one of its runs: {', '.join(runs[:5])}"
+    if models := models_below(path):
+        return f"; give {models[0]}, which has a COLMAP model"
     foreign = [file for file in sorted(path.iterdir()) if file.suffix.lower() in _CONVERTERS]
     if foreign:
         return f"; it has {foreign[0].name}: {_CONVERTERS[foreign[0].suffix.lower()]}"

@@ -18,6 +18,9 @@ from g2ard.scene.lenses import PhotoLens
 
 _MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
 
+_NO_COEFFICIENTS = ("k4", "k5", "k6", "s1", "s2", "s3", "s4")
+"""Coefficients that lenses lack; of these, fisheyes have k4."""
+
 _LEAST_ANGLE = 1e-6
 """Smallest distance of a field of view from 0 and π, radians."""
 
@@ -64,6 +67,12 @@ class _Frame(msgspec.Struct):
     p2: Number = 0.0
     k3: Number = 0.0
     k4: Number = 0.0
+    k5: Number = 0.0
+    k6: Number = 0.0
+    s1: Number = 0.0
+    s2: Number = 0.0
+    s3: Number = 0.0
+    s4: Number = 0.0
     K: Any = None
     intrinsics: Any = None
 
@@ -213,8 +222,11 @@ def _intrinsics(place: Place, frame: _Frame, photo: Path) -> Lens:
         known = ", ".join((*_MODELS, "OPENCV_FISHEYE", "EQUIRECTANGULAR"))
         error = place.error(f"has an unsupported {model} lens; expected {known}")
         raise error.at(hint="undistort the photos")
-    if frame.k4 and model in _MODELS:
-        error = place.to("k4").error(f"is {frame.k4}; lenses have k1, k2, k3, p1 and p2")
+    unused = [name for name in _NO_COEFFICIENTS if getattr(frame, name)]
+    if unused and (model in _MODELS or unused != ["k4"]):
+        error = place.to(unused[0]).error(
+            f"is {getattr(frame, unused[0])}; lenses have k1, k2, k3, p1 and p2"
+        )
         raise error.at(hint="undistort the photos")
     width, height = _size(place, frame, photo)
     if model == "EQUIRECTANGULAR":

@@ -152,6 +152,20 @@ def test_models_elsewhere_are_read(tmp_path: Path, text: bool, place: str) -> No
 
 
 @pytest.mark.parametrize("text", [False, True])
+@pytest.mark.parametrize("place", ["dense/sparse", "model", "sparse/geo", "out/colmap/sparse"])
+def test_models_in_other_places_are_named(tmp_path: Path, text: bool, place: str) -> None:
+    project(tmp_path, text)
+    (tmp_path / "sparse" / "0").rename(tmp_path / "kept")
+    shutil.rmtree(tmp_path / "sparse")
+    (tmp_path / place).parent.mkdir(parents=True, exist_ok=True)
+    (tmp_path / "kept").rename(tmp_path / place)
+    with pytest.raises(InputError) as caught:
+        read_views(tmp_path)
+    assert f"give {tmp_path / place}" in str(caught.value)
+    assert sum(p is not None for p in read_views(tmp_path / place).image_paths) == 4
+
+
+@pytest.mark.parametrize("text", [False, True])
 def test_tables_in_capitals_are_read(tmp_path: Path, text: bool) -> None:
     project(tmp_path, text)
     for file in list((tmp_path / "sparse" / "0").iterdir()):
