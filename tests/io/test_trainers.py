@@ -54,6 +54,16 @@ def test_cameras_json_with_photos(tmp_path: Path) -> None:
     assert [note.code for note in found.notes] == ["missing_photos"]
 
 
+def test_cameras_json_fits_smaller_photos(tmp_path: Path) -> None:
+    """Trainers write the size of the full photos, and may keep smaller ones."""
+    path = inria(tmp_path / "model" / "cameras.json", width=160, height=120)
+    for i in range(len(POSES)):
+        photo(tmp_path / "photos" / f"{i:03d}.jpg", (80, 60))
+    cameras = read_view_set(path, images=tmp_path / "photos").cameras
+    assert (cameras.widths[0], cameras.heights[0]) == (80, 60)
+    assert cameras.Ks[0].tolist() == [[35, 0, 40], [0, 35.5, 30], [0, 0, 1]]
+
+
 def test_cameras_json_names_that_repeat_get_their_id(tmp_path: Path) -> None:
     path = inria(tmp_path / "cameras.json", POSES[:3])
     content = json.loads(path.read_text())
