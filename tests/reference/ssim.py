@@ -12,9 +12,12 @@ def kernel() -> Tensor:
 
 
 def ssim(a: Tensor, b: Tensor, mask: Tensor | None = None) -> Tensor:
-    """Mean SSIM of two (H, W, C) float64 images, zero-padded; `mask`: (H, W), pixels that count."""
+    """Mean SSIM of two (H, W, C) float64 images; `mask`: (H, W), pixels that count.
+
+    Beyond the edge pixels are black, and count if there is no mask.
+    """
     weights = torch.ones(a.shape[:2], dtype=torch.float64) if mask is None else mask.double()
-    counts = torch.nn.functional.pad(weights, (5, 5, 5, 5), value=1.0)  # black pixels beyond the edge count
+    counts = torch.nn.functional.pad(weights, (5, 5, 5, 5), value=float(mask is None))
 
     def windows(padded: Tensor) -> Tensor:
         return torch.nn.functional.conv2d(padded[:, None], kernel()[None, None])

@@ -75,6 +75,8 @@ def masked(shape: tuple[int, ...], kind: str) -> NDArray[np.bool_]:
     height, width = shape[:2]
     if kind == "one pixel":
         mask[height // 2, width // 3] = True
+    elif kind == "corner":
+        mask[-2:, :1] = True
     elif kind == "block":
         mask[height // 4 : -(height // 5) or None, width // 3 :] = True
     elif kind == "all but a block":
@@ -86,7 +88,7 @@ def masked(shape: tuple[int, ...], kind: str) -> NDArray[np.bool_]:
     return mask
 
 
-MASKS = ("one pixel", "block", "all but a block", "few", "most", "all")
+MASKS = ("one pixel", "corner", "block", "all but a block", "few", "most", "all")
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -102,8 +104,6 @@ def test_masked_loss_gradient_and_metric_are_the_twin_s(
     few = mask.sum() < 100  # float32's rounding of variances does not average out
     want = float(reference.ssim(a64, b64, counts))
     assert ssim(a, b, mask) == pytest.approx(want, abs=3e-4 if few else 1e-5)
-    if mask.all():
-        assert ssim(a, b, mask) == ssim(a, b)
     for loss_of in (l1_ssim, l1_ssim_anywhere):
         x = torch.from_numpy(a).requires_grad_()
         loss = loss_of(x, torch.from_numpy(b), 0.7, counts)
@@ -171,12 +171,42 @@ def test_masked_ssim_is_between_minus_one_and_one_and_sees_the_mask_alone(
         np.testing.assert_array_equal(other_gradient, gradient)
 
 
-@pytest.mark.parametrize("size", [0, 1, 2, 24, 40])
-def test_black_against_white_in_a_mask_is_as_without_one(size: int) -> None:
+@pytest.mark.parametrize("corner", [(0, 0), (0, 1), (1, 0), (1, 1), (0.5, 0.5), (0, 0.2)])
+@pytest.mark.parametrize("size", [0, 1, 2, 24, 40, 52])
+def test_black_against_white_is_the_same_in_every_mask(size: int, corner: tuple[float, float]) -> None:
     black, white = np.zeros((52, 52, 3), np.float32), np.ones((52, 52, 3), np.float32)
     mask = np.zeros((52, 52), bool)
-    mask[6 : 6 + size, 6 : 6 + size] = True  # windows end before the edge, beyond which both are black
-    assert ssim(black, white, mask) == pytest.approx(1e-4 if size else 1, abs=2e-5)
+    top, left = (round(share * (52 - size)) for share in corner)
+    mask[top : top + size, left : left + size] = True
+    assert ssim(black, white, mask) == pytest.approx(1e-4 if size else 1, abs=1e-7)
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    st.tuples(st.integers(1, 12), st.integers(1, 40), st.sampled_from([1, 3])),
+    st.tuples(*4 * [st.integers(0, 7)]),
+    st.integers(0, 2**32 - 1),
+    st.floats(0, 1),
+)
+def test_pixels_beyond_the_edge_are_like_others_outside_a_mask(
+    shape: tuple[int, int, int], around: tuple[int, int, int, int], seed: int, share: float
+) -> None:
+    rng = np.random.default_rng(seed)
+    a, b = (rng.random(shape).astype(np.float32) for _ in range(2))
+    mask = rng.random(shape[:2]) < share
+    top, bottom, left, right = around
+    more = ((top, bottom), (left, right))
+    wide_a, wide_b = (np.pad(image, (*more, (0, 0)), constant_values=0.7) for image in (a, b))
+    wide_mask = np.pad(mask, more)
+    inner = np.s_[top : top + shape[0], left : left + shape[1]]
+    loss, gradient = _core.l1_ssim(a, b, 0.7, mask)
+    wide_loss, wide_gradient = _core.l1_ssim(wide_a, wide_b, 0.7, wide_mask)
+    assert wide_loss == pytest.approx(loss, abs=1e-6)
+    scale = float(np.abs(gradient).max())
+    np.testing.assert_allclose(wide_gradient[inner], gradient, atol=1e-4 * scale + 1e-9)
+    images_of = (torch.from_numpy(image) for image in (a, b))
+    found = l1_ssim_anywhere(*images_of, 0.7, torch.from_numpy(mask)).item()
+    assert found == pytest.approx(loss, abs=1e-4)
 
 
 def test_edges_are_the_twin_s() -> None:

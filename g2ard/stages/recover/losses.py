@@ -80,11 +80,11 @@ def l1_ssim_anywhere(
         t = conv2d(t, weights.view(1, 1, 1, -1), padding=(0, _SSIM_WINDOW // 2))
         return conv2d(t, weights.view(1, 1, -1, 1), padding=(_SSIM_WINDOW // 2, 0))
 
-    inside = 1 - summed((~counts).to(image.dtype)[None, None])
-    inside = torch.where(counts, inside, 1.0)
+    # Without a mask, pixels beyond the edge are black and count; with one they have no part.
+    inside = None if mask is None else summed(counts.to(image.dtype)[None, None]).where(counts, 1.0)
 
     def blurred(t: Tensor) -> Tensor:
-        return summed(t) / inside
+        return summed(t) if inside is None else summed(t) / inside
 
     mean_x, mean_y = blurred(x), blurred(y)
     var_x = (blurred(x * x) - mean_x**2).clamp_min(0)
