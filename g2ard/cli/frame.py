@@ -329,7 +329,9 @@ class Run:
         write_views(path, cameras, splits=splits, weights=weights, format=format, overwrite=overwrite)
         self.kept.append(f"{path} is written")
         if lost := lost_views(cameras, view_format(path, format), splits, weights is not None):
-            self.say(f"note: {path}: without {', '.join(lost)}")
+            self.say(
+                f"note: {path} leaves out {' and '.join([', '.join(lost[:-1]), lost[-1]][len(lost) == 1 :])}"
+            )
 
     def claim(self, flag: str, *outputs: Path, folder: bool = False) -> None:
         """Record what an option writes, before any work.

@@ -64,7 +64,7 @@ def lost_views(
     photos = sum(lens is not None for lens in cameras.lenses)
     lost += [f"photos of {plural(photos, 'view')} that other lenses took"] if photos else []
     kinds = sum(kind != USUAL for kind in cameras.kinds)
-    lost += [f"kinds of {plural(kinds, 'view')}"] if kinds else []
+    lost += [f"the kinds of {plural(kinds, 'view')}"] if kinds else []
     return lost + (["sampling weights"] if weighted else [])
 
 

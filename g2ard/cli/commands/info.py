@@ -186,8 +186,9 @@ def _rows(figures: dict[str, Any]) -> list[list[str]]:
     for key in ("opacity", "largest_scale", "smallest_scale", "elongation", "fov_degrees"):
         if key in figures:
             quantiles = figures[key]
-            label = f"{key.replace('_', ' ')} ({' '.join(quantiles)} %)"
-            rows.append([label, "  ".join(f"{value:.3g}" for value in quantiles.values())])
+            named = {"0": "least", "50": "median", "100": "most"}
+            told = (f"{named.get(at, f'{at} %')} {value:.3g}" for at, value in quantiles.items())
+            rows.append([key.replace("_", " "), ", ".join(told)])
     if "close_overdraw" in figures:
         close = figures["close_overdraw"]
         rows.append(["Gaussians per pixel, near", f"{close['mean']:.0f}, at worst {close['worst']:.0f}"])
