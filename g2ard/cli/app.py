@@ -26,14 +26,6 @@ COMMANDS = {
 }
 """Command → its line in `g2ard --help`, in that order; each is a module of `g2ard.cli.commands`."""
 
-app = typer.Typer(
-    help="Distil dense 3D Gaussian scenes into compact, standard 3DGS scenes of an exact size.",
-    no_args_is_help=True,
-    add_completion=True,
-    pretty_exceptions_enable=False,
-    context_settings={"help_option_names": ["-h", "--help"]},
-)
-
 
 def _version(show: bool) -> None:
     if show:
@@ -43,7 +35,6 @@ def _version(show: bool) -> None:
         raise typer.Exit
 
 
-@app.callback()
 def _root(
     version: Annotated[
         bool, typer.Option("-V", "--version", callback=_version, is_eager=True, help="Print the version.")
@@ -52,10 +43,28 @@ def _root(
     pass
 
 
-def list_commands() -> None:
-    """Register the names and lines of all commands, for `g2ard --help` alone."""
+def _made() -> typer.Typer:
+    """Create an application without commands."""
+    made = typer.Typer(
+        help="Distil dense 3D Gaussian scenes into compact, standard 3DGS scenes of an exact size.",
+        no_args_is_help=True,
+        add_completion=True,
+        pretty_exceptions_enable=False,
+        context_settings={"help_option_names": ["-h", "--help"]},
+    )
+    made.callback()(_root)
+    return made
+
+
+app = _made()
+
+
+def listing() -> typer.Typer:
+    """Create an application that only lists the commands, for `g2ard --help`."""
+    made = _made()
     for name, line in COMMANDS.items():
-        app.command(name, help=line)(_listed)
+        made.command(name, help=line)(_listed)
+    return made
 
 
 def _listed() -> None:

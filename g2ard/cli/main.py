@@ -7,7 +7,7 @@ from typing import TextIO
 
 import typer
 
-from g2ard.cli.app import app, list_commands, register_commands
+from g2ard.cli.app import app, listing, register_commands
 from g2ard.cli.console import wrapped
 from g2ard.system import interrupt
 
@@ -18,9 +18,8 @@ def main() -> None:
     """Run the `g2ard` program."""
     _name_shell(sys.argv[1:])
     if sys.argv[1:] in ([], ["-h"], ["--help"]) and "_G2ARD_COMPLETE" not in os.environ:
-        list_commands()  # importing the commands takes time
-    else:
-        register_commands(next(iter(sys.argv[1:]), None))
+        run_program(listing(), "g2ard")  # importing the commands takes time
+    register_commands(next(iter(sys.argv[1:]), None))
     run_program(app, "g2ard")
 
 

@@ -148,7 +148,7 @@ def test_recover_reports_losing_steps(tmp_path: Path, command_line: CommandLine)
 
 
 def test_the_time_of_recovery_is_called_so(command_line: CommandLine, folder: Path) -> None:
-    shown = command_line("distill", "--help", cwd=folder)[1]
+    shown = command_line("distill", "--help-all", cwd=folder)[1]
     assert "--recovery-time" in shown
     ask = ("distill", "a.ply", "-r", 10, "-o", "run")
     status, out, error = command_line(*ask, "--recovery-time", "90s", "--print-config", cwd=folder)
