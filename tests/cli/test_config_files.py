@@ -65,7 +65,10 @@ def test_keys_above_tables_apply_to_every_command(command_line: CommandLine, fol
         ("simplify ball.ply -o s{count}.ply -n 50 -n 2k,10%", {"count": [50, "2k", "10%"]}),
         ("lod ball.ply -o lod", {"scene": "ball.ply", "ratios": [1, 2, 4, 8, 16]}),
         ("info ball.ply views.json", {"paths": ["ball.ply", "views.json"]}),
-        ("poses ball.ply -o p.json --resolution 320x240 --up 0,0,1", {"resolution": "320x240", "up": [0, 0, 1]}),
+        (
+            "poses ball.ply -o p.json --resolution 320x240 --up 0,0,1",
+            {"resolution": "320x240", "up": [0, 0, 1]},
+        ),
         (
             "distill ball.ply -o run -n 50 --keep-region 0,0,.5,1 --keep-region 1,2,3,4",
             {"count": 50, "keep-region": ["0,0,0.5,1", "1,2,3,4"]},
