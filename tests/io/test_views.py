@@ -31,6 +31,26 @@ def test_own_views_round_trip(tmp_path_factory: pytest.TempPathFactory, count: i
     assert found.image_paths == (None,) * count
 
 
+def test_poses_become_rigid(tmp_path: Path) -> None:
+    """Those of other programs may have rounding errors or a uniform scale, four rows or three."""
+    truth = views(3, 0)
+    write_views(tmp_path / "a.json", truth)
+    content = json.loads((tmp_path / "a.json").read_text())
+    for view, change in zip(content["views"], (1 + 1e-7, 1, 1), strict=True):
+        pose = np.array(view["camera_from_world"])
+        pose[:3, :3] *= change
+        view["camera_from_world"] = pose.tolist()
+    content["views"][2]["camera_from_world"].pop()
+    (tmp_path / "a.json").write_text(json.dumps(content))
+    found = read_views(tmp_path / "a.json").viewmats
+    np.testing.assert_allclose(found, truth.viewmats, atol=1e-6)
+    rotations = found[:, :3, :3]
+    np.testing.assert_allclose(
+        rotations @ rotations.transpose(0, 2, 1), np.broadcast_to(np.eye(3), (3, 3, 3)), atol=1e-12
+    )
+    assert found[:, 3].tolist() == 3 * [[0, 0, 0, 1]]
+
+
 def test_own_views_name_photos_splits_and_weights(tmp_path: Path) -> None:
     truth = views(4, photos=tmp_path / "photos")
     (tmp_path / "deep").mkdir()
