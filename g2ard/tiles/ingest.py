@@ -17,7 +17,7 @@ from g2ard.io import kind, open_point_stream, open_stream
 from g2ard.io.atomic import drop_empty, parents_made
 from g2ard.io.detect import MANIFEST
 from g2ard.io.jsonfile import Place, checked, read_json
-from g2ard.io.lock import LOCK, locked
+from g2ard.io.lock import LOCK, check_unlocked, locked
 from g2ard.io.stream import SceneStream
 from g2ard.io.tile_store import VERSION, TileStore
 from g2ard.io.types import Note
@@ -110,6 +110,8 @@ def ingest(
     key = _key(feed.stream.identity(), settings)
     done = _done(folder, key, overwrite)
     if done is not None:
+        with suppress(OutputError):  # another call may be about to end
+            check_unlocked(folder)  # removes the lock of a killed one
         say(f"{folder}: already holds these {plural(done.count, 'Gaussian')}; skipped")
         return done
     made = _made(folder)

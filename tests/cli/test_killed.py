@@ -89,7 +89,7 @@ def test_the_same_command_again_ends_and_cleans_up(
     assert status == 0, error
     whole, count = left(tmp_path / "whole"), int((logs / "count").read_text())
     assert not any(part.startswith(".") for file in whole for part in Path(file).parts), list(whole)
-    assert count >= _MOMENTS
+    assert count > 2
     for after in sorted({1 + round(i * (count - 1) / (_MOMENTS - 1)) for i in range(_MOMENTS)} | {count - 1}):
         folder = fresh(inputs, tmp_path / str(after))
         assert run(f"killed{after}", folder, after)[0] == -9
