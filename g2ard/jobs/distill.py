@@ -32,6 +32,8 @@ from g2ard.scene.splats import Splats
 from g2ard.stages.lift import lift, lift_rows
 from g2ard.stages.recover.anchors import FREE, Regularizers
 from g2ard.stages.recover.auto_preset import PriorMeasures, measure_prior, regularizers_for
+from g2ard.stages.recover.config import RecoverConfig
+from g2ard.stages.recover.schedule import Schedule
 
 Scene = Splats | Points | str | Path | None
 
@@ -221,7 +223,8 @@ def prepare(
     if recovers:
         say(f"regularisers: {preset_label}")
     config = options.configured(regularizers, default_degree)
-    config = replace(config, recover=replace(config.recover, from_points=read.from_photos))
+    if read.from_photos:
+        config = replace(config, recover=_from_points(options, config.recover))
     return DistillJob(
         prior=prior,
         aim=aim,
@@ -276,6 +279,15 @@ def _regularizers(
     if read.lifted and kind == "paper":
         kind = "paper-lift"
     return regularizers_for(kind, prior, photos, paper=paper)
+
+
+def _from_points(options: DistillOptions, config: RecoverConfig) -> RecoverConfig:
+    """Return the configuration for points of photos: unless asked, their `finest` size is 0."""
+    schedule = config.schedule
+    asked = isinstance(options.named("recover.schedule"), Schedule)
+    if not asked and options.named("recover.schedule.finest") is None:
+        schedule = replace(schedule, finest=0.0)
+    return replace(config, schedule=schedule, from_points=True)
 
 
 def _task(prior: Splats, count: int, train: Cameras | None, photos: bool, *, alone: bool) -> str:

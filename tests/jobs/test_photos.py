@@ -1,7 +1,9 @@
 """Distillation from photos without a scene."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -9,9 +11,13 @@ import pytest
 import g2ard
 from g2ard.io.images import load_premultiplied, write_png
 from g2ard.io.types import Points
+from g2ard.jobs.budget import Budget
+from g2ard.jobs.distill import prepare
+from g2ard.jobs.distill_options import DistillOptions
 from g2ard.jobs.hull import visual_hull
 from g2ard.jobs.photos import distinct, points_along_rays, topped_up
-from g2ard.progress import silent
+from g2ard.progress import silent, unsaid
+from g2ard.stages.recover.schedule import TUNED
 from helpers.commands import CommandLine, refused, succeeds
 from helpers.photos import photos_of, rgba_photos_of
 
@@ -78,7 +84,7 @@ def test_points_of_photos_are_at_as_many_places_as_asked(repeated: int, tmp_path
         background=(0.0, 0.0, 0.0),
         seed=0,
         progress=silent,
-        say=lambda text: None,
+        say=unsaid,
     )
     assert len(found) == len(g2ard.lift(found.positions, found.colors)) == 8_000
 
@@ -115,6 +121,28 @@ def test_more_gaussians_of_photos_take_more_steps(tmp_path: Path, command_line: 
 
     assert [steps("-n", count) for count in (500, 5_000)] == [300, 600]
     assert steps("-n", 5_000, "--steps", 50) == 50
+
+
+@pytest.mark.parametrize(
+    ("scene", "settings", "finest"),
+    [
+        (None, {}, 0.0),
+        (None, {"recover.schedule": "fast"}, 0.0),
+        ("photos/sparse.ply", {}, 0.0),
+        ("scan.ply", {}, 1.0),
+        (None, {"recover.schedule.finest": 0.5}, 0.5),
+        (None, {"recover.schedule": replace(TUNED, finest=2.0)}, 2.0),
+    ],
+)
+def test_points_of_photos_move_however_small_they_are(
+    scene: str | None, settings: dict[str, Any], finest: float, tmp_path: Path
+) -> None:
+    photos_of(tmp_path / "photos", points=True)
+    (tmp_path / "scan.ply").write_bytes((tmp_path / "photos" / "sparse.ply").read_bytes())
+    options = DistillOptions(views=tmp_path / "photos", settings={"recover.steps": 3, **settings})
+    job = prepare(scene and tmp_path / scene, Budget(500), options, progress=silent, say=unsaid)
+    assert job.config.recover.schedule.finest == finest
+    assert job.config.recover.from_points == (finest != 1.0)
 
 
 def test_points_that_no_second_photo_supports_are_dropped(tmp_path: Path) -> None:

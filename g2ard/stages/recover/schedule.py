@@ -105,7 +105,7 @@ class Schedule(Settings):
         appearance_decay: shares (rounds, final) to which appearance rates decay exponentially; 1 keeps them.
         multiplier: factor on all rates; None chooses it by short trials, starting at `multiplier_for`.
         reach: see `Rates`; None chooses it from the initial error (`reach_for`).
-        finest: see `Rates`.
+        finest: see `Rates`. `distill` takes 0 for points found in photos, unless it is set.
         reference_extent: `rates.means` is scaled by the cameras' extent (`Cameras.extent`) over this, so that
             the scene's unit does not matter; None takes it in scene units.
         guarded: whether a recovery that loses quality returns to the best scene or its start; otherwise all
