@@ -14,7 +14,7 @@ from g2ard.config.checks import checks_arguments
 from g2ard.config.choices import RenderModel
 from g2ard.errors import InputError, OutputError, require
 from g2ard.io import kind, open_point_stream, open_stream
-from g2ard.io.atomic import drop_empty, parents_made
+from g2ard.io.atomic import drop_empty, drop_temporaries, parents_made
 from g2ard.io.detect import MANIFEST
 from g2ard.io.jsonfile import Place, checked, read_json
 from g2ard.io.lock import LOCK, check_unlocked, locked
@@ -112,6 +112,7 @@ def ingest(
     if done is not None:
         with suppress(OutputError):  # another call may be about to end
             check_unlocked(folder)  # removes the lock of a killed one
+            drop_temporaries(folder, MANIFEST)
         say(f"{folder}: already holds these {plural(done.count, 'Gaussian')}; skipped")
         return done
     made = _made(folder)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from g2ard.config.choices import RenderModel
 from g2ard.errors import OutputError
-from g2ard.io.atomic import atomic_output
+from g2ard.io.atomic import atomic_output, drop_temporaries
 from g2ard.io.detect import MANIFEST, POINTS
 from g2ard.io.stream import PointStream, SceneStream
 from g2ard.io.tile_store import FORMAT, VERSION, TileStore, halo_name, packed, row_width, tile_name
@@ -32,7 +32,7 @@ _POINT_DTYPE = np.dtype([("near", "<f4", 3), ("rgb", "<f4", 3), ("far", "<f8", 3
 
 _ROWS_AT_ONCE = 1 << 16
 """Rows of a lifted tile written at a time."""
-_TILE_FILE = re.compile(r"(tile|halo)-\d{5,}\.f32|tiles\.json|\.tiles\.json\.\w+|\.points")
+_TILE_FILE = re.compile(r"(tile|halo)-\d{5,}\.f32|tiles\.json|\.tiles\.[0-9a-f]{12}\.json|\.points")
 
 
 def is_tile_file(name: str) -> bool:
@@ -42,6 +42,7 @@ def is_tile_file(name: str) -> bool:
 
 def clear(folder: Path) -> None:
     """Remove all files that belong to tiles, the manifest first."""
+    drop_temporaries(folder, MANIFEST)
     for path in sorted(folder.iterdir(), key=lambda path: path.name != MANIFEST):
         if path.is_dir() and path.name == POINTS:
             shutil.rmtree(path)
