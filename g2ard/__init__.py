@@ -57,8 +57,8 @@ if TYPE_CHECKING:
     from g2ard.jobs.recover import recover
     from g2ard.jobs.register import register
     from g2ard.jobs.simplify import simplify
-    from g2ard.jobs.turntable import orbit
     from g2ard.jobs.viewer_frame import up_of
+    from g2ard.jobs.views import orbit
     from g2ard.levels import Georeference, save_levels
     from g2ard.pipeline.adapt import AdaptConfig, Adapted, adapt
     from g2ard.pipeline.config import DistillConfig, SelectConfig

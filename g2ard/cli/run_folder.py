@@ -23,7 +23,7 @@ from g2ard.io.scene_formats import FORMATS
 from g2ard.io.types import ViewSet
 from g2ard.jobs.budget import DEVICES, Budget
 from g2ard.jobs.viewer_frame import frame_with
-from g2ard.pipeline.run_views import RunViews
+from g2ard.pipeline.distill import RunViews
 from g2ard.progress import plural
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats

@@ -22,7 +22,7 @@ from g2ard.rendering.targets import CACHE_BYTES
 from g2ard.scene.samples import evenly_spaced
 
 if TYPE_CHECKING:
-    from g2ard.jobs.job import DistillJob
+    from g2ard.jobs.distill import DistillJob
 
 _USUAL_PIXELS = 480_000
 """Pixels of a generated view."""

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,12 +21,11 @@ from g2ard.io.reports import Report
 from g2ard.io.scenes import tell
 from g2ard.jobs.budget import Budget
 from g2ard.jobs.cost import Cost, cost_of
-from g2ard.jobs.distill import prepare
+from g2ard.jobs.distill import DistillJob, prepare
 from g2ard.jobs.distill_options import DistillOptions
 from g2ard.jobs.inputs import Views, load_scene, scorable
-from g2ard.jobs.job import DistillJob
-from g2ard.jobs.viewer_frame import up_of
-from g2ard.levels.tileset import Georeference, map_system
+from g2ard.jobs.viewer_frame import frame_of, up_of
+from g2ard.levels.tileset import TILE_OF_SCENE, Georeference, map_system
 from g2ard.levels.tileset import save_tileset as write_tileset
 from g2ard.levels.tree import Cut, Level, aligned
 from g2ard.pipeline.distill import distill as pipeline
@@ -39,6 +38,7 @@ from g2ard.scene.splats import Splats
 from g2ard.stages.evaluate import evaluate
 from g2ard.stages.simplify import simplify
 from g2ard.stages.simplify.growth import opacity_lost, say_gaps
+from g2ard.viewer import Start, write_globe_page, write_stream_page
 
 RATIOS = (1.0, 2.0, 4.0, 8.0, 16.0)
 """Reduction factors; each level has half the Gaussians of the previous one, as in viewers' own tools."""
@@ -392,3 +392,46 @@ def level_size(cameras: Cameras, ratio: float) -> int:
     """Return the longer side of a level's views in pixels."""
     longest = int(max(cameras.widths.max(), cameras.heights.max()))
     return longest if ratio == 1 else max(_SMALLEST_VIEW_SIDE, round(longest / ratio**0.25))
+
+
+_ROWS = 500_000
+"""Gaussians of the coarsest level among which the opening view is chosen."""
+
+
+def write_level_page(
+    folder: Path,
+    levels: Sequence[Level],
+    kind: Literal["sog", "3dtiles"],
+    *,
+    views: Views | None = None,
+    beside: str | Path | None = None,
+    up: Sequence[float] | None = None,
+    background: Colour = BLACK,
+    seed: int = 0,
+    progress: Progress = silent,
+) -> int:
+    """Write the page that shows the levels in a folder, and return its bytes.
+
+    Args:
+        levels: the levels in the folder, finest first.
+        kind: streamed SOG, or 3D Tiles with z up.
+        views, beside, up: see `g2ard.jobs.viewer_frame.frame_of`. The page's title names
+            `beside`, or else the folder.
+    """
+    coarse = levels[-1]
+    few = coarse.take(np.array(evenly_spaced(len(coarse), _ROWS, floor=True)))
+    frame = frame_of(few, views, beside=beside, up=up, seed=seed, progress=progress)
+    page, title, offset = folder / "index.html", Path(beside or folder).resolve().name, np.asarray(few.offset)
+    if kind == "sog":
+        rotation, position = frame.placed(offset)
+        placed: dict[str, Any] = {"rotation": rotation, "position": position}
+        antialiased = few.antialiased
+        return write_stream_page(
+            page, title, start=frame.start, antialiased=antialiased, background=background, **placed
+        )
+    reach = float(np.linalg.norm(np.ptp(few.means, axis=0)))
+    start = frame.start or Start((0.0, reach / 4, -reach), (0.0, 0.0, 0.0), (60.0, 45.0))
+    eye, target = (
+        (TILE_OF_SCENE @ (frame.world(point) - offset)).tolist() for point in (start.position, start.target)
+    )
+    return write_globe_page(page, title, eye=eye, target=target, fov=max(start.fov))

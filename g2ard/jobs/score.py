@@ -5,7 +5,7 @@ from typing import Any
 
 from g2ard.config.choices import Colour
 from g2ard.config.schema import listed
-from g2ard.jobs.job import DistillJob
+from g2ard.jobs.distill import DistillJob
 from g2ard.pipeline.distill import Distilled
 from g2ard.progress import Progress
 from g2ard.rendering.targets import Targets

@@ -28,7 +28,7 @@ from g2ard.jobs.tiling import Tiling, needs_whole, refuse_whole
 from g2ard.jobs.views import cameras_for_weights, pool_times, views_of
 from g2ard.levels import Cut
 from g2ard.pipeline.config import DistillConfig
-from g2ard.pipeline.run_views import RunViews
+from g2ard.pipeline.distill import RunViews
 from g2ard.progress import Progress, Say, silent, unsaid
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats

@@ -10,16 +10,17 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
+from g2ard.config.checks import AtLeastOne, checks_arguments
 from g2ard.config.choices import is_made
 from g2ard.errors import InputError
 from g2ard.io.splits import for_scores, for_training, split_mask, splits_of
 from g2ard.io.types import ViewSet
 from g2ard.jobs.inputs import Views, drop_held_out, load_view_sets, load_views
-from g2ard.jobs.view_checks import as_pool, check_sight, found_views, warn_of_sight
+from g2ard.jobs.view_checks import as_pool, check_sight, found_views, opaque_points, warn_of_sight
 from g2ard.pipeline.config import SelectConfig
-from g2ard.pipeline.run_views import RunViews
-from g2ard.progress import Progress, Say, silent, unsaid
-from g2ard.scene.cameras import USUAL, Camera, Cameras, rows_by_kind
+from g2ard.pipeline.distill import RunViews
+from g2ard.progress import Progress, Say, direction, silent, unsaid
+from g2ard.scene.cameras import USUAL, Camera, Cameras, look_at, rows_by_kind
 from g2ard.scene.splats import Splats
 from g2ard.stages.select.light import complete
 from g2ard.stages.simplify import simplify
@@ -409,3 +410,67 @@ def _times(prior: Splats, represents: float) -> float:
 def pool_times(count: float) -> float:
     """Return the growth factor of the pool for a tiled scene of `count` Gaussians."""
     return max(1.0, count / _POOL_GAUSSIANS)
+
+
+_TURN_POOL = 32
+"""Generated poses, of which the one that shows most of the scene begins the turn."""
+
+
+@checks_arguments
+def orbit(
+    scene: Splats,
+    count: AtLeastOne = 48,
+    *,
+    size: tuple[int, int] = (800, 600),
+    up: Sequence[float] | None = None,
+    seed: int = 0,
+    progress: Progress = silent,
+    say: Say = unsaid,
+) -> Cameras:
+    """Return views at equal angles on a level circle around a scene, like `g2ard render --orbit`.
+
+    All look at the circle's middle.
+
+    The first view is the generated one that shows most of the scene; the circle's middle is what lies at the
+    median depth in its direction.
+
+    Args:
+        scene: the scene.
+        count: number of views; the one after the last would be the first again.
+        size: width and height, pixels.
+        up: (3,) direction away from the ground; None estimates it.
+        seed: seed of the generated poses.
+        progress: called while poses are planned.
+        say: called with the estimated up direction.
+
+    Returns:
+        The views, in order.
+
+    Raises:
+        InputError: the scene is not visible, or has no room for poses around it.
+
+    >>> ball = np.random.default_rng(0).normal(size=(900, 3))
+    >>> ball /= np.linalg.norm(ball, axis=1, keepdims=True)
+    >>> scene = Splats.create(ball, scales=np.full((900, 3), 0.05), logit_opacities=np.full(900, 4))
+    >>> len(orbit(scene, 4, size=(64, 48)))
+    4
+    """
+    from g2ard.poses import plan_pool
+
+    pool = plan_pool(scene, _TURN_POOL, size=size, up=up, seed=seed, progress=progress)
+    points, axis = opaque_points(scene), np.asarray(pool.up, np.float64)
+    if up is None:
+        say(f"up: {direction(axis)}, estimated; --up X,Y,Z sets it")
+    first = max(pool.cameras, key=lambda view: float(view.holds(points).mean()))
+    eye, ahead = first.position, first.viewmat[2, :3]
+    held = points[first.holds(points)]
+    target = eye + float(np.median((held - eye) @ ahead)) * ahead
+    height = ((eye - target) @ axis) * axis
+    level = eye - target - height
+    across = np.cross(axis, level)
+    views = []
+    for k in range(count):
+        angle = 2 * np.pi * k / count
+        position = target + height + np.cos(angle) * level + np.sin(angle) * across
+        views.append(replace(first, viewmat=look_at(position, target, axis), name=f"{k:04d}"))
+    return Cameras.of(views)

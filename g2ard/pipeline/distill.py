@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,20 +12,101 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from g2ard.config.checks import checks_arguments
+from g2ard.io.reports import LEFT_OUT, Report
+from g2ard.io.types import ViewSet
 from g2ard.pipeline.config import DistillConfig, SelectConfig
-from g2ard.pipeline.report import DistillReport, RoundReport, StageSeconds, ViewsReport
 from g2ard.progress import Progress, plural, silent
 from g2ard.rendering.targets import Photos, PhotosOrRenders, Subset, Targets, checked_targets, fingerprint_of
 from g2ard.rendering.visibility import visibility_source
+from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
 from g2ard.stages.recover import checkpoint as checkpoints
 from g2ard.stages.recover import recover
 from g2ard.stages.recover.anchors import Anchors
 from g2ard.stages.recover.draw import checked_weights
 from g2ard.stages.recover.optimize import Watch
+from g2ard.stages.recover.report import RecoverReport
 from g2ard.stages.select import SurfaceOptions, select
 from g2ard.stages.simplify import simplify
+from g2ard.stages.simplify.report import SimplifyReport
 from g2ard.system.cached import cached_property
+
+
+@dataclass(frozen=True, eq=False)
+class RunViews:
+    """Views of a run.
+
+    Args:
+        train: views for training, of the usual and other kinds.
+        test: usual views for scoring.
+        apart: views of other kinds; None if there are none.
+        pool: the whole generated pool, written beside the result.
+        full: the usual views for scoring at their own size, if a requested size shrank them.
+        unseen: share of the sampled matter that no view of the pool sees.
+    """
+
+    train: ViewSet
+    test: Cameras
+    apart: Cameras | None = None
+    pool: ViewSet | None = None
+    unseen: float | None = None
+    full: Cameras | None = None
+
+    def resized(self, longest: int) -> RunViews:
+        """Shrink all views for training and scoring."""
+        apart = self.apart and self.apart.resized(longest)
+        return replace(self, train=self.train.resized(longest), test=self.test.resized(longest), apart=apart)
+
+
+@dataclass(frozen=True)
+class ViewsReport(Report):
+    """Report of the view selection.
+
+    Args:
+        chosen: names of the chosen views, best first.
+        refused: names of views that see nothing of the scene or lie inside geometry.
+        left_out: share of the whole pool's objective that the remaining views would add.
+    """
+
+    policy: str
+    candidates: int
+    chosen: list[str]
+    weighted: bool
+    refused: list[str]
+    left_out: float
+
+
+@dataclass(frozen=True)
+class RoundReport(Report):
+    """Report of a round: simplification, and its recoveries if there are any."""
+
+    count: int
+    simplify: SimplifyReport
+    recover: tuple[RecoverReport, ...] = ()
+
+
+@dataclass(frozen=True)
+class StageSeconds(Report):
+    """Wall seconds of each stage.
+
+    Args:
+        resumed: part of these spent by earlier, interrupted calls; None if there were none.
+    """
+
+    select: float
+    simplify: float
+    recover: float
+    resumed: float | None = field(default=None, metadata=LEFT_OUT)
+
+
+@dataclass(frozen=True)
+class DistillReport(Report):
+    """Report of a distillation. `views` holds its selection of views, or None."""
+
+    rounds: tuple[RoundReport, ...]
+    seconds: StageSeconds
+    views: ViewsReport | None
+
 
 __all__ = ["DistillConfig", "Distilled", "SelectConfig", "distill"]
 

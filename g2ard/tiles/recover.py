@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from g2ard.config.schema import changed, values_of
 from g2ard.io.tile_store import TileStore
-from g2ard.pipeline.run_views import RunViews
+from g2ard.pipeline.distill import RunViews
 from g2ard.rendering.renderer import RasterSettings, Renderer, settings_for
 from g2ard.rendering.targets import TeacherRenders
 from g2ard.report.kinds import KindScore, by_kind

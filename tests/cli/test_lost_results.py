@@ -21,7 +21,7 @@ from helpers.scenes import around, checkered_ball
 from helpers.writing_commands import COMMANDS, write_inputs
 
 SLOW = {
-    "distill": ("g2ard.jobs.distill.prepare", "g2ard.jobs.job.DistillJob.run"),
+    "distill": ("g2ard.jobs.distill.prepare", "g2ard.jobs.distill.DistillJob.run"),
     "clean": ("g2ard.jobs.clean.clean",),
     "lod": ("g2ard.jobs.levels.lod",),
     "register": ("g2ard.stages.register.register",),

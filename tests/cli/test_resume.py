@@ -14,7 +14,7 @@ from g2ard.cli.frame import Run
 from g2ard.cli.resume import stoppable
 from g2ard.errors import InputError
 from g2ard.io import write_splats, write_views
-from g2ard.jobs.job import DistillJob
+from g2ard.jobs.distill import DistillJob
 from g2ard.pipeline.distill import Distilled
 from g2ard.stages.recover import checkpoint
 from helpers.commands import CommandLine, refused, succeeds

@@ -9,9 +9,10 @@ import pytest
 
 from helpers.commands import CommandLine
 
-TRAIN = "--views views.json --teacher ball.ply --steps 2"
+VIEWED = "--views views.json"
+TRAIN = f"{VIEWED} --teacher ball.ply --steps 2"
 COMMANDS = {
-    "distill ball.ply -r 8 --views views.json --steps 2 --no-page -o run": "g2ard.jobs.job.DistillJob.run",
+    f"distill ball.ply -r 8 {VIEWED} --steps 2 --no-page -o run": "g2ard.jobs.distill.DistillJob.run",
     f"recover ball.ply {TRAIN} -o out.ply": "g2ard.jobs.recover.RecoverJob.run",
     f"adapt ball.ply {TRAIN} -o out.ply": "g2ard.pipeline.adapt.adapt",
     "lod ball.ply -r 4,8 --merge-only --views views.json -o levels": "g2ard.jobs.levels.lod",

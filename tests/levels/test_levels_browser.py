@@ -12,8 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from g2ard.jobs.level_page import write_level_page
-from g2ard.jobs.levels import lod, save_tileset
+from g2ard.jobs.levels import lod, save_tileset, write_level_page
 from g2ard.levels import Cut, Georeference, save_levels
 from g2ard.rendering.metrics import psnr
 from g2ard.rendering.renderer import Renderer

@@ -10,8 +10,14 @@ import pytest
 
 from g2ard import io
 from g2ard.errors import InputError
-from g2ard.pipeline.adapt import AdaptConfig, adapt
-from g2ard.pipeline.recolour import blended_appearance, colour_change, recoloured, views_seeing
+from g2ard.pipeline.adapt import (
+    AdaptConfig,
+    adapt,
+    blended_appearance,
+    colour_change,
+    recoloured,
+    views_seeing,
+)
 from g2ard.rendering.renderer import render
 from g2ard.rendering.targets import Subset, TeacherRenders
 from g2ard.stages.evaluate import evaluate

@@ -21,7 +21,7 @@ from g2ard.progress import plural
 if TYPE_CHECKING:
     from g2ard.cli.run_folder import RunFolder
     from g2ard.jobs.cost import Cost
-    from g2ard.jobs.job import DistillJob
+    from g2ard.jobs.distill import DistillJob
     from g2ard.pipeline.distill import Distilled
 
 

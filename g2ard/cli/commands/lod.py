@@ -299,7 +299,7 @@ class _Writer:
             return written + self._page(levels, axis)
 
     def _page(self, levels: Sequence[Level], up: Sequence[float] | None) -> int:
-        from g2ard.jobs.level_page import write_level_page
+        from g2ard.jobs.levels import write_level_page
 
         run = self.run
         written = write_level_page(

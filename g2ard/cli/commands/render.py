@@ -84,9 +84,8 @@ def render(
     from g2ard.io.animation import write_animation
     from g2ard.io.images import to_bytes
     from g2ard.jobs.inputs import load_views
-    from g2ard.jobs.turntable import orbit
     from g2ard.jobs.view_checks import warn_of_sight
-    from g2ard.jobs.views import views_or_pool
+    from g2ard.jobs.views import orbit, views_or_pool
     from g2ard.rendering.panorama import stations
     from g2ard.rendering.renderer import RasterSettings, Renderer
 
