@@ -89,7 +89,7 @@ def _count(folder: Path) -> int:
     tables = _tables(folder)
     try:
         if tables is None or tables[1].suffix.lower() == ".txt":
-            return 0 if tables is None else len(_images_txt(tables[1])[0])
+            return 0 if tables is None else len(_images_txt(tables[1]))
         with tables[1].open("rb") as file:
             (count,) = _COUNT.unpack(file.read(_COUNT.size))
             return int(count)
