@@ -53,7 +53,7 @@ def drop_ended(run: Run, place: Path, resume: bool, last: Path) -> bool:
 def checkpoint_beside(output: Path, ending: str) -> Path:
     """Return the hidden place for checkpoints of a scene, beside its file or SOG folder."""
     whole = output.parent if output.name == "meta.json" else output
-    return whole.with_name(hidden_name(whole.name, ending))
+    return whole.parent / hidden_name(whole.name, ending)
 
 
 def finished_before(output: Path, changed: Path) -> OutputError:

@@ -77,9 +77,9 @@ def test_simplify_fits(tmp_path: Path, command_line: CommandLine) -> None:
     assert f"b.sog: {(tmp_path / 'b.sog').stat().st_size:,} of 60,000 bytes" in told
     assert 50_000 < (tmp_path / "b.sog").stat().st_size <= 60_000
     told = succeeds(command_line, tmp_path, "simplify", "a.ply", "--fit", "quest3", "-o", "c.ply").err
-    assert "quest3: all 6,000 Gaussians already fit" in told
+    assert "quest3: nothing to do, all 6,000 Gaussians already fit" in told
     told = succeeds(command_line, tmp_path, "simplify", "a.ply", "--fit", "9MB", "-o", "e.ply").err
-    assert "9MB: all 6,000 Gaussians already fit" in told
+    assert "9MB: nothing to do, all 6,000 Gaussians already fit" in told
     assert len(read_splats(tmp_path / "c.ply")) == 6000 < DEVICES["quest3"]
     told = succeeds(command_line, tmp_path, "simplify", "a.ply", "--min-psnr", "25", "-o", "d.ply").err
     assert " Gaussians keep 2" in told

@@ -250,7 +250,7 @@ def test_progress_figures(student: Splats, targets: TeacherRenders, monkeypatch:
         student,
         targets,
         RecoverConfig(steps=60),
-        progress=lambda *a: seen.append(a) if a[0] == "recover" else None,
+        progress=lambda *a: seen.append(a) if a[0] == "recover" and a[1] else None,
         watch=lambda step, _, splats: scenes.update({step: splats()}),
     )
     assert [a[1] for a in seen] == list(range(1, 61))

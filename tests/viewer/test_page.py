@@ -270,7 +270,7 @@ def test_a_run_has_a_page_unless_too_large(tmp_path: Path, monkeypatch: pytest.M
     assert size == path.stat().st_size
     assert "view.html" in line
     assert Parts(path).labels == ["scene.sog: 300 Gaussians"]
-    run = SimpleNamespace(write=lambda scene, splats, overwrite: write_splats(scene, splats))
+    run = SimpleNamespace(write=lambda scene, splats, **_: write_splats(scene, splats))
     RunFolder(run, tmp_path, "scene.sog", resume=False).write_scene(ball)
     assert not path.exists()  # a page of an earlier run
     monkeypatch.setitem(budget.DEVICES, "web", 299)
