@@ -163,7 +163,7 @@ _HOMES = {
     "jobs.recover": ("recover",),
     "jobs.register": ("register",),
     "jobs.simplify": ("simplify",),
-    "jobs.turntable": ("orbit",),
+    "jobs.views": ("orbit",),
     "jobs.viewer_frame": ("up_of",),
     "poses": ("make_pool",),
     "pipeline.presets": ("preset",),

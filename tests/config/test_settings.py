@@ -119,7 +119,7 @@ SOME = {
     "simplify": "simplify.max_growth=1.5",
     "select": "select.kappa=12.5",
     "recover": "recover.schedule.rates.sh0=0.0125",
-    "adapt": "adapt.recovery.rates.sh0=0.0125",
+    "adapt": "adapt.prior_views=0.5",
     "distill": "simplify.neighbors=5",
 }
 

@@ -38,7 +38,7 @@ steps = 12
 steps = 12
 [compare]
 size = 48
-count = 4
+looks = 4
 [render]
 size = 48
 [evaluate]
