@@ -318,7 +318,7 @@ def _instead(path: Path) -> str:
     foreign = [file for file in sorted(path.iterdir()) if file.suffix.lower() in _CONVERTERS]
     if foreign:
         return f"; it has {foreign[0].name}: {_CONVERTERS[foreign[0].suffix.lower()]}"
-    for place in (path, path / "images"):
+    for place in (path / "images", path):
         photos = _photos_in(place)
         if not photos:
             continue
