@@ -232,7 +232,7 @@ def test_little_address_space_ends_on_the_cpu(kilobytes: int, tmp_path: Path, gp
 
 def test_lists_devices(tmp_path: Path, command_line: CommandLine) -> None:
     out, told = succeeds(command_line, tmp_path, "info", "--devices", "--json", "-")
-    assert told.splitlines()[0].strip() == "Devices"
+    assert told.splitlines()[0].strip() == "What --device takes"
     assert "--device gpu" in told
     assert "┡" not in told  # what ends a header
     found = json.loads(out)
