@@ -26,12 +26,11 @@ _COMMANDS = {
     "distill": "distill ball.ply -n 60 --views views.json --steps 6 --size 32 -o run --resume",
     "lod": "lod ball.ply -r 1,4 --views views.json --steps 4 --size 32 -o out --resume",
     "lod-merged": "lod ball.ply -r 1,4 --merge-only --format 3dtiles -o out --resume",
-    "lod-tiles": "lod ball.ply -r 2,8 --merge-only --tile-rows 150 --workers 1 -o out --resume",
     "ingest": "ingest ball.ply small.ply -o tiles --tile-rows 150",
     "ingest-cloud": "ingest cloud.ply -o tiles --tile-rows 150",
 }
 _COUNTED = ("replace", "link", "rename", "unlink", "rmdir")
-_MOMENTS = 6
+_MOMENTS = 3
 _TIMES = re.compile(r"seconds|time|rss|resumed|peak|^share$|^bytes$")
 
 
