@@ -64,8 +64,6 @@ RENAMED = {
     ("poses", "--size"): "--resolution",
     ("compare", "-n"): "-k",
     ("compare", "--count"): "-k",
-    ("distill", "--view"): "--page",
-    ("distill", "--no-view"): "--no-page",
 }
 """Command and an option's former spelling → its spelling."""
 

@@ -108,7 +108,7 @@ def test_scores_are_those_of_pinhole_photos(
     truth, scores = [g2ard.Renderer(room).clipped(view) for view in held], {}
     for kind in ("pinhole", "panorama", "fisheye"):
         path = written(tmp_path / kind, kind, room)
-        ask = ("distill", "cloud.ply", "--views", path, "-n", 700, "--no-view", "-o", f"{kind}.run")
+        ask = ("distill", "cloud.ply", "--views", path, "-n", 700, "--no-page", "-o", f"{kind}.run")
         succeeds(command_line, tmp_path, *ask)
         found = g2ard.Renderer(g2ard.load(tmp_path / f"{kind}.run" / "scene.ply"))
         off = [np.mean((found.clipped(view) - image) ** 2) for view, image in zip(held, truth, strict=True)]
