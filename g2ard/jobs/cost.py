@@ -17,6 +17,7 @@ from g2ard.errors import InputError, require
 from g2ard.io import open_stream
 from g2ard.io.tile_store import TileStore, row_width
 from g2ard.jobs.tiling import Tiling, cut_into, folder_of_tiles
+from g2ard.jobs.views import FULL_PIXELS
 from g2ard.progress import plural
 from g2ard.rendering.targets import CACHE_BYTES
 from g2ard.scene.samples import evenly_spaced
@@ -36,7 +37,7 @@ _PAGE_BYTES, _PAGE_FULL = 170, 130_000
 """Memory of packing the viewer page: bytes per Gaussian and SH coefficient above degree 0, and the count from
 which it stops growing. Measured on playbot: 113 MB for 25,000 Gaussians, 511 for 125,000, 538 for 250,000.
 """
-_PROGRAM_BYTES = 150_000_000
+_PROGRAM_BYTES = 90_000_000
 """Bytes of the interpreter and loaded libraries."""
 _TRAINER_BYTES = 983
 """Bytes per Gaussian in recovery: parameters, Adam's moments, buffers (`docs/benchmarks.md`)."""
@@ -115,7 +116,12 @@ def _peak_bytes(job: DistillJob, count: int, pixels: int, page: bool) -> int:
     packing = _PAGE_BYTES * 3 * ((degree + 1) ** 2 - 1) * min(count, _PAGE_FULL)
     targets = min(CACHE_BYTES, pixels * (12 if job.teacher is not None else 3))
     trained = targets + scene + _TRAINER_BYTES * count
-    written = targets + 2 * scene + (packing if page else 0)
+    full = (
+        0
+        if job.views.full is None
+        else 12 * min(FULL_PIXELS, int((job.views.full.widths * job.views.full.heights).sum()))
+    )
+    written = targets + full + 2 * scene + (packing if page else 0)
     # The recovered scene and its rows come on top.
     return _PROGRAM_BYTES + int(max(targets + WHOLE_TIMES * scene, trained, written)) + 2 * small
 

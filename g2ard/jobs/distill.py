@@ -22,7 +22,7 @@ from g2ard.jobs.inputs import Views, load_scene, make_targets, scorable
 from g2ard.jobs.measured_budget import Aim, Reduction, aim_of
 from g2ard.jobs.photos import distinct, sparse_file, sparse_points, topped_up
 from g2ard.jobs.view_checks import check_photos, propose_background
-from g2ard.jobs.views import Use, views_of
+from g2ard.jobs.views import FULL_PIXELS, Use, views_of
 from g2ard.pipeline.config import DistillConfig
 from g2ard.pipeline.distill import Distilled, RunViews
 from g2ard.pipeline.distill import distill as pipeline
@@ -38,9 +38,6 @@ from g2ard.stages.recover.auto_preset import PriorMeasures, measure_prior, regul
 from g2ard.stages.recover.config import RecoverConfig
 from g2ard.stages.recover.schedule import Schedule
 from g2ard.system.cached import cached_property
-
-_FULL_PIXELS = 32_000_000
-"""Pixels of the views that are scored at their own size after a requested one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,13 +117,13 @@ class DistillJob:
     def full_size(self) -> Targets | None:
         """Held-out targets at the views' own size, made on access; None if no size shrank them.
 
-        Of large views there are only as many as `_FULL_PIXELS` hold, evenly spaced.
+        Of large views there are only as many as `FULL_PIXELS` hold, evenly spaced.
         """
         cameras = self.views.full
         if cameras is None:
             return None
         largest = int((cameras.widths * cameras.heights).max())
-        some = evenly_spaced(len(cameras), max(1, _FULL_PIXELS // largest))
+        some = evenly_spaced(len(cameras), max(1, FULL_PIXELS // largest))
         return scorable(self.targets_for(cameras.take(some), lazy=True))
 
     def _every_second_apart(self, first: int) -> Targets | None:

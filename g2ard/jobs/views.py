@@ -32,6 +32,9 @@ Up = Sequence[float] | None
 Use = Literal["distil", "levels", "tiles", "merging"]
 """Use of generated views. Levels and tiles are scored in usual views alone; merging has no recovery."""
 
+FULL_PIXELS = 8_000_000
+"""Pixels of the views that are scored at their own size after a requested one."""
+
 _POOL_VIEWS, _TRAINING_VIEWS, _POOL_GROWTH = 128, 112, 2.0
 """Generated usual views, those of them that train (every 8th is held out for scoring), and the largest factor
 if a view shows little of the scene."""

@@ -19,7 +19,7 @@ from reference import poses as naive
 
 def test_views_are_made_where_none_are_given(command_line: CommandLine, folder: Path) -> None:
     ask = ("render", "ball.ply", "--size", 64)
-    error = succeeds(command_line, folder, *ask, "-n", 4, "--sheet", "a/look.png").err
+    error = succeeds(command_line, folder, *ask, "-k", 4, "--sheet", "a/look.png").err
     assert "4 images in a/look.png" in error
     with Image.open(folder / "a" / "look.png") as picture:
         assert picture.width > 128
