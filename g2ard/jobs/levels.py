@@ -289,7 +289,13 @@ def _level(
     else:
         level = merged = _merged(job, finer, count)
     scores = [
-        evaluate(splats, held_out, background=job.config.recover.background, progress=job.progress).psnr
+        evaluate(
+            splats,
+            held_out,
+            background=job.config.recover.background,
+            progress=job.progress,
+            stage="scoring",
+        ).psnr
         for splats in ((merged, level) if recover else (merged,))
     ]
     seconds = time.perf_counter() - began

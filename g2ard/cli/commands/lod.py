@@ -191,7 +191,8 @@ def lod(
     with stoppable(run, stopped, resume, writer.meta):
         stopped.mkdir(parents=True, exist_ok=True)
         job = prepare_levels(given, ratios=ratios, recover=recover, work=stopped, **choices)
-        stages = [stage for cost in job.costs for stage in cost.stages]
+        made = [cost for ratio, cost in zip(job.ratios, job.costs, strict=True) if ratio > 1]
+        stages = [stage for cost in made for stage in cost.stages]
         run.console.expect([*stages, ("write", 3.0), ("the page", 1.0)])
         levels = job.run()
         written = writer.save(levels.splats, sky=levels.sky)
