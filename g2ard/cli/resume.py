@@ -37,7 +37,7 @@ def began_output(place: Path, output: Path) -> bool:
         [path.stat().st_mtime_ns for place in places for path in (place, *place.rglob("*")) if path.is_file()]
         for places in ((place, lock), (output,))
     )
-    return bool(kept and written) and min(kept) <= min(written)
+    return bool(kept) and output.exists() and all(min(kept) <= time for time in written)  # or none yet
 
 
 def drop_ended(run: Run, place: Path, resume: bool, last: Path) -> bool:
