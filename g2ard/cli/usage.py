@@ -64,6 +64,8 @@ RENAMED = {
     ("poses", "--size"): "--resolution",
     ("compare", "-n"): "-k",
     ("compare", "--count"): "-k",
+    ("render", "-n"): "-k",
+    ("render", "--count"): "-k",
 }
 """Command and an option's former spelling → its spelling."""
 

@@ -56,7 +56,7 @@ def read(path: Path, images: Path | None = None) -> ViewSet:
 
 
 def _frame(path: Path, number: int, node: Any, folder: Path) -> Frame | str:
-    """Return the view of a photo, or why there is none."""
+    """Return the view of a photo, or the reason why it cannot be used."""
     named = str(node["name"].value()) if node.isDefined("name") else ""
     stem = "_".join(filter(None, [f"{number:04d}", _NO_NAME.sub("_", named).strip("_.")[:80]]))
     kind = next((k for k in ("spherical", "pinhole") if node.isDefined(f"{k}Representation")), None)

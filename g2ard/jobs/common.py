@@ -84,7 +84,7 @@ def common_of(paths: Sequence[Path], *, background: bool = False) -> Common | No
 
 @dataclass(frozen=True, eq=False)
 class _Run:
-    """What a run's report says about its targets."""
+    """The targets of a run, as its report states them."""
 
     path: Path
     teacher: Path | None

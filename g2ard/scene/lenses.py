@@ -24,7 +24,7 @@ PARAMETERS = {
     "FISHEYE": 4,
     "EQUIRECTANGULAR": 0,
 }
-"""Number of parameters of each model, in COLMAP's order; a panorama has none."""
+"""Number of parameters of each model, in COLMAP's order; 0 for a panorama."""
 
 FACES: dict[str, Float] = {
     "front": np.eye(3),

@@ -1,4 +1,4 @@
-"""What a new user meets: names of outputs, words of the summary, and what is refused before any work."""
+"""Names of outputs, words of the summary, and refusals before any work, as a new user meets them."""
 
 import re
 from pathlib import Path

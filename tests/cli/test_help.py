@@ -1,4 +1,4 @@
-"""What `--help` and `--help-all` show, and options that were renamed."""
+"""Options in `--help` and `--help-all`, and options that were renamed."""
 
 import ast
 import re

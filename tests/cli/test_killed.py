@@ -59,7 +59,7 @@ def untimed(value: Any) -> Any:
 
 
 def left(folder: Path) -> dict[str, Any]:
-    """Return the files of a folder: their content, without durations; pages and pictures by name alone."""
+    """Return the files of a folder: their content without durations; of pages and pictures only the names."""
     found: dict[str, Any] = {}
     for path in sorted(path for path in folder.rglob("*") if path.is_file()):
         content: Any = path.read_bytes() if path.suffix not in (".html", ".png") else None

@@ -32,7 +32,7 @@ def test_own_views_round_trip(tmp_path_factory: pytest.TempPathFactory, count: i
 
 
 def test_poses_become_rigid(tmp_path: Path) -> None:
-    """Those of other programs may have rounding errors or a uniform scale, four rows or three."""
+    """Poses of other programs may have rounding errors or a uniform scale, and three or four rows."""
     truth = views(3, 0)
     write_views(tmp_path / "a.json", truth)
     content = json.loads((tmp_path / "a.json").read_text())

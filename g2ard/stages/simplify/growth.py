@@ -1,4 +1,4 @@
-"""How far merged Gaussians widen where α ≤ 0.99 cannot hold their mass: measured in a few small renders.
+"""Choose by small renders how far merged Gaussians widen where α ≤ 0.99 cannot hold their mass.
 
 A surface of one layer, such as a lifted point cloud, needs wide Gaussians to stay closed. In a trained scene
 the same growth only blurs, because other layers are behind each gap. Mass cannot tell the two apart, an image
@@ -24,7 +24,7 @@ _GAPS = 0.02
 _GAP_VIEWS, _GAP_PIXELS = 8, 400
 """Views in which it is measured, and their longer side."""
 RECOVERED_GAPS = "keep more Gaussians, or recover longer (--schedule best)"
-"""What to do about gaps that recovery left."""
+"""Advice about gaps that recovery left."""
 
 GROWTHS = (1.25, 1.6, 2.0, 2.5, 3.2, 4.0)
 """Growths to choose from; the first is for what recovery improves afterwards, and for planning."""
