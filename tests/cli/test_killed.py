@@ -30,7 +30,7 @@ _COMMANDS = {
     "ingest-cloud": "ingest cloud.ply -o tiles --tile-rows 150",
 }
 _COUNTED = ("replace", "link", "rename", "unlink", "rmdir")
-_MOMENTS = 3
+_MOMENTS = 6
 _TIMES = re.compile(r"seconds|time|rss|resumed|peak|^share$|^bytes$")
 
 
