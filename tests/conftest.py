@@ -4,6 +4,7 @@ import contextlib
 import gc
 import io
 import os
+import signal
 import subprocess
 import sys
 from collections import Counter
@@ -21,6 +22,9 @@ from helpers.project import environment
 from helpers.scenes import around, checkered_ball
 
 Said = tuple[int, str, str]
+
+
+signal.signal(signal.SIGINT, signal.default_int_handler)  # processes in the background start with it ignored
 
 
 def pytest_terminal_summary(terminalreporter: Any) -> None:
@@ -96,6 +100,7 @@ def _here(words: list[str], cwd: Path, env: dict[str, str]) -> Said:
         patch.object(sys, "argv", [program, *words]),
         contextlib.redirect_stdout(out),
         contextlib.redirect_stderr(err),
+        patch("webbrowser.open", side_effect=KeyboardInterrupt),  # a page that is shown is closed at once
     ):
         os.chdir(cwd)
         try:
