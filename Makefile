@@ -38,8 +38,9 @@ test: setup
 	OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 RAYON_NUM_THREADS=2 $(BIN)/python -m pytest --numprocesses $(TEST_PROCESSES) --dist loadfile
 
 # The part of `make test` that needs what a fresh machine has not (an adapter, a browser, Node packages): it must skip there.
+# With `-p g2ard-gpu`, cargo would compile wgpu once more, for other features of what it depends on.
 test-fresh: setup
-	cargo test --quiet --profile bench -p g2ard-gpu
+	cargo test --quiet --profile bench --workspace --exclude g2ard-core
 	$(BIN)/python -m pytest $$(grep -lE '^from helpers.(browser|peers) import|adapters\(\)' -r tests --include='test_*.py')
 
 # Over 10,000 random gradient cases; a slice of them is in `make test`.

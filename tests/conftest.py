@@ -8,7 +8,7 @@ import signal
 import subprocess
 import sys
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -25,6 +25,14 @@ Said = tuple[int, str, str]
 
 
 signal.signal(signal.SIGINT, signal.default_int_handler)  # processes in the background start with it ignored
+
+
+@pytest.fixture(autouse=True)
+def unchanged_signals() -> Iterator[None]:
+    """Fail a test after which Ctrl-C has another handler: it would end the process in a later test."""
+    yield
+    left = signal.signal(signal.SIGINT, signal.default_int_handler)
+    assert left is signal.default_int_handler
 
 
 def pytest_terminal_summary(terminalreporter: Any) -> None:
