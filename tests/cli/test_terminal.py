@@ -199,11 +199,10 @@ def test_results_on_the_terminal_itself(
 @pytest.mark.parametrize("command", ENDLESS)
 def test_ctrl_c_leaves_one_line_and_a_cursor(command: str, shown: Callable[..., Screen]) -> None:
     stage, more = ENDLESS[command]
-    for columns in (40, 80):
-        screen = shown(command, *more.split(), columns=columns, stop_at=stage)
-        assert screen.status == 130, screen.received
-        assert_tidy(screen)
-        assert "g2ard: interrupted" in "".join(screen.lines)
+    screen = shown(command, *more.split(), columns=40, stop_at=stage)
+    assert screen.status == 130, screen.received
+    assert_tidy(screen)
+    assert "g2ard: interrupted" in "".join(screen.lines)
 
 
 def test_an_error_in_the_middle_comes_last(shown: Callable[..., Screen]) -> None:
@@ -224,16 +223,15 @@ LONG = (
 
 @pytest.mark.parametrize("ask", LONG, ids=" ".join)
 def test_messages_break_between_words(ask: tuple[str, ...], shown: Callable[..., Screen]) -> None:
-    """At every width the words of messages, tables and bars aside, are those of a wide terminal."""
+    """On a narrow terminal the words of messages, tables and bars aside, are those of a wide one."""
     words = {word.strip(":,") for word in " ".join(shown(*ask, columns=500).lines).split()}
-    for columns in (40, 80):
-        screen = shown(*ask, columns=columns)
-        assert_tidy(screen)
-        strange = [
-            word
-            for line in screen.lines
-            if not re.search("[━│┃]", line)
-            for word in line.split()
-            if word.strip(":,") not in words and not re.search(r"\d", word) and len(word) < columns - 1
-        ]
-        assert not strange, "\n".join(screen.lines)
+    screen = shown(*ask, columns=40)
+    assert_tidy(screen)
+    strange = [
+        word
+        for line in screen.lines
+        if not re.search("[━│┃]", line)
+        for word in line.split()
+        if word.strip(":,") not in words and not re.search(r"\d", word) and len(word) < 39
+    ]
+    assert not strange, "\n".join(screen.lines)
