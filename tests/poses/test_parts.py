@@ -10,9 +10,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from g2ard.poses import plan_pool
 from g2ard.poses.matter import Grid, Matter
 from g2ard.poses.numbers import halton, strata
+from g2ard.poses.sight import Glance
 from g2ard.poses.site import Site, Terrain
+from g2ard.scene.splats import Splats
+from helpers.scenes import views_at
 from reference import poses as naive
 
 
@@ -111,3 +115,54 @@ def test_terrain_follows_slopes_and_goes_under_roofs() -> None:
     at = rng.uniform(3, 21, (200, 3))
     np.testing.assert_allclose(terrain.height(at), 0.2 * at[:, 0], atol=0.3)
     np.testing.assert_allclose(terrain.height(np.array([[12.5, 12.5, 0]])), 2.5, atol=0.4)
+
+
+def test_terrain_is_bilinear_between_blocks_and_flat_beyond_the_edge() -> None:
+    rng = np.random.default_rng(1)
+    heights = rng.normal(size=(5, 4))
+    terrain = Terrain(np.array([2.0, -1.0]), 0.5, heights)
+    x, y = rng.uniform(1.5, 5.0, 300), rng.uniform(-1.5, 1.5, 300)
+    found = terrain.height(np.stack([x, y, rng.normal(size=300)], axis=1))
+    middles = [terrain.low[k] + (np.arange(heights.shape[k]) + 0.5) * terrain.block for k in range(2)]
+    for at in range(300):
+        along_y = [np.interp(y[at], middles[1], row) for row in heights]
+        assert found[at] == pytest.approx(np.interp(x[at], middles[0], along_y), abs=1e-12)
+
+
+def test_the_ground_fixes_the_up_direction_wherever_it_lies() -> None:
+    """Most matter of this scene is in the ball, so that the ground lies far below its middle."""
+    scene = naive.joined(naive.statue(), naive.sphere((0, 0, 1.3), 1.0, 0.03))
+    for seed in range(3):
+        turn = naive.rotation(seed)
+        up = plan_pool(naive.moved(scene, turn), 1, kind="orbit").up
+        assert np.linalg.norm(up - turn[:, 2]) < np.radians(0.1)
+
+
+@pytest.mark.parametrize("count", [40, 160])
+def test_each_spot_of_the_ground_lies_in_about_five_nadir_frames(count: int) -> None:
+    ground = naive.rectangle((0, 0, 0), (90, 0, 0), (0, 30, 0), 0.5, (0, 0, 1))
+    huts = [naive.box((10.0 * i, 5, 0), (3, 3, 2), 0.4, floor=False) for i in range(3)]
+    cameras = plan_pool(naive.joined(ground, *huts), count, kind="aerial", up=(0, 0, 1)).cameras
+    heights = cameras.positions[cameras.forwards[:, 2] < -0.999, 2]
+    side = 2 * np.tan(np.radians(25))
+    frames = (side * heights * 0.75 * side * heights).sum() / (90 * 30)
+    assert 3.5 < frames < 8
+
+
+def test_glances_tell_fine_matter_by_its_angle() -> None:
+    """Rows of balls whose images do not touch, each at a distance that gives its angle."""
+    angles = np.array([0.01, 0.02, 0.028, 0.032, 0.045, 0.08])
+    across = np.linspace(-0.5, 0.5, len(angles))
+    far = np.where(np.arange(len(angles)) % 2, 2.0, 3.0)
+    points = far[:, None] * np.stack([across, np.zeros(len(angles)), np.ones(len(angles))], axis=1)
+    away = np.linalg.norm(points, axis=1)
+    scene = Splats.create(points, scales=np.repeat((angles * away)[:, None], 3, axis=1))
+    views = views_at([np.eye(4)], (96, 72), 80.0)
+    single = np.array([Glance(scene.take(slice(i, i + 1))).of(views)[0, 0] for i in range(len(angles))])
+    mean, fine, coarse = Glance(scene).of(views)[:, 0]
+    assert mean == pytest.approx(single.sum(), rel=0.05)
+    assert fine == pytest.approx(single[:3].sum(), rel=0.05)
+    assert coarse == pytest.approx(0.08)
+    mean, fine, coarse = Glance(scene).of(views, reach=np.array([2.6]))[:, 0]
+    assert mean == pytest.approx(single.sum(), rel=0.05)
+    assert fine == pytest.approx(single[1:3:2].sum(), rel=0.05)
