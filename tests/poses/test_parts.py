@@ -143,10 +143,12 @@ def test_each_spot_of_the_ground_lies_in_about_five_nadir_frames(count: int) -> 
     ground = naive.rectangle((0, 0, 0), (90, 0, 0), (0, 30, 0), 0.5, (0, 0, 1))
     huts = [naive.box((10.0 * i, 5, 0), (3, 3, 2), 0.4, floor=False) for i in range(3)]
     cameras = plan_pool(naive.joined(ground, *huts), count, kind="aerial", up=(0, 0, 1)).cameras
-    heights = cameras.positions[cameras.forwards[:, 2] < -0.999, 2]
+    nadir = cameras.positions[cameras.forwards[:, 2] < -0.999]
+    heights = nadir[:, 2]
     side = 2 * np.tan(np.radians(25))
     frames = (side * heights * 0.75 * side * heights).sum() / (90 * 30)
     assert 3.5 < frames < 8
+    assert (np.ptp(nadir[:, :2], axis=0) > (45, 15)).all()
 
 
 def test_glances_tell_fine_matter_by_its_angle() -> None:
@@ -166,3 +168,27 @@ def test_glances_tell_fine_matter_by_its_angle() -> None:
     mean, fine, coarse = Glance(scene).of(views, reach=np.array([2.6]))[:, 0]
     assert mean == pytest.approx(single.sum(), rel=0.05)
     assert fine == pytest.approx(single[1:3:2].sum(), rel=0.05)
+
+
+def test_a_wide_disc_fills_the_cells_around_its_centre(monkeypatch) -> None:
+    monkeypatch.setattr("g2ard.poses.matter._CELLS", (64_000, 64_000))  # forty along a side
+    disc = Splats.create([[0.0, 0, 0]], scales=[[0.3, 0.2, 1e-3]], logit_opacities=[3.0])
+    matter = Matter.of(disc)
+    half = 5 * matter.scales[0, 2]
+    grid = Grid.of(np.full(3, -half), np.full(3, half), matter, np.eye(3))
+    filled = np.argwhere(grid.opaque == 0)
+    centres = grid.low + (filled + 0.5) * grid.cell
+    reach = np.abs(centres).max(axis=0) / matter.scales[0, 2]
+    np.testing.assert_allclose(centres[:, :2].min(axis=0), -centres[:, :2].max(axis=0), atol=grid.cell)
+    np.testing.assert_allclose(reach[:2], [1.4, 0.9], atol=0.2)
+
+
+def test_the_reason_of_the_up_direction_says_what_decides_its_sign() -> None:
+    z = np.linspace(0, 9, 4000) ** 2 / 9  # denser at its foot
+    turns = np.arange(4000) * 2.4
+    round_ = np.stack([np.cos(turns), np.sin(turns), np.zeros(4000)], axis=1)
+    pole = naive.discs(0.3 * round_ + np.outer(z, [0, 0, 1]), round_, 0.05)
+    found = plan_pool(pole, 1, kind="orbit")
+    assert found.up @ (0, 0, 1) > 0.99
+    assert "heavier end is down" in found.why
+    assert "lies above it" in plan_pool(naive.statue(), 1, kind="orbit").why
