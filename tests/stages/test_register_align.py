@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from g2ard import _core
 from g2ard.rendering.renderer import Renderer
 from g2ard.stages.register.align import Aligned, Shot, align, level_of, normal_equations, shot_of
-from g2ard.stages.register.grey import blurred, blurred_back, grey_of, local_zncc, zncc
+from g2ard.stages.register.grey import blurred, blurred_back, grey_of, local_zncc, shift_between, zncc
 from g2ard.stages.register.polish import Energy, Prior, polish
 from g2ard.stages.register.pose import moved, pose_error
 from helpers.registration import BALL, CONFIG, off, pyramid_of
@@ -199,3 +199,20 @@ def test_it_ends_at_the_pose(view: int) -> None:
     held = Prior(start.viewmat, 1e9 * np.eye(6))
     stays = polish(renderer, start, camera, level, held, CONFIG)
     assert pose_error(stays.viewmat, start.viewmat)[0] < 1e-4
+
+
+@pytest.mark.parametrize("shape", [(1, 9), (6, 1), (5, 8), (9, 6)])
+def test_a_shift_is_that_of_the_best_correlation_without_wrapping(shape: tuple[int, int]) -> None:
+    rng = np.random.default_rng(sum(shape))
+    for _ in range(8):
+        a, b = rng.normal(size=(2, *shape))
+        found = {}
+        for down in range(-(shape[0] // 2), shape[0] // 2 + 1):
+            for right in range(-(shape[1] // 2), shape[1] // 2 + 1):
+                there = [slice(max(0, s), n + min(0, s)) for s, n in zip((down, right), shape, strict=True)]
+                here = [slice(max(0, -s), n + min(0, -s)) for s, n in zip((down, right), shape, strict=True)]
+                found[right, down] = (a[*here] * b[*there]).sum() / np.sqrt((a * a).sum() * (b * b).sum())
+        best = max(found, key=lambda shift: found[shift])
+        right, down, score = shift_between(a, b)
+        assert (right, down) == best
+        assert score == pytest.approx(found[best], abs=1e-6)
