@@ -277,6 +277,24 @@ def test_a_view_within_matter_is_refused(tmp_path):
     assert alone.order.tolist() == [0]
 
 
+def test_a_view_is_within_matter_nearer_than_a_fiftieth_of_the_usual_depth():
+    """Views of a flat wall, whose depths are the distances to it, of the same sight in any unit."""
+    x, y = (a.ravel() for a in np.meshgrid(np.linspace(-6, 6, 121), np.linspace(-6, 6, 121)))
+    wall = Splats.create(
+        np.stack([x, y, 0 * x], axis=1),
+        scales=np.tile([0.1, 0.1, 1e-4], (len(x), 1)),
+        logit_opacities=3 + 0 * x,
+    )
+    away = np.array([2.0] * 5 + [0.1, 0.06, 0.044, 0.036, 0.025, 0.015])
+    eyes = np.stack([np.linspace(-2, 2, len(away)), 0 * away, away], axis=1)
+    cameras = views(eyes, eyes - [0, 0, 1])
+    for unit in (1, 1e3):
+        scene, pool = in_units(wall, cameras, unit)
+        depths, _ = poses.outlooks(surface(scene, 5000), pool)
+        inside = poses.inside_geometry(scene, pool, depths, lambda *_: None)
+        np.testing.assert_array_equal(inside, away < 0.04)
+
+
 def test_auto_k_stops_at_the_bend():
     ring = np.repeat(np.linspace(0, 2 * np.pi, 6, endpoint=False), 10)
     rng = np.random.default_rng(4)
