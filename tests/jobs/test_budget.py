@@ -144,6 +144,11 @@ def test_a_result_that_is_too_large_is_merged_further() -> None:
     assert "merging 1,000 to " in said[0]
 
 
+@pytest.mark.parametrize("count", [2, 3, 40])
+def test_a_size_that_no_count_fits_leaves_one_gaussian(count: int) -> None:
+    assert len(Aim(count, bytes=1, file="a.ply").shrink(checkered_ball(count))) == 1
+
+
 def test_bytes_are_of_the_degree_that_is_written() -> None:
     scene, said = checkered_ball(3000), []
     small = g2ard.distill(scene, fit="300kB", sh_degree=3, steps=3, size=64, say=said.append)

@@ -11,6 +11,9 @@ from g2ard.config.choices import Colour
 from g2ard.errors import InputError
 from g2ard.io.types import Points
 from g2ard.jobs import view_checks
+from g2ard.jobs.budget import Budget
+from g2ard.jobs.distill import prepare
+from g2ard.jobs.distill_options import DistillOptions
 from g2ard.jobs.view_checks import check_photos
 from g2ard.scene.splats import SH_C0
 from helpers.photos import photographed
@@ -67,3 +70,17 @@ def test_few_gaussians_are_too_little_to_reject_photos(
     assert "does not look like the photos (correlation 0.10)" in said[0]
     with pytest.raises(InputError, match="the photos do not show the scene"):
         check_photos(BALL, photos, (0, 0, 0), said.append)
+
+
+@pytest.mark.parametrize("kind", ["renders", "photos", "both"])
+def test_a_job_uses_photos_over_renders_where_it_has_both(kind: str, tmp_path: Path) -> None:
+    pictured = photographed(tmp_path, BALL, VIEWS)
+    views = {
+        "renders": VIEWS,
+        "photos": pictured,
+        "both": replace(pictured, image_paths=(*pictured.image_paths[:6], *[None] * 6)),
+    }[kind]
+    job = prepare(BALL, Budget(300), DistillOptions(views=views))
+    assert job.photos_over_renders == (kind == "both")
+    assert job.reads_photos == (kind != "renders")
+    assert (job.teacher is None) == (kind == "photos")
