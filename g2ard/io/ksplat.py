@@ -127,7 +127,7 @@ def _rows(
     if level == 2:
         values = values / 255 * (limits[1] - limits[0]) + limits[0]
     for first, last in ((0, 9), (9, 24), (24, 45))[: section.degree]:
-        band = values[:, first:last].reshape(section.rows, 3, -1)
+        band = values[:, first:last].reshape(section.rows, 3, (last - first) // 3)
         raw.shN[:, first // 3 : last // 3] = band.transpose(0, 2, 1)
     return raw, end
 

@@ -1,5 +1,6 @@
 """.ksplat of GaussianSplats3D: files that it wrote (see `ksplat/README.md`), and damaged copies."""
 
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +9,7 @@ import pytest
 from g2ard.errors import InputError
 from g2ard.io import kind, read_scene
 from helpers.packed_files import truth, unpacked_ksplat
+from helpers.scenes import assert_same_bits
 
 
 @pytest.mark.parametrize(
@@ -32,6 +34,18 @@ def test_ksplat(name: str, degree: int, place: float, size: float, harmonics: fl
     np.testing.assert_allclose(found.opacities, scene.opacities, atol=1 / 255)
     np.testing.assert_allclose(found.colors, scene.colors, atol=1 / 255)
     np.testing.assert_allclose(found.shN, scene.shN[:, : (degree + 1) ** 2 - 1], atol=harmonics)
+
+
+@pytest.mark.parametrize("rows", [0, 1, 50, 60, 61, 2**32 - 1])
+def test_a_section_may_have_room_for_more_rows(rows: int, tmp_path: Path) -> None:
+    path = unpacked_ksplat("level0-sh2", tmp_path)
+    whole, data = read_scene(path).splats, path.read_bytes()
+    path.write_bytes(data[:4096] + struct.pack("<I", rows) + data[4100:])
+    if rows:
+        assert_same_bits(read_scene(path).splats, whole.take(range(min(rows, 60))))
+    else:
+        with pytest.raises(InputError, match="Gaussian"):
+            read_scene(path)
 
 
 @pytest.mark.parametrize(

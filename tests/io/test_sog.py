@@ -190,6 +190,19 @@ def test_a_gap_in_a_codebook_drops_what_names_it(tmp_path: Path) -> None:
     assert [(n.code, n.count) for n in found.notes] == [("dropped_rows", 1)]
 
 
+@pytest.mark.parametrize("part", ["scales", "sh0", "shN"])
+def test_a_codebook_holds_each_number_that_is_named(tmp_path: Path, part: str) -> None:
+    files = parts()
+    codes = webp(square(3 * np.arange(40).reshape(10, 4) % 8))
+    files |= {"scales.webp": codes, "sh0.webp": codes}
+    files["shN_centroids.webp"] = webp(np.arange(2 * 64 * 3 * 3).reshape(2, 64 * 3, 3) % 8)
+    book = np.linspace(-1, 1, 8).tolist()
+    assert len(read_splats(folder(tmp_path / "whole", within(files, part, "codebook", book)))) == 10
+    path = folder(tmp_path / "short", within(files, part, "codebook", book[:7]))
+    with faulty(path / "meta.json", (f"{part}.codebook", None)):
+        read_splats(path)
+
+
 @pytest.mark.parametrize(
     ("changes", "fault"),
     [

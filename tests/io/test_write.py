@@ -195,7 +195,7 @@ def test_spz_version_3_is_the_default_and_holds_what_version_4_does(tmp_path: Pa
     assert_same_bits(read_splats(three), read_splats(four))
 
 
-@pytest.mark.parametrize("fine", [2e-2, 1e-3, 2e-5])
+@pytest.mark.parametrize("fine", [2e-2, 1e-3, 3e-4, 1e-4, 2e-5])
 def test_spz_steps_suit_the_finest_gaussians(tmp_path: Path, fine: float) -> None:
     truth = scene(700, 0)
     scales = np.full((700, 3), 0.1, np.float32)
