@@ -17,6 +17,7 @@ from g2ard.errors import InputError
 from g2ard.io import read_splats, write_splats
 from g2ard.io.tile_store import TileStore
 from g2ard.progress import silent
+from g2ard.rendering.renderer import RasterSettings
 from g2ard.rendering.targets import TeacherRenders
 from g2ard.rendering.visibility import visibility_source
 from g2ard.scene.cameras import Cameras, look_at
@@ -28,7 +29,7 @@ from g2ard.stages.simplify.growth import GROWTHS
 from g2ard.tiles.executor import Workers, executor
 from g2ard.tiles.ingest import ingest
 from g2ard.tiles.merging import TiledScene, cheapest, plan_ends, simplify_tiles
-from g2ard.tiles.steps import GONE, TiledRun
+from g2ard.tiles.steps import GONE, TiledRun, _add_until_converged
 from g2ard.tiles.tasks import Task
 from helpers.systems import needs_proc, workers_of
 from helpers.tiled_scenes import reduced, ring, town
@@ -153,6 +154,39 @@ def test_tiles_that_no_view_sees_keep_their_share(store: TileStore, tmp_path: Pa
     assert len(small) == 900
     rows = [len(core) for core, _ in store.tree.route(small.means)]
     assert min(rows) > 20
+
+
+def test_rows_that_no_view_sees_are_counted(tmp_path: Path) -> None:
+    """Of those that have an opacity, for others are never drawn."""
+    scene = town()
+    scene.logit_opacities[:] = 1
+    write_splats(tmp_path / "a.ply", scene)
+    tiles = ingest(tmp_path / "a.ply", tmp_path / "tiles", tile_rows=3000)
+    K = [[300, 0, 40], [0, 300, 30], [0, 0, 1]]
+    west = [(-4, 0, 9), (-6, 2, 9), (-5, -2, 9)]  # straight down on the western half
+    down = [look_at(eye, [eye[0], eye[1] + 1e-3, 0]) for eye in west]
+    views = Cameras.from_lists(down, [K] * 3, [(80, 60)] * 3, ["a", "b", "c"])
+    with executor() as runs:
+        done = simplify_tiles(TiledRun(tiles, Workers(runs, tmp_path), SimplifyConfig()), 900, views)
+    unseen = np.count_nonzero(visibility_source(views)(scene).weight == 0)
+    assert done.unseen == pytest.approx(unseen, rel=0.02)
+    assert len(scene) / 2 < unseen < len(scene)
+
+
+@pytest.mark.parametrize(("found", "rounds"), [(5, 2), (9, 2), (10, 4), (20, 4)])
+def test_views_are_added_until_a_round_finds_under_a_hundredth_more(found: int, rounds: int) -> None:
+    class Sums:
+        weight = np.zeros(1000)
+
+        def add(self, views: list[object], *_: object) -> None:
+            at = np.count_nonzero(self.weight)
+            self.weight[at : at + found] = 1
+
+        def by_row(self) -> tuple[np.ndarray]:
+            return (self.weight,)
+
+    used = _add_until_converged(Sums(), ring(64), RasterSettings(), 1000)
+    assert len(used) == len(set(used)) == rounds * 16
 
 
 def test_workers_and_row_order_change_no_bit(
