@@ -3,6 +3,7 @@
 import math
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -180,6 +181,23 @@ def test_views_that_see_through_each_other_s_surfaces_make_a_prior_noisy() -> No
     moved = view_consistency(replace(ball, offset=ball.offset + far), views.recentred(-far))
     assert moved == pytest.approx(sound, abs=0.01)
     assert view_consistency(ball, views.take([0])) is None
+
+
+@pytest.mark.parametrize(("ratio", "agree"), [(1, 1), (1.04, 1), (1.06, 0), (1.3, 0), (0.96, 1), (0.94, 0)])
+def test_depths_agree_within_a_twentieth(ratio: float, agree: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two views from one place, one of which sees everything `ratio` times as far."""
+    views = around(2, (32, 24))
+    views = replace(views, viewmats=views.viewmats[[0, 0]])
+    depths = iter([2.0, 2 * ratio, 2 * ratio, 2.0])
+
+    class Renders:
+        def __init__(self, *_: object, **__: object) -> None: ...
+
+        def render(self, view: object, median: bool) -> SimpleNamespace:
+            return SimpleNamespace(median=np.full((24, 32), next(depths)))
+
+    monkeypatch.setattr("g2ard.stages.recover.auto_preset.Renderer", Renders)
+    assert view_consistency(checkered_ball(10), views) == agree
 
 
 def test_a_scaled_schedule_keeps_its_proportions() -> None:

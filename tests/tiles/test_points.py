@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -146,3 +147,18 @@ def test_bad_points_are_dropped_and_noted(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="none of its 500 points is finite"):
         ingest(save(tmp_path / "b.ply", properties, dtype="f8"), tmp_path / "b", tile_rows=100)
     assert not (tmp_path / "b").exists()
+
+
+@pytest.mark.parametrize(("free", "fits"), [(100, False), (200, True)])
+def test_a_disk_without_room_for_points_and_tiles_is_refused(
+    free: int, fits: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A point takes 48 bytes until it is lifted, its Gaussian 56."""
+    path = ply(tmp_path / "cloud.ply", streets(4000))
+    monkeypatch.setattr("shutil.disk_usage", lambda _: SimpleNamespace(free=4000 * free))
+    if fits:
+        assert ingest(path, tmp_path / "tiles", tile_rows=4000).count == 4000
+    else:
+        with pytest.raises(OutputError, match="the disk has"):
+            ingest(path, tmp_path / "tiles", tile_rows=4000)
+        assert [file.name for file in tmp_path.iterdir()] == ["cloud.ply"]
