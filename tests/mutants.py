@@ -4,11 +4,11 @@
     python tests/mutants.py python --count 100 --seed 1
     python tests/mutants.py rust --count 50 --seed 1
 
-The working tree is copied, so nothing in it changes. For Python, the tests are first run once under coverage;
-a change is then tested by those tests that execute its line, the nearest and fastest first, in a fork of a
-process that has imported torch. For Rust, all
-changes go into one build of the core's tests, and a variable of the environment selects one of them. Each
-line of the output is one change: killed, or survived.
+The working tree is copied and does not change. For Python, the tests run once under coverage, about half an
+hour on two cores. Each change is then tested by the tests that execute its line, those of its module and the
+fastest first, in a fork of a process that has imported torch. For Rust, one build of the core's tests holds
+all changes, and an environment variable selects one. Survivors need a look: slow tests, tests of other
+packages and, for Rust, the tests of Python take no part, and some changes have no effect.
 """
 
 import argparse
@@ -239,7 +239,7 @@ class Covered:
             part.read()
 
     def tests(self, change: Change, module: str) -> list[str]:
-        """Return tests of about `TESTS_OF_SECONDS`; those whose file imports the module come first.
+        """Return tests of about `TESTS_OF_SECONDS`; those whose file is named like the module come first.
 
         A line that runs once, when its module is imported, is left to the tests that execute any line of it.
         """
