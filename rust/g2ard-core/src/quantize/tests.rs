@@ -123,6 +123,31 @@ fn palettes_find_separate_groups_and_their_weighted_means() {
 }
 
 #[test]
+fn the_unit_of_the_weights_does_not_matter() {
+    let (rows, weights) = blobs();
+    let mut random = Lcg(24);
+    let values: Vec<f32> = (0..9000).map(|_| random.centred() as f32).collect();
+    let value_weights: Vec<f32> = (0..9000).map(|_| random.uniform_f32()).collect();
+    let found = |unit: f32| {
+        let scaled = |weights: &[f32]| -> Vec<f32> { weights.iter().map(|w| w * unit).collect() };
+        let entries = palette(
+            &rows,
+            9,
+            Some(&scaled(&weights)),
+            12,
+            4,
+            &Control::default(),
+        );
+        let book = codebook(&values, Some(&scaled(&value_weights)), 64);
+        (entries.unwrap(), book.unwrap())
+    };
+    let whole = found(1.0);
+    for power in [-30, -12, 9] {
+        assert_eq!(found(2f32.powi(power)), whole, "{power}");
+    }
+}
+
+#[test]
 fn palettes_end_on_values_of_any_magnitude() {
     let (values, weights) = blobs();
     for scale in [0.0, 1e-40, 1e-30, 1e-20, 1e18, 1e25, 3e37] {

@@ -237,6 +237,21 @@ mod tests {
     }
 
     #[test]
+    fn targets_are_shares_that_grow_with_the_angle_to_the_surface() {
+        let anchors = sphere(16);
+        for kappa in [0.0f64, 2.0, 40.0] {
+            for n in sphere(5) {
+                let shares = target(&anchors, n, kappa);
+                assert!((shares.iter().sum::<f64>() - 1.0).abs() < 1e-12);
+                for (a, share) in anchors.iter().zip(&shares) {
+                    let ratio = (kappa * (dot(*a, n).abs() - dot(anchors[0], n).abs())).exp();
+                    assert!((share / (ratio * shares[0]) - 1.0).abs() < 1e-9, "{kappa}");
+                }
+            }
+        }
+    }
+
+    #[test]
     fn utilities_have_the_slope_that_their_exponent_says() {
         for alpha in [0.0, 0.5, 1.0, 2.0, 3.0] {
             let coverage = Coverage {

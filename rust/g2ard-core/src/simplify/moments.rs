@@ -158,6 +158,32 @@ mod tests {
     }
 
     #[test]
+    fn merged_opacities_hold_the_mass_up_to_the_largest() {
+        let splats = Splats {
+            logit_opacities: vec![-3.0],
+            sh: vec![[0.0; 3]],
+            sh_coeffs: 1,
+            ..Splats::default()
+        };
+        for scale in [0.3, 1.0, 20.0] {
+            let gaussian = Gaussian {
+                mean: [0.0; 3],
+                rotation: [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]],
+                scales: [scale; 3],
+            };
+            for depth in [1e-6f64, 0.01, 0.7, 3.0, 4.6, 4.7, 30.0, 1e4] {
+                let mass = depth * footprint(gaussian.scales);
+                let merged = Merged::of(&splats, &[0], &[1.0], mass, gaussian);
+                let want = (-(-depth).exp_m1()).min(MAX_OPACITY);
+                assert!((sigmoid(merged.logit) / want - 1.0).abs() < 1e-6, "{depth}");
+                assert_eq!(merged.clamped, want == MAX_OPACITY, "{depth}");
+            }
+            let none = Merged::of(&splats, &[0], &[1.0], 0.0, gaussian);
+            assert_eq!(none.logit, -3.0);
+        }
+    }
+
+    #[test]
     fn pooling_conserves_moments_far_from_the_origin() {
         let at = |x: f64| [5.4e6 + x, -3e5, 12.0];
         let unit = [1e-4, 0.0, 0.0, 1e-4, 0.0, 1e-4];
