@@ -591,3 +591,14 @@ def test_attributes_of_a_glb_may_be_normalised_integers(tmp_path: Path, name: st
     for attribute, field in STORED.items():
         step = 0.51 / np.iinfo(dtype).max if attribute == name else 1e-7
         np.testing.assert_allclose(getattr(found, field), getattr(plain, field), atol=step)
+
+
+@pytest.mark.parametrize("suffix", ["sog", "spz", "usda"])
+def test_formats_that_take_long_to_pack_report_their_progress(tmp_path: Path, suffix: str) -> None:
+    told: list[tuple[int, int]] = []
+    write_splats(
+        tmp_path / f"a.{suffix}", scene(300), progress=lambda _, done, total: told.append((done, total))
+    )
+    assert told == sorted(told)
+    assert told[-1][0] == told[-1][1] > 0
+    assert len({total for _, total in told}) == 1
