@@ -95,6 +95,9 @@ def test_one_tile_is_the_whole_to_the_bit(seen: bool) -> None:
     assert len(a) == 2 * budget
     assert (costs >= 0).all()
     out = here.assemble(clusters(of, a, b, 3 * budget), budget)
+    alone = here.assemble(np.arange(len(prepared), dtype=np.uint32), len(prepared))
+    assert (alone["needed_growth"] == 1).all()
+    assert out["needed_growth"].max() > 1
     both = [
         (np.float32(out["means"]), out["logit_opacities"]),
         (np.float32(whole.means), whole.logit_opacities),

@@ -199,3 +199,34 @@ impl Pinhole {
         ))
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn slopes_are_limited_to_the_image_and_15_percent_beyond_each_side() {
+        for (focal, center, size) in [
+            ([60.0, 60.0], [31.0, 24.0], [63, 47]),
+            ([400.0, 30.0], [-5.0, 90.0], [32, 80]),
+        ] {
+            let view = Pinhole::of(&Camera {
+                viewmat: [[0.0; 4]; 3],
+                fx: focal[0],
+                fy: focal[1],
+                cx: center[0],
+                cy: center[1],
+                width: size[0],
+                height: size[1],
+                near: 0.01,
+            });
+            for k in 0..2 {
+                let side = size[k] as f32;
+                for (limit, pixel) in view.limits[k].into_iter().zip([-0.15 * side, 1.15 * side]) {
+                    let at = view.focal[k] * limit + view.center[k];
+                    assert!((at - pixel).abs() < 1e-3, "{k}: {at} {pixel}");
+                }
+            }
+        }
+    }
+}

@@ -192,6 +192,28 @@ mod tests {
     }
 
     #[test]
+    fn a_cell_weighs_its_members_by_footprint_in_any_unit() {
+        for unit in [1e-4, 1.0, 1e4] {
+            for (opacities, share) in [([0.4, 0.8], 0.8), ([0.4, 0.0], 0.0), ([0.0, 0.0], 0.5)] {
+                let scene = Gaussians {
+                    means: &[[unit, 0.0, 0.0], [3.0 * unit, 0.0, 0.0]],
+                    quats: &[[1.0, 0.0, 0.0, 0.0]; 2],
+                    scales: &[[0.1, 0.1, 0.01], [0.2, 0.1, 0.01]]
+                        .map(|s| s.map(|v| v * unit as f32)),
+                    opacities: &opacities,
+                };
+                let (center, _, _, area) = cell(&scene, &[0, 1]);
+                assert!(
+                    (center[0] / unit - 1.0 - 2.0 * share).abs() < 1e-5,
+                    "{unit}"
+                );
+                let want: f64 = 0.01 * f64::from(opacities[0]) + 0.02 * f64::from(opacities[1]);
+                assert!((area / (unit * unit) - want).abs() < 1e-6);
+            }
+        }
+    }
+
+    #[test]
     fn weights_sum_to_one_and_the_largest_hundredth_is_cut() {
         let mut weights: Vec<f64> = (1..=1001).map(f64::from).collect();
         weights[1000] = 1e9;
