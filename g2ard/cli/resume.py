@@ -99,9 +99,7 @@ def stoppable(run: Run, place: Path, resume: bool, output: Path) -> Iterator[Non
             if is_taken(output) and not run.overwrite:  # another run wrote it since it was checked
                 raise OutputError("exists", path=output, hint="{overwrite=True} replaces it")
             _drop_temporaries(place, output)
-            if resume and left_at(place):
-                say_from(run, place, output)
-            with _kept(run, place, resume):
+            with kept(run, place, resume, output, f"from {place}"):
                 yield
     finally:
         drop_empty(made)
@@ -120,14 +118,21 @@ def _drop_temporaries(place: Path, output: Path) -> None:
 
 
 @contextmanager
-def _kept(run: Run, place: Path, resume: bool) -> Iterator[None]:
+def kept(run: Run, place: Path, resume: bool, what: Path, where: str) -> Iterator[None]:
+    """Remove checkpoints at `place` unless they are resumed; after an error or Ctrl-C say `where` they are.
+
+    Args:
+        what: output that the command writes.
+    """
     if not resume:
         _remove(place)
+    elif left_at(place):
+        say_from(run, place, what)
     try:
         yield
     except (Exception, KeyboardInterrupt) as error:
         if left_at(place) and not (resume and isinstance(error, InputError)):
-            run.kept.append(f"run the same command with --resume to continue from {place}")
+            run.kept.append(f"run the same command with --resume to continue {where}")
         raise
     else:
         _remove(place)
@@ -137,14 +142,19 @@ def _kept(run: Run, place: Path, resume: bool) -> Iterator[None]:
 
 
 def say_from(run: Run, place: Path, what: Path) -> None:
-    """Say where a resumed run continues: its finished stages, and the steps of a stage under way."""
+    """Say where a resumed run continues: after its finished steps, or from a step of recovery."""
     from g2ard.stages.recover.checkpoint import steps_at
 
-    files = sorted(place.glob("[!.]*.npz")) if place.is_dir() else [place]
-    steps = [count for file in files if (count := steps_at(file)) is not None]
-    done = [file.stem for file in files if place.is_dir() and not file.stem.endswith(".checkpoint")]
-    parts = [f"after {', '.join(done)}"] * bool(done) + [f"from step {count:,}" for count in steps]
-    run.say(f"{what}: continues {' '.join(parts) or f'from {place}'}")
+    done = finished_steps(place)
+    steps = None if place.is_dir() else steps_at(place)
+    where = f"after {', '.join(done)}" if done else f"from {place if steps is None else f'step {steps:,}'}"
+    run.say(f"{what}: continues {where}")
+
+
+def finished_steps(place: Path) -> list[str]:
+    """Return the names of finished steps in a folder of checkpoints."""
+    stems = (path.stem for path in sorted(place.glob("[!.]*.npz")))  # the name, and a hash of 16 digits
+    return list(dict.fromkeys(stem[:-17] for stem in stems if not stem.endswith(".checkpoint")))
 
 
 def left_at(place: Path) -> bool:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
@@ -11,11 +10,19 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from g2ard.cli.frame import Run
-from g2ard.cli.resume import OPTIONS, check_stopped, finished_before, is_finished, left_at, say_from
+from g2ard.cli.resume import (
+    OPTIONS,
+    check_stopped,
+    finished_before,
+    finished_steps,
+    is_finished,
+    kept,
+    left_at,
+)
 from g2ard.config.choices import Colour, ViewFormat
 from g2ard.errors import InputError, OutputError
 from g2ard.io import write_views
-from g2ard.io.atomic import atomic_output, check_output, drop_temporaries
+from g2ard.io.atomic import atomic_output, check_output, drop_empty, drop_temporaries
 from g2ard.io.jsonfile import read_json
 from g2ard.io.lock import check_unlocked, locked
 from g2ard.io.paths import file_identity
@@ -44,11 +51,9 @@ _VIEW_FILES: dict[ViewFormat, str] = {
 
 _CALL_OPTIONS = (
     *("output", "resume", "keep", "page", "dry_run", "threads", "device"),
-    *("memory", "workers", "scheduler", "work", "views_format"),
+    *("memory", "workers", "scheduler", "work", "views_format", "count", "ratio"),
 )
-"""Options that may change when a run is resumed. `device` may change except to or from CUDA."""
-_BUDGET_OPTIONS = ("count", "ratio")
-"""Budget options; each folder has one budget."""
+"""Options that may be others than a finished run's: `device` except CUDA, and budgets of the same count."""
 
 
 class RunFolder:
@@ -82,24 +87,19 @@ class RunFolder:
             check_output(self.path, self._run.overwrite, folder=True)
         if left or not self._resume:
             check_stopped(self._run, self.work, self._resume, self.scene)
-        if self._resume and left:
-            self._check_same(self.work / OPTIONS, budget, "begun")
-        elif self.is_done:
-            self._check_same(self._report, budget, "finished")
-            self._check_inputs()
+        if self.is_done:
+            self._check_same(budget)
 
-    def _check_same(self, record: Path, budget: Budget, how: str) -> None:
-        """Raise an `OutputError` if the budget or options that an earlier run recorded differ."""
-        if record.exists() and (others := _others(self._run, read_json(record), budget)):
+    def _check_same(self, budget: Budget) -> None:
+        """Raise an `OutputError` if the finished run's budget, options or input files were others."""
+        record = read_json(self._report)
+        if others := _others(self._run, record, budget):
             raise OutputError(
-                f"{how} with other options ({', '.join(others)})",
+                f"finished with other options ({', '.join(others)})",
                 path=self.path,
                 hint="-w without --resume starts over",
             )
-
-    def _check_inputs(self) -> None:
-        """Raise an `OutputError` if a file that the finished run read is another one now."""
-        for name, known in read_json(self._report).get("inputs", {}).items():
+        for name, known in record.get("inputs", {}).items():
             path = Path(name)
             if path.is_file() and file_identity([path]) != [known]:
                 raise finished_before(self.path, path)
@@ -110,54 +110,37 @@ class RunFolder:
         return read_json(self._report)
 
     @contextmanager
-    def writing(self, photos: Iterable[Path] = ()) -> Iterator[bool]:
-        """Create the folder and yield whether it is new; no other run may write here meanwhile.
+    def writing(self, photos: Iterable[Path] = ()) -> Iterator[None]:
+        """Create the folder; no other run may write here meanwhile, and an empty folder is removed.
 
         Args:
             photos: files that the run reads, besides those of its options.
         """
         files = [*self._run.input_files(), *photos]
         self._inputs = dict(zip(map(str, files), file_identity(files), strict=True))
-        made = not self.path.exists()
+        made = [] if self.path.exists() else [self.path]
         self.path.mkdir(parents=True, exist_ok=True)
-        with locked(self.path):
-            if self.scene.exists() and not (self._run.overwrite or left_at(self.work)):
-                raise OutputError("exists", path=self.path, hint="{overwrite=True} replaces it")
-            drop_temporaries(self.path)
-            yield made
+        try:
+            with locked(self.path):
+                if self.scene.exists() and not (self._run.overwrite or left_at(self.work)):
+                    raise OutputError("exists", path=self.path, hint="{overwrite=True} replaces it")
+                drop_temporaries(self.path)
+                yield
+        finally:
+            drop_empty(made)
 
     @contextmanager
     def working(self, input_count: int, output_count: int, photos: Iterable[Path]) -> Iterator[None]:
         """Create the folder for checkpoints; after an error or Ctrl-C, keep what it holds."""
-        with self.writing(photos) as made, self._working(input_count, output_count, made=made):
-            yield
-
-    @contextmanager
-    def _working(self, input_count: int, output_count: int, *, made: bool) -> Iterator[None]:
-        run = self._run
-        if self._resume and not left_at(self.work):
-            run.say(f"{self.path}: nothing to resume, starting over")
-        elif self._resume:
-            say_from(run, self.work, self.path)
-        if not self._resume:
-            shutil.rmtree(self.work, ignore_errors=True)
-        self.work.mkdir(parents=True, exist_ok=True)
-        if not left_at(self.work):
-            told = {"input_count": input_count, "output_count": output_count, "config": run.config}
-            text = json.dumps(told, default=str)
-            (self.work / OPTIONS).write_text(text, encoding="utf-8", newline="\n")
-        try:
-            yield
-        except (Exception, KeyboardInterrupt) as error:
-            if left_at(self.work):
-                if not (self._resume and isinstance(error, InputError)):
-                    run.kept.append(f"run the same command with --resume to continue in {self.path}")
-            else:
-                shutil.rmtree(
-                    self.path if made and not self.scene.exists() else self.work, ignore_errors=True
-                )
-            raise
-        shutil.rmtree(self.work)
+        with self.writing(photos):
+            if self._resume and not left_at(self.work):
+                self._run.say(f"{self.path}: nothing to resume, starting over")
+            with kept(self._run, self.work, self._resume, self.path, f"in {self.path}"):
+                self.work.mkdir(parents=True, exist_ok=True)
+                told = {"input_count": input_count, "output_count": output_count, "config": self._run.config}
+                text = json.dumps(told, default=str)
+                (self.work / OPTIONS).write_text(text, encoding="utf-8", newline="\n")
+                yield
 
     def write_scene(self, splats: Splats | TiledScene, *, compare: bool = False) -> None:
         """Write the scene, and remove an earlier run's scenes in other formats and the pages about them.
@@ -239,15 +222,14 @@ def stopped_run(folder: Path) -> dict[str, Any] | None:
     if not left_at(work):
         return None
     told = read_json(work / OPTIONS) if (work / OPTIONS).exists() else {}
-    kept = sorted(path.name.removesuffix(".npz") for path in work.glob("[!.]*.npz"))
-    return {"path": str(folder), "kind": "stopped run", "kept": kept, **told}
+    return {"path": str(folder), "kind": "stopped run", "kept": finished_steps(work), **told}
 
 
 def _others(run: Run, before: Mapping[str, Any], budget: Budget) -> list[str]:
     """Return the names of options whose values differ from those of an earlier run."""
     then = before.get("config", {})
     now = json.loads(json.dumps(run.config, default=str))
-    names = [name for name in now if name in then and name not in (*_CALL_OPTIONS, *_BUDGET_OPTIONS)]
+    names = [name for name in now if name in then and name not in _CALL_OPTIONS]
     found = [name.replace("_", "-") for name in names if now[name] != then[name]]
     if "cuda" in (now["device"], then.get("device")) and now["device"] != then.get("device"):
         found.append("device")

@@ -131,8 +131,7 @@ class LevelsJob:
                 level = self.job.prior
                 report = LevelReport(len(level), 1.0, level_size(self.job.views.train.cameras, 1), 0.0)
             else:
-                place = None if self.work is None else self.work / f"level-{len(splats)}"
-                level, finer, report = _level(self.job, finer, count, ratio, self.recover, place)
+                level, finer, report = _level(self.job, finer, count, ratio, self.recover, self.work)
             self.job.say(report.line(len(splats)))
             splats.append(level)
             reports.append(report)
@@ -271,8 +270,6 @@ def _level(
     held_out = scorable(job.targets_for(job.views.test.resized(longest)), job.say)
     if recover:
         apart = None if job.views.apart is None or job.teacher is None else job.views.apart.resized(longest)
-        if work is not None:
-            work.mkdir(parents=True, exist_ok=True)
         done = pipeline(
             finer,
             count,

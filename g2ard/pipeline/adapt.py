@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -15,18 +14,19 @@ from g2ard.config.checks import AtLeastOne, NotNegative, Within, checks_argument
 from g2ard.config.choices import AdaptSchedule
 from g2ard.errors import InputError
 from g2ard.io.reports import Report
+from g2ard.pipeline.steps import Steps
 from g2ard.progress import Progress, plural, silent
 from g2ard.rendering.renderer import Renderer
-from g2ard.rendering.targets import Targets, checked_targets, fingerprint_of, mask_of
+from g2ard.rendering.targets import Targets, checked_targets, mask_of
 from g2ard.rendering.visibility import visibility
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.samples import evenly_spaced
 from g2ard.scene.splats import SH_C0, Splats
-from g2ard.stages.recover import RecoverConfig, checkpoint, recover
+from g2ard.stages.recover import RecoverConfig
 from g2ard.stages.recover.anchors import FREE
 from g2ard.stages.recover.config import FitConfig
 from g2ard.stages.recover.probe import Probe
-from g2ard.stages.recover.report import Gain
+from g2ard.stages.recover.report import Gain, RecoverReport
 from g2ard.stages.recover.schedule import PAPER, TUNED, Schedule
 
 _FITTED_VIEWS = 16
@@ -254,84 +254,36 @@ class Adapted:
         return f"Adapted({plural(len(self.splats), 'Gaussian')}, {self.report.psnr})"
 
 
-@dataclass(eq=False)
-class _Fit:
-    """A fit in stretches, whose state is kept in `work`, if given.
+def _fit(
+    start: Splats, targets: Targets, config: AdaptConfig, steps: Steps, progress: Progress
+) -> tuple[Splats, list[RecoverReport]]:
+    """Recover with frozen geometry in stretches, until one gains less than the tolerance."""
+    scene, before = start, 0
+    reports: list[RecoverReport] = []
 
-    Args:
-        key: fingerprint that checkpoints must have; unused without `work`.
-    """
+    def told(stage: str, done: int, total: int, info: Mapping[str, Any] | None = None) -> None:
+        progress(stage, before + done, config.steps, info or {})
 
-    splats: Splats
-    targets: Targets
-    config: AdaptConfig
-    key: str
-    work: Path | None
-    progress: Progress
-    seconds: float = 0.0
-    converged: bool = False
-    stretches: list[dict[str, Any]] = field(default_factory=list)
-
-    def run(self) -> None:
-        """Take stretches until one gains less than the tolerance; continue from those in `work`."""
-        lengths = self.config.stretches()
-        self._restore()
-        while len(self.stretches) < len(lengths) and not self.converged:
-            self._stretch(lengths[len(self.stretches)])
-            self._save()
-        taken = sum(stretch["steps"] for stretch in self.stretches)
-        self.progress("adapt", taken, taken, {})
-
-    def _stretch(self, steps: int) -> None:
-        config = self.config
+    for length in config.stretches():
         how = RecoverConfig(
             schedule=config.recovery,
-            steps=steps,
+            steps=length,
             regularizers=FREE,  # geometry is frozen
             ssim_weight=config.ssim_weight,
             background=config.background,
-            seed=config.seed + len(self.stretches),
+            seed=config.seed + len(reports),
             engine=config.engine,
         )
-        within = self._steps(len(self.stretches))
-        before = sum(stretch["steps"] for stretch in self.stretches)
-
-        def progress(stage: str, done: int, total: int, info: Mapping[str, Any] | None = None) -> None:
-            self.progress(stage, before + done, config.steps, info or {})
-
-        told = silent if self.progress is silent else progress
-        recovered = recover(self.splats, self.targets, how, checkpoint=within, progress=told, stage="adapt")
-        gain, old = recovered.report.psnr, self.splats
-        new = recovered.splats
-        self.splats = replace(old, logit_opacities=new.logit_opacities, sh0=new.sh0, shN=new.shN)
-        self.stretches.append({"steps": steps, "psnr": gain.after})
-        self.seconds += recovered.report.seconds
-        self.converged = gain.after - gain.before < config.tolerance
-
-    def _save(self) -> None:
-        if self.work:
-            meta = {name: getattr(self, name) for name in ("seconds", "converged", "stretches")}
-            arrays = {name: getattr(self.splats, name) for name in ("logit_opacities", "sh0", "shN")}
-            checkpoint.save(self.work / "stretches.npz", self.key, meta, arrays)
-            self._drop_steps()
-
-    def _steps(self, stretch: int) -> Path | None:
-        """Return the file for the steps within a stretch."""
-        return self.work / f"steps-{stretch + 1}.npz" if self.work else None
-
-    def _drop_steps(self) -> None:
-        """Remove the steps of finished stretches, also if a run ended before it did so."""
-        for stretch in range(len(self.stretches)):
-            if path := self._steps(stretch):
-                path.unlink(missing_ok=True)
-
-    def _restore(self) -> None:
-        if self.work and (self.work / "stretches.npz").exists():
-            meta, arrays = checkpoint.load(self.work / "stretches.npz", self.key)
-            self.splats = replace(self.splats, **arrays)
-            self.seconds, self.converged = meta["seconds"], meta["converged"]
-            self.stretches = meta["stretches"]
-            self._drop_steps()
+        name = f"stretch-{len(reports) + 1}"
+        tell = silent if progress is silent else told
+        new, report = steps.recover(name, scene, targets, how, progress=tell, stage="adapt")
+        scene = replace(scene, logit_opacities=new.logit_opacities, sh0=new.sh0, shN=new.shN)
+        reports.append(report)
+        before += length
+        if report.psnr.after - report.psnr.before < config.tolerance:
+            break
+    progress("adapt", before, before, {})
+    return scene, reports
 
 
 @checks_arguments
@@ -355,15 +307,15 @@ def adapt(
         compact: the scene; cameras are in world coordinates, including its offset.
         targets: photos, or renders of a scene with the wanted appearance.
         config: see `AdaptConfig`.
-        work: existing folder for checkpoints, written after every stretch, every minute and at Ctrl-C. The
-            same call resumes from them, with the same result.
+        work: existing folder for finished stretches and for checkpoints, written every minute and at Ctrl-C.
+            The same call resumes from them, with the same result.
         progress: called after every step.
 
     Returns:
         The scene with new appearance, its Gaussians in the same order.
 
     Raises:
-        InputError: no Gaussians, no views, or checkpoints of another run.
+        InputError: no Gaussians or no views.
         KeyboardInterrupt: after Ctrl-C, when the checkpoint is written.
 
     >>> import g2ard
@@ -383,27 +335,21 @@ def adapt(
         change = colour_change(given, targets, config.background)
         change = change if change.gain >= config.colour_worth else None
         start = given if change is None else recoloured(given, change)
-    key = "" if work is None else _key(config, compact, targets)
-    fit = _Fit(start, targets, config, key, work, progress)
-    fit.run()
+    fitted, fits = _fit(start, targets, config, Steps(work), progress)
     if config.prior_views:
         seen = views_seeing(start, targets.cameras)
         share = seen / (seen + config.prior_views)
-    result = blended_appearance(start, fit.splats, share)
+    result = blended_appearance(start, fitted, share)
     changed = None if change is None else {k: np.asarray(v).tolist() for k, v in vars(change).items()}
+    taken = zip(config.stretches(), fits, strict=False)
+    stretches = tuple(Stretch(steps, fit.psnr.after) for steps, fit in taken)
     report = AdaptReport(
-        steps=sum(s["steps"] for s in fit.stretches),
-        seconds=fit.seconds,
-        converged=fit.converged,
+        steps=sum(stretch.steps for stretch in stretches),
+        seconds=sum(fit.seconds for fit in fits),
+        converged=fits[-1].psnr.after - fits[-1].psnr.before < config.tolerance,
         psnr=Gain(probe.all_of(given), probe.all_of(result), probe.scored_in),
-        stretches=tuple(map(Stretch.of, fit.stretches)),
+        stretches=stretches,
         colour_change=changed,
         prior_share=float(1 - share.mean()),
     )
     return Adapted(result, report)
-
-
-def _key(config: AdaptConfig, compact: Splats, targets: Targets) -> str:
-    """Return the fingerprint that checkpoints of an adaptation must have."""
-    parts = (repr(config), compact.fingerprint(), fingerprint_of(targets))
-    return hashlib.sha256("\n".join(parts).encode()).hexdigest()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import time
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -15,21 +14,18 @@ from g2ard.config.checks import checks_arguments
 from g2ard.io.reports import LEFT_OUT, Report
 from g2ard.io.types import ViewSet
 from g2ard.pipeline.config import DistillConfig, SelectConfig
+from g2ard.pipeline.steps import Steps
 from g2ard.progress import Progress, plural, silent
-from g2ard.rendering.targets import Photos, PhotosOrRenders, Subset, Targets, checked_targets, fingerprint_of
+from g2ard.rendering.targets import Photos, PhotosOrRenders, Subset, Targets, checked_targets
 from g2ard.rendering.visibility import visibility_source
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
-from g2ard.stages.recover import checkpoint as checkpoints
-from g2ard.stages.recover import recover
-from g2ard.stages.recover.anchors import Anchors
 from g2ard.stages.recover.draw import checked_weights
 from g2ard.stages.recover.optimize import Watch
 from g2ard.stages.recover.report import RecoverReport
 from g2ard.stages.select import SurfaceOptions, select
 from g2ard.stages.simplify import simplify
 from g2ard.stages.simplify.report import SimplifyReport
-from g2ard.system.cached import cached_property
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,8 +106,6 @@ class DistillReport(Report):
 
 __all__ = ["DistillConfig", "Distilled", "SelectConfig", "distill"]
 
-_ARRAYS = ("means", "quats", "scales", "logit_opacities", "sh0", "shN")
-
 
 @dataclass(frozen=True, eq=False)
 class Distilled:
@@ -163,7 +157,8 @@ def distill(
         weights: (C,) sampling weight of each view; None computes them.
         validation: views of another kind, not trained on, that limit recovery's changes if they lose quality,
             see `g2ard.stages.recover.recover`.
-        work: folder for finished rounds and checkpoints; the same call resumes from it.
+        work: folder for finished steps and checkpoints. The same call resumes from it, and one with other
+            settings repeats only the steps that depend on them.
         progress: called by all stages.
         watch: called after every step of every recovery, see `g2ard.stages.recover.recover`.
 
@@ -171,7 +166,7 @@ def distill(
         The compact scene with its unrecovered version and report.
 
     Raises:
-        InputError: the budget does not fit, no view sees the prior, or `work` belongs to another run.
+        InputError: the budget does not fit, or no view sees the prior.
         KeyboardInterrupt: after Ctrl-C; the same call resumes from `work`.
     """
     config, targets, prior = config or DistillConfig(), checked_targets(targets), prior.narrowed()
@@ -186,17 +181,16 @@ def distill(
         targets,
         config,
         len(counts),
+        Steps(work),
         checked_weights(weights, len(targets.cameras)),
         validation=validation,
-        work=work,
         progress=progress,
         watch=watch,
     )
     for number, count in enumerate(counts, start=1):
         rounds.advance(number, count, final=number == len(counts))
-    report = DistillReport(
-        tuple(map(RoundReport.of, rounds.log)), StageSeconds.of(rounds.seconds), rounds.supervision.report
-    )
+    seconds = StageSeconds(**rounds.seconds, resumed=rounds.steps.resumed)
+    report = DistillReport(tuple(rounds.log), seconds, rounds.supervision.report)
     return Distilled(rounds.state, rounds.simplified, report)
 
 
@@ -246,47 +240,36 @@ class _Supervision:
 
 @dataclass(eq=False)
 class _Rounds:
-    """State of the rounds: scene, protection flags and log; each stage is saved if `work` is given."""
+    """State of the rounds: scene, protection flags and log."""
 
     prior: Splats
     budget: int
     targets: Targets
     config: DistillConfig
     count: int
+    steps: Steps
     weights: Any = None
     validation: Targets | None = None
-    work: Path | None = None
     progress: Progress = silent
     watch: Watch | None = None
 
     def __post_init__(self) -> None:
         self.state = self.simplified = self.prior
         self.protected: Any = None
-        self.log: list[dict[str, Any]] = []
+        self.log: list[RoundReport] = []
         self.seconds = {"select": 0.0, "simplify": 0.0, "recover": 0.0}
         self._select(self.prior)
 
-    @cached_property
-    def key(self) -> str:
-        """Fingerprint that saved stages must have; computed only with a work folder."""
-        weights = None if self.weights is None else self.weights.tolist()
-        options = repr((self.budget, self.config, weights))
-        parts = [options, self.prior.fingerprint(), fingerprint_of(self.targets)]
-        if self.validation is not None:
-            parts.append(fingerprint_of(self.validation))
-        return hashlib.sha256("\n".join(parts).encode()).hexdigest()
-
     def advance(self, number: int, count: int, *, final: bool) -> None:
         """Run one round: simplify to `count` and recover; the final round adds the final recovery."""
-        entry: dict[str, Any] = {"count": count}
         if self.config.select.reselect and number > 1:
             self._select(self.state)
-        self._simplify(number, count, entry)
+        simplified, recovered = self._simplify(number, count), []
         if self.config.recover.schedule.round_steps > 0:
-            self._recover(f"round-{number}", entry, final=False)
+            recovered.append(self._recover(f"round-{number}", final=False))
         if final:
-            self._recover("final", entry, final=True)
-        self.log.append(entry)
+            recovered.append(self._recover("final", final=True))
+        self.log.append(RoundReport(count, simplified, tuple(recovered)))
 
     def _select(self, scene: Splats) -> None:
         began = time.monotonic()
@@ -298,63 +281,60 @@ class _Rounds:
                 targets[view]
                 self.progress("targets", view + 1, count)
 
-    def _simplify(self, number: int, count: int, entry: dict[str, Any]) -> None:
-        name = f"simplified-{number}"
-        if self._restore(name, entry):
-            self._count_resumed(entry["simplify"]["seconds"])
-        else:
+    def _simplify(self, number: int, count: int) -> SimplifyReport:
+        cameras, scene, config = self.targets.cameras, self.state, self.config.simplify
+        blind = config.method == "paper" or count == len(scene)
+
+        def settings() -> object:
+            kept = None if self.protected is None else np.packbits(self.protected).tobytes()
+            return config, count, self.budget, None if blind else cameras.fingerprint(), kept
+
+        def step(_: Path | None) -> tuple[Splats, SimplifyReport, dict[str, Any]]:
             began = time.monotonic()
-            blind = self.config.simplify.method == "paper" or count == len(self.state)
             done = simplify(
-                self.state,
+                scene,
                 count,
-                config=self.config.simplify,
-                visibility=None if blind else visibility_source(self.targets.cameras, progress=self.progress),
+                config=config,
+                visibility=None if blind else visibility_source(cameras, progress=self.progress),
                 protected=self.protected,
                 final_budget=self.budget,
                 progress=self.progress,
             )
-            self.state, self.protected = done.splats, done.protected
-            entry["simplify"] = {**done.report.as_dict(), "seconds": time.monotonic() - began}
-            self._save(name, entry)
-        self.seconds["simplify"] += entry["simplify"]["seconds"]
+            report = replace(done.report, seconds=time.monotonic() - began)
+            return done.splats, report, {"protected": done.protected}
+
+        self.state, report, arrays = self.steps.run(
+            f"simplified-{number}", scene, settings, SimplifyReport, step
+        )
+        self.protected = arrays["protected"]
+        self.seconds["simplify"] += report.seconds or 0.0
         if self.config.recover.sh_degree is not None:
             self.state = self.state.with_sh_degree(self.config.recover.sh_degree)
         self.simplified = self.state
+        return report
 
-    def _recover(self, name: str, entry: dict[str, Any], *, final: bool) -> None:
-        if self._restore(name, entry):
-            self._count_resumed(entry["recover"][-1]["seconds"])
-        else:
-            limit = self._time_limit(final)
-            config = replace(
+    def _recover(self, name: str, *, final: bool) -> RecoverReport:
+        limit = self._time_limit(final)
+        self.state, report = self.steps.recover(
+            name,
+            self.state,
+            self.supervision.targets,
+            replace(
                 self.config.recover,
                 steps=self._steps() if final and limit is None else None,
                 recovery_time=limit,
                 final=final,
-            )
-            checkpoint = self.work / f"{name}.checkpoint.npz" if self.work else None
-            done = recover(
-                self.state,
-                self.supervision.targets,
-                config,
-                weights=self.supervision.weights,
-                anchors=Anchors.of(self.simplified, config.regularizers.in_plane),
-                validation=self.validation,
-                checkpoint=checkpoint,
-                progress=self.progress,
-                stage="recover" if final else f"recover {name}",
-                watch=self.watch,
-                skip_same=True,
-            )
-            self.state = done.splats
-            entry.setdefault("recover", []).append(done.report.as_dict())
-            if done.report.resumed is not None:
-                self._count_resumed(done.report.resumed)
-            self._save(name, entry)
-            if checkpoint is not None:
-                checkpoint.unlink(missing_ok=True)
-        self.seconds["recover"] += entry["recover"][-1]["seconds"]
+            ),
+            built=self.simplified,
+            weights=self.supervision.weights,
+            validation=self.validation,
+            progress=self.progress,
+            stage="recover" if final else f"recover {name}",
+            watch=self.watch,
+            skip_same=True,
+        )
+        self.seconds["recover"] += report.seconds
+        return report
 
     def _steps(self) -> int:
         photos = isinstance(self.targets, Photos | PhotosOrRenders)
@@ -369,25 +349,3 @@ class _Rounds:
         final_steps = schedule.steps if config.steps is None else config.steps
         all_steps = final_steps + self.count * schedule.round_steps
         return config.recovery_time * (final_steps if final else schedule.round_steps) / all_steps
-
-    def _count_resumed(self, seconds: float) -> None:
-        """Add the time of a stage, or part of one, that an earlier call took."""
-        self.seconds["resumed"] = self.seconds.get("resumed", 0.0) + seconds
-
-    def _save(self, name: str, entry: dict[str, Any]) -> None:
-        if self.work is None:
-            return
-        arrays = {array: getattr(self.state, array) for array in _ARRAYS}
-        arrays["protected"] = np.asarray(self.protected)
-        checkpoints.save(self.work / f"{name}.npz", self.key, {"entry": entry}, arrays)
-
-    def _restore(self, name: str, entry: dict[str, Any]) -> bool:
-        """Restore a finished stage of an earlier run, and return whether it was found."""
-        path = self.work / f"{name}.npz" if self.work else None
-        if path is None or not path.exists():
-            return False
-        meta, arrays = checkpoints.load(path, self.key)
-        self.protected = arrays.pop("protected")
-        self.state = replace(self.prior, **arrays)
-        entry.update(meta["entry"])
-        return True

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -282,6 +283,13 @@ class Cameras:
     def usual(self) -> Cameras:
         """Return the views of the usual kind; all views if there are no others."""
         return self.take(rows_by_kind(self.kinds).get(USUAL, range(len(self))))
+
+    def fingerprint(self) -> str:
+        """Return a hash of poses, intrinsics, image sizes and kinds."""
+        digest = hashlib.sha256(str(self.kinds).encode())
+        for array in (self.viewmats, self.Ks, self.widths, self.heights):
+            digest.update(np.ascontiguousarray(array).tobytes())
+        return digest.hexdigest()
 
     def resized(self, longest: int | None) -> Cameras:
         """Return the views with their longer side shrunk to at most `longest` pixels (None keeps them)."""

@@ -22,8 +22,8 @@ from helpers.scenes import around, checkered_ball
 
 LEFT = [
     ("recover a.ply --steps 3 -o out.ply", ".out.ply.checkpoint.npz"),
-    ("adapt a.ply --steps 3 -o out.ply", ".out.ply.work/stretches.npz"),
-    ("distill a.ply -r 2 --steps 3 -o run", "run/.unfinished/simplified-1.npz"),
+    ("adapt a.ply --steps 3 -o out.ply", ".out.ply.work/stretch-1-0123456789abcdef.npz"),
+    ("distill a.ply -r 2 --steps 3 -o run", "run/.unfinished/simplified-1-0123456789abcdef.npz"),
 ]
 
 
@@ -43,12 +43,12 @@ def test_checkpoints_are_kept(folder: Path, command_line: CommandLine, command: 
     place = folder / left
     place.parent.mkdir(parents=True, exist_ok=True)
     place.write_bytes(b"junk")
-    for flags, words in (
-        ((), "left by an interrupted run; --resume continues it, -w starts over"),
-        (("--resume", "-w"), f"{left}: not a checkpoint of g2ard, or a damaged one"),
-    ):
-        assert words in refused(command_line, folder, *ask, *flags, "-q", status=1)
-        assert place.read_bytes() == b"junk"
+    words = "left by an interrupted run; --resume continues it, -w starts over"
+    assert words in refused(command_line, folder, *ask, "-q", status=1)
+    if place.parent == folder:  # others are named by their content
+        words = f"{left}: not a checkpoint of g2ard, or a damaged one"
+        assert words in refused(command_line, folder, *ask, "--resume", "-wq", status=1)
+    assert place.read_bytes() == b"junk"
     succeeds(command_line, folder, *ask, "-w")
     assert not place.exists()
     assert not list(folder.glob(".*"))

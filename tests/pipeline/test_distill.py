@@ -40,8 +40,7 @@ def test_views_of_another_kind_are_handed_on(targets: TeacherRenders, tmp_path: 
     config = DistillConfig(recover=RecoverConfig(steps=20))
     done = distill(PRIOR, 300, targets, config, validation=near, work=tmp_path)
     assert done.report.rounds[0].recover[0].validation.looks
-    with pytest.raises(InputError, match="other options"):
-        distill(PRIOR, 300, targets, config, work=tmp_path)
+    assert not distill(PRIOR, 300, targets, config, work=tmp_path).report.rounds[0].recover[0].validation
 
 
 def test_one_step_per_round_makes_rounds(targets: TeacherRenders) -> None:
@@ -71,8 +70,25 @@ def test_an_interrupted_run_resumes_to_the_same_bits(targets: TeacherRenders, tm
         {"targets": TeacherRenders(brighter, around())},
         {"budget": 999},
     ):
-        with pytest.raises(InputError, match="belongs to a run with another scene"):
-            distill(**{**given, **other}, work=tmp_path)
+        found = distill(**{**given, **other}, work=tmp_path)
+        assert_same_bits(found.splats, distill(**{**given, **other}).splats)
+
+
+def test_only_steps_that_depend_on_a_changed_setting_are_repeated(
+    targets: TeacherRenders, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = DistillConfig(recover=RecoverConfig(steps=20))
+    first = distill(PRIOR, 300, targets, config, work=tmp_path)
+    monkeypatch.setattr("g2ard.pipeline.distill.simplify", None)
+    again = distill(PRIOR, 300, targets, changed(config, {"recover.steps": 9}), work=tmp_path)
+    assert again.report.rounds[0].simplify == first.report.rounds[0].simplify
+    assert again.report.rounds[0].recover[0].steps == 9
+    monkeypatch.setattr("g2ard.pipeline.steps.recover", None)
+    assert_same_bits(distill(PRIOR, 300, targets, config, work=tmp_path).splats, first.splats)
+    for path in tmp_path.iterdir():
+        path.write_bytes(b"PK")
+    with pytest.raises(InputError, match=r"simplified-1-\w{16}.npz: not a checkpoint of g2ard, or a damaged"):
+        distill(PRIOR, 300, targets, config, work=tmp_path)
 
 
 def test_command_on_a_trained_scene(command_line: CommandLine, tmp_path: Path) -> None:
@@ -141,11 +157,12 @@ def test_a_loss_in_any_kind_of_view_is_reported() -> None:
 
 def test_steps_by_need_are_for_teachers() -> None:
     from g2ard.pipeline.distill import _Rounds
+    from g2ard.pipeline.steps import Steps
 
     part = replace(around(12), Ks=around(12).Ks * [[[4], [4], [1]]])  # a sixteenth of the ball in each
 
     def horizon(targets: Targets, config: DistillConfig) -> int | None:
-        return _Rounds(PRIOR, 300, targets, config, 1)._steps()
+        return _Rounds(PRIOR, 300, targets, config, 1, Steps(None))._steps()
 
     teacher, config = (
         TeacherRenders(PRIOR, part, lazy=True),

@@ -1,0 +1,96 @@
+"""Steps from scene to scene, whose results a folder keeps by content."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, TypeVar
+
+from numpy.typing import NDArray
+
+from g2ard.rendering.targets import Targets, fingerprint_of
+from g2ard.scene.splats import ARRAYS, Splats
+from g2ard.stages.recover import RecoverConfig, checkpoint, recover
+from g2ard.stages.recover.anchors import Anchors
+from g2ard.stages.recover.report import RecoverReport
+from g2ard.stages.simplify.report import SimplifyReport
+
+R = TypeVar("R", RecoverReport, SimplifyReport)
+_Result = tuple[Splats, R, dict[str, NDArray[Any]]]
+
+
+class Steps:
+    """Steps of a run: each is computed unless the folder, if any, holds its result.
+
+    A result's file name contains a hash of the step's scene, settings and other inputs, so a run with other
+    settings computes only the steps that depend on them. `resumed` is the time in seconds that earlier calls
+    spent on these steps; None without any.
+    """
+
+    def __init__(self, folder: Path | None) -> None:
+        self._folder = folder
+        self.resumed: float | None = None
+
+    def run(
+        self,
+        name: str,
+        scene: Splats,
+        settings: Callable[[], object],
+        kind: type[R],
+        step: Callable[[Path | None], _Result[R]],
+    ) -> _Result[R]:
+        """Return the scene after a step, a report of this kind, and other arrays.
+
+        Args:
+            settings: returns all that the result depends on besides `scene`, as it is printed.
+            step: takes the file for checkpoints within the step.
+        """
+        if self._folder is None:
+            return step(None)
+        key = hashlib.sha256(repr((name, scene.fingerprint(), settings())).encode()).hexdigest()
+        file, within = (self._folder / f"{name}-{key[:16]}{end}" for end in (".npz", ".checkpoint.npz"))
+        if file.exists():
+            meta, arrays = checkpoint.load(file, key)
+            made = replace(scene, **{array: arrays.pop(array) for array in ARRAYS})
+            result = made, kind.of(meta["report"]), arrays
+            self._count(result[1].seconds)
+        else:
+            made, report, others = result = step(within)
+            kept = {array: getattr(made, array) for array in ARRAYS}
+            checkpoint.save(file, key, {"report": report.as_dict()}, {**kept, **others})
+            self._count(getattr(report, "resumed", None))
+        within.unlink(missing_ok=True)
+        return result
+
+    def recover(
+        self,
+        name: str,
+        student: Splats,
+        targets: Targets,
+        config: RecoverConfig,
+        *,
+        built: Splats | None = None,
+        weights: NDArray[Any] | None = None,
+        validation: Targets | None = None,
+        **options: Any,
+    ) -> tuple[Splats, RecoverReport]:
+        """Recover a scene, like `recover`; `built` is the scene before any recovery."""
+
+        def settings() -> object:
+            views = [fingerprint_of(each) for each in (targets, validation) if each is not None]
+            before = None if built is None else built.fingerprint()
+            return config, views, before, None if weights is None else weights.tolist()
+
+        def step(within: Path | None) -> _Result[RecoverReport]:
+            options["anchors"] = None if built is None else Anchors.of(built, config.regularizers.in_plane)
+            options.update(weights=weights, validation=validation, checkpoint=within)
+            done = recover(student, targets, config, **options)
+            return done.splats, done.report, {}
+
+        return self.run(name, student, settings, RecoverReport, step)[:2]
+
+    def _count(self, seconds: float | None) -> None:
+        if seconds is not None:
+            self.resumed = (self.resumed or 0.0) + seconds
