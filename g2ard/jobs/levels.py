@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Generic, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +19,7 @@ from g2ard.errors import InputError
 from g2ard.io.detect import kind
 from g2ard.io.reports import Report
 from g2ard.io.scenes import tell
+from g2ard.io.tile_store import StoredScene
 from g2ard.jobs.budget import Budget
 from g2ard.jobs.cost import Cost, cost_of
 from g2ard.jobs.distill import DistillJob, prepare
@@ -79,11 +80,14 @@ class LevelReport(Report):
         return f"level {number}: {plural(self.count, 'Gaussian')}{told}"
 
 
+L = TypeVar("L", Splats, StoredScene)
+
+
 @dataclass(frozen=True, eq=False)
-class Levels:
+class Levels(Generic[L]):
     """Levels of detail of a scene, finest first, with a report on each, and the sky if it is apart."""
 
-    splats: tuple[Splats, ...]
+    splats: tuple[L, ...]
     reports: tuple[LevelReport, ...]
     sky: Splats | None = None
 
@@ -121,21 +125,39 @@ class LevelsJob:
             costs.append(cost_of(job, count, recover=self.recover, page=False))
         return costs
 
-    def run(self) -> Levels:
+    def run(self) -> Levels[Splats]:
         """Make the levels."""
-        splats: list[Splats] = []
-        reports: list[LevelReport] = []
-        finer = self.job.prior
-        for ratio, count in zip(self.ratios, self.counts, strict=True):
-            if ratio == 1:
-                level = self.job.prior
-                report = LevelReport(len(level), 1.0, level_size(self.job.views.train.cameras, 1), 0.0)
-            else:
-                level, finer, report = _level(self.job, finer, count, ratio, self.recover, self.work)
-            self.job.say(report.line(len(splats)))
-            splats.append(level)
-            reports.append(report)
-        return Levels(tuple(splats), tuple(reports), self.sky)
+        job = self.job
+        made = make_levels(job.prior, self.ratios, job.views.train.cameras, self._level, job.say)
+        return replace(made, sky=self.sky)
+
+    def _level(self, finer: Splats, count: int, longest: int) -> tuple[Splats, Splats, float, float | None]:
+        """Make one level, see `make_levels`."""
+        job, views = self.job, self.job.views.resized(longest)
+        held_out = scorable(job.targets_for(views.test), job.say)
+        if not self.recover:
+            level = merged = _merged(job, finer, count)
+        else:
+            apart = None if job.teacher is None else views.apart
+            done = pipeline(
+                finer,
+                count,
+                job.targets_for(views.train.cameras),
+                job.config,
+                weights=job.weights,
+                validation=None if apart is None else job.targets_for(apart.take(range(0, len(apart), 2))),
+                work=self.work,
+                progress=job.progress,
+            )
+            level, merged = done.splats, done.simplified
+            lost = opacity_lost(job.prior, level, held_out.cameras)
+            say_gaps(lost, job.say, f"give levels more Gaussians (--ratios), here {count:,}")
+        common: dict[str, Any] = {"background": job.config.recover.background, "progress": job.progress}
+
+        def score(splats: Splats) -> float:
+            return evaluate(splats, held_out, stage="scoring", **common).psnr
+
+        return level, merged, score(merged), score(level) if self.recover else None
 
 
 @checks_arguments
@@ -193,7 +215,7 @@ def prepare_levels(
 
 
 @signature_of(prepare_levels)
-def lod(*scene: Any, **options: Any) -> Levels:
+def lod(*scene: Any, **options: Any) -> Levels[Splats]:
     """Make levels of detail of a trained scene, exactly like the command `g2ard lod`.
 
     Each level is merged from the previous one, so its Gaussians are unions of finer ones. At √r times the
@@ -261,46 +283,34 @@ def check_ratios(ratios: Sequence[float]) -> None:
         raise InputError(f"expected rising numbers of at least 1, got {given}", parameter="ratios")
 
 
-def _level(
-    job: DistillJob, finer: Splats, count: int, ratio: float, recover: bool, work: Path | None
-) -> tuple[Splats, Splats, LevelReport]:
-    """Return the level, its unrecovered version, and its report."""
-    began = time.perf_counter()
-    longest = level_size(job.views.train.cameras, ratio)
-    held_out = scorable(job.targets_for(job.views.test.resized(longest)), job.say)
-    if recover:
-        apart = None if job.views.apart is None or job.teacher is None else job.views.apart.resized(longest)
-        done = pipeline(
-            finer,
-            count,
-            job.targets_for(job.views.train.cameras.resized(longest)),
-            job.config,
-            weights=job.weights,
-            validation=None if apart is None else job.targets_for(apart.take(range(0, len(apart), 2))),
-            work=work,
-            progress=job.progress,
-        )
-        level, merged = done.splats, done.simplified
-        lost = opacity_lost(job.prior, level, held_out.cameras)
-        say_gaps(lost, job.say, f"give levels more Gaussians (--ratios), here {count:,}")
-    else:
-        level = merged = _merged(job, finer, count)
-    scores = [
-        evaluate(
-            splats,
-            held_out,
-            background=job.config.recover.background,
-            progress=job.progress,
-            stage="scoring",
-        ).psnr
-        for splats in ((merged, level) if recover else (merged,))
-    ]
-    seconds = time.perf_counter() - began
-    return (
-        level,
-        merged,
-        LevelReport(count, ratio, longest, seconds, scores[0], scores[1] if recover else None),
-    )
+def make_levels(
+    scene: L,
+    ratios: Sequence[float],
+    cameras: Cameras,
+    make: Callable[[L, int, int], tuple[L, L, float, float | None]],
+    say: Say,
+) -> Levels[L]:
+    """Make levels of a scene in memory or in tiles.
+
+    Args:
+        cameras: training views of the scene itself.
+        make: takes the level before as it was merged, a count and the longer side of views; returns the
+            level, the same before recovery, and the PSNR of both, None without recovery.
+    """
+    levels: list[L] = []
+    reports: list[LevelReport] = []
+    finer = scene
+    for ratio in ratios:
+        began, level = time.perf_counter(), scene
+        scores: list[float | None] = []
+        count, size = Budget(ratio=ratio).of(len(scene)), level_size(cameras, ratio)
+        if ratio > 1:
+            level, finer, *scores = make(finer, count, size)
+        report = LevelReport(count, ratio, size, time.perf_counter() - began, *scores)
+        say(report.line(len(levels)))
+        levels.append(level)
+        reports.append(report)
+    return Levels(tuple(levels), tuple(reports))
 
 
 def _merged(job: DistillJob, finer: Splats, count: int) -> Splats:

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import re
 import shutil
-import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -23,10 +22,9 @@ from g2ard.jobs.budget import Budget
 from g2ard.jobs.cost import RECOVERY_TIMES, workers_for
 from g2ard.jobs.distill_options import DistillOptions
 from g2ard.jobs.inputs import Views, load_view_sets, say_regions
-from g2ard.jobs.levels import LevelReport, check_ratios, level_size
+from g2ard.jobs.levels import Levels, check_ratios, make_levels
 from g2ard.jobs.tiling import Tiling, needs_whole, refuse_whole
 from g2ard.jobs.views import cameras_for_weights, pool_times, views_of
-from g2ard.levels import Cut
 from g2ard.pipeline.config import DistillConfig
 from g2ard.pipeline.distill import RunViews
 from g2ard.progress import Progress, Say, silent, unsaid
@@ -39,7 +37,7 @@ from g2ard.stages.simplify import SimplifyConfig
 from g2ard.stages.simplify.growth import say_gaps
 from g2ard.tiles.executor import Workers, executor
 from g2ard.tiles.ingest import ingest
-from g2ard.tiles.merging import TiledScene, key_of, simplify_tiles
+from g2ard.tiles.merging import TiledScene, simplify_tiles
 from g2ard.tiles.pour import is_tile_file
 from g2ard.tiles.recover import TiledScores, recover_tiles
 from g2ard.tiles.sights import Surroundings
@@ -235,18 +233,6 @@ def distill_in_tiles(
         return TiledDistilled(job.store, small, done, scores, job.views)
 
 
-@dataclass(frozen=True, eq=False)
-class TiledLevels:
-    """A scene's levels of detail in tiles, the finest first, and a report on each."""
-
-    scenes: tuple[StoredScene, ...]
-    reports: tuple[LevelReport, ...]
-
-    def key(self, rule: Cut) -> str:
-        """Return 16 hexadecimal digits that identify the files they are written to."""
-        return key_of([[scene.store.key for scene in self.scenes], asdict(rule)])
-
-
 def lod_in_tiles(
     scene: Path,
     ratios: Sequence[float],
@@ -256,7 +242,7 @@ def lod_in_tiles(
     recover: bool = True,
     progress: Progress = silent,
     say: Say = unsaid,
-) -> TiledLevels:
+) -> Levels[StoredScene]:
     """Make levels of detail of a scene larger than memory.
 
     As in `g2ard.lod`, a level is merged from the one before, which lies in tiles of its own, and recovered
@@ -270,41 +256,25 @@ def lod_in_tiles(
     """
     check_ratios(ratios)
     refuse_whole(scene, needs_whole(options.config))
-    levels: list[StoredScene] = []
-    reports: list[LevelReport] = []
     around: Surroundings | None = None
     with _job(scene, tiling, options, Budget(ratio=ratios[-1]), recover, progress, say) as job:
-        finer = job.store
-        for number, ratio in enumerate(ratios):
-            if ratio == 1:
-                size = level_size(job.views.train.cameras, 1)
-                level, report = job.store, LevelReport(job.store.count, 1.0, size, 0.0)
-            else:
-                count = Budget(ratio=ratio).of(job.store.count, str(scene))
-                level, finer, around, report = _level(job, finer, around, count, ratio, say)
-            say(report.line(number))
-            levels.append(StoredScene(level))
-            reports.append(report)
-    return TiledLevels(tuple(levels), tuple(reports))
 
+        def make(
+            finer: StoredScene, count: int, longest: int
+        ) -> tuple[StoredScene, StoredScene, float, float | None]:
+            nonlocal around
+            views = job.views.resized(longest)
+            small = job.simplified(finer.store, count, (views if recover else job.views).train.cameras)
+            say_gaps(small.opacity_lost, say)
+            around = around or small.surroundings  # the first level is merged from the dense scene itself
+            assert around is not None  # views are given
+            merged = StoredScene(job.stored(small, "merged"))
+            done, scores = job.recovered(small, around, views)
+            if not recover:
+                return merged, merged, scores.simplified, None
+            return StoredScene(job.stored(done, "level")), merged, scores.simplified, scores.recovered
 
-def _level(
-    job: _Job, finer: TileStore, around: Surroundings | None, count: int, ratio: float, say: Say
-) -> tuple[TileStore, TileStore, Surroundings, LevelReport]:
-    """Return the level, its unrecovered version, the placement of the dense tiles and a report."""
-    began = time.perf_counter()
-    longest = level_size(job.views.train.cameras, ratio)
-    views = job.views.resized(longest)
-    small = job.simplified(finer, count, (views if job.learn else job.views).train.cameras)
-    say_gaps(small.opacity_lost, say)
-    around = around or small.surroundings  # the first level is merged from the dense scene itself
-    assert around is not None  # views are given
-    merged = job.stored(small, "merged")
-    done, scores = job.recovered(small, around, views)
-    level = job.stored(done, "level") if job.learn else merged
-    seconds = time.perf_counter() - began
-    recovered = scores.recovered if job.learn else None
-    return level, merged, around, LevelReport(count, ratio, longest, seconds, scores.simplified, recovered)
+        return make_levels(StoredScene(job.store), ratios, job.views.train.cameras, make, say)
 
 
 def _weighted(views: ViewSet, sample: Splats, config: DistillConfig, progress: Progress) -> ViewSet:

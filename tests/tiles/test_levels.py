@@ -11,7 +11,8 @@ from g2ard.errors import InputError
 from g2ard.io import sog
 from g2ard.io.tile_store import StoredScene
 from g2ard.jobs.distill_options import DistillOptions
-from g2ard.jobs.tiled import TiledLevels, lod_in_tiles
+from g2ard.jobs.levels import Levels
+from g2ard.jobs.tiled import lod_in_tiles
 from g2ard.jobs.tiling import Tiling
 from g2ard.levels import Cut, cut, save_levels, tree
 from g2ard.scene.splats import Splats
@@ -78,7 +79,7 @@ def test_levels_on_disk_give_the_files_of_levels_in_memory(tmp_path: Path, degre
     assert files_of(tmp_path / "a") == files_of(tmp_path / "b")
 
 
-def levels_in_tiles(place: Path, folder: Path, **more: object) -> TiledLevels:
+def levels_in_tiles(place: Path, folder: Path, **more: object) -> Levels[StoredScene]:
     options = DistillOptions(views=place / "views.json", size=64, settings={"steps": 12})
     tiling = Tiling(tile_rows=1700, workers=1, folder=folder)
     return lod_in_tiles(place / "town.ply", (1, 3, 12), tiling, options, **more)  # type: ignore[arg-type]
@@ -86,8 +87,8 @@ def levels_in_tiles(place: Path, folder: Path, **more: object) -> TiledLevels:
 
 def test_levels_have_exact_counts_and_a_stopped_chain_goes_on(place: Path, tmp_path: Path) -> None:
     whole = levels_in_tiles(place, tmp_path / "whole")
-    assert [len(level) for level in whole.scenes] == [6000, 2000, 500]
-    assert [len(level.store.tiles) for level in whole.scenes] == [4, 2, 1]
+    assert [len(level) for level in whole.splats] == [6000, 2000, 500]
+    assert [len(level.store.tiles) for level in whole.splats] == [4, 2, 1]
     for report in whole.reports[1:]:
         assert report.recovered > report.simplified > 15
 
@@ -105,9 +106,9 @@ def test_levels_have_exact_counts_and_a_stopped_chain_goes_on(place: Path, tmp_p
     again = levels_in_tiles(place, tmp_path / "again")
     assert all(path.stat().st_mtime_ns == time for path, time in before.items())
     rows = np.arange(500)
-    one, other = (levels.scenes[2].take(rows).fingerprint() for levels in (whole, again))
+    one, other = (levels.splats[2].take(rows).fingerprint() for levels in (whole, again))
     assert one == other
-    assert whole.key(Cut()) == again.key(Cut()) != whole.key(Cut(most=9))
+    assert [level.store.key for level in whole.splats] == [level.store.key for level in again.splats]
 
 
 def test_the_command_in_tiles(place: Path, tmp_path: Path, command_line) -> None:

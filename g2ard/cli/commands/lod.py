@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -22,7 +22,6 @@ from g2ard.progress import plural
 
 if TYPE_CHECKING:
     from g2ard.jobs.levels import Levels, LevelsJob
-    from g2ard.jobs.tiled import TiledLevels
     from g2ard.jobs.tiling import Tiling
     from g2ard.levels import Cut, Georeference
     from g2ard.levels.tree import Level
@@ -201,8 +200,6 @@ def lod(
 
 def _tell_costs(run: Run, job: LevelsJob) -> None:
     """Print the rough time and memory of each level and of all."""
-    from dataclasses import asdict
-
     levels = []
     for number, (ratio, count, cost) in enumerate(zip(job.ratios, job.counts, job.costs, strict=True)):
         if ratio == 1:
@@ -236,6 +233,7 @@ def _in_tiles(
     from g2ard.jobs.levels import recovery_settings
     from g2ard.jobs.tiled import lod_in_tiles, working
     from g2ard.system.peak_memory import peak_rss_of_all
+    from g2ard.tiles.merging import key_of
 
     run, folder = writer.run, tiling.folder
     assert folder is not None
@@ -248,9 +246,9 @@ def _in_tiles(
         levels = lod_in_tiles(
             scene, ratios, tiling, options, recover=recover, progress=run.progress, say=run.say
         )
-        begun = folder / f"written-{levels.key(writer.cut)}"
+        begun = folder / f"written-{key_of([[one.store.key for one in levels.splats], asdict(writer.cut)])}"
         begun.mkdir(exist_ok=True)
-        _tell(run, writer.output, levels, writer.save(levels.scenes, begun), peak_rss_bytes=peak_rss_of_all())
+        _tell(run, writer.output, levels, writer.save(levels.splats, begun), peak_rss_bytes=peak_rss_of_all())
 
 
 @dataclass(frozen=True)
@@ -342,7 +340,7 @@ def _check_same(meta: Path, ratios: Sequence[float]) -> None:
         )
 
 
-def _tell(run: Run, output: Path, levels: Levels | TiledLevels, size: int, **more: Any) -> None:
+def _tell(run: Run, output: Path, levels: Levels[Any], size: int, **more: Any) -> None:
     run.say(f"{output}: {plural(len(levels.reports), 'level')}, {size / 1e6:.2f} MB")
     result: dict[str, Any] = {"output": str(output), "bytes": size}
     run.result({**result, "levels": [report.as_dict() for report in levels.reports], **more})
