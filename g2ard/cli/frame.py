@@ -35,6 +35,7 @@ from g2ard.io import check_scene_output, check_views_output, find_views, kind, r
 from g2ard.io.atomic import atomic_output, check_output
 from g2ard.io.detect import run_scene
 from g2ard.io.paths import is_photo, real_path
+from g2ard.io.reports import plain
 from g2ard.io.scene_formats import axes_note, files_of, scene_format
 from g2ard.io.scenes import tell, write_scene
 from g2ard.pipeline.presets import configured
@@ -245,7 +246,7 @@ class Run:
         if self.json is None:
             return
         with self.finishing("--json"):
-            text = json.dumps({**data, **self._used(), "config": self.config}, indent=2, default=_plain)
+            text = json.dumps({**data, **self._used(), "config": self.config}, indent=2, default=plain)
             if self.json == "-":
                 self.console.print(text)
                 return
@@ -435,10 +436,6 @@ def _flat(value: Any) -> Any:
     if isinstance(value, list) and value and all(isinstance(one, Counts | Ratios) for one in value):
         return [budget for several in value for budget in several]
     return value
-
-
-def _plain(value: Any) -> Any:
-    return value.tolist() if hasattr(value, "tolist") else str(value)
 
 
 def command(

@@ -26,6 +26,7 @@ from g2ard.io.atomic import atomic_output, check_output, drop_empty, drop_tempor
 from g2ard.io.jsonfile import read_json
 from g2ard.io.lock import check_unlocked, locked
 from g2ard.io.paths import file_identity
+from g2ard.io.reports import plain
 from g2ard.io.scene_formats import FORMATS
 from g2ard.io.types import ViewSet
 from g2ard.jobs.budget import DEVICES, Budget
@@ -184,7 +185,7 @@ class RunFolder:
     def write_report(self, report: dict[str, Any]) -> None:
         told = {**report, "config": self._run.config, "inputs": self._inputs}
         with self._run.finishing("report.json"), atomic_output(self._report, overwrite=True) as temporary:
-            text = json.dumps(told, indent=2, default=str)
+            text = json.dumps(told, indent=2, default=plain)
             temporary.write_text(text + "\n", encoding="utf-8", newline="\n")
 
     def write_view(self, splats: Splats, cameras: Cameras, background: Colour) -> tuple[int | None, str]:

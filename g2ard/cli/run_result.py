@@ -12,6 +12,7 @@ from g2ard.progress import plural
 if TYPE_CHECKING:
     from g2ard.jobs.budget import Budget
     from g2ard.jobs.measured_budget import Aim
+    from g2ard.pipeline.distill import ViewsReport
     from g2ard.report.kinds import KindScore
     from g2ard.scene.splats import Splats
 
@@ -24,7 +25,7 @@ _LEAST_REPORTED_SHARE = 0.005
 
 def write_table(run: Run, report: dict[str, Any]) -> None:
     """Print the scores by kind of view, under counts, sizes and times."""
-    from g2ard.report.kinds import COLUMNS, KindScore, cells
+    from g2ard.report.kinds import COLUMNS, cells
 
     size = report["bytes"]
     seconds = {name: value for name, value in report["seconds"].items() if name != "resumed"}
@@ -40,21 +41,20 @@ def write_table(run: Run, report: dict[str, Any]) -> None:
         sizes = f"{size['input'] / 1e6:.2f} MB as .ply → {made}"
     run.say(f"{before} → {plural(report['output_count'], 'Gaussian')}, {sizes}; {times}")
     title = f"held-out views against {report['against']}, {report['size']}, simplified → recovered:"
-    run.console.table(title, list(COLUMNS), cells(map(KindScore.of, report["kinds"])))
+    run.console.table(title, list(COLUMNS), cells(report["kinds"]))
 
 
 def told(report: dict[str, Any], *, verbose: bool = False) -> list[str]:
     """Return lines on recovery, losses, unseen parts and packing; `verbose` adds idle
     regularisers."""
     from g2ard.jobs.packing import score_lines
-    from g2ard.report.kinds import KindScore
-    from g2ard.stages.recover.report import RecoverReport, outcome, unregularized
+    from g2ard.stages.recover.report import outcome, unregularized
     from g2ard.stages.simplify.growth import RECOVERED_GAPS, gaps_line
 
-    rounds = [[RecoverReport.of(done) for done in entry.get("recover", [])] for entry in report["rounds"]]
+    rounds = [entry.recover for entry in report["rounds"]]
     lines = [outcome(one) for entry in rounds for one in entry]
     lines += [unregularized(rounds)] if verbose else []
-    lines += [loss(KindScore.of(kind)) for kind in report["kinds"]]
+    lines += list(map(loss, report["kinds"]))
     lines.append(gaps_line(report["opacity_lost"], RECOVERED_GAPS))
     if report["unseen"] and report["unseen"] > _LEAST_REPORTED_SHARE:
         lines.append(f"{report['unseen']:.0%} of the scene is in no view: simplified but not recovered")
@@ -102,17 +102,17 @@ def loss(
     return f"{lost}; the mean of all {kind.views} {how} {abs(kind.psnr.gain):.2f} dB"
 
 
-def say_views(run: Run, views: dict[str, Any] | None, chosen: bool) -> None:
+def say_views(run: Run, views: ViewsReport | None, chosen: bool) -> None:
     """Print the number of unused and selected views, if not all candidates are used."""
     if views is None:
         return
-    if views["refused"]:
-        count = plural(len(views["refused"]), "view")
+    if views.refused:
+        count = plural(len(views.refused), "view")
         run.say(f"{count} not used: the scene is not in sight, or the camera is inside it")
     if chosen:
         run.say(
-            f"views: {len(views['chosen'])} of {views['candidates']} by {views['policy']};"
-            f" the rest would have added {100 * views['left_out']:.1f} %"
+            f"views: {len(views.chosen)} of {views.candidates} by {views.policy};"
+            f" the rest would have added {100 * views.left_out:.1f} %"
         )
 
 

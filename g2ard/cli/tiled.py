@@ -2,7 +2,6 @@
 
 import time
 from collections.abc import Sequence
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -86,7 +85,7 @@ def distill_in_tiles(
         with folder.writing():
             report = {
                 **_report(store, small, began),
-                "scores": asdict(scores),
+                "scores": scores,
                 "size": done.views.test.size_text,
                 "views": {"train": len(done.views.train.cameras), "test": len(done.views.test)},
             }

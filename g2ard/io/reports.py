@@ -26,7 +26,7 @@ class Report:
     def as_dict(self) -> dict[str, Any]:
         """Return the report as JSON values: fields by name, nested reports as dicts."""
         values = ((f, getattr(self, f.name)) for f in fields(self))
-        return {f.name: _plain(v) for f, v in values if v is not None or "left_out" not in f.metadata}
+        return {f.name: _nested(v) for f, v in values if v is not None or "left_out" not in f.metadata}
 
     @classmethod
     def of(cls, data: Mapping[str, Any]) -> Self:
@@ -36,10 +36,17 @@ class Report:
         return cls(**{name: _read(kinds[name], data[name]) for name in names})
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
+    """Return a report or array as JSON values, and anything else as text, for `json.dumps`."""
     if isinstance(value, Report):
         return value.as_dict()
-    return [_plain(item) for item in value] if isinstance(value, list | tuple) else value
+    return value.tolist() if hasattr(value, "tolist") else str(value)
+
+
+def _nested(value: Any) -> Any:
+    if isinstance(value, Report):
+        return value.as_dict()
+    return [_nested(item) for item in value] if isinstance(value, list | tuple) else value
 
 
 def _read(kind: Any, value: Any) -> Any:

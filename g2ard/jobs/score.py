@@ -38,7 +38,6 @@ def report_of(job: DistillJob, done: Distilled) -> dict[str, Any]:
     own_size = None if full is None else _scores(*scenes, full, background, job.progress)
     made = job.views.pool is not None and "test" in job.views.pool.splits
     config = replace(job.config, simplify=job.config.simplify.resolved(antialiased=job.prior.antialiased))
-    report = done.report.as_dict()
     return {
         "input_count": len(job.prior),
         "output_count": len(done.splats),
@@ -50,7 +49,7 @@ def report_of(job: DistillJob, done: Distilled) -> dict[str, Any]:
         "apart": apart,
         "size": job.held_out.cameras.size_text,
         "own_size": own_size and {name: _means(scores) for name, scores in own_size.items()},
-        "kinds": [kind.as_dict() for kind in by_kind(before, after, USUAL if made else "given")],
+        "kinds": by_kind(before, after, USUAL if made else "given"),
         "unseen": _unseen(job, done),
         "opacity_lost": None
         if job.config.recover.from_points
@@ -58,11 +57,11 @@ def report_of(job: DistillJob, done: Distilled) -> dict[str, Any]:
         "overdraw": overdraw(done.splats, job.held_out.cameras),
         "against": job.against,
         "preset": job.preset,
-        "prior": job.measured.as_dict(),
-        "rounds": report["rounds"],
-        "views": report["views"],
+        "prior": job.measured,
+        "rounds": done.report.rounds,
+        "views": done.report.views,
         "settings": listed(config),
-        "seconds": report["seconds"],
+        "seconds": done.report.seconds.as_dict(),
     }
 
 

@@ -26,8 +26,6 @@ _SHOWN = 3
 _POINTS = 4096
 """Gaussians that tell how much of the scene a view has in frame."""
 
-_STAGES = ("simplified", "recovered")
-
 
 def distill_report(
     path: Path,
@@ -72,9 +70,9 @@ def distill_report(
     )
     show(typical)
     page.heading("Scores")
-    page.table(COLUMNS, cells(map(KindScore.of, report["kinds"])))
+    page.table(COLUMNS, cells(report["kinds"]))
     page.paragraph(f"PSNR and SSIM: simplified → recovered, in views of {report['size']}.")
-    if edges := edges_line(report):
+    if edges := edges_line(report["kinds"]):
         page.paragraph(edges)
     for line in told:
         page.paragraph(line)
@@ -95,15 +93,8 @@ def distill_report(
     page.write(path)
 
 
-def edges_line(report: dict[str, Any]) -> str | None:
-    """Return the scores of thin structures, None for reports without them.
-
-    >>> edges_line({"kinds": [{"kind": "near", "views": 2, "psnr": {"before": 1, "after": 2}, "ssim": None,
-    ...             "worst": "a", "worst_psnr": {"before": 1, "after": 2}, "lost": 0,
-    ...             "edge_psnr": {"before": 30.0, "after": 33.5}}]})
-    'Edges, wires and text (PSNR of gradients): near 30.00 → 33.50 dB.'
-    """
-    kinds = [KindScore.of(kind) for kind in report["kinds"]]
+def edges_line(kinds: Sequence[KindScore]) -> str | None:
+    """Return the scores of thin structures, None without them."""
     found = [
         f"{kind.kind} {kind.edge_psnr.before:.2f} → {kind.edge_psnr.after:.2f} dB"
         for kind in kinds
@@ -118,14 +109,14 @@ def verdict(report: dict[str, Any]) -> str:
     Args:
         report: what `g2ard distill` writes as report.json.
 
-    >>> change = {"before": 30.0, "after": 36.6}
-    >>> kind = {"kind": "near", "views": 12, "psnr": change, "ssim": change, "worst": "near_0003",
-    ...         "worst_psnr": change, "lost": 0}
+    >>> from g2ard.report.kinds import Change
+    >>> change = Change(30.0, 36.6)
+    >>> kind = KindScore("near", 12, change, change, "near_0003", change, 0)
     >>> verdict({"input_count": 5000, "output_count": 500, "lifted": False, "against": "teacher renders",
     ...          "kinds": [kind]})  # doctest: +ELLIPSIS
     '500 of 5,000 Gaussians reproduce the scene at 36.6 dB, the mean of 12 held-out views; ...'
     """
-    kinds = [KindScore.of(kind) for kind in report["kinds"]]
+    kinds: Sequence[KindScore] = report["kinds"]
     if not kinds:
         return f"{plural(report['output_count'], 'Gaussian')}; no held-out view shows the scene."
     weakest = min(kinds, key=lambda kind: kind.psnr.after)
@@ -178,13 +169,13 @@ def tiled_report(path: Path, title: str, report: dict[str, Any]) -> None:
         report: content of report.json from `g2ard distill` in tiles.
     """
     scores, views = report["scores"], report["views"]
-    shown = sorted((t for t in scores["tiles"] if t["pixels"]), key=lambda t: (t["recovered"], t["tile"]))
-    page = Page(title, verdict(report | {"kinds": scores["kinds"]}))
-    page.table(COLUMNS, cells(map(KindScore.of, scores["kinds"])))
+    shown = sorted((tile for tile in scores.tiles if tile.pixels), key=lambda t: (t.recovered, t.tile))
+    page = Page(title, verdict(report | {"kinds": scores.kinds}))
+    page.table(COLUMNS, cells(scores.kinds))
     page.paragraph(
-        f"Simplified {scores['simplified']:.2f} dB, recovered {scores['recovered']:.2f} dB over the "
-        f"{scores['pixels']:,} pixels that tiles own in {plural(views['test'], 'held-out view')}; "
-        f"{plural(views['train'], 'training view')}, {scores['steps']:,} recovery steps of all tiles "
+        f"Simplified {scores.simplified:.2f} dB, recovered {scores.recovered:.2f} dB over the "
+        f"{scores.pixels:,} pixels that tiles own in {plural(views['test'], 'held-out view')}; "
+        f"{plural(views['train'], 'training view')}, {scores.steps:,} recovery steps of all tiles "
         f"together, {report['seconds']['total']:,.0f} s."
     )
     page.heading("Tiles, worst first")
@@ -192,16 +183,17 @@ def tiled_report(path: Path, title: str, report: dict[str, Any]) -> None:
         ["tile", "Gaussians", "simplified, dB", "recovered, dB", "steps", "pixels"],
         [
             [
-                str(tile["tile"]),
-                f"{tile['count']:,}",
-                *(f"{tile[stage]:.2f}" for stage in _STAGES),
-                f"{tile['steps']:,}",
-                f"{tile['pixels']:,}",
+                str(tile.tile),
+                f"{tile.count:,}",
+                f"{tile.simplified:.2f}",
+                f"{tile.recovered:.2f}",
+                f"{tile.steps:,}",
+                f"{tile.pixels:,}",
             ]
             for tile in shown
         ],
     )
-    if others := len(scores["tiles"]) - len(shown):
+    if others := len(scores.tiles) - len(shown):
         page.paragraph(f"The {plural(others, 'other tile')} own no pixel in a held-out view.")
     page.write(path)
 

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard.config.schema import changed, values_of
+from g2ard.io.reports import Report
 from g2ard.io.tile_store import TileStore
 from g2ard.pipeline.distill import RunViews
 from g2ard.rendering.renderer import RasterSettings, Renderer, settings_for
@@ -51,7 +52,7 @@ _FEWEST_OWNED_PIXELS = 256
 
 
 @dataclass(frozen=True)
-class TileScore:
+class TileScore(Report):
     """Score of one tile.
 
     Args:
@@ -67,7 +68,7 @@ class TileScore:
 
 
 @dataclass(frozen=True)
-class TiledScores:
+class TiledScores(Report):
     """Scores on held-out views, over all pixels owned by tiles.
 
     Args:

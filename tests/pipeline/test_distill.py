@@ -137,8 +137,8 @@ def test_a_loss_in_any_kind_of_view_is_reported() -> None:
                 view = {"name": f"{kind}_{i}", "kind": kind}
                 before.append({**view, "psnr": 30.0, "ssim": 0.9})
                 after.append({**view, "psnr": 30.0 + share * gain, "ssim": 0.9 + ssim})
-        kinds = [kind.as_dict() for kind in by_kind(before, after)]
-        return told({"rounds": [], "kinds": kinds, "unseen": unseen, "opacity_lost": None})
+        found = {"kinds": by_kind(before, after), "unseen": unseen, "opacity_lost": None}
+        return told({"rounds": [], **found})
 
     assert said(1.0, None, None) == ["1 of 2 usual views lost PSNR; the mean of all 2 gained 1.00 dB"]
     assert said(0.02, 0.02, 0.0) == []

@@ -343,4 +343,4 @@ def _check_same(meta: Path, ratios: Sequence[float]) -> None:
 def _tell(run: Run, output: Path, levels: Levels[Any], size: int, **more: Any) -> None:
     run.say(f"{output}: {plural(len(levels.reports), 'level')}, {size / 1e6:.2f} MB")
     result: dict[str, Any] = {"output": str(output), "bytes": size}
-    run.result({**result, "levels": [report.as_dict() for report in levels.reports], **more})
+    run.result({**result, "levels": levels.reports, **more})

@@ -94,8 +94,8 @@ def recover(
     gain, count = result.report.psnr, plural(len(job.student), "Gaussian")
     where = f"{opt.trained_on(split)} {job.views.cameras.size_text}"
     run.say(f"{output}: {count}, {where}: {gain.before:.2f} → {gain.after:.2f} dB")
-    report = {**result.report.as_dict(), "preset": job.preset, "prior": job.measures.as_dict()}
-    report |= {"kinds": [kind.as_dict() for kind in kinds], "settings": listed(job.config)}
+    report = {**result.report.as_dict(), "preset": job.preset, "prior": job.measures}
+    report |= {"kinds": kinds, "settings": listed(job.config)}
     run.result({**report, "output": str(output)})
 
 

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from g2ard.errors import InputError
 from g2ard.io.atomic import atomic_output
+from g2ard.io.reports import plain
 from g2ard.system import interrupt
 
 _START_OVER_HINT = "{overwrite=True} starts over"
@@ -24,7 +25,7 @@ PERIOD = 60.0
 
 def save(path: Path, key: str, meta: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> None:
     """Write a checkpoint; `key` identifies the run."""
-    text = json.dumps({"key": key, **meta}, default=_plain)
+    text = json.dumps({"key": key, **meta}, default=plain)
     everything: dict[str, Any] = {"meta": np.array(text), **arrays}
     with atomic_output(path, overwrite=True) as temporary:
         np.savez(temporary, **everything)
@@ -60,10 +61,6 @@ def steps_at(path: Path) -> int | None:
     except Exception:  # as `load`, which the resumed run calls
         return None
     return done if isinstance(done, int) else None
-
-
-def _plain(value: Any) -> Any:
-    return value.tolist() if hasattr(value, "tolist") else str(value)
 
 
 @contextmanager
