@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -279,18 +279,15 @@ def views_or_pool(
 
     Other arguments are those of `views_of`.
     """
-    from g2ard.poses import plan_pool
-
     if views is not None and not is_made(views):
         return views
     if views is None and beside is not None:
         found = found_views(beside, scene, [], say, turned=up is not None)
         if found:
             return found
-    if count is None:
-        planned = _planned(scene, _POOL_VIEWS, up=up, seed=seed, progress=progress, grow=_POOL_GROWTH)
-    else:
-        planned = plan_pool(scene, count, up=up, seed=seed, rows=_POOL_SAMPLE, progress=progress)
+    grow = _POOL_GROWTH if count is None else 1.0
+    size = _POOL_VIEWS if count is None else count
+    planned = _planned(scene, size, up=up, seed=seed, progress=progress, grow=grow)
     if student is not None:
         mix = partial(
             _mixed,
@@ -345,8 +342,6 @@ def cameras_for_weights(
     Returns:
         The cameras, or None for no views.
     """
-    from g2ard.poses import plan_pool
-
     made = is_made(views)
     if method == "paper" and views is not None:
         say("paper uses no views")
@@ -363,47 +358,34 @@ def cameras_for_weights(
     if method != "default" and not made:
         return None
     try:
-        times = _times(scene, represents)
-        pool = plan_pool(
+        return _planned(
             scene,
-            round(_WEIGHT_VIEWS * times),
+            _WEIGHT_VIEWS,
             up=up,
             seed=seed,
-            rows=round(_WEIGHT_ROWS * times),
+            rows=_WEIGHT_ROWS,
             near=_WEIGHT_NEAR_SHARE,
             represents=represents,
             progress=progress,
-        )
+        ).cameras
     except InputError as e:
         say(f"continuing without views: {e}")
         return None
-    return pool.cameras
 
 
 def _planned(
     prior: Splats,
     count: int,
     *,
-    up: Up,
-    seed: int,
-    progress: Progress,
-    grow: float = 1.0,
+    rows: int = _POOL_SAMPLE,
     represents: float = 1.0,
+    **options: Any,
 ) -> Pool:
-    """Plan a pool of `count` to `grow` × `count` views, more in proportion to a tiled scene's size."""
+    """Plan a pool as `plan_pool` does, but larger in proportion to a tiled scene's size."""
     from g2ard.poses import plan_pool
 
     times = _times(prior, represents)
-    return plan_pool(
-        prior,
-        round(count * times),
-        up=up,
-        seed=seed,
-        rows=round(_POOL_SAMPLE * times),
-        grow=grow,
-        represents=represents,
-        progress=progress,
-    )
+    return plan_pool(prior, round(count * times), rows=round(rows * times), represents=represents, **options)
 
 
 def _times(prior: Splats, represents: float) -> float:
