@@ -87,7 +87,9 @@ CASES: dict[str, Call] = {
     "recover-skipping": recovery(targets=Broken(), schedule=PAPER_SCHEDULE),
     "distill": distillation(DistillConfig(recover=RecoverConfig(steps=12)), validation=NEAR),
     "distill-rounds": distillation(
-        DistillConfig(SelectConfig(views_count=4), recover=RecoverConfig(schedule=ROUNDS, sh_degree=0))
+        DistillConfig(
+            SelectConfig(views_count=4, reselect=True), recover=RecoverConfig(schedule=ROUNDS, sh_degree=0)
+        )
     ),
     "paper": distillation(PAPER),
     "adapt": lambda work, progress: adapt(
@@ -192,3 +194,15 @@ def test_after_a_power_cut_at_any_file(name: str, tmp_path: Path, monkeypatch: p
             run(moment, tmp_path / str(moment))
         ended = content(call(tmp_path / str(moment), lambda *_: None))
         assert_same(ended, whole, f"cut after {moment} of {files} files")
+
+
+def test_runs_that_share_a_folder_do_not_mix(tmp_path: Path) -> None:
+    config, brighter = AdaptConfig(steps=9), replace(SMALL, sh0=SMALL.sh0 + np.float32(0.1))
+    for scene, targets, how in (
+        (SMALL, TARGETS, config),
+        (SMALL, TARGETS, replace(config, seed=1)),
+        (brighter, TARGETS, config),
+        (SMALL, NEAR, config),
+    ):
+        found, alone = (content(adapt(scene, targets, how, work=work)) for work in (tmp_path, None))
+        assert_same(found, alone, repr(how))

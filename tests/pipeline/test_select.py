@@ -21,8 +21,7 @@ from g2ard.stages.recover.schedule import TUNED
 from g2ard.stages.select import select
 from g2ard.stages.simplify import SimplifyConfig
 from helpers.commands import CommandLine, refused, succeeds
-from helpers.interruptions import interrupt_at
-from helpers.scenes import around, assert_same_bits, checkered_ball
+from helpers.scenes import around, checkered_ball
 
 PRIOR = checkered_ball(1500)
 SHORT = DistillConfig(simplify=SimplifyConfig(method="paper"), recover=RecoverConfig(steps=20))
@@ -103,24 +102,6 @@ def test_views_are_selected_once_by_default(monkeypatch: pytest.MonkeyPatch) -> 
     counts.clear()
     distill(PRIOR, 600, targets, changed(config, {"select.reselect": True}))
     assert counts == [1500, 1125, 844, 633]
-
-
-def test_an_interrupted_run_resumes_with_the_same_views(tmp_path: Path) -> None:
-    config = changed(
-        SHORT,
-        {
-            "select.views_count": 6,
-            "select.reselect": True,
-            "recover.schedule": replace(TUNED, steps=20, round_steps=10),
-        },
-    )
-    targets = TeacherRenders(PRIOR, crowded())
-    whole = distill(PRIOR, 600, targets, config)
-    with pytest.raises(KeyboardInterrupt):
-        distill(PRIOR, 600, targets, config, work=tmp_path, progress=interrupt_at("recover round-2", 4))
-    again = distill(PRIOR, 600, targets, config, work=tmp_path)
-    assert_same_bits(whole.splats, again.splats)
-    assert whole.report.views == again.report.views
 
 
 def test_the_command_reports_unchosen_views(command_line: CommandLine, tmp_path: Path) -> None:
