@@ -11,7 +11,7 @@ from g2ard.progress import plural
 
 if TYPE_CHECKING:
     from g2ard.jobs.budget import Budget
-    from g2ard.jobs.measured_budget import Aim
+    from g2ard.jobs.measured_budget import ResolvedBudget
     from g2ard.pipeline.distill import ViewsReport
     from g2ard.report.kinds import KindScore
     from g2ard.scene.splats import Splats
@@ -150,9 +150,9 @@ def why_large(splats: Splats) -> str:
     return f"{share:.0%} of it is SH above degree 0; --sh-degree 0 removes it"
 
 
-def tell_quality(run: Run, aim: Aim, splats: Splats) -> None:
+def tell_quality(run: Run, budget: ResolvedBudget, splats: Splats) -> None:
     """Print the quality of a result with a quality budget; exit with status 3 if it is too low."""
-    judgement = aim.judge(splats)
+    judgement = budget.judge(splats)
     if judgement is None:
         return
     met, line = judgement

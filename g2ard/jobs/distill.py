@@ -19,7 +19,7 @@ from g2ard.jobs.budget import Budget
 from g2ard.jobs.clean import clean as remove_clutter
 from g2ard.jobs.distill_options import DistillOptions
 from g2ard.jobs.inputs import Views, load_scene, make_targets, scorable
-from g2ard.jobs.measured_budget import Aim, Reduction, aim_of
+from g2ard.jobs.measured_budget import Reduction, ResolvedBudget, resolved
 from g2ard.jobs.photos import distinct, sparse_file, sparse_points, topped_up
 from g2ard.jobs.view_checks import check_photos, propose_background
 from g2ard.jobs.views import FULL_PIXELS, Use, views_of
@@ -46,7 +46,7 @@ class DistillJob:
 
     Args:
         prior: the dense scene, or a lifted point cloud.
-        aim: the resolved budget.
+        budget: the resolved budget.
         teacher: the scene rendered for targets; None if all targets are photos.
         photos_over_renders: use photos where views have them and renders for the rest; always False without a
             teacher.
@@ -55,7 +55,7 @@ class DistillJob:
     """
 
     prior: Splats
-    aim: Aim
+    budget: ResolvedBudget
     views: RunViews
     teacher: Splats | None
     photos_over_renders: bool
@@ -95,7 +95,7 @@ class DistillJob:
     @cached_property
     def targets(self) -> Targets:
         """Training targets."""
-        few = self.config.select.views_count is not None or self.is_kept(self.aim.count)
+        few = self.config.select.views_count is not None or self.is_kept(self.budget.count)
         return self.targets_for(self.views.train.cameras, self._renderer, lazy=few)
 
     @cached_property
@@ -130,7 +130,7 @@ class DistillJob:
         cameras = self.views.apart
         if cameras is None or self.teacher is None or len(cameras) < 2:
             return None
-        unused = first == 0 and self.is_kept(self.aim.count)
+        unused = first == 0 and self.is_kept(self.budget.count)
         return self.targets_for(cameras.take(range(first, len(cameras), 2)), self._renderer, lazy=unused)
 
     def render_targets(self) -> None:
@@ -164,7 +164,7 @@ class DistillJob:
         self.render_targets()
         done = pipeline(
             self.prior,
-            self.aim.count,
+            self.budget.count,
             self.targets,
             self.config,
             weights=self.weights,
@@ -172,7 +172,7 @@ class DistillJob:
             work=work,
             progress=self.progress,
         )
-        return replace(done, splats=self.aim.shrink(done.splats, self.say), held_out=self.held_out)
+        return replace(done, splats=self.budget.shrink(done.splats, self.say), held_out=self.held_out)
 
 
 Scene = Splats | Points | str | Path | None
@@ -293,7 +293,7 @@ def distill(
     )
     job = prepare(scene, budget, options, progress=progress, say=say)
     done = job.run(work)
-    if judgement := job.aim.judge(done.splats):
+    if judgement := job.budget.judge(done.splats):
         say(judgement[1])
     return done
 
@@ -346,7 +346,7 @@ def prepare(
         say=say,
     )
     file = f"scene.{options.format}"
-    aim = aim_of(budget, reduce, read.name, file, recovered=True, sh_degree=degree)
+    wanted = resolved(budget, reduce, read.name, file, recovered=True, sh_degree=degree)
     photos, renders = _sources(views, options.photos, read.lifted)
     choice = _regularizers(options, read, prior, cameras if photos else None)
     regularizers, preset_label, measured = choice
@@ -357,8 +357,8 @@ def prepare(
             shown = read.prior.take(np.arange(read.given)) if read.lifted else prior
             insisted, renders_too = options.photos is True, not read.lifted
             check_photos(shown, cameras, recover.background, say, insisted=insisted, renders=renders_too)
-    say(_task(prior, aim.count, cameras if recovers else None, photos, alone=read.from_photos))
-    if not read.from_photos and aim.count == len(prior):
+    say(_task(prior, wanted.count, cameras if recovers else None, photos, alone=read.from_photos))
+    if not read.from_photos and wanted.count == len(prior):
         say(f"nothing to simplify: the scene has {plural(len(prior), 'Gaussian')}")
     if recovers:
         say(f"regularisers: {preset_label}")
@@ -367,7 +367,7 @@ def prepare(
         config = replace(config, recover=_from_points(options, config.recover))
     return DistillJob(
         prior=prior,
-        aim=aim,
+        budget=wanted,
         views=replace(views, apart=None) if photos else views,  # photos exist only for given poses
         teacher=prior if renders else None,
         photos_over_renders=photos and renders,

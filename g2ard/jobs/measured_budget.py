@@ -7,7 +7,6 @@ import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -38,8 +37,8 @@ _POOL_SAMPLE = 100_000
 """Gaussians that those views are planned on."""
 _PROBE_ROWS = 4096
 """Gaussians of the first probe file, which estimates the bytes per Gaussian."""
-_BYTES_PROBES, _BYTES_ACCEPTED, _BYTES_AIM = 6, 0.98, 0.99
-"""Most files written to find a count for bytes; shares of the bytes that are accepted and aimed at."""
+_BYTES_PROBES, _BYTES_ACCEPTED, _BYTES_GOAL = 6, 0.98, 0.99
+"""Most files written to find a count for bytes; shares of the bytes that are accepted and sought."""
 _BYTES_SAFETY = 0.985
 """Safety factor on the bytes if recovery will change the scene after the search."""
 _QUALITY_TRIALS = 8
@@ -229,10 +228,10 @@ def count_for_bytes(splats: Splats, wanted: int, name: str, reduce: Callable[[in
         if over[0] - fits[0] <= 1:
             break
         if fits[0] and over[1]:  # file sizes grow in steps, so interpolate with limits
-            share = (_BYTES_AIM * wanted - fits[1]) / (over[1] - fits[1])
+            share = (_BYTES_GOAL * wanted - fits[1]) / (over[1] - fits[1])
             count = round(fits[0] + min(max(share, 0.1), 0.9) * (over[0] - fits[0]))
         else:
-            count = int(count * _BYTES_AIM * wanted / size)
+            count = int(count * _BYTES_GOAL * wanted / size)
     return fits[0]
 
 
@@ -247,7 +246,7 @@ def count_for_layers(count: int, most: float, reduce: Callable[[int], Splats]) -
         layers = 0.0 if near is None else near.mean
         if layers <= most or count <= _FEWEST_GAUSSIANS:
             break
-        count = max(_FEWEST_GAUSSIANS, int(count * min((_BYTES_AIM * most / layers) ** 2, 0.95)))
+        count = max(_FEWEST_GAUSSIANS, int(count * min((_BYTES_GOAL * most / layers) ** 2, 0.95)))
     return count, layers
 
 
@@ -306,21 +305,21 @@ def _next_count(excesses: Mapping[int, float], met: int, missed: int, most: int)
         met: smallest count that keeps the quality, `most` until one does.
         missed: largest count that does not, 0 until one does not.
     """
-    aim = _QUALITY_TOLERANCE / 2
+    goal = _QUALITY_TOLERANCE / 2
     if missed and met < most:  # interpolate between them; otherwise extrapolate from the only known side
-        share = (aim - excesses[missed]) / max(excesses[met] - excesses[missed], 1e-12)
+        share = (goal - excesses[missed]) / max(excesses[met] - excesses[missed], 1e-12)
         return round(missed * (met / missed) ** min(max(share, 0.05), 0.95))
     near = met if met < most else missed
     (a, at_a), (b, at_b) = min(excesses.items()), max(excesses.items())
     slope = (at_b - at_a) / math.log2(b / a) if b > a else _GAIN_PER_DOUBLING
-    steps = (aim - excesses[near]) / max(slope, _GAIN_PER_DOUBLING / 4)
+    steps = (goal - excesses[near]) / max(slope, _GAIN_PER_DOUBLING / 4)
     # Extrapolation is unreliable, and towards N the excess grows faster than linearly.
     highest = math.sqrt(near * most) if met == most else most
     return max(_FEWEST_GAUSSIANS, round(min(near * 2 ** min(max(steps, -3.0), 3.0), highest)))
 
 
 @dataclass(frozen=True, eq=False)
-class Aim:
+class ResolvedBudget:
     """Budget resolved for a scene.
 
     Args:
@@ -364,7 +363,7 @@ class Aim:
         return False, f"{line}, less than the requested {self.wanted}; {more}"
 
 
-def aim_of(
+def resolved(
     budget: Budget,
     reduce: Reduction,
     name: str,
@@ -372,7 +371,7 @@ def aim_of(
     *,
     recovered: bool = False,
     sh_degree: int | None = None,
-) -> Aim:
+) -> ResolvedBudget:
     """Resolve a budget for the scene of `reduce`, which makes the result.
 
     Args:
@@ -383,36 +382,35 @@ def aim_of(
     splats, say = reduce.splats, reduce.say
     if budget.min_psnr is not None or budget.min_ssim is not None:
         wanted = Quality(budget.min_psnr or 0.0, budget.min_ssim or 0.0)
-        return _aim_for_quality(reduce, wanted, file, recovered)
+        return _resolved_for_quality(reduce, wanted, file, recovered)
+
+    def made(count: int) -> Splats:
+        return (simplify(splats, count, method="fast") if recovered else reduce(count)).splats
+
     if budget.bytes is not None:
         if sh_degree is not None:
             splats = splats.with_sh_degree(sh_degree)
         most = int(budget.bytes * _BYTES_SAFETY) if recovered else budget.bytes
-        made = partial(simplify, splats, method="fast") if recovered else reduce
-        found = count_for_bytes(splats, most, file, lambda count: made(count).splats)
-        about = f"about {plural(found, 'Gaussian')}"
-        say(f"{budget.fit}: {_all_fit(splats) if found == len(splats) else about}")
-        return Aim(found, bytes=budget.bytes, file=file)
-    found = most = budget.of(len(splats), name)
-    check_positions(file, splats, found)
+        found = count_for_bytes(splats, most, file, made)
+    else:
+        found = budget.of(len(splats), name)
+        check_positions(file, splats, found)
     if budget.layers is not None:
-        made = partial(simplify, splats, method="fast") if recovered else reduce
-        found, layers = count_for_layers(most, budget.layers, lambda count: made(count).splats)
-        if found < most:
+        whole = found
+        found, layers = count_for_layers(whole, budget.layers, made)
+        if found < whole:
             say(
-                f"{budget.fit}: near views blend more than {budget.layers} Gaussians per pixel at {most:,}, "
+                f"{budget.fit}: near views blend more than {budget.layers} Gaussians per pixel at {whole:,}, "
                 f"{layers:.0f} at {found:,}"
             )
     if budget.fit is not None:
-        say(f"{budget.fit}: {_all_fit(splats) if found == len(splats) else plural(found, 'Gaussian')}")
-    return Aim(found)
+        fits = plural(found, "Gaussian") if budget.bytes is None else f"about {plural(found, 'Gaussian')}"
+        all_fit = f"nothing to do, all {plural(found, 'Gaussian')} already fit"
+        say(f"{budget.fit}: {all_fit if found == len(splats) else fits}")
+    return ResolvedBudget(found, budget.bytes, file)
 
 
-def _all_fit(splats: Splats) -> str:
-    return f"nothing to do, all {plural(len(splats), 'Gaussian')} already fit"
-
-
-def _aim_for_quality(reduce: Reduction, wanted: Quality, file: str, recovered: bool) -> Aim:
+def _resolved_for_quality(reduce: Reduction, wanted: Quality, file: str, recovered: bool) -> ResolvedBudget:
     """Find the count that keeps a quality in generated views, as read back from the format of `file`."""
     from g2ard.poses import plan_pool
 
@@ -430,4 +428,4 @@ def _aim_for_quality(reduce: Reduction, wanted: Quality, file: str, recovered: b
         stage = " before recovery" if recovered else ""
         views = plural(len(cameras), "view")
         say(f"{plural(found, 'Gaussian')} keep {near}{stage}, in {views} generated to choose the count")
-    return Aim(found, file=file, wanted=wanted, dense=splats, cameras=cameras)
+    return ResolvedBudget(found, file=file, wanted=wanted, dense=splats, cameras=cameras)

@@ -10,7 +10,7 @@ from g2ard.config.checks import checks_arguments
 from g2ard.config.choices import FormatName, RenderModel
 from g2ard.jobs.budget import Budget
 from g2ard.jobs.inputs import Views, load_scene
-from g2ard.jobs.measured_budget import Reduction, aim_of
+from g2ard.jobs.measured_budget import Reduction, resolved
 from g2ard.pipeline.presets import configured
 from g2ard.progress import Progress, Say, silent, unsaid
 from g2ard.scene.splats import Splats
@@ -100,10 +100,10 @@ def simplify(
         progress=progress,
         say=say,
     )
-    aim = aim_of(wanted, reduce, name, f"scene.{format}")
-    small = reduce(aim.count)
+    budget = resolved(wanted, reduce, name, f"scene.{format}")
+    small = reduce(budget.count)
     say_gaps(small.report.opacity_lost, say)
-    if judgement := aim.judge(small.splats):
+    if judgement := budget.judge(small.splats):
         say(judgement[1])
     return small
 

@@ -15,13 +15,13 @@ from g2ard.jobs.close_up import close_up
 from g2ard.jobs.distill import prepare
 from g2ard.jobs.distill_options import DistillOptions
 from g2ard.jobs.measured_budget import (
-    Aim,
     Quality,
     Reduction,
-    aim_of,
+    ResolvedBudget,
     count_for_bytes,
     count_for_quality,
     file_bytes,
+    resolved,
 )
 from g2ard.scene.splats import Splats
 from g2ard.stages.simplify import simplify
@@ -90,18 +90,18 @@ def test_simplify_fits(tmp_path: Path, command_line: CommandLine) -> None:
 def test_quest3_bounds_overdraw(recovered: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     scene, said = checkered_ball(6000), []
     reduce = Reduction(scene, blind=True, say=said.append)
-    plain = aim_of(Budget(fit="quest3"), reduce, "a", "a.ply", recovered=recovered)
-    assert plain.count == aim_of(Budget(fit="web"), reduce, "a", "a.ply").count == 6000
+    plain = resolved(Budget(fit="quest3"), reduce, "a", "a.ply", recovered=recovered)
+    assert plain.count == resolved(Budget(fit="web"), reduce, "a", "a.ply").count == 6000
     dense = close_up(scene)
     assert dense is not None
     monkeypatch.setitem(LAYERS, "quest3", dense.mean / 2)
-    found = aim_of(Budget(fit="Quest3"), reduce, "a", "a.ply", recovered=recovered).count
+    found = resolved(Budget(fit="Quest3"), reduce, "a", "a.ply", recovered=recovered).count
     near = close_up(fast(scene, found) if recovered else reduce(found).splats)
     assert near is not None
     assert dense.mean / 4 < near.mean <= dense.mean / 2
     assert f"at {found:,}" in " ".join(said)
     monkeypatch.setitem(LAYERS, "quest3", 1e-3)  # out of reach: the search ends, and says what it has
-    assert aim_of(Budget(fit="quest3"), reduce, "a", "a.ply", recovered=recovered).count < found
+    assert resolved(Budget(fit="quest3"), reduce, "a", "a.ply", recovered=recovered).count < found
 
 
 @pytest.mark.parametrize(
@@ -112,7 +112,7 @@ def test_distill_measures_the_simplification_that_it_makes(settings: dict[str, A
     said: list[str] = []
     options = DistillOptions(views=around(16, (48, 36)), settings={"steps": 1, **settings})
     job = prepare(checkered_ball(800), Budget(min_psnr=24), options, say=said.append)
-    judged = job.aim.judge(job.run().simplified)
+    judged = job.budget.judge(job.run().simplified)
     assert judged is not None
     kept = judged[1].partition(" in the 12 views")[0]
     assert f"{kept} before recovery, in 12 views generated to choose the count" in said
@@ -138,7 +138,7 @@ def test_one_budget_that_makes_sense(words: str, tmp_path: Path, command_line: C
 def test_a_result_that_is_too_large_is_merged_further() -> None:
     first, said = fast(checkered_ball(3000), 1000), []
     most = file_bytes(first, "a.ply") // 2
-    small = Aim(1000, bytes=most, file="a.ply").shrink(first, said.append)
+    small = ResolvedBudget(1000, bytes=most, file="a.ply").shrink(first, said.append)
     assert file_bytes(small, "a.ply") <= most
     assert 0.9 * 500 < len(small) < 510
     assert "merging 1,000 to " in said[0]
@@ -146,7 +146,7 @@ def test_a_result_that_is_too_large_is_merged_further() -> None:
 
 @pytest.mark.parametrize("count", [2, 3, 40])
 def test_a_size_that_no_count_fits_leaves_one_gaussian(count: int) -> None:
-    assert len(Aim(count, bytes=1, file="a.ply").shrink(checkered_ball(count))) == 1
+    assert len(ResolvedBudget(count, bytes=1, file="a.ply").shrink(checkered_ball(count))) == 1
 
 
 def test_bytes_are_of_the_degree_that_is_written() -> None:

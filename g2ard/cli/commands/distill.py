@@ -141,7 +141,7 @@ def distill(
     if scene is not None:
         say_fit(run, scene, budget, f"scene.{format}")
     job = prepare(scene, budget, options, **run.callbacks)
-    cost = cost_of(job, job.aim.count, page=page)
+    cost = cost_of(job, job.budget.count, page=page)
     if dry_run:
         _tell_cost(run, job, cost)
         return
@@ -153,7 +153,7 @@ def distill(
     result, report = _distil(run, scene or Path(str(views)), job, folder, before)
     run.kept = [f"{folder.path} is finished"]
     run.result(report)
-    tell_quality(run, job.aim, result.splats)
+    tell_quality(run, job.budget, result.splats)
 
 
 def _check_options(
@@ -182,7 +182,7 @@ def _check_kind(scene: Path) -> None:
 
 def _tell_cost(run: Run, job: DistillJob, cost: Cost) -> None:
     """Print what a distillation would do, and its rough time and memory."""
-    count = job.aim.count
+    count = job.budget.count
     run.answer(
         f"{plural(count, 'Gaussian')}, {plural(cost.views, 'target image')} of {cost.pixels:,} pixels, "
         f"{plural(cost.steps, 'step')}: roughly {max(1, cost.seconds):.0f} s on two cores and "
@@ -201,7 +201,7 @@ def _distil(
         before: seconds of the stages before this call.
     """
     began, page = time.monotonic(), ""
-    with folder.working(len(job.prior), job.aim.count, _photos(job)):
+    with folder.working(len(job.prior), job.budget.count, _photos(job)):
         result = job.run(folder.work)
         folder.write_scene(result.splats)
         folder.write_simplified(result.simplified if run.config["keep"] else None)

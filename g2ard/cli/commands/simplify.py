@@ -64,7 +64,7 @@ def simplify(
     from g2ard.cli.tiled import simplify_in_tiles
     from g2ard.jobs.cost import WHOLE_TIMES, check_whole_memory
     from g2ard.jobs.inputs import say_notes
-    from g2ard.jobs.measured_budget import Reduction, aim_of
+    from g2ard.jobs.measured_budget import Reduction, resolved
     from g2ard.jobs.tiling import is_tiled, needs_whole, refuse_whole
     from g2ard.stages.simplify import SimplifyConfig
 
@@ -105,11 +105,11 @@ def simplify(
     reading = started - began  # shared by all budgets
     common: dict[str, Any] = {"seed": run.seed, "progress": run.progress, "say": run.say}
     reduce = Reduction(splats, views=given, blind=no_views, config=config, beside=scene, up=up, **common)
-    aims = [aim_of(budget, reduce, str(scene), output.name) for budget in budgets]
+    wanted = [resolved(budget, reduce, str(scene), output.name) for budget in budgets]
     reports = []
-    rows = maps.paths(total) if maps else [None] * len(aims)
-    for aim, place, parents in zip(aims, outputs.paths(total), rows, strict=True):
-        small = reduce(aim.count)
+    rows = maps.paths(total) if maps else [None] * len(wanted)
+    for one, place, parents in zip(wanted, outputs.paths(total), rows, strict=True):
+        small = reduce(one.count)
         simplified = time.perf_counter()
         run.write(place, small.splats)
         if parents is not None:
@@ -121,10 +121,10 @@ def simplify(
         started = written
         reports.append(_report(found, small, config, seconds))
         _tell(run, scene, small, place, seconds["total"])
-        if aim.bytes is not None:
-            run.say(f"{place}: {written_bytes(place):,} of {aim.bytes:,} bytes")
+        if one.bytes is not None:
+            run.say(f"{place}: {written_bytes(place):,} of {one.bytes:,} bytes")
     run.results(reports)
-    tell_quality(run, aims[0], small.splats)
+    tell_quality(run, wanted[0], small.splats)
 
 
 def _parents_file(run: Run) -> Callable[[Path, Budget], None]:
