@@ -257,7 +257,7 @@ def workers_for(store: TileStore, tiling: Tiling, times: float = 1.0) -> int:
     memory = tiling.usable_memory
     largest = max(store.tiles, key=lambda tile: tile.rows + tile.halo)
     rows, most = largest.rows + largest.halo, store.settings.get("tile_rows") or largest.rows
-    made_here = tiling.folder is not None and store.folder.parent == tiling.folder
+    made_here = store.folder.parent == tiling.folder
     tiles = TileMemory(store.count, store.row_bytes, times, None if made_here else store.folder)
     need = tiles.of(rows)
     fit = memory // need

@@ -58,7 +58,7 @@ def working(tiling: Tiling, *views: Views | None) -> Iterator[None]:
         views: given to the command; they are read now, and the scheduler is tried, because writing tiles
             takes long.
     """
-    folder = _folder(tiling)
+    folder = tiling.folder
     _check_folder(folder)
     _check_given(tiling, views)
     made = not folder.exists()
@@ -80,11 +80,6 @@ def working(tiling: Tiling, *views: Views | None) -> Iterator[None]:
             folder.rmdir()  # where the lock had to go first
     finally:
         drop_empty(above)
-
-
-def _folder(tiling: Tiling) -> Path:
-    assert tiling.folder is not None
-    return tiling.folder
 
 
 def _check_folder(folder: Path) -> None:
@@ -135,14 +130,12 @@ def _tiles_and_workers(
                 hint=f"run `g2ard ingest --render-model {render_model}` on their scene",
             )
     else:
-        folder = _folder(tiling) / "tiles"
-        rows, replace_others = tiling.most_rows, not tiling.keep
         store = ingest(
             scene,
-            folder,
-            tile_rows=rows,
+            tiling.folder / "tiles",
+            tile_rows=tiling.most_rows,
             render_model=render_model,
-            overwrite=replace_others,
+            overwrite=not tiling.keep,
             progress=progress,
             say=say,
         )
@@ -150,7 +143,7 @@ def _tiles_and_workers(
     threads = max(1, tiling.usable_cores // workers)
     say(f"{len(store.tiles):,} tiles of {store.count:,} Gaussians, {workers} at a time")
     with executor(workers, threads, tiling.scheduler) as runs:
-        yield store, Workers(runs, _folder(tiling) / "steps", progress)
+        yield store, Workers(runs, tiling.folder / "steps", progress)
 
 
 def simplify_in_tiles(
@@ -329,7 +322,7 @@ class _Job:
 
     def stored(self, scene: TiledScene, name: str, like: TileStore | None = None) -> TileStore:
         """Write a derived scene in tiles of its own, or in those of another."""
-        folder = _folder(self.tiling) / f"{name}-{scene.key}"
+        folder = self.tiling.folder / f"{name}-{scene.key}"
         return ingest(scene.stream(), folder, tile_rows=self.tiling.most_rows, like=like)
 
 

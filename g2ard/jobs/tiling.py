@@ -41,7 +41,7 @@ class Tiling:
     workers: int | None = None
     cores: int | None = None
     scheduler: str | None = None
-    folder: Path | None = None
+    folder: Path = Path(".tiles")
     keep: bool = True
 
     @property

@@ -148,7 +148,6 @@ def lod(
     run.claim("--output", output, folder=True)
     run.claim("--resume", stopped, folder=True)
     work = tiling.folder if tiled else stopped
-    assert work is not None
     finished = not dry_run and is_finished(run, stopped, resume, writer.page)
     if not (dry_run or (tiled and tiling.keep)):
         finished |= drop_ended(run, work, resume or tiled, writer.page)
@@ -163,7 +162,7 @@ def lod(
     if finished or not (tiled or dry_run):
         check_stopped(run, stopped, resume or finished, writer.meta)
     if tiled:
-        _in_tiles(writer, scene, ratios, tiling, views, steps, size, colour, recover)
+        _in_tiles(writer, ratios, tiling, steps, size, recover)
         return
     check_whole_memory(scene, tiling, LEVELS_TIMES, RECOVERY_TIMES)
     choices: dict[str, Any] = {
@@ -175,8 +174,7 @@ def lod(
         "render_model": run.render_model,
         "split_sky": environment,
         "seed": run.seed,
-        "progress": run.progress,
-        "say": run.say,
+        **run.callbacks,
     }
     if dry_run:
         _tell_costs(run, prepare_levels(scene, ratios=ratios, recover=recover, **choices))
@@ -219,13 +217,10 @@ def _tell_costs(run: Run, job: LevelsJob) -> None:
 
 def _in_tiles(
     writer: _Writer,
-    scene: Path,
     ratios: Sequence[float],
     tiling: Tiling,
-    views: Any,
     steps: int | None,
     size: int | None,
-    background: Colour,
     recover: bool,
 ) -> None:
     """Write levels tile by tile; finished steps stay in the tiling's folder until the command succeeds."""
@@ -236,16 +231,13 @@ def _in_tiles(
     from g2ard.tiles.merging import key_of
 
     run, folder = writer.run, tiling.folder
-    assert folder is not None
-    settings = recovery_settings(steps, background, run.seed)
+    settings = recovery_settings(steps, writer.background, run.seed)
     options = DistillOptions(
-        views=views, size=size, up=writer.up, render_model=run.render_model, settings=settings
+        views=writer.views, size=size, up=writer.up, render_model=run.render_model, settings=settings
     )
     run.unfinished = f"finished steps are in {folder}; run the same command to continue"
-    with working(tiling, views):
-        levels = lod_in_tiles(
-            scene, ratios, tiling, options, recover=recover, progress=run.progress, say=run.say
-        )
+    with working(tiling, writer.views):
+        levels = lod_in_tiles(writer.scene, ratios, tiling, options, recover=recover, **run.callbacks)
         begun = folder / f"written-{key_of([[one.store.key for one in levels.splats], asdict(writer.cut)])}"
         begun.mkdir(exist_ok=True)
         _tell(run, writer.output, levels, writer.save(levels.splats, begun), peak_rss_bytes=peak_rss_of_all())
@@ -287,7 +279,7 @@ class _Writer:
 
         run = self.run
         common: dict[str, Any] = {"cut": self.cut, "overwrite": run.overwrite, "work": work}
-        common |= {"progress": run.progress, "say": run.say}
+        common |= run.callbacks
         if self.kind == "sog":
             axis, written = self.up, save_levels(self.output, levels, environment=sky, **common)
         else:
