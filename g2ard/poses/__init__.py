@@ -5,7 +5,6 @@ Planners (`outside`, `within`) propose poses from endless even sequences, and ke
 space and see enough (`sight`). `pool` combines them.
 """
 
-from g2ard.poses.make import make_pool
-from g2ard.poses.pool import Pool, plan_pool
+from g2ard.poses.pool import Pool, make_pool, plan_pool
 
 __all__ = ["Pool", "make_pool", "plan_pool"]

@@ -20,7 +20,6 @@ from g2ard.errors import InputError, require
 from g2ard.io.images import load_image, load_mask
 from g2ard.io.paths import file_identity
 from g2ard.progress import Progress, plural, silent
-from g2ard.rendering.exposure import inverse_exposure
 from g2ard.rendering.renderer import RasterSettings, Renderer
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
@@ -354,7 +353,7 @@ class Photos(_Cached):
         self._background = background
         self._masks: dict[int, NDArray[np.bool_] | None] = {}
         self._undo = {
-            view: inverse_exposure(name, exposures[name])
+            view: _inverse_exposure(name, exposures[name])
             for view, name in enumerate(cameras.names)
             if exposures and name in exposures
         }
@@ -511,3 +510,12 @@ class PhotosOrRenders(_Chosen):
         rows = np.where(pictured, np.cumsum(pictured), np.cumsum(~pictured)) - 1
         places = [(photos if photo else others, int(row)) for photo, row in zip(pictured, rows, strict=True)]
         super().__init__(cameras, places)
+
+
+def _inverse_exposure(name: str, exposure: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Return the (3, 4) transform from the photo `name` to a render, from its exposure (render to photo)."""
+    matrix = np.asarray(exposure, np.float64)
+    if matrix.shape != (3, 4) or not np.isfinite(matrix).all() or abs(np.linalg.det(matrix[:, :3])) < 1e-6:
+        raise InputError(f"exposure of {name}: expected an invertible 3×4 matrix")
+    inverse = np.linalg.inv(matrix[:, :3])
+    return np.hstack([inverse, -inverse @ matrix[:, 3:]]).astype(np.float32)

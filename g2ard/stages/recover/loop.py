@@ -11,6 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 import g2ard.stages.recover.checkpoint as checkpoints
+from g2ard.config.choices import ENGINES
+from g2ard.errors import InputError, require_torch
 from g2ard.progress import Progress, silent
 from g2ard.rendering.renderer import settings_for
 from g2ard.rendering.targets import Targets, fingerprint_of, mask_of
@@ -20,7 +22,6 @@ from g2ard.stages.recover.anchors import Anchors, drift95
 from g2ard.stages.recover.config import RecoverConfig
 from g2ard.stages.recover.draw import drawn
 from g2ard.stages.recover.engine import Engine, Objective
-from g2ard.stages.recover.engine_choice import engine_class
 from g2ard.stages.recover.guard import Guard
 from g2ard.stages.recover.probe import Probe
 from g2ard.stages.recover.schedule import multiplier_for, reach_for
@@ -138,7 +139,7 @@ class Loop:
             frozen=self.frozen,
             relative=len(self.targets.cameras.usual()) < len(self.targets.cameras),
         )
-        return engine_class(config.engine)(objective)
+        return _engine_class(config.engine)(objective)
 
     def choose_rates(self, start: float) -> None:
         """Choose reach and multiplier: the schedule's, or from the initial error and short trials.
@@ -313,3 +314,22 @@ class Loop:
 def finite(reach: float) -> float | None:
     """Return `reach`, or None for infinity, which JSON lacks."""
     return None if math.isinf(reach) else reach
+
+
+def _engine_class(name: str) -> Callable[[Objective], Engine]:
+    """Return the engine class of a name in `RecoverConfig.engine`, importing its packages on demand."""
+    if name == "fused":
+        from g2ard.stages.recover.fused_engine import FusedEngine
+
+        return FusedEngine
+    if name == "torch":
+        require_torch("engine 'torch'")
+        from g2ard.stages.recover.torch_engine import TorchEngine
+
+        return TorchEngine
+    if name == "gsplat":
+        require_torch("engine 'gsplat'", "torch gsplat")
+        from g2ard.stages.recover.gsplat_engine import GsplatEngine
+
+        return GsplatEngine
+    raise InputError(f"expected {', '.join(ENGINES)}, got {name!r}", parameter="engine")

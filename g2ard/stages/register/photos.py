@@ -16,14 +16,13 @@ from g2ard.progress import Progress, silent
 from g2ard.rendering.renderer import Renderer
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
-from g2ard.stages.register.acceptance import acceptance
 from g2ard.stages.register.attempts import Candidate, Photo, Search, Start, loaded
 from g2ard.stages.register.config import RegisterConfig
 from g2ard.stages.register.grey import band_passed
 from g2ard.stages.register.matchers import matcher_named
 from g2ard.stages.register.pool import PoolRenders, small_render, turned
 from g2ard.stages.register.pose import pose_error
-from g2ard.stages.register.report import KEPT, PhotoReport, PoseError, Registered, RegisterReport
+from g2ard.stages.register.report import KEPT, PhotoReport, PoseError, Registered, RegisterReport, Status
 
 Float = NDArray[np.float64]
 _FEATURES_BONUS = 0.05
@@ -222,7 +221,7 @@ def _reported(name: str, best: Candidate, config: RegisterConfig, renders: int) 
         position = np.sqrt(np.trace(estimate.covariance[:3, :3]))
         rotation = np.sqrt(np.trace(estimate.covariance[3:, 3:]))
         sigma = PoseError(float(position), float(np.degrees(rotation)))
-    status, reason = acceptance(best.zncc, sigma, estimate.depth, config)
+    status, reason = _acceptance(best.zncc, sigma, estimate.depth, config)
     names = ("matches", "inliers", "spread", "reprojection", "passes")
     of_features: dict[str, Any] = {}
     if best.solved is not None:
@@ -243,3 +242,26 @@ def _reported(name: str, best: Candidate, config: RegisterConfig, renders: int) 
         renders=renders,
         camera_from_world=_rows(estimate.viewmat),
     )
+
+
+def _acceptance(
+    zncc: float, sigma: PoseError | None, depth: float, config: RegisterConfig
+) -> tuple[Status, str | None]:
+    """Return the status of a pose and the reason, None if it is registered.
+
+    Args:
+        zncc: median local ZNCC of photo and render.
+        sigma: standard deviations of the pose; None if the photo does not determine it.
+        depth: median depth of the render, scene units.
+    """
+    if sigma is None:
+        return "refused", "the photo does not determine the pose"
+    if zncc < min(config.doubt, config.accept):
+        return "refused", f"the best render looks unlike it (ZNCC {zncc:.2f})"
+    if zncc < config.accept:
+        return "uncertain", f"the best render looks unlike it (ZNCC {zncc:.2f})"
+    if sigma.rotation > config.max_angle_sigma:
+        return "uncertain", f"the rotation is only known to {sigma.rotation:.2g}°"
+    if sigma.position > config.max_position_sigma * depth:
+        return "uncertain", f"the position is only known to {sigma.position / depth:.2g} of the depth"
+    return "registered", None
