@@ -51,8 +51,8 @@ def lift(
     neighbourhood's variances λ₁ ≥ λ₂ along the tangents, s₁ = spread·√λ₁,
     s₂ = max(spread·√λ₂, s₁/max_anisotropy) and the normal scale s₃ = normal_ratio·√(s₁s₂), in the points'
     unit. Where neighbours lie on a line, as along a scanner's rings, lines are thinned until a neighbourhood
-    spans the surface, which gives the normal and the variance across the line. Points of one position are
-    merged into one with their mean colour.
+    spans the surface, which gives the normal; the distance of the next lines on both sides gives the scale
+    across the line. Points of one position are merged into one with their mean colour.
 
     Args:
         points: (N, 3), any unit and origin; pass float64 to keep map coordinates exact.

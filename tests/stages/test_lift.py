@@ -110,36 +110,8 @@ def test_discs_of_scan_lines_lie_along_the_surface(ratio, noise):
     got = lift(points @ rotation.T, np.full_like(points, 0.5))
     off = np.degrees(np.arccos(np.clip(np.abs(normals(got) @ rotation[:, 2]), 0, 1)))
     assert np.percentile(off, 95) < 12
-    np.testing.assert_allclose(np.median(got.scales[:, 0]) / gap, 0.55, atol=0.25)
-    assert np.percentile(got.scales[:, 0], 99) < 1.5 * gap
-
-
-def rings(count, turns, low=-30, high=10, room=(8, 8, 8, 8, 1.7, 9)):
-    """Points of a scanner with rings of elevations and 1 cm of noise in a box, its normals, and its walls."""
-    up, around = np.meshgrid(
-        np.radians(np.linspace(low, high, count)), np.arange(turns) * 2 * np.pi / turns, indexing="ij"
-    )
-    d = np.stack([np.cos(up) * np.cos(around), np.cos(up) * np.sin(around), np.sin(up)], -1).reshape(-1, 3)
-    sides = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, -1], [0, 0, 1]])
-    far = np.where(d @ sides.T > 0, np.array(room) / np.maximum(d @ sides.T, 1e-9), np.inf)
-    reach = far.min(1) + np.random.default_rng(0).normal(0, 0.01, len(d))
-    return d * reach[:, None], sides[far.argmin(1)], far.argmin(1) < 4
-
-
-@pytest.mark.parametrize(("count", "turns"), [(16, 900), (16, 2400), (32, 1800), (64, 1024)])
-def test_discs_of_rings_lie_along_the_surface(count, turns):
-    points, truth, wall = rings(count, turns)
-    got = lift(points, np.full_like(points, 0.5))
-    off = np.degrees(np.arccos(np.clip(np.abs((normals(got) * truth).sum(1)), 0, 1)))
-    assert max(np.median(off[wall]), np.median(off[~wall])) < 15
-
-
-def test_a_wire_over_the_ground_stays_thin():
-    rng = np.random.default_rng(0)
-    ground = np.column_stack([rng.uniform(-5, 5, (4000, 2)), rng.normal(0, 0.01, 4000)])
-    wire = np.column_stack([np.linspace(-5, 5, 400), rng.normal(0, 0.005, 400), np.full(400, 3.0)])
-    got = lift(np.concatenate([ground, wire]), np.full((4400, 3), 0.5))
-    assert got.scales[4000:].max() < 0.2
+    assert 0.25 < np.median(got.scales[:, 0]) / gap < 0.6
+    assert np.percentile(got.scales[:, 0], 99) < 0.8 * gap
 
 
 @pytest.mark.parametrize("copies", [2, 3, 11, 12, 40])

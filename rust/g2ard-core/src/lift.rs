@@ -64,6 +64,11 @@ impl Patch {
         }
     }
 
+    /// Returns whether the neighbourhood is nearly a line.
+    fn narrow(&self) -> bool {
+        self.sigmas[1] < lines::LINE * self.sigmas[0] && self.sigmas[0].is_finite()
+    }
+
     fn tangential(&self, config: &LiftConfig) -> [f64; 2] {
         let [wide, narrow] = self.sigmas.map(|s| config.spread * s);
         [wide, narrow.max(wide / config.max_anisotropy)]
@@ -78,21 +83,27 @@ pub fn lift(points: &[[f64; 3]], config: &LiftConfig, control: &Control) -> Resu
     config.validate()?;
     let tree = Tree::build(points);
     control.begin(points.len() as u64);
-    let chunks: Vec<Vec<Patch>> = (0..points.len().div_ceil(CHUNK))
+    let chunks: Vec<(Vec<Patch>, Vec<u32>)> = (0..points.len().div_ceil(CHUNK))
         .into_par_iter()
         .map(|chunk| {
             control.check()?;
             let here = chunk * CHUNK..((chunk + 1) * CHUNK).min(points.len());
-            let mut patches = Vec::with_capacity(here.len());
+            let (mut patches, mut beside) = (Vec::with_capacity(here.len()), Vec::new());
             tree.nearest(here.clone(), config.neighbors, |at, near| {
-                patches.push(Patch::of(&extent(points, tree.rows()[at], near)));
+                let patch = Patch::of(&extent(points, tree.rows()[at], near));
+                if patch.narrow() {
+                    beside.extend(near.iter().map(|n| n.1));
+                }
+                patches.push(patch);
             });
             control.advance(here.len() as u64);
-            Ok(patches)
+            Ok((patches, beside))
         })
         .collect::<Result<_>>()?;
-    let mut patches = chunks.concat();
-    lines::widen(points, tree.rows(), &mut patches, config.neighbors, control)?;
+    let (patches, beside): (Vec<_>, Vec<_>) = chunks.into_iter().unzip();
+    let mut patches = patches.concat();
+    let lines = lines::find(tree.rows(), &patches, &beside);
+    lines::widen(points, lines, &mut patches, config, control)?;
     Ok(discs(&tree, &patches, config))
 }
 
