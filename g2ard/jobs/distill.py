@@ -22,7 +22,7 @@ from g2ard.jobs.inputs import Views, load_scene, make_targets, scorable
 from g2ard.jobs.measured_budget import Reduction, ResolvedBudget, resolved
 from g2ard.jobs.photos import distinct, sparse_file, sparse_points, topped_up
 from g2ard.jobs.view_checks import check_photos, propose_background
-from g2ard.jobs.views import FULL_PIXELS, Use, views_of
+from g2ard.jobs.views import Use, views_of, within_pixels
 from g2ard.pipeline.config import DistillConfig
 from g2ard.pipeline.distill import Distilled, RunViews
 from g2ard.pipeline.distill import distill as pipeline
@@ -30,7 +30,6 @@ from g2ard.progress import Progress, Say, plural, silent, unsaid
 from g2ard.rendering.renderer import Renderer
 from g2ard.rendering.targets import Targets, kinds_of, kinds_told
 from g2ard.scene.cameras import Cameras
-from g2ard.scene.samples import evenly_spaced
 from g2ard.scene.splats import Splats
 from g2ard.stages.lift import lift, lift_rows
 from g2ard.stages.recover.anchors import FREE, Regularizers
@@ -117,14 +116,10 @@ class DistillJob:
     def full_size(self) -> Targets | None:
         """Held-out targets at the views' own size, made on access; None if no size shrank them.
 
-        Of large views there are only as many as `FULL_PIXELS` hold, evenly spaced.
+        Of large views there are only some, see `within_pixels`.
         """
         cameras = self.views.full
-        if cameras is None:
-            return None
-        largest = int((cameras.widths * cameras.heights).max())
-        some = evenly_spaced(len(cameras), max(1, FULL_PIXELS // largest))
-        return scorable(self.targets_for(cameras.take(some), lazy=True))
+        return None if cameras is None else scorable(self.targets_for(within_pixels(cameras), lazy=True))
 
     def _every_second_apart(self, first: int) -> Targets | None:
         cameras = self.views.apart

@@ -48,7 +48,7 @@ def report_of(job: DistillJob, done: Distilled) -> dict[str, Any]:
         "scores": scores,
         "apart": apart,
         "size": job.held_out.cameras.size_text,
-        "own_size": own_size and {name: _means(scores) for name, scores in own_size.items()},
+        "own_size": own_size and {name: means(scores) for name, scores in own_size.items()},
         "kinds": by_kind(before, after, USUAL if made else "given"),
         "unseen": _unseen(job, done),
         "opacity_lost": None
@@ -78,7 +78,8 @@ def _scores(
     }
 
 
-def _means(scores: dict[str, Any]) -> dict[str, Any]:
+def means(scores: dict[str, Any]) -> dict[str, Any]:
+    """Return the means of an evaluation and where it was scored."""
     return {name: scores[name] for name in ("psnr", "ssim", "edge_psnr", "scored_in")}
 
 

@@ -8,7 +8,7 @@ from g2ard.errors import InputError
 from g2ard.io.types import ViewSet
 from g2ard.jobs.inputs import Views, load_scene, load_split_views, load_trained, make_targets, scorable
 from g2ard.jobs.view_checks import check_photos, propose_background, warn_of_sight
-from g2ard.jobs.views import views_or_pool
+from g2ard.jobs.views import shrunk, views_or_pool, within_pixels
 from g2ard.progress import Progress, Say, silent, unsaid
 from g2ard.rendering.targets import Targets
 from g2ard.scene.cameras import USUAL, Cameras
@@ -94,6 +94,15 @@ class Teaching:
         if self.dense is None or self._photos:
             propose_background(cameras, self._background, self._chosen, self._say)
         return self._made(cameras, progress=self._progress, say=self._say, **options)
+
+    def full_size(self, cameras: Cameras, size: int | None, **options: Any) -> Targets | None:
+        """Return the targets of unshrunk views, made on first access; None if `size` shrinks none of them.
+
+        Of large views there are only some, see `within_pixels`.
+        """
+        if shrunk(cameras, size) is None:
+            return None
+        return scorable(self._made(within_pixels(cameras), lazy=True, **options))
 
     def held_out(self, views: Views, size: int | None) -> Targets | None:
         """Return the targets of the test views, made on first access; None if there are no such views."""

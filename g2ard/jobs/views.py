@@ -21,6 +21,7 @@ from g2ard.pipeline.config import SelectConfig
 from g2ard.pipeline.distill import RunViews
 from g2ard.progress import Progress, Say, direction, silent, unsaid
 from g2ard.scene.cameras import USUAL, Camera, Cameras, look_at, rows_by_kind
+from g2ard.scene.samples import evenly_spaced
 from g2ard.scene.splats import Splats
 from g2ard.stages.select.light import complete
 from g2ard.stages.simplify import simplify
@@ -124,7 +125,7 @@ def views_of(
         check_sight(prior, train.cameras, say)
     else:
         train, test = (replace(part, cameras=as_pool(part.cameras)) for part in (train, test))
-    full = _shrunk(test.cameras, options.size)
+    full = shrunk(test.cameras, options.size)
     train, test = train.resized(options.size), test.resized(options.size)
     if not teach or any(train.cameras.image_paths):
         if options.config.select.focus:
@@ -140,10 +141,16 @@ def views_of(
     return RunViews(train, test.cameras, apart, full=full)
 
 
-def _shrunk(cameras: Cameras, size: int | None) -> Cameras | None:
+def shrunk(cameras: Cameras, size: int | None) -> Cameras | None:
     """Return the views if `size` shrinks any of them, otherwise None."""
     larger = size is not None and bool((np.maximum(cameras.widths, cameras.heights) > size).any())
     return cameras if larger else None
+
+
+def within_pixels(cameras: Cameras) -> Cameras:
+    """Return as many of the views as `FULL_PIXELS` hold, evenly spaced."""
+    largest = int((cameras.widths * cameras.heights).max())
+    return cameras.take(evenly_spaced(len(cameras), max(1, FULL_PIXELS // largest)))
 
 
 def _generated(
@@ -164,7 +171,7 @@ def _generated(
     train, scored = train.resized(size), test
     if held_out is not None:
         train, scored = drop_held_out(train, held_out, say), held_out
-    full = _shrunk(scored, size)
+    full = shrunk(scored, size)
     return RunViews(train, scored.resized(size), apart and apart.resized(size), pool, unseen, full)
 
 

@@ -176,6 +176,50 @@ def test_no_second_score_without_a_size(runs: Path, command_line: CommandLine) -
         assert "own size" not in succeeds(command_line, runs, *ask, *size, "-wo", "run").err
 
 
+@pytest.mark.parametrize("runs", ["renders", "photos"], indirect=True)
+@pytest.mark.parametrize("scenes", [("better",), ("better", "worse")])
+def test_evaluate_scores_once_more_at_the_views_own_size(
+    runs: Path, command_line: CommandLine, scenes: tuple[str, ...]
+) -> None:
+    def rows(*size: object) -> tuple[list[dict[str, Any]], str]:
+        printed = succeeds(command_line, runs, "evaluate", *scenes, *size, "--json", "-")
+        return json.loads(printed.out)["scenes"], printed.err
+
+    small, told = rows("--size", 32)
+    large, plain = rows("--size", 64)
+    assert "own size" not in plain
+    (line,) = [line for line in told.splitlines() if "own size" in line]
+    assert "64×48 px" in line
+    for row, same in zip(small, large, strict=True):
+        assert "32×24 px" in row["scored_in"]
+        assert same["own_size"] is None
+        assert row["own_size"] == {name: same[name] for name in row["own_size"]}
+        assert f"{same['psnr']:.2f} dB, SSIM {same['ssim']:.4f}" in line
+        assert len(scenes) == 1 or Path(row["scene"]).name in line
+
+
+def test_a_run_at_a_size_is_evaluated_at_the_photos_own_size(runs: Path, command_line: CommandLine) -> None:
+    photos = photographed(runs / "better", BALL, around(8, (64, 48)))
+    g2ard.save_views("photos.json", photos)
+    ask = ("distill", "ball.ply", "-n", 40, "--views", "photos.json", "--photos", "--steps", 2, "--no-page")
+    succeeds(command_line, runs, *ask, "--size", 32, "-o", "run")
+    expected = json.loads((runs / "run" / "report.json").read_text())["own_size"]["recovered"]
+    ask = ("evaluate", "run/scene.ply", "--views", "photos.json", "--size", 32, "--json", "-")
+    (row,) = json.loads(succeeds(command_line, runs, *ask).out)["scenes"]
+    assert row["own_size"] == expected
+
+
+def test_only_some_large_views_are_scored_at_their_own_size(
+    runs: Path, command_line: CommandLine, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("g2ard.jobs.views.FULL_PIXELS", 3 * 64 * 48)
+    g2ard.save_views("views.json", around(8, (64, 48)))
+    ask = ("evaluate", "better/scene.ply", "--teacher", "ball.ply", "--views", "views.json", "--split", "all")
+    (row,) = json.loads(succeeds(command_line, runs, *ask, "--size", 32, "--json", "-").out)["scenes"]
+    assert row["own_size"]["scored_in"].startswith("3 views")
+    assert row["scored_in"].startswith("8 views")
+
+
 def test_results_say_their_size() -> None:
     views = around(8, (64, 48))
     targets = g2ard.TeacherRenders(BALL, views)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -68,6 +69,7 @@ def evaluate(
     from g2ard.io.describe import bytes_of
     from g2ard.jobs.common import better_line, common_of
     from g2ard.jobs.inputs import load_views, scorable
+    from g2ard.jobs.score import means
     from g2ard.jobs.teaching import Teaching, check_teacher
     from g2ard.jobs.view_checks import check_sight
     from g2ard.rendering.lpips import load_lpips
@@ -106,11 +108,16 @@ def evaluate(
         **run.callbacks,
     )
     of_targets = [] if teacher is None else [("targets", 2.0)]
-    of_scenes = [stage for path in scenes for stage in ((path.name, 4.0), ("visibility", 1.0))]
+    of_scenes = [
+        stage
+        for path in scenes
+        for stage in ((path.name, 4.0), (f"{path.name} unshrunk", 4.0 if size else 0.0), ("visibility", 1.0))
+    ]
     run.console.expect([*of_targets, *of_scenes])
     frozen = run.load(anchors) if anchors else None
-    cameras = load_views(teaching.views(given), split, size, run.say, unpictured=teaching.dense is not None)
-    targets = scorable(teaching.targets(cameras, settings=settings), run.say)
+    full = load_views(teaching.views(given), split, None, run.say, unpictured=teaching.dense is not None)
+    targets = scorable(teaching.targets(full.resized(size), settings=settings), run.say)
+    unshrunk = teaching.full_size(full, size, settings=settings)
     cameras = targets.cameras
     networks = load_lpips(lpips, scaled=lpips_input == "scaled", device=device) if lpips else None
     rows: list[dict[str, Any]] = []
@@ -120,23 +127,24 @@ def evaluate(
         check_sight(splats, cameras, run.say)
         if own is None and not rows:  # photos of a run, or of another scene here, are meant
             teaching.check_photos(splats, cameras)
-        scored = score(
+        alike = partial(
+            score,
             splats,
-            targets,
             background=colour,
             lpips=networks,
             settings=settings,
             eight_bit=eight_bit,
             device=device,
             progress=run.progress,
-            stage=path.name,
         )
+        scored = alike(targets, stage=path.name)
         found.append(scored)
         drift = None if frozen is None else _drift(frozen, splats, path)
         rows.append(
             {
                 "scene": str(path),
                 **scored.as_dict(),
+                "own_size": unshrunk and means(alike(unshrunk, stage=f"{path.name} unshrunk").as_dict()),
                 "drift95": drift,
                 "needle": needle_share(splats.scales),
                 "file_bytes": bytes_of(path),
@@ -146,7 +154,10 @@ def evaluate(
     protocol = f"{convention}'s conventions, {'8-bit' if eight_bit else 'float'} renders"
     name = "" if split == "all" else split
     _table(run, f"{scored_in(targets, name)}; {protocol}", rows)
-    better = better_line(short_names(scenes), found, targets, name)
+    names = short_names(scenes)
+    if unshrunk is not None:
+        run.say(_own_size_line(names, rows))
+    better = better_line(names, found, targets, name)
     if better:
         run.say(better)
     counts = Counter(view["against"] for view in rows[0]["views"])
@@ -167,6 +178,20 @@ def _drift(frozen: Splats, splats: Splats, path: Path) -> float:
         )
     splats = splats.narrowed()
     return drift95(Anchors.of(frozen.narrowed(splats.offset)), splats.means)
+
+
+def _own_size_line(names: list[str], rows: list[dict[str, Any]]) -> str:
+    """Describe the scores at the views' own size.
+
+    >>> score = {"psnr": 25.5, "ssim": 0.8, "scored_in": "7 photos, 960×540 px"}
+    >>> _own_size_line(["a"], [{"own_size": score}])
+    "at the views' own size (7 photos, 960×540 px): 25.50 dB, SSIM 0.8000"
+    """
+    scores = [row["own_size"] for row in rows]
+    told = [f"{score['psnr']:.2f} dB, SSIM {score['ssim']:.4f}" for score in scores]
+    if len(rows) > 1:
+        told = [f"{name} {text}" for name, text in zip(names, told, strict=True)]
+    return f"at the views' own size ({scores[0]['scored_in']}): {'; '.join(told)}"
 
 
 def _table(run: Run, title: str, rows: list[dict[str, Any]]) -> None:
