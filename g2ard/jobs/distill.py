@@ -24,7 +24,7 @@ from g2ard.jobs.photos import distinct, sparse_file, sparse_points, topped_up
 from g2ard.jobs.view_checks import check_photos, propose_background
 from g2ard.jobs.views import Use, views_of, within_pixels
 from g2ard.pipeline.config import DistillConfig
-from g2ard.pipeline.distill import Distilled, RunViews
+from g2ard.pipeline.distill import Distilled, RunViews, is_recovered
 from g2ard.pipeline.distill import distill as pipeline
 from g2ard.progress import Progress, Say, plural, silent, unsaid
 from g2ard.rendering.renderer import Renderer
@@ -51,6 +51,7 @@ class DistillJob:
             teacher.
         preset: the regularisers chosen, and why.
         cleaned: number of Gaussians removed by kind of clutter; None without cleaning.
+        recovered: whether an earlier call recovered the scene, so that targets are needed for scoring alone.
     """
 
     prior: Splats
@@ -63,6 +64,7 @@ class DistillJob:
     preset: str
     measured: PriorMeasures
     cleaned: dict[str, int] | None = None
+    recovered: bool = False
     progress: Progress = silent
     say: Say = unsaid
 
@@ -94,8 +96,8 @@ class DistillJob:
     @cached_property
     def targets(self) -> Targets:
         """Training targets."""
-        few = self.config.select.views_count is not None or self.is_kept(self.budget.count)
-        return self.targets_for(self.views.train.cameras, self._renderer, lazy=few)
+        few = self.config.select.views_count is not None or self._trains_nothing
+        return self._for_training(self.views.train.cameras, lazy=few)
 
     @cached_property
     def held_out(self) -> Targets:
@@ -125,8 +127,22 @@ class DistillJob:
         cameras = self.views.apart
         if cameras is None or self.teacher is None or len(cameras) < 2:
             return None
-        unused = first == 0 and self.is_kept(self.budget.count)
-        return self.targets_for(cameras.take(range(first, len(cameras), 2)), self._renderer, lazy=unused)
+        chosen = cameras.take(range(first, len(cameras), 2))
+        if first == 0:
+            return self._for_training(chosen, lazy=self._trains_nothing)
+        return self.targets_for(chosen, self._renderer)
+
+    @property
+    def _trains_nothing(self) -> bool:
+        return self.recovered or self.is_kept(self.budget.count)
+
+    def _for_training(self, cameras: Cameras, *, lazy: bool) -> Targets:
+        """Return targets; those that nothing will train on do not hold the shared renderer."""
+        return self.targets_for(cameras, None if self._trains_nothing else self._renderer, lazy=lazy)
+
+    def resuming(self, work: Path | None) -> DistillJob:
+        """Return this job, or one that knows that an earlier call recovered the scene in `work`."""
+        return replace(self, recovered=True) if is_recovered(work) else self
 
     def render_targets(self) -> None:
         """Render all targets that are not lazy; `run` calls this too."""
@@ -287,7 +303,7 @@ def distill(
         settings={name: value for name, value in fields.items() if value is not None} | dict(settings or {}),
     )
     job = prepare(scene, budget, options, progress=progress, say=say)
-    done = job.run(work)
+    done = job.resuming(work).run(work)
     if judgement := job.budget.judge(done.splats):
         say(judgement[1])
     return done

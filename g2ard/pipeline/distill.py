@@ -14,7 +14,7 @@ from g2ard.config.checks import checks_arguments
 from g2ard.io.reports import LEFT_OUT, Report
 from g2ard.io.types import ViewSet
 from g2ard.pipeline.config import DistillConfig, SelectConfig
-from g2ard.pipeline.steps import Steps
+from g2ard.pipeline.steps import Steps, is_kept
 from g2ard.progress import Progress, plural, silent
 from g2ard.rendering.targets import Photos, PhotosOrRenders, Subset, Targets, checked_targets
 from g2ard.rendering.visibility import visibility_source
@@ -106,6 +106,9 @@ class DistillReport(Report):
 
 __all__ = ["DistillConfig", "Distilled", "SelectConfig", "distill"]
 
+_FINAL = "final"
+"""Name of the last recovery."""
+
 
 @dataclass(frozen=True, eq=False)
 class Distilled:
@@ -194,6 +197,11 @@ def distill(
     return Distilled(rounds.state, rounds.simplified, report)
 
 
+def is_recovered(work: Path | None) -> bool:
+    """Return whether a work folder holds the result of a final recovery."""
+    return work is not None and is_kept(work, _FINAL)
+
+
 @dataclass(frozen=True, eq=False)
 class _Supervision:
     """Training targets with sampling weights, and a report of their selection."""
@@ -268,14 +276,15 @@ class _Rounds:
         if self.config.recover.schedule.round_steps > 0:
             recovered.append(self._recover(f"round-{number}", final=False))
         if final:
-            recovered.append(self._recover("final", final=True))
+            recovered.append(self._recover(_FINAL, final=True))
         self.log.append(RoundReport(count, simplified, tuple(recovered)))
 
     def _select(self, scene: Splats) -> None:
         began = time.monotonic()
         self.supervision = _Supervision.of(scene, self.targets, self.config, self.weights, self.progress)
         self.seconds["select"] += time.monotonic() - began
-        if self.config.select.views_count is not None:  # load all now, so that later steps take equal time
+        few = self.config.select.views_count is not None
+        if few and not is_recovered(self.work):  # load all now, so that later steps take equal time
             targets, count = self.supervision.targets, len(self.supervision.targets.cameras)
             for view in range(count):
                 targets[view]

@@ -19,6 +19,12 @@ from g2ard.stages.simplify.report import SimplifyReport
 
 R = TypeVar("R", RecoverReport, SimplifyReport)
 _Result = tuple[Splats, R, dict[str, NDArray[Any]]]
+_WITHIN = ".checkpoint.npz"
+
+
+def is_kept(folder: Path, name: str) -> bool:
+    """Return whether a folder holds a result of a step, of whatever settings."""
+    return any(not path.name.endswith(_WITHIN) for path in folder.glob(f"{name}-*.npz"))
 
 
 class Steps:
@@ -50,7 +56,7 @@ class Steps:
         if self._folder is None:
             return step(None)
         key = hashlib.sha256(repr((name, scene.fingerprint(), settings())).encode()).hexdigest()
-        file, within = (self._folder / f"{name}-{key[:16]}{end}" for end in (".npz", ".checkpoint.npz"))
+        file, within = (self._folder / f"{name}-{key[:16]}{end}" for end in (".npz", _WITHIN))
         if file.exists():
             meta, arrays = checkpoint.load(file, key)
             made = replace(scene, **{array: arrays.pop(array) for array in ARRAYS})

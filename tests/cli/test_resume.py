@@ -14,8 +14,10 @@ from g2ard.cli.frame import Run
 from g2ard.cli.resume import stoppable
 from g2ard.errors import InputError
 from g2ard.io import write_splats, write_views
+from g2ard.jobs import score as scoring
 from g2ard.jobs.distill import DistillJob
 from g2ard.pipeline.distill import Distilled
+from g2ard.rendering.targets import TeacherRenders
 from g2ard.stages.recover import checkpoint
 from helpers.commands import CommandLine, refused, succeeds
 from helpers.scenes import around, checkered_ball
@@ -109,6 +111,38 @@ def test_a_file_that_is_not_a_checkpoint_is_named(tmp_path: Path, content: bytes
     with pytest.raises(InputError) as caught:
         checkpoint.load(path, "key")
     assert str(caught.value).startswith(f"{path}: not a checkpoint of g2ard, or a damaged one; ")
+
+
+@pytest.mark.parametrize("options", [(), ("--set", "select.views_count=2"), ("--views", "v.json")])
+def test_a_recovered_run_renders_only_views_that_are_scored(
+    folder: Path, command_line: CommandLine, monkeypatch: pytest.MonkeyPatch, options: tuple[str, ...]
+) -> None:
+    rendered: list[str] = []
+    make, score = TeacherRenders._make, scoring.report_of
+
+    def counting(self: TeacherRenders, view: int) -> Any:
+        rendered.append(self.cameras.names[view])
+        return make(self, view)
+
+    def stopped(*given: Any) -> Any:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(TeacherRenders, "_make", counting)
+    write_views(folder / "v.json", around(8, (32, 24)))
+    ask = ("distill", "a.ply", "-r", 2, "--steps", 3, "--size", 24, "--no-page", *options)
+    succeeds(command_line, folder, *ask, "-o", "whole")
+    every = set(rendered)
+    monkeypatch.setattr(scoring, "report_of", stopped)
+    assert command_line(*ask, "-o", "run", cwd=folder)[0] == 130
+    monkeypatch.setattr(scoring, "report_of", score)
+    rendered.clear()
+    succeeds(command_line, folder, *ask, "-o", "run", "--resume")
+    report = json.loads((folder / "run" / "report.json").read_text())
+    scores = (report["scores"], report["apart"] or report["scores"])
+    scored = {view["name"] for part in scores for view in part["recovered"]["views"]}
+    assert set(rendered) == scored
+    assert scored < every
+    assert (folder / "run" / "scene.ply").read_bytes() == (folder / "whole" / "scene.ply").read_bytes()
 
 
 def test_the_total_of_a_resumed_run_holds_what_was_done_before(

@@ -148,6 +148,7 @@ def distill(
     check_job_memory(job, tiling.memory, cost.bytes)
     run.console.expect(cost.stages)
     prepared = time.monotonic()
+    job = job.resuming(folder.work if resume else None)
     job.render_targets()
     before = {"prepare": prepared - began, "targets": time.monotonic() - prepared}
     result, report = _distil(run, scene or Path(str(views)), job, folder, before)
