@@ -30,6 +30,7 @@ from g2ard.io.reports import plain
 from g2ard.io.scene_formats import FORMATS
 from g2ard.io.types import ViewSet
 from g2ard.jobs.budget import DEVICES, Budget
+from g2ard.jobs.cost import LARGEST_DENSE
 from g2ard.jobs.viewer_frame import frame_with
 from g2ard.pipeline.distill import RunViews
 from g2ard.progress import plural
@@ -188,8 +189,13 @@ class RunFolder:
             text = json.dumps(told, indent=2, default=plain)
             temporary.write_text(text + "\n", encoding="utf-8", newline="\n")
 
-    def write_view(self, splats: Splats, cameras: Cameras, background: Colour) -> tuple[int | None, str]:
+    def write_view(
+        self, splats: Splats, dense: Splats | None, cameras: Cameras, background: Colour
+    ) -> tuple[int | None, str]:
         """Write view.html unless browsers would not draw the scene smoothly.
+
+        Args:
+            dense: the dense scene, shown beside the result unless it would make the page large.
 
         Returns:
             Size of the page in bytes, None if it was not written, and a line to print.
@@ -198,7 +204,10 @@ class RunFolder:
         if count > most:
             return None, f"{self._view} skipped: over {most:,} Gaussians (`g2ard view` writes it anyway)"
         stand = frame_with(splats, cameras)
-        shown = [(f"{self.scene.name}: {plural(count, 'Gaussian')}", stand.of(splats))]
+        named = [(self.scene.name, splats)]
+        if dense is not None and count < len(dense) <= LARGEST_DENSE:
+            named.append(("dense", dense))
+        shown = [(f"{name}: {plural(len(scene), 'Gaussian')}", stand.of(scene)) for name, scene in named]
         written = write_page(self._view, shown, start=stand.start, background=background, overwrite=True)
         return written.bytes, f"view: {self._view} ({written.bytes / 1e6:.2f} MB)"
 

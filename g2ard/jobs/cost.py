@@ -37,6 +37,8 @@ _PAGE_BYTES, _PAGE_FULL = 170, 130_000
 """Memory of packing the viewer page: bytes per Gaussian and SH coefficient above degree 0, and the count from
 which it stops growing. Measured on playbot: 113 MB for 25,000 Gaussians, 511 for 125,000, 538 for 250,000.
 """
+LARGEST_DENSE = 250_000
+"""Largest dense scene that view.html shows beside the result: it adds at most 8 MB of SOG at SH degree 2."""
 _PROGRAM_BYTES = 90_000_000
 """Bytes of the interpreter and loaded libraries."""
 _TRAINER_BYTES = 983
@@ -113,7 +115,10 @@ def _peak_bytes(job: DistillJob, count: int, pixels: int, page: bool) -> int:
     given = job.config.recover.sh_degree
     degree = job.prior.sh_degree if given is None else given
     scene, small = job.prior.nbytes, 4 * row_width(degree) * count
-    packing = _PAGE_BYTES * 3 * ((degree + 1) ** 2 - 1) * min(count, _PAGE_FULL)
+    packed, deepest = count, degree
+    if len(job.prior) <= LARGEST_DENSE:  # shown beside the result
+        packed, deepest = max(count, len(job.prior)), max(degree, job.prior.sh_degree)
+    packing = _PAGE_BYTES * 3 * ((deepest + 1) ** 2 - 1) * min(packed, _PAGE_FULL)
     targets = min(CACHE_BYTES, pixels * (12 if job.teacher is not None else 3))
     trained = targets + scene + _TRAINER_BYTES * count
     full = (

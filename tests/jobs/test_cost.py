@@ -36,13 +36,16 @@ def test_a_dry_run_counts_and_writes_nothing(tmp_path: Path, command_line: Comma
     assert told["pixels"] == 48 * 36
 
 
-def test_memory_grows_with_views_and_gaussians() -> None:
+def test_memory_grows_with_views_and_gaussians(monkeypatch: pytest.MonkeyPatch) -> None:
     options = DistillOptions(size=48, settings={"recovery_time": 7.0})
     job = prepare(checkered_ball(900), Budget(90), options)
+    both = cost_of(job, 90)  # its page holds the dense scene too
+    monkeypatch.setattr("g2ard.jobs.cost.LARGEST_DENSE", 899)
     few, many = cost_of(job, 90), cost_of(job, 450)
     assert few.bytes > 12 * few.views * few.pixels
     assert dict(few.stages)["recover"] == 7.0
     assert many.bytes - few.bytes >= 983 * 360
+    assert both.bytes > many.bytes
     assert cost_of(job, 90, page=False).seconds < few.seconds == sum(seconds for _, seconds in few.stages)
 
 

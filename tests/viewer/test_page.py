@@ -266,15 +266,21 @@ def test_the_command_shows_a_scene_and_a_run(command_line: CommandLine, tmp_path
 def test_a_run_has_a_page_unless_too_large(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     ball, path = checkered_ball(300), tmp_path / "view.html"
     folder = RunFolder(None, tmp_path, "scene.sog", resume=False)
-    size, line = folder.write_view(ball, around(6), (1.0, 1.0, 1.0))
+    size, line = folder.write_view(ball, None, around(6), (1.0, 1.0, 1.0))
     assert size == path.stat().st_size
     assert "view.html" in line
     assert Parts(path).labels == ["scene.sog: 300 Gaussians"]
+    folder.write_view(ball.take(range(30)), ball, around(6), (1.0, 1.0, 1.0))
+    assert Parts(path).labels == ["scene.sog: 30 Gaussians", "dense: 300 Gaussians"]
+    for dense, largest in ((ball, 299), (ball.take(range(30)), 300)):  # too large, or the same
+        monkeypatch.setattr("g2ard.cli.run_folder.LARGEST_DENSE", largest)
+        folder.write_view(ball.take(range(30)), dense, around(6), (1.0, 1.0, 1.0))
+        assert Parts(path).labels == ["scene.sog: 30 Gaussians"]
     run = SimpleNamespace(write=lambda scene, splats, **_: write_splats(scene, splats))
     RunFolder(run, tmp_path, "scene.sog", resume=False).write_scene(ball)
     assert not path.exists()  # a page of an earlier run
     monkeypatch.setitem(budget.DEVICES, "web", 299)
-    size, line = folder.write_view(ball, around(6), (1.0, 1.0, 1.0))
+    size, line = folder.write_view(ball, None, around(6), (1.0, 1.0, 1.0))
     assert size is None
     assert "over 299 Gaussians" in line
     assert not path.exists()

@@ -214,8 +214,9 @@ def _distil(
         _write_pages(run, source, job, result, report, folder.path)
         if run.config["page"]:
             seen, colour = job.views.train.cameras, job.config.recover.background
+            dense = None if job.config.recover.from_points else job.prior
             with run.finishing("view.html"):
-                report["bytes"]["view"], page = folder.write_view(result.splats, seen, colour)
+                report["bytes"]["view"], page = folder.write_view(result.splats, dense, seen, colour)
         folder.write_report(report)
     of_photos = job.config.recover.from_points  # such points are no scene to compare with
     write_table(run, report)
