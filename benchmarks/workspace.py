@@ -36,6 +36,7 @@ PROTOCOLS: dict[str, tuple[str, ...]] = {
     "pool": ("pool",),
     "standing": ("near", "standing"),
     "anywhere": ("anywhere",),
+    "other": ("near", "standing", "anywhere"),
 }
 """Protocol → kinds of views to score; photos exist for the pool, and for a scene's further score views."""
 

@@ -22,10 +22,12 @@ from benchmarks.study import SceneSpec, Study, key
 from benchmarks.workspace import PROTOCOLS, Workspace, budget_of, kinds_for
 from g2ard import io
 from g2ard.scene.splats import Splats
+from g2ard.stages.simplify.growth import GROWTHS
 
 __all__ = ["Simplify"]
 
 _SPARK = ["node", str(Path(baselines.__file__).with_name("spark.mjs"))]
+_SPLAT_TRANSFORM = ("splat-transform", "splat-transform-adaptive")
 _FLAGS = {
     "default": [],
     "no-views": ["--no-views"],
@@ -33,6 +35,11 @@ _FLAGS = {
     "paper": ["--method", "paper"],
 }
 """Method of g2ard → its flags."""
+_GROWTHS = {f"growth-{growth:g}": growth for growth in GROWTHS}
+"""`default` with one growth of merged Gaussians, instead of the one that it chooses."""
+_FLAGS |= {name: ["--set", f"max_growth={growth:g}"] for name, growth in _GROWTHS.items()}
+_OWN = ("default", *_GROWTHS)
+"""Methods that look from views of their own."""
 
 
 @dataclass(frozen=True)
@@ -44,10 +51,11 @@ class Simplify(Study):
     with a pool of its own, as its user runs it.
 
     Args:
-        protocol: kinds of views to score: "pool", "standing" (near and standing views), "anywhere", or "all".
+        protocol: kinds of views to score: "pool", "standing" (near and standing views), "anywhere", "other"
+            (these three), or "all".
     """
 
-    METHODS: ClassVar[Mapping[str, Any]] = {name: name for name in (*REDUCERS, "spark")}
+    METHODS: ClassVar[Mapping[str, Any]] = {name: name for name in (*REDUCERS, "spark", *_GROWTHS)}
     PROCESSES: ClassVar[bool] = True
 
     protocol: str = key("all", choices=tuple(PROTOCOLS), axis=True)
@@ -55,9 +63,10 @@ class Simplify(Study):
     @classmethod
     def default_methods(cls) -> list[str]:
         """Return all methods, except other programs that are not installed."""
-        missing = () if shutil.which("splat-transform") else ("splat-transform", "splat-transform-adaptive")
-        spark = bool(shutil.which("node")) and version_of(*_SPARK).startswith("Spark")
-        return [name for name in cls.METHODS if name not in missing and (spark or name != "spark")]
+        missing = set[str]() if shutil.which("splat-transform") else {*_SPLAT_TRANSFORM}
+        if not (shutil.which("node") and version_of(*_SPARK).startswith("Spark")):
+            missing.add("spark")
+        return [name for name in cls.METHODS if name not in (*missing, *_GROWTHS)]
 
     def cells(self, scene: SceneSpec, work: Path) -> Iterator[Cell]:
         """Yield a cell per ratio and method."""
@@ -79,7 +88,7 @@ class Simplify(Study):
             if kind not in place.kinds_of_views:
                 yield {**row, "views": 0}  # no place for them in this scene
                 continue
-            own = kind != "pool" and method == "default" and place.scene.train is None
+            own = kind != "pool" and method in _OWN and place.scene.train is None
             if own not in ran:
                 ran[own] = self._run(place, method, budget, own)
             usage, small = ran[own]
@@ -106,6 +115,6 @@ class Simplify(Study):
             path = output.with_name("job.json")
             path.write_text(json.dumps(job), encoding="utf-8", newline="\n")
             return [*python, "benchmarks.kinds.worker", str(path)]
-        views = ["--views", str(place.train)] if method == "default" and not own else []
+        views = ["--views", str(place.train)] if method in _OWN and not own else []
         command = [*python, "g2ard", "simplify", source, "-n", str(budget), "-o", str(output), "-q"]
         return [*command, *_FLAGS[method], *views]

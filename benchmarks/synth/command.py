@@ -70,3 +70,18 @@ def city(
     splits = ", ".join(f"{count} {name}" for name, count in manifest["views"].items())
     run.say(f"{output}: {plural(config.points, 'point')}, {splits} views of {width}×{height}")
     run.result({**manifest, "output": str(output), "seconds": time.monotonic() - began})
+
+
+@command("rings", parent=synth, example="python -m benchmarks synth rings -o rings.ply")
+def rings(
+    run: Run,
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="CLOUD", help="Output .ply.")],
+) -> None:
+    """Generate a coloured point cloud: a room, scanned from two places by rings of lasers."""
+    from benchmarks.synth.rings import ring_scan
+    from g2ard.io import write_points
+
+    points = ring_scan()
+    write_points(output, points, overwrite=run.overwrite)
+    run.say(f"{output}: {plural(len(points.positions), 'point')}")
+    run.result({"points": len(points.positions), "output": str(output)})

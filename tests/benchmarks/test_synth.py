@@ -6,8 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmarks.synth import City, CityConfig, city, write_city
+from benchmarks.synth import City, CityConfig, city, rings, write_city
 from benchmarks.synth.layout import Material
+from benchmarks.synth.rings import ring_scan
 from benchmarks.synth.shapes import Kind, Shapes, cast
 from g2ard.errors import InputError, OutputError
 from g2ard.io import read_points, read_views
@@ -207,3 +208,18 @@ def test_command_line(tmp_path, command_line):
     assert "exists" in err
     for wrong in (["--size", "0x4"], ["--points", "25%"], ["--offset", "1,2"], ["--views", "3"]):
         assert run("-w", *wrong)[0] == 2
+
+
+def test_a_ring_scan_lies_on_a_room_and_its_furniture(tmp_path, command_line):
+    status, _, err = command_line("benchmarks", "synth", "rings", "-o", "rings.ply", cwd=tmp_path)
+    assert (status, "115,200 points" in err) == (0, True)
+    cloud = read_points(tmp_path / "rings.ply")
+    room = np.array([10.0, 7.0, 3.0])
+    off = [np.minimum(np.abs(cloud.positions), np.abs(cloud.positions - room)).min(axis=1)]
+    for lo, hi in rings._FURNITURE:  # the largest of six signed distances of a box is that of its surface
+        far = np.maximum(np.array(lo) - cloud.positions, cloud.positions - np.array(hi)).max(axis=1)
+        off.append(np.abs(far))
+    assert np.min(off, axis=0).max() < 0.06  # six times the noise
+    assert (off[0] > 0.06).mean() > 0.01  # some are on furniture
+    assert 0.05 < cloud.colors.min() < cloud.colors.max() < 1
+    assert ring_scan(4, 10).positions.tobytes() == ring_scan(4, 10).positions.tobytes()
