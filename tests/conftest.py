@@ -108,6 +108,7 @@ def _here(words: list[str], cwd: Path, env: dict[str, str]) -> Said:
         patch.object(sys, "argv", [program, *words]),
         contextlib.redirect_stdout(out),
         contextlib.redirect_stderr(err),
+        patch("g2ard.system.interrupt.ends_the_program"),  # signals stay those of pytest
         patch("webbrowser.open", side_effect=KeyboardInterrupt),  # a page that is shown is closed at once
     ):
         os.chdir(cwd)
