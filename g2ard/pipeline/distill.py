@@ -14,7 +14,7 @@ from g2ard.config.checks import checks_arguments
 from g2ard.io.reports import LEFT_OUT, Report
 from g2ard.io.types import ViewSet
 from g2ard.pipeline.config import DistillConfig, SelectConfig
-from g2ard.pipeline.steps import Steps, is_kept
+from g2ard.pipeline.steps import Steps
 from g2ard.progress import Progress, plural, silent
 from g2ard.rendering.targets import Photos, PhotosOrRenders, Subset, Targets, checked_targets
 from g2ard.rendering.visibility import visibility_source
@@ -199,7 +199,7 @@ def distill(
 
 def is_recovered(work: Path | None) -> bool:
     """Return whether a work folder holds the result of a final recovery."""
-    return work is not None and is_kept(work, _FINAL)
+    return Steps(work).has(_FINAL)
 
 
 @dataclass(frozen=True, eq=False)
@@ -284,7 +284,7 @@ class _Rounds:
         self.supervision = _Supervision.of(scene, self.targets, self.config, self.weights, self.progress)
         self.seconds["select"] += time.monotonic() - began
         few = self.config.select.views_count is not None
-        if few and not is_recovered(self.work):  # load all now, so that later steps take equal time
+        if few and not self.steps.has(_FINAL):  # load all now, so that later steps take equal time
             targets, count = self.supervision.targets, len(self.supervision.targets.cameras)
             for view in range(count):
                 targets[view]

@@ -22,11 +22,6 @@ _Result = tuple[Splats, R, dict[str, NDArray[Any]]]
 _WITHIN = ".checkpoint.npz"
 
 
-def is_kept(folder: Path, name: str) -> bool:
-    """Return whether a folder holds a result of a step, of whatever settings."""
-    return any(not path.name.endswith(_WITHIN) for path in folder.glob(f"{name}-*.npz"))
-
-
 class Steps:
     """Steps of a run: each is computed unless the folder, if any, holds its result.
 
@@ -38,6 +33,11 @@ class Steps:
     def __init__(self, folder: Path | None) -> None:
         self._folder = folder
         self.resumed: float | None = None
+
+    def has(self, name: str) -> bool:
+        """Return whether the folder holds a result of a step, of whatever settings."""
+        files = [] if self._folder is None else self._folder.glob(f"{name}-*.npz")
+        return any(not file.name.endswith(_WITHIN) for file in files)
 
     def run(
         self,
