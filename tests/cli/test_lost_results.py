@@ -88,7 +88,7 @@ def test_a_run_whose_scores_failed_is_resumed(
         f"g2ard: scoring failed: {INJECTED}; run/scene.ply is written; "
         "run the same command with --resume to continue in run\n"
     )
-    monkeypatch.setattr("g2ard.pipeline.distill.recover", None)  # it is not run again
+    monkeypatch.setattr("g2ard.pipeline.steps.recover", None)  # it is not run again
     succeeds(command_line, folder, *ask, "--resume")
     assert sorted(path.name for path in (folder / "run").iterdir()) == [
         *("preview.png", "report.html", "report.json", "scene.ply", "scored.json", "views.json"),
