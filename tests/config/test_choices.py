@@ -10,7 +10,7 @@ from g2ard.io.scene_formats import FORMATS
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
 from g2ard.stages.recover.anchors import PAPER_REGULARIZERS, REGULARIZERS
-from g2ard.stages.recover.loop import engine_class
+from g2ard.stages.recover.loop import _engine_class
 from g2ard.stages.recover.schedule import SCHEDULES
 from g2ard.stages.select import select
 from g2ard.stages.simplify import SimplifyConfig
@@ -30,4 +30,4 @@ def test_other_names_are_refused_with_the_list() -> None:
     with pytest.raises(InputError, match=r"expected auto, directional, .*, uniform, got 'best'"):
         select(scene, views, 1, policy="best")
     with pytest.raises(InputError, match=r"engine: expected fused, torch, gsplat, got 'jax'"):
-        engine_class("jax")
+        _engine_class("jax")

@@ -67,8 +67,8 @@ def watch(monkeypatch: pytest.MonkeyPatch) -> Watch:
     import g2ard.jobs.measured_budget
     import g2ard.jobs.recover
     import g2ard.jobs.score
-    import g2ard.pipeline.adapt
     import g2ard.pipeline.distill
+    import g2ard.pipeline.steps
     import g2ard.stages.evaluate
 
     seen = Watch()
@@ -83,9 +83,8 @@ def watch(monkeypatch: pytest.MonkeyPatch) -> Watch:
 
         monkeypatch.setattr(module, name, told)
 
-    watched(g2ard.pipeline.adapt, "adapt", 1, seen.trained)
     watched(g2ard.jobs.recover, "optimize", 1, seen.trained)
-    watched(g2ard.pipeline.distill, "recover", 1, seen.trained)
+    watched(g2ard.pipeline.steps, "recover", 1, seen.trained)
     for module in (g2ard.jobs.measured_budget, g2ard.pipeline.distill):
         watched(module, "visibility_source", 0, seen.looked)
     for module in (g2ard.stages.evaluate, g2ard.jobs.score):
