@@ -1,7 +1,8 @@
 """A headless Chromium for tests, over its DevTools pipe: no driver and no further package is needed.
 
 Looked for in $G2ARD_CHROMIUM, then among what is installed (Debian's chromium, Chrome, playwright's own);
-tests that need one skip where there is none. It draws on the CPU (SwiftShader) and finds no other host.
+tests that need one skip where there is none. It draws on the CPU (SwiftShader, its own Vulkan driver, which
+variables such as VK_DRIVER_FILES would hide) and finds no other host.
 """
 
 import base64
@@ -62,6 +63,7 @@ class Browser:
 
         self._process = subprocess.Popen(
             [chromium(), *_FLAGS, f"--user-data-dir={self._profile.name}", f"--window-size={width},{height}"],
+            env={name: value for name, value in os.environ.items() if not name.startswith("VK_")},
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
             preexec_fn=place,
