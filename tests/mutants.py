@@ -33,7 +33,7 @@ from helpers.project import ROOT
 PACKAGES = ["config", "io", "jobs", "pipeline", "poses", "rendering", "scene", "stages", "tiles"]
 MODULES = ["quantize", "select", "simplify", "train"]
 TESTS_OF_SECONDS = 15
-"""How long the tests of one change may take, by the times of the run under coverage."""
+"""Limit for the tests of one change, in seconds that they took under coverage."""
 
 
 class Change(NamedTuple):
@@ -223,7 +223,7 @@ def cover(tree: Path, folder: Path) -> None:
 
 
 class Covered:
-    """Which tests execute a line, and how long they take."""
+    """Tests that execute each line, and their durations."""
 
     def __init__(self, folder: Path) -> None:
         from coverage import CoverageData

@@ -71,7 +71,7 @@ def left(folder: Path) -> dict[str, Any]:
 
 @pytest.mark.parametrize("name", _COMMANDS)
 def test_the_same_command_again_ends_and_cleans_up(name: str, inputs: Path, tmp_path: Path) -> None:
-    """By turns killed before and after a file is put in place."""
+    """The kills come alternately before and after a file is put in place."""
     words, logs = _COMMANDS[name].split(), tmp_path / "logs"
     logs.mkdir()
 

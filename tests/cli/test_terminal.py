@@ -223,7 +223,7 @@ LONG = (
 
 @pytest.mark.parametrize("ask", LONG, ids=" ".join)
 def test_messages_break_between_words(ask: tuple[str, ...], shown: Callable[..., Screen]) -> None:
-    """On a narrow terminal the words of messages, tables and bars aside, are those of a wide one."""
+    """A narrow terminal shows the words of a wide one, apart from tables and bars."""
     words = {word.strip(":,") for word in " ".join(shown(*ask, columns=500).lines).split()}
     screen = shown(*ask, columns=40)
     assert_tidy(screen)

@@ -254,7 +254,7 @@ def with_far(count: int, times: float, unit: float, seed: int, around: int = 400
 def test_far_rows_leave_the_others_precise(
     tmp_path: Path, name: str, count: int, times: float, unit: float
 ) -> None:
-    """Of three quarters of the rows, positions keep 60 dB of the ball's size."""
+    """Positions of three quarters of the rows keep 60 dB of the ball's size."""
     truth = with_far(count, times, unit, seed=count)
     found = read_splats(saved(tmp_path, name, truth, **({"compress": "spz"} if name == "glb" else {})))
     near = truth.means[np.linalg.norm(truth.means, axis=1) < 0.8 * unit]

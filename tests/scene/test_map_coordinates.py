@@ -172,7 +172,7 @@ def test_writers_tell_every_rounding_of_far_scenes(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("kind", ["sog", "3dtiles"])
 def test_levels_of_map_coordinates_stand_where_they_belong(tmp_path: Path, kind: str) -> None:
-    """They get one offset, whatever their files would choose, and the rounding is told once."""
+    """They get one offset, whatever their files would choose, and one warning names the rounding."""
     fine = np.random.default_rng(0).normal(scale=1e-8, size=BALL.means.shape)
     far = far_of(replace(BALL, means=BALL.means + fine))
     levels = [far, far.take(slice(0, 40)), far.take(slice(40, 60))]

@@ -160,7 +160,7 @@ def test_tiles_that_no_view_sees_keep_their_share(store: TileStore, tmp_path: Pa
 
 
 def test_rows_that_no_view_sees_are_counted(tmp_path: Path) -> None:
-    """Of those that have an opacity, for others are never drawn."""
+    """All rows here are opaque enough to be drawn; fainter ones would not count."""
     scene = town()
     scene.logit_opacities[:] = 1
     write_splats(tmp_path / "a.ply", scene)

@@ -20,7 +20,7 @@ const CELLS: [f64; 2] = [0.5, 16.0];
 /// Distance of the farthest neighbour of a thinned line, in cells.
 const REACH: f64 = 5.0;
 
-/// Extent of a disc across its line over the distance of the next lines, so that there are no gaps between lines.
+/// Extent of a disc across its line over the distance of the next lines. It leaves no gaps between lines.
 const ACROSS: f64 = 0.4;
 /// Extent along the line over the standard deviation of the points on it: √12 / 4π / ACROSS, so that discs have the area of
 /// those of even points as dense.
