@@ -17,7 +17,9 @@ def test_distill_scores_the_packed_file(command_line: CommandLine, folder: Path)
     error = succeeds(command_line, folder, *ask, "-o", "run").err
     report = json.loads((folder / "run" / "report.json").read_text())
     packed, unpacked = report["packed"]["psnr"], report["scores"]["recovered"]["psnr"]
-    assert f"scene.splat: 0.00 MB, {packed:.1f} dB in held-out views ({unpacked:.1f} as .ply)" in error
+    (scored,) = [line for line in error.splitlines() if line.startswith("scene.splat: ")]
+    scores = f"{packed:.1f} dB in held-out views, {report['size']} ({unpacked:.1f} as .ply)"
+    assert scored == f"scene.splat: 0.00 MB, {scores}"
     assert 10 < packed < unpacked
     assert "dB in held-out views (" not in succeeds(command_line, folder, *ask[:-1], "ply", "-o", "plain").err
 
