@@ -35,6 +35,12 @@ def unchanged_signals() -> Iterator[None]:
     assert left is signal.default_int_handler
 
 
+def pytest_collection_finish() -> None:
+    """Spare the garbage collector what stays to the end: modules and collected tests."""
+    gc.collect()
+    gc.freeze()
+
+
 def pytest_terminal_summary(terminalreporter: Any) -> None:
     """Count the skipped tests by reason. `.ci/run` repeats these lines at its end."""
     stats = terminalreporter.stats
@@ -109,6 +115,7 @@ def _here(words: list[str], cwd: Path, env: dict[str, str]) -> Said:
         contextlib.redirect_stdout(out),
         contextlib.redirect_stderr(err),
         patch("g2ard.system.interrupt.ends_the_program"),  # signals stay those of pytest
+        patch("gc.freeze"),  # `main` takes it that the program ends
         patch("webbrowser.open", side_effect=KeyboardInterrupt),  # a page that is shown is closed at once
     ):
         os.chdir(cwd)
@@ -118,7 +125,6 @@ def _here(words: list[str], cwd: Path, env: dict[str, str]) -> Said:
             status = end.code
         finally:
             os.chdir(before)
-            gc.unfreeze()  # `main` takes it that the program ends
             for name in set(sys.modules) - known:  # a user's module of that name may be another's next time
                 if str(getattr(sys.modules[name], "__file__", None)).startswith(str(cwd)):
                     del sys.modules[name]

@@ -38,11 +38,16 @@ class PreparedScene(Splats):
     @cached_property
     def core(self) -> _core.Scene:
         """Arrays of the scene and their order in Rust."""
-        return _core.Scene(self)
+        return _core.Scene(self._arrays)
 
     def restore(self, order: NDArray[np.uint32], bounds: NDArray[np.float64]) -> None:
         """Restore `core.order` and `core.bounds` of the same scene."""
-        vars(self)["core"] = _core.Scene(self, (order, bounds.tolist()))
+        vars(self)["core"] = _core.Scene(self._arrays, (order, bounds.tolist()))
+
+    @property
+    def _arrays(self) -> Splats:
+        """A scene of the same arrays, for `core`: a reference to this one would be a cycle."""
+        return Splats(**_values(self))
 
 
 def as_prepared(splats: Splats) -> PreparedScene:
@@ -52,8 +57,11 @@ def as_prepared(splats: Splats) -> PreparedScene:
     """
     if isinstance(splats, PreparedScene):
         return splats
-    values = {f.name: getattr(splats, f.name) for f in fields(splats)}
-    return PreparedScene(**values | {"quats": unit_quats(splats.quats)})
+    return PreparedScene(**_values(splats) | {"quats": unit_quats(splats.quats)})
+
+
+def _values(splats: Splats) -> dict[str, Any]:
+    return {f.name: getattr(splats, f.name) for f in fields(splats)}
 
 
 def finite_rows_of(splats: Splats) -> tuple[PreparedScene, NDArray[np.bool_] | slice]:

@@ -1,6 +1,5 @@
 """Tasks (pure functions from files to one file), and the scenes and cameras in those files."""
 
-import gc
 import hashlib
 import json
 import math
@@ -132,8 +131,6 @@ def run_task(task: Task, tell: Callable[[float], None] | None = None) -> Path:
         task.share_file.unlink(missing_ok=True)
     with atomic_output(task.output, overwrite=True) as temporary, temporary.open("wb") as file:
         np.savez(file, **arrays)  # type: ignore[arg-type]
-    del arrays
-    gc.collect()  # break reference cycles between scenes and their cores
     return task.output
 
 

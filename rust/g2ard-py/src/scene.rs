@@ -8,7 +8,6 @@ use numpy::{
     PyArray1, PyReadonlyArray1, PyReadonlyArray2, PyReadonlyArray3, PyUntypedArrayMethods,
 };
 use pyo3::prelude::*;
-use pyo3::{PyTraverseError, PyVisit};
 
 use crate::arrays;
 use crate::work::long;
@@ -93,11 +92,6 @@ impl PyScene {
             splats: splats.clone().unbind(),
             ordered: Arc::new(ordered),
         })
-    }
-
-    /// Let the garbage collector see the reference cycle between a scene and its `Scene`.
-    fn __traverse__(&self, visit: PyVisit<'_>) -> Result<(), PyTraverseError> {
-        visit.call(&self.splats)
     }
 
     /// The scene's median point.
