@@ -1,36 +1,44 @@
 """Reader for ACE's pose files: text, one photo per line."""
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from g2ard.errors import InputError
+from g2ard.io.jsonfile import Place
 from g2ard.io.paths import read_text
 from g2ard.io.photos import posed
 
 
 def read(path: Path) -> dict[str, NDArray[np.float64]]:
-    """Read lines `NAME qw qx qy qz tx ty tz …` as photo → (4, 4) camera_from_world.
-
-    Empty lines and lines that begin with # are skipped.
-    """
+    """Read lines `NAME qw qx qy qz tx ty tz …` as photo → (4, 4) camera_from_world."""
     out: dict[str, NDArray[np.float64]] = {}
-    for number, line in enumerate(read_text(path).splitlines(), 1):
-        words = line.split()
-        if not words or words[0].startswith("#"):
-            continue
-        try:
-            pose = np.array(words[1:8], np.float64)
-        except ValueError:
-            pose = np.zeros(0)
-        if len(pose) != 7 or not np.isfinite(pose).all() or not np.linalg.norm(pose[:4]) > 0:
-            raise InputError(
-                "is not a name, a quaternion wxyz and a translation", path=path, index=number, item="line"
-            )
-        if words[0] in out:
-            raise InputError(f"repeats the name {words[0]!r}", path=path, index=number, item="line")
-        out[words[0]] = posed(pose[:4], pose[4:])
+    for place, name, numbers in lines(path):
+        if not numbers[:4].any():
+            raise place.error("has a quaternion of length zero")
+        if name in out:
+            raise place.error(f"repeats the name {name!r}")
+        out[name] = posed(numbers[:4], numbers[4:])
     if not out:
         raise InputError("no poses found", path=path)
     return out
+
+
+def lines(path: Path, heading: int = 0) -> Iterator[tuple[Place, str, NDArray[np.float64]]]:
+    """Yield the name and the seven numbers of each line after a heading of lines.
+
+    Empty lines and lines that begin with # are skipped.
+    """
+    for number, line in enumerate(read_text(path).splitlines(), 1):
+        words, place = line.split(), Place(path, number, "line")
+        if number <= heading or not words or words[0].startswith("#"):
+            continue
+        try:
+            numbers = np.array(words[1:8], np.float64)
+        except ValueError:
+            numbers = np.zeros(0)
+        if len(numbers) != 7 or not np.isfinite(numbers).all():
+            raise place.error("is not a name and seven numbers")
+        yield place, words[0], numbers

@@ -146,7 +146,6 @@ def drop_temporaries(folder: Path, *outputs: str) -> None:
 
 
 def _remove(path: Path) -> None:
-    """Remove a file or folder, or as much of it as possible."""
     if path.is_dir() and not path.is_symlink():
         shutil.rmtree(path, ignore_errors=True)
     else:

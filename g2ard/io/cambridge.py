@@ -4,13 +4,15 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from g2ard.errors import InputError, damaged
+from g2ard.io.ace import lines
 from g2ard.io.colmap import parsing
 from g2ard.io.finding import Finder
 from g2ard.io.paths import read_text
-from g2ard.io.photos import Frame, Lens, photo_size, posed, view_set
-from g2ard.io.types import ViewSet
+from g2ard.io.photos import Frame, Lens, Listed, photo_size, posed
+from g2ard.io.types import Note
 
 _PHOTO_SIZE = (1920, 1080)
 """Size of the original photos, for which focal lengths are given."""
@@ -29,7 +31,7 @@ def holds(folder: Path) -> bool:
     return (folder / _NVM_FILE).is_file() and any((folder / name).is_file() for name in _SPLIT_FILES.values())
 
 
-def read(path: Path, images: Path | None = None) -> ViewSet:
+def read(path: Path, images: Path | None = None) -> Listed:
     """Read the train and test lists of a scene's folder.
 
     A line is the photo's name, the camera's centre and the quaternion (wxyz) of camera_from_world.
@@ -42,27 +44,24 @@ def read(path: Path, images: Path | None = None) -> ViewSet:
     for split, name in _SPLIT_FILES.items():
         if not (path / name).is_file():
             continue
-        for photo_name, pose in _poses(path / name):
+        for place, photo_name, pose in lines(path / name, heading=3):
+            if not pose[3:].any():
+                raise place.error("has a quaternion of length zero")
             lens = lenses.get(_stem(photo_name))
             guessed += lens is None
             photo = finder.photo(photo_name)
             frames.append(_frame(path / name, photo_name, pose, lens or median, photo, split))
-    views = view_set(path, frames)
-    if not guessed:
-        return views
     text = f"{guessed} views are not in {_NVM_FILE}; they get the median focal length, {median.focal:.1f}"
-    return views.noted("guessed_focal", guessed, text)
+    return Listed(path, frames, notes=(Note("guessed_focal", guessed, text),) if guessed else ())
 
 
-def _frame(where: Path, name: str, pose: list[float], lens: _Focal, photo: Path, split: str) -> Frame:
+def _frame(where: Path, name: str, pose: NDArray[np.float64], lens: _Focal, photo: Path, split: str) -> Frame:
     width, height = photo_size(photo, where) if photo.is_file() else _PHOTO_SIZE
     view = posed(pose[3:], (0, 0, 0))
-    view[:3, 3] = -view[:3, :3] @ np.array(pose[:3])
+    view[:3, 3] = -view[:3, :3] @ pose[:3]
     focal = lens.focal * width / _PHOTO_SIZE[0]
-    K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
-    return Frame(
-        name, view, Lens((width, height), K, (-lens.radial, 0.0, 0.0, 0.0, 0.0)), photo, split, listed=name
-    )
+    own = Lens.pinhole((width, height), (focal, focal), distortion=(-lens.radial, 0.0, 0.0, 0.0, 0.0))
+    return Frame(name, view, own, photo, split, listed=name)
 
 
 def _stem(name: str) -> str:
@@ -73,36 +72,14 @@ def _stem(name: str) -> str:
 def _lenses(path: Path) -> dict[str, _Focal]:
     """Read the lenses of an NVM file's first model: name, focal, quaternion, centre, radial, 0 per line."""
     with parsing(path):
-        lines = read_text(path).splitlines()
-        if not lines or not lines[0].startswith("NVM_V3"):
+        text = read_text(path).splitlines()
+        if not text or not text[0].startswith("NVM_V3"):
             raise InputError("not VisualSFM's NVM_V3", path=path)
-        at = next((i for i, line in enumerate(lines[1:], 1) if line.strip()), None)
+        at = next((i for i, line in enumerate(text[1:], 1) if line.strip()), None)
         if at is None:
             raise damaged("truncated: nothing follows its first line", path=path)
-        rows = [line.replace("\t", " ").split() for line in lines[at + 1 : at + 1 + int(lines[at])]]
+        rows = [line.replace("\t", " ").split() for line in text[at + 1 : at + 1 + int(text[at])]]
         lenses = {_stem(row[0]): _Focal(float(row[1]), float(row[9])) for row in rows}
     if not lenses:
         raise InputError("has no cameras", path=path)
     return lenses
-
-
-def _poses(path: Path) -> list[tuple[str, list[float]]]:
-    """Read poses, one per line after three lines of heading."""
-    out = []
-    with parsing(path):
-        for number, line in enumerate(read_text(path).splitlines()[3:], 4):
-            words = line.split()
-            if not words:
-                continue
-            if len(words) != 8:
-                raise InputError(
-                    f"has {len(words)} words, expected a name and 7 numbers",
-                    path=path,
-                    index=number,
-                    item="line",
-                )
-            pose = [float(word) for word in words[1:]]
-            if not np.isfinite(pose).all() or not np.linalg.norm(pose[3:]) > 0:
-                raise InputError("is not a valid pose", path=path, index=number, item="line")
-            out.append((words[0], pose))
-    return out

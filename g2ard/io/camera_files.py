@@ -1,19 +1,20 @@
-"""Writers of views for other programs: INRIA's cameras.json, nerfstudio's transforms.json, COLMAP text.
+"""Views as text: g2ard's own .json, INRIA's cameras.json, nerfstudio's transforms.json, COLMAP's tables.
 
-They hold less than g2ard's own .json; `lost_views` says what a format cannot hold.
+The others hold less than g2ard's own; `lost_views` says what a format cannot hold.
 """
 
 import json
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from g2ard.config.choices import ViewFormat
-from g2ard.errors import OutputError
-from g2ard.io.paths import real_path
+from g2ard.errors import InputError, OutputError
+from g2ard.io import views
+from g2ard.io.paths import beside
 from g2ard.io.photos import inverse
 from g2ard.io.transforms import FLIP
 from g2ard.progress import plural
@@ -68,8 +69,27 @@ def lost_views(
     return lost + (["sampling weights"] if weighted else [])
 
 
-def write_inria(path: Path, cameras: Cameras) -> None:
-    """Write {id, img_name, width, height, position, rotation, fx, fy} per view, in OpenCV axes."""
+def texts_of(
+    path: Path,
+    cameras: Cameras,
+    format: ViewFormat,
+    splits: Sequence[str | None] = (),
+    weights: ArrayLike | None = None,
+) -> dict[str, str]:
+    """Return the files of views by their paths below `path`, which is "" for a single file."""
+    if not len(cameras):
+        raise InputError("not written: there are no views", path=path)
+    if format == "colmap":
+        return _colmap(cameras)
+    if format == "inria":
+        return {"": _inria(cameras)}
+    if format == "nerfstudio":
+        return {"": _nerfstudio(cameras, path, splits)}
+    return {"": views.text_of(path, cameras, splits, weights)}
+
+
+def _inria(cameras: Cameras) -> str:
+    """Return {id, img_name, width, height, position, rotation, fx, fy} per view, in OpenCV axes."""
     rows = []
     for i, viewmat in enumerate(cameras.viewmats):
         turn = viewmat[:3, :3].T
@@ -85,16 +105,13 @@ def write_inria(path: Path, cameras: Cameras) -> None:
                 "fx": float(cameras.Ks[i, 0, 0]),
             }
         )
-    path.write_text(_lines(rows) + "\n", encoding="utf-8")
+    return _lines(rows) + "\n"
 
 
-def write_nerfstudio(path: Path, cameras: Cameras, place: Path, splits: Sequence[str | None]) -> None:
-    """Write a transforms.json: world_from_camera in OpenGL axes, and lists of file names per split.
+def _nerfstudio(cameras: Cameras, place: Path, splits: Sequence[str | None]) -> str:
+    """Return a transforms.json: world_from_camera in OpenGL axes, and lists of file names per split.
 
-    Args:
-        cameras: the views; those without a photo are named `images/NAME`.
-        place: the final path, which photos are relative to.
-        splits: "train", "test" or another word per view, or ().
+    Photos are relative to the file `place`; views without one are named `images/NAME`.
     """
     lenses = [_lens(cameras, i) for i in range(len(cameras))]
     shared = lenses[0] if all(lens == lenses[0] for lens in lenses) else {}
@@ -112,12 +129,11 @@ def write_nerfstudio(path: Path, cameras: Cameras, place: Path, splits: Sequence
     for word in sorted({word for word in splits if word}):
         names = [frame["file_path"] for frame, own in zip(frames, splits, strict=True) if own == word]
         head[f"{word}_filenames"] = names
-    text = json.dumps(head)[:-1] + f', "frames": {_lines(frames)}}}\n'
-    path.write_text(text, encoding="utf-8")
+    return json.dumps(head)[:-1] + f', "frames": {_lines(frames)}}}\n'
 
 
-def write_colmap(folder: Path, cameras: Cameras) -> None:
-    """Write sparse/0 with cameras.txt, images.txt and an empty points3D.txt; a camera per lens."""
+def _colmap(cameras: Cameras) -> dict[str, str]:
+    """Return sparse/0 with cameras.txt, images.txt and an empty points3D.txt; a camera per lens."""
     lenses: dict[str, int] = {}
     images = []
     for i, viewmat in enumerate(cameras.viewmats):
@@ -128,16 +144,12 @@ def write_colmap(folder: Path, cameras: Cameras) -> None:
         camera = lenses.setdefault(" ".join(map(str, kind)), len(lenses) + 1)
         pose = [*quaternion_of(viewmat[:3, :3]).tolist(), *viewmat[:3, 3].tolist()]
         images.append(" ".join(map(str, [i + 1, *pose, camera, cameras.names[i]])) + "\n\n")
-    model = folder / "sparse" / "0"
-    model.mkdir(parents=True, exist_ok=True)
-    tables = {
+    rows = {
         "cameras": "".join(f"{number} {words}\n" for words, number in lenses.items()),
         "images": "".join(images),
         "points3D": "",
     }
-    for name, rows in tables.items():
-        text = f"# {_COLUMNS[name]}\n{rows}"
-        (model / f"{name}.txt").write_text(text, encoding="utf-8")
+    return {f"sparse/0/{name}.txt": f"# {columns}\n{rows[name]}" for name, columns in _COLUMNS.items()}
 
 
 _COLUMNS = {
@@ -157,13 +169,3 @@ def _lens(cameras: Cameras, i: int) -> dict[str, Any]:
 
 def _lines(rows: list[dict[str, Any]]) -> str:
     return "[\n" + ",\n".join(map(json.dumps, rows)) + "\n]"
-
-
-def beside(photo: Path | None, place: Path) -> str | None:
-    """Return a photo's path relative to the folder of `place`."""
-    if photo is None:
-        return None
-    try:
-        return Path(os.path.relpath(real_path(photo), real_path(place.parent))).as_posix()
-    except ValueError:  # another drive on Windows
-        return real_path(photo).as_posix()

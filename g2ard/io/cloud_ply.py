@@ -68,13 +68,8 @@ def _color(path: Path, values: NDArray[Any], name: str) -> NDArray[np.float32]:
         return values.astype(np.float32)
 
 
-def write(path: Path, points: Points, *, overwrite: bool = False) -> None:
-    """Write a binary .ply: x y z as float64, red green blue as bytes."""
-    write_blocks(path, len(points), [points], overwrite=overwrite)
-
-
 def write_blocks(path: Path, count: int, blocks: Iterable[Points], *, overwrite: bool = False) -> None:
-    """Write `count` points that arrive in blocks, as `write` does."""
+    """Write a binary .ply of `count` points that arrive in blocks: float64 positions, 8-bit colours."""
     types = dict.fromkeys(_POSITION, "<f8") | dict.fromkeys(COLOR_NAMES[0], "u1")
 
     def rows_of(points: Points) -> NDArray[Any]:

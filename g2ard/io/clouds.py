@@ -74,4 +74,4 @@ def write_points(path: str | Path, points: Points, *, overwrite: bool = False) -
     path = Path(path)
     if path.suffix.lower() != ".ply":
         raise OutputError("point clouds are written as .ply", path=path)
-    cloud_ply.write(path, points, overwrite=overwrite)
+    cloud_ply.write_blocks(path, len(points), [points], overwrite=overwrite)

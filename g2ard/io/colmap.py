@@ -6,19 +6,20 @@ Rigs and frames (COLMAP 3.12 and later) give the poses of images that have none 
 import math
 import re
 import struct
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from g2ard.errors import InputError, damaged
 from g2ard.io.finding import Finder
-from g2ard.io.paths import decoded
-from g2ard.io.photos import Frame, Lens, photo_size, posed, view_set
-from g2ard.io.types import ViewSet
+from g2ard.io.jsonfile import Place
+from g2ard.io.paths import read_text
+from g2ard.io.photos import Frame, Lens, Listed, photo_size, posed
+from g2ard.io.types import Note
 from g2ard.progress import plural
 from g2ard.scene.lenses import PARAMETERS, PhotoLens
 
@@ -89,9 +90,9 @@ def _count(folder: Path) -> int:
     tables = _tables(folder)
     try:
         if tables is None or tables[1].suffix.lower() == ".txt":
-            return 0 if tables is None else len(_images_txt(tables[1]))
+            return 0 if tables is None else len(_images(TextTable(tables[1], "image")))
         with tables[1].open("rb") as file:
-            (count,) = _COUNT.unpack(file.read(_COUNT.size))
+            (count,) = _COUNT.packed.unpack(file.read(_COUNT.packed.size))
             return int(count)
     except (InputError, OSError, ValueError, struct.error):
         return 0
@@ -174,32 +175,24 @@ def parsing(path: Path) -> Iterator[None]:
         raise InputError(f"{error.strerror}", path=path) from error
 
 
-def read(path: Path, images: Path | None = None) -> ViewSet:
+def read(path: Path, images: Path | None = None) -> Listed:
     """Read the registered images of a COLMAP model as views, sorted by name.
 
     `path` is the project folder, the model's folder, one of its files, or a folder of photos beside the
     model, such as images_4. Cameras are scaled to resized photos (Mip-NeRF 360's images_2, images_4). Of
     several models in numbered folders, the one with the most images is read, unless `path` is one.
     """
-    left_out: list[tuple[str, InputError]] = []
-    folder, listed = frames(path, images, left_out)
-    views = view_set(folder, listed, left_out)
-    beside = photos_beside(path)
-    others = [other for other in _models(beside[0] if beside else path) if other != folder]
+    found, beside = listed(path, images), photos_beside(path)
+    others = [other for other in _models(beside[0] if beside else path) if other != found.path]
     if not others:
-        return views
+        return found
     largest = max(others, key=_count)
-    text = f"read {folder} of {len(others) + 1} models; {largest} has {plural(_count(largest), 'image')}"
-    return views.noted("other_models", len(others), text)
+    text = f"read {found.path} of {len(others) + 1} models; {largest} has {plural(_count(largest), 'image')}"
+    return found._replace(notes=(Note("other_models", len(others), text),))
 
 
-def frames(
-    path: Path, images: Path | None = None, left_out: list[tuple[str, InputError]] | None = None
-) -> tuple[Path, list[Frame]]:
-    """Return the model's folder and its frames, with or without photos.
-
-    Views with numbers that are not finite are appended to `left_out`; None raises their error.
-    """
+def listed(path: Path, images: Path | None = None) -> Listed:
+    """Return the frames of `read`, without a note on other models."""
     if images is None and (beside := photos_beside(path)):
         path, images = beside
     folder = model_folder(path)
@@ -207,15 +200,14 @@ def frames(
     if folder is None or tables is None:
         error = incomplete(path)
         raise error or InputError("has no COLMAP model (cameras and images, .bin or .txt)", path=path)
-    binary = tables[0].suffix.lower() == ".bin"
     with parsing(tables[0]):
-        cameras = (_cameras_bin if binary else _cameras_txt)(tables[0])
+        cameras = _cameras(open_table(tables[0], "camera"))
     with parsing(tables[1]):
-        images_read = (_images_bin if binary else _images_txt)(tables[1])
+        images_read = _images(open_table(tables[1], "image"))
     if not images_read:
         raise InputError("has no images", path=tables[1])
     finder = Finder(images) if images else Finder(*_photo_folders(path, folder))
-    listed, faults = list[Frame](), list[tuple[str, InputError]]()
+    frames, faults = list[Frame](), list[tuple[str, InputError]]()
     by_rig = None
     sizes: dict[int, tuple[int, int]] = {}
     for image in sorted(images_read, key=lambda i: i.name):
@@ -234,19 +226,15 @@ def frames(
         if image.fault is None and any(image.pose[:4]):
             pose = posed(image.pose[:4], image.pose[4:])
         else:
-            by_rig = _rig_poses(folder, binary) if by_rig is None else by_rig
+            by_rig = _rig_poses(folder, tables[1].suffix.lower()) if by_rig is None else by_rig
             pose = by_rig.get((image.key, image.camera))
         if pose is None:
             if image.fault is None:
                 raise InputError(f"{image.name!r}: its quaternion is zero", path=tables[1])
             faults.append((image.name, image.fault))
             continue
-        listed.append(Frame(image.name, pose, camera, photo, listed=image.name))
-    if faults and left_out is None:
-        raise faults[0][1]
-    if left_out is not None:
-        left_out += faults
-    return folder, listed
+        frames.append(Frame(image.name, pose, camera, photo, listed=image.name))
+    return Listed(folder, frames, faults)
 
 
 def _photo_folders(path: Path, model: Path) -> list[Path]:
@@ -256,39 +244,178 @@ def _photo_folders(path: Path, model: Path) -> list[Path]:
     return found[:1] or [path / "images"]
 
 
+class Columns(NamedTuple):
+    """Columns of a table: how binary tables pack them, one letter of `struct` each, and their names."""
+
+    packed: struct.Struct
+    names: tuple[str, ...]
+
+    @classmethod
+    def of(cls, letters: str, *names: str) -> Self:
+        return cls(struct.Struct(f"<{letters}"), names)
+
+
+_POSE = ("QW", "QX", "QY", "QZ", "TX", "TY", "TZ")
+_COUNT = Columns.of("Q", "COUNT")
+_CAMERA = Columns.of("iiQQ", "CAMERA_ID", "MODEL", "WIDTH", "HEIGHT")
+_IMAGE = Columns.of("IdddddddI", "IMAGE_ID", *_POSE, "CAMERA_ID")
+_POINTS = Columns.of("Q", "POINTS2D")
+_RIG, _SENSOR = Columns.of("II", "RIG_ID", "NUM_SENSORS"), Columns.of("iI", "SENSOR_TYPE", "SENSOR_ID")
+_HAS_POSE, _IN_RIG = Columns.of("B", "HAS_POSE"), Columns.of("ddddddd", *_POSE)
+_FRAME = Columns.of("IIdddddddI", "FRAME_ID", "RIG_ID", *_POSE, "NUM_DATA_IDS")
+_DATA = Columns.of("iIQ", "SENSOR_TYPE", "SENSOR_ID", "DATA_ID")
+_WORDS = ("MODEL", "SENSOR_TYPE")
+"""Columns that are numbers in binary tables, and words in text."""
+
+_CAMERA_SENSOR = (0, "CAMERA")
+_SPLITS = {"image": len(_IMAGE.names), "point": 7}
+"""Columns of a line of text before its rest: the name of an image, the error and track of a point."""
+
+
 class Table:
-    """A binary table: little-endian values without padding, read one after the other."""
+    """A binary table, read one value after the other. Iterating yields the index of each row.
 
-    def __init__(self, path: Path) -> None:
-        self.path, self.data, self.at = path, path.read_bytes(), 0
-        (self.count,) = self.take("table", 0, _COUNT, ["COUNT"])
+    Args:
+        item: what a row is called in errors.
+    """
 
-    def take(self, item: str, i: int, layout: struct.Struct, names: Sequence[str]) -> tuple[Any, ...]:
-        """Return the next values, which errors call by these names of entry `i`, such as camera 3."""
+    def __init__(self, path: Path, item: str) -> None:
+        self.path, self.item, self.row = path, item, 0
+        self.data, self._at = path.read_bytes(), 0
+        (self.count,) = self.take(_COUNT)
+
+    def __iter__(self) -> Iterator[int]:
+        for row in range(self.count):
+            self.row = row
+            yield row
+
+    def take(self, columns: Columns) -> tuple[Any, ...]:
+        """Return the next values of this row; raise an `InputError` if one is missing or malformed."""
+        layout = columns.packed
         try:
-            values = layout.unpack_from(self.data, self.at)
+            values = layout.unpack_from(self.data, self._at)
         except struct.error:
-            ends = (self.at + struct.calcsize(layout.format[: k + 2]) for k in range(len(names)))
-            raise self.cut_off(item, i, names[sum(end <= len(self.data) for end in ends)]) from None
-        self.at += layout.size
+            ends = (self._at + struct.calcsize(layout.format[: k + 2]) for k in range(len(columns.names)))
+            raise self._cut_off(columns.names[sum(end <= len(self.data) for end in ends)]) from None
+        self._at += layout.size
         return values
 
-    def finite(self, item: str, i: int, layout: struct.Struct, names: Sequence[str]) -> tuple[Any, ...]:
-        """Return the next values as `take` does, or raise an `InputError` if one is not finite."""
-        values = self.take(item, i, layout, names)
+    def params(self, model: str) -> tuple[str, tuple[float, ...]]:
+        """Return the name of a model of cameras, and its parameters, which come next."""
+        number = int(model)
+        name = _MODELS[number] if 0 <= number < len(_MODELS) else f"number {number}"
+        count = (_PARAMETERS | PARAMETERS).get(name, 0)
+        return name, self.take(Columns.of(count * "d", *_params(count)))
+
+    def name(self) -> str:
+        """Return the name of an image, which ends with a zero byte."""
+        end = self.data.find(b"\0", self._at)
+        if end < 0:
+            raise self._cut_off("NAME")
+        start, self._at = self._at, end + 1
+        try:
+            return self.data[start:end].decode()
+        except UnicodeDecodeError:
+            raise self.place("NAME").error("is not UTF-8") from None
+
+    def skip_points(self) -> None:
+        self.skip(24 * self.take(_POINTS)[0], "POINTS2D")
+
+    def skip(self, size: int, name: str) -> None:
+        """Move past the bytes of a column."""
+        self._at += size
+        if self._at > len(self.data):
+            raise self._cut_off(name)
+
+    def place(self, name: str) -> Place:
+        return Place(self.path, self.row, self.item, name)
+
+    def fault(self, names: Sequence[str], values: Sequence[float]) -> NotFinite | None:
+        """Return what is wrong with the first of these values that is not finite."""
         for name, value in zip(names, values, strict=True):
             if not math.isfinite(value):
-                raise NotFinite(f"is {value}", path=self.path, property=name, index=i, item=item)
-        return values
+                return NotFinite(f"is {value}", path=self.path, property=name, index=self.row, item=self.item)
+        return None
 
-    def skip(self, item: str, i: int, size: int, name: str) -> None:
-        """Move past bytes, which errors call by this name."""
-        self.at += size
-        if self.at > len(self.data):
-            raise self.cut_off(item, i, name)
+    def _cut_off(self, name: str) -> InputError:
+        return damaged("is cut off", path=self.path, property=name, index=self.row, item=self.item)
 
-    def cut_off(self, item: str, i: int, name: str) -> InputError:
-        return damaged("is cut off", path=self.path, property=name, index=i, item=item)
+
+class TextTable(Table):
+    """A table of lines of words, without comments."""
+
+    def __init__(self, path: Path, item: str) -> None:
+        self.path, self.item, self.row = path, item, -1
+        lines = read_text(path).splitlines()
+        self._lines, self._next = [line for line in lines if not line.startswith("#")], 0
+        self.words, self._at = list[str](), 0
+
+    def __iter__(self) -> Iterator[int]:
+        while self._next < len(self._lines):
+            self.words, self._at = self._lines[self._next].split(maxsplit=_SPLITS.get(self.item, -1)), 0
+            self._next += 1
+            if self.words:
+                self.row += 1
+                yield self.row
+
+    def take(self, columns: Columns) -> tuple[Any, ...]:
+        return tuple(map(self._value, columns.names, columns.packed.format[1:]))
+
+    def _value(self, name: str, kind: str) -> int | float | str:
+        if self._at >= len(self.words):
+            raise self.place(name).error("is missing")
+        word = self.words[self._at]
+        self._at += 1
+        if name in _WORDS:
+            return word
+        if kind == "d" and (found := _NOT_FINITE.fullmatch(word)):
+            return math.inf if found["inf"] else math.nan
+        try:
+            if "_" in word or not word.isascii():  # Python reads both
+                raise ValueError(word)
+            value = float(word) if kind == "d" else int(word)
+            if not math.isfinite(value):
+                raise ValueError(word)
+        except (ValueError, OverflowError):
+            raise self.place(name).error(f"is {word!r}") from None
+        return value
+
+    def params(self, model: str) -> tuple[str, tuple[float, ...]]:
+        count = len(self.words) - self._at
+        return model, self.take(Columns.of(count * "d", *_params(count)))
+
+    def name(self) -> str:
+        """Return the rest of the line, which may have spaces."""
+        if self._at >= len(self.words):
+            raise self.place("NAME").error("is missing")
+        return self.words[self._at].strip()
+
+    def skip_points(self) -> None:
+        """Move past the next line if it has the points of an image; it may be empty or missing."""
+        self._next += self._next < len(self._lines) and _is_points(self._lines[self._next])
+
+
+_NOT_FINITE = re.compile(r"[+-]?(nan(\(.*\))?|(?P<inf>inf(inity)?)|\d\.#\w+)", re.IGNORECASE)
+"""Numbers that are not finite, as C and C++ write them on any system."""
+
+
+def _is_points(line: str) -> bool:
+    """Return whether a line of images.txt has triples x, y, POINT3D_ID, unlike the line of an image."""
+    words = line.split()
+    ids = words[2::3]
+    return len(words) % 3 == 0 and all(map(_WHOLE.fullmatch, ids)) and all(map(_NUMBER.fullmatch, words[:30]))
+
+
+_WHOLE, _NUMBER = re.compile(r"-?\d+"), re.compile(r"[+-]?(nan|inf|[\d.]+(e[+-]?\d+)?)", re.IGNORECASE)
+
+
+def _params(count: int) -> list[str]:
+    return [f"PARAMS[{k}]" for k in range(count)]
+
+
+def open_table(path: Path, item: str) -> Table:
+    """Open a table, .bin or .txt."""
+    return (TextTable if path.suffix.lower() == ".txt" else Table)(path, item)
 
 
 def _camera(path: Path, model: str, size: tuple[int, int], p: tuple[float, ...]) -> Lens:
@@ -313,82 +440,66 @@ def _camera(path: Path, model: str, size: tuple[int, int], p: tuple[float, ...])
             f"invalid camera of {size[0]:,}×{size[1]:,} pixels and focal lengths {fx}, {fy}", path=path
         )
     k1, k2, p1, p2 = (*k, 0.0, 0.0, 0.0, 0.0)[:4]
-    return Lens(size, np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]]), (k1, k2, p1, p2, 0.0))
+    return Lens.pinhole(size, (fx, fy), (cx, cy), (k1, k2, p1, p2, 0.0))
 
 
-_POSE = ("QW", "QX", "QY", "QZ", "TX", "TY", "TZ")
-_IMAGE_NAMES = ("IMAGE_ID", *_POSE, "CAMERA_ID")
-_CAMERA_NAMES = ("CAMERA_ID", "MODEL", "WIDTH", "HEIGHT")
-_COUNT, _CAMERA, _IMAGE = struct.Struct("<Q"), struct.Struct("<iiQQ"), struct.Struct("<IdddddddI")
-
-
-def _cameras_bin(path: Path) -> dict[int, Lens | NotFinite]:
-    table, cameras = Table(path), dict[int, Lens | NotFinite]()
-    for i in range(table.count):
-        key, model, width, height = table.take("camera", i, _CAMERA, _CAMERA_NAMES)
-        name = _MODELS[model] if 0 <= model < len(_MODELS) else f"number {model}"
-        names = [f"PARAMS[{k}]" for k in range((_PARAMETERS | PARAMETERS).get(name, 0))]
-        try:
-            values = table.finite("camera", i, struct.Struct(f"<{len(names) * 'd'}"), names)
-            cameras[key] = _camera(path, name, (width, height), values)
-        except NotFinite as error:
-            cameras[key] = error
+def _cameras(table: Table) -> dict[int, Lens | NotFinite]:
+    cameras: dict[int, Lens | NotFinite] = {}
+    for _ in table:
+        key, kind, *size = table.take(_CAMERA)
+        model, params = table.params(kind)
+        fault = table.fault(_params(len(params)), params)
+        cameras[key] = fault or _camera(table.path, model, (size[0], size[1]), params)
     return cameras
 
 
-def _images_bin(path: Path) -> list[_Image]:
-    table = Table(path)
-    images: list[_Image] = []
-    for i in range(table.count):
-        at, fault = table.at, None
-        try:
-            key, *pose, camera = table.finite("image", i, _IMAGE, _IMAGE_NAMES)
-        except NotFinite as error:
-            fault, table.at = error, at
-            key, *pose, camera = table.take("image", i, _IMAGE, _IMAGE_NAMES)
-        end = table.data.find(b"\0", table.at)
-        if end < 0:
-            raise table.cut_off("image", i, "NAME")
-        try:
-            name = table.data[table.at : end].decode()
-        except UnicodeDecodeError:
-            raise InputError("is not UTF-8", path=path, property="NAME", index=i, item="image") from None
-        table.at = end + 1
-        (points,) = table.take("image", i, _COUNT, ["POINTS2D"])
-        table.skip("image", i, 24 * points, "POINTS2D")
-        images.append(_Image(key, name, camera, tuple(pose), fault))
+def _images(table: Table) -> list[_Image]:
+    """Read the pose (wxyz and translation, camera from world), camera and name of each image."""
+    images = []
+    for _ in table:
+        key, *pose, camera = table.take(_IMAGE)
+        images.append(_Image(key, table.name(), camera, tuple(pose), table.fault(_POSE, pose)))
+        table.skip_points()
     return images
 
 
-_U32, _SENSOR, _SEVEN = struct.Struct("<I"), struct.Struct("<iI"), struct.Struct("<ddddddd")
-_FRAME, _DATA = struct.Struct("<IIddddddd"), struct.Struct("<iIQ")
-_IS_CAMERA = 0
-
-
-def _rig_poses(folder: Path, binary: bool) -> dict[tuple[int, int], NDArray[np.float64]]:
+def _rig_poses(folder: Path, suffix: str) -> dict[tuple[int, int], NDArray[np.float64]]:
     """Return camera_from_world by image and camera, as frames and rigs say; no poses without their files.
 
     camera_from_world = sensor_from_rig · rig_from_world. Poses that are unknown or not finite are missing.
     """
-    held, suffix = _held(folder), ".bin" if binary else ".txt"
+    held = _held(folder)
     rigs, frames = held.get(f"rigs{suffix}"), held.get(f"frames{suffix}")
     if rigs is None or frames is None:
         return {}
     with parsing(rigs):
-        sensors = (_rigs_bin if binary else _rigs_txt)(rigs)
+        sensors = _sensors(open_table(rigs, "rig"))
     found: dict[tuple[int, int], NDArray[np.float64]] = {}
     with parsing(frames):
-        for rig, numbers, images in (_frames_bin if binary else _frames_txt)(frames):
+        table = open_table(frames, "frame")
+        for _ in table:
+            _key, rig, *numbers, count = table.take(_FRAME)
             from_world = _known(numbers)
-            for camera, image in images:
-                in_rig = sensors.get(rig, {}).get(camera)
+            for kind, sensor, image in [table.take(_DATA) for _ in range(count)]:
+                in_rig = sensors.get((rig, sensor)) if kind in _CAMERA_SENSOR else None
                 if from_world is not None and in_rig is not None:
-                    found[image, camera] = in_rig @ from_world
+                    found[image, sensor] = in_rig @ from_world
     return found
 
 
-_Rigs = dict[int, dict[int, NDArray[np.float64] | None]]
-_RigFrames = Iterator[tuple[int, tuple[float, ...], list[tuple[int, int]]]]
+def _sensors(table: Table) -> dict[tuple[int, int], NDArray[np.float64] | None]:
+    """Return camera_from_rig by rig and camera; the first sensor of a rig is its origin."""
+    sensors: dict[tuple[int, int], NDArray[np.float64] | None] = {}
+    for _ in table:
+        rig, count = table.take(_RIG)
+        for number in range(count):
+            kind, sensor = table.take(_SENSOR)
+            pose: NDArray[np.float64] | None = np.eye(4)
+            if number:
+                pose = _known(table.take(_IN_RIG)) if table.take(_HAS_POSE)[0] else None
+            if kind in _CAMERA_SENSOR:
+                sensors[rig, sensor] = pose
+    return sensors
 
 
 def _known(numbers: Sequence[float]) -> NDArray[np.float64] | None:
@@ -396,143 +507,3 @@ def _known(numbers: Sequence[float]) -> NDArray[np.float64] | None:
     if not all(map(math.isfinite, numbers)) or not any(numbers[:4]):
         return None
     return posed(numbers[:4], numbers[4:])
-
-
-def _rigs_bin(path: Path) -> _Rigs:
-    table, rigs = Table(path), _Rigs()
-    for i in range(table.count):
-        (key,) = table.take("rig", i, _U32, ["RIG_ID"])
-        (count,) = table.take("rig", i, _U32, ["NUM_SENSORS"])
-        rigs[key] = {}
-        for number in range(count):
-            kind, sensor = table.take("rig", i, _SENSOR, ["SENSOR_TYPE", "SENSOR_ID"])
-            pose: NDArray[np.float64] | None = np.eye(4)
-            if number:
-                (has_pose,) = table.take("rig", i, struct.Struct("<B"), ["HAS_POSE"])
-                pose = _known(table.take("rig", i, _SEVEN, _POSE)) if has_pose else None
-            if kind == _IS_CAMERA:
-                rigs[key][sensor] = pose
-    return rigs
-
-
-def _frames_bin(path: Path) -> _RigFrames:
-    table = Table(path)
-    for i in range(table.count):
-        _key, rig, *pose = table.take("frame", i, _FRAME, ["FRAME_ID", "RIG_ID", *_POSE])
-        (count,) = table.take("frame", i, _U32, ["NUM_DATA_IDS"])
-        names = ["SENSOR_TYPE", "SENSOR_ID", "DATA_ID"]
-        data = [table.take("frame", i, _DATA, names) for _ in range(count)]
-        yield rig, tuple(pose), [(sensor, image) for kind, sensor, image in data if kind == _IS_CAMERA]
-
-
-def _rigs_txt(path: Path) -> _Rigs:
-    rigs = _Rigs()
-    for words in (iter(line.split()) for line in text_lines(path) if line.strip()):
-        key, count = int(next(words, "")), int(next(words, ""))
-        rigs[key] = {}
-        for number in range(count):
-            kind, sensor = next(words, ""), int(next(words, ""))
-            pose: NDArray[np.float64] | None = np.eye(4)
-            if number:
-                has_pose = int(next(words, ""))
-                pose = _known([float(next(words, "")) for _ in _POSE]) if has_pose else None
-            if kind == "CAMERA":
-                rigs[key][sensor] = pose
-    return rigs
-
-
-def _frames_txt(path: Path) -> _RigFrames:
-    for words in (iter(line.split()) for line in text_lines(path) if line.strip()):
-        _key, rig = int(next(words, "")), int(next(words, ""))
-        pose = tuple(float(next(words, "")) for _ in _POSE)
-        data = [
-            (next(words, ""), int(next(words, "")), int(next(words, ""))) for _ in range(int(next(words, "")))
-        ]
-        yield rig, pose, [(sensor, image) for kind, sensor, image in data if kind == "CAMERA"]
-
-
-_CAMERA_COLUMNS = (("CAMERA_ID", 0), ("WIDTH", 2), ("HEIGHT", 3))
-_KEY_COLUMNS = (("IMAGE_ID", 0), ("CAMERA_ID", 8))
-_POSE_COLUMNS = tuple((name, at) for at, name in enumerate(_POSE, 1))
-
-
-def text_lines(path: Path) -> list[str]:
-    """Return the lines of a COLMAP text table without comments; empty lines may be rows."""
-    return [line for line in decoded(path.read_bytes()).splitlines() if not line.startswith("#")]
-
-
-def _cameras_txt(path: Path) -> dict[int, Lens | NotFinite]:
-    cameras: dict[int, Lens | NotFinite] = {}
-    rows = [words for line in text_lines(path) if (words := line.split())]
-    for i, words in enumerate(rows):
-        key, width, height = (number(path, "camera", i, words, name, at) for name, at in _CAMERA_COLUMNS)
-        try:
-            params = tuple(
-                number(path, "camera", i, words, f"PARAMS[{at - 4}]", at, _finite)
-                for at in range(4, len(words))
-            )
-            cameras[int(key)] = _camera(path, words[1], (int(width), int(height)), params)
-        except NotFinite as error:
-            cameras[int(key)] = error
-    return cameras
-
-
-def number(
-    path: Path, item: str, i: int, words: list[str], name: str, at: int, kind: Callable[[str], float] = int
-) -> float:
-    """Return a column of row `i` of a text table."""
-    if at >= len(words):
-        raise InputError("is missing", path=path, property=name, index=i, item=item)
-    word = words[at]
-    if kind is _finite and _NOT_FINITE.fullmatch(word):
-        raise NotFinite(f"is {word!r}", path=path, property=name, index=i, item=item)
-    try:
-        if "_" in word or not word.isascii():  # float() accepts both
-            raise ValueError(word)
-        return kind(word)
-    except ValueError:
-        raise InputError(f"is {word!r}", path=path, property=name, index=i, item=item) from None
-
-
-def _finite(word: str) -> float:
-    value = float(word)
-    if not math.isfinite(value):
-        raise ValueError(word)
-    return value
-
-
-_NOT_FINITE = re.compile(r"[+-]?(nan(\(.*\))?|inf(inity)?|\d\.#\w+)", re.IGNORECASE)
-"""Numbers that are not finite, as C and C++ write them on any system."""
-
-
-def _images_txt(path: Path) -> list[_Image]:
-    """Read images.txt: per image a line with its pose (wxyz and translation, camera from world), camera
-    and name, then a line with its points, which is skipped and may be empty or missing.
-    """
-    images: list[_Image] = []
-    points = False
-    for line in text_lines(path):
-        if not line.strip() or (points and _is_points(line)):
-            points = False
-            continue
-        i, words, points = len(images), line.split(maxsplit=9), True
-        pose, fault = tuple[float, ...](), None
-        try:
-            pose = tuple(number(path, "image", i, words, key, at, _finite) for key, at in _POSE_COLUMNS)
-        except NotFinite as error:
-            fault = error
-        key, camera = (int(number(path, "image", i, words, *column)) for column in _KEY_COLUMNS)
-        if len(words) < 10:
-            raise InputError("is missing", path=path, property="NAME", index=i, item="image")
-        images.append(_Image(key, words[9].strip(), camera, pose, fault))
-    return images
-
-
-def _is_points(line: str) -> bool:
-    """Return whether a line of images.txt has triples x, y, POINT3D_ID, unlike the line of an image."""
-    words = line.split()
-    ids = words[2::3]
-    return len(words) % 3 == 0 and all(map(_WHOLE.fullmatch, ids)) and all(map(_NUMBER.fullmatch, words[:30]))
-
-
-_WHOLE, _NUMBER = re.compile(r"-?\d+"), re.compile(r"[+-]?(nan|inf|[\d.]+(e[+-]?\d+)?)", re.IGNORECASE)

@@ -50,9 +50,7 @@ class Stream(RawStream):
         bounds += [f"{end}_scale_{axis}" for end in ("min", "max") for axis in ("x", "y", "z")]
         if "min_r" in chunk_properties:
             bounds += [f"{end}_{channel}" for end in ("min", "max") for channel in "rgb"]
-        missing = [name for name in bounds if name not in chunk_properties]
-        if missing:
-            raise InputError(f"element 'chunk' lacks {', '.join(map(repr, missing))}", path=path)
+        plyfiles.require(path, chunk_properties, bounds, "a compressed scene", "chunk")
         rest = [p for p in header.properties("sh") if re.fullmatch(r"f_rest_\d+", p)]
         if len(rest) not in (0, 9, 24, 45) or set(rest) != {f"f_rest_{k}" for k in range(len(rest))}:
             raise InputError(f"element 'sh' has {len(rest)} coefficients; expected 9, 24 or 45", path=path)
@@ -150,9 +148,8 @@ def write(path: Path, splats: Splats, *, overwrite: bool = False) -> float:
     comments = plyfiles.comments_of(splats.offset, splats.render_model, splats.up)
     with atomic_output(path, overwrite) as temporary, temporary.open("wb") as file:
         PlyData(elements, byte_order="<", comments=comments).write(file)
-    low, high = (np.stack([chunk[f"{end}_{axis}"] for axis in "xyz"], axis=1) for end in ("min", "max"))
     of, shares = np.arange(len(splats)) // _CHUNK_ROWS, _unpacked(words["packed_position"], _VECTOR_BITS)
-    return rounding(given, low[of] * (1 - shares) + high[of] * shares + splats.offset)
+    return rounding(given, _between(chunk, of, "{}_{}", "xyz", shares) + splats.offset)
 
 
 def _within(

@@ -133,7 +133,6 @@ def _views(views: ViewSet) -> dict[str, Any]:
 
 
 def _photo_notes(cameras: Cameras) -> list[Note]:
-    """Return notes on alpha, a constant border colour and mixed sizes of the photos."""
     photos = [photo for photo in cameras.image_paths if photo is not None]
     traits = photo_traits(photos)
     notes = []

@@ -37,7 +37,7 @@ READERS: dict[Kind, dict[str, tuple[str, ...]]] = {
     },
     "views": {
         "views": (),
-        "nerfstudio": ("config.yml",),  # before its data, which are in another world
+        "nerfstudio": ("config.yml",),
         "colmap": ("cameras.bin", "cameras.txt", "images.bin", "images.txt"),
         "nerfstudio_export": (),
         "transforms": (),
@@ -48,11 +48,32 @@ READERS: dict[Kind, dict[str, tuple[str, ...]]] = {
         "gsplat_run": ("cfg.yml",),
     },
 }
-"""Formats of each kind: the module that reads it, and suffixes or names of its files.
+"""Formats of each kind: the module that reads it, and suffixes or names of its files."""
 
-Modules of views are asked in this order which folders (`holds`) and which content of a .json (`describes`)
-they read.
+_FOLDERS: dict[str, tuple[str, ...] | None] = {
+    "nerfstudio": ("dataparser_transforms.json",),  # before its data, which are in another world
+    "colmap": None,
+    "nerfstudio_export": None,
+    "transforms": ("transforms.json", *(f"transforms_{split}.json" for split in ("train", "val", "test"))),
+    "cambridge": None,
+    "llff": ("poses_bounds.npy",),
+    "polycam": None,
+    "inria": ("cameras.json",),
+    "gsplat_run": None,
+}
+"""Formats of folders of views in the order of preference, and files of which one says so.
+
+None asks the module (`holds`).
 """
+
+_JSON: dict[str, tuple[type, set[str]]] = {
+    "transforms": (dict, {"frames"}),
+    "views": (dict, {"views"}),
+    "nerfstudio": (dict, {"transform", "scale"}),
+    "nerfstudio_export": (list, {"file_path", "transform"}),
+    "inria": (list, {"position", "rotation"}),
+}
+"""Formats of .json files of views: an object with these keys, or a list of such objects."""
 
 KINDS: dict[str, Kind] = {name: kind for kind, formats in READERS.items() for name in formats}
 _BY_NAME = {end: name for formats in READERS.values() for name, ends in formats.items() for end in ends}
@@ -125,9 +146,7 @@ def reader(path: str | Path, expected: Kind) -> tuple[Path, Any]:
     found = KINDS[name]
     if expected == "points" and name == "colmap":
         name = "points3d"
-    elif expected == "views" and name == "e57":
-        name = "e57_photos"
-    elif found != expected:
+    elif found != expected and (expected, name) != ("views", "e57"):
         what = _NAMES[found] if found != "views" else name
         hint = _OTHER_KINDS.get((expected, found))
         raise InputError(f"expected {_NAMES[expected]}, found {what}", path=path, hint=hint)
@@ -200,6 +219,21 @@ def run_background(path: str | Path) -> Colour | None:
     return checked(settings.get("recover.background", BLACK), tuple[Within1, Within1, Within1], place)
 
 
+def holds(name: str, folder: Path) -> bool:
+    """Return whether a folder holds views of a format."""
+    files = _FOLDERS[name]
+    if files is None:
+        return bool(import_module(f"g2ard.io.{name}").holds(folder))
+    return any((folder / file).is_file() for file in files)
+
+
+def json_format(content: Any) -> str | None:
+    """Return the format of views in JSON content, or None."""
+    kind, sample = (list, next(iter(content), None)) if isinstance(content, list) else (dict, content)
+    keys = set(sample) if isinstance(sample, dict) else set[str]()
+    return next((name for name, (own, needed) in _JSON.items() if own is kind and needed <= keys), None)
+
+
 def find_views(scene: str | Path) -> Path | None:
     """Return the path of the cameras that a scene was trained with, for `read_view_set`, or None.
 
@@ -230,10 +264,10 @@ def _cameras_of(own: Path) -> Iterator[Path]:
     iteration = re.fullmatch(r"iteration_\d+", own.name) and own.parent.name == "point_cloud"
     places = [own / inria.NAME, *([own.parent.parent / inria.NAME] if iteration else ())]
     files = [file for file in places if file.is_file()]
-    yield from (file for file in files if _describes(inria, file))
+    yield from (file for file in files if _format_in(file) == "inria")
     if (own / nerfstudio.NAME).is_file():
         yield own / nerfstudio.NAME
-    if any(_describes(nerfstudio_export, own / name) for name in nerfstudio_export.LISTS):
+    if any(_format_in(own / name) == "nerfstudio_export" for name in nerfstudio_export.LISTS):
         yield own
     with suppress(InputError):  # a cfg.yml that cannot be read is some other program's
         if own.name == "ply" and gsplat_run.holds(own.parent):
@@ -241,13 +275,13 @@ def _cameras_of(own: Path) -> Iterator[Path]:
     yield from files  # without cameras it is damaged: its reader raises the error
 
 
-def _describes(module: Any, file: Path) -> bool:
-    """Return whether a JSON file exists and is of a module's format."""
+def _format_in(file: Path) -> str | None:
+    """Return the format of views in a JSON file, or None if it does not exist or cannot be read."""
     from g2ard.io.jsonfile import read_any_json
 
     with suppress(InputError):
-        return file.is_file() and module.describes(read_any_json(file))
-    return False
+        return json_format(read_any_json(file)) if file.is_file() else None
+    return None
 
 
 def _folder_format(path: Path) -> str:
@@ -258,9 +292,8 @@ def _folder_format(path: Path) -> str:
         return "tiles"
     if (chunks := chunks_of(path)) and not _by_gsplat(chunks[0]):
         return "sog"
-    for name in READERS["views"]:
-        if import_module(f"g2ard.io.{name}").holds(path):
-            return name
+    if name := next((name for name in _FOLDERS if holds(name, path)), None):
+        return name
     if (path / "tileset.json").is_file():
         return file_format(path / "tileset.json")
     if any(path.glob("tile-*.f32")) or (path / POINTS).is_dir():
@@ -351,13 +384,13 @@ def _photos_in(folder: Path) -> list[Path]:
 
 def _poses_above(path: Path) -> Path | None:
     """Return the transforms.json, or the folder of another file of poses, beside a folder of photos."""
-    from g2ard.io import colmap, inria, transforms
+    from g2ard.io import colmap, transforms
 
     above = path.parent
     files = transforms.files_of(above)
     if len(files) == 1:
         return next(iter(files))
-    return above if files or colmap.model_folder(above) or inria.holds(above) else None
+    return above if files or colmap.model_folder(above) or holds("inria", above) else None
 
 
 def _ply_format(path: Path) -> str:
@@ -377,10 +410,8 @@ def _json_format(path: Path) -> str:
     from g2ard.io.jsonfile import read_any_json
 
     content = read_any_json(path)
-    for name in READERS["views"]:
-        module = import_module(f"g2ard.io.{name}")
-        if hasattr(module, "describes") and module.describes(content):
-            return name
+    if name := json_format(content):
+        return name
     if isinstance(content, dict) and {"geometricError", "root"} <= set(content):
         raise InputError(
             "is a tileset of 3D Tiles, for viewers such as CesiumJS",

@@ -1,5 +1,9 @@
-"""Reader for laser scans, .e57, with pye57."""
+"""Reader for laser scans, .e57, with pye57: their points, and their photos as views."""
 
+import hashlib
+import os
+import re
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -10,10 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard.errors import G2ardError, InputError, missing
+from g2ard.io.atomic import atomic_output
 from g2ard.io.limits import check_unpacked
+from g2ard.io.photos import Frame, Lens, Listed, inverse, posed
 from g2ard.io.stream import MarkedPoints, PointStream, from_row, full_scales
+from g2ard.io.transforms import FLIP
 from g2ard.io.types import Note
 from g2ard.progress import plural
+from g2ard.scene.lenses import PhotoLens
 from g2ard.scene.transform import rotation_matrices
 
 _CARTESIAN = ("cartesianX", "cartesianY", "cartesianZ")
@@ -22,6 +30,15 @@ _COLORS = ("colorRed", "colorGreen", "colorBlue")
 
 _SAMPLE_ROWS = 100_000
 """Points at the beginning of each scan that tell where it is."""
+
+_PANORAMA_AXES = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+"""OpenCV's camera axes in those of a panorama, whose middle is along x, with z up."""
+
+_FULL_CIRCLE = 0.01
+"""Largest relative difference of a panorama's aspect from 2:1."""
+
+_SUFFIXES = {"jpegImage": ".jpg", "pngImage": ".png"}
+_NO_NAME = re.compile(r"[^\w.-]+")
 
 
 @dataclass(frozen=True)
@@ -46,9 +63,9 @@ class Stream(PointStream):
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        with opened(path) as file:
+        with _opened(path) as file:
             self._scans = [_scan(path, file, number) for number in range(file.scan_count)]
-            self._photos = posed_photos(file)
+            self._photos = sum(node.isDefined("pose") for node in _images(file))
         count = sum(scan.count for scan in self._scans)
         check_unpacked(path, path.stat().st_size, 24 * count)
         sample = [np.zeros((0, 3))]
@@ -76,7 +93,7 @@ class Stream(PointStream):
             return
         from pye57 import libe57
 
-        with opened(self.path) as file:
+        with _opened(self.path) as file:
             fields = {name: np.empty(rows) for name in (*scan.place, *scan.color, *scan.invalid)}
             buffers = libe57.VectorSourceDestBuffer()
             for name, values in fields.items():
@@ -133,20 +150,15 @@ def _limits(header: Any) -> tuple[float, float]:
     return float(found["intensityMinimum"].value()), float(found["intensityMaximum"].value())
 
 
-def image_count(file: Any) -> int:
-    """Return the number of images of an open file."""
+def _images(file: Any) -> list[Any]:
+    """Return the nodes of the photos of an open file."""
     root = file.image_file.root()
-    return int(root["images2D"].childCount()) if root.isDefined("images2D") else 0
-
-
-def posed_photos(file: Any) -> int:
-    """Return the number of images of an open file that have a pose."""
-    images = range(image_count(file))
-    return sum(file.image_file.root()["images2D"][i].isDefined("pose") for i in images)
+    count = root["images2D"].childCount() if root.isDefined("images2D") else 0
+    return [root["images2D"][i] for i in range(count)]
 
 
 @contextmanager
-def opened(path: Path) -> Iterator[Any]:
+def _opened(path: Path) -> Iterator[Any]:
     """Open a file; errors of the library become an `InputError`."""
     try:
         import pye57
@@ -163,3 +175,92 @@ def opened(path: Path) -> Iterator[Any]:
     except Exception as error:  # those of libE57Format have several lines
         text = (str(error).strip() or type(error).__name__).splitlines()[0]
         raise InputError(f"cannot be read as E57: {text}", path=path) from error
+
+
+def read(path: Path, images: Path | None = None) -> Listed:
+    """Read photos with poses as views; their files are copied to a cache once.
+
+    Panoramas of the full sphere look along x with z up; pinhole images look along −z with y up, as the format
+    defines. Others (for reference, cylindrical, without a pose) are left out with a note.
+    """
+    if images is not None:
+        raise InputError("has its photos inside", path=path, hint="leave {images} out")
+    with _opened(path) as file:
+        nodes = _images(file)
+        if not nodes:
+            raise InputError("holds no photos", path=path, hint="give views with photos of their own")
+        folder = _cache_of(path)
+        found = [_frame(path, number, node, folder) for number, node in enumerate(nodes)]
+    frames = [frame for frame in found if isinstance(frame, Frame)]
+    left_out = [reason for reason in found if isinstance(reason, str)]
+    if not frames:
+        raise InputError(f"none of its {plural(len(nodes), 'photo')} can be used: {left_out[0]}", path=path)
+    text = f"{plural(len(left_out), 'photo')} of {len(nodes)} left out: {left_out[0] if left_out else ''}"
+    return Listed(path, frames, notes=(Note("left_out_photos", len(left_out), text),) if left_out else ())
+
+
+def _frame(path: Path, number: int, node: Any, folder: Path) -> Frame | str:
+    """Return the view of a photo, or the reason why it cannot be used."""
+    named = str(node["name"].value()) if node.isDefined("name") else ""
+    stem = "_".join(filter(None, [f"{number:04d}", _NO_NAME.sub("_", named).strip("_.")[:80]]))
+    kind = next((k for k in ("spherical", "pinhole") if node.isDefined(f"{k}Representation")), None)
+    if kind is None:
+        return f"{stem} has no spherical or pinhole representation"
+    if not node.isDefined("pose"):
+        return f"{stem} has no pose"
+    shown = node[f"{kind}Representation"]
+    size = int(shown["imageWidth"].value()), int(shown["imageHeight"].value())
+    if min(size) < 1:
+        return f"{stem} has {size[0]}×{size[1]} pixels"
+    if kind == "spherical":
+        if abs(size[0] - 2 * size[1]) > _FULL_CIRCLE * size[0]:
+            return f"{stem} is a panorama of {size[0]}×{size[1]} pixels, not of the full sphere"
+        lens = Lens.of(PhotoLens("EQUIRECTANGULAR", size, ()))
+    else:
+        focal, across, down, cx, cy = (
+            float(shown[name].value())
+            for name in ("focalLength", "pixelWidth", "pixelHeight", "principalPointX", "principalPointY")
+        )
+        if not (focal > 0 and across > 0 and down > 0):
+            return f"{stem} has no focal length"
+        lens = Lens.pinhole(size, (focal / across, focal / down), (cx, cy))
+    blob = next((name for name in _SUFFIXES if shown.isDefined(name)), None)
+    if blob is None:
+        return f"{stem} has no JPEG or PNG"
+    photo = _copied(shown[blob], folder / f"{stem}{_SUFFIXES[blob]}")
+    mask = (
+        _copied(shown["imageMask"], folder / "masks" / f"{stem}.png")
+        if shown.isDefined("imageMask")
+        else None
+    )
+    world_from_camera = _pose(node["pose"]) @ (_PANORAMA_AXES if kind == "spherical" else FLIP)
+    return Frame(photo.name, inverse(world_from_camera), lens, photo, mask=mask, listed=photo.name)
+
+
+def _pose(node: Any) -> NDArray[np.float64]:
+    """Return world_from_photo; parts that are missing are those of the identity."""
+    quat, shift = [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0]
+    if node.isDefined("rotation"):
+        quat = [float(node["rotation"][axis].value()) for axis in "wxyz"]
+    if node.isDefined("translation"):
+        shift = [float(node["translation"][axis].value()) for axis in "xyz"]
+    return posed(quat, shift)
+
+
+def _copied(blob: Any, target: Path) -> Path:
+    """Copy a photo into the cache, unless it is there."""
+    if target.is_file() and target.stat().st_size == blob.byteCount():
+        return target
+    target.parent.mkdir(parents=True, exist_ok=True)
+    with atomic_output(target, overwrite=True) as temporary:
+        temporary.write_bytes(np.asarray(blob.read_buffer()).tobytes())
+    return target
+
+
+def _cache_of(path: Path) -> Path:
+    """Return the folder of a file's photos below the user's cache folder; another file has another one."""
+    state = path.stat()
+    key = f"{path.resolve()}\n{state.st_size}\n{state.st_mtime_ns}"
+    usual = os.environ.get("LOCALAPPDATA") if sys.platform == "win32" else os.environ.get("XDG_CACHE_HOME")
+    base = Path(usual) if usual else Path.home() / ".cache"
+    return base / "g2ard" / "e57" / f"{path.stem}-{hashlib.sha256(key.encode()).hexdigest()[:16]}"

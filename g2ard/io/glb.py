@@ -10,6 +10,7 @@ The draft asks for SPZ's own axes, which differ by half a turn about y.
 import base64
 import json
 import struct
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
@@ -24,7 +25,7 @@ from g2ard.io import spz
 from g2ard.io.atomic import atomic_output
 from g2ard.io.jsonfile import Number, Place, Row, Vector, Whole, checked, parse_json
 from g2ard.io.packing import packing_order, rounding, unit_quats, writable
-from g2ard.io.paths import check_regular
+from g2ard.io.paths import check_regular, decoded
 from g2ard.io.sanitize import Raw, cleaned
 from g2ard.io.types import Note, Scene
 from g2ard.progress import plural
@@ -225,8 +226,6 @@ class _Primitive(msgspec.Struct):
 
 
 class _Splatting(msgspec.Struct, rename="camel"):
-    """The extension of a primitive of splats."""
-
     kernel: Any = "ellipse"
     color_space: Any = None
     extensions: dict[str, Any] = {}
@@ -263,8 +262,6 @@ class _View(msgspec.Struct, rename="camel"):
 
 
 class _Compressed(msgspec.Struct, rename="camel"):
-    """The extension of an SPZ."""
-
     buffer_view: Whole
 
 
@@ -283,10 +280,9 @@ def read(path: Path) -> Scene:
 
 
 def _chunks(path: Path) -> tuple[Any, bytes]:
-    """Return the JSON document and the binary chunk."""
     data = path.read_bytes()
     if path.suffix.lower() == ".gltf":
-        return _with_buffer(path, parse_json(path, data))
+        return _with_buffer(path, parse_json(path, decoded(path, data)))
     if len(data) < 20 or struct.unpack_from("<II", data) != (_MAGIC, 2):
         raise InputError(f"not a .glb of glTF 2.0 (begins with {data[:4]!r})", path=path)
     found: dict[int, bytes] = {}
@@ -299,7 +295,7 @@ def _chunks(path: Path) -> tuple[Any, bytes]:
         at += 8 + size
     if _JSON not in found:
         raise InputError("holds no JSON chunk", path=path)
-    return parse_json(path, found[_JSON]), found.get(_BIN, b"")
+    return parse_json(path, decoded(path, found[_JSON])), found.get(_BIN, b"")
 
 
 def _with_buffer(path: Path, document: Any) -> tuple[Any, bytes]:
@@ -321,40 +317,46 @@ def _with_buffer(path: Path, document: Any) -> tuple[Any, bytes]:
 
 def _scene(path: Path, document: _Document, binary: bytes) -> Scene:
     """Read all splat primitives, each as often as nodes show it."""
-    notes: list[Note] = []
-    parts: list[Splats] = []
-    others = uneven = 0
-    for index, mesh in enumerate(document.meshes):
-        placements = None
-        for at, primitive in enumerate(mesh.primitives):
-            within = Place(path).to("meshes", index, "primitives", at)
-            if not {EXTENSION, _SPZ_ALONE} & set(primitive.extensions):
-                others += 1
-                continue
-            scene = _primitive(within, document, binary, primitive)
-            notes += [note for note in scene.notes if note not in notes]
-            placements = _placements(path, document.nodes, index) if placements is None else placements
-            for placement in placements:
-                try:
-                    moved, exact = deformed(scene.splats, placement)
-                except InputError as error:
-                    raise error.at(path=path, parameter=None, message=f"a node {error.message}") from None
-                parts.append(moved)
-                uneven += not exact
-    if not parts:
+    others = sum(not _has_splats(primitive) for mesh in document.meshes for primitive in mesh.primitives)
+    found = placed(path, _shown(path, document, binary))
+    if found is None:
         raise InputError(f"has no primitive with {EXTENSION}", path=path)
-    if others:
-        notes.insert(0, Note("ignored_meshes", others, f"{plural(others, 'other primitive')} ignored"))
+    text = f"{plural(others, 'other primitive')} ignored"
+    return replace(found, notes=(Note("ignored_meshes", others, text), *found.notes)) if others else found
+
+
+def _has_splats(primitive: _Primitive) -> bool:
+    return bool({EXTENSION, _SPZ_ALONE} & set(primitive.extensions))
+
+
+def _shown(path: Path, document: _Document, binary: bytes) -> Iterator[tuple[Scene, NDArray[np.float64]]]:
+    """Yield each splat primitive with each of its placements."""
+    for index, mesh in enumerate(document.meshes):
+        held = [at for at, primitive in enumerate(mesh.primitives) if _has_splats(primitive)]
+        placements = _placements(path, document.nodes, index) if held else []
+        for at in held:
+            within = Place(path).to("meshes", index, "primitives", at)
+            scene = _primitive(within, document, binary, mesh.primitives[at])
+            yield from ((scene, placement) for placement in placements)
+
+
+def placed(path: Path, parts: Iterable[tuple[Scene, NDArray[np.float64]]]) -> Scene | None:
+    """Join parts by their (4, 4) placements, in the axes of a .ply; return None without parts."""
+    moved, notes, uneven = list[Splats](), list[Note](), 0
+    for part, placement in parts:
+        notes += [note for note in part.notes if note not in notes]
+        try:
+            splats, exact = deformed(part.splats, placement)
+        except InputError as error:
+            raise error.at(path=path, parameter=None, message=f"a node {error.message}") from None
+        moved.append(splats)
+        uneven += not exact
     if uneven:
-        notes.append(uneven_note(uneven))
-    splats = parts[0] if len(parts) == 1 else join(parts)
-    return Scene(splats, tuple(notes))
-
-
-def uneven_note(count: int) -> Note:
-    """Return the note on placements that colours by direction cannot follow exactly."""
-    text = f"{plural(count, 'part')} scaled unevenly: colours by direction follow approximately"
-    return Note("uneven_placement", count, text)
+        text = f"{plural(uneven, 'part')} scaled unevenly: colours by direction follow approximately"
+        notes.append(Note("uneven_placement", uneven, text))
+    if not moved:
+        return None
+    return Scene(moved[0] if len(moved) == 1 else join(moved), tuple(notes))
 
 
 def _primitive(within: Place, document: _Document, binary: bytes, primitive: _Primitive) -> Scene:

@@ -4,9 +4,9 @@ from pathlib import Path
 
 from g2ard.errors import InputError
 from g2ard.io import colmap
-from g2ard.io.photos import view_set
+from g2ard.io.photos import Listed
 from g2ard.io.settings import below, read_settings
-from g2ard.io.types import ViewSet
+from g2ard.io.types import Note
 
 NAME = "cfg.yml"
 
@@ -24,7 +24,7 @@ def data_of(path: Path) -> Path | None:
     return None if named is None else below(file, named)
 
 
-def read(path: Path, images: Path | None = None) -> ViewSet:
+def read(path: Path, images: Path | None = None) -> Listed:
     """Read a run's cameras with their splits: every `test_every`th in order of names is test.
 
     Only runs with `normalize_world_space: false` are supported. Others move the world by the points'
@@ -49,15 +49,16 @@ def read(path: Path, images: Path | None = None) -> ViewSet:
     smaller = data / f"images_{settings.word('data_factor')}"
     photos = images or (smaller if smaller.is_dir() else None)
     try:
-        model, frames = colmap.frames(data, photos)
+        found = colmap.listed(data, photos)
+        frames = found.whole()
     except InputError as error:
         raise InputError(f"data_dir: {error}", path=file) from error
     every = settings.word("test_every") or "8"
     if not every.isdigit() or int(every) < 1:
         raise InputError(f"is {every!r}, expected a whole number ≥ 1", path=file, property="test_every")
     words = ["train" if i % int(every) else "test" for i in range(len(frames))]
-    views = view_set(model, [f._replace(split=word) for f, word in zip(frames, words, strict=True)])
+    split = Listed(found.path, [f._replace(split=word) for f, word in zip(frames, words, strict=True)])
     if settings.word("pose_opt") != "true":
-        return views
+        return split
     text = "the run optimised its poses; these are the poses before training"
-    return views.noted("optimised_poses", len(frames), text)
+    return split._replace(notes=(Note("optimised_poses", len(frames), text),))

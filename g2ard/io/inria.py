@@ -9,8 +9,8 @@ import numpy as np
 
 from g2ard.io.finding import Finder
 from g2ard.io.jsonfile import Matrix, Number, Place, Vector, Whole, checked, read_any_json
-from g2ard.io.photos import Frame, Lens, fits, inverse, photo_size, rigid, view_set
-from g2ard.io.types import ViewSet
+from g2ard.io.photos import Frame, Lens, Listed, fits, inverse, photo_size, rigid
+from g2ard.io.types import Note
 from g2ard.progress import plural
 
 NAME = "cameras.json"
@@ -27,17 +27,7 @@ class _Camera(msgspec.Struct):
     id: Any = None
 
 
-def holds(folder: Path) -> bool:
-    return (folder / NAME).is_file()
-
-
-def describes(content: Any) -> bool:
-    """Return whether JSON content is a list of such cameras."""
-    first = content[0] if isinstance(content, list) and content else None
-    return isinstance(first, dict) and {"position", "rotation"} <= set(first)
-
-
-def read(path: Path, images: Path | None = None) -> ViewSet:
+def read(path: Path, images: Path | None = None) -> Listed:
     """Read a model's training and test cameras from its folder or its cameras.json.
 
     `rotation` holds the rows of world_from_camera, in OpenCV axes. The principal point is the image's centre,
@@ -54,12 +44,9 @@ def read(path: Path, images: Path | None = None) -> ViewSet:
     for i, frame in enumerate(frames):
         if times[frame.name] > 1:
             frames[i] = frame._replace(name=f"{frame.name}_{i if listed[i].id is None else listed[i].id}")
-    views = view_set(file, frames)
     repeated = sum(count for count in times.values() if count > 1)
-    if not repeated:
-        return views
     text = f"{plural(repeated, 'camera')} of {len(frames)} have repeated names; their ids are appended"
-    return views.noted("repeated_names", repeated, text)
+    return Listed(file, frames, notes=(Note("repeated_names", repeated, text),) if repeated else ())
 
 
 def _frame(place: Place, camera: _Camera, finder: Finder | None) -> Frame:
@@ -76,7 +63,7 @@ def _frame(place: Place, camera: _Camera, finder: Finder | None) -> Frame:
     return Frame(
         name=camera.img_name,
         viewmat=inverse(rigid(world_from_camera, place.to("rotation"))),
-        lens=Lens((width, height), np.array([[fx, 0, width / 2], [0, fy, height / 2], [0, 0, 1]])),
+        lens=Lens.pinhole((width, height), (fx, fy)),
         photo=photo,
         listed=camera.img_name,
     )

@@ -13,7 +13,7 @@ import msgspec
 from msgspec import Meta
 
 from g2ard.errors import InputError
-from g2ard.io.paths import decoded
+from g2ard.io.paths import read_text
 
 _LARGEST_NUMBER = sys.float_info.max
 _LONGEST_SHOWN_VALUE = 40
@@ -74,21 +74,25 @@ def read_json(path: Path) -> dict[str, Any]:
     return checked(read_any_json(path), dict[str, Any], Place(path))
 
 
+def read_own(path: Path, format: str, version: int) -> dict[str, Any]:
+    """Return the object in a JSON file of g2ard's, which states this format and version."""
+    content = read_json(path)
+    if content.get("format") != format:
+        raise Place(path).to("format").error(f"is {content.get('format')!r}, expected {format!r}")
+    if content.get("version") != version:
+        raise InputError(f"unsupported version {content.get('version')!r}; expected {version}", path=path)
+    return content
+
+
 def read_any_json(path: Path) -> Any:
     """Return the content of a JSON file."""
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise InputError(error.strerror or str(error), path=path) from error
-    return parse_json(path, data)
+    return parse_json(path, read_text(path))
 
 
-def parse_json(path: Path, data: bytes) -> Any:
+def parse_json(path: Path, text: str) -> Any:
     """Return the content of JSON text; `path` is for errors."""
     try:
-        return json.loads(decoded(data))
-    except UnicodeDecodeError as error:
-        raise InputError("not a text file", path=path) from error
+        return json.loads(text)
     except json.JSONDecodeError as error:
         raise InputError(f"is not JSON ({error.msg})", path=path, index=error.lineno, item="line") from error
     except RecursionError as error:
@@ -133,7 +137,6 @@ def checked(value: Any, kind: type[Value], place: Place, entries: str | None = N
 
 
 def _special(kind: type, value: Any) -> Any:
-    """Convert a value to a type of this module."""
     if kind is Whole:
         is_number = isinstance(value, int | float) and not isinstance(value, bool)
         if is_number and 0 <= value <= _LARGEST_NUMBER and value % 1 == 0:

@@ -57,20 +57,13 @@ def read(path: Path) -> Scene:
         raise damaged(f"is cut off within the headers of {sections} sections", path=path)
     parts = []
     for i in range(sections):
-        section = _section(path, data, i)
-        parts.append(_rows(path, data, i, at, section, level, limits))
-        at = parts[-1][1]
-    count, rest = (
-        sum(len(raw.means) for raw, _ in parts),
-        max((raw.shN.shape[1] for raw, _ in parts), default=0),
-    )
-    whole, start = Raw.empty(count, rest), 0
+        raw, at = _rows(path, data, i, at, _section(path, data, i), level, limits)
+        parts.append(raw)
+    rest = max((raw.shN.shape[1] for raw in parts), default=0)
+    whole, start = Raw.empty(sum(len(raw.means) for raw in parts), rest), 0
     whole.shN[:] = 0
-    for raw, _ in parts:
-        into = whole.take(slice(start, start := start + len(raw.means)))
-        for name in ("means", "quats", "log_scales", "logit_opacities", "sh0"):
-            getattr(into, name)[:] = getattr(raw, name)
-        into.shN[:, : raw.shN.shape[1]] = raw.shN
+    for raw in parts:
+        whole.take(slice(start, start := start + len(raw.means))).fill(vars(raw).values())
     return cleaned(path, whole)
 
 

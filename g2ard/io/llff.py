@@ -7,8 +7,7 @@ import numpy as np
 from g2ard.errors import InputError, damaged
 from g2ard.io.jsonfile import Place
 from g2ard.io.paths import is_photo
-from g2ard.io.photos import Frame, Lens, inverse, photo_size, rigid, view_set
-from g2ard.io.types import ViewSet
+from g2ard.io.photos import Frame, Lens, Listed, inverse, photo_size, rigid
 from g2ard.progress import plural
 
 NAME = "poses_bounds.npy"
@@ -17,11 +16,7 @@ _LLFF_AXES = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 """Columns that turn down, right, backwards into right, down, forward."""
 
 
-def holds(folder: Path) -> bool:
-    return (folder / NAME).is_file()
-
-
-def read(path: Path, images: Path | None = None) -> ViewSet:
+def read(path: Path, images: Path | None = None) -> Listed:
     """Read the poses of all photos of a folder, in the order of their names.
 
     Each row holds a 3×5 matrix and the nearest and farthest depth, which are ignored. The matrix is
@@ -49,7 +44,7 @@ def read(path: Path, images: Path | None = None) -> ViewSet:
         matrix = row[:15].reshape(3, 5)
         photo = photos[i] if photos else None
         frames.append(_frame(Place(file, i, "row"), matrix, photo))
-    return view_set(file, frames)
+    return Listed(file, frames)
 
 
 def _frame(place: Place, matrix: np.ndarray, photo: Path | None) -> Frame:
@@ -57,8 +52,7 @@ def _frame(place: Place, matrix: np.ndarray, photo: Path | None) -> Frame:
     if not (height >= 1 and width >= 1 and focal > 0 and np.isfinite(matrix).all()):
         raise place.error(f"has height {height}, width {width} and focal length {focal}")
     pose = rigid(np.hstack([matrix[:, :3] @ _LLFF_AXES, matrix[:, 3:4]]), place)
-    size = round(width), round(height)
-    lens = Lens(size, np.array([[focal, 0, size[0] / 2], [0, focal, size[1] / 2], [0, 0, 1]]))
+    lens = Lens.pinhole((round(width), round(height)), (focal, focal))
     if photo is not None:
         lens = lens.at(photo_size(photo, place.path, lens.size))
     name = f"{place.index:05d}" if photo is None else photo.name

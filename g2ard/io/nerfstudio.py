@@ -3,7 +3,6 @@
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import msgspec
 import numpy as np
@@ -12,9 +11,9 @@ from numpy.typing import NDArray
 from g2ard.errors import InputError
 from g2ard.io import colmap, transforms
 from g2ard.io.jsonfile import Place, Pose, Positive, checked, read_json
-from g2ard.io.photos import Frame, inverse, rigid, view_set
+from g2ard.io.photos import Frame, Listed, inverse, rigid
 from g2ard.io.settings import Settings, below, read_settings
-from g2ard.io.types import ViewSet
+from g2ard.io.types import Note
 from g2ard.scene.samples import evenly_spaced
 
 NAME = "dataparser_transforms.json"
@@ -35,16 +34,7 @@ class _Applied(msgspec.Struct):
     applied_scale: Positive = 1.0
 
 
-def holds(folder: Path) -> bool:
-    return (folder / NAME).is_file()
-
-
-def describes(content: Any) -> bool:
-    """Return whether JSON content is that of `NAME`."""
-    return isinstance(content, dict) and {"transform", "scale"} <= set(content) and "frames" not in content
-
-
-def read(path: Path, images: Path | None = None) -> ViewSet:
+def read(path: Path, images: Path | None = None) -> Listed:
     """Read a run's training and test cameras in the world of the exported scene.
 
     x_trained = s·(D·A⁻¹·x) with s = scale / applied_scale. D and `scale`, from dataparser_transforms.json,
@@ -63,17 +53,17 @@ def read(path: Path, images: Path | None = None) -> ViewSet:
     frames, A, applied_scale = _data(folder, settings, images)
     scale = trained.scale / applied_scale
     trained_from_saved = rigid(D @ np.linalg.inv(A), place.to("transform"))
-    views = view_set(file, [_moved(frame, trained_from_saved, scale) for frame in frames])
+    found = Listed(file, [_moved(frame, trained_from_saved, scale) for frame in frames])
     mode = _optimized(settings)
     if mode is None:
-        return views
+        return found
     text = f"the run optimised its poses ({mode}); these are the poses before training"
-    return views.noted("optimised_poses", len(frames), text)
+    return found._replace(notes=(Note("optimised_poses", len(frames), text),))
 
 
 def _data(
     folder: Path, settings: Settings | None, images: Path | None
-) -> tuple[list[Frame], NDArray[np.float64], float]:
+) -> tuple[Sequence[Frame], NDArray[np.float64], float]:
     """Return the data's frames, and A and the scale that were applied to them."""
     if settings is None:
         if not (folder / "transforms.json").is_file():
@@ -89,12 +79,11 @@ def _data(
     if parser == "ColmapDataParser":
         model = place / (options.path("colmap_path") or "colmap/sparse/0")
         photos = images or place / (options.path("images_path") or "images")
-        return colmap.frames(model, photos if photos.is_dir() else None)[1], _EYE, 1.0
+        return colmap.listed(model, photos if photos.is_dir() else None).whole(), _EYE, 1.0
     return _saved(place, images, options if parser == "NerfstudioDataParser" else None)
 
 
 def _parser(path: Path, settings: Settings) -> tuple[str, Settings, Path]:
-    """Return the parser's name, its options and the path of the data."""
     manager = settings.block("pipeline", "datamanager")
     parser = manager and manager[1].block("dataparser")
     if not parser or not manager:
@@ -110,10 +99,10 @@ def _parser(path: Path, settings: Settings) -> tuple[str, Settings, Path]:
 
 def _saved(
     data: Path, images: Path | None, options: Settings | None
-) -> tuple[list[Frame], NDArray[np.float64], float]:
+) -> tuple[Sequence[Frame], NDArray[np.float64], float]:
     """Return the frames, A and scale of a transforms.json, or of a folder with transforms*.json."""
     file = data / "transforms.json" if (data / "transforms.json").is_file() else data
-    frames = transforms.frames(file, images)
+    frames = transforms.listed(file, images).whole()
     if not frames:
         raise InputError("no transforms.json in the run's data", path=data)
     place = Place(file).to("applied_transform")
@@ -130,7 +119,7 @@ def _saved(
     return frames, A, content.applied_scale
 
 
-def _split(frames: Sequence[Frame], options: Settings) -> list[Frame]:
+def _split(frames: Sequence[Frame], options: Settings) -> Sequence[Frame]:
     """Assign the run's split by `eval_mode` over sorted photo paths, if views are split at all."""
     count, mode = len(frames), options.word("eval_mode")
     order = sorted(range(count), key=lambda i: frames[i].photo or Path(frames[i].name))
@@ -149,7 +138,7 @@ def _split(frames: Sequence[Frame], options: Settings) -> list[Frame]:
     elif mode == "filename":
         train = np.array(["train" in Path(frame.name).name for frame in frames])
     else:
-        return list(frames)
+        return frames
     words = np.where(train, "train", "test").tolist()
     return [frame._replace(split=word) for frame, word in zip(frames, words, strict=True)]
 

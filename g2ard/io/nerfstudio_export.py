@@ -1,7 +1,6 @@
 """Reader for `ns-export cameras` of nerfstudio: transforms_train.json and transforms_eval.json."""
 
 from pathlib import Path
-from typing import Any
 
 import msgspec
 import numpy as np
@@ -10,9 +9,8 @@ from g2ard.errors import InputError
 from g2ard.io import colmap, transforms
 from g2ard.io.finding import Finder
 from g2ard.io.jsonfile import Place, Pose, checked, read_any_json
-from g2ard.io.photos import Frame, Lens, photo_size, rigid, view_set
+from g2ard.io.photos import Frame, Lens, Listed, photo_size, rigid
 from g2ard.io.settings import below
-from g2ard.io.types import ViewSet
 
 LISTS = {"transforms_train.json": "train", "transforms_eval.json": "test"}
 """File → its split."""
@@ -27,18 +25,12 @@ def holds(folder: Path) -> bool:
     return bool(exported(folder))
 
 
-def describes(content: Any) -> bool:
-    """Return whether JSON content is such a list."""
-    first = content[0] if isinstance(content, list) and content else None
-    return isinstance(first, dict) and {"file_path", "transform"} <= set(first)
-
-
 def exported(folder: Path) -> list[Path]:
     lists = [folder / name for name in LISTS if (folder / name).is_file()]
-    return [file for file in lists if describes(read_any_json(file))]
+    return [file for file in lists if isinstance(read_any_json(file), list)]
 
 
-def read(path: Path, images: Path | None = None) -> ViewSet:
+def read(path: Path, images: Path | None = None) -> Listed:
     """Read exported poses, {file_path, transform}: world_from_camera, 3×4, OpenGL axes, in the scene's world.
 
     `path` is one of the lists, or the folder of both. Intrinsics come from a transforms.json or a COLMAP
@@ -52,7 +44,7 @@ def read(path: Path, images: Path | None = None) -> ViewSet:
         frames += [
             _frame(Place(file, i, "camera"), camera, finder, lenses) for i, camera in enumerate(listed)
         ]
-    return view_set(path, frames)
+    return Listed(path, frames)
 
 
 def _frame(
@@ -92,9 +84,9 @@ def _lens(listed: Place, named: Path, place: Path | None, known: dict[Path, dict
 
 def _lenses(folder: Path) -> dict[str, Lens]:
     if (folder / "transforms.json").is_file():
-        frames = transforms.frames(folder / "transforms.json")
+        frames = transforms.listed(folder / "transforms.json").whole()
     elif folder.is_dir() and colmap.model_folder(folder) is not None:
-        frames = colmap.frames(folder)[1]
+        frames = colmap.listed(folder).whole()
     else:
         return {}
     names = [Path(frame.photo.name if frame.photo else frame.name).name for frame in frames]

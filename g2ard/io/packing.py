@@ -96,7 +96,6 @@ def morton_order(means: NDArray[Any]) -> NDArray[np.intp]:
 
 
 def _spread(v: NDArray[np.uint64]) -> NDArray[np.uint64]:
-    """Spread the bits of `v` to every third bit."""
     for shift, mask in (
         (32, 0x001F00000000FFFF),
         (16, 0x001F0000FF0000FF),

@@ -34,23 +34,34 @@ def real_path(path: str | Path) -> Path:
     return Path(os.path.realpath(path))
 
 
+def beside(photo: Path | None, place: Path) -> str | None:
+    """Return a photo's path relative to the folder of `place`."""
+    if photo is None:
+        return None
+    try:
+        return Path(os.path.relpath(real_path(photo), real_path(place.parent))).as_posix()
+    except ValueError:  # another drive on Windows
+        return real_path(photo).as_posix()
+
+
 def check_regular(path: Path) -> None:
     """Raise an `InputError` for a pipe, device or socket, which might block forever."""
     if path.exists() and not (path.is_file() or path.is_dir()):
         raise InputError("not a regular file", path=path)
 
 
-def decoded(data: bytes) -> str:
-    """Decode text in UTF-8, or in UTF-16 with a byte order mark, which is removed."""
-    wide = data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
-    return data.decode("utf-16" if wide else "utf-8-sig")
-
-
 def read_text(path: Path) -> str:
     try:
-        return decoded(path.read_bytes())
+        return decoded(path, path.read_bytes())
     except OSError as error:
-        raise InputError(f"{error.strerror}", path=path) from error
+        raise InputError(error.strerror or str(error), path=path) from error
+
+
+def decoded(path: Path, data: bytes) -> str:
+    """Decode text in UTF-8, or in UTF-16 with a byte order mark, which is removed; `path` is for errors."""
+    wide = data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+    try:
+        return data.decode("utf-16" if wide else "utf-8-sig")
     except UnicodeDecodeError as error:
         raise InputError("not a text file", path=path) from error
 

@@ -61,6 +61,18 @@ class Lens(NamedTuple):
         return self._replace(size=size, K=K)
 
     @classmethod
+    def pinhole(
+        cls,
+        size: tuple[int, int],
+        focal: tuple[float, float],
+        middle: tuple[float, float] | None = None,
+        distortion: tuple[float, ...] = (0.0,) * 5,
+    ) -> Lens:
+        """Return the lens of focal lengths and a principal point, None for the middle of the image."""
+        (fx, fy), (cx, cy) = focal, (size[0] / 2, size[1] / 2) if middle is None else middle
+        return cls(size, np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], np.float64), distortion)
+
+    @classmethod
     def of(cls, photo: PhotoLens) -> Lens:
         """Return the lens of a photo, from which `view_set` makes views."""
         return cls(photo.size, np.diag([*photo.focal, 1.0]), photo=photo)
@@ -78,6 +90,27 @@ class Frame(NamedTuple):
     mask: Path | None = None
     kind: str = USUAL
     listed: str = ""
+
+
+class Listed(NamedTuple):
+    """Views as a file lists them.
+
+    Args:
+        path: the file or folder.
+        left_out: names of views with numbers that are not finite, and what is wrong.
+        notes: further notes.
+    """
+
+    path: Path
+    frames: Sequence[Frame]
+    left_out: Sequence[tuple[str, InputError]] = ()
+    notes: tuple[Note, ...] = ()
+
+    def whole(self) -> Sequence[Frame]:
+        """Return the frames, or raise the error of the first view that is left out."""
+        if self.left_out:
+            raise self.left_out[0][1]
+        return self.frames
 
 
 def photo_size(
@@ -114,7 +147,6 @@ def fits(size: tuple[float, float], like: tuple[float, float]) -> bool:
 
 
 def _orientation(photo: Path) -> int:
-    """Return a photo's EXIF orientation, 1 without one."""
     with suppress(Exception):
         with photo.open("rb") as file:
             if file.read(4) not in _OFTEN_TURNED:
@@ -209,15 +241,11 @@ def _mask(frame: Frame) -> Path | None:
     return find_mask(frame.photo, len(plain_parts(frame.listed or frame.name)))
 
 
-def view_set(path: Path, frames: Sequence[Frame], left_out: Sequence[tuple[str, InputError]] = ()) -> ViewSet:
-    """Stack frames with unique names; frames whose photo is missing keep their pose only.
-
-    Args:
-        left_out: names of views with numbers that are not finite, and what is wrong; the first is raised if
-            there are no others.
-    """
-    if not frames:
-        raise left_out[0][1] if left_out else InputError("no views found", path=path)
+def view_set(listed: Listed) -> ViewSet:
+    """Stack frames with unique names; frames whose photo is missing keep their pose only."""
+    path, frames, left_out, further = listed
+    if not frames and not listed.whole():
+        raise InputError("no views found", path=path)
     name, times = Counter(frame.name for frame in frames).most_common(1)[0]
     if times > 1:
         raise InputError(f"{times} views are named {name!r}; names must be unique", path=path)
@@ -236,14 +264,14 @@ def view_set(path: Path, frames: Sequence[Frame], left_out: Sequence[tuple[str, 
         made = sum(frame.lens.photo is not None for frame in frames)
         text = f"{plural(len(bent), 'photo')} ({models}) resampled to {plural(made, 'pinhole view')}"
         notes.append(Note("resampled", made, text))
-    listed = [frame for frame in frames if frame.photo is not None]
-    present = [frame for frame in frames if frame.photo is not None and frame.photo.is_file()]
+    pictured = [frame for frame in frames if frame.photo is not None]
+    present = [frame for frame in pictured if frame.photo and frame.photo.is_file()]
     if present and len(present) < len(frames):
         there = {frame.name for frame in present}
         frames = [f if f.name in there else f._replace(photo=None, mask=None) for f in frames]
-    elif not present and listed:
-        text = f"none of {plural(len(listed), 'photo')} found; using poses only"
-        notes.append(Note("no_photos", len(listed), f"{text} (the first is {listed[0].photo})"))
+    elif not present and pictured:
+        text = f"none of {plural(len(pictured), 'photo')} found; using poses only"
+        notes.append(Note("no_photos", len(pictured), f"{text} (the first is {pictured[0].photo})"))
         frames = [frame._replace(photo=None) for frame in frames]
     cameras = replace(_cameras(path, frames), source=path)
     masked = sum(mask is not None for mask in cameras.mask_paths)
@@ -256,7 +284,7 @@ def view_set(path: Path, frames: Sequence[Frame], left_out: Sequence[tuple[str, 
     weights = [f.weight for f in frames]
     return ViewSet(
         cameras,
-        tuple(notes),
+        (*notes, *further),
         splits if any(splits) else (),
         None if set(weights) == {None} else np.array([1.0 if w is None else w for w in weights]),
     )
@@ -284,49 +312,44 @@ def _idle_masks(present: Sequence[Frame]) -> list[Path]:
     return [folder for folder, _ in folders if any(is_photo(file) for file in folder.rglob("*"))]
 
 
+_PHOTO_NOTES = {
+    "unreadable_photos": "of {views} cannot be read: {first}; convert to JPEG or PNG",
+    "equal_names": "not found among equal names in folders: {first}",
+    "other_suffix": "found with another suffix: {first}",
+    "exif_orientation": "with an EXIF orientation (the first is {first}): turned where only that fits the "
+    "size of the view, otherwise read as stored",
+}
+"""Code of a note on photos → its text after their number."""
+
+
 def _checked_photos(frames: Sequence[Frame]) -> tuple[list[Frame], list[Note]]:
     """Drop photos that cannot be read, and photos that names of several folders were shortened to.
 
     Returns:
         The frames, and notes on these and on photos found with another suffix.
     """
-    out, notes = list(frames), list[Note]()
-    bad, shared, renamed, exif = list[str](), list[str](), list[str](), list[Path]()
+    out, found = list(frames), {code: list[str]() for code in _PHOTO_NOTES}
     times = Counter(frame.photo for frame in frames)
     for i, frame in enumerate(frames):
-        photo = frame.photo
+        photo, wanted = frame.photo, Path(frame.listed)
         if photo is None or not photo.is_file():
             continue
         if (what := unreadable(photo)) is not None:
-            bad.append(f"{frame.name} is {what}")
+            found["unreadable_photos"].append(f"{frame.name} is {what}")
             out[i] = frame._replace(photo=None, mask=None)
-            continue
-        if frame.listed and times[photo] > 1 and not is_end(frame.listed, photo):
-            shared.append(f"{frame.name} is not {photo}, which another view has")
+        elif frame.listed and times[photo] > 1 and not is_end(frame.listed, photo):
+            found["equal_names"].append(f"{frame.name} is not {photo}, which another view has")
             out[i] = frame._replace(photo=None, mask=None)
-            continue
-        wanted = Path(frame.listed)
-        if is_a_photo(wanted) and photo.suffix.lower() != wanted.suffix.lower():
-            renamed.append(f"{frame.listed} is {photo.name}")
-        if _orientation(photo) != 1:
-            exif.append(photo)
-    if bad:
-        text = (
-            f"{plural(len(bad), 'photo')} of {len(frames)} cannot be read: {bad[0]}; convert to JPEG or PNG"
-        )
-        notes.append(Note("unreadable_photos", len(bad), text))
-    if shared:
-        text = f"{plural(len(shared), 'photo')} not found among equal names in folders: {shared[0]}"
-        notes.append(Note("equal_names", len(shared), text))
-    if renamed:
-        text = f"{plural(len(renamed), 'photo')} found with another suffix: {renamed[0]}"
-        notes.append(Note("other_suffix", len(renamed), text))
-    if exif:
-        text = (
-            f"{plural(len(exif), 'photo')} with an EXIF orientation (the first is {exif[0].name}): turned "
-            "where only that fits the size of the view, otherwise read as stored"
-        )
-        notes.append(Note("exif_orientation", len(exif), text))
+        else:
+            if is_a_photo(wanted) and photo.suffix.lower() != wanted.suffix.lower():
+                found["other_suffix"].append(f"{frame.listed} is {photo.name}")
+            if _orientation(photo) != 1:
+                found["exif_orientation"].append(photo.name)
+    notes = []
+    for code, photos in found.items():
+        if photos:
+            text = _PHOTO_NOTES[code].format(first=photos[0], views=len(frames))
+            notes.append(Note(code, len(photos), f"{plural(len(photos), 'photo')} {text}"))
     return out, notes
 
 

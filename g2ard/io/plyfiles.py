@@ -281,9 +281,9 @@ def spread_rows(rows: NDArray[Any]) -> NDArray[Any]:
     return np.frombuffer(b"".join(parts), rows.dtype)
 
 
-def require(path: Path, present: list[str], wanted: list[str], what: str) -> None:
+def require(path: Path, present: list[str], wanted: list[str], what: str, element: str = "vertex") -> None:
     """Raise an `InputError` that lists the `wanted` properties that are not `present`."""
     missing = [name for name in wanted if name not in present]
     if missing:
         words = ", ".join(map(repr, missing))
-        raise InputError(f"{what} needs the vertex property {words}", path=path)
+        raise InputError(f"{what} needs the {element} property {words}", path=path)

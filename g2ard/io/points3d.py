@@ -1,23 +1,22 @@
 """Reader for COLMAP's sparse points as a coloured point cloud."""
 
-import struct
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from g2ard.errors import InputError, damaged
-from g2ard.io.colmap import Table, model_folder, number, parsing, points_file, text_lines
+from g2ard.io.colmap import Columns, Table, TextTable, model_folder, parsing, points_file
 from g2ard.io.jsonfile import Place
-from g2ard.io.stream import WholeCloud, full_scales
+from g2ard.io.stream import MarkedPoints, PointStream, full_scales
 
-_COLUMNS = tuple((name, at) for at, name in enumerate("XYZRGB", 1))
-_POINT = struct.Struct("<QdddBBBdQ")
-_NAMES = ("POINT3D_ID", *"XYZRGB", "ERROR", "TRACK")
+_POINT = Columns.of("QdddBBBdQ", "POINT3D_ID", *"XYZRGB", "ERROR", "TRACK")
+_NUMBERS = Columns.of("ddddddd", "POINT3D_ID", *"XYZRGB")
 
 
-class Stream(WholeCloud):
-    """The points3D.bin or .txt itself, or that of the model in a COLMAP folder."""
+class Stream(PointStream):
+    """The points3D.bin or .txt itself, or that of the model in a COLMAP folder, in memory."""
 
     def __init__(self, path: Path) -> None:
         if path.is_dir() or path.stem.lower() != "points3d":
@@ -26,38 +25,44 @@ class Stream(WholeCloud):
                 raise InputError("has no points3D.bin or points3D.txt", path=model_folder(path) or path)
             path = file
         with parsing(path):
-            positions, rgb = (_binary if path.suffix.lower() == ".bin" else _text)(path)
-        super().__init__(path, positions, rgb.astype(np.float32), full_scales(np.dtype(np.uint8)))
+            self._positions, rgb = (_binary if path.suffix.lower() == ".bin" else _text)(path)
+        self._colors = rgb.astype(np.float32)
+        super().__init__(path, len(rgb), self._positions, full_scales(rgb.dtype))
+
+    def raw(self, rows: int, start: int) -> Iterator[MarkedPoints]:
+        for first in range(start, self.count, rows):
+            part = slice(first, first + rows)
+            colors = self._colors[part]
+            yield self._positions[part], colors, np.zeros(len(colors), bool)
 
 
 def _binary(path: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
     """Read rows of id, x y z, r g b, error and a track of variable length."""
-    table = Table(path)
+    table = Table(path, "point")
     count, size = table.count, len(table.data)
-    if count * _POINT.size > size:
+    if count * _POINT.packed.size > size:
         raise damaged(f"truncated: {count:,} points in {size:,} bytes", path=path)
     positions, rgb = np.empty((count, 3)), np.empty((count, 3), np.uint8)
-    for i in range(count):
-        _key, x, y, z, r, g, b, _error, track = table.take("point", i, _POINT, _NAMES)
+    for i in table:
+        _key, x, y, z, r, g, b, _error, track = table.take(_POINT)
         positions[i], rgb[i] = (x, y, z), (r, g, b)
-        table.skip("point", i, 8 * track, "TRACK")
+        table.skip(8 * track, "TRACK")
     return positions, rgb
 
 
 def _text(path: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
-    lines = [line for line in text_lines(path) if line.strip()]
-    rows = [line.split(maxsplit=7) for line in lines]
-    plain = all(line.isascii() and "_" not in line for line in lines)  # float() accepts more
+    table = TextTable(path, "point")
+    rows = [table.words[1:7] for _ in table]
+    plain = all(word.isascii() and "_" not in word for words in rows for word in words)  # float() reads both
     try:
-        values = np.array([words[1:7] for words in rows], np.float64).reshape(-1, 6)
+        values = np.array(rows, np.float64).reshape(len(rows), 6)
     except ValueError:
         plain = False
     if not plain:  # find the wrong number
-        values_read = [[number(path, "point", i, w, *c, float) for c in _COLUMNS] for i, w in enumerate(rows)]
-        values = np.array(values_read)
+        table = TextTable(path, "point")
+        values = np.array([table.take(_NUMBERS)[1:] for _ in table])
     inside = (values[:, 3:] >= 0) & (values[:, 3:] <= 255)
     if not inside.all():
         i, channel = (int(at) for at in np.argwhere(~inside)[0])
-        place = Place(path, i, "point", "RGB"[channel])
-        raise place.error(f"is {rows[i][4 + channel]!r}, expected 0 to 255")
+        raise Place(path, i, "point", "RGB"[channel]).error(f"is {rows[i][3 + channel]!r}, expected 0 to 255")
     return values[:, :3], values[:, 3:].astype(np.uint8)

@@ -8,9 +8,9 @@ import numpy as np
 from g2ard.errors import InputError
 from g2ard.io.finding import Finder
 from g2ard.io.jsonfile import Number, Place, Whole, checked, read_json
-from g2ard.io.photos import Frame, Lens, rigid, view_set
+from g2ard.io.photos import Frame, Lens, Listed, rigid
 from g2ard.io.transforms import opencv_view
-from g2ard.io.types import ViewSet
+from g2ard.io.types import Note
 
 _FOLDERS = (("corrected_cameras", "corrected_images"), ("cameras", "images"))
 """Folders of cameras and photos: after Polycam's optimisation, and as ARKit tracked them."""
@@ -36,7 +36,7 @@ def cameras_in(path: Path) -> tuple[Path, Path] | None:
     return None
 
 
-def read(path: Path, images: Path | None = None) -> ViewSet:
+def read(path: Path, images: Path | None = None) -> Listed:
     """Read the keyframes of a capture: fx, fy, cx, cy, width, height, and rows t_00 … t_23 of
     world_from_camera in OpenGL axes, metres, y up.
     """
@@ -46,11 +46,11 @@ def read(path: Path, images: Path | None = None) -> ViewSet:
     cameras, photos = folders
     files = sorted(cameras.glob("*.json"), key=lambda file: (len(file.stem), file.stem))
     finder = Finder(images or photos)
-    views = view_set(path, [_frame(file, finder) for file in files])
+    found = Listed(path, [_frame(file, finder) for file in files])
     if cameras.name == "corrected_cameras":
-        return views
+        return found
     text = "the capture has no corrected_cameras; these are ARKit's poses as tracked"
-    return views.noted("tracked_poses", len(files), text)
+    return found._replace(notes=(Note("tracked_poses", len(files), text),))
 
 
 def _frame(file: Path, finder: Finder) -> Frame:
@@ -59,7 +59,6 @@ def _frame(file: Path, finder: Finder) -> Frame:
     if not (fx > 0 and fy > 0 and min(width, height) > 0):
         raise place.error(f"has focal lengths {fx}, {fy} and {width}×{height} pixels")
     name = f"{file.stem}.jpg"
-    lens = Lens((width, height), np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]))
-    return Frame(
-        name, opencv_view(rigid(np.array(pose).reshape(3, 4), place)), lens, finder.photo(name), listed=name
-    )
+    lens = Lens.pinhole((width, height), (fx, fy), (cx, cy))
+    viewmat = opencv_view(rigid(np.array(pose).reshape(3, 4), place))
+    return Frame(name, viewmat, lens, finder.photo(name), listed=name)

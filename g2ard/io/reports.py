@@ -50,7 +50,6 @@ def _nested(value: Any) -> Any:
 
 
 def _read(kind: Any, value: Any) -> Any:
-    """Convert a JSON value to the type of its field."""
     if value is None:
         return None
     if get_origin(kind) in (Union, types.UnionType):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,6 +25,9 @@ of 1, and −log(1 − α) is still accurate in float32."""
 
 LOG_SCALE_LIMIT = 43.0
 """Limit of log-scales: exp(43)² = 2.2e37 and exp(−43)² = 4.5e-38 are still normal float32."""
+
+
+_Up = tuple[float, float, float] | None
 
 
 @dataclass
@@ -50,10 +54,10 @@ class Raw:
         """Return a view of some rows."""
         return Raw(*(array[rows] for array in vars(self).values()))
 
-    def fill(self, scene: Splats) -> None:
-        """Copy a scene, with its linear scales as `log_scales`."""
-        self.means[:], self.quats[:], self.log_scales[:] = scene.means, scene.quats, scene.scales
-        self.logit_opacities[:], self.sh0[:], self.shN[:] = scene.logit_opacities, scene.sh0, scene.shN
+    def fill(self, arrays: Iterable[NDArray[Any]]) -> None:
+        """Copy the arrays of a scene in the order of these, from the first row and coefficient on."""
+        for own, values in zip(vars(self).values(), arrays, strict=True):
+            own[tuple(map(slice, values.shape))] = values
 
     def set_linear(self, scales: NDArray[Any], alphas: NDArray[Any]) -> None:
         """Store scales and opacities as logarithms and logits; rows of negative scales become NaN."""
@@ -61,18 +65,10 @@ class Raw:
             self.log_scales[:] = np.log(scales.astype(np.float64))
             self.logit_opacities[:] = logits_of(alphas.astype(np.float64))
 
-    def activated(self, render_model: RenderModel, offset: NDArray[np.float64]) -> Splats:
+    def activated(self, render_model: RenderModel, offset: NDArray[np.float64], up: _Up = None) -> Splats:
         """Return the scene, after `Tally.clean` has exponentiated `log_scales` in place."""
-        return Splats(
-            self.means,
-            self.quats,
-            self.log_scales,
-            self.logit_opacities,
-            self.sh0,
-            self.shN,
-            offset,
-            render_model,
-        )
+        means, quats, scales, logits, sh0, shN = vars(self).values()
+        return Splats(means, quats, scales, logits, sh0, shN, offset, render_model, up)
 
 
 def cleaned(
@@ -84,11 +80,8 @@ def cleaned(
     clamped, and quaternions of length zero become the identity. Notes count all changes, and tell if the
     whole scene is invisible.
     """
-    count = len(raw.means)
-    keep, tally = np.ones(count, bool), Tally()
-    for start in range(0, count, BLOCK):
-        rows = slice(start, start + BLOCK)
-        keep[rows] = tally.clean(raw.take(rows))
+    tally = Tally()
+    keep = tally.clean(raw)
     notes = [*(notes or ()), *tally.notes(path)]
     splats = raw.activated(render_model, np.zeros(3))
     return Scene(splats.take(keep) if tally.dropped else splats, tuple(notes))
@@ -164,6 +157,13 @@ class Tally(RowTally):
 
     def clean(self, raw: Raw) -> NDArray[np.bool_]:
         """Clamp and activate rows in place, making `log_scales` linear; return an (N,) mask to keep."""
+        keep = np.ones(len(raw.means), bool)
+        for start in range(0, len(keep), BLOCK):
+            rows = slice(start, start + BLOCK)
+            keep[rows] = self._clean(raw.take(rows))
+        return keep
+
+    def _clean(self, raw: Raw) -> NDArray[np.bool_]:
         logits, scales, quats = raw.logit_opacities, raw.log_scales, raw.quats
         good = ~np.isnan(logits) & ~(np.isnan(scales) | (scales == np.inf)).any(1)
         for values in (raw.means, quats, raw.sh0, raw.shN):

@@ -4,30 +4,321 @@ A folder may hold a scene in spatial chunks, named `{lod}_{chunk}` or listed by 
 finest level of detail is read.
 """
 
+import io
+import math
 import re
 import struct
 import zipfile
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal, NamedTuple, Self
 
 import msgspec
 import numpy as np
 from msgspec import UNSET, UnsetType
 from numpy.typing import NDArray
+from PIL.Image import Image
 
+from g2ard.config.choices import RenderModel
 from g2ard.errors import InputError, damaged
-from g2ard.io.jsonfile import FileName, Place, Whole, checked, parse_json, read_json
-from g2ard.io.limits import check_unpacked
-from g2ard.io.paths import check_regular, file_identity
-from g2ard.io.sanitize import Raw
-from g2ard.io.sog_chunk import Chunk, Decoder, Meta, count_of, means_of, rest_of
+from g2ard.io.jsonfile import FileName, Place, Vector, Whole, checked, parse_json, read_json
+from g2ard.io.limits import check_unpacked, opened_image
+from g2ard.io.packing import from_smallest_three
+from g2ard.io.paths import check_regular, decoded, file_identity
+from g2ard.io.sanitize import BLOCK, Raw, logits_of
 from g2ard.io.stream import RawStream, from_row
 from g2ard.io.types import Note
 from g2ard.progress import plural
 from g2ard.scene.transform import one_model
+
+_COEFFICIENTS = {0: 0, 1: 3, 2: 8, 3: 15}
+_LARGEST_FLOAT32 = float.fromhex("0x1.fffffep+127")
+"""Largest float32."""
+_LARGEST_LOG = math.log1p(_LARGEST_FLOAT32)
+_PALETTE_COLUMNS = 64
+"""Entries of the SH palette per row of its image."""
+
+_Float32 = Annotated[float, msgspec.Meta(ge=-_LARGEST_FLOAT32, le=_LARGEST_FLOAT32)]
+_Log = Annotated[float, msgspec.Meta(ge=-_LARGEST_LOG, le=_LARGEST_LOG)]
+_Bound = _Float32 | Annotated[list[_Float32], msgspec.Meta(min_length=3, max_length=4)]
+"""A bound of all channels, or one of each: three, and opacity as the fourth."""
+
+_OneFile = Annotated[list[FileName], msgspec.Meta(min_length=1)]
+_TwoFiles = Annotated[list[FileName], msgspec.Meta(min_length=2)]
+
+
+class _Means(msgspec.Struct):
+    files: _TwoFiles
+    mins: _Log | Annotated[list[_Log], msgspec.Meta(min_length=3, max_length=4)]
+    maxs: _Log | Annotated[list[_Log], msgspec.Meta(min_length=3, max_length=4)]
+    shape: list[Whole] = []
+
+
+class _Part(msgspec.Struct):
+    files: _OneFile
+    codebook: list[float | None] | UnsetType = UNSET
+    mins: _Bound | None = None
+    maxs: _Bound | None = None
+
+
+class _Rest(_Part):
+    files: _TwoFiles
+    bands: Annotated[int, msgspec.Meta(ge=0, le=3)] | UnsetType = UNSET
+
+
+class _Own(msgspec.Struct):
+    offset: Vector = (0.0, 0.0, 0.0)
+
+
+class _Meta(msgspec.Struct):
+    """Content of a meta.json; version 1 has mins and maxs in place of codebooks."""
+
+    means: _Means
+    scales: _Part
+    quats: _Part
+    sh0: _Part
+    shN: _Rest | UnsetType = UNSET
+    version: Literal[1, 2] = 1
+    count: Whole | None = None
+    model: Any = None
+    antialias: Any = False
+    g2ard: _Own = msgspec.field(default_factory=_Own)
+
+    @property
+    def render_model(self) -> RenderModel:
+        """The render model: `model`, or in older files `antialias`."""
+        states = self.model == "antialiased" if self.model is not None else self.antialias is True
+        return "antialiased" if states else "classic"
+
+
+class _Chunk(NamedTuple):
+    """A meta.json, its folder or archive for errors, and where the files beside it are."""
+
+    place: Path
+    files: Path | zipfile.Path
+    meta: _Meta
+
+    @classmethod
+    def of(cls, place: Path, files: Path | zipfile.Path, content: Any) -> Self:
+        return cls(place, files, checked(content, _Meta, Place(place / "meta.json")))
+
+    @property
+    def file(self) -> Place:
+        """Place of meta.json, for errors."""
+        return Place(self.place / "meta.json")
+
+
+def _read_file(place: Path, files: Path | zipfile.Path, name: str) -> bytes:
+    """Read a file of a chunk, from an archive within `check_unpacked`."""
+    file = files / name
+    try:
+        if isinstance(file, zipfile.Path):
+            info = file.root.getinfo(file.at)
+            check_unpacked(place / name, info.compress_size, info.file_size)
+        else:
+            check_regular(file)
+        return file.read_bytes()
+    except (KeyError, FileNotFoundError) as error:
+        raise InputError("no such file", path=place / name) from error
+    except (OSError, ValueError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error) as error:
+        raise InputError(f"cannot be read ({error})", path=place / name) from error
+
+
+def _count_of(chunk: _Chunk) -> int:
+    meta = chunk.meta
+    count = meta.count if meta.version == 2 else next(iter(meta.means.shape), None)
+    if count is None:
+        place = chunk.file.to("count") if meta.version == 2 else chunk.file.to("means", "shape", 0)
+        raise place.error("is missing")
+    first = meta.means.files[0]
+    with _opened_image(chunk, first) as image:  # before allocating memory
+        if image.width * image.height < count:
+            pixels = image.width * image.height
+            raise InputError(f"has {pixels:,} pixels for {count:,} Gaussians", path=chunk.place / first)
+    return count
+
+
+def _rest_of(chunk: _Chunk) -> int:
+    """Return the number of coefficients past band 0; version 1 only implies it by the palette's width."""
+    part = chunk.meta.shN
+    if part is UNSET:
+        return 0
+    if part.bands is not UNSET:
+        return _COEFFICIENTS[part.bands]
+    file = _sh_files(part)[0]
+    rest, left = divmod(_image(chunk, file).shape[1], _PALETTE_COLUMNS)
+    if left or rest not in _COEFFICIENTS.values():
+        raise InputError("does not have the width of a palette of SH degree 1 to 3", path=chunk.place / file)
+    return rest
+
+
+def _sh_files(part: _Rest) -> tuple[str, str]:
+    files = part.files[:2]
+    centroids = next((f for f in files if "centroids" in f), files[0])
+    return centroids, next((f for f in files if f != centroids), files[1])
+
+
+@contextmanager
+def _opened_image(chunk: _Chunk, name: str) -> Iterator[Image]:
+    from PIL import (
+        WebPImagePlugin,  # noqa: F401  (Pillow would load all its formats to find this one)
+    )
+
+    data = _read_file(chunk.place, chunk.files, name)
+    with opened_image(chunk.place / name, io.BytesIO(data)) as image:
+        yield image
+
+
+def _image(chunk: _Chunk, name: str) -> NDArray[np.uint8]:
+    """Return (height, width, 4) bytes."""
+    with _opened_image(chunk, name) as image:
+        return np.asarray(image.convert("RGBA"))
+
+
+def _rows(chunk: _Chunk, name: str, count: int) -> NDArray[np.uint8]:
+    """Return (count, 4) bytes, one pixel per Gaussian."""
+    pixels = _image(chunk, name).reshape(-1, 4)
+    if len(pixels) < count:
+        raise InputError(f"has {len(pixels):,} pixels for {count:,} Gaussians", path=chunk.place / name)
+    return pixels[:count]
+
+
+class _Decoder:
+    """Images of a chunk, 20 to 28 bytes per Gaussian, and the lookup tables of their bytes."""
+
+    def __init__(self, chunk: _Chunk, count: int) -> None:
+        meta, self.chunk = chunk.meta, chunk
+        names = [*meta.means.files[:2], meta.quats.files[0], meta.scales.files[0], meta.sh0.files[0]]
+        self._low, self._high, self._quats, self._scales, self._base = (_rows(chunk, n, count) for n in names)
+        self._positions = _positions(meta.means)
+        self._log_scales = _Values(chunk.file.to("scales"), meta.scales)
+        self._colors = _Values(chunk.file.to("sh0"), meta.sh0)
+        self._logits = _logits(chunk.file.to("sh0"), meta.sh0)
+        self._rest = _rest_of(chunk)
+        if meta.shN is not UNSET and self._rest:
+            self._labels_file = _sh_files(meta.shN)[1]
+            self._palette, self._labels = _palette(chunk, meta.shN, self._rest, count)
+
+    def fill(self, rows: slice, raw: Raw) -> None:
+        """Decode the Gaussians `rows` into `raw` in blocks that fit into the cache."""
+        for start in range(rows.start, rows.stop, BLOCK):
+            stop = min(start + BLOCK, rows.stop)
+            self._fill(slice(start, stop), raw.take(slice(start - rows.start, stop - rows.start)))
+
+    def _fill(self, rows: slice, raw: Raw) -> None:
+        _fill_means(raw.means, self._low[rows], self._high[rows], self._positions)
+        raw.quats[:] = _quats(self._quats[rows])
+        raw.log_scales[:] = self._log_scales.of(self._scales[rows, :3])
+        raw.sh0[:, 0] = self._colors.of(self._base[rows, :3])
+        raw.logit_opacities[:] = self._logits[self._base[rows, 3]]
+        raw.shN[:, self._rest :] = 0
+        if self._rest:
+            self._fill_rest(rows, raw.shN)
+
+    def _fill_rest(self, rows: slice, out: NDArray[np.float32]) -> None:
+        """Look up palette entries by label."""
+        index = self._labels[rows, 0] + (self._labels[rows, 1].astype(np.intp) << 8)
+        if index.max() >= len(self._palette):
+            row = int(np.argmax(index >= len(self._palette)))
+            raise InputError(
+                f"has palette entry {index[row]} of {len(self._palette)}",
+                path=self.chunk.place / self._labels_file,
+                index=rows.start + row,
+                item="Gaussian",
+            )
+        np.take(self._palette, index, axis=0, out=out[:, : self._rest], mode="clip")
+
+
+def _means_of(chunk: _Chunk, count: int) -> NDArray[np.float32]:
+    """Decode only the (count, 3) means."""
+    low, high = (_rows(chunk, name, count) for name in chunk.meta.means.files[:2])
+    means = np.empty((count, 3), np.float32)
+    _fill_means(means, low, high, _positions(chunk.meta.means))
+    return means
+
+
+def _fill_means(
+    out: NDArray[np.float32], low: NDArray[np.uint8], high: NDArray[np.uint8], positions: NDArray[Any]
+) -> None:
+    """Decode positions from 16-bit codes, a byte from each of two images."""
+    for axis in range(3):
+        out[:, axis] = positions[axis][low[:, axis] + (high[:, axis].astype(int) << 8)]
+
+
+def _positions(part: _Means) -> NDArray[Any]:
+    """Return the (3, 65536) values of codes per axis, which are stored as sign(x)·ln(|x| + 1)."""
+    low, high = (np.broadcast_to(np.atleast_1d(bound)[:3], 3) for bound in (part.mins, part.maxs))
+    logs = low + (high - low) * (np.arange(65536)[:, None] / 65535)
+    return (np.sign(logs) * np.expm1(np.abs(logs))).T.astype(np.float32)
+
+
+def _logits(place: Place, part: _Part) -> NDArray[Any]:
+    """Return the (256,) logits of opacity bytes, which are α in version 2 and logits in version 1."""
+    alpha = np.arange(256) / 255
+    if part.codebook is UNSET:
+        low, high = (_bound(place.to(name), getattr(part, name), slice(3, 4)) for name in ("mins", "maxs"))
+        return low + (high - low) * alpha
+    return logits_of(alpha)
+
+
+def _bound(place: Place, bound: _Bound | None, channels: slice) -> NDArray[Any]:
+    """Return a bound of channels, of a list or for all."""
+    if bound is None or (isinstance(bound, list) and len(bound) < channels.stop):
+        raise (place if bound is None else place.to(3)).error("is missing")
+    return np.asarray(bound[channels] if isinstance(bound, list) else bound)
+
+
+class _Values:
+    """Values of bytes: from a codebook (version 2), or between mins and maxs (version 1)."""
+
+    def __init__(self, place: Place, part: _Part) -> None:
+        self._place = place.to("codebook")
+        self._book: NDArray[Any] | None = None
+        if part.codebook is not UNSET:
+            book = np.array(part.codebook, np.float64)
+            wrong = np.isfinite(book) & (np.abs(book) > _LARGEST_FLOAT32)
+            if wrong.any():
+                raise self._place.to(int(np.argmax(wrong))).error("is beyond the range of float32")
+            self._book = book.astype(np.float32)
+            return
+        low, high = (_bound(place.to(name), getattr(part, name), slice(3)) for name in ("mins", "maxs"))
+        self._low, self._high = low, high
+
+    def of(self, codes: NDArray[np.uint8]) -> NDArray[Any]:
+        if self._book is None:
+            values: NDArray[Any] = self._low + (self._high - self._low) * (codes / 255)
+            return values
+        if len(self._book) < 256 and codes.size and (top := int(codes.max())) >= len(self._book):
+            raise self._place.error(f"has {len(self._book)} numbers, expected at least {top + 1}")
+        return self._book[codes]
+
+
+def _quats(codes: NDArray[np.uint8]) -> NDArray[Any]:
+    """Decode (N, 4) wxyz: three components in ±1/√2; the fourth byte − 252 is the index of the largest.
+
+    Other fourth bytes give a zero quaternion, which later becomes the identity, with a note.
+    """
+    quats = from_smallest_three(codes[:, 3] & 3, (codes[:, :3] / 255 - 0.5) * np.sqrt(2))
+    quats[codes[:, 3] < 252] = 0
+    return quats
+
+
+def _palette(
+    chunk: _Chunk, part: _Rest, rest: int, count: int
+) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+    """Return the (entries, K−1, 3) coefficients of the palette, and the labels."""
+    centroids, labels = _sh_files(part)
+    image = _image(chunk, centroids)
+    if image.shape[1] != _PALETTE_COLUMNS * rest:
+        raise InputError(
+            f"has width {image.shape[1]}, expected {_PALETTE_COLUMNS * rest}", path=chunk.place / centroids
+        )
+    values = _Values(chunk.file.to("shN"), part)
+    palette = values.of(image[:, :, :3].reshape(-1, rest, 3)).astype(np.float32)
+    return palette, _rows(chunk, labels, count)
+
 
 _CHUNK_NAME = re.compile(r"(\d+)_(\d+)")
 
@@ -46,8 +337,6 @@ class _Node(msgspec.Struct):
 
 
 class _Levels(msgspec.Struct):
-    """Content of a lod-meta.json."""
-
     tree: _Node
     filenames: list[FileName]
     environment: str | None = None
@@ -101,7 +390,7 @@ def _listed(index: Path) -> list[Path]:
     return chunks
 
 
-def _offset(chunks: list[Chunk]) -> NDArray[np.float64]:
+def _offset(chunks: list[_Chunk]) -> NDArray[np.float64]:
     """Return the offset that g2ard stored under "g2ard"; zeros if it is missing or chunks differ."""
     found = {chunk.meta.g2ard.offset for chunk in chunks}
     return np.array(found.pop() if len(found) == 1 else (0, 0, 0), np.float64)
@@ -126,8 +415,8 @@ class Stream(RawStream):
 
     def __init__(self, path: Path) -> None:
         with _opened(path) as chunks:
-            self._counts = [count_of(chunk) for chunk in chunks]
-            self._rest = max(map(rest_of, chunks), default=0)
+            self._counts = [_count_of(chunk) for chunk in chunks]
+            self._rest = max(map(_rest_of, chunks), default=0)
             offset, model = (
                 _offset(chunks),
                 one_model([chunk.meta.render_model for chunk in chunks] or ["classic"]),
@@ -144,13 +433,13 @@ class Stream(RawStream):
     def positions(self, rows: int) -> Iterator[NDArray[np.float32]]:
         with _opened(self.path) as chunks:
             for chunk, count in zip(chunks, self._counts, strict=True):
-                yield means_of(chunk, count)
+                yield _means_of(chunk, count)
 
     def raw(self, rows: int, start: int) -> Iterator[Raw]:
         with _opened(self.path) as chunks:
             for number, begin in from_row(self._counts, start):
                 count = self._counts[number]
-                decoder = Decoder(chunks[number], count)
+                decoder = _Decoder(chunks[number], count)
                 for at in range(begin, count, rows):
                     raw = Raw.empty(min(rows, count - at), self._rest)
                     decoder.fill(slice(at, at + len(raw.means)), raw)
@@ -158,48 +447,20 @@ class Stream(RawStream):
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[list[Chunk]]:
+def _opened(path: Path) -> Iterator[list[_Chunk]]:
     if path.suffix.lower() != ".sog":
-        yield [
-            _chunk(folder, read_json(folder / "meta.json"), _folder_loader(folder))
-            for folder in chunks_of(path)
-        ]
+        yield [_Chunk.of(folder, folder, read_json(folder / "meta.json")) for folder in chunks_of(path)]
         return
     try:
         with zipfile.ZipFile(path) as bundle:
             inside = [name for name in bundle.namelist() if name.rpartition("/")[2] == "meta.json"]
             if not inside:
                 raise InputError("has no meta.json", path=path)
-            prefix = min(inside, key=len).removesuffix("meta.json")
-            load = _bundle_loader(path, bundle, prefix)
-            yield [_chunk(path, parse_json(path / "meta.json", load("meta.json")), load)]
+            files = zipfile.Path(bundle, min(inside, key=len).removesuffix("meta.json"))
+            meta = path / "meta.json"
+            text = decoded(meta, _read_file(path, files, "meta.json"))
+            yield [_Chunk.of(path, files, parse_json(meta, text))]
     except InputError:
         raise
     except (zipfile.BadZipFile, EOFError, OSError, ValueError, struct.error, OverflowError) as error:
         raise damaged(f"is not a complete .sog archive ({error})", path=path) from error
-
-
-def _chunk(place: Path, content: Any, load: Callable[[str], bytes]) -> Chunk:
-    return Chunk(place, checked(content, Meta, Place(place / "meta.json")), load)
-
-
-def _bundle_loader(path: Path, bundle: zipfile.ZipFile, prefix: str) -> Callable[[str], bytes]:
-    """Return a function that reads a file of the archive within `check_unpacked`."""
-
-    def load(name: str) -> bytes:
-        info = bundle.getinfo(prefix + name)
-        check_unpacked(path / name, info.compress_size, info.file_size)
-        try:
-            return bundle.read(info)
-        except (zipfile.BadZipFile, EOFError, OSError, ValueError, RuntimeError, zlib.error) as error:
-            raise InputError(f"is damaged in the archive ({error})", path=path / name) from error
-
-    return load
-
-
-def _folder_loader(folder: Path) -> Callable[[str], bytes]:
-    def load(name: str) -> bytes:
-        check_regular(folder / name)
-        return (folder / name).read_bytes()
-
-    return load

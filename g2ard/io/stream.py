@@ -13,7 +13,7 @@ from g2ard.config.choices import RenderModel
 from g2ard.io.paths import file_identity
 from g2ard.io.sanitize import BLOCK, PointTally, Raw, Tally
 from g2ard.io.types import Cloud, Note, Points, Scene
-from g2ard.scene.splats import Splats
+from g2ard.scene.splats import ARRAYS, Splats
 from g2ard.scene.transform import one_model
 
 _DEGREE_OF_REST = {0: 0, 3: 1, 8: 2, 15: 3}
@@ -103,10 +103,10 @@ class SceneStream(Stream[Splats]):
         """Read all rows into memory."""
         raw, kept = Raw.empty(self.count, (self.sh_degree + 1) ** 2 - 1), 0
         for block in self.blocks(BLOCK):
-            raw.take(slice(kept, kept := kept + len(block))).fill(block)
+            rows = raw.take(slice(kept, kept := kept + len(block)))
+            rows.fill(getattr(block, name) for name in ARRAYS)
         notes = self.all_notes()
-        splats = raw.take(slice(kept)).activated(self.render_model, self.offset)
-        return Scene(replace(splats, up=self.up), notes)
+        return Scene(raw.take(slice(kept)).activated(self.render_model, self.offset, self.up), notes)
 
 
 class RawStream(SceneStream):
@@ -121,10 +121,7 @@ class RawStream(SceneStream):
 
     def blocks(self, rows: int, start: int = 0) -> Iterator[Splats]:
         for raw in self.raw(rows, start):
-            keep, before = np.ones(len(raw.means), bool), self.tally.dropped
-            for first in range(0, len(keep), BLOCK):
-                part = slice(first, first + BLOCK)
-                keep[part] = self.tally.clean(raw.take(part))
+            before, keep = self.tally.dropped, self.tally.clean(raw)
             splats = raw.activated(self.render_model, self.offset)
             yield splats if self.tally.dropped == before else splats.take(keep)
 
@@ -250,26 +247,6 @@ class PointStream(Stream[RawPoints]):
         return Cloud(Points(positions[:kept], np.clip(colors[:kept] / np.float32(self.divisor), 0, 1)), notes)
 
 
-class WholeCloud(PointStream):
-    """Point cloud in memory."""
-
-    def __init__(
-        self,
-        path: Path,
-        positions: NDArray[np.float64],
-        colors: NDArray[np.float32],
-        scales: Sequence[float] = (1.0,),
-    ) -> None:
-        self._positions, self._colors = positions, colors
-        super().__init__(path, len(positions), positions, scales)
-
-    def raw(self, rows: int, start: int) -> Iterator[MarkedPoints]:
-        for first in range(start, self.count, rows):
-            part = slice(first, first + rows)
-            positions, colors = self._positions[part], self._colors[part]
-            yield positions, colors, np.zeros(len(positions), bool)
-
-
 _DEGREES = Note(
     "degrees",
     1,
@@ -310,9 +287,9 @@ class JoinedScenes(Joined[Splats], SceneStream):
     streams: Sequence[SceneStream]
 
     def __init__(self, streams: Sequence[SceneStream]) -> None:
-        self.streams, self._rest = streams, (max(stream.sh_degree for stream in streams) + 1) ** 2 - 1
+        self.streams, rest = streams, (max(stream.sh_degree for stream in streams) + 1) ** 2 - 1
         count, model = sum(s.count for s in streams), one_model([s.render_model for s in streams])
-        SceneStream.__init__(self, streams[0].path, count, self._rest, streams[0].offset, render_model=model)
+        SceneStream.__init__(self, streams[0].path, count, rest, streams[0].offset, render_model=model)
         ups = {stream.up for stream in streams}
         self.up = ups.pop() if len(ups) == 1 else None
 
@@ -326,10 +303,8 @@ class JoinedScenes(Joined[Splats], SceneStream):
             stream = self.streams[number]
             stream.tally = self.tally
             for block in stream.blocks(rows, begin):
-                shN = np.zeros((len(block), self._rest, 3), np.float32)
-                shN[:, : block.shN.shape[1]] = block.shN
                 means = self._moved(block.means, stream.offset)
-                yield replace(block, means=means, shN=shN, offset=self.offset)
+                yield replace(block.with_sh_degree(self.sh_degree), means=means, offset=self.offset)
 
     def _moved(self, means: NDArray[np.float32], offset: NDArray[np.float64]) -> NDArray[np.float32]:
         shift = offset - self.offset

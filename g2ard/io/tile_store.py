@@ -20,7 +20,8 @@ from numpy.typing import NDArray
 from g2ard.config.choices import RenderModel
 from g2ard.errors import InputError
 from g2ard.io.detect import MANIFEST
-from g2ard.io.jsonfile import Number, Place, Vector, Whole, checked, read_json
+from g2ard.io.jsonfile import Number, Place, Vector, Whole, checked, read_own
+from g2ard.io.sanitize import Raw
 from g2ard.io.types import Note
 from g2ard.scene.kdtree import KdTree
 from g2ard.scene.splats import Splats
@@ -132,35 +133,20 @@ class TileStore:
         path = folder / MANIFEST
         if not path.is_file():
             raise InputError(f"no finished tiles ({MANIFEST} is missing)", path=folder)
-        content = read_json(path)
-        if content.get("format") != FORMAT:
-            raise InputError("not a manifest of tiles", path=path)
-        if content.get("version") != VERSION:
-            raise InputError(f"unsupported version {content.get('version')!r}; expected {VERSION}", path=path)
         place = Place(path)
-        manifest = checked(content, _Manifest, place)
+        manifest = checked(read_own(path, FORMAT, VERSION), _Manifest, place)
         try:
-            tree = KdTree.from_json(manifest.cells)
+            values = msgspec.structs.asdict(manifest)
+            tree = KdTree.from_json(values.pop("cells"))
         except (TypeError, ValueError, RecursionError) as error:
             raise place.to("cells").error(f"is not a tree ({error})") from error
         if tree.leaves != len(manifest.tiles):
             raise place.to("cells").error(f"has {tree.leaves} leaves for {len(manifest.tiles)} tiles")
         if sum(tile.rows for tile in manifest.tiles) != manifest.count:
             raise place.to("count").error(f"is {manifest.count}, which is not the sum of the tiles' rows")
-        store = cls(
-            folder,
-            tuple(msgspec.structs.replace(tile, index=i) for i, tile in enumerate(manifest.tiles)),
-            manifest.count,
-            manifest.sh_degree,
-            np.array(manifest.offset),
-            manifest.margin,
-            tree,
-            manifest.notes,
-            manifest.key,
-            manifest.settings,
-            manifest.render_model,
-            manifest.up,
-        )
+        tiles = tuple(msgspec.structs.replace(tile, index=i) for i, tile in enumerate(manifest.tiles))
+        values |= {"tiles": tiles, "offset": np.array(manifest.offset)}
+        store = cls(folder, tree=tree, **values)
         for tile in store.tiles:
             store._check_size(tile_name(tile.index), tile.rows)
             store._check_size(halo_name(tile.index), tile.halo)
@@ -259,17 +245,13 @@ class TileStore:
     def unpacked(self, count: int, blocks: Iterable[NDArray[np.float32]], *, sh: bool = True) -> Splats:
         """Return the scene of `count` packed rows, given in blocks; `sh` as for `read`."""
         rest = (self.sh_degree + 1) ** 2 - 1 if sh else 0
-        means, quats = np.empty((count, 3), np.float32), np.empty((count, 4), np.float32)
-        scales, logits = np.empty((count, 3), np.float32), np.empty(count, np.float32)
-        sh0, shN = np.empty((count, 1, 3), np.float32), np.empty((count, rest, 3), np.float32)
-        start = 0
+        raw, start = Raw.empty(count, rest), 0
         for rows in blocks:
-            at = slice(start, start + len(rows))
-            means[at], quats[at], scales[at] = rows[:, :3], rows[:, 3:7], rows[:, 7:10]
-            logits[at], sh0[at, 0] = rows[:, 10], rows[:, 11:14]
-            shN[at] = rows[:, 14 : 14 + 3 * rest].reshape(len(rows), rest, 3)
-            start += len(rows)
-        return Splats(means, quats, scales, logits, sh0, shN, self.offset.copy(), self.render_model, self.up)
+            part = raw.take(slice(start, start := start + len(rows)))
+            part.means[:], part.quats[:], part.log_scales[:] = rows[:, :3], rows[:, 3:7], rows[:, 7:10]
+            part.logit_opacities[:], part.sh0[:, 0] = rows[:, 10], rows[:, 11:14]
+            part.shN[:] = rows[:, 14 : 14 + 3 * rest].reshape(len(rows), rest, 3)
+        return raw.activated(self.render_model, self.offset.copy(), self.up)
 
 
 class StoredScene:

@@ -1,6 +1,7 @@
 """Reader for transforms.json of instant-ngp, nerfstudio and NeRF's synthetic scenes."""
 
 import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +13,8 @@ from numpy.typing import NDArray
 from g2ard.errors import InputError
 from g2ard.io.finding import Finder, is_end
 from g2ard.io.jsonfile import Number, Place, Pose, Vector, Whole, checked, read_json
-from g2ard.io.photos import Frame, Lens, fits, inverse, photo_size, rigid, view_set
-from g2ard.io.types import ViewSet
+from g2ard.io.photos import Frame, Lens, Listed, fits, inverse, photo_size, rigid
+from g2ard.io.types import Note
 from g2ard.scene.lenses import PhotoLens
 
 _MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
@@ -82,37 +83,24 @@ class _Numbered(msgspec.Struct):
     rot_mat: Any
 
 
-def holds(folder: Path) -> bool:
-    return bool(files_of(folder))
-
-
-def describes(content: Any) -> bool:
-    return isinstance(content, dict) and "frames" in content
-
-
-def read(path: Path, images: Path | None = None) -> ViewSet:
+def read(path: Path, images: Path | None = None) -> Listed:
     """Read frames with their photos and intrinsics, which override those of the file.
 
     `path` is the JSON, or a folder with transforms.json, or with transforms_train.json and
     transforms_test.json, which then are the splits. transforms_train.json finds the other beside it.
     """
-    left_out: list[tuple[str, InputError]] = []
     if path.name != _TRAIN:
-        return view_set(path, frames(path, images, left_out), left_out)
-    if (path.parent / _TEST).is_file():
-        files = {path: "train", path.parent / _TEST: "test"}
-        both = [frame for file, split in files.items() for frame in _frames(file, images, left_out, split)]
-        return view_set(path, both, left_out).noted("test_beside", 1, f"{_TEST} beside it has the test views")
-    text = f"no {_TEST} beside it; every 8th of its views is held out"
-    return view_set(path, frames(path, images, left_out), left_out).noted("no_test_beside", 1, text)
+        return listed(path, images)
+    test, note = path.parent / _TEST, Note("test_beside", 1, f"{_TEST} beside it has the test views")
+    if test.is_file():
+        return _listed(path, {path: "train", test: "test"}, images)._replace(notes=(note,))
+    note = Note("no_test_beside", 1, f"no {_TEST} beside it; every 8th of its views is held out")
+    return listed(path, images)._replace(notes=(note,))
 
 
-def frames(
-    path: Path, images: Path | None = None, left_out: list[tuple[str, InputError]] | None = None
-) -> list[Frame]:
-    """Return the frames of `read`, with or without photos; see `_frames` for `left_out`."""
-    files = {path: None} if path.is_file() else files_of(path)
-    return [frame for file, split in files.items() for frame in _frames(file, images, left_out, split)]
+def listed(path: Path, images: Path | None = None) -> Listed:
+    """Return the frames of `read`, of a transforms_train.json without the other beside it."""
+    return _listed(path, {path: None} if path.is_file() else files_of(path), images)
 
 
 def files_of(folder: Path) -> dict[Path, str | None]:
@@ -124,11 +112,17 @@ def files_of(folder: Path) -> dict[Path, str | None]:
     return {file: split for file, split in named.items() if file.is_file()}
 
 
+def _listed(path: Path, files: Mapping[Path, str | None], images: Path | None) -> Listed:
+    frames, left_out = list[Frame](), list[tuple[str, InputError]]()
+    for file, split in files.items():
+        frames += _frames(file, images, left_out, split)
+    return Listed(path, frames, left_out)
+
+
 def _frames(
-    path: Path, images: Path | None, left_out: list[tuple[str, InputError]] | None, split: str | None = None
+    path: Path, images: Path | None, left_out: list[tuple[str, InputError]], split: str | None
 ) -> list[Frame]:
-    """Read the frames of a transforms.json, and append views with numbers that are not finite to
-    `left_out`, which None does not allow.
+    """Read the frames of a transforms.json, and append views with numbers that are not finite to `left_out`.
 
     If it lists the names of its splits, these count (None for an unlisted frame), otherwise `split`. Frames
     of `test_frames`, `val_frames` and `eval_frames` (as test) are in these splits, the others then in train.
@@ -149,7 +143,7 @@ def _frames(
             try:
                 frames.append(_frame(place, shared, entry, finder, masks)._replace(split=word))
             except InputError as error:
-                if left_out is None or not isinstance(entry, dict) or _finite(entry):
+                if not isinstance(entry, dict) or _finite(entry):
                     raise
                 left_out.append((str(entry.get("file_path")), error))
     split_of = _stated(path, content)
@@ -159,7 +153,6 @@ def _frames(
 
 
 def _finite(value: Any) -> bool:
-    """Return whether all numbers of JSON content are finite."""
     if isinstance(value, dict):
         return all(map(_finite, value.values()))
     if isinstance(value, list):
@@ -258,7 +251,7 @@ def _pinhole(place: Place, frame: _Frame, size: tuple[int, int]) -> Lens:
         raise place.error("has no focal length (fl_x, camera_angle_x, or a 3×3 K or intrinsics)")
     cx = width / 2 if frame.cx is UNSET else frame.cx
     cy = height / 2 if frame.cy is UNSET else frame.cy
-    return Lens((width, height), np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), distortion)
+    return Lens.pinhole((width, height), (fx, fy), (cx, cy), distortion)
 
 
 def _matrix(place: Place, frame: _Frame) -> NDArray[np.float64] | None:

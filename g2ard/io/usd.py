@@ -7,6 +7,7 @@ harmonic odd in them. Scales and opacities are linear. Band 0 precedes the other
 import re
 import zipfile
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -15,14 +16,13 @@ from numpy.typing import NDArray
 
 from g2ard.errors import InputError, OutputError, missing
 from g2ard.io.atomic import atomic_output
-from g2ard.io.glb import LINEAR_NOTE, uneven_note
+from g2ard.io.glb import LINEAR_NOTE, placed
 from g2ard.io.packing import rounding, unit_quats, writable
 from g2ard.io.sanitize import Raw, cleaned
 from g2ard.io.spz import FLIPS
 from g2ard.io.types import Note, Scene
 from g2ard.progress import Progress, plural, silent
 from g2ard.scene.splats import SH_C0, Splats
-from g2ard.scene.transform import deformed, join
 
 _SCHEMA = "ParticleField3DGaussianSplat"
 _KERNEL = "ParticleFieldKernelGaussianEllipsoidAPI"
@@ -141,20 +141,13 @@ def read(path: Path) -> Scene:
     held = list(stage.Traverse(pxr.Usd.TraverseInstanceProxies(pxr.Usd.PrimDefaultPredicate)))
     fields = [prim for prim in held if _is_field(prim)]
     shown = [prim for prim in fields if _visible(pxr, prim)]
-    if not shown:
+    hidden = len(fields) - len(shown)
+    ignored = Note("invisible_prims", hidden, f"{plural(hidden, 'invisible prim')} ignored")
+    parts = ((_read_prim(path, pxr, prim), _to_ply(pxr, stage, prim)) for prim in shown)
+    found = placed(path, parts) if shown else None
+    if found is None:
         raise InputError(_nothing(path, held, len(fields)), path=path)
-    parts, notes, uneven = [], list[Note](), 0
-    for prim in shown:
-        scene = _read_prim(path, pxr, prim)
-        notes += [note for note in scene.notes if note not in notes]
-        moved, exact = deformed(scene.splats, _to_ply(pxr, stage, prim))
-        parts.append(moved)
-        uneven += not exact
-    if hidden := len(fields) - len(shown):
-        notes.append(Note("invisible_prims", hidden, f"{plural(hidden, 'invisible prim')} ignored"))
-    if uneven:
-        notes.append(uneven_note(uneven))
-    return Scene(parts[0] if len(parts) == 1 else join(parts), tuple(notes))
+    return replace(found, notes=(*found.notes, ignored)) if hidden else found
 
 
 def _not_a_stage(path: Path, error: Exception) -> InputError:
@@ -243,7 +236,6 @@ def _color_space(pxr: Any, prim: Any) -> str:
 
 
 def _earliest(pxr: Any, attribute: Any) -> Any:
-    """Return the earliest value of an attribute, or None."""
     return attribute.Get(pxr.Usd.TimeCode.EarliestTime()) if attribute else None
 
 
@@ -277,7 +269,6 @@ def _to_ply(pxr: Any, stage: Any, prim: Any) -> NDArray[np.float64]:
 
 
 def _pxr(path: Path) -> Any:
-    """Return the package of OpenUSD, with the modules used here."""
     try:
         import pxr
         from pxr import Gf, Tf, Usd, UsdGeom, UsdVol, Vt  # noqa: F401

@@ -71,7 +71,7 @@ def read_view_set(
         unpictured: whether to keep views without photos among others.
         alpha: "mask" makes a photo with alpha and without a mask its own mask.
     """
-    from g2ard.io.photos import alpha_as_masks, pictured
+    from g2ard.io.photos import alpha_as_masks, pictured, view_set
     from g2ard.io.splits import split_mask
     from g2ard.io.types import ViewFiles
 
@@ -82,7 +82,7 @@ def read_view_set(
     if images is not None and not images.is_dir():
         raise InputError("no such folder of photos", path=images)
     try:
-        views = module.read(path, images)
+        views = view_set(module.read(path, images))
     except OSError as error:  # invalid photo name, unreadable folder
         raise InputError(error.strerror or str(error), path=path) from error
     views = views if unpictured else pictured(views)
@@ -124,25 +124,16 @@ def write_views(
     >>> g2ard.save_views(folder / "views.json", views, splits=["train"])
     >>> g2ard.save_views(folder / "transforms.json", views, splits=["train"])  # for nerfstudio
     """
-    from g2ard.io import camera_files, views
+    from g2ard.io.camera_files import lost_views, texts_of, view_format
     from g2ard.scene.cameras import Cameras
 
     check_type("cameras", cameras, Cameras)
     path = Path(path)
-    kind = camera_files.view_format(path, format)
-    if kind == "g2ard":
-        views.write(path, cameras, splits=splits, weights=weights, overwrite=overwrite)
-        return
-    if not len(cameras):
-        raise InputError("not written: there are no views", path=path)
-    if kind == "colmap":
-        with atomic_folder(path, overwrite) as temporary:
-            camera_files.write_colmap(temporary, cameras)
-    else:
-        with atomic_output(path, overwrite) as temporary:
-            if kind == "inria":
-                camera_files.write_inria(temporary, cameras)
-            else:
-                camera_files.write_nerfstudio(temporary, cameras, path, splits)
-    if lost := camera_files.lost_views(cameras, kind, splits, weights is not None):
+    kind = view_format(path, format)
+    texts = texts_of(path, cameras, kind, splits, weights)
+    with (atomic_folder if kind == "colmap" else atomic_output)(path, overwrite) as temporary:
+        for name, text in texts.items():
+            (temporary / name).parent.mkdir(parents=True, exist_ok=True)
+            (temporary / name).write_text(text, encoding="utf-8")
+    if lost := lost_views(cameras, kind, splits, weights is not None):
         warnings.warn(f"{path}: without {', '.join(lost)}", stacklevel=3)  # past `checks_arguments`

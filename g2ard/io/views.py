@@ -12,12 +12,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from g2ard.errors import InputError
-from g2ard.io.atomic import atomic_output
-from g2ard.io.camera_files import beside
 from g2ard.io.finding import Finder
-from g2ard.io.jsonfile import Matrix, Number, Place, Pose, Weight, Whole, checked, read_json
-from g2ard.io.photos import Frame, Lens, rigid, view_set
-from g2ard.io.types import ViewSet
+from g2ard.io.jsonfile import Matrix, Number, Place, Pose, Weight, Whole, checked, read_own
+from g2ard.io.paths import beside
+from g2ard.io.photos import Frame, Lens, Listed, rigid
 from g2ard.progress import plural
 from g2ard.scene.cameras import USUAL, Cameras
 from g2ard.scene.lenses import PARAMETERS, PhotoLens
@@ -52,30 +50,13 @@ class _File(msgspec.Struct):
     views: list[_View] = []
 
 
-def holds(folder: Path) -> bool:
-    """Return False: the file has any name."""
-    return False
-
-
-def describes(content: Any) -> bool:
-    views = content.get("views") if isinstance(content, dict) else None
-    return isinstance(views, list) or (isinstance(content, dict) and {"views", "format"} <= set(content))
-
-
-def read(path: Path, images: Path | None = None) -> ViewSet:
+def read(path: Path, images: Path | None = None) -> Listed:
     """Read views; photo paths are relative to the file unless `images`, a folder of photos, is given."""
-    content = read_json(path)
-    head = content.get("format"), content.get("version")
-    if head[0] != _FORMAT:
-        raise InputError(f"is {head[0]!r}, expected {_FORMAT!r}", path=path, property="format")
-    if head[1] != _VERSION:
-        raise InputError(f"unsupported version {head[1]!r}; expected {_VERSION}", path=path)
-    views = checked(content, _File, Place(path), entries="view").views
+    views = checked(read_own(path, _FORMAT, _VERSION), _File, Place(path), entries="view").views
     if not views:
         raise InputError("no views found ('views' is empty)", path=path)
     finder, masks = Finder(images or path.parent), Finder(path.parent)
-    parsed = [_frame(Place(path, i, "view"), view, finder, masks) for i, view in enumerate(views)]
-    return view_set(path, parsed)
+    return Listed(path, [_frame(Place(path, i, "view"), view, finder, masks) for i, view in enumerate(views)])
 
 
 def _frame(place: Place, view: _View, finder: Finder, masks: Finder) -> Frame:
@@ -121,20 +102,13 @@ def _written(lens: PhotoLens | None) -> dict[str, Any] | None:
     return {"model": lens.model, "size": lens.size, "params": lens.params, "turn": turn}
 
 
-def write(
-    path: Path,
-    cameras: Cameras,
-    *,
-    splits: Sequence[str | None] = (),
-    weights: ArrayLike | None = None,
-    overwrite: bool = False,
-) -> None:
-    """Write views, one per line, with exact floats; see `g2ard.io.write_views`."""
+def text_of(path: Path, cameras: Cameras, splits: Sequence[str | None], weights: ArrayLike | None) -> str:
+    """Return views, one per line, with exact floats; see `g2ard.io.write_views`."""
     count = len(cameras)
     given = np.full(count, np.nan) if weights is None else np.asarray(weights, np.float64)
     drawn = [None if np.isnan(weight) else weight for weight in given.tolist()]
     parts = list(splits) or [None] * count
-    if not count or len(parts) != count or len(drawn) != count:
+    if len(parts) != count or len(drawn) != count:
         raise InputError(
             f"{plural(count, 'view')}, {len(parts)} splits and {len(drawn)} weights do not match", path=path
         )
@@ -156,5 +130,4 @@ def write(
         }
         lines.append(json.dumps({key: value for key, value in view.items() if value is not None}))
     head = f'{{"format": "{_FORMAT}", "version": {_VERSION}, "views": [\n'
-    with atomic_output(path, overwrite) as temporary:
-        temporary.write_text(head + ",\n".join(lines) + "\n]}\n", encoding="utf-8")
+    return head + ",\n".join(lines) + "\n]}\n"

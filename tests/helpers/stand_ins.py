@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 import g2ard
-from g2ard.io.camera_files import write_colmap
+from g2ard.io import write_views
 from g2ard.scene.splats import SH_C0
 from helpers import cloud_files, dataset_files, lpips_weights
 from helpers.feature_scenes import blotched
@@ -108,7 +108,7 @@ def _colmap(folder: Path, origin: Sequence[float] = (0, 0, 0)) -> None:
     moved = views.viewmats.copy()
     moved[:, :3, 3] -= moved[:, :3, :3] @ np.array(origin)
     names = tuple(f"{name}.png" for name in views.names)
-    write_colmap(folder, replace(views, viewmats=moved, names=names))
+    write_views(folder, replace(views, viewmats=moved, names=names), format="colmap", overwrite=True)
     rows = [
         f"{i} {x} {y} {z} 128 128 128 0.5 1 0 2 0" for i, (x, y, z) in enumerate(SCENE.means[::4] + origin)
     ]

@@ -93,6 +93,17 @@ def test_a_binary_value_that_is_not_finite_is_named(tmp_path: Path, name: str, a
     check_fault(caught.value, path, fault)
 
 
+@pytest.mark.parametrize("number", [-1, 18, 99])
+def test_a_model_of_unknown_number_is_rejected(tmp_path: Path, number: int) -> None:
+    folder = colmap(tmp_path / "project", orbit(1), text=False)
+    path = folder / "sparse" / "0" / "cameras.bin"
+    data = bytearray(path.read_bytes())
+    struct.pack_into("<i", data, 8 + 4, number)
+    path.write_bytes(data)
+    with faulty(path, f"number {number}"):
+        read_views(folder)
+
+
 def test_other_and_absent_cameras_are_rejected(tmp_path: Path) -> None:
     folder = colmap(tmp_path / "project", orbit(2), text=True)
     cameras = folder / "sparse" / "0" / "cameras.txt"
@@ -145,6 +156,14 @@ def test_numbers_of_points3d_text(tmp_path: Path, row: str, column: str) -> None
         read_points(points)
     points.write_text("1 nan 0 0 0 255 9 0.1\n2 0 0 0 0 255 9 0.1\n")
     assert read_points(points).colors.tolist() == [[0, 1, np.float32(9 / 255)]]
+
+
+@pytest.mark.parametrize("rows", [1, 5, 6, 12])
+def test_points_that_all_lack_a_column(tmp_path: Path, rows: int) -> None:
+    points = tmp_path / "points3D.txt"
+    points.write_text("".join(f"{i} 1 2 3 9 9\n" for i in range(rows)))
+    with faulty(points, ("B", 0)):
+        read_points(points)
 
 
 def test_caliterra() -> None:
@@ -237,8 +256,10 @@ def test_rigs_and_frames_give_poses_that_images_lack(
         table = folder / f"{name}{file.suffix}"
         whole = table.read_bytes()
         table.write_bytes(whole[:-30])
-        with pytest.raises(InputError, match=rf"{table.name}"):
+        with pytest.raises(InputError, match=rf"{table.name}") as caught:
             read_views(tmp_path)
+        assert caught.value.property
+        assert caught.value.index is not None
         table.write_bytes(whole)
     (folder / f"frames{file.suffix}").unlink()
     if len(lost) < 9 and value:

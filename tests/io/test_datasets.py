@@ -12,6 +12,7 @@ from g2ard.errors import InputError
 from g2ard.io.detect import KINDS
 from g2ard.io.images import load_image
 from helpers.dataset_files import POSES, cambridge, llff, mip_nerf_360, opengl, polycam
+from helpers.faults import faulty
 from helpers.view_files import photo
 
 
@@ -111,14 +112,11 @@ def test_llff(tmp_path: Path) -> None:
 
 def test_a_damaged_poses_bounds_is_refused(tmp_path: Path) -> None:
     file = tmp_path / "poses_bounds.npy"
-    file.write_bytes(b"no array")
-    with pytest.raises(InputError, match=r"poses_bounds.npy: is not a NumPy array"):
-        io.read_views(file)
     np.save(file, np.zeros((3, 12)))
     with pytest.raises(InputError, match="holds 3×12 values of float64, expected N×17"):
         io.read_views(file)
     np.save(file, np.zeros((3, 17)))
-    with pytest.raises(InputError, match="row 0 has height 0"):
+    with faulty(file, (None, 0)):
         io.read_views(file)
 
 
@@ -130,8 +128,9 @@ def test_polycam(folder: str, notes: list[str], tmp_path: Path) -> None:
     np.testing.assert_allclose(found.cameras.Ks[0], [[95, 0, 51], [0, 96, 37], [0, 0, 1]])
     assert found.cameras.names[:3] == ("9999000.jpg", "9999500.jpg", "10000000.jpg")  # in order of time
     assert [note.code for note in found.notes] == notes
-    (next((tmp_path / "keyframes").glob("*cameras/*.json"))).write_text("{}")
-    with pytest.raises(InputError, match="property 't_00' is missing"):
+    file = next((tmp_path / "keyframes").glob("*cameras/*.json"))
+    file.write_text("{}")
+    with faulty(file, ("t_00", None)):
         io.read_views(tmp_path)
 
 
@@ -150,7 +149,7 @@ def test_a_frame_may_carry_its_matrix_and_photos_may_lie_beside_the_file(key: st
     assert found.image_paths[2] == tmp_path / "2.png"
     frames[1][key] = [[0, 0, 50], [0, 91, 40], [0, 0, 1]]
     file.write_text(json.dumps({"frames": frames}))
-    with pytest.raises(InputError, match=f"property '{key}' of frame 1 is not a matrix of focal lengths"):
+    with faulty(file, (key, 1)):
         io.read_views(file)
 
 
@@ -169,6 +168,4 @@ def test_a_colmap_model_without_a_table_says_which(part: str, tmp_path: Path) ->
 def test_every_line_of_the_table_names_a_reader(name: str, tmp_path: Path) -> None:
     module = import_module(f"g2ard.io.{name}")
     assert hasattr(module, "read") or (hasattr(module, "Stream") and KINDS[name] != "views")
-    if KINDS[name] == "views":
-        assert not module.holds(tmp_path)
-        assert not getattr(module, "describes", bool)([])
+    assert not hasattr(module, "holds") or not module.holds(tmp_path)

@@ -191,11 +191,14 @@ def test_the_largest_of_several_models_is_read(tmp_path: Path, small: str, large
     assert any(large in str(note) and "4 images" in str(note) for note in chosen.notes)
 
 
+@pytest.mark.parametrize("points", ["", "1.5 2.5 -1", "1.5 2.5 -1 3.5 4.5 7 0 0 12"])
 @pytest.mark.parametrize("kept", [lambda i: False, lambda i: i % 2, lambda i: i != 3, lambda i: True])
-def test_images_txt_with_and_without_lines_of_points(tmp_path: Path, kept: Callable[[int], bool]) -> None:
+def test_images_txt_with_and_without_lines_of_points(
+    tmp_path: Path, kept: Callable[[int], bool], points: str
+) -> None:
     project(tmp_path)
     file = tmp_path / "sparse" / "0" / "images.txt"
-    lines = file.read_text().splitlines()[1:]
+    lines = [points if i % 2 else line for i, line in enumerate(file.read_text().splitlines()[1:])]
     file.write_text("".join(f"{line}\n" for i, line in enumerate(lines) if not i % 2 or kept(i)))
     assert read_views(tmp_path).names == tuple(NAMES)
 

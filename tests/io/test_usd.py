@@ -15,20 +15,14 @@ from g2ard.rendering.renderer import Renderer
 from g2ard.scene.cameras import Camera
 from g2ard.scene.splats import Splats
 from g2ard.scene.transform import transform
+from helpers import ply_files
+from helpers.faults import faulty
 from reference.rotations import covariances
 
 
 def scene(degree: int = 3, offset: tuple[float, float, float] = (0, 0, 0)) -> Splats:
-    rng = np.random.default_rng(degree)
-    return Splats.create(
-        rng.normal(size=(40, 3)).astype(np.float32),
-        quats=rng.normal(size=(40, 4)),
-        scales=rng.uniform(0.05, 0.4, (40, 3)),
-        logit_opacities=rng.normal(size=40),
-        sh0=rng.normal(size=(40, 1, 3)),
-        shN=rng.normal(0, 0.3, (40, (degree + 1) ** 2 - 1, 3)),
-        offset=offset,
-    )
+    made = ply_files.scene(40, degree, degree, offset)
+    return replace(made, means=made.means.astype(np.float32))
 
 
 def attributes(path: Path) -> dict[str, np.ndarray]:
@@ -124,6 +118,13 @@ def test_all_visible_prims_are_joined(tmp_path: Path, count: int, hidden: int) -
     assert found.splats.sh_degree == max(part.sh_degree for part in parts)
 
 
+def test_a_placement_that_flattens_names_the_file(tmp_path: Path) -> None:
+    pytest.importorskip("pxr")
+    path = prims(tmp_path, prim(tmp_path, "a", scene(0), op("scale", 1, 0, 1)))
+    with faulty(path, "flattens"):
+        read_scene(path)
+
+
 def test_instances_and_the_earliest_time_are_read(tmp_path: Path) -> None:
     pytest.importorskip("pxr")
     truth = scene(1)
@@ -169,7 +170,7 @@ def test_what_a_stage_holds_instead_is_named(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="all invisible"):
         read_scene(prims(tmp_path, prim(tmp_path, "a", scene(0), HIDDEN)))
     (tmp_path / "c.usda").write_text('#usda 1.0\ndef Xform "W"\n{\n    float[] a = [1, 2\n}\n')
-    with pytest.raises(InputError, match="line 5"):
+    with faulty(tmp_path / "c.usda", (None, 5)):
         read_scene(tmp_path / "c.usda")
 
 

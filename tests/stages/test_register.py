@@ -59,7 +59,7 @@ def test_poses_as_text_are_camera_from_world(site: Path) -> None:
     [
         ("a 1 0 0 0 1 2", "line 1 is not a name"),
         ("a 1 0 0 0 1 2 nan", "line 1 is not a name"),
-        ("a 0 0 0 0 1 2 3", "line 1 is not a name"),
+        ("a 0 0 0 0 1 2 3", "line 1 has a quaternion of length zero"),
         ("a 1 0 0 0 1 2 3\n\na 1 0 0 0 1 2 3", "line 3 repeats the name 'a'"),
         ("# nothing\n", "no poses found"),
     ],

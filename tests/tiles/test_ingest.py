@@ -232,7 +232,7 @@ def test_damage_is_named(tmp_path: Path) -> None:
 
     content = json.loads(text)
     for change, message in (
-        ({"format": "other"}, "not a manifest of tiles"),
+        ({"format": "other"}, "'format' is 'other'"),
         ({"version": 99}, "unsupported version 99"),
         ({"count": 3}, "property 'count'"),
         ({"sh_degree": 7}, "property 'sh_degree'"),
