@@ -42,25 +42,14 @@ def test_any_negative_scale_means_logarithms(tmp_path: Path, shift: float) -> No
     assert [note.code for note in found.notes] == ["log_scales"]
 
 
-@pytest.mark.parametrize("degree", range(4))
-def test_gaussians_are_points_whose_attributes_have_one_value_each(tmp_path: Path, degree: int) -> None:
-    document, binary = parts_of(tmp_path, scene(30, degree))
-    (primitive,) = document["meshes"][0]["primitives"]
-    assert primitive["mode"] == 0  # POINTS
-    assert document["extensionsUsed"] == list(primitive["extensions"]) == [EXTENSION]
-    assert {document["accessors"][at]["count"] for at in primitive["attributes"].values()} == {30}
-    ends = [view["byteOffset"] + view["byteLength"] for view in document["bufferViews"]]
-    assert max(ends) <= document["buffers"][0]["byteLength"] <= len(binary)
-
-
-@pytest.mark.parametrize("nodes", [1, 2, 3])
+@pytest.mark.parametrize("nodes", [0, 1, 2, 3])
 def test_a_mesh_is_read_as_often_as_nodes_show_it(tmp_path: Path, nodes: int) -> None:
     truth = scene()
     document, binary = parts_of(tmp_path, truth)
     shown = [{"mesh": 0, "translation": [-5.0 * k, 0, 0]} for k in range(nodes)]
     document |= {"nodes": shown, "scenes": [{"nodes": list(range(nodes))}]}
     found = read_splats(write_glb(tmp_path / "a.glb", document, binary))
-    whole = np.concatenate([truth.means + np.array([5.0 * k, 0, 0]) for k in range(nodes)])
+    whole = np.concatenate([truth.means + np.array([5.0 * k, 0, 0]) for k in range(max(nodes, 1))])
     np.testing.assert_allclose(found.means + found.offset, whole, atol=1e-5)
 
 

@@ -1,6 +1,9 @@
 """No damaged file ends in a traceback: readers answer with sound data or one line of InputError."""
 
+import gzip
 import re
+import struct
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -28,6 +31,61 @@ def test_malformed_files_end_in_one_line_that_names_them(tmp_path: Path, what: s
         refused += line is not None
         assert line is None or ("\n" not in line and str(tmp_path) in line), how
     assert refused >= 50, f"{refused} of {len(files)}"
+
+
+def packed(head: bytes) -> bytes:
+    """Return an .spz of version 3 that begins like this."""
+    return gzip.compress(head + bytes(200))
+
+
+PLY = b"ply\nformat ascii 1.0\n"
+DAMAGES: list[tuple[str, Callable[[bytes], bytes], str]] = [
+    ("ksplat", lambda data: data[:100], "cut off within its header"),
+    ("ksplat", lambda data: data[:4200], "cut off within the headers of 1 sections"),
+    ("ksplat", lambda data: data[:-1], "section 0 is cut off"),
+    ("ksplat", lambda data: b"\1" + data[1:], "unsupported version 1.1"),
+    ("ksplat", lambda data: data[:20] + b"\7" + data[21:], "unsupported compression level 7"),
+    ("ksplat", lambda data: data[:4136] + b"\4" + data[4137:], "section 0 .*SH degree 4"),
+    ("ksplat", lambda data: data[:4128] + b"\xff" + data[4129:], "section 0 has inconsistent buckets"),
+    ("ksplat", lambda data: data[:5120] + bytes(4) + data[5124:], "section 0 has more rows"),
+    ("glb", lambda data: data[:10], "not a .glb"),
+    ("glb", lambda data: data[: len(data) // 2], "truncated|broken"),
+    ("glb", lambda data: data.replace(b'"ellipse"', b'"boxes!!"'), "kernel"),
+    ("glb", lambda data: data.replace(b"splatting:SCALE", b"splatting:SCALY"), "SCALE.* is missing"),
+    (
+        "glb",
+        lambda data: data.replace(b'"count":9,', b'"count":99,', 1).replace(b"g2ard", b"g2ar"),
+        "truncated",
+    ),
+    ("spz 3", lambda data: packed(b"NOPE"), "not an SPZ"),
+    ("spz 3", lambda data: b"", "not an SPZ"),
+    ("spz 3", lambda data: packed(b"NGSP" + struct.pack("<IIBBBB", 9, 1, 0, 12, 0, 0)), "version 9"),
+    *(("splat", lambda data, size=size: bytes(size), "multiple of 32") for size in (0, 33)),
+    ("sog", lambda data: b"PK\x03\x04nonsense", "not a complete .sog archive"),
+    ("poses_bounds.npy", lambda data: b"no array", "not a NumPy array"),
+    *(
+        (what, lambda data, keep=keep: data[:keep], "cannot be read as LAS|truncated|broken")
+        for what in ("las", "laz")
+        for keep in (0, 20, 300, -30)
+    ),
+    ("scene", lambda data: b"", "is empty"),
+    ("scene", lambda data: b"PK\x03\x04 a zip", "not a PLY"),
+    ("scene", lambda data: b"plywood\n", "not a PLY"),
+    ("scene", lambda data: PLY + b"element vertex 3\n", "end_header"),
+    ("scene", lambda data: PLY + b"element vertex many\nend_header\n", "line 3"),
+    ("scene", lambda data: PLY + b"property float x\nend_header\n", "line 3"),
+    ("scene", lambda data: PLY + b"element face 0\nend_header\n", "no 'vertex' element"),
+]
+
+
+@pytest.mark.parametrize(("what", "damage", "words"), DAMAGES)
+def test_damage_is_named(tmp_path: Path, what: str, damage: Callable[[bytes], bytes], words: str) -> None:
+    path = MAKERS[what](tmp_path)
+    path.write_bytes(damage(path.read_bytes()))
+    line = read_checked(path)
+    assert line is not None
+    assert path.name in line
+    assert re.search(words, line)
 
 
 NAMED = ["transforms", "cameras.json", "views", "ns-export", "meta.json", "lod-meta.json"]

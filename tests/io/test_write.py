@@ -105,6 +105,7 @@ def test_packing_reports_its_progress(tmp_path: Path, name: str) -> None:
     assert files
     assert done == total > 1, stage
     assert counts == sorted(counts)
+    assert {report[2] for report in told} == {total}
 
 
 def test_names_and_options(tmp_path: Path) -> None:
@@ -422,25 +423,6 @@ def test_glb_keeps_the_rules(tmp_path: Path) -> None:
     assert sum(name.startswith(f"{EXTENSION}:SH_DEGREE_") for name in arrays) == 16
 
 
-def test_broken_glb_is_one_line(tmp_path: Path) -> None:
-    good = saved(tmp_path, "glb", scene(50, 1)).read_bytes()
-    path = tmp_path / "b.glb"
-    for keep, message in ((10, "not a .glb"), (len(good) // 2, "truncated|broken")):
-        path.write_bytes(good[:keep])
-        with pytest.raises(InputError, match=message):
-            read_splats(path)
-    path.write_bytes(good.replace(b'"mesh":0', b'"mesh":9'))
-    assert not read_splats(path).offset.any()
-    for old, new, message in (
-        (b'"ellipse"', b'"boxes!!"', "kernel"),
-        (f'"{EXTENSION}:SCALE"'.encode(), f'"{EXTENSION}:SCALY"'.encode(), "attribute .* is missing"),
-        (b'"count":50', b'"count":99', "truncated"),
-    ):
-        path.write_bytes(good.replace(old, new))
-        with pytest.raises(InputError, match=message):
-            read_splats(path)
-
-
 # ── other people's readers ───────────────────────────────────────────────────────────────────────────
 
 
@@ -591,14 +573,3 @@ def test_attributes_of_a_glb_may_be_normalised_integers(tmp_path: Path, name: st
     for attribute, field in STORED.items():
         step = 0.51 / np.iinfo(dtype).max if attribute == name else 1e-7
         np.testing.assert_allclose(getattr(found, field), getattr(plain, field), atol=step)
-
-
-@pytest.mark.parametrize("suffix", ["sog", "spz", "usda"])
-def test_formats_that_take_long_to_pack_report_their_progress(tmp_path: Path, suffix: str) -> None:
-    told: list[tuple[int, int]] = []
-    write_splats(
-        tmp_path / f"a.{suffix}", scene(300), progress=lambda _, done, total: told.append((done, total))
-    )
-    assert told == sorted(told)
-    assert told[-1][0] == told[-1][1] > 0
-    assert len({total for _, total in told}) == 1
