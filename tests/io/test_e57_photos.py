@@ -70,8 +70,9 @@ def written(path: Path, *photos: dict) -> Path:
                     turn.set(axis, libe57.FloatNode(image, float(value)))
                 for axis, value in zip("xyz", photo["shift"], strict=True):
                     shift.set(axis, libe57.FloatNode(image, float(value)))
-                pose.set("rotation", turn)
-                pose.set("translation", shift)
+                for part, values in (("rotation", turn), ("translation", shift)):
+                    if part != photo.get("without"):
+                        pose.set(part, values)
                 node.set("pose", pose)
             width, height = photo.get("size", SIZE.get(kind, (8, 8)))
             picture = np.zeros((height, width, 3))
@@ -123,6 +124,15 @@ def test_views_show_what_lies_in_their_directions(tmp_path: Path, kinds: list[st
         local = np.stack([u, v, np.ones_like(u)], -1) @ np.linalg.inv(view.K).T
         expected = pattern(local @ view.viewmat[:3, :3])
         assert np.abs(load_image(views, i) - expected).mean() < (0.01 if format == "PNG" else 0.02)
+
+
+@pytest.mark.parametrize("without", ["rotation", "translation"])
+def test_missing_parts_of_a_pose_are_those_of_the_identity(tmp_path: Path, without: str) -> None:
+    photo = posed("pinhole", 0)
+    (view,) = read_views(written(tmp_path / "a.e57", photo | {"without": without}))
+    whole = photo | ({"quat": [1, 0, 0, 0]} if without == "rotation" else {"shift": [0, 0, 0]})
+    (expected,) = read_views(written(tmp_path / "b.e57", whole))
+    np.testing.assert_allclose(view.viewmat, expected.viewmat, atol=1e-12)
 
 
 def test_masks_and_the_cache(tmp_path: Path, cache: Path) -> None:
