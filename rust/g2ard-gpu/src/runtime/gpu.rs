@@ -57,6 +57,10 @@ impl Buffer {
     }
 }
 
+/// A uniform buffer.
+#[derive(Debug, Clone)]
+pub struct Constants(pub(super) wgpu::Buffer);
+
 /// The first error since the last check.
 type Health = Arc<Mutex<Option<Error>>>;
 
@@ -161,13 +165,23 @@ impl Gpu {
         Ok(buffer)
     }
 
-    /// A uniform buffer with the constants of one dispatch.
-    pub(super) fn constants(&self, values: &[u32]) -> wgpu::Buffer {
+    /// A uniform buffer with the constants of a dispatch.
+    pub fn constants(&self, values: &[u32]) -> Constants {
         let bytes = 4 * values.len().next_multiple_of(4) as u64;
         let usage = BufferUsages::UNIFORM | BufferUsages::COPY_DST;
-        let buffer = self.create("constants", bytes, usage);
-        self.write(&buffer, bytemuck::cast_slice(values));
+        let buffer = Constants(self.create("constants", bytes, usage));
+        self.set_constants(&buffer, values);
         buffer
+    }
+
+    /// Change constants before work that is submitted from now on.
+    pub fn set_constants(&self, constants: &Constants, values: &[u32]) {
+        self.write(&constants.0, bytemuck::cast_slice(values));
+    }
+
+    /// Write the first words of a buffer before work that is submitted from now on.
+    pub fn overwrite<T: bytemuck::NoUninit>(&self, buffer: &Buffer, data: &[T]) {
+        self.write(&buffer.inner, bytemuck::cast_slice(data));
     }
 
     pub(super) fn create(&self, label: &str, size: u64, usage: BufferUsages) -> wgpu::Buffer {

@@ -10,6 +10,6 @@ mod work;
 pub use adapters::{Adapter, list};
 pub use error::{Error, Result};
 pub(crate) use gpu::lock;
-pub use gpu::{Buffer, Gpu, Kernel, Options};
+pub use gpu::{Buffer, Constants, Gpu, Kernel, Options};
 pub use panics::guarded;
-pub use work::{Pending, Work};
+pub use work::{Pending, Program, Work};

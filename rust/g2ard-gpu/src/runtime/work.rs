@@ -4,11 +4,12 @@ use std::iter;
 use std::time::Duration;
 
 use wgpu::{
-    BindGroupDescriptor, BindGroupEntry, BufferUsages, CommandEncoder, ComputePassDescriptor,
-    ComputePassTimestampWrites, MapMode, PollType, QuerySet, QuerySetDescriptor, QueryType,
+    BindGroup, BindGroupDescriptor, BindGroupEntry, BufferUsages, CommandEncoder, ComputePass,
+    ComputePassDescriptor, ComputePassTimestampWrites, ComputePipeline, MapMode, PollType,
+    QuerySet, QuerySetDescriptor, QueryType,
 };
 
-use super::gpu::{Buffer, Gpu, Kernel};
+use super::gpu::{Buffer, Constants, Gpu, Kernel};
 use super::{Error, Result};
 
 /// Most workgroups along one axis of a dispatch that WebGPU guarantees.
@@ -23,13 +24,28 @@ const PATIENCE: u64 = 120;
 /// Recorded work; nothing runs before `submit`.
 pub struct Work<'a> {
     gpu: &'a Gpu,
-    encoder: CommandEncoder,
-    clock: Option<Clock>,
+    program: Program,
+}
+
+/// Commands with their pipelines and bindings, which can run many times.
+#[derive(Clone, Default)]
+pub struct Program(Vec<Command>);
+
+#[derive(Clone)]
+enum Command {
+    Run {
+        kernel: &'static str,
+        pipeline: ComputePipeline,
+        bindings: BindGroup,
+        groups: [u32; 2],
+    },
+    Clear(wgpu::Buffer),
 }
 
 /// Start and end of each kernel.
 struct Clock {
     ticks: QuerySet,
+    resolved: wgpu::Buffer,
     kernels: Vec<&'static str>,
 }
 
@@ -44,20 +60,17 @@ pub struct Pending<'a> {
 
 impl<'a> Work<'a> {
     pub fn new(gpu: &'a Gpu) -> Self {
-        let encoder = gpu.device.create_command_encoder(&Default::default());
-        let clock = gpu.timed.then(|| Clock {
-            ticks: gpu.device.create_query_set(&QuerySetDescriptor {
-                label: Some("ticks"),
-                ty: QueryType::Timestamp,
-                count: 2 * MAX_TIMED as u32,
-            }),
-            kernels: Vec::new(),
-        });
-        Self {
-            gpu,
-            encoder,
-            clock,
-        }
+        Self::of(gpu, Program::default())
+    }
+
+    /// Work that begins with a program.
+    pub fn of(gpu: &'a Gpu, program: Program) -> Self {
+        Self { gpu, program }
+    }
+
+    /// The commands, to run them many times.
+    pub fn program(self) -> Program {
+        self.program
     }
 
     /// Run a kernel in `groups` workgroups. Binding 0 holds `constants`; `buffers` follow.
@@ -85,78 +98,153 @@ impl<'a> Work<'a> {
         if groups == 0 {
             return Ok(());
         }
-        let pipeline = self.gpu.pipeline(kernel)?;
         let constants = self.gpu.constants(constants);
+        self.run_with(kernel, groups, &constants, buffers)
+    }
+
+    /// Run a kernel with constants that may change between two runs of a program.
+    pub fn run_with(
+        &mut self,
+        kernel: &Kernel,
+        groups: usize,
+        constants: &Constants,
+        buffers: &[(u32, &Buffer)],
+    ) -> Result<()> {
+        let pipeline = self.gpu.pipeline(kernel)?;
         let rest = buffers.iter().map(|(at, buffer)| (*at, &buffer.inner));
-        let entries: Vec<_> = iter::once((0, &constants))
+        let entries: Vec<_> = iter::once((0, &constants.0))
             .chain(rest)
             .map(|(binding, buffer)| BindGroupEntry {
                 binding,
                 resource: buffer.as_entire_binding(),
             })
             .collect();
-        let group = self.gpu.device.create_bind_group(&BindGroupDescriptor {
+        let bindings = self.gpu.device.create_bind_group(&BindGroupDescriptor {
             label: Some(kernel.name),
             layout: &pipeline.get_bind_group_layout(0),
             entries: &entries,
         });
-        let mut pass = self.encoder.begin_compute_pass(&ComputePassDescriptor {
-            label: Some(kernel.name),
-            timestamp_writes: self.clock.as_mut().and_then(|c| c.next(kernel.name)),
-        });
-        pass.set_pipeline(&pipeline);
-        pass.set_bind_group(0, &group, &[]);
         let rows = groups.div_ceil(MAX_GROUPS);
-        pass.dispatch_workgroups(groups.div_ceil(rows) as u32, rows as u32, 1);
+        self.program.0.push(Command::Run {
+            kernel: kernel.name,
+            pipeline,
+            bindings,
+            groups: [groups.div_ceil(rows) as u32, rows as u32],
+        });
         Ok(())
     }
 
     /// Fill a buffer with zeros.
     pub fn clear(&mut self, buffer: &Buffer) {
-        self.encoder.clear_buffer(&buffer.inner, 0, None);
+        self.program.0.push(Command::Clear(buffer.inner.clone()));
     }
 
     /// Submit the work. Each of `reads` is a buffer and the number of its first words to read when the work is done.
-    pub fn submit(mut self, reads: &[(&Buffer, usize)]) -> Result<Pending<'a>> {
+    pub fn submit(self, reads: &[(&Buffer, usize)]) -> Result<Pending<'a>> {
+        let gpu = self.gpu;
+        let mut encoder = gpu.device.create_command_encoder(&Default::default());
+        let clock = gpu.timed.then(|| Clock::new(gpu));
+        let timed = self.program.encode(&mut encoder, clock);
+        let mut readback = |from: &wgpu::Buffer, size: u64| {
+            let usage = BufferUsages::MAP_READ | BufferUsages::COPY_DST;
+            let copy = gpu.create("readback", size, usage);
+            encoder.copy_buffer_to_buffer(from, 0, &copy, 0, size);
+            copy
+        };
         let mut reads: Vec<_> = reads
             .iter()
-            .map(|(buffer, words)| self.readback(&buffer.inner, 4 * (*words).max(1) as u64))
+            .map(|(buffer, words)| readback(&buffer.inner, 4 * (*words).max(1) as u64))
             .collect();
-        let timed = self.clock.take().filter(|c| !c.kernels.is_empty());
-        let timed = timed.map(|clock| {
-            let count = 2 * clock.kernels.len() as u32;
-            let (size, usage) = (8 * u64::from(count), BufferUsages::QUERY_RESOLVE);
-            let ticks = self
-                .gpu
-                .create("ticks", size, usage | BufferUsages::COPY_SRC);
-            self.encoder
-                .resolve_query_set(&clock.ticks, 0..count, &ticks, 0);
-            reads.push(self.readback(&ticks, size));
-            clock.kernels
+        let timed = timed.map(|(ticks, kernels)| {
+            reads.push(readback(&ticks, 16 * kernels.len() as u64));
+            kernels
         });
-        let index = self.gpu.queue.submit([self.encoder.finish()]);
-        self.gpu.check()?;
+        let index = gpu.queue.submit([encoder.finish()]);
+        gpu.check()?;
         for copy in &reads {
             copy.map_async(MapMode::Read, .., |_| {}); // `take` sees whether it succeeded
         }
         Ok(Pending {
-            gpu: self.gpu,
+            gpu,
             index,
             reads,
             timed,
         })
     }
+}
 
-    /// A copy of a buffer that the CPU can map.
-    fn readback(&mut self, from: &wgpu::Buffer, size: u64) -> wgpu::Buffer {
-        let usage = BufferUsages::MAP_READ | BufferUsages::COPY_DST;
-        let copy = self.gpu.create("readback", size, usage);
-        self.encoder.copy_buffer_to_buffer(from, 0, &copy, 0, size);
-        copy
+impl Program {
+    /// Encode the commands; return the ticks of each kernel if a clock measures them.
+    fn encode(
+        &self,
+        encoder: &mut CommandEncoder,
+        mut clock: Option<Clock>,
+    ) -> Option<(wgpu::Buffer, Vec<&'static str>)> {
+        let mut at = 0;
+        while at < self.0.len() {
+            if let Command::Clear(buffer) = &self.0[at] {
+                encoder.clear_buffer(buffer, 0, None);
+                at += 1;
+                continue;
+            }
+            // Kernels that are timed have a pass of their own.
+            let most = if clock.is_some() { 1 } else { usize::MAX };
+            let kernel = self.0[at].kernel();
+            let mut pass = encoder.begin_compute_pass(&ComputePassDescriptor {
+                label: kernel,
+                timestamp_writes: clock.as_mut().and_then(|c| c.next(kernel?)),
+            });
+            let run = self.0[at..].iter().take(most);
+            at += run
+                .take_while(|command| command.dispatch(&mut pass))
+                .count();
+        }
+        clock.and_then(|clock| clock.resolve(encoder))
+    }
+}
+
+impl Command {
+    fn kernel(&self) -> Option<&'static str> {
+        match self {
+            Self::Run { kernel, .. } => Some(kernel),
+            Self::Clear(_) => None,
+        }
+    }
+
+    /// Dispatch a kernel; false for other commands.
+    fn dispatch(&self, pass: &mut ComputePass) -> bool {
+        let Self::Run {
+            pipeline,
+            bindings,
+            groups: [columns, rows],
+            ..
+        } = self
+        else {
+            return false;
+        };
+        pass.set_pipeline(pipeline);
+        pass.set_bind_group(0, bindings, &[]);
+        pass.dispatch_workgroups(*columns, *rows, 1);
+        true
     }
 }
 
 impl Clock {
+    fn new(gpu: &Gpu) -> Self {
+        let ticks = gpu.device.create_query_set(&QuerySetDescriptor {
+            label: Some("ticks"),
+            ty: QueryType::Timestamp,
+            count: 2 * MAX_TIMED as u32,
+        });
+        let size = 16 * MAX_TIMED as u64;
+        let usage = BufferUsages::QUERY_RESOLVE | BufferUsages::COPY_SRC;
+        Self {
+            ticks,
+            resolved: gpu.create("ticks", size, usage),
+            kernels: Vec::new(),
+        }
+    }
+
     fn next(&mut self, kernel: &'static str) -> Option<ComputePassTimestampWrites<'_>> {
         let at = 2 * self.kernels.len() as u32;
         if self.kernels.len() == MAX_TIMED {
@@ -168,6 +256,15 @@ impl Clock {
             beginning_of_pass_write_index: Some(at),
             end_of_pass_write_index: Some(at + 1),
         })
+    }
+
+    fn resolve(self, encoder: &mut CommandEncoder) -> Option<(wgpu::Buffer, Vec<&'static str>)> {
+        if self.kernels.is_empty() {
+            return None;
+        }
+        let count = 2 * self.kernels.len() as u32;
+        encoder.resolve_query_set(&self.ticks, 0..count, &self.resolved, 0);
+        Some((self.resolved, self.kernels))
     }
 }
 
