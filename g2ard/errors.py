@@ -104,6 +104,10 @@ class MissingDependencyError(G2ardError, ImportError):  # type: ignore[misc]  # 
     """Missing optional package; the hint is the command that installs it."""
 
 
+class DeviceError(G2ardError, RuntimeError):
+    """Failure of a GPU during recovery, which continues on the CPU."""
+
+
 def damaged(message: str, **fields: Any) -> InputError:
     """Return the error for a damaged file, with the hint to get it again."""
     return InputError(message, hint="the file is damaged: copy or export it again", **fields)

@@ -37,8 +37,9 @@ def _duration(text: str) -> float:
 _SH_DEGREE = typer.Option(min=0, max=3, help="SH degree of the result; by default that of the scene.")
 ShDegreeOption = Annotated[int | None, _SH_DEGREE]
 _ENGINE = typer.Option(
-    help="Engine of the steps, with equal results up to rounding: fused (Rust, the default), torch "
-    "(autograd; needs the extra `torch`) or gsplat (NVIDIA GPU, as --device cuda; extra `cuda`)."
+    help="Engine of the steps, with equal results up to rounding: fused (Rust or --device gpu, the "
+    "default), torch (autograd; needs the extra `torch`) or gsplat (NVIDIA GPU, as --device cuda; extra "
+    "`cuda`)."
 )
 FIELDS: dict[str, tuple[Any, Any]] = {
     "simplify.method": (Method, typer.Option(help="Simplification method.")),

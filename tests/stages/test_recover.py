@@ -4,7 +4,7 @@ import itertools
 import json
 import math
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from g2ard.errors import InputError
+from g2ard.errors import DeviceError, InputError
 from g2ard.rendering.renderer import Renderer
 from g2ard.rendering.targets import Subset, TeacherRenders
 from g2ard.rendering.visibility import visibility
@@ -24,10 +24,13 @@ from g2ard.stages.evaluate import evaluate
 from g2ard.stages.recover import RecoverConfig, loop, probe, recover, trials
 from g2ard.stages.recover import checkpoint as checkpoint_module
 from g2ard.stages.recover.anchors import REGULARIZERS, Anchors
+from g2ard.stages.recover.fused_engine import FusedEngine
 from g2ard.stages.recover.guard import Guard, blended
 from g2ard.stages.recover.report import outcome
 from g2ard.stages.recover.schedule import TUNED
 from g2ard.stages.simplify import simplify
+from g2ard.system import devices
+from helpers.gpus import skip_without_gpu
 from helpers.interruptions import press_ctrl_c_at
 from helpers.scenes import around, assert_same_bits, checkered_ball, under_a_sky
 from helpers.threads import on_threads
@@ -48,6 +51,20 @@ def student() -> Splats:
     return simplify(TEACHER, 500, method="paper").splats  # leaves recovery more to do than the default
 
 
+@pytest.fixture
+def engine(request: pytest.FixtureRequest) -> Iterator[str]:
+    """An engine by its name, or "gpu": the fused engine's on the GPU."""
+    if request.param != "gpu":
+        yield request.param
+        return
+    skip_without_gpu()
+    devices.use("gpu")
+    yield "fused"
+    notes = devices.notes()
+    devices.use("cpu")
+    assert notes == []
+
+
 @pytest.mark.parametrize("engine", ["fused", "torch"])
 def test_recovery_lifts_unseen_views(student: Splats, targets: TeacherRenders, engine: Any) -> None:
     result = recover(student, targets, RecoverConfig(steps=150, engine=engine))
@@ -61,13 +78,62 @@ def test_recovery_lifts_unseen_views(student: Splats, targets: TeacherRenders, e
     assert result.report.regularizers.steps == 1
 
 
-def test_both_engines_take_the_same_steps(student: Splats, targets: TeacherRenders) -> None:
-    fused, torch = (recover(student, targets, RecoverConfig(steps=60, engine=e)) for e in ("fused", "torch"))
+@pytest.mark.parametrize("engine", ["fused", "gpu"], indirect=True)
+def test_engines_take_the_same_steps(student: Splats, targets: TeacherRenders, engine: Any) -> None:
+    fused, torch = (recover(student, targets, RecoverConfig(steps=60, engine=e)) for e in (engine, "torch"))
     assert abs(fused.report.psnr.after - torch.report.psnr.after) < 0.005
     for name in ("means", "scales", "logit_opacities", "sh0", "shN"):
         ours, theirs = getattr(fused.splats, name), getattr(torch.splats, name)
         moved = np.linalg.norm(ours - getattr(student.with_sh_degree(fused.splats.sh_degree), name))
         assert np.linalg.norm(ours - theirs) < 1e-2 * moved, name
+
+
+@pytest.mark.parametrize("engine", ["gpu"], indirect=True)
+def test_the_gpu_recovers_like_the_cpu(student: Splats, targets: TeacherRenders, engine: Any) -> None:
+    config = RecoverConfig(steps=60, regularizers=replace(REGULARIZERS["noisy"], period=10))
+    there = recover(student, targets, config)
+    assert devices.state().served == 1  # no trials
+    again = recover(student, targets, config)
+    assert_same_bits(there.splats, again.splats)
+    devices.use("cpu")
+    here = recover(student, targets, config)
+    assert here.report.psnr.before == there.report.psnr.before
+    assert abs(here.report.psnr.after - there.report.psnr.after) < 0.02
+    unseen = TeacherRenders(TEACHER, around(7, (80, 60), 2.5))
+    assert abs(evaluate(here.splats, unseen).psnr - evaluate(there.splats, unseen).psnr) < 0.02
+
+
+@pytest.mark.parametrize("call", [4, 70, 140], ids=["in a trial", "early", "late"])
+@pytest.mark.parametrize("saved", [False, True])
+def test_if_a_device_fails_the_steps_since_the_last_checkpoint_are_repeated(
+    student: Splats,
+    targets: TeacherRenders,
+    saved: bool,
+    call: int,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    config = RecoverConfig(steps=110)
+    calls, step = [0], FusedEngine.step
+
+    def counted(self: FusedEngine, *args: Any, **kwargs: Any) -> float:
+        calls[0] += 1
+        if calls[0] == call:
+            raise DeviceError("the device was lost")
+        return step(self, *args, **kwargs)
+
+    monkeypatch.setattr(FusedEngine, "step", counted)
+    monkeypatch.setattr(checkpoint_module, "PERIOD", 0.0)
+    checkpoint = tmp_path / "c.npz" if saved else None
+    found = recover(student, targets, config, checkpoint=checkpoint)
+    failed, call, calls[0] = calls[0], 0, 0
+    whole = recover(student, targets, config)
+    assert_same_bits(whole.splats, found.splats)
+    assert whole.report.loss == found.report.loss
+    assert found.report.resumed is None
+    assert found.report.geometry == whole.report.geometry
+    in_trial = failed - calls[0] <= 25
+    assert in_trial if saved else failed > calls[0]
 
 
 def test_same_bits_from_run_to_run_and_for_any_threads(student: Splats, targets: TeacherRenders) -> None:
@@ -83,8 +149,9 @@ def test_same_bits_from_run_to_run_and_for_any_threads(student: Splats, targets:
         ("fused", 40, None),
         ("torch", 40, None),
         ("fused", 110, None),
-        *((e, 40, UNEVEN) for e in ("fused", "torch")),
+        *((e, 40, UNEVEN) for e in ("fused", "torch", "gpu")),
     ],
+    indirect=["engine"],
 )
 def test_an_interrupted_run_resumes_to_the_same_bits(
     student: Splats, targets: TeacherRenders, engine: Any, steps: int, weights: Any, tmp_path: Path
@@ -195,7 +262,7 @@ def test_both_engines_limit_the_same_gaussians(student: Splats, targets: Teacher
     assert np.linalg.norm(fused.means - student.means) < 0.8 * np.linalg.norm(free.means - student.means)
 
 
-@pytest.mark.parametrize("engine", ["fused", "torch"])
+@pytest.mark.parametrize("engine", ["fused", "torch", "gpu"], indirect=True)
 def test_gaussians_behind_a_mask_do_not_change(student: Splats, engine: Any) -> None:
     kept = 20  # columns that count
 

@@ -1,7 +1,8 @@
-"""The fused trainer does what rasterize + l1_ssim + torch's Adam do, to rounding; sparse and resumable."""
+"""The fused trainer, on CPU and GPU, does what rasterize + l1_ssim + torch's Adam do, sparsely."""
 
 import copy
 import math
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,8 @@ from g2ard.stages.recover.extent import extents, share_of_rate
 from g2ard.stages.recover.losses import TorchAnchors, l1_ssim, regularization
 from g2ard.stages.recover.rasterize import rasterize
 from g2ard.stages.recover.schedule import Rates
+from g2ard.system import devices
+from helpers.gpus import skip_without_gpu
 from helpers.raster_cases import NAMES, Params, camera, scene, splats_of, tensors_of
 
 RATES = {"means": 2e-3, "quats": 1e-2, "log_scales": 2e-2, "logit_opacities": 5e-2, "sh0": 2e-2, "shN": 2e-3}
@@ -30,7 +33,25 @@ def arrays(p: Params) -> tuple[NDArray[np.float32], ...]:
     return tuple(p[k] for k in NAMES)
 
 
-def trainer_of(p: Params, units: NDArray[np.float32] | None = None, isa: str | None = None) -> _core.Trainer:
+CPU = _core.instruction_sets()[0]
+every_isa = pytest.mark.parametrize("on", [*_core.instruction_sets(), "gpu"])
+on_both = pytest.mark.parametrize("on", [CPU, "gpu"])
+
+
+@pytest.fixture(scope="module", autouse=True)
+def gpu() -> Iterator[None]:
+    """Use the GPU for trainers without an instruction set."""
+    devices.use("gpu")
+    yield
+    assert devices.notes() == [] or not devices.adapters()
+    devices.use("cpu")
+
+
+def trainer_of(p: Params, units: NDArray[np.float32] | None = None, on: str = CPU) -> _core.Trainer:
+    """A trainer on the GPU, or on the CPU by an instruction set."""
+    if on == "gpu":
+        skip_without_gpu()
+    isa = None if on == "gpu" else on
     return _core.Trainer(arrays(p), Photometric(SETTINGS, BACKGROUND, 0.2), units, isa)
 
 
@@ -137,12 +158,12 @@ def assert_close(
         assert np.linalg.norm(a - want[name]) < 0.1 * moved, name
 
 
-@pytest.mark.parametrize("isa", _core.instruction_sets())
+@every_isa
 @pytest.mark.parametrize("degree", [0, 2, 3])
-def test_steps_are_torch_s(degree: int, isa: str) -> None:
+def test_steps_are_torch_s(degree: int, on: str) -> None:
     p, cameras, targets = problem(degree=degree)
     units = np.exp(p["log_scales"]).max(1)
-    trainer, twin = trainer_of(p, units, isa), Twin(p, units)
+    trainer, twin = trainer_of(p, units, on), Twin(p, units)
     for i in range(6):
         loss, updated = step(trainer, cameras[i % 3], targets[i % 3])
         want = twin.step(cameras[i % 3], targets[i % 3])
@@ -152,10 +173,10 @@ def test_steps_are_torch_s(degree: int, isa: str) -> None:
     assert trainer.skipped == 0
 
 
-@pytest.mark.parametrize("isa", _core.instruction_sets())
+@every_isa
 @pytest.mark.parametrize(("reach", "finest"), [(3.0, 0.0), (6.0, 2.0), (math.inf, 2.0)])
 def test_what_a_view_shows_too_large_or_cannot_resolve_moves_less(
-    isa: str, reach: float, finest: float
+    on: str, reach: float, finest: float
 ) -> None:
     p, cameras, targets = problem()
     p["log_scales"][::7] += 2
@@ -163,14 +184,14 @@ def test_what_a_view_shows_too_large_or_cannot_resolve_moves_less(
     sizes = {"reach": None if math.isinf(reach) else reach, "finest": finest}
     shares = naive_shares(p, cameras[0], reach, finest)
     assert all(np.ptp(np.quantile(share, [0.05, 0.95])) > 0.5 for share in shares.values())
-    trainer, twin = trainer_of(p, isa=isa), Twin(p)
+    trainer, twin = trainer_of(p, on=on), Twin(p)
     for i in range(6):
         step(trainer, cameras[i % 3], targets[i % 3], **sizes)
         twin.step(cameras[i % 3], targets[i % 3], reach=reach, finest=finest)
     assert_close(trainer.arrays(), twin.p, p, to=2e-2)
-    free = trainer_of(p, isa=isa)
+    free = trainer_of(p, on=on)
     step(free, cameras[0], targets[0])
-    limited = trainer_of(p, isa=isa)
+    limited = trainer_of(p, on=on)
     step(limited, cameras[0], targets[0], **sizes)
     for name, a, b in zip(NAMES, limited.arrays(), free.arrays(), strict=True):
         if name in shares:  # the first step of Adam is the rate itself
@@ -194,7 +215,8 @@ def test_sizes_on_the_screen_are_the_naive_ones() -> None:
     np.testing.assert_allclose(found[ahead], want["log_scales"][ahead.numpy()], rtol=1e-4, atol=1e-12)
 
 
-def test_dense_steps_are_torch_optim_s() -> None:
+@on_both
+def test_dense_steps_are_torch_optim_s(on: str) -> None:
     """Sparse Adam equals `torch.optim.Adam` if every Gaussian is in view."""
     p, cameras, targets = problem(n=60)
     p["means"] *= 0.5
@@ -206,7 +228,7 @@ def test_dense_steps_are_torch_optim_s() -> None:
     mine = tensors_of(copy.deepcopy(p))  # the optimiser writes into them
     groups = [{"params": [m], "lr": RATES[k]} for k, m in zip(NAMES, mine, strict=True)]
     adam = torch.optim.Adam(groups, betas=(0.9, 0.999), eps=1e-15)
-    trainer = trainer_of(p)
+    trainer = trainer_of(p, on=on)
     for _ in range(4):
         adam.zero_grad()
         image, _, _ = rasterize(*mine, cameras[0], 0, background=BACKGROUND)
@@ -218,10 +240,11 @@ def test_dense_steps_are_torch_optim_s() -> None:
     assert_close(trainer.arrays(), want, p, to=2e-2)
 
 
-def test_untouched_gaussians_do_not_move() -> None:
+@on_both
+def test_untouched_gaussians_do_not_move(on: str) -> None:
     p, cameras, targets = problem()
     p["means"][:50] += 100
-    trainer = trainer_of(p)
+    trainer = trainer_of(p, on=on)
     for _ in range(3):
         _, updated = step(trainer, cameras[0], targets[0])
         assert updated <= 150
@@ -230,24 +253,26 @@ def test_untouched_gaussians_do_not_move() -> None:
     assert not np.array_equal(trainer.arrays()[0][50:], p["means"][50:])
 
 
-def test_relative_steps_descend_the_logarithm_of_the_loss() -> None:
+@on_both
+def test_relative_steps_descend_the_logarithm_of_the_loss(on: str) -> None:
     p, (view, *_), (target, *_) = problem()
-    plain, relative = trainer_of(p), trainer_of(p)
+    plain, relative = trainer_of(p, on=on), trainer_of(p, on=on)
     loss, _ = plain.step(view_of(view, 0, SETTINGS), target, Rates(**RATES))
     assert relative.step(view_of(view, 0, SETTINGS), target, Rates(**RATES), relative=0.02)[0] == loss
     want = plain.state()["first"] * np.float32(0.02 / loss)
     np.testing.assert_allclose(relative.state()["first"], want, rtol=1e-3, atol=1e-3 * np.abs(want).max())
 
 
-def test_resume_is_bitwise() -> None:
+@on_both
+def test_resume_is_bitwise(on: str) -> None:
     p, cameras, targets = problem()
-    straight = trainer_of(p, np.full(200, 0.5, np.float32))
+    straight = trainer_of(p, np.full(200, 0.5, np.float32), on)
     for i in range(6):
         step(straight, cameras[i % 3], targets[i % 3])
         if i == 2:
             state = copy.deepcopy(straight.state())
             middle = dict(zip(NAMES, straight.arrays(), strict=True))
-    resumed = trainer_of(middle)
+    resumed = trainer_of(middle, on=on)
     resumed.load(state)
     for i in range(3, 6):
         step(resumed, cameras[i % 3], targets[i % 3])
@@ -266,7 +291,8 @@ def test_resume_is_bitwise() -> None:
         Regularizers(0, 3, True, thickness=0.0),
     ],
 )
-def test_regularizers_are_torch_s(weights: Regularizers) -> None:
+@on_both
+def test_regularizers_are_torch_s(weights: Regularizers, on: str) -> None:
     """The step follows the summed gradient, from a scene with needles that has left its anchors."""
     p, cameras, targets = problem(n=100, degree=0)
     anchors = Anchors.of(splats_of(p))
@@ -280,7 +306,7 @@ def test_regularizers_are_torch_s(weights: Regularizers) -> None:
     def extra(q: dict[str, torch.Tensor]) -> torch.Tensor:
         return regularization(q["means"], q["quats"], q["log_scales"], torch_anchors, weights)
 
-    trainer, twin = trainer_of(p), Twin(p)
+    trainer, twin = trainer_of(p, on=on), Twin(p)
     trainer.anchor(anchors.means, np.ascontiguousarray(anchors.frames), anchors.r_parallel, anchors.r_perp)
     for i in range(3):
         step(trainer, cameras[i], targets[i], weights)
@@ -293,28 +319,30 @@ def test_regularizers_are_torch_s(weights: Regularizers) -> None:
         assert error < 2e-3, f"{name}: {error}"
 
 
-def test_gradients_that_are_not_finite_are_skipped_and_counted() -> None:
+@on_both
+def test_gradients_that_are_not_finite_are_skipped_and_counted(on: str) -> None:
     p, cameras, targets = problem(n=50)
     target = targets[0].copy()
     target[20, 28] = np.nan
-    trainer = trainer_of(p)
+    trainer = trainer_of(p, on=on)
     _, updated = step(trainer, cameras[0], target)
     assert trainer.skipped > 0
     assert updated + trainer.skipped <= 50
     assert all(np.isfinite(a).all() for a in trainer.arrays())
 
 
-def test_bad_input_is_named() -> None:
+@on_both
+def test_bad_input_is_named(on: str) -> None:
     p, cameras, targets = problem(n=10)
     with pytest.raises(InputError, match="target: expected 6720 values"):
-        step(trainer_of(p), cameras[0], targets[0][:5])
+        step(trainer_of(p, on=on), cameras[0], targets[0][:5])
     with pytest.raises(InputError, match="anchors set before"):
-        step(trainer_of(p), cameras[0], targets[0], Regularizers(1.0, 1.0, True))
+        step(trainer_of(p, on=on), cameras[0], targets[0], Regularizers(1.0, 1.0, True))
     with pytest.raises(InputError, match=r"reach: .* above 0"):
-        step(trainer_of(p), cameras[0], targets[0], reach=0.0)
+        step(trainer_of(p, on=on), cameras[0], targets[0], reach=0.0)
     with pytest.raises(InputError, match="units: expected 10 values"):
-        trainer_of(p, np.ones(9, np.float32))
-    state = trainer_of(p).state()
+        trainer_of(p, np.ones(9, np.float32), on)
+    state = trainer_of(p, on=on).state()
     state["order"][:] = 0
     with pytest.raises(InputError, match="order: expected a permutation"):
-        trainer_of(p).load(state)
+        trainer_of(p, on=on).load(state)

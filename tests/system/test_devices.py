@@ -17,16 +17,19 @@ from g2ard.io import read_splats, write_splats, write_views
 from g2ard.poses import make_pool
 from g2ard.rendering.metrics import psnr
 from g2ard.rendering.renderer import Renderer
+from g2ard.rendering.targets import TeacherRenders
 from g2ard.rendering.visibility import visibility_source
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
+from g2ard.stages.recover import RecoverConfig, recover
 from g2ard.stages.select import surface, visible_cells
 from g2ard.stages.simplify import Simplified, flag, simplify
 from g2ard.system import devices
 from helpers.commands import CommandLine, refused, succeeds
+from helpers.gpus import skip_without_gpu
 from helpers.project import ROOT
 from helpers.realdata import real
-from helpers.scenes import around, checkered_ball
+from helpers.scenes import around, assert_same_bits, checkered_ball
 
 SEEN_ALIKE = 0.999
 """Share of (view, cell) that must agree."""
@@ -38,12 +41,7 @@ DECIBELS = 0.05
 @pytest.fixture
 def gpu() -> Iterator[None]:
     """Use the GPU, software ones too. Skip without one, unless the environment requires it."""
-    found = devices.adapters()
-    if not found:
-        why = "this build has no GPU kernels" if found is None else "no adapter"
-        if os.environ.get("G2ARD_REQUIRE_GPU") == "1":
-            pytest.fail(f"{why}, but G2ARD_REQUIRE_GPU=1 is set")
-        pytest.skip(f"{why}; install Mesa's lavapipe (mesa-vulkan-drivers)" if found == [] else why)
+    skip_without_gpu()
     devices.use("gpu")
     yield
     devices.use("cpu")
@@ -200,6 +198,34 @@ def test_failures_are_reported_at_once(capsys: pytest.CaptureFixture, gpu: None)
     assert capsys.readouterr().err.startswith("GPU: ")
     run.progress("simplify", 2, 2)
     assert "GPU" not in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("most", [64, 40_000, 200_000], ids=["to open", "for a scene", "for a view"])
+def test_recovery_continues_on_the_cpu_if_a_gpu_has_no_room(most: int, gpu: None) -> None:
+    ball = checkered_ball(300)
+    targets, config = TeacherRenders(ball, around(4)), RecoverConfig(steps=5)
+    devices.use("cpu")
+    want = recover(ball, targets, config)
+    _core.set_device("gpu", most)
+    found = recover(ball, targets, config)
+    assert len(devices.notes()) == 1
+    assert_same_bits(want.splats, found.splats)
+    assert want.report.loss == found.report.loss
+
+
+def test_recover_says_that_the_gpu_took_its_steps(
+    tmp_path: Path, command_line: CommandLine, gpu: None
+) -> None:
+    write_splats(tmp_path / "a.ply", checkered_ball(300))
+    write_splats(tmp_path / "b.ply", checkered_ball(200))
+    write_views(tmp_path / "v.json", around(4))
+    run = ("recover", "b.ply", "--teacher", "a.ply", "--views", "v.json", "--steps", 4, "-w", "-v")
+    told = {
+        device: succeeds(command_line, tmp_path, *run, "-o", f"{device}.ply", "--device", device).err
+        for device in ("cpu", "gpu")
+    }
+    assert "on the CPU" not in told["gpu"]
+    assert ("GPU: 1 kernel" in told["gpu"], "GPU: " in told["cpu"]) == (True, False)
 
 
 @pytest.mark.parametrize("kilobytes", [600_000, 3_000_000])

@@ -23,8 +23,9 @@ class FitConfig(Settings):
         ssim_weight: λ in (1−λ)·L1 + λ·(1−SSIM); 0.2 as in 3DGS.
         background: RGB behind the scene.
         seed: seed of the order of views.
-        engine: "fused" runs whole steps in Rust; "torch" uses autograd over the Rust rasteriser and
-            `SelectiveAdam`, with equal results up to rounding; "gsplat" is the same on an NVIDIA GPU.
+        engine: "fused" runs whole steps in Rust, or on the GPU in use; "torch" uses autograd over the Rust
+            rasteriser and `SelectiveAdam`, with equal results up to rounding; "gsplat" is the same on an
+            NVIDIA GPU.
 
     Raises:
         InputError: a value out of range.

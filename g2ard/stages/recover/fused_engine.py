@@ -1,4 +1,4 @@
-"""Engine that runs whole steps in Rust: forward, loss, backward, regularisers and sparse Adam."""
+"""Engine that runs whole steps in Rust or on a GPU: forward, loss, backward, regularisers and sparse Adam."""
 
 from dataclasses import replace
 from typing import Any
@@ -15,7 +15,10 @@ from g2ard.stages.recover.sizes import radii
 
 
 class FusedEngine:
-    """Engine equivalent to `TorchEngine` up to rounding."""
+    """Engine equivalent to `TorchEngine` up to rounding, on the device in use (`system.devices`).
+
+    Its state is the same on every device. After a `DeviceError` new engines run on the CPU.
+    """
 
     def __init__(self, objective: Objective) -> None:
         self._objective = objective

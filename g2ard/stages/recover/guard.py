@@ -209,8 +209,7 @@ class Guard:
         for name in _STATE:
             setattr(self, name, meta[name])
         best_arrays = {name: arrays.pop(_BEST + name) for name in ARRAYS if _BEST + name in arrays}
-        if best_arrays:
-            self.best = replace(self.start, **best_arrays)
+        self.best = replace(self.start, **best_arrays) if best_arrays else self.start
 
     def meta(self) -> dict[str, Any]:
         """Return the state that a checkpoint stores besides the best scene."""

@@ -1,18 +1,20 @@
 """Steps of one recovery, the choice of rates before them, and checkpoints."""
 
+import copy
 import hashlib
 import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 import g2ard.stages.recover.checkpoint as checkpoints
 from g2ard.config.choices import ENGINES
-from g2ard.errors import InputError, require_torch
+from g2ard.errors import DeviceError, InputError, require_torch
 from g2ard.progress import Progress, silent
 from g2ard.rendering.renderer import settings_for
 from g2ard.rendering.targets import Targets, fingerprint_of, mask_of
@@ -139,7 +141,11 @@ class Loop:
             frozen=self.frozen,
             relative=len(self.targets.cameras.usual()) < len(self.targets.cameras),
         )
-        return _engine_class(config.engine)(objective)
+        engine_class = _engine_class(config.engine)
+        try:
+            return engine_class(objective)
+        except DeviceError:  # from now on it is the CPU's
+            return engine_class(objective)
 
     def choose_rates(self, start: float) -> None:
         """Choose reach and multiplier: the schedule's, or from the initial error and short trials.
@@ -183,11 +189,14 @@ class Loop:
     def _trial(self, multiplier: float, steps: int, end: float) -> float:
         """Return the PSNR after a few steps from the start; raise TimeoutError at `end` (monotonic)."""
         engine = self._new_engine()
-        for step in range(steps):
-            if time.monotonic() > end:
-                raise TimeoutError
-            self._learn(engine, step, step / steps, multiplier)
-        return self.probe.all_of(engine.splats())
+        try:
+            for step in range(steps):
+                if time.monotonic() > end:
+                    raise TimeoutError
+                self._learn(engine, step, step / steps, multiplier)
+            return self.probe.all_of(engine.splats())
+        except DeviceError:
+            return self._trial(multiplier, steps, end)
 
     def _learn(
         self, engine: Engine, step: int, share: float, multiplier: float, *, regularize: bool = False
@@ -198,10 +207,29 @@ class Loop:
         target, mask = self.targets[view], mask_of(self.targets, view)
         return engine.step(view, target, rates, regularize=regularize, mask=mask)
 
-    def run(self, checkpoint: Path | None, progress: Progress, stage: str, watch: Watch | None) -> None:
-        """Take all steps, after those of a checkpoint if it exists."""
+    def run(self, checkpoint: Path | None, progress: Progress, stage: str, watch: Watch | None) -> Splats:
+        """Take all steps, after those of a checkpoint if it exists; return the scene.
+
+        If a GPU fails, the CPU continues from the last checkpoint, or from the start.
+        """
         if checkpoint is not None and checkpoint.exists():
             self._resume(checkpoint)
+        start = copy.deepcopy(self._meta())
+        while True:
+            try:
+                self._run(checkpoint, progress, stage, watch)
+                return self.engine.splats()
+            except DeviceError:  # `system.devices.notes` has the reason
+                del self.engine
+                seconds, resumed = self.seconds, self.resumed
+                if checkpoint is not None and checkpoint.exists():
+                    self._resume(checkpoint)
+                else:
+                    self._restore(copy.deepcopy(start), {"losses": np.zeros(0)})
+                self.seconds, self.resumed = seconds, resumed
+
+    def _run(self, checkpoint: Path | None, progress: Progress, stage: str, watch: Watch | None) -> None:
+        """Take the remaining steps."""
         earlier, began, saved = self.seconds, time.monotonic(), time.monotonic()
         with checkpoints.deferred_interrupt() as interrupted:
             while self._used_share() < 1 and self.guard.stopped is None:
@@ -296,19 +324,26 @@ class Loop:
             self._epoch = epoch, drawn(self.config.seed, epoch, count, self.weights)
         return int(self._epoch[1][position])
 
+    def _meta(self) -> dict[str, Any]:
+        """Return everything that a checkpoint stores besides arrays."""
+        return {name: getattr(self, name) for name in _CHECKPOINT_FIELDS} | {"guard": self.guard.meta()}
+
     def _save(self, path: Path) -> None:
-        meta = {name: getattr(self, name) for name in _CHECKPOINT_FIELDS} | {"guard": self.guard.meta()}
         arrays = {**self.engine.state(), "losses": np.array(self.losses), **self.guard.arrays()}
-        checkpoints.save(path, self.key, meta, arrays)
+        checkpoints.save(path, self.key, self._meta(), arrays)
 
     def _resume(self, path: Path) -> None:
         meta, arrays = checkpoints.load(path, self.key)
+        self._restore(meta, arrays)
+        self.engine.load(arrays)
+        self.resumed = self.seconds
+
+    def _restore(self, meta: dict[str, Any], arrays: dict[str, Any]) -> None:
+        """Restore all but the engine, whose arrays remain in `arrays`."""
         self.losses = arrays.pop("losses").tolist()
         self.guard.load(meta["guard"], arrays)
-        self.engine.load(arrays)
         for name in _CHECKPOINT_FIELDS:
             setattr(self, name, meta[name])
-        self.resumed = self.seconds
 
 
 def finite(reach: float) -> float | None:

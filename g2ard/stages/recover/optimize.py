@@ -123,14 +123,15 @@ def recover(
 
     guard = Guard(probe.all_of, student, before, others, harmful, config.schedule.guarded)
     validation_key = None if validation is None else fingerprint_of(validation)
+    end = result = student
+    after, blend = before, 1.0
     loop = Loop(student, targets, config, view_weights, anchors, probe, guard, validation_key, frozen)
     if not exact:
         if checkpoint is None or not checkpoint.exists():
             progress(stage, 0, 0, {})
             loop.choose_rates(before)
-        loop.run(checkpoint, progress, stage, watch)
-    end = student if exact else loop.engine.splats()
-    result, after, blend = (student, before, 1.0) if exact else guard.choose_by_training(end)
+        end = loop.run(checkpoint, progress, stage, watch)
+        result, after, blend = guard.choose_by_training(end)
     prior_views: float | None = 0.0
     if result is end and validation is not None:
         result, prior_views = guard.choose_by_validation(end, loop.views_seen, loop.done)

@@ -27,6 +27,9 @@ pub enum Error {
     /// A loop would never end: what should hold of its input does not.
     #[error("{0}: this is a bug in g2ard")]
     Stuck(&'static str),
+    /// A device other than the CPU failed; the work continues on the CPU.
+    #[error("{0}")]
+    Device(String),
     /// The caller asked to stop (see [`crate::Control`]).
     #[error("interrupted")]
     Interrupted,
@@ -46,12 +49,7 @@ impl Error {
     }
 
     /// Check that `name` has as many `what` (rows or values) as expected.
-    pub(crate) fn unless_equal(
-        name: &'static str,
-        got: usize,
-        expected: usize,
-        what: &str,
-    ) -> Result<()> {
+    pub fn unless_equal(name: &'static str, got: usize, expected: usize, what: &str) -> Result<()> {
         refuse!(got != expected => name, format!("{expected} {what}"), got);
         Ok(())
     }

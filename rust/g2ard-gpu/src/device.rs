@@ -4,15 +4,16 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
 
 use g2ard_core::raster::visibility::{VisibilityAccumulator, VisibilityKernels};
-use g2ard_core::raster::{Camera, Settings};
+use g2ard_core::raster::{Camera, Params, Settings};
 use g2ard_core::select::{Gaussians, Surface, ViewKernels};
 use g2ard_core::simplify::{Group, GroupKernels, Merged};
 use g2ard_core::spatial::Cells;
+use g2ard_core::train::{Store, Train, TrainKernels};
 use g2ard_core::{Backend, Control, Cpu, Result, Splats};
 
 use crate::rows::{Rows, Run};
 use crate::runtime::{self, Error, Gpu, Options, guarded, lock};
-use crate::{groups, probe, visibility, voxels};
+use crate::{groups, probe, train, visibility, voxels};
 
 #[cfg(test)]
 mod tests;
@@ -28,8 +29,9 @@ pub enum Choice {
     Auto,
 }
 
-/// Smallest number of rows for which opening a device pays.
+/// Smallest number of rows for which opening a device pays, for one pass over them and for training.
 const WORTH_OPENING: usize = 200_000;
+const WORTH_TRAINING: usize = 10_000;
 
 /// A backend that runs GPU kernels. After a device fails, it uses the CPU and does not retry.
 #[derive(Debug, Default)]
@@ -37,6 +39,8 @@ pub struct Device {
     choice: Choice,
     options: Options,
     state: Mutex<State>,
+    /// The state for training, which may pay where single kernels do not, and fail alone.
+    training: Mutex<State>,
     notes: Mutex<Vec<String>>,
     /// Kernels that ran on the GPU.
     served: AtomicU64,
@@ -69,8 +73,12 @@ struct Opened {
 
 impl Opened {
     fn new(gpu: Gpu) -> Self {
+        Self::sharing(Arc::new(gpu))
+    }
+
+    fn sharing(gpu: Arc<Gpu>) -> Self {
         Self {
-            gpu: Some(Arc::new(gpu)),
+            gpu: Some(gpu),
             process: std::process::id(),
         }
     }
@@ -110,7 +118,8 @@ impl Device {
 
     /// The open device; None before the first kernel and on the CPU.
     pub fn gpu(&self) -> Option<Arc<Gpu>> {
-        lock(&self.state).gpu()
+        let kernels = lock(&self.state).gpu();
+        kernels.or_else(|| lock(&self.training).gpu())
     }
 
     /// The device for work on `rows` rows; opened on first use if the work is large enough.
@@ -152,7 +161,49 @@ impl Device {
         }
     }
 
-    fn note(&self, error: &Error) {
+    /// The device for training `rows` rows.
+    fn trains(&self, rows: usize) -> Option<Arc<Gpu>> {
+        let mut state = lock(&self.training);
+        if matches!(&*state, State::Open(opened) if opened.inherited()) {
+            self.note(&Error::Forked);
+            *state = State::Off;
+        }
+        if matches!(*state, State::Untried) {
+            let gpu = match self.choice {
+                Choice::Cpu => return None,
+                Choice::Auto if rows < WORTH_TRAINING => return None,
+                Choice::Auto => guarded(|| self.worth_training()).unwrap_or_else(|error| {
+                    self.note(&error);
+                    None
+                }),
+                Choice::Gpu => self.ready(rows),
+            };
+            *state = gpu.map_or(State::Off, |gpu| State::Open(Opened::sharing(gpu)));
+        }
+        state.gpu()
+    }
+
+    /// A real GPU that trains faster than the CPU.
+    fn worth_training(&self) -> runtime::Result<Option<Arc<Gpu>>> {
+        let opened = lock(&self.state).gpu();
+        let gpu = match opened {
+            Some(gpu) => gpu,
+            None => match Gpu::open(false, self.options) {
+                Ok(gpu) => Arc::new(gpu),
+                Err(Error::NoAdapter | Error::NoRoom { .. }) => return Ok(None),
+                Err(other) => return Err(other),
+            },
+        };
+        Ok(probe::training_pays(&gpu)?.then_some(gpu))
+    }
+
+    /// Train on the CPU from now on, because a trainer failed.
+    pub fn stop_training(&self, why: &str) {
+        self.note(&why);
+        *lock(&self.training) = State::Off;
+    }
+
+    fn note(&self, error: &impl std::fmt::Display) {
         let line = format!("GPU: {error}; goes on on the CPU");
         let mut notes = lock(&self.notes);
         if !notes.contains(&line) {
@@ -250,6 +301,26 @@ impl VisibilityKernels for Device {
             }
         }
         Cpu.add_views(sums, cameras, settings, control)
+    }
+}
+
+impl TrainKernels for Device {
+    fn trainer(&self, params: &Params, units: Option<&[f32]>) -> Result<Box<dyn Train>> {
+        params.validate()?;
+        let Some(gpu) = self.trains(params.len()) else {
+            return Cpu.trainer(params, units);
+        };
+        let start = Store::new(params, units)?.export();
+        match guarded(|| train::Trainer::new(gpu, &start, params.sh_coeffs)) {
+            Ok(trainer) => {
+                self.served.fetch_add(1, Ordering::Relaxed);
+                Ok(Box::new(trainer))
+            }
+            Err(error) => {
+                self.stop_training(&error.to_string());
+                Cpu.trainer(params, units)
+            }
+        }
     }
 }
 

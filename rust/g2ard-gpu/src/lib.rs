@@ -12,6 +12,7 @@ mod scan;
 mod sort;
 #[cfg(test)]
 mod testing;
+mod train;
 mod two;
 mod visibility;
 mod voxels;

@@ -1,14 +1,17 @@
-//! A check that a device computes correctly, and a race against the CPU.
+//! A check that a device computes correctly, and races against the CPU.
 
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use g2ard_core::random::Lcg;
+use g2ard_core::raster::{Camera, Params, Settings};
 use g2ard_core::simplify::GroupKernels;
+use g2ard_core::train::{Rates, StepInput, Store, Train, TrainKernels};
 use g2ard_core::{Control, Cpu, Splats};
 
-use crate::groups;
 use crate::rows::Rows;
 use crate::runtime::{Error, Gpu, Result};
+use crate::{groups, train};
 
 /// Groups of the check, groups of the race, and rows per group.
 const FEW: usize = 128;
@@ -31,6 +34,94 @@ pub fn pays(gpu: &Gpu) -> Result<bool> {
     check(gpu)?;
     let (here, there) = race(gpu, MANY)?;
     Ok(here.as_secs_f64() > PAYS * there.as_secs_f64())
+}
+
+/// Rows, pixels and steps of the race of trainers.
+const TRAINED: usize = 20_000;
+const SIZE: [usize; 2] = [640, 480];
+const STEPS: usize = 4;
+
+/// Largest relative difference of their losses.
+const LOSS_TOLERANCE: f64 = 1e-3;
+
+/// Check that the device trains as the CPU does, and faster once its kernels are compiled.
+pub fn training_pays(gpu: &Arc<Gpu>) -> Result<bool> {
+    let (here, there) = race_of_trainers(gpu, TRAINED, SIZE)?;
+    Ok(here.as_secs_f64() > PAYS * there.as_secs_f64())
+}
+
+/// Seconds of the CPU and of the device for the same steps.
+fn race_of_trainers(gpu: &Arc<Gpu>, rows: usize, size: [usize; 2]) -> Result<(Duration, Duration)> {
+    let mut random = Lcg(2);
+    let mut draw = |columns: usize, low: f64, high: f64| -> Vec<f32> {
+        (0..columns * rows)
+            .map(|_| random.between(low, high) as f32)
+            .collect()
+    };
+    let params = Params {
+        means: &draw(3, -1.0, 1.0),
+        quats: &draw(4, 0.1, 1.0),
+        log_scales: &draw(3, -5.0, -3.0),
+        logit_opacities: &draw(1, -2.0, 4.0),
+        sh0: &draw(3, -1.0, 1.0),
+        sh_n: &[],
+        sh_coeffs: 1,
+    };
+    let start = Store::new(&params, None)?.export();
+    let mut there = train::Trainer::new(gpu.clone(), &start, params.sh_coeffs)?;
+    let (want, here) = steps(&mut *Cpu.trainer(&params, None)?, size)?;
+    let (got, there) = steps(&mut there, size)?;
+    let apart = (want - got).abs();
+    if apart > LOSS_TOLERANCE * want || apart.is_nan() {
+        return Err(Error::Wrong(gpu.adapter.name.clone()));
+    }
+    Ok((here, there))
+}
+
+/// The last loss of a few steps, and the time of all but the first.
+fn steps(trainer: &mut dyn Train, [width, height]: [usize; 2]) -> Result<(f64, Duration)> {
+    let mut random = Lcg(3);
+    let target: Vec<f32> = (0..3 * width * height)
+        .map(|_| random.uniform_f32())
+        .collect();
+    let camera = Camera {
+        viewmat: [
+            [1.0, 0.0, 0.0, 0.0],
+            [0.0, 1.0, 0.0, 0.0],
+            [0.0, 0.0, 1.0, 2.0],
+        ],
+        fx: width as f64,
+        fy: width as f64,
+        cx: width as f64 / 2.0,
+        cy: height as f64 / 2.0,
+        width,
+        height,
+        near: 0.01,
+    };
+    let input = StepInput {
+        camera: &camera,
+        settings: Settings::default(),
+        background: [0.0; 3],
+        target: &target,
+        mask: None,
+        ssim_weight: 0.2,
+        relative: None,
+        rates: Rates {
+            means: 1e-3,
+            sh0: 0.01,
+            ..Rates::default()
+        },
+        reach: None,
+        finest: 0.0,
+        regularizers: None,
+    };
+    trainer.step(&input)?;
+    let began = Instant::now();
+    let mut loss = 0.0;
+    for _ in 1..STEPS {
+        loss = trainer.step(&input)?.loss;
+    }
+    Ok((loss, began.elapsed()))
 }
 
 /// Seconds of the CPU and of the device for the same groups.
@@ -84,5 +175,6 @@ mod tests {
     fn software_is_right() {
         let Some(gpu) = gpu() else { return };
         check(&gpu).unwrap();
+        race_of_trainers(&Arc::new(gpu), 500, [64, 48]).unwrap();
     }
 }

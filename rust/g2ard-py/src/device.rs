@@ -26,6 +26,16 @@ pub fn kernels() -> Arc<Kernels> {
     chosen.clone().unwrap_or_default()
 }
 
+/// Train on the CPU from now on, because a device's trainer failed.
+#[cfg(feature = "gpu")]
+pub fn stop_training(why: &str) {
+    kernels().stop_training(why);
+}
+
+/// No other device trains in this build.
+#[cfg(not(feature = "gpu"))]
+pub fn stop_training(_why: &str) {}
+
 /// Choose cpu, gpu or auto for all kernels from now on. For tests, `max_binding` limits the bytes bound at once;
 /// `timed` measures the time of every kernel.
 #[cfg(feature = "gpu")]

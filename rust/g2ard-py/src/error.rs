@@ -5,15 +5,15 @@ use pyo3::exceptions::{PyKeyboardInterrupt, PyRuntimeError};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 
-/// `InvalidInput` and `NonFinite` → `g2ard.errors.InputError`; `Interrupted` → `KeyboardInterrupt`; others →
-/// `RuntimeError`.
+/// `InvalidInput` and `NonFinite` → `g2ard.errors.InputError`; `Device` → `DeviceError`; `Interrupted` →
+/// `KeyboardInterrupt`; others → `RuntimeError`.
 pub fn to_py(error: Error) -> PyErr {
     if error == Error::Interrupted {
         return PyKeyboardInterrupt::new_err(());
     }
     Python::attach(|py| {
-        let input = input_error(py, &error).ok().flatten();
-        input.unwrap_or_else(|| PyRuntimeError::new_err(error.to_string()))
+        let known = known_error(py, &error).ok().flatten();
+        known.unwrap_or_else(|| PyRuntimeError::new_err(error.to_string()))
     })
 }
 
@@ -26,8 +26,9 @@ pub fn invalid(
     to_py(Error::invalid(name, expected, got))
 }
 
-/// An `InputError` whose `parameter` is the field at fault, and whose `index` its first row that is not finite.
-fn input_error(py: Python<'_>, error: &Error) -> PyResult<Option<PyErr>> {
+/// An exception of `g2ard.errors`. The `parameter` of an `InputError` is the field at fault, its `index` the first row
+/// that is not finite.
+fn known_error(py: Python<'_>, error: &Error) -> PyResult<Option<PyErr>> {
     let fields = PyDict::new(py);
     let message = match error {
         Error::InvalidInput {
@@ -47,9 +48,14 @@ fn input_error(py: Python<'_>, error: &Error) -> PyResult<Option<PyErr>> {
             fields.set_item("index", first_index)?;
             format!("is the first of {count} with a non-finite value")
         }
+        Error::Device(why) => why.clone(),
         Error::Stuck(_) | Error::Interrupted => return Ok(None),
     };
-    let class = py.import("g2ard.errors")?.getattr("InputError")?;
+    let name = match error {
+        Error::Device(_) => "DeviceError",
+        _ => "InputError",
+    };
+    let class = py.import("g2ard.errors")?.getattr(name)?;
     Ok(Some(PyErr::from_value(
         class.call((message,), Some(&fields))?,
     )))

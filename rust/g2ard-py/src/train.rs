@@ -2,8 +2,10 @@
 
 use g2ard_core::raster::{Camera, Settings};
 use g2ard_core::train::{
-    Attribute, Biases, Exported, Rates, Regularizers, StepInput, Trainer, step_rows,
+    Attribute, Biases, Exported, Rates, Regularizers, StepInput, Train, TrainKernels, Trainer,
+    step_rows,
 };
+use g2ard_core::{Error, Result};
 use numpy::{
     IntoPyArray, PyArray1, PyArrayDyn, PyArrayMethods, PyReadonlyArray1, PyReadonlyArray2,
     PyReadonlyArray3, PyReadwriteArray1, PyReadwriteArrayDyn,
@@ -14,6 +16,7 @@ use std::sync::{Mutex, PoisonError};
 
 use crate::arrays::{flat, optional};
 use crate::constants::Config;
+use crate::device::{kernels, stop_training};
 use crate::error::{invalid, to_py};
 use crate::raster::{Arrays, Floats, isa_named};
 use crate::views::{RasterOptions, View};
@@ -74,8 +77,18 @@ pub struct PyTrainer {
 }
 
 struct Trained {
-    inner: Trainer,
+    inner: Box<dyn Train>,
+    rows: usize,
+    sh_coeffs: usize,
     skipped: usize,
+}
+
+/// Let the CPU train from now on if the error is a device's.
+fn noted<T>(result: Result<T>) -> Result<T> {
+    if let Err(Error::Device(why)) = &result {
+        stop_training(why);
+    }
+    result
 }
 
 impl PyTrainer {
@@ -99,6 +112,7 @@ impl PyTrainer {
 
 #[pymethods]
 impl PyTrainer {
+    /// A trainer on the device in use, or on the CPU with the instruction set `isa`.
     #[new]
     #[pyo3(signature = (arrays, objective, units = None, isa = None))]
     fn new(
@@ -108,12 +122,21 @@ impl PyTrainer {
         units: Option<Floats<'_>>,
         isa: Option<&str>,
     ) -> PyResult<Self> {
-        let isa = isa_named(isa)?;
+        let isa = isa.map(|name| isa_named(Some(name))).transpose()?;
         let units = optional("units", &units)?;
         let params = arrays.params()?;
-        let inner = work::quick(py, || Trainer::new(&params, units, isa))?;
+        let inner = work::quick(py, || match isa {
+            Some(isa) => Ok(Box::new(Trainer::new(&params, units, isa)?) as Box<dyn Train>),
+            None => kernels().trainer(&params, units),
+        })?;
+        let trained = Trained {
+            inner,
+            rows: params.len(),
+            sh_coeffs: params.sh_coeffs,
+            skipped: 0,
+        };
         Ok(Self {
-            trained: Mutex::new(Trained { inner, skipped: 0 }),
+            trained: Mutex::new(trained),
             settings: objective.settings.settings()?,
             background: objective.background,
             ssim_weight: objective.ssim_weight,
@@ -137,6 +160,7 @@ impl PyTrainer {
         work::locked(py, &self.trained)
             .inner
             .set_anchors(means, frames, r_parallel, r_perp)
+            .or_else(|error| noted(Err(error)))
             .map_err(to_py)
     }
 
@@ -144,7 +168,7 @@ impl PyTrainer {
     fn freeze(&self, py: Python<'_>, frozen: PyReadonlyArray1<'_, bool>) -> PyResult<()> {
         let frozen = flat("frozen", &frozen)?;
         let mut trained = work::locked(py, &self.trained);
-        trained.inner.freeze(frozen).map_err(to_py)
+        noted(trained.inner.freeze(frozen)).map_err(to_py)
     }
 
     /// Take one step; return (photometric loss before it, Gaussians moved). `mask`: where the loss counts.
@@ -173,7 +197,7 @@ impl PyTrainer {
         };
         let mut trained = work::locked(py, &self.trained);
         let inner = &mut trained.inner;
-        let report = work::quick(py, || inner.step(&input))?;
+        let report = work::quick(py, || noted(inner.step(&input)))?;
         trained.skipped += report.skipped;
         Ok((report.loss, report.updated))
     }
@@ -181,8 +205,8 @@ impl PyTrainer {
     /// Return the six parameter arrays, rows in the caller's order.
     fn arrays<'py>(&self, py: Python<'py>) -> PyResult<Vec<Bound<'py, PyArrayDyn<f32>>>> {
         let trained = work::locked(py, &self.trained);
-        let store = trained.inner.store();
-        let (n, rest) = (store.len(), store.sh_coeffs() - 1);
+        let (n, rest) = (trained.rows, trained.sh_coeffs - 1);
+        let values = work::quick(py, || noted(trained.inner.values()))?;
         let shapes = [
             vec![n, 3],
             vec![n, 4],
@@ -192,16 +216,21 @@ impl PyTrainer {
             vec![n, rest, 3],
         ];
         let starts = [0, 3, 7, 10, 11, 14, 14 + 3 * rest];
+        let columns = |at: &[usize]| -> Vec<f32> {
+            let rows = values.chunks_exact(14 + 3 * rest);
+            rows.flat_map(|row| &row[at[0]..at[1]]).copied().collect()
+        };
         shapes
             .into_iter()
             .zip(starts.windows(2))
-            .map(|(shape, at)| PyArray1::from_vec(py, store.columns(at[0], at[1])).reshape(shape))
+            .map(|(shape, at)| PyArray1::from_vec(py, columns(at)).reshape(shape))
             .collect()
     }
 
     /// Return everything that a bitwise resume needs: a dict of arrays.
     fn state<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
-        let state = work::locked(py, &self.trained).inner.store().export();
+        let trained = work::locked(py, &self.trained);
+        let state = work::quick(py, || noted(trained.inner.export()))?;
         let dict = [
             ("values", state.values.into_pyarray(py)),
             ("first", state.first.into_pyarray(py)),
@@ -225,7 +254,7 @@ impl PyTrainer {
             order: vector(state, "order")?,
         };
         let mut trained = work::locked(py, &self.trained);
-        trained.inner.import(&state).map_err(to_py)
+        noted(trained.inner.import(&state)).map_err(to_py)
     }
 
     /// Number of Gaussian steps skipped since the start because a gradient was not finite.

@@ -8,12 +8,12 @@ use crate::raster::project::{RowGradients, unproject};
 use crate::raster::rasterizer::ChunkSums;
 use crate::raster::simd::{Kernel, LANES, Lanes, Lanes16, Mask};
 
-pub(super) const BETA1: f64 = 0.9;
-pub(super) const BETA2: f64 = 0.999;
+pub const BETA1: f64 = 0.9;
+pub const BETA2: f64 = 0.999;
 /// Under the root of the second moment; `selective_adam.py` has the same.
-pub(super) const EPSILON: f32 = 1e-15;
+pub const EPSILON: f32 = 1e-15;
 /// Beyond this the square of a gradient leaves f32: such a row is skipped as not finite.
-pub(super) const GRADIENT_MAX: f32 = 1e18;
+pub const GRADIENT_MAX: f32 = 1e18;
 
 /// 1/(1 − β₁ᵗ) and 1/√(1 − β₂ᵗ) for each count of steps t, worked out in f64.
 #[derive(Debug, Default)]
@@ -32,6 +32,13 @@ impl Biases {
                 (1.0 / bias(BETA2).sqrt()) as f32,
             ]);
         }
+    }
+
+    /// The pairs of every count of steps up to the last one that differs from 1, and one more.
+    pub fn table() -> Vec<[f32; 2]> {
+        let mut biases = Self::default();
+        biases.extend_to(UNBIASED);
+        biases.0
     }
 
     pub(super) fn of(&self, steps: usize) -> [f32; 2] {

@@ -23,12 +23,42 @@ constants! {
     }
 }
 
-/// First rows of a block's attributes: the mean, the frame row by row, 1/r∥ and 1/r⊥; and their number.
+/// First places of an anchor's values: the mean, the frame row by row, 1/r∥ and 1/r⊥; and their number.
 const MEAN: usize = 0;
 const FRAME: usize = 3;
 const PARALLEL: usize = 12;
 const PERP: usize = 13;
 const ROWS: usize = 14;
+
+/// The values of each anchor: its mean, its frame row by row, 1/r∥ and 1/r⊥. `order[i]` is the caller's row of row i.
+pub fn anchor_rows(
+    order: &[u32],
+    means: &[f32],
+    frames: &[f32],
+    r_parallel: &[f32],
+    r_perp: &[f32],
+) -> Result<Vec<[f32; ROWS]>> {
+    let n = order.len();
+    for (name, got, expected) in [
+        ("anchor means", means.len(), 3 * n),
+        ("anchor frames", frames.len(), 9 * n),
+        ("r_parallel", r_parallel.len(), n),
+        ("r_perp", r_perp.len(), n),
+    ] {
+        Error::unless_equal(name, got, expected, "values")?;
+    }
+    let row = |&from: &u32| {
+        let from = from as usize;
+        let mut values = [0.0; ROWS];
+        values[MEAN..FRAME].copy_from_slice(&means[3 * from..][..3]);
+        values[FRAME..PARALLEL].copy_from_slice(&frames[9 * from..][..9]);
+        // The reciprocal, not its square: 1/r² of a 1e-20 thin disc leaves f32.
+        values[PARALLEL] = 1.0 / r_parallel[from];
+        values[PERP] = 1.0 / r_perp[from];
+        values
+    };
+    Ok(order.iter().map(row).collect())
+}
 
 /// Frozen geometry of N Gaussians in the trainer's order.
 #[derive(Debug, Clone)]
@@ -46,32 +76,17 @@ impl Anchors {
         r_parallel: &[f32],
         r_perp: &[f32],
     ) -> Result<Self> {
-        let n = order.len();
-        for (name, got, expected) in [
-            ("anchor means", means.len(), 3 * n),
-            ("anchor frames", frames.len(), 9 * n),
-            ("r_parallel", r_parallel.len(), n),
-            ("r_perp", r_perp.len(), n),
-        ] {
-            Error::unless_equal(name, got, expected, "values")?;
-        }
-        let mut blocks = vec![Lanes16::default(); n.div_ceil(LANES) * ROWS];
-        for (row, from) in order.iter().enumerate() {
-            let from = *from as usize;
+        let rows = anchor_rows(order, means, frames, r_parallel, r_perp)?;
+        let mut blocks = vec![Lanes16::default(); rows.len().div_ceil(LANES) * ROWS];
+        for (row, values) in rows.iter().enumerate() {
             let block = &mut blocks[row / LANES * ROWS..][..ROWS];
-            for k in 0..3 {
-                block[MEAN + k].0[row % LANES] = means[3 * from + k];
+            for (lanes, value) in block.iter_mut().zip(values) {
+                lanes.0[row % LANES] = *value;
             }
-            for k in 0..9 {
-                block[FRAME + k].0[row % LANES] = frames[9 * from + k];
-            }
-            // The reciprocal, not its square: 1/r² of a 1e-20 thin disc leaves f32.
-            block[PARALLEL].0[row % LANES] = 1.0 / r_parallel[from];
-            block[PERP].0[row % LANES] = 1.0 / r_perp[from];
         }
         Ok(Self {
             blocks,
-            count: n as f32,
+            count: rows.len() as f32,
         })
     }
 

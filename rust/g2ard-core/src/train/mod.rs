@@ -12,8 +12,8 @@ mod store;
 #[cfg(test)]
 mod tests;
 
-pub use adam::Biases;
-pub use anchors::{Anchors, Regularizers};
+pub use adam::{BETA1, BETA2, Biases, EPSILON, GRADIENT_MAX};
+pub use anchors::{Anchors, Regularizers, anchor_rows};
 pub use row_major::{Attribute, step_rows};
 pub use store::{Exported, Store};
 
@@ -23,11 +23,11 @@ use crate::raster::rasterizer::ChunkSums;
 use crate::raster::simd::{LANES, dispatch};
 use crate::raster::{Camera, Image, ImageGradients, Isa, Params, Rasterizer, Settings};
 use crate::ssim::{Loss, Mask, Shape};
-use crate::{Error, Result};
+use crate::{Cpu, Error, Result};
 use adam::Update;
 
 /// Smaller losses, about 40 dB, are hardly visible.
-const LEAST_LOSS: f32 = 0.005;
+pub const LEAST_LOSS: f32 = 0.005;
 
 /// Adam's learning rate of each attribute.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
@@ -68,6 +68,32 @@ pub struct StepInput<'a> {
     pub regularizers: Option<Regularizers>,
 }
 
+impl StepInput<'_> {
+    /// Check the view, the target's size and the options; `anchored`: whether anchors were set.
+    pub fn validate(&self, anchored: bool) -> Result<()> {
+        self.camera.validate()?;
+        self.settings.validate()?;
+        let shape = self.shape();
+        Error::unless_equal("target", self.target.len(), shape.values(), "values")?;
+        if let Some(reach) = self.reach {
+            refuse!(!(reach > 0.0 && reach.is_finite()) => "reach", "pixels, more than 0", reach);
+        }
+        refuse!(!(self.finest >= 0.0 && self.finest.is_finite()) => "finest", "pixels, at least 0", self.finest);
+        refuse!(self.regularizers.is_some() && !anchored => "regularizers", "anchors set before", "none");
+        let pixels = shape.height * shape.width;
+        let counts = self.mask.map_or(pixels, <[bool]>::len);
+        Error::unless_equal("mask", counts, pixels, "values")
+    }
+
+    fn shape(&self) -> Shape {
+        Shape {
+            height: self.camera.height,
+            width: self.camera.width,
+            channels: 3,
+        }
+    }
+}
+
 /// The outcome of a step.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct Report {
@@ -77,6 +103,45 @@ pub struct Report {
     pub updated: usize,
     /// Gaussians left alone because a gradient was not finite.
     pub skipped: usize,
+}
+
+/// A trainer on the processor or on another device. Rows are numbered as the caller numbers them.
+pub trait Train: Send + Sync {
+    /// One step; with [`Error::Device`] it must go on elsewhere, from its last export.
+    fn step(&mut self, input: &StepInput) -> Result<Report>;
+
+    /// Parameters in the layout of [`Exported::values`].
+    fn values(&self) -> Result<Vec<f32>>;
+
+    /// Everything that [`Train::import`] needs.
+    fn export(&self) -> Result<Exported>;
+
+    /// Restore an earlier export; training then continues bit for bit, except on another device.
+    fn import(&mut self, state: &Exported) -> Result<()>;
+
+    /// Rows that no step changes.
+    fn freeze(&mut self, frozen: &[bool]) -> Result<()>;
+
+    /// Set the surface that [`StepInput::regularizers`] pull the Gaussians to: means 3 values each, frames 9, radii 1.
+    fn set_anchors(
+        &mut self,
+        means: &[f32],
+        frames: &[f32],
+        r_parallel: &[f32],
+        r_perp: &[f32],
+    ) -> Result<()>;
+}
+
+/// Makes trainers on a device.
+pub trait TrainKernels {
+    /// `units`: factor of each Gaussian's rate of the mean; `None` means 1.
+    fn trainer(&self, params: &Params, units: Option<&[f32]>) -> Result<Box<dyn Train>>;
+}
+
+impl TrainKernels for Cpu {
+    fn trainer(&self, params: &Params, units: Option<&[f32]>) -> Result<Box<dyn Train>> {
+        Ok(Box::new(Trainer::new(params, units, Isa::detect())?))
+    }
 }
 
 /// Parameters, Adam's moments, and buffers of a step.
@@ -118,21 +183,6 @@ impl Trainer {
         &self.store
     }
 
-    /// Restores an earlier [`Store::export`]; training then continues bit for bit.
-    pub fn import(&mut self, state: &Exported) -> Result<()> {
-        self.store.import(state)?;
-        self.mark_free();
-        Ok(())
-    }
-
-    /// Rows that no step changes, as the caller numbers them.
-    pub fn freeze(&mut self, frozen: &[bool]) -> Result<()> {
-        Error::unless_equal("frozen", frozen.len(), self.store.len(), "rows")?;
-        self.frozen = frozen.to_vec();
-        self.mark_free();
-        Ok(())
-    }
-
     fn mark_free(&mut self) {
         let frozen = &self.frozen;
         self.free = match frozen.iter().any(|&f| f) {
@@ -147,54 +197,10 @@ impl Trainer {
         };
     }
 
-    /// Sets the surface that [`StepInput::regularizers`] pull the Gaussians to. Rows as the caller numbers them: means 3 values
-    /// each, frames 9, radii 1.
-    pub fn set_anchors(
-        &mut self,
-        means: &[f32],
-        frames: &[f32],
-        r_parallel: &[f32],
-        r_perp: &[f32],
-    ) -> Result<()> {
-        self.anchors = Some(Anchors::new(
-            self.store.order(),
-            means,
-            frames,
-            r_parallel,
-            r_perp,
-        )?);
-        Ok(())
-    }
-
-    /// Renders the view, finds the loss and its gradients, and takes one Adam step.
-    pub fn step(&mut self, input: &StepInput) -> Result<Report> {
-        let loss = self.photometric_loss(input)?;
-        let (updated, skipped) = self.adam_step(input);
-        Ok(Report {
-            loss,
-            updated,
-            skipped,
-        })
-    }
-
     /// Renders the view; returns its loss against the target, and leaves the gradient.
     fn photometric_loss(&mut self, input: &StepInput) -> Result<f64> {
-        let camera = input.camera;
-        camera.validate()?;
-        input.settings.validate()?;
-        let shape = Shape {
-            height: camera.height,
-            width: camera.width,
-            channels: 3,
-        };
-        Error::unless_equal("target", input.target.len(), shape.values(), "values")?;
-        if let Some(reach) = input.reach
-            && !(reach > 0.0 && reach.is_finite())
-        {
-            return Err(Error::invalid("reach", "pixels, more than 0", reach));
-        }
-        refuse!(!(input.finest >= 0.0 && input.finest.is_finite()) => "finest", "pixels, at least 0", input.finest);
-        refuse!(input.regularizers.is_some() && self.anchors.is_none() => "regularizers", "anchors set before", "none");
+        input.validate(self.anchors.is_some())?;
+        let (camera, shape) = (input.camera, input.shape());
         self.image.resize(shape.values(), 0.0);
         self.gradient.resize(shape.values(), 0.0);
         self.alpha.resize(camera.width * camera.height, 0.0);
@@ -259,5 +265,50 @@ impl Trainer {
         let (updated, skipped) = chunks.iter().fold((0, 0), |t, c| (t.0 + c.0, t.1 + c.1));
         self.store.count_step();
         (updated, skipped)
+    }
+}
+
+impl Train for Trainer {
+    fn step(&mut self, input: &StepInput) -> Result<Report> {
+        let loss = self.photometric_loss(input)?;
+        let (updated, skipped) = self.adam_step(input);
+        Ok(Report {
+            loss,
+            updated,
+            skipped,
+        })
+    }
+
+    fn values(&self) -> Result<Vec<f32>> {
+        Ok(self.store.columns(0, self.store.attributes()))
+    }
+
+    fn export(&self) -> Result<Exported> {
+        Ok(self.store.export())
+    }
+
+    fn import(&mut self, state: &Exported) -> Result<()> {
+        self.store.import(state)?;
+        self.mark_free();
+        Ok(())
+    }
+
+    fn freeze(&mut self, frozen: &[bool]) -> Result<()> {
+        Error::unless_equal("frozen", frozen.len(), self.store.len(), "rows")?;
+        self.frozen = frozen.to_vec();
+        self.mark_free();
+        Ok(())
+    }
+
+    fn set_anchors(
+        &mut self,
+        means: &[f32],
+        frames: &[f32],
+        r_parallel: &[f32],
+        r_perp: &[f32],
+    ) -> Result<()> {
+        let order = self.store.order();
+        self.anchors = Some(Anchors::new(order, means, frames, r_parallel, r_perp)?);
+        Ok(())
     }
 }

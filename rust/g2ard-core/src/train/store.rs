@@ -43,6 +43,37 @@ pub struct Exported {
     pub order: Vec<u32>,
 }
 
+impl Exported {
+    /// Check the lengths, and that `order` is a permutation.
+    pub fn validate(&self, rows: usize, attributes: usize) -> Result<()> {
+        let (n, all) = (rows, rows * attributes);
+        for (name, got, expected) in [
+            ("values", self.values.len(), all),
+            ("first moments", self.first.len(), all),
+            ("second moments", self.second.len(), all),
+            ("units", self.units.len(), n),
+            ("steps", self.steps.len(), n),
+            ("order", self.order.len(), n),
+        ] {
+            Error::unless_equal(name, got, expected, "values")?;
+        }
+        let mut seen = vec![false; n];
+        for row in &self.order {
+            match seen.get_mut(*row as usize) {
+                Some(s) if !*s => *s = true,
+                _ => {
+                    return Err(Error::invalid(
+                        "order",
+                        "a permutation",
+                        format!("{row} twice or too large"),
+                    ));
+                }
+            }
+        }
+        Ok(())
+    }
+}
+
 impl Store {
     /// Copies the parameters in Morton order, with moments of 0. `units` are factors of the means' rate, 1 by default.
     pub fn new(params: &Params, units: Option<&[f32]>) -> Result<Self> {
@@ -161,30 +192,8 @@ impl Store {
 
     /// Restores an exported store of as many rows and attributes, including its order.
     pub fn import(&mut self, state: &Exported) -> Result<()> {
-        let (n, all) = (self.rows, self.rows * self.attributes());
-        for (name, got, expected) in [
-            ("values", state.values.len(), all),
-            ("first moments", state.first.len(), all),
-            ("second moments", state.second.len(), all),
-            ("units", state.units.len(), n),
-            ("steps", state.steps.len(), n),
-            ("order", state.order.len(), n),
-        ] {
-            Error::unless_equal(name, got, expected, "values")?;
-        }
-        let mut seen = vec![false; n];
-        for row in &state.order {
-            match seen.get_mut(*row as usize) {
-                Some(s) if !*s => *s = true,
-                _ => {
-                    return Err(Error::invalid(
-                        "order",
-                        "a permutation",
-                        format!("{row} twice or too large"),
-                    ));
-                }
-            }
-        }
+        state.validate(self.rows, self.attributes())?;
+        let n = self.rows;
         self.order.clone_from(&state.order);
         let [mut values, mut first, mut second] =
             [&self.values, &self.first, &self.second].map(|v| vec![Lanes16::default(); v.len()]);
