@@ -39,7 +39,7 @@ COLUMNS: dict[str, Column] = {
     "format": Column(str, "", "file format, or another program's"),
     "matcher": Column(str, "", "see RegisterConfig"),
     "start": Column(str, "", "kind of start of a registration"),
-    "isa": Column(str, "", "instruction set"),
+    "isa": Column(str, "", "instruction set, or adapter"),
     "threads": Column(int, "d", "number of threads"),
     "seed": Column(int, "d", "seed of the cell"),
     "draw": Column(int, None, "which of several random subsets"),

@@ -10,6 +10,8 @@ from g2ard import _core
 from g2ard.io import write_splats
 from g2ard.rendering.renderer import render
 from g2ard.scene.splats import Splats
+from g2ard.system import devices
+from helpers.gpus import skip_without_gpu
 from helpers.studies import measured
 
 
@@ -35,6 +37,18 @@ def test_figures_hang_together(tmp_path: Path) -> None:
         assert row["total_ms"] > 0
         assert row["contributing"] > 1000
     assert len({row["contributing"] for row in rows}) == 1
+
+
+def test_a_gpu_is_measured_beside_the_cpu(tmp_path: Path) -> None:
+    skip_without_gpu()
+    write_splats(tmp_path / "cloud.ply", cloud())
+    options = {"counts": "500", "image": "48,32", "repeats": "2"}
+    rows = measured("gpu", SceneSpec("cloud", str(tmp_path / "cloud.ply")), tmp_path / "out", **options)
+    adapters = devices.adapters()
+    assert adapters
+    assert [row["isa"] for row in rows] == [_core.instruction_sets()[0], f"gpu: {adapters[0].name}"]
+    assert all(row["total_ms"] > 0 for row in rows)
+    assert devices.state().served == 0
 
 
 def test_the_built_in_view_sees_the_scene() -> None:
