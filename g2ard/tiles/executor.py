@@ -1,5 +1,6 @@
 """Executors of tasks: this process, processes of this machine, or a Dask cluster."""
 
+import concurrent.futures
 import os
 import signal
 import threading
@@ -99,14 +100,14 @@ def executor(
     """
     forget_workers()
     threads = threads or max(1, (os.cpu_count() or 1) // workers)
-    if scheduler:
-        with _dask_client(scheduler, workers) as client:
-            yield partial(_run_on_dask, client, threads)
-    elif workers == 1:
+    if workers == 1 and not scheduler:
         yield _run_here
-    else:
-        with closing(_Processes(workers, threads)) as processes:
-            yield processes.run
+        return
+    with ExitStack() as opened:
+        pool: Any = partial(ProcessPoolExecutor, workers, get_context("spawn"), _begin)
+        if scheduler:
+            pool = partial(_dask_client(scheduler, workers, opened).get_executor, pure=False)
+        yield opened.enter_context(closing(_Pool(pool, threads))).run
 
 
 def _run_here(tasks: Sequence[Task], told: Told) -> None:
@@ -115,20 +116,21 @@ def _run_here(tasks: Sequence[Task], told: Told) -> None:
         told(task, 1.0)
 
 
-class _Processes:
-    """A pool of processes, recreated after one of them is killed."""
+class _Pool:
+    """A pool of processes or of Dask's workers, opened again after one of them is killed.
 
-    def __init__(self, workers: int, threads: int):
-        self._workers, self._threads = workers, threads
-        self._pool: ProcessPoolExecutor | None = None
+    Results are paths and the workers' memory, because Dask cannot spill what workers hold in Rust's memory.
+    """
+
+    def __init__(self, opened: Callable[[], concurrent.futures.Executor], threads: int):
+        self._opened, self._threads = opened, threads
+        self._pool: concurrent.futures.Executor | None = None
 
     def run(self, tasks: Sequence[Task], told: Told) -> None:
         _sweep(tasks)
-        if self._pool is None:
-            context = get_context("spawn")
-            self._pool = ProcessPoolExecutor(self._workers, context, _begin, (self._threads,))
+        self._pool = self._pool or self._opened()
         try:
-            futures = {self._pool.submit(_run_noted, task): task for task in tasks}
+            futures = {self._pool.submit(_work, task, self._threads): task for task in tasks}
             pending = set(futures)
             while pending:  # wait briefly: Ctrl-C does not end a longer wait on Windows
                 done, pending = wait(pending, timeout=0.2, return_when=FIRST_COMPLETED)
@@ -138,16 +140,19 @@ class _Processes:
                 for future in pending:
                     if future.running():
                         told(futures[future], futures[future].share)
-        except BrokenProcessPool:
+        except Exception as error:
             self.close()
-            raise WorkerDiedError from None
+            if isinstance(error, BrokenProcessPool) or type(error).__name__ == "KilledWorker":
+                raise WorkerDiedError from None
+            raise
 
     def close(self) -> None:
+        """Cancel what is left, and kill the processes of this pool."""
         if self._pool is None:
             return
-        processes = list((self._pool._processes or {}).values())
+        processes = list((getattr(self._pool, "_processes", None) or {}).values())
         manager: threading.Thread | None = getattr(self._pool, "_executor_manager_thread", None)
-        self._pool.shutdown(wait=False, cancel_futures=True)
+        self._pool.shutdown(wait=False)
         for process in processes:
             with suppress(OSError, ValueError):
                 process.kill()
@@ -165,17 +170,17 @@ def _sweep(tasks: Sequence[Task]) -> None:
             begun.rmdir() if begun.is_dir() else begun.unlink(missing_ok=True)
 
 
-def _run_noted(task: Task) -> tuple[int, int | None]:
+def _work(task: Task, threads: int) -> tuple[int, int | None]:
     """Run a task in a worker; return the worker's process ID and its peak memory."""
+    _core.set_num_threads(threads)
     run_task(task)
     return os.getpid(), peak_rss()
 
 
-def _begin(threads: int) -> None:
+def _begin() -> None:
     """Initialise a worker: leave Ctrl-C to the parent, and exit when the parent dies."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
-    _core.set_num_threads(threads)
 
 
 def _end_with_parent() -> None:
@@ -185,53 +190,26 @@ def _end_with_parent() -> None:
     os._exit(1)
 
 
-@contextmanager
-def _dask_client(scheduler: str, workers: int) -> Iterator[Any]:
-    """Connect to a Dask scheduler, or start one on this machine."""
+def _dask_client(scheduler: str, workers: int, opened: ExitStack) -> Any:
+    """Connect to a Dask scheduler, or start one on this machine; `opened` closes both."""
     try:
         from distributed import Client, LocalCluster
     except ImportError:
         raise missing("Dask", "distributed", parameter="scheduler") from None
-    with ExitStack() as opened:
-        if scheduler == "local":
-            cluster = LocalCluster(  # type: ignore[no-untyped-call]
-                n_workers=workers,
-                threads_per_worker=1,
-                processes=True,
-                dashboard_address=None,
-                memory_limit=0,
-            )
-            scheduler = opened.enter_context(closing(cluster)).scheduler_address
-        try:
-            client = Client(scheduler, timeout="10s", set_as_default=False)  # type: ignore[no-untyped-call]
-        except (OSError, TimeoutError, ValueError) as error:
-            raise InputError(
-                f"--scheduler {scheduler}: no answer ({error}); start one with `dask scheduler`, which "
-                "prints its address"
-            ) from None
-        yield opened.enter_context(closing(client))
-
-
-def _run_on_dask(client: Any, threads: int, tasks: Sequence[Task], told: Told) -> None:
-    """Run tasks on workers that see the same files under the same paths.
-
-    Results are paths, because Dask cannot spill what workers hold in Rust's memory.
-    """
-    from distributed import KilledWorker, as_completed
-
-    by_key = {f"g2ard-{task.key}": task for task in tasks}
-    futures = [client.submit(_work, task, threads, key=key, pure=True) for key, task in by_key.items()]
+    if scheduler == "local":
+        cluster = LocalCluster(  # type: ignore[no-untyped-call]
+            n_workers=workers,
+            threads_per_worker=1,
+            processes=True,
+            dashboard_address=None,
+            memory_limit=0,
+        )
+        scheduler = opened.enter_context(closing(cluster)).scheduler_address
     try:
-        for future in as_completed(futures, loop=client.loop):  # type: ignore[no-untyped-call]
-            future.result()
-            told(by_key[future.key], 1.0)
-    except BaseException as error:
-        client.cancel(futures, force=True)
-        if isinstance(error, KilledWorker):
-            raise WorkerDiedError from None
-        raise
-
-
-def _work(task: Task, threads: int) -> str:
-    _core.set_num_threads(threads)
-    return str(run_task(task))
+        client = Client(scheduler, timeout="10s", set_as_default=False)  # type: ignore[no-untyped-call]
+    except (OSError, TimeoutError, ValueError) as error:
+        raise InputError(
+            f"--scheduler {scheduler}: no answer ({error}); start one with `dask scheduler`, which "
+            "prints its address"
+        ) from None
+    return opened.enter_context(closing(client))
