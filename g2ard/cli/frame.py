@@ -133,7 +133,6 @@ class Run:
         self.noted = False  # whether a GPU failed
         self._adapter: str | None = None  # last adapter in use
         self.kept: list[str] = []  # outputs and checkpoints that remain, for messages of errors and Ctrl-C
-        self.unfinished: str | None = None  # what else Ctrl-C leaves
         self._failed: str | None = None  # what an error ended after the scene was written
         given = (*options.values(), common["config"])
         paths = [p for value in given for p in (value if isinstance(value, list) else [value])]
@@ -540,8 +539,7 @@ def _execute(run: Run, fn: Callable[..., None], options: dict[str, Any], cuda: b
         with run.console, _device(run):
             fn(run, **options)
     except KeyboardInterrupt:
-        left = [run.unfinished, *run.kept] if run.unfinished else run.kept
-        run.console.error(f"interrupted; {'; '.join(left) or 'nothing was written'}")
+        run.console.error(f"interrupted; {'; '.join(run.kept) or 'nothing was written'}")
         raise typer.Exit(interrupt.status()) from None
     except (G2ardError, OSError, MemoryError) as e:
         run.console.error(run.failure(one_line(e, run.flags)))

@@ -26,7 +26,7 @@ from g2ard.io.atomic import atomic_output, check_output, drop_empty, drop_tempor
 from g2ard.io.jsonfile import read_json
 from g2ard.io.lock import check_unlocked, locked
 from g2ard.io.paths import file_identity
-from g2ard.io.reports import plain
+from g2ard.io.reports import Report, plain
 from g2ard.io.scene_formats import FORMATS
 from g2ard.io.types import ViewSet
 from g2ard.jobs.budget import DEVICES, Budget
@@ -74,26 +74,23 @@ class RunFolder:
         self._scored = path / "scored.json"  # if some scored views are not in views.json
         self._inputs: dict[str, Any] = {}  # identity of each file that this run reads
 
-    @property
-    def is_done(self) -> bool:
-        """Whether --resume finds a finished run."""
-        return self.scene.exists() and is_finished(self._run, self.work, self._resume, self._report)
-
-    def check(self, budget: Budget) -> None:
-        """Raise an `OutputError` unless the run may write here."""
+    def check(self, budget: Budget) -> dict[str, Any] | None:
+        """Return the report of a finished run if --resume finds one; raise an `OutputError` unless the run
+        may write here."""
         self._run.spare_inputs(self.scene, *self._other_scenes(), self._simplified, self._views, self._scored)
         check_unlocked(self.path)
         left = left_at(self.work)
         killed = self.path.is_dir() and [path.name for path in self.path.iterdir()] == [_WORK_FOLDER]
-        if not left and not self.is_done and not killed:
+        done = self.scene.exists() and is_finished(self._run, self.work, self._resume, self._report)
+        if not left and not done and not killed:
             check_output(self.path, self._run.overwrite, folder=True)
         if left or not self._resume:
             check_stopped(self._run, self.work, self._resume, self.scene)
-        if self.is_done:
-            self._check_same(budget)
+        return self._finished(budget) if done else None
 
-    def _check_same(self, budget: Budget) -> None:
-        """Raise an `OutputError` if the finished run's budget, options or input files were others."""
+    def _finished(self, budget: Budget) -> dict[str, Any]:
+        """Return the finished run's report; raise an `OutputError` if its budget, options or input files were
+        others."""
         record = read_json(self._report)
         if others := _others(self._run, record, budget):
             raise OutputError(
@@ -105,11 +102,8 @@ class RunFolder:
             path = Path(name)
             if path.is_file() and file_identity([path]) != [known]:
                 raise finished_before(self.path, path)
-
-    def tell_finished(self) -> dict[str, Any]:
-        """Say that the run is finished, and return its report."""
         self._run.say(f"{self.path}: already finished; -w without --resume starts over")
-        return read_json(self._report)
+        return record
 
     @contextmanager
     def writing(self, photos: Iterable[Path] = ()) -> Iterator[None]:
@@ -144,26 +138,28 @@ class RunFolder:
                 (self.work / OPTIONS).write_text(text, encoding="utf-8", newline="\n")
                 yield
 
-    def write_scene(self, splats: Splats | TiledScene, *, compare: bool = False) -> None:
-        """Write the scene, and remove an earlier run's scenes in other formats and the pages about them.
+    def write(
+        self,
+        splats: Splats | TiledScene,
+        simplified: Splats | TiledScene,
+        views: RunViews,
+        *,
+        compare: bool = False,
+    ) -> None:
+        """Write the scene, with --keep the simplified one, and the views with their splits.
 
-        `compare` is that of `Run.write`.
+        An earlier run's scenes and the pages about them are removed. Generated views are also written in the
+        format of --views-format. `compare` is that of `Run.write`.
         """
         self._run.write(self.scene, splats, overwrite=True, compare=compare)
         pages = (self.path / name for name in ("report.json", "report.html", "preview.png", "view.html"))
         for other in (*self._other_scenes(), *pages):
             other.unlink(missing_ok=True)
-
-    def write_simplified(self, splats: Splats | TiledScene | None) -> None:
-        """Write the simplified scene; without one, remove an earlier run's."""
-        if splats is None:
+        if self._run.config["keep"]:
+            self._simplified.parent.mkdir(exist_ok=True)
+            self._run.write(self._simplified, simplified, overwrite=True)
+        else:
             self._simplified.unlink(missing_ok=True)
-            return
-        self._simplified.parent.mkdir(exist_ok=True)
-        self._run.write(self._simplified, splats, overwrite=True)
-
-    def write_views(self, views: RunViews) -> None:
-        """Write the run's views with their splits, generated ones also in the format of --views-format."""
         own = views.pool or views.train
         if "test" not in own.splits:
             splits = ("train",) * len(own.cameras) + ("test",) * len(views.test)
@@ -183,8 +179,8 @@ class RunFolder:
         scored = _joined(others, held_out)
         write_views(self._scored, scored, splits=["test"] * len(scored), overwrite=True)
 
-    def write_report(self, report: dict[str, Any]) -> None:
-        told = {**report, "config": self._run.config, "inputs": self._inputs}
+    def write_report(self, report: Report) -> None:
+        told = {**report.as_dict(), "config": self._run.config, "inputs": self._inputs}
         with self._run.finishing("report.json"), atomic_output(self._report, overwrite=True) as temporary:
             text = json.dumps(told, indent=2, default=plain)
             temporary.write_text(text + "\n", encoding="utf-8", newline="\n")
@@ -210,6 +206,14 @@ class RunFolder:
         shown = [(f"{name}: {plural(len(scene), 'Gaussian')}", stand.of(scene)) for name, scene in named]
         written = write_page(self._view, shown, start=stand.start, background=background, overwrite=True)
         return written.bytes, f"view: {self._view} ({written.bytes / 1e6:.2f} MB)"
+
+    def say_files(self, picture: str | None = None, page: str = "") -> None:
+        """Name the files, and record that the run is finished."""
+        scene = f"scene: {self.scene} ({self.scene.stat().st_size / 1e6:.2f} MB)"
+        shown = f"picture: {self.path / picture}" if picture else ""
+        report = f"report: {self.path / 'report.html'}, {self._report}"
+        self._run.say("\n".join(filter(None, (scene, shown, report, page))))
+        self._run.kept.append(f"{self.path} is finished")
 
     def _other_scenes(self) -> list[Path]:
         """Return the scene's file names in other formats."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from g2ard.cli.frame import Run
 from g2ard.io.scene_formats import FORMATS, scene_format, written_bytes
@@ -12,8 +12,7 @@ from g2ard.progress import plural
 if TYPE_CHECKING:
     from g2ard.jobs.budget import Budget
     from g2ard.jobs.measured_budget import ResolvedBudget
-    from g2ard.pipeline.distill import ViewsReport
-    from g2ard.report.kinds import KindScore
+    from g2ard.report.run import KindScore, RunReport, TiledReport, ViewsReport
     from g2ard.scene.splats import Splats
 
 _REPORTED_PSNR_LOSS, _REPORTED_SSIM_LOSS = 0.05, 0.001
@@ -23,62 +22,53 @@ _LEAST_REPORTED_SHARE = 0.005
 """Share of the scene too small to report."""
 
 
-def write_table(run: Run, report: dict[str, Any]) -> None:
-    """Print the scores by kind of view, under counts, sizes and times."""
-    from g2ard.report.kinds import COLUMNS, cells
+def write_table(run: Run, report: RunReport | TiledReport) -> None:
+    """Print the scores by kind of view."""
+    from g2ard.report.run import COLUMNS, cells
 
-    size = report["bytes"]
-    seconds = {name: value for name, value in report["seconds"].items() if name != "resumed"}
+    title = f"held-out views against {report.against}, {report.size}, simplified → recovered:"
+    run.console.table(title, list(COLUMNS), cells(report.kinds))
+
+
+def counts_line(report: RunReport) -> str:
+    """Return counts, sizes and times."""
+    size, packed = report.bytes, report.packed
+    seconds = {name: value for name, value in report.seconds.items() if name != "resumed"}
     times = ", ".join(f"{name} {value:.1f} s" for name, value in seconds.items())
-    count = report["input_count"]
-    before = plural(count, "point") if report["lifted"] else f"{count:,}"
-    made = f"{size['output'] / 1e6:.2f} MB as .ply"
-    if packed := report.get("packed"):
-        made = f"{size['file'] / 1e6:.2f} MB as .{packed['file'].partition('.')[2]}"
-    if report["photos"]:
-        before, sizes = plural(report["photos"], "photo"), made
-    else:
-        sizes = f"{size['input'] / 1e6:.2f} MB as .ply → {made}"
-    run.say(f"{before} → {plural(report['output_count'], 'Gaussian')}, {sizes}; {times}")
-    title = f"held-out views against {report['against']}, {report['size']}, simplified → recovered:"
-    run.console.table(title, list(COLUMNS), cells(report["kinds"]))
+    sizes = _megabytes(size["output"], ".ply") if packed is None else _megabytes(size["file"], packed.file)
+    if not report.photos:
+        sizes = f"{_megabytes(size['input'], '.ply')} → {sizes}"
+    return f"{report.source} → {plural(report.output_count, 'Gaussian')}, {sizes}; {times}"
 
 
-def told(report: dict[str, Any], *, verbose: bool = False) -> list[str]:
+def _megabytes(size: int | None, file: str) -> str:
+    return f"{(size or 0) / 1e6:.2f} MB as .{file.partition('.')[2]}"
+
+
+def told(report: RunReport, *, verbose: bool = False) -> list[str]:
     """Return lines on recovery, losses, unseen parts and packing; `verbose` adds idle
     regularisers."""
     from g2ard.jobs.packing import score_lines
     from g2ard.stages.recover.report import outcome, unregularized
     from g2ard.stages.simplify.growth import RECOVERED_GAPS, gaps_line
 
-    rounds = [entry.recover for entry in report["rounds"]]
+    rounds = [entry.recover for entry in report.rounds]
     lines = [outcome(one) for entry in rounds for one in entry]
     lines += [unregularized(rounds)] if verbose else []
-    lines += list(map(loss, report["kinds"]))
-    lines.append(gaps_line(report["opacity_lost"], RECOVERED_GAPS))
-    if report["unseen"] and report["unseen"] > _LEAST_REPORTED_SHARE:
-        lines.append(f"{report['unseen']:.0%} of the scene is in no view: simplified but not recovered")
-    if packed := report.get("packed"):
-        lines += score_lines(
-            packed, report["bytes"]["file"], report["scores"]["recovered"]["psnr"], report["size"]
+    lines += list(map(loss, report.kinds))
+    lines.append(gaps_line(report.opacity_lost, RECOVERED_GAPS))
+    if report.unseen and report.unseen > _LEAST_REPORTED_SHARE:
+        lines.append(f"{report.unseen:.0%} of the scene is in no view: simplified but not recovered")
+    if report.packed:
+        size, unpacked = report.bytes["file"] or 0, report.scores["recovered"].psnr
+        lines += score_lines(report.packed, size, unpacked, report.size)
+    if report.own_size:
+        before, after = (report.own_size[name] for name in ("simplified", "recovered"))
+        lines.append(
+            f"at the views' own size ({after.scored_in}): {before.psnr:.2f} → {after.psnr:.2f} dB, "
+            f"SSIM {before.ssim:.4f} → {after.ssim:.4f}"
         )
-    if full := report.get("own_size"):
-        lines.append(own_size_line(full))
     return [line for line in lines if line is not None]
-
-
-def own_size_line(scores: dict[str, Any]) -> str:
-    """Describe the scores at the views' own size.
-
-    >>> score = {"psnr": 25.5, "ssim": 0.8, "scored_in": "7 photos, 960×540 px"}
-    >>> own_size_line({"simplified": score, "recovered": score | {"psnr": 27.0}})
-    "at the views' own size (7 photos, 960×540 px): 25.50 → 27.00 dB, SSIM 0.8000 → 0.8000"
-    """
-    before, after = scores["simplified"], scores["recovered"]
-    return (
-        f"at the views' own size ({after['scored_in']}): {before['psnr']:.2f} → {after['psnr']:.2f} dB, "
-        f"SSIM {before['ssim']:.4f} → {after['ssim']:.4f}"
-    )
 
 
 def loss(

@@ -1,18 +1,29 @@
-"""Check the options of a command that works in tiles."""
+"""Options of a command that works in tiles, and the folder that holds its work."""
 
 from __future__ import annotations
 
+import re
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import typer
 
 from g2ard.cli.budget_options import TILES
 from g2ard.cli.frame import Run
-from g2ard.io.atomic import hidden_name
+from g2ard.config.choices import is_made
+from g2ard.errors import G2ardError, OutputError
+from g2ard.io.atomic import drop_empty, hidden_name, parents_made
+from g2ard.io.lock import locked
 
 if TYPE_CHECKING:
     from g2ard.jobs.tiling import Tiling
+
+
+_WORK_NAME = re.compile(r"tiles|steps|(student|merged|level|written)-[0-9a-f]{16}")
+"""Names that commands create in the work folder."""
 
 
 def tiling_of(run: Run, scene: Path | None, output: Path) -> Tiling:
@@ -56,3 +67,78 @@ def _check_rows(scene: Path, rows: int) -> None:
     if (scene / MANIFEST).is_file() and (made := TileStore.open(scene).settings.get("tile_rows")) != rows:
         held = f"already has tiles of {made:,}" if made else "already has tiles"
         raise typer.BadParameter(f"--tile-rows: {scene} {held}; to change them, run {cut_into(scene, rows)}")
+
+
+@contextmanager
+def working(run: Run, tiling: Tiling, *views: Any, again: str = "") -> Iterator[None]:
+    """Hold `tiling.folder`, created if absent, while a command works on tiles there.
+
+    Success removes the folder unless the user named it. An error removes it if this command created it and a
+    resumed run would find nothing in it: no finished task and, after errors of the output, no tiles either.
+
+    Args:
+        views: given to the command; they are read now, and the scheduler is tried, because writing tiles
+            takes long.
+        again: option with which the same command continues.
+    """
+    folder = tiling.folder
+    _check_folder(folder)
+    _check_given(tiling, views)
+    made = not folder.exists()
+    above = parents_made(folder)
+    try:
+        folder.mkdir(exist_ok=True)
+        with locked(folder):
+            try:
+                yield
+            except Exception as error:  # usage errors too, which the command line raises
+                if made and not _worth_keeping(folder, error):
+                    shutil.rmtree(folder, ignore_errors=True)
+                elif not tiling.keep and isinstance(error, G2ardError):
+                    run.kept.insert(0, f"finished work is kept in {folder}")
+                raise
+            except KeyboardInterrupt:
+                left = f"finished steps are in {folder}; run the same command{again} to continue"
+                run.kept.insert(0, left)
+                raise
+            if not tiling.keep:
+                shutil.rmtree(folder, ignore_errors=True)
+        with suppress(OSError):
+            folder.rmdir()  # where the lock had to go first
+    finally:
+        drop_empty(above)
+
+
+def _check_folder(folder: Path) -> None:
+    """Reject a folder that holds anything but tiled work."""
+    try:
+        names = sorted(path.name for path in folder.iterdir()) if folder.exists() else []
+    except OSError as error:
+        raise OutputError(f"cannot write: {error.strerror}; choose another folder", path=folder) from error
+    from g2ard.tiles.pour import is_tile_file
+
+    of_tiles = [name for name in names if is_tile_file(name)]
+    others = [name for name in names if not name.startswith(".")]
+    if of_tiles or (others and not any(map(_WORK_NAME.fullmatch, names))):
+        raise OutputError(
+            f"holds {(of_tiles or others)[0]} and is not a work folder; choose another folder", path=folder
+        )
+
+
+def _check_given(tiling: Tiling, views: tuple[Any, ...]) -> None:
+    from g2ard.jobs.inputs import load_view_sets
+    from g2ard.tiles.executor import executor
+
+    for given in views:
+        if given is not None and not is_made(given):
+            load_view_sets(given, [], None, unpictured=True)
+    if tiling.scheduler not in (None, "local"):
+        with executor(scheduler=tiling.scheduler):
+            pass
+
+
+def _worth_keeping(folder: Path, error: Exception) -> bool:
+    """Return whether a command that resumes after this error finds something done."""
+    if any((folder / "steps").glob("[!.]*.npz")):
+        return True
+    return isinstance(error, OutputError) and any(path.name != "tiles" for path in folder.glob("[!.]*/[!.]*"))

@@ -12,7 +12,9 @@ from numpy.typing import NDArray
 
 from g2ard.config.checks import AtLeastOne, checks_arguments
 from g2ard.config.choices import FormatName, RenderModel, is_made
+from g2ard.config.schema import listed
 from g2ard.errors import InputError
+from g2ard.io import read_splats
 from g2ard.io.paths import real_path
 from g2ard.io.types import Points
 from g2ard.jobs.budget import Budget
@@ -24,18 +26,21 @@ from g2ard.jobs.photos import distinct, sparse_file, sparse_points, topped_up
 from g2ard.jobs.view_checks import check_photos, propose_background
 from g2ard.jobs.views import Use, views_of, within_pixels
 from g2ard.pipeline.config import DistillConfig
-from g2ard.pipeline.distill import Distilled, RunViews, is_recovered
+from g2ard.pipeline.distill import Distilled, RunViews
 from g2ard.pipeline.distill import distill as pipeline
 from g2ard.progress import Progress, Say, plural, silent, unsaid
-from g2ard.rendering.renderer import Renderer
 from g2ard.rendering.targets import Targets, kinds_of, kinds_told
-from g2ard.scene.cameras import Cameras
+from g2ard.rendering.visibility import overdraw
+from g2ard.report.run import Packed, RunReport, by_kind
+from g2ard.scene.cameras import USUAL, Cameras
 from g2ard.scene.splats import Splats
+from g2ard.stages.evaluate import Evaluation, evaluate
 from g2ard.stages.lift import lift, lift_rows
 from g2ard.stages.recover.anchors import FREE, Regularizers
 from g2ard.stages.recover.auto_preset import PriorMeasures, measure_prior, regularizers_for
 from g2ard.stages.recover.config import RecoverConfig
 from g2ard.stages.recover.schedule import Schedule
+from g2ard.stages.simplify.growth import opacity_lost
 from g2ard.system.cached import cached_property
 
 
@@ -51,7 +56,6 @@ class DistillJob:
             teacher.
         preset: the regularisers chosen, and why.
         cleaned: number of Gaussians removed by kind of clutter; None without cleaning.
-        recovered: whether an earlier call recovered the scene, so that targets are needed for scoring alone.
     """
 
     prior: Splats
@@ -64,7 +68,6 @@ class DistillJob:
     preset: str
     measured: PriorMeasures
     cleaned: dict[str, int] | None = None
-    recovered: bool = False
     progress: Progress = silent
     say: Say = unsaid
 
@@ -72,11 +75,6 @@ class DistillJob:
     def reads_photos(self) -> bool:
         """Whether any target may be a photo."""
         return self.teacher is None or self.photos_over_renders
-
-    @property
-    def against(self) -> str:
-        """Kinds of the scoring targets, as text for summaries."""
-        return kinds_of(self.held_out)
 
     @property
     def weights(self) -> NDArray[np.float64] | None:
@@ -96,13 +94,12 @@ class DistillJob:
     @cached_property
     def targets(self) -> Targets:
         """Training targets."""
-        few = self.config.select.views_count is not None or self._trains_nothing
-        return self._for_training(self.views.train.cameras, lazy=few)
+        return self.targets_for(self.views.train.cameras)
 
     @cached_property
     def held_out(self) -> Targets:
         """Held-out targets of the same kind that have a valid pixel, for scoring only."""
-        return scorable(self.targets_for(self.views.test, self._renderer), self.say)
+        return scorable(self.targets_for(self.views.test), self.say)
 
     @cached_property
     def validation(self) -> Targets | None:
@@ -116,74 +113,110 @@ class DistillJob:
 
     @cached_property
     def full_size(self) -> Targets | None:
-        """Held-out targets at the views' own size, made on access; None if no size shrank them.
+        """Held-out targets at the views' own size; None if no size shrank them.
 
         Of large views there are only some, see `within_pixels`.
         """
         cameras = self.views.full
-        return None if cameras is None else scorable(self.targets_for(within_pixels(cameras), lazy=True))
+        return None if cameras is None else scorable(self.targets_for(within_pixels(cameras)))
 
     def _every_second_apart(self, first: int) -> Targets | None:
         cameras = self.views.apart
         if cameras is None or self.teacher is None or len(cameras) < 2:
             return None
-        chosen = cameras.take(range(first, len(cameras), 2))
-        if first == 0:
-            return self._for_training(chosen, lazy=self._trains_nothing)
-        return self.targets_for(chosen, self._renderer)
+        return self.targets_for(cameras.take(range(first, len(cameras), 2)))
 
-    @property
-    def _trains_nothing(self) -> bool:
-        return self.recovered or self.is_kept(self.budget.count)
-
-    def _for_training(self, cameras: Cameras, *, lazy: bool) -> Targets:
-        """Return targets; those that nothing will train on do not hold the shared renderer."""
-        return self.targets_for(cameras, None if self._trains_nothing else self._renderer, lazy=lazy)
-
-    def resuming(self, work: Path | None) -> DistillJob:
-        """Return this job, or one that knows that an earlier call recovered the scene in `work`."""
-        return replace(self, recovered=True) if is_recovered(work) else self
-
-    def render_targets(self) -> None:
-        """Render all targets that are not lazy; `run` calls this too."""
-        _ = self.targets, self.held_out, self.validation, self.apart
-        vars(self).pop("_renderer", None)  # its buffers are larger than the scene
-
-    @cached_property
-    def _renderer(self) -> Renderer | None:
-        """Renderer of the teacher, shared by all targets."""
-        background = self.config.recover.background
-        return None if self.teacher is None else Renderer(self.teacher, background=background)
-
-    def targets_for(
-        self, cameras: Cameras, renderer: Renderer | None = None, *, lazy: bool = False
-    ) -> Targets:
-        """Return targets of this job's kind for views; see `g2ard.jobs.inputs.make_targets`."""
+    def targets_for(self, cameras: Cameras) -> Targets:
+        """Return targets of this job's kind for views, made on access; see `make_targets`."""
         return make_targets(
             cameras,
             self.teacher,
             self.config.recover.background,
-            lazy=lazy,
             photos=self.photos_over_renders,
-            renderer=renderer,
-            progress=self.progress,
             say=self.say,
         )
 
     def run(self, work: Path | None = None) -> Distilled:
         """Distil the scene; `work` is the folder for resuming, see `g2ard.pipeline.distill`."""
-        self.render_targets()
+        targets, held_out = self.targets, self.held_out  # reject masks without a pixel before any work
         done = pipeline(
             self.prior,
             self.budget.count,
-            self.targets,
+            targets,
             self.config,
             weights=self.weights,
             validation=self.validation,
             work=work,
             progress=self.progress,
         )
-        return replace(done, splats=self.budget.shrink(done.splats, self.say), held_out=self.held_out)
+        return replace(done, splats=self.budget.shrink(done.splats, self.say), held_out=held_out)
+
+    def report(self, done: Distilled, file: Path) -> RunReport:
+        """Score the simplified and the recovered scene in held-out views, and describe the run.
+
+        Args:
+            file: the written result; its scores are those of the file read back if it is packed.
+        """
+        scenes = {"simplified": done.simplified, "recovered": done.splats}
+        from_points = self.config.recover.from_points
+
+        def scored(targets: Targets) -> dict[str, Evaluation]:
+            return {name: self._scores(splats, targets, name) for name, splats in scenes.items()}
+
+        scores, apart = scored(self.held_out), None if self.apart is None else scored(self.apart)
+        before, after = (
+            [view for part in (scores, apart) if part for view in part[name].views] for name in scenes
+        )
+        full = None if self.full_size is None else scored(self.full_size)
+        made = self.views.pool is not None and "test" in self.views.pool.splits
+        config = replace(
+            self.config, simplify=self.config.simplify.resolved(antialiased=self.prior.antialiased)
+        )
+        return RunReport(
+            input_count=len(self.prior),
+            output_count=len(done.splats),
+            lifted=self.lifted,
+            photos=len(self.views.train.cameras) if from_points else None,
+            cleaned=self.cleaned,
+            bytes={"input": self.prior.nbytes, "output": done.splats.nbytes, "file": file.stat().st_size},
+            scores=scores,
+            apart=apart,
+            size=self.held_out.cameras.size_text,
+            own_size=None if full is None else {name: found.means for name, found in full.items()},
+            kinds=by_kind(before, after, USUAL if made else "given"),
+            unseen=self._unseen(done),
+            opacity_lost=None
+            if from_points
+            else opacity_lost(self.prior, done.splats, self.held_out.cameras),
+            overdraw=overdraw(done.splats, self.held_out.cameras),
+            against=kinds_of(self.held_out),
+            preset=self.preset,
+            prior=self.measured,
+            rounds=done.report.rounds,
+            views=done.report.views,
+            settings=listed(config),
+            seconds=done.report.seconds.as_dict(),
+            packed=None if file.name == "scene.ply" else self._packed(file),
+        )
+
+    def _scores(self, splats: Splats, targets: Targets, name: str) -> Evaluation:
+        background, stage = self.config.recover.background, f"score {name}"
+        return evaluate(splats, targets, background=background, progress=self.progress, stage=stage)
+
+    def _packed(self, file: Path) -> Packed:
+        found = self._scores(read_splats(file), self.held_out, "file")
+        return Packed(file.name, found.psnr, found.ssim)
+
+    def _unseen(self, done: Distilled) -> float | None:
+        """Return the share of the scene that no view sees, or None for the paper's method.
+
+        For a generated pool it is the share of the matter, otherwise of the Gaussians in simplification's
+        views.
+        """
+        if self.views.unseen is not None:
+            return self.views.unseen
+        unseen = done.report.rounds[0].simplify.unseen
+        return None if unseen is None else unseen / len(self.prior)
 
 
 Scene = Splats | Points | str | Path | None
@@ -303,7 +336,7 @@ def distill(
         settings={name: value for name, value in fields.items() if value is not None} | dict(settings or {}),
     )
     job = prepare(scene, budget, options, progress=progress, say=say)
-    done = job.resuming(work).run(work)
+    done = job.run(work)
     if judgement := job.budget.judge(done.splats):
         say(judgement[1])
     return done

@@ -17,8 +17,8 @@ from g2ard.io import read_scene, read_view_set
 from g2ard.io.exposures import find_exposures
 from g2ard.io.splits import not_held_out, split_mask, splits_of
 from g2ard.io.types import Note, ViewFiles, ViewSet
-from g2ard.progress import Progress, Say, plural, silent, unsaid
-from g2ard.rendering.renderer import RasterSettings, Renderer
+from g2ard.progress import Say, plural, unsaid
+from g2ard.rendering.renderer import RasterSettings
 from g2ard.rendering.targets import Photos, PhotosOrRenders, Targets, TeacherRenders, with_pixels
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.regions import in_any
@@ -138,19 +138,15 @@ def make_targets(
     teacher: Splats | None,
     background: tuple[float, float, float],
     *,
-    lazy: bool = False,
     photos: bool = False,
     settings: RasterSettings | None = None,
-    renderer: Renderer | None = None,
-    progress: Progress = silent,
     say: Say = unsaid,
 ) -> Targets:
-    """Return targets: renders of the teacher, or photos if there is no teacher.
+    """Return targets, made on access: renders of the teacher, or photos if there is no teacher.
 
-    With `photos` and a teacher, each view's photo is used, or a render if it has none. `lazy` renders on
-    first access.
+    With `photos` and a teacher, each view's photo is used, or a render if it has none.
     """
-    renders: Any = {"settings": settings, "lazy": lazy, "renderer": renderer, "progress": progress}
+    renders: Any = {"settings": settings, "lazy": True}
     if teacher is not None and not photos:
         return TeacherRenders(teacher, cameras, background=background, **renders)
     exposures = find_exposures(cameras)

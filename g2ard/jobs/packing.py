@@ -5,13 +5,12 @@ from typing import Any
 
 import numpy as np
 
-from g2ard.config.choices import Colour
 from g2ard.errors import InputError
 from g2ard.io import read_splats
 from g2ard.io.scene_formats import scene_format
 from g2ard.poses import plan_pool
-from g2ard.progress import Progress
-from g2ard.rendering.targets import Targets, TeacherRenders
+from g2ard.rendering.targets import TeacherRenders
+from g2ard.report.run import Packed
 from g2ard.scene.splats import Splats
 from g2ard.scene.transform import change_of_axes, with_axes
 from g2ard.stages.evaluate import evaluate
@@ -26,24 +25,16 @@ _MOST_COMPARED_GAUSSIANS = 2_000_000
 """Gaussians above which scenes are not compared."""
 
 
-def score_file(path: Path, targets: Targets, background: Colour, progress: Progress) -> dict[str, Any]:
-    """Read a scene file back and return its mean scores in the views of `targets`."""
-    scores = evaluate(
-        read_splats(path), targets, background=background, progress=progress, stage="score file"
-    )
-    return {"file": path.name, "psnr": scores.psnr, "ssim": scores.ssim}
-
-
-def score_lines(packed: dict[str, Any], size: int, unpacked: float, pixels: str) -> list[str]:
+def score_lines(packed: Packed, size: int, unpacked: float, pixels: str) -> list[str]:
     """Return a packed file's size in bytes and score beside that of the unpacked scene, and a warning if its
     loss is large and visible. `pixels` is the size of the views.
 
-    >>> score_lines({"file": "scene.sog", "psnr": 37.86}, 1_310_000, 37.94, "800×600 px")
+    >>> score_lines(Packed("scene.sog", 37.86, 0.9), 1_310_000, 37.94, "800×600 px")
     ['scene.sog: 1.31 MB, 37.9 dB in held-out views, 800×600 px (37.9 as .ply)']
-    >>> len(score_lines({"file": "scene.sog", "psnr": 58.6}, 1_310_000, 62.6, "800×600 px"))
+    >>> len(score_lines(Packed("scene.sog", 58.6, 0.9), 1_310_000, 62.6, "800×600 px"))
     1
     """
-    name, psnr = packed["file"], packed["psnr"]
+    name, psnr = packed.file, packed.psnr
     scores = f"{psnr:.1f} dB in held-out views, {pixels} ({unpacked:.1f} as .ply)"
     lines = [f"{name}: {size / 1e6:.2f} MB, {scores}"]
     if unpacked - psnr > _WARNED_LOSS and psnr < _INVISIBLE_LOSS_PSNR:

@@ -15,13 +15,14 @@ from g2ard.config.schema import changed, full_paths
 from g2ard.errors import InputError, require
 from g2ard.io.types import ViewSet
 from g2ard.jobs.inputs import Views, load_scene
-from g2ard.jobs.score import scores_by_kind
 from g2ard.jobs.teaching import Teaching, check_teacher
 from g2ard.pipeline.presets import PRESETS, configured
 from g2ard.progress import Progress, Say, plural, silent, unsaid
-from g2ard.rendering.targets import Targets, checked_targets, kinds_of, kinds_told
-from g2ard.report.kinds import KindScore
+from g2ard.rendering.targets import Targets, checked_targets, fill, kinds_of, kinds_told
+from g2ard.report.run import KindScore, by_kind
+from g2ard.scene.cameras import USUAL
 from g2ard.scene.splats import Splats
+from g2ard.stages.evaluate import evaluate
 from g2ard.stages.recover import RecoverConfig, Recovered
 from g2ard.stages.recover import recover as optimize
 from g2ard.stages.recover.anchors import Anchors
@@ -59,6 +60,9 @@ class RecoverJob:
     def run(self, checkpoint: Path | None = None, watch: Watch | None = None) -> Recovered:
         """Recover the student; see `g2ard.recover`."""
         built, in_plane = self.anchors, self.config.regularizers.in_plane
+        if not self._same:
+            for targets in filter(None, (self.targets, self.validation)):
+                fill(targets, self.progress)
         return optimize(
             self.student,
             self.targets,
@@ -72,6 +76,12 @@ class RecoverJob:
             skip_same=True,
         )
 
+    @property
+    def _same(self) -> bool:
+        """Whether the student is the teacher, so that nothing is to be learned."""
+        dense = self.teaching.dense
+        return dense is not None and dense.fingerprint() == self.student.fingerprint()
+
     @cached_property
     def held_out(self) -> Targets | None:
         """Held-out targets for scoring; None without such views."""
@@ -81,8 +91,18 @@ class RecoverJob:
         """Score student and result in held-out views, by kind of view; empty without such views."""
         if self.held_out is None:
             return ()
-        background = self.config.background
-        return scores_by_kind(self.student, result.splats, self.held_out, background, self.progress)
+        before, after = (
+            evaluate(
+                splats,
+                self.held_out,
+                background=self.config.background,
+                progress=self.progress,
+                stage=f"score {name}",
+            ).views
+            for name, splats in (("simplified", self.student), ("recovered", result.splats))
+        )
+        given = set(self.held_out.cameras.kinds) == {USUAL}
+        return by_kind(before, after, "given" if given else USUAL)
 
 
 @checks_arguments
@@ -252,8 +272,7 @@ def prepare(
         say=say,
     )
     pool = teaching.views(views, start)
-    same = teaching.dense is not None and teaching.dense.fingerprint() == start.fingerprint()
-    chosen, targets = teaching.training(start, pool, split, size, lazy=same)
+    chosen, targets = teaching.training(start, pool, split, size)
     of_split = "training view" if split == "train" else f"{split} view"
     say(f"{plural(len(chosen.cameras), of_split)} against {kinds_of(targets)}")
     weighted = named.get("select.weighted", True) if weighted is None else weighted
@@ -285,7 +304,7 @@ def prepare(
         teaching,
         pool if split == "train" else None,
         size,
-        teaching.validation(pool, size, lazy=same) if split == "train" and config.schedule.guarded else None,
+        teaching.validation(pool, size) if split == "train" and config.schedule.guarded else None,
         progress,
     )
 

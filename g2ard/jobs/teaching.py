@@ -1,5 +1,6 @@
 """Views and targets of the commands that train on images or score against them."""
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from g2ard.progress import Progress, Say, silent, unsaid
 from g2ard.rendering.targets import Targets
 from g2ard.scene.cameras import USUAL, Cameras
 from g2ard.scene.splats import Splats
+from g2ard.system.cached import cached_property
 
 
 def check_teacher(views: Views | None, teacher: Splats | str | Path | None) -> None:
@@ -23,6 +25,7 @@ def check_teacher(views: Views | None, teacher: Splats | str | Path | None) -> N
         raise InputError("there are no targets", hint="give {views}, or a {teacher} to generate views of")
 
 
+@dataclass(frozen=True, eq=False)
 class Teaching:
     """Source of targets: photos, or renders of a teacher.
 
@@ -35,23 +38,21 @@ class Teaching:
         seed: seed of generated views.
     """
 
-    def __init__(
-        self,
-        teacher: Splats | str | Path | None,
-        background: Colour,
-        *,
-        chosen: bool,
-        photos: bool = False,
-        render_model: RenderModel | None = None,
-        seed: int = 0,
-        progress: Progress = silent,
-        say: Say = unsaid,
-    ) -> None:
-        self._beside = None if isinstance(teacher, Splats) else teacher
-        self._photos, self._seed = photos, seed
-        self._background, self._chosen = background, chosen
-        self._progress, self._say = progress, say
-        self.dense = load_scene(teacher, say, render_model) if isinstance(teacher, str | Path) else teacher
+    teacher: Splats | str | Path | None
+    background: Colour
+    chosen: bool
+    photos: bool = False
+    render_model: RenderModel | None = None
+    seed: int = 0
+    progress: Progress = silent
+    say: Say = unsaid
+
+    @cached_property
+    def dense(self) -> Splats | None:
+        """The teacher, if there is one."""
+        if isinstance(self.teacher, str | Path):
+            return load_scene(self.teacher, self.say, self.render_model)
+        return self.teacher
 
     def views(self, given: Views | None, student: Splats | None = None) -> Views:
         """Return the given views, or those found beside the teacher, or generated ones.
@@ -64,59 +65,54 @@ class Teaching:
         return views_or_pool(
             self.dense,
             given,
-            beside=self._beside,
+            beside=None if isinstance(self.teacher, Splats) else self.teacher,
             student=student,
-            seed=self._seed,
-            progress=self._progress,
-            say=self._say,
+            seed=self.seed,
+            progress=self.progress,
+            say=self.say,
         )
 
-    def training(
-        self, scene: Splats, views: Views, split: str, size: int | None, *, lazy: bool = False
-    ) -> tuple[ViewSet, Targets]:
-        """Read a split of the views and return it with its targets; reject photos of another scene.
-
-        `lazy` renders targets on first access.
-        """
-        chosen = load_trained(views, split, size, self._say, unpictured=self.dense is not None)
-        warn_of_sight(scene, chosen.cameras, self._say)
-        targets = self.targets(chosen.cameras, lazy=lazy)
+    def training(self, scene: Splats, views: Views, split: str, size: int | None) -> tuple[ViewSet, Targets]:
+        """Read a split of the views and return it with its targets; reject photos of another scene."""
+        chosen = load_trained(views, split, size, self.say, unpictured=self.dense is not None)
+        warn_of_sight(scene, chosen.cameras, self.say)
+        targets = self.targets(chosen.cameras)
         self.check_photos(scene, chosen.cameras)
         return chosen, targets
 
     def check_photos(self, scene: Splats, cameras: Cameras) -> None:
         """Reject photos that do not show the scene, unless they are insisted on."""
-        if self.dense is None or self._photos:
-            check_photos(scene, cameras, self._background, self._say, insisted=self._photos)
+        if self.dense is None or self.photos:
+            check_photos(scene, cameras, self.background, self.say, insisted=self.photos)
 
     def targets(self, cameras: Cameras, **options: Any) -> Targets:
         """Return the targets of the views; note if another background fits their photos."""
-        if self.dense is None or self._photos:
-            propose_background(cameras, self._background, self._chosen, self._say)
-        return self._made(cameras, progress=self._progress, say=self._say, **options)
+        if self.dense is None or self.photos:
+            propose_background(cameras, self.background, self.chosen, self.say)
+        return self._made(cameras, say=self.say, **options)
 
     def full_size(self, cameras: Cameras, size: int | None, **options: Any) -> Targets | None:
-        """Return the targets of unshrunk views, made on first access; None if `size` shrinks none of them.
+        """Return the targets of unshrunk views; None if `size` shrinks none of them.
 
         Of large views there are only some, see `within_pixels`.
         """
         if shrunk(cameras, size) is None:
             return None
-        return scorable(self._made(within_pixels(cameras), lazy=True, **options))
+        return scorable(self._made(within_pixels(cameras), **options))
 
     def held_out(self, views: Views, size: int | None) -> Targets | None:
-        """Return the targets of the test views, made on first access; None if there are no such views."""
+        """Return the targets of the test views; None if there are no such views."""
         cameras = self._split(views, "test")
         if cameras is None:
             return None
-        return scorable(self._made(cameras.resized(size), lazy=True), self._say)
+        return scorable(self._made(cameras.resized(size)), self.say)
 
-    def validation(self, views: Views, size: int | None, *, lazy: bool = False) -> Targets | None:
-        """Return the renders of the views of other kinds in split `val`, or None; see `training`."""
-        cameras = None if self.dense is None or self._photos else self._split(views, "val")
+    def validation(self, views: Views, size: int | None) -> Targets | None:
+        """Return the renders of the views of other kinds in split `val`, or None."""
+        cameras = None if self.dense is None or self.photos else self._split(views, "val")
         if cameras is None or USUAL in cameras.kinds:
             return None
-        return self._made(cameras.resized(size), lazy=lazy, progress=self._progress, say=self._say)
+        return self._made(cameras.resized(size), say=self.say)
 
     def _split(self, views: Views, name: str) -> Cameras | None:
         """Return the views of a split, or None if it is empty."""
@@ -125,4 +121,4 @@ class Teaching:
         return pool.cameras.take(rows) if rows else None
 
     def _made(self, cameras: Cameras, **options: Any) -> Targets:
-        return make_targets(cameras, self.dense, self._background, photos=self._photos, **options)
+        return make_targets(cameras, self.dense, self.background, photos=self.photos, **options)

@@ -1,33 +1,31 @@
-"""Simplification, distillation and levels of detail in tiles, and the folder that holds their work."""
+"""Simplification, distillation and levels of detail in tiles."""
 
 from __future__ import annotations
 
-import re
-import shutil
+import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from g2ard.config.choices import RenderModel, is_made
-from g2ard.errors import G2ardError, InputError, OutputError
-from g2ard.io.atomic import drop_empty, parents_made
+from g2ard.config.choices import RenderModel
+from g2ard.errors import InputError
 from g2ard.io.detect import MANIFEST
-from g2ard.io.lock import locked
 from g2ard.io.tile_store import StoredScene, TileStore
 from g2ard.io.types import ViewSet
 from g2ard.jobs.budget import Budget
 from g2ard.jobs.cost import RECOVERY_TIMES, workers_for
 from g2ard.jobs.distill_options import DistillOptions
-from g2ard.jobs.inputs import Views, load_view_sets, say_regions
+from g2ard.jobs.inputs import Views, say_regions
 from g2ard.jobs.levels import Levels, check_ratios, make_levels
 from g2ard.jobs.tiling import Tiling, needs_whole, refuse_whole
 from g2ard.jobs.views import cameras_for_weights, pool_times, views_of
 from g2ard.pipeline.config import DistillConfig
 from g2ard.pipeline.distill import RunViews
 from g2ard.progress import Progress, Say, silent, unsaid
+from g2ard.report.run import TiledReport, TiledScores
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
 from g2ard.stages.recover.auto_preset import regularizers_for
@@ -35,81 +33,13 @@ from g2ard.stages.recover.schedule import steps_for
 from g2ard.stages.select import select
 from g2ard.stages.simplify import SimplifyConfig
 from g2ard.stages.simplify.growth import say_gaps
+from g2ard.system.peak_memory import peak_rss_of_all
 from g2ard.tiles.executor import Workers, executor
 from g2ard.tiles.ingest import ingest
 from g2ard.tiles.merging import TiledScene, simplify_tiles
-from g2ard.tiles.pour import is_tile_file
-from g2ard.tiles.recover import TiledScores, recover_tiles
+from g2ard.tiles.recover import recover_tiles
 from g2ard.tiles.sights import Surroundings
 from g2ard.tiles.steps import TiledRun
-
-_WORK_NAME = re.compile(r"tiles|steps|(student|merged|level|written)-[0-9a-f]{16}")
-"""Names that commands create in the work folder."""
-
-
-@contextmanager
-def working(tiling: Tiling, *views: Views | None) -> Iterator[None]:
-    """Hold `tiling.folder`, created if absent, while a command works on tiles there.
-
-    Success removes the folder unless the user named it. An error removes it if this command created it and a
-    resumed run would find nothing in it: no finished task and, after errors of the output, no tiles either.
-
-    Args:
-        views: given to the command; they are read now, and the scheduler is tried, because writing tiles
-            takes long.
-    """
-    folder = tiling.folder
-    _check_folder(folder)
-    _check_given(tiling, views)
-    made = not folder.exists()
-    above = parents_made(folder)
-    try:
-        folder.mkdir(exist_ok=True)
-        with locked(folder):
-            try:
-                yield
-            except Exception as error:  # usage errors too, which the command line raises
-                if made and not _worth_keeping(folder, error):
-                    shutil.rmtree(folder, ignore_errors=True)
-                elif not tiling.keep and isinstance(error, G2ardError):
-                    raise type(error)(f"{error}; finished work is kept in {folder}") from error
-                raise
-            if not tiling.keep:
-                shutil.rmtree(folder, ignore_errors=True)
-        with suppress(OSError):
-            folder.rmdir()  # where the lock had to go first
-    finally:
-        drop_empty(above)
-
-
-def _check_folder(folder: Path) -> None:
-    """Reject a folder that holds anything but tiled work."""
-    try:
-        names = sorted(path.name for path in folder.iterdir()) if folder.exists() else []
-    except OSError as error:
-        raise OutputError(f"cannot write: {error.strerror}; choose another folder", path=folder) from error
-    of_tiles = [name for name in names if is_tile_file(name)]
-    others = [name for name in names if not name.startswith(".")]
-    if of_tiles or (others and not any(map(_WORK_NAME.fullmatch, names))):
-        raise OutputError(
-            f"holds {(of_tiles or others)[0]} and is not a work folder; choose another folder", path=folder
-        )
-
-
-def _check_given(tiling: Tiling, views: tuple[Views | None, ...]) -> None:
-    for given in views:
-        if given is not None and not is_made(given):
-            load_view_sets(given, [], None, unpictured=True)
-    if tiling.scheduler not in (None, "local"):
-        with executor(scheduler=tiling.scheduler):
-            pass
-
-
-def _worth_keeping(folder: Path, error: Exception) -> bool:
-    """Return whether a command that resumes after this error finds something done."""
-    if any((folder / "steps").glob("[!.]*.npz")):
-        return True
-    return isinstance(error, OutputError) and any(path.name != "tiles" for path in folder.glob("[!.]*/[!.]*"))
 
 
 @contextmanager
@@ -194,13 +124,12 @@ def simplify_in_tiles(
 
 @dataclass(frozen=True, eq=False)
 class TiledDistilled:
-    """A distilled scene in tiles: the dense one, before and after recovery, its scores and its views."""
+    """A distilled scene in tiles, before and after recovery, with its views and its report."""
 
-    store: TileStore
     simplified: TiledScene
     recovered: TiledScene
-    scores: TiledScores
     views: RunViews
+    report: TiledReport
 
 
 def distill_in_tiles(
@@ -219,11 +148,24 @@ def distill_in_tiles(
     Args:
         options: as for `g2ard.distill`, without what `needs_whole` returns.
     """
+    began = time.monotonic()
     with _job(scene, tiling, options, budget, True, progress, say) as job:
-        small = job.simplified(job.store, job.count, job.views.train.cameras)
+        views = job.views
+        small = job.simplified(job.store, job.count, views.train.cameras)
         assert small.surroundings is not None  # views are given
-        done, scores = job.recovered(small, small.surroundings, job.views)
-        return TiledDistilled(job.store, small, done, scores, job.views)
+        done, scores = job.recovered(small, small.surroundings, views)
+        report = TiledReport(
+            input_count=job.store.count,
+            output_count=len(done),
+            tiles=list(done.counts),
+            notes={note.code: note.count for note in job.store.notes},
+            seconds={"total": time.monotonic() - began},
+            peak_rss_bytes=peak_rss_of_all(),
+            scores=scores,
+            size=views.test.size_text,
+            views={"train": len(views.train.cameras), "test": len(views.test)},
+        )
+        return TiledDistilled(small, done, views, report)
 
 
 def lod_in_tiles(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,13 +11,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from g2ard.config.checks import checks_arguments
-from g2ard.io.reports import LEFT_OUT, Report
 from g2ard.io.types import ViewSet
 from g2ard.pipeline.config import DistillConfig, SelectConfig
 from g2ard.pipeline.steps import Steps
 from g2ard.progress import Progress, plural, silent
-from g2ard.rendering.targets import Photos, PhotosOrRenders, Subset, Targets, checked_targets
+from g2ard.rendering.targets import Photos, PhotosOrRenders, Subset, Targets, checked_targets, fill
 from g2ard.rendering.visibility import visibility_source
+from g2ard.report.run import DistillReport, RoundReport, StageSeconds, ViewsReport
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
 from g2ard.stages.recover.draw import checked_weights
@@ -52,56 +52,6 @@ class RunViews:
         """Shrink all views for training and scoring."""
         apart = self.apart and self.apart.resized(longest)
         return replace(self, train=self.train.resized(longest), test=self.test.resized(longest), apart=apart)
-
-
-@dataclass(frozen=True)
-class ViewsReport(Report):
-    """Report of the view selection.
-
-    Args:
-        chosen: names of the chosen views, best first.
-        refused: names of views that see nothing of the scene or lie inside geometry.
-        left_out: share of the whole pool's objective that the remaining views would add.
-    """
-
-    policy: str
-    candidates: int
-    chosen: list[str]
-    weighted: bool
-    refused: list[str]
-    left_out: float
-
-
-@dataclass(frozen=True)
-class RoundReport(Report):
-    """Report of a round: simplification, and its recoveries if there are any."""
-
-    count: int
-    simplify: SimplifyReport
-    recover: tuple[RecoverReport, ...] = ()
-
-
-@dataclass(frozen=True)
-class StageSeconds(Report):
-    """Wall seconds of each stage.
-
-    Args:
-        resumed: part of these spent by earlier, interrupted calls; None if there were none.
-    """
-
-    select: float
-    simplify: float
-    recover: float
-    resumed: float | None = field(default=None, metadata=LEFT_OUT)
-
-
-@dataclass(frozen=True)
-class DistillReport(Report):
-    """Report of a distillation. `views` holds its selection of views, or None."""
-
-    rounds: tuple[RoundReport, ...]
-    seconds: StageSeconds
-    views: ViewsReport | None
 
 
 __all__ = ["DistillConfig", "Distilled", "SelectConfig", "distill"]
@@ -197,11 +147,6 @@ def distill(
     return Distilled(rounds.state, rounds.simplified, report)
 
 
-def is_recovered(work: Path | None) -> bool:
-    """Return whether a work folder holds the result of a final recovery."""
-    return Steps(work).has(_FINAL)
-
-
 @dataclass(frozen=True, eq=False)
 class _Supervision:
     """Training targets with sampling weights, and a report of their selection."""
@@ -265,7 +210,7 @@ class _Rounds:
         self.state = self.simplified = self.prior
         self.protected: Any = None
         self.log: list[RoundReport] = []
-        self.seconds = {"select": 0.0, "simplify": 0.0, "recover": 0.0}
+        self.seconds = {"targets": 0.0, "select": 0.0, "simplify": 0.0, "recover": 0.0}
         self._select(self.prior)
 
     def advance(self, number: int, count: int, *, final: bool) -> None:
@@ -283,12 +228,11 @@ class _Rounds:
         began = time.monotonic()
         self.supervision = _Supervision.of(scene, self.targets, self.config, self.weights, self.progress)
         self.seconds["select"] += time.monotonic() - began
-        few = self.config.select.views_count is not None
-        if few and not self.steps.has(_FINAL):  # load all now, so that later steps take equal time
-            targets, count = self.supervision.targets, len(self.supervision.targets.cameras)
-            for view in range(count):
-                targets[view]
-                self.progress("targets", view + 1, count)
+        began = time.monotonic()
+        if self.budget < len(self.prior) and not self.steps.has(_FINAL):  # otherwise few may be drawn
+            for targets in filter(None, (self.supervision.targets, self.validation)):
+                fill(targets, self.progress)
+        self.seconds["targets"] += time.monotonic() - began
 
     def _simplify(self, number: int, count: int) -> SimplifyReport:
         cameras, scene, config = self.targets.cameras, self.state, self.config.simplify

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -20,6 +21,17 @@ from g2ard.stages.simplify.report import SimplifyReport
 R = TypeVar("R", RecoverReport, SimplifyReport)
 _Result = tuple[Splats, R, dict[str, NDArray[Any]]]
 _WITHIN = ".checkpoint.npz"
+
+
+def key_of(content: object) -> str:
+    """Return 16 hexadecimal digits of a hash of JSON values, of paths by their names (files of steps, whose
+    names hold such digits), and of anything else as it is printed."""
+
+    def told(value: object) -> str:
+        return value.name if isinstance(value, Path) else repr(value)
+
+    text = json.dumps(content, sort_keys=True, separators=(",", ":"), default=told)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
 class Steps:
@@ -55,8 +67,8 @@ class Steps:
         """
         if self._folder is None:
             return step(None)
-        key = hashlib.sha256(repr((name, scene.fingerprint(), settings())).encode()).hexdigest()
-        file, within = (self._folder / f"{name}-{key[:16]}{end}" for end in (".npz", _WITHIN))
+        key = key_of([name, scene.fingerprint(), settings()])
+        file, within = (self._folder / f"{name}-{key}{end}" for end in (".npz", _WITHIN))
         if file.exists():
             meta, arrays = checkpoint.load(file, key)
             made = replace(scene, **{array: arrays.pop(array) for array in ARRAYS})

@@ -157,6 +157,12 @@ def as_image(image: Any, cameras: Cameras, view: int, parameter: str) -> NDArray
     )
 
 
+def fill(targets: Targets, progress: Progress, views: Sequence[int] | None = None) -> None:
+    """Create the targets of some views, all by default, that memory will hold; others remain on access."""
+    if isinstance(targets, _Cached | _Chosen):
+        targets.fill(progress, views)
+
+
 _ROUNDING = 1e-3
 """Excess over [0, 1] that is clipped."""
 _BYTE_LIKE = 1.5
@@ -176,11 +182,21 @@ class _Chosen:
     @property
     def source(self) -> str:
         """Sources of the other targets, and the rows taken from each."""
+        return " | ".join(f"{_source(targets)} {rows}" for targets, rows in self._parts())
+
+    def _parts(self, views: Sequence[int] | None = None) -> list[tuple[Targets, list[int]]]:
+        """Return the other targets and the rows in them of some views, of all by default."""
         rows: dict[int, list[int]] = {}
-        for targets, row in self._places:
+        places = self._places if views is None else [self._places[view] for view in views]
+        for targets, row in places:
             rows.setdefault(id(targets), []).append(row)
-        parts = {id(targets): targets for targets, _ in self._places}
-        return " | ".join(f"{_source(targets)} {rows[key]}" for key, targets in parts.items())
+        parts = {id(targets): targets for targets, _ in places}
+        return [(parts[key], rows[key]) for key in parts]
+
+    def fill(self, progress: Progress, views: Sequence[int] | None = None) -> None:
+        """Create the targets of some views that memory will hold, see `_Cached.fill`."""
+        for targets, rows in self._parts(views):
+            fill(targets, progress, rows)
 
     def __getitem__(self, view: int) -> NDArray[np.float32]:
         targets, row = self._places[view]
@@ -252,6 +268,8 @@ _KEEPING = threading.Lock()
 class _Cached(ABC):
     """Cache of what `_make` returns, up to `limit` bytes, first come first kept."""
 
+    _value_bytes = 1
+
     def __init__(self, cameras: Cameras, limit: int) -> None:
         require("limit", limit, limit >= 0, "at least 0 bytes")
         self.cameras = cameras
@@ -280,13 +298,15 @@ class _Cached(ABC):
                 self._bytes += size
         return made
 
-    def fill(self, value_bytes: int, progress: Progress, stage: str) -> None:
-        """Create the targets that the cache will hold now, so that later steps take equal time."""
-        sizes = 3 * value_bytes * self.cameras.widths.astype(np.int64) * self.cameras.heights
-        count = int((np.cumsum(sizes) <= self._limit).sum())
-        for view in range(count):
+    def fill(self, progress: Progress, views: Sequence[int] | None = None) -> None:
+        """Create the targets of some views, all by default, that the cache will hold now, so that later
+        steps take equal time."""
+        chosen = np.arange(len(self.cameras)) if views is None else np.asarray(views, np.int64)
+        pixels = self.cameras.widths.astype(np.int64) * self.cameras.heights
+        count = int((np.cumsum(3 * self._value_bytes * pixels[chosen]) <= self._limit).sum())
+        for number, view in enumerate(chosen[:count].tolist(), 1):
             self._stored(view)
-            progress(stage, view + 1, count)
+            progress("targets", number, count)
 
 
 class Photos(_Cached):
@@ -446,12 +466,17 @@ class TeacherRenders(_Cached):
         super().__init__(cameras, limit)
         pixels = int((cameras.widths.astype(np.int64) * cameras.heights).sum())
         self._rounded = 3 * np.float32().nbytes * pixels > limit
+        self._value_bytes = 2 if self._rounded else 4
         self._teacher = teacher
         self._background, self._settings = background, settings
         self._renderer = renderer
         if not lazy:
-            self.fill(2 if self._rounded else 4, progress, "targets")
-            self._renderer = None  # its buffers are larger than the scene
+            self.fill(progress)
+
+    def fill(self, progress: Progress, views: Sequence[int] | None = None) -> None:
+        """Render the views that the cache will hold, see `_Cached.fill`."""
+        super().fill(progress, views)
+        self._renderer = None  # its buffers are larger than the scene
 
     @property
     def source(self) -> str:

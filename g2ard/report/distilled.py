@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from itertools import zip_longest
 from pathlib import Path
 from statistics import fmean
-from typing import Any
 
 import numpy as np
 
@@ -14,11 +13,12 @@ from g2ard.progress import plural
 from g2ard.rendering.metrics import psnr
 from g2ard.rendering.renderer import Renderer
 from g2ard.rendering.targets import Targets
-from g2ard.report.kinds import COLUMNS, LOST, KindScore, cells
 from g2ard.report.page import Comparison, Page, Shown
-from g2ard.scene.cameras import USUAL, rows_by_kind
+from g2ard.report.run import COLUMNS, LOST, KindScore, RunReport, TiledReport, cells
+from g2ard.scene.cameras import rows_by_kind
 from g2ard.scene.samples import evenly_spaced
 from g2ard.scene.splats import Splats
+from g2ard.stages.evaluate import ViewScore
 
 _SHOWN = 3
 """Pictures of the page, and rows of the preview picture."""
@@ -32,7 +32,7 @@ def distill_report(
     title: str,
     scenes: Sequence[tuple[str, Splats]],
     targets: Sequence[Targets],
-    report: dict[str, Any],
+    report: RunReport,
     background: Colour = BLACK,
     told: Sequence[str] = (),
 ) -> None:
@@ -40,15 +40,14 @@ def distill_report(
     view and of the worst ones.
 
     Args:
-        scenes: (name, scene) of `simplified` and `recovered`, as `report["scores"]` names them.
+        scenes: (name, scene) of `simplified` and `recovered`, as `report.scores` names them.
         targets: photos or teacher renders of the held-out views, and of the views of other kinds, if any.
-        report: what `g2ard distill` writes as report.json.
         told: summary lines that the command prints.
     """
     page = Page(title, verdict(report))
     views = [(part, row) for part in targets for row in range(len(part.cameras))]
-    parts = [report["scores"], *([report["apart"]] if report["apart"] else [])]
-    scores = {name: [view for part in parts for view in part[name]["views"]] for name, _ in scenes}
+    parts = [part for part in (report.scores, report.apart) if part]
+    scores = {name: [view for part in parts for view in part[name].views] for name, _ in scenes}
     before, after = scores[scenes[0][0]], scores[scenes[-1][0]]
     renderers = [(name, Renderer(splats, background=background)) for name, splats in reversed(scenes)]
 
@@ -56,23 +55,23 @@ def distill_report(
         part, row = views[view]
         camera = part.cameras[row]
         shown = [
-            Shown(stage, to_bytes(renderer.image(camera)), f"{scores[stage][view]['psnr']:.2f} dB")
+            Shown(stage, to_bytes(renderer.image(camera)), f"{scores[stage][view].psnr:.2f} dB")
             for stage, renderer in renderers
         ]
         title = f"{part.cameras.names[row]}, {camera.width}×{camera.height} px"
         page.comparison(Comparison(title, to_bytes(part[row]), shown))
 
-    typical = sorted(range(len(after)), key=lambda row: after[row]["psnr"])[len(after) // 2]
+    typical = sorted(range(len(after)), key=lambda row: after[row].psnr)[len(after) // 2]
     page.heading("A typical view")
     page.paragraph(
-        f"Left of the divider: the {'photo' if 'photo' in report['against'] else 'dense scene'}. "
+        f"Left of the divider: the {'photo' if 'photo' in report.against else 'dense scene'}. "
         "Right: the result. Below: its worst regions, magnified."
     )
     show(typical)
     page.heading("Scores")
-    page.table(COLUMNS, cells(report["kinds"]))
-    page.paragraph(f"PSNR and SSIM: simplified → recovered, in views of {report['size']}.")
-    if edges := edges_line(report["kinds"]):
+    page.table(COLUMNS, cells(report.kinds))
+    page.paragraph(f"PSNR and SSIM: simplified → recovered, in views of {report.size}.")
+    if edges := edges_line(report.kinds):
         page.paragraph(edges)
     for line in told:
         page.paragraph(line)
@@ -84,11 +83,11 @@ def distill_report(
         page.heading("Worst views")
     for view in worst:
         show(view)
-    size, seconds = report["bytes"], report["seconds"]
+    before_mb, after_mb = ((report.bytes[name] or 0) / 1e6 for name in ("input", "output"))
     page.paragraph(
-        f"{size['input'] / 1e6:.2f} → {size['output'] / 1e6:.2f} MB as .ply, in {seconds['total']:,.0f} s. "
-        f"Scored against {report['against']} in views that were not trained on, "
-        f"which blend {report['overdraw']:.1f} Gaussians per pixel."
+        f"{before_mb:.2f} → {after_mb:.2f} MB as .ply, in {report.seconds['total']:,.0f} s. "
+        f"Scored against {report.against} in views that were not trained on, "
+        f"which blend {report.overdraw:.1f} Gaussians per pixel."
     )
     page.write(path)
 
@@ -103,49 +102,41 @@ def edges_line(kinds: Sequence[KindScore]) -> str | None:
     return f"Edges, wires and text (PSNR of gradients): {', '.join(found)}." if found else None
 
 
-def verdict(report: dict[str, Any]) -> str:
+def verdict(report: RunReport | TiledReport) -> str:
     """Summarise a run in one sentence.
 
-    Args:
-        report: what `g2ard distill` writes as report.json.
-
-    >>> from g2ard.report.kinds import Change
+    >>> from types import SimpleNamespace
+    >>> from g2ard.report.run import Change
     >>> change = Change(30.0, 36.6)
-    >>> kind = KindScore("near", 12, change, change, "near_0003", change, 0)
-    >>> verdict({"input_count": 5000, "output_count": 500, "lifted": False, "against": "teacher renders",
-    ...          "kinds": [kind]})  # doctest: +ELLIPSIS
-    '500 of 5,000 Gaussians reproduce the scene at 36.6 dB, the mean of 12 held-out views; ...'
+    >>> kinds = [KindScore("near", 12, change, change, "near_0003", change, 0)]
+    >>> made, size = "500 of 5,000 Gaussians", "800×600 px"
+    >>> verdict(SimpleNamespace(kinds=kinds, made=made, size=size, against="photos"))  # doctest: +ELLIPSIS
+    '500 of 5,000 Gaussians reproduce the photos at 36.6 dB, the mean of 12 held-out views of 800×600 px; ...'
     """
-    kinds: Sequence[KindScore] = report["kinds"]
+    kinds = report.kinds
     if not kinds:
-        return f"{plural(report['output_count'], 'Gaussian')}; no held-out view shows the scene."
+        return f"{plural(report.output_count, 'Gaussian')}; no held-out view shows the scene."
     weakest = min(kinds, key=lambda kind: kind.psnr.after)
     last = f"the worst view is {weakest.worst} ({weakest.worst_psnr.after:.1f} dB)"
     if len(kinds) > 1:
         last = f"{weakest.kind} views are weakest ({weakest.psnr.after:.1f} dB)"
-    count = f"{report['output_count']:,} of {plural(report['input_count'], 'Gaussian')}"
-    if report.get("photos"):
-        count = f"{plural(report['output_count'], 'Gaussian')} from {plural(report['photos'], 'photo')}"
-    elif report.get("lifted"):
-        count = f"{plural(report['output_count'], 'Gaussian')} from {plural(report['input_count'], 'point')}"
-    what = "photos" if "photo" in report.get("against", "") else "scene"
+    what = "photos" if "photo" in report.against else "scene"
     views = sum(kind.views for kind in kinds)
     mean = sum(kind.views * kind.psnr.after for kind in kinds) / views
     over = f"the mean of {views} held-out views" if views > 1 else "in one held-out view"
-    over += f" of {report['size']}" if "size" in report else ""
-    return f"{count} reproduce the {what} at {mean:.1f} dB, {over}; {last}."
+    return f"{report.made} reproduce the {what} at {mean:.1f} dB, {over} of {report.size}; {last}."
 
 
-def _below_start(before: Sequence[dict[str, Any]], after: Sequence[dict[str, Any]]) -> list[tuple[int, str]]:
+def _below_start(before: Sequence[ViewScore], after: Sequence[ViewScore]) -> list[tuple[int, str]]:
     """Return the views whose PSNR fell by over `LOST`, most first, with a text on each.
 
-    >>> rows = [{"name": name, "psnr": 30.0} for name in "ab"]
-    >>> _below_start(rows, [{"name": "a", "psnr": 31.0}, {"name": "b", "psnr": 29.0}])
+    >>> rows = [ViewScore(name, 30.0) for name in "ab"]
+    >>> _below_start(rows, [ViewScore("a", 31.0), ViewScore("b", 29.0)])
     [(1, 'b 30.00 → 29.00 dB')]
     """
-    falls = [old["psnr"] - new["psnr"] for old, new in zip(before, after, strict=True)]
+    falls = [old.psnr - new.psnr for old, new in zip(before, after, strict=True)]
     rows = sorted((row for row, fall in enumerate(falls) if fall > LOST), key=lambda row: -falls[row])
-    texts = [f"{after[i]['name']} {before[i]['psnr']:.2f} → {after[i]['psnr']:.2f} dB" for i in rows]
+    texts = [f"{after[i].name} {before[i].psnr:.2f} → {after[i].psnr:.2f} dB" for i in rows]
     return list(zip(rows, texts, strict=True))
 
 
@@ -154,29 +145,25 @@ def _shown(lost: Sequence[int], worst: Sequence[int]) -> list[int]:
     return list(dict.fromkeys([*lost[:1], *worst]))[:_SHOWN]
 
 
-def _worst(scores: Sequence[dict[str, Any]]) -> list[int]:
+def _worst(scores: Sequence[ViewScore]) -> list[int]:
     """Return views to show: the worst of each kind in turn, weakest kind first."""
-    found = rows_by_kind([view.get("kind", USUAL) for view in scores])
-    kinds = [sorted(rows, key=lambda row: scores[row]["psnr"]) for rows in found.values()]
-    kinds.sort(key=lambda rows: fmean(scores[row]["psnr"] for row in rows))
+    found = rows_by_kind([view.kind for view in scores])
+    kinds = [sorted(rows, key=lambda row: scores[row].psnr) for rows in found.values()]
+    kinds.sort(key=lambda rows: fmean(scores[row].psnr for row in rows))
     return [row for turn in zip_longest(*kinds) for row in turn if row is not None][:_SHOWN]
 
 
-def tiled_report(path: Path, title: str, report: dict[str, Any]) -> None:
-    """Write the HTML page of a run in tiles.
-
-    Args:
-        report: content of report.json from `g2ard distill` in tiles.
-    """
-    scores, views = report["scores"], report["views"]
+def tiled_report(path: Path, title: str, report: TiledReport) -> None:
+    """Write the HTML page of a run in tiles."""
+    scores, views = report.scores, report.views
     shown = sorted((tile for tile in scores.tiles if tile.pixels), key=lambda t: (t.recovered, t.tile))
-    page = Page(title, verdict(report | {"kinds": scores.kinds}))
+    page = Page(title, verdict(report))
     page.table(COLUMNS, cells(scores.kinds))
     page.paragraph(
         f"Simplified {scores.simplified:.2f} dB, recovered {scores.recovered:.2f} dB over the "
         f"{scores.pixels:,} pixels that tiles own in {plural(views['test'], 'held-out view')}; "
         f"{plural(views['train'], 'training view')}, {scores.steps:,} recovery steps of all tiles "
-        f"together, {report['seconds']['total']:,.0f} s."
+        f"together, {report.seconds['total']:,.0f} s."
     )
     page.heading("Tiles, worst first")
     page.table(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -12,12 +13,13 @@ from g2ard.config.checks import checks_arguments
 from g2ard.config.choices import BLACK, Colour
 from g2ard.errors import InputError
 from g2ard.io.images import as_saved
+from g2ard.io.reports import Report
 from g2ard.progress import Progress, plural, silent
 from g2ard.rendering.cuda import renderer_on
 from g2ard.rendering.lpips import Lpips
 from g2ard.rendering.metrics import edge_psnr, psnr, ssim
 from g2ard.rendering.renderer import RasterSettings
-from g2ard.rendering.targets import Targets, against_of, checked_targets, mask_of, scored_in
+from g2ard.rendering.targets import Targets, against_of, checked_targets, fill, mask_of, scored_in
 from g2ard.scene.cameras import USUAL
 from g2ard.scene.splats import Splats
 
@@ -25,7 +27,7 @@ from g2ard.scene.splats import Splats
 @dataclass(frozen=True)
 class ViewScore:
     """Scores of one view: PSNR and that of gradients in dB, SSIM in [−1, 1], LPIPS by network (empty without
-    weights).
+    weights); NaN where not measured.
 
     `against` is "photo" or "teacher" if the targets say so, `kind` the kind of view (`Cameras.kinds`),
     `size` the width and height of the images in pixels.
@@ -33,8 +35,8 @@ class ViewScore:
 
     name: str
     psnr: float
-    ssim: float
-    edge_psnr: float
+    ssim: float = math.nan
+    edge_psnr: float = math.nan
     lpips: Mapping[str, float] = field(default_factory=dict)
     against: str | None = None
     kind: str = USUAL
@@ -42,7 +44,17 @@ class ViewScore:
 
 
 @dataclass(frozen=True)
-class Evaluation:
+class Means(Report):
+    """Mean scores over views, and number, kind and size of these."""
+
+    psnr: float
+    ssim: float
+    edge_psnr: float
+    scored_in: str
+
+
+@dataclass(frozen=True)
+class Evaluation(Report):
     """Scores of a scene over a set of views.
 
     Args:
@@ -80,6 +92,11 @@ class Evaluation:
     def lpips(self) -> dict[str, float]:
         """Mean of the views' LPIPS, by network."""
         return {net: float(np.mean([v.lpips[net] for v in self.views])) for net in self.views[0].lpips}
+
+    @property
+    def means(self) -> Means:
+        """Means of the scores, and where they were measured."""
+        return Means(self.psnr, self.ssim, self.edge_psnr, self.scored_in)
 
     def as_dict(self) -> dict[str, Any]:
         """Return the content of `g2ard evaluate --json`."""
@@ -155,6 +172,7 @@ def evaluate(
     """
     targets = checked_targets(targets)
     cameras = targets.cameras
+    fill(targets, progress)
     renderer = renderer_on(device, splats, background, settings)
     scores = []
     for view, name in enumerate(cameras.names):

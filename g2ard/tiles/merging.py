@@ -1,7 +1,5 @@
 """Simplification of a tiled scene to one exact budget."""
 
-import hashlib
-import json
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,6 +12,7 @@ from g2ard.config.choices import RenderModel
 from g2ard.errors import InputError
 from g2ard.io.stream import PartsStream
 from g2ard.io.tile_store import TileStore
+from g2ard.pipeline.steps import key_of
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats, unit_quats
 from g2ard.scene.transform import join
@@ -185,12 +184,6 @@ def _scene(
         surroundings=None if sights is None else sights.surroundings,
         render_model=store.render_model,
     )
-
-
-def key_of(files: Any) -> str:
-    """Return 16 hexadecimal digits of a hash of file names, which contain the hashes of their content."""
-    names = json.dumps(files, default=lambda path: path.name)
-    return hashlib.sha256(names.encode()).hexdigest()[:16]
 
 
 def finished(small: Splats, sh_degree: int) -> Splats:

@@ -2,28 +2,29 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from g2ard.config.schema import changed, values_of
-from g2ard.io.reports import Report
 from g2ard.io.tile_store import TileStore
 from g2ard.pipeline.distill import RunViews
+from g2ard.pipeline.steps import key_of
 from g2ard.rendering.renderer import RasterSettings, Renderer, settings_for
 from g2ard.rendering.targets import TeacherRenders
-from g2ard.report.kinds import KindScore, by_kind
+from g2ard.report.run import TiledScores, TileScore, by_kind
 from g2ard.scene.cameras import USUAL, Cameras
 from g2ard.scene.prepared import PreparedScene
 from g2ard.scene.splats import SH_C0, Splats
 from g2ard.scene.transform import join
+from g2ard.stages.evaluate import ViewScore
 from g2ard.stages.recover import RecoverConfig, recover
 from g2ard.stages.recover.anchors import Anchors
 from g2ard.stages.recover.draw import checked_weights
 from g2ard.tiles.executor import Workers
-from g2ard.tiles.merging import TiledScene, finished, key_of
+from g2ard.tiles.merging import TiledScene, finished
 from g2ard.tiles.sights import Surroundings, in_sight, light_of, written
 from g2ard.tiles.tasks import (
     Arguments,
@@ -49,38 +50,6 @@ _OWNED_ALPHA = 0.5
 
 _FEWEST_OWNED_PIXELS = 256
 """Fewest owned pixels for a view to be used."""
-
-
-@dataclass(frozen=True)
-class TileScore(Report):
-    """Score of one tile.
-
-    Args:
-        simplified, recovered, pixels, steps: as in `TiledScores`; PSNR is meaningless without pixels.
-    """
-
-    tile: int
-    count: int
-    simplified: float
-    recovered: float
-    pixels: int
-    steps: int
-
-
-@dataclass(frozen=True)
-class TiledScores(Report):
-    """Scores on held-out views, over all pixels owned by tiles.
-
-    Args:
-        pixels: number of pixels scored.
-    """
-
-    simplified: float
-    recovered: float
-    pixels: int
-    kinds: tuple[KindScore, ...]
-    steps: int
-    tiles: tuple[TileScore, ...]
 
 
 class TileTargets(TeacherRenders):
@@ -262,8 +231,8 @@ def recover_tiles(
     lost = np.sum(errors, axis=0)
     shown = [(camera, *_psnr(lost[:, i])) for i, camera in enumerate(views.test) if lost[0, i, 1]]
     kinds = by_kind(
-        [{"name": view.name, "kind": view.kind, "psnr": before} for view, before, _ in shown],
-        [{"name": view.name, "kind": view.kind, "psnr": after} for view, _, after in shown],
+        [ViewScore(view.name, before, kind=view.kind) for view, before, _ in shown],
+        [ViewScore(view.name, after, kind=view.kind) for view, _, after in shown],
         USUAL if views.pool is not None else "given",
     )
     pixels = int(lost[0, :, 1].sum()) // 3

@@ -12,14 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard import _core
-from g2ard.io.atomic import atomic_output
 from g2ard.io.tile_store import TileStore
 from g2ard.rendering.visibility import LONGEST, MOST_VIEWS, NEAR
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.samples import evenly_spaced, weighted_quantile
 from g2ard.tiles.executor import Workers
 from g2ard.tiles.steps import COARSE, TiledRun
-from g2ard.tiles.tasks import Task, is_whole, load, scene_of
+from g2ard.tiles.tasks import Task, is_whole, load, save, scene_of
 
 _LEAST_LIGHT_SHARE = 0.01
 """Share of a view's light from which it sees a tile."""
@@ -144,8 +143,7 @@ def written(work: Path, cameras: Cameras) -> Path:
     content = b"".join(np.ascontiguousarray(array).tobytes() for array in arrays.values())
     path = work / f"views-{hashlib.sha256(content).hexdigest()[:16]}.npz"
     if not is_whole(path):
-        with atomic_output(path, overwrite=True) as temporary, temporary.open("wb") as file:
-            np.savez(file, **arrays)
+        save(path, arrays)
     return path
 
 

@@ -1,7 +1,5 @@
 """Tasks (pure functions from files to one file), and the scenes and cameras in those files."""
 
-import hashlib
-import json
 import math
 import time
 import zipfile
@@ -20,6 +18,7 @@ from numpy.typing import NDArray
 from g2ard.errors import InputError
 from g2ard.io.atomic import atomic_output
 from g2ard.io.tile_store import TileStore
+from g2ard.pipeline.steps import key_of
 from g2ard.rendering.renderer import RasterSettings
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.prepared import PreparedScene, as_prepared, finite_rows_of
@@ -79,13 +78,7 @@ class Task:
     @property
     def key(self) -> str:
         """16 hexadecimal digits that identify the task's output."""
-        names = {
-            name: [path.name for path in (paths if isinstance(paths, list) else [paths])]
-            for name, paths in self.inputs.items()
-        }
-        content = [_OUTPUT_VERSION, self.function, dict(self.arguments), names]
-        text = json.dumps(content, sort_keys=True, separators=(",", ":"))
-        return hashlib.sha256(text.encode()).hexdigest()[:16]
+        return key_of([_OUTPUT_VERSION, self.function, dict(self.arguments), dict(self.inputs)])
 
     @property
     def output(self) -> Path:
@@ -129,9 +122,14 @@ def run_task(task: Task, tell: Callable[[float], None] | None = None) -> Path:
     finally:
         _TELL.reset(before)
         task.share_file.unlink(missing_ok=True)
-    with atomic_output(task.output, overwrite=True) as temporary, temporary.open("wb") as file:
-        np.savez(file, **arrays)  # type: ignore[arg-type]
+    save(task.output, arrays)
     return task.output
+
+
+def save(path: Path, arrays: Arrays) -> None:
+    """Write a task's file atomically."""
+    with atomic_output(path, overwrite=True) as temporary, temporary.open("wb") as file:
+        np.savez(file, **arrays)  # type: ignore[arg-type]
 
 
 def _share_writer(path: Path) -> Callable[[float], None]:

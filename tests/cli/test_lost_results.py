@@ -82,7 +82,7 @@ def test_a_run_whose_scores_failed_is_resumed(
 ) -> None:
     folder = shutil.copytree(inputs, tmp_path / "inputs")
     ask = ("distill", "ball.ply", "-r", 8, "--steps", 2, "--views", "views.json", "--no-page", "-o", "run")
-    with stages_after(folder / "run" / "scene.ply", failing="g2ard.jobs.score.report_of"):
+    with stages_after(folder / "run" / "scene.ply", failing="g2ard.jobs.distill.DistillJob.report"):
         line = refused(command_line, folder, *ask, "-q", status=1)
     assert line == (
         f"g2ard: scoring failed: {INJECTED}; run/scene.ply is written; "

@@ -14,7 +14,6 @@ from g2ard.cli.frame import Run
 from g2ard.cli.resume import stoppable
 from g2ard.errors import InputError
 from g2ard.io import write_splats, write_views
-from g2ard.jobs import score as scoring
 from g2ard.jobs.distill import DistillJob
 from g2ard.pipeline.distill import Distilled
 from g2ard.rendering.targets import TeacherRenders
@@ -118,7 +117,7 @@ def test_a_recovered_run_renders_only_views_that_are_scored(
     folder: Path, command_line: CommandLine, monkeypatch: pytest.MonkeyPatch, options: tuple[str, ...]
 ) -> None:
     rendered: list[str] = []
-    make, score = TeacherRenders._make, scoring.report_of
+    make, score = TeacherRenders._make, DistillJob.report
 
     def counting(self: TeacherRenders, view: int) -> Any:
         rendered.append(self.cameras.names[view])
@@ -132,9 +131,9 @@ def test_a_recovered_run_renders_only_views_that_are_scored(
     ask = ("distill", "a.ply", "-r", 2, "--steps", 3, "--size", 24, "--no-page", *options)
     succeeds(command_line, folder, *ask, "-o", "whole")
     every = set(rendered)
-    monkeypatch.setattr(scoring, "report_of", stopped)
+    monkeypatch.setattr(DistillJob, "report", stopped)
     assert command_line(*ask, "-o", "run", cwd=folder)[0] == 130
-    monkeypatch.setattr(scoring, "report_of", score)
+    monkeypatch.setattr(DistillJob, "report", score)
     rendered.clear()
     succeeds(command_line, folder, *ask, "-o", "run", "--resume")
     report = json.loads((folder / "run" / "report.json").read_text())

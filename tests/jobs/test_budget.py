@@ -11,13 +11,13 @@ import g2ard
 from g2ard.errors import InputError
 from g2ard.io import read_splats, write_splats
 from g2ard.jobs.budget import DEVICES, LAYERS, Budget
-from g2ard.jobs.close_up import close_up
 from g2ard.jobs.distill import prepare
 from g2ard.jobs.distill_options import DistillOptions
 from g2ard.jobs.measured_budget import (
     Quality,
     Reduction,
     ResolvedBudget,
+    close_up,
     count_for_bytes,
     count_for_quality,
     file_bytes,

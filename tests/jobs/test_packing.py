@@ -8,6 +8,7 @@ import numpy as np
 
 import g2ard
 from g2ard.jobs.packing import score_lines
+from g2ard.report.run import Packed
 from helpers.commands import CommandLine, succeeds
 from helpers.scenes import checkered_ball
 
@@ -25,13 +26,12 @@ def test_distill_scores_the_packed_file(command_line: CommandLine, folder: Path)
 
 
 def test_a_costly_format_names_a_better_one() -> None:
-    packed = {"file": "scene.spz", "psnr": 39.74}
+    packed = Packed("scene.spz", 39.74, 0.9)
     assert score_lines(packed, 1_000_000, 40.0, "64×48 px")[1:] == []
     (warning,) = score_lines(packed, 1_000_000, 48.05, "64×48 px")[1:]
     assert warning == "warning: scene.spz: the format costs 8.3 dB; .sog loses less, .ply nothing"
-    assert (
-        ".sog" not in score_lines({"file": "scene.SOG", "psnr": 30}, 1, 48, "64×48 px")[1].partition(";")[2]
-    )
+    worse = Packed("scene.SOG", 30, 0.9)
+    assert ".sog" not in score_lines(worse, 1, 48, "64×48 px")[1].partition(";")[2]
 
 
 def test_convert_warns_only_of_a_visible_loss(command_line: CommandLine, tmp_path: Path) -> None:

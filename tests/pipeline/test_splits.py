@@ -64,9 +64,9 @@ class Watch:
 
 @pytest.fixture
 def watch(monkeypatch: pytest.MonkeyPatch) -> Watch:
+    import g2ard.jobs.distill
     import g2ard.jobs.measured_budget
     import g2ard.jobs.recover
-    import g2ard.jobs.score
     import g2ard.pipeline.distill
     import g2ard.pipeline.steps
     import g2ard.stages.evaluate
@@ -87,7 +87,7 @@ def watch(monkeypatch: pytest.MonkeyPatch) -> Watch:
     watched(g2ard.pipeline.steps, "recover", 1, seen.trained)
     for module in (g2ard.jobs.measured_budget, g2ard.pipeline.distill):
         watched(module, "visibility_source", 0, seen.looked)
-    for module in (g2ard.stages.evaluate, g2ard.jobs.score):
+    for module in (g2ard.stages.evaluate, g2ard.jobs.distill, g2ard.jobs.recover):
         watched(module, "evaluate", 1, seen.scored)
     return seen
 

@@ -2,13 +2,16 @@
 
 import re
 import subprocess
+from dataclasses import fields, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from g2ard.report.distilled import _worst, verdict
-from g2ard.report.kinds import by_kind
 from g2ard.report.page import Comparison, Page, Shown
+from g2ard.report.run import RunReport, by_kind
+from g2ard.stages.evaluate import ViewScore
 from helpers.browser import chromium
 from helpers.commands import CommandLine, succeeds
 from helpers.studies import check_page, study
@@ -41,7 +44,7 @@ def test_distill_writes_a_report(command_line: CommandLine, tmp_path: Path) -> N
 
 
 VIEWS = [
-    {"name": name, "psnr": psnr, "ssim": 0.9} | ({"kind": "near"} if "near" in name else {})
+    ViewScore(name, psnr, 0.9, kind="near" if "near" in name else "usual")
     for name, psnr in zip(
         ("pose_0", "pose_1", "near_0", "near_1", "near_2"), (38, 30, 29, 25, 27), strict=True
     )
@@ -49,14 +52,19 @@ VIEWS = [
 
 
 def test_pictures_are_the_worst_view_of_each_kind_in_turn() -> None:
-    assert [VIEWS[row]["name"] for row in _worst(VIEWS)] == ["near_1", "pose_1", "near_2"]
+    assert [VIEWS[row].name for row in _worst(VIEWS)] == ["near_1", "pose_1", "near_2"]
     assert _worst(VIEWS[:1]) == [0]
 
 
+def _report(**known: Any) -> RunReport:
+    return RunReport(**{field.name: known.get(field.name) for field in fields(RunReport)})
+
+
 def test_the_verdict_names_the_weakest_kind_of_view() -> None:
-    report = {"input_count": 90, "output_count": 9, "against": "renders", "kinds": by_kind(VIEWS, VIEWS)}
-    told = "9 of 90 Gaussians reproduce the scene at 29.8 dB, the mean of 5 held-out views"
+    counts = {"input_count": 90, "output_count": 9, "size": "48×36 px"}
+    report = _report(**counts, against="renders", kinds=by_kind(VIEWS, VIEWS))
+    told = "9 of 90 Gaussians reproduce the scene at 29.8 dB, the mean of 5 held-out views of 48×36 px"
     assert verdict(report) == f"{told}; near views are weakest (27.0 dB)."
-    assert verdict(report | {"kinds": []}) == "9 Gaussians; no held-out view shows the scene."
-    of_photos = verdict(report | {"lifted": True, "against": "photos"})
+    assert verdict(replace(report, kinds=())) == "9 Gaussians; no held-out view shows the scene."
+    of_photos = verdict(replace(report, lifted=True, against="photos"))
     assert of_photos.startswith("9 Gaussians from 90 points reproduce the photos at")

@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from g2ard.report.kinds import COLUMNS
 from g2ard.report.page import Comparison, Page, Shown
+from g2ard.report.run import COLUMNS
 from helpers.browser import Browser
 
 ROW = ["anywhere", "128", "29.34 → 32.27", "pose_0113_anywhere 27.01", "0.7896 → 0.8607"]

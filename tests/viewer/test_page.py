@@ -20,8 +20,10 @@ from g2ard import viewer
 from g2ard.cli.run_folder import RunFolder
 from g2ard.errors import InputError, OutputError
 from g2ard.io import read_splats, write_splats, write_views
+from g2ard.io.types import ViewSet
 from g2ard.jobs import budget
 from g2ard.jobs.viewer_frame import frame_of, frame_with
+from g2ard.pipeline.distill import RunViews
 from g2ard.scene.cameras import Camera, Cameras
 from g2ard.scene.splats import Splats
 from g2ard.viewer import Start, check_page_output, page, write_page
@@ -276,8 +278,10 @@ def test_a_run_has_a_page_unless_too_large(tmp_path: Path, monkeypatch: pytest.M
         monkeypatch.setattr("g2ard.cli.run_folder.LARGEST_DENSE", largest)
         folder.write_view(ball.take(range(30)), dense, around(6), (1.0, 1.0, 1.0))
         assert Parts(path).labels == ["scene.sog: 30 Gaussians"]
-    run = SimpleNamespace(write=lambda scene, splats, **_: write_splats(scene, splats))
-    RunFolder(run, tmp_path, "scene.sog", resume=False).write_scene(ball)
+    config = {"keep": False, "views_format": "g2ard"}
+    run = SimpleNamespace(write=lambda scene, splats, **_: write_splats(scene, splats), config=config)
+    views = RunViews(ViewSet(around(4)), around(2))
+    RunFolder(run, tmp_path, "scene.sog", resume=False).write(ball, ball, views)
     assert not path.exists()  # a page of an earlier run
     monkeypatch.setitem(budget.DEVICES, "web", 299)
     size, line = folder.write_view(ball, None, around(6), (1.0, 1.0, 1.0))

@@ -3,26 +3,39 @@
 from __future__ import annotations
 
 import time
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from g2ard.cli import options as opt
 from g2ard.cli.frame import Run, command
 from g2ard.cli.outputs import budget_of, refuse_file
-from g2ard.cli.run_result import say_fit, say_views, say_weight, tell_quality, told, write_table
-from g2ard.cli.tiling import tiling_of
+from g2ard.cli.run_result import (
+    counts_line,
+    loss,
+    say_fit,
+    say_views,
+    say_weight,
+    tell_quality,
+    told,
+    write_table,
+)
+from g2ard.cli.tiling import tiling_of, working
 from g2ard.config.choices import is_made
 from g2ard.io import kind
 from g2ard.progress import plural
 
 if TYPE_CHECKING:
     from g2ard.cli.run_folder import RunFolder
+    from g2ard.jobs.budget import Budget
     from g2ard.jobs.cost import Cost
     from g2ard.jobs.distill import DistillJob
+    from g2ard.jobs.distill_options import DistillOptions
+    from g2ard.jobs.tiling import Tiling
     from g2ard.pipeline.distill import Distilled
+    from g2ard.report.run import RunReport
 
 
 @command(
@@ -93,7 +106,6 @@ def distill(
     Scenes larger than memory and folders of tiles are distilled tile by tile.
     """
     from g2ard.cli.run_folder import RunFolder
-    from g2ard.cli.tiled import distill_in_tiles
     from g2ard.jobs.cost import check_job_memory, cost_of
     from g2ard.jobs.distill import prepare
     from g2ard.jobs.distill_options import DistillOptions
@@ -113,11 +125,9 @@ def distill(
     refuse_file(output, f"the scene in it is scene.{format}")
     run.claim("--output", output, folder=True)
     folder = RunFolder(run, output, f"scene.{format}", resume)
-    if not dry_run:
-        folder.check(budget)
-        if folder.is_done:
-            run.result(folder.tell_finished())
-            return
+    if not dry_run and (finished := folder.check(budget)):
+        run.result(finished)
+        return
     if scene is not None:
         _check_kind(scene)
     options = DistillOptions(
@@ -136,7 +146,7 @@ def distill(
     if scene is not None and is_tiled(scene, tiling):
         whole = {"clean": clean, "photos": photos, "dry_run": dry_run}
         refuse_whole(scene, needs_whole(options.config, preset, [budget], **whole))
-        distill_in_tiles(run, scene, tiling, budget, options, folder)
+        _in_tiles(run, scene, tiling, budget, options, folder)
         return
     if scene is not None:
         say_fit(run, scene, budget, f"scene.{format}")
@@ -147,14 +157,7 @@ def distill(
         return
     check_job_memory(job, tiling.memory, cost.bytes)
     run.console.expect(cost.stages)
-    prepared = time.monotonic()
-    job = job.resuming(folder.work if resume else None)
-    job.render_targets()
-    before = {"prepare": prepared - began, "targets": time.monotonic() - prepared}
-    result, report = _distil(run, scene or Path(str(views)), job, folder, before)
-    run.kept = [f"{folder.path} is finished"]
-    run.result(report)
-    tell_quality(run, job.budget, result.splats)
+    _whole(run, scene or Path(str(views)), job, folder, time.monotonic() - began)
 
 
 def _check_options(
@@ -193,57 +196,74 @@ def _tell_cost(run: Run, job: DistillJob, cost: Cost) -> None:
     run.result({"count": count, **asdict(cost), "seconds": cost.seconds})
 
 
-def _distil(
-    run: Run, source: Path, job: DistillJob, folder: RunFolder, before: dict[str, float]
-) -> tuple[Distilled, dict[str, Any]]:
-    """Distil, write the run's folder and print a summary.
-
-    Args:
-        before: seconds of the stages before this call.
-    """
+def _whole(run: Run, source: Path, job: DistillJob, folder: RunFolder, prepared: float) -> None:
+    """Distil, write the run's folder and print a summary; `prepared` are seconds before this call."""
     began, page = time.monotonic(), ""
     with folder.working(len(job.prior), job.budget.count, _photos(job)):
         result = job.run(folder.work)
-        folder.write_scene(result.splats)
-        folder.write_simplified(result.simplified if run.config["keep"] else None)
-        folder.write_views(job.views)
+        folder.write(result.splats, result.simplified, job.views)
         folder.write_scored(job.held_out.cameras, None if job.apart is None else job.apart.cameras)
         with run.finishing("scoring"):
-            report = _scored(run, job, result, folder)
-        report["seconds"] = _seconds(before, report["seconds"], time.monotonic() - began)
+            report = job.report(result, folder.scene)
+        report = replace(report, seconds=_seconds(prepared, report.seconds, time.monotonic() - began))
         _write_pages(run, source, job, result, report, folder.path)
         if run.config["page"]:
             seen, colour = job.views.train.cameras, job.config.recover.background
             dense = None if job.config.recover.from_points else job.prior
             with run.finishing("view.html"):
-                report["bytes"]["view"], page = folder.write_view(result.splats, dense, seen, colour)
+                size, page = folder.write_view(result.splats, dense, seen, colour)
+            report = replace(report, bytes={**report.bytes, "view": size})
         folder.write_report(report)
     of_photos = job.config.recover.from_points  # such points are no scene to compare with
+    run.say(counts_line(report))
     write_table(run, report)
     for line in told(report, verbose=run.verbose):
         run.say(line)
-    say_views(run, report["views"], job.config.select.views_count is not None)
+    say_views(run, report.views, job.config.select.views_count is not None)
     if not of_photos:
         say_weight(run, source, folder.scene, result.splats, lifted=job.prior if job.lifted else None)
+    folder.say_files("preview.png", page)
+    run.result(report.as_dict())
+    tell_quality(run, job.budget, result.splats)
+
+
+def _in_tiles(
+    run: Run, scene: Path, tiling: Tiling, budget: Budget, options: DistillOptions, folder: RunFolder
+) -> None:
+    """Distil tile by tile; finished steps stay in the tiling's folder until the command succeeds."""
+    from g2ard.jobs.tiled import distill_in_tiles
+    from g2ard.report.distilled import tiled_report
+
+    with working(run, tiling, options.views, options.held_out, again=" with --resume"):
+        done = distill_in_tiles(scene, budget, tiling, options, **run.callbacks)
+        report, scores = done.report, done.report.scores
+        with folder.writing():
+            folder.write(done.recovered, done.simplified, done.views, compare=True)
+            counts = f"{report.input_count:,} → {report.output_count:,}"
+            with run.finishing("report.html"):
+                tiled_report(folder.path / "report.html", f"{scene.name}: {counts}", report)
+            folder.write_report(report)
+    write_table(run, report)
+    for line in filter(None, map(loss, report.kinds)):
+        run.say(line)
     run.say(
-        f"scene: {folder.scene} ({folder.scene.stat().st_size / 1e6:.2f} MB)\n"
-        f"picture: {folder.path / 'preview.png'}\n"
-        f"report: {folder.path / 'report.html'}, {folder.path / 'report.json'}"
-        + (f"\n{page}" if page else "")
+        f"{folder.path}: {report.output_count:,} of {report.input_count:,} Gaussians; over all pixels "
+        f"{scores.simplified:.2f} → {scores.recovered:.2f} dB; "
+        f"{plural(scores.steps, 'step')} in all tiles together"
     )
-    return result, report
+    folder.say_files()
+    run.result(report.as_dict())
 
 
-def _seconds(before: dict[str, float], stages: dict[str, float], elapsed: float) -> dict[str, float]:
+def _seconds(prepared: float, stages: dict[str, float], elapsed: float) -> dict[str, float]:
     """Return the seconds by stage, with the scores as the rest of `elapsed`, and their total.
 
-    >>> _seconds({"prepare": 4.0}, {"simplify": 2.0, "recover": 9.0, "resumed": 3.0}, 10.0)
+    >>> _seconds(4.0, {"simplify": 2.0, "recover": 9.0, "resumed": 3.0}, 10.0)
     {'prepare': 4.0, 'simplify': 2.0, 'recover': 9.0, 'resumed': 3.0, 'score': 2.0, 'total': 17.0}
     """
     resumed = stages.get("resumed", 0.0)
-    measured = sum(stages.values()) - resumed
-    found = {**before, **stages, "score": elapsed + resumed - measured}
-    return {**found, "total": sum(before.values()) + elapsed + resumed}
+    score = elapsed + 2 * resumed - sum(stages.values())
+    return {"prepare": prepared, **stages, "score": score, "total": prepared + elapsed + resumed}
 
 
 def _photos(job: DistillJob) -> list[Path]:
@@ -253,27 +273,14 @@ def _photos(job: DistillJob) -> list[Path]:
     return list(dict.fromkeys(path for path in paths if path is not None)) if job.reads_photos else []
 
 
-def _scored(run: Run, job: DistillJob, result: Distilled, folder: RunFolder) -> dict[str, Any]:
-    """Return the report, with scores of the file read back if it is packed."""
-    from g2ard.jobs.packing import score_file
-    from g2ard.jobs.score import report_of
-
-    report = report_of(job, result)
-    report["bytes"]["file"] = folder.scene.stat().st_size
-    if folder.scene.name != "scene.ply":
-        colour = job.config.recover.background
-        report["packed"] = score_file(folder.scene, job.held_out, colour, run.progress)
-    return report
-
-
 def _write_pages(
-    run: Run, source: Path, job: DistillJob, result: Distilled, report: dict[str, Any], folder: Path
+    run: Run, source: Path, job: DistillJob, result: Distilled, report: RunReport, folder: Path
 ) -> None:
     """Write report.html and preview.png."""
     from g2ard.report.distilled import distill_report, preview
 
     scenes = [("simplified", result.simplified), ("recovered", result.splats)]
-    before = plural(report["photos"], "photo") if report["photos"] else f"{len(job.prior):,}"
+    before = plural(report.photos, "photo") if report.photos else f"{len(job.prior):,}"
     title = f"{source.name}: {before} → {plural(len(result.splats), 'Gaussian')}"
     targets = [job.held_out] if job.apart is None else [job.held_out, job.apart]
     colour = job.config.recover.background

@@ -69,7 +69,6 @@ def evaluate(
     from g2ard.io.describe import bytes_of
     from g2ard.jobs.common import better_line, common_of
     from g2ard.jobs.inputs import load_views, scorable
-    from g2ard.jobs.score import means
     from g2ard.jobs.teaching import Teaching, check_teacher
     from g2ard.jobs.view_checks import check_sight
     from g2ard.rendering.lpips import load_lpips
@@ -144,7 +143,7 @@ def evaluate(
             {
                 "scene": str(path),
                 **scored.as_dict(),
-                "own_size": unshrunk and means(alike(unshrunk, stage=f"{path.name} unshrunk").as_dict()),
+                "own_size": unshrunk and alike(unshrunk, stage=f"{path.name} unshrunk").means.as_dict(),
                 "drift95": drift,
                 "needle": needle_share(splats.scales),
                 "file_bytes": bytes_of(path),

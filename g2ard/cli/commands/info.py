@@ -99,7 +99,7 @@ def _noted(figures: dict[str, Any], text: str) -> None:
 
 
 def _overdraw(splats: Splats) -> dict[str, Any]:
-    from g2ard.jobs.close_up import close_up
+    from g2ard.jobs.measured_budget import close_up
 
     found = close_up(splats)
     return {} if found is None else {"close_overdraw": found.as_dict()}

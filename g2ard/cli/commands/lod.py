@@ -14,7 +14,7 @@ from g2ard.cli import options as opt
 from g2ard.cli.budget_options import Ratios
 from g2ard.cli.frame import Run, command
 from g2ard.cli.outputs import refuse_file
-from g2ard.cli.tiling import tiling_of
+from g2ard.cli.tiling import tiling_of, working
 from g2ard.config.choices import BLACK, Colour
 from g2ard.errors import OutputError
 from g2ard.io.atomic import hidden_name
@@ -226,17 +226,16 @@ def _in_tiles(
     """Write levels tile by tile; finished steps stay in the tiling's folder until the command succeeds."""
     from g2ard.jobs.distill_options import DistillOptions
     from g2ard.jobs.levels import recovery_settings
-    from g2ard.jobs.tiled import lod_in_tiles, working
+    from g2ard.jobs.tiled import lod_in_tiles
+    from g2ard.pipeline.steps import key_of
     from g2ard.system.peak_memory import peak_rss_of_all
-    from g2ard.tiles.merging import key_of
 
     run, folder = writer.run, tiling.folder
     settings = recovery_settings(steps, writer.background, run.seed)
     options = DistillOptions(
         views=writer.views, size=size, up=writer.up, render_model=run.render_model, settings=settings
     )
-    run.unfinished = f"finished steps are in {folder}; run the same command to continue"
-    with working(tiling, writer.views):
+    with working(run, tiling, writer.views):
         levels = lod_in_tiles(writer.scene, ratios, tiling, options, recover=recover, **run.callbacks)
         begun = folder / f"written-{key_of([[one.store.key for one in levels.splats], asdict(writer.cut)])}"
         begun.mkdir(exist_ok=True)

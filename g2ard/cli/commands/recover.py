@@ -17,7 +17,7 @@ from g2ard.progress import plural
 
 if TYPE_CHECKING:
     from g2ard.jobs.recover import RecoverJob
-    from g2ard.report.kinds import KindScore
+    from g2ard.report.run import KindScore
     from g2ard.stages.recover import Recovered
 
 _FIELDS = "schedule steps recovery_time sh_degree engine background seed"
@@ -111,7 +111,7 @@ def _tell_outcome(run: Run, result: Recovered) -> None:
 def _score(run: Run, job: RecoverJob, result: Recovered) -> tuple[KindScore, ...]:
     """Score held-out views, and print the table and losses."""
     from g2ard.rendering.targets import kinds_of
-    from g2ard.report.kinds import COLUMNS, cells
+    from g2ard.report.run import COLUMNS, cells
 
     kinds = job.score(result)
     if job.held_out is not None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -14,7 +14,7 @@ from g2ard.cli import options as opt
 from g2ard.cli.frame import Run, command
 from g2ard.cli.outputs import Outputs, budgets_of
 from g2ard.cli.run_result import say_fit, say_weight, tell_quality
-from g2ard.cli.tiling import tiling_of
+from g2ard.cli.tiling import tiling_of, working
 from g2ard.config.choices import is_made
 from g2ard.config.schema import listed
 from g2ard.io.atomic import atomic_output, check_output
@@ -25,6 +25,7 @@ from g2ard.system.peak_memory import peak_rss
 if TYPE_CHECKING:
     from g2ard.io.types import Scene
     from g2ard.jobs.budget import Budget
+    from g2ard.jobs.tiling import Tiling
     from g2ard.stages.simplify import Simplified, SimplifyConfig
 
 
@@ -61,7 +62,6 @@ def simplify(
     generated views. The fast method uses views only if --views is given; the paper's method uses none.
     Scenes larger than memory and folders of tiles are simplified tile by tile to the same exact budget.
     """
-    from g2ard.cli.tiled import simplify_in_tiles
     from g2ard.jobs.cost import WHOLE_TIMES, check_whole_memory
     from g2ard.jobs.inputs import say_notes
     from g2ard.jobs.measured_budget import Reduction, resolved
@@ -85,7 +85,7 @@ def simplify(
     given = opt.with_images(views, images)
     if is_tiled(scene, tiling):
         refuse_whole(scene, needs_whole(config, preset, budgets, parents=parents))
-        simplify_in_tiles(run, scene, tiling, outputs, budgets, config, given, no_views, up)
+        _in_tiles(run, scene, tiling, outputs, budgets, config, views=given, blind=no_views, up=up)
         return
     say_fit(run, scene, budgets[0], output.name)
     check_whole_memory(scene, tiling, WHOLE_TIMES)
@@ -125,6 +125,62 @@ def simplify(
             run.say(f"{place}: {written_bytes(place):,} of {one.bytes:,} bytes")
     run.results(reports)
     tell_quality(run, wanted[0], small.splats)
+
+
+def _in_tiles(
+    run: Run,
+    scene: Path,
+    tiling: Tiling,
+    outputs: Outputs,
+    budgets: Sequence[Budget],
+    config: SimplifyConfig,
+    *,
+    views: Any,
+    **options: Any,
+) -> None:
+    """Simplify tile by tile; finished steps stay in the work folder until it succeeds, or longer if named."""
+    from g2ard.jobs.tiled import simplify_in_tiles
+    from g2ard.stages.simplify.growth import say_gaps
+    from g2ard.system.peak_memory import peak_rss_of_all
+
+    began, reports = time.perf_counter(), []
+    with working(run, tiling, views):
+        made = simplify_in_tiles(
+            scene,
+            budgets,
+            tiling,
+            views=views,
+            config=config,
+            seed=run.seed,
+            render_model=run.render_model,
+            counted=outputs.check,
+            **options,
+            **run.callbacks,
+        )
+        for at, (store, small) in enumerate(made):
+            place = outputs.paths(store.count)[at]
+            run.write(place, small, compare=True)
+            seconds = time.perf_counter() - began
+            merging = config.turned("default").resolved(antialiased=small.render_model == "antialiased")
+            reports.append(
+                {
+                    "input_count": store.count,
+                    "output_count": len(small),
+                    "tiles": list(small.counts),
+                    "notes": {note.code: note.count for note in store.notes},
+                    "seconds": {"total": seconds},
+                    "peak_rss_bytes": peak_rss_of_all(),
+                    "views": small.views,
+                    "unseen": small.unseen,
+                    "growth": small.growth,
+                    "opacity_lost": small.opacity_lost,
+                    "method": "default",
+                    "settings": listed(merging),
+                }
+            )
+            say_gaps(small.opacity_lost, run.say)
+            run.say(f"{place}: {len(small):,} of {store.count:,} Gaussians in {seconds:.1f} s")
+    run.results(reports)
 
 
 def _parents_file(run: Run) -> Callable[[Path, Budget], None]:

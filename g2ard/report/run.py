@@ -1,0 +1,307 @@
+"""Reports of a distillation, as its folder keeps them in report.json, and scores by kind of view."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from statistics import fmean
+from typing import Any
+
+from g2ard.io.reports import LEFT_OUT, Report
+from g2ard.progress import plural
+from g2ard.scene.cameras import USUAL, rows_by_kind
+from g2ard.stages.evaluate import Evaluation, Means, ViewScore
+from g2ard.stages.recover.auto_preset import PriorMeasures
+from g2ard.stages.recover.report import RecoverReport
+from g2ard.stages.simplify.report import SimplifyReport
+
+LOST = 0.05
+"""Loss of a view in dB that counts."""
+
+
+@dataclass(frozen=True)
+class Change(Report):
+    """A score of the simplified and of the recovered scene."""
+
+    before: float
+    after: float
+
+    @property
+    def gain(self) -> float:
+        """Return the score that recovery gained."""
+        return self.after - self.before
+
+
+@dataclass(frozen=True)
+class KindScore(Report):
+    """Scores in the views of one kind, none of them used for training.
+
+    Args:
+        kind: near, standing, anywhere or another kind that views state; otherwise `usual` for generated
+            views and `given` for the user's.
+        ssim: mean SSIM; None for a scene in tiles.
+        worst: name of the view with the lowest PSNR after recovery.
+        worst_psnr: PSNR of that view, dB.
+        lost: number of views that lost over 0.05 dB.
+        edge_psnr: mean PSNR of gradients, dB; None for a scene in tiles.
+    """
+
+    kind: str
+    views: int
+    psnr: Change
+    ssim: Change | None
+    worst: str
+    worst_psnr: Change
+    lost: int
+    edge_psnr: Change | None = None
+
+
+def by_kind(
+    before: Sequence[ViewScore], after: Sequence[ViewScore], usual: str = USUAL
+) -> tuple[KindScore, ...]:
+    """Summarise scores by kind of view.
+
+    Args:
+        before: scores of each view with the simplified scene.
+        after: the same with the recovered scene.
+        usual: name for the usual kind.
+
+    >>> before, after = (ViewScore("near_0000", psnr, kind="near") for psnr in (30.0, 31.0))
+    >>> found, = by_kind([before], [after])
+    >>> found.kind, found.psnr.gain, found.ssim, found.worst
+    ('near', 1.0, None, 'near_0000')
+    """
+
+    def changes(score: str, rows: Sequence[int]) -> list[Change]:
+        return [Change(getattr(before[row], score), getattr(after[row], score)) for row in rows]
+
+    def mean_if_scored(score: str, rows: Sequence[int]) -> Change | None:
+        found = mean(changes(score, rows))
+        return None if math.isnan(found.after) else found
+
+    def mean(found: Sequence[Change]) -> Change:
+        return Change(fmean(change.before for change in found), fmean(change.after for change in found))
+
+    scores = []
+    for kind, rows in rows_by_kind([view.kind for view in after]).items():
+        psnr = changes("psnr", rows)
+        worst = min(range(len(rows)), key=lambda i: psnr[i].after)
+        scores.append(
+            KindScore(
+                usual if kind == USUAL else kind,
+                len(rows),
+                mean(psnr),
+                mean_if_scored("ssim", rows),
+                after[rows[worst]].name,
+                psnr[worst],
+                sum(change.gain < -LOST for change in psnr),
+                mean_if_scored("edge_psnr", rows),
+            )
+        )
+    return tuple(scores)
+
+
+COLUMNS = ("kind of view", "views", "PSNR, dB", "worst view", "SSIM")
+
+
+def cells(kinds: Iterable[KindScore]) -> list[list[str]]:
+    """Return the rows of a table with `COLUMNS`."""
+    return [
+        [
+            kind.kind,
+            str(kind.views),
+            f"{kind.psnr.before:.2f} → {kind.psnr.after:.2f}",
+            f"{kind.worst} {kind.worst_psnr.after:.2f}",
+            f"{kind.ssim.before:.4f} → {kind.ssim.after:.4f}" if kind.ssim else "–",
+        ]
+        for kind in kinds
+    ]
+
+
+@dataclass(frozen=True)
+class ViewsReport(Report):
+    """Report of the view selection.
+
+    Args:
+        chosen: names of the chosen views, best first.
+        refused: names of views that see nothing of the scene or lie inside geometry.
+        left_out: share of the whole pool's objective that the remaining views would add.
+    """
+
+    policy: str
+    candidates: int
+    chosen: list[str]
+    weighted: bool
+    refused: list[str]
+    left_out: float
+
+
+@dataclass(frozen=True)
+class RoundReport(Report):
+    """Report of a round: simplification, and its recoveries if there are any."""
+
+    count: int
+    simplify: SimplifyReport
+    recover: tuple[RecoverReport, ...] = ()
+
+
+@dataclass(frozen=True)
+class StageSeconds(Report):
+    """Wall seconds of each stage.
+
+    Args:
+        targets: loading or rendering of training images.
+        resumed: part of these spent by earlier, interrupted calls; None if there were none.
+    """
+
+    targets: float
+    select: float
+    simplify: float
+    recover: float
+    resumed: float | None = field(default=None, metadata=LEFT_OUT)
+
+
+@dataclass(frozen=True)
+class DistillReport(Report):
+    """Report of a distillation. `views` holds its selection of views, or None."""
+
+    rounds: tuple[RoundReport, ...]
+    seconds: StageSeconds
+    views: ViewsReport | None
+
+
+@dataclass(frozen=True)
+class Packed(Report):
+    """Mean scores of a scene as read back from its file."""
+
+    file: str
+    psnr: float
+    ssim: float
+
+
+@dataclass(frozen=True)
+class RunReport(Report):
+    """Report of a run in one piece.
+
+    Args:
+        lifted: whether the scene was lifted from points.
+        photos: number of photos of a start from photos alone.
+        cleaned: Gaussians removed by kind of clutter; None without cleaning.
+        bytes: of the `input` and the `output` as .ply, and of the `file` and the `view` page as written.
+        scores: in held-out views, of the `simplified` and of the `recovered` scene.
+        apart: the same in views of other kinds, or None.
+        size: image size of these views.
+        own_size: means at the views' own size if a requested one shrank them, or None.
+        unseen: share of the scene that no view sees; None for the paper's method.
+        opacity_lost: share of the light of opaque pixels that the result lets through; None for points from
+            photos.
+        overdraw: Gaussians per pixel.
+        preset: the regularisers chosen, and why; `prior` are the measures that chose them.
+        settings: every setting by path.
+        seconds: by stage.
+        packed: scores of a file that is not .ply.
+    """
+
+    input_count: int
+    output_count: int
+    lifted: bool
+    photos: int | None
+    cleaned: dict[str, int] | None
+    bytes: dict[str, int | None]
+    scores: dict[str, Evaluation]
+    apart: dict[str, Evaluation] | None
+    size: str
+    own_size: dict[str, Means] | None
+    kinds: tuple[KindScore, ...]
+    unseen: float | None
+    opacity_lost: float | None
+    overdraw: float
+    against: str
+    preset: str
+    prior: PriorMeasures
+    rounds: tuple[RoundReport, ...]
+    views: ViewsReport | None
+    settings: dict[str, Any]
+    seconds: dict[str, float]
+    packed: Packed | None = field(default=None, metadata=LEFT_OUT)
+
+    @property
+    def source(self) -> str:
+        """Number of photos, points or Gaussians that the result was made from."""
+        if self.photos:
+            return plural(self.photos, "photo")
+        return plural(self.input_count, "point") if self.lifted else f"{self.input_count:,}"
+
+    @property
+    def made(self) -> str:
+        """Number of Gaussians of the result, and what it was made from."""
+        if self.photos or self.lifted:
+            return f"{plural(self.output_count, 'Gaussian')} from {self.source}"
+        return f"{self.output_count:,} of {plural(self.input_count, 'Gaussian')}"
+
+
+@dataclass(frozen=True)
+class TileScore(Report):
+    """Score of one tile.
+
+    Args:
+        simplified, recovered, pixels, steps: as in `TiledScores`; PSNR is meaningless without pixels.
+    """
+
+    tile: int
+    count: int
+    simplified: float
+    recovered: float
+    pixels: int
+    steps: int
+
+
+@dataclass(frozen=True)
+class TiledScores(Report):
+    """Scores on held-out views, over all pixels owned by tiles.
+
+    Args:
+        pixels: number of pixels scored.
+    """
+
+    simplified: float
+    recovered: float
+    pixels: int
+    kinds: tuple[KindScore, ...]
+    steps: int
+    tiles: tuple[TileScore, ...]
+
+
+@dataclass(frozen=True)
+class TiledReport(Report):
+    """Report of a run in tiles.
+
+    Args:
+        tiles: Gaussians of the result by tile.
+        notes: number of each kind of note on the scene's file.
+        peak_rss_bytes: peak memory of all processes.
+        size: image size of the held-out views.
+        views: number of views for training and for scoring.
+    """
+
+    input_count: int
+    output_count: int
+    tiles: list[int]
+    notes: dict[str, int]
+    seconds: dict[str, float]
+    peak_rss_bytes: int | None
+    scores: TiledScores
+    size: str
+    views: dict[str, int]
+    against = "teacher renders"
+
+    @property
+    def made(self) -> str:
+        """Number of Gaussians of the result, and of the scene."""
+        return f"{self.output_count:,} of {plural(self.input_count, 'Gaussian')}"
+
+    @property
+    def kinds(self) -> tuple[KindScore, ...]:
+        """Scores by kind of view."""
+        return self.scores.kinds
