@@ -39,7 +39,9 @@ from g2ard.scene.splats import Splats
 from g2ard.viewer import write_page
 
 if TYPE_CHECKING:
-    from g2ard.tiles.merging import TiledScene
+    from g2ard.jobs.distill import RunTargets
+    from g2ard.jobs.tiled import TiledDistilled
+    from g2ard.pipeline.distill import Distilled
 
 _WORK_FOLDER = ".unfinished"
 """Folder in a run's folder for finished rounds and checkpoints."""
@@ -139,25 +141,21 @@ class RunFolder:
                 yield
 
     def write(
-        self,
-        splats: Splats | TiledScene,
-        simplified: Splats | TiledScene,
-        views: RunViews,
-        *,
-        compare: bool = False,
+        self, done: Distilled | TiledDistilled, views: RunViews, targets: RunTargets | None = None
     ) -> None:
         """Write the scene, with --keep the simplified one, and the views with their splits.
 
         An earlier run's scenes and the pages about them are removed. Generated views are also written in the
-        format of --views-format. `compare` is that of `Run.write`.
+        format of --views-format, and all scored views if some of `targets` are of other kinds. Without
+        targets, which score the file later, a lossy file is compared with the scene.
         """
-        self._run.write(self.scene, splats, overwrite=True, compare=compare)
+        self._run.write(self.scene, done.splats, overwrite=True, compare=targets is None)
         pages = (self.path / name for name in ("report.json", "report.html", "preview.png", "view.html"))
         for other in (*self._other_scenes(), *pages):
             other.unlink(missing_ok=True)
         if self._run.config["keep"]:
             self._simplified.parent.mkdir(exist_ok=True)
-            self._run.write(self._simplified, simplified, overwrite=True)
+            self._run.write(self._simplified, done.simplified, overwrite=True)
         else:
             self._simplified.unlink(missing_ok=True)
         own = views.pool or views.train
@@ -170,13 +168,10 @@ class RunFolder:
             self._run.write_views(
                 self.path / _VIEW_FILES[also], own.cameras, also, own.splits, overwrite=True
             )
-
-    def write_scored(self, held_out: Cameras, others: Cameras | None) -> None:
-        """Write all scored views if some are of other kinds; otherwise remove an earlier run's."""
-        if others is None:
+        if targets is None or targets.apart is None:
             self._scored.unlink(missing_ok=True)
             return
-        scored = _joined(others, held_out)
+        scored = _joined(targets.apart.cameras, targets.held_out.cameras)
         write_views(self._scored, scored, splits=["test"] * len(scored), overwrite=True)
 
     def write_report(self, report: Report) -> None:

@@ -96,7 +96,7 @@ def clean(
     (860, 40)
     """
     kinds = kinds_of(only, strength)
-    splats = scene if isinstance(scene, Splats) else load_scene(scene, say, render_model)
+    splats = load_scene(scene, say, render_model)
     if kinds:
         check_finite(splats, "scene")
     sky = None

@@ -172,7 +172,7 @@ def read_merged(
 
 def _loaded(scene: Scene, axes: AxesName | None, render_model: RenderModel | None, say: Say) -> Splats:
     """Read a scene whose file may store other axes than its format defines."""
-    splats = scene if isinstance(scene, Splats) else load_scene(scene, say, render_model)
+    splats = load_scene(scene, say, render_model)
     if axes is None:
         return splats
     defined = "RDF"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -42,6 +43,25 @@ from g2ard.stages.recover.config import RecoverConfig
 from g2ard.stages.recover.schedule import Schedule
 from g2ard.stages.simplify.growth import opacity_lost
 from g2ard.system.cached import cached_property
+
+
+@dataclass(frozen=True, eq=False)
+class RunTargets:
+    """Targets of a run.
+
+    Args:
+        held_out: those for scoring that have a valid pixel.
+        validation: every second view of another kind; None without such views or a teacher to render them.
+        apart: the others of these views, for scoring.
+        full: held-out targets at the views' own size, of large views only some (`within_pixels`); None if no
+            size shrank them.
+    """
+
+    train: Targets
+    held_out: Targets
+    validation: Targets | None
+    apart: Targets | None
+    full: Targets | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,64 +112,35 @@ class DistillJob:
         )
 
     @cached_property
-    def targets(self) -> Targets:
-        """Training targets."""
-        return self.targets_for(self.views.train.cameras)
+    def targets(self) -> RunTargets:
+        """Targets of the views, made on access; see `make_targets`."""
+        views, say = self.views, self.say
 
-    @cached_property
-    def held_out(self) -> Targets:
-        """Held-out targets of the same kind that have a valid pixel, for scoring only."""
-        return scorable(self.targets_for(self.views.test), self.say)
+        def made(cameras: Cameras, say: Say = unsaid) -> Targets:
+            background, photos = self.config.recover.background, self.photos_over_renders
+            return make_targets(cameras, self.teacher, background, photos=photos, say=say)
 
-    @cached_property
-    def validation(self) -> Targets | None:
-        """Every second view of another kind, for validation during recovery; None as for `apart`."""
-        return self._every_second_apart(0)
-
-    @cached_property
-    def apart(self) -> Targets | None:
-        """The others of these views, for scoring; None without such views or a teacher to render them."""
-        return self._every_second_apart(1)
-
-    @cached_property
-    def full_size(self) -> Targets | None:
-        """Held-out targets at the views' own size; None if no size shrank them.
-
-        Of large views there are only some, see `within_pixels`.
-        """
-        cameras = self.views.full
-        return None if cameras is None else scorable(self.targets_for(within_pixels(cameras)))
-
-    def _every_second_apart(self, first: int) -> Targets | None:
-        cameras = self.views.apart
-        if cameras is None or self.teacher is None or len(cameras) < 2:
-            return None
-        return self.targets_for(cameras.take(range(first, len(cameras), 2)))
-
-    def targets_for(self, cameras: Cameras) -> Targets:
-        """Return targets of this job's kind for views, made on access; see `make_targets`."""
-        return make_targets(
-            cameras,
-            self.teacher,
-            self.config.recover.background,
-            photos=self.photos_over_renders,
-            say=self.say,
-        )
+        train, held_out = made(views.train.cameras, say), scorable(made(views.test, say), say)
+        validation = apart = None
+        if self.teacher is not None and views.apart is not None and len(views.apart) > 1:
+            validation, apart = (made(views.apart.take(range(i, len(views.apart), 2))) for i in (0, 1))
+        full = None if views.full is None else scorable(made(within_pixels(views.full)))
+        return RunTargets(train, held_out, validation, apart, full)
 
     def run(self, work: Path | None = None) -> Distilled:
         """Distil the scene; `work` is the folder for resuming, see `g2ard.pipeline.distill`."""
-        targets, held_out = self.targets, self.held_out  # reject masks without a pixel before any work
+        targets = self.targets
         done = pipeline(
             self.prior,
             self.budget.count,
-            targets,
+            targets.train,
             self.config,
             weights=self.weights,
-            validation=self.validation,
+            validation=targets.validation,
             work=work,
             progress=self.progress,
         )
-        return replace(done, splats=self.budget.shrink(done.splats, self.say), held_out=held_out)
+        return replace(done, splats=self.budget.shrink(done.splats, self.say), held_out=targets.held_out)
 
     def report(self, done: Distilled, file: Path) -> RunReport:
         """Score the simplified and the recovered scene in held-out views, and describe the run.
@@ -158,20 +149,26 @@ class DistillJob:
             file: the written result; its scores are those of the file read back if it is packed.
         """
         scenes = {"simplified": done.simplified, "recovered": done.splats}
-        from_points = self.config.recover.from_points
+        from_points, background = self.config.recover.from_points, self.config.recover.background
+        score = partial(evaluate, background=background, progress=self.progress)
 
         def scored(targets: Targets) -> dict[str, Evaluation]:
-            return {name: self._scores(splats, targets, name) for name, splats in scenes.items()}
+            return {name: score(splats, targets, stage=f"score {name}") for name, splats in scenes.items()}
 
-        scores, apart = scored(self.held_out), None if self.apart is None else scored(self.apart)
+        targets, cameras = self.targets, self.targets.held_out.cameras
+        scores, apart = scored(targets.held_out), None if targets.apart is None else scored(targets.apart)
         before, after = (
             [view for part in (scores, apart) if part for view in part[name].views] for name in scenes
         )
-        full = None if self.full_size is None else scored(self.full_size)
+        full = None if targets.full is None else scored(targets.full)
         made = self.views.pool is not None and "test" in self.views.pool.splits
         config = replace(
             self.config, simplify=self.config.simplify.resolved(antialiased=self.prior.antialiased)
         )
+        packed = None
+        if file.name != "scene.ply":
+            found = score(read_splats(file), targets.held_out, stage="score file")
+            packed = Packed(file.name, found.psnr, found.ssim)
         return RunReport(
             input_count=len(self.prior),
             output_count=len(done.splats),
@@ -181,31 +178,21 @@ class DistillJob:
             bytes={"input": self.prior.nbytes, "output": done.splats.nbytes, "file": file.stat().st_size},
             scores=scores,
             apart=apart,
-            size=self.held_out.cameras.size_text,
+            size=cameras.size_text,
             own_size=None if full is None else {name: found.means for name, found in full.items()},
             kinds=by_kind(before, after, USUAL if made else "given"),
             unseen=self._unseen(done),
-            opacity_lost=None
-            if from_points
-            else opacity_lost(self.prior, done.splats, self.held_out.cameras),
-            overdraw=overdraw(done.splats, self.held_out.cameras),
-            against=kinds_of(self.held_out),
+            opacity_lost=None if from_points else opacity_lost(self.prior, done.splats, cameras),
+            overdraw=overdraw(done.splats, cameras),
+            against=kinds_of(targets.held_out),
             preset=self.preset,
             prior=self.measured,
             rounds=done.report.rounds,
             views=done.report.views,
             settings=listed(config),
             seconds=done.report.seconds.as_dict(),
-            packed=None if file.name == "scene.ply" else self._packed(file),
+            packed=packed,
         )
-
-    def _scores(self, splats: Splats, targets: Targets, name: str) -> Evaluation:
-        background, stage = self.config.recover.background, f"score {name}"
-        return evaluate(splats, targets, background=background, progress=self.progress, stage=stage)
-
-    def _packed(self, file: Path) -> Packed:
-        found = self._scores(read_splats(file), self.held_out, "file")
-        return Packed(file.name, found.psnr, found.ssim)
 
     def _unseen(self, done: Distilled) -> float | None:
         """Return the share of the scene that no view sees, or None for the paper's method.

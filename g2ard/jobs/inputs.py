@@ -30,11 +30,15 @@ Views = Cameras | ViewSet | ViewFiles | str | Path  # cameras, or the path of vi
 Split = str | Callable[..., "NDArray[np.bool_]"]  # of `split_mask`, or a function like `for_training`
 
 
-def load_scene(path: str | Path, say: Say = unsaid, render_model: RenderModel | None = None) -> Splats:
-    """Read a scene and report its notes."""
-    scene = read_scene(path, render_model=render_model)
-    say_notes(path, scene.notes, say)
-    return scene.splats
+def load_scene(
+    scene: Splats | str | Path, say: Say = unsaid, render_model: RenderModel | None = None
+) -> Splats:
+    """Return a scene; one that is a path is read, and its notes are reported."""
+    if isinstance(scene, Splats):
+        return scene
+    found = read_scene(scene, render_model=render_model)
+    say_notes(scene, found.notes, say)
+    return found.splats
 
 
 def say_notes(path: str | Path, notes: Sequence[Note], say: Say) -> None:

@@ -24,7 +24,7 @@ from g2ard.jobs.budget import Budget
 from g2ard.jobs.cost import Cost, cost_of
 from g2ard.jobs.distill import DistillJob, prepare
 from g2ard.jobs.distill_options import DistillOptions
-from g2ard.jobs.inputs import Views, load_scene, scorable
+from g2ard.jobs.inputs import Views, load_scene
 from g2ard.jobs.viewer_frame import frame_of, up_of
 from g2ard.levels.tileset import TILE_OF_SCENE, Georeference, map_system
 from g2ard.levels.tileset import save_tileset as write_tileset
@@ -134,28 +134,27 @@ class LevelsJob:
     def _level(self, finer: Splats, count: int, longest: int) -> tuple[Splats, Splats, float, float | None]:
         """Make one level, see `make_levels`."""
         job, views = self.job, self.job.views.resized(longest)
-        held_out = scorable(job.targets_for(views.test), job.say)
+        targets = replace(job, views=replace(views, full=None)).targets
         if not self.recover:
             level = merged = _merged(job, finer, count)
         else:
-            apart = None if job.teacher is None else views.apart
             done = pipeline(
                 finer,
                 count,
-                job.targets_for(views.train.cameras),
+                targets.train,
                 job.config,
                 weights=job.weights,
-                validation=None if apart is None else job.targets_for(apart.take(range(0, len(apart), 2))),
+                validation=targets.validation,
                 work=self.work,
                 progress=job.progress,
             )
             level, merged = done.splats, done.simplified
-            lost = opacity_lost(job.prior, level, held_out.cameras)
+            lost = opacity_lost(job.prior, level, targets.held_out.cameras)
             say_gaps(lost, job.say, f"give levels more Gaussians (--ratios), here {count:,}")
         common: dict[str, Any] = {"background": job.config.recover.background, "progress": job.progress}
 
         def score(splats: Splats) -> float:
-            return evaluate(splats, held_out, stage="scoring", **common).psnr
+            return evaluate(splats, targets.held_out, stage="scoring", **common).psnr
 
         return level, merged, score(merged), score(level) if self.recover else None
 
@@ -184,12 +183,12 @@ def prepare_levels(
     check_ratios(ratios)
     check_trained(scene)
     sky = None
+    if not isinstance(scene, Splats):
+        beside = beside or scene
     if isinstance(scene, Splats):
         scene = scene.narrowed()  # levels and sky then have one offset
     if split_sky:
-        if not isinstance(scene, Splats):
-            beside = beside or scene
-            scene = load_scene(scene, say, render_model)
+        scene = load_scene(scene, say, render_model)
         if (far := sky_mask(scene)).any():
             say(f"sky: {plural(int(far.sum()), 'Gaussian')}, kept whole")
             scene, sky = scene.take(~far), scene.take(far)

@@ -214,7 +214,7 @@ def recover(
         validation = checked_targets(validation, "validation")
     config = config or RecoverConfig()
     config = changed(config, full_paths(named, config))
-    start = _scene(student, render_model, say)
+    start = load_scene(student, say, render_model).narrowed()
     if not isinstance(anchors, Anchors | None):
         anchors = Anchors.of(_built(anchors, start, render_model, say), config.regularizers.in_plane)
     return optimize(
@@ -260,7 +260,7 @@ def prepare(
     require("preset", repr(preset), preset in PRESETS, f"one of {', '.join(PRESETS)}")
     named = {**PRESETS[preset], **given}
     config = configured(RecoverConfig(), preset, given)
-    start = _scene(student, render_model, say)
+    start = load_scene(student, say, render_model).narrowed()
     teaching = Teaching(
         teacher,
         config.background,
@@ -309,15 +309,11 @@ def prepare(
     )
 
 
-def _scene(scene: Splats | str | Path, render_model: RenderModel | None, say: Say) -> Splats:
-    return scene.narrowed() if isinstance(scene, Splats) else load_scene(scene, say, render_model)
-
-
 def _built(
     anchors: Splats | str | Path, student: Splats, render_model: RenderModel | None, say: Say
 ) -> Splats:
     """Return the student as it was built, in its present coordinates."""
-    scene = _scene(anchors, render_model, say)
+    scene = load_scene(anchors, say, render_model)
     if len(scene) != len(student):
         raise InputError(
             f"has {plural(len(scene), 'Gaussian')}, the student has {len(student):,}",

@@ -93,7 +93,7 @@ def prepare(
     if poses is None:
         poses = dict(zip(taken.names, taken.viewmats, strict=True)) if pool is None else {}
     starts, true = (_named(given, taken.names) for given in (poses, truth or {}))
-    splats = scene if isinstance(scene, Splats) else load_scene(scene, say, render_model)
+    splats = load_scene(scene, say, render_model)
     propose_background(taken, background or BLACK, background is not None, say)
     places = pool if pool is None or isinstance(pool, Cameras) else pool_of(splats, pool, seed, progress, say)
     return RegisterJob(splats, taken, starts, places, true, config, keep, background or BLACK, progress)

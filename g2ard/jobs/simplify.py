@@ -88,9 +88,10 @@ def simplify(
     given = {name: value for name, value in fields.items() if value is not None}
     config = configured(config or SimplifyConfig(), settings=given | dict(settings or {}))
     wanted = Budget(count, ratio, fit=fit, min_psnr=min_psnr, min_ssim=min_ssim)
-    splats, beside, name = _scene(scene, beside, render_model, say)
+    name = "scene" if isinstance(scene, Splats) else str(scene)
+    beside = beside if isinstance(scene, Splats) else beside or scene
     reduce = Reduction(
-        splats,
+        load_scene(scene, say, render_model),
         views=views,
         blind=blind,
         config=config,
@@ -106,12 +107,3 @@ def simplify(
     if judgement := budget.judge(small.splats):
         say(judgement[1])
     return small
-
-
-def _scene(
-    scene: Splats | str | Path, beside: str | Path | None, render_model: RenderModel | None, say: Say
-) -> tuple[Splats, str | Path | None, str]:
-    """Return the scene, where to look for cameras, and its name in errors."""
-    if isinstance(scene, Splats):
-        return scene, beside, "scene"
-    return load_scene(scene, say, render_model), beside or scene, str(scene)

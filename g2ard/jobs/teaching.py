@@ -50,9 +50,7 @@ class Teaching:
     @cached_property
     def dense(self) -> Splats | None:
         """The teacher, if there is one."""
-        if isinstance(self.teacher, str | Path):
-            return load_scene(self.teacher, self.say, self.render_model)
-        return self.teacher
+        return None if self.teacher is None else load_scene(self.teacher, self.say, self.render_model)
 
     def views(self, given: Views | None, student: Splats | None = None) -> Views:
         """Return the given views, or those found beside the teacher, or generated ones.

@@ -124,10 +124,10 @@ def simplify_in_tiles(
 
 @dataclass(frozen=True, eq=False)
 class TiledDistilled:
-    """A distilled scene in tiles, before and after recovery, with its views and its report."""
+    """A distilled scene in tiles, with its unrecovered version, its views and its report."""
 
+    splats: TiledScene
     simplified: TiledScene
-    recovered: TiledScene
     views: RunViews
     report: TiledReport
 
@@ -165,7 +165,7 @@ def distill_in_tiles(
             size=views.test.size_text,
             views={"train": len(views.train.cameras), "test": len(views.test)},
         )
-        return TiledDistilled(small, done, views, report)
+        return TiledDistilled(done, small, views, report)
 
 
 def lod_in_tiles(

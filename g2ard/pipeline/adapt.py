@@ -335,7 +335,7 @@ def adapt(
         change = colour_change(given, targets, config.background)
         change = change if change.gain >= config.colour_worth else None
         start = given if change is None else recoloured(given, change)
-    fitted, fits = _fit(start, targets, config, Steps(work), progress)
+    fitted, fits = _fit(start, targets, config, Steps(work, progress), progress)
     if config.prior_views:
         seen = views_seeing(start, targets.cameras)
         share = seen / (seen + config.prior_views)

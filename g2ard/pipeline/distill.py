@@ -8,21 +8,21 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from g2ard.config.checks import checks_arguments
 from g2ard.io.types import ViewSet
 from g2ard.pipeline.config import DistillConfig, SelectConfig
 from g2ard.pipeline.steps import Steps
 from g2ard.progress import Progress, plural, silent
-from g2ard.rendering.targets import Photos, PhotosOrRenders, Subset, Targets, checked_targets, fill
+from g2ard.rendering.targets import Photos, PhotosOrRenders, Subset, Targets, checked_targets
 from g2ard.rendering.visibility import visibility_source
 from g2ard.report.run import DistillReport, RoundReport, StageSeconds, ViewsReport
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
+from g2ard.stages.recover import RecoverConfig
 from g2ard.stages.recover.draw import checked_weights
 from g2ard.stages.recover.optimize import Watch
-from g2ard.stages.recover.report import RecoverReport
 from g2ard.stages.select import SurfaceOptions, select
 from g2ard.stages.simplify import simplify
 from g2ard.stages.simplify.report import SimplifyReport
@@ -125,180 +125,134 @@ def distill(
     config, targets, prior = config or DistillConfig(), checked_targets(targets), prior.narrowed()
     if validation is not None:
         validation = checked_targets(validation, "validation")
-    counts = [budget]
-    if config.recover.schedule.round_steps > 0:
+    schedule, counts, steps = config.recover.schedule, [budget], Steps(work, progress)
+    if schedule.round_steps > 0:
         counts = config.simplify.rounds(len(prior), budget, recovered=True)
-    rounds = _Rounds(
-        prior,
-        budget,
-        targets,
-        config,
-        len(counts),
-        Steps(work),
-        checked_weights(weights, len(targets.cameras)),
-        validation=validation,
-        progress=progress,
-        watch=watch,
-    )
+    given = checked_weights(weights, len(targets.cameras))
+    photos = isinstance(targets, Photos | PhotosOrRenders)
+    scene, protected, selecting, log = prior, None, 0.0, []
     for number, count in enumerate(counts, start=1):
-        rounds.advance(number, count, final=number == len(counts))
-    seconds = StageSeconds(**rounds.seconds, resumed=rounds.steps.resumed)
-    report = DistillReport(tuple(rounds.log), seconds, rounds.supervision.report)
-    return Distilled(rounds.state, rounds.simplified, report)
+        if number == 1 or config.select.reselect:
+            began = time.monotonic()
+            chosen = _selected(scene, targets, config, given, progress)
+            selecting += time.monotonic() - began
+        simplified, report, protected = _simplified(
+            steps, number, scene, count, budget, targets.cameras, config, protected, progress
+        )
+        scene, recoveries = simplified, []
+        final = number == len(counts)
+        for name in [f"round-{number}"] * (schedule.round_steps > 0) + [_FINAL] * final:
+            scene, recovery = steps.recover(
+                name,
+                scene,
+                chosen.targets,
+                _recovery(config.recover, scene, chosen.targets.cameras, len(counts), photos, name == _FINAL),
+                built=simplified,
+                weights=chosen.weights,
+                validation=validation,
+                filled=budget < len(prior),  # otherwise the scene may be its own teacher
+                stage="recover" if name == _FINAL else f"recover {name}",
+                watch=watch,
+                skip_same=True,
+            )
+            recoveries.append(recovery)
+        log.append(RoundReport(count, report, tuple(recoveries)))
+    seconds = StageSeconds(
+        targets=steps.filling,
+        select=selecting,
+        simplify=sum(entry.simplify.seconds or 0.0 for entry in log),
+        recover=sum(recovery.seconds for entry in log for recovery in entry.recover),
+        resumed=steps.resumed,
+    )
+    return Distilled(scene, simplified, DistillReport(tuple(log), seconds, chosen.report))
 
 
 @dataclass(frozen=True, eq=False)
-class _Supervision:
+class _Selected:
     """Training targets with sampling weights, and a report of their selection."""
 
     targets: Targets
     weights: Any
     report: ViewsReport | None
 
-    @classmethod
-    def of(
-        cls, scene: Splats, targets: Targets, config: DistillConfig, weights: Any, progress: Progress
-    ) -> _Supervision:
-        """Select the views that see `scene`; given `weights` override those of the selection."""
-        cameras = targets.cameras
-        how = config.select
-        if how.views_count is None and (weights is not None or not how.weighted):
-            return cls(targets, weights, None)
-        policy = how.policy if how.views_count is not None else "auto"
-        chosen = select(
+
+def _selected(
+    scene: Splats, targets: Targets, config: DistillConfig, weights: Any, progress: Progress
+) -> _Selected:
+    """Select the views that see `scene`; given `weights` override those of the selection."""
+    cameras, how = targets.cameras, config.select
+    if how.views_count is None and (weights is not None or not how.weighted):
+        return _Selected(targets, weights, None)
+    policy = how.policy if how.views_count is not None else "auto"
+    chosen = select(
+        scene,
+        cameras,
+        how.count_of(len(cameras)),
+        policy=policy,
+        seed=config.recover.seed,
+        options=how if isinstance(how, SurfaceOptions) else None,
+        progress=progress,
+    )
+    rows = np.argsort(chosen.order)
+    if weights is not None:
+        weights = weights[chosen.order[rows]]
+    elif how.weighted:
+        weights = chosen.weights[rows]
+    report = ViewsReport(
+        policy=policy,
+        candidates=len(cameras),
+        chosen=[cameras.names[i] for i in chosen.order],
+        weighted=weights is not None,
+        refused=[cameras.names[i] for i in chosen.refused],
+        left_out=chosen.left_out,
+    )
+    return _Selected(Subset(targets, chosen.order[rows]), weights, report)
+
+
+def _simplified(
+    steps: Steps,
+    number: int,
+    scene: Splats,
+    count: int,
+    budget: int,
+    cameras: Cameras,
+    config: DistillConfig,
+    protected: NDArray[np.bool_] | None,
+    progress: Progress,
+) -> tuple[Splats, SimplifyReport, NDArray[np.bool_]]:
+    """Simplify to the count of a round; return the scene, a report and the flags for the next round."""
+    blind = config.simplify.method == "paper" or count == len(scene)
+    kept = None if protected is None else np.packbits(protected).tobytes()
+    content = [config.simplify, count, budget, None if blind else cameras.fingerprint(), kept]
+
+    def step(_: Path | None) -> tuple[Splats, SimplifyReport, dict[str, Any]]:
+        began = time.monotonic()
+        done = simplify(
             scene,
-            cameras,
-            how.count_of(len(cameras)),
-            policy=policy,
-            seed=config.recover.seed,
-            options=how if isinstance(how, SurfaceOptions) else None,
+            count,
+            config=config.simplify,
+            visibility=None if blind else visibility_source(cameras, progress=progress),
+            protected=protected,
+            final_budget=budget,
             progress=progress,
         )
-        rows = np.argsort(chosen.order)
-        subset = Subset(targets, chosen.order[rows])
-        if weights is not None:
-            weights = weights[chosen.order[rows]]
-        elif how.weighted:
-            weights = chosen.weights[rows]
-        report = ViewsReport(
-            policy=policy,
-            candidates=len(cameras),
-            chosen=[cameras.names[i] for i in chosen.order],
-            weighted=weights is not None,
-            refused=[cameras.names[i] for i in chosen.refused],
-            left_out=chosen.left_out,
-        )
-        return cls(subset, weights, report)
+        report = replace(done.report, seconds=time.monotonic() - began)
+        return done.splats, report, {"protected": done.protected}
+
+    done, report, arrays = steps.run(f"simplified-{number}", scene, lambda: content, SimplifyReport, step)
+    if config.recover.sh_degree is not None:
+        done = done.with_sh_degree(config.recover.sh_degree)
+    return done, report, arrays["protected"]
 
 
-@dataclass(eq=False)
-class _Rounds:
-    """State of the rounds: scene, protection flags and log."""
-
-    prior: Splats
-    budget: int
-    targets: Targets
-    config: DistillConfig
-    count: int
-    steps: Steps
-    weights: Any = None
-    validation: Targets | None = None
-    progress: Progress = silent
-    watch: Watch | None = None
-
-    def __post_init__(self) -> None:
-        self.state = self.simplified = self.prior
-        self.protected: Any = None
-        self.log: list[RoundReport] = []
-        self.seconds = {"targets": 0.0, "select": 0.0, "simplify": 0.0, "recover": 0.0}
-        self._select(self.prior)
-
-    def advance(self, number: int, count: int, *, final: bool) -> None:
-        """Run one round: simplify to `count` and recover; the final round adds the final recovery."""
-        if self.config.select.reselect and number > 1:
-            self._select(self.state)
-        simplified, recovered = self._simplify(number, count), []
-        if self.config.recover.schedule.round_steps > 0:
-            recovered.append(self._recover(f"round-{number}", final=False))
-        if final:
-            recovered.append(self._recover(_FINAL, final=True))
-        self.log.append(RoundReport(count, simplified, tuple(recovered)))
-
-    def _select(self, scene: Splats) -> None:
-        began = time.monotonic()
-        self.supervision = _Supervision.of(scene, self.targets, self.config, self.weights, self.progress)
-        self.seconds["select"] += time.monotonic() - began
-        began = time.monotonic()
-        if self.budget < len(self.prior) and not self.steps.has(_FINAL):  # otherwise few may be drawn
-            for targets in filter(None, (self.supervision.targets, self.validation)):
-                fill(targets, self.progress)
-        self.seconds["targets"] += time.monotonic() - began
-
-    def _simplify(self, number: int, count: int) -> SimplifyReport:
-        cameras, scene, config = self.targets.cameras, self.state, self.config.simplify
-        blind = config.method == "paper" or count == len(scene)
-
-        def settings() -> object:
-            kept = None if self.protected is None else np.packbits(self.protected).tobytes()
-            return config, count, self.budget, None if blind else cameras.fingerprint(), kept
-
-        def step(_: Path | None) -> tuple[Splats, SimplifyReport, dict[str, Any]]:
-            began = time.monotonic()
-            done = simplify(
-                scene,
-                count,
-                config=config,
-                visibility=None if blind else visibility_source(cameras, progress=self.progress),
-                protected=self.protected,
-                final_budget=self.budget,
-                progress=self.progress,
-            )
-            report = replace(done.report, seconds=time.monotonic() - began)
-            return done.splats, report, {"protected": done.protected}
-
-        self.state, report, arrays = self.steps.run(
-            f"simplified-{number}", scene, settings, SimplifyReport, step
-        )
-        self.protected = arrays["protected"]
-        self.seconds["simplify"] += report.seconds or 0.0
-        if self.config.recover.sh_degree is not None:
-            self.state = self.state.with_sh_degree(self.config.recover.sh_degree)
-        self.simplified = self.state
-        return report
-
-    def _recover(self, name: str, *, final: bool) -> RecoverReport:
-        limit = self._time_limit(final)
-        self.state, report = self.steps.recover(
-            name,
-            self.state,
-            self.supervision.targets,
-            replace(
-                self.config.recover,
-                steps=self._steps() if final and limit is None else None,
-                recovery_time=limit,
-                final=final,
-            ),
-            built=self.simplified,
-            weights=self.supervision.weights,
-            validation=self.validation,
-            progress=self.progress,
-            stage="recover" if final else f"recover {name}",
-            watch=self.watch,
-            skip_same=True,
-        )
-        self.seconds["recover"] += report.seconds
-        return report
-
-    def _steps(self) -> int:
-        photos = isinstance(self.targets, Photos | PhotosOrRenders)
-        cameras = self.supervision.targets.cameras
-        return self.config.recover.final_steps(self.state, cameras, photos=photos)
-
-    def _time_limit(self, final: bool) -> float | None:
-        """Return this recovery's share of the time limit for all."""
-        config, schedule = self.config.recover, self.config.recover.schedule
-        if config.recovery_time is None:
-            return None
-        final_steps = schedule.steps if config.steps is None else config.steps
-        all_steps = final_steps + self.count * schedule.round_steps
-        return config.recovery_time * (final_steps if final else schedule.round_steps) / all_steps
+def _recovery(
+    config: RecoverConfig, scene: Splats, cameras: Cameras, rounds: int, photos: bool, final: bool
+) -> RecoverConfig:
+    """Return the settings of one recovery: the steps of the last one, or its share of the time for all."""
+    schedule, limit = config.schedule, config.recovery_time
+    if limit is None:
+        steps = config.final_steps(scene, cameras, photos=photos) if final else None
+        return replace(config, steps=steps, final=final)
+    last = schedule.steps if config.steps is None else config.steps
+    limit = limit * (last if final else schedule.round_steps) / (last + rounds * schedule.round_steps)
+    return replace(config, steps=None, recovery_time=limit, final=final)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -11,7 +12,8 @@ from typing import Any, TypeVar
 
 from numpy.typing import NDArray
 
-from g2ard.rendering.targets import Targets, fingerprint_of
+from g2ard.progress import Progress, silent
+from g2ard.rendering.targets import Targets, fill, fingerprint_of
 from g2ard.scene.splats import ARRAYS, Splats
 from g2ard.stages.recover import RecoverConfig, checkpoint, recover
 from g2ard.stages.recover.anchors import Anchors
@@ -39,17 +41,13 @@ class Steps:
 
     A result's file name contains a hash of the step's scene, settings and other inputs, so a run with other
     settings computes only the steps that depend on them. `resumed` is the time in seconds that earlier calls
-    spent on these steps; None without any.
+    spent on these steps, None without any; `filling` the time spent on loading or rendering targets.
     """
 
-    def __init__(self, folder: Path | None) -> None:
-        self._folder = folder
+    def __init__(self, folder: Path | None, progress: Progress = silent) -> None:
+        self._folder, self._progress = folder, progress
         self.resumed: float | None = None
-
-    def has(self, name: str) -> bool:
-        """Return whether the folder holds a result of a step, of whatever settings."""
-        files = [] if self._folder is None else self._folder.glob(f"{name}-*.npz")
-        return any(not file.name.endswith(_WITHIN) for file in files)
+        self.filling = 0.0
 
     def run(
         self,
@@ -92,9 +90,15 @@ class Steps:
         built: Splats | None = None,
         weights: NDArray[Any] | None = None,
         validation: Targets | None = None,
+        filled: bool = True,
         **options: Any,
     ) -> tuple[Splats, RecoverReport]:
-        """Recover a scene, like `recover`; `built` is the scene before any recovery."""
+        """Recover a scene, like `recover`.
+
+        Args:
+            built: the scene before any recovery.
+            filled: whether to make the targets before the first step, so that all steps take equal time.
+        """
 
         def settings() -> object:
             views = [fingerprint_of(each) for each in (targets, validation) if each is not None]
@@ -102,8 +106,13 @@ class Steps:
             return config, views, before, None if weights is None else weights.tolist()
 
         def step(within: Path | None) -> _Result[RecoverReport]:
+            began = time.monotonic()
+            for each in filter(None, (targets, validation)) if filled else ():
+                fill(each, self._progress)
+            self.filling += time.monotonic() - began
             options["anchors"] = None if built is None else Anchors.of(built, config.regularizers.in_plane)
             options.update(weights=weights, validation=validation, checkpoint=within)
+            options.setdefault("progress", self._progress)
             done = recover(student, targets, config, **options)
             return done.splats, done.report, {}
 

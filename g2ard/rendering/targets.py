@@ -301,10 +301,12 @@ class _Cached(ABC):
     def fill(self, progress: Progress, views: Sequence[int] | None = None) -> None:
         """Create the targets of some views, all by default, that the cache will hold now, so that later
         steps take equal time."""
-        chosen = np.arange(len(self.cameras)) if views is None else np.asarray(views, np.int64)
+        views = range(len(self.cameras)) if views is None else views
+        missing = np.array([view for view in views if view not in self._kept], np.int64)
         pixels = self.cameras.widths.astype(np.int64) * self.cameras.heights
-        count = int((np.cumsum(3 * self._value_bytes * pixels[chosen]) <= self._limit).sum())
-        for number, view in enumerate(chosen[:count].tolist(), 1):
+        room = self._limit - self._bytes
+        count = int((np.cumsum(3 * self._value_bytes * pixels[missing]) <= room).sum())
+        for number, view in enumerate(missing[:count].tolist(), 1):
             self._stored(view)
             progress("targets", number, count)
 

@@ -245,7 +245,7 @@ def _distilled_in_tiles(settings: Mapping[str, Any]) -> object:
     options = DistillOptions(views=UNEVEN, size=48, settings={**FAR, **settings})
     refuse_whole(scene, needs_whole(options.config))
     done = distill_in_tiles(scene, Budget(count=BUDGET), tiling, options)
-    return done.recovered.whole().fingerprint()
+    return done.splats.whole().fingerprint()
 
 
 PRIORS = ("trained", "lift", "noisy")

@@ -157,13 +157,12 @@ def test_a_loss_in_any_kind_of_view_is_reported() -> None:
 
 
 def test_steps_by_need_are_for_teachers() -> None:
-    from g2ard.pipeline.distill import _Rounds
-    from g2ard.pipeline.steps import Steps
+    from g2ard.pipeline.distill import _recovery
 
     part = replace(around(12), Ks=around(12).Ks * [[[4], [4], [1]]])  # a sixteenth of the ball in each
 
     def horizon(targets: Targets, config: DistillConfig) -> int | None:
-        return _Rounds(PRIOR, 300, targets, config, 1, Steps(None))._steps()
+        return _recovery(config.recover, PRIOR, targets.cameras, 1, photos=False, final=True).steps
 
     teacher, config = (
         TeacherRenders(PRIOR, part, lazy=True),

@@ -43,7 +43,6 @@ def adapt(
     from g2ard.jobs.teaching import Teaching
     from g2ard.pipeline.adapt import AdaptConfig
     from g2ard.pipeline.adapt import adapt as refit
-    from g2ard.rendering.targets import fill
 
     if teacher is not None and not photos:
         run.refuse_typed("with --teacher, unless --photos is given", "images", "alpha")
@@ -69,7 +68,6 @@ def adapt(
     _, targets = teaching.training(splats, opt.with_images(views, images, alpha), split, size)
     with stoppable(run, work, resume, output):
         work.mkdir(parents=True, exist_ok=True)
-        fill(targets, run.progress)
         result = refit(splats, targets, config, work=work, progress=run.progress)
         run.write(output, result.splats)
     gain, end = result.report.psnr, "converged" if result.report.converged else "all steps taken"

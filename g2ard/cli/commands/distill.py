@@ -201,8 +201,7 @@ def _whole(run: Run, source: Path, job: DistillJob, folder: RunFolder, prepared:
     began, page = time.monotonic(), ""
     with folder.working(len(job.prior), job.budget.count, _photos(job)):
         result = job.run(folder.work)
-        folder.write(result.splats, result.simplified, job.views)
-        folder.write_scored(job.held_out.cameras, None if job.apart is None else job.apart.cameras)
+        folder.write(result, job.views, job.targets)
         with run.finishing("scoring"):
             report = job.report(result, folder.scene)
         report = replace(report, seconds=_seconds(prepared, report.seconds, time.monotonic() - began))
@@ -238,7 +237,7 @@ def _in_tiles(
         done = distill_in_tiles(scene, budget, tiling, options, **run.callbacks)
         report, scores = done.report, done.report.scores
         with folder.writing():
-            folder.write(done.recovered, done.simplified, done.views, compare=True)
+            folder.write(done, done.views)
             counts = f"{report.input_count:,} → {report.output_count:,}"
             with run.finishing("report.html"):
                 tiled_report(folder.path / "report.html", f"{scene.name}: {counts}", report)
@@ -282,9 +281,9 @@ def _write_pages(
     scenes = [("simplified", result.simplified), ("recovered", result.splats)]
     before = plural(report.photos, "photo") if report.photos else f"{len(job.prior):,}"
     title = f"{source.name}: {before} → {plural(len(result.splats), 'Gaussian')}"
-    targets = [job.held_out] if job.apart is None else [job.held_out, job.apart]
+    targets = list(filter(None, (job.targets.held_out, job.targets.apart)))
     colour = job.config.recover.background
     with run.finishing("report.html"):
         distill_report(folder / "report.html", title, scenes, targets, report, colour, told=told(report))
     with run.finishing("preview.png"):
-        preview(folder / "preview.png", job.held_out, scenes, colour)
+        preview(folder / "preview.png", targets[0], scenes, colour)
