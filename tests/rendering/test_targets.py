@@ -7,8 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from g2ard.progress import silent
 from g2ard.rendering.renderer import Renderer
-from g2ard.rendering.targets import Photos, Subset, TeacherRenders, checked_targets, fingerprint_of
+from g2ard.rendering.targets import Photos, Subset, TeacherRenders, checked_targets, fill, fingerprint_of
 from helpers.photos import photographed
 from helpers.scenes import around, checkered_ball
 from helpers.view_files import photo
@@ -33,6 +34,26 @@ def test_no_more_is_rendered_than_is_kept(monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.setattr(Renderer, "clipped", lambda self, view: rendered.append(view) or real(self, view))
     targets = TeacherRenders(ball, views, limit=5 * 2 * 3 * 32 * 24 + 99)
     assert len(rendered) == len(targets._kept) == 5
+
+
+@pytest.mark.parametrize("limit", [10**6, 4 * 2 * 3 * 32 * 24 + 99])
+def test_targets_are_filled_once_and_within_the_limit(limit: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    ball, views = checkered_ball(400), around(12, (32, 24))
+    rendered: list[str] = []
+    real = TeacherRenders._make
+    monkeypatch.setattr(
+        TeacherRenders, "_make", lambda self, view: rendered.append(views.names[view]) or real(self, view)
+    )
+    targets = TeacherRenders(ball, views, limit=limit, lazy=True)
+    targets[7]
+    some = Subset(Subset(targets, [9, 7, 3, 1, 5]), [4, 3, 2, 1])  # rows 5, 1, 3 and 7
+    told: list[tuple[int, int]] = []
+    for _ in range(2):
+        fill(some, lambda stage, done, total, info=None: told.append((done, total)))
+    assert rendered == [views.names[row] for row in (7, 5, 1, 3)]
+    assert told == [(1, 3), (2, 3), (3, 3)]
+    fill(targets, silent)
+    assert len(rendered) == len(targets._kept) == (12 if limit == 10**6 else 4)
 
 
 def test_masks_count_towards_the_limit(tmp_path: Path) -> None:
