@@ -358,6 +358,16 @@ class Run:
         self.claim(flag, *files_of(path))
         check_scene_output(path, self.overwrite)
 
+    def claim_file(self, flag: str, path: Path, *, page: bool = False) -> None:
+        """Record a file or a page that an option writes, and check that it can be written."""
+        self.claim(flag, path)
+        if page:
+            from g2ard.viewer import check_page_output
+
+            check_page_output(path, self.overwrite)
+        else:
+            check_output(path, self.overwrite)
+
     def claim_views(self, path: Path, format: ViewFormat | None) -> None:
         """Record the views that a command writes, and check that they can be written."""
         self.claim("--output", path, folder=path.suffix == "")
@@ -524,13 +534,11 @@ def _parameter(name: str, kind: Any, option: Any, default: Any = None) -> inspec
 def _execute(run: Run, fn: Callable[..., None], options: dict[str, Any], cuda: bool) -> None:
     if run.device not in ("auto", "cpu", "gpu", "cuda"):
         raise typer.BadParameter(f"--device: expected auto, cpu, gpu or cuda, got {run.device!r}")
-    if run.json not in (None, "-"):
-        run.claim("--json", Path(str(run.json)))
     if run.device == "cuda" and not cuda:
         run.say("--device cuda: this command does not use CUDA; it runs on the CPU")
     try:
         if run.json not in (None, "-"):
-            check_output(str(run.json), run.overwrite)
+            run.claim_file("--json", Path(str(run.json)))
         if run.threads:
             from g2ard import _core
 

@@ -52,20 +52,19 @@ class Outputs:
     """Outputs of a command, one per budget; `{ratio}` and `{count}` in the pattern are the budget's.
 
     Args:
-        check: called with each path before work begins: records it with `Run.claim` and checks it.
-        name: flag of the pattern, for messages.
+        check: called with the flag and each path before work begins, such as `Run.claim_scene`.
+        name: flag of the pattern.
     """
 
     def __init__(
         self,
-        run: Run,
         pattern: Path,
         budgets: Sequence[Budget],
-        check: Callable[[Path, Budget], object],
+        check: Callable[[str, Path], object],
         *,
         name: str = "--output",
     ) -> None:
-        self._run, self._pattern, self._budgets, self._check = run, str(pattern), budgets, check
+        self._pattern, self._budgets, self._check, self._name = str(pattern), budgets, check, name
         self._checked: set[Path] = set()
         if strange := set(re.findall(r"{[^{}]*}", self._pattern)) - {"{ratio}", "{count}"}:
             raise typer.BadParameter(
@@ -104,9 +103,9 @@ class Outputs:
 
     def check(self, total: int | None = None) -> None:
         """Check each path once, as soon as the paths are known."""
-        for path, budget in zip(self.paths(total), self._budgets, strict=False):
+        for path in self.paths(total):
             if path not in self._checked:
-                self._check(path, budget)
+                self._check(self._name, path)
                 self._checked.add(path)
 
     def _needs_total(self) -> bool:

@@ -10,7 +10,6 @@ import typer
 from g2ard.cli.frame import Run, command
 from g2ard.cli.options import SceneArgument, picture
 from g2ard.errors import InputError
-from g2ard.io import check_output
 from g2ard.progress import plural
 
 if TYPE_CHECKING:
@@ -88,8 +87,7 @@ def clean(
     if output is None and not dry_run:
         raise typer.BadParameter("give an output with -o, or --dry-run")
     if preview is not None:
-        run.claim("--preview", preview)
-        check_output(preview, run.overwrite)
+        run.claim_file("--preview", preview)
     for flag, path in (("--output", output), ("--split-sky", split_sky)):
         if path is not None and not dry_run:
             run.claim_scene(flag, path)

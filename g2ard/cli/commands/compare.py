@@ -50,14 +50,13 @@ def compare(
     from g2ard.jobs.views import views_or_pool
     from g2ard.rendering.targets import TeacherRenders
     from g2ard.stages.evaluate import evaluate
-    from g2ard.viewer import check_page_output, write_page
+    from g2ard.viewer import write_page
 
     if views is not None and not is_made(views):
         run.refuse_typed("on given views", "looks")
     paths = run_scene(first), run_scene(second)
     if output is not None:
-        run.claim("--output", output)
-        check_page_output(output, run.overwrite)
+        run.claim_file("--output", output, page=True)
     page = [] if output is None else [("page", 1.0), ("sog", 2.0), ("sog", 0.5)]
     run.console.expect([("poses", 1.0), ("targets", 2.0), ("evaluate", 3.0), *page])
     reference, other = (run.load(path) for path in paths)

@@ -8,7 +8,6 @@ from typing import Annotated, Any, Literal, cast
 
 import typer
 
-from g2ard import io
 from g2ard.cli.fields import ShDegreeOption
 from g2ard.cli.frame import Run, command
 from g2ard.cli.options import numbers
@@ -173,8 +172,7 @@ def _check_output(run: Run, output: Path, options: dict[str, Any]) -> None:
         return
     if options:
         raise OutputError(f".csv has no option {next(iter(options))!r}", path=output)
-    run.claim("--output", output)
-    io.check_output(output, run.overwrite)
+    run.claim_file("--output", output)
 
 
 def _with_axes(

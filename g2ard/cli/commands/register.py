@@ -115,7 +115,6 @@ def register(
     from g2ard.report.registered import registration_report
     from g2ard.stages.register import RegisterConfig
     from g2ard.stages.register.report import summarize
-    from g2ard.viewer import check_page_output
 
     settings = run.settled(RegisterConfig())[0]
     with run.usage():
@@ -129,8 +128,7 @@ def register(
         raise typer.BadParameter("--intrinsics and --focal exclude each other; give one")
     run.claim_views(output, format)
     if report is not None:
-        run.claim("--report", report)
-        check_page_output(report, run.overwrite)
+        run.claim_file("--report", report, page=True)
     planned = [] if pool is None else [("poses", 5.0), ("pool", 5.0)]
     run.console.expect([*planned, ("register", 30.0), *([("report", 2.0)] if report else [])])
     job = prepare(

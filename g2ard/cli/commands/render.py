@@ -102,8 +102,7 @@ def render(
         run.refuse_typed("without an animation", "fps")
     views = opt.with_images(views, images)
     if sheet is not None:
-        run.claim("--sheet", sheet)
-        check_output(sheet, run.overwrite)
+        run.claim_file("--sheet", sheet)
     splats = run.load(scene)
     found: Any
     if turn is not None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -17,7 +17,7 @@ from g2ard.cli.run_result import say_fit, say_weight, tell_quality
 from g2ard.cli.tiling import tiling_of, working
 from g2ard.config.choices import is_made
 from g2ard.config.schema import listed
-from g2ard.io.atomic import atomic_output, check_output
+from g2ard.io.atomic import atomic_output
 from g2ard.io.scene_formats import written_bytes
 from g2ard.progress import plural
 from g2ard.system.peak_memory import peak_rss
@@ -80,7 +80,7 @@ def simplify(
     if given_views or no_views or config.method == "paper" or (config.method == "fast" and views is None):
         run.refuse_typed("without generated views", "up")
     tiling = tiling_of(run, scene, output)
-    outputs = Outputs(run, output, budgets, lambda path, _: run.claim_scene("--output", path))
+    outputs = Outputs(output, budgets, run.claim_scene)
     outputs.check()
     given = opt.with_images(views, images)
     if is_tiled(scene, tiling):
@@ -89,7 +89,7 @@ def simplify(
         return
     say_fit(run, scene, budgets[0], output.name)
     check_whole_memory(scene, tiling, WHOLE_TIMES)
-    maps = None if parents is None else Outputs(run, parents, budgets, _parents_file(run), name="--parents")
+    maps = None if parents is None else Outputs(parents, budgets, run.claim_file, name="--parents")
     if maps is not None:
         maps.check()
     seen = [("read", 0.2), ("poses", 1.0), ("visibility", 2.0)]  # seconds for playbot
@@ -181,14 +181,6 @@ def _in_tiles(
             say_gaps(small.opacity_lost, run.say)
             run.say(f"{place}: {len(small):,} of {store.count:,} Gaussians in {seconds:.1f} s")
     run.results(reports)
-
-
-def _parents_file(run: Run) -> Callable[[Path, Budget], None]:
-    def check(path: Path, _: Budget) -> None:
-        run.claim("--parents", path)
-        check_output(path, run.overwrite)
-
-    return check
 
 
 def _report(

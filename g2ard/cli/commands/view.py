@@ -102,11 +102,10 @@ def _write(
 ) -> None:
     """Write the page of one scene or two."""
     from g2ard.jobs.viewer_frame import frame_of
-    from g2ard.viewer import check_page_output, write_page
+    from g2ard.viewer import write_page
 
     views = opt.with_images(given, images)
-    run.claim("--output", output)
-    check_page_output(output, run.overwrite)
+    run.claim_file("--output", output, page=True)
     paths = [run_scene(path) for path in (scene, other) if path is not None]
     loaded = [run.load(path) for path in paths]
     if views is None and scene.is_dir() and (scene / "views.json").is_file():
