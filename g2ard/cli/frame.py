@@ -305,7 +305,7 @@ class Run:
         if about_axes := axes_note(path, options):
             self.say(f"note: {path}: {about_axes}")
         if compare:
-            from g2ard.jobs.packing import loss_warning
+            from g2ard.jobs.measured_budget import loss_warning
 
             with self.finishing("comparing the file with the scene"):
                 warning = loss_warning(path, splats, options)

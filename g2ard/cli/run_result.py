@@ -48,7 +48,7 @@ def _megabytes(size: int | None, file: str) -> str:
 def told(report: RunReport, *, verbose: bool = False) -> list[str]:
     """Return lines on recovery, losses, unseen parts and packing; `verbose` adds idle
     regularisers."""
-    from g2ard.jobs.packing import score_lines
+    from g2ard.jobs.measured_budget import score_lines
     from g2ard.stages.recover.report import outcome, unregularized
     from g2ard.stages.simplify.growth import RECOVERED_GAPS, gaps_line
 

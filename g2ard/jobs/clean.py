@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from g2ard.config.checks import checks_arguments
 from g2ard.config.choices import RenderModel
@@ -17,7 +18,7 @@ from g2ard.progress import Progress, Say, plural, silent, unsaid
 from g2ard.rendering.visibility import visibility
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.sky import sky_mask
-from g2ard.scene.splats import Splats, check_finite
+from g2ard.scene.splats import SH_C0, Splats, check_finite
 from g2ard.stages.clean import FLOATING, KINDS, Cleaning, compare_depths, find_clutter
 
 _CLUTTER_VIEWS, _CLUTTER_SIDE = 96, 400
@@ -26,6 +27,10 @@ _CLUTTER_ROWS = 100_000
 """Gaussians that those views are planned on."""
 _CLUTTER_NEAR = 0.25
 """Share of nearer views among them."""
+
+_LUMA = np.array([0.2126, 0.7152, 0.0722])
+_SCENE_BRIGHTNESS_SHARE = 0.45
+"""Share of the brightness taken from the scene, so that its shape stays visible."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,3 +145,24 @@ def kinds_of(only: Sequence[str] | None, strength: float) -> tuple[str, ...]:
         if not strength and kind in FLOATING:
             raise InputError(f"{kind} needs a strength", parameter="only", hint="give {strength=0.5}")
     return tuple(kind for kind in (KINDS if only is None else only) if strength or kind not in FLOATING)
+
+
+def painted(splats: Splats, colors: ArrayLike) -> Splats:
+    """Recolour a scene, view-independently, shaded by the luma of its own colours.
+
+    Args:
+        colors: (N, 3) in [0, 1].
+
+    Returns:
+        The same geometry and opacities, SH degree 0.
+
+    >>> scene = Splats.create(np.zeros((2, 3)), scales=np.ones((2, 3)), sh0=np.full((2, 1, 3), 9.0))
+    >>> painted(scene, [[1, 0, 0], [0, 0, 1]]).colors.round(3).tolist() == [[1, 0, 0], [0, 0, 1]]
+    True
+    """
+    paint = np.asarray(colors, np.float64)
+    require("colors", paint.shape, paint.shape == (len(splats), 3), f"shape ({len(splats)}, 3)")
+    luma = np.clip(splats.colors.astype(np.float64) @ _LUMA, 0, 1)
+    shaded = paint * (1 - _SCENE_BRIGHTNESS_SHARE + _SCENE_BRIGHTNESS_SHARE * luma[:, None])
+    sh0 = np.ascontiguousarray(((shaded - 0.5) / SH_C0)[:, None], np.float32)
+    return replace(splats, sh0=sh0, shN=np.zeros((len(splats), 0, 3), np.float32))

@@ -11,7 +11,7 @@ from g2ard.poses.pool import Pool, plan_pool
 from g2ard.progress import Progress, silent
 from g2ard.scene.splats import Splats
 
-_IMPORTERS = ("poses", "jobs.clean", "jobs.measured_budget", "jobs.packing")
+_IMPORTERS = ("poses", "jobs.clean", "jobs.measured_budget")
 """Modules in which jobs find `plan_pool`."""
 _MOST = 12
 """Plans that are kept."""

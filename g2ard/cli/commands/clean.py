@@ -130,8 +130,8 @@ def _paint(path: Path, done: Cleaned, cameras: Cameras, overwrite: bool) -> None
     import numpy as np
 
     from g2ard.io.images import contact_sheet, write_png
+    from g2ard.jobs.clean import painted
     from g2ard.rendering.renderer import Renderer
-    from g2ard.report.paint import painted
     from g2ard.scene.samples import evenly_spaced
 
     colors = np.array([*(color for _, color in _COLORS.values()), _GREY])[done.clutter.kind]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, Any
@@ -58,18 +59,16 @@ def view(
     if output is not None:
         _write(run, scene, other, output, views, images, start, background, up)
         return
-    from g2ard.cli.serving import show
-
     if _is_levels(scene):
         if other is not None:
             raise typer.BadParameter(f"{scene}: levels of detail cannot be compared")
         run.refuse_typed("on levels of detail", "views", "images", "start", "background", "up")
-        show(run, scene, "index.html")
+        _show(run, scene, "index.html")
         return
     with TemporaryDirectory(prefix="g2ard-") as folder:
         page = Path(folder) / "view.html"
         _write(run, scene, other or _dense_of(scene), page, views, images, start, background, up)
-        show(run, page.parent, page.name)
+        _show(run, page.parent, page.name)
 
 
 def _is_levels(path: Path) -> bool:
@@ -141,3 +140,26 @@ def _told(paths: list[Path], scenes: list[Splats], sizes: tuple[int, ...]) -> li
         {"scene": str(path), "count": len(splats), "bytes": size}
         for path, splats, size in zip(paths, scenes, sizes, strict=True)
     ]
+
+
+def _show(run: Run, folder: Path, page: str) -> None:
+    """Open a page of a folder in the browser, and serve the folder to this machine alone until Ctrl-C."""
+    import webbrowser
+    from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+    from threading import Event, Thread
+
+    class Quiet(SimpleHTTPRequestHandler):
+        def log_message(self, format: str, *args: Any) -> None:
+            """Log nothing."""
+
+    with ThreadingHTTPServer(("127.0.0.1", 0), partial(Quiet, directory=str(folder))) as server:
+        Thread(target=server.serve_forever, daemon=True).start()
+        address = f"http://127.0.0.1:{server.server_address[1]}/{page}"
+        run.answer(f"{address} (Ctrl-C ends)")
+        try:
+            webbrowser.open(address)
+            Event().wait()
+        except KeyboardInterrupt:
+            run.say("stopped")
+        finally:
+            server.shutdown()

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from g2ard.errors import InputError
-from g2ard.report.paint import painted
+from g2ard.jobs.clean import painted
 from helpers.scenes import checkered_ball
 
 
