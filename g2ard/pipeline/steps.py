@@ -41,7 +41,7 @@ class Steps:
 
     A result's file name contains a hash of the step's scene, settings and other inputs, so a run with other
     settings computes only the steps that depend on them. `resumed` is the time in seconds that earlier calls
-    spent on these steps, None without any; `filling` the time spent on loading or rendering targets.
+    spent on these steps, None without any; `filling` the time spent on rendering targets.
     """
 
     def __init__(self, folder: Path | None, progress: Progress = silent) -> None:
@@ -97,7 +97,7 @@ class Steps:
 
         Args:
             built: the scene before any recovery.
-            filled: whether to make the targets before the first step, so that all steps take equal time.
+            filled: whether to render targets before the first step, so that all steps take equal time.
         """
 
         def settings() -> object:

@@ -158,8 +158,8 @@ def as_image(image: Any, cameras: Cameras, view: int, parameter: str) -> NDArray
 
 
 def fill(targets: Targets, progress: Progress, views: Sequence[int] | None = None) -> None:
-    """Create the targets of some views, all by default, that memory will hold; others remain on access."""
-    if isinstance(targets, _Cached | _Chosen):
+    """Render what memory will hold of some views, all by default; photos are read when they are drawn."""
+    if isinstance(targets, TeacherRenders | _Chosen):
         targets.fill(progress, views)
 
 
@@ -194,7 +194,7 @@ class _Chosen:
         return [(parts[key], rows[key]) for key in parts]
 
     def fill(self, progress: Progress, views: Sequence[int] | None = None) -> None:
-        """Create the targets of some views that memory will hold, see `_Cached.fill`."""
+        """Render some views, see `TeacherRenders.fill`."""
         for targets, rows in self._parts(views):
             fill(targets, progress, rows)
 
@@ -268,8 +268,6 @@ _KEEPING = threading.Lock()
 class _Cached(ABC):
     """Cache of what `_make` returns, up to `limit` bytes, first come first kept."""
 
-    _value_bytes = 1
-
     def __init__(self, cameras: Cameras, limit: int) -> None:
         require("limit", limit, limit >= 0, "at least 0 bytes")
         self.cameras = cameras
@@ -297,18 +295,6 @@ class _Cached(ABC):
                 kept[view] = made
                 self._bytes += size
         return made
-
-    def fill(self, progress: Progress, views: Sequence[int] | None = None) -> None:
-        """Create the targets of some views, all by default, that the cache will hold now, so that later
-        steps take equal time."""
-        views = range(len(self.cameras)) if views is None else views
-        missing = np.array([view for view in views if view not in self._kept], np.int64)
-        pixels = self.cameras.widths.astype(np.int64) * self.cameras.heights
-        room = self._limit - self._bytes
-        count = int((np.cumsum(3 * self._value_bytes * pixels[missing]) <= room).sum())
-        for number, view in enumerate(missing[:count].tolist(), 1):
-            self._stored(view)
-            progress("targets", number, count)
 
 
 class Photos(_Cached):
@@ -468,7 +454,6 @@ class TeacherRenders(_Cached):
         super().__init__(cameras, limit)
         pixels = int((cameras.widths.astype(np.int64) * cameras.heights).sum())
         self._rounded = 3 * np.float32().nbytes * pixels > limit
-        self._value_bytes = 2 if self._rounded else 4
         self._teacher = teacher
         self._background, self._settings = background, settings
         self._renderer = renderer
@@ -476,8 +461,15 @@ class TeacherRenders(_Cached):
             self.fill(progress)
 
     def fill(self, progress: Progress, views: Sequence[int] | None = None) -> None:
-        """Render the views that the cache will hold, see `_Cached.fill`."""
-        super().fill(progress, views)
+        """Render the views, all by default, that the cache will hold, so that later steps take equal time."""
+        views = range(len(self.cameras)) if views is None else views
+        missing = np.array([view for view in views if view not in self._kept], np.int64)
+        pixels = self.cameras.widths.astype(np.int64) * self.cameras.heights
+        sizes = np.cumsum(3 * (2 if self._rounded else 4) * pixels[missing])
+        count = int((sizes <= self._limit - self._bytes).sum())
+        for number, view in enumerate(missing[:count].tolist(), 1):
+            self._stored(view)
+            progress("targets", number, count)
         self._renderer = None  # its buffers are larger than the scene
 
     @property

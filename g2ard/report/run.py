@@ -151,7 +151,7 @@ class StageSeconds(Report):
     """Wall seconds of each stage.
 
     Args:
-        targets: loading or rendering of training images.
+        targets: rendering of training images.
         resumed: part of these spent by earlier, interrupted calls; None if there were none.
     """
 
