@@ -30,7 +30,7 @@ from g2ard.pipeline.config import DistillConfig
 from g2ard.pipeline.distill import Distilled, RunViews
 from g2ard.pipeline.distill import distill as pipeline
 from g2ard.progress import Progress, Say, plural, silent, unsaid
-from g2ard.rendering.targets import Targets, kinds_of, kinds_told
+from g2ard.rendering.targets import Targets, fill, kinds_of, kinds_told
 from g2ard.rendering.visibility import overdraw
 from g2ard.report.run import Packed, RunReport, by_kind
 from g2ard.scene.cameras import USUAL, Cameras
@@ -130,6 +130,8 @@ class DistillJob:
     def run(self, work: Path | None = None) -> Distilled:
         """Distil the scene; `work` is the folder for resuming, see `g2ard.pipeline.distill`."""
         targets = self.targets
+        for scored in filter(None, (targets.held_out, targets.apart)):
+            fill(scored, self.progress)
         done = pipeline(
             self.prior,
             self.budget.count,

@@ -31,6 +31,7 @@ from g2ard.levels.tileset import save_tileset as write_tileset
 from g2ard.levels.tree import Cut, Level, aligned
 from g2ard.pipeline.distill import distill as pipeline
 from g2ard.progress import Progress, Say, direction, plural, silent, unsaid
+from g2ard.rendering.targets import fill
 from g2ard.rendering.visibility import visibility_source
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.samples import evenly_spaced
@@ -135,6 +136,7 @@ class LevelsJob:
         """Make one level, see `make_levels`."""
         job, views = self.job, self.job.views.resized(longest)
         targets = replace(job, views=replace(views, full=None)).targets
+        fill(targets.held_out, job.progress)
         if not self.recover:
             level = merged = _merged(job, finer, count)
         else:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -136,8 +137,9 @@ def distill(
             began = time.monotonic()
             chosen = _selected(scene, targets, config, given, progress)
             selecting += time.monotonic() - began
+        drawn = (chosen.targets, validation) if budget < len(prior) else ()  # it may be its own teacher
         simplified, report, protected = _simplified(
-            steps, number, scene, count, budget, targets.cameras, config, protected, progress
+            steps, number, scene, count, budget, targets.cameras, config, protected, progress, drawn
         )
         scene, recoveries = simplified, []
         final = number == len(counts)
@@ -150,7 +152,7 @@ def distill(
                 built=simplified,
                 weights=chosen.weights,
                 validation=validation,
-                filled=budget < len(prior),  # otherwise the scene may be its own teacher
+                filled=bool(drawn),
                 stage="recover" if name == _FINAL else f"recover {name}",
                 watch=watch,
                 skip_same=True,
@@ -219,13 +221,19 @@ def _simplified(
     config: DistillConfig,
     protected: NDArray[np.bool_] | None,
     progress: Progress,
+    drawn: Sequence[Targets | None],
 ) -> tuple[Splats, SimplifyReport, NDArray[np.bool_]]:
-    """Simplify to the count of a round; return the scene, a report and the flags for the next round."""
+    """Simplify to the count of a round; return the scene, a report and the flags for the next round.
+
+    Args:
+        drawn: targets that the recovery to come draws, rendered first.
+    """
     blind = config.simplify.method == "paper" or count == len(scene)
     kept = None if protected is None else np.packbits(protected).tobytes()
     content = [config.simplify, count, budget, None if blind else cameras.fingerprint(), kept]
 
     def step(_: Path | None) -> tuple[Splats, SimplifyReport, dict[str, Any]]:
+        steps.fill(*drawn)
         began = time.monotonic()
         done = simplify(
             scene,

@@ -97,7 +97,7 @@ class Steps:
 
         Args:
             built: the scene before any recovery.
-            filled: whether to render targets before the first step, so that all steps take equal time.
+            filled: whether to render targets first, see `fill`.
         """
 
         def settings() -> object:
@@ -106,10 +106,8 @@ class Steps:
             return config, views, before, None if weights is None else weights.tolist()
 
         def step(within: Path | None) -> _Result[RecoverReport]:
-            began = time.monotonic()
-            for each in filter(None, (targets, validation)) if filled else ():
-                fill(each, self._progress)
-            self.filling += time.monotonic() - began
+            if filled:
+                self.fill(targets, validation)
             options["anchors"] = None if built is None else Anchors.of(built, config.regularizers.in_plane)
             options.update(weights=weights, validation=validation, checkpoint=within)
             options.setdefault("progress", self._progress)
@@ -117,6 +115,13 @@ class Steps:
             return done.splats, done.report, {}
 
         return self.run(name, student, settings, RecoverReport, step)[:2]
+
+    def fill(self, *targets: Targets | None) -> None:
+        """Render targets before steps that must run, so that all of them take equal time."""
+        began = time.monotonic()
+        for each in filter(None, targets):
+            fill(each, self._progress)
+        self.filling += time.monotonic() - began
 
     def _count(self, seconds: float | None) -> None:
         if seconds is not None:
