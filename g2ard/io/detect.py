@@ -228,9 +228,15 @@ def holds(name: str, folder: Path) -> bool:
 
 
 def json_format(content: Any) -> str | None:
-    """Return the format of views in JSON content, or None."""
+    """Return the format of views in JSON content, or None.
+
+    >>> json_format({"views": []}), json_format({"views": {"train": 40}})
+    ('views', None)
+    """
     kind, sample = (list, next(iter(content), None)) if isinstance(content, list) else (dict, content)
     keys = set(sample) if isinstance(sample, dict) else set[str]()
+    if "format" not in keys and "views" in keys and not isinstance(sample["views"], list):
+        keys.remove("views")  # a number of views, say
     return next((name for name, (own, needed) in _JSON.items() if own is kind and needed <= keys), None)
 
 
