@@ -234,9 +234,10 @@ def json_format(content: Any) -> str | None:
     ('views', None)
     """
     kind, sample = (list, next(iter(content), None)) if isinstance(content, list) else (dict, content)
-    keys = set(sample) if isinstance(sample, dict) else set[str]()
-    if "format" not in keys and "views" in keys and not isinstance(sample["views"], list):
-        keys.remove("views")  # a number of views, say
+    fields = sample if isinstance(sample, dict) else {}
+    keys = set(fields)
+    if "format" not in keys and not isinstance(fields.get("views"), list):
+        keys.discard("views")  # a number of views, say
     return next((name for name, (own, needed) in _JSON.items() if own is kind and needed <= keys), None)
 
 
