@@ -136,6 +136,27 @@ def test_if_a_device_fails_the_steps_since_the_last_checkpoint_are_repeated(
     assert in_trial if saved else failed > calls[0]
 
 
+@pytest.mark.parametrize("read", ["splats", "counts"])
+def test_a_device_may_fail_while_the_result_is_read(
+    student: Splats, targets: TeacherRenders, read: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = RecoverConfig(steps=12, schedule=replace(TUNED, multiplier=1.0))
+    others = TeacherRenders(TEACHER, around(3, (40, 30), 2.0))
+    whole = recover(student, targets, config, validation=others)
+    reader, reads = getattr(FusedEngine, read), []
+
+    def lost(self: FusedEngine) -> Any:
+        reads.append(read)
+        if len(reads) == 1:
+            raise DeviceError("the device was lost")
+        return reader(self) if read == "splats" else reader.fget(self)
+
+    monkeypatch.setattr(FusedEngine, read, lost if read == "splats" else property(lost))
+    found = recover(student, targets, config, validation=others)
+    assert len(reads) > 1
+    assert_same_bits(whole.splats, found.splats)
+
+
 def test_same_bits_from_run_to_run_and_for_any_threads(student: Splats, targets: TeacherRenders) -> None:
     config = RecoverConfig(steps=25, regularizers=replace(REGULARIZERS["noisy"], period=10))
     first, *others = on_threads(lambda: recover(student, targets, config).splats)

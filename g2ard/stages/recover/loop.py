@@ -121,7 +121,7 @@ class Loop:
         return self.skipped_before + self.engine.skipped
 
     @property
-    def views_seen(self) -> NDArray[np.float64]:
+    def _views_seen(self) -> NDArray[np.float64]:
         """Estimated number of views that contributed to each Gaussian, (N,), from its steps."""
         steps = self.done - (int(self.guard.backed_off[-1]["step"]) if self.guard.backed_off else 0)
         return self.engine.counts * (len(self.targets.cameras) / max(1, steps))
@@ -207,8 +207,12 @@ class Loop:
         target, mask = self.targets[view], mask_of(self.targets, view)
         return engine.step(view, target, rates, regularize=regularize, mask=mask)
 
-    def run(self, checkpoint: Path | None, progress: Progress, stage: str, watch: Watch | None) -> Splats:
-        """Take all steps, after those of a checkpoint if it exists; return the scene.
+    def run(
+        self, checkpoint: Path | None, progress: Progress, stage: str, watch: Watch | None
+    ) -> tuple[Splats, NDArray[np.float64] | None]:
+        """Take all steps, after those of a checkpoint if it exists.
+
+        Return the scene, and with validation views the number of views that each Gaussian was seen in.
 
         If a GPU fails, the CPU continues from the last checkpoint, or from the start.
         """
@@ -218,7 +222,7 @@ class Loop:
         while True:
             try:
                 self._run(checkpoint, progress, stage, watch)
-                return self.engine.splats()
+                return self.engine.splats(), None if self.validation_key is None else self._views_seen
             except DeviceError:  # `system.devices.notes` has the reason
                 del self.engine
                 seconds, resumed = self.seconds, self.resumed

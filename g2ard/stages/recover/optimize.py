@@ -124,17 +124,17 @@ def recover(
     guard = Guard(probe.all_of, student, before, others, harmful, config.schedule.guarded)
     validation_key = None if validation is None else fingerprint_of(validation)
     end = result = student
-    after, blend = before, 1.0
+    after, blend, seen = before, 1.0, None
     loop = Loop(student, targets, config, view_weights, anchors, probe, guard, validation_key, frozen)
     if not exact:
         if checkpoint is None or not checkpoint.exists():
             progress(stage, 0, 0, {})
             loop.choose_rates(before)
-        end = loop.run(checkpoint, progress, stage, watch)
+        end, seen = loop.run(checkpoint, progress, stage, watch)
         result, after, blend = guard.choose_by_training(end)
     prior_views: float | None = 0.0
-    if result is end and validation is not None:
-        result, prior_views = guard.choose_by_validation(end, loop.views_seen, loop.done)
+    if result is end and seen is not None:
+        result, prior_views = guard.choose_by_validation(end, seen, loop.done)
         if result is not end:
             after, blend = probe.all_of(result), float(result is not student)
     return Recovered(
