@@ -147,7 +147,7 @@ class _Pool:
             raise
 
     def close(self) -> None:
-        """Cancel what is left, and kill the processes of this pool."""
+        """Cancel unfinished tasks, and kill the processes of this pool."""
         if self._pool is None:
             return
         processes = list((getattr(self._pool, "_processes", None) or {}).values())

@@ -16,7 +16,9 @@ from helpers.cloud_files import columns, ply
 from helpers.killed import command, forked, killed
 from helpers.scenes import around, checkered_ball
 
-pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="systems without fork")
+pytestmark = pytest.mark.skipif(
+    not hasattr(os, "fork"), reason="needs os.fork, to kill a process at a chosen moment"
+)
 
 _TAUGHT = "--views views.json --teacher ball.ply --steps 6"
 _COMMANDS = {

@@ -21,7 +21,7 @@ use constants::Step;
 use frame::{Frame, Room};
 use scene::Scene;
 
-/// The device's trainer. After [`g2ard_core::Error::Device`] it is of no more use.
+/// The device's trainer. It cannot be used after [`g2ard_core::Error::Device`].
 pub struct Trainer {
     gpu: Own,
     scene: Scene,

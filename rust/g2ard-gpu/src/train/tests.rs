@@ -259,7 +259,7 @@ fn gradients_are_the_cpus() {
     }
 }
 
-/// Check that a few steps with an option come to the CPU's parameters. Adam turns a gradient that is lost in rounding into
+/// Check that a few steps with an option give the CPU's parameters. Adam turns a gradient that is lost in rounding into
 /// a full step, so a few values may differ.
 fn compare_steps(
     gpu: &Arc<Gpu>,
