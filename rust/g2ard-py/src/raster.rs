@@ -9,7 +9,7 @@ use numpy::{IntoPyArray, PyArray1, PyArrayMethods, PyReadonlyArrayDyn, PyUntyped
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use rayon::prelude::*;
-use std::sync::Mutex;
+use std::sync::{Mutex, PoisonError};
 use std::thread::{self, ThreadId};
 
 use crate::arrays::{flat, optional};
@@ -256,14 +256,19 @@ pub fn accumulate_each<'py>(
     let settings = options.settings()?;
     let all = work::long(py, progress, |control| {
         control.begin(views.len() as u64);
-        let one = |rasterizer: &mut Rasterizer, view: &View| {
+        // Buffers that views share: new ones cost more than a small view.
+        let spare = Mutex::new(Vec::<Rasterizer>::new());
+        let spare = || spare.lock().unwrap_or_else(PoisonError::into_inner);
+        let one = |view: &View| {
             control.check()?;
+            let mut rasterizer = spare().pop().unwrap_or_default();
             let mut sums = Accumulated::new(params.len());
             rasterizer.accumulate(&params, &view.camera(), &settings, &mut sums)?;
+            spare().push(rasterizer);
             control.advance(1);
             Ok(sums)
         };
-        let views = views.par_iter().map_init(Rasterizer::default, one);
+        let views = views.par_iter().with_max_len(1).map(one);
         views.collect::<Result<Vec<_>>>()
     })?;
     all.into_iter().map(|sums| dict_of(py, sums)).collect()

@@ -23,6 +23,7 @@ pub fn neighbors(entries: &[f32], dims: usize) -> Vec<Vec<u32>> {
         .collect();
     (0..count)
         .into_par_iter()
+        .with_max_len(64)
         .map(|at| {
             let entry = &entries[at * dims..][..dims];
             let groups = nearest(entry, &middles, dims, 0..middles.len() / dims, GROUPS);

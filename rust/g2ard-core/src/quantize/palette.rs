@@ -79,7 +79,8 @@ fn assign(points: &Rows, entries: &[f32], around: &[Vec<u32>], labels: &mut [u32
         }
         usize::from(*label != before)
     };
-    labels.par_iter_mut().enumerate().map(move_one).sum()
+    let labels = labels.par_iter_mut().enumerate().with_max_len(256);
+    labels.map(move_one).sum()
 }
 
 /// Move entries to the means of their rows; entries without rows stay.

@@ -1,4 +1,13 @@
-//! Prefetches of memory for the passes.
+//! Memory of the passes: buffers that only grow, and prefetches.
+
+/// The first `len` elements of a buffer, which grows if it is shorter and never shrinks: what a smaller view leaves
+/// unused need not be cleared for a larger one again.
+pub fn first<T: Copy + Default>(buffer: &mut Vec<T>, len: usize) -> &mut [T] {
+    if buffer.len() < len {
+        buffer.resize(len, T::default());
+    }
+    &mut buffer[..len]
+}
 
 /// Prefetches a value that is read soon.
 #[inline(always)]

@@ -13,11 +13,12 @@ use rayon::prelude::*;
 
 use super::BATCH;
 use super::backward::SUMS;
-use super::blocks::{BlockMasks, MOST_BLOCKS};
+use super::blocks::BlockMasks;
 use super::depth_sort::{self, Key};
 use super::disjoint::DisjointSlice;
 use super::gradients::{Gather, Gradients};
 use super::grid::TileGrid;
+use super::memory;
 use super::params::{Params, Source};
 use super::project::{Project, Splat, View};
 use super::simd::{Isa, LANES, Lanes16, dispatch};
@@ -60,6 +61,7 @@ pub struct Rasterizer {
     intersectors: Vec<TileIntersector>,
     /// (first splat, number visible) of each chunk of rows.
     chunks: Vec<(usize, usize)>,
+    /// Visible splats by depth: the first [`Self::collect_keys`] of them.
     order: Vec<Key>,
     spare: Vec<Key>,
     bins: Bins,
@@ -197,7 +199,7 @@ impl Rasterizer {
     /// The visible splats of every chunk of rows, and their slots.
     fn visible(&self) -> impl IndexedParallelIterator<Item = (&[Splat], Range<usize>)> {
         let chunks = self.chunks.par_iter().enumerate();
-        chunks.map(|(chunk, &(first, count))| {
+        chunks.with_max_len(1).map(|(chunk, &(first, count))| {
             let splats = &self.splats[first..first + count];
             (splats, self.bins.slots_of(chunk))
         })
@@ -215,10 +217,10 @@ impl Rasterizer {
         let (view, rows) = (View::new(camera, settings), source.len());
         self.state = None;
         self.project(&view, source, grid);
-        self.collect_keys();
-        depth_sort::sort(&mut self.order, &mut self.spare);
+        let visible = self.collect_keys();
+        depth_sort::sort(&mut self.order, &mut self.spare, visible);
         self.bins.fill(
-            &self.order,
+            &self.order[..visible],
             &self.tile_lists,
             &self.intersectors,
             CHUNK * LANES,
@@ -230,7 +232,7 @@ impl Rasterizer {
             self.batches.push((first, 0));
             first += ((tile[1] - tile[0]) as usize).div_ceil(BATCH);
         }
-        self.block_masks.resize(first, [0; MOST_BLOCKS]);
+        memory::first(&mut self.block_masks, first);
         self.state = Some(ForwardState {
             camera: *camera,
             settings: *settings,
@@ -245,14 +247,13 @@ impl Rasterizer {
     fn project<S: Source>(&mut self, view: &View, source: S, grid: TileGrid) {
         let groups = source.len().div_ceil(LANES);
         let isa = self.isa;
-        self.splats.resize(groups * LANES, Splat::default());
-        self.tile_lists.resize(groups * LANES, TileList::default());
+        let splats = memory::first(&mut self.splats, groups * LANES);
+        let tile_lists = memory::first(&mut self.tile_lists, groups * LANES);
         self.intersectors
             .resize_with(groups.div_ceil(CHUNK), TileIntersector::default);
-        let parts = self
-            .splats
+        let parts = splats
             .par_chunks_mut(CHUNK * LANES)
-            .zip(self.tile_lists.par_chunks_mut(CHUNK * LANES))
+            .zip(tile_lists.par_chunks_mut(CHUNK * LANES))
             .zip(&mut self.intersectors);
         let project =
             |(chunk, ((out, tile_lists), intersector)): (usize, ((&mut _, &mut _), &mut _))| {
@@ -271,20 +272,21 @@ impl Rasterizer {
             };
         parts
             .enumerate()
+            .with_max_len(1)
             .map(project)
             .collect_into_vec(&mut self.chunks);
     }
 
-    /// The visible splats' keys, in row order.
-    fn collect_keys(&mut self) {
+    /// Collects the visible splats' keys, in row order; returns their number.
+    fn collect_keys(&mut self) -> usize {
         let mut first = 0;
         let starts = self.chunks.iter().map(|&(_, count)| {
             first += count;
             first - count
         });
         let starts: Vec<usize> = starts.collect();
-        self.order.resize(first, Key::default());
-        let order = DisjointSlice::new(&mut self.order);
+        let visible = first;
+        let order = DisjointSlice::new(memory::first(&mut self.order, visible));
         let chunks = self.chunks.par_iter().zip(starts);
         chunks.for_each(|(&(first, count), start)| {
             // SAFETY: the chunks' stretches of keys do not overlap.
@@ -296,5 +298,6 @@ impl Rasterizer {
                 };
             }
         });
+        visible
     }
 }

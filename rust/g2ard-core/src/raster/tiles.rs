@@ -4,15 +4,15 @@ use std::ops::Range;
 
 use rayon::prelude::*;
 
-use super::depth_sort::Key;
+use super::depth_sort::{Key, prefix_sums};
 use super::disjoint::DisjointSlice;
 use super::grid::TileGrid;
-use super::memory::prefetch;
+use super::memory::{first, prefetch};
 use super::tile_lists::{TileIntersector, TileList};
 use crate::Result;
 
 /// Number of stretches of the depth order: fixed, so that work is split equally for any number of threads.
-const STRETCHES: usize = 16;
+const STRETCHES: usize = 32;
 /// Number of keys that a stretch prefetches ahead, because their splats are scattered in memory.
 const AHEAD: usize = 16;
 /// Number of pairs that a u32 counts.
@@ -28,7 +28,7 @@ pub struct Pair {
 /// Every tile's pairs, nearest first.
 #[derive(Debug, Default)]
 pub struct Bins {
-    pub pairs: Vec<Pair>,
+    pairs: Vec<Pair>,
     /// Tile t owns `pairs[starts[t]..starts[t + 1]]`.
     pub starts: Vec<u32>,
     /// First slot of each chunk of splats, and the number of slots.
@@ -40,6 +40,11 @@ impl Bins {
     /// A tile's pairs, nearest first.
     pub fn pairs_of(&self, tile: usize) -> &[Pair] {
         &self.pairs[self.starts[tile] as usize..self.starts[tile + 1] as usize]
+    }
+
+    /// Number of pairs.
+    pub fn len(&self) -> usize {
+        self.starts.last().map_or(0, |&end| end as usize)
     }
 
     /// The slots of a chunk's splats.
@@ -71,7 +76,8 @@ impl Bins {
         self.counts.resize(STRETCHES * total_tiles, 0);
         let stretches = order
             .par_chunks(stretch)
-            .zip(self.counts.par_chunks_mut(total_tiles));
+            .zip(self.counts.par_chunks_mut(total_tiles))
+            .with_max_len(1);
         stretches.for_each(|(keys, counts)| {
             for (i, key) in keys.iter().enumerate() {
                 if let Some(ahead) = keys.get(i + AHEAD) {
@@ -82,12 +88,16 @@ impl Bins {
                 tile_lists[splat].for_each(list, 0, narrow, |tile, _| counts[tile] += 1);
             }
         });
-        let pairs = self.prefix(total_tiles);
-        self.pairs.resize(pairs, Pair::default());
-        let (out, slots) = (DisjointSlice::new(&mut self.pairs), &self.slots);
+        self.starts.clear();
+        self.starts.resize(total_tiles + 1, 0);
+        prefix_sums(&mut self.counts, &mut self.starts[1..]);
+        let count = self.len();
+        let pairs = first(&mut self.pairs, count);
+        let (out, slots) = (DisjointSlice::new(pairs), &self.slots);
         let stretches = order
             .par_chunks(stretch)
-            .zip(self.counts.par_chunks_mut(total_tiles));
+            .zip(self.counts.par_chunks_mut(total_tiles))
+            .with_max_len(1);
         stretches.for_each(|(keys, next)| {
             for (i, key) in keys.iter().enumerate() {
                 if let Some(ahead) = keys.get(i + AHEAD) {
@@ -95,8 +105,8 @@ impl Bins {
                 }
                 let splat = key.splat as usize;
                 let list = &intersectors[splat / chunk].list;
-                let first = slots[splat / chunk];
-                tile_lists[splat].for_each(list, first, narrow, |tile, slot| {
+                let first_slot = slots[splat / chunk];
+                tile_lists[splat].for_each(list, first_slot, narrow, |tile, slot| {
                     let splat = key.splat;
                     // SAFETY: the prefix sums give every stretch its own places in every tile, and do not overflow: there
                     // are as many pairs as slots.
@@ -106,23 +116,6 @@ impl Bins {
             }
         });
         Ok(())
-    }
-
-    /// Turns the counts into each stretch's first place in each tile; returns how many pairs there are.
-    fn prefix(&mut self, tiles: usize) -> usize {
-        self.starts.clear();
-        let mut at = 0u32;
-        for tile in 0..tiles {
-            self.starts.push(at);
-            for stretch in 0..STRETCHES {
-                let count = &mut self.counts[stretch * tiles + tile];
-                let first = at;
-                at += *count;
-                *count = first;
-            }
-        }
-        self.starts.push(at);
-        at as usize
     }
 }
 

@@ -52,6 +52,7 @@ fn each_view<T: Send>(
     control.begin(cameras.len() as u64);
     cameras
         .par_iter()
+        .with_max_len(1)
         .map_init(Scratch::default, |scratch, camera| {
             control.check()?;
             let found = look(scratch, &Pinhole::of(camera));

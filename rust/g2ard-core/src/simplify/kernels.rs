@@ -101,6 +101,7 @@ pub(super) fn in_chunks<T: Send>(
 ) -> Result<impl Iterator<Item = T>> {
     let chunks: Vec<Vec<T>> = (0..count.div_ceil(CHUNK))
         .into_par_iter()
+        .with_max_len(1)
         .map(|c| {
             control.check()?;
             Ok((c * CHUNK..count.min((c + 1) * CHUNK)).map(&make).collect())

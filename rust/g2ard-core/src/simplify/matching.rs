@@ -174,6 +174,7 @@ pub fn candidates(
     lists
         .par_chunks_mut(CHUNK * k)
         .enumerate()
+        .with_max_len(1)
         .try_for_each(|(chunk, lists)| {
             control.check()?;
             let first = chunk * CHUNK;

@@ -25,7 +25,7 @@ impl Steps<'_> {
         refuse!(self.steps.len() != count || count == 0 =>
             "steps", format!("{count} cells, at least 1"), self.steps.len());
         Error::unless_equal("directions", directions.len(), eyes.len(), "rows")?;
-        let rays = eyes.par_iter().zip(directions);
+        let rays = eyes.par_iter().zip(directions).with_max_len(256);
         Ok(rays
             .map(|(eye, direction)| self.first_hit(eye, direction))
             .collect())

@@ -60,25 +60,29 @@ impl Loss {
         let count = values as f32;
         let scale = [(1.0 - ssim_weight) / count, -ssim_weight / count];
         let gradient = DisjointSlice::new(gradient);
-        self.sums.par_iter_mut().enumerate().for_each_init(
-            || vec![0f32; scratch_len(shape, COLUMNS.min(row))],
-            |scratch, (index, sums)| {
-                let (y, x) = (index / across * ROWS, index % across * COLUMNS);
-                let tile = Tile {
-                    image,
-                    target,
-                    shape,
-                    factors,
-                    weights,
-                    scale,
-                    rows: y..shape.height.min(y + ROWS),
-                    columns: x..row.min(x + COLUMNS),
-                    scratch,
-                    gradient,
-                };
-                *sums = dispatch(isa, tile);
-            },
-        );
+        self.sums
+            .par_iter_mut()
+            .enumerate()
+            .with_max_len(2)
+            .for_each_init(
+                || vec![0f32; scratch_len(shape, COLUMNS.min(row))],
+                |scratch, (index, sums)| {
+                    let (y, x) = (index / across * ROWS, index % across * COLUMNS);
+                    let tile = Tile {
+                        image,
+                        target,
+                        shape,
+                        factors,
+                        weights,
+                        scale,
+                        rows: y..shape.height.min(y + ROWS),
+                        columns: x..row.min(x + COLUMNS),
+                        scratch,
+                        gradient,
+                    };
+                    *sums = dispatch(isa, tile);
+                },
+            );
         let total = self
             .sums
             .iter()

@@ -18,6 +18,7 @@ pub fn psnr(a: &[f32], b: &[f32], shape: Shape) -> Result<f64> {
     let chunks: Vec<f64> = a
         .par_chunks(1 << 14)
         .zip(b.par_chunks(1 << 14))
+        .with_max_len(2)
         .map(|(a, b)| {
             a.iter()
                 .zip(b)

@@ -3,10 +3,12 @@
 use rayon::prelude::*;
 
 use super::Rasterizer;
+use super::tiled::MOST_TILES;
 use crate::Result;
 use crate::raster::accumulate::{ALL, Accumulate, Accumulated, SharedSums, Total, smallest_pixels};
 use crate::raster::disjoint::DisjointSlice;
 use crate::raster::grid::TileGrid;
+use crate::raster::memory;
 use crate::raster::params::{Params, Source};
 use crate::raster::simd::dispatch;
 use crate::raster::tile_batch::TileBatch;
@@ -69,30 +71,29 @@ impl Rasterizer {
     }
 
     fn accumulate_tiles<const KINDS: usize>(&mut self) {
-        let pairs = self.bins.pairs.len();
-        self.shares.resize(pairs * KINDS, 0.0);
-        self.written.clear();
-        self.written.resize(pairs, 0);
+        let pairs = self.bins.len();
+        let shares = memory::first(&mut self.shares, pairs * KINDS);
+        memory::first(&mut self.written, pairs).fill(0);
         let Some(state) = &self.state else { return };
         let camera = &state.camera;
         let grid = state.grid;
-        let slots = DisjointSlice::new(self.shares.as_chunks_mut::<KINDS>().0);
+        let slots = DisjointSlice::new(shares.as_chunks_mut::<KINDS>().0);
         let written = DisjointSlice::new(&mut self.written);
         let (bins, splats, isa) = (&self.bins, &self.splats, self.isa);
-        (0..self.batches.len()).into_par_iter().for_each_init(
-            TileBatch::default,
-            |tile_batch, tile| {
-                let accumulate = Accumulate {
-                    pairs: bins.pairs_of(tile),
-                    splats,
-                    rect: grid.rect(tile, camera),
-                    settings: &state.settings,
-                    tile_batch,
-                    slots,
-                    written,
-                };
-                dispatch(isa, accumulate);
-            },
-        );
+        let tiles = (0..self.batches.len())
+            .into_par_iter()
+            .with_max_len(MOST_TILES);
+        tiles.for_each_init(TileBatch::default, |tile_batch, tile| {
+            let accumulate = Accumulate {
+                pairs: bins.pairs_of(tile),
+                splats,
+                rect: grid.rect(tile, camera),
+                settings: &state.settings,
+                tile_batch,
+                slots,
+                written,
+            };
+            dispatch(isa, accumulate);
+        });
     }
 }
