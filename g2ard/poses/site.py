@@ -203,9 +203,12 @@ class Terrain:
         inside = ((place >= 0) & (place < shape)).all(axis=1)
         block_of = np.where(inside, place[:, 0] * shape[1] + place[:, 1], -1)
         heights = np.full(int(np.prod(shape)), np.nan)
-        for k in np.unique(block_of[inside]):
-            rows = block_of == k
-            heights[k] = quantile(points[rows, 2], weights[rows], _LOW)
+        order = np.argsort(block_of, kind="stable")
+        found, firsts = np.unique(block_of[order], return_index=True)
+        for k, first, end in zip(found, firsts, [*firsts[1:], len(order)], strict=False):
+            if k >= 0:
+                rows = order[first:end]
+                heights[k] = quantile(points[rows, 2], weights[rows], _LOW)
         heights = _filled(heights.reshape(shape), box[0, 2])
         lowest = _around(heights, np.inf).min(axis=0)
         opened = _around(lowest, -np.inf).max(axis=0)  # without bumps narrower than three blocks

@@ -24,6 +24,7 @@ from g2ard.rendering.renderer import RasterSettings, Renderer
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
 from g2ard.system.cached import cached_property
+from g2ard.system.threads import in_threads
 
 CACHE_BYTES = 2_000_000_000
 """Bytes of targets cached in memory; further ones are loaded or rendered again on each access."""
@@ -467,8 +468,7 @@ class TeacherRenders(_Cached):
         pixels = self.cameras.widths.astype(np.int64) * self.cameras.heights
         sizes = np.cumsum(3 * (2 if self._rounded else 4) * pixels[missing])
         count = int((sizes <= self._limit - self._bytes).sum())
-        for number, view in enumerate(missing[:count].tolist(), 1):
-            self._stored(view)
+        for number, _ in enumerate(in_threads(self._stored, missing[:count].tolist()), 1):
             progress("targets", number, count)
         self._renderer = None  # its buffers are larger than the scene
 

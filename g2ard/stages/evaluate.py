@@ -22,6 +22,7 @@ from g2ard.rendering.renderer import RasterSettings
 from g2ard.rendering.targets import Targets, against_of, checked_targets, fill, mask_of, scored_in
 from g2ard.scene.cameras import USUAL
 from g2ard.scene.splats import Splats
+from g2ard.system.threads import in_threads
 
 
 @dataclass(frozen=True)
@@ -174,8 +175,9 @@ def evaluate(
     cameras = targets.cameras
     fill(targets, progress)
     renderer = renderer_on(device, splats, background, settings)
-    scores = []
-    for view, name in enumerate(cameras.names):
+
+    def score(view: int) -> ViewScore:
+        name = cameras.names[view]
         image, target = renderer.clipped(cameras[view]), targets[view]
         if eight_bit:
             image, target = as_saved(image), as_saved(target)
@@ -183,17 +185,19 @@ def evaluate(
         mask = mask_of(targets, view)
         if mask is not None and not mask.any():
             raise InputError(f"({name}) has no valid pixel", index=view, item="view")
-        scores.append(
-            ViewScore(
-                name,
-                psnr(image, target, mask),
-                ssim(image, target, mask),
-                edge_psnr(image, target, mask),
-                perceived,
-                against_of(targets, view),
-                cameras.kinds[view],
-                (int(cameras.widths[view]), int(cameras.heights[view])),
-            )
+        return ViewScore(
+            name,
+            psnr(image, target, mask),
+            ssim(image, target, mask),
+            edge_psnr(image, target, mask),
+            perceived,
+            against_of(targets, view),
+            cameras.kinds[view],
+            (int(cameras.widths[view]), int(cameras.heights[view])),
         )
-        progress(stage, view + 1, len(cameras))
+
+    scores = []
+    for done in in_threads(score, range(len(cameras))):
+        scores.append(done)
+        progress(stage, len(scores), len(cameras))
     return Evaluation(len(splats), splats.nbytes, tuple(scores), scored_in(targets))

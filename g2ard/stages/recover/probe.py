@@ -2,7 +2,7 @@
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,7 @@ from g2ard.rendering.targets import Subset, Targets, mask_of, scored_in, with_pi
 from g2ard.scene.cameras import rows_by_kind
 from g2ard.scene.samples import evenly_spaced
 from g2ard.scene.splats import Splats
+from g2ard.system.threads import in_threads
 
 _SCORED_VIEWS = 8
 """Views that are scored, of training and of each kind of validation views."""
@@ -53,7 +54,7 @@ class Probe:
     def all_of(self, splats: Splats) -> float:
         """Return the mean PSNR over the views."""
         renderer = Renderer(splats, background=self._background)
-        return float(np.mean([self._score(renderer, view) for view in self._views]))
+        return float(np.mean(list(in_threads(lambda view: self._score(renderer, view), self._views))))
 
     def latest(self, splats: Callable[[], Splats], step: int, seconds: float) -> tuple[float, int]:
         """Return the mean PSNR and its step; the previous ones if scoring has used its share of the time.
@@ -108,18 +109,17 @@ def harmful_changes(
         training: views that were.
     """
     held = _Comparison(start, result, validation, background)
-    losing = [held.lost(view) > _TOLERATED_LOSS for view in range(len(validation.cameras))]
+    losing = [lost > _TOLERATED_LOSS for lost in held.lost()]
     if not any(losing):
         return None
     compared = Subset(training, evenly_spaced(len(training.cameras), _COMPARED_VIEWS))
     trained = _Comparison(start, result, compared, background)
     total, worse = np.zeros((2, len(result)))
-    for view, loses in enumerate(losing):
-        light = held.light(view)
+    for light, loses in zip(held.light(), losing, strict=True):
         total += light
         worse += light * loses
-    for view in range(len(compared.cameras)):
-        total += trained.light(view)
+    for light in trained.light():
+        total += light
     return (total > 0) & (worse > 0)
 
 
@@ -136,7 +136,6 @@ class _Comparison:
         means, quats, scales, logits, sh0, _ = arrays_of(scene)
         colours = np.zeros_like(sh0), np.zeros((len(scene), 0, 3), np.float32)
         self._grey = (means, quats, scales, logits, *colours)
-        self._rasterizer = _core.Rasterizer()
 
     def _errors(self, view: int) -> list[NDArray[np.float64]]:
         camera, target = self._targets.cameras[view], self._targets[view]
@@ -146,17 +145,24 @@ class _Comparison:
         ]
         return errors if mask is None else [error * mask for error in errors]
 
-    def lost(self, view: int) -> float:
-        """Return the loss in dB."""
+    def lost(self) -> Iterator[float]:
+        """Yield each view's loss in dB."""
+        return in_threads(self._lost, range(len(self._cameras)))
+
+    def light(self) -> Iterator[NDArray[np.float32]]:
+        """Yield each view's (N,) Σ αT·E, with E the change of the error relative to the mean before."""
+        return in_threads(self._light, range(len(self._cameras)))
+
+    def _lost(self, view: int) -> float:
         before, after = (max(float(error.mean()), _LEAST_MSE) for error in self._errors(view))
         return 10 * math.log10(after / before)
 
-    def light(self, view: int) -> NDArray[np.float32]:
-        """Return (N,) Σ αT·E, with E the change of the error relative to the mean before."""
+    def _light(self, view: int) -> NDArray[np.float32]:
         before, after = self._errors(view)
         image = np.zeros((*before.shape, 3), np.float32)
         image[..., 0] = (after - before) / (max(float(before.mean()), _INVISIBLE_MSE) * before.size)
         seen = view_of(self._cameras, view, self._settings)
-        self._rasterizer.forward(self._grey, seen, self._settings, [0.0, 0.0, 0.0], 0)
-        light: NDArray[np.float32] = self._rasterizer.backward(self._grey, image)[4][:, 0, 0]
+        rasterizer = _core.Rasterizer()
+        rasterizer.forward(self._grey, seen, self._settings, [0.0, 0.0, 0.0], 0)
+        light: NDArray[np.float32] = rasterizer.backward(self._grey, image)[4][:, 0, 0]
         return light  # the gradient of a colour is Σ αT·E

@@ -18,6 +18,7 @@ from g2ard.rendering.renderer import RasterSettings, Renderer, settings_for
 from g2ard.scene.cameras import Camera, Cameras
 from g2ard.scene.samples import evenly_spaced
 from g2ard.scene.splats import Splats
+from g2ard.system.threads import in_threads
 
 _GAPS = 0.02
 """Least share of opacity lost that shows as gaps."""
@@ -116,7 +117,8 @@ class Renders:
         if settings is None:
             settings = settings_for(scene.means, antialiased=scene.antialiased)
         views = list(views)
-        return cls(views, settings, _images(scene, views, settings))
+        renderer = Renderer(scene, settings=settings)
+        return cls(views, settings, list(in_threads(lambda view: _image(renderer, view), views)))
 
     def compare(self, scene: Splats) -> tuple[float, float, float]:
         """Return the error of a simplified scene, and the light lost in pixels where the dense one is opaque.
@@ -127,20 +129,25 @@ class Renders:
             The logarithms of the views' mean squared errors, summed over pixels; the light that opaque pixels
             let through though the dense scene stops it; and all that the dense scene stops there.
         """
-        error = lost = opaque = 0.0
-        for image, dense in zip(_images(scene, self.views, self.settings), self.images, strict=True):
+        renderer = Renderer(scene, settings=self.settings)
+
+        def differ(view: int) -> tuple[float, float, float]:
+            image, dense = _image(renderer, self.views[view]), self.images[view]
             squared = np.square(np.subtract(image, dense, dtype=np.float64)).mean()
-            error += dense[..., 0].size * float(np.log(squared + _LEAST_ERROR))
+            error = dense[..., 0].size * float(np.log(squared + _LEAST_ERROR))
             there = dense[..., 3] > _OPAQUE
-            opaque += float(dense[there, 3].sum(dtype=np.float64))
-            lost += float(np.maximum(dense - image, 0)[there, 3].sum(dtype=np.float64))
+            lost = float(np.maximum(dense - image, 0)[there, 3].sum(dtype=np.float64))
+            return error, lost, float(dense[there, 3].sum(dtype=np.float64))
+
+        error = lost = opaque = 0.0
+        for differs, misses, stops in in_threads(differ, range(len(self.views))):
+            error, lost, opaque = error + differs, lost + misses, opaque + stops
         return error, lost, opaque
 
 
-def _images(scene: Splats, views: list[Camera], settings: RasterSettings) -> list[NDArray[np.float32]]:
-    renderer = Renderer(scene, settings=settings)
-    made = (renderer.render(view) for view in views)
-    return [np.dstack([np.clip(one.image, 0, 1), one.alpha]) for one in made]
+def _image(renderer: Renderer, view: Camera) -> NDArray[np.float32]:
+    one = renderer.render(view)
+    return np.dstack([np.clip(one.image, 0, 1), one.alpha])
 
 
 def opacity_lost(dense: Splats, result: Splats, cameras: Cameras) -> float:
