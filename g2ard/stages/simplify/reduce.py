@@ -163,8 +163,8 @@ def simplify(
     renders = None
     if compare and isinstance(config, Pairs) and budget < len(scene):
         views = getattr(visibility, "views", None)
-        ordered = scene.take(scene.core.order)  # ties in depth go by row
-        renders = Renders.of(ordered, outside_views(scene) if views is None else some_views(views))
+        views = outside_views(scene) if views is None else some_views(views)
+        renders = Renders.of(scene.take(scene.core.order), views)  # ties in depth go by row
     if not isinstance(config, Pairs):
         out = _paper(scene, budget, protected, final_budget or budget, config, progress)
     elif config.keep_region and visibility is None:
