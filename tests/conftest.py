@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+import tempfile
 from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -17,7 +18,7 @@ import pytest
 
 import g2ard
 from g2ard.io import write_views
-from helpers.plans import share_plans
+from helpers.plans import FOLDER, share_plans
 from helpers.project import environment
 from helpers.scenes import around, checkered_ball
 
@@ -33,6 +34,13 @@ def unchanged_signals() -> Iterator[None]:
     yield
     left = signal.signal(signal.SIGINT, signal.default_int_handler)
     assert left is signal.default_int_handler
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    if FOLDER not in os.environ:  # processes that are started later inherit it
+        plans = tempfile.TemporaryDirectory(prefix="plans")
+        config.add_cleanup(plans.cleanup)
+        os.environ[FOLDER] = plans.name
 
 
 def pytest_collection_finish() -> None:

@@ -19,6 +19,7 @@ import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
 from difflib import get_close_matches
+from functools import cache
 from typing import Any, ClassVar, Literal, Self, TypeVar, get_args, get_origin, get_type_hints
 
 from g2ard.config.checks import bare, check_fields, check_type, described, options_of
@@ -191,7 +192,8 @@ class _Leaf:
 def _leaves(config: Any, root: str | None = None, every: bool = False) -> Iterator[_Leaf]:
     """List what can be set; with `every`, also in other variants."""
     root = _root(config) if root is None else root
-    kinds = get_type_hints(type(config), include_extras=True)
+    owner: Any = type(config)
+    kinds = _kinds(owner)
     for f in fields(config):
         path, value = _joined(root, f.name), getattr(config, f.name)
         if is_dataclass(value):
@@ -203,10 +205,15 @@ def _leaves(config: Any, root: str | None = None, every: bool = False) -> Iterat
             chosen = every and f.name == getattr(config, "_tag", None)
             yield _Leaf(path, Literal[tuple(config._variants)] if chosen else kinds[f.name], value)
     for kind in getattr(config, "_variants", {}).values() if every else ():
-        kinds = get_type_hints(kind, include_extras=True)
+        kinds = _kinds(kind)
         for f in fields(kind):
             if f.name not in _names(config):
                 yield _Leaf(_joined(root, f.name), kinds[f.name], f.default)
+
+
+@cache
+def _kinds(config: type) -> dict[str, Any]:
+    return get_type_hints(config, include_extras=True)
 
 
 def _root(config: Any) -> str:

@@ -1,39 +1,67 @@
 """Plans of views that tests share: planning is a pure function, and most of the time of a short run."""
 
+import hashlib
+import os
+import pickle
+import tempfile
 from collections import OrderedDict
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
+from os import replace as put_in_place  # the original: tests of interruptions count its calls
+from pathlib import Path
 from typing import Any
 
 import pytest
 
 from g2ard.poses.pool import Pool, plan_pool
 from g2ard.progress import Progress, silent
+from g2ard.scene.cameras import Camera
 from g2ard.scene.splats import Splats
 
+FOLDER = "G2ARD_TEST_PLANS"
+"""Variable of the environment: a folder in which all processes of a run of the tests keep plans."""
 _IMPORTERS = ("poses", "jobs.clean", "jobs.measured_budget")
 """Modules in which jobs find `plan_pool`."""
-_MOST = 12
-"""Plans that are kept."""
+_MOST = 100
+"""Plans that are kept in memory."""
 
-_plans: OrderedDict[str, Pool] = OrderedDict()
+_plans: OrderedDict[str, Any] = OrderedDict()
 
 
 def share_plans(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Plan the views of a scene once in this process; tests/poses tests that plans are the same each time."""
+    """Plan the views of a scene once in all processes; tests/poses tests that plans are the same each time."""
     for name in _IMPORTERS:
         monkeypatch.setattr(f"g2ard.{name}.plan_pool", _shared)
 
 
 def _shared(splats: Splats, *count: int, progress: Progress = silent, **options: Any) -> Pool:
     key = f"{splats.fingerprint()} {count} {sorted(options.items())}"
-    if key in _plans:
-        _plans.move_to_end(key)
-        for stage in ("scene", "poses"):
-            progress(stage, 1, 1)
-        return _plans[key]
-    pool = plan_pool(splats, *count, progress=progress, **options)
-    _plans[key] = replace(pool, more=cache(pool.more))
+    plan = cache(lambda: plan_pool(splats, *count, progress=progress, **options))
+
+    def more(kind: str, wanted: int) -> list[Camera]:
+        return _kept(f"{key} {kind} {wanted}", lambda: plan().more(kind, wanted))
+
+    pool = _kept(key, lambda: replace(plan(), more=_none))
+    for stage in ("scene", "poses"):
+        progress(stage, 1, 1)
+    return replace(pool, more=more)
+
+
+def _none(kind: str, count: int) -> list[Camera]:
+    return []
+
+
+def _kept(key: str, make: Callable[[], Any]) -> Any:
+    """Return what `make` returned for this key, in this process or another one."""
+    if key not in _plans:
+        path = Path(os.environ.get(FOLDER, "nowhere"), hashlib.sha256(key.encode()).hexdigest())
+        _plans[key] = pickle.loads(path.read_bytes()) if path.exists() else make()
+        if path.parent.is_dir() and not path.exists():
+            with tempfile.NamedTemporaryFile(dir=path.parent, delete=False) as file:
+                pickle.dump(_plans[key], file)
+            put_in_place(file.name, path)
+    _plans.move_to_end(key)
     while len(_plans) > _MOST:
         _plans.popitem(last=False)
     return _plans[key]
