@@ -41,9 +41,11 @@ if __name__ == "__main__":
     sys.path[:0] = [str(Path(__file__).resolve().parents[up]) for up in (0, 1)]
 
 import numpy as np
+import pytest
 
 from helpers import golden_cases as cases
 from helpers.killed import command, forked, killed
+from helpers.plans import FOLDER, share_plans
 
 RECORD, TABLE = (Path(__file__).with_suffix(suffix) for suffix in (".json", ".txt"))
 MOMENTS = (0.2, 0.7)
@@ -320,6 +322,8 @@ def run_all(chosen: list[Case], root: Path, jobs: int) -> dict[str, Found]:
     for name in g2ard.__all__:
         if name != "rasterize":  # needs torch
             getattr(g2ard, name)
+    if FOLDER in os.environ:  # among other tests
+        share_plans(pytest.MonkeyPatch())
     inputs = root / "inputs"
     inputs.mkdir()
     if forked(lambda: cases.make_inputs(inputs), root / "inputs.log", root / "inputs.log", root):

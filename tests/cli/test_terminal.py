@@ -53,7 +53,7 @@ DRAWN = {
 }
 """Stages whose bars commands draw."""
 TO_STDOUT = ("evaluate", "compare", "info")
-KINDS: list[tuple[int, dict[str, str]]] = [(40, {"NO_COLOR": "1"}), (200, {}), (80, {"TERM": "dumb"})]
+KINDS: list[tuple[int, dict[str, str]]] = [(40, {"NO_COLOR": "1"}), (80, {"TERM": "dumb"})]
 ENDLESS = {
     "distill": ("recover", "--steps 100000"),
     "recover": ("recover", "--steps 100000"),
@@ -150,7 +150,7 @@ def test_a_terminal_ends_with_the_messages_of_a_pipe(
     inputs: Path,
     command_line: Callable[..., tuple[int, str, str]],
 ) -> None:
-    screen = shown(command)
+    screen = shown(command, columns=200)
     assert screen.status == 0, screen.received
     assert_tidy(screen)
     if command in DRAWN:

@@ -38,9 +38,11 @@ def forked(work: Callable[[], object], out: Path, err: Path, folder: Path) -> in
     except BaseException:
         traceback.print_exc()
     finally:
-        sys.stdout.flush()
-        sys.stderr.flush()
-        os._exit(status if isinstance(status, int) else 1)
+        try:
+            sys.stdout.flush()
+            sys.stderr.flush()
+        finally:
+            os._exit(status if isinstance(status, int) else 1)
 
 
 def command(words: list[str]) -> Callable[[], object]:

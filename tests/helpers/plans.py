@@ -30,7 +30,7 @@ _plans: OrderedDict[str, Any] = OrderedDict()
 
 
 def share_plans(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Plan the views of a scene once in all processes; tests/poses tests that plans are the same each time."""
+    """Plan a scene's views once for all processes; tests/poses tests that plans are the same each time."""
     for name in _IMPORTERS:
         monkeypatch.setattr(f"g2ard.{name}.plan_pool", _shared)
 

@@ -36,6 +36,8 @@ size = 48
 steps = 12
 [adapt]
 steps = 12
+[recover]
+size = 48
 [compare]
 size = 48
 looks = 4
@@ -68,6 +70,12 @@ def shrunk(words: Sequence[str]) -> list[str]:
 
 def _scene(path: Path) -> None:
     g2ard.save(path, SCENE)
+
+
+def _scene_with_views(path: Path) -> None:
+    """A scene that was trained in a few small views, for devices that take seconds for a picture."""
+    _scene(path)
+    g2ard.save_views(path.with_name("cameras.json"), around(8, (48, 36)))
 
 
 def _small(path: Path) -> None:
@@ -220,6 +228,7 @@ OF_PAGE: dict[str, dict[str, Callable[[Path], None]]] = {
     "docs/how-to/web-delivery.md": {"project": _map_colmap},
     "docs/how-to/lidar-map.md": {"project": _map_colmap},
     "docs/how-to/clean-floaters.md": {"scene.ply": _sky},
+    "docs/how-to/gpus.md": {"scene.ply": _scene_with_views},
     "docs/how-to/own-views.md": {"views.json": _views},
     "docs/how-to/rasteriser.md": {"small.ply": _simplified},
 }
@@ -240,8 +249,8 @@ def provide(name: str, folder: Path, page: str, store: Path) -> None:
     make = own.get(first) or STAND_INS.get(first)
     if make is None or (folder / first).exists():
         return
-    made = store / (page.replace("/", "-") if first in own else "any") / first
+    made = store / (page.replace("/", "-") if first in own else "any") / f"for {first}"
     if not made.exists():
-        made.parent.mkdir(parents=True, exist_ok=True)
-        make(made)
-    (shutil.copytree if made.is_dir() else shutil.copyfile)(made, folder / first)
+        made.mkdir(parents=True)
+        make(made / first)
+    shutil.copytree(made, folder, dirs_exist_ok=True)

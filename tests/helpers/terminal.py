@@ -81,11 +81,16 @@ def _serve() -> None:
     """Run the commands that stdin asks for, one JSON object per line."""
     from importlib import import_module
 
+    import pytest
+
     from g2ard.cli import console
     from g2ard.cli.app import COMMANDS
+    from helpers.plans import share_plans
+
+    share_plans(pytest.MonkeyPatch())
 
     # Commands on tiny scenes end before the live line would appear.
-    console._LIVE_LINE_DELAY, console._LIVE_LINE_PERIOD, console._SILENT_SECONDS = 0.0, 0.01, 0.02  # type: ignore[misc]
+    console._LIVE_LINE_DELAY, console._LIVE_LINE_PERIOD, console._SILENT_SECONDS = 0.0, 0.02, 0.04  # type: ignore[misc]
     for name in ("rich.live", "rich.progress_bar", "rich.table", "g2ard.pipeline", "g2ard.jobs.distill"):
         import_module(name)
     for name in COMMANDS:
