@@ -25,7 +25,7 @@ def ask(scene: SceneSpec, out: Path, methods: str, protocol: str = "pool") -> li
 
 
 @needs_processes
-def test_measures_writes_and_resumes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_measures_writes_and_resumes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, programs: None) -> None:
     scene = ball_of(tmp_path, 2000)
     rows = ask(scene, tmp_path / "out", ",".join(METHODS))
     assert [row["method"] for row in rows] == list(METHODS)

@@ -211,6 +211,10 @@ DISTILL: dict[str, Any] = {
     "select.focus": "near",
     "select.focus_share": 0.25,
 }
+HANDED_ON = {"simplify.fold", "recover.ssim_weight", "recover.regularizers.anchor", "recover.schedule.reach"}
+FEW = {name: value for name, value in DISTILL.items() if name.startswith("select.") or name in HANDED_ON}
+"""Settings that a whole distillation is tried with: stages get theirs as one object, so few tell for all.
+In tiles all are tried."""
 UNEVEN = ViewSet(VIEWS, splits=("train",) * 7 + ("test",), weights=np.arange(8.0) ** 2)
 BUDGET = 80
 
@@ -248,7 +252,7 @@ def _distilled_in_tiles(settings: Mapping[str, Any]) -> object:
     return done.splats.whole().fingerprint()
 
 
-PRIORS = ("trained", "lift", "noisy")
+PRIORS = ("trained", "lift")  # noisy has the terms of lift
 RUNS: dict[str, tuple[Callable[[Mapping[str, Any]], object], dict[str, Any]]] = {
     **{method: (_simplified(method, views=VIEWS), SIMPLIFY) for method in ("default", "fast")},
     **{f"{method} blind": (_simplified(method, blind=True), SIMPLIFY) for method in ("default", "fast")},
@@ -259,7 +263,7 @@ RUNS: dict[str, tuple[Callable[[Mapping[str, Any]], object], dict[str, Any]]] = 
     "lift": (_lifted, LIFT),
     **dict.fromkeys(("adapt", "adapt paper"), (_adapted, ADAPT)),
     **dict.fromkeys(("register sift", "register direct"), (_registered, REGISTER)),
-    "distill": (_distilled, DISTILL),
+    "distill": (_distilled, FEW),
     "distill in tiles": (_distilled_in_tiles, DISTILL),
 }
 RECOVERY: dict[str, Any] = {"steps": 6, "regularizers.period": 1, "regularizers.shape": 1.0}
