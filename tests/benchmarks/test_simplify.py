@@ -21,7 +21,7 @@ METHODS = ("default", "fast", "paper", "nanogs", "lightgaussian")
 
 
 def ask(scene: SceneSpec, out: Path, methods: str, protocol: str = "pool") -> list[Row]:
-    return measured("simplify", scene, out, ratios="4", methods=methods, protocol=protocol)
+    return measured("simplify", scene, out, ratios="4", methods=methods, protocol=protocol, size="64")
 
 
 @needs_processes
@@ -139,7 +139,7 @@ def test_the_study_of_growth_has_every_growth_that_is_chosen_from() -> None:
 @needs_processes
 def test_fixed_growths_are_compared_in_other_views_than_those_that_choose(tmp_path: Path) -> None:
     scene = ball_of(tmp_path, 2000, views=False)
-    rows = measured("growth", scene, tmp_path / "out", ratios="10", methods="growth-1.25,growth-4")
+    rows = measured("growth", scene, tmp_path / "out", ratios="10", methods="growth-1.25,growth-4", size="64")
     first, last = (rows[i : i + 3] for i in (0, 3))
     assert [row["views_kind"] for row in first] == ["near", "standing", "anywhere"]
     assert all(a["count"] == b["count"] and a["psnr"] != b["psnr"] for a, b in zip(first, last, strict=True))
