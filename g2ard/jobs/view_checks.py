@@ -45,18 +45,24 @@ _BLIND_VIEWS_SHARE = 0.1
 
 
 def found_views(
-    scene: str | Path, splats: Splats, splits: Sequence[str], say: Say = unsaid, *, turned: bool = False
+    scene: str | Path | None,
+    splats: Splats,
+    splits: Sequence[str],
+    say: Say = unsaid,
+    *,
+    turned: bool = False,
 ) -> Path | None:
     """Find views beside a scene (`g2ard.io.find_views`) that see it.
 
     Args:
+        scene: its path; None finds nothing.
         splits: splits that must not be empty.
         turned: whether an up direction was given, which found views do not need.
 
     Returns:
         A path for `load_views`, or None.
     """
-    path = find_views(scene)
+    path = None if scene is None else find_views(scene)
     if path is None:
         return None
     try:

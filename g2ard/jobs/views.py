@@ -85,7 +85,7 @@ def views_of(
         represents: Gaussians per row if `prior` is a sample of a larger scene; the pool grows with it.
     """
     views_beside = None
-    if options.views is None and beside is not None:
+    if options.views is None:
         wanted = ["train"] if options.held_out is not None else ["train", "test"]
         views_beside = found_views(beside, prior, wanted, say, turned=options.up is not None)
     given = views_beside or options.views
@@ -288,10 +288,8 @@ def views_or_pool(
     """
     if views is not None and not is_made(views):
         return views
-    if views is None and beside is not None:
-        found = found_views(beside, scene, [], say, turned=up is not None)
-        if found:
-            return found
+    if views is None and (found := found_views(beside, scene, [], say, turned=up is not None)):
+        return found
     grow = _POOL_GROWTH if count is None else 1.0
     size = _POOL_VIEWS if count is None else count
     planned = _planned(scene, size, up=up, seed=seed, progress=progress, grow=grow)
@@ -342,28 +340,21 @@ def cameras_for_weights(
 
     Args:
         views: as for `views_of`; the training split is used.
-        method: `fast` uses only given or requested views, `paper` none.
+        method: those other than `default` use only given or requested views.
 
     Other arguments are those of `views_of`.
 
     Returns:
         The cameras, or None for no views.
     """
-    made = is_made(views)
-    if method == "paper" and views is not None:
-        say("paper uses no views")
-    if method == "paper" and made:
+    if views is None and method != "default":
         return None
-    if views is None and beside is not None and method == "default":
-        views_beside = found_views(beside, scene, ["train"], say, turned=up is not None)
-        if views_beside:
-            return as_pool(load_views(views_beside, "train", None, say))
-    if views is not None and not made:
+    if views is None and (found := found_views(beside, scene, ["train"], say, turned=up is not None)):
+        return as_pool(load_views(found, "train", None, say))
+    if views is not None and not is_made(views):
         given = load_views(views, "train", None, say)
         warn_of_sight(scene, given, say)
         return given
-    if method != "default" and not made:
-        return None
     try:
         return _planned(
             scene,
