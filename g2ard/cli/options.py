@@ -160,13 +160,13 @@ ViewsFormatOption = Annotated[
         help="Also write generated views as cameras.json (inria), transforms.json (nerfstudio) or colmap/.",
     ),
 ]
-_UNWRITTEN = Path("dry-run")
+UNWRITTEN = Path("dry-run")
 """Output of a dry run without -o."""
 
 
 def _need_no_output(ctx: typer.Context, dry_run: bool) -> bool:
     if dry_run:
-        ctx.default_map = {"output": str(_UNWRITTEN), **(ctx.default_map or {})}
+        ctx.default_map = {"output": str(UNWRITTEN), **(ctx.default_map or {})}
     return dry_run
 
 

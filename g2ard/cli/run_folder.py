@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -39,12 +39,16 @@ from g2ard.scene.splats import Splats
 from g2ard.viewer import write_page
 
 if TYPE_CHECKING:
-    from g2ard.jobs.distill import RunTargets
-    from g2ard.jobs.tiled import TiledDistilled
+    from g2ard.jobs.distill import DistillJob, RunTargets
+    from g2ard.jobs.tiled import TiledDistilled, TiledJob
     from g2ard.pipeline.distill import Distilled
+    from g2ard.report.run import RunReport, TiledReport
 
 _WORK_FOLDER = ".unfinished"
 """Folder in a run's folder for finished rounds and checkpoints."""
+
+_PICTURE = "preview.png"
+"""Name of a run's picture."""
 
 _VIEW_FILES: dict[ViewFormat, str] = {
     "inria": "cameras.json",
@@ -108,13 +112,12 @@ class RunFolder:
         return record
 
     @contextmanager
-    def writing(self, photos: Iterable[Path] = ()) -> Iterator[None]:
-        """Create the folder; no other run may write here meanwhile, and an empty folder is removed.
+    def working(self, job: DistillJob | TiledJob) -> Iterator[None]:
+        """Create the folder, where no other run may write meanwhile; an empty folder is removed.
 
-        Args:
-            photos: files that the run reads, besides those of its options.
+        In one piece, it holds checkpoints too, which are kept after an error or Ctrl-C.
         """
-        files = [*self._run.input_files(), *photos]
+        files = [*self._run.input_files(), *job.photos]
         self._inputs = dict(zip(map(str, files), file_identity(files), strict=True))
         made = [] if self.path.exists() else [self.path]
         self.path.mkdir(parents=True, exist_ok=True)
@@ -123,22 +126,22 @@ class RunFolder:
                 if self.scene.exists() and not (self._run.overwrite or left_at(self.work)):
                     raise OutputError("exists", path=self.path, hint="{overwrite=True} replaces it")
                 drop_temporaries(self.path)
-                yield
+                with nullcontext() if job.tiles else self._checkpoints(job):
+                    yield
         finally:
             drop_empty(made)
 
     @contextmanager
-    def working(self, input_count: int, output_count: int, photos: Iterable[Path]) -> Iterator[None]:
+    def _checkpoints(self, job: DistillJob | TiledJob) -> Iterator[None]:
         """Create the folder for checkpoints; after an error or Ctrl-C, keep what it holds."""
-        with self.writing(photos):
-            if self._resume and not left_at(self.work):
-                self._run.say(f"{self.path}: nothing to resume, starting over")
-            with kept(self._run, self.work, self._resume, self.path, f"in {self.path}"):
-                self.work.mkdir(parents=True, exist_ok=True)
-                told = {"input_count": input_count, "output_count": output_count, "config": self._run.config}
-                text = json.dumps(told, default=str)
-                (self.work / OPTIONS).write_text(text, encoding="utf-8", newline="\n")
-                yield
+        if self._resume and not left_at(self.work):
+            self._run.say(f"{self.path}: nothing to resume, starting over")
+        with kept(self._run, self.work, self._resume, self.path, f"in {self.path}"):
+            self.work.mkdir(parents=True, exist_ok=True)
+            counts = {"input_count": job.total, "output_count": job.budget.count}
+            text = json.dumps({**counts, "config": self._run.config}, default=str)
+            (self.work / OPTIONS).write_text(text, encoding="utf-8", newline="\n")
+            yield
 
     def write(
         self, done: Distilled | TiledDistilled, views: RunViews, targets: RunTargets | None = None
@@ -149,13 +152,14 @@ class RunFolder:
         format of --views-format, and all scored views if some of `targets` are of other kinds. Without
         targets, which score the file later, a lossy file is compared with the scene.
         """
-        self._run.write(self.scene, done.splats, overwrite=True, compare=targets is None)
-        pages = (self.path / name for name in ("report.json", "report.html", "preview.png", "view.html"))
+        run = self._run
+        run.write(self.scene, done.splats, overwrite=True, compare=targets is None)
+        pages = (self.path / name for name in ("report.json", "report.html", _PICTURE, "view.html"))
         for other in (*self._other_scenes(), *pages):
             other.unlink(missing_ok=True)
-        if self._run.config["keep"]:
+        if run.config["keep"]:
             self._simplified.parent.mkdir(exist_ok=True)
-            self._run.write(self._simplified, done.simplified, overwrite=True)
+            run.write(self._simplified, done.simplified, overwrite=True)
         else:
             self._simplified.unlink(missing_ok=True)
         own = views.pool or views.train
@@ -163,16 +167,46 @@ class RunFolder:
             splits = ("train",) * len(own.cameras) + ("test",) * len(views.test)
             own = ViewSet(_joined(own.cameras, views.test), splits=splits)
         write_views(self._views, own.cameras, splits=own.splits, overwrite=True)
-        also: ViewFormat = self._run.config["views_format"]
+        also: ViewFormat = run.config["views_format"]
         if views.pool is not None and also in _VIEW_FILES:
-            self._run.write_views(
-                self.path / _VIEW_FILES[also], own.cameras, also, own.splits, overwrite=True
-            )
+            run.write_views(self.path / _VIEW_FILES[also], own.cameras, also, own.splits, overwrite=True)
         if targets is None or targets.apart is None:
             self._scored.unlink(missing_ok=True)
             return
         scored = _joined(targets.apart.cameras, targets.held_out.cameras)
         write_views(self._scored, scored, splits=["test"] * len(scored), overwrite=True)
+
+    def write_pages(
+        self, title: str, job: Any, done: Any, report: RunReport | TiledReport, told: Sequence[str]
+    ) -> tuple[RunReport | TiledReport, str]:
+        """Write report.html and, in one piece, preview.png and with --page view.html.
+
+        Args:
+            told: the summary that the command prints.
+
+        Returns:
+            The report with the size of the page, and a line about the page.
+        """
+        from g2ard.report.distilled import distill_report, preview, tiled_report
+        from g2ard.report.run import TiledReport
+
+        if isinstance(report, TiledReport):
+            with self._run.finishing("report.html"):
+                tiled_report(self.path / "report.html", title, report)
+            return report, ""
+        scenes = [("simplified", done.simplified), ("recovered", done.splats)]
+        targets = list(filter(None, (job.targets.held_out, job.targets.apart)))
+        recover, page = job.config.recover, self.path / "report.html"
+        with self._run.finishing("report.html"):
+            distill_report(page, title, scenes, targets, report, recover.background, told)
+        with self._run.finishing(_PICTURE):
+            preview(self.path / _PICTURE, targets[0], scenes, recover.background)
+        if not self._run.config["page"]:
+            return report, ""
+        dense, seen = None if recover.from_points else job.prior, job.views.train.cameras
+        with self._run.finishing("view.html"):
+            size, line = self.write_view(done.splats, dense, seen, recover.background)
+        return replace(report, bytes={**report.bytes, "view": size}), line
 
     def write_report(self, report: Report) -> None:
         told = {**report.as_dict(), "config": self._run.config, "inputs": self._inputs}
@@ -202,10 +236,11 @@ class RunFolder:
         written = write_page(self._view, shown, start=stand.start, background=background, overwrite=True)
         return written.bytes, f"view: {self._view} ({written.bytes / 1e6:.2f} MB)"
 
-    def say_files(self, picture: str | None = None, page: str = "") -> None:
+    def say_files(self, page: str = "") -> None:
         """Name the files, and record that the run is finished."""
+        picture = self.path / _PICTURE
         scene = f"scene: {self.scene} ({self.scene.stat().st_size / 1e6:.2f} MB)"
-        shown = f"picture: {self.path / picture}" if picture else ""
+        shown = f"picture: {picture}" if picture.exists() else ""
         report = f"report: {self.path / 'report.html'}, {self._report}"
         self._run.say("\n".join(filter(None, (scene, shown, report, page))))
         self._run.kept.append(f"{self.path} is finished")

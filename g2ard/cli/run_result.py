@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from g2ard.cli.frame import Run
 from g2ard.io.scene_formats import FORMATS, scene_format, written_bytes
 from g2ard.progress import plural
 
 if TYPE_CHECKING:
+    from g2ard.cli.run_folder import RunFolder
     from g2ard.jobs.budget import Budget
+    from g2ard.jobs.cost import Cost
+    from g2ard.jobs.distill import DistillJob
     from g2ard.jobs.measured_budget import ResolvedBudget
+    from g2ard.jobs.tiled import TiledJob, Tiles
     from g2ard.report.run import KindScore, RunReport, TiledReport, ViewsReport
     from g2ard.scene.splats import Splats
 
@@ -22,12 +27,54 @@ _LEAST_REPORTED_SHARE = 0.005
 """Share of the scene too small to report."""
 
 
-def write_table(run: Run, report: RunReport | TiledReport) -> None:
-    """Print the scores by kind of view."""
-    from g2ard.report.run import COLUMNS, cells
+def tell_run(
+    run: Run, source: Path, job: Any, done: Any, report: RunReport | TiledReport, folder: RunFolder, page: str
+) -> None:
+    """Print the summary of a run and write its result.
 
+    Args:
+        source: what was distilled.
+        page: line about the page.
+    """
+    from g2ard.report.run import COLUMNS, RunReport, cells
+
+    if isinstance(report, RunReport):
+        run.say(counts_line(report))
     title = f"held-out views against {report.against}, {report.size}, simplified → recovered:"
     run.console.table(title, list(COLUMNS), cells(report.kinds))
+    for line in told(report, verbose=run.verbose):
+        run.say(line)
+    if isinstance(report, RunReport):
+        say_views(run, report.views, job.config.select.views_count is not None)
+        if not job.config.recover.from_points:  # such points are no scene to compare with
+            say_weight(run, source, folder.scene, done.splats, lifted=job.prior if job.lifted else None)
+    else:
+        scores = report.scores
+        run.say(
+            f"{folder.path}: {report.output_count:,} of {report.input_count:,} Gaussians; over all pixels "
+            f"{scores.simplified:.2f} → {scores.recovered:.2f} dB; "
+            f"{plural(scores.steps, 'step')} in all tiles together"
+        )
+    folder.say_files(page)
+    run.result(report.as_dict())
+    tell_quality(run, job.budget, done.splats)
+
+
+def tell_plan(run: Run, job: DistillJob | TiledJob, cost: Cost) -> None:
+    """Print what a distillation would do, and its rough time and memory."""
+    count = job.budget.count
+    run.answer(
+        f"{plural(count, 'Gaussian')}, {plural(cost.views, 'target image')} of {cost.pixels:,} pixels, "
+        f"{plural(cost.steps, 'step')}: roughly {max(1, cost.seconds):.0f} s on two cores and "
+        f"{cost.bytes / 1e6:,.0f} MB"
+    )
+    run.say_dry()
+    run.result({"count": count, **asdict(cost), "seconds": cost.seconds, **tiles_of(job.tiles)})
+
+
+def tiles_of(tiles: Tiles | None) -> dict[str, int]:
+    """Return the numbers of tiles and workers, for the result of a dry run."""
+    return {} if tiles is None else {"tiles": tiles.plan.tiles, "workers": tiles.plan.workers}
 
 
 def counts_line(report: RunReport) -> str:
@@ -45,9 +92,13 @@ def _megabytes(size: int | None, file: str) -> str:
     return f"{(size or 0) / 1e6:.2f} MB as .{file.partition('.')[2]}"
 
 
-def told(report: RunReport, *, verbose: bool = False) -> list[str]:
+def told(report: RunReport | TiledReport, *, verbose: bool = False) -> list[str]:
     """Return lines on recovery, losses, unseen parts and packing; `verbose` adds idle
     regularisers."""
+    from g2ard.report.run import TiledReport
+
+    if isinstance(report, TiledReport):
+        return [line for line in map(loss, report.kinds) if line]
     from g2ard.jobs.measured_budget import score_lines
     from g2ard.stages.recover.report import outcome, unregularized
     from g2ard.stages.simplify.growth import RECOVERED_GAPS, gaps_line

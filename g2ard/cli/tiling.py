@@ -28,7 +28,7 @@ _WORK_NAME = re.compile(r"tiles|steps|(student|merged|level|written)-[0-9a-f]{16
 
 def tiling_of(run: Run, scene: Path | None, output: Path) -> Tiling:
     """Check the options and return them as a `Tiling`."""
-    from g2ard.jobs.cost import bytes_of
+    from g2ard.jobs.memory import bytes_of
     from g2ard.jobs.tiling import Tiling
 
     tile_rows, memory, workers, scheduler, work = (run.shared[name] for name in TILES)

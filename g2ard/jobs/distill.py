@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +24,7 @@ from g2ard.jobs.budget import Budget
 from g2ard.jobs.clean import clean as remove_clutter
 from g2ard.jobs.distill_options import DistillOptions
 from g2ard.jobs.inputs import Views, load_scene, make_targets, scorable
-from g2ard.jobs.measured_budget import Reduction, ResolvedBudget, resolved
+from g2ard.jobs.measured_budget import Reduction, ResolvedBudget
 from g2ard.jobs.photos import distinct, sparse_file, sparse_points, topped_up
 from g2ard.jobs.view_checks import check_photos, propose_background
 from g2ard.jobs.views import Use, views_of, within_pixels
@@ -31,9 +33,10 @@ from g2ard.pipeline.distill import Distilled, RunViews
 from g2ard.pipeline.distill import distill as pipeline
 from g2ard.progress import Progress, Say, plural, silent, unsaid
 from g2ard.rendering.targets import Targets, fill, kinds_of, kinds_told
-from g2ard.rendering.visibility import overdraw
+from g2ard.rendering.visibility import overdraw, visibility_source
 from g2ard.report.run import Packed, RunReport, by_kind
 from g2ard.scene.cameras import USUAL, Cameras
+from g2ard.scene.samples import evenly_spaced
 from g2ard.scene.splats import Splats
 from g2ard.stages.evaluate import Evaluation, evaluate
 from g2ard.stages.lift import lift, lift_rows
@@ -41,8 +44,13 @@ from g2ard.stages.recover.anchors import FREE, Regularizers
 from g2ard.stages.recover.auto_preset import PriorMeasures, measure_prior, regularizers_for
 from g2ard.stages.recover.config import RecoverConfig
 from g2ard.stages.recover.schedule import Schedule
-from g2ard.stages.simplify.growth import opacity_lost
+from g2ard.stages.simplify import simplify
+from g2ard.stages.simplify.growth import opacity_lost, say_gaps
 from g2ard.system.cached import cached_property
+
+if TYPE_CHECKING:
+    from g2ard.jobs.tiled import TiledJob
+    from g2ard.jobs.tiling import Tiling
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +83,9 @@ class DistillJob:
         photos_over_renders: use photos where views have them and renders for the rest; always False without a
             teacher.
         preset: the regularisers chosen, and why.
+        recovers: whether the scene is recovered, or only merged.
         cleaned: number of Gaussians removed by kind of clutter; None without cleaning.
+        began, prepared: when the preparation began and ended.
     """
 
     prior: Splats
@@ -87,14 +97,35 @@ class DistillJob:
     lifted: bool
     preset: str
     measured: PriorMeasures
+    recovers: bool = True
     cleaned: dict[str, int] | None = None
+    began: float = 0.0
+    prepared: float = 0.0
     progress: Progress = silent
     say: Say = unsaid
+    tiles = None
+
+    @property
+    def dense(self) -> Splats:
+        """The dense scene."""
+        return self.prior
+
+    @property
+    def total(self) -> int:
+        """Gaussians of the dense scene."""
+        return len(self.prior)
 
     @property
     def reads_photos(self) -> bool:
         """Whether any target may be a photo."""
         return self.teacher is None or self.photos_over_renders
+
+    @property
+    def photos(self) -> list[Path]:
+        """The photos and masks that targets may be."""
+        views = (self.views.train.cameras, self.views.test)
+        paths = (path for cameras in views for path in (*cameras.image_paths, *cameras.mask_paths))
+        return list(dict.fromkeys(path for path in paths if path is not None)) if self.reads_photos else []
 
     @property
     def weights(self) -> NDArray[np.float64] | None:
@@ -110,6 +141,16 @@ class DistillJob:
             and (degree is None or degree >= self.prior.sh_degree)
             and self.config.recover.schedule.guarded
         )
+
+    def steps(self, count: int) -> int:
+        """Return the steps of all recoveries: after each round, if there are rounds, and of the last."""
+        recover, simplify = self.config.recover, self.config.simplify
+        like = self.prior.take(np.array(evenly_spaced(len(self.prior), count)))
+        last = recover.final_steps(like, self.views.train.cameras, photos=self.reads_photos)
+        if not recover.schedule.round_steps:
+            return last
+        rounds = simplify.rounds(len(self.prior), count, recovered=True)
+        return last + len(rounds) * recover.schedule.round_steps
 
     @cached_property
     def targets(self) -> RunTargets:
@@ -129,20 +170,46 @@ class DistillJob:
 
     def run(self, work: Path | None = None) -> Distilled:
         """Distil the scene; `work` is the folder for resuming, see `g2ard.pipeline.distill`."""
-        targets = self.targets
-        for scored in filter(None, (targets.held_out, targets.apart)):
+        for scored in filter(None, (self.targets.held_out, self.targets.apart)):
             fill(scored, self.progress)
-        done = pipeline(
-            self.prior,
-            self.budget.count,
-            targets.train,
+        done = self._reduced(self.prior, self.budget.count, work)
+        splats = self.budget.shrink(done.splats, self.say)
+        return replace(done, splats=splats, held_out=self.targets.held_out)
+
+    def _reduced(self, scene: Splats, count: int, work: Path | None) -> Distilled:
+        """Simplify and recover the dense scene, or one derived from it."""
+        return pipeline(
+            scene,
+            count,
+            self.targets.train,
             self.config,
             weights=self.weights,
-            validation=targets.validation,
+            validation=self.targets.validation,
             work=work,
             progress=self.progress,
         )
-        return replace(done, splats=self.budget.shrink(done.splats, self.say), held_out=targets.held_out)
+
+    def level(
+        self, finer: Splats, count: int, views: RunViews, work: Path | None = None
+    ) -> tuple[Splats, Splats, float, float | None]:
+        """Make a level of detail, see `g2ard.jobs.levels.LevelsJob`."""
+        job = replace(self, views=replace(views, full=None))
+        held_out = job.targets.held_out
+        fill(held_out, self.progress)
+
+        def score(splats: Splats) -> float:
+            colour = self.config.recover.background
+            return evaluate(splats, held_out, stage="scoring", background=colour, progress=self.progress).psnr
+
+        if not self.recovers:
+            visibility = visibility_source(self.views.train.cameras, progress=self.progress)
+            merged = simplify(finer, count, visibility=visibility, compare=True, progress=self.progress)
+            say_gaps(merged.report.opacity_lost, self.say)
+            return merged.splats, merged.splats, score(merged.splats), None
+        done = job._reduced(finer, count, work)
+        lost = opacity_lost(self.prior, done.splats, held_out.cameras)
+        say_gaps(lost, self.say, f"give levels more Gaussians (--ratios), here {count:,}")
+        return done.splats, done.simplified, score(done.simplified), score(done.splats)
 
     def report(self, done: Distilled, file: Path) -> RunReport:
         """Score the simplified and the recovered scene in held-out views, and describe the run.
@@ -192,9 +259,16 @@ class DistillJob:
             rounds=done.report.rounds,
             views=done.report.views,
             settings=listed(config),
-            seconds=done.report.seconds.as_dict(),
+            seconds=self._seconds(done.report.seconds.as_dict()),
             packed=packed,
         )
+
+    def _seconds(self, stages: dict[str, float]) -> dict[str, float]:
+        """Return the seconds by stage, with the scores as the rest until now, and their total."""
+        now, resumed = time.monotonic(), stages.get("resumed", 0.0)
+        score = now - self.prepared + 2 * resumed - sum(stages.values())
+        total = now - self.began + resumed
+        return {"prepare": self.prepared - self.began, **stages, "score": score, "total": total}
 
     def _unseen(self, done: Distilled) -> float | None:
         """Return the share of the scene that no view sees, or None for the paper's method.
@@ -331,6 +405,38 @@ def distill(
     return done
 
 
+@contextmanager
+def preparing(
+    scene: Scene,
+    budget: Budget,
+    options: DistillOptions,
+    tiling: Tiling | None = None,
+    *,
+    use: Use = "distil",
+    planned: bool = False,
+    progress: Progress = silent,
+    say: Say = unsaid,
+) -> Iterator[DistillJob | TiledJob]:
+    """Prepare a distillation in one piece, or in tiles.
+
+    Args:
+        tiling: how to process the scene, a path, in tiles; None for one piece.
+        planned: whether tiles are only planned.
+    """
+    callbacks: dict[str, Any] = {"progress": progress, "say": say}
+    if tiling is None:
+        yield prepare(scene, budget, options, use=use, **callbacks)
+        return
+    from g2ard.jobs.tiled import preparing_tiles
+
+    assert isinstance(scene, Path)
+    recovers = use != "merging"
+    with preparing_tiles(
+        scene, budget, options, tiling, recovers=recovers, planned=planned, **callbacks
+    ) as job:
+        yield job
+
+
 def prepare(
     scene: Scene,
     budget: Budget,
@@ -345,7 +451,7 @@ def prepare(
     With the use `merging`, messages leave out what only recovery uses. Other arguments and errors are those
     of `distill`.
     """
-    recovers = use != "merging"
+    began, recovers = time.monotonic(), use != "merging"
     recover = options.config.recover  # rejects invalid settings before anything is read
     if not isinstance(scene, Splats):
         progress("read", 0, 0)
@@ -367,19 +473,18 @@ def prepare(
         progress=progress,
         say=say,
     )
-    cameras, simplify = views.train.cameras, options.config.simplify
+    cameras = views.train.cameras
     reduce = Reduction(
         prior,
         cameras=cameras,
-        blind=simplify.method == "paper",
-        config=simplify,
+        blind=options.config.simplify.method == "paper",
+        config=options.config.simplify,
         seed=recover.seed,
         recovered=recovers,
         progress=progress,
         say=say,
     )
-    file = f"scene.{options.format}"
-    wanted = resolved(budget, reduce, read.name, file, recovered=True, sh_degree=degree)
+    wanted = reduce.resolved(budget, read.name, f"scene.{options.format}", degree)
     photos, renders = _sources(views, options.photos, read.lifted)
     choice = _regularizers(options, read, prior, cameras if photos else None)
     regularizers, preset_label, measured = choice
@@ -408,7 +513,10 @@ def prepare(
         lifted=read.lifted,
         preset=preset_label,
         measured=measured,
+        recovers=recovers,
         cleaned=cleaned,
+        began=began,
+        prepared=time.monotonic(),
         progress=progress,
         say=say,
     )

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, Generic, Literal, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from g2ard.config.checks import AtLeastOne, checks_arguments, signature_of
+from g2ard.config.checks import AtLeastOne, checks_arguments
 from g2ard.config.choices import BLACK, Colour, RenderModel
 from g2ard.errors import InputError
 from g2ard.io.detect import kind
@@ -22,25 +23,23 @@ from g2ard.io.scenes import tell
 from g2ard.io.tile_store import StoredScene
 from g2ard.jobs.budget import Budget
 from g2ard.jobs.cost import Cost, cost_of
-from g2ard.jobs.distill import DistillJob, prepare
+from g2ard.jobs.distill import DistillJob, preparing
 from g2ard.jobs.distill_options import DistillOptions
 from g2ard.jobs.inputs import Views, load_scene
 from g2ard.jobs.viewer_frame import frame_of, up_of
 from g2ard.levels.tileset import TILE_OF_SCENE, Georeference, map_system
 from g2ard.levels.tileset import save_tileset as write_tileset
 from g2ard.levels.tree import Cut, Level, aligned
-from g2ard.pipeline.distill import distill as pipeline
 from g2ard.progress import Progress, Say, direction, plural, silent, unsaid
-from g2ard.rendering.targets import fill
-from g2ard.rendering.visibility import visibility_source
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.samples import evenly_spaced
 from g2ard.scene.sky import sky_mask
 from g2ard.scene.splats import Splats
-from g2ard.stages.evaluate import evaluate
-from g2ard.stages.simplify import simplify
-from g2ard.stages.simplify.growth import opacity_lost, say_gaps
 from g2ard.viewer import Start, write_globe_page, write_stream_page
+
+if TYPE_CHECKING:
+    from g2ard.jobs.tiled import TiledJob
+    from g2ard.jobs.tiling import Tiling
 
 RATIOS = (1.0, 2.0, 4.0, 8.0, 16.0)
 """Reduction factors; each level has half the Gaussians of the previous one, as in viewers' own tools."""
@@ -98,71 +97,111 @@ class Levels(Generic[L]):
 
 @dataclass(frozen=True, eq=False)
 class LevelsJob:
-    """Prepared levels: inputs are read and everything is decided. Other fields are arguments of `lod`.
+    """Prepared levels: inputs are read and everything is decided.
 
     Args:
         job: the distillation that levels are steps of.
         sky: sky and far background, kept apart; None without.
     """
 
-    job: DistillJob
-    sky: Splats | None
+    job: DistillJob | TiledJob
     ratios: Sequence[float]
-    recover: bool
-    work: Path | None
+    sky: Splats | None = None
 
     @property
     def counts(self) -> list[int]:
         """Gaussians of each level."""
-        return [Budget(ratio=ratio).of(len(self.job.prior)) for ratio in self.ratios]
+        return [Budget(ratio=ratio).of(self.job.total) for ratio in self.ratios]
+
+    @property
+    def sizes(self) -> list[int]:
+        """Longer side in pixels of each level's views."""
+        return [level_size(self.job.views.train.cameras, ratio) for ratio in self.ratios]
 
     @property
     def costs(self) -> list[Cost]:
         """Cost of each level, nothing for the scene itself."""
-        costs = []
-        for ratio, count in zip(self.ratios, self.counts, strict=True):
-            views = self.job.views.resized(level_size(self.job.views.train.cameras, ratio))
-            job = replace(self.job, views=views)
-            costs.append(cost_of(job, count, recover=self.recover, page=False))
-        return costs
+        views = self.job.views
+        return [
+            cost_of(replace(self.job, views=views.resized(size)), count, page=False)
+            for count, size in zip(self.counts, self.sizes, strict=True)
+        ]
 
-    def run(self) -> Levels[Splats]:
-        """Make the levels."""
-        job = self.job
-        made = make_levels(job.prior, self.ratios, job.views.train.cameras, self._level, job.say)
-        return replace(made, sky=self.sky)
+    def run(self, work: Path | None = None) -> Levels[Any]:
+        """Make the levels; `work` is the folder for resuming a scene in one piece.
 
-    def _level(self, finer: Splats, count: int, longest: int) -> tuple[Splats, Splats, float, float | None]:
-        """Make one level, see `make_levels`."""
-        job, views = self.job, self.job.views.resized(longest)
-        targets = replace(job, views=replace(views, full=None)).targets
-        fill(targets.held_out, job.progress)
-        if not self.recover:
-            level = merged = _merged(job, finer, count)
+        Each is merged from the one before as it was merged. The job returns a level, the same before
+        recovery, and the PSNR of both, None without recovery.
+        """
+        job: Any = self.job
+        levels: list[Any] = []
+        reports: list[LevelReport] = []
+        finer = scene = job.dense
+        for ratio, count, size in zip(self.ratios, self.counts, self.sizes, strict=True):
+            began, level = time.perf_counter(), scene
+            scores: list[float | None] = []
+            if ratio > 1:
+                level, finer, *scores = job.level(finer, count, job.views.resized(size), work)
+            report = LevelReport(count, ratio, size, time.perf_counter() - began, *scores)
+            job.say(report.line(len(levels)))
+            levels.append(level)
+            reports.append(report)
+        return Levels(tuple(levels), tuple(reports), self.sky)
+
+
+@contextmanager
+def preparing_levels(
+    scene: Splats | str | Path,
+    tiling: Tiling | None = None,
+    *,
+    ratios: Sequence[float],
+    recover: bool,
+    steps: int | None,
+    background: Colour,
+    split_sky: bool,
+    seed: int,
+    planned: bool = False,
+    progress: Progress = silent,
+    say: Say = unsaid,
+    **inputs: Any,
+) -> Iterator[LevelsJob]:
+    """Read the scene and decide everything for `lod`, whose arguments these are.
+
+    Args:
+        tiling: how to process the scene in tiles; None for one piece.
+        planned: whether tiles are only planned.
+    """
+    check_ratios(ratios)
+    check_trained(scene)
+    sky = None
+    if isinstance(scene, Splats):
+        scene = scene.narrowed()  # levels and sky then have one offset
+    else:
+        inputs["beside"] = inputs.get("beside") or scene
+    if split_sky:
+        scene = load_scene(scene, say, inputs["render_model"])
+        if (far := sky_mask(scene)).any():
+            say(f"sky: {plural(int(far.sum()), 'Gaussian')}, kept whole")
+            scene, sky = scene.take(~far), scene.take(far)
         else:
-            done = pipeline(
-                finer,
-                count,
-                targets.train,
-                job.config,
-                weights=job.weights,
-                validation=targets.validation,
-                work=self.work,
-                progress=job.progress,
-            )
-            level, merged = done.splats, done.simplified
-            lost = opacity_lost(job.prior, level, targets.held_out.cameras)
-            say_gaps(lost, job.say, f"give levels more Gaussians (--ratios), here {count:,}")
-        common: dict[str, Any] = {"background": job.config.recover.background, "progress": job.progress}
-
-        def score(splats: Splats) -> float:
-            return evaluate(splats, targets.held_out, stage="scoring", **common).psnr
-
-        return level, merged, score(merged), score(level) if self.recover else None
+            say("sky: none found, so nothing is kept apart")
+    settings = {"recover.background": background, "recover.seed": seed}
+    settings |= {} if steps is None else {"recover.steps": steps}
+    with preparing(
+        scene,
+        Budget(ratio=ratios[-1]),
+        DistillOptions(settings=settings, **inputs),
+        tiling,
+        use="levels" if recover else "merging",
+        planned=planned,
+        progress=progress,
+        say=say,
+    ) as job:
+        yield LevelsJob(job, ratios, sky)
 
 
 @checks_arguments
-def prepare_levels(
+def lod(
     scene: Splats | str | Path,
     *,
     ratios: Sequence[float] = RATIOS,
@@ -180,43 +219,7 @@ def prepare_levels(
     work: Path | None = None,
     progress: Progress = silent,
     say: Say = unsaid,
-) -> LevelsJob:
-    """Read the scene and decide everything for `lod`, whose arguments these are."""
-    check_ratios(ratios)
-    check_trained(scene)
-    sky = None
-    if not isinstance(scene, Splats):
-        beside = beside or scene
-    if isinstance(scene, Splats):
-        scene = scene.narrowed()  # levels and sky then have one offset
-    if split_sky:
-        scene = load_scene(scene, say, render_model)
-        if (far := sky_mask(scene)).any():
-            say(f"sky: {plural(int(far.sum()), 'Gaussian')}, kept whole")
-            scene, sky = scene.take(~far), scene.take(far)
-        else:
-            say("sky: none found, so nothing is kept apart")
-    job = prepare(
-        scene,
-        Budget(ratio=ratios[-1]),
-        DistillOptions(
-            views=views,
-            photos=photos,
-            size=size,
-            beside=beside,
-            up=up,
-            render_model=render_model,
-            settings=recovery_settings(steps, background, seed),
-        ),
-        use="levels" if recover else "merging",
-        progress=progress,
-        say=say,
-    )
-    return LevelsJob(job, sky, ratios, recover, work)
-
-
-@signature_of(prepare_levels)
-def lod(*scene: Any, **options: Any) -> Levels[Splats]:
+) -> Levels[Splats]:
     """Make levels of detail of a trained scene, exactly like the command `g2ard lod`.
 
     Each level is merged from the previous one, so its Gaussians are unions of finer ones. At √r times the
@@ -257,13 +260,24 @@ def lod(*scene: Any, **options: Any) -> Levels[Splats]:
     >>> [len(level) for level in lod(ball, ratios=(1, 4, 8), steps=3, size=48).splats]
     [800, 200, 100]
     """
-    return prepare_levels(*scene, **options).run()
-
-
-def recovery_settings(steps: int | None, background: Colour, seed: int) -> dict[str, Any]:
-    """Return the settings of a level's recovery by path."""
-    settings = {"recover.background": background, "recover.seed": seed}
-    return settings if steps is None else {**settings, "recover.steps": steps}
+    with preparing_levels(
+        scene,
+        ratios=ratios,
+        recover=recover,
+        steps=steps,
+        background=background,
+        split_sky=split_sky,
+        seed=seed,
+        progress=progress,
+        say=say,
+        views=views,
+        photos=photos,
+        size=size,
+        beside=beside,
+        up=up,
+        render_model=render_model,
+    ) as job:
+        return job.run(work)
 
 
 def check_trained(scene: Splats | str | Path) -> None:
@@ -282,44 +296,6 @@ def check_ratios(ratios: Sequence[float]) -> None:
     if not len(ratios) or not rising or not all(1 <= ratio < math.inf for ratio in ratios):
         given = ", ".join(f"{ratio:g}" for ratio in ratios)
         raise InputError(f"expected rising numbers of at least 1, got {given}", parameter="ratios")
-
-
-def make_levels(
-    scene: L,
-    ratios: Sequence[float],
-    cameras: Cameras,
-    make: Callable[[L, int, int], tuple[L, L, float, float | None]],
-    say: Say,
-) -> Levels[L]:
-    """Make levels of a scene in memory or in tiles.
-
-    Args:
-        cameras: training views of the scene itself.
-        make: takes the level before as it was merged, a count and the longer side of views; returns the
-            level, the same before recovery, and the PSNR of both, None without recovery.
-    """
-    levels: list[L] = []
-    reports: list[LevelReport] = []
-    finer = scene
-    for ratio in ratios:
-        began, level = time.perf_counter(), scene
-        scores: list[float | None] = []
-        count, size = Budget(ratio=ratio).of(len(scene)), level_size(cameras, ratio)
-        if ratio > 1:
-            level, finer, *scores = make(finer, count, size)
-        report = LevelReport(count, ratio, size, time.perf_counter() - began, *scores)
-        say(report.line(len(levels)))
-        levels.append(level)
-        reports.append(report)
-    return Levels(tuple(levels), tuple(reports))
-
-
-def _merged(job: DistillJob, finer: Splats, count: int) -> Splats:
-    """Merge to the next level, weighted by visibility in the training views."""
-    visibility = visibility_source(job.views.train.cameras, progress=job.progress)
-    merged = simplify(finer, count, visibility=visibility, compare=True, progress=job.progress)
-    say_gaps(merged.report.opacity_lost, job.say)
-    return merged.splats
 
 
 @checks_arguments

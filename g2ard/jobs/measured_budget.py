@@ -18,6 +18,7 @@ from g2ard.errors import InputError
 from g2ard.io import read_splats, write_splats
 from g2ard.io.reports import Report
 from g2ard.io.scene_formats import check_positions, scene_format, written_bytes
+from g2ard.io.types import Note
 from g2ard.jobs.budget import Budget
 from g2ard.jobs.inputs import Views, say_regions
 from g2ard.jobs.views import cameras_for_weights
@@ -31,7 +32,7 @@ from g2ard.scene.cameras import Cameras
 from g2ard.scene.samples import evenly_spaced
 from g2ard.scene.splats import Splats
 from g2ard.scene.transform import change_of_axes, with_axes
-from g2ard.stages.simplify import Pairs, Simplified, SimplifyConfig, Visibility, VisibilitySource, simplify
+from g2ard.stages.simplify import Pairs, SimplifyConfig, Visibility, VisibilitySource, simplify
 from g2ard.system.cached import cached_property
 
 _QUALITY_VIEWS, _QUALITY_SIDE = 12, 400
@@ -76,6 +77,8 @@ class Reduction:
     Args:
         cameras: cameras that give visibility weights to every method, instead of `views`.
         recovered: whether the results are recovered afterwards, so that their growth is not measured.
+        notes: notes on the scene's file.
+        tiles: the scene, if it is in tiles.
     """
 
     splats: Splats
@@ -87,9 +90,11 @@ class Reduction:
     up: Sequence[float] | None = None
     seed: int = 0
     recovered: bool = False
+    notes: Sequence[Note] = ()
     progress: Progress = silent
     say: Say = unsaid
-    _made: dict[int, Simplified] = field(default_factory=dict)
+    _made: dict[int, Any] = field(default_factory=dict)
+    tiles: Any = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
         check_seed("seed", self.seed)
@@ -103,41 +108,114 @@ class Reduction:
                 raise InputError("has no effect with views", parameter="simplify.pixel_scale")
             if self.config.dilation != Pairs.dilation and self.splats.antialiased:
                 raise InputError("has no effect on antialiased scenes", parameter="simplify.dilation")
-        say_regions(self.splats, self.config, "the scene", self.say)
+        if self.tiles is None:
+            say_regions(self.splats, self.config, "the scene", self.say)
+        else:
+            say_regions(self.splats, self.config, "a sample of the scene", unsaid)
 
-    def __call__(self, count: int) -> Simplified:
+    @property
+    def total(self) -> int:
+        """Gaussians of the scene."""
+        return len(self.splats) if self.tiles is None else int(self.tiles.plan.count)
+
+    def __call__(self, count: int) -> Any:
         if count not in self._made:
-            made = simplify(
-                self.splats,
-                count,
-                visibility=self._visibility if count < len(self.splats) else None,
-                compare=not self.recovered,
-                config=self.config,
-                progress=self.progress,
-            )
-            self._made = dict([*self._made.items(), (count, made)][-2:])
+            self._made = dict([*self._made.items(), (count, self.made(count))][-2:])
         return self._made[count]
+
+    def made(self, count: int) -> Any:
+        """Simplify the scene."""
+        return simplify(
+            self.splats,
+            count,
+            visibility=self._visibility if count < self.total else None,
+            compare=not self.recovered,
+            config=self.config,
+            progress=self.progress,
+        )
+
+    @cached_property
+    def seen(self) -> Cameras | None:
+        """Views that weigh Gaussians by visibility."""
+        if self.blind or self.cameras is not None:
+            return None if self.blind else self.cameras
+        return cameras_for_weights(
+            self.splats,
+            self.views,
+            self.config.method,
+            beside=self.beside,
+            up=self.up,
+            seed=self.seed,
+            represents=self.total / len(self.splats),
+            progress=self.progress,
+            say=self.say,
+        )
 
     @cached_property
     def _visibility(self) -> VisibilitySource | None:
-        if self.blind:
+        if self.seen is None:
             return None
-        cameras = self.cameras
-        if cameras is None:
-            cameras = cameras_for_weights(
-                self.splats,
-                self.views,
-                self.config.method,
-                beside=self.beside,
-                up=self.up,
-                seed=self.seed,
-                progress=self.progress,
-                say=self.say,
-            )
-        if cameras is None:
-            return None
-        source = visibility_source(cameras, progress=self.progress)
+        source = visibility_source(self.seen, progress=self.progress)
         return _Remembering(source, source.views)
+
+    def resolved(self, budget: Budget, name: str, file: str, sh_degree: int | None = None) -> ResolvedBudget:
+        """Resolve a budget for the scene, called `name` in errors.
+
+        If recovery follows, bytes are searched with the method `fast` and a margin.
+
+        Args:
+            file: a file name; its suffix is the format for `Budget.fit`.
+            sh_degree: of the result; None is the scene's.
+        """
+        splats, say = self.splats, self.say
+        if self.tiles is not None:  # `needs_whole` rejects what depends on more than the number of Gaussians
+            return ResolvedBudget(budget.of(self.total, name))
+        if budget.min_psnr is not None or budget.min_ssim is not None:
+            return self._resolved_for_quality(Quality(budget.min_psnr or 0.0, budget.min_ssim or 0.0), file)
+
+        def tried(count: int) -> Splats:
+            small = simplify(splats, count, method="fast") if self.recovered else self(count)
+            return small.splats
+
+        if budget.bytes is not None:
+            if sh_degree is not None:
+                splats = splats.with_sh_degree(sh_degree)
+            most = int(budget.bytes * _BYTES_SAFETY) if self.recovered else budget.bytes
+            found = count_for_bytes(splats, most, file, tried)
+        else:
+            found = budget.of(len(splats), name)
+            check_positions(file, splats, found)
+        if budget.layers is not None:
+            whole = found
+            found, layers = count_for_layers(whole, budget.layers, tried)
+            if found < whole:
+                say(
+                    f"{budget.fit}: near views blend more than {budget.layers} Gaussians per pixel at "
+                    f"{whole:,}, {layers:.0f} at {found:,}"
+                )
+        if budget.fit is not None:
+            fits = plural(found, "Gaussian") if budget.bytes is None else f"about {plural(found, 'Gaussian')}"
+            all_fit = f"nothing to do, all {plural(found, 'Gaussian')} already fit"
+            say(f"{budget.fit}: {all_fit if found == len(splats) else fits}")
+        return ResolvedBudget(found, budget.bytes, file)
+
+    def _resolved_for_quality(self, wanted: Quality, file: str) -> ResolvedBudget:
+        """Find the count that keeps a quality in generated views, as read back from the format of `file`."""
+        splats = self.splats
+        pool = plan_pool(splats, _QUALITY_VIEWS, seed=self.seed, rows=_POOL_SAMPLE, progress=self.progress)
+        cameras = pool.cameras.resized(_QUALITY_SIDE)
+        found, near = count_for_quality(
+            splats, wanted, cameras, lambda count: as_file(self(count).splats, file)
+        )
+        if found == len(splats):
+            self.say(f"no smaller count was found that keeps the quality; keeping all {found:,} Gaussians")
+        else:
+            stage = " before recovery" if self.recovered else ""
+            views = plural(len(cameras), "view")
+            self.say(
+                f"{plural(found, 'Gaussian')} keep {near}{stage}, in {views} generated to choose the count"
+            )
+        return ResolvedBudget(found, file=file, wanted=wanted, dense=splats, cameras=cameras)
 
 
 class _Remembering:
@@ -396,72 +474,6 @@ class ResolvedBudget:
         if len(splats) >= len(self.dense):
             more = f"{scene_format(self.file).suffix} cannot store more quality"
         return False, f"{line}, less than the requested {self.wanted}; {more}"
-
-
-def resolved(
-    budget: Budget,
-    reduce: Reduction,
-    name: str,
-    file: str,
-    *,
-    recovered: bool = False,
-    sh_degree: int | None = None,
-) -> ResolvedBudget:
-    """Resolve a budget for the scene of `reduce`, which makes the result.
-
-    Args:
-        file: a file name; its suffix is the format for `Budget.fit`.
-        recovered: whether recovery follows. Bytes are then searched with the method `fast` and a margin.
-        sh_degree: of the result; None is the scene's.
-    """
-    splats, say = reduce.splats, reduce.say
-    if budget.min_psnr is not None or budget.min_ssim is not None:
-        wanted = Quality(budget.min_psnr or 0.0, budget.min_ssim or 0.0)
-        return _resolved_for_quality(reduce, wanted, file, recovered)
-
-    def made(count: int) -> Splats:
-        return (simplify(splats, count, method="fast") if recovered else reduce(count)).splats
-
-    if budget.bytes is not None:
-        if sh_degree is not None:
-            splats = splats.with_sh_degree(sh_degree)
-        most = int(budget.bytes * _BYTES_SAFETY) if recovered else budget.bytes
-        found = count_for_bytes(splats, most, file, made)
-    else:
-        found = budget.of(len(splats), name)
-        check_positions(file, splats, found)
-    if budget.layers is not None:
-        whole = found
-        found, layers = count_for_layers(whole, budget.layers, made)
-        if found < whole:
-            say(
-                f"{budget.fit}: near views blend more than {budget.layers} Gaussians per pixel at {whole:,}, "
-                f"{layers:.0f} at {found:,}"
-            )
-    if budget.fit is not None:
-        fits = plural(found, "Gaussian") if budget.bytes is None else f"about {plural(found, 'Gaussian')}"
-        all_fit = f"nothing to do, all {plural(found, 'Gaussian')} already fit"
-        say(f"{budget.fit}: {all_fit if found == len(splats) else fits}")
-    return ResolvedBudget(found, budget.bytes, file)
-
-
-def _resolved_for_quality(reduce: Reduction, wanted: Quality, file: str, recovered: bool) -> ResolvedBudget:
-    """Find the count that keeps a quality in generated views, as read back from the format of `file`."""
-    splats, say = reduce.splats, reduce.say
-    pool = plan_pool(splats, _QUALITY_VIEWS, seed=reduce.seed, rows=_POOL_SAMPLE, progress=reduce.progress)
-    cameras = pool.cameras.resized(_QUALITY_SIDE)
-
-    def written(count: int) -> Splats:
-        return as_file(reduce(count).splats, file)
-
-    found, near = count_for_quality(splats, wanted, cameras, written)
-    if found == len(splats):
-        say(f"no smaller count was found that keeps the quality; keeping all {found:,} Gaussians")
-    else:
-        stage = " before recovery" if recovered else ""
-        views = plural(len(cameras), "view")
-        say(f"{plural(found, 'Gaussian')} keep {near}{stage}, in {views} generated to choose the count")
-    return ResolvedBudget(found, file=file, wanted=wanted, dense=splats, cameras=cameras)
 
 
 def score_lines(packed: Packed, size: int, unpacked: float, pixels: str) -> list[str]:

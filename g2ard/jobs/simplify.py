@@ -2,20 +2,68 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from g2ard.config.checks import checks_arguments
 from g2ard.config.choices import FormatName, RenderModel
+from g2ard.io import read_scene
+from g2ard.io.types import Note
 from g2ard.jobs.budget import Budget
-from g2ard.jobs.inputs import Views, load_scene
-from g2ard.jobs.measured_budget import Reduction, resolved
+from g2ard.jobs.inputs import Views, say_notes
+from g2ard.jobs.measured_budget import Reduction
 from g2ard.pipeline.presets import configured
 from g2ard.progress import Progress, Say, silent, unsaid
 from g2ard.scene.splats import Splats
 from g2ard.stages.simplify import Simplified, SimplifyConfig
 from g2ard.stages.simplify.growth import say_gaps
+
+if TYPE_CHECKING:
+    from g2ard.jobs.tiling import Tiling
+
+
+@contextmanager
+def reducing(
+    scene: Splats | str | Path,
+    tiling: Tiling | None = None,
+    *,
+    planned: bool = False,
+    counted: Callable[[int], None] = lambda total: None,
+    render_model: RenderModel | None = None,
+    beside: str | Path | None = None,
+    progress: Progress = silent,
+    say: Say = unsaid,
+    **options: Any,
+) -> Iterator[Reduction]:
+    """Read a scene to be simplified, see `simplify`, or open its tiles.
+
+    Args:
+        tiling: how to process the scene, a path, in tiles; None for one piece.
+        planned: whether tiles are only planned.
+        counted: called with the number of Gaussians before any work on them.
+        options: other fields of `Reduction`.
+    """
+    callbacks: dict[str, Any] = {"progress": progress, "say": say}
+    beside = beside if isinstance(scene, Splats) else beside or scene
+    if tiling is not None:
+        from g2ard.jobs.tiled import TiledReduction, opened
+
+        how: dict[str, Any] = {"render_model": render_model, "planned": planned, **callbacks}
+        with opened(Path(str(scene)), tiling, 1.0, **how) as tiles:
+            counted(tiles.plan.count)
+            options |= {"beside": beside, "notes": tiles.store.notes if tiles.store else (), **callbacks}
+            yield TiledReduction(tiles.sample(options["config"]), tiles=tiles, **options)
+        return
+    notes: Sequence[Note] = ()
+    if not isinstance(scene, Splats):
+        progress("read", 0, 0)
+        found = read_scene(scene, render_model=render_model)
+        say_notes(scene, found.notes, say)
+        scene, notes = found.splats, found.notes
+    counted(len(scene))
+    yield Reduction(scene, beside=beside, notes=notes, **options, **callbacks)
 
 
 @checks_arguments
@@ -89,20 +137,11 @@ def simplify(
     config = configured(config or SimplifyConfig(), settings=given | dict(settings or {}))
     wanted = Budget(count, ratio, fit=fit, min_psnr=min_psnr, min_ssim=min_ssim)
     name = "scene" if isinstance(scene, Splats) else str(scene)
-    beside = beside if isinstance(scene, Splats) else beside or scene
-    reduce = Reduction(
-        load_scene(scene, say, render_model),
-        views=views,
-        blind=blind,
-        config=config,
-        beside=beside,
-        up=up,
-        seed=seed,
-        progress=progress,
-        say=say,
-    )
-    budget = resolved(wanted, reduce, name, f"scene.{format}")
-    small = reduce(budget.count)
+    inputs: dict[str, Any] = {"views": views, "blind": blind, "beside": beside, "up": up, "seed": seed}
+    inputs |= {"render_model": render_model, "progress": progress, "say": say}
+    with reducing(scene, config=config, **inputs) as reduce:
+        budget = reduce.resolved(wanted, name, f"scene.{format}")
+        small: Simplified = reduce(budget.count)
     say_gaps(small.report.opacity_lost, say)
     if judgement := budget.judge(small.splats):
         say(judgement[1])

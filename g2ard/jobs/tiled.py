@@ -1,36 +1,37 @@
-"""Simplification, distillation and levels of detail in tiles."""
+"""Simplification, distillation and levels of detail of scenes in tiles."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from g2ard.config.choices import RenderModel
 from g2ard.errors import InputError
+from g2ard.io import open_stream
 from g2ard.io.detect import MANIFEST
+from g2ard.io.reports import Report
+from g2ard.io.sanitize import BLOCK
 from g2ard.io.tile_store import StoredScene, TileStore
-from g2ard.io.types import ViewSet
 from g2ard.jobs.budget import Budget
-from g2ard.jobs.cost import RECOVERY_TIMES, workers_for
 from g2ard.jobs.distill_options import DistillOptions
-from g2ard.jobs.inputs import Views, say_regions
-from g2ard.jobs.levels import Levels, check_ratios, make_levels
-from g2ard.jobs.tiling import Tiling, needs_whole, refuse_whole
-from g2ard.jobs.views import cameras_for_weights, pool_times, views_of
+from g2ard.jobs.inputs import say_regions
+from g2ard.jobs.measured_budget import Reduction, ResolvedBudget
+from g2ard.jobs.memory import RECOVERY_TIMES, TilePlan, plan_tiles
+from g2ard.jobs.tiling import Tiling
+from g2ard.jobs.views import pool_times, views_of
 from g2ard.pipeline.config import DistillConfig
-from g2ard.pipeline.distill import RunViews
+from g2ard.pipeline.distill import RunViews, selected
 from g2ard.progress import Progress, Say, silent, unsaid
 from g2ard.report.run import TiledReport, TiledScores
-from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
+from g2ard.scene.transform import join
 from g2ard.stages.recover.auto_preset import regularizers_for
-from g2ard.stages.recover.schedule import steps_for
-from g2ard.stages.select import select
 from g2ard.stages.simplify import SimplifyConfig
 from g2ard.stages.simplify.growth import say_gaps
 from g2ard.system.peak_memory import peak_rss_of_all
@@ -39,27 +40,74 @@ from g2ard.tiles.ingest import ingest
 from g2ard.tiles.merging import TiledScene, simplify_tiles
 from g2ard.tiles.recover import recover_tiles
 from g2ard.tiles.sights import Surroundings
-from g2ard.tiles.steps import TiledRun
+from g2ard.tiles.steps import TiledRun, sample_stride
+
+
+@dataclass(frozen=True, eq=False)
+class Tiles:
+    """A scene in tiles: written, with workers, or only planned.
+
+    Args:
+        store: the tiles; None if they are not written.
+        workers: None if nothing is to be computed.
+    """
+
+    scene: Path
+    tiling: Tiling
+    plan: TilePlan
+    store: TileStore | None = None
+    workers: Workers | None = None
+    render_model: RenderModel | None = None
+
+    @property
+    def written(self) -> TileStore:
+        """The tiles, which are not only planned."""
+        assert self.store is not None
+        return self.store
+
+    def run(self, config: SimplifyConfig, store: TileStore | None = None) -> TiledRun:
+        """Begin to simplify the tiles, or those of a scene derived from them."""
+        assert self.workers is not None
+        return TiledRun(store or self.written, self.workers, config)
+
+    def sample(self, config: SimplifyConfig) -> Splats:
+        """Return a sample of the Gaussians, from which views are planned and constants chosen."""
+        if self.workers is not None:
+            return self.run(config).sample()
+        stream = open_stream(self.scene, render_model=self.render_model)
+        stride, read, parts = sample_stride(stream.count), 0, []
+        for block in stream.blocks(BLOCK):
+            parts.append(block.take(slice(-read % stride, None, stride)))
+            read += len(block)
+        return join(parts)
 
 
 @contextmanager
-def _tiles_and_workers(
-    scene: Path, tiling: Tiling, times: float, render_model: RenderModel | None, progress: Progress, say: Say
-) -> Iterator[tuple[TileStore, Workers]]:
+def opened(
+    scene: Path,
+    tiling: Tiling,
+    times: float,
+    *,
+    render_model: RenderModel | None = None,
+    planned: bool = False,
+    progress: Progress = silent,
+    say: Say = unsaid,
+) -> Iterator[Tiles]:
     """Open the tiles of a scene, streamed into `tiling.folder` if it is a file, and start workers.
 
     Args:
         tiling: how. Tiles of another size are replaced unless the user named the folder.
+        times: memory of a tile relative to merging it.
+        planned: only plan this; nothing is written.
     """
-    if (scene / MANIFEST).is_file():
-        store = TileStore.open(scene)
-        if render_model not in (None, store.render_model):
-            raise InputError(
-                f"these tiles are {store.render_model}",
-                path=scene,
-                hint=f"run `g2ard ingest --render-model {render_model}` on their scene",
-            )
-    else:
+    store = TileStore.open(scene) if (scene / MANIFEST).is_file() else None
+    if store is not None and render_model not in (None, store.render_model):
+        raise InputError(
+            f"these tiles are {store.render_model}",
+            path=scene,
+            hint=f"run `g2ard ingest --render-model {render_model}` on their scene",
+        )
+    if store is None and not planned:
         store = ingest(
             scene,
             tiling.folder / "tiles",
@@ -69,235 +117,207 @@ def _tiles_and_workers(
             progress=progress,
             say=say,
         )
-    workers = workers_for(store, tiling, times)
-    threads = max(1, tiling.usable_cores // workers)
-    say(f"{len(store.tiles):,} tiles of {store.count:,} Gaussians, {workers} at a time")
-    with executor(workers, threads, tiling.scheduler) as runs:
-        yield store, Workers(runs, tiling.folder / "steps", progress)
+    plan = plan_tiles(store or open_stream(scene), tiling, times)
+    say(f"{plan.tiles:,} tiles of {plan.count:,} Gaussians, {plan.workers} at a time")
+    tiles = Tiles(scene, tiling, plan, store, render_model=render_model)
+    if planned:
+        yield tiles
+        return
+    threads = max(1, tiling.usable_cores // plan.workers)
+    with executor(plan.workers, threads, tiling.scheduler) as runs:
+        yield replace(tiles, workers=Workers(runs, tiling.folder / "steps", progress))
 
 
-def simplify_in_tiles(
-    scene: Path,
-    budgets: Sequence[Budget],
-    tiling: Tiling,
-    *,
-    views: Views | None = None,
-    blind: bool = False,
-    config: SimplifyConfig | None = None,
-    up: Sequence[float] | None = None,
-    seed: int = 0,
-    render_model: RenderModel | None = None,
-    counted: Callable[[int], object] | None = None,
-    progress: Progress = silent,
-    say: Say = unsaid,
-) -> Iterator[tuple[TileStore, TiledScene]]:
-    """Simplify a scene larger than memory to several budgets, each computed when it is requested.
+@dataclass(frozen=True)
+class TiledSimplifyReport(Report):
+    """Report of a simplification in tiles; the fields are those of `TiledScene`."""
 
-    Args:
-        tiling: how; `folder` keeps finished steps, so that the same call resumes.
-        counted: called with the scene's count before work on its tiles.
-    """
-    config = config or SimplifyConfig()
-    with _tiles_and_workers(scene, tiling, 1.0, render_model, progress, say) as (store, workers):
-        if counted is not None:
-            counted(store.count)
-        counts = [budget.of(store.count, str(scene)) for budget in budgets]
-        run, cameras = TiledRun(store, workers, config), None
-        if not blind and min(counts) < store.count:
-            sample = run.sample()
-            say_regions(sample, config, "a sample of the scene", unsaid)
-            cameras = cameras_for_weights(
-                sample,
-                views,
-                "default",
-                beside=scene,
-                up=up,
-                seed=seed,
-                represents=store.count / len(sample),
-                progress=progress,
-                say=say,
-            )
-        for count in counts:
-            seen = cameras if count < store.count else None
-            yield store, simplify_tiles(run, count, seen, compare=True)
+    input_count: int
+    output_count: int
+    tiles: list[int]
+    views: int
+    unseen: int | None
+    growth: float | None
+    opacity_lost: float | None
+    rounds = ()
+
+
+@dataclass(frozen=True, eq=False)
+class TiledSimplified:
+    """A simplified scene in tiles, and a report."""
+
+    splats: TiledScene
+    report: TiledSimplifyReport
+
+
+class TiledReduction(Reduction):
+    """Reductions of a scene in `tiles`; `splats` is a sample."""
+
+    tiles: Tiles
+
+    def made(self, count: int) -> TiledSimplified:
+        """Simplify the scene; finished steps are in the folder of its workers."""
+        views = self.seen if count < self.total else None
+        small = simplify_tiles(self.tiles.run(self.config), count, views, compare=True)
+        parts = list(small.counts), small.views, small.unseen, small.growth, small.opacity_lost
+        return TiledSimplified(small, TiledSimplifyReport(self.total, len(small), *parts))
 
 
 @dataclass(frozen=True, eq=False)
 class TiledDistilled:
-    """A distilled scene in tiles, with its unrecovered version, its views and its report."""
+    """A distilled scene in tiles, with its unrecovered version and its scores."""
 
     splats: TiledScene
     simplified: TiledScene
-    views: RunViews
-    report: TiledReport
+    scores: TiledScores
 
 
-def distill_in_tiles(
-    scene: Path,
-    budget: Budget,
-    tiling: Tiling,
-    options: DistillOptions,
-    *,
-    progress: Progress = silent,
-    say: Say = unsaid,
-) -> TiledDistilled:
-    """Distil a scene larger than memory.
+@dataclass(eq=False)
+class TiledJob:
+    """A prepared distillation in tiles: everything is decided.
 
-    Targets are the dense scene's own renders, in views that are given, found beside it or generated.
+    Targets are the dense scene's own renders.
 
     Args:
-        options: as for `g2ard.distill`, without what `needs_whole` returns.
-    """
-    began = time.monotonic()
-    with _job(scene, tiling, options, budget, True, progress, say) as job:
-        views = job.views
-        small = job.simplified(job.store, job.count, views.train.cameras)
-        assert small.surroundings is not None  # views are given
-        done, scores = job.recovered(small, small.surroundings, views)
-        report = TiledReport(
-            input_count=job.store.count,
-            output_count=len(done),
-            tiles=list(done.counts),
-            notes={note.code: note.count for note in job.store.notes},
-            seconds={"total": time.monotonic() - began},
-            peak_rss_bytes=peak_rss_of_all(),
-            scores=scores,
-            size=views.test.size_text,
-            views={"train": len(views.train.cameras), "test": len(views.test)},
-        )
-        return TiledDistilled(done, small, views, report)
-
-
-def lod_in_tiles(
-    scene: Path,
-    ratios: Sequence[float],
-    tiling: Tiling,
-    options: DistillOptions,
-    *,
-    recover: bool = True,
-    progress: Progress = silent,
-    say: Say = unsaid,
-) -> Levels[StoredScene]:
-    """Make levels of detail of a scene larger than memory.
-
-    As in `g2ard.lod`, a level is merged from the one before, which lies in tiles of its own, and recovered
-    against the dense scene's renders in views shrunk by √√r.
-
-    Args:
-        recover: optimise each level; otherwise levels are only merged.
-
-    Returns:
-        The levels, of exactly round(N/r) Gaussians each.
-    """
-    check_ratios(ratios)
-    refuse_whole(scene, needs_whole(options.config))
-    around: Surroundings | None = None
-    with _job(scene, tiling, options, Budget(ratio=ratios[-1]), recover, progress, say) as job:
-
-        def make(
-            finer: StoredScene, count: int, longest: int
-        ) -> tuple[StoredScene, StoredScene, float, float | None]:
-            nonlocal around
-            views = job.views.resized(longest)
-            small = job.simplified(finer.store, count, (views if recover else job.views).train.cameras)
-            say_gaps(small.opacity_lost, say)
-            around = around or small.surroundings  # the first level is merged from the dense scene itself
-            assert around is not None  # views are given
-            merged = StoredScene(job.stored(small, "merged"))
-            done, scores = job.recovered(small, around, views)
-            if not recover:
-                return merged, merged, scores.simplified, None
-            return StoredScene(job.stored(done, "level")), merged, scores.simplified, scores.recovered
-
-        return make_levels(StoredScene(job.store), ratios, job.views.train.cameras, make, say)
-
-
-def _weighted(views: ViewSet, sample: Splats, config: DistillConfig, progress: Progress) -> ViewSet:
-    """Return training views with the sampling weights that a distillation in one piece would use."""
-    weights = views.weights
-    if not config.select.weighted:
-        weights = None
-    elif weights is None:
-        chosen = select(sample, views.cameras, len(views.cameras), progress=progress)
-        weights = np.zeros(len(views.cameras))
-        weights[chosen.order] = chosen.weights
-    return replace(views, weights=weights)
-
-
-@dataclass(frozen=True, eq=False)
-class _Job:
-    """A distillation in tiles with everything decided.
-
-    Args:
-        learn: whether anything is recovered, or only scored.
+        sample: of the dense scene.
+        recovers: whether anything is recovered, or only scored.
+        began: when the preparation began.
+        around: placement of the dense tiles, once they have been seen.
     """
 
-    store: TileStore
-    count: int
+    tiles: Tiles
+    budget: ResolvedBudget
     sample: Splats
     views: RunViews
     config: DistillConfig
-    learn: bool
-    workers: Workers
-    tiling: Tiling
+    recovers: bool
+    began: float
+    say: Say = unsaid
+    around: Surroundings | None = None
+    targets = None
+    photos = ()
 
-    def simplified(self, store: TileStore, count: int, cameras: Cameras) -> TiledScene:
-        """Simplify a scene in tiles: the dense one, or one derived from it."""
-        run = TiledRun(store, self.workers, self.config.simplify)
-        return simplify_tiles(run, count, cameras, compare=not self.learn)
+    @property
+    def total(self) -> int:
+        """Gaussians of the dense scene."""
+        return self.tiles.plan.count
 
-    def recovered(
-        self, small: TiledScene, around: Surroundings, views: RunViews
-    ) -> tuple[TiledScene, TiledScores]:
-        """Recover a simplified scene, unless nothing is to be learned, and score it."""
-        needed = steps_for(self.sample, views.train.cameras, self.config.recover.schedule.steps)
-        steps = self.config.recover.steps or round(needed * pool_times(self.store.count))
-        return recover_tiles(
-            self.store,
-            self.stored(small, "student", like=self.store),
-            around,
-            views,
-            self.config.recover,
-            steps if self.learn else 0,
-            self.workers,
+    @property
+    def dense(self) -> StoredScene:
+        """The dense scene."""
+        return StoredScene(self.tiles.written)
+
+    def is_kept(self, count: int) -> bool:
+        """Return False: all is recovered in tiles."""
+        return False
+
+    def steps(self, count: int) -> int:
+        """Return the steps of a recovery of the whole scene."""
+        recover = self.config.recover
+        needed = recover.final_steps(self.sample, self.views.train.cameras, photos=False)
+        return needed if recover.steps is not None else round(needed * pool_times(self.total))
+
+    def run(self, work: Path | None = None) -> TiledDistilled:
+        """Distil the scene; finished steps are in the folder of its workers."""
+        return self._reduced(self.tiles.written, self.budget.count, self.views)
+
+    def level(
+        self, finer: StoredScene, count: int, views: RunViews, work: Path | None = None
+    ) -> tuple[StoredScene, StoredScene, float, float | None]:
+        """Make a level of detail, see `g2ard.jobs.levels.LevelsJob`."""
+        done = self._reduced(finer.store, count, views)
+        merged = StoredScene(self._stored(done.simplified, "merged"))
+        if not self.recovers:
+            return merged, merged, done.scores.simplified, None
+        level = StoredScene(self._stored(done.splats, "level"))
+        return level, merged, done.scores.simplified, done.scores.recovered
+
+    def report(self, done: TiledDistilled, file: Path) -> TiledReport:
+        """Describe the run."""
+        return TiledReport(
+            input_count=self.total,
+            output_count=len(done.splats),
+            tiles=list(done.splats.counts),
+            notes={note.code: note.count for note in self.tiles.written.notes},
+            seconds={"total": time.monotonic() - self.began},
+            peak_rss_bytes=peak_rss_of_all(),
+            scores=done.scores,
+            size=self.views.test.size_text,
+            views={"train": len(self.views.train.cameras), "test": len(self.views.test)},
         )
 
-    def stored(self, scene: TiledScene, name: str, like: TileStore | None = None) -> TileStore:
+    def _reduced(self, store: TileStore, count: int, views: RunViews) -> TiledDistilled:
+        """Simplify the dense scene or one derived from it, recover it unless nothing is, and score it."""
+        seen = views if self.recovers else self.views
+        run = self.tiles.run(self.config.simplify, store)
+        small = simplify_tiles(run, count, seen.train.cameras, compare=not self.recovers)
+        say_gaps(small.opacity_lost, self.say)
+        self.around = self.around or small.surroundings  # the first is made from the dense scene itself
+        assert self.around is not None  # views are given
+        dense = self.tiles.written
+        student = self._stored(small, "student", like=dense)
+        steps = replace(self, views=views).steps(count) if self.recovers else 0
+        splats, scores = recover_tiles(
+            dense, student, self.around, views, self.config.recover, steps, run.workers
+        )
+        return TiledDistilled(splats, small, scores)
+
+    def _stored(self, scene: TiledScene, name: str, like: TileStore | None = None) -> TileStore:
         """Write a derived scene in tiles of its own, or in those of another."""
-        folder = self.tiling.folder / f"{name}-{scene.key}"
-        return ingest(scene.stream(), folder, tile_rows=self.tiling.most_rows, like=like)
+        folder = self.tiles.tiling.folder / f"{name}-{scene.key}"
+        return ingest(scene.stream(), folder, tile_rows=self.tiles.tiling.most_rows, like=like)
 
 
 @contextmanager
-def _job(
+def preparing_tiles(
     scene: Path,
-    tiling: Tiling,
-    options: DistillOptions,
     budget: Budget,
-    learn: bool,
-    progress: Progress,
-    say: Say,
-) -> Iterator[_Job]:
-    """Open the tiles, start workers, and decide views and constants of a distillation."""
+    options: DistillOptions,
+    tiling: Tiling,
+    *,
+    recovers: bool = True,
+    planned: bool = False,
+    progress: Progress = silent,
+    say: Say = unsaid,
+) -> Iterator[TiledJob]:
+    """Open the tiles, start workers, and decide everything that a distillation needs.
+
+    Args:
+        options: as for `g2ard.distill`, without what `needs_whole` returns.
+        planned: only plan it: the job has a cost, but cannot run.
+    """
+    began = time.monotonic()
     options.check_trained()
+    callbacks: dict[str, Any] = {"progress": progress, "say": say}
     model = options.render_model
-    with _tiles_and_workers(scene, tiling, RECOVERY_TIMES, model, progress, say) as (store, workers):
-        count = budget.of(store.count, str(scene))
-        sample = TiledRun(store, workers, options.config.simplify).sample()
+    with opened(scene, tiling, RECOVERY_TIMES, render_model=model, planned=planned, **callbacks) as tiles:
+        total = tiles.plan.count
+        count = budget.of(total, str(scene))
+        sample = tiles.sample(options.config.simplify)
         say_regions(sample, options.config.simplify, "a sample of the scene", unsaid)
         views = views_of(
             sample,
             options,
             count,
             beside=options.beside or scene,
-            use="tiles" if learn else "merging",
-            represents=store.count / len(sample),
-            progress=progress,
-            say=say,
+            use="tiles" if recovers else "merging",
+            represents=total / len(sample),
+            **callbacks,
         )
         regularizers, why, _ = regularizers_for(options.named("recover.regularizers"), sample)
         config = options.configured(regularizers)
-        if learn:
+        if recovers:
             say(f"regularisers: {why}")
-            views = replace(views, train=_weighted(views.train, sample, config, progress))
-        yield _Job(store, count, sample, views, config, learn, workers, tiling)
+            views = _weighted(views, sample, config, progress)
+        yield TiledJob(tiles, ResolvedBudget(count), sample, views, config, recovers, began, say)
+
+
+def _weighted(views: RunViews, sample: Splats, config: DistillConfig, progress: Progress) -> RunViews:
+    """Return views with the sampling weights that a distillation in one piece would use; 0 is never drawn."""
+    train = views.train
+    given = train.weights if config.select.weighted else None
+    rows, weights, _ = selected(sample, train.cameras, config, given, progress)
+    if weights is not None and rows is not None:
+        weights, drawn = np.zeros(len(train.cameras)), weights
+        weights[rows] = drawn
+    return replace(views, train=replace(train, weights=weights))

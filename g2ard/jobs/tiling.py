@@ -132,8 +132,8 @@ def needs_whole(
     >>> from g2ard.stages.simplify import SimplifyConfig
     >>> needs_whole(SimplifyConfig(), budgets=[Budget(fit="web")], clean=False)
     []
-    >>> needs_whole(SimplifyConfig("fast"), budgets=[Budget(min_psnr=30, min_ssim=0.9)], dry_run=True)
-    ['--method fast', '--min-psnr 30', '--min-ssim 0.9', '--dry-run']
+    >>> needs_whole(SimplifyConfig("fast"), budgets=[Budget(min_psnr=30, min_ssim=0.9)], clean=True)
+    ['--method fast', '--min-psnr 30', '--min-ssim 0.9', '--clean']
     """
     from g2ard.pipeline.config import DistillConfig
     from g2ard.stages.simplify import Default

@@ -135,9 +135,10 @@ def distill(
     for number, count in enumerate(counts, start=1):
         if number == 1 or config.select.reselect:
             began = time.monotonic()
-            chosen = _selected(scene, targets, config, given, progress)
+            rows, weighed, views = selected(scene, targets.cameras, config, given, progress)
+            chosen = targets if rows is None else Subset(targets, rows)
             selecting += time.monotonic() - began
-        drawn = (chosen.targets, validation) if budget < len(prior) else ()  # it may be its own teacher
+        drawn = (chosen, validation) if budget < len(prior) else ()  # it may be its own teacher
         simplified, report, protected = _simplified(
             steps, number, scene, count, budget, targets.cameras, config, protected, progress, drawn
         )
@@ -147,10 +148,10 @@ def distill(
             scene, recovery = steps.recover(
                 name,
                 scene,
-                chosen.targets,
-                _recovery(config.recover, scene, chosen.targets.cameras, len(counts), photos, name == _FINAL),
+                chosen,
+                _recovery(config.recover, scene, chosen.cameras, len(counts), photos, name == _FINAL),
                 built=simplified,
-                weights=chosen.weights,
+                weights=weighed,
                 validation=validation,
                 filled=bool(drawn),
                 stage="recover" if name == _FINAL else f"recover {name}",
@@ -166,25 +167,19 @@ def distill(
         recover=sum(recovery.seconds for entry in log for recovery in entry.recover),
         resumed=steps.resumed,
     )
-    return Distilled(scene, simplified, DistillReport(tuple(log), seconds, chosen.report))
+    return Distilled(scene, simplified, DistillReport(tuple(log), seconds, views))
 
 
-@dataclass(frozen=True, eq=False)
-class _Selected:
-    """Training targets with sampling weights, and a report of their selection."""
+def selected(
+    scene: Splats, cameras: Cameras, config: DistillConfig, given: NDArray[Any] | None, progress: Progress
+) -> tuple[NDArray[Any] | None, NDArray[Any] | None, ViewsReport | None]:
+    """Select the views that see `scene`; return their rows, None for all, their weights and a report.
 
-    targets: Targets
-    weights: Any
-    report: ViewsReport | None
-
-
-def _selected(
-    scene: Splats, targets: Targets, config: DistillConfig, weights: Any, progress: Progress
-) -> _Selected:
-    """Select the views that see `scene`; given `weights` override those of the selection."""
-    cameras, how = targets.cameras, config.select
-    if how.views_count is None and (weights is not None or not how.weighted):
-        return _Selected(targets, weights, None)
+    Given weights override those of the selection.
+    """
+    how = config.select
+    if how.views_count is None and (given is not None or not how.weighted):
+        return None, given, None
     policy = how.policy if how.views_count is not None else "auto"
     chosen = select(
         scene,
@@ -195,11 +190,10 @@ def _selected(
         options=how if isinstance(how, SurfaceOptions) else None,
         progress=progress,
     )
-    rows = np.argsort(chosen.order)
-    if weights is not None:
-        weights = weights[chosen.order[rows]]
-    elif how.weighted:
-        weights = chosen.weights[rows]
+    order = np.argsort(chosen.order)
+    weights = chosen.weights[order] if how.weighted else None
+    if given is not None:
+        weights = given[chosen.order[order]]
     report = ViewsReport(
         policy=policy,
         candidates=len(cameras),
@@ -208,7 +202,7 @@ def _selected(
         refused=[cameras.names[i] for i in chosen.refused],
         left_out=chosen.left_out,
     )
-    return _Selected(Subset(targets, chosen.order[rows]), weights, report)
+    return chosen.order[order], weights, report
 
 
 def _simplified(

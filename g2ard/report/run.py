@@ -227,6 +227,12 @@ class RunReport(Report):
     packed: Packed | None = field(default=None, metadata=LEFT_OUT)
 
     @property
+    def title(self) -> str:
+        """Numbers before and after."""
+        before = plural(self.photos, "photo") if self.photos else f"{self.input_count:,}"
+        return f"{before} → {plural(self.output_count, 'Gaussian')}"
+
+    @property
     def source(self) -> str:
         """Number of photos, points or Gaussians that the result was made from."""
         if self.photos:
@@ -295,6 +301,11 @@ class TiledReport(Report):
     size: str
     views: dict[str, int]
     against = "teacher renders"
+
+    @property
+    def title(self) -> str:
+        """Numbers before and after."""
+        return f"{self.input_count:,} → {self.output_count:,}"
 
     @property
     def made(self) -> str:

@@ -115,7 +115,7 @@ def cut_tree(points: Points, rows_each: float, most: int) -> KdTree:
     Returns:
         A tree; a leaf whose points all coincide may hold more.
     """
-    parts = _parts(len(points), rows_each, most)
+    parts = parts_of(len(points), rows_each, most)
     if parts == 1 or len(points) < 2:
         return KdTree()
     low, high = np.percentile(points, _BOX_PERCENTILES, axis=0)
@@ -130,7 +130,7 @@ def cut_tree(points: Points, rows_each: float, most: int) -> KdTree:
     return KdTree()
 
 
-def _parts(points: int, rows_each: float, most: int) -> int:
+def parts_of(points: int, rows_each: float, most: int) -> int:
     """Return the smallest number of equal parts that are expected to hold at most `most` rows each."""
     parts = max(1, int(np.ceil(points * rows_each / most)))
     sigmas = _SAMPLE_SIGMAS if rows_each > 1 else 0.0

@@ -20,7 +20,7 @@ from g2ard.io.detect import MANIFEST, POINTS
 from g2ard.io.stream import PointStream, SceneStream
 from g2ard.io.tile_store import FORMAT, VERSION, TileStore, halo_name, packed, row_width, tile_name
 from g2ard.progress import Progress, Say, plural
-from g2ard.scene.kdtree import KdTree, Points, Sampler, cut_tree, margin_of
+from g2ard.scene.kdtree import KdTree, Points, Sampler, cut_tree, margin_of, parts_of
 from g2ard.scene.splats import Splats
 from g2ard.stages.lift import LiftConfig, lift_rows
 
@@ -38,6 +38,12 @@ _TILE_FILE = re.compile(r"(tile|halo)-\d{5,}\.f32|tiles\.json|\.tiles\.[0-9a-f]{
 def is_tile_file(name: str) -> bool:
     """Return whether a file or folder of this name belongs to tiles, complete or partial."""
     return _TILE_FILE.fullmatch(name) is not None
+
+
+def expected_tiles(count: int, tile_rows: int) -> int:
+    """Return into how many tiles of at most `tile_rows` a scene is cut, unless positions coincide."""
+    points = min(count, _TREE_SAMPLE)
+    return parts_of(points, count / points, tile_rows)
 
 
 def clear(folder: Path) -> None:

@@ -356,6 +356,12 @@ def _widened(scene: Splats, times: int) -> Splats:
     return replace(scene, scales=scene.scales * factor)
 
 
+def sample_stride(count: int) -> int:
+    """Return the number of rows of which one is in the sample of a scene."""
+    rows, most = _SAMPLE
+    return int(np.clip(count // rows, 1, most))
+
+
 class TiledRun:
     """Steps of a tiled simplification, of which the first, `coarse`, runs at once."""
 
@@ -370,9 +376,8 @@ class TiledRun:
         self.config = asdict(merging.resolved(antialiased=model == "antialiased"))
         self.sizes = [tile.rows for tile in store.tiles]
         self.coarse: list[Path] = []
-        rows, most = _SAMPLE
-        sampled = int(np.clip(store.count // rows, 1, most))
-        self.coarse = self.each("coarse", "coarse", per_tile=[{"sampled": sampled}] * len(self.sizes))
+        sampled = [{"sampled": sample_stride(store.count)}] * len(self.sizes)
+        self.coarse = self.each("coarse", "coarse", per_tile=sampled)
 
     def each(
         self,

@@ -18,6 +18,8 @@ COMMANDS = [
     "lod ball.ply -r 2,4 --views views.json --size 24 --merge-only -o lod",
     f"distill ball.ply -r 8 {TRAIN} -o run",
     f"recover small.ply {TRAIN} --teacher ball.ply -o better.ply",
+    "simplify ball.ply -r 4 --views views.json --tile-rows 100 --workers 1 -o tiled.ply",
+    f"distill ball.ply -r 8 {TRAIN} --focus far --tile-rows 100 --workers 1 -o run",
     "clean ball.ply --preview found.png -o clean.ply",
 ]
 

@@ -16,8 +16,9 @@ from g2ard.config.choices import POLICIES
 from g2ard.config.schema import values_of
 from g2ard.io.types import ViewSet
 from g2ard.jobs.budget import Budget
+from g2ard.jobs.distill import preparing
 from g2ard.jobs.distill_options import DistillOptions
-from g2ard.jobs.tiled import distill_in_tiles, simplify_in_tiles
+from g2ard.jobs.simplify import reducing
 from g2ard.jobs.tiling import Tiling, needs_whole, refuse_whole
 from g2ard.pipeline.adapt import appearance_only
 from g2ard.pipeline.presets import configured
@@ -239,17 +240,16 @@ def _simplified_in_tiles(settings: Mapping[str, Any]) -> object:
     scene, tiling = _tiles()
     config = configured(g2ard.SimplifyConfig(), settings=settings)
     refuse_whole(scene, needs_whole(config))
-    budgets = [Budget(count=BUDGET)]
-    ((_, small),) = simplify_in_tiles(scene, budgets, tiling, views=UNEVEN, config=config)
-    return small.whole().fingerprint()
+    with reducing(scene, tiling, views=UNEVEN, config=config) as reduce:
+        return reduce(BUDGET).splats.whole().fingerprint()
 
 
 def _distilled_in_tiles(settings: Mapping[str, Any]) -> object:
     scene, tiling = _tiles()
     options = DistillOptions(views=UNEVEN, size=48, settings={**FAR, **settings})
     refuse_whole(scene, needs_whole(options.config))
-    done = distill_in_tiles(scene, Budget(count=BUDGET), tiling, options)
-    return done.splats.whole().fingerprint()
+    with preparing(scene, Budget(count=BUDGET), options, tiling) as job:
+        return job.run().splats.whole().fingerprint()
 
 
 PRIORS = ("trained", "lift")  # noisy has the terms of lift

@@ -21,7 +21,6 @@ from g2ard.jobs.measured_budget import (
     count_for_bytes,
     count_for_quality,
     file_bytes,
-    resolved,
 )
 from g2ard.scene.splats import Splats
 from g2ard.stages.simplify import simplify
@@ -89,19 +88,19 @@ def test_simplify_fits(tmp_path: Path, command_line: CommandLine) -> None:
 @pytest.mark.parametrize("recovered", [False, True])
 def test_quest3_bounds_overdraw(recovered: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     scene, said = checkered_ball(6000), []
-    reduce = Reduction(scene, blind=True, say=said.append)
-    plain = resolved(Budget(fit="quest3"), reduce, "a", "a.ply", recovered=recovered)
-    assert plain.count == resolved(Budget(fit="web"), reduce, "a", "a.ply").count == 6000
+    reduce = Reduction(scene, blind=True, recovered=recovered, say=said.append)
+    plain = reduce.resolved(Budget(fit="quest3"), "a", "a.ply")
+    assert plain.count == reduce.resolved(Budget(fit="web"), "a", "a.ply").count == 6000
     dense = close_up(scene)
     assert dense is not None
     monkeypatch.setitem(LAYERS, "quest3", dense.mean / 2)
-    found = resolved(Budget(fit="Quest3"), reduce, "a", "a.ply", recovered=recovered).count
+    found = reduce.resolved(Budget(fit="Quest3"), "a", "a.ply").count
     near = close_up(fast(scene, found) if recovered else reduce(found).splats)
     assert near is not None
     assert dense.mean / 4 < near.mean <= dense.mean / 2
     assert f"at {found:,}" in " ".join(said)
     monkeypatch.setitem(LAYERS, "quest3", 1e-3)  # out of reach: the search ends, and says what it has
-    assert resolved(Budget(fit="quest3"), reduce, "a", "a.ply", recovered=recovered).count < found
+    assert reduce.resolved(Budget(fit="quest3"), "a", "a.ply").count < found
 
 
 @pytest.mark.parametrize(

@@ -17,6 +17,7 @@ from helpers.commands import CommandLine, refused, succeeds
 from helpers.photos import photos_of
 from helpers.project import environment
 from helpers.scenes import checkered_ball
+from helpers.tiled_scenes import town_in
 
 
 def test_a_dry_run_counts_and_writes_nothing(tmp_path: Path, command_line: CommandLine) -> None:
@@ -34,6 +35,47 @@ def test_a_dry_run_counts_and_writes_nothing(tmp_path: Path, command_line: Comma
     assert views < told["views"] <= views + 72  # those of other kinds are in no file
     assert told["seconds"] == sum(seconds for _, seconds in told["stages"]) > 0
     assert told["pixels"] == 48 * 36
+
+
+@pytest.mark.parametrize("scene", ["town.ply", "tiles"])
+def test_a_dry_run_plans_tiles_like_the_run(scene: str, tmp_path: Path, command_line: CommandLine) -> None:
+    folder = town_in(tmp_path, 3000, views=4)
+    words = ("ingest", "town.ply", "-o", "tiles", "--tile-rows", 800)
+    store = [] if scene == "town.ply" else succeeds(command_line, folder, *words)
+    before = sorted(folder.rglob("*"))
+    ask = ("distill", scene, "-r", 10, "--views", "views.json", "--size", 24, "--steps", 2, "--json", "-")
+    ask += ("--workers", 1) if store else ("--workers", 1, "--tile-rows", 800)
+    told = json.loads(succeeds(command_line, folder, *ask, "--dry-run").out)
+    assert sorted(folder.rglob("*")) == before
+    ran = json.loads(succeeds(command_line, folder, *ask, "-o", "run").out)
+    assert (told["count"], told["tiles"], told["workers"]) == (ran["output_count"], len(ran["tiles"]), 1)
+    assert told["steps"] == 2
+    assert told["views"] >= sum(ran["views"].values())
+    assert told["seconds"] == pytest.approx(sum(seconds for _, seconds in told["stages"]))
+    assert ("tiles" in dict(told["stages"])) == (not store)
+
+
+@pytest.mark.parametrize("rows", [(), ("--tile-rows", 800, "--workers", 1)])
+def test_a_dry_run_of_simplify(rows: tuple[object, ...], tmp_path: Path, command_line: CommandLine) -> None:
+    folder = town_in(tmp_path, 3000, views=4)
+    ask = ("simplify", "town.ply", "-r", "10,20", "--views", "views.json", *rows, "--dry-run", "--json", "-")
+    plans = json.loads(succeeds(command_line, folder, *ask).out)["runs"]
+    assert [plan["count"] for plan in plans] == [300, 150]
+    assert {plan["views"] for plan in plans} == {2}
+    assert [plan.get("tiles") for plan in plans] == [4 if rows else None] * 2
+    assert all(plan["seconds"] > 0 and plan["bytes"] > 1e7 for plan in plans)
+    assert {path.name for path in folder.iterdir()} == {"town.ply", "views.json"}
+
+
+def test_a_dry_run_of_levels_plans_tiles(tmp_path: Path, command_line: CommandLine) -> None:
+    folder = town_in(tmp_path, 3000, views=4)
+    ask = ("lod", "town.ply", "-r", "1,4,8", "--views", "views.json", "--size", 24, "--tile-rows", 800)
+    out, said = succeeds(command_line, folder, *ask, "--steps", 90, "--dry-run", "--json", "-")
+    found = [(one["level"], one["count"], one["steps"]) for one in json.loads(out)["levels"]]
+    assert found == [(1, 750, 90), (2, 375, 90)]
+    assert "4 tiles of 3,000 Gaussians" in said
+    assert "200 MB" in refused(command_line, folder, *ask, "--dry-run", "--memory", "200MB", status=1)
+    assert {path.name for path in folder.iterdir()} == {"town.ply", "views.json"}
 
 
 def test_memory_grows_with_views_and_gaussians(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -14,7 +14,7 @@ import pytest
 
 from g2ard.errors import InputError
 from g2ard.io import read_splats, write_splats
-from g2ard.jobs.cost import workers_for
+from g2ard.jobs.memory import plan_tiles
 from g2ard.jobs.tiling import Tiling
 from g2ard.rendering.targets import TeacherRenders
 from g2ard.scene.splats import Splats
@@ -168,7 +168,7 @@ def test_distill_in_one_piece_heeds_memory(command_line: CommandLine, folder: Pa
 
 def test_more_memory_takes_more_workers(folder: Path, tmp_path: Path) -> None:
     store = ingest(folder / "town.ply", tmp_path / "tiles", tile_rows=2500)
-    few, many = (workers_for(store, Tiling(memory=size, cores=64)) for size in (10**9, 4 * 10**9))
+    few, many = (plan_tiles(store, Tiling(memory=size, cores=64)).workers for size in (10**9, 4 * 10**9))
     assert 1 < few < many
 
 

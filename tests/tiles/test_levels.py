@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,11 +11,10 @@ from g2ard import io
 from g2ard.errors import InputError
 from g2ard.io import sog
 from g2ard.io.tile_store import StoredScene
-from g2ard.jobs.distill_options import DistillOptions
-from g2ard.jobs.levels import Levels
-from g2ard.jobs.tiled import lod_in_tiles
+from g2ard.jobs.levels import Levels, preparing_levels
 from g2ard.jobs.tiling import Tiling
 from g2ard.levels import Cut, cut, save_levels, tree
+from g2ard.progress import Say, unsaid
 from g2ard.scene.splats import Splats
 from g2ard.system.peak_memory import peak_rss
 from g2ard.tiles.ingest import ingest
@@ -79,10 +79,12 @@ def test_levels_on_disk_give_the_files_of_levels_in_memory(tmp_path: Path, degre
     assert files_of(tmp_path / "a") == files_of(tmp_path / "b")
 
 
-def levels_in_tiles(place: Path, folder: Path, **more: object) -> Levels[StoredScene]:
-    options = DistillOptions(views=place / "views.json", size=64, settings={"steps": 12})
+def levels_in_tiles(place: Path, folder: Path, say: Say = unsaid) -> Levels[StoredScene]:
+    options: dict[str, Any] = {"ratios": (1, 3, 12), "recover": True, "steps": 12, "background": (0, 0, 0)}
+    options |= {"split_sky": False, "seed": 0, "views": place / "views.json", "size": 64, "say": say}
     tiling = Tiling(tile_rows=1700, workers=1, folder=folder)
-    return lod_in_tiles(place / "town.ply", (1, 3, 12), tiling, options, **more)  # type: ignore[arg-type]
+    with preparing_levels(place / "town.ply", tiling, **options) as job:
+        return job.run()
 
 
 def test_levels_have_exact_counts_and_a_stopped_chain_goes_on(place: Path, tmp_path: Path) -> None:

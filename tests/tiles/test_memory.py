@@ -9,13 +9,13 @@ from g2ard.errors import InputError
 from g2ard.io import write_splats
 from g2ard.io.tile_store import TileStore
 from g2ard.jobs import tiling as policy
-from g2ard.jobs.cost import (
+from g2ard.jobs.memory import (
     LEVELS_TIMES,
     RECOVERY_TIMES,
     TileMemory,
     bytes_of,
     check_whole_memory,
-    workers_for,
+    plan_tiles,
 )
 from g2ard.jobs.tiling import Tiling
 from g2ard.tiles.ingest import ingest
@@ -48,32 +48,32 @@ def test_tiles_that_are_advised_fit(scene: Path, tmp_path: Path, memory: str) ->
         check_whole_memory(scene, Tiling(memory=size), LEVELS_TIMES, RECOVERY_TIMES)
     store = tiles(scene, tmp_path / "a", advised(str(e.value)))
     assert len(store.tiles) > 1
-    assert workers_for(store, Tiling(memory=size, folder=tmp_path / "a"), RECOVERY_TIMES) == 1
+    assert plan_tiles(store, Tiling(memory=size, folder=tmp_path / "a"), RECOVERY_TIMES).workers == 1
     store = tiles(scene, tmp_path / "b", 11_000)
     with pytest.raises(InputError, match=r"a tile of [\d,]+ Gaussians and [\d,]+ around it takes about") as e:
-        workers_for(store, Tiling(memory=size, folder=tmp_path / "b"), RECOVERY_TIMES)
+        plan_tiles(store, Tiling(memory=size, folder=tmp_path / "b"), RECOVERY_TIMES).workers
     again = tiles(scene, tmp_path / "c", advised(str(e.value)))
-    assert workers_for(again, Tiling(memory=size), RECOVERY_TIMES) == 1
+    assert plan_tiles(again, Tiling(memory=size), RECOVERY_TIMES).workers == 1
 
 
 def test_an_error_names_the_least_memory_that_works(scene: Path, tmp_path: Path) -> None:
     store = tiles(scene, tmp_path / "a", 6000)
     for refuse in (
         lambda: check_whole_memory(scene, Tiling(memory=200_000_000), LEVELS_TIMES, RECOVERY_TIMES),
-        lambda: workers_for(store, Tiling(memory=200_000_000, folder=tmp_path / "a"), RECOVERY_TIMES),
+        lambda: plan_tiles(store, Tiling(memory=200_000_000, folder=tmp_path / "a"), RECOVERY_TIMES).workers,
     ):
         with pytest.raises(InputError, match="more than --memory 200 MB; the least that tiles take is") as e:
             refuse()
         told = re.search(r"tiles take is about (\d+) MB, with --tile-rows 1,000$", str(e.value))
         assert told, e.value
         least = tiles(scene, tmp_path / told[1], 1000)
-        assert workers_for(least, Tiling(memory=bytes_of(f"{told[1]}MB")), RECOVERY_TIMES) == 1
+        assert plan_tiles(least, Tiling(memory=bytes_of(f"{told[1]}MB")), RECOVERY_TIMES).workers == 1
 
 
 def test_tiles_of_a_folder_are_not_cut_anew(scene: Path, tmp_path: Path) -> None:
     store = tiles(scene, tmp_path, 6000)
     with pytest.raises(InputError, match=r"; `g2ard ingest \S+tiles -o DIR --tile-rows [\d,]+` takes less"):
-        workers_for(store, Tiling(memory=bytes_of("202MB"), folder=tmp_path / ".x.tiles"))
+        plan_tiles(store, Tiling(memory=bytes_of("202MB"), folder=tmp_path / ".x.tiles"))
 
 
 def test_the_machines_memory_is_the_default(
@@ -83,7 +83,7 @@ def test_the_machines_memory_is_the_default(
     monkeypatch.setattr(policy, "_physical_memory", lambda: 4_000_000_000)
     told = r"--workers 1000 take about 20\d[\d.]* GB, more than the 3\.2 GB used of the machine's"
     with pytest.raises(InputError, match=told + r" memory; --workers 1\d fit$"):
-        workers_for(store, Tiling(folder=tmp_path, workers=1000))
+        plan_tiles(store, Tiling(folder=tmp_path, workers=1000)).workers
 
 
 def test_no_more_tiles_are_advised_than_are_made() -> None:

@@ -39,7 +39,6 @@ _DISTILL = ("distill", "-r", "10", "-o", "x", "--views", "views.json")
         (_SIMPLIFY, "--set morton_premerge_steps=3", "--set simplify.morton_premerge_steps"),
         (_DISTILL, "--set morton_premerge_steps=3", "--set simplify.morton_premerge_steps"),
         (_DISTILL, "--recovery-time 5m", "--recovery-time"),
-        (_DISTILL, "--dry-run", "--dry-run"),
         (("simplify", "-o", "x.ply"), "--min-ssim 0.9", "--min-ssim 0.9"),
         (("distill", "-o", "x"), "--fit 50kB", "--fit 50kB"),
     ],

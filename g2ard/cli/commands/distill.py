@@ -2,40 +2,19 @@
 
 from __future__ import annotations
 
-import time
-from dataclasses import asdict, replace
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated, Any
 
 import typer
 
 from g2ard.cli import options as opt
 from g2ard.cli.frame import Run, command
 from g2ard.cli.outputs import budget_of, refuse_file
-from g2ard.cli.run_result import (
-    counts_line,
-    loss,
-    say_fit,
-    say_views,
-    say_weight,
-    tell_quality,
-    told,
-    write_table,
-)
+from g2ard.cli.run_result import say_fit, tell_plan, tell_run, told
 from g2ard.cli.tiling import tiling_of, working
 from g2ard.config.choices import is_made
 from g2ard.io import kind
-from g2ard.progress import plural
-
-if TYPE_CHECKING:
-    from g2ard.cli.run_folder import RunFolder
-    from g2ard.jobs.budget import Budget
-    from g2ard.jobs.cost import Cost
-    from g2ard.jobs.distill import DistillJob
-    from g2ard.jobs.distill_options import DistillOptions
-    from g2ard.jobs.tiling import Tiling
-    from g2ard.pipeline.distill import Distilled
-    from g2ard.report.run import RunReport
 
 
 @command(
@@ -107,12 +86,11 @@ def distill(
     """
     from g2ard.cli.run_folder import RunFolder
     from g2ard.jobs.cost import check_job_memory, cost_of
-    from g2ard.jobs.distill import prepare
+    from g2ard.jobs.distill import preparing
     from g2ard.jobs.distill_options import DistillOptions
     from g2ard.jobs.tiling import is_tiled, needs_whole, refuse_whole
     from g2ard.pipeline.config import DistillConfig
 
-    began = time.monotonic()
     settings, _ = run.settled(DistillConfig(), preset)
     budget = budget_of(run)
     given = views is not None and not is_made(views)
@@ -143,21 +121,32 @@ def distill(
         settings=settings,
     )
     tiling = tiling_of(run, scene, output)
-    if scene is not None and is_tiled(scene, tiling):
-        whole = {"clean": clean, "photos": photos, "dry_run": dry_run}
-        refuse_whole(scene, needs_whole(options.config, preset, [budget], **whole))
-        _in_tiles(run, scene, tiling, budget, options, folder)
-        return
-    if scene is not None:
+    tiled = scene is not None and is_tiled(scene, tiling)
+    held: AbstractContextManager[None] = nullcontext()
+    if scene is not None and tiled:
+        refuse_whole(scene, needs_whole(options.config, preset, [budget], clean=clean, photos=photos))
+        if not dry_run:
+            held = working(run, tiling, options.views, options.held_out, again=" with --resume")
+    elif scene is not None:
         say_fit(run, scene, budget, f"scene.{format}")
-    job = prepare(scene, budget, options, **run.callbacks)
-    cost = cost_of(job, job.budget.count, page=page)
-    if dry_run:
-        _tell_cost(run, job, cost)
-        return
-    check_job_memory(job, tiling.memory, cost.bytes)
-    run.console.expect(cost.stages)
-    _whole(run, scene or Path(str(views)), job, folder, time.monotonic() - began)
+    how = tiling if tiled else None
+    with held, preparing(scene, budget, options, how, planned=dry_run, **run.callbacks) as job:
+        cost = cost_of(job, job.budget.count, page=page)
+        if dry_run:
+            tell_plan(run, job, cost)
+            return
+        check_job_memory(job, tiling.memory, cost.bytes)
+        run.console.expect(cost.stages)
+        source = scene or Path(str(views))
+        with folder.working(job):
+            done: Any = job.run(folder.work)
+            folder.write(done, job.views, job.targets)
+            with run.finishing("scoring"):
+                report: Any = job.report(done, folder.scene)
+            title = f"{source.name}: {report.title}"
+            report, line = folder.write_pages(title, job, done, report, told(report))
+            folder.write_report(report)
+    tell_run(run, source, job, done, report, folder, line)
 
 
 def _check_options(
@@ -182,108 +171,3 @@ def _check_kind(scene: Path) -> None:
         raise typer.BadParameter(
             f"{scene} holds views, not a scene; to start from photos, pass it as --views with -n COUNT"
         )
-
-
-def _tell_cost(run: Run, job: DistillJob, cost: Cost) -> None:
-    """Print what a distillation would do, and its rough time and memory."""
-    count = job.budget.count
-    run.answer(
-        f"{plural(count, 'Gaussian')}, {plural(cost.views, 'target image')} of {cost.pixels:,} pixels, "
-        f"{plural(cost.steps, 'step')}: roughly {max(1, cost.seconds):.0f} s on two cores and "
-        f"{cost.bytes / 1e6:,.0f} MB"
-    )
-    run.say_dry()
-    run.result({"count": count, **asdict(cost), "seconds": cost.seconds})
-
-
-def _whole(run: Run, source: Path, job: DistillJob, folder: RunFolder, prepared: float) -> None:
-    """Distil, write the run's folder and print a summary; `prepared` are seconds before this call."""
-    began, page = time.monotonic(), ""
-    with folder.working(len(job.prior), job.budget.count, _photos(job)):
-        result = job.run(folder.work)
-        folder.write(result, job.views, job.targets)
-        with run.finishing("scoring"):
-            report = job.report(result, folder.scene)
-        report = replace(report, seconds=_seconds(prepared, report.seconds, time.monotonic() - began))
-        _write_pages(run, source, job, result, report, folder.path)
-        if run.config["page"]:
-            seen, colour = job.views.train.cameras, job.config.recover.background
-            dense = None if job.config.recover.from_points else job.prior
-            with run.finishing("view.html"):
-                size, page = folder.write_view(result.splats, dense, seen, colour)
-            report = replace(report, bytes={**report.bytes, "view": size})
-        folder.write_report(report)
-    of_photos = job.config.recover.from_points  # such points are no scene to compare with
-    run.say(counts_line(report))
-    write_table(run, report)
-    for line in told(report, verbose=run.verbose):
-        run.say(line)
-    say_views(run, report.views, job.config.select.views_count is not None)
-    if not of_photos:
-        say_weight(run, source, folder.scene, result.splats, lifted=job.prior if job.lifted else None)
-    folder.say_files("preview.png", page)
-    run.result(report.as_dict())
-    tell_quality(run, job.budget, result.splats)
-
-
-def _in_tiles(
-    run: Run, scene: Path, tiling: Tiling, budget: Budget, options: DistillOptions, folder: RunFolder
-) -> None:
-    """Distil tile by tile; finished steps stay in the tiling's folder until the command succeeds."""
-    from g2ard.jobs.tiled import distill_in_tiles
-    from g2ard.report.distilled import tiled_report
-
-    with working(run, tiling, options.views, options.held_out, again=" with --resume"):
-        done = distill_in_tiles(scene, budget, tiling, options, **run.callbacks)
-        report, scores = done.report, done.report.scores
-        with folder.writing():
-            folder.write(done, done.views)
-            counts = f"{report.input_count:,} → {report.output_count:,}"
-            with run.finishing("report.html"):
-                tiled_report(folder.path / "report.html", f"{scene.name}: {counts}", report)
-            folder.write_report(report)
-    write_table(run, report)
-    for line in filter(None, map(loss, report.kinds)):
-        run.say(line)
-    run.say(
-        f"{folder.path}: {report.output_count:,} of {report.input_count:,} Gaussians; over all pixels "
-        f"{scores.simplified:.2f} → {scores.recovered:.2f} dB; "
-        f"{plural(scores.steps, 'step')} in all tiles together"
-    )
-    folder.say_files()
-    run.result(report.as_dict())
-
-
-def _seconds(prepared: float, stages: dict[str, float], elapsed: float) -> dict[str, float]:
-    """Return the seconds by stage, with the scores as the rest of `elapsed`, and their total.
-
-    >>> _seconds(4.0, {"simplify": 2.0, "recover": 9.0, "resumed": 3.0}, 10.0)
-    {'prepare': 4.0, 'simplify': 2.0, 'recover': 9.0, 'resumed': 3.0, 'score': 2.0, 'total': 17.0}
-    """
-    resumed = stages.get("resumed", 0.0)
-    score = elapsed + 2 * resumed - sum(stages.values())
-    return {"prepare": prepared, **stages, "score": score, "total": prepared + elapsed + resumed}
-
-
-def _photos(job: DistillJob) -> list[Path]:
-    """Return the photos and masks that the job reads."""
-    views = (job.views.train.cameras, job.views.test)
-    paths = (path for cameras in views for path in (*cameras.image_paths, *cameras.mask_paths))
-    return list(dict.fromkeys(path for path in paths if path is not None)) if job.reads_photos else []
-
-
-def _write_pages(
-    run: Run, source: Path, job: DistillJob, result: Distilled, report: RunReport, folder: Path
-) -> None:
-    """Write report.html and preview.png."""
-    from g2ard.report.distilled import distill_report, preview
-
-    scenes = [("simplified", result.simplified), ("recovered", result.splats)]
-    before = plural(report.photos, "photo") if report.photos else f"{len(job.prior):,}"
-    title = f"{source.name}: {before} → {plural(len(result.splats), 'Gaussian')}"
-    targets = list(filter(None, (job.targets.held_out, job.targets.apart)))
-    colour = job.config.recover.background
-    with run.finishing("report.html"):
-        distill_report(folder / "report.html", title, scenes, targets, report, colour, told=told(report))
-    with run.finishing("preview.png"):
-        preview(folder / "preview.png", targets[0], scenes, colour)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -120,10 +121,11 @@ def lod(
     """
     from g2ard.cli.resume import began_output, check_stopped, drop_ended, is_finished, stoppable
     from g2ard.io.atomic import check_output
-    from g2ard.jobs.cost import LEVELS_TIMES, RECOVERY_TIMES, check_whole_memory
-    from g2ard.jobs.levels import check_ratios, check_trained, prepare_levels
+    from g2ard.jobs.levels import check_ratios, check_trained, preparing_levels
+    from g2ard.jobs.memory import LEVELS_TIMES, RECOVERY_TIMES, check_whole_memory
     from g2ard.jobs.tiling import is_tiled
     from g2ard.levels import Cut
+    from g2ard.system.peak_memory import peak_rss_of_all
 
     refuse_file(output, "levels of detail")
     check_trained(scene)
@@ -151,49 +153,52 @@ def lod(
     finished = not dry_run and is_finished(run, stopped, resume, writer.page)
     if not (dry_run or (tiled and tiling.keep)):
         finished |= drop_ended(run, work, resume or tiled, writer.page)
-    if dry_run:
-        if tiled:
-            raise typer.BadParameter("--dry-run is for scenes that fit into memory")
-    elif finished:
+    if finished:
         _check_same(writer.meta, ratios)
-    else:
+    elif not dry_run:
         run.overwrite |= (tiled or resume) and began_output(work, output) and not writer.page.exists()
         check_output(output, run.overwrite, folder=True)
     if finished or not (tiled or dry_run):
         check_stopped(run, stopped, resume or finished, writer.meta)
-    if tiled:
-        _in_tiles(writer, ratios, tiling, steps, size, recover)
-        return
-    check_whole_memory(scene, tiling, LEVELS_TIMES, RECOVERY_TIMES)
-    choices: dict[str, Any] = {
-        "views": views,
-        "steps": steps,
-        "size": size,
-        "background": colour,
-        "up": up,
-        "render_model": run.render_model,
-        "split_sky": environment,
-        "seed": run.seed,
-        **run.callbacks,
-    }
-    if dry_run:
-        _tell_costs(run, prepare_levels(scene, ratios=ratios, recover=recover, **choices))
-        return
     given: Path | Splats = scene
-    if kind == "3dtiles":
-        from g2ard.levels.tileset import check_tiles
+    held: AbstractContextManager[None] = nullcontext()
+    if not tiled:
+        check_whole_memory(scene, tiling, LEVELS_TIMES, RECOVERY_TIMES)
+        if kind == "3dtiles" and not dry_run:
+            from g2ard.levels.tileset import check_tiles
 
-        given, choices["beside"] = run.load(scene), scene
-        check_tiles(output, given, max(ratios), rule)
-    with stoppable(run, stopped, resume, writer.meta):
-        stopped.mkdir(parents=True, exist_ok=True)
-        job = prepare_levels(given, ratios=ratios, recover=recover, work=stopped, **choices)
+            given = run.load(scene)
+            check_tiles(output, given, max(ratios), rule)
+    if not dry_run:
+        held = working(run, tiling, views) if tiled else stoppable(run, stopped, resume, writer.meta)
+    options: dict[str, Any] = {"ratios": ratios, "recover": recover, "steps": steps, "background": colour}
+    options |= {"split_sky": environment, "seed": run.seed, **run.callbacks}
+    options |= {"views": views, "size": size, "up": up, "render_model": run.render_model, "beside": scene}
+    how = tiling if tiled else None
+    with held, preparing_levels(given, how, planned=dry_run, photos=False, **options) as job:
+        if dry_run:
+            _tell_costs(run, job)
+            return
         made = [cost for ratio, cost in zip(job.ratios, job.costs, strict=True) if ratio > 1]
         stages = [stage for cost in made for stage in cost.stages]
         run.console.expect([*stages, ("write", 3.0), ("the page", 1.0)])
-        levels = job.run()
-        written = writer.save(levels.splats, sky=levels.sky)
-    _tell(run, output, levels, written)
+        if not tiled:
+            stopped.mkdir(parents=True, exist_ok=True)
+        levels = job.run(stopped)
+        begun = _begun(tiling, levels, rule) if tiled else None
+        written = writer.save(levels.splats, begun, levels.sky)
+        peak = {"peak_rss_bytes": peak_rss_of_all()} if tiled else {}
+        _tell(run, output, levels, written, **peak)
+
+
+def _begun(tiling: Tiling, levels: Levels[Any], rule: Cut) -> Path:
+    """Return the folder for files of these levels that are begun."""
+    from g2ard.pipeline.steps import key_of
+
+    content = [[one.store.key for one in levels.splats], asdict(rule)]
+    begun = tiling.folder / f"written-{key_of(content)}"
+    begun.mkdir(exist_ok=True)
+    return begun
 
 
 def _tell_costs(run: Run, job: LevelsJob) -> None:
@@ -202,7 +207,7 @@ def _tell_costs(run: Run, job: LevelsJob) -> None:
     for number, (ratio, count, cost) in enumerate(zip(job.ratios, job.counts, job.costs, strict=True)):
         if ratio == 1:
             continue
-        steps = f", {plural(cost.steps, 'step')}" if job.recover else ""
+        steps = f", {plural(cost.steps, 'step')}" if job.job.recovers else ""
         run.answer(
             f"level {number}: {plural(count, 'Gaussian')}{steps}: "
             f"roughly {max(1, cost.seconds):.0f} s on two cores"
@@ -213,33 +218,6 @@ def _tell_costs(run: Run, job: LevelsJob) -> None:
     run.answer(f"all levels: roughly {max(1, seconds):.0f} s and {most / 1e6:,.0f} MB")
     run.say_dry()
     run.result({"levels": levels, "total": {"seconds": seconds, "bytes": most}})
-
-
-def _in_tiles(
-    writer: _Writer,
-    ratios: Sequence[float],
-    tiling: Tiling,
-    steps: int | None,
-    size: int | None,
-    recover: bool,
-) -> None:
-    """Write levels tile by tile; finished steps stay in the tiling's folder until the command succeeds."""
-    from g2ard.jobs.distill_options import DistillOptions
-    from g2ard.jobs.levels import recovery_settings
-    from g2ard.jobs.tiled import lod_in_tiles
-    from g2ard.pipeline.steps import key_of
-    from g2ard.system.peak_memory import peak_rss_of_all
-
-    run, folder = writer.run, tiling.folder
-    settings = recovery_settings(steps, writer.background, run.seed)
-    options = DistillOptions(
-        views=writer.views, size=size, up=writer.up, render_model=run.render_model, settings=settings
-    )
-    with working(run, tiling, writer.views):
-        levels = lod_in_tiles(writer.scene, ratios, tiling, options, recover=recover, **run.callbacks)
-        begun = folder / f"written-{key_of([[one.store.key for one in levels.splats], asdict(writer.cut)])}"
-        begun.mkdir(exist_ok=True)
-        _tell(run, writer.output, levels, writer.save(levels.splats, begun), peak_rss_bytes=peak_rss_of_all())
 
 
 @dataclass(frozen=True)
@@ -273,7 +251,7 @@ class _Writer:
 
     def save(self, levels: Sequence[Level], work: Path | None = None, sky: Splats | None = None) -> int:
         """Write the levels and a page that shows them, and return their bytes."""
-        from g2ard.jobs.levels import save_tileset, tileset_up
+        from g2ard.jobs.levels import save_tileset, tileset_up, write_level_page
         from g2ard.levels import save_levels
 
         run = self.run
@@ -285,26 +263,14 @@ class _Writer:
             axis = tileset_up(levels, self.up, run.say).tolist()
             written = save_tileset(self.output, levels, up=axis, place=self.spot, **common)
         run.kept.append(f"{self.output} is written")
+        frame: dict[str, Any] = {"views": self.views, "beside": self.scene, "up": axis, "seed": run.seed}
+        frame |= {"background": self.background, "progress": run.progress}
         with run.finishing("the page"):
-            return written + self._page(levels, axis)
-
-    def _page(self, levels: Sequence[Level], up: Sequence[float] | None) -> int:
-        from g2ard.jobs.levels import write_level_page
-
-        run = self.run
-        written = write_level_page(
-            self.output,
-            levels,
-            self.kind,
-            views=self.views,
-            beside=self.scene,
-            up=up,
-            background=self.background,
-            seed=run.seed,
-            progress=run.progress,
-        )
-        query = "" if self.kind == "sog" else "/?cesium=URL (a folder of CesiumJS)"
-        run.say(f"page: python -m http.server --directory {self.output}, then http://localhost:8000{query}")
+            written += write_level_page(self.output, levels, self.kind, **frame)
+            query = "" if self.kind == "sog" else "/?cesium=URL (a folder of CesiumJS)"
+            run.say(
+                f"page: python -m http.server --directory {self.output}, then http://localhost:8000{query}"
+            )
         return written
 
 

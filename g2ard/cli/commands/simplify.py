@@ -4,28 +4,26 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from g2ard import io
 from g2ard.cli import options as opt
 from g2ard.cli.frame import Run, command
 from g2ard.cli.outputs import Outputs, budgets_of
-from g2ard.cli.run_result import say_fit, say_weight, tell_quality
+from g2ard.cli.run_result import say_fit, say_weight, tell_quality, tiles_of
 from g2ard.cli.tiling import tiling_of, working
 from g2ard.config.choices import is_made
 from g2ard.config.schema import listed
 from g2ard.io.atomic import atomic_output
 from g2ard.io.scene_formats import written_bytes
 from g2ard.progress import plural
-from g2ard.system.peak_memory import peak_rss
+from g2ard.system.peak_memory import peak_rss_of_all
 
 if TYPE_CHECKING:
-    from g2ard.io.types import Scene
-    from g2ard.jobs.budget import Budget
-    from g2ard.jobs.tiling import Tiling
+    from g2ard.jobs.measured_budget import Reduction
     from g2ard.stages.simplify import Simplified, SimplifyConfig
 
 
@@ -55,6 +53,7 @@ def simplify(
         Path | None,
         typer.Option(metavar="FILE.npy", help="Also write each Gaussian's row in the result, or -1."),
     ] = None,
+    dry_run: opt.DryRunOption = False,
 ) -> None:
     """Reduce a scene to an exact number of Gaussians; no images needed.
 
@@ -62,9 +61,9 @@ def simplify(
     generated views. The fast method uses views only if --views is given; the paper's method uses none.
     Scenes larger than memory and folders of tiles are simplified tile by tile to the same exact budget.
     """
-    from g2ard.jobs.cost import WHOLE_TIMES, check_whole_memory
-    from g2ard.jobs.inputs import say_notes
-    from g2ard.jobs.measured_budget import Reduction, resolved
+    from g2ard.jobs.cost import cost_of_reduction
+    from g2ard.jobs.memory import WHOLE_TIMES, check_whole_memory
+    from g2ard.jobs.simplify import reducing
     from g2ard.jobs.tiling import is_tiled, needs_whole, refuse_whole
     from g2ard.stages.simplify import SimplifyConfig
 
@@ -80,120 +79,89 @@ def simplify(
     if given_views or no_views or config.method == "paper" or (config.method == "fast" and views is None):
         run.refuse_typed("without generated views", "up")
     tiling = tiling_of(run, scene, output)
-    outputs = Outputs(output, budgets, run.claim_scene)
-    outputs.check()
     given = opt.with_images(views, images)
-    if is_tiled(scene, tiling):
+    name = "scene.ply" if output == opt.UNWRITTEN else output.name
+    outputs = None if dry_run else Outputs(output, budgets, run.claim_scene)
+    if outputs is not None:
+        outputs.check()
+    tiled, maps = is_tiled(scene, tiling), None
+    held: AbstractContextManager[None] = nullcontext()
+    if tiled:
         refuse_whole(scene, needs_whole(config, preset, budgets, parents=parents))
-        _in_tiles(run, scene, tiling, outputs, budgets, config, views=given, blind=no_views, up=up)
-        return
-    say_fit(run, scene, budgets[0], output.name)
-    check_whole_memory(scene, tiling, WHOLE_TIMES)
-    maps = None if parents is None else Outputs(parents, budgets, run.claim_file, name="--parents")
-    if maps is not None:
-        maps.check()
-    seen = [("read", 0.2), ("poses", 1.0), ("visibility", 2.0)]  # seconds for playbot
-    run.console.expect([*seen, *[("simplify", 1.2), ("visibility", 0.5), ("write", 0.1)] * len(budgets)])
-    began = time.perf_counter()
-    run.begin("read")
-    found = io.read_scene(scene, render_model=run.render_model)
-    say_notes(scene, found.notes, run.say)
-    splats, total = found.splats, len(found.splats)
-    for named in filter(None, (outputs, maps)):
-        named.check(total)
-    started = time.perf_counter()
-    reading = started - began  # shared by all budgets
-    common: dict[str, Any] = {"seed": run.seed, "progress": run.progress, "say": run.say}
-    reduce = Reduction(splats, views=given, blind=no_views, config=config, beside=scene, up=up, **common)
-    wanted = [resolved(budget, reduce, str(scene), output.name) for budget in budgets]
-    reports = []
-    rows = maps.paths(total) if maps else [None] * len(wanted)
-    for one, place, parents in zip(wanted, outputs.paths(total), rows, strict=True):
-        small = reduce(one.count)
-        simplified = time.perf_counter()
-        run.write(place, small.splats)
-        if parents is not None:
-            with run.finishing("--parents"):
-                _write_parents(run, parents, small)
-        written = time.perf_counter()
-        seconds = {"read": reading, "simplify": simplified - started, "write": written - simplified}
-        seconds["total"] = sum(seconds.values())
-        started = written
-        reports.append(_report(found, small, config, seconds))
-        _tell(run, scene, small, place, seconds["total"])
-        if one.bytes is not None:
-            run.say(f"{place}: {written_bytes(place):,} of {one.bytes:,} bytes")
+        held = nullcontext() if dry_run else working(run, tiling, given)
+    else:
+        say_fit(run, scene, budgets[0], name)
+        check_whole_memory(scene, tiling, WHOLE_TIMES)
+        if parents is not None and not dry_run:
+            maps = Outputs(parents, budgets, run.claim_file, name="--parents")
+        seen = [("read", 0.2), ("poses", 1.0), ("visibility", 2.0)]  # seconds for playbot
+        run.console.expect([*seen, *[("simplify", 1.2), ("visibility", 0.5), ("write", 0.1)] * len(budgets)])
+    named = list(filter(None, (outputs, maps)))
+    for each in named:
+        each.check()
+
+    def counted(total: int) -> None:
+        for each in named:
+            each.check(total)
+
+    began, reports = time.perf_counter(), []
+    inputs: dict[str, Any] = {"views": given, "blind": no_views, "up": up, "seed": run.seed}
+    inputs |= {"render_model": run.render_model, "planned": dry_run, "counted": counted, **run.callbacks}
+    with held, reducing(scene, tiling if tiled else None, config=config, **inputs) as reduce:
+        reading = (started := time.perf_counter()) - began  # shared by all budgets
+        wanted = [reduce.resolved(budget, str(scene), name) for budget in budgets]
+        if outputs is None:
+            _tell_plan(run, reduce, [one.count for one in wanted])
+            return
+        if tiled:
+            costs = [cost_of_reduction(reduce, one.count) for one in wanted]
+            run.console.expect([stage for cost in costs for stage in cost.stages])
+        rows = maps.paths(reduce.total) if maps else [None] * len(wanted)
+        for one, place, parents in zip(wanted, outputs.paths(reduce.total), rows, strict=True):
+            small = reduce(one.count)
+            simplified = time.perf_counter()
+            run.write(place, small.splats, compare=tiled)
+            if parents is not None:
+                with run.finishing("--parents"):
+                    _write_parents(run, parents, small)
+            written = time.perf_counter()
+            seconds = {"read": reading, "simplify": simplified - started, "write": written - simplified}
+            seconds["total"], started = sum(seconds.values()), written
+            reports.append(_report(reduce, small, config, seconds))
+            _tell(run, scene, reduce, small, place, seconds["total"])
+            if one.bytes is not None:
+                run.say(f"{place}: {written_bytes(place):,} of {one.bytes:,} bytes")
     run.results(reports)
     tell_quality(run, wanted[0], small.splats)
 
 
-def _in_tiles(
-    run: Run,
-    scene: Path,
-    tiling: Tiling,
-    outputs: Outputs,
-    budgets: Sequence[Budget],
-    config: SimplifyConfig,
-    *,
-    views: Any,
-    **options: Any,
-) -> None:
-    """Simplify tile by tile; finished steps stay in the work folder until it succeeds, or longer if named."""
-    from g2ard.jobs.tiled import simplify_in_tiles
-    from g2ard.stages.simplify.growth import say_gaps
-    from g2ard.system.peak_memory import peak_rss_of_all
+def _tell_plan(run: Run, reduce: Reduction, counts: Sequence[int]) -> None:
+    """Print the counts, and the rough time and memory of each."""
+    from g2ard.jobs.cost import cost_of_reduction
 
-    began, reports = time.perf_counter(), []
-    with working(run, tiling, views):
-        made = simplify_in_tiles(
-            scene,
-            budgets,
-            tiling,
-            views=views,
-            config=config,
-            seed=run.seed,
-            render_model=run.render_model,
-            counted=outputs.check,
-            **options,
-            **run.callbacks,
+    plans = []
+    for count in counts:
+        cost = cost_of_reduction(reduce, count)
+        run.answer(
+            f"{plural(count, 'Gaussian')}, weighed in {plural(cost.views, 'view')}: roughly "
+            f"{max(1, cost.seconds):.0f} s on two cores and {cost.bytes / 1e6:,.0f} MB"
         )
-        for at, (store, small) in enumerate(made):
-            place = outputs.paths(store.count)[at]
-            run.write(place, small, compare=True)
-            seconds = time.perf_counter() - began
-            merging = config.turned("default").resolved(antialiased=small.render_model == "antialiased")
-            reports.append(
-                {
-                    "input_count": store.count,
-                    "output_count": len(small),
-                    "tiles": list(small.counts),
-                    "notes": {note.code: note.count for note in store.notes},
-                    "seconds": {"total": seconds},
-                    "peak_rss_bytes": peak_rss_of_all(),
-                    "views": small.views,
-                    "unseen": small.unseen,
-                    "growth": small.growth,
-                    "opacity_lost": small.opacity_lost,
-                    "method": "default",
-                    "settings": listed(merging),
-                }
-            )
-            say_gaps(small.opacity_lost, run.say)
-            run.say(f"{place}: {len(small):,} of {store.count:,} Gaussians in {seconds:.1f} s")
-    run.results(reports)
+        told: dict[str, Any] = {"count": count, "views": cost.views, "stages": cost.stages}
+        plans.append({**told, "bytes": cost.bytes, "seconds": cost.seconds, **tiles_of(reduce.tiles)})
+    run.say_dry()
+    run.results(plans)
 
 
 def _report(
-    found: Scene, small: Simplified, config: SimplifyConfig, seconds: dict[str, float]
+    reduce: Reduction, small: Simplified, config: SimplifyConfig, seconds: dict[str, float]
 ) -> dict[str, Any]:
-    config = config.resolved(antialiased=small.splats.antialiased)
     return {
         **small.report.as_dict(),
         "method": config.method,
-        "settings": listed(config),
-        "notes": {note.code: note.count for note in found.notes},
+        "settings": listed(config.resolved(antialiased=reduce.splats.antialiased)),
+        "notes": {note.code: note.count for note in reduce.notes},
         "seconds": seconds,
-        "peak_rss_bytes": peak_rss(),
+        "peak_rss_bytes": peak_rss_of_all(),
     }
 
 
@@ -205,18 +173,17 @@ def _write_parents(run: Run, path: Path, small: Simplified) -> None:
         np.save(file, small.parents)
 
 
-def _tell(run: Run, scene: Path, small: Simplified, output: Path, seconds: float) -> None:
+def _tell(run: Run, scene: Path, reduce: Reduction, small: Simplified, output: Path, seconds: float) -> None:
     from g2ard.stages.simplify.growth import say_gaps
 
-    if run.verbose:
+    if run.verbose and small.report.rounds:
         _table(run, small)
-    total = small.report.input_count
-    share = (small.report.unseen or 0) / total
+    share = (small.report.unseen or 0) / reduce.total
     if share >= 0.02:
         run.say(f"note: no view sees {share:.0%} of the Gaussians; they are weighted by size only")
     say_gaps(small.report.opacity_lost, run.say)
-    say_weight(run, scene, output, small.splats)
-    run.say(f"{output}: {len(small.splats):,} of {plural(total, 'Gaussian')} in {seconds:.1f} s")
+    say_weight(run, scene, output, reduce.splats)  # a sample has as much SH
+    run.say(f"{output}: {len(small.splats):,} of {plural(reduce.total, 'Gaussian')} in {seconds:.1f} s")
 
 
 def _table(run: Run, small: Simplified) -> None:

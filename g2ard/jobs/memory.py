@@ -1,0 +1,185 @@
+"""Memory of scenes in one piece and in tiles, and the workers that fit, from counts alone."""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+from g2ard.errors import InputError, require
+from g2ard.io import open_stream
+from g2ard.io.stream import SceneStream
+from g2ard.io.tile_store import TileStore, row_width
+from g2ard.jobs.tiling import Tiling, cut_into, folder_of_tiles
+
+WHOLE_TIMES, LEVELS_TIMES = 3.6, 7.0
+"""Memory in one piece as a multiple of the scene's arrays: simplification, and levels without recovery."""
+
+_TASK_BYTES, _ROW_BYTES, _ROW_TIMES = 200_000_000, 290, 0.8
+"""Peak memory of a task: bytes of the program, bytes per Gaussian (halo included), and a multiple of its
+arrays. Measured: 1.95 GB for 5.5 million of SH 0, 0.98 GB for 1.8 million of SH 3
+(`docs/benchmarks.md`)."""
+
+RECOVERY_TIMES = 1.5
+"""Memory of recovering or scoring a tile, renders included, relative to merging it."""
+
+_LEAST_ROWS = 1000
+"""Rows of the smallest tiles that messages advise."""
+
+_HALO_TIMES = 1.5
+"""Rows of the largest tile, halo included, relative to `--tile-rows`, at most."""
+
+_MEMORY_SIZE = re.compile(r"(\d+(?:\.\d+)?)\s*([kKmMgGtT]?)(?:i?[bB])?")
+
+
+@dataclass(frozen=True)
+class TileMemory:
+    """Estimate of the memory that tiles of a scene take.
+
+    Args:
+        times: memory relative to merging a tile.
+        folder: folder of existing tiles, which `--tile-rows` cannot change; None if it can.
+    """
+
+    count: int
+    row_bytes: float
+    times: float = 1.0
+    folder: Path | None = None
+
+    def of(self, rows: int) -> int:
+        """Return the bytes of a task on this many rows, halo included."""
+        return _TASK_BYTES + int(self.times * rows * (_ROW_BYTES + _ROW_TIMES * self.row_bytes))
+
+    def advice(self, memory: int, most: int) -> str:
+        """Return a tile size, at most `most`, that fits into `memory` bytes, or the least that tiles take.
+
+        >>> TileMemory(60_000, 56).advice(210_000_000, 30_000)
+        '--tile-rows 19,000 takes less'
+        >>> TileMemory(60_000, 56).advice(100_000_000, 30_000)
+        'the least that tiles take is about 201 MB, with --tile-rows 1,000'
+        """
+        from g2ard.tiles.ingest import MOST_TILES
+
+        a_row = _HALO_TIMES * (self.of(1) - _TASK_BYTES)
+        least = min(max(_LEAST_ROWS, -(-self.count // MOST_TILES)), most)
+        rows = _rounded_down(min((memory - _TASK_BYTES) / a_row, most))
+        if rows >= least:
+            return f"{cut_into(self.folder, rows)} takes less"
+        need = amount(self.of(round(_HALO_TIMES * least)), up=True)
+        return f"the least that tiles take is about {need}, with {cut_into(self.folder, least)}"
+
+
+def amount(size: float, *, up: bool = False) -> str:
+    """Format bytes: whole megabytes below a gigabyte, at most two decimals above.
+
+    >>> amount(207_100_000), amount(207_100_000, up=True), amount(1_500_000_000), amount(20_349_000_000)
+    ('207 MB', '208 MB', '1.5 GB', '20.34 GB')
+    """
+    rounded = math.ceil if up else math.floor
+    if (megabytes := rounded(size / 1e6)) < 1000:
+        return f"{megabytes} MB"
+    return f"{rounded(size / 1e7) / 100:g} GB"
+
+
+def _rounded_down(value: float) -> int:
+    """Round down to two digits."""
+    step = 10 ** max(0, len(str(int(max(0, value)))) - 2)
+    return int(max(0, value) // step * step)
+
+
+def _limit_text(tiling: Tiling) -> str:
+    size = amount(tiling.usable_memory)
+    return f"--memory {size}" if tiling.memory else f"the {size} used of the machine's memory"
+
+
+def bytes_of(text: str) -> int:
+    """Parse a size such as 4GB, 500MB or 2GiB; units are powers of 1000, with an i of 1024.
+
+    >>> bytes_of("4GB"), bytes_of("1.5 gib")
+    (4000000000, 1610612736)
+    """
+    match = _MEMORY_SIZE.fullmatch(text.strip())
+    base = 1024 if "i" in text.lower() else 1000
+    size = (
+        0.0 if match is None else float(match[1]) * base ** ["", "k", "m", "g", "t"].index(match[2].lower())
+    )
+    require("memory", repr(text), size >= 1e6, "a size such as 4GB or 800MB")
+    return int(size)
+
+
+def check_whole_memory(scene: Path, tiling: Tiling, times: float, tile_times: float = 1.0) -> None:
+    """Reject a scene that takes more than `--memory` in one piece.
+
+    Args:
+        tiling: with the limit; nothing is checked without one.
+        times: memory in one piece relative to the scene's arrays.
+        tile_times: memory of a tile relative to merging it.
+    """
+    if tiling.memory is None:
+        return
+    stream = open_stream(scene)
+    row_bytes = 4 * row_width(stream.sh_degree)
+    need = _TASK_BYTES + int(times * stream.count * row_bytes)
+    if need > tiling.memory:
+        tiles = TileMemory(stream.count, row_bytes, tile_times, folder_of_tiles(scene))
+        raise InputError(
+            f"{stream.count:,} Gaussians in one piece take about {amount(need, up=True)}, "
+            f"{amount(_TASK_BYTES)} of it the program, more than {_limit_text(tiling)}; "
+            f"{tiles.advice(tiling.memory, max(1, stream.count // 2))}",
+            path=scene,
+        )
+
+
+@dataclass(frozen=True)
+class TilePlan:
+    """Tiles of a scene, and the workers that process them.
+
+    Args:
+        count: Gaussians of the scene.
+        tiles: number of tiles; expected, if they are not written yet.
+        bytes: peak memory of all processes together.
+    """
+
+    count: int
+    tiles: int
+    workers: int
+    bytes: int
+
+
+def plan_tiles(scene: TileStore | SceneStream, tiling: Tiling, times: float = 1.0) -> TilePlan:
+    """Return the tiles of a scene, written or not, and the number of workers that memory and cores allow.
+
+    Args:
+        times: memory of a tile relative to merging it.
+    """
+    from g2ard.tiles.pour import expected_tiles
+
+    memory, count, folder = tiling.usable_memory, scene.count, None
+    if isinstance(scene, TileStore):
+        number, most = len(scene.tiles), scene.settings.get("tile_rows")
+        largest = max(scene.tiles, key=lambda tile: tile.rows + tile.halo)
+        rows, halo = int(largest.rows), int(largest.halo)
+        folder = None if scene.folder.parent == tiling.folder else scene.folder
+    else:
+        number, most = expected_tiles(count, tiling.most_rows), tiling.most_rows
+        rows = -(-count // number)
+        halo = round((_HALO_TIMES - 1) * rows)
+    tiles = TileMemory(count, 4 * row_width(scene.sh_degree), times, folder)
+    need = tiles.of(rows + halo)
+    fit = memory // need
+    if fit > 1:  # several workers are processes beside this one
+        fit = max(1, (memory - _TASK_BYTES) // need)
+    if fit < 1:
+        raise InputError(
+            f"a tile of {rows:,} Gaussians and {halo:,} around it takes about "
+            f"{amount(need, up=True)}, {amount(_TASK_BYTES)} of it the program, more than "
+            f"{_limit_text(tiling)}; {tiles.advice(memory, most or rows)}"
+        )
+    if tiling.workers is not None and tiling.scheduler is None and tiling.workers > fit:
+        raise InputError(
+            f"--workers {tiling.workers} take about {amount(tiling.workers * need, up=True)}, more than "
+            f"{_limit_text(tiling)}; --workers {fit} fit"
+        )
+    workers = tiling.workers or max(1, min(fit, tiling.usable_cores))
+    return TilePlan(count, number, workers, workers * need + (_TASK_BYTES if workers > 1 else 0))
