@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -126,10 +127,22 @@ class RunFolder:
                 if self.scene.exists() and not (self._run.overwrite or left_at(self.work)):
                     raise OutputError("exists", path=self.path, hint="{overwrite=True} replaces it")
                 drop_temporaries(self.path)
-                with nullcontext() if job.tiles else self._checkpoints(job):
+                with self._marked() if job.tiles else self._checkpoints(job):
                     yield
         finally:
             drop_empty(made)
+
+    @contextmanager
+    def _marked(self) -> Iterator[None]:
+        """Mark the folder as this run's, whose finished steps are elsewhere, until all its files are written."""
+        if self.work.exists() and not self._resume:
+            shutil.rmtree(self.work)
+        self.work.mkdir(exist_ok=True)
+        try:
+            yield
+            shutil.rmtree(self.work)
+        finally:
+            drop_empty([self.work])
 
     @contextmanager
     def _checkpoints(self, job: DistillJob | TiledJob) -> Iterator[None]:
@@ -153,6 +166,7 @@ class RunFolder:
         targets, which score the file later, a lossy file is compared with the scene.
         """
         run = self._run
+        (self.work / "written").touch()  # from now on, --resume may replace this run's files
         run.write(self.scene, done.splats, overwrite=True, compare=targets is None)
         pages = (self.path / name for name in ("report.json", "report.html", _PICTURE, "view.html"))
         for other in (*self._other_scenes(), *pages):

@@ -16,7 +16,7 @@ from g2ard.cli.frame import Run
 from g2ard.config.choices import is_made
 from g2ard.errors import G2ardError, OutputError
 from g2ard.io.atomic import drop_empty, hidden_name, parents_made
-from g2ard.io.lock import locked
+from g2ard.io.lock import check_unlocked, locked
 
 if TYPE_CHECKING:
     from g2ard.jobs.tiling import Tiling
@@ -107,6 +107,14 @@ def working(run: Run, tiling: Tiling, *views: Any, again: str = "") -> Iterator[
             folder.rmdir()  # where the lock had to go first
     finally:
         drop_empty(above)
+
+
+def drop_work(tiling: Tiling) -> None:
+    """Remove the tiles and steps of a run that was killed after its last output."""
+    if not tiling.keep and tiling.folder.exists():
+        _check_folder(tiling.folder)
+        check_unlocked(tiling.folder)
+        shutil.rmtree(tiling.folder, ignore_errors=True)
 
 
 def _check_folder(folder: Path) -> None:

@@ -12,7 +12,7 @@ from g2ard.cli import options as opt
 from g2ard.cli.frame import Run, command
 from g2ard.cli.outputs import budget_of, refuse_file
 from g2ard.cli.run_result import say_fit, tell_plan, tell_run, told
-from g2ard.cli.tiling import tiling_of, working
+from g2ard.cli.tiling import drop_work, tiling_of, working
 from g2ard.config.choices import is_made
 from g2ard.io import kind
 
@@ -104,6 +104,7 @@ def distill(
     run.claim("--output", output, folder=True)
     folder = RunFolder(run, output, f"scene.{format}", resume)
     if not dry_run and (finished := folder.check(budget)):
+        drop_work(tiling_of(run, scene, output))
         run.result(finished)
         return
     if scene is not None:
