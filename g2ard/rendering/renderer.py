@@ -1,4 +1,4 @@
-"""CPU renderer: numpy in, numpy out."""
+"""Renderer: numpy in, numpy out."""
 
 from __future__ import annotations
 
@@ -173,13 +173,13 @@ class Renderer:
         self._rasterizer = _core.Rasterizer()
 
     def image(self, camera: Camera) -> _Floats:
-        """Render the (H, W, 3) image only, see `Rendered.image`; faster than `render`.
+        """Render the (H, W, 3) image only, see `Rendered.image`; faster than `render`, and by gsplat's
+        convention on the device in use (`system.devices`).
 
         Raises:
             InputError: an invalid camera, see `Cameras`.
         """
-        image, _, _, _ = self._forward(camera, 0)
-        return image
+        return self._rasterizer.image(self._arrays, self._view(camera), self._settings, self.background)
 
     def clipped(self, camera: Camera) -> _Floats:
         """Return `image` clipped to [0, 1], as photos are."""
@@ -252,9 +252,11 @@ class Renderer:
     def _forward(
         self, camera: Camera, depths: int
     ) -> tuple[_Floats, _Floats, _Floats | None, _Floats | None]:
-        here = Cameras.of([camera]).recentred(self._offset)
-        view = view_of(here, 0, self._settings)
+        view = self._view(camera)
         return self._rasterizer.forward(self._arrays, view, self._settings, self.background, depths)
+
+    def _view(self, camera: Camera) -> View:
+        return view_of(Cameras.of([camera]).recentred(self._offset), 0, self._settings)
 
 
 @checks_arguments

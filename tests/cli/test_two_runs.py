@@ -18,7 +18,7 @@ COMMANDS = {
     "lod ball.ply -r 4,8 --merge-only --views views.json -o levels": "g2ard.jobs.levels.preparing_levels",
     "simplify ball.ply -r 8 --no-views -o out.ply": "g2ard.cli.frame.write_scene",
     "select ball.ply --views views.json -k 3 -o out.json": "g2ard.cli.frame.write_views",
-    "render ball.ply --views views.json -o out": "g2ard.rendering.renderer.Renderer.render",
+    "render ball.ply --views views.json -o out": "g2ard.rendering.renderer.Renderer.image",
 }
 """Command → the function in it that begins another run of the same command."""
 

@@ -65,3 +65,13 @@ def gpu_digest() -> str:
     """Return a hash of a result that a GPU may compute."""
     means = simplify(checkered_ball(2000), 200, method="paper").splats.means
     return hashlib.sha256(np.ascontiguousarray(means).tobytes()).hexdigest()
+
+
+def renderer_of_a_ball() -> Renderer:
+    """Return a renderer of a scene that is always the same."""
+    return Renderer(checkered_ball(500))
+
+
+def image_digest(renderer: Renderer) -> str:
+    """Return a hash of an image that a GPU may draw."""
+    return hashlib.sha256(renderer.image(around(1)[0]).tobytes()).hexdigest()

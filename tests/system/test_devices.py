@@ -5,6 +5,8 @@ import os
 import subprocess
 import sys
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +18,7 @@ from g2ard.errors import InputError
 from g2ard.io import read_splats, write_splats, write_views
 from g2ard.poses import make_pool
 from g2ard.rendering.metrics import psnr
-from g2ard.rendering.renderer import Renderer
+from g2ard.rendering.renderer import RasterSettings, Renderer
 from g2ard.rendering.targets import TeacherRenders
 from g2ard.rendering.visibility import visibility_source
 from g2ard.scene.cameras import Cameras
@@ -156,6 +158,92 @@ def test_simplify_reports_that_the_gpu_looked(
         assert len(read_splats(tmp_path / "c.ply")) == 100
 
 
+IMAGES = [
+    RasterSettings(),
+    RasterSettings(antialiased=True, near=2.5),
+    RasterSettings(alpha_max=0.999, near=0.2),
+]
+
+
+@pytest.mark.parametrize("settings", IMAGES, ids=["plain", "antialiased", "older"])
+@pytest.mark.parametrize("offset", [0.0, 600_000.0])
+def test_images_are_drawn_on_the_gpu(settings: RasterSettings, offset: float, gpu: None) -> None:
+    ball, views = checkered_ball(2000), around(3, (75, 50)).recentred([-offset, 0.0, 0.0])
+    ball = replace(ball, means=ball.means + np.array([offset, 0.0, 0.0]))
+    background = (0.1, 0.2, 0.3)
+    devices.use("cpu")
+    here = Renderer(ball, background=background, settings=settings)
+    want = [here.image(view) for view in views]
+    devices.use("gpu")
+    there = Renderer(ball, background=background, settings=settings)
+    got = [there.image(view) for view in views]
+    assert served() == 1
+    np.testing.assert_allclose(got, want, rtol=0, atol=1e-5)
+    np.testing.assert_array_equal([there.image(view) for view in views], got)
+    assert np.std(got) > 0.01
+
+
+def test_what_the_gpu_does_not_draw_is_the_cpus(gpu: None) -> None:
+    """Depths, panoramas and gradients, also after an image of the GPU's, and INRIA's convention."""
+    ball, view = checkered_ball(500), around(1, (48, 40))[0]
+    gradient = np.ones((40, 48, 3), np.float32)
+    made = []
+    for device in ("cpu", "gpu"):
+        devices.use(device)
+        renderer, inria = Renderer(ball), Renderer(ball, settings=RasterSettings(convention="inria"))
+        around_it = renderer.panorama(view, width=32).image
+        renderer.image(view)
+        slope = renderer.pose_gradient(gradient)
+        rendered = renderer.render(view, median=True)
+        made.append(
+            [around_it, slope, rendered.image, rendered.depth, rendered.median, inria.image(view)],
+        )
+    assert served() == 1
+    for here, there in zip(*made, strict=True):
+        np.testing.assert_array_equal(here, there)
+
+
+@pytest.mark.parametrize("most", [64, 40_000, 200_000], ids=["to open", "for a scene", "for a view"])
+def test_images_are_the_cpus_if_a_gpu_has_no_room(most: int, gpu: None) -> None:
+    ball, views = checkered_ball(600), around(3, (160, 120))
+    devices.use("cpu")
+    want = [Renderer(ball).image(view) for view in views]
+    _core.set_device("gpu", most)
+    renderer = Renderer(ball)
+    np.testing.assert_array_equal([renderer.image(view) for view in views], want)
+    assert len(devices.notes()) == 1
+    np.testing.assert_array_equal(Renderer(ball).image(views[0]), want[0])
+    assert devices.notes() == []
+
+
+def test_threads_share_a_renderer_on_the_gpu(gpu: None) -> None:
+    renderer, views = Renderer(checkered_ball(500)), around(6, (48, 36))
+    want = [renderer.image(view) for view in views]
+    with ThreadPoolExecutor(3) as pool:
+        np.testing.assert_array_equal(list(pool.map(renderer.image, views)), want)
+    assert served() == 1
+
+
+DRAWING = {
+    "render": "render a.ply -o out",
+    "evaluate": "evaluate b.ply --teacher a.ply --split all",
+    "compare": "compare a.ply b.ply",
+    "recover": "recover b.ply --teacher a.ply --steps 4 -o c.ply",
+    "adapt": "adapt b.ply --teacher a.ply --steps 4 -o c.ply",
+}
+
+
+@pytest.mark.parametrize("name", DRAWING)
+def test_commands_draw_on_the_gpu(name: str, tmp_path: Path, command_line: CommandLine, gpu: None) -> None:
+    write_splats(tmp_path / "a.ply", checkered_ball(300))
+    write_splats(tmp_path / "b.ply", checkered_ball(200))
+    write_views(tmp_path / "v.json", around(4, (48, 36)))
+    run = (*DRAWING[name].split(), "--views", "v.json", "--json", "-", "--device", "gpu")
+    out, told = succeeds(command_line, tmp_path, *run)
+    assert "on the CPU" not in told
+    assert json.loads(out)["device"]["kernels"] >= (3 if name in ("recover", "adapt") else 1)
+
+
 def test_refuses_other_names() -> None:
     with pytest.raises(InputError, match="abacus"):
         devices.use("abacus")
@@ -208,7 +296,9 @@ def test_recovery_continues_on_the_cpu_if_a_gpu_has_no_room(most: int, gpu: None
     want = recover(ball, targets, config)
     _core.set_device("gpu", most)
     found = recover(ball, targets, config)
-    assert len(devices.notes()) == 1
+    notes = devices.notes()
+    assert 1 <= len(notes) <= 2  # of steps and of images
+    assert all(note.endswith("goes on on the CPU") for note in notes)
     assert_same_bits(want.splats, found.splats)
     assert want.report.loss == found.report.loss
 
@@ -225,7 +315,7 @@ def test_recover_says_that_the_gpu_took_its_steps(
         for device in ("cpu", "gpu")
     }
     assert "on the CPU" not in told["gpu"]
-    assert ("GPU: 1 kernel" in told["gpu"], "GPU: " in told["cpu"]) == (True, False)
+    assert ("GPU: " in told["gpu"], "GPU: " in told["cpu"]) == (True, False)
 
 
 @pytest.mark.parametrize("kilobytes", [600_000, 3_000_000])

@@ -80,6 +80,23 @@ if _core.adapters():
         return got
     in_child(answered, cpu)
 """,
+    "with a scene on a device": """
+from helpers.forked import image_digest, renderer_of_a_ball
+cpu = image_digest(renderer_of_a_ball())
+if _core.adapters():
+    _core.set_device("gpu")
+    held = [renderer_of_a_ball()]
+    gpu = image_digest(held[0])
+    assert _core.device_state()["served"] == 1, _core.device_notes()
+    def answered():
+        got = image_digest(held[0])
+        notes = _core.device_notes()
+        assert len(notes) == 1 and "spawn" in notes[0], notes
+        held.clear()
+        return got
+    in_child(answered, cpu)
+    assert image_digest(held[0]) == gpu
+""",
 }
 
 

@@ -132,14 +132,17 @@ def render(
     renderer = Renderer(splats, background=colour, settings=RasterSettings(convention=convention))
     with nullcontext() if output is None else atomic_folder(output, run.overwrite) as folder:
         for view in range(len(cameras)):
+            camera = cameras[view]
+            rendered: Rendered | None = None
             if around:
-                rendered = renderer.panorama(cameras[view], width=2 * max(2, (size or _PANORAMA) // 2))
-            else:
-                rendered = renderer.render(cameras[view])
+                rendered = renderer.panorama(camera, width=2 * max(2, (size or _PANORAMA) // 2))
+            elif depth:
+                rendered = renderer.render(camera)
+            image = renderer.image(camera) if rendered is None else rendered.image
             if wanted:
-                shown.append(to_bytes(rendered.image))
+                shown.append(to_bytes(image))
             if folder is not None:
-                _write_view(folder / places[view], rendered, depth)
+                _write_view(folder / places[view], image, rendered.depth if rendered and depth else None)
             run.progress("render", view + 1, len(cameras))
     run.kept += [f"{output} is written"] if output is not None else []
     if animation is not None:
@@ -177,17 +180,17 @@ def _files(stem: Path, depth: bool) -> list[Path]:
     return [stem.with_name(stem.name + suffix) for suffix in (".png", ".depth.npy")[: 1 + depth]]
 
 
-def _write_view(stem: Path, rendered: Rendered, depth: bool) -> None:
+def _write_view(stem: Path, image: NDArray[np.float32], depth: NDArray[np.float32] | None) -> None:
     """Write the files of one view."""
     import numpy as np
 
     from g2ard.io.images import write_png
 
-    picture, *depths = _files(stem, depth)
+    picture, *depths = _files(stem, depth is not None)
     picture.parent.mkdir(parents=True, exist_ok=True)
-    write_png(picture, rendered.image)
-    for path in depths:
-        np.save(path, rendered.depth)
+    write_png(picture, image)
+    if depth is not None:
+        np.save(depths[0], depth)
 
 
 def _write_sheet(

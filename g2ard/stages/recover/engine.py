@@ -65,7 +65,10 @@ class Engine(Protocol):
         regularize: bool,
         mask: NDArray[np.bool_] | None = None,
     ) -> float:
-        """Take one optimiser step on one view; return its photometric loss."""
+        """Take one optimiser step on one view; return its photometric loss.
+
+        A view's target and mask are the same in all steps, so an engine may keep them.
+        """
 
     def splats(self) -> Splats:
         """Return the current scene, with normalised quaternions."""

@@ -53,6 +53,7 @@ class FusedEngine:
             objective.regularizers if regularize else None,
             mask,
             TYPICAL_LOSS if objective.relative else None,
+            view,
         )
         return loss
 

@@ -1,10 +1,11 @@
 //! The backend that callers use: GPU kernels while they work, then the CPU, with the reasons.
 
+use std::collections::HashSet;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
 
 use g2ard_core::raster::visibility::{VisibilityAccumulator, VisibilityKernels};
-use g2ard_core::raster::{Camera, Params, Settings};
+use g2ard_core::raster::{Camera, Convention, Params, Settings};
 use g2ard_core::select::{Gaussians, Surface, ViewKernels};
 use g2ard_core::simplify::{Group, GroupKernels, Merged};
 use g2ard_core::spatial::Cells;
@@ -12,7 +13,7 @@ use g2ard_core::train::{Store, Train, TrainKernels};
 use g2ard_core::{Backend, Control, Cpu, Result, Splats};
 
 use crate::rows::{Rows, Run};
-use crate::runtime::{self, Error, Gpu, Options, guarded, lock};
+use crate::runtime::{self, Error, Gpu, Options, Owned, guarded, lock};
 use crate::{groups, probe, train, visibility, voxels};
 
 #[cfg(test)]
@@ -33,67 +34,58 @@ pub enum Choice {
 const WORTH_OPENING: usize = 200_000;
 const WORTH_TRAINING: usize = 10_000;
 
+/// Number of images of one scene before opening a device pays.
+const WORTH_DRAWING: usize = 8;
+
 /// A backend that runs GPU kernels. After a device fails, it uses the CPU and does not retry.
 #[derive(Debug, Default)]
 pub struct Device {
     choice: Choice,
     options: Options,
     state: Mutex<State>,
-    /// The state for training, which may pay where single kernels do not, and fail alone.
+    /// The state for training and images, which may pay where single kernels do not, and fail alone.
     training: Mutex<State>,
-    notes: Mutex<Vec<String>>,
+    notes: Mutex<Notes>,
     /// Kernels that ran on the GPU.
     served: AtomicU64,
+}
+
+/// Messages for the user: those to tell, and all so far, because smaller scenes try a device again.
+#[derive(Debug, Default)]
+struct Notes {
+    pending: Vec<String>,
+    all: HashSet<String>,
 }
 
 #[derive(Debug, Default)]
 enum State {
     #[default]
     Untried,
-    Open(Opened),
+    Open(Owned<Arc<Gpu>>),
     Off,
 }
 
 impl State {
     fn gpu(&self) -> Option<Arc<Gpu>> {
         match self {
-            Self::Open(opened) if !opened.inherited() => opened.gpu.clone(),
+            Self::Open(opened) => opened.get().ok().cloned(),
             _ => None,
         }
     }
 }
 
-/// A device and the process that opened it. In a forked child the driver has neither its threads nor its connections, so
-/// the child does not even close the device.
-#[derive(Debug)]
-struct Opened {
-    gpu: Option<Arc<Gpu>>,
-    process: u32,
+/// What a device keeps of a scene between two images of it.
+pub enum Drawn {
+    /// Nothing; the CPU has drawn so many images.
+    Nothing(usize),
+    Scene(Box<train::Images>),
+    /// Nothing ever, because the device has failed.
+    Never,
 }
 
-impl Opened {
-    fn new(gpu: Gpu) -> Self {
-        Self::sharing(Arc::new(gpu))
-    }
-
-    fn sharing(gpu: Arc<Gpu>) -> Self {
-        Self {
-            gpu: Some(gpu),
-            process: std::process::id(),
-        }
-    }
-
-    /// Whether the device is a forked child's parent's.
-    fn inherited(&self) -> bool {
-        self.process != std::process::id()
-    }
-}
-
-impl Drop for Opened {
-    fn drop(&mut self) {
-        if self.inherited() {
-            std::mem::forget(self.gpu.take());
-        }
+impl Default for Drawn {
+    fn default() -> Self {
+        Self::Nothing(0)
     }
 }
 
@@ -108,7 +100,7 @@ impl Device {
 
     /// Messages for the user since the last call.
     pub fn notes(&self) -> Vec<String> {
-        std::mem::take(&mut *lock(&self.notes))
+        std::mem::take(&mut lock(&self.notes).pending)
     }
 
     /// Number of kernels that ran on the GPU.
@@ -141,7 +133,7 @@ impl Device {
                 }),
             };
             *state = match opened {
-                Ok(Some(gpu)) => State::Open(Opened::new(gpu)),
+                Ok(Some(gpu)) => State::Open(Owned::new(Arc::new(gpu))),
                 Ok(None) => State::Off,
                 Err(error) => {
                     self.note(&error);
@@ -161,7 +153,7 @@ impl Device {
         }
     }
 
-    /// The device for training `rows` rows.
+    /// The device for training or drawing `rows` rows.
     fn trains(&self, rows: usize) -> Option<Arc<Gpu>> {
         let mut state = lock(&self.training);
         if matches!(&*state, State::Open(opened) if opened.inherited()) {
@@ -178,7 +170,7 @@ impl Device {
                 }),
                 Choice::Gpu => self.ready(rows),
             };
-            *state = gpu.map_or(State::Off, |gpu| State::Open(Opened::sharing(gpu)));
+            *state = gpu.map_or(State::Off, |gpu| State::Open(Owned::new(gpu)));
         }
         state.gpu()
     }
@@ -197,7 +189,60 @@ impl Device {
         Ok(probe::training_pays(&gpu)?.then_some(gpu))
     }
 
-    /// Train on the CPU from now on, because a trainer failed.
+    /// Draw an image of a scene: always the same one with the same `drawn`. None if the CPU must draw.
+    pub fn image(
+        &self,
+        drawn: &mut Drawn,
+        params: &Params,
+        camera: &Camera,
+        settings: &Settings,
+        background: [f32; 3],
+    ) -> Result<Option<Vec<f32>>> {
+        params.validate()?;
+        camera.validate()?;
+        settings.validate()?;
+        if self.choice == Choice::Cpu || settings.convention != Convention::Gsplat {
+            return Ok(None);
+        }
+        let found = match drawn {
+            Drawn::Never => return Ok(None),
+            Drawn::Scene(scene) => scene.draw(camera, settings, background),
+            Drawn::Nothing(earlier) => {
+                let Some(gpu) = self.draws(params.len(), *earlier) else {
+                    *earlier += 1;
+                    return Ok(None);
+                };
+                train::Images::new(gpu, params).and_then(|mut scene| {
+                    let image = scene.draw(camera, settings, background)?;
+                    self.served.fetch_add(1, Ordering::Relaxed);
+                    *drawn = Drawn::Scene(Box::new(scene));
+                    Ok(image)
+                })
+            }
+        };
+        Ok(found
+            .inspect_err(|error| {
+                *drawn = Drawn::Never;
+                match error {
+                    // Smaller scenes may fit.
+                    Error::OutOfMemory | Error::NoRoom { .. } => self.note(error),
+                    _ if error.is_of_size() => self.note(error),
+                    _ => self.stop_training(&error.to_string()),
+                }
+            })
+            .ok())
+    }
+
+    /// The device for images of a scene of `rows` rows, of which the CPU drew `earlier` ones.
+    fn draws(&self, rows: usize, earlier: usize) -> Option<Arc<Gpu>> {
+        let untried = matches!(*lock(&self.training), State::Untried);
+        if self.choice == Choice::Auto && untried && earlier < WORTH_DRAWING {
+            return None;
+        }
+        self.trains(rows)
+    }
+
+    /// Train and draw on the CPU from now on, because the device failed.
     pub fn stop_training(&self, why: &str) {
         self.note(&why);
         *lock(&self.training) = State::Off;
@@ -206,8 +251,8 @@ impl Device {
     fn note(&self, error: &impl std::fmt::Display) {
         let line = format!("GPU: {error}; goes on on the CPU");
         let mut notes = lock(&self.notes);
-        if !notes.contains(&line) {
-            notes.push(line);
+        if notes.all.insert(line.clone()) {
+            notes.pending.push(line);
         }
     }
 

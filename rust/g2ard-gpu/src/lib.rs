@@ -17,4 +17,4 @@ mod two;
 mod visibility;
 mod voxels;
 
-pub use device::{Choice, Device};
+pub use device::{Choice, Device, Drawn};

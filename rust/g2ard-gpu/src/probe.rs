@@ -104,6 +104,7 @@ fn steps(trainer: &mut dyn Train, [width, height]: [usize; 2]) -> Result<(f64, D
         background: [0.0; 3],
         target: &target,
         mask: None,
+        view: None,
         ssim_weight: 0.2,
         relative: None,
         rates: Rates {

@@ -4,6 +4,8 @@ use std::sync::{Arc, PoisonError, RwLock};
 
 #[cfg(not(feature = "gpu"))]
 use g2ard_core::Cpu;
+use g2ard_core::Result;
+use g2ard_core::raster::{Camera, Params, Settings};
 #[cfg(feature = "gpu")]
 use g2ard_gpu::{Choice, Device, runtime};
 use pyo3::exceptions::PyValueError;
@@ -35,6 +37,35 @@ pub fn stop_training(why: &str) {
 /// No other device trains in this build.
 #[cfg(not(feature = "gpu"))]
 pub fn stop_training(_why: &str) {}
+
+#[cfg(feature = "gpu")]
+pub use g2ard_gpu::Drawn;
+#[cfg(not(feature = "gpu"))]
+pub type Drawn = ();
+
+/// Draw an image on the device in use; None if the CPU must draw. With `drawn` the scene must stay the same.
+#[cfg(feature = "gpu")]
+pub fn image(
+    drawn: &mut Drawn,
+    params: &Params,
+    camera: &Camera,
+    settings: &Settings,
+    background: [f32; 3],
+) -> Result<Option<Vec<f32>>> {
+    kernels().image(drawn, params, camera, settings, background)
+}
+
+/// No other device draws in this build.
+#[cfg(not(feature = "gpu"))]
+pub fn image(
+    _drawn: &mut Drawn,
+    _params: &Params,
+    _camera: &Camera,
+    _settings: &Settings,
+    _background: [f32; 3],
+) -> Result<Option<Vec<f32>>> {
+    Ok(None)
+}
 
 /// Choose cpu, gpu or auto for all kernels from now on. For tests, `max_binding` limits the bytes bound at once;
 /// `timed` measures the time of every kernel.

@@ -3,7 +3,8 @@
 use g2ard_core::Result;
 use g2ard_core::raster::simd::Isa;
 use g2ard_core::raster::{
-    Accumulated, Gradients, Image, ImageGradients, Params, PoseGradient, Rasterizer,
+    Accumulated, Camera, Gradients, Image, ImageGradients, Params, PoseGradient, Rasterizer,
+    Settings,
 };
 use numpy::{IntoPyArray, PyArray1, PyArrayMethods, PyReadonlyArrayDyn, PyUntypedArrayMethods};
 use pyo3::prelude::*;
@@ -13,6 +14,7 @@ use std::sync::{Mutex, PoisonError};
 use std::thread::{self, ThreadId};
 
 use crate::arrays::{flat, optional};
+use crate::device::{self, Drawn};
 use crate::error::{invalid, to_py};
 use crate::views::{RasterOptions, View};
 use crate::work;
@@ -72,6 +74,40 @@ struct Rendering {
     inner: Rasterizer,
     /// The thread of the last forward pass.
     thread: ThreadId,
+    /// The scene that `image` drew last, and what a device keeps of it.
+    scene: Option<(Py<PyAny>, Drawn)>,
+    /// The last image if a device drew it, without the forward pass that gradients need.
+    elsewhere: Option<(Camera, Settings, [f32; 3])>,
+}
+
+impl Rendering {
+    /// Repeat the last forward pass on the CPU if it was a device's.
+    fn bring_back(&mut self, params: &Params) -> Result<()> {
+        if let Some((camera, settings, background)) = self.elsewhere.take() {
+            self.here(params, &camera, &settings, background)?;
+        }
+        Ok(())
+    }
+
+    /// Draw an image on the CPU.
+    fn here(
+        &mut self,
+        params: &Params,
+        camera: &Camera,
+        settings: &Settings,
+        background: [f32; 3],
+    ) -> Result<Vec<f32>> {
+        let pixels = camera.width * camera.height;
+        let (mut rgb, mut alpha) = (vec![0f32; 3 * pixels], vec![0f32; pixels]);
+        let mut image = Image {
+            rgb: &mut rgb,
+            alpha: &mut alpha,
+            depth: None,
+            median: None,
+        };
+        (self.inner).forward(params, camera, settings, background, &mut image)?;
+        Ok(rgb)
+    }
 }
 
 type Array<'py, D> = Bound<'py, numpy::PyArray<f32, D>>;
@@ -94,7 +130,45 @@ impl PyRasterizer {
         Ok(Self(Mutex::new(Rendering {
             inner: Rasterizer::new(isa_named(isa)?),
             thread: thread::current().id(),
+            scene: None,
+            elsewhere: None,
         })))
+    }
+
+    /// Return the image (H, W, 3) alone, drawn by the device in use. A device keeps the scene while the same tuple of
+    /// arrays is passed, whose values must not change.
+    fn image<'py>(
+        &self,
+        py: Python<'py>,
+        scene: &Bound<'py, PyAny>,
+        view: View,
+        options: RasterOptions,
+        background: [f32; 3],
+    ) -> PyResult<Array<'py, numpy::Ix3>> {
+        let arrays: Arrays<'_> = scene.extract()?;
+        let params = arrays.params()?;
+        let (camera, settings) = (view.camera(), options.settings()?);
+        camera.validate().map_err(to_py)?;
+        let mut rendering = work::locked(py, &self.0);
+        let rendering = &mut *rendering;
+        let last = rendering.scene.take();
+        let mut drawn = match last {
+            Some((same, drawn)) if same.is(scene) => drawn,
+            _ => Drawn::default(),
+        };
+        let (rgb, elsewhere) = work::quick(py, || {
+            let there = device::image(&mut drawn, &params, &camera, &settings, background)?;
+            let elsewhere = there.is_some();
+            let rgb = match there {
+                Some(rgb) => rgb,
+                None => rendering.here(&params, &camera, &settings, background)?,
+            };
+            Ok((rgb, elsewhere))
+        })?;
+        rendering.scene = Some((scene.clone().unbind(), drawn));
+        rendering.thread = thread::current().id();
+        rendering.elsewhere = elsewhere.then_some((camera, settings, background));
+        PyArray1::from_vec(py, rgb).reshape([camera.height, camera.width, 3])
     }
 
     /// Return image (H, W, 3), alpha (H, W), depth (H, W) and median depth (H, W); the first `depths` of the two
@@ -135,6 +209,7 @@ impl PyRasterizer {
             Ok((rgb, alpha, depth, median))
         })?;
         rendering.thread = thread::current().id();
+        rendering.elsewhere = None;
         let shape = [height, width];
         Ok((
             PyArray1::from_vec(py, rgb).reshape([height, width, 3])?,
@@ -161,7 +236,7 @@ impl PyRasterizer {
             depth: optional("depth gradient", &depth)?,
         };
         let mut rendering = work::locked(py, &self.0);
-        let inner = &mut rendering.inner;
+        let rendering = &mut *rendering;
         let out = work::quick(py, || {
             let mut out = [
                 params.means,
@@ -181,7 +256,8 @@ impl PyRasterizer {
                 sh0,
                 sh_n,
             };
-            inner.backward(&params, &gradients, &mut rows)?;
+            rendering.bring_back(&params)?;
+            (rendering.inner).backward(&params, &gradients, &mut rows)?;
             Ok(out)
         })?;
         let shapes = [
@@ -211,8 +287,11 @@ impl PyRasterizer {
             let expected = "a render before it in the same thread";
             return Err(invalid("pose gradient", expected, "another thread's"));
         }
-        let inner = &mut rendering.inner;
-        work::quick(py, || inner.pose_gradient(&params, &gradients))
+        let rendering = &mut *rendering;
+        work::quick(py, || {
+            rendering.bring_back(&params)?;
+            rendering.inner.pose_gradient(&params, &gradients)
+        })
     }
 }
 

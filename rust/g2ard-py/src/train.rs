@@ -100,6 +100,7 @@ impl PyTrainer {
             background: self.background,
             target,
             mask: None,
+            view: None,
             ssim_weight: self.ssim_weight,
             relative: None,
             rates: Rates::default(),
@@ -171,8 +172,9 @@ impl PyTrainer {
         noted(trained.inner.freeze(frozen)).map_err(to_py)
     }
 
-    /// Take one step; return (photometric loss before it, Gaussians moved). `mask`: where the loss counts.
-    #[pyo3(signature = (view, target, rates, regularizers = None, mask = None, relative = None))]
+    /// Take one step; return (photometric loss before it, Gaussians moved). `mask`: where the loss counts. `number`: of a
+    /// view whose target and mask are the same in all steps.
+    #[pyo3(signature = (view, target, rates, regularizers = None, mask = None, relative = None, number = None))]
     #[expect(clippy::too_many_arguments, reason = "Python's signature")]
     fn step(
         &self,
@@ -183,11 +185,13 @@ impl PyTrainer {
         regularizers: Option<Config<Regularizers>>,
         mask: Option<PyReadonlyArray2<'_, bool>>,
         relative: Option<f32>,
+        number: Option<u32>,
     ) -> PyResult<(f64, usize)> {
         let camera = view.camera();
         let target = flat("target", &target)?;
         let input = StepInput {
             mask: optional("mask", &mask)?,
+            view: number,
             relative,
             reach: rates.reach_in(&camera),
             finest: rates.finest,

@@ -51,6 +51,8 @@ pub struct StepInput<'a> {
     pub target: &'a [f32],
     /// height × width: where the loss counts; `None` means everywhere.
     pub mask: Option<&'a [bool]>,
+    /// Number of the view if its target and mask are the same in all steps, so that a device may keep them.
+    pub view: Option<u32>,
     /// λ of (1 − λ)·L1 + λ·(1 − SSIM).
     pub ssim_weight: f32,
     /// Times the gradient of the loss's logarithm: all views then count alike, whatever their loss. `None` takes the

@@ -13,6 +13,7 @@ fn steps_give_the_same_bits_on_any_number_of_threads_and_learn() {
             background: [0.0; 3],
             target: &target,
             mask: None,
+            view: None,
             ssim_weight: 0.2,
             relative: None,
             rates: Rates {
@@ -59,6 +60,7 @@ fn moved(finest: f32) -> f32 {
         background: [0.0; 3],
         target: &target,
         mask: None,
+        view: None,
         ssim_weight: 0.2,
         relative: None,
         rates: Rates {

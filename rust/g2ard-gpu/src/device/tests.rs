@@ -195,7 +195,7 @@ fn a_forked_process_leaves_its_parents_device_alone() {
     assert_eq!(device.either(1, |_| Ok(8), || Ok(7)).unwrap(), 8);
     let opened = Arc::downgrade(&device.gpu().expect("an open device"));
     if let State::Open(opened) = &mut *lock(&device.state) {
-        opened.process ^= 1;
+        opened.fork();
     }
     assert!(device.gpu().is_none());
     for _ in 0..2 {
@@ -215,4 +215,140 @@ fn a_stop_is_no_failure() {
     let found = device.either(1, |_| Err(Error::Interrupted), || Ok(7));
     assert_eq!(found.unwrap_err(), g2ard_core::Error::Interrupted);
     assert!(device.notes().is_empty());
+}
+
+/// Splats as trainers and renderers take them, on a wavy sheet before a camera.
+struct Sheet {
+    rows: [Vec<f32>; 5],
+}
+
+impl Sheet {
+    fn new(count: usize) -> Self {
+        let splats = scenes(count).swap_remove(0).1;
+        let means = splats.means.as_flattened().iter().map(|&v| v as f32);
+        let scales = splats.scales.as_flattened().iter().map(|v| v.ln());
+        Self {
+            rows: [
+                means.collect(),
+                splats.quats.as_flattened().to_vec(),
+                scales.collect(),
+                splats.logit_opacities.clone(),
+                splats
+                    .sh
+                    .chunks(splats.sh_coeffs)
+                    .flat_map(|sh| sh[0])
+                    .collect(),
+            ],
+        }
+    }
+
+    fn params(&self) -> Params<'_> {
+        let [means, quats, log_scales, logit_opacities, sh0] = &self.rows;
+        Params {
+            means,
+            quats,
+            log_scales,
+            logit_opacities,
+            sh0,
+            sh_n: &[],
+            sh_coeffs: 1,
+        }
+    }
+}
+
+fn image(
+    device: &Device,
+    drawn: &mut Drawn,
+    sheet: &Sheet,
+    settings: Settings,
+) -> Option<Vec<f32>> {
+    let camera = Camera {
+        viewmat: [
+            [1.0, 0.0, 0.0, 0.0],
+            [0.0, 1.0, 0.0, 0.0],
+            [0.0, 0.0, 1.0, 8.0],
+        ],
+        fx: 40.0,
+        fy: 40.0,
+        cx: 20.0,
+        cy: 15.0,
+        width: 40,
+        height: 30,
+        near: 0.01,
+    };
+    let found = device.image(drawn, &sheet.params(), &camera, &settings, [0.0; 3]);
+    found.unwrap()
+}
+
+#[test]
+fn an_image_that_the_device_cannot_draw_is_left_to_the_cpu() {
+    let Some(device) = device(Options::default()) else {
+        return;
+    };
+    let (sheet, plain) = (Sheet::new(300), Settings::default());
+    let mut drawn = Drawn::default();
+    let convention = Convention::Inria;
+    let inria = Settings {
+        convention,
+        ..plain
+    };
+    assert!(image(&device, &mut drawn, &sheet, inria).is_none());
+    let first = image(&device, &mut drawn, &sheet, plain).unwrap();
+    assert!(first.iter().any(|v| *v > 0.0));
+    assert!(image(&device, &mut drawn, &sheet, plain).unwrap() == first);
+    assert_eq!((device.served(), device.notes()), (1, Vec::new()));
+    if let Drawn::Scene(scene) = &mut drawn {
+        scene.fork();
+    }
+    assert!(image(&device, &mut drawn, &sheet, plain).is_none());
+    let notes = device.notes();
+    assert!(notes.len() == 1 && notes[0].contains("spawn"), "{notes:?}");
+    assert!(image(&device, &mut Drawn::default(), &sheet, plain).is_none());
+    assert!(device.notes().is_empty());
+}
+
+#[test]
+fn a_scene_too_large_to_draw_leaves_smaller_ones_to_the_device() {
+    let max_binding = Some(1 << 17);
+    let options = Options {
+        max_binding,
+        ..Options::default()
+    };
+    let Some(device) = device(options) else {
+        return;
+    };
+    let (large, small) = (Sheet::new(3000), Sheet::new(1));
+    for notes in [1, 0] {
+        let mut drawn = Drawn::default();
+        assert!(image(&device, &mut drawn, &large, Settings::default()).is_none());
+        assert_eq!(device.notes().len(), notes);
+        assert!(image(&device, &mut drawn, &large, Settings::default()).is_none());
+        assert!(device.notes().is_empty());
+    }
+    let mut drawn = Drawn::default();
+    assert!(image(&device, &mut drawn, &small, Settings::default()).is_some());
+    device.gpu().expect("an open device").lose();
+    for notes in [1, 0] {
+        assert!(image(&device, &mut drawn, &small, Settings::default()).is_none());
+        assert_eq!(device.notes().len(), notes);
+        drawn = Drawn::default();
+    }
+}
+
+#[test]
+fn few_images_and_software_are_the_cpus() {
+    let sheet = Sheet::new(10);
+    for choice in [Choice::Cpu, Choice::Auto] {
+        let device = Device::new(choice, Options::default());
+        let mut drawn = Drawn::default();
+        for _ in 0..2 * WORTH_DRAWING {
+            assert!(image(&device, &mut drawn, &sheet, Settings::default()).is_none());
+        }
+        assert_eq!((device.served(), device.notes()), (0, Vec::new()));
+    }
+    let device = Device::new(Choice::Auto, Options::default());
+    assert!(device.draws(WORTH_TRAINING, WORTH_DRAWING - 1).is_none());
+    assert!(matches!(*lock(&device.training), State::Untried));
+    let _ = device.draws(WORTH_TRAINING, WORTH_DRAWING);
+    assert!(!matches!(*lock(&device.training), State::Untried));
 }

@@ -160,7 +160,7 @@ impl Gpu {
     pub fn upload<T: bytemuck::NoUninit>(&self, what: &'static str, data: &[T]) -> Result<Buffer> {
         let bytes: &[u8] = bytemuck::cast_slice(data);
         let buffer = self.buffer(what, bytes.len() / 4)?;
-        self.write(&buffer.inner, bytes);
+        self.write(&buffer.inner, 0, bytes);
         self.check()?;
         Ok(buffer)
     }
@@ -176,12 +176,17 @@ impl Gpu {
 
     /// Change constants before work that is submitted from now on.
     pub fn set_constants(&self, constants: &Constants, values: &[u32]) {
-        self.write(&constants.0, bytemuck::cast_slice(values));
+        self.write(&constants.0, 0, bytemuck::cast_slice(values));
     }
 
     /// Write the first words of a buffer before work that is submitted from now on.
     pub fn overwrite<T: bytemuck::NoUninit>(&self, buffer: &Buffer, data: &[T]) {
-        self.write(&buffer.inner, bytemuck::cast_slice(data));
+        self.overwrite_at(buffer, 0, data);
+    }
+
+    /// Write words of a buffer from the `first` one on, before work that is submitted from now on.
+    pub fn overwrite_at<T: bytemuck::NoUninit>(&self, buffer: &Buffer, first: usize, data: &[T]) {
+        self.write(&buffer.inner, 4 * first as u64, bytemuck::cast_slice(data));
     }
 
     pub(super) fn create(&self, label: &str, size: u64, usage: BufferUsages) -> wgpu::Buffer {
@@ -193,8 +198,8 @@ impl Gpu {
         })
     }
 
-    fn write(&self, buffer: &wgpu::Buffer, bytes: &[u8]) {
-        self.queue.write_buffer(buffer, 0, bytes);
+    fn write(&self, buffer: &wgpu::Buffer, at: u64, bytes: &[u8]) {
+        self.queue.write_buffer(buffer, at, bytes);
         self.sent.fetch_add(bytes.len() as u64, Ordering::Relaxed);
     }
 

@@ -40,6 +40,11 @@ enum Command {
         groups: [u32; 2],
     },
     Clear(wgpu::Buffer),
+    Copy {
+        from: wgpu::Buffer,
+        to: wgpu::Buffer,
+        bytes: u64,
+    },
 }
 
 /// Start and end of each kernel.
@@ -60,12 +65,13 @@ pub struct Pending<'a> {
 
 impl<'a> Work<'a> {
     pub fn new(gpu: &'a Gpu) -> Self {
-        Self::of(gpu, Program::default())
+        let program = Program::default();
+        Self { gpu, program }
     }
 
-    /// Work that begins with a program.
-    pub fn of(gpu: &'a Gpu, program: Program) -> Self {
-        Self { gpu, program }
+    /// Run a program.
+    pub fn append(&mut self, program: &Program) {
+        self.program.0.extend_from_slice(&program.0);
     }
 
     /// The commands, to run them many times.
@@ -139,6 +145,15 @@ impl<'a> Work<'a> {
         self.program.0.push(Command::Clear(buffer.inner.clone()));
     }
 
+    /// Copy a buffer to the beginning of another.
+    pub fn copy(&mut self, from: &Buffer, to: &Buffer) {
+        self.program.0.push(Command::Copy {
+            from: from.inner.clone(),
+            to: to.inner.clone(),
+            bytes: 4 * from.words() as u64,
+        });
+    }
+
     /// Submit the work. Each of `reads` is a buffer and the number of its first words to read when the work is done.
     pub fn submit(self, reads: &[(&Buffer, usize)]) -> Result<Pending<'a>> {
         let gpu = self.gpu;
@@ -182,8 +197,7 @@ impl Program {
     ) -> Option<(wgpu::Buffer, Vec<&'static str>)> {
         let mut at = 0;
         while at < self.0.len() {
-            if let Command::Clear(buffer) = &self.0[at] {
-                encoder.clear_buffer(buffer, 0, None);
+            if self.0[at].transfer(encoder) {
                 at += 1;
                 continue;
             }
@@ -207,8 +221,18 @@ impl Command {
     fn kernel(&self) -> Option<&'static str> {
         match self {
             Self::Run { kernel, .. } => Some(kernel),
-            Self::Clear(_) => None,
+            Self::Clear(_) | Self::Copy { .. } => None,
         }
+    }
+
+    /// Encode a command outside of passes; false for kernels.
+    fn transfer(&self, encoder: &mut CommandEncoder) -> bool {
+        match self {
+            Self::Run { .. } => return false,
+            Self::Clear(buffer) => encoder.clear_buffer(buffer, 0, None),
+            Self::Copy { from, to, bytes } => encoder.copy_buffer_to_buffer(from, 0, to, 0, *bytes),
+        }
+        true
     }
 
     /// Dispatch a kernel; false for other commands.

@@ -1,8 +1,11 @@
 //! Constants of a step in the layout that kernels read.
 
 use bytemuck::{Pod, Zeroable};
+use g2ard_core::raster::{Camera, Settings};
 use g2ard_core::select::Pinhole;
 use g2ard_core::train::{LEAST_LOSS, StepInput};
+
+use super::scene::Values;
 
 /// `Step` of step.wgsl.
 #[derive(Clone, Copy, Pod, Zeroable)]
@@ -16,7 +19,8 @@ pub struct Step {
     center: [f32; 4],
     limits: [[f32; 2]; 2],
     background: [f32; 4],
-    size: [u32; 2],
+    /// Of the image.
+    pub size: [u32; 2],
     near: f32,
     alpha_max: f32,
     light_min: f32,
@@ -24,6 +28,7 @@ pub struct Step {
     rows: u32,
     coeffs: u32,
     pub capacity: u32,
+    /// Pairs of a tile that can be drawn.
     pub most_in_tile: u32,
     masked: u32,
     values: f32,
@@ -50,20 +55,19 @@ fn split<const N: usize>(values: [f64; N]) -> [[f32; N]; 2] {
 }
 
 impl Step {
-    /// Constants of a step on `rows` Gaussians; room for pairs is set later.
-    pub fn of(input: &StepInput, rows: usize, coeffs: usize) -> Self {
-        let (camera, rates) = (input.camera, &input.rates);
+    /// Constants of an image of a scene; room for pairs is set later.
+    pub fn image(
+        camera: &Camera,
+        settings: &Settings,
+        [red, green, blue]: [f32; 3],
+        values: &Values,
+    ) -> Self {
         let rotation = camera.viewmat.map(split);
         let [x, y, z] = camera.position();
         let [eye, eye_rest] = split([x, y, z, 0.0]);
         let [focal, focal_rest] = split([camera.fx, camera.fy]);
         let [center, center_rest] = split([camera.cx, camera.cy]);
         let both = |[a, b]: [f32; 2], [c, d]: [f32; 2]| [a, b, c, d];
-        let [red, green, blue] = input.background;
-        let pixels = camera.width * camera.height;
-        let counted = |mask: &[bool]| mask.iter().filter(|counts| **counts).count();
-        let weights = input.regularizers.unwrap_or_default();
-        let shape = weights.shape / rows as f32;
         Self {
             rotation: rotation.map(|[high, _]| high),
             rotation_rest: rotation.map(|[_, rest]| rest),
@@ -75,11 +79,23 @@ impl Step {
             background: [red, green, blue, 0.0],
             size: [camera.width as u32, camera.height as u32],
             near: camera.near,
-            alpha_max: input.settings.alpha_max,
-            light_min: input.settings.transmittance_min,
-            antialiased: input.settings.antialiased.into(),
-            rows: rows as u32,
-            coeffs: coeffs as u32,
+            alpha_max: settings.alpha_max,
+            light_min: settings.transmittance_min,
+            antialiased: settings.antialiased.into(),
+            rows: values.rows as u32,
+            coeffs: values.coeffs as u32,
+            ..Self::zeroed()
+        }
+    }
+
+    /// Constants of a step; room for pairs is set later.
+    pub fn of(input: &StepInput, values: &Values) -> Self {
+        let (camera, rates, rows) = (input.camera, &input.rates, values.rows as f32);
+        let pixels = camera.width * camera.height;
+        let counted = |mask: &[bool]| mask.iter().filter(|counts| **counts).count();
+        let weights = input.regularizers.unwrap_or_default();
+        let shape = weights.shape / rows;
+        Self {
             masked: input.mask.is_some().into(),
             values: 3.0 * input.mask.map_or(pixels, counted).max(1) as f32,
             ssim_weight: input.ssim_weight,
@@ -95,7 +111,7 @@ impl Step {
             ],
             reach: input.reach.unwrap_or(0.0),
             finest: input.finest,
-            anchor: weights.anchor.max(0.0) / rows as f32,
+            anchor: weights.anchor.max(0.0) / rows,
             thickness: (shape * weights.thickness).max(0.0),
             rank: if weights.effective_rank {
                 shape.max(0.0)
@@ -103,7 +119,7 @@ impl Step {
                 0.0
             },
             rank_offset: weights.rank_offset,
-            ..Self::zeroed()
+            ..Self::image(camera, &input.settings, input.background, values)
         }
     }
 

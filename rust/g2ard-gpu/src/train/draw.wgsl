@@ -1,6 +1,7 @@
 // A tile's splats. `draw`, front to back: a workgroup takes a tile, a thread a pixel. After every bucket of pairs it stores
-// the pixel's light and, in the end, the colour behind the bucket. `backward`, back to front: a workgroup takes a bucket,
-// a thread a pair; the pixels pass through the threads from the last pair to the first. A pair's sums go to its place.
+// the pixel's light and, in the end, the colour behind the bucket. `show` draws and stores the image alone. `backward`, back
+// to front: a workgroup takes a bucket, a thread a pair; the pixels pass through the threads from the last pair to the first.
+// A pair's sums go to its place.
 
 @group(0) @binding(1) var<storage, read> splats: array<Splat>;
 @group(0) @binding(2) var<storage, read> drawn: array<u32>;
@@ -49,6 +50,61 @@ var<workgroup> pairs: array<Pair, 32>;
 var<workgroup> lit: atomic<u32>;
 var<workgroup> extent: vec2<u32>;
 
+// The first pixel of a tile; its pairs, first and end, go to `extent`.
+fn begin(tile: u32, t: u32) -> vec2<u32> {
+    let across = tiles_across();
+    if t == 0u {
+        extent = vec2(0u);
+        if tile < across * tiles_down() { extent = vec2(first[tile], first[tile + 1u]); }
+    }
+    return TILE * vec2(tile % across, tile / across);
+}
+
+// Fetch a bucket's pairs for the workgroup.
+fn fetch(start: u32, count: u32, corner: vec2<u32>, t: u32) {
+    if t < count { pairs[t] = pair_at(start + t, corner); }
+    if t == 0u { atomicStore(&lit, 0u); }
+    workgroupBarrier();
+}
+
+struct Light {
+    // What would remain if no pixel ever stopped: a stopped pixel's only falls further below the minimum.
+    now: f32,
+    left: f32,
+    reached: u32, // pairs of the tile up to the last one that the pixel shows
+}
+
+// The colour that the fetched pairs, after `before` others, show at a pixel.
+fn blend(count: u32, before: u32, at: vec2<u32>, light: ptr<function, Light>) -> vec3<f32> {
+    var rgb = vec3(0.0);
+    for (var k = 0u; k < count; k++) {
+        let log2_alpha = reach(pairs[k], at).z;
+        if log2_alpha < LOG2_ALPHA_MIN { continue; }
+        let alpha = min(exp2(log2_alpha), task.alpha_max);
+        let now = (*light).now;
+        let next = now - alpha * now;
+        if next > task.light_min {
+            rgb += alpha * now * pairs[k].rgb;
+            (*light).left = next;
+            (*light).reached = before + k + 1u;
+        }
+        (*light).now = next;
+    }
+    return rgb;
+}
+
+// Set `extent.x` to whether a pixel of the tile is not yet stopped.
+fn look(light: f32, t: u32) {
+    if light > task.light_min { atomicStore(&lit, 1u); }
+    workgroupBarrier();
+    if t == 0u { extent.x = atomicLoad(&lit); }
+}
+
+fn store(pixel: vec2<u32>, rgb: vec3<f32>) {
+    let at = pixel.y * task.size.x + pixel.x;
+    for (var c = 0u; c < 3u; c++) { image[3u * at + c] = rgb[c]; }
+}
+
 @compute @workgroup_size(16, 16)
 fn draw(
     @builtin(workgroup_id) group: vec3<u32>,
@@ -57,47 +113,24 @@ fn draw(
     @builtin(local_invocation_index) t: u32,
 ) {
     let tile = block_of(group, groups);
-    let across = tiles_across();
-    let corner = TILE * vec2(tile % across, tile / across);
+    let corner = begin(tile, t);
+    let span = workgroupUniformLoad(&extent);
     let pixel = corner + local.xy;
     let inside = all(pixel < task.size);
-    if t == 0u {
-        extent = vec2(0u);
-        if tile < across * tiles_down() { extent = vec2(first[tile], first[tile + 1u]); }
-    }
-    let span = workgroupUniformLoad(&extent);
-    // The light that would remain if no pixel ever stopped: a stopped pixel's only falls further below the minimum.
-    var light = select(0.0, 1.0, inside);
-    var left = light;
-    var reached = 0u;
+    let full = select(0.0, 1.0, inside);
+    var light = Light(full, full, 0u);
     var bucket = PIXELS * (span.x / BUCKET + tile) + t;
     let bottom = bucket;
     for (var start = span.x; start < span.y; start += BUCKET) {
         let count = min(span.y - start, BUCKET);
-        if t < count { pairs[t] = pair_at(start + t, corner); }
-        if t == 0u { atomicStore(&lit, 0u); }
-        workgroupBarrier();
-        var rgb = vec3(0.0);
-        for (var k = 0u; k < count; k++) {
-            let log2_alpha = reach(pairs[k], local.xy).z;
-            if log2_alpha < LOG2_ALPHA_MIN { continue; }
-            let alpha = min(exp2(log2_alpha), task.alpha_max);
-            let next = light - alpha * light;
-            if next > task.light_min {
-                rgb += alpha * light * pairs[k].rgb;
-                left = next;
-                reached = start - span.x + k + 1u;
-            }
-            light = next;
-        }
-        behind[bucket] = vec4(rgb, left);
+        fetch(start, count, corner, t);
+        let rgb = blend(count, start - span.x, local.xy, &light);
+        behind[bucket] = vec4(rgb, light.left);
         bucket += PIXELS;
-        if light > task.light_min { atomicStore(&lit, 1u); }
-        workgroupBarrier();
-        if t == 0u { extent.x = atomicLoad(&lit); }
+        look(light.now, t);
         if workgroupUniformLoad(&extent).x == 0u { break; }
     }
-    var rgb = left * task.background.rgb;
+    var rgb = light.left * task.background.rgb;
     while bucket > bottom {
         bucket -= PIXELS;
         let own = behind[bucket];
@@ -105,10 +138,33 @@ fn draw(
         rgb += own.rgb;
     }
     if inside {
-        let at = pixel.y * task.size.x + pixel.x;
-        for (var c = 0u; c < 3u; c++) { image[3u * at + c] = rgb[c]; }
-        last[at] = reached;
+        store(pixel, rgb);
+        last[pixel.y * task.size.x + pixel.x] = light.reached;
     }
+}
+
+@compute @workgroup_size(16, 16)
+fn show(
+    @builtin(workgroup_id) group: vec3<u32>,
+    @builtin(num_workgroups) groups: vec3<u32>,
+    @builtin(local_invocation_id) local: vec3<u32>,
+    @builtin(local_invocation_index) t: u32,
+) {
+    let corner = begin(block_of(group, groups), t);
+    let span = workgroupUniformLoad(&extent);
+    let pixel = corner + local.xy;
+    let inside = all(pixel < task.size);
+    let full = select(0.0, 1.0, inside);
+    var light = Light(full, full, 0u);
+    var rgb = vec3(0.0);
+    for (var start = span.x; start < span.y; start += BUCKET) {
+        let count = min(span.y - start, BUCKET);
+        fetch(start, count, corner, t);
+        rgb += blend(count, start - span.x, local.xy, &light);
+        look(light.now, t);
+        if workgroupUniformLoad(&extent).x == 0u { break; }
+    }
+    if inside { store(pixel, rgb + light.left * task.background.rgb); }
 }
 
 var<workgroup> bucket_: vec3<u32>; // its tile, its first pair and their number

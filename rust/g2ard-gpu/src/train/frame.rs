@@ -1,6 +1,7 @@
-//! Buffers of a view, and the kernels of a step, recorded once.
+//! Buffers of a view, and the kernels of an image or of a step, recorded once.
 
-use super::scene::Scene;
+use super::constants::Step;
+use super::scene::{Scene, Values};
 use crate::runtime::{Buffer, Constants, Error, Gpu, Kernel, Program, Result, Work};
 use crate::scan;
 use crate::sort::{Keyed, sort};
@@ -20,6 +21,7 @@ const COUNT: Kernel = Kernel::new("train.count", PAIRS, "count");
 const EXPAND: Kernel = Kernel::new("train.expand", PAIRS, "expand");
 const STARTS: Kernel = Kernel::new("train.starts", PAIRS, "starts");
 const FORWARD: Kernel = Kernel::new("train.draw", DRAW, "draw");
+const SHOW: Kernel = Kernel::new("train.show", DRAW, "show");
 const BACKWARD: Kernel = Kernel::new("train.backward", DRAW, "backward");
 const WEIGH: Kernel = Kernel::new("train.weigh", LOSS, "weigh");
 const COMPARE: Kernel = Kernel::new("train.compare", LOSS, "compare");
@@ -35,20 +37,20 @@ const BUCKET: usize = 32;
 const SPLAT_WORDS: usize = 13;
 const SUMS: usize = 9;
 /// Words of the state: pairs, failure, Gaussians moved and skipped, loss, its factor.
-pub const STATE: usize = 6;
+const STATE: usize = 6;
 
 /// Room for a view.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub struct Room {
-    pub pixels: usize,
-    pub tiles: usize,
+struct Room {
+    pixels: usize,
+    tiles: usize,
     /// Pairs of splat and tile.
-    pub pairs: usize,
+    pairs: usize,
 }
 
 impl Room {
     /// For an image, and any number of pairs.
-    pub fn of(gpu: &Gpu, width: usize, height: usize) -> Result<Self> {
+    fn of(gpu: &Gpu, width: usize, height: usize) -> Result<Self> {
         let tiles = width.div_ceil(TILE) * height.div_ceil(TILE);
         // A splat may meet all of them, one after the other.
         let limit = gpu.max_rounds() as u64;
@@ -68,7 +70,7 @@ impl Room {
     }
 
     /// Room for both.
-    pub fn with(self, other: Self) -> Self {
+    fn with(self, other: Self) -> Self {
         Self {
             pixels: self.pixels.max(other.pixels),
             tiles: self.tiles.max(other.tiles),
@@ -77,25 +79,37 @@ impl Room {
     }
 }
 
-pub struct Frame {
-    pub room: Room,
-    pub target: Buffer,
+/// What a step compares the image with.
+pub struct Target {
+    pub image: Buffer,
     /// A byte per pixel.
     pub mask: Buffer,
-    pub state: Buffer,
-    #[cfg(test)]
+}
+
+pub struct Frame {
+    room: Room,
+    state: Buffer,
     pub image: Buffer,
-    pub step: Program,
+    /// None for images alone.
+    pub target: Option<Target>,
+    program: Program,
 }
 
 impl Frame {
-    pub fn new(gpu: &Gpu, scene: &Scene, constants: &Constants, room: Room) -> Result<Self> {
+    /// Record a step of `trained`, or an image of `values`.
+    fn new(
+        gpu: &Gpu,
+        values: &Values,
+        trained: Option<&Scene>,
+        constants: &Constants,
+        room: Room,
+    ) -> Result<Self> {
         let Room {
             pixels,
             tiles,
             pairs,
         } = room;
-        let rows = scene.rows;
+        let rows = values.rows;
         let state = gpu.buffer("state", STATE)?;
         let mut work = Work::new(gpu);
         work.clear(&state);
@@ -105,7 +119,7 @@ impl Frame {
 
         let splats = gpu.buffer("splats", SPLAT_WORDS * rows)?;
         let by_depth = Keyed::new(gpu, rows)?;
-        let bound = [&scene.values, &splats, &by_depth.keys, &by_depth.words];
+        let bound = [&values.buffer, &splats, &by_depth.keys, &by_depth.words];
         run(&mut work, &SPLAT, rows, THREADS, &numbered(bound))?;
         let order = sort(gpu, &mut work, by_depth, rows, 0..32)?.words;
 
@@ -115,7 +129,8 @@ impl Frame {
         scan::exclusive(gpu, &mut work, &before, rows)?;
         let by_tile = Keyed::new(gpu, pairs)?;
         let drawn = gpu.buffer("pairs", pairs)?;
-        let sums = gpu.buffer("sums of pairs", SUMS * pairs)?;
+        let summed = trained.map_or(1, |_| pairs);
+        let sums = gpu.buffer("sums of pairs", SUMS * summed)?;
         let own = [
             (5, &by_tile.keys),
             (6, &by_tile.words),
@@ -131,10 +146,21 @@ impl Frame {
         run(&mut work, &STARTS, rows.max(tiles + 1), THREADS, &bound)?;
 
         let image = gpu.buffer("image", 3 * pixels)?;
+        let shared = [&splats, &drawn, &by_tile.words, &first];
+        let Some(scene) = trained else {
+            let bound = [&shared[..], &[&image]].concat();
+            run(&mut work, &SHOW, tiles, 1, &numbered(bound))?;
+            return Ok(Self {
+                room,
+                state,
+                image,
+                target: None,
+                program: work.program(),
+            });
+        };
         let buckets = pairs / BUCKET + tiles;
         let behind = gpu.buffer("light of buckets", 4 * TILE * TILE * buckets)?;
         let last = gpu.buffer("last pairs", pixels)?;
-        let shared = [&splats, &drawn, &by_tile.words, &first];
         let bound = [&shared[..], &[&image, &behind, &last]].concat();
         run(&mut work, &FORWARD, tiles, 1, &numbered(bound))?;
 
@@ -156,7 +182,7 @@ impl Frame {
         let bound = [&shared[..], &[&pull, &behind, &last, &sums]].concat();
         run(&mut work, &BACKWARD, buckets, 1, &numbered(bound))?;
         let bound = [
-            &scene.values,
+            &values.buffer,
             &scene.moments,
             &scene.states,
             &splats,
@@ -168,13 +194,122 @@ impl Frame {
         run(&mut work, &ADAM, rows, THREADS, &numbered(bound))?;
         Ok(Self {
             room,
-            target,
-            mask,
             state,
-            #[cfg(test)]
             image,
-            step: work.program(),
+            target: Some(Target {
+                image: target,
+                mask,
+            }),
+            program: work.program(),
         })
+    }
+}
+
+/// The last frame, whose constants are the view's.
+pub struct View {
+    constants: Constants,
+    pub frame: Option<Frame>,
+}
+
+/// What a run leaves: Gaussians moved and skipped, and the loss.
+pub struct Outcome {
+    pub updated: u32,
+    pub skipped: u32,
+    pub loss: f32,
+    /// For images alone, three values per pixel.
+    pub image: Vec<f32>,
+}
+
+impl View {
+    pub fn new(gpu: &Gpu) -> Self {
+        Self {
+            constants: gpu.constants(&vec![0; size_of::<Step>() / 4]),
+            frame: None,
+        }
+    }
+
+    /// Take a step of `trained`, or draw an image of `values`; again with more room until the pairs fit. `fill` writes the
+    /// target.
+    pub fn run(
+        &mut self,
+        gpu: &Gpu,
+        values: &Values,
+        trained: Option<&Scene>,
+        mut task: Step,
+        fill: impl Fn(&mut Work, &Target),
+    ) -> Result<Outcome> {
+        let [width, height] = task.size.map(|side| side as usize);
+        let mut room = Room::of(gpu, width, height)?;
+        room.pairs = (2 * values.rows).max(1 << 14);
+        // A thread draws a tile's pairs one after the other, and does little else.
+        let most_in_tile = gpu.max_rounds() / 8 * 7;
+        loop {
+            let (frame, constants) = self.frame_for(gpu, values, trained, room)?;
+            task.capacity = frame.room.pairs as u32;
+            task.most_in_tile = u32::try_from(most_in_tile).unwrap_or(u32::MAX);
+            gpu.set_constants(constants, task.words());
+            let mut work = Work::new(gpu);
+            if let Some(target) = &frame.target {
+                fill(&mut work, target);
+            }
+            work.append(&frame.program);
+            let image = (&frame.image, 3 * width * height);
+            let reads = [(&frame.state, STATE), image];
+            let wanted = trained.map_or(2, |_| 1);
+            let found = work.submit(&reads[..wanted])?.take()?;
+            let mut found = found.into_iter();
+            let state = found.next().unwrap_or_default();
+            let [pairs, failed, updated, skipped, loss, _] = state[..] else {
+                return Err(Error::Lost("it left no state".to_owned()));
+            };
+            let too_many = |what, count: usize, limit: usize| Error::TooMany {
+                what,
+                count: count as u64,
+                limit: limit as u64,
+            };
+            match failed {
+                0 => {
+                    return Ok(Outcome {
+                        updated,
+                        skipped,
+                        loss: f32::from_bits(loss),
+                        image: bytemuck::cast_vec(found.next().unwrap_or_default()),
+                    });
+                }
+                1 if pairs as usize > frame.room.pairs => {
+                    room.pairs = pairs as usize / 4 * 5 + 1024;
+                }
+                1 => {
+                    let what = "pairs of splat and tile of a view";
+                    return Err(too_many(what, 1 << 32, (1 << 32) - 1));
+                }
+                _ => {
+                    let what = "splats in a tile of a view";
+                    return Err(too_many(what, most_in_tile + 1, most_in_tile));
+                }
+            }
+        }
+    }
+
+    /// The frame, with at least this room, and its constants.
+    fn frame_for(
+        &mut self,
+        gpu: &Gpu,
+        values: &Values,
+        trained: Option<&Scene>,
+        room: Room,
+    ) -> Result<(&Frame, &Constants)> {
+        let held = &mut self.frame;
+        let had = held.as_ref().map_or(Room::default(), |frame| frame.room);
+        let room = room.with(had);
+        let frame = match held.take() {
+            Some(frame) if frame.room == room => frame,
+            outgrown => {
+                drop(outgrown); // before its successor takes as much memory
+                Frame::new(gpu, values, trained, &self.constants, room)?
+            }
+        };
+        Ok((held.insert(frame), &self.constants))
     }
 }
 

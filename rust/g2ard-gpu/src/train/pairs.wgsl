@@ -71,7 +71,8 @@ fn expand(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_workgroups)
     drawn[i] = row;
     let tile = nth_tile(splats[row], i - before[low]);
     keys[i] = vec2(tile, 0u);
-    if tile == none { sums[i] = array<f32, 9>(); }
+    // Images alone take no sums.
+    if tile == none && i < arrayLength(&sums) { sums[i] = array<f32, 9>(); }
 }
 
 @compute @workgroup_size(64)

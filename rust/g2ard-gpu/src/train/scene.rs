@@ -1,5 +1,6 @@
 //! Gaussians on the device: parameters and Adam's moments, one attribute after the other, in the order of a [`Store`].
 
+use g2ard_core::raster::Params;
 use g2ard_core::train::{Biases, Exported};
 use rayon::prelude::*;
 
@@ -10,10 +11,49 @@ const ANCHOR: usize = 14;
 /// Words of `Row` of update.wgsl.
 const ROW: usize = 3;
 
-pub struct Scene {
+/// Parameters, one attribute after the other.
+pub struct Values {
     pub rows: usize,
+    /// SH coefficients of a colour.
     pub coeffs: usize,
-    pub values: Buffer,
+    pub buffer: Buffer,
+}
+
+impl Values {
+    fn new(gpu: &Gpu, rows: usize, coeffs: usize) -> Result<Self> {
+        Ok(Self {
+            rows,
+            coeffs,
+            buffer: gpu.buffer("values", rows * attributes(coeffs))?,
+        })
+    }
+
+    /// A scene's, in the caller's order.
+    pub fn of(gpu: &Gpu, params: &Params) -> Result<Self> {
+        let values = Self::new(gpu, params.len(), params.sh_coeffs)?;
+        let rest = 3 * (params.sh_coeffs - 1);
+        let parts = [
+            (params.means, 3),
+            (params.quats, 4),
+            (params.log_scales, 3),
+            (params.logit_opacities, 1),
+            (params.sh0, 3),
+            (params.sh_n, rest),
+        ];
+        let columns = parts
+            .into_iter()
+            .flat_map(|(rows, width)| (0..width).map(move |k| (rows, width, k)));
+        for (number, (rows, width, k)) in columns.enumerate() {
+            let column: Vec<f32> = rows.par_chunks(width).map(|row| row[k]).collect();
+            gpu.overwrite_at(&values.buffer, number * values.rows, &column);
+        }
+        gpu.check()?;
+        Ok(values)
+    }
+}
+
+pub struct Scene {
+    pub values: Values,
     pub moments: Buffer,
     pub states: Buffer,
     pub anchors: Buffer,
@@ -29,9 +69,7 @@ impl Scene {
     pub fn new(gpu: &Gpu, state: &Exported, coeffs: usize) -> Result<Self> {
         let rows = state.order.len();
         let mut scene = Self {
-            rows,
-            coeffs,
-            values: gpu.buffer("values", rows * attributes(coeffs))?,
+            values: Values::new(gpu, rows, coeffs)?,
             moments: gpu.buffer("moments", 2 * rows * attributes(coeffs))?,
             states: gpu.buffer("rows", ROW * rows)?,
             anchors: gpu.buffer("anchors", ANCHOR * rows)?,
@@ -45,7 +83,7 @@ impl Scene {
     }
 
     pub fn attributes(&self) -> usize {
-        attributes(self.coeffs)
+        attributes(self.values.coeffs)
     }
 
     /// Replace everything but anchors and frozen rows by a state of as many rows.
@@ -64,7 +102,7 @@ impl Scene {
             .into_iter()
             .map(|[value, _]| value)
             .collect();
-        gpu.overwrite(&self.values, &values);
+        gpu.overwrite(&self.values.buffer, &values);
         let moments = columns(&|at| [state.first[at], state.second[at]]);
         gpu.overwrite(&self.moments, &moments);
         self.write_rows(gpu, &state.steps);
@@ -100,17 +138,18 @@ impl Scene {
 
     /// Read the parameters, as [`Exported::values`].
     pub fn values(&self, gpu: &Gpu) -> Result<Vec<f32>> {
-        let read = Work::new(gpu).submit(&[(&self.values, self.values.words())])?;
+        let buffer = &self.values.buffer;
+        let read = Work::new(gpu).submit(&[(buffer, buffer.words())])?;
         let [words] = read.take()?.try_into().unwrap_or_default();
         Ok(self.by_row(&words, 0, 1))
     }
 
     pub fn export(&self, gpu: &Gpu) -> Result<Exported> {
-        let buffers = [&self.values, &self.moments, &self.states];
+        let buffers = [&self.values.buffer, &self.moments, &self.states];
         let reads = buffers.map(|buffer| (buffer, buffer.words()));
         let found = Work::new(gpu).submit(&reads)?.take()?;
         let [values, moments, states] = found.try_into().unwrap_or_default();
-        let mut steps = vec![0; self.rows];
+        let mut steps = vec![0; self.values.rows];
         for (&row, state) in self.order.iter().zip(states.chunks(ROW)) {
             steps[row as usize] = state[1];
         }
@@ -126,11 +165,11 @@ impl Scene {
 
     /// Row-major values in the caller's order, from every `stride`-th word from `first`.
     fn by_row(&self, words: &[u32], first: usize, stride: usize) -> Vec<f32> {
-        let all = self.attributes();
-        let mut out = vec![0.0; self.rows * all];
+        let (all, rows) = (self.attributes(), self.values.rows);
+        let mut out = vec![0.0; rows * all];
         for (i, &row) in self.order.iter().enumerate() {
             for (k, value) in out[row as usize * all..][..all].iter_mut().enumerate() {
-                *value = f32::from_bits(words[(k * self.rows + i) * stride + first]);
+                *value = f32::from_bits(words[(k * rows + i) * stride + first]);
             }
         }
         out

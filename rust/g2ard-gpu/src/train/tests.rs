@@ -6,6 +6,7 @@ use g2ard_core::train::{Rates, Regularizers, Store, Trainer as Cpu};
 use g2ard_core::{Error, Splats};
 
 use super::*;
+use crate::runtime::Work;
 use crate::testing::{gpu, gpu_in_pieces, scenes};
 
 /// Gaussians as trainers take them.
@@ -126,6 +127,7 @@ fn input<'a>(camera: &'a Camera, target: &'a [f32]) -> StepInput<'a> {
         background: [0.1, 0.2, 0.3],
         target,
         mask: None,
+        view: None,
         ssim_weight: 0.2,
         relative: None,
         rates: RATES,
@@ -141,9 +143,10 @@ fn target_of(camera: &Camera) -> Vec<f32> {
 
 fn image_there(trainer: &mut Trainer, input: &StepInput) -> Vec<f32> {
     trainer.step(input).unwrap();
-    let frame = trainer.frame.as_ref().unwrap();
+    let held = trainer.held.get().unwrap();
+    let frame = held.view.frame.as_ref().unwrap();
     let values = 3 * input.camera.width * input.camera.height;
-    let read = Work::new(trainer.gpu.get().unwrap()).submit(&[(&frame.image, values)]);
+    let read = Work::new(&held.gpu).submit(&[(&frame.image, values)]);
     let words = read.unwrap().take().unwrap().swap_remove(0);
     words.into_iter().map(f32::from_bits).collect()
 }
@@ -178,29 +181,72 @@ fn cases() -> Vec<(&'static str, Arrays, Camera)> {
     all
 }
 
+/// Check that two images are the same within rounding.
+fn compare_images(what: &str, want: &[f32], got: &[f32]) {
+    assert_eq!(want.len(), got.len(), "{what}");
+    let apart = want.iter().zip(got).map(|(a, b)| (a - b).abs());
+    let most = apart.fold(0f32, f32::max);
+    eprintln!("{what}: {most:.1e}");
+    assert!(most <= 1e-5 && got.iter().all(|v| v.is_finite()), "{what}");
+}
+
 #[test]
 fn images_are_the_cpus() {
     let Some(gpu) = gpu().map(Arc::new) else {
         return;
     };
     for (name, arrays, camera) in cases() {
-        for antialiased in [false, true] {
+        let mut alone = Images::new(gpu.clone(), &arrays.params()).unwrap();
+        let (near, alpha_max) = (camera.near, Settings::default().alpha_max);
+        for (antialiased, near, alpha_max) in [
+            (false, near, alpha_max),
+            (true, near, alpha_max),
+            (false, 7.9, 0.999),
+        ] {
+            let camera = Camera { near, ..camera };
             let target = target_of(&camera);
+            let settings = Settings {
+                antialiased,
+                alpha_max,
+                ..Settings::default()
+            };
             let input = StepInput {
-                settings: Settings {
-                    antialiased,
-                    ..Settings::default()
-                },
+                settings,
                 ..input(&camera, &target)
             };
             let want = image_here(&arrays.params(), &input);
+            let what = format!("{name}, antialiased {antialiased}, near {near}");
+            let got = alone.draw(&camera, &settings, input.background).unwrap();
+            compare_images(&what, &want, &got);
             let got = image_there(&mut arrays.on(&gpu), &input);
-            let apart: Vec<f32> = want.iter().zip(&got).map(|(a, b)| (a - b).abs()).collect();
-            let most = apart.into_iter().fold(0f32, f32::max);
-            eprintln!("{name}, antialiased {antialiased}: {most:.1e}");
-            assert!(most <= 1e-5 && got.iter().all(|v| v.is_finite()), "{name}");
+            compare_images(&format!("{what}, of a step"), &want, &got);
         }
     }
+}
+
+#[test]
+fn images_of_any_size_follow_each_other_with_the_same_bytes() {
+    let Some(gpu) = gpu().map(Arc::new) else {
+        return;
+    };
+    // Each of a few wide Gaussians meets all tiles: more pairs than there is room for at first.
+    let mut arrays = Arrays::random(60, 4, 4);
+    arrays.log_scales.fill(0.5);
+    let views = [(16, 16), (1, 1), (500, 300), (17, 200), (300, 17)];
+    let run = || {
+        let mut there = Images::new(gpu.clone(), &arrays.params()).unwrap();
+        views.map(|(width, height)| {
+            let camera = camera(width, height, 3.0);
+            let background = [0.1, 0.2, 0.3];
+            let got = there.draw(&camera, &Settings::default(), background);
+            let want = image_here(&arrays.params(), &input(&camera, &target_of(&camera)));
+            let got = got.unwrap();
+            compare_images(&format!("{width}×{height}"), &want, &got);
+            got
+        })
+    };
+    let first = run();
+    assert!(run() == first);
 }
 
 /// Largest difference of gradients, as a share of the row's largest of the same kind.
@@ -458,6 +504,51 @@ fn runs_give_the_same_bytes() {
 }
 
 #[test]
+fn targets_that_stay_change_no_bit() {
+    let Some(gpu) = gpu().map(Arc::new) else {
+        return;
+    };
+    let arrays = Arrays::random(500, 4, 8);
+    let views = [
+        camera(75, 50, 3.0),
+        camera(50, 90, 4.0),
+        camera(40, 40, 3.0),
+    ];
+    let masks = [(75, 50), (50, 90)].map(|(w, h)| {
+        let mask: Vec<bool> = (0..w * h).map(|i| i % w > 20).collect();
+        mask
+    });
+    let one = 4 * 3 * 75 * 50 + 75 * 50;
+    let run = |number: fn(usize) -> Option<u32>, room: usize| {
+        let mut trainer = arrays.on(&gpu);
+        trainer.held.get_mut().unwrap().targets = Targets::within(room);
+        let reports: Vec<Report> = (0..9)
+            .map(|i| {
+                let target = target_of(&views[i % 3]);
+                let step = StepInput {
+                    mask: masks.get(i % 3).map(|mask| &mask[..]),
+                    view: number(i % 3),
+                    ..input(&views[i % 3], &target)
+                };
+                trainer.step(&step).unwrap()
+            })
+            .collect();
+        let count = trainer.held.get().unwrap().targets.count();
+        (count, reports, trainer.export().unwrap())
+    };
+    let sent = run(|_| None, 1 << 20);
+    assert_eq!(sent.0, 0);
+    for (room, count) in [(1 << 20, 3), (one, 1), (one - 1, 1), (16, 0)] {
+        let kept = run(|i| Some(i as u32), room);
+        assert_eq!(kept.0, count, "{room}");
+        assert!(
+            (kept.1, kept.2) == (sent.1.clone(), sent.2.clone()),
+            "{room}"
+        );
+    }
+}
+
+#[test]
 fn views_of_any_size_follow_each_other() {
     let Some(gpu) = gpu().map(Arc::new) else {
         return;
@@ -508,9 +599,9 @@ fn what_a_device_cannot_do_is_an_error_and_its_state_goes_on_elsewhere() {
     let want = there.step(&input).unwrap();
     let got = here.step(&input).unwrap();
     assert!((want.loss - got.loss).abs() <= 1e-5 * want.loss);
-    there.gpu.process += 1;
+    there.held.fork();
     assert!(matches!(there.step(&input), Err(Error::Device(_))));
-    there.gpu.process -= 1;
+    there.held.fork();
     gpu.lose();
     assert!(matches!(there.step(&input), Err(Error::Device(_))));
     assert!(matches!(there.export(), Err(Error::Device(_))));
@@ -535,4 +626,7 @@ fn more_splats_in_a_tile_than_a_thread_can_draw_are_an_error() {
     let target = target_of(&camera);
     let found = arrays.on(&gpu).step(&input(&camera, &target));
     assert!(matches!(found, Err(Error::Device(_))), "{found:?}");
+    let mut alone = Images::new(gpu, &arrays.params()).unwrap();
+    let found = alone.draw(&camera, &Settings::default(), [0.0; 3]);
+    assert!(found.unwrap_err().is_of_size());
 }
