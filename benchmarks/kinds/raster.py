@@ -1,4 +1,4 @@
-"""Study of the time of a recovery step."""
+"""Study of the time of a recovery step on the CPU."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ from g2ard.stages.recover.engine import Photometric
 from g2ard.stages.recover.schedule import Rates
 from g2ard.system import devices
 
-__all__ = ["Raster", "built_in_view", "drawn"]
+__all__ = ["GPU", "Raster", "built_in_view", "drawn", "timed_step"]
 
-_GPU = "gpu: "
+GPU = "gpu: "
 """Prefix of an adapter's name among instruction sets."""
 
 
@@ -36,14 +36,14 @@ class Raster(Study):
     """A study of `_core.Trainer`'s speed on seeded subsets of a scene, in a view of the whole scene.
 
     Args:
-        methods: "best" instruction set, or "all" of them; "gpu" for the best adapter, even a software one.
+        methods: "best" instruction set, or "all" of them.
         counts: Gaussians drawn from the scene.
         image: width and height of the view, for scenes without views.
         threads: thread counts; 0 means the current one.
         repeats: timed steps; the fastest is recorded.
     """
 
-    METHODS: ClassVar[Mapping[str, Any]] = {"best": "best", "all": "all", "gpu": "gpu"}
+    METHODS: ClassVar[Mapping[str, Any]] = {"best": "best", "all": "all"}
 
     counts: tuple[int, ...] = key((20_000, 100_000, 300_000), least=1, axis=True)
     image: tuple[int, int] = key((640, 480), least=1)
@@ -51,14 +51,9 @@ class Raster(Study):
     repeats: int = key(15, least=1)
 
     def cells(self, scene: SceneSpec, work: Path) -> Iterator[Cell]:
-        """Yield a cell per count, instruction set or adapter, and number of threads."""
+        """Yield a cell per count, instruction set and number of threads."""
         place = Workspace(work, self, scene)
         isas = _core.instruction_sets()[: None if "all" in self.methods else 1]
-        if "gpu" in self.methods:
-            adapters = devices.adapters()
-            if not adapters:
-                raise InputError("no adapter, or a build without GPU kernels", parameter="methods")
-            isas = [*(isas if len(self.methods) > 1 else ()), _GPU + adapters[0].name]
         for count in self.counts:
             for isa in isas:
                 for threads in self.threads:
@@ -70,12 +65,10 @@ class Raster(Study):
         before = _core.num_threads()
         try:
             _core.set_num_threads(threads)
-            devices.use("gpu" if isa.startswith(_GPU) else "cpu")
             splats = place.splats
             view = place.train_cameras if place.scene.train else built_in_view(splats, *self.image)
-            return [_row(drawn(splats, count, seed=self.seeds[0]), view, isa, self.repeats)]
+            return [timed_step(drawn(splats, count, seed=self.seeds[0]), view, isa, self.repeats)]
         finally:
-            devices.use("cpu")
             _core.set_num_threads(before)
 
 
@@ -107,14 +100,18 @@ def built_in_view(splats: Splats, width: int, height: int) -> Cameras:
     return Cameras.from_lists([pose], [K], [(width, height)], ["built-in"])
 
 
-def _row(splats: Splats, cameras: Cameras, isa: str, repeats: int) -> Row:
+def timed_step(splats: Splats, cameras: Cameras, isa: str | None, repeats: int) -> Row:
+    """Time a recovery step in the first view, by an instruction set or on the device in use.
+
+    Raises:
+        InputError: the device failed.
+    """
     settings = RasterSettings(antialiased=False)
     arrays, view = arrays_of(splats), view_of(cameras.recentred(splats.offset), 0, settings)
     width, height = view[2]
-    named = None if isa.startswith(_GPU) else isa
-    rendered, *_ = _core.Rasterizer(named).forward(arrays, view, settings, [0.0, 0.0, 0.0], 0)
+    rendered, *_ = _core.Rasterizer(isa).forward(arrays, view, settings, [0.0, 0.0, 0.0], 0)
     target = np.ascontiguousarray(rendered[::-1])
-    trainer = _core.Trainer(arrays, Photometric(settings, (0.0, 0.0, 0.0), 0.2), splats.scales.max(1), named)
+    trainer = _core.Trainer(arrays, Photometric(settings, (0.0, 0.0, 0.0), 0.2), splats.scales.max(1), isa)
     still = Rates(*[0.0] * 6)  # rates of 0 keep the scene
     steps = timeit.repeat(lambda: trainer.step(view, target, still), number=1, repeat=repeats)
     if notes := devices.notes():

@@ -12,7 +12,7 @@ from g2ard.rendering.renderer import render
 from g2ard.scene.splats import Splats
 from g2ard.system import devices
 from helpers.gpus import skip_without_gpu
-from helpers.studies import measured
+from helpers.studies import ball_of, measured
 
 
 def cloud(n: int = 3000) -> Splats:
@@ -41,14 +41,20 @@ def test_figures_hang_together(tmp_path: Path) -> None:
 
 def test_a_gpu_is_measured_beside_the_cpu(tmp_path: Path) -> None:
     skip_without_gpu()
-    write_splats(tmp_path / "cloud.ply", cloud())
-    options = {"counts": "500", "image": "48,32", "repeats": "2"}
-    rows = measured("gpu", SceneSpec("cloud", str(tmp_path / "cloud.ply")), tmp_path / "out", **options)
+    scene, options = ball_of(tmp_path, 1500), {"ratios": "5", "repeats": "2", "steps": "5", "size": "48"}
+    rows = measured("gpu", scene, tmp_path / "out", methods="cpu,gpu", **options)
     adapters = devices.adapters()
     assert adapters
     assert [row["isa"] for row in rows] == [_core.instruction_sets()[0], f"gpu: {adapters[0].name}"]
-    assert all(row["total_ms"] > 0 for row in rows)
     assert devices.state().served == 0
+    columns = ("total_ms", "steps_per_s", "targets_s", "recover_s", "score_s", "peak_mb", "psnr")
+    for row in rows:
+        assert row["count"] == 300
+        assert all(row[name] > 0 for name in columns)
+    assert abs(rows[0]["psnr"] - rows[1]["psnr"]) < 0.05
+    if adapters[0].timestamps:
+        assert all(rows[1][f"{name}_ms"] > 0 for name in ("project", "sort", "draw", "backward", "update"))
+    assert "draw_ms" not in rows[0]
 
 
 def test_the_built_in_view_sees_the_scene() -> None:
