@@ -134,7 +134,7 @@ class RunFolder:
 
     @contextmanager
     def _marked(self) -> Iterator[None]:
-        """Mark the folder as this run's, whose finished steps are elsewhere, until all its files are written."""
+        """Mark the folder until its files are written; the finished steps are elsewhere."""
         if self.work.exists() and not self._resume:
             shutil.rmtree(self.work)
         self.work.mkdir(exist_ok=True)

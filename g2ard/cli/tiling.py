@@ -123,7 +123,7 @@ def _check_folder(folder: Path) -> None:
         names = sorted(path.name for path in folder.iterdir()) if folder.exists() else []
     except OSError as error:
         raise OutputError(f"cannot write: {error.strerror}; choose another folder", path=folder) from error
-    from g2ard.tiles.pour import is_tile_file
+    from g2ard.tiles.writer import is_tile_file
 
     of_tiles = [name for name in names if is_tile_file(name)]
     others = [name for name in names if not name.startswith(".")]

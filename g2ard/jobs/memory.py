@@ -153,7 +153,7 @@ def plan_tiles(scene: TileStore | SceneStream, tiling: Tiling, times: float = 1.
     Args:
         times: memory of a tile relative to merging it.
     """
-    from g2ard.tiles.pour import expected_tiles
+    from g2ard.tiles.writer import expected_tiles
 
     memory, count, folder = tiling.usable_memory, scene.count, None
     if isinstance(scene, TileStore):

@@ -40,7 +40,7 @@ from g2ard.tiles.ingest import ingest
 from g2ard.tiles.merging import TiledScene, simplify_tiles
 from g2ard.tiles.recover import recover_tiles
 from g2ard.tiles.sights import Surroundings
-from g2ard.tiles.steps import TiledRun, sample_stride
+from g2ard.tiles.simplify import TiledRun, sample_stride
 
 
 @dataclass(frozen=True, eq=False)

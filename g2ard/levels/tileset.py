@@ -24,9 +24,9 @@ from g2ard.io.packing import writable
 from g2ard.io.scene_formats import Rounding
 from g2ard.io.spz import check_far
 from g2ard.io.types import Note
+from g2ard.levels.streamed_sog import read_object, write_json
 from g2ard.levels.tree import Cut, Leaf, Level, Node, aligned
 from g2ard.levels.tree import cut as cut_tree
-from g2ard.levels.write import read_object, write_json
 from g2ard.progress import Progress, silent
 from g2ard.scene.shape import longer_axes
 from g2ard.scene.splats import Splats

@@ -23,7 +23,7 @@ from g2ard.io.tile_store import VERSION, TileStore
 from g2ard.io.types import Note
 from g2ard.progress import Progress, Say, plural, silent, unsaid
 from g2ard.stages.lift import LiftConfig
-from g2ard.tiles.pour import PointFeed, SceneFeed, TileWriter, clear, is_tile_file, lift_tiles, pour
+from g2ard.tiles.writer import PointFeed, SceneFeed, TileWriter, clear, is_tile_file, lift_tiles, pour
 
 TILE_ROWS = 5_000_000
 """Default largest number of rows per tile."""

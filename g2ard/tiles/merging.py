@@ -18,7 +18,7 @@ from g2ard.scene.splats import Splats, unit_quats
 from g2ard.scene.transform import join
 from g2ard.stages.simplify.growth import GROWTHS, best_growth
 from g2ard.tiles.sights import Sights, Surroundings
-from g2ard.tiles.steps import TiledRun
+from g2ard.tiles.simplify import TiledRun
 from g2ard.tiles.tasks import load, small_scene
 
 _HALF = 1 << 16

@@ -84,8 +84,8 @@ def recover_tile(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays
     """Recover a tile and score it on held-out views.
 
     Args:
-        arguments: `tile`; `levels`, see `g2ard.tiles.steps`; `steps`, 0 to only score; `config`, recovery's
-            constants by path; `train`, `test` and `apart`, the views of these inputs that see the tile;
+        arguments: `tile`; `levels`, see `g2ard.tiles.simplify`; `steps`, 0 to only score; `config`, constants
+            of recovery by path; `train`, `test` and `apart`, the views of these inputs that see the tile;
             `weights`, the sampling weight of each view of `train`.
         inputs: `coarse`, the output of `coarse` for each tile; `own`, for this tile; `train`, `test` and
             `apart`, cameras in world coordinates.

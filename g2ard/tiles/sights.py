@@ -17,7 +17,7 @@ from g2ard.rendering.visibility import LONGEST, MOST_VIEWS, NEAR
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.samples import evenly_spaced, weighted_quantile
 from g2ard.tiles.executor import Workers
-from g2ard.tiles.steps import COARSE, TiledRun
+from g2ard.tiles.simplify import COARSE, TiledRun
 from g2ard.tiles.tasks import Task, is_whole, load, save, scene_of
 
 _LEAST_LIGHT_SHARE = 0.01
@@ -159,7 +159,7 @@ def light_of(store: TileStore, coarse: list[Path], cameras: Cameras, workers: Wo
     chunks = [range(i, min(i + _VIEWS_PER_TASK, len(here))) for i in range(0, len(here), _VIEWS_PER_TASK)]
     tasks = [
         Task(
-            "g2ard.tiles.steps:light",
+            "g2ard.tiles.simplify:light",
             f"light-{number:05}",
             workers.folder,
             {"views": list(chunk), "level": level, "near": near},

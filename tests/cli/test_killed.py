@@ -26,7 +26,8 @@ _COMMANDS = {
     "recover-folder": f"recover small.ply {_TAUGHT} -o out/meta.json --resume",
     "adapt": f"adapt small.ply {_TAUGHT} -o out.ply --resume",
     "distill": "distill ball.ply -n 60 --views views.json --steps 6 --size 32 -o run --resume",
-    "distill-tiles": "distill ball.ply -n 60 --views views.json --steps 6 --size 32 --tile-rows 150 -o run --resume",
+    "distill-tiles": "distill ball.ply -n 60 --views views.json --steps 6 --size 32 --tile-rows 150 -o run "
+    "--resume",
     "lod": "lod ball.ply -r 1,4 --views views.json --steps 4 --size 32 -o out --resume",
     "lod-merged": "lod ball.ply -r 1,4 --views views.json --merge-only --format 3dtiles -o out --resume",
     "ingest": "ingest ball.ply small.ply -o tiles --tile-rows 150",

@@ -14,7 +14,7 @@ from g2ard.scene.splats import Splats
 from g2ard.stages.simplify import SimplifyConfig
 from g2ard.tiles.executor import Workers, executor
 from g2ard.tiles.merging import simplify_tiles
-from g2ard.tiles.steps import TiledRun
+from g2ard.tiles.simplify import TiledRun
 from g2ard.tiles.tasks import Arguments, Arrays, Inputs, Places, tell_share
 
 

@@ -109,7 +109,7 @@ def test_neither_blocks_nor_order_decide(tmp_path: Path) -> None:
 
 
 def test_a_sample_does_not_depend_on_the_order(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("g2ard.tiles.pour._TREE_SAMPLE", 400)
+    monkeypatch.setattr("g2ard.tiles.writer._TREE_SAMPLE", 400)
     scene = town(20_000)
     source = saved(tmp_path / "town.ply", scene)
     mixed = saved(tmp_path / "mixed.ply", scene.take(np.random.default_rng(1).permutation(len(scene))))
@@ -124,7 +124,7 @@ def test_a_sample_does_not_depend_on_the_order(tmp_path: Path, monkeypatch: pyte
 
 
 def test_overfull_tiles_of_a_sample_are_split(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("g2ard.tiles.pour._TREE_SAMPLE", 60)
+    monkeypatch.setattr("g2ard.tiles.writer._TREE_SAMPLE", 60)
     monkeypatch.setattr("g2ard.scene.kdtree._SAMPLE_SIGMAS", 0.0)
     source = saved(tmp_path / "town.ply", town(20_000))
     said: list[str] = []

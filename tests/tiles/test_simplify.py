@@ -29,7 +29,7 @@ from g2ard.stages.simplify.growth import GROWTHS
 from g2ard.tiles.executor import Workers, executor
 from g2ard.tiles.ingest import ingest
 from g2ard.tiles.merging import TiledScene, cheapest, plan_ends, simplify_tiles
-from g2ard.tiles.steps import GONE, TiledRun, _add_until_converged
+from g2ard.tiles.simplify import GONE, TiledRun, _add_until_converged
 from g2ard.tiles.tasks import Task
 from helpers.systems import needs_proc, workers_of
 from helpers.tiled_scenes import reduced, ring, town

@@ -15,7 +15,7 @@ mod morton_tree;
 mod outcome;
 mod pairwise;
 mod paper;
-mod residual;
+mod protection;
 mod rows;
 mod tile;
 mod trim;
@@ -29,7 +29,7 @@ pub use moments::{Merged, merge, optical_mass, pool, weights};
 pub use outcome::Outcome;
 pub use pairwise::{Pairwise, PairwiseRound};
 pub use paper::{Paper, PaperPlan, PaperRound};
-pub use residual::{color, protection_flags};
+pub use protection::{color, protection_flags};
 pub use tile::{Tile, TilePlan};
 
 use crate::Splats;

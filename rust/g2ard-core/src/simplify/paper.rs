@@ -3,7 +3,7 @@
 use rayon::prelude::*;
 
 use super::moments::{Merged, optical_mass, sigmoid};
-use super::residual::color;
+use super::protection::color;
 use super::trim::best;
 use super::{GONE, GroupKernels, Outcome, Step};
 use crate::constants::constants;
