@@ -26,8 +26,6 @@ NOT_RUN = {
     r"rustup target add .*": "downloads a toolchain",
     r"colmap .*": "another program",
     r"\.venv/bin/python tests/goldens\.py .*": "takes minutes; tests/test_goldens.py runs a slice",
-    r"\.venv/bin/pip install coverage": "needed by tests/mutants.py alone",
-    r"\.venv/bin/python tests/mutants\.py .*": "takes an hour",
     r"python -m http\.server .*": "a server that does not end",
     r"dask (scheduler|worker)\b.*": "a server that does not end; tests/tiles starts one",
     r"python -m benchmarks synth .*": "takes a minute; tests/benchmarks/test_synth.py makes a small one",
