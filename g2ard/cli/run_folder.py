@@ -166,7 +166,8 @@ class RunFolder:
         targets, which score the file later, a lossy file is compared with the scene.
         """
         run = self._run
-        (self.work / "written").touch()  # from now on, --resume may replace this run's files
+        if self.work.is_dir():
+            (self.work / "written").touch()  # from now on, --resume may replace this run's files
         run.write(self.scene, done.splats, overwrite=True, compare=targets is None)
         pages = (self.path / name for name in ("report.json", "report.html", _PICTURE, "view.html"))
         for other in (*self._other_scenes(), *pages):

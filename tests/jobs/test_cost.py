@@ -113,7 +113,8 @@ def peak_of(ask: list[str], folder: Path) -> int:
         "import subprocess, sys; from resource import RUSAGE_CHILDREN, getrusage\n"
         "subprocess.run(sys.argv[1:], check=True); print(getrusage(RUSAGE_CHILDREN).ru_maxrss)"
     )
-    program = [sys.executable, "-c", code, sys.executable, "-m", "g2ard", *ask, "-q"]
+    ask = [*ask, "--device", "cpu", "-q"]  # a software adapter takes memory
+    program = [sys.executable, "-c", code, sys.executable, "-m", "g2ard", *ask]
     done = subprocess.run(program, cwd=folder, env=environment(), capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr
     return int(done.stdout) * (1 if sys.platform == "darwin" else 1024)

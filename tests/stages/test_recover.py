@@ -92,12 +92,12 @@ def test_engines_take_the_same_steps(student: Splats, targets: TeacherRenders, e
 def test_the_gpu_recovers_like_the_cpu(student: Splats, targets: TeacherRenders, engine: Any) -> None:
     config = RecoverConfig(steps=60, regularizers=replace(REGULARIZERS["noisy"], period=10))
     there = recover(student, targets, config)
-    assert devices.state().served == 1  # no trials
+    assert devices.state().served > 1  # the steps, and images to score
     again = recover(student, targets, config)
     assert_same_bits(there.splats, again.splats)
     devices.use("cpu")
     here = recover(student, targets, config)
-    assert here.report.psnr.before == there.report.psnr.before
+    assert abs(here.report.psnr.before - there.report.psnr.before) < 1e-5
     assert abs(here.report.psnr.after - there.report.psnr.after) < 0.02
     unseen = TeacherRenders(TEACHER, around(7, (80, 60), 2.5))
     assert abs(evaluate(here.splats, unseen).psnr - evaluate(there.splats, unseen).psnr) < 0.02

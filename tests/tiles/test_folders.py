@@ -137,12 +137,12 @@ def test_killed_levels_leave_nothing_beside_the_output(tmp_path: Path) -> None:
     killed = (
         "import os, sys; sys.path.insert(0, sys.argv[1])\n"
         "from pathlib import Path; from helpers.level_files import scattered\n"
-        "from g2ard.levels import Cut, save_levels, write\n"
-        "link, done = write._linked, []\n"
+        "from g2ard.levels import Cut, save_levels, streamed_sog\n"
+        "link, done = streamed_sog._linked, []\n"
         "def dies(*names):\n"
         "    done.append(link(*names))\n"
         "    if len(done) == 9: os._exit(9)\n"
-        "write._linked = dies\n"
+        "streamed_sog._linked = dies\n"
         "save_levels(Path('out'), [scattered(2000), scattered(300, 1)], cut=Cut(most=200), work=Path('work'))"
     )
     call = [sys.executable, "-c", killed, str(ROOT / "tests")]

@@ -103,6 +103,9 @@ def simplify(
     def counted(total: int) -> None:
         for each in named:
             each.check(total)
+        if tiled:
+            for budget in budgets:  # in tiles, all are of the count
+                budget.of(total, str(scene))
 
     began, reports = time.perf_counter(), []
     inputs: dict[str, Any] = {"views": given, "blind": no_views, "up": up, "seed": run.seed}
