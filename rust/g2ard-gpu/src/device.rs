@@ -76,7 +76,7 @@ impl State {
 
 /// What a device keeps of a scene between two images of it.
 pub enum Drawn {
-    /// Nothing; the CPU has drawn so many images.
+    /// Nothing yet; the number of images that the CPU has drawn.
     Nothing(usize),
     Scene(Box<train::Images>),
     /// Nothing ever, because the device has failed.
