@@ -1,9 +1,10 @@
 """Base class of reports: dataclasses that convert to and from JSON."""
 
-import types
 from collections.abc import Mapping
-from dataclasses import MISSING, dataclass, fields
-from typing import Any, Self, Union, get_args, get_origin, get_type_hints
+from dataclasses import dataclass, fields
+from typing import Any, Self
+
+import msgspec
 
 LEFT_OUT = {"left_out": True}
 """Metadata of an optional field that JSON omits without a value."""
@@ -31,9 +32,7 @@ class Report:
     @classmethod
     def of(cls, data: Mapping[str, Any]) -> Self:
         """Restore a report from `as_dict`."""
-        kinds = get_type_hints(cls)
-        names = [f.name for f in fields(cls) if f.name in data or f.default is MISSING]
-        return cls(**{name: _read(kinds[name], data[name]) for name in names})
+        return msgspec.convert(data, cls)
 
 
 def plain(value: Any) -> Any:
@@ -47,15 +46,3 @@ def _nested(value: Any) -> Any:
     if isinstance(value, Report):
         return value.as_dict()
     return [_nested(item) for item in value] if isinstance(value, list | tuple) else value
-
-
-def _read(kind: Any, value: Any) -> Any:
-    if value is None:
-        return None
-    if get_origin(kind) in (Union, types.UnionType):
-        kind = next(option for option in get_args(kind) if option is not type(None))
-    if isinstance(kind, type) and issubclass(kind, Report):
-        return kind.of(value)
-    if get_origin(kind) is tuple:
-        return tuple(_read(get_args(kind)[0], item) for item in value)
-    return value
