@@ -150,7 +150,7 @@ def reader(path: str | Path, expected: Kind) -> tuple[Path, Any]:
         what = _NAMES[found] if found != "views" else name
         hint = _OTHER_KINDS.get((expected, found))
         raise InputError(f"expected {_NAMES[expected]}, found {what}", path=path, hint=hint)
-    return path, import_module(f"g2ard.io.{name}")
+    return path, import_module(f"g2ard.io.{'tile_store' if name == 'tiles' else name}")
 
 
 @lru_cache(maxsize=64)

@@ -88,72 +88,37 @@ def cleaned(
 
 
 @dataclass
-class RowTally:
-    """Counts of rows, and of those dropped because they are not finite, over the blocks of a file."""
+class Tally:
+    """Counts over the blocks of a file of Gaussians or points: of rows, and of values that readers change."""
 
+    item: str = "Gaussian"
     rows: int = 0
     dropped: int = 0
     first: int = -1
+    noise: int = 0
+    logits: int = 0
+    scales: int = 0
+    quats: int = 0
+    brightest: float = -LOGIT_LIMIT
 
-    def count(self, good: NDArray[np.bool_]) -> None:
-        """Count rows, given an (n,) mask of those that are kept."""
+    def _count(self, good: NDArray[np.bool_]) -> None:
+        """Count rows, given an (n,) mask of those that are finite."""
         lost = len(good) - int(np.count_nonzero(good))
         if lost and not self.dropped:
             self.first = self.rows + int(np.argmin(good))
         self.dropped += lost
         self.rows += len(good)
 
-    def dropped_notes(self, path: Path, item: str, hint: str | None = None) -> list[Note]:
-        """Return a note on dropped rows; raise an `InputError` with `hint` if none remains."""
-        if not self.rows:
-            raise InputError(f"has no {item}s", path=path)
-        if self.dropped == self.rows:
-            raise InputError(f"none of its {plural(self.rows, item)} is finite", path=path, hint=hint)
-        if not self.dropped:
-            return []
-        text = f"{plural(self.dropped, f'non-finite {item}')} dropped (the first is row {self.first})"
-        return [Note("dropped_rows", self.dropped, text)]
-
-
-@dataclass
-class PointTally(RowTally):
-    """Counts of points that are not finite or noise, and the brightest colour, over the blocks of a cloud."""
-
-    brightest: float = 0.0
-    noise: int = 0
-
     def keep(
         self, positions: NDArray[Any], colors: NDArray[Any], noise: NDArray[np.bool_]
     ) -> NDArray[np.bool_]:
-        """Return an (n,) mask of the finite rows that are not noise, and count all."""
+        """Return an (n,) mask of the finite points that are not noise, and count all."""
         good = np.all(np.isfinite(positions), axis=1) & np.all(np.isfinite(colors), axis=1)
-        self.count(good)
+        self._count(good)
         self.noise += int(np.count_nonzero(good & noise))
         good &= ~noise
         self.brightest = max(self.brightest, float(np.max(colors, where=good[:, None], initial=0.0)))
         return good
-
-    def notes(self, path: Path) -> list[Note]:
-        """Return notes on dropped points; raise an `InputError` if none remains."""
-        notes = self.dropped_notes(path, "point")
-        if self.noise == self.rows - self.dropped:
-            raise InputError(
-                f"all of its {plural(self.noise, 'point')} are marked as noise or invalid", path=path
-            )
-        if self.noise:
-            text = f"{plural(self.noise, 'point')} dropped that the file marks as noise, withheld or invalid"
-            notes.append(Note("noise", self.noise, text))
-        return notes
-
-
-@dataclass
-class Tally(RowTally):
-    """Counts of dropped, clamped and repaired values over the blocks of a scene."""
-
-    logits: int = 0
-    scales: int = 0
-    quats: int = 0
-    brightest: float = -LOGIT_LIMIT
 
     def clean(self, raw: Raw) -> NDArray[np.bool_]:
         """Clamp and activate rows in place, making `log_scales` linear; return an (N,) mask to keep."""
@@ -178,7 +143,7 @@ class Tally(RowTally):
         if zero.any():
             self.quats += int(np.count_nonzero(zero))
             quats[zero] = (1, 0, 0, 0)
-        self.count(good)
+        self._count(good)
         self.brightest = float(np.max(logits, where=good, initial=self.brightest))
         return good
 
@@ -189,16 +154,32 @@ class Tally(RowTally):
 
     def notes(self, path: Path) -> list[Note]:
         """Return notes on all rows; raise an `InputError` if none remains."""
-        notes = self.dropped_notes(path, "Gaussian", "use an earlier checkpoint of the training")
-        for count, code, what, then in (
-            (self.logits, "clamped_logits", "opacity logit", f"beyond ±{LOGIT_LIMIT:g} clamped"),
-            (self.scales, "clamped_scales", "log-scale", f"beyond ±{LOG_SCALE_LIMIT:g} clamped"),
-            (self.quats, "zero_quats", "quaternion", "of length zero made the identity"),
-        ):
-            if count:
-                notes.append(Note(code, count, f"{plural(count, what)} {then}"))
-        if self.brightest < DRAWN_LOGIT:
-            left = self.rows - self.dropped
+        points, left = self.item == "point", self.rows - self.dropped
+        if not self.rows:
+            raise InputError(f"has no {self.item}s", path=path)
+        if not left:
+            hint = None if points else "use an earlier checkpoint of the training"
+            raise InputError(f"none of its {plural(self.rows, self.item)} is finite", path=path, hint=hint)
+        if self.noise == left:
+            text = f"all of its {plural(self.noise, 'point')} are marked as noise or invalid"
+            raise InputError(text, path=path)
+        changes = {
+            "dropped_rows": (
+                self.dropped,
+                f"non-finite {self.item}",
+                f"dropped (the first is row {self.first})",
+            ),
+            "noise": (self.noise, "point", "dropped that the file marks as noise, withheld or invalid"),
+            "clamped_logits": (self.logits, "opacity logit", f"beyond ±{LOGIT_LIMIT:g} clamped"),
+            "clamped_scales": (self.scales, "log-scale", f"beyond ±{LOG_SCALE_LIMIT:g} clamped"),
+            "zero_quats": (self.quats, "quaternion", "of length zero made the identity"),
+        }
+        notes = [
+            Note(code, count, f"{plural(count, what)} {then}")
+            for code, (count, what, then) in changes.items()
+            if count
+        ]
+        if self.brightest < DRAWN_LOGIT and not points:
             notes.append(Note("invisible", left, "the scene is invisible: every opacity is below 1/255"))
         return notes
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from g2ard.config.choices import RenderModel
 from g2ard.io.paths import file_identity
-from g2ard.io.sanitize import BLOCK, PointTally, Raw, Tally
+from g2ard.io.sanitize import BLOCK, Raw, Tally
 from g2ard.io.types import Cloud, Note, Points, Scene
 from g2ard.scene.splats import ARRAYS, Splats
 from g2ard.scene.transform import one_model
@@ -48,12 +48,15 @@ class Stream(ABC, Generic[Block]):
         tally: counts over the rows that `blocks` has read.
     """
 
-    tally: Any
-
     def __init__(
-        self, path: Path, count: int, offset: NDArray[np.float64] | None, notes: tuple[Note, ...] = ()
+        self,
+        path: Path,
+        count: int,
+        offset: NDArray[np.float64] | None,
+        notes: tuple[Note, ...] = (),
+        item: str = "Gaussian",
     ) -> None:
-        self.path, self.count, self.notes = path, count, notes
+        self.path, self.count, self.notes, self.tally = path, count, notes, Tally(item)
         self.offset = np.zeros(3) if offset is None else offset
 
     def identity(self) -> list[Any]:
@@ -78,7 +81,7 @@ class Stream(ABC, Generic[Block]):
 
 
 class SceneStream(Stream[Splats]):
-    """Scene in blocks, which are cleaned as in `g2ard.io.read_scene`.
+    """Scene in blocks. Readers yield its `raw` rows, which are cleaned as in `g2ard.io.read_scene`.
 
     Attributes:
         sh_degree: 0–3.
@@ -96,25 +99,12 @@ class SceneStream(Stream[Splats]):
         render_model: RenderModel = "classic",
     ) -> None:
         super().__init__(path, count, offset, notes)
-        self.tally, self.render_model, self.sh_degree = Tally(), render_model, _DEGREE_OF_REST[rest]
+        self.render_model, self.sh_degree = render_model, _DEGREE_OF_REST[rest]
         self.up: tuple[float, float, float] | None = None
 
-    def whole(self) -> Scene:
-        """Read all rows into memory."""
-        raw, kept = Raw.empty(self.count, (self.sh_degree + 1) ** 2 - 1), 0
-        for block in self.blocks(BLOCK):
-            rows = raw.take(slice(kept, kept := kept + len(block)))
-            rows.fill(getattr(block, name) for name in ARRAYS)
-        notes = self.all_notes()
-        return Scene(raw.take(slice(kept)).activated(self.render_model, self.offset, self.up), notes)
-
-
-class RawStream(SceneStream):
-    """Scene whose rows must be cleaned."""
-
-    @abstractmethod
     def raw(self, rows: int, start: int) -> Iterator[Raw]:
         """Yield the source's rows from `start`, at most `rows` at a time; callers may change the arrays."""
+        raise NotImplementedError
 
     def positions(self, rows: int) -> Iterator[NDArray[np.float32]]:
         return (raw.means for raw in self.raw(rows, 0))
@@ -124,6 +114,15 @@ class RawStream(SceneStream):
             before, keep = self.tally.dropped, self.tally.clean(raw)
             splats = raw.activated(self.render_model, self.offset)
             yield splats if self.tally.dropped == before else splats.take(keep)
+
+    def whole(self) -> Scene:
+        """Read all rows into memory."""
+        raw, kept = Raw.empty(self.count, (self.sh_degree + 1) ** 2 - 1), 0
+        for block in self.blocks(BLOCK):
+            rows = raw.take(slice(kept, kept := kept + len(block)))
+            rows.fill(getattr(block, name) for name in ARRAYS)
+        notes = self.all_notes()
+        return Scene(raw.take(slice(kept)).activated(self.render_model, self.offset, self.up), notes)
 
 
 class PartsStream(SceneStream):
@@ -197,8 +196,7 @@ class PointStream(Stream[RawPoints]):
         middle, extent = (low + high) / 2, high - low
         far = np.isfinite(middle).all() and (np.abs(middle) > np.linalg.norm(extent)).any()
         notes = (_DEGREES,) if _in_degrees(middle, extent) else ()
-        super().__init__(path, count, np.rint(middle) if far else None, notes)
-        self.tally: PointTally = PointTally()
+        super().__init__(path, count, np.rint(middle) if far else None, notes, "point")
         self.scales = scales
 
     @abstractmethod
@@ -214,7 +212,7 @@ class PointStream(Stream[RawPoints]):
 
     def header_notes(self) -> tuple[Note, ...]:
         notes, rows = list(self.notes), self.tally.rows
-        if rows and not self.tally.brightest:
+        if rows and self.tally.brightest <= 0:
             text = "all colours are 0; add colours, for example with PDAL's filters.colorization"
             notes.append(Note("black", rows, text))
         elif rows and self.divisor == _FULL[0] < self.scales[-1]:
@@ -318,8 +316,7 @@ class JoinedClouds(Joined[RawPoints], PointStream):
 
     def __init__(self, streams: Sequence[PointStream]) -> None:
         self.streams, self._divisors = streams, dict[int, float]()
-        Stream.__init__(self, streams[0].path, sum(s.count for s in streams), streams[0].offset)
-        self.tally = PointTally()
+        Stream.__init__(self, streams[0].path, sum(s.count for s in streams), streams[0].offset, item="point")
 
     def raw(self, rows: int, start: int) -> Iterator[MarkedPoints]:
         for number, begin in from_row([stream.count for stream in self.streams], start):
@@ -331,7 +328,7 @@ class JoinedClouds(Joined[RawPoints], PointStream):
         """Return a file's divisor, which takes an additional pass over its points."""
         if number not in self._divisors:
             stream = self.streams[number]
-            stream.tally = PointTally()
+            stream.tally = Tally("point")
             for points in stream.raw(rows, 0):
                 stream.tally.keep(*points)
             self._divisors[number] = stream.divisor

@@ -22,6 +22,7 @@ from g2ard.errors import InputError
 from g2ard.io.detect import MANIFEST
 from g2ard.io.jsonfile import Number, Place, Vector, Whole, checked, read_own
 from g2ard.io.sanitize import Raw
+from g2ard.io.stream import PartsStream
 from g2ard.io.types import Note
 from g2ard.scene.kdtree import KdTree
 from g2ard.scene.splats import Splats
@@ -252,6 +253,17 @@ class TileStore:
             part.logit_opacities[:], part.sh0[:, 0] = rows[:, 10], rows[:, 11:14]
             part.shN[:] = rows[:, 14 : 14 + 3 * rest].reshape(len(rows), rest, 3)
         return raw.activated(self.render_model, self.offset.copy(), self.up)
+
+
+class Stream(PartsStream):
+    """Tiles of a folder as a scene, read one at a time."""
+
+    def __init__(self, path: Path) -> None:
+        store = TileStore.open(path)
+        counts = [tile.rows for tile in store.tiles]
+        parts = counts, store.read, store.sh_degree, store.offset
+        super().__init__(path, *parts, [store.key], store.notes, store.render_model)
+        self.up = store.up
 
 
 class StoredScene:

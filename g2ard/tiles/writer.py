@@ -17,6 +17,7 @@ from g2ard.config.choices import RenderModel
 from g2ard.errors import OutputError
 from g2ard.io.atomic import atomic_output, drop_temporaries
 from g2ard.io.detect import MANIFEST, POINTS
+from g2ard.io.sanitize import Tally
 from g2ard.io.stream import PointStream, SceneStream
 from g2ard.io.tile_store import FORMAT, VERSION, TileStore, halo_name, packed, row_width, tile_name
 from g2ard.progress import Progress, Say, plural
@@ -211,7 +212,7 @@ def pour(
     tree, margin = _planned(folder, feed, tile_rows, rows, progress, like)
     while True:
         writer = TileWriter(folder, tree, margin, feed.row_bytes)
-        stream.tally = type(stream.tally)()
+        stream.tally = Tally(stream.tally.item)
         for block, positions in feed.rows(rows):
             writer.add(block, positions)
             progress("tiles", stream.tally.rows, stream.count)
