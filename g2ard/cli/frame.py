@@ -323,7 +323,7 @@ class Run:
         overwrite: bool = False,
     ) -> None:
         """Write views, and report what their format cannot hold."""
-        from g2ard.io.camera_files import lost_views, view_format
+        from g2ard.io.view_sets import lost_views, view_format
 
         overwrite = self.overwrite or overwrite
         write_views(path, cameras, splits=splits, weights=weights, format=format, overwrite=overwrite)

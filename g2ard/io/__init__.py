@@ -11,14 +11,17 @@ The first function of each row returns data; the second also returns notes about
 """
 
 from g2ard.io.atomic import atomic_folder, atomic_output, check_output
-from g2ard.io.clouds import open_point_stream, read_cloud, read_points, write_points
 from g2ard.io.detect import find_views, kind
 from g2ard.io.scenes import (
     check_scene,
     check_scene_output,
+    open_point_stream,
     open_stream,
+    read_cloud,
+    read_points,
     read_scene,
     read_splats,
+    write_points,
     write_splats,
 )
 from g2ard.io.view_sets import check_views_output, read_view_set, read_views, write_views

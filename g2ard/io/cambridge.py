@@ -1,5 +1,6 @@
-"""Reader for Cambridge Landmarks: poses from dataset_*.txt, focal lengths from reconstruction.nvm."""
+"""Readers for poses as text, a photo per line: Cambridge Landmarks (focal lengths in an .nvm) and ACE."""
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -7,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard.errors import InputError, damaged
-from g2ard.io.ace import lines
 from g2ard.io.colmap import parsing
 from g2ard.io.finding import Finder
+from g2ard.io.jsonfile import Place
 from g2ard.io.paths import read_text
 from g2ard.io.photos import Frame, Lens, Listed, photo_size, posed
 from g2ard.io.types import Note
@@ -44,7 +45,7 @@ def read(path: Path, images: Path | None = None) -> Listed:
     for split, name in _SPLIT_FILES.items():
         if not (path / name).is_file():
             continue
-        for place, photo_name, pose in lines(path / name, heading=3):
+        for place, photo_name, pose in _lines(path / name, heading=3):
             if not pose[3:].any():
                 raise place.error("has a quaternion of length zero")
             lens = lenses.get(_stem(photo_name))
@@ -83,3 +84,35 @@ def _lenses(path: Path) -> dict[str, _Focal]:
     if not lenses:
         raise InputError("has no cameras", path=path)
     return lenses
+
+
+def read_ace(path: Path) -> dict[str, NDArray[np.float64]]:
+    """Read ACE's lines `NAME qw qx qy qz tx ty tz …` as photo → (4, 4) camera_from_world."""
+    out: dict[str, NDArray[np.float64]] = {}
+    for place, name, numbers in _lines(path):
+        if not numbers[:4].any():
+            raise place.error("has a quaternion of length zero")
+        if name in out:
+            raise place.error(f"repeats the name {name!r}")
+        out[name] = posed(numbers[:4], numbers[4:])
+    if not out:
+        raise InputError("no poses found", path=path)
+    return out
+
+
+def _lines(path: Path, heading: int = 0) -> Iterator[tuple[Place, str, NDArray[np.float64]]]:
+    """Yield the name and the seven numbers of each line after a heading of lines.
+
+    Empty lines and lines that begin with # are skipped.
+    """
+    for number, line in enumerate(read_text(path).splitlines(), 1):
+        words, place = line.split(), Place(path, number, "line")
+        if number <= heading or not words or words[0].startswith("#"):
+            continue
+        try:
+            numbers = np.array(words[1:8], np.float64)
+        except ValueError:
+            numbers = np.zeros(0)
+        if len(numbers) != 7 or not np.isfinite(numbers).all():
+            raise place.error("is not a name and seven numbers")
+        yield place, words[0], numbers

@@ -1,4 +1,4 @@
-"""Reader for COLMAP models: cameras and images, binary or text.
+"""Reader for COLMAP models, cameras and images, binary or text; writer for text.
 
 Rigs and frames (COLMAP 3.12 and later) give the poses of images that have none of their own.
 """
@@ -19,9 +19,12 @@ from g2ard.io.finding import Finder
 from g2ard.io.jsonfile import Place
 from g2ard.io.paths import read_text
 from g2ard.io.photos import Frame, Lens, Listed, photo_size, posed
+from g2ard.io.transforms import intrinsics_of
 from g2ard.io.types import Note
 from g2ard.progress import plural
+from g2ard.scene.cameras import Cameras
 from g2ard.scene.lenses import PARAMETERS, PhotoLens
+from g2ard.scene.transform import quaternion_of
 
 _MODELS = (
     *("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV"),
@@ -507,3 +510,32 @@ def _known(numbers: Sequence[float]) -> NDArray[np.float64] | None:
     if not all(map(math.isfinite, numbers)) or not any(numbers[:4]):
         return None
     return posed(numbers[:4], numbers[4:])
+
+
+def texts_of(cameras: Cameras) -> dict[str, str]:
+    """Return sparse/0 with cameras.txt, images.txt and an empty points3D.txt; a camera per lens."""
+    lenses: dict[str, int] = {}
+    images = []
+    for i, viewmat in enumerate(cameras.viewmats):
+        lens = intrinsics_of(cameras, i)
+        words = [lens[key] for key in ("w", "h", "fl_x", "fl_y", "cx", "cy")]
+        bent = [lens[key] for key in ("k1", "k2", "p1", "p2")]
+        kind = ["OPENCV", *words, *bent] if any(bent) else ["PINHOLE", *words]
+        camera = lenses.setdefault(" ".join(map(str, kind)), len(lenses) + 1)
+        pose = [*quaternion_of(viewmat[:3, :3]).tolist(), *viewmat[:3, 3].tolist()]
+        images.append(" ".join(map(str, [i + 1, *pose, camera, cameras.names[i]])) + "\n\n")
+    rows = {
+        "cameras": "".join(f"{number} {words}\n" for words, number in lenses.items()),
+        "images": "".join(images),
+        "points3D": "",
+    }
+    return {
+        f"sparse/0/{name}.txt": f"# {columns}\n{rows[name]}" for name, columns in _WRITTEN.items()
+    }
+
+
+_WRITTEN = {
+    "cameras": "CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]",
+    "images": "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, then a line of POINTS2D[]",
+    "points3D": "POINT3D_ID X Y Z R G B ERROR TRACK[]",
+}

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from g2ard.errors import G2ardError, InputError, missing
 from g2ard.io.atomic import atomic_output
-from g2ard.io.limits import check_unpacked
+from g2ard.io.paths import check_unpacked
 from g2ard.io.photos import Frame, Lens, Listed, inverse, posed
 from g2ard.io.stream import MarkedPoints, PointStream, from_row, full_scales
 from g2ard.io.transforms import FLIP

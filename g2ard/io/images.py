@@ -17,8 +17,8 @@ from PIL import Image, ImageDraw, ImageFont, ImageOps
 from g2ard.config.choices import BLACK, Colour
 from g2ard.errors import InputError
 from g2ard.io.atomic import atomic_output
-from g2ard.io.limits import opened_image
-from g2ard.io.photos import fits, photo_size, turns
+from g2ard.io.jsonfile import Place, Row, checked, read_json
+from g2ard.io.photos import fits, opened_image, photo_size, turns
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.lenses import PhotoLens
 from g2ard.scene.samples import evenly_spaced
@@ -137,6 +137,31 @@ def colour_text(colour: Colour) -> str:
     named = {(0.0, 0.0, 0.0): "black", (1.0, 1.0, 1.0): "white"}
     red, green, blue = (round(float(value), 3) for value in colour)
     return named.get((red, green, blue), f"{red:g},{green:g},{blue:g}")
+
+
+def find_exposures(cameras: Cameras) -> dict[str, NDArray[np.float64]]:
+    """Return exposures by view name from 3DGS's exposure.json beside the photos' folder, if there is one.
+
+    It holds a 3×4 matrix C per photo, named with or without the suffix: photo = C·(render, 1).
+    """
+    exposures: dict[str, NDArray[np.float64]] = {}
+    tables: dict[Path, dict[str, NDArray[np.float64]]] = {}
+    for name, photo in zip(cameras.names, cameras.image_paths, strict=True):
+        if photo is None:
+            continue
+        path = photo.parent.parent / "exposure.json"
+        if path not in tables:
+            content = read_json(path) if path.is_file() else {}
+            tables[path] = {
+                key: np.array(checked(rows, tuple[Row, Row, Row], Place(path).to(key)))
+                for key, rows in content.items()
+            }
+        table = tables[path]
+        for key in (name, photo.name, photo.stem):
+            if key in table:
+                exposures[name] = table[key]
+                break
+    return exposures
 
 
 def load_mask(cameras: Cameras, index: int) -> NDArray[np.bool_] | None:

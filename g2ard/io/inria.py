@@ -1,4 +1,4 @@
-"""Reader for cameras.json, which INRIA's trainer writes into a model's folder."""
+"""Reader and writer for cameras.json, which INRIA's trainer writes into a model's folder."""
 
 from collections import Counter
 from pathlib import Path
@@ -10,8 +10,10 @@ import numpy as np
 from g2ard.io.finding import Finder
 from g2ard.io.jsonfile import Matrix, Number, Place, Vector, Whole, checked, read_any_json
 from g2ard.io.photos import Frame, Lens, Listed, fits, inverse, photo_size, rigid
+from g2ard.io.transforms import json_rows
 from g2ard.io.types import Note
 from g2ard.progress import plural
+from g2ard.scene.cameras import Cameras
 
 NAME = "cameras.json"
 
@@ -67,3 +69,23 @@ def _frame(place: Place, camera: _Camera, finder: Finder | None) -> Frame:
         photo=photo,
         listed=camera.img_name,
     )
+
+
+def text_of(cameras: Cameras) -> str:
+    """Return {id, img_name, width, height, position, rotation, fx, fy} per view, in OpenCV axes."""
+    rows = []
+    for i, viewmat in enumerate(cameras.viewmats):
+        turn = viewmat[:3, :3].T
+        rows.append(
+            {
+                "id": i,
+                "img_name": cameras.names[i],
+                "width": int(cameras.widths[i]),
+                "height": int(cameras.heights[i]),
+                "position": (-turn @ viewmat[:3, 3]).tolist(),
+                "rotation": turn.tolist(),
+                "fy": float(cameras.Ks[i, 1, 1]),
+                "fx": float(cameras.Ks[i, 0, 0]),
+            }
+        )
+    return json_rows(rows) + "\n"

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from g2ard.errors import InputError, damaged, missing
-from g2ard.io.limits import check_unpacked
+from g2ard.io.paths import check_unpacked
 from g2ard.io.stream import MarkedPoints, PointStream, full_scales
 
 _LARGEST_CHUNK = 1 << 30

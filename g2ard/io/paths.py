@@ -1,4 +1,4 @@
-"""Checks for paths: links, special files, names that leave their folder."""
+"""Checks for files: links, special files, names that leave their folder, sizes when unpacked."""
 
 import codecs
 import hashlib
@@ -29,6 +29,11 @@ _OTHER_PHOTOS = {
 """Suffixes of photos that cannot be read, and their formats."""
 
 
+_LARGEST_RATIO = 100
+_ALWAYS_UNPACKED = 64 << 20
+"""Bytes that any file may unpack to; larger ones are limited by `_LARGEST_RATIO`."""
+
+
 def real_path(path: str | Path) -> Path:
     """Return the path with links resolved; circular links are kept (`Path.resolve` would raise)."""
     return Path(os.path.realpath(path))
@@ -48,6 +53,20 @@ def check_regular(path: Path) -> None:
     """Raise an `InputError` for a pipe, device or socket, which might block forever."""
     if path.exists() and not (path.is_file() or path.is_dir()):
         raise InputError("not a regular file", path=path)
+
+
+def check_unpacked(path: str | Path, packed: int, unpacked: int) -> None:
+    """Raise an `InputError` for data that unpacks to over 64 MiB and over 100 times its size, in bytes.
+
+    >>> check_unpacked("a.spz", 1 << 20, 100 << 20)
+    >>> check_unpacked("b.spz", 1 << 10, 100 << 20)
+    Traceback (most recent call last):
+    ...
+    g2ard.errors.InputError: b.spz: 1,024 bytes would unpack to 104,857,600; the limit is 67,108,864
+    """
+    most = max(_ALWAYS_UNPACKED, _LARGEST_RATIO * packed)
+    if unpacked > most:
+        raise InputError(f"{packed:,} bytes would unpack to {unpacked:,}; the limit is {most:,}", path=path)
 
 
 def read_text(path: Path) -> str:

@@ -1,26 +1,25 @@
-"""Helpers for readers of views: photos of frames, and frames to cameras."""
+"""Helpers for readers of views: photos of frames within limits, and frames to cameras."""
 
 from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import IO, TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from g2ard.errors import InputError
+from g2ard.errors import InputError, damaged
 from g2ard.io.finding import find_mask, is_a_photo, is_end, mask_folders, plain_parts
 from g2ard.io.jsonfile import Place
-from g2ard.io.limits import opened_image
-from g2ard.io.paths import is_photo, other_photo
+from g2ard.io.paths import check_regular, is_photo, other_photo
 from g2ard.io.types import Note, ViewSet
 from g2ard.progress import plural
-from g2ard.scene.cameras import USUAL, Cameras
+from g2ard.scene.cameras import LARGEST_IMAGE, USUAL, Cameras, check_image
 from g2ard.scene.lenses import PhotoLens
 from g2ard.scene.transform import rotation_matrices
 
@@ -111,6 +110,30 @@ class Listed(NamedTuple):
         if self.left_out:
             raise self.left_out[0][1]
         return self.frames
+
+
+@contextmanager
+def opened_image(path: Path, content: IO[bytes] | None = None) -> Iterator[Image.Image]:
+    """Open `path`, or `content`, as a Pillow image after checking its size.
+
+    Exceptions in the block become an `InputError` about a damaged image, except for `FileNotFoundError`.
+    """
+    from PIL import Image, UnidentifiedImageError
+
+    if content is None:
+        check_regular(path)
+    try:
+        with Image.open(content or path) as image:
+            check_image(*image.size, path=path)
+            yield image
+    except (InputError, FileNotFoundError):
+        raise
+    except Image.DecompressionBombError as error:
+        raise InputError(f"has more than {LARGEST_IMAGE:,} pixels", path=path) from error
+    except UnidentifiedImageError as error:
+        raise InputError("is not an image", path=path) from error
+    except Exception as error:  # Pillow's decoders raise any exception for damaged files
+        raise damaged(f"cannot be decoded ({str(error) or type(error).__name__})", path=path) from error
 
 
 def photo_size(

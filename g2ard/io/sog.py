@@ -24,9 +24,9 @@ from PIL.Image import Image
 from g2ard.config.choices import RenderModel
 from g2ard.errors import InputError, damaged
 from g2ard.io.jsonfile import FileName, Place, Vector, Whole, checked, parse_json, read_json
-from g2ard.io.limits import check_unpacked, opened_image
 from g2ard.io.packing import from_smallest_three
-from g2ard.io.paths import check_regular, decoded, file_identity
+from g2ard.io.paths import check_regular, check_unpacked, decoded, file_identity
+from g2ard.io.photos import opened_image
 from g2ard.io.sanitize import BLOCK, Raw, logits_of
 from g2ard.io.stream import SceneStream, from_row
 from g2ard.io.types import Note

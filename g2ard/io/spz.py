@@ -20,7 +20,7 @@ from g2ard.config.choices import Axes
 from g2ard.errors import InputError, damaged, missing, require
 from g2ard.io import packing
 from g2ard.io.atomic import atomic_output
-from g2ard.io.limits import check_unpacked
+from g2ard.io.paths import check_unpacked
 from g2ard.io.sanitize import Raw, cleaned, logits_of
 from g2ard.io.types import Note, Scene
 from g2ard.progress import Progress, plural, silent

@@ -1,7 +1,8 @@
-"""Reader for transforms.json of instant-ngp, nerfstudio and NeRF's synthetic scenes."""
+"""Reader and writer for transforms.json of instant-ngp, nerfstudio and NeRF's synthetic scenes."""
 
+import json
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +14,10 @@ from numpy.typing import NDArray
 from g2ard.errors import InputError
 from g2ard.io.finding import Finder, is_end
 from g2ard.io.jsonfile import Number, Place, Pose, Vector, Whole, checked, read_json
+from g2ard.io.paths import beside
 from g2ard.io.photos import Frame, Lens, Listed, fits, inverse, photo_size, rigid
 from g2ard.io.types import Note
+from g2ard.scene.cameras import Cameras
 from g2ard.scene.lenses import PhotoLens
 
 _MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
@@ -283,3 +286,39 @@ def _size(place: Place, frame: _Frame, photo: Path) -> tuple[int, int]:
         return photo_size(photo, place.path, stated)
     error = place.error(f"has neither w and h nor a photo {photo}")
     raise error.at(hint="{images=DIR} names the folder of photos that are elsewhere")
+
+
+def text_of(path: Path, cameras: Cameras, splits: Sequence[str | None]) -> str:
+    """Return a transforms.json: world_from_camera in OpenGL axes, and lists of file names per split.
+
+    Photos are relative to `path`; views without one are named `images/NAME`.
+    """
+    lenses = [intrinsics_of(cameras, i) for i in range(len(cameras))]
+    shared = lenses[0] if all(lens == lenses[0] for lens in lenses) else {}
+    frames: list[dict[str, Any]] = []
+    for i, viewmat in enumerate(cameras.viewmats):
+        photo, mask = (
+            (cameras.image_paths[i], cameras.mask_paths[i]) if cameras.lenses[i] is None else (None, None)
+        )
+        pose = np.asarray(inverse(viewmat) @ FLIP)
+        frame = {"file_path": beside(photo, path) or f"images/{cameras.names[i]}"}
+        if (covered := beside(mask, path)) is not None:
+            frame["mask_path"] = covered
+        frames.append({**frame, **({} if shared else lenses[i]), "transform_matrix": pose.tolist()})
+    head: dict[str, Any] = {"camera_model": "OPENCV", **shared}
+    for word in sorted({word for word in splits if word}):
+        names = [frame["file_path"] for frame, own in zip(frames, splits, strict=True) if own == word]
+        head[f"{word}_filenames"] = names
+    return json.dumps(head)[:-1] + f', "frames": {json_rows(frames)}}}\n'
+
+
+def intrinsics_of(cameras: Cameras, i: int) -> dict[str, Any]:
+    """Return intrinsics as in transforms.json."""
+    K = cameras.Ks[i]
+    lens: dict[str, Any] = {"w": int(cameras.widths[i]), "h": int(cameras.heights[i])}
+    lens |= {"fl_x": float(K[0, 0]), "fl_y": float(K[1, 1]), "cx": float(K[0, 2]), "cy": float(K[1, 2])}
+    return lens | dict(zip(("k1", "k2", "p1", "p2", "k3"), cameras.distortions[i].tolist(), strict=True))
+
+
+def json_rows(rows: list[dict[str, Any]]) -> str:
+    return "[\n" + ",\n".join(map(json.dumps, rows)) + "\n]"

@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING
 
 from g2ard.config.checks import check_type, checks_arguments
 from g2ard.config.choices import ViewFormat
-from g2ard.errors import InputError
+from g2ard.errors import InputError, OutputError
 from g2ard.io.atomic import atomic_folder, atomic_output, check_output
 from g2ard.io.detect import reader, run_views
+from g2ard.progress import plural
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -21,10 +22,58 @@ if TYPE_CHECKING:
     from g2ard.scene.cameras import Cameras
 
 
+_OFF_CENTRE = 0.5
+"""Distance in pixels of a principal point from the middle that is worth a note."""
+
+
+def view_format(path: Path, given: ViewFormat | None = None) -> ViewFormat:
+    """Return the format of an output path: the given one, or that of its name.
+
+    >>> [view_format(Path(name)) for name in ("poses.json", "a/cameras.json", "transforms_1.json", "model")]
+    ['g2ard', 'inria', 'nerfstudio', 'colmap']
+    """
+    suffix, name = path.suffix.lower(), path.name.lower()
+    if given is None and suffix == "":
+        return "colmap"
+    expected = "" if given == "colmap" else ".json"
+    if suffix != expected:
+        where = "a folder" if given == "colmap" else ".json, or as a folder for COLMAP"
+        raise OutputError(f"views are written as {where}", path=path)
+    if given is not None:
+        return given
+    if name == "cameras.json":
+        return "inria"
+    return "nerfstudio" if name.startswith("transforms") else "g2ard"
+
+
+def lost_views(
+    cameras: Cameras, format: ViewFormat, splits: Sequence[str | None], weighted: bool
+) -> list[str]:
+    """Describe what a format cannot hold of views."""
+    from g2ard.scene.cameras import USUAL
+
+    if format == "g2ard":
+        return []
+    lost = []
+    middle = [[w / 2, h / 2] for w, h in zip(cameras.widths, cameras.heights, strict=True)]
+    off = int((abs(cameras.Ks[:, :2, 2] - middle).max(axis=1) > _OFF_CENTRE).sum())
+    if format == "inria" and off:
+        lost.append(f"{plural(off, 'principal point')} beside the image's middle")
+    bent = cameras.distortions[:, slice(None) if format == "inria" else slice(4, None)].any(axis=1)
+    if format != "nerfstudio" and bent.any():
+        what = "lens distortion" if format == "inria" else "k3 of the lens distortion"
+        lost.append(f"{what} of {plural(int(bent.sum()), 'view')}")
+    if format != "nerfstudio" and any(word not in (None, "train") for word in splits):
+        lost.append("splits")
+    photos = sum(lens is not None for lens in cameras.lenses)
+    lost += [f"photos of {plural(photos, 'view')} that other lenses took"] if photos else []
+    kinds = sum(kind != USUAL for kind in cameras.kinds)
+    lost += [f"the kinds of {plural(kinds, 'view')}"] if kinds else []
+    return lost + (["sampling weights"] if weighted else [])
+
+
 def check_views_output(path: str | Path, overwrite: bool = False, format: ViewFormat | None = None) -> Path:
     """Raise the `OutputError` that `write_views` would raise, before any work."""
-    from g2ard.io.camera_files import view_format
-
     return check_output(path, overwrite, folder=view_format(Path(path), format) == "colmap")
 
 
@@ -124,13 +173,22 @@ def write_views(
     >>> g2ard.save_views(folder / "views.json", views, splits=["train"])
     >>> g2ard.save_views(folder / "transforms.json", views, splits=["train"])  # for nerfstudio
     """
-    from g2ard.io.camera_files import lost_views, texts_of, view_format
+    from g2ard.io import colmap, inria, transforms, views
     from g2ard.scene.cameras import Cameras
 
     check_type("cameras", cameras, Cameras)
     path = Path(path)
     kind = view_format(path, format)
-    texts = texts_of(path, cameras, kind, splits, weights)
+    if not len(cameras):
+        raise InputError("not written: there are no views", path=path)
+    if kind == "colmap":
+        texts = colmap.texts_of(cameras)
+    elif kind == "inria":
+        texts = {"": inria.text_of(cameras)}
+    elif kind == "nerfstudio":
+        texts = {"": transforms.text_of(path, cameras, splits)}
+    else:
+        texts = {"": views.text_of(path, cameras, splits, weights)}
     with (atomic_folder if kind == "colmap" else atomic_output)(path, overwrite) as temporary:
         for name, text in texts.items():
             (temporary / name).parent.mkdir(parents=True, exist_ok=True)

@@ -17,7 +17,7 @@ from g2ard.poses import plan_pool
 from g2ard.progress import Progress, Say, plural, silent, unsaid
 from g2ard.rendering.visibility import visibility
 from g2ard.scene.cameras import Cameras
-from g2ard.scene.sky import sky_mask
+from g2ard.scene.regions import sky_mask
 from g2ard.scene.splats import SH_C0, Splats, check_finite
 from g2ard.stages.clean import FLOATING, KINDS, Cleaning, compare_depths, find_clutter
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from g2ard.config.choices import RenderModel
 from g2ard.errors import InputError
 from g2ard.io import read_scene, read_view_set
-from g2ard.io.exposures import find_exposures
+from g2ard.io.images import find_exposures
 from g2ard.io.splits import not_held_out, split_mask, splits_of
 from g2ard.io.types import Note, ViewFiles, ViewSet
 from g2ard.progress import Say, plural, unsaid

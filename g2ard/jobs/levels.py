@@ -32,8 +32,8 @@ from g2ard.levels.tileset import save_tileset as write_tileset
 from g2ard.levels.tree import Cut, Level, aligned
 from g2ard.progress import Progress, Say, direction, plural, silent, unsaid
 from g2ard.scene.cameras import Cameras
+from g2ard.scene.regions import sky_mask
 from g2ard.scene.samples import evenly_spaced
-from g2ard.scene.sky import sky_mask
 from g2ard.scene.splats import Splats
 from g2ard.viewer import Start, write_globe_page, write_stream_page
 

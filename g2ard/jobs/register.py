@@ -15,7 +15,8 @@ from g2ard.config.checks import AboveZero, checks_arguments, signature_of
 from g2ard.config.choices import BLACK, Alpha, Colour, Keep, RenderModel
 from g2ard.config.schema import changed, full_paths
 from g2ard.errors import InputError, require
-from g2ard.io import ace, read_view_set
+from g2ard.io import read_view_set
+from g2ard.io.cambridge import read_ace
 from g2ard.io.detect import file_format
 from g2ard.io.paths import is_photo
 from g2ard.io.photos import exif_focal, has_alpha, photo_size
@@ -315,9 +316,9 @@ def _check_aspects(files: list[Path], sizes: list[tuple[int, int]], views: list[
 
 
 def read_poses(path: Path) -> dict[str, NDArray[np.float64]]:
-    """Read name → (4, 4) camera_from_world from views in any format, or from ACE's text (`g2ard.io.ace`)."""
+    """Read name → (4, 4) camera_from_world from views in any format, or from ACE's text (`read_ace`)."""
     if path.suffix.lower() == ".txt" and path.is_file():
-        return ace.read(path)
+        return read_ace(path)
     cameras = read_view_set(path, unpictured=True).cameras
     return dict(zip(cameras.names, cameras.viewmats, strict=True))
 

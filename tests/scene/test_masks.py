@@ -12,8 +12,7 @@ from PIL import Image
 
 from g2ard import io
 from g2ard.errors import InputError
-from g2ard.io.exposures import find_exposures
-from g2ard.io.images import load_mask, write_png
+from g2ard.io.images import find_exposures, load_mask, write_png
 from g2ard.rendering.metrics import psnr, ssim
 from g2ard.rendering.renderer import render
 from g2ard.rendering.targets import Photos

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from g2ard.scene.sky import sky_mask
+from g2ard.scene.regions import sky_mask
 from g2ard.scene.transform import transform
 from helpers.scenes import checkered_ball, under_a_sky
 

@@ -10,7 +10,8 @@ from PIL import Image
 
 import g2ard
 from g2ard.errors import InputError
-from g2ard.io import ace, read_views, write_splats, write_views
+from g2ard.io import read_views, write_splats, write_views
+from g2ard.io.cambridge import read_ace
 from g2ard.io.images import write_png
 from g2ard.jobs.register import matched, photos_of, read_poses
 from g2ard.scene.cameras import Cameras
@@ -49,7 +50,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_poses_as_text_are_camera_from_world(site: Path) -> None:
-    found, truth = ace.read(site / "coarse.txt"), read_poses(site / "truth.json")
+    found, truth = read_ace(site / "coarse.txt"), read_poses(site / "truth.json")
     for i, (name, pose) in enumerate(found.items()):
         np.testing.assert_allclose(pose, off(truth[name.removesuffix(".png")], 0.08, 2, i), atol=1e-12)
 
@@ -67,7 +68,7 @@ def test_poses_as_text_are_camera_from_world(site: Path) -> None:
 def test_text_without_poses_is_rejected(text: str, words: str, tmp_path: Path) -> None:
     (tmp_path / "p.txt").write_text(text)
     with pytest.raises(InputError, match=words):
-        ace.read(tmp_path / "p.txt")
+        read_ace(tmp_path / "p.txt")
 
 
 def test_names_match_whole_then_by_unambiguous_stems() -> None:
