@@ -17,7 +17,7 @@ from benchmarks.process import machine
 from benchmarks.rows import Row, shown
 from benchmarks.study import Study
 from g2ard import __version__
-from g2ard.report.page import Comparison, Page, Shown
+from g2ard.report.page import Page, Shown
 
 __all__ = ["write_report"]
 
@@ -193,7 +193,7 @@ def _views(page: Page, folder: Path, rows: Sequence[Row]) -> None:
                 for name, views in told.items()
             ]
             target = _read(folder / ours["targets"] / f"{view}.jpg")
-            page.comparison(Comparison(ours["views"][view]["name"], target, images))
+            page.comparison(ours["views"][view]["name"], target, images)
 
 
 def _read(path: Path) -> np.ndarray[Any, Any]:

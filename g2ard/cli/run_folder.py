@@ -248,8 +248,8 @@ class RunFolder:
         if dense is not None and count < len(dense) <= LARGEST_DENSE:
             named.append(("dense", dense))
         shown = [(f"{name}: {plural(len(scene), 'Gaussian')}", stand.of(scene)) for name, scene in named]
-        written = write_page(self._view, shown, start=stand.start, background=background, overwrite=True)
-        return written.bytes, f"view: {self._view} ({written.bytes / 1e6:.2f} MB)"
+        written, _ = write_page(self._view, shown, start=stand.start, background=background, overwrite=True)
+        return written, f"view: {self._view} ({written / 1e6:.2f} MB)"
 
     def say_files(self, page: str = "") -> None:
         """Name the files, and record that the run is finished."""

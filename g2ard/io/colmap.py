@@ -529,9 +529,7 @@ def texts_of(cameras: Cameras) -> dict[str, str]:
         "images": "".join(images),
         "points3D": "",
     }
-    return {
-        f"sparse/0/{name}.txt": f"# {columns}\n{rows[name]}" for name, columns in _WRITTEN.items()
-    }
+    return {f"sparse/0/{name}.txt": f"# {columns}\n{rows[name]}" for name, columns in _WRITTEN.items()}
 
 
 _WRITTEN = {

@@ -18,7 +18,7 @@ from g2ard.io import check_scene, spz
 from g2ard.io.scene_formats import FORMATS
 from g2ard.jobs.inputs import load_scene
 from g2ard.progress import Say, unsaid
-from g2ard.scene.attributes import Condition
+from g2ard.scene.attributes import check_condition, fulfilling
 from g2ard.scene.splats import Splats
 from g2ard.scene.transform import (
     change_of_axes,
@@ -59,7 +59,7 @@ class Changes(Settings):
         if self.invert and self.box is None and self.sphere is None:
             raise InputError("has nothing to invert", parameter="invert", hint="give {box} or {sphere}")
         if self.where is not None:
-            Condition(self.where)
+            check_condition(self.where)
         if self.transform is not None:
             similarity(self.transform)
 
@@ -72,7 +72,7 @@ class Changes(Settings):
             keep &= in_sphere(splats, self.sphere[:3], self.sphere[3])
         keep ^= self.invert
         if self.where is not None:
-            keep &= Condition(self.where).of(splats)
+            keep &= fulfilling(splats, self.where)
         if not keep.any():
             raise InputError(
                 f"the conditions keep none of {len(splats):,} Gaussians",

@@ -2,6 +2,6 @@
 
 from g2ard.levels.streamed_sog import save_levels
 from g2ard.levels.tileset import Georeference, save_tileset
-from g2ard.levels.tree import Cut, Leaf, Node, cut
+from g2ard.levels.tree import Cut, Node, cut
 
-__all__ = ["Cut", "Georeference", "Leaf", "Node", "cut", "save_levels", "save_tileset"]
+__all__ = ["Cut", "Georeference", "Node", "cut", "save_levels", "save_tileset"]

@@ -29,7 +29,7 @@ from g2ard.io.packing import packing_order
 from g2ard.io.scene_formats import Rounding
 from g2ard.io.scenes import tell
 from g2ard.io.sog_write import largest_rounding, sog_files
-from g2ard.levels.tree import Cut, Leaf, Level, Node, aligned
+from g2ard.levels.tree import Cut, Level, Node, aligned
 from g2ard.levels.tree import cut as cut_tree
 from g2ard.progress import Progress, Say, silent
 from g2ard.scene.splats import Splats
@@ -196,12 +196,12 @@ class _Files:
         return splats.take(np.concatenate(order))
 
 
-def _node(tree: Node | Leaf, files: _Files) -> dict[str, Any]:
+def _node(tree: Node, files: _Files) -> dict[str, Any]:
     node: dict[str, Any] = {"bound": {"min": _rounded(tree.low), "max": _rounded(tree.high)}}
-    if isinstance(tree, Leaf):
-        placed = {str(level): files.place(level, rows) for level, rows in enumerate(tree.rows) if len(rows)}
-        return {**node, "lods": placed}
-    return {**node, "children": [_node(child, files) for child in tree.children]}
+    if tree.children:
+        return {**node, "children": [_node(child, files) for child in tree.children]}
+    placed = {str(level): files.place(level, rows) for level, rows in enumerate(tree.rows) if len(rows)}
+    return {**node, "lods": placed}
 
 
 def _rounded(values: Sequence[float] | NDArray[np.float64]) -> list[float]:

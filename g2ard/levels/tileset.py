@@ -25,7 +25,7 @@ from g2ard.io.scene_formats import Rounding
 from g2ard.io.spz import check_far
 from g2ard.io.types import Note
 from g2ard.levels.streamed_sog import read_object, write_json
-from g2ard.levels.tree import Cut, Leaf, Level, Node, aligned
+from g2ard.levels.tree import Cut, Level, Node, aligned
 from g2ard.levels.tree import cut as cut_tree
 from g2ard.progress import Progress, silent
 from g2ard.scene.shape import longer_axes
@@ -208,12 +208,12 @@ class _Tiles:
     error: float
     files: dict[str, tuple[int, list[NDArray[np.int64]], Float]] = field(default_factory=dict)
 
-    def of(self, node: Node | Leaf, level: int) -> list[dict[str, Any]]:
+    def of(self, node: Node, level: int) -> list[dict[str, Any]]:
         """Return tiles that together show a level, or finer ones where it is empty, and all below it."""
-        below: tuple[Node | Leaf, ...] = (node,) if isinstance(node, Leaf) else node.children
-        rows = [leaf.rows[level] for leaf in ([node] if isinstance(node, Leaf) else node.leaves())]
+        below = node.children or (node,)
+        rows = [leaf.rows[level] for leaf in node.leaves()]
         count = sum(map(len, rows))
-        if count > self.most and isinstance(node, Node):
+        if count > self.most and node.children:
             return [tile for part in below for tile in self.of(part, level)]
         finer = [tile for part in below for tile in self.of(part, level - 1)] if level else []
         if not count:
@@ -237,7 +237,7 @@ class _Tiles:
         return parts
 
 
-def _tile(node: Node | Leaf, error: float, children: list[dict[str, Any]]) -> dict[str, Any]:
+def _tile(node: Node, error: float, children: list[dict[str, Any]]) -> dict[str, Any]:
     middle = TILE_OF_SCENE @ (node.low + node.high) / 2
     half = np.abs(TILE_OF_SCENE @ (node.high - node.low)) / 2
     tile: dict[str, Any] = {

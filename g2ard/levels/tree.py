@@ -47,34 +47,25 @@ class Cut(Settings):
 
 
 @dataclass(frozen=True, eq=False)
-class Leaf:
-    """A leaf of the tree: a box in space and the rows in it.
+class Node:
+    """A node of the tree: a box in space, and two children or, in a leaf, the rows in it.
 
     Args:
         low, high: (3,) float64 box around its Gaussians' 1σ ellipsoids, relative to the offset.
-        rows: per level, the rows in this leaf; may be empty.
+        rows: per level, the rows in a leaf; may be empty.
     """
 
     low: Float
     high: Float
-    rows: tuple[Rows, ...]
+    children: tuple[Node, ...] = ()
+    rows: tuple[Rows, ...] = ()
 
-
-@dataclass(frozen=True, eq=False)
-class Node:
-    """An inner node: its box and two children."""
-
-    low: Float
-    high: Float
-    children: tuple[Node | Leaf, Node | Leaf]
-
-    def leaves(self) -> Iterator[Leaf]:
-        """Yield all leaves below, in tree order."""
+    def leaves(self) -> Iterator[Node]:
+        """Yield all leaves, in tree order."""
+        if not self.children:
+            yield self
         for child in self.children:
-            if isinstance(child, Leaf):
-                yield child
-            else:
-                yield from child.leaves()
+            yield from child.leaves()
 
 
 def aligned(levels: Sequence[Level]) -> tuple[list[Level], float, bool]:
@@ -110,7 +101,7 @@ def check_levels(levels: Sequence[Level]) -> None:
                 raise error.at(message=f"of level {number} {error.message}") from None
 
 
-def cut(levels: Sequence[Level], rule: Cut | None = None, scratch: Path | None = None) -> Node | Leaf:
+def cut(levels: Sequence[Level], rule: Cut | None = None, scratch: Path | None = None) -> Node:
     """Cut space at medians of the means of all levels, along the longest side of their box.
 
     Args:
@@ -168,7 +159,7 @@ class _Tree:
         with TemporaryFile(dir=self.scratch) as file:
             return np.memmap(file, dtype, "w+", shape=shape)
 
-    def of(self, rows: Rows, axes: tuple[int, ...]) -> Node | Leaf:
+    def of(self, rows: Rows, axes: tuple[int, ...]) -> Node:
         """Build the node of these rows; `axes` are the axes of its ancestors' cuts, outermost first."""
         low, high = self._box(rows)
         sides = high - low
@@ -214,7 +205,7 @@ class _Tree:
             done += len(some)
         return below, above
 
-    def _leaf(self, rows: Rows) -> Leaf:
+    def _leaf(self, rows: Rows) -> Node:
         """Build the leaf of these rows: its rows per level, and the box of their Gaussians' 1σ extents."""
         ends, parts = np.searchsorted(rows, self.starts), []
         low, high = np.full(3, np.inf), np.full(3, -np.inf)
@@ -228,4 +219,4 @@ class _Tree:
                 means, reach = some.means.astype(np.float64), _reach(some)
                 low = np.minimum(low, (means - reach).min(axis=0))
                 high = np.maximum(high, (means + reach).max(axis=0))
-        return Leaf(low, high, tuple(parts))
+        return Node(low, high, rows=tuple(parts))

@@ -13,7 +13,7 @@ from g2ard.progress import plural
 from g2ard.rendering.metrics import psnr
 from g2ard.rendering.renderer import Renderer
 from g2ard.rendering.targets import Targets
-from g2ard.report.page import Comparison, Page, Shown
+from g2ard.report.page import Page, Shown
 from g2ard.report.run import COLUMNS, LOST, KindScore, RunReport, TiledReport, cells
 from g2ard.scene.cameras import rows_by_kind
 from g2ard.scene.samples import evenly_spaced
@@ -59,7 +59,7 @@ def distill_report(
             for stage, renderer in renderers
         ]
         title = f"{part.cameras.names[row]}, {camera.width}×{camera.height} px"
-        page.comparison(Comparison(title, to_bytes(part[row]), shown))
+        page.comparison(title, to_bytes(part[row]), shown)
 
     typical = sorted(range(len(after)), key=lambda row: after[row].psnr)[len(after) // 2]
     page.heading("A typical view")

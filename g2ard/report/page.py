@@ -31,18 +31,6 @@ class Shown:
     caption: str = ""
 
 
-@dataclass(frozen=True, eq=False)
-class Comparison:
-    """A view's target and its renderings by several methods, the first of which is shown initially.
-
-    The worst regions of the first rendering are magnified.
-    """
-
-    title: str
-    target: NDArray[np.uint8]
-    shown: Sequence[Shown]
-
-
 @dataclass(frozen=True)
 class Window:
     """A rectangle of an image, as fractions of its width and height.
@@ -135,34 +123,35 @@ class Page:
             f"<figcaption>{text}</figcaption></figure>"
         )
 
-    def comparison(self, view: Comparison) -> None:
+    def comparison(self, title: str, target: NDArray[np.uint8], shown: Sequence[Shown]) -> None:
         """Add a view: a slider between the target and any rendering, and magnified crops of each.
 
-        Crops keep the resolution of the given images; whole images are shrunk.
+        The first rendering is shown initially, and its worst regions are magnified. Crops keep the resolution
+        of the given images; whole images are shrunk.
         """
-        target = self._image(view.target)
-        numbers = [self._image(shown.image) for shown in view.shown]
-        windows = worst_windows(view.shown[0].image, view.target)
-        height, width = view.target.shape[:2]
+        number = self._image(target)
+        numbers = [self._image(one.image) for one in shown]
+        windows = worst_windows(shown[0].image, target)
+        height, width = target.shape[:2]
         options = "".join(
             f'<option value="{n}">{escape(s.name)} {escape(s.caption)}</option>'
-            for n, s in zip(numbers, view.shown, strict=True)
+            for n, s in zip(numbers, shown, strict=True)
         )
         marks = "".join(
             f'<i class="roi r{k % 2}" style="left:{w.left:.2%};top:{w.top:.2%};width:{w.width:.2%};'
             f'height:{w.height:.2%}"></i>'
             for k, w in enumerate(windows)
         )
-        named = [Shown("target", view.target), *view.shown]
+        named = [Shown("target", target), *shown]
         crops = [
-            f'<div class="crops r{k % 2}">{"".join(self._crop(shown, w) for shown in named)}</div>'
+            f'<div class="crops r{k % 2}">{"".join(self._crop(one, w) for one in named)}</div>'
             for k, w in enumerate(windows)
         ]
         self._parts.append(
-            f'<section class="view"><h4>{escape(view.title)}</h4><div class="pair">'
+            f'<section class="view"><h4>{escape(title)}</h4><div class="pair">'
             f'<div class="slider" style="aspect-ratio:{width}/{height};'
             f'max-width:calc(85vh*{width / height:.4f})">'
-            f'<img data-i="{target}" alt="target"><img class="over" data-i="{numbers[0]}" alt="rendering">'
+            f'<img data-i="{number}" alt="target"><img class="over" data-i="{numbers[0]}" alt="rendering">'
             f'{marks}<span class="tag left">target</span><span class="tag right"></span>'
             f'<input type="range" min="0" max="100" value="50" aria-label="target or rendering"></div>'
             f'<label class="pick">right: <select>{options}</select></label></div>'

@@ -14,7 +14,7 @@ from g2ard.errors import InputError
 from g2ard.io.images import load_image, to_bytes
 from g2ard.progress import plural
 from g2ard.rendering.renderer import Renderer
-from g2ard.report.page import Comparison, Page, Shown
+from g2ard.report.page import Page, Shown
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
 from g2ard.stages.register.report import PhotoReport, Registered
@@ -67,7 +67,7 @@ def registration_report(
         shown = [Shown("found", render, alike)]
         if row.name in starts:
             shown.append(Shown("start", to_bytes(renderer.image(replace(one[0], viewmat=starts[row.name])))))
-        page.comparison(Comparison(f"{row.name}: {row.status}", photo, shown))
+        page.comparison(f"{row.name}: {row.status}", photo, shown)
         matches = found.matches.get(row.name)
         if matches is not None:
             scale = photo.shape[1] / photos.take([i]).resized(side)[0].width

@@ -2,7 +2,6 @@
 
 import ast
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import reduce
 from typing import Any
 
@@ -55,9 +54,8 @@ def columns(splats: Splats) -> dict[str, NDArray[Any]]:
     return found
 
 
-@dataclass(frozen=True)
-class Condition:
-    """A condition on Gaussians, such as `opacity > 0.05 and largest_scale < 2`.
+def fulfilling(splats: Splats, condition: str) -> NDArray[np.bool_]:
+    """Return the (N,) mask of Gaussians that fulfil a condition: `opacity > 0.05 and largest_scale < 2`.
 
     Names are `ATTRIBUTES`: those of `columns`; `smallest_scale` and `largest_scale` of the three standard
     deviations; and `elongation`, the largest over the middle one. Arithmetic (+, -, *, /, abs, sqrt, min,
@@ -65,28 +63,26 @@ class Condition:
     Anything else is rejected; nothing runs as Python.
 
     >>> two = Splats.create([[0, 0, 0], [9, 0, 0]], scales=[[1, 1, 1], [1, 2, 3]])
-    >>> Condition("abs(x) <= 5 and not largest_scale > 2").of(two).tolist()
+    >>> fulfilling(two, "abs(x) <= 5 and not largest_scale > 2").tolist()
     [True, False]
 
     Raises:
         InputError: the text is not a condition, or uses an unknown name or operation.
     """
 
-    text: str
+    try:
+        with np.errstate(all="ignore"):
+            found = _value(_tree(condition), splats)
+    except RecursionError as error:
+        raise _invalid("nests too deeply") from error
+    if not _is_condition(found):
+        raise _invalid(f"{condition!r} is a number; compare it with another")
+    return np.array(np.broadcast_to(found, len(splats)))
 
-    def __post_init__(self) -> None:
-        self.of(Splats.create(np.zeros((1, 3)), scales=np.ones((1, 3))))
 
-    def of(self, splats: Splats) -> NDArray[np.bool_]:
-        """Return the (N,) mask of Gaussians that fulfil the condition."""
-        try:
-            with np.errstate(all="ignore"):
-                found = _value(_tree(self.text), splats)
-        except RecursionError as error:
-            raise _invalid("nests too deeply") from error
-        if not _is_condition(found):
-            raise _invalid(f"{self.text!r} is a number; compare it with another")
-        return np.array(np.broadcast_to(found, len(splats)))
+def check_condition(condition: str) -> None:
+    """Raise the `InputError` of `fulfilling` for any scene."""
+    fulfilling(Splats.create(np.zeros((1, 3)), scales=np.ones((1, 3))), condition)
 
 
 _ARITHMETIC: dict[type[ast.AST], Callable[[Any, Any], Any]] = {

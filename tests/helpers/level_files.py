@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from g2ard.levels import Leaf, Node
+from g2ard.levels import Node
 from g2ard.scene.splats import Splats
 
 
@@ -20,8 +20,8 @@ def scattered(count: int, seed: int = 0, offset: float = 0.0) -> Splats:
     )
 
 
-def leaves_of(tree: Node | Leaf) -> list[Leaf]:
-    return [tree] if isinstance(tree, Leaf) else list(tree.leaves())
+def leaves_of(tree: Node) -> list[Node]:
+    return list(tree.leaves())
 
 
 def files_of(folder: Path) -> dict[str, str]:

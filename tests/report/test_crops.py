@@ -13,7 +13,7 @@ from PIL import Image
 
 from g2ard.rendering.targets import TeacherRenders
 from g2ard.report import distilled
-from g2ard.report.page import Comparison, Page, Shown, worst_windows
+from g2ard.report.page import Page, Shown, worst_windows
 from g2ard.scene.cameras import Cameras
 from helpers.scenes import around, checkered_ball
 from helpers.studies import check_page
@@ -53,7 +53,7 @@ def test_crops_are_cut_at_full_resolution() -> None:
     wrong = target.copy()
     wrong[300:720, 200:760] = 255 - target[300:720, 200:760]  # a window's size: 28 % of each side
     page = Page("A page")
-    page.comparison(Comparison("a view", target, [Shown("wrong", wrong, "9 dB")]))
+    page.comparison("a view", target, [Shown("wrong", wrong, "9 dB")])
     html = page.text()
     check_page(html)
     whole, over, *crops = images_of(html)
@@ -67,7 +67,7 @@ def test_crops_are_cut_at_full_resolution() -> None:
 def test_the_caption_of_a_crop_names_its_image() -> None:
     page = Page("report", "")
     grey = np.full((60, 80, 3), 128, np.uint8)
-    page.comparison(Comparison("view", grey, [Shown("small", grey // 2, "23.40 dB")]))
+    page.comparison("view", grey, [Shown("small", grey // 2, "23.40 dB")])
     text = page.text()
     captions = re.findall(r'class="crop">.*?<figcaption>(.*?)</figcaption>', text)
     assert set(captions) == {"target", "small<br>whole view <b>23.40 dB</b>"}

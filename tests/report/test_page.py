@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from g2ard.report.distilled import _worst, verdict
-from g2ard.report.page import Comparison, Page, Shown
+from g2ard.report.page import Page, Shown
 from g2ard.report.run import RunReport, by_kind
 from g2ard.stages.evaluate import ViewScore
 from helpers.browser import chromium
@@ -22,7 +22,7 @@ def test_the_page_works_in_a_browser(tmp_path: Path) -> None:
     page = Page("A page")
     target = np.zeros((30, 40, 3), np.uint8)
     shown = [Shown(name, np.full_like(target, shade), "9 dB") for name, shade in (("one", 90), ("two", 200))]
-    page.comparison(Comparison("a view", target, shown))
+    page.comparison("a view", target, shown)
     page.write(tmp_path / "page.html")
     options = ["--headless=new", "--no-sandbox", "--disable-gpu", "--virtual-time-budget=2000", "--dump-dom"]
     dom = subprocess.run(

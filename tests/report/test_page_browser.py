@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from g2ard.report.page import Comparison, Page, Shown
+from g2ard.report.page import Page, Shown
 from g2ard.report.run import COLUMNS
 from helpers.browser import Browser
 
@@ -32,7 +32,7 @@ def test_tables_fit_the_window_and_name_their_columns(width: int, tmp_path: Path
 def test_pictures_are_no_taller_than_the_screen(shape: tuple[int, int], tmp_path: Path) -> None:
     image = np.zeros((*shape, 3), np.uint8)
     page = Page("a page")
-    page.comparison(Comparison("view", image, [Shown("recovered", image + np.uint8(9))]))
+    page.comparison("view", image, [Shown("recovered", image + np.uint8(9))])
     page.write(tmp_path / "report.html")
     with Browser(1000, 640) as browser:
         browser.open((tmp_path / "report.html").as_uri())

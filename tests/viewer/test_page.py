@@ -26,7 +26,7 @@ from g2ard.jobs.viewer_frame import frame_of, frame_with
 from g2ard.pipeline.distill import RunViews
 from g2ard.scene.cameras import Camera, Cameras
 from g2ard.scene.splats import Splats
-from g2ard.viewer import Start, check_page_output, page, write_page
+from g2ard.viewer import Start, check_page_output, write_page
 from helpers.commands import CommandLine, refused, succeeds
 from helpers.scenes import around, checkered_ball
 
@@ -75,14 +75,14 @@ def test_the_bundle_is_the_one_its_readme_names() -> None:
     assert {name: hashlib.sha256(data).hexdigest() for name, data in found.items()} == sums
     release = re.search(r"SuperSplat Viewer (\S+)", readme)
     assert release
-    assert f"SuperSplat Viewer {release[1]} " in page._NOTICE
+    assert f"SuperSplat Viewer {release[1]} " in viewer._NOTICE
     assert f'version = "{release[1]}"'.encode() in script
 
 
 def test_a_page_holds_viewer_and_scene_and_names_no_address(tmp_path: Path) -> None:
     ball = checkered_ball(200)
     start = Start((1.0, 2.0, 3.0), (0.0, 0.0, 0.5), (42.0, 30.0))
-    written = write_page(
+    written, sizes = write_page(
         tmp_path / "a.html",
         [("a </script> & b", ball)],
         start=start,
@@ -90,7 +90,7 @@ def test_a_page_holds_viewer_and_scene_and_names_no_address(tmp_path: Path) -> N
         background=(1.0, 0.5, 0.25),
     )
     parts = Parts(tmp_path / "a.html")
-    assert written.bytes == (tmp_path / "a.html").stat().st_size
+    assert written == (tmp_path / "a.html").stat().st_size
     assert parts.addresses == ["data:,"]
     assert parts.labels == ["a </script> & b"]
     view = json.loads(parts.scripts["view"])
@@ -106,7 +106,7 @@ def test_a_page_holds_viewer_and_scene_and_names_no_address(tmp_path: Path) -> N
     back = parts.scene(0, tmp_path)
     assert len(back) == 200
     assert back.sh_degree == ball.sh_degree
-    assert written.scenes == ((tmp_path / "back0.sog").stat().st_size,)
+    assert sizes == ((tmp_path / "back0.sog").stat().st_size,)
     assert "createViewer" in parts.scripts["module"]
     text = (tmp_path / "a.html").read_text(encoding="utf-8")
     assert "Permission is hereby granted" in text
@@ -133,7 +133,7 @@ def test_failures_leave_no_half_written_page(tmp_path: Path, monkeypatch: pytest
         write_page(tmp_path / "made" / "too" / "a.HTML", [("a", ball)])
     with pytest.raises(InputError, match=r"b\.html"):
         write_page(tmp_path / "b.html", [("a", ball.take(slice(0)))])
-    monkeypatch.setattr(page, "_LARGEST_SOG_BYTES", 100)
+    monkeypatch.setattr(viewer, "_LARGEST_SOG_BYTES", 100)
     with pytest.raises(InputError, match="browsers accept at most"):
         write_page(tmp_path / "b.html", [("a", ball)])
     assert [path.name for path in tmp_path.iterdir()] == ["made"]

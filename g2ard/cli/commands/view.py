@@ -113,7 +113,7 @@ def _write(
     named = zip(short_names(paths), loaded, strict=True)
     labels = [f"{name}: {plural(len(splats), 'Gaussian')}" for name, splats in named]
     run.begin("page")
-    written = write_page(
+    written, scene_sizes = write_page(
         output,
         [(label, stand.of(splats)) for label, splats in zip(labels, loaded, strict=True)],
         start=stand.start,
@@ -122,13 +122,13 @@ def _write(
         progress=run.progress,
     )
     run.kept.append(f"{output} is written")
-    sizes = " and ".join(f"{size / 1e6:.2f}" for size in written.scenes)
-    run.say(f"{output}: {' | '.join(labels)}; {sizes} MB as SOG, {written.bytes / 1e6:.2f} MB in all")
+    sizes = " and ".join(f"{size / 1e6:.2f}" for size in scene_sizes)
+    run.say(f"{output}: {' | '.join(labels)}; {sizes} MB as SOG, {written / 1e6:.2f} MB in all")
     run.result(
         {
             "output": str(output),
-            "bytes": written.bytes,
-            "scenes": _told(paths, loaded, written.scenes),
+            "bytes": written,
+            "scenes": _told(paths, loaded, scene_sizes),
             "start": stand.name,
             "up": stand.up.tolist(),
         }
