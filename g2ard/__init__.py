@@ -47,7 +47,7 @@ if TYPE_CHECKING:
     from g2ard.io import read_views as load_views
     from g2ard.io import write_splats as save
     from g2ard.io import write_views as save_views
-    from g2ard.io.tile_store import TileStore
+    from g2ard.io.tiles import TileStore
     from g2ard.io.types import Points
     from g2ard.jobs.clean import Cleaned, clean
     from g2ard.jobs.convert import convert
@@ -182,7 +182,7 @@ _HOMES = {
     "stages.simplify": ("Simplified", "SimplifyConfig"),
     "rendering.targets": ("Photos", "TeacherRenders"),
     "tiles.ingest": ("ingest",),
-    "io.tile_store": ("TileStore",),
+    "io.tiles": ("TileStore",),
 }
 """Module → its public names."""
 

@@ -61,7 +61,7 @@ def _beside(output: Path) -> Path:
 def _check_rows(scene: Path, rows: int) -> None:
     """Raise a usage error if a folder of tiles was written with another --tile-rows."""
     from g2ard.io.detect import MANIFEST
-    from g2ard.io.tile_store import TileStore
+    from g2ard.io.tiles import TileStore
     from g2ard.jobs.tiling import cut_into
 
     if (scene / MANIFEST).is_file() and (made := TileStore.open(scene).settings.get("tile_rows")) != rows:

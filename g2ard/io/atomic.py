@@ -18,8 +18,7 @@ from uuid import uuid4
 from g2ard.errors import OutputError
 from g2ard.io.paths import real_path
 
-_LONGEST_NAME = 255
-"""Bytes of the longest file name of usual file systems."""
+_LONGEST_NAME = 255  # bytes of the longest file name of usual file systems
 
 
 def check_output(path: str | Path, overwrite: bool = False, *, folder: bool = False) -> Path:
@@ -99,12 +98,6 @@ def _check_stream(path: Path) -> None:
         raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
 
 
-def _opened(path: Path) -> int:
-    """Open a device or pipe for writing; an open file keeps its position."""
-    descriptor = _descriptor(path)
-    return os.open(path, os.O_WRONLY) if descriptor is None else os.dup(descriptor)
-
-
 def _target(path: Path) -> Path:
     """Return where a link leads, which need not exist."""
     if not path.is_symlink():
@@ -125,8 +118,7 @@ def _beside(path: Path) -> Path:
     return path.with_name(_hidden(path, uuid4().hex[:12]))
 
 
-_ANY = 12 * "_"
-"""Stands for the random part of a hidden name."""
+_ANY = 12 * "_"  # stands for the random part of a hidden name
 
 
 def _hidden(path: Path, middle: str) -> str:
@@ -175,13 +167,6 @@ def atomic_output(path: str | Path, overwrite: bool = False) -> AbstractContextM
 
     On failure or Ctrl-C, the temporary file is removed and an existing `path` is kept. Without `overwrite`,
     so is a `path` that another process made in the meantime.
-
-    >>> import tempfile
-    >>> folder = Path(tempfile.mkdtemp())
-    >>> with atomic_output(folder / "a.txt") as temporary:
-    ...     _ = temporary.write_text("whole")
-    >>> [p.name for p in folder.iterdir()]
-    ['a.txt']
     """
     path = check_output(path, overwrite)
     return _copied(path) if is_stream(path) else _renamed(path, overwrite, folder=False)
@@ -241,7 +226,9 @@ def _failure(error: OSError, path: Path, temporary: Path) -> OSError:
 def _pour(source: Path, stream: Path) -> None:
     for text in filter(None, (sys.stdout, sys.stderr)):
         text.flush()  # they may be the stream
-    with source.open("rb") as content, open(_opened(stream), "wb") as target:
+    descriptor = _descriptor(stream)
+    opened = os.open(stream, os.O_WRONLY) if descriptor is None else os.dup(descriptor)  # at its position
+    with source.open("rb") as content, open(opened, "wb") as target:
         shutil.copyfileobj(content, target)
 
 

@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,16 +14,9 @@ from g2ard.io.paths import read_text
 from g2ard.io.photos import Frame, Lens, Listed, photo_size, posed
 from g2ard.io.types import Note
 
-_PHOTO_SIZE = (1920, 1080)
-"""Size of the original photos, for which focal lengths are given."""
-
+_PHOTO_SIZE = (1920, 1080)  # size of the original photos, for which focal lengths are given
 _SPLIT_FILES = {"train": "dataset_train.txt", "test": "dataset_test.txt"}
 _NVM_FILE = "reconstruction.nvm"
-
-
-class _Focal(NamedTuple):
-    focal: float
-    radial: float
 
 
 def holds(folder: Path) -> bool:
@@ -40,7 +32,7 @@ def read(path: Path, images: Path | None = None) -> Listed:
     order.
     """
     lenses = _lenses(path / _NVM_FILE)
-    median = _Focal(float(np.median([lens.focal for lens in lenses.values()])), 0.0)
+    median = float(np.median([focal for focal, _ in lenses.values()]))
     frames, guessed, finder = [], 0, Finder(images or path)
     for split, name in _SPLIT_FILES.items():
         if not (path / name).is_file():
@@ -51,17 +43,19 @@ def read(path: Path, images: Path | None = None) -> Listed:
             lens = lenses.get(_stem(photo_name))
             guessed += lens is None
             photo = finder.photo(photo_name)
-            frames.append(_frame(path / name, photo_name, pose, lens or median, photo, split))
-    text = f"{guessed} views are not in {_NVM_FILE}; they get the median focal length, {median.focal:.1f}"
+            frames.append(_frame(path / name, photo_name, pose, lens or (median, 0.0), photo, split))
+    text = f"{guessed} views are not in {_NVM_FILE}; they get the median focal length, {median:.1f}"
     return Listed(path, frames, notes=(Note("guessed_focal", guessed, text),) if guessed else ())
 
 
-def _frame(where: Path, name: str, pose: NDArray[np.float64], lens: _Focal, photo: Path, split: str) -> Frame:
+def _frame(
+    where: Path, name: str, pose: NDArray[np.float64], lens: tuple[float, float], photo: Path, split: str
+) -> Frame:
     width, height = photo_size(photo, where) if photo.is_file() else _PHOTO_SIZE
     view = posed(pose[3:], (0, 0, 0))
     view[:3, 3] = -view[:3, :3] @ pose[:3]
-    focal = lens.focal * width / _PHOTO_SIZE[0]
-    own = Lens.pinhole((width, height), (focal, focal), distortion=(-lens.radial, 0.0, 0.0, 0.0, 0.0))
+    focal, radial = lens[0] * width / _PHOTO_SIZE[0], lens[1]
+    own = Lens.pinhole((width, height), (focal, focal), distortion=(-radial, 0.0, 0.0, 0.0, 0.0))
     return Frame(name, view, own, photo, split, listed=name)
 
 
@@ -70,8 +64,11 @@ def _stem(name: str) -> str:
     return name.rsplit(".", 1)[0]
 
 
-def _lenses(path: Path) -> dict[str, _Focal]:
-    """Read the lenses of an NVM file's first model: name, focal, quaternion, centre, radial, 0 per line."""
+def _lenses(path: Path) -> dict[str, tuple[float, float]]:
+    """Read focal lengths and radial parameters of an NVM file's first model by the stems of photos.
+
+    A line holds name, focal length, quaternion, centre, radial parameter and 0.
+    """
     with parsing(path):
         text = read_text(path).splitlines()
         if not text or not text[0].startswith("NVM_V3"):
@@ -80,7 +77,7 @@ def _lenses(path: Path) -> dict[str, _Focal]:
         if at is None:
             raise damaged("truncated: nothing follows its first line", path=path)
         rows = [line.replace("\t", " ").split() for line in text[at + 1 : at + 1 + int(text[at])]]
-        lenses = {_stem(row[0]): _Focal(float(row[1]), float(row[9])) for row in rows}
+        lenses = {_stem(row[0]): (float(row[1]), float(row[9])) for row in rows}
     if not lenses:
         raise InputError("has no cameras", path=path)
     return lenses

@@ -41,10 +41,6 @@ _MODEL_FILES = tuple(
 """Files of a model."""
 
 
-class NotFinite(InputError):
-    """A number that is not finite; its view is left out."""
-
-
 class _Image(NamedTuple):
     """A row of the table of images; `fault` is what is wrong with its pose, if a number is not finite."""
 
@@ -52,7 +48,7 @@ class _Image(NamedTuple):
     name: str
     camera: int
     pose: tuple[float, ...]
-    fault: NotFinite | None = None
+    fault: InputError | None = None
 
 
 def holds(folder: Path) -> bool:
@@ -111,8 +107,7 @@ def models_below(path: Path) -> list[Path]:
     return found
 
 
-_MOST_FOLDERS = 64
-"""Folders of a level to look into."""
+_MOST_FOLDERS = 64  # folders of a level to look into
 
 
 def photos_beside(path: Path) -> tuple[Path, Path] | None:
@@ -217,7 +212,7 @@ def listed(path: Path, images: Path | None = None) -> Listed:
         if image.camera not in cameras:
             raise InputError(f"{image.name!r} has the unknown camera {image.camera}", path=tables[1])
         camera = cameras[image.camera]
-        if isinstance(camera, NotFinite):
+        if isinstance(camera, InputError):
             faults.append((image.name, camera))
             continue
         photo = finder.photo(image.name)
@@ -267,20 +262,14 @@ _RIG, _SENSOR = Columns.of("II", "RIG_ID", "NUM_SENSORS"), Columns.of("iI", "SEN
 _HAS_POSE, _IN_RIG = Columns.of("B", "HAS_POSE"), Columns.of("ddddddd", *_POSE)
 _FRAME = Columns.of("IIdddddddI", "FRAME_ID", "RIG_ID", *_POSE, "NUM_DATA_IDS")
 _DATA = Columns.of("iIQ", "SENSOR_TYPE", "SENSOR_ID", "DATA_ID")
-_WORDS = ("MODEL", "SENSOR_TYPE")
-"""Columns that are numbers in binary tables, and words in text."""
-
+_WORDS = ("MODEL", "SENSOR_TYPE")  # columns that are numbers in binary tables, and words in text
 _CAMERA_SENSOR = (0, "CAMERA")
 _SPLITS = {"image": len(_IMAGE.names), "point": 7}
 """Columns of a line of text before its rest: the name of an image, the error and track of a point."""
 
 
 class Table:
-    """A binary table, read one value after the other. Iterating yields the index of each row.
-
-    Args:
-        item: what a row is called in errors.
-    """
+    """A binary table, read one value after the other. Iterating yields the index of each row, an `item`."""
 
     def __init__(self, path: Path, item: str) -> None:
         self.path, self.item, self.row = path, item, 0
@@ -333,11 +322,11 @@ class Table:
     def place(self, name: str) -> Place:
         return Place(self.path, self.row, self.item, name)
 
-    def fault(self, names: Sequence[str], values: Sequence[float]) -> NotFinite | None:
+    def fault(self, names: Sequence[str], values: Sequence[float]) -> InputError | None:
         """Return what is wrong with the first of these values that is not finite."""
         for name, value in zip(names, values, strict=True):
             if not math.isfinite(value):
-                return NotFinite(f"is {value}", path=self.path, property=name, index=self.row, item=self.item)
+                return self.place(name).error(f"is {value}")
         return None
 
     def _cut_off(self, name: str) -> InputError:
@@ -446,8 +435,8 @@ def _camera(path: Path, model: str, size: tuple[int, int], p: tuple[float, ...])
     return Lens.pinhole(size, (fx, fy), (cx, cy), (k1, k2, p1, p2, 0.0))
 
 
-def _cameras(table: Table) -> dict[int, Lens | NotFinite]:
-    cameras: dict[int, Lens | NotFinite] = {}
+def _cameras(table: Table) -> dict[int, Lens | InputError]:
+    cameras: dict[int, Lens | InputError] = {}
     for _ in table:
         key, kind, *size = table.take(_CAMERA)
         model, params = table.params(kind)

@@ -33,9 +33,7 @@ _CHUNK_ROWS = 256
 _SCALE_LIMIT = 20.0
 """Log-scales are clamped to ±20, as in SuperSplat, since an outlier would coarsen its chunk."""
 
-_VECTOR_BITS = 11, 10, 11
-"""Bits of the three components of a position or scale."""
-
+_VECTOR_BITS = 11, 10, 11  # bits of the three components of a position or scale
 _PACKED = ["packed_position", "packed_rotation", "packed_scale", "packed_color"]
 
 

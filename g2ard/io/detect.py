@@ -107,8 +107,7 @@ _CONVERTERS = {
 MANIFEST, POINTS = "tiles.json", ".points"
 """Files of finished and unfinished folders of tiles, and their folder of points to lift."""
 
-_MOST_INSPECTED_FILES = 64
-"""Maximum files of a folder to inspect for suggestions."""
+_MOST_INSPECTED_FILES = 64  # maximum files of a folder to inspect for suggestions
 
 
 def kind(path: str | Path) -> Kind:
@@ -150,7 +149,7 @@ def reader(path: str | Path, expected: Kind) -> tuple[Path, Any]:
         what = _NAMES[found] if found != "views" else name
         hint = _OTHER_KINDS.get((expected, found))
         raise InputError(f"expected {_NAMES[expected]}, found {what}", path=path, hint=hint)
-    return path, import_module(f"g2ard.io.{'tile_store' if name == 'tiles' else name}")
+    return path, import_module(f"g2ard.io.{name}")
 
 
 @lru_cache(maxsize=64)

@@ -27,16 +27,12 @@ from g2ard.scene.transform import rotation_matrices
 _CARTESIAN = ("cartesianX", "cartesianY", "cartesianZ")
 _SPHERICAL = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
 _COLORS = ("colorRed", "colorGreen", "colorBlue")
-
-_SAMPLE_ROWS = 100_000
-"""Points at the beginning of each scan that tell where it is."""
+_SAMPLE_ROWS = 100_000  # points at the beginning of each scan that tell where it is
 
 _PANORAMA_AXES = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 """OpenCV's camera axes in those of a panorama, whose middle is along x, with z up."""
 
-_FULL_CIRCLE = 0.01
-"""Largest relative difference of a panorama's aspect from 2:1."""
-
+_FULL_CIRCLE = 0.01  # largest relative difference of a panorama's aspect from 2:1
 _SUFFIXES = {"jpegImage": ".jpg", "pngImage": ".png"}
 _NO_NAME = re.compile(r"[^\w.-]+")
 

@@ -98,8 +98,7 @@ def is_a_photo(path: Path) -> bool:
 def mask_folders(photo: Path, depth: int) -> list[tuple[Path, Path]]:
     """Return folders of masks for a photo, nearest first, and the photo's path in its own folder beside them.
 
-    Args:
-        depth: how many folders above the photo may be that of all photos.
+    The folder of all photos is at most `depth` folders above the photo.
     """
     found = []
     for own in photo.parents[: max(1, depth)]:

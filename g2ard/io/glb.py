@@ -30,7 +30,7 @@ from g2ard.io.sanitize import Raw, cleaned
 from g2ard.io.types import Note, Scene
 from g2ard.progress import plural
 from g2ard.scene.splats import Splats
-from g2ard.scene.transform import deformed, join, rotation_matrices
+from g2ard.scene.transform import deformed, harmonic_signs, join, rotation_matrices
 
 EXTENSION = "KHR_gaussian_splatting"
 SPZ_EXTENSION = f"{EXTENSION}_compression_spz_2"
@@ -44,9 +44,8 @@ _MAGIC, _JSON, _BIN = 0x46546C67, 0x4E4F534A, 0x004E4942
 _FLOAT, _USHORT, _UBYTE = 5126, 5123, 5121
 _TYPES = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 _DTYPES = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
-_SH_FLIPS = np.array([-1, 1, -1, 1, -1, 1, -1, 1, -1, 1, -1, 1, -1, 1, -1], np.float32)
-"""Sign of each harmonic of bands 1–3 after half a turn about z: (−1)^m."""
 _GLTF_TURN = np.array([-1.0, -1, 1])
+_SH_FLIPS = harmonic_signs(_GLTF_TURN)
 
 
 def write(path: Path, splats: Splats, *, overwrite: bool = False, compress: str | None = None) -> float:
@@ -106,10 +105,7 @@ def spz_glb(
 ) -> tuple[list[bytes], float]:
     """Return the parts of a .glb that holds an SPZ, and the largest change of a position by rounding.
 
-    Args:
-        path: named in messages.
-        splats: the scene, whose `offset` is the node's translation.
-        centre: (3,) moved from the means to the node's translation, so that coordinates are fine.
+    The node's translation is the scene's `offset`, and `centre`, which makes coordinates small.
     """
     movable, centre = centre is not None, np.zeros(3) if centre is None else centre
     bits = spz.fraction_bits(path, splats.means.astype(np.float64) - centre, splats, movable=movable)
@@ -141,7 +137,7 @@ def spz_glb(
 
 def _about_y(splats: Splats) -> Splats:
     """Turn a scene by half a turn about y, exactly: from SPZ's axes to glTF's, seen in those of a .ply."""
-    signs = (_SH_FLIPS * spz.FLIPS)[: splats.shN.shape[1], None]
+    signs = harmonic_signs((-1, 1, -1))[: splats.shN.shape[1], None]
     means = splats.means * np.array([-1, 1, -1], splats.means.dtype)
     return replace(
         splats, means=means, quats=splats.quats * np.array([1, -1, 1, -1], np.float32), shN=splats.shN * signs

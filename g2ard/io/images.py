@@ -1,9 +1,12 @@
-"""Photos as arrays that fit their cameras, PNGs, and contact sheets."""
+"""Photos as arrays that fit their cameras, PNGs, contact sheets, and animations."""
 
 from __future__ import annotations
 
+import itertools
+import shutil
+import subprocess
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -15,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from PIL import Image, ImageDraw, ImageFont, ImageOps
 
 from g2ard.config.choices import BLACK, Colour
-from g2ard.errors import InputError
+from g2ard.errors import InputError, MissingDependencyError
 from g2ard.io.atomic import atomic_output
 from g2ard.io.jsonfile import Place, Row, checked, read_json
 from g2ard.io.photos import fits, opened_image, photo_size, turns
@@ -23,28 +26,20 @@ from g2ard.scene.cameras import Cameras
 from g2ard.scene.lenses import PhotoLens
 from g2ard.scene.samples import evenly_spaced
 
-_BORDER_PHOTOS = 5
-"""Photos whose borders are compared."""
+_BORDER_PHOTOS = 5  # photos whose borders are compared
 _BORDER_COLOUR_SLACK, _BORDER_SHARE = 3 / 255, 0.8
 """Largest difference from a constant border colour, and the least share of border pixels that have it."""
 
-_SHEET_GAP = 6
-"""Pixels between the images of a contact sheet."""
+_SHEET_GAP = 6  # pixels between the images of a contact sheet
 
 
 def load_image(cameras: Cameras, index: int, background: Sequence[float] = BLACK) -> NDArray[np.float32]:
     """Read the photo of a view as an image of its pinhole camera.
 
     A distorted photo is undistorted at its own resolution, then resized by area. Beyond the photo's edge, the
-    edge is repeated; `load_mask` hides it. EXIF orientation counts only where the view's size
-    needs it, because poses usually refer to stored pixels. Grey becomes three
-    equal channels; alpha is composited over the background.
-
-    Args:
-        background: RGB in [0, 1] behind transparent pixels.
-
-    Returns:
-        (H, W, 3) float32 in [0, 1].
+    edge is repeated; `load_mask` hides it. EXIF orientation counts only where the view's size needs it,
+    because poses usually refer to stored pixels. Grey becomes three equal channels, and alpha is composited
+    over the background. The result is (H, W, 3) float32 in [0, 1].
     """
     return composited(load_premultiplied(cameras, index), background)
 
@@ -57,11 +52,7 @@ def composited(image: NDArray[np.float32], background: Sequence[float]) -> NDArr
 
 
 def load_premultiplied(cameras: Cameras, index: int) -> NDArray[np.float32]:
-    """Read a photo as `load_image` does, but keep its alpha.
-
-    Returns:
-        (H, W, 3) float32 RGB, or (H, W, 4) RGBA with RGB premultiplied.
-    """
+    """Read a photo as `load_image` does, but with alpha as (H, W, 4) RGBA, whose RGB is premultiplied."""
     path, name = cameras.image_paths[index], cameras.names[index]
     if path is None:
         raise InputError(f"({name}) has no photo", index=index, item="view", hint="pass views with photos")
@@ -165,11 +156,10 @@ def find_exposures(cameras: Cameras) -> dict[str, NDArray[np.float64]]:
 
 
 def load_mask(cameras: Cameras, index: int) -> NDArray[np.bool_] | None:
-    """Read the mask of a view's photo, in the pixels of `load_image`.
+    """Read the (H, W) mask of a view's photo, in the pixels of `load_image`; None if all count.
 
-    Returns:
-        (H, W), True if the photo holds the pixel, and its mask is brighter than half, or, for a photo that is
-        its own mask, its alpha is above half; None if all are.
+    Pixels count that the photo holds and whose mask is brighter than half; for a photo that is its own mask,
+    those whose alpha is above half.
     """
     held, path = _held(cameras, index), cameras.mask_paths[index]
     if path is None:
@@ -211,8 +201,7 @@ def _held_at(
     return found
 
 
-_WHOLE = 0.999
-"""Share of a pixel above which it counts as whole."""
+_WHOLE = 0.999  # share of a pixel above which it counts as whole
 
 
 def _open(path: Path, like: tuple[int, int] | None = None) -> NDArray[np.float32]:
@@ -309,8 +298,7 @@ def _through(
     return resized((top * (1 - down) + bottom * down).reshape(shape), size)
 
 
-_MOST_SAMPLES = 8
-"""Most samples of a photo along each side of a pixel."""
+_MOST_SAMPLES = 8  # most samples of a photo along each side of a pixel
 
 
 @lru_cache(maxsize=6)  # the faces of a cube
@@ -380,11 +368,7 @@ def as_saved(image: ArrayLike) -> NDArray[np.float32]:
 
 
 def write_png(path: str | Path, image: ArrayLike, *, overwrite: bool = False) -> None:
-    """Write an image as an 8-bit PNG, atomically.
-
-    Args:
-        image: (H, W, 3), (H, W, 4) or (H, W), floats in [0, 1] or bytes.
-    """
+    """Write (H, W, 3), (H, W, 4) or (H, W) floats in [0, 1] or bytes as an 8-bit PNG, atomically."""
     values = to_bytes(image)
     if values.ndim == 3 and values.shape[2] == 1:
         values = values[..., 0]
@@ -397,14 +381,9 @@ def write_png(path: str | Path, image: ArrayLike, *, overwrite: bool = False) ->
 def contact_sheet(
     rows: Sequence[Sequence[ArrayLike]], labels: Sequence[str], *, row_labels: Sequence[str] = ()
 ) -> NDArray[np.uint8]:
-    """Arrange images in a grid: one row per view, one column per kind (photo, simplified, recovered…).
+    """Arrange images of any sizes in a grid on a dark background: a row per view, a column per kind.
 
-    Args:
-        rows: rows of images (H, W, 3), floats in [0, 1] or bytes, of any sizes; rows may be short.
-        row_labels: a caption under each row; () for none.
-
-    Returns:
-        (H, W, 3) bytes, on a dark background.
+    Rows may be short, and have captions below.
     """
     grid = [
         [Image.fromarray(np.ascontiguousarray(to_bytes(image))).convert("RGB") for image in row]
@@ -435,3 +414,62 @@ def contact_sheet(
             draw.text((_SHEET_GAP, top + height), row_labels[r], fill=(200, 200, 200), font=font)
         top += height + foot + _SHEET_GAP
     return np.asarray(sheet)
+
+
+ANIMATIONS = (".gif", ".webp", ".mp4")
+
+
+def check_animation(path: Path) -> None:
+    """Check that an animation of this suffix can be written."""
+    if path.suffix.lower() == ".mp4" and shutil.which("ffmpeg") is None:
+        raise MissingDependencyError(
+            "an .mp4 needs the program ffmpeg", path=path, hint="install it, or write .webp or .gif"
+        )
+
+
+def write_animation(
+    path: Path, images: Iterable[NDArray[np.uint8]], *, fps: float = 25, overwrite: bool = False
+) -> None:
+    """Write images of one size as an endless animation in the format of the suffix.
+
+    A .gif rounds their duration to hundredths of a second.
+    """
+    check_animation(path)
+    frames = _one_size(path, iter(images))
+    with atomic_output(path, overwrite) as temporary:
+        if path.suffix.lower() == ".mp4":
+            _encode(temporary, frames, fps)
+            return
+        first, *rest = [Image.fromarray(frame) for frame in frames]
+        options: dict[str, Any] = {"duration": 1000 / fps, "loop": 0, "quality": 80, "optimize": True}
+        first.save(temporary, save_all=True, append_images=rest, **options)
+
+
+def _one_size(path: Path, frames: Iterator[NDArray[np.uint8]]) -> Iterator[NDArray[np.uint8]]:
+    first = next(frames)
+    for frame in itertools.chain([first], frames):
+        if frame.shape != first.shape:
+            sizes = " and ".join(f"{width}×{height}" for height, width, _ in (first.shape, frame.shape))
+            raise InputError(f"views of one size make an animation, got {sizes}", path=path)
+        yield np.ascontiguousarray(frame)
+
+
+def _encode(path: Path, frames: Iterator[NDArray[np.uint8]], fps: float) -> None:
+    """Pipe raw frames to ffmpeg; H.264 with 4:2:0 needs even sides, so odd ones lose a pixel."""
+    first = next(frames)
+    height, width = first.shape[:2]
+    command = ["ffmpeg", "-y", "-loglevel", "error", "-f", "rawvideo", "-pix_fmt", "rgb24"]
+    command += ["-s", f"{width}x{height}", "-r", f"{fps:g}", "-i", "-"]
+    command += ["-vf", "crop=trunc(iw/2)*2:trunc(ih/2)*2", "-pix_fmt", "yuv420p", "-crf", "18", str(path)]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        assert process.stdin is not None
+        assert process.stderr is not None
+        try:
+            for frame in itertools.chain([first], frames):
+                process.stdin.write(frame.tobytes())
+            process.stdin.close()
+        except BrokenPipeError:
+            pass
+        said = process.stderr.read().decode(errors="replace").strip()
+    if process.returncode:
+        raise InputError(f"ffmpeg failed: {said.splitlines()[-1] if said else process.returncode}", path=path)

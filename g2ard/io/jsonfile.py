@@ -16,8 +16,7 @@ from g2ard.errors import InputError
 from g2ard.io.paths import read_text
 
 _LARGEST_NUMBER = sys.float_info.max
-_LONGEST_SHOWN_VALUE = 40
-"""Longest value in a message, characters."""
+_LONGEST_SHOWN_VALUE = 40  # longest value in a message, characters
 
 _WORDS = {
     "float": "a number",

@@ -1,7 +1,7 @@
 """Reader for .ksplat of GaussianSplats3D: sections of rows at one of three compression levels, SH 0–3."""
 
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,28 +11,19 @@ from g2ard.io.sanitize import Raw, cleaned
 from g2ard.io.types import Scene
 from g2ard.scene.splats import SH_C0
 
-_HEADER, _SECTION = 4096, 1024
-"""Bytes of the file's header and of a section's."""
+_HEADER = 4096  # bytes of the file's header
+_SECTION = np.dtype(
+    [
+        *((name, "<u4") for name in ("count", "capacity", "bucket_size", "buckets")),
+        *(("block", "<f4"), ("bucket_bytes", "<u2"), ("_0", "V2"), ("steps", "<u4"), ("_1", "V4")),
+        *(("full", "<u4"), ("partial", "<u4"), ("degree", "<u2"), ("_2", "V982")),
+    ]
+)
+"""Header of a section."""
 
 _SH_COUNTS = {0: 0, 1: 9, 2: 24, 3: 45}
-_SH_RANGE = (-1.5, 1.5)
-"""Range of 8-bit harmonics if the header gives none."""
-
-_SCALE_RANGE = 32767
-"""Half of the steps of a 16-bit position within its bucket, if a section gives none."""
-
-
-class _Section(NamedTuple):
-    rows: int
-    capacity: int
-    bucket_size: int
-    buckets: int
-    block: float
-    bucket_bytes: int
-    steps: int
-    full: int
-    partial: int
-    degree: int
+_SH_RANGE = (-1.5, 1.5)  # range of 8-bit harmonics if the header gives none
+_SCALE_RANGE = 32767  # half of the steps of a 16-bit position within its bucket, if a section gives none
 
 
 def read(path: Path) -> Scene:
@@ -52,7 +43,7 @@ def read(path: Path) -> Scene:
     if level not in (0, 1, 2):
         raise InputError(f"unsupported compression level {level}; expected 0, 1 or 2", path=path)
     limits = tuple(float(given) or usual for given, usual in zip(floats[9:11], _SH_RANGE, strict=True))
-    at = _HEADER + sections * _SECTION
+    at = _HEADER + sections * _SECTION.itemsize
     if len(data) < at:
         raise damaged(f"is cut off within the headers of {sections} sections", path=path)
     parts = []
@@ -67,36 +58,22 @@ def read(path: Path) -> Scene:
     return cleaned(path, whole)
 
 
-def _section(path: Path, data: bytes, i: int) -> _Section:
-    at = _HEADER + i * _SECTION
-    words = np.frombuffer(data, "<u4", 11, at).tolist()
-    block = float(np.frombuffer(data, "<f4", 1, at + 16)[0])
-    degree = words[10] & 0xFFFF
-    if degree not in _SH_COUNTS:
-        text = f"has the unsupported SH degree {degree}; expected 0 to 3"
+def _section(path: Path, data: bytes, i: int) -> dict[str, Any]:
+    values = np.frombuffer(data, _SECTION, 1, _HEADER + i * _SECTION.itemsize)[0].item()
+    section = dict(zip(_SECTION.names or (), values, strict=True))
+    if section["degree"] not in _SH_COUNTS:
+        text = f"has the unsupported SH degree {section['degree']}; expected 0 to 3"
         raise InputError(text, path=path, index=i, item="section")
-    count, capacity, size, buckets = words[:4]
-    return _Section(
-        min(count, capacity),
-        capacity,
-        size,
-        buckets,
-        block,
-        words[5] & 0xFFFF,
-        words[6] or _SCALE_RANGE,
-        words[8],
-        words[9],
-        degree,
-    )
+    return section
 
 
 def _rows(
-    path: Path, data: bytes, i: int, at: int, section: _Section, level: int, limits: tuple[float, ...]
+    path: Path, data: bytes, i: int, at: int, section: dict[str, Any], level: int, limits: tuple[float, ...]
 ) -> tuple[Raw, int]:
     """Return the rows of section `i`, which begins at byte `at`, and the byte after it."""
     packed = "<f4" if level == 0 else "<u2"
     real = "<f4" if level == 0 else "<f2"
-    harmonics = _SH_COUNTS[section.degree]
+    harmonics, count = _SH_COUNTS[section["degree"]], min(section["count"], section["capacity"])
     row = np.dtype(
         [
             ("mean", packed, 3),
@@ -106,12 +83,12 @@ def _rows(
             ("sh", "u1" if level == 2 else real, (harmonics,)),
         ]
     )
-    begin = at + 4 * section.partial + section.bucket_bytes * section.buckets
-    end = begin + row.itemsize * section.capacity
+    begin = at + 4 * section["partial"] + section["bucket_bytes"] * section["buckets"]
+    end = begin + row.itemsize * section["capacity"]
     if end > len(data):
         raise damaged("is cut off", path=path, index=i, item="section")
-    rows = np.frombuffer(data, row, section.rows, begin)
-    raw = Raw.empty(section.rows, harmonics // 3)
+    rows = np.frombuffer(data, row, count, begin)
+    raw = Raw.empty(count, harmonics // 3)
     raw.means[:] = rows["mean"] if level == 0 else _centres(path, data, i, at, section, rows["mean"])
     raw.set_linear(rows["scale"], rows["rgba"][:, 3] / 255)
     raw.quats[:] = rows["quat"]
@@ -119,25 +96,25 @@ def _rows(
     values = rows["sh"].astype(np.float64)
     if level == 2:
         values = values / 255 * (limits[1] - limits[0]) + limits[0]
-    for first, last in ((0, 9), (9, 24), (24, 45))[: section.degree]:
-        band = values[:, first:last].reshape(section.rows, 3, (last - first) // 3)
+    for first, last in ((0, 9), (9, 24), (24, 45))[: section["degree"]]:
+        band = values[:, first:last].reshape(count, 3, (last - first) // 3)
         raw.shN[:, first // 3 : last // 3] = band.transpose(0, 2, 1)
     return raw, end
 
 
 def _centres(
-    path: Path, data: bytes, i: int, at: int, section: _Section, steps: NDArray[Any]
+    path: Path, data: bytes, i: int, at: int, section: dict[str, Any], steps: NDArray[Any]
 ) -> NDArray[np.float64]:
     """Return positions from 16-bit steps: full buckets first, then partial ones of the listed lengths."""
-    if section.bucket_bytes < 12 or section.full + section.partial != section.buckets:
+    full, partial, buckets, size = (section[k] for k in ("full", "partial", "buckets", "bucket_bytes"))
+    if size < 12 or full + partial != buckets:
         raise damaged("has inconsistent buckets", path=path, index=i, item="section")
-    lengths = np.frombuffer(data, "<u4", section.partial, at).astype(np.int64)
-    lengths = np.concatenate([np.full(section.full, section.bucket_size, np.int64), lengths])
-    if lengths.sum() < section.rows:
+    lengths = np.frombuffer(data, "<u4", partial, at).astype(np.int64)
+    lengths = np.concatenate([np.full(full, section["bucket_size"], np.int64), lengths])
+    if lengths.sum() < len(steps):
         raise damaged("has more rows than its buckets hold", path=path, index=i, item="section")
-    start = at + 4 * section.partial
-    shape = (section.buckets, section.bucket_bytes)
-    table = np.frombuffer(data, "u1", shape[0] * shape[1], start).reshape(shape)
+    table = np.frombuffer(data, "u1", buckets * size, at + 4 * partial).reshape(buckets, size)
     centres = np.ascontiguousarray(table[:, :12]).view("<f4").astype(np.float64)
-    bucket = np.repeat(np.arange(section.buckets), np.minimum(lengths, section.rows))[: section.rows]
-    return (steps.astype(np.float64) - section.steps) * (section.block / 2 / section.steps) + centres[bucket]
+    bucket = np.repeat(np.arange(buckets), np.minimum(lengths, len(steps)))[: len(steps)]
+    half = section["steps"] or _SCALE_RANGE
+    return (steps.astype(np.float64) - half) * (section["block"] / 2 / half) + centres[bucket]

@@ -19,8 +19,7 @@ _LARGEST_CHUNK = 1 << 30
 _SAMPLES, _SAMPLE_ROWS = 20, 5000
 """Number and length of the runs of points that tell where a file's points are."""
 
-_NOISE = (7, 18)
-"""Classes of low and high noise."""
+_NOISE = (7, 18)  # classes of low and high noise
 
 
 class Stream(PointStream):

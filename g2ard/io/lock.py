@@ -43,14 +43,6 @@ def locked(folder: Path, output: str | None = None) -> Iterator[None]:
     """Lock an existing folder, or one output in it, or raise an `OutputError` if another process holds it.
 
     File systems without locks are not locked.
-
-    >>> import tempfile
-    >>> folder = Path(tempfile.mkdtemp())
-    >>> with locked(folder):
-    ...     [path.name for path in folder.iterdir()]
-    ['.lock']
-    >>> list(folder.iterdir())
-    []
     """
     path = lock_file(folder, output)
     file, shown = _opened(path), folder if output is None else folder / output

@@ -12,9 +12,7 @@ from g2ard.io.sanitize import LOG_SCALE_LIMIT
 from g2ard.scene.splats import Splats
 
 _MORTON_BITS = 21
-
-_NEAR = 4.0
-"""Distance of near rows from the median, as a multiple of the 75th percentile of all distances."""
+_NEAR = 4.0  # distance of near rows from the median, as a multiple of the 75th percentile of all distances
 
 _OTHER_COMPONENTS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
 """Indices of the components of a quaternion other than one."""
@@ -33,9 +31,7 @@ def writable(path: Path, splats: Splats) -> Splats:
 def rounding(splats: Splats, stored: Splats | NDArray[np.float64]) -> float:
     """Return the largest difference of a coordinate from its stored value, in scene units.
 
-    Args:
-        splats: the scene.
-        stored: the scene as stored, or its (N, 3) world coordinates; rows in the same order.
+    `stored` is the scene as stored, or its (N, 3) world coordinates; rows in the same order.
     """
     if stored is splats or not len(splats):
         return 0.0
@@ -143,6 +139,11 @@ def from_smallest_three(largest: NDArray[Any], others: NDArray[np.float64]) -> N
     quats[rows[:, None], _OTHER_COMPONENTS[largest]] = others
     quats[rows, largest] = np.sqrt(np.maximum(0, 1 - (others**2).sum(axis=1)))
     return quats
+
+
+def as_bytes(values: NDArray[Any]) -> NDArray[np.uint8]:
+    """Round values to bytes, clipped to 0 … 255."""
+    return np.clip(np.rint(values), 0, 255).astype(np.uint8)
 
 
 def coded(values: NDArray[Any], top: int) -> NDArray[np.int64]:

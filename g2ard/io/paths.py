@@ -10,12 +10,8 @@ from typing import Any
 
 from g2ard.errors import InputError
 
-_HASHED_END_BYTES = 1 << 16
-"""Bytes at each end of a file to hash."""
-
-_LONGEST_NAME = 200
-"""Longest file name, bytes; systems allow 255, including suffixes and temporary names."""
-
+_HASHED_END_BYTES = 1 << 16  # bytes at each end of a file to hash
+_LONGEST_NAME = 200  # longest file name, bytes; systems allow 255, including suffixes and temporary names
 _PHOTO_SUFFIXES = (".png", ".jpg", ".jpeg", ".jfif", ".webp", ".tif", ".tiff", ".bmp")
 
 _RAW = ".dng .cr2 .cr3 .nef .arw .raf .orf .rw2 .raw"
@@ -30,8 +26,7 @@ _OTHER_PHOTOS = {
 
 
 _LARGEST_RATIO = 100
-_ALWAYS_UNPACKED = 64 << 20
-"""Bytes that any file may unpack to; larger ones are limited by `_LARGEST_RATIO`."""
+_ALWAYS_UNPACKED = 64 << 20  # bytes that any file may unpack to; larger ones are limited by `_LARGEST_RATIO`
 
 
 def real_path(path: str | Path) -> Path:
@@ -56,14 +51,7 @@ def check_regular(path: Path) -> None:
 
 
 def check_unpacked(path: str | Path, packed: int, unpacked: int) -> None:
-    """Raise an `InputError` for data that unpacks to over 64 MiB and over 100 times its size, in bytes.
-
-    >>> check_unpacked("a.spz", 1 << 20, 100 << 20)
-    >>> check_unpacked("b.spz", 1 << 10, 100 << 20)
-    Traceback (most recent call last):
-    ...
-    g2ard.errors.InputError: b.spz: 1,024 bytes would unpack to 104,857,600; the limit is 67,108,864
-    """
+    """Raise an `InputError` for data that unpacks to over 64 MiB and over 100 times its size, in bytes."""
     most = max(_ALWAYS_UNPACKED, _LARGEST_RATIO * packed)
     if unpacked > most:
         raise InputError(f"{packed:,} bytes would unpack to {unpacked:,}; the limit is {most:,}", path=path)
@@ -96,13 +84,8 @@ def short_names(paths: Sequence[Path]) -> list[str]:
 def output_names(path: str | Path, names: Sequence[str]) -> list[str]:
     """Return file names for views, without suffix, that stay inside one folder.
 
-    Roots, drives and `..` are removed. Names that only differ in their suffix keep it.
-
-    Args:
-        path: the file of views, for errors.
-
-    Raises:
-        InputError: a name is invalid, longer than 200 bytes, or equals another one.
+    Roots, drives and `..` are removed. Names that only differ in their suffix keep it. Names that are invalid
+    or longer than 200 bytes, or equal, raise an `InputError` about the file of views, `path`.
 
     >>> output_names("v.json", ["../images/a.png", "/b/c.jpg", "d.png", "d.jpg"])
     ['images/a', 'b/c', 'd.png', 'd.jpg']

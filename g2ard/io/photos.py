@@ -33,11 +33,8 @@ _EXIF, _FOCAL, _FILM_FOCAL = 0x8769, 0x920A, 0xA405
 _SENSOR_PIXELS, _SENSOR_UNIT, _STORED_WIDTH = 0xA20E, 0xA210, 0xA002
 """Tags of EXIF: its own directory, focal lengths in mm, sensor pixels per unit, the unit, and the width."""
 
-_UNITS = {2: 25.4, 3: 10.0, 4: 1.0, 5: 1e-3}
-"""Millimetres of a unit of sensor pixels: inch, cm, mm and µm."""
-
-_FILM_DIAGONAL = math.hypot(36, 24)
-"""Diagonal of 35 mm film, mm."""
+_UNITS = {2: 25.4, 3: 10.0, 4: 1.0, 5: 1e-3}  # millimetres of a unit of sensor pixels: inch, cm, mm and µm
+_FILM_DIAGONAL = math.hypot(36, 24)  # diagonal of 35 mm film, mm
 
 
 class Lens(NamedTuple):
@@ -139,10 +136,7 @@ def opened_image(path: Path, content: IO[bytes] | None = None) -> Iterator[Image
 def photo_size(
     path: Path, listed_in: Path | None = None, like: tuple[float, float] | None = None
 ) -> tuple[int, int]:
-    """Read width and height from a photo's header, upright by EXIF if only that fits the size `like`.
-
-    `listed_in`, the file that names the photo, is for errors.
-    """
+    """Read width and height from a photo's header, upright by EXIF if only that fits the size `like`."""
     try:
         with opened_image(path) as image:
             return turned(image.size) if turns(image, like) else image.size
@@ -210,8 +204,7 @@ def exif_focal(path: Path) -> float | None:
 def rigid(matrix: NDArray[np.float64], place: Place) -> NDArray[np.float64]:
     """Return the rigid transform nearest to a (4, 4) or (3, 4) pose with rounding errors or a uniform scale.
 
-    Raises:
-        InputError: the pose is not finite, is mirrored, or differs from a rotation by over 1 %.
+    Raise an `InputError` for a pose that is not finite, is mirrored, or differs from a rotation by over 1 %.
     """
     if matrix.shape not in ((4, 4), (3, 4)) or not np.isfinite(matrix).all():
         raise place.error("is not a finite 4×4 matrix")
@@ -346,11 +339,7 @@ _PHOTO_NOTES = {
 
 
 def _checked_photos(frames: Sequence[Frame]) -> tuple[list[Frame], list[Note]]:
-    """Drop photos that cannot be read, and photos that names of several folders were shortened to.
-
-    Returns:
-        The frames, and notes on these and on photos found with another suffix.
-    """
+    """Drop photos that cannot be read, and photos that names of several folders were shortened to."""
     out, found = list(frames), {code: list[str]() for code in _PHOTO_NOTES}
     times = Counter(frame.photo for frame in frames)
     for i, frame in enumerate(frames):

@@ -27,8 +27,7 @@ _QUATS = ["rot_0", "rot_1", "rot_2", "rot_3"]
 _REQUIRED_PROPERTIES = [*_MEANS, *_DC, "opacity", *_SCALES, *_QUATS]
 _NORMALS = ["nx", "ny", "nz"]
 _FILTER = "filter_3d"
-_FEWEST_JUDGED = 3 * 16
-"""Scales, three of a Gaussian, that suffice to tell whether they are logarithms."""
+_FEWEST_JUDGED = 3 * 16  # scales, three of a Gaussian, that suffice to tell whether they are logarithms
 _FLAT_LOG_RATIO = np.log(np.float32(1e-3))
 """Logarithm of the thickness of 2D Gaussians over their shorter scale."""
 

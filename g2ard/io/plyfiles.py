@@ -30,11 +30,8 @@ _RENDER_MODES: dict[str, RenderModel | Literal["2dgs"]] = {
 COLOR_NAMES = (["red", "green", "blue"], ["r", "g", "b"], ["diffuse_red", "diffuse_green", "diffuse_blue"])
 """Names of colours."""
 
-_HEADER_LIMIT = 1 << 20
-"""Longest header, bytes."""
-
-_MARK = b"\xef\xbb\xbf"
-"""Byte order mark of UTF-8."""
+_HEADER_LIMIT = 1 << 20  # longest header, bytes
+_MARK = b"\xef\xbb\xbf"  # byte order mark of UTF-8
 
 _ASCII = bytes(range(128)) + b"?" * 128
 """Translation of names and comments of other character sets, byte by byte."""

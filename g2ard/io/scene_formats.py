@@ -103,10 +103,7 @@ def lost_in(path: str | Path, splats: Splats, **options: object) -> list[Note]:
 def check_positions(path: str | Path, splats: Splats, count: int | None = None) -> None:
     """Raise the `InputError` of writing a scene whose positions the format cannot hold, before the work.
 
-    Args:
-        path: the output.
-        splats: the scene that the written one will be made from.
-        count: Gaussians that it is reduced to; those of surfaces widen with the root of the ratio.
+    Gaussians of surfaces widen with the root of the ratio when the scene is reduced to `count`.
     """
     if scene_format(path).module == "spz" and len(splats):
         from g2ard.io.spz import check_far
@@ -119,9 +116,7 @@ def check_positions(path: str | Path, splats: Splats, count: int | None = None) 
 class Rounding:
     """Changes of positions by rounding in one file or in several of a scene.
 
-    Args:
-        far: whether the scene was moved to fit float32, so that every change is told and not only those that
-            can be visible.
+    If the scene was moved to fit float32 (`far`), every change is told, not only those that can be visible.
     """
 
     far: bool

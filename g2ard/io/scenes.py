@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from g2ard.config.checks import check_type, checks_arguments
 from g2ard.errors import InputError, OutputError
-from g2ard.io.atomic import check_output
+from g2ard.io.atomic import atomic_output, check_output
 from g2ard.io.detect import file_format, reader
 from g2ard.io.scene_formats import Rounding, check_options, lost_in, scene_format
 from g2ard.progress import Progress, Say, silent
@@ -158,6 +158,32 @@ def write_scene(
     rounding = Rounding(far=bool((splats.narrowed().offset != splats.offset).any()))
     rounding.add(error, splats)
     return [*rounding.notes, *lost_in(path, splats, **options)]
+
+
+def write_table(path: Path, splats: Splats, *, overwrite: bool = False) -> None:
+    """Write a .csv, a header and a row per Gaussian: the columns of `g2ard.scene.attributes.columns`.
+
+    Numbers have the digits that distinguish float32 values; positions with an offset those of float64.
+    """
+    import numpy as np
+
+    from g2ard.io.sanitize import BLOCK
+    from g2ard.scene.attributes import columns
+
+    if not len(splats):
+        raise InputError("not written: the scene has no Gaussians", path=path)
+    with (
+        atomic_output(path, overwrite) as temporary,
+        temporary.open("w", encoding="ascii", newline="") as file,
+    ):
+        for at in range(0, len(splats), BLOCK):
+            table = columns(splats.take(slice(at, at + BLOCK)))
+            if at == 0:
+                file.write(",".join(table) + "\r\n")
+            far = splats.offset.any()
+            digits = ["%.17g" if far and name in ("x", "y", "z") else "%.9g" for name in table]
+            rows = np.column_stack([values.astype(np.float64) for values in table.values()])
+            np.savetxt(file, rows, fmt=digits, delimiter=",", newline="\r\n")
 
 
 def tell(path: str | Path, notes: Iterable[Note], say: Say | None = None) -> None:

@@ -10,7 +10,7 @@ import re
 import struct
 import zipfile
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple, Self
@@ -34,11 +34,9 @@ from g2ard.progress import plural
 from g2ard.scene.transform import one_model
 
 _COEFFICIENTS = {0: 0, 1: 3, 2: 8, 3: 15}
-_LARGEST_FLOAT32 = float.fromhex("0x1.fffffep+127")
-"""Largest float32."""
+_LARGEST_FLOAT32 = float.fromhex("0x1.fffffep+127")  # largest float32
 _LARGEST_LOG = math.log1p(_LARGEST_FLOAT32)
-_PALETTE_COLUMNS = 64
-"""Entries of the SH palette per row of its image."""
+_PALETTE_COLUMNS = 64  # entries of the SH palette per row of its image
 
 _Float32 = Annotated[float, msgspec.Meta(ge=-_LARGEST_FLOAT32, le=_LARGEST_FLOAT32)]
 _Log = Annotated[float, msgspec.Meta(ge=-_LARGEST_LOG, le=_LARGEST_LOG)]
@@ -193,8 +191,8 @@ class _Decoder:
         names = [*meta.means.files[:2], meta.quats.files[0], meta.scales.files[0], meta.sh0.files[0]]
         self._low, self._high, self._quats, self._scales, self._base = (_rows(chunk, n, count) for n in names)
         self._positions = _positions(meta.means)
-        self._log_scales = _Values(chunk.file.to("scales"), meta.scales)
-        self._colors = _Values(chunk.file.to("sh0"), meta.sh0)
+        self._log_scales = _values(chunk.file.to("scales"), meta.scales)
+        self._colors = _values(chunk.file.to("sh0"), meta.sh0)
         self._logits = _logits(chunk.file.to("sh0"), meta.sh0)
         self._rest = _rest_of(chunk)
         if meta.shN is not UNSET and self._rest:
@@ -210,8 +208,8 @@ class _Decoder:
     def _fill(self, rows: slice, raw: Raw) -> None:
         _fill_means(raw.means, self._low[rows], self._high[rows], self._positions)
         raw.quats[:] = _quats(self._quats[rows])
-        raw.log_scales[:] = self._log_scales.of(self._scales[rows, :3])
-        raw.sh0[:, 0] = self._colors.of(self._base[rows, :3])
+        raw.log_scales[:] = self._log_scales(self._scales[rows, :3])
+        raw.sh0[:, 0] = self._colors(self._base[rows, :3])
         raw.logit_opacities[:] = self._logits[self._base[rows, 3]]
         raw.shN[:, self._rest :] = 0
         if self._rest:
@@ -270,29 +268,23 @@ def _bound(place: Place, bound: _Bound | None, channels: slice) -> NDArray[Any]:
     return np.asarray(bound[channels] if isinstance(bound, list) else bound)
 
 
-class _Values:
-    """Values of bytes: from a codebook (version 2), or between mins and maxs (version 1)."""
-
-    def __init__(self, place: Place, part: _Part) -> None:
-        self._place = place.to("codebook")
-        self._book: NDArray[Any] | None = None
-        if part.codebook is not UNSET:
-            book = np.array(part.codebook, np.float64)
-            wrong = np.isfinite(book) & (np.abs(book) > _LARGEST_FLOAT32)
-            if wrong.any():
-                raise self._place.to(int(np.argmax(wrong))).error("is beyond the range of float32")
-            self._book = book.astype(np.float32)
-            return
+def _values(place: Place, part: _Part) -> Callable[[NDArray[np.uint8]], NDArray[Any]]:
+    """Return the values of bytes: from a codebook (version 2), or between mins and maxs (version 1)."""
+    if part.codebook is UNSET:
         low, high = (_bound(place.to(name), getattr(part, name), slice(3)) for name in ("mins", "maxs"))
-        self._low, self._high = low, high
+        return lambda codes: low + (high - low) * (codes / 255)
+    place, book = place.to("codebook"), np.array(part.codebook, np.float64)
+    wrong = np.isfinite(book) & (np.abs(book) > _LARGEST_FLOAT32)
+    if wrong.any():
+        raise place.to(int(np.argmax(wrong))).error("is beyond the range of float32")
+    table = book.astype(np.float32)
 
-    def of(self, codes: NDArray[np.uint8]) -> NDArray[Any]:
-        if self._book is None:
-            values: NDArray[Any] = self._low + (self._high - self._low) * (codes / 255)
-            return values
-        if len(self._book) < 256 and codes.size and (top := int(codes.max())) >= len(self._book):
-            raise self._place.error(f"has {len(self._book)} numbers, expected at least {top + 1}")
-        return self._book[codes]
+    def looked_up(codes: NDArray[np.uint8]) -> NDArray[Any]:
+        if len(table) < 256 and codes.size and (top := int(codes.max())) >= len(table):
+            raise place.error(f"has {len(table)} numbers, expected at least {top + 1}")
+        return table[codes]
+
+    return looked_up
 
 
 def _quats(codes: NDArray[np.uint8]) -> NDArray[Any]:
@@ -315,8 +307,8 @@ def _palette(
         raise InputError(
             f"has width {image.shape[1]}, expected {_PALETTE_COLUMNS * rest}", path=chunk.place / centroids
         )
-    values = _Values(chunk.file.to("shN"), part)
-    palette = values.of(image[:, :, :3].reshape(-1, rest, 3)).astype(np.float32)
+    values = _values(chunk.file.to("shN"), part)
+    palette = values(image[:, :, :3].reshape(-1, rest, 3)).astype(np.float32)
     return palette, _rows(chunk, labels, count)
 
 
@@ -327,13 +319,9 @@ class _Lod(msgspec.Struct):
     file: Whole
 
 
-class _Lods(msgspec.Struct):
-    finest: _Lod | UnsetType = msgspec.field(default=UNSET, name="0")
-
-
 class _Node(msgspec.Struct):
     children: list["_Node"] = []
-    lods: _Lods = msgspec.field(default_factory=_Lods)
+    lods: dict[str, Any] = {}
 
 
 class _Levels(msgspec.Struct):
@@ -371,10 +359,11 @@ def _listed(index: Path) -> list[Path]:
     while nodes:
         node, place = nodes.pop()
         nodes.extend((child, place.to("children", i)) for i, child in enumerate(node.children))
-        if node.lods.finest is not UNSET:
-            at = node.lods.finest.file
+        if "0" in node.lods:
+            place = place.to("lods", "0")
+            at = checked(node.lods["0"], _Lod, place).file
             if at >= len(files):
-                raise place.to("lods", "0", "file").error(f"is {at}, but there are {len(files)} filenames")
+                raise place.to("file").error(f"is {at}, but there are {len(files)} filenames")
             used.add(at)
     for i in sorted(used):
         place = Place(index).to("filenames", i)

@@ -28,14 +28,9 @@ from g2ard.progress import Progress, silent
 from g2ard.scene.shape import longer_axes
 from g2ard.scene.splats import Splats
 
-_PALETTE_COLUMNS = 64
-"""Entries of the palette per row of its image."""
-
-_LONGEST_WEBP_SIDE = 16_383
-"""Longest side of a WebP image, pixels."""
-
-_KMEANS_STEPS = 6
-"""Steps of k-means after the split; 10 more gain 0.01 dB."""
+_PALETTE_COLUMNS = 64  # entries of the palette per row of its image
+_LONGEST_WEBP_SIDE = 16_383  # longest side of a WebP image, pixels
+_KMEANS_STEPS = 6  # steps of k-means after the split; 10 more gain 0.01 dB
 
 
 def write(path: Path, splats: Splats, *, overwrite: bool = False, progress: Progress = silent) -> float:

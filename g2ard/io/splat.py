@@ -2,14 +2,12 @@
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from g2ard.errors import InputError, damaged
 from g2ard.io.atomic import atomic_output
-from g2ard.io.packing import world_means, writable
+from g2ard.io.packing import as_bytes, world_means, writable
 from g2ard.io.sanitize import Raw
 from g2ard.io.stream import SceneStream
 from g2ard.scene.splats import SH_C0, Splats, unit_quats
@@ -52,13 +50,9 @@ def write(path: Path, splats: Splats, *, overwrite: bool = False) -> float:
     means = world_means(path, splats, ".splat")
     rows["mean"] = means
     rows["scale"] = splats.scales
-    rows["rgba"][:, :3] = _bytes(splats.colors * 255)
-    rows["rgba"][:, 3] = _bytes(splats.opacities * 255)
-    rows["quat"] = _bytes(unit_quats(splats.quats) * 128 + 128)
+    rows["rgba"][:, :3] = as_bytes(splats.colors * 255)
+    rows["rgba"][:, 3] = as_bytes(splats.opacities * 255)
+    rows["quat"] = as_bytes(unit_quats(splats.quats) * 128 + 128)
     with atomic_output(path, overwrite) as temporary:
         temporary.write_bytes(rows.tobytes())
     return float(np.abs(rows["mean"] - means).max())
-
-
-def _bytes(values: NDArray[Any]) -> NDArray[np.uint8]:
-    return np.clip(np.rint(values), 0, 255).astype(np.uint8)

@@ -25,21 +25,16 @@ from g2ard.io.sanitize import Raw, cleaned, logits_of
 from g2ard.io.types import Note, Scene
 from g2ard.progress import Progress, plural, silent
 from g2ard.scene.splats import Splats
-from g2ard.scene.transform import change_of_axes, with_axes
+from g2ard.scene.transform import change_of_axes, harmonic_signs, with_axes
 
 _MAGIC = b"NGSP"
-_HEADER = 16
-"""Size of the header, bytes."""
-
-_GZIP_BLOCK = 1 << 20
-"""Bytes packed between two reports of progress, a fraction of a second."""
-
+_HEADER = 16  # size of the header, bytes
+_GZIP_BLOCK = 1 << 20  # bytes packed between two reports of progress, a fraction of a second
 _POSITION_BITS = 24
 _COEFFICIENTS = (0, 3, 8, 15, 24)
 _ANTIALIASED, _HAS_EXTENSIONS = 0x1, 0x2
 _COORDINATE_SYSTEM = 0xADBE0003
-_HEADER_4 = 32
-"""Size of the header of version 4, bytes."""
+_HEADER_4 = 32  # size of the header of version 4, bytes
 
 _ADOBE_AXES: tuple[Axes, ...] = (
     *("LDB", "RDB", "LUB", "RUB", "LDF", "RDF", "LUF", "RUF"),
@@ -49,11 +44,10 @@ _ADOBE_AXES: tuple[Axes, ...] = (
 them. Its header swaps the names of 9 and 15, and of 10 and 16.
 """
 
-_COLOR_SCALE = 0.15
-"""SPZ's factor for band 0, which leaves room for colours outside [0, 1]."""
+_COLOR_SCALE = 0.15  # SPZ's factor for band 0, which leaves room for colours outside [0, 1]
 
-FLIPS = np.array([-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], np.float32)
-"""Sign of each harmonic of bands 1–3 when y and z change sign (PLY order: y z x | xy yz z² xz x²−y² | …)."""
+FLIPS = harmonic_signs((1, -1, -1))
+"""Signs of harmonics, which differ between SPZ's axes and those of a .ply."""
 
 _USUAL_BITS, _MOST_BITS = 12, 20
 
@@ -138,11 +132,7 @@ def _gunzip(path: Path, data: bytes) -> bytes:
 
 
 def _sizes(path: Path, head: bytes) -> list[int]:
-    """Return the bytes of the unpacked positions, alphas, colours, scales, rotations and harmonics.
-
-    They follow from the header's count and SH degree: positions are 3 × 24 bits; a rotation is three bytes in
-    version 2, and three components of 10 bits with the index of the fourth since version 3.
-    """
+    """Return the bytes of the unpacked positions, alphas, colours, scales, rotations and harmonics."""
     if head[:4] != _MAGIC:
         raise InputError(f"not an SPZ file (begins with {head[:4]!r})", path=path)
     if len(head) < _HEADER:
@@ -328,17 +318,11 @@ def fraction_bits(path: Path, means: NDArray[np.float64], splats: Splats, *, mov
     """Return the fractional bits of 24-bit coordinates.
 
     Usually 12. More, as far as the extent allows, if a step of 2^−12 exceeds a quarter of the 1st percentile
-    of the Gaussians' middle scales.
+    of the Gaussians' middle scales. The error if steps exceed both 2^−12 and the median middle scale names
+    the Gaussians to blame, if they are few, and the box of the others.
 
     Args:
-        path: file for messages.
-        means: (N, 3) coordinates to store.
-        splats: the Gaussians, in the same order.
         movable: whether the origin of the coordinates follows from them, so that far is far from the median.
-
-    Raises:
-        InputError: steps exceed both 2^−12 and the median middle scale; if that is due to a few Gaussians, it
-            names them and the box of the others.
     """
     reach = np.abs(means).max(axis=1)
     farthest = float(reach.max())
@@ -376,12 +360,13 @@ def _streams(splats: Splats, means: NDArray[np.float64], bits: int, version: int
     """Pack positions, alphas, colours, scales, rotations and, if any, harmonics."""
     fixed = np.rint(means * (1, -1, -1) * (1 << bits)).astype("<i4")
     quats = packing.unit_quats(splats.quats) * (1, 1, -1, -1)
+    signs = np.where(quats[:, :1] < 0, -1, 1)  # w ≥ 0
     streams = [
         fixed.reshape(-1, 1).view(np.uint8)[:, :3].tobytes(),
         _bytes(splats.opacities.astype(np.float64) * 255),
         _bytes((splats.sh0[:, 0].astype(np.float64) * _COLOR_SCALE + 0.5) * 255),
         _bytes((packing.log_scales(splats) + 10) * 16),
-        _xyz(quats) if version == 2 else _packed(quats),
+        _bytes(quats[:, 1:] * signs * 127.5 + 127.5) if version == 2 else _packed(quats),
     ]
     if splats.sh_degree:  # in all 8 bits: rounding to fewer is where other writers lose most
         flips = FLIPS[: splats.shN.shape[1], None]
@@ -390,12 +375,7 @@ def _streams(splats: Splats, means: NDArray[np.float64], bits: int, version: int
 
 
 def _bytes(values: NDArray[Any]) -> bytes:
-    return np.clip(np.rint(values), 0, 255).astype(np.uint8).tobytes()
-
-
-def _xyz(quats: NDArray[np.float64]) -> bytes:
-    """Pack quaternions for version 2: x y z, with the sign for which w ≥ 0."""
-    return _bytes(quats[:, 1:] * np.where(quats[:, :1] < 0, -1, 1) * 127.5 + 127.5)
+    return packing.as_bytes(values).tobytes()
 
 
 def _packed(quats: NDArray[np.float64]) -> bytes:

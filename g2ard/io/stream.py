@@ -25,14 +25,9 @@ RawPoints = tuple[NDArray[np.float64], NDArray[np.float32]]
 MarkedPoints = tuple[NDArray[np.float64], NDArray[np.float32], NDArray[np.bool_]]
 """Positions, colours, and an (n,) mask of points that the file marks as noise."""
 
-_FULL = (255.0, 65535.0)
-"""Largest colours of 8 and 16 bits."""
-
-_FAR = 10.0
-"""Distance from the origin, in extents, beyond which coordinates may be those of a map."""
-
-_STEEP = 20.0
-"""Extent in z over that in x and y beyond which x and y may be degrees."""
+_FULL = (255.0, 65535.0)  # largest colours of 8 and 16 bits
+_FAR = 10.0  # distance from the origin, in extents, beyond which coordinates may be those of a map
+_STEEP = 20.0  # extent in z over that in x and y beyond which x and y may be degrees
 
 Block = TypeVar("Block", Splats, RawPoints)
 
@@ -126,12 +121,7 @@ class SceneStream(Stream[Splats]):
 
 
 class PartsStream(SceneStream):
-    """Scene of clean parts that are loaded one at a time.
-
-    Args:
-        part: function that loads a part by index.
-        identity: JSON that identifies the scene.
-    """
+    """Scene of clean parts that `part` loads by index, one at a time."""
 
     def __init__(
         self,
@@ -188,11 +178,10 @@ class PointStream(Stream[RawPoints]):
     ) -> None:
         """Open a cloud, whose centre becomes the offset if it is far from the origin.
 
-        Args:
-            sample: (n, 3) positions from all parts of the cloud. Files' own bounds may be wrong.
-            scales: see `full_scales`.
+        The (n, 3) sample is of all parts of the cloud, since files' own bounds may be wrong.
         """
-        low, high = _robust_bounds(sample)
+        finite = sample[np.isfinite(sample).all(axis=1)]
+        low, high = np.percentile(finite, (1, 99), axis=0) if len(finite) else np.zeros((2, 3))
         middle, extent = (low + high) / 2, high - low
         far = np.isfinite(middle).all() and (np.abs(middle) > np.linalg.norm(extent)).any()
         notes = (_DEGREES,) if _in_degrees(middle, extent) else ()
@@ -251,13 +240,6 @@ _DEGREES = Note(
     "x and y look like degrees of longitude and latitude, and z like metres; project them to metres, for "
     "example with `pdal translate IN OUT reprojection --filters.reprojection.out_srs=EPSG:32633`",
 )
-
-
-def _robust_bounds(sample: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the 1st and 99th percentiles of finite positions; zeros without any."""
-    at = sample[np.isfinite(sample).all(axis=1)]
-    bounds: NDArray[np.float64] = np.percentile(at, (1, 99), axis=0) if len(at) else np.zeros((2, 3))
-    return bounds
 
 
 def _in_degrees(middle: NDArray[np.float64], extent: NDArray[np.float64]) -> bool:

@@ -30,10 +30,8 @@ _NAME = "Splats"
 _SH = "radiance:sphericalHarmonics"
 _COLOR = "primvars:displayColor"
 _USD_TURN, _QUAT_TURN = np.array([1.0, -1, -1]), np.array([1.0, 1, -1, -1])
-_TEXT_ROWS = 8192
-"""Rows formatted together as text."""
-_EXTENT_SIGMAS = 3.0
-"""Extent of a Gaussian, as a multiple of its largest scale."""
+_TEXT_ROWS = 8192  # rows formatted together as text
+_EXTENT_SIGMAS = 3.0  # extent of a Gaussian, as a multiple of its largest scale
 
 
 def write(path: Path, splats: Splats, *, overwrite: bool = False, progress: Progress = silent) -> float:

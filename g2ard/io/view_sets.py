@@ -22,8 +22,7 @@ if TYPE_CHECKING:
     from g2ard.scene.cameras import Cameras
 
 
-_OFF_CENTRE = 0.5
-"""Distance in pixels of a principal point from the middle that is worth a note."""
+_OFF_CENTRE = 0.5  # distance in pixels of a principal point from the middle that is worth a note
 
 
 def view_format(path: Path, given: ViewFormat | None = None) -> ViewFormat:

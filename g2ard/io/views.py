@@ -46,13 +46,10 @@ class _View(msgspec.Struct):
     lens: _PhotoLens | None = None
 
 
-class _File(msgspec.Struct):
-    views: list[_View] = []
-
-
 def read(path: Path, images: Path | None = None) -> Listed:
     """Read views; photo paths are relative to the file unless `images`, a folder of photos, is given."""
-    views = checked(read_own(path, _FORMAT, _VERSION), _File, Place(path), entries="view").views
+    content = read_own(path, _FORMAT, _VERSION).get("views", [])
+    views = checked(content, list[_View], Place(path).to("views"), entries="view")
     if not views:
         raise InputError("no views found ('views' is empty)", path=path)
     finder, masks = Finder(images or path.parent), Finder(path.parent)

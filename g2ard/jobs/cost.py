@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from g2ard.errors import InputError
-from g2ard.io.tile_store import row_width
+from g2ard.io.tiles import row_width
 from g2ard.jobs.memory import RECOVERY_TIMES, WHOLE_TIMES, TileMemory, amount
 from g2ard.jobs.views import FULL_PIXELS
 from g2ard.progress import plural

@@ -20,7 +20,7 @@ from g2ard.errors import InputError
 from g2ard.io.detect import kind
 from g2ard.io.reports import Report
 from g2ard.io.scenes import tell
-from g2ard.io.tile_store import StoredScene
+from g2ard.io.tiles import StoredScene
 from g2ard.jobs.budget import Budget
 from g2ard.jobs.cost import Cost, cost_of
 from g2ard.jobs.distill import DistillJob, preparing

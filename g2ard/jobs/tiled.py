@@ -17,7 +17,7 @@ from g2ard.io import open_stream
 from g2ard.io.detect import MANIFEST
 from g2ard.io.reports import Report
 from g2ard.io.sanitize import BLOCK
-from g2ard.io.tile_store import StoredScene, TileStore
+from g2ard.io.tiles import StoredScene, TileStore
 from g2ard.jobs.budget import Budget
 from g2ard.jobs.distill_options import DistillOptions
 from g2ard.jobs.inputs import say_regions

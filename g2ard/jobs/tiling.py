@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from g2ard.errors import InputError
 from g2ard.io import open_stream
 from g2ard.io.detect import MANIFEST, kind
-from g2ard.io.tile_store import TileStore
+from g2ard.io.tiles import TileStore
 
 if TYPE_CHECKING:
     from g2ard.jobs.budget import Budget

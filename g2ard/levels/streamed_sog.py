@@ -155,9 +155,7 @@ def _linked(source: str, target: str) -> None:
 class _Files:
     """Assignment of leaves to files: a level's leaves fill a file until it holds more than `most` rows.
 
-    Args:
-        rounding: changes of positions in the files.
-        error: largest change of a position before.
+    Positions are rounded in the files, and before by up to `error`.
     """
 
     levels: Sequence[Level]

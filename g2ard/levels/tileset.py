@@ -66,9 +66,7 @@ class Georeference(Settings):
     def of_map(cls, system: Any, offset: ArrayLike) -> Georeference:
         """Return the place of an offset in map coordinates, with the direction of grid north as heading.
 
-        Args:
-            system: a coordinate system of `map_system`.
-            offset: (3,) easting, northing, height in metres.
+        The offset is easting, northing and height in metres of a system of `map_system`.
         """
         import pyproj
 
@@ -96,12 +94,7 @@ class Georeference(Settings):
 
 
 def map_system(name: str) -> Any:
-    """Return pyproj's coordinate system of a name such as EPSG:32635.
-
-    Raises:
-        InputError: an unknown name, or a system without eastings and northings in metres.
-        MissingDependencyError: pyproj is not installed.
-    """
+    """Return pyproj's coordinate system of a name such as EPSG:32635, projected and in metres."""
     try:
         import pyproj
     except ImportError as error:
@@ -194,12 +187,7 @@ def _upright(up: ArrayLike) -> Float:
 
 @dataclass
 class _Tiles:
-    """The tiles of a tree, and the rows of their files.
-
-    Args:
-        rounding: changes of positions in the files.
-        error: largest change of a position before.
-    """
+    """The tiles of a tree, the rows of their files, and the rounding in them and before (`error`)."""
 
     levels: Sequence[Level]
     most: int

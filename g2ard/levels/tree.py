@@ -15,7 +15,7 @@ from g2ard.config.checks import AtLeastOne, Positive
 from g2ard.config.schema import Settings
 from g2ard.errors import InputError
 from g2ard.io.packing import rounding
-from g2ard.io.tile_store import StoredScene
+from g2ard.io.tiles import StoredScene
 from g2ard.scene.splats import Splats, check_finite
 from g2ard.scene.transform import rotation_matrices
 
@@ -25,8 +25,7 @@ Level = Splats | StoredScene
 Float = NDArray[np.float64]
 Rows = NDArray[np.int64]
 
-_ROWS_AT_ONCE = 1 << 20
-"""Rows processed together."""
+_ROWS_AT_ONCE = 1 << 20  # rows processed together
 
 
 @dataclass(frozen=True)
@@ -69,11 +68,7 @@ class Node:
 
 
 def aligned(levels: Sequence[Level]) -> tuple[list[Level], float, bool]:
-    """Return levels with float32 means and one offset.
-
-    Returns:
-        The levels, the largest change of a position by rounding, and whether their offset changed.
-    """
+    """Return levels with float32 means and one offset, the largest rounding, and whether offsets changed."""
     check_levels(levels)
     first = levels[0]
     offset = first.narrowed().offset if isinstance(first, Splats) else first.offset
@@ -108,9 +103,6 @@ def cut(levels: Sequence[Level], rule: Cut | None = None, scratch: Path | None =
         levels: the same scene at several levels, finest first, with equal offsets.
         scratch: folder for unnamed temporary files of positions and row numbers. Memory then holds 4 bytes
             per row plus the rows of one leaf. None keeps everything in memory.
-
-    Returns:
-        The root of the tree, a leaf if nothing is split.
 
     >>> fine = Splats.create([[0, 0, 0], [9, 0, 0]], scales=[[1, 1, 2]] * 2)
     >>> tree = cut([fine, fine.take([0])], Cut(most=2))

@@ -20,11 +20,8 @@ from g2ard.scene.samples import evenly_spaced
 from g2ard.scene.splats import Splats
 from g2ard.stages.evaluate import ViewScore
 
-_SHOWN = 3
-"""Pictures of the page, and rows of the preview picture."""
-
-_POINTS = 4096
-"""Gaussians that tell how much of the scene a view has in frame."""
+_SHOWN = 3  # pictures of the page, and rows of the preview picture
+_POINTS = 4096  # Gaussians that tell how much of the scene a view has in frame
 
 
 def distill_report(
@@ -78,7 +75,8 @@ def distill_report(
     lost = _below_start(before, after)
     if lost:
         page.paragraph(f"Views that ended below their start: {', '.join(text for _, text in lost)}.")
-    worst = [view for view in _shown([row for row, _ in lost], _worst(after)) if view != typical]
+    shown = list(dict.fromkeys([*(row for row, _ in lost[:1]), *_worst(after)]))[:_SHOWN]
+    worst = [view for view in shown if view != typical]
     if worst:
         page.heading("Worst views")
     for view in worst:
@@ -140,11 +138,6 @@ def _below_start(before: Sequence[ViewScore], after: Sequence[ViewScore]) -> lis
     return list(zip(rows, texts, strict=True))
 
 
-def _shown(lost: Sequence[int], worst: Sequence[int]) -> list[int]:
-    """Return the view that lost most, if any, then the worst ones."""
-    return list(dict.fromkeys([*lost[:1], *worst]))[:_SHOWN]
-
-
 def _worst(scores: Sequence[ViewScore]) -> list[int]:
     """Return views to show: the worst of each kind in turn, weakest kind first."""
     found = rows_by_kind([view.kind for view in scores])
@@ -191,9 +184,6 @@ def preview(
     """Write a PNG with a row for each of three views: target, then each scene with its PSNR.
 
     The views are those of each third that have most of the scene in frame.
-
-    Args:
-        scenes: (label, scene), left to right after the target.
     """
     cameras, shown = targets.cameras, scenes[-1][1]
     some = shown.take(evenly_spaced(len(shown), _POINTS))

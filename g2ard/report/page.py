@@ -14,9 +14,7 @@ from numpy.typing import NDArray
 from g2ard.io.atomic import atomic_output
 from g2ard.io.images import to_bytes
 
-_WINDOW, _CROPS = 0.28, 2
-"""Side of an automatic crop as a share of the image's, and number of crops."""
-
+_WINDOW, _CROPS = 0.28, 2  # side of an automatic crop as a share of the image's, and number of crops
 _LONGEST = 1280
 _QUALITY = 86
 _HERE = Path(__file__).parent
@@ -56,15 +54,7 @@ def _span(start: float, extent: float, size: int) -> slice:
 
 
 def worst_windows(image: NDArray[np.uint8], target: NDArray[np.uint8]) -> list[Window]:
-    """Return the windows with the largest error, worst first, in shares of the image's size.
-
-    >>> target = np.zeros((100, 100, 3), np.uint8)
-    >>> image = target.copy()
-    >>> image[70:80, 20:30] = 255
-    >>> found = worst_windows(image, target)[0]
-    >>> bool(found.left <= 0.2 and 0.3 <= found.left + found.width), bool(found.top <= 0.7)
-    (True, True)
-    """
+    """Return the windows with the largest error, worst first, in shares of the image's size."""
     error = ((image.astype(np.float64) - target) ** 2).sum(-1)
     height, width = error.shape
     rows, columns = max(1, int(_WINDOW * height)), max(1, int(_WINDOW * width))

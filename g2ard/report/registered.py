@@ -19,11 +19,8 @@ from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
 from g2ard.stages.register.report import PhotoReport, Registered
 
-_VIEWS, _SIZE = 12, 640
-"""Number of photos shown, and the longer side of their images in pixels."""
-
-_LINES = 80
-"""Matches drawn per photo."""
+_VIEWS, _SIZE = 12, 640  # number of photos shown, and the longer side of their images in pixels
+_LINES = 80  # matches drawn per photo
 
 
 def registration_report(
@@ -80,11 +77,7 @@ def registration_report(
 def _matches_drawn(
     photo: NDArray[np.uint8], render: NDArray[np.uint8], matches: NDArray[np.float64]
 ) -> NDArray[np.uint8]:
-    """Draw photo and render side by side, (H, 2 W, 3), with a line for each match.
-
-    Args:
-        matches: (M, 4) matching pixels (u, v) of photo and render.
-    """
+    """Draw photo and render side by side, with a line for each match, (M, 4) pixels u, v of both."""
     from PIL import Image, ImageDraw
 
     pair = Image.fromarray(np.concatenate([photo, render], 1))

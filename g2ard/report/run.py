@@ -60,12 +60,7 @@ class KindScore(Report):
 def by_kind(
     before: Sequence[ViewScore], after: Sequence[ViewScore], usual: str = USUAL
 ) -> tuple[KindScore, ...]:
-    """Summarise scores by kind of view.
-
-    Args:
-        before: scores of each view with the simplified scene.
-        after: the same with the recovered scene.
-        usual: name for the usual kind.
+    """Summarise scores of views before and after recovery by kind of view; `usual` names the usual kind.
 
     >>> before, after = (ViewScore("near_0000", psnr, kind="near") for psnr in (30.0, 31.0))
     >>> found, = by_kind([before], [after])
@@ -249,11 +244,7 @@ class RunReport(Report):
 
 @dataclass(frozen=True)
 class TileScore(Report):
-    """Score of one tile.
-
-    Args:
-        simplified, recovered, pixels, steps: as in `TiledScores`; PSNR is meaningless without pixels.
-    """
+    """Score of one tile; its PSNR is meaningless without pixels."""
 
     tile: int
     count: int
@@ -265,11 +256,7 @@ class TileScore(Report):
 
 @dataclass(frozen=True)
 class TiledScores(Report):
-    """Scores on held-out views, over all pixels owned by tiles.
-
-    Args:
-        pixels: number of pixels scored.
-    """
+    """Scores on held-out views, over all pixels owned by tiles."""
 
     simplified: float
     recovered: float

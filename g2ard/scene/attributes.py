@@ -12,8 +12,7 @@ from g2ard.errors import InputError
 from g2ard.scene.shape import elongation
 from g2ard.scene.splats import Splats
 
-_LONGEST = 1000
-"""Characters of a condition at most, so that it cannot nest too deeply."""
+_LONGEST = 1000  # characters of a condition at most, so that it cannot nest too deeply
 
 _TABLE: dict[tuple[str, ...], Callable[[Splats], NDArray[Any]]] = {
     ("x", "y", "z"): lambda splats: splats.means.astype(np.float64) + splats.offset,

@@ -26,11 +26,8 @@ LARGEST_IMAGE = 160_000_000
 _LARGEST_CAMERA_VALUE = 1e12
 """Largest value of poses and intrinsics; larger ones are damaged data and overflow when squared."""
 
-_POSE_SLACK = 1e-3
-"""Deviation of a pose from a rigid transform that counts as rounding."""
-
-_MEDIAN_VIEWS = 16
-"""Views used for medians over all views."""
+_POSE_SLACK = 1e-3  # deviation of a pose from a rigid transform that counts as rounding
+_MEDIAN_VIEWS = 16  # views used for medians over all views
 
 _ARRAY_SHAPES = {"viewmats": (4, 4), "Ks": (3, 3), "widths": (), "heights": (), "distortions": (5,)}
 """Arrays of `Cameras` and their shapes per view."""
@@ -169,14 +166,9 @@ class Cameras:
 
     def __post_init__(self) -> None:
         n = len(self.viewmats)
-        if not self.image_paths:
-            object.__setattr__(self, "image_paths", (None,) * n)
-        if not self.mask_paths:
-            object.__setattr__(self, "mask_paths", (None,) * n)
-        if not self.lenses:
-            object.__setattr__(self, "lenses", (None,) * n)
-        if not self.kinds:
-            object.__setattr__(self, "kinds", (USUAL,) * n)
+        for name, one in (("image_paths", None), ("mask_paths", None), ("lenses", None), ("kinds", USUAL)):
+            if not getattr(self, name):
+                object.__setattr__(self, name, (one,) * n)
         if not len(self.distortions):
             object.__setattr__(self, "distortions", np.zeros((n, 5)))
         for name, shape in _ARRAY_SHAPES.items():

@@ -9,14 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-_SAMPLE_SIGMAS = 4.0
-"""Standard deviations by which a tile may exceed the count estimated from a sample."""
-
-_HALO_SHARE = 0.03
-"""Margin of a halo as a fraction of a tile's side."""
-
-_BOX_PERCENTILES = 1, 99
-"""Percentiles that bound a box when its sides are measured, to ignore floaters."""
+_SAMPLE_SIGMAS = 4.0  # standard deviations by which a tile may exceed the count estimated from a sample
+_HALO_SHARE = 0.03  # margin of a halo as a fraction of a tile's side
+_BOX_PERCENTILES = 1, 99  # percentiles that bound a box when its sides are measured, to ignore floaters
 
 Points = NDArray[np.float32]
 Rows = NDArray[np.intp]
@@ -102,18 +97,10 @@ class KdTree:
 
 
 def cut_tree(points: Points, rows_each: float, most: int) -> KdTree:
-    """Cut until no leaf is expected to hold more than `most` rows.
+    """Cut until no leaf is expected to hold more than `most` rows, unless all its points coincide.
 
     Each cut is along the longest side, at the quantile that gives both parts whole numbers of tiles. The
-    order of the points does not matter.
-
-    Args:
-        points: (N, 3) float32, finite: all rows or a sample.
-        rows_each: rows per point; 1 for all rows.
-        most: maximum rows of a leaf.
-
-    Returns:
-        A tree; a leaf whose points all coincide may hold more.
+    order of the points, which are finite and stand for `rows_each` rows, does not matter.
     """
     parts = parts_of(len(points), rows_each, most)
     if parts == 1 or len(points) < 2:

@@ -38,8 +38,7 @@ FACES: dict[str, Float] = {
 
 _ONE_VIEW = np.radians(50)
 """Largest angle from the axis to the middle of an edge of a photo that one pinhole view shows."""
-_LEAST_SEEN = 0.05
-"""Least share of a face that the photo must hold."""
+_LEAST_SEEN = 0.05  # least share of a face that the photo must hold
 
 
 _CORNER = np.radians(95)

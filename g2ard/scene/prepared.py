@@ -25,8 +25,7 @@ DRAWN_LOG_SCALES: tuple[float, float] = _LIMITS["drawn_log_scales"]
 LARGEST_SCALE = np.float32(np.exp(43))
 """Largest scale whose square fits float32; readers clamp to it too."""
 
-_LEAST_LOGIT = np.float32(-_LIMITS["logit_of_opaque"])
-"""Least logit; readers clamp to it too."""
+_LEAST_LOGIT = np.float32(-_LIMITS["logit_of_opaque"])  # least logit; readers clamp to it too
 
 
 class PreparedScene(Splats):

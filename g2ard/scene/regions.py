@@ -21,14 +21,9 @@ _SKY_RADII = (np.sqrt(2) + 1) / (np.sqrt(2) - 1)
 """Least distance of the sky from the middle of the near scene, about 5.8 of its radii: between any two places
 within the radius, the distance to the sky changes by less than √2, the step between two levels of detail."""
 
-_NEAR_SHARE = 2 / 3
-"""Share of the opacity within the radius of the near scene."""
-
-_LEAST_SKY_SHARE = 1e-3
-"""Share of all directions up to which far Gaussians are floaters."""
-
-_RADIUS_SAMPLE = 200_000
-"""Largest number of rows that decide middle and radius."""
+_NEAR_SHARE = 2 / 3  # share of the opacity within the radius of the near scene
+_LEAST_SKY_SHARE = 1e-3  # share of all directions up to which far Gaussians are floaters
+_RADIUS_SAMPLE = 200_000  # largest number of rows that decide middle and radius
 
 
 def check_region(region: Sequence[float]) -> Region:

@@ -9,10 +9,7 @@ from numpy.typing import NDArray
 def evenly_spaced(count: int, most: int, *, floor: bool = False) -> list[int]:
     """Return at most `most` evenly spaced indices below `count`, the first and last included.
 
-    Args:
-        count: number of items; 0 gives no index.
-        most: largest number of indices.
-        floor: round down instead of to the nearest index.
+    `floor` rounds down instead of to the nearest index.
 
     >>> evenly_spaced(9, 3), evenly_spaced(2, 3), evenly_spaced(4, 3), evenly_spaced(4, 3, floor=True)
     ([0, 4, 8], [0, 1], [0, 2, 3], [0, 1, 3])

@@ -20,14 +20,9 @@ SH_C0 = 0.28209479177387814
 DRAWN_LOGIT = -5.54
 """Logit below which α < 1/255, which no renderer draws."""
 
-_UNIT_SLACK = 1e-6
-"""Deviation of a quaternion's length from 1 that counts as rounding: a few ulps of float32."""
-
-_FINE_STEP = 1e-4
-"""Rounding of positions that nothing shows, as a share of a Gaussian's scale."""
-
-_COLOR_SLACK = 1e-5
-"""Excess of a colour over [0, 1] that counts as rounding."""
+_UNIT_SLACK = 1e-6  # deviation of a quaternion's length from 1 that counts as rounding: a few ulps of float32
+_FINE_STEP = 1e-4  # rounding of positions that nothing shows, as a share of a Gaussian's scale
+_COLOR_SLACK = 1e-5  # excess of a colour over [0, 1] that counts as rounding
 
 _FAR_SPREADS, _SAMPLE = 16.0, 65_536
 """Distance from the origin, in spreads, beyond which points are far; number of points that decide."""
@@ -193,11 +188,7 @@ class Splats:
         return replace(self, **{name: getattr(self, name)[index] for name in ARRAYS})
 
     def with_sh_degree(self, degree: int) -> Splats:
-        """Return the scene with higher bands cut off or padded with zeros.
-
-        Raises:
-            InputError: the degree is not 0–3.
-        """
+        """Return the scene with higher bands cut off or padded with zeros; the degree is 0–3."""
         if degree not in range(4):
             raise InputError(f"SH degree: expected 0 to 3, got {degree}")
         rest = (degree + 1) ** 2 - 1
@@ -278,9 +269,6 @@ def check_finite(splats: Splats, parameter: str) -> None:
 def unit_colors(colors: ArrayLike, parameter: str = "colors") -> NDArray[np.float64]:
     """Return colours in [0, 1]: bytes divided by 255, 16-bit integers by 65,535, others as they are.
 
-    Raises:
-        InputError: a finite value outside [0, 1], with the row.
-
     >>> unit_colors(np.uint8([[255, 51, 0]])).tolist()
     [[1.0, 0.2, 0.0]]
     """
@@ -331,14 +319,10 @@ def far_middle(points: NDArray[Any], size: float = 0.0) -> NDArray[np.float64]:
 
 
 def unit_quats(quats: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Normalise quaternions: q / |q|.
+    """Normalise (N, 4) quaternions wxyz.
 
-    Args:
-        quats: (N, 4) float32 wxyz.
-
-    Returns:
-        (N, 4) float32. Rows within 1e-6 of length 1 keep every bit, so that writing and reading change
-        nothing. Zeros become the identity. Rows that are not finite are kept for writers to report.
+    Rows within 1e-6 of length 1 keep every bit, so that writing and reading change nothing. Zeros become the
+    identity. Rows that are not finite are kept for writers to report.
 
     >>> unit_quats(np.float32([[-2, 0, 0, 0], [0, 3e30, 4e30, 0], [0, 0, 0, 0]])).round(6).tolist()
     [[-1.0, 0.0, 0.0, 0.0], [0.0, 0.6000000238418579, 0.800000011920929, 0.0], [1.0, 0.0, 0.0, 0.0]]

@@ -5,7 +5,8 @@ Axes are three letters for the directions of x, y and z, such as RDF for right, 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -23,22 +24,16 @@ _DIRECTIONS = {
     **{"R": (1, 0, 0), "U": (0, 1, 0), "B": (0, 0, 1)},
     **{"L": (-1, 0, 0), "D": (0, -1, 0), "F": (0, 0, -1)},
 }
-_SH_PARITY = np.repeat(np.array([-1, 1, -1], np.float32), (3, 5, 7))
-"""Sign of each harmonic of bands 1–3 under x ↦ −x."""
+_ODD = ("y", "z", "x", "xy", "yz", "", "xz", "", "y", "xyz", "y", "z", "x", "z", "x")
+"""Axes in which each harmonic of bands 1–3 is odd."""
 
 
 def transform(splats: Splats, matrix: ArrayLike) -> Splats:
     """Apply x ↦ s·R·x + t to means, scales, rotations and harmonics.
 
-    World coordinates are means + `offset`: a shift far beyond the scene's extent goes into the float64
-    `offset`, since float32 means would lose their digits.
-
-    Args:
-        splats: the scene.
-        matrix: (4, 4) row-major, a similarity: one scale s > 0, a rotation R, a translation t in scene units.
-
-    Returns:
-        The scene; `offset` is moved if it is not zero or t exceeds 16 extents of the scene.
+    The (4, 4) matrix is a similarity: one scale s > 0, a rotation R, a translation t in scene units. If t
+    exceeds 16 extents of the scene, or `offset` is not zero, it moves the float64 `offset`, since float32
+    means would lose their digits.
 
     Raises:
         InputError: the matrix is not a similarity.
@@ -60,11 +55,12 @@ def transform(splats: Splats, matrix: ArrayLike) -> Splats:
         offset = offset + shift
     else:
         means, offset = means + shift, np.zeros(3)
-    turn = quaternion_of(rotation)
+    w, x, y, z = quaternion_of(rotation)
+    turn = np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
     return replace(
         splats,
         means=means.astype(splats.means.dtype),
-        quats=_product(turn, splats.quats.astype(np.float64)).astype(np.float32),
+        quats=(splats.quats.astype(np.float64) @ turn.T).astype(np.float32),
         scales=(splats.scales * scale).astype(np.float32),
         shN=rotate_harmonics(splats.shN, rotation),
         offset=offset,
@@ -101,9 +97,6 @@ def deformed(splats: Splats, matrix: NDArray[np.float64]) -> tuple[Splats, bool]
 
     Covariances become MΣMᵀ. Harmonics follow rotations and mirrors exactly; for other maps, bands 1 to 3 are
     fitted to the colours that c(M⁻¹·d) has, and the base colour stays.
-
-    Raises:
-        InputError: the map flattens the scene, or is not finite.
     """
     linear = matrix[:3, :3]
     if not np.isfinite(matrix).all() or abs(det := float(np.linalg.det(linear))) < np.finfo(float).tiny:
@@ -115,7 +108,9 @@ def deformed(splats: Splats, matrix: NDArray[np.float64]) -> tuple[Splats, bool]
     axes = rotation_matrices(splats.quats) * splats.scales.astype(np.float64)[:, None, :]
     frames, scales, _ = np.linalg.svd(linear @ axes)
     frames *= np.sign(np.linalg.det(frames))[:, None, None]
-    moved = placed(replace(splats, up=None), _shift(matrix, splats))
+    shift = np.eye(4)
+    shift[:3, 3] = linear @ splats.offset + matrix[:3, 3] - splats.offset
+    moved = placed(replace(splats, up=None), shift)
     if exact:
         shN = rotate_harmonics(splats.shN, np.sign(det) * turn)
     else:
@@ -127,13 +122,6 @@ def deformed(splats: Splats, matrix: NDArray[np.float64]) -> tuple[Splats, bool]
         scales=scales.astype(np.float32),
         shN=shN,
     ), exact
-
-
-def _shift(matrix: NDArray[np.float64], splats: Splats) -> NDArray[np.float64]:
-    """Return the translation that `offset` takes when a map is applied to means and offset."""
-    shift = np.eye(4)
-    shift[:3, 3] = matrix[:3, :3] @ splats.offset + matrix[:3, 3] - splats.offset
-    return shift
 
 
 def _warped(shN: NDArray[np.float32], linear: NDArray[np.float64]) -> NDArray[np.float32]:
@@ -167,11 +155,7 @@ def _quaternions(rotations: NDArray[np.float64]) -> NDArray[np.float32]:
 
 
 def similarity(matrix: ArrayLike) -> tuple[float, NDArray[np.float64], NDArray[np.float64]]:
-    """Decompose a 4×4 matrix into s, R (3, 3) and t (3,).
-
-    Raises:
-        InputError: it is not 4×4 and finite, mirrors, shears, or scales axes differently.
-    """
+    """Decompose a 4×4 matrix into s, R (3, 3) and t (3,), or raise an `InputError` if it is no similarity."""
     m = np.asarray(matrix, np.float64)
     if m.shape != (4, 4) or not np.isfinite(m).all() or not np.allclose(m[3], [0, 0, 0, 1]):
         raise InputError(
@@ -228,22 +212,11 @@ def rotation_matrices(quats: NDArray[np.floating]) -> NDArray[np.float64]:
     return np.stack([np.stack(row, -1) for row in rows], -2)
 
 
-def _product(p: NDArray[np.float64], q: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return (N, 4) p·q: rotation q followed by p."""
-    w, x, y, z = p
-    left = np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
-    return q @ left.T
-
-
 def rotate_harmonics(shN: NDArray[np.float32], rotation: NDArray[np.float64]) -> NDArray[np.float32]:
     """Rotate the coefficients of bands 1 to 3 by R: c'(d) = c(R⁻¹·d).
 
     Bands rotate separately: the matrix M of a band solves Y(d)·M = Y(R⁻¹·d) by least squares over many
     directions.
-
-    Args:
-        shN: (N, K, 3), K in {0, 3, 8, 15}, 3DGS's order and signs.
-        rotation: (3, 3).
     """
     out = np.empty_like(shN)
     directions = np.random.default_rng(0).normal(size=(64, 3))
@@ -256,6 +229,16 @@ def rotate_harmonics(shN: NDArray[np.float32], rotation: NDArray[np.float64]) ->
         turn = np.linalg.lstsq(here[:, rows], there[:, rows], rcond=None)[0]
         out[:, rows] = np.einsum("kj,njc->nkc", turn, shN[:, rows].astype(np.float64))
     return out
+
+
+def harmonic_signs(axes: Iterable[float]) -> NDArray[np.float32]:
+    """Return the (15,) signs of the coefficients of bands 1 to 3 when axes x, y and z get these signs.
+
+    >>> harmonic_signs((1, -1, -1))[:3].tolist()
+    [-1.0, -1.0, 1.0]
+    """
+    signs = dict(zip("xyz", axes, strict=True))
+    return np.array([math.prod(signs[axis] for axis in odd) for odd in _ODD], np.float32)
 
 
 def _basis(d: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -300,16 +283,13 @@ def with_axes(splats: Splats, matrix: NDArray[np.float64]) -> Splats:
     turned = transform(splats, rotation)
     if sign > 0:
         return turned
-    odd = _SH_PARITY[: splats.shN.shape[1], None]
+    odd = harmonic_signs((-1, -1, -1))[: splats.shN.shape[1], None]
     up = None if turned.up is None else (-turned.up[0], -turned.up[1], -turned.up[2])
     return replace(turned, means=-turned.means, offset=-turned.offset, shN=turned.shN * odd, up=up)
 
 
 def join(scenes: Sequence[Splats]) -> Splats:
     """Join scenes into one, relative to the first one's offset and at the highest SH degree.
-
-    Raises:
-        InputError: no scene, or scenes of different render models.
 
     >>> a = Splats.create([[0, 0, 0]], scales=[[1, 1, 1]], offset=[100, 0, 0])
     >>> b = Splats.create([[1, 0, 0]], scales=[[1, 1, 1]])
@@ -338,11 +318,7 @@ def one_model(models: Sequence[RenderModel]) -> RenderModel:
 
 
 def in_box(splats: Splats, low: ArrayLike, high: ArrayLike) -> NDArray[np.bool_]:
-    """Return the (N,) mask of means in an axis-aligned box (inclusive), world coordinates.
-
-    Raises:
-        InputError: a lower bound above its upper one.
-    """
+    """Return the (N,) mask of means in an axis-aligned box (inclusive), world coordinates."""
     low, high = (np.asarray(v, np.float64) for v in (low, high))
     if not (low <= high).all():
         raise InputError(
@@ -355,11 +331,7 @@ def in_box(splats: Splats, low: ArrayLike, high: ArrayLike) -> NDArray[np.bool_]
 
 
 def in_sphere(splats: Splats, center: ArrayLike, radius: float) -> NDArray[np.bool_]:
-    """Return the (N,) mask of means within `radius` of `center`, world coordinates.
-
-    Raises:
-        InputError: a radius that is not positive.
-    """
+    """Return the (N,) mask of means within `radius` of `center`, world coordinates."""
     if not radius > 0:
         raise InputError(f"expected a radius > 0, got {radius:g}", parameter="sphere")
     world = splats.means.astype(np.float64) + splats.offset

@@ -96,9 +96,7 @@ def write_stream_page(
 ) -> int:
     """Write a page that streams lod-meta.json from its own folder, and return its bytes.
 
-    Args:
-        start: as for `write_page`.
-        rotation, position: quaternion x y z w and translation from the files' axes to the viewer's.
+    Quaternion x y z w and position lead from the files' axes to the viewer's.
     """
     shown = {
         "start": None if start is None else asdict(start),
@@ -116,9 +114,7 @@ def write_globe_page(
 ) -> int:
     """Write a page that shows the tileset.json of its own folder with a CesiumJS named in its address.
 
-    Args:
-        eye, target: (3,) initial camera in the axes of the tiles.
-        fov: degrees, along the window's longer side.
+    The initial camera is in the axes of the tiles, its field of view along the window's longer side.
     """
     view = {"eye": [float(x) for x in eye], "target": [float(x) for x in target], "fov": float(fov)}
     text = (_HERE / "globe.html").read_text(encoding="utf-8")

@@ -7,7 +7,7 @@ import pytest
 
 from g2ard.errors import InputError
 from g2ard.io import write_splats
-from g2ard.io.tile_store import TileStore
+from g2ard.io.tiles import TileStore
 from g2ard.jobs import tiling as policy
 from g2ard.jobs.memory import (
     LEVELS_TIMES,

@@ -110,7 +110,7 @@ def convert(
     ] = None,
 ) -> None:
     """Convert scenes to another format or other axes, and merge, crop or move them."""
-    from g2ard.io import table
+    from g2ard.io.scenes import write_table
     from g2ard.jobs.convert import Changes, read_merged
 
     scenes, output = _parted(run, scenes, output)
@@ -143,7 +143,7 @@ def convert(
     splats, read = changes.apply(whole), len(whole)
     if as_table:
         run.begin("write")
-        table.write(output, splats, overwrite=run.overwrite)
+        write_table(output, splats, overwrite=run.overwrite)
     else:
         run.write(output, splats, compare=True, **options)
     size = written_bytes(output)

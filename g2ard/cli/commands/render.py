@@ -81,8 +81,7 @@ def render(
     up: opt.UpOption = None,
 ) -> None:
     """Render views of a scene as PNG or as an animation."""
-    from g2ard.io.animation import write_animation
-    from g2ard.io.images import to_bytes
+    from g2ard.io.images import to_bytes, write_animation
     from g2ard.jobs.inputs import load_views
     from g2ard.jobs.view_checks import warn_of_sight
     from g2ard.jobs.views import orbit, views_or_pool
@@ -158,12 +157,12 @@ def render(
 
 def _folder_or_animation(run: Run, output: Path | None, depth: bool) -> tuple[Path | None, Path | None]:
     """Check the output, and return it as a folder or as an animation's file."""
-    from g2ard.io.animation import SUFFIXES, check_animation
+    from g2ard.io.images import ANIMATIONS, check_animation
 
     if output is None:
         return None, None
     run.claim("--output", output)
-    if output.suffix.lower() not in SUFFIXES:
+    if output.suffix.lower() not in ANIMATIONS:
         if output.suffix.lower() in _NO_FOLDER:
             raise typer.BadParameter(f"-o: expected a folder, .gif, .webp or .mp4, got {output.name!r}")
         check_output(output, run.overwrite, folder=True)

@@ -29,8 +29,7 @@ from g2ard.scene.splats import Splats
 
 FORMAT, VERSION = "g2ard tiles", 1
 
-_ROWS_AT_ONCE = 1 << 16
-"""Rows read at a time."""
+_ROWS_AT_ONCE = 1 << 16  # rows read at a time
 
 
 def tile_name(index: int) -> str:
@@ -187,20 +186,12 @@ class TileStore:
         return self._read(tile_name(index), tile.rows, tile.checks[0], sh)
 
     def read_halo(self, index: int, *, sh: bool = True) -> Splats:
-        """Read the rows of a tile's halo, in the order of the source; `sh` as for `read`.
-
-        Raises:
-            InputError: as for `read`.
-        """
+        """Read the rows of a tile's halo like those of `read`."""
         tile = self.tiles[index]
         return self._read(halo_name(index), tile.halo, tile.checks[1], sh)
 
     def rows(self, index: int) -> NDArray[np.float32]:
-        """Return a (rows, 14 + 3K) memory map of a tile's own rows; `check` verifies its contents.
-
-        Raises:
-            InputError: the file is missing or has another size.
-        """
+        """Return a (rows, 14 + 3K) memory map of a tile's own rows; `check` verifies its contents."""
         tile = self.tiles[index]
         shape = (tile.rows, row_width(self.sh_degree))
         if not tile.rows:
@@ -209,11 +200,7 @@ class TileStore:
         return np.memmap(self.folder / tile_name(index), "<f4", "r", shape=shape)
 
     def check(self, index: int) -> None:
-        """Verify the checksum of a tile's own rows.
-
-        Raises:
-            InputError: as for `read`.
-        """
+        """Verify the checksum of a tile's own rows."""
         rows, crc = self.rows(index), 0
         for start in range(0, len(rows), _ROWS_AT_ONCE):
             crc = zlib.crc32(rows[start : start + _ROWS_AT_ONCE].data, crc)
