@@ -41,16 +41,6 @@ _MODEL_FILES = tuple(
 """Files of a model."""
 
 
-class _Image(NamedTuple):
-    """A row of the table of images; `fault` is what is wrong with its pose, if a number is not finite."""
-
-    key: int
-    name: str
-    camera: int
-    pose: tuple[float, ...]
-    fault: InputError | None = None
-
-
 def holds(folder: Path) -> bool:
     """Return whether a folder holds a model, or photos beside one."""
     return model_folder(folder) is not None or photos_beside(folder) is not None
@@ -208,30 +198,30 @@ def listed(path: Path, images: Path | None = None) -> Listed:
     frames, faults = list[Frame](), list[tuple[str, InputError]]()
     by_rig = None
     sizes: dict[int, tuple[int, int]] = {}
-    for image in sorted(images_read, key=lambda i: i.name):
-        if image.camera not in cameras:
-            raise InputError(f"{image.name!r} has the unknown camera {image.camera}", path=tables[1])
-        camera = cameras[image.camera]
+    for name, key, number, own, fault in sorted(images_read, key=lambda image: image[0]):
+        if number not in cameras:
+            raise InputError(f"{name!r} has the unknown camera {number}", path=tables[1])
+        camera = cameras[number]
         if isinstance(camera, InputError):
-            faults.append((image.name, camera))
+            faults.append((name, camera))
             continue
-        photo = finder.photo(image.name)
+        photo = finder.photo(name)
         if images is not None and photo.is_file():
-            if image.camera not in sizes:  # one lens, one size
-                sizes[image.camera] = photo_size(photo, tables[1], camera.size)
-            camera = camera.at(sizes[image.camera])
+            if number not in sizes:  # one lens, one size
+                sizes[number] = photo_size(photo, tables[1], camera.size)
+            camera = camera.at(sizes[number])
         pose = None
-        if image.fault is None and any(image.pose[:4]):
-            pose = posed(image.pose[:4], image.pose[4:])
+        if fault is None and any(own[:4]):
+            pose = posed(own[:4], own[4:])
         else:
             by_rig = _rig_poses(folder, tables[1].suffix.lower()) if by_rig is None else by_rig
-            pose = by_rig.get((image.key, image.camera))
+            pose = by_rig.get((key, number))
         if pose is None:
-            if image.fault is None:
-                raise InputError(f"{image.name!r}: its quaternion is zero", path=tables[1])
-            faults.append((image.name, image.fault))
+            if fault is None:
+                raise InputError(f"{name!r}: its quaternion is zero", path=tables[1])
+            faults.append((name, fault))
             continue
-        frames.append(Frame(image.name, pose, camera, photo, listed=image.name))
+        frames.append(Frame(name, pose, camera, photo, listed=name))
     return Listed(folder, frames, faults)
 
 
@@ -445,12 +435,15 @@ def _cameras(table: Table) -> dict[int, Lens | InputError]:
     return cameras
 
 
-def _images(table: Table) -> list[_Image]:
-    """Read the pose (wxyz and translation, camera from world), camera and name of each image."""
+def _images(table: Table) -> list[tuple[str, int, int, list[float], InputError | None]]:
+    """Read name, number, camera, pose (wxyz and translation, camera from world) of each image.
+
+    The last value is what is wrong with its pose, if a number is not finite.
+    """
     images = []
     for _ in table:
         key, *pose, camera = table.take(_IMAGE)
-        images.append(_Image(key, table.name(), camera, tuple(pose), table.fault(_POSE, pose)))
+        images.append((table.name(), key, camera, pose, table.fault(_POSE, pose)))
         table.skip_points()
     return images
 

@@ -13,7 +13,7 @@ import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple, Self
+from typing import Annotated, Any, Literal
 
 import msgspec
 import numpy as np
@@ -91,65 +91,83 @@ class _Meta(msgspec.Struct):
         return "antialiased" if states else "classic"
 
 
-class _Chunk(NamedTuple):
-    """A meta.json, its folder or archive for errors, and where the files beside it are."""
+class _Chunk:
+    """A meta.json and the images beside it, in a folder or an archive; `place` is that for errors."""
 
-    place: Path
-    files: Path | zipfile.Path
-    meta: _Meta
+    def __init__(self, place: Path, files: Path | zipfile.Path) -> None:
+        self.place, self.files, self.file = place, files, Place(place / "meta.json")
+        text = decoded(self.file.path, self.read("meta.json"))
+        self.meta = checked(parse_json(self.file.path, text), _Meta, self.file)
 
-    @classmethod
-    def of(cls, place: Path, files: Path | zipfile.Path, content: Any) -> Self:
-        return cls(place, files, checked(content, _Meta, Place(place / "meta.json")))
+    def read(self, name: str) -> bytes:
+        """Read a file, from an archive within `check_unpacked`."""
+        file, path = self.files / name, self.place / name
+        try:
+            if isinstance(file, zipfile.Path):
+                info = file.root.getinfo(file.at)
+                check_unpacked(path, info.compress_size, info.file_size)
+            else:
+                check_regular(file)
+            return file.read_bytes()
+        except (KeyError, FileNotFoundError) as error:
+            raise InputError("no such file", path=path) from error
+        except (OSError, ValueError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error) as error:
+            raise InputError(f"cannot be read ({error})", path=path) from error
 
-    @property
-    def file(self) -> Place:
-        """Place of meta.json, for errors."""
-        return Place(self.place / "meta.json")
+    @contextmanager
+    def opened_image(self, name: str) -> Iterator[Image]:
+        from PIL import (
+            WebPImagePlugin,  # noqa: F401  (Pillow would load all its formats to find this one)
+        )
 
+        with opened_image(self.place / name, io.BytesIO(self.read(name))) as image:
+            yield image
 
-def _read_file(place: Path, files: Path | zipfile.Path, name: str) -> bytes:
-    """Read a file of a chunk, from an archive within `check_unpacked`."""
-    file = files / name
-    try:
-        if isinstance(file, zipfile.Path):
-            info = file.root.getinfo(file.at)
-            check_unpacked(place / name, info.compress_size, info.file_size)
-        else:
-            check_regular(file)
-        return file.read_bytes()
-    except (KeyError, FileNotFoundError) as error:
-        raise InputError("no such file", path=place / name) from error
-    except (OSError, ValueError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error) as error:
-        raise InputError(f"cannot be read ({error})", path=place / name) from error
+    def image(self, name: str) -> NDArray[np.uint8]:
+        """Return (height, width, 4) bytes."""
+        with self.opened_image(name) as image:
+            return np.asarray(image.convert("RGBA"))
 
+    def rows(self, name: str, count: int) -> NDArray[np.uint8]:
+        """Return (count, 4) bytes, one pixel per Gaussian."""
+        pixels = self.image(name).reshape(-1, 4)
+        if len(pixels) < count:
+            raise InputError(f"has {len(pixels):,} pixels for {count:,} Gaussians", path=self.place / name)
+        return pixels[:count]
 
-def _count_of(chunk: _Chunk) -> int:
-    meta = chunk.meta
-    count = meta.count if meta.version == 2 else next(iter(meta.means.shape), None)
-    if count is None:
-        place = chunk.file.to("count") if meta.version == 2 else chunk.file.to("means", "shape", 0)
-        raise place.error("is missing")
-    first = meta.means.files[0]
-    with _opened_image(chunk, first) as image:  # before allocating memory
-        if image.width * image.height < count:
+    def count(self) -> int:
+        meta = self.meta
+        count = meta.count if meta.version == 2 else next(iter(meta.means.shape), None)
+        if count is None:
+            place = self.file.to("count") if meta.version == 2 else self.file.to("means", "shape", 0)
+            raise place.error("is missing")
+        first = meta.means.files[0]
+        with self.opened_image(first) as image:  # before allocating memory
             pixels = image.width * image.height
-            raise InputError(f"has {pixels:,} pixels for {count:,} Gaussians", path=chunk.place / first)
-    return count
+        if pixels < count:
+            raise InputError(f"has {pixels:,} pixels for {count:,} Gaussians", path=self.place / first)
+        return count
 
+    def rest(self) -> int:
+        """Return the number of coefficients past band 0; version 1 only implies it by the palette's width."""
+        part = self.meta.shN
+        if part is UNSET:
+            return 0
+        if part.bands is not UNSET:
+            return _COEFFICIENTS[part.bands]
+        file = _sh_files(part)[0]
+        rest, left = divmod(self.image(file).shape[1], _PALETTE_COLUMNS)
+        if left or rest not in _COEFFICIENTS.values():
+            text = "does not have the width of a palette of SH degree 1 to 3"
+            raise InputError(text, path=self.place / file)
+        return rest
 
-def _rest_of(chunk: _Chunk) -> int:
-    """Return the number of coefficients past band 0; version 1 only implies it by the palette's width."""
-    part = chunk.meta.shN
-    if part is UNSET:
-        return 0
-    if part.bands is not UNSET:
-        return _COEFFICIENTS[part.bands]
-    file = _sh_files(part)[0]
-    rest, left = divmod(_image(chunk, file).shape[1], _PALETTE_COLUMNS)
-    if left or rest not in _COEFFICIENTS.values():
-        raise InputError("does not have the width of a palette of SH degree 1 to 3", path=chunk.place / file)
-    return rest
+    def means(self, count: int) -> NDArray[np.float32]:
+        """Decode only the (count, 3) means."""
+        low, high = (self.rows(name, count) for name in self.meta.means.files[:2])
+        means = np.empty((count, 3), np.float32)
+        _fill_means(means, low, high, _positions(self.meta.means))
+        return means
 
 
 def _sh_files(part: _Rest) -> tuple[str, str]:
@@ -158,43 +176,18 @@ def _sh_files(part: _Rest) -> tuple[str, str]:
     return centroids, next((f for f in files if f != centroids), files[1])
 
 
-@contextmanager
-def _opened_image(chunk: _Chunk, name: str) -> Iterator[Image]:
-    from PIL import (
-        WebPImagePlugin,  # noqa: F401  (Pillow would load all its formats to find this one)
-    )
-
-    data = _read_file(chunk.place, chunk.files, name)
-    with opened_image(chunk.place / name, io.BytesIO(data)) as image:
-        yield image
-
-
-def _image(chunk: _Chunk, name: str) -> NDArray[np.uint8]:
-    """Return (height, width, 4) bytes."""
-    with _opened_image(chunk, name) as image:
-        return np.asarray(image.convert("RGBA"))
-
-
-def _rows(chunk: _Chunk, name: str, count: int) -> NDArray[np.uint8]:
-    """Return (count, 4) bytes, one pixel per Gaussian."""
-    pixels = _image(chunk, name).reshape(-1, 4)
-    if len(pixels) < count:
-        raise InputError(f"has {len(pixels):,} pixels for {count:,} Gaussians", path=chunk.place / name)
-    return pixels[:count]
-
-
 class _Decoder:
     """Images of a chunk, 20 to 28 bytes per Gaussian, and the lookup tables of their bytes."""
 
     def __init__(self, chunk: _Chunk, count: int) -> None:
         meta, self.chunk = chunk.meta, chunk
         names = [*meta.means.files[:2], meta.quats.files[0], meta.scales.files[0], meta.sh0.files[0]]
-        self._low, self._high, self._quats, self._scales, self._base = (_rows(chunk, n, count) for n in names)
+        self._low, self._high, self._quats, self._scales, self._base = (chunk.rows(n, count) for n in names)
         self._positions = _positions(meta.means)
         self._log_scales = _values(chunk.file.to("scales"), meta.scales)
         self._colors = _values(chunk.file.to("sh0"), meta.sh0)
         self._logits = _logits(chunk.file.to("sh0"), meta.sh0)
-        self._rest = _rest_of(chunk)
+        self._rest = chunk.rest()
         if meta.shN is not UNSET and self._rest:
             self._labels_file = _sh_files(meta.shN)[1]
             self._palette, self._labels = _palette(chunk, meta.shN, self._rest, count)
@@ -227,14 +220,6 @@ class _Decoder:
                 item="Gaussian",
             )
         np.take(self._palette, index, axis=0, out=out[:, : self._rest], mode="clip")
-
-
-def _means_of(chunk: _Chunk, count: int) -> NDArray[np.float32]:
-    """Decode only the (count, 3) means."""
-    low, high = (_rows(chunk, name, count) for name in chunk.meta.means.files[:2])
-    means = np.empty((count, 3), np.float32)
-    _fill_means(means, low, high, _positions(chunk.meta.means))
-    return means
 
 
 def _fill_means(
@@ -302,14 +287,14 @@ def _palette(
 ) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
     """Return the (entries, K−1, 3) coefficients of the palette, and the labels."""
     centroids, labels = _sh_files(part)
-    image = _image(chunk, centroids)
+    image = chunk.image(centroids)
     if image.shape[1] != _PALETTE_COLUMNS * rest:
         raise InputError(
             f"has width {image.shape[1]}, expected {_PALETTE_COLUMNS * rest}", path=chunk.place / centroids
         )
     values = _values(chunk.file.to("shN"), part)
     palette = values(image[:, :, :3].reshape(-1, rest, 3)).astype(np.float32)
-    return palette, _rows(chunk, labels, count)
+    return palette, chunk.rows(labels, count)
 
 
 _CHUNK_NAME = re.compile(r"(\d+)_(\d+)")
@@ -404,8 +389,8 @@ class Stream(SceneStream):
 
     def __init__(self, path: Path) -> None:
         with _opened(path) as chunks:
-            self._counts = [_count_of(chunk) for chunk in chunks]
-            self._rest = max(map(_rest_of, chunks), default=0)
+            self._counts = [chunk.count() for chunk in chunks]
+            self._rest = max((chunk.rest() for chunk in chunks), default=0)
             offset, model = (
                 _offset(chunks),
                 one_model([chunk.meta.render_model for chunk in chunks] or ["classic"]),
@@ -422,7 +407,7 @@ class Stream(SceneStream):
     def positions(self, rows: int) -> Iterator[NDArray[np.float32]]:
         with _opened(self.path) as chunks:
             for chunk, count in zip(chunks, self._counts, strict=True):
-                yield _means_of(chunk, count)
+                yield chunk.means(count)
 
     def raw(self, rows: int, start: int) -> Iterator[Raw]:
         with _opened(self.path) as chunks:
@@ -438,17 +423,14 @@ class Stream(SceneStream):
 @contextmanager
 def _opened(path: Path) -> Iterator[list[_Chunk]]:
     if path.suffix.lower() != ".sog":
-        yield [_Chunk.of(folder, folder, read_json(folder / "meta.json")) for folder in chunks_of(path)]
+        yield [_Chunk(folder, folder) for folder in chunks_of(path)]
         return
     try:
         with zipfile.ZipFile(path) as bundle:
             inside = [name for name in bundle.namelist() if name.rpartition("/")[2] == "meta.json"]
             if not inside:
                 raise InputError("has no meta.json", path=path)
-            files = zipfile.Path(bundle, min(inside, key=len).removesuffix("meta.json"))
-            meta = path / "meta.json"
-            text = decoded(meta, _read_file(path, files, "meta.json"))
-            yield [_Chunk.of(path, files, parse_json(meta, text))]
+            yield [_Chunk(path, zipfile.Path(bundle, min(inside, key=len).removesuffix("meta.json")))]
     except InputError:
         raise
     except (zipfile.BadZipFile, EOFError, OSError, ValueError, struct.error, OverflowError) as error:

@@ -10,8 +10,8 @@ import json
 import os
 import re
 import shutil
-from collections.abc import Collection, Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from g2ard._core import __version__
 from g2ard.config.checks import checks_arguments
 from g2ard.errors import InputError
-from g2ard.io.atomic import atomic_folder, drop_temporaries
+from g2ard.io.atomic import atomic_folder, drop_empty, drop_temporaries
 from g2ard.io.jsonfile import read_json
 from g2ard.io.packing import packing_order
 from g2ard.io.scene_formats import Rounding
@@ -88,12 +88,11 @@ def save_levels(
     tree = cut_tree(levels, rule, work)
     files = _Files(levels, rule.most, {}, Rounding(moved), error)
     meta = _meta(levels, rule, _node(tree, files), list(files.parts), environment is not None)
-    before = _named_in(path)
     if work is not None:
         drop_temporaries(work)
         drop_temporaries(path.parent, path.name)
         files.write(work, path, progress)
-    with atomic_folder(path, overwrite) as folder:
+    with replaced(path, overwrite, _named_in(path)) as (folder, written):
         if work is None:
             files.write(folder, path, progress)
         else:
@@ -103,10 +102,6 @@ def save_levels(
             _write_part(folder / _ENVIRONMENT_META, sog_files(path / _ENVIRONMENT_META, environment))
             files.rounding.add(largest_rounding(environment), environment)
         write_json(folder / "lod-meta.json", meta)
-        written = {
-            file.relative_to(folder): file.stat().st_size for file in folder.rglob("*") if file.is_file()
-        }
-    _remove(path, before - written.keys())
     if work is not None:
         for name in files.parts:
             shutil.rmtree((work / name).parent, ignore_errors=True)
@@ -220,13 +215,22 @@ def _named_in(path: Path) -> set[Path]:
     return named
 
 
-def _remove(path: Path, files: Collection[Path]) -> None:
-    """Remove files and the folders that become empty."""
-    for file in files:
-        (path / file).unlink(missing_ok=True)
-    for folder in {(path / file).parent for file in files}:
-        with suppress(OSError):
-            folder.rmdir()
+@contextmanager
+def replaced(path: Path, overwrite: bool, before: set[Path]) -> Iterator[tuple[Path, dict[Path, int]]]:
+    """Write a folder atomically, and remove those of the files `before` that it does not have.
+
+    Yield the new folder, and a dict that gets the bytes of its files at the end.
+    """
+    written: dict[Path, int] = {}
+    with atomic_folder(path, overwrite) as folder:
+        yield folder, written
+        written |= {
+            file.relative_to(folder): file.stat().st_size for file in folder.rglob("*") if file.is_file()
+        }
+    stale = [path / file for file in before - written.keys()]
+    for file in stale:
+        file.unlink(missing_ok=True)
+    drop_empty(list({file.parent for file in stale}))
 
 
 def _names(content: dict[str, Any], key: str, pattern: re.Pattern[str]) -> list[str]:

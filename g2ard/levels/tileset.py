@@ -18,13 +18,12 @@ from g2ard._core import __version__
 from g2ard.config.checks import Finite, Within
 from g2ard.config.schema import Settings
 from g2ard.errors import InputError, missing
-from g2ard.io.atomic import atomic_folder
 from g2ard.io.glb import EXTENSION, SPZ_EXTENSION, spz_glb
 from g2ard.io.packing import writable
 from g2ard.io.scene_formats import Rounding
 from g2ard.io.spz import check_far
 from g2ard.io.types import Note
-from g2ard.levels.streamed_sog import read_object, write_json
+from g2ard.levels.streamed_sog import read_object, replaced, write_json
 from g2ard.levels.tree import Cut, Level, Node, aligned
 from g2ard.levels.tree import cut as cut_tree
 from g2ard.progress import Progress, silent
@@ -149,19 +148,12 @@ def save_tileset(
         "geometricError": max(size, root["geometricError"]),
         "root": root,
     }
-    before = _named_in(path / "tileset.json")
-    with atomic_folder(path, overwrite) as folder:
-        written = 0
+    with replaced(path, overwrite, _named_in(path / "tileset.json")) as (folder, written):
         for number, name in enumerate(tiles.files, start=1):
-            content = b"".join(tiles.content(name))
-            (folder / name).write_bytes(content)
-            written += len(content)
+            (folder / name).write_bytes(b"".join(tiles.content(name)))
             progress("write", number, len(tiles.files))
         write_json(folder / "tileset.json", tileset)
-        written += (folder / "tileset.json").stat().st_size
-    for name in before - tiles.files.keys():
-        (path / name).unlink(missing_ok=True)
-    return written, tiles.rounding.notes
+    return sum(written.values()), tiles.rounding.notes
 
 
 def check_tiles(path: Path, splats: Splats, ratio: float, cut: Cut | None = None) -> None:
@@ -236,11 +228,11 @@ def _tile(node: Node, error: float, children: list[dict[str, Any]]) -> dict[str,
     return {**tile, "children": children} if children else tile
 
 
-def _named_in(file: Path) -> set[str]:
+def _named_in(file: Path) -> set[Path]:
     """Return the names of the .glb files beside a tileset.json that it names."""
     tiles, names = [read_object(file).get("root", {})], set()
     while tiles:
         tile = tiles.pop()
         names.add(str(tile.get("content", {}).get("uri", "")))
         tiles += tile.get("children", [])
-    return {name for name in names if name.endswith(".glb") and "/" not in name and "\\" not in name}
+    return {Path(name) for name in names if name.endswith(".glb") and "/" not in name and "\\" not in name}

@@ -29,23 +29,18 @@ class Shown:
     caption: str = ""
 
 
-@dataclass(frozen=True)
-class Window:
-    """A rectangle of an image, as fractions of its width and height.
+Window = tuple[float, float, float, float]
+"""Left, top, width and height of a rectangle of an image, as fractions of its width and height."""
 
-    >>> Window(0.25, 0.5, 0.25, 0.25).pixels(100, 200)
+
+def pixels(window: Window, height: int, width: int) -> tuple[slice, slice]:
+    """Return the rows and columns of a window in an image of that size, at least one of each.
+
+    >>> pixels((0.25, 0.5, 0.25, 0.25), 100, 200)
     (slice(50, 75, None), slice(50, 100, None))
     """
-
-    left: float
-    top: float
-    width: float
-    height: float
-
-    def pixels(self, height: int, width: int) -> tuple[slice, slice]:
-        """Return the rows and columns in an image of that size, at least one of each."""
-        rows = _span(self.top, self.height, height)
-        return rows, _span(self.left, self.width, width)
+    left, top, across, down = window
+    return _span(top, down, height), _span(left, across, width)
 
 
 def _span(start: float, extent: float, size: int) -> slice:
@@ -65,7 +60,7 @@ def worst_windows(image: NDArray[np.uint8], target: NDArray[np.uint8]) -> list[W
     found: list[Window] = []
     while len(found) < _CROPS and sums.max() >= 0:
         top, left = (int(k) for k in np.unravel_index(int(np.argmax(sums)), sums.shape))
-        found.append(Window(left / width, top / height, columns / width, rows / height))
+        found.append((left / width, top / height, columns / width, rows / height))
         # No later window may overlap this one.
         sums[max(0, top - rows + 1) : top + rows, max(0, left - columns + 1) : left + columns] = -1
     return found
@@ -128,9 +123,9 @@ class Page:
             for n, s in zip(numbers, shown, strict=True)
         )
         marks = "".join(
-            f'<i class="roi r{k % 2}" style="left:{w.left:.2%};top:{w.top:.2%};width:{w.width:.2%};'
-            f'height:{w.height:.2%}"></i>'
-            for k, w in enumerate(windows)
+            f'<i class="roi r{k % 2}" style="left:{left:.2%};top:{top:.2%};width:{across:.2%};'
+            f'height:{down:.2%}"></i>'
+            for k, (left, top, across, down) in enumerate(windows)
         )
         named = [Shown("target", target), *shown]
         crops = [
@@ -149,7 +144,7 @@ class Page:
         )
 
     def _crop(self, shown: Shown, window: Window) -> str:
-        rows, columns = window.pixels(*shown.image.shape[:2])
+        rows, columns = pixels(window, *shown.image.shape[:2])
         number = self._image(shown.image[rows, columns])
         whole = f"<br>whole view <b>{escape(shown.caption)}</b>" if shown.caption else ""
         return (

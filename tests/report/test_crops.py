@@ -13,7 +13,7 @@ from PIL import Image
 
 from g2ard.rendering.targets import TeacherRenders
 from g2ard.report import distilled
-from g2ard.report.page import Page, Shown, worst_windows
+from g2ard.report.page import Page, Shown, pixels, worst_windows
 from g2ard.scene.cameras import Cameras
 from helpers.scenes import around, checkered_ball
 from helpers.studies import check_page
@@ -33,17 +33,17 @@ def test_worst_windows_hold_the_error_and_do_not_overlap() -> None:
         first, second = worst_windows(image, target)
         mask = np.zeros(target.shape[:2], int)
         for window in (first, second):
-            mask[window.pixels(60, 80)] += 1
+            mask[pixels(window, 60, 80)] += 1
         assert mask.max() == 1
         error = (image.astype(float) ** 2).sum(-1)
-        rows, columns = first.pixels(60, 80)
+        rows, columns = pixels(first, 60, 80)
         best = max(
             error[i : i + rows.stop - rows.start, j : j + columns.stop - columns.start].sum()
             for i in range(60 - (rows.stop - rows.start) + 1)
             for j in range(80 - (columns.stop - columns.start) + 1)
         )
         assert error[rows, columns].sum() == best
-        assert error[second.pixels(60, 80)].sum() <= best
+        assert error[pixels(second, 60, 80)].sum() <= best
     assert len(worst_windows(target[:1, :1], target[:1, :1])) == 1  # no room for a second
 
 
