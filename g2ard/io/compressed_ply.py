@@ -78,7 +78,6 @@ class Stream(SceneStream):
             yield self._decode(first, vertex, sh)
 
     def _decode(self, first: int, vertex: NDArray[Any], sh: NDArray[Any] | None) -> Raw:
-        """Decode rows, the first of which is row `first` of the file."""
         raw, chunk, rest = Raw.empty(len(vertex), self._rest), self._chunk, self._rest
         of = np.arange(first, first + len(vertex)) // _CHUNK_ROWS
         position, rotation, scale, color = (vertex[name] for name in _PACKED)

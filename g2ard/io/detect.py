@@ -333,7 +333,6 @@ def _near(path: Path) -> str:
 
 
 def _instead(path: Path) -> str:
-    """Suggest what to do with an unsupported folder."""
     from g2ard.io.colmap import models_below
     from g2ard.io.photos import unreadable
 

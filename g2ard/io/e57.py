@@ -139,7 +139,6 @@ def _scan(path: Path, file: Any, number: int) -> _Scan:
 
 
 def _limits(header: Any) -> tuple[float, float]:
-    """Return the least and the largest intensity of a scan, as its header says, or 0 and 1."""
     if "intensityLimits" not in header.scan_fields:
         return 0.0, 1.0
     found = header["intensityLimits"]
@@ -147,7 +146,6 @@ def _limits(header: Any) -> tuple[float, float]:
 
 
 def _images(file: Any) -> list[Any]:
-    """Return the nodes of the photos of an open file."""
     root = file.image_file.root()
     count = root["images2D"].childCount() if root.isDefined("images2D") else 0
     return [root["images2D"][i] for i in range(count)]

@@ -156,7 +156,6 @@ def _glb(path: Path, document: dict[str, Any], blobs: list[bytes]) -> list[bytes
 
 
 def _attributes(splats: Splats) -> dict[str, NDArray[Any]]:
-    """Return the primitive's attributes, (N, C) each."""
     linear = np.clip(splats.colors.astype(np.float64), 0, 1)
     linear = np.where(linear <= 0.04045, linear / 12.92, ((linear + 0.055) / 1.055) ** 2.4)
     alphas = splats.opacities[:, None]
@@ -476,7 +475,6 @@ def _placements(path: Path, nodes: list[_Node], mesh: int) -> list[NDArray[np.fl
 
 
 def _local(node: _Node) -> NDArray[np.float64]:
-    """Return a node's (4, 4) matrix, given as such or as translation, rotation and scale."""
     if node.matrix is not None:
         return np.array(node.matrix).reshape(4, 4).T
     matrix = np.eye(4)

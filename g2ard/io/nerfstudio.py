@@ -144,7 +144,6 @@ def _split(frames: Sequence[Frame], options: Settings) -> Sequence[Frame]:
 
 
 def _optimized(settings: Settings | None) -> str | None:
-    """Return the mode of pose optimisation, or None if it is off or unknown."""
     optimizer = settings and settings.block("pipeline", "model", "camera_optimizer")
     mode = optimizer[1].word("mode") if optimizer else None
     return None if mode in (None, "off", "false") else mode

@@ -312,11 +312,11 @@ def _pinholes(frame: Frame) -> list[Frame]:
     if lens is None or frame.lens.made:
         return [frame]
     views = []
-    for face in lens.faces(frame.lens.size[0] / lens.size[0]):
+    for face, turn, K, size in lens.faces(frame.lens.size[0] / lens.size[0]):
         viewmat = np.eye(4)
-        viewmat[:3] = face.turn.T @ frame.viewmat[:3]
-        name = f"{frame.name}#{face.name}" if face.name else frame.name
-        own = Lens(face.size, face.K, photo=lens.turned(face.turn), made=True)
+        viewmat[:3] = turn.T @ frame.viewmat[:3]
+        name = f"{frame.name}#{face}" if face else frame.name
+        own = Lens(size, K, photo=lens.turned(turn), made=True)
         views.append(frame._replace(name=name, viewmat=viewmat, lens=own))
     return views
 

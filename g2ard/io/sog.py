@@ -247,7 +247,6 @@ def _logits(place: Place, part: _Part) -> NDArray[Any]:
 
 
 def _bound(place: Place, bound: _Bound | None, channels: slice) -> NDArray[Any]:
-    """Return a bound of channels, of a list or for all."""
     if bound is None or (isinstance(bound, list) and len(bound) < channels.stop):
         raise (place if bound is None else place.to(3)).error("is missing")
     return np.asarray(bound[channels] if isinstance(bound, list) else bound)

@@ -151,7 +151,6 @@ def _sizes(path: Path, head: bytes) -> list[int]:
 
 
 def _slices(path: Path, data: bytes, sizes: list[int]) -> list[bytes]:
-    """Return the attributes of versions 2 and 3, which follow the header."""
     ends = _HEADER + np.cumsum(sizes)
     if len(data) < ends[-1]:
         raise damaged(f"truncated: {len(data):,} of {ends[-1]:,} bytes", path=path)
@@ -357,7 +356,6 @@ def fraction_bits(path: Path, means: NDArray[np.float64], splats: Splats, *, mov
 
 
 def _streams(splats: Splats, means: NDArray[np.float64], bits: int, version: int) -> list[bytes]:
-    """Pack positions, alphas, colours, scales, rotations and, if any, harmonics."""
     fixed = np.rint(means * (1, -1, -1) * (1 << bits)).astype("<i4")
     quats = packing.unit_quats(splats.quats) * (1, 1, -1, -1)
     signs = np.where(quats[:, :1] < 0, -1, 1)  # w ≥ 0
@@ -379,7 +377,6 @@ def _bytes(values: NDArray[Any]) -> bytes:
 
 
 def _packed(quats: NDArray[np.float64]) -> bytes:
-    """Pack quaternions for versions 3 and 4, see `_quats_packed`."""
     largest, others = packing.smallest_three(quats[:, [1, 2, 3, 0]])
     words = largest.astype(np.uint32)
     for k in range(3):

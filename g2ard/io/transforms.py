@@ -31,18 +31,11 @@ _TRAIN, _TEST = "transforms_train.json", "transforms_test.json"
 _APART = {"test_frames": "test", "val_frames": "val", "eval_frames": "test"}
 """Further lists of frames, as of ScanNet++, and their splits."""
 
+_SPLITS = ("train", "val", "test")
+"""Splits for which nerfstudio lists the names of photos, as in train_filenames."""
+
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 """OpenGL camera axes (y up, looking along −z) to OpenCV's (y down, looking along z)."""
-
-
-class _Content(msgspec.Struct):
-    frames: list[Any] = []
-    test_frames: list[Any] = []
-    val_frames: list[Any] = []
-    eval_frames: list[Any] = []
-    train_filenames: list[Any] = []
-    val_filenames: list[Any] = []
-    test_filenames: list[Any] = []
 
 
 class _Frame(msgspec.Struct):
@@ -109,7 +102,7 @@ def files_of(folder: Path) -> dict[Path, str | None]:
     whole = folder / "transforms.json"
     if whole.is_file():
         return {whole: None}
-    named = {folder / f"transforms_{split}.json": split for split in ("train", "val", "test")}
+    named = {folder / f"transforms_{split}.json": split for split in _SPLITS}
     return {file: split for file, split in named.items() if file.is_file()}
 
 
@@ -129,17 +122,20 @@ def _frames(
     of `test_frames`, `val_frames` and `eval_frames` (as test) are in these splits, the others then in train.
     """
     shared = read_json(path)
-    content = checked(shared, _Content, Place(path))
-    if not content.frames:
+    lists = {
+        key: checked(shared.get(key, []), list[Any], Place(path).to(key))
+        for key in ("frames", *_APART, *(f"{split}_filenames" for split in _SPLITS))
+    }
+    if not lists["frames"]:
         raise InputError("no views found ('frames' is empty)", path=path)
     folder, above = path.parent, path.parent.parent
     finder = Finder(images) if images else Finder(folder, folder / "images", above / "resized_images")
     masks = Finder(folder, folder / "masks", above / "resized_anon_masks")
-    apart = [(key, word) for key, word in _APART.items() if getattr(content, key)]
+    apart = [(key, word) for key, word in _APART.items() if lists[key]]
     frames: list[Frame] = []
     for key, word in [("frames", "train" if apart else split), *apart]:
         item = "frame" if key == "frames" else f"{key} entry"
-        for i, entry in enumerate(getattr(content, key)):
+        for i, entry in enumerate(lists[key]):
             place = Place(path, i, item)
             try:
                 frames.append(_frame(place, shared, entry, finder, masks)._replace(split=word))
@@ -147,7 +143,7 @@ def _frames(
                 if not isinstance(entry, dict) or _finite(entry):
                     raise
                 left_out.append((str(entry.get("file_path")), error))
-    split_of = _stated(path, content)
+    split_of = _stated(path, lists)
     if not split_of:
         return frames
     return [frame._replace(split=split_of.get(Path(frame.listed).as_posix())) for frame in frames]
@@ -161,11 +157,11 @@ def _finite(value: Any) -> bool:
     return not isinstance(value, float) or math.isfinite(value)
 
 
-def _stated(path: Path, content: _Content) -> dict[str, str]:
+def _stated(path: Path, lists: dict[str, list[Any]]) -> dict[str, str]:
     """Return file_path → split from nerfstudio's lists train_filenames, val_filenames and test_filenames."""
     stated: dict[str, str] = {}
-    for split in ("train", "val", "test"):
-        for listed in getattr(content, f"{split}_filenames"):
+    for split in _SPLITS:
+        for listed in lists[f"{split}_filenames"]:
             name = Path(str(listed)).as_posix()
             if stated.setdefault(name, split) != split and stated[name] == "train":
                 raise InputError(f"{name!r} is in both train_filenames and {split}_filenames", path=path)

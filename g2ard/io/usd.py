@@ -158,7 +158,6 @@ def _not_a_stage(path: Path, error: Exception) -> InputError:
 
 
 def _is_field(prim: Any) -> bool:
-    """Return whether a prim is a field of Gaussians, by its type or by its kernel."""
     of_kernel = prim.GetTypeName() == "ParticleField" and _KERNEL in prim.GetAppliedSchemas()
     return bool(prim.GetTypeName() == _SCHEMA or of_kernel)
 
@@ -191,7 +190,6 @@ def _nothing(path: Path, held: list[Any], fields: int) -> str:
 
 
 def _read_prim(path: Path, pxr: Any, prim: Any) -> Scene:
-    """Read a prim without its placement."""
     means = _values(path, pxr, prim, "positions", 3, None)
     count, notes = len(means), []
     degree = _earliest(pxr, prim.GetAttribute(f"{_SH}Degree"))

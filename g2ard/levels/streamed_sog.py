@@ -112,7 +112,6 @@ def save_levels(
 def _meta(
     levels: Sequence[Level], rule: Cut, root: dict[str, Any], names: list[str], has_environment: bool
 ) -> dict[str, Any]:
-    """Return the content of lod-meta.json."""
     counts = [len(level) for level in levels]
     return {
         "version": 1,

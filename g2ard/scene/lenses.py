@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,13 +45,8 @@ _CORNER = np.radians(95)
 edge, fisheyes see nothing."""
 
 
-class Face(NamedTuple):
-    """A pinhole view of a photo; `name` is empty if it is the only one."""
-
-    name: str
-    turn: Float
-    K: Float
-    size: tuple[int, int]
+Face = tuple[str, Float, Float, tuple[int, int]]
+"""A pinhole view of a photo: name, empty if it is the only one, rotation as in `FACES`, K and size."""
 
 
 @dataclass(frozen=True)
@@ -111,7 +105,6 @@ class PhotoLens:
         return np.tan(angle) if self.model in ("FULL_OPENCV", "FOV") else angle
 
     def _bent(self, u: Float, v: Float) -> tuple[Float, Float]:
-        """Distort points of the plane."""
         _, _, rest = self._centre_and_rest
         r2 = u * u + v * v
         if self.model == "FOV":
@@ -146,7 +139,7 @@ class PhotoLens:
         size = (round(self.size[0] * scale), round(self.size[1] * scale))
         if self.model == "FULL_OPENCV":
             fx, fy, cx, cy = (scale * value for value in self.params[:4])
-            return [Face("", np.eye(3), np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), size)]
+            return [("", np.eye(3), np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), size)]
         focal = scale * float(np.sqrt(self.focal[0] * self.focal[1]))
         if self.model != "EQUIRECTANGULAR":
             cx, cy, _ = self._centre_and_rest
@@ -157,13 +150,13 @@ class PhotoLens:
             if max(left, right, top, bottom) <= _ONE_VIEW:
                 a, b, c, d = (focal * np.tan(edge) for edge in (left, right, top, bottom))
                 K = np.array([[focal, 0, a], [0, focal, c], [0, 0, 1]])
-                return [Face("", np.eye(3), K, (max(1, round(a + b)), max(1, round(c + d))))]
+                return [("", np.eye(3), K, (max(1, round(a + b)), max(1, round(c + d))))]
         side = max(2, round(2 * focal))
         K = np.array([[side / 2, 0, side / 2], [0, side / 2, side / 2], [0, 0, 1]])
         steps = (np.arange(32) + 0.5) / 16 - 1
         grid = np.stack([*(a.ravel() for a in np.meshgrid(steps, steps)), np.ones(32 * 32)], 1)
         held = {name: self.turned(turn).project(grid)[1].mean() for name, turn in FACES.items()}
-        return [Face(name, FACES[name], K, (side, side)) for name in FACES if held[name] >= _LEAST_SEEN]
+        return [(name, FACES[name], K, (side, side)) for name in FACES if held[name] >= _LEAST_SEEN]
 
 
 @lru_cache(maxsize=64)
