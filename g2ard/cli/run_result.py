@@ -14,9 +14,8 @@ if TYPE_CHECKING:
     from g2ard.cli.run_folder import RunFolder
     from g2ard.jobs.budget import Budget
     from g2ard.jobs.cost import Cost
-    from g2ard.jobs.distill import DistillJob
     from g2ard.jobs.measured_budget import ResolvedBudget
-    from g2ard.jobs.tiled import TiledJob, Tiles
+    from g2ard.jobs.tiled import Tiles
     from g2ard.report.run import KindScore, RunReport, TiledReport, ViewsReport
     from g2ard.scene.splats import Splats
 
@@ -60,16 +59,15 @@ def tell_run(
     tell_quality(run, job.budget, done.splats)
 
 
-def tell_plan(run: Run, job: DistillJob | TiledJob, cost: Cost) -> None:
-    """Print what a distillation would do, and its rough time and memory."""
-    count = job.budget.count
+def tell_plan(run: Run, count: int, cost: Cost, tiles: Tiles | None = None) -> None:
+    """Print what a command would do that trains `count` Gaussians, and its rough time and memory."""
     run.answer(
         f"{plural(count, 'Gaussian')}, {plural(cost.views, 'target image')} of {cost.pixels:,} pixels, "
         f"{plural(cost.steps, 'step')}: roughly {max(1, cost.seconds):.0f} s on two cores and "
         f"{cost.bytes / 1e6:,.0f} MB"
     )
     run.say_dry()
-    run.result({"count": count, **asdict(cost), "seconds": cost.seconds, **tiles_of(job.tiles)})
+    run.result({"count": count, **asdict(cost), "seconds": cost.seconds, **tiles_of(tiles)})
 
 
 def tiles_of(tiles: Tiles | None) -> dict[str, int]:

@@ -1,4 +1,4 @@
-"""Rough time and memory of distillations, from counts alone.
+"""Rough time and memory of commands that make scenes, from counts alone.
 
 They serve remaining times, `--dry-run` and `--memory`.
 """
@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from g2ard.jobs.distill import DistillJob
     from g2ard.jobs.measured_budget import Reduction
     from g2ard.jobs.tiled import TiledJob, Tiles
+    from g2ard.scene.cameras import Cameras
+    from g2ard.scene.splats import Splats
 
 _USUAL_PIXELS = 480_000
 """Pixels of a generated view."""
@@ -54,7 +56,7 @@ _TRAINER_BYTES = 983
 
 @dataclass(frozen=True)
 class Cost:
-    """Rough cost of a distillation.
+    """Rough cost of making a scene.
 
     Args:
         views: number of views that need a target, including those for scoring.
@@ -84,7 +86,7 @@ def cost_of(job: DistillJob | TiledJob, count: int, *, page: bool = True) -> Cos
     """
     train, test = job.views.train.cameras, job.views.test
     apart = 0 if job.views.apart is None else len(job.views.apart)
-    pixels = int(np.mean(train.widths.astype(np.int64) * train.heights))
+    pixels = _mean_pixels(train)
     kept, size = job.is_kept(count), pixels / _USUAL_PIXELS
     steps = 0 if kept or not job.recovers else job.steps(count)
     views = len(test) + apart + (len(train) if job.recovers else 0)
@@ -102,6 +104,40 @@ def cost_of(job: DistillJob | TiledJob, count: int, *, page: bool = True) -> Cos
     stages.append(("scoring", _SCORE * size * len(test)))
     stages += [("report.html", _REPORT), ("view.html", _PAGE)] if page else []
     return Cost(views, pixels, steps, tuple(stages), _peak_bytes(job, count, views * pixels, page))
+
+
+def cost_of_recovery(
+    scene: Splats,
+    training: Cameras,
+    others: int,
+    steps: int,
+    *,
+    scored: int = 0,
+    seconds: float | None = None,
+    teacher: Splats | None = None,
+    stage: str = "recover",
+) -> Cost:
+    """Return the cost of fitting a scene as it is, by `g2ard recover` or `g2ard adapt`.
+
+    Args:
+        others: number of further views that need a target, of which `scored` are scored before and after.
+        seconds: time limit of the fit instead of the steps' time.
+        teacher: scene that renders the targets; None if they are photos.
+        stage: name of the fit in progress messages.
+    """
+    pixels, views = _mean_pixels(training), len(training) + others
+    size = pixels / _USUAL_PIXELS
+    stages = [] if teacher is None else [("targets", _RENDER * size * views)]
+    stages.append((stage, seconds or _STEP * size * steps))
+    stages += [("scoring", 2 * _SCORE * size * scored)] if scored else []
+    dense = 0 if teacher is None else teacher.nbytes
+    targets = min(CACHE_BYTES, views * pixels * (3 if teacher is None else 12))
+    memory = _PROGRAM_BYTES + targets + dense + 3 * scene.nbytes + _TRAINER_BYTES * len(scene)
+    return Cost(views, pixels, steps, tuple(stages), memory)
+
+
+def _mean_pixels(cameras: Cameras) -> int:
+    return int(np.mean(cameras.widths.astype(np.int64) * cameras.heights))
 
 
 def cost_of_reduction(reduce: Reduction, count: int) -> Cost:

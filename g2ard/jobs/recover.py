@@ -14,6 +14,7 @@ from g2ard.config.choices import RenderModel
 from g2ard.config.schema import changed, full_paths
 from g2ard.errors import InputError, require
 from g2ard.io.types import ViewSet
+from g2ard.jobs.cost import Cost, cost_of_recovery
 from g2ard.jobs.inputs import Views, load_scene
 from g2ard.jobs.teaching import Teaching, check_teacher
 from g2ard.pipeline.presets import PRESETS, configured
@@ -81,6 +82,21 @@ class RecoverJob:
         """Whether the student is the teacher, so that nothing is to be learned."""
         dense = self.teaching.dense
         return dense is not None and dense.fingerprint() == self.student.fingerprint()
+
+    @property
+    def cost(self) -> Cost:
+        """Rough time and memory."""
+        scored = 0 if self.held_out is None else len(self.held_out.cameras)
+        others = scored + (0 if self.validation is None else len(self.validation.cameras))
+        return cost_of_recovery(
+            self.student,
+            self.views.cameras,
+            others,
+            0 if self._same else self.config.horizon,
+            scored=scored,
+            seconds=self.config.recovery_time,
+            teacher=self.teaching.dense,
+        )
 
     @cached_property
     def held_out(self) -> Targets | None:

@@ -139,3 +139,15 @@ def test_a_dry_run_needs_no_output(budget: str, folder: Path, command_line: Comm
         ask = ("--ratios", "1,2", *ask[2:])
         succeeds(command_line, folder, "lod", "ball.ply", *ask)
     assert set(folder.iterdir()) == before
+
+
+@pytest.mark.parametrize("command", ["recover", "adapt"])
+def test_a_dry_run_of_a_fit(command: str, folder: Path, command_line: CommandLine) -> None:
+    before = set(folder.iterdir())
+    ask = (command, "ball.ply", "--views", "views.json", "--teacher", "ball.ply", "--steps", 4, "--json", "-")
+    told = json.loads(succeeds(command_line, folder, *ask, "--dry-run").out)
+    assert set(folder.iterdir()) == before
+    ran = json.loads(succeeds(command_line, folder, *ask, "-o", "fit.ply").out)
+    assert told["count"] == len(g2ard.load(folder / "fit.ply"))
+    assert (told["steps"], ran["steps"]) == ((4, 4) if command == "adapt" else (0, 0))  # it is its teacher
+    assert {"targets", command} <= dict(told["stages"]).keys()

@@ -8,6 +8,7 @@ import typer
 from g2ard.cli import options as opt
 from g2ard.cli.frame import Run, command
 from g2ard.cli.resume import check_scene_run, checkpoint_beside, stoppable
+from g2ard.cli.run_result import tell_plan
 from g2ard.config.schema import listed
 from g2ard.io.scene_formats import check_positions
 from g2ard.pipeline.presets import configured
@@ -38,8 +39,10 @@ def adapt(
     size: opt.SizeOption = None,
     background: opt.BackgroundOption = None,
     preset: opt.PaperOption = None,
+    dry_run: opt.DryRunOption = False,
 ) -> None:
     """Refit colours and opacities to new images; means, rotations and scales stay fixed."""
+    from g2ard.jobs.cost import cost_of_recovery
     from g2ard.jobs.teaching import Teaching
     from g2ard.pipeline.adapt import AdaptConfig
     from g2ard.pipeline.adapt import adapt as refit
@@ -51,11 +54,9 @@ def adapt(
     opt.choose_engine(run, settings, "adapt.engine")
     config = configured(AdaptConfig(), preset or "auto", settings)
     work = checkpoint_beside(output, ".work")
-    check_scene_run(run, work, resume, output)
+    if not dry_run:
+        check_scene_run(run, work, resume, output)
     splats = run.load(compact)
-    check_positions(output, splats)
-    made = [] if teacher is None else [("targets", 4.0)]
-    run.console.expect([*made, ("adapt", 0.02 * config.steps)])
     teaching = Teaching(
         teacher,
         config.background,
@@ -66,6 +67,12 @@ def adapt(
         **run.callbacks,
     )
     _, targets = teaching.training(splats, opt.with_images(views, images, alpha), split, size)
+    cost = cost_of_recovery(splats, targets.cameras, 0, config.steps, teacher=teaching.dense, stage="adapt")
+    if dry_run:
+        tell_plan(run, len(splats), cost)
+        return
+    check_positions(output, splats)
+    run.console.expect(cost.stages)
     with stoppable(run, work, resume, output):
         work.mkdir(parents=True, exist_ok=True)
         result = refit(splats, targets, config, work=work, progress=run.progress)

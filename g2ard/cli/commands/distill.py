@@ -134,7 +134,7 @@ def distill(
     with held, preparing(scene, budget, options, how, planned=dry_run, **run.callbacks) as job:
         cost = cost_of(job, job.budget.count, page=page)
         if dry_run:
-            tell_plan(run, job, cost)
+            tell_plan(run, job.budget.count, cost, job.tiles)
             return
         check_job_memory(job, tiling.memory, cost.bytes)
         run.console.expect(cost.stages)

@@ -10,7 +10,7 @@ import typer
 from g2ard.cli import options as opt
 from g2ard.cli.frame import Run, command
 from g2ard.cli.resume import check_scene_run, checkpoint_beside, stoppable
-from g2ard.cli.run_result import loss
+from g2ard.cli.run_result import loss, tell_plan
 from g2ard.config.schema import listed
 from g2ard.io.scene_formats import check_positions
 from g2ard.progress import plural
@@ -53,6 +53,7 @@ def recover(
     ] = None,
     size: opt.SizeOption = None,
     background: opt.BackgroundOption = None,
+    dry_run: opt.DryRunOption = False,
 ) -> None:
     """Optimise a fixed set of Gaussians against photos or a teacher's renders."""
     from g2ard.jobs.recover import prepare
@@ -66,7 +67,8 @@ def recover(
     with run.usage():
         check_teacher(views, teacher)
     checkpoint = checkpoint_beside(output, ".checkpoint.npz")
-    check_scene_run(run, checkpoint, resume, output)
+    if not dry_run:
+        check_scene_run(run, checkpoint, resume, output)
     opt.choose_engine(run, settings, "recover.engine")
     job = prepare(
         student,
@@ -82,9 +84,12 @@ def recover(
         anchors=anchors,
         **run.callbacks,
     )
-    scoring = 0.01 * len(job.views.cameras)
+    cost = job.cost
+    if dry_run:
+        tell_plan(run, len(job.student), cost)
+        return
     check_positions(output, job.student)
-    run.console.expect([("recover", 0.02 * job.config.horizon), ("scoring", scoring)])
+    run.console.expect(cost.stages)
     with stoppable(run, checkpoint, resume, output):
         result = job.run(checkpoint)
         run.write(output, result.splats)
