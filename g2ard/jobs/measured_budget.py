@@ -168,8 +168,8 @@ class Reduction:
             sh_degree: of the result; None is the scene's.
         """
         splats, say = self.splats, self.say
-        if self.tiles is not None:  # `needs_whole` rejects what depends on more than the number of Gaussians
-            return ResolvedBudget(budget.of(self.total, name))
+        if self.tiles is not None:
+            return resolved_in_tiles(budget, self.total, splats, name, file, say)
         if budget.min_psnr is not None or budget.min_ssim is not None:
             return self._resolved_for_quality(Quality(budget.min_psnr or 0.0, budget.min_ssim or 0.0), file)
 
@@ -289,6 +289,26 @@ def _written(splats: Splats, name: str, **options: Any) -> Iterator[Path]:
             path = Path(folder) / f"scene{scene_format(name).suffix}"
         write_splats(path, splats, **options)
         yield path
+
+
+def resolved_in_tiles(
+    budget: Budget, total: int, sample: Splats, name: str, file: str, say: Say
+) -> ResolvedBudget:
+    """Resolve a budget for `total` Gaussians in tiles; `needs_whole` rejects those that need to measure them.
+
+    Args:
+        sample: some of them, with the SH degree of the result.
+        file: name of a .ply, in which all Gaussians take as many bytes.
+    """
+    if budget.bytes is None:
+        return ResolvedBudget(budget.of(total, name))
+    one, two = (file_bytes(sample.take(np.arange(rows)), file) for rows in (1, 2))
+    header = one - (two - one) + len(str(total))
+    count = min(total, (budget.bytes - header) // (two - one))
+    if count < 1:
+        raise InputError(f"{budget.bytes:,} bytes are too few; a Gaussian takes {one:,}", path=file)
+    say(f"{budget.fit}: {plural(count, 'Gaussian')}")
+    return ResolvedBudget(count, budget.bytes, file)
 
 
 def count_for_bytes(splats: Splats, wanted: int, name: str, reduce: Callable[[int], Splats]) -> int:

@@ -21,7 +21,7 @@ from g2ard.io.tiles import StoredScene, TileStore
 from g2ard.jobs.budget import Budget
 from g2ard.jobs.distill_options import DistillOptions
 from g2ard.jobs.inputs import say_regions
-from g2ard.jobs.measured_budget import Reduction, ResolvedBudget
+from g2ard.jobs.measured_budget import Reduction, ResolvedBudget, resolved_in_tiles
 from g2ard.jobs.memory import RECOVERY_TIMES, TilePlan, plan_tiles
 from g2ard.jobs.tiling import Tiling
 from g2ard.jobs.views import pool_times, views_of
@@ -292,13 +292,15 @@ def preparing_tiles(
     model = options.render_model
     with opened(scene, tiling, RECOVERY_TIMES, render_model=model, planned=planned, **callbacks) as tiles:
         total = tiles.plan.count
-        count = budget.of(total, str(scene))
         sample = tiles.sample(options.config.simplify)
+        degree = options.config.recover.sh_degree
+        stored = sample if degree is None else sample.with_sh_degree(degree)
+        wanted = resolved_in_tiles(budget, total, stored, str(scene), f"scene.{options.format}", say)
         say_regions(sample, options.config.simplify, "a sample of the scene", unsaid)
         views = views_of(
             sample,
             options,
-            count,
+            wanted.count,
             beside=options.beside or scene,
             use="tiles" if recovers else "merging",
             represents=total / len(sample),
@@ -309,7 +311,7 @@ def preparing_tiles(
         if recovers:
             say(f"regularisers: {why}")
             views = _weighted(views, sample, config, progress)
-        yield TiledJob(tiles, ResolvedBudget(count), sample, views, config, recovers, began, say)
+        yield TiledJob(tiles, wanted, sample, views, config, recovers, began, say)
 
 
 def _weighted(views: RunViews, sample: Splats, config: DistillConfig, progress: Progress) -> RunViews:

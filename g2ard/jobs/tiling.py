@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 from g2ard.errors import InputError
 from g2ard.io import open_stream
 from g2ard.io.detect import MANIFEST, kind
+from g2ard.io.scene_formats import scene_format
 from g2ard.io.tiles import TileStore
 
 if TYPE_CHECKING:
@@ -117,6 +118,7 @@ def needs_whole(
     config: SimplifyConfig | DistillConfig,
     preset: str | None = None,
     budgets: Sequence[Budget] = (),
+    file: str = "scene.ply",
     **options: object,
 ) -> list[str]:
     """Return what needs the whole scene in memory, as options.
@@ -126,6 +128,7 @@ def needs_whole(
     Args:
         config: of a simplification or a distillation.
         preset: from which the config may come.
+        file: name of the output; only in a .ply do all Gaussians take as many bytes.
         options: options of the command that need the whole scene if they are given.
 
     >>> from g2ard.jobs.budget import Budget
@@ -153,7 +156,7 @@ def needs_whole(
             steps = simplify.morton_premerge_steps
             given["--set simplify.morton_premerge_steps"] = steps not in (None, usual)
     for budget in budgets:
-        given[f"--fit {budget.fit}"] = budget.bytes is not None
+        given[f"--fit {budget.fit}"] = budget.bytes is not None and scene_format(file).suffix != ".ply"
         given[f"--min-psnr {budget.min_psnr}"] = budget.min_psnr is not None
         given[f"--min-ssim {budget.min_ssim}"] = budget.min_ssim is not None
     given |= {f"--{name.replace('_', '-')}": bool(value) for name, value in options.items()}

@@ -21,6 +21,7 @@ from g2ard.jobs.measured_budget import (
     count_for_bytes,
     count_for_quality,
     file_bytes,
+    resolved_in_tiles,
 )
 from g2ard.scene.splats import Splats
 from g2ard.stages.simplify import simplify
@@ -30,6 +31,11 @@ from helpers.scenes import around, checkered_ball
 
 def fast(splats: Splats, count: int) -> Splats:
     return simplify(splats, count, method="fast").splats
+
+
+def test_bytes_too_few_for_a_gaussian_in_tiles() -> None:
+    with pytest.raises(InputError, match=r"a\.ply: 100 bytes are too few"):
+        resolved_in_tiles(Budget(fit="0.1kB"), 6000, checkered_ball(9), "scene", "a.ply", print)
 
 
 @pytest.mark.parametrize("name", ["a.ply", "a.SOG", "a.spz", "a.compressed.ply", "x/meta.json"])

@@ -83,6 +83,24 @@ def test_a_device_that_all_rows_fit(command_line: CommandLine, folder: Path, tmp
     assert len(read_splats(tmp_path / "all.ply")) == 9000
 
 
+@pytest.mark.parametrize(
+    ("words", "written"),
+    [
+        (("simplify", "-o", "small.ply", "--no-views"), "small.ply"),
+        (("distill", "-o", "run", "--sh-degree", 0, "--steps", 2, "--size", 24), "run/scene.ply"),
+    ],
+)
+def test_tiles_fill_a_file(
+    words: tuple[object, ...], written: str, command_line: CommandLine, folder: Path, tmp_path: Path
+) -> None:
+    rows = ("--fit", "40kB", "--tile-rows", 2500, "--workers", 1)
+    command, *others = words
+    succeeds(command_line, tmp_path, command, folder / "town.ply", *others, *rows)
+    count = len(read_splats(tmp_path / written))
+    size = (tmp_path / written).stat().st_size
+    assert size <= 40_000 < size + 2 * size / count
+
+
 def test_a_folder_of_tiles_is_a_scene(command_line: CommandLine, folder: Path, tmp_path: Path) -> None:
     store = ingest(folder / "town.ply", tmp_path / "tiles", tile_rows=2500)
     common = ["-n", "900", "--no-views", "--workers", "1"]

@@ -40,7 +40,7 @@ _DISTILL = ("distill", "-r", "10", "-o", "x", "--views", "views.json")
         (_DISTILL, "--set morton_premerge_steps=3", "--set simplify.morton_premerge_steps"),
         (_DISTILL, "--recovery-time 5m", "--recovery-time"),
         (("simplify", "-o", "x.ply"), "--min-ssim 0.9", "--min-ssim 0.9"),
-        (("distill", "-o", "x"), "--fit 50kB", "--fit 50kB"),
+        (("distill", "-o", "x", "--format", "sog"), "--fit 50kB", "--fit 50kB"),
     ],
 )
 def test_options_that_need_one_piece_are_named_as_typed(

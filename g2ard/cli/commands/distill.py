@@ -125,7 +125,8 @@ def distill(
     tiled = scene is not None and is_tiled(scene, tiling)
     held: AbstractContextManager[None] = nullcontext()
     if scene is not None and tiled:
-        refuse_whole(scene, needs_whole(options.config, preset, [budget], clean=clean, photos=photos))
+        whole = needs_whole(options.config, preset, [budget], f"scene.{format}", clean=clean, photos=photos)
+        refuse_whole(scene, whole)
         if not dry_run:
             held = working(run, tiling, options.views, options.held_out, again=" with --resume")
     elif scene is not None:

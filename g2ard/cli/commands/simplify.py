@@ -87,7 +87,7 @@ def simplify(
     tiled, maps = is_tiled(scene, tiling), None
     held: AbstractContextManager[None] = nullcontext()
     if tiled:
-        refuse_whole(scene, needs_whole(config, preset, budgets, parents=parents))
+        refuse_whole(scene, needs_whole(config, preset, budgets, name, parents=parents))
         held = nullcontext() if dry_run else working(run, tiling, given)
     else:
         say_fit(run, scene, budgets[0], name)
@@ -104,7 +104,7 @@ def simplify(
         for each in named:
             each.check(total)
         if tiled:
-            for budget in budgets:  # in tiles, all are of the count
+            for budget in filter(lambda one: one.bytes is None, budgets):
                 budget.of(total, str(scene))
 
     began, reports = time.perf_counter(), []
