@@ -16,6 +16,7 @@ from typing import Any
 
 from g2ard import _core
 from g2ard.errors import InputError, missing
+from g2ard.io.atomic import drop_temporaries
 from g2ard.progress import Progress, silent
 from g2ard.system.peak_memory import forget_workers, note_worker, peak_rss
 from g2ard.tiles.tasks import Task, run_task
@@ -51,6 +52,9 @@ class Workers:
         """Run the tasks that are not done; return the files of all, in order."""
         total, deaths = sum(task.cost for task in tasks), 0
         while todo := [task for task in tasks if not task.done]:
+            drop_temporaries(self.folder)  # of workers that were killed, as the shares
+            for task in todo:
+                task.share_file.unlink(missing_ok=True)
             try:
                 self._round(todo, stage, total)
             except WorkerDiedError:
@@ -127,7 +131,6 @@ class _Pool:
         self._pool: concurrent.futures.Executor | None = None
 
     def run(self, tasks: Sequence[Task], told: Told) -> None:
-        _sweep(tasks)
         self._pool = self._pool or self._opened()
         try:
             futures = {self._pool.submit(_work, task, self._threads): task for task in tasks}
@@ -161,13 +164,6 @@ class _Pool:
         if manager is not None:
             manager.join(timeout=_POOL_SHUTDOWN_SECONDS)
         self._pool = None
-
-
-def _sweep(tasks: Sequence[Task]) -> None:
-    """Remove what killed workers left: partial files, or the empty folder of `check_output`."""
-    for task in tasks:
-        for begun in task.folder.glob(f".{task.output.stem}.*"):
-            begun.rmdir() if begun.is_dir() else begun.unlink(missing_ok=True)
 
 
 def _work(task: Task, threads: int) -> tuple[int, int | None]:

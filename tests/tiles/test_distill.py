@@ -105,7 +105,11 @@ def test_a_folder_of_tiles_is_a_scene(command_line: CommandLine, folder: Path, t
     store = ingest(folder / "town.ply", tmp_path / "tiles", tile_rows=2500)
     common = ["-n", "900", "--no-views", "--workers", "1"]
     work = ("--work", tmp_path / "work")
+    left = tmp_path / "work" / "steps" / ".views-0.0123456789ab.npz"  # by a killed run
+    left.parent.mkdir(parents=True)
+    left.write_bytes(b"begun")
     succeeds(command_line, tmp_path, "simplify", store.folder, *common, "-o", "a.ply", *work)
+    assert not left.exists()
     rows = ("--tile-rows", "2500")
     succeeds(command_line, tmp_path, "simplify", folder / "town.ply", *common, "-o", "b.ply", *rows)
     assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()

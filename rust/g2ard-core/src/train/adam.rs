@@ -10,7 +10,7 @@ use crate::raster::simd::{Kernel, LANES, Lanes, Lanes16, Mask};
 
 pub const BETA1: f64 = 0.9;
 pub const BETA2: f64 = 0.999;
-/// Under the root of the second moment; `selective_adam.py` has the same.
+/// Added to the root of the second moment; `SelectiveAdam` has the same.
 pub const EPSILON: f32 = 1e-15;
 /// Beyond this the square of a gradient leaves f32: such a row is skipped as not finite.
 pub const GRADIENT_MAX: f32 = 1e18;
