@@ -74,7 +74,7 @@ class RunFolder:
 
     def __init__(self, run: Run, path: Path, name: str, resume: bool) -> None:
         self._run, self._resume = run, resume
-        self.path, self.scene, self.work = path, path / name, path / _WORK_FOLDER
+        self.path, self.scene, self.unfinished = path, path / name, path / _WORK_FOLDER
         self._report = path / "report.json"  # written last
         self._simplified = path / "simplified" / "scene.ply"  # with --keep, for `evaluate --anchors`
         self._view, self._views = path / "view.html", path / "views.json"
@@ -86,13 +86,13 @@ class RunFolder:
         may write here."""
         self._run.spare_inputs(self.scene, *self._other_scenes(), self._simplified, self._views, self._scored)
         check_unlocked(self.path)
-        left = left_at(self.work)
+        left = left_at(self.unfinished)
         killed = self.path.is_dir() and [path.name for path in self.path.iterdir()] == [_WORK_FOLDER]
-        done = self.scene.exists() and is_finished(self._run, self.work, self._resume, self._report)
+        done = self.scene.exists() and is_finished(self._run, self.unfinished, self._resume, self._report)
         if not left and not done and not killed:
             check_output(self.path, self._run.overwrite, folder=True)
         if left or not self._resume:
-            check_stopped(self._run, self.work, self._resume, self.scene)
+            check_stopped(self._run, self.unfinished, self._resume, self.scene)
         return self._finished(budget) if done else None
 
     def _finished(self, budget: Budget) -> dict[str, Any]:
@@ -113,7 +113,7 @@ class RunFolder:
         return record
 
     @contextmanager
-    def working(self, job: DistillJob | TiledJob) -> Iterator[None]:
+    def held(self, job: DistillJob | TiledJob) -> Iterator[None]:
         """Create the folder, where no other run may write meanwhile; an empty folder is removed.
 
         In one piece, it holds checkpoints too, which are kept after an error or Ctrl-C.
@@ -124,7 +124,7 @@ class RunFolder:
         self.path.mkdir(parents=True, exist_ok=True)
         try:
             with locked(self.path):
-                if self.scene.exists() and not (self._run.overwrite or left_at(self.work)):
+                if self.scene.exists() and not (self._run.overwrite or left_at(self.unfinished)):
                     raise OutputError("exists", path=self.path, hint="{overwrite=True} replaces it")
                 drop_temporaries(self.path)
                 with self._marked() if job.tiles else self._checkpoints(job):
@@ -135,25 +135,25 @@ class RunFolder:
     @contextmanager
     def _marked(self) -> Iterator[None]:
         """Mark the folder until its files are written; the finished steps are elsewhere."""
-        if self.work.exists() and not self._resume:
-            shutil.rmtree(self.work)
-        self.work.mkdir(exist_ok=True)
+        if self.unfinished.exists() and not self._resume:
+            shutil.rmtree(self.unfinished)
+        self.unfinished.mkdir(exist_ok=True)
         try:
             yield
-            shutil.rmtree(self.work)
+            shutil.rmtree(self.unfinished)
         finally:
-            drop_empty([self.work])
+            drop_empty([self.unfinished])
 
     @contextmanager
     def _checkpoints(self, job: DistillJob | TiledJob) -> Iterator[None]:
         """Create the folder for checkpoints; after an error or Ctrl-C, keep what it holds."""
-        if self._resume and not left_at(self.work):
+        if self._resume and not left_at(self.unfinished):
             self._run.say(f"{self.path}: nothing to resume, starting over")
-        with kept(self._run, self.work, self._resume, self.path, f"in {self.path}"):
-            self.work.mkdir(parents=True, exist_ok=True)
+        with kept(self._run, self.unfinished, self._resume, self.path, f"in {self.path}"):
+            self.unfinished.mkdir(parents=True, exist_ok=True)
             counts = {"input_count": job.total, "output_count": job.budget.count}
             text = json.dumps({**counts, "config": self._run.config}, default=str)
-            (self.work / OPTIONS).write_text(text, encoding="utf-8", newline="\n")
+            (self.unfinished / OPTIONS).write_text(text, encoding="utf-8", newline="\n")
             yield
 
     def write(
@@ -166,8 +166,8 @@ class RunFolder:
         targets, which score the file later, a lossy file is compared with the scene.
         """
         run = self._run
-        if self.work.is_dir():
-            (self.work / "written").touch()  # from now on, --resume may replace this run's files
+        if self.unfinished.is_dir():
+            (self.unfinished / "written").touch()  # from now on, --resume may replace this run's files
         run.write(self.scene, done.splats, overwrite=True, compare=targets is None)
         pages = (self.path / name for name in ("report.json", "report.html", _PICTURE, "view.html"))
         for other in (*self._other_scenes(), *pages):

@@ -70,11 +70,13 @@ def _check_rows(scene: Path, rows: int) -> None:
 
 
 @contextmanager
-def working(run: Run, tiling: Tiling, *views: Any, again: str = "") -> Iterator[None]:
+def work_folder(run: Run, tiling: Tiling, *views: Any, again: str = "") -> Iterator[None]:
     """Hold `tiling.folder`, created if absent, while a command works on tiles there.
 
-    Success removes the folder unless the user named it. An error removes it if this command created it and a
-    resumed run would find nothing in it: no finished task and, after errors of the output, no tiles either.
+    Finished tasks in it are not computed again, with or without --resume and --overwrite: their names hash
+    all that they depend on. Success removes the folder unless the user named it. An error removes it if this
+    command created it and a resumed run would find nothing in it: no finished task and, after errors of the
+    output, no tiles either.
 
     Args:
         views: given to the command; they are read now, and the scheduler is tried, because writing tiles

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import g2ard
-from g2ard.jobs.common import common_of
+from g2ard.jobs.comparison import common_of
 from helpers.commands import CommandLine, refused, succeeds
 from helpers.photos import photographed
 from helpers.scenes import around, checkered_ball

@@ -127,7 +127,7 @@ def _closer(
     Only runs know what they were made of.
     """
     from g2ard.errors import InputError
-    from g2ard.jobs.common import better_line, common_of, is_run, source_of
+    from g2ard.jobs.comparison import better_line, common_of, is_run, source_of
     from g2ard.jobs.inputs import load_views, scorable
     from g2ard.jobs.teaching import Teaching
     from g2ard.stages.evaluate import evaluate

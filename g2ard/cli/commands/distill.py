@@ -12,7 +12,7 @@ from g2ard.cli import options as opt
 from g2ard.cli.frame import Run, command
 from g2ard.cli.outputs import budget_of, refuse_file
 from g2ard.cli.run_result import say_fit, tell_plan, tell_run, told
-from g2ard.cli.tiling import drop_work, tiling_of, working
+from g2ard.cli.tiling import drop_work, tiling_of, work_folder
 from g2ard.config.choices import is_made
 from g2ard.io import kind
 
@@ -128,7 +128,7 @@ def distill(
         whole = needs_whole(options.config, preset, [budget], f"scene.{format}", clean=clean, photos=photos)
         refuse_whole(scene, whole)
         if not dry_run:
-            held = working(run, tiling, options.views, options.held_out, again=" with --resume")
+            held = work_folder(run, tiling, options.views, options.held_out, again=" with --resume")
     elif scene is not None:
         say_fit(run, scene, budget, f"scene.{format}")
     how = tiling if tiled else None
@@ -140,8 +140,8 @@ def distill(
         check_job_memory(job, tiling.memory, cost.bytes)
         run.console.expect(cost.stages)
         source = scene or Path(str(views))
-        with folder.working(job):
-            done: Any = job.run(folder.work)
+        with folder.held(job):
+            done: Any = job.run(folder.unfinished)
             folder.write(done, job.views, job.targets)
             with run.finishing("scoring"):
                 report: Any = job.report(done, folder.scene)

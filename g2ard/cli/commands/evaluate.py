@@ -67,7 +67,7 @@ def evaluate(
     For the evaluation of the original 3DGS, use --convention inria --8bit --lpips-input unscaled.
     """
     from g2ard.io.describe import bytes_of
-    from g2ard.jobs.common import better_line, common_of
+    from g2ard.jobs.comparison import better_line, common_of
     from g2ard.jobs.inputs import load_views, scorable
     from g2ard.jobs.teaching import Teaching, check_teacher
     from g2ard.jobs.view_checks import check_sight

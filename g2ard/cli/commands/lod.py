@@ -15,7 +15,7 @@ from g2ard.cli import options as opt
 from g2ard.cli.budget_options import Ratios
 from g2ard.cli.frame import Run, command
 from g2ard.cli.outputs import refuse_file
-from g2ard.cli.tiling import tiling_of, working
+from g2ard.cli.tiling import tiling_of, work_folder
 from g2ard.config.choices import BLACK, Colour
 from g2ard.errors import OutputError
 from g2ard.io.atomic import hidden_name
@@ -170,7 +170,7 @@ def lod(
             given = run.load(scene)
             check_tiles(output, given, max(ratios), rule)
     if not dry_run:
-        held = working(run, tiling, views) if tiled else stoppable(run, stopped, resume, writer.meta)
+        held = work_folder(run, tiling, views) if tiled else stoppable(run, stopped, resume, writer.meta)
     options: dict[str, Any] = {"ratios": ratios, "recover": recover, "steps": steps, "background": colour}
     options |= {"split_sky": environment, "seed": run.seed, **run.callbacks}
     options |= {"views": views, "size": size, "up": up, "render_model": run.render_model, "beside": scene}

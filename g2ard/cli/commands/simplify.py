@@ -14,7 +14,7 @@ from g2ard.cli import options as opt
 from g2ard.cli.frame import Run, command
 from g2ard.cli.outputs import Outputs, budgets_of
 from g2ard.cli.run_result import say_fit, say_weight, tell_quality, tiles_of
-from g2ard.cli.tiling import tiling_of, working
+from g2ard.cli.tiling import tiling_of, work_folder
 from g2ard.config.choices import is_made
 from g2ard.config.schema import listed
 from g2ard.io.atomic import atomic_output
@@ -88,7 +88,7 @@ def simplify(
     held: AbstractContextManager[None] = nullcontext()
     if tiled:
         refuse_whole(scene, needs_whole(config, preset, budgets, name, parents=parents))
-        held = nullcontext() if dry_run else working(run, tiling, given)
+        held = nullcontext() if dry_run else work_folder(run, tiling, given)
     else:
         say_fit(run, scene, budgets[0], name)
         check_whole_memory(scene, tiling, WHOLE_TIMES)

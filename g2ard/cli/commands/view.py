@@ -80,7 +80,7 @@ def _is_levels(path: Path) -> bool:
 def _dense_of(path: Path) -> Path | None:
     """Return the scene that a run was made of, if it is there and browsers can show it."""
     from g2ard.io.describe import describe
-    from g2ard.jobs.common import source_of
+    from g2ard.jobs.comparison import source_of
 
     dense = source_of(path)
     if dense is None or not dense.is_file():
