@@ -362,7 +362,7 @@ class Run:
         """Record a file or a page that an option writes, and check that it can be written."""
         self.claim(flag, path)
         if page:
-            from g2ard.viewer import check_page_output
+            from g2ard.viewer.page import check_page_output
 
             check_page_output(path, self.overwrite)
         else:

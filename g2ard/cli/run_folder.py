@@ -37,7 +37,7 @@ from g2ard.pipeline.distill import RunViews
 from g2ard.progress import plural
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
-from g2ard.viewer import write_page
+from g2ard.viewer.page import write_page
 
 if TYPE_CHECKING:
     from g2ard.jobs.distill import DistillJob, RunTargets

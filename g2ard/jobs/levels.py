@@ -35,7 +35,7 @@ from g2ard.scene.cameras import Cameras
 from g2ard.scene.regions import sky_mask
 from g2ard.scene.samples import evenly_spaced
 from g2ard.scene.splats import Splats
-from g2ard.viewer import Start, write_globe_page, write_stream_page
+from g2ard.viewer.page import Start, write_globe_page, write_stream_page
 
 if TYPE_CHECKING:
     from g2ard.jobs.tiled import TiledJob

@@ -21,7 +21,7 @@ from g2ard.rendering.renderer import Renderer
 from g2ard.scene.cameras import Camera, Cameras
 from g2ard.scene.splats import Splats
 from g2ard.scene.transform import quaternion_of, transform, unit_up
-from g2ard.viewer import Start
+from g2ard.viewer.page import Start
 
 _START_POOL = 32
 """Number of generated poses from which the initial camera is chosen."""

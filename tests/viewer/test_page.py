@@ -16,7 +16,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from g2ard import viewer
+from g2ard.viewer import page as viewer
 from g2ard.cli.run_folder import RunFolder
 from g2ard.errors import InputError, OutputError
 from g2ard.io import read_splats, write_splats, write_views
@@ -26,7 +26,7 @@ from g2ard.jobs.viewer_frame import frame_of, frame_with
 from g2ard.pipeline.distill import RunViews
 from g2ard.scene.cameras import Camera, Cameras
 from g2ard.scene.splats import Splats
-from g2ard.viewer import Start, check_page_output, write_page
+from g2ard.viewer.page import Start, check_page_output, write_page
 from helpers.commands import CommandLine, refused, succeeds
 from helpers.scenes import around, checkered_ball
 

@@ -15,7 +15,7 @@ from g2ard.jobs.viewer_frame import frame_with
 from g2ard.rendering.metrics import psnr
 from g2ard.scene.cameras import Camera, Cameras
 from g2ard.scene.splats import Splats
-from g2ard.viewer import write_page
+from g2ard.viewer.page import write_page
 from helpers.browser import Browser
 from helpers.pages import FRONT, GREY, HEIGHT, WIDTH, assert_shows, drawn, rendered, show
 from helpers.realdata import real

@@ -50,7 +50,7 @@ def compare(
     from g2ard.jobs.views import views_or_pool
     from g2ard.rendering.targets import TeacherRenders
     from g2ard.stages.evaluate import evaluate
-    from g2ard.viewer import write_page
+    from g2ard.viewer.page import write_page
 
     if views is not None and not is_made(views):
         run.refuse_typed("on given views", "looks")

@@ -101,7 +101,7 @@ def _write(
 ) -> None:
     """Write the page of one scene or two."""
     from g2ard.jobs.viewer_frame import frame_of
-    from g2ard.viewer import write_page
+    from g2ard.viewer.page import write_page
 
     views = opt.with_images(given, images)
     run.claim_file("--output", output, page=True)
