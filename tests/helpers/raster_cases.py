@@ -89,3 +89,22 @@ def oracle(
         clip_margin=clip_margin,
     )
     return out, tensors
+
+
+def gsplat_rasterization(**given: Any) -> tuple[torch.Tensor, None, None]:
+    """Render gsplat's documented arguments with the naive oracle."""
+    assert given["packed"] is False
+    assert given["colors"].shape[1] == (given["sh_degree"] + 1) ** 2
+    out = reference.render(
+        *(given[name].double() for name in ("means", "quats")),
+        given["scales"].double().log(),
+        torch.logit(given["opacities"].double()),
+        given["colors"][:, :1].double(),
+        given["colors"][:, 1:].double(),
+        viewmat=given["viewmats"][0].double(),
+        K=given["Ks"][0].double(),
+        width=given["width"],
+        height=given["height"],
+        background=tuple(given["backgrounds"][0].tolist()),
+    )
+    return out.image[None].float(), None, None

@@ -37,7 +37,7 @@ def median_depths(splats, viewmat, K, size, pixels):
     return out
 
 
-def agreement(splats, surface, cameras, seen, cells):
+def agreement(splats, surface, cameras, seen, cells, tolerance):
     """(agreeing, kept, all) pairs of a view and one of `cells` that falls on its image.
 
     Kept are those around which neighbouring pixels' depths differ by less than 1 %.
@@ -48,6 +48,7 @@ def agreement(splats, surface, cameras, seen, cells):
         cameras: views in world coordinates.
         seen: `g2ard.stages.select.visible_cells` of both.
         cells: which cells to try.
+        tolerance: share of the depth by which a visible cell may differ from it.
     """
     agree = kept = total = 0
     for i in range(len(cameras)):
@@ -63,7 +64,7 @@ def agreement(splats, surface, cameras, seen, cells):
         near, far = depth.min(1), depth.max(1)
         smooth = (far - near < 0.01 * np.maximum(near, 1e-300)) | (far == 0)
         z = z[there]
-        want = (depth[:, 0] > 0) & (np.abs(z - depth[:, 0]) <= np.maximum(surface.size, 0.01 * z))
+        want = (depth[:, 0] > 0) & (np.abs(z - depth[:, 0]) <= np.maximum(surface.size, tolerance * z))
         got = np.isin(np.asarray(cells)[there], seen.of(i))
         agree += int((want == got)[smooth].sum())
         kept, total = kept + int(smooth.sum()), total + len(z)

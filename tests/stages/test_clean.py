@@ -142,20 +142,6 @@ def test_unknown_kinds_are_rejected() -> None:
         find(splats, kinds=("dust",))
 
 
-def test_the_command(tmp_path: Path, command_line: CommandLine) -> None:
-    splats, _ = junk()
-    write_splats(tmp_path / "a.ply", splats)
-    told = succeeds(command_line, tmp_path, "clean", "a.ply", "--dry-run", "--preview", "p.png").err
-    assert "are clutter" in told
-    assert (tmp_path / "p.png").stat().st_size > 1000
-    assert not (tmp_path / "b.ply").exists()
-    error = succeeds(command_line, tmp_path, "clean", "a.ply", "--only", "giant", "-o", "b.sog").err
-    assert f"b.sog: keeps {len(splats) - 1:,} of {len(splats):,} Gaussians" in error
-    assert len(read_splats(tmp_path / "b.sog")) == len(splats) - 1
-    for words in ([], ["--only", "dust", "--dry-run"], ["--only", "haze", "--dry-run"]):
-        assert command_line("clean", "a.ply", *words, cwd=tmp_path)[0] == 2
-
-
 def test_the_sky_is_kept_apart_and_joined_again(tmp_path: Path, command_line: CommandLine) -> None:
     splats, _ = junk()
     rays = np.random.default_rng(1).normal(size=(400, 3))

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from g2ard import io
 from g2ard.errors import InputError
@@ -45,8 +46,6 @@ def test_eight_bit_rounds_both_sides_as_png_does(tmp_path: Path) -> None:
     images = []
     for scene in (small, ball):
         write_png(tmp_path / "x.png", render(scene, views[0]).image, overwrite=True)
-        from PIL import Image
-
         with Image.open(tmp_path / "x.png") as image:
             images.append(np.asarray(image, np.float32) / 255)
     assert found.views[0].psnr == pytest.approx(psnr(*images), abs=1e-4)
@@ -76,24 +75,6 @@ def test_each_view_has_its_photo_or_the_teachers_render(tmp_path: Path) -> None:
     assert np.array_equal(only[3], rendered[3])
     with pytest.raises(InputError, match="exposure of view_000"):
         PhotosOrRenders(views, ball, exposures={"view_000": np.zeros((3, 4))})
-
-
-def test_command(command_line: CommandLine, tmp_path: Path) -> None:
-    ball = checkered_ball(300)
-    io.write_splats(tmp_path / "ball.ply", ball)
-    io.write_splats(tmp_path / "small.ply", ball.take(slice(200)))
-    io.write_views(tmp_path / "views.json", pictured(tmp_path))
-    common = ["small.ply", "--views", "views.json", "--split", "all", "--json", "-"]
-    options = ["--teacher", "ball.ply", "--photos", "--convention", "inria", "--8bit"]
-    out = succeeds(command_line, tmp_path, "evaluate", *common, *options).out
-    found = json.loads(out)
-    assert found["against"] == {"photo": 2, "teacher": 2}
-    assert found["scenes"][0]["overdraw"] > 1
-    assert found["protocol"] == {"convention": "inria", "8bit": True, "lpips_input": None}
-    assert [v["against"] for v in found["scenes"][0]["views"]] == ["photo", "teacher"] * 2
-    plain = json.loads(command_line("evaluate", *common, "--teacher", "ball.ply", cwd=tmp_path)[1])
-    assert plain["against"] == "teacher"
-    assert plain["scenes"][0]["psnr"] != found["scenes"][0]["psnr"]
 
 
 def test_reports_state_file_sizes(command_line: CommandLine, folder: Path) -> None:

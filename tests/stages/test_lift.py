@@ -1,43 +1,22 @@
 """The lift against its float64 twin, and on the clouds that break lifts."""
 
-import json
-
 import numpy as np
 import pytest
 
 from g2ard.errors import InputError
 from g2ard.scene.splats import SH_C0
 from g2ard.stages.lift import _anchor, lift
-from helpers.commands import succeeds
+from helpers.clouds import lines, surface
 from helpers.threads import on_threads
 from reference.lift import discs
-
-
-def surface(n=400, seed=0):
-    rng = np.random.default_rng(seed)
-    x, y = rng.uniform(-5, 5, (2, n))
-    return np.stack([x, y, np.sin(x) + 0.01 * rng.normal(size=n)], 1)
-
-
-def normals(splats):
-    w, x, y, z = splats.quats.T.astype(np.float64)
-    return np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], 1)
-
-
-def test_equals_the_naive_twin():
-    points = surface()
-    got = lift(points, np.full_like(points, 0.25))
-    want_normals, want_scales = discs(points - _anchor(points))
-    np.testing.assert_allclose(got.scales, want_scales, rtol=1e-5)
-    np.testing.assert_allclose(np.abs((normals(got) * want_normals).sum(1)), 1, atol=1e-5)
-    np.testing.assert_allclose(0.5 + SH_C0 * got.sh0[:, 0], 0.25, atol=1e-6)
-    np.testing.assert_allclose(got.opacities, 0.5, atol=1e-6)
-    assert got.sh_degree == 0
 
 
 def test_spread_is_an_option():
     points = surface(100)
     got = lift(points, np.full_like(points, 0.25), spread=0.6)
+    np.testing.assert_allclose(0.5 + SH_C0 * got.sh0[:, 0], 0.25, atol=1e-6)
+    np.testing.assert_allclose(got.opacities, 0.5, atol=1e-6)
+    assert got.sh_degree == 0
     _, want_scales = discs(points - _anchor(points), spread=0.6)
     np.testing.assert_allclose(got.scales, want_scales, rtol=1e-5)
 
@@ -53,8 +32,8 @@ def test_translation_and_scale_by_powers_of_two_are_exact():
         np.testing.assert_array_equal(there.quats, here.quats)
 
 
-def test_threads_do_not_matter():
-    points = surface(20_000)
+@pytest.mark.parametrize("points", [surface(20_000), lines(24, 500)[0]], ids=["surface", "lines"])
+def test_threads_do_not_matter(points):
     found = on_threads(lambda: lift(points, np.full_like(points, 0.5)).fingerprint())
     assert len(set(found)) == 1
 
@@ -81,39 +60,6 @@ def test_degenerate_clouds_give_sensible_discs(points):
     assert (got.scales[:, 0] <= 4.0001 * got.scales[:, 1]).all()
 
 
-def lines(count, each, noise=0.004, seed=0):
-    """A plane of 6 × 6 scanned in lines: points and the distance of lines."""
-    x, y = np.tile(np.linspace(-3, 3, each), count), np.repeat(np.linspace(-3, 3, count), each)
-    return np.column_stack([x, y, np.random.default_rng(seed).normal(0, noise, len(x))]), 6 / (count - 1)
-
-
-def turn(seed):
-    """A random rotation."""
-    return np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))[0]
-
-
-@pytest.mark.parametrize(("count", "each"), [(12, 30), (9, 60), (6, 150), (5, 240)])
-def test_lines_equal_the_naive_twin(count, each):
-    points = lines(count, each)[0] @ turn(count).T
-    got = lift(points, np.full_like(points, 0.25))
-    want_normals, want_scales = discs(points - _anchor(points))
-    np.testing.assert_allclose(got.scales, want_scales, rtol=1e-5)
-    np.testing.assert_allclose(np.abs((normals(got) * want_normals).sum(1)), 1, atol=1e-5)
-
-
-@pytest.mark.parametrize("ratio", [3, 10, 34, 60])
-@pytest.mark.parametrize("noise", [0.05, 0.3])
-def test_discs_of_scan_lines_lie_along_the_surface(ratio, noise):
-    """Their width is that of the distance of lines. Noise is a share of the spacing within lines."""
-    points, gap = lines(24, 23 * ratio + 1, noise * 6 / (23 * ratio))
-    rotation = turn(ratio)
-    got = lift(points @ rotation.T, np.full_like(points, 0.5))
-    off = np.degrees(np.arccos(np.clip(np.abs(normals(got) @ rotation[:, 2]), 0, 1)))
-    assert np.percentile(off, 95) < 12
-    assert 0.25 < np.median(got.scales[:, 0]) / gap < 0.6
-    assert np.percentile(got.scales[:, 0], 99) < 0.8 * gap
-
-
 @pytest.mark.parametrize("copies", [2, 3, 11, 12, 40])
 @pytest.mark.parametrize("shuffled", [False, True])
 def test_copies_of_points_give_the_discs_of_points(copies, shuffled):
@@ -131,12 +77,6 @@ def test_copies_of_points_give_the_discs_of_points(copies, shuffled):
     np.testing.assert_array_equal(got.means, once.means[order])
     np.testing.assert_array_equal(got.scales, once.scales[order])
     np.testing.assert_allclose(got.sh0, once.sh0[order], atol=1e-5)
-
-
-def test_threads_do_not_matter_in_lines():
-    points = lines(24, 500)[0]
-    found = on_threads(lambda: lift(points, np.full_like(points, 0.5)).fingerprint())
-    assert len(set(found)) == 1
 
 
 def test_non_finite_points_are_left_out():
@@ -160,21 +100,6 @@ def test_non_finite_points_are_left_out():
 def test_bad_input_is_named(points, colors, options, message):
     with pytest.raises(InputError, match=message):
         lift(points, colors, **options)
-
-
-def test_command_line(tmp_path, command_line):
-    from g2ard.io import read_splats, write_points
-    from g2ard.io.types import Points
-
-    points = surface(300) + np.array([500_000.0, 4_000_000.0, 0.0])
-    write_points(tmp_path / "cloud.ply", Points(points, np.full((300, 3), 0.5, np.float32)))
-    out = succeeds(command_line, tmp_path, "lift", "cloud.ply", "-o", "prior.ply", "--json", "-").out
-    assert json.loads(out)["output_count"] == 300
-    prior = read_splats(tmp_path / "prior.ply")
-    np.testing.assert_allclose(prior.means + prior.offset, points, atol=0.01)
-    status, _, err = command_line("lift", "absent.ply", "-o", "other.ply", cwd=tmp_path)
-    assert (status, len(err.splitlines())) == (1, 1)
-    assert "absent.ply" in err
 
 
 def test_near_coordinates_get_no_offset():

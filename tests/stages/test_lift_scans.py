@@ -6,6 +6,8 @@ import pytest
 from g2ard import Renderer
 from g2ard.scene.cameras import Camera
 from g2ard.stages.lift import _anchor, lift
+from helpers.clouds import lines, surface
+from helpers.similarities import turn
 from reference.lift import discs
 
 SIZE, FOCAL = (96, 48), 70.0
@@ -179,21 +181,35 @@ def test_wires_in_one_plane_are_no_wider_than_their_distance(gap):
     assert got.scales[4000:].max() < max(0.6 * gap, 0.15)
 
 
-@pytest.mark.parametrize(("name", "kind"), [("along", "random"), ("pair", "rings")])
-def test_wires_equal_the_naive_twin(name, kind):
-    points = np.concatenate([ground(kind)[::6], *WIRES[name]])
+CLOUDS = {
+    "surface": surface(),
+    **{f"{n} lines": lines(n, each)[0] @ turn(n).T for n, each in ((12, 30), (9, 60), (6, 150), (5, 240))},
+    "wire over points": np.concatenate([ground("random")[::6], *WIRES["along"]]),
+    "wires over rings": np.concatenate([ground("rings")[::6], *WIRES["pair"]]),
+    "rings in a room": Scan(Box(1.7), 12, 180).points,
+}
+
+
+@pytest.mark.parametrize("name", CLOUDS)
+def test_discs_are_the_naive_twin_s(name):
+    points = CLOUDS[name]
     got = lift(points, np.full_like(points, 0.25))
     want_normals, want_scales = discs(points - _anchor(points))
     np.testing.assert_allclose(got.scales, want_scales, rtol=1e-4)
     np.testing.assert_allclose(np.abs((normals(got) * want_normals).sum(1)), 1, atol=1e-4)
 
 
-def test_rings_equal_the_naive_twin():
-    points = Scan(Box(1.7), 12, 180).points
-    got = lift(points, np.full_like(points, 0.25))
-    want_normals, want_scales = discs(points - _anchor(points))
-    np.testing.assert_allclose(got.scales, want_scales, rtol=1e-4)
-    np.testing.assert_allclose(np.abs((normals(got) * want_normals).sum(1)), 1, atol=1e-4)
+@pytest.mark.parametrize("ratio", [3, 10, 34, 60])
+@pytest.mark.parametrize("noise", [0.05, 0.3])
+def test_discs_of_scan_lines_lie_along_the_surface(ratio, noise):
+    """Their width is that of the distance of lines. Noise is a share of the spacing within lines."""
+    points, gap = lines(24, 23 * ratio + 1, noise * 6 / (23 * ratio))
+    rotation = turn(ratio)
+    got = lift(points @ rotation.T, np.full_like(points, 0.5))
+    off = np.degrees(np.arccos(np.clip(np.abs(normals(got) @ rotation[:, 2]), 0, 1)))
+    assert np.percentile(off, 95) < 12
+    assert 0.25 < np.median(got.scales[:, 0]) / gap < 0.6
+    assert np.percentile(got.scales[:, 0], 99) < 0.8 * gap
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.01, 0.05])

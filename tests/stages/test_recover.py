@@ -1,7 +1,6 @@
 """The recovery loop: it recovers, both engines agree, it resumes to the same bits, it holds the anchors."""
 
 import itertools
-import json
 import math
 import re
 from collections.abc import Callable, Iterator
@@ -65,9 +64,8 @@ def engine(request: pytest.FixtureRequest) -> Iterator[str]:
     assert notes == []
 
 
-@pytest.mark.parametrize("engine", ["fused", "torch"])
-def test_recovery_lifts_unseen_views(student: Splats, targets: TeacherRenders, engine: Any) -> None:
-    result = recover(student, targets, RecoverConfig(steps=150, engine=engine))
+def test_recovery_lifts_unseen_views(student: Splats, targets: TeacherRenders) -> None:
+    result = recover(student, targets, RecoverConfig(steps=150))
     unseen = TeacherRenders(TEACHER, around(7, (80, 60), 2.5))
     assert len(result.splats) == len(student)
     assert evaluate(result.splats, unseen).psnr > evaluate(student, unseen).psnr + 3
@@ -78,10 +76,24 @@ def test_recovery_lifts_unseen_views(student: Splats, targets: TeacherRenders, e
     assert result.report.regularizers.steps == 1
 
 
-@pytest.mark.parametrize("engine", ["fused", "gpu"], indirect=True)
-def test_engines_take_the_same_steps(student: Splats, targets: TeacherRenders, engine: Any) -> None:
-    fused, torch = (recover(student, targets, RecoverConfig(steps=60, engine=e)) for e in (engine, "torch"))
+@pytest.mark.parametrize(
+    ("engine", "reach"), [("fused", None), ("fused", 0.02), ("gpu", None)], indirect=["engine"]
+)
+def test_engines_take_the_same_steps(
+    student: Splats, targets: TeacherRenders, engine: Any, reach: float | None
+) -> None:
+    """Also where some Gaussians are held back, and for as many steps of each Gaussian."""
+    counts: dict[str, NDArray[Any]] = {}
+
+    def recovered(engine: Any) -> Any:
+        config = RecoverConfig(schedule=replace(TUNED, reach=reach), steps=30, engine=engine)
+        count = lambda step, info, scene: counts.update({engine: scene.__self__.counts})  # noqa: E731
+        return recover(student, targets, config, watch=count)
+
+    fused, torch = recovered(engine), recovered("torch")
     assert abs(fused.report.psnr.after - torch.report.psnr.after) < 0.005
+    assert counts[engine].max() == 30
+    assert (counts[engine] != counts["torch"]).mean() < 0.01
     for name in ("means", "scales", "logit_opacities", "sh0", "shN"):
         ours, theirs = getattr(fused.splats, name), getattr(torch.splats, name)
         moved = np.linalg.norm(ours - getattr(student.with_sh_degree(fused.splats.sh_degree), name))
@@ -90,7 +102,7 @@ def test_engines_take_the_same_steps(student: Splats, targets: TeacherRenders, e
 
 @pytest.mark.parametrize("engine", ["gpu"], indirect=True)
 def test_the_gpu_recovers_like_the_cpu(student: Splats, targets: TeacherRenders, engine: Any) -> None:
-    config = RecoverConfig(steps=60, regularizers=replace(REGULARIZERS["noisy"], period=10))
+    config = RecoverConfig(steps=25, regularizers=replace(REGULARIZERS["noisy"], period=10))
     there = recover(student, targets, config)
     assert devices.state().served > 1  # the steps, and images to score
     again = recover(student, targets, config)
@@ -99,8 +111,6 @@ def test_the_gpu_recovers_like_the_cpu(student: Splats, targets: TeacherRenders,
     here = recover(student, targets, config)
     assert abs(here.report.psnr.before - there.report.psnr.before) < 1e-5
     assert abs(here.report.psnr.after - there.report.psnr.after) < 0.02
-    unseen = TeacherRenders(TEACHER, around(7, (80, 60), 2.5))
-    assert abs(evaluate(here.splats, unseen).psnr - evaluate(there.splats, unseen).psnr) < 0.02
 
 
 @pytest.mark.parametrize("call", [4, 70, 140], ids=["in a trial", "early", "late"])
@@ -166,12 +176,7 @@ def test_same_bits_from_run_to_run_and_for_any_threads(student: Splats, targets:
 
 @pytest.mark.parametrize(
     ("engine", "steps", "weights"),
-    [
-        ("fused", 40, None),
-        ("torch", 40, None),
-        ("fused", 110, None),
-        *((e, 40, UNEVEN) for e in ("fused", "torch", "gpu")),
-    ],
+    [("fused", 110, None), *((engine, 24, UNEVEN) for engine in ("fused", "torch", "gpu"))],
     indirect=["engine"],
 )
 def test_an_interrupted_run_resumes_to_the_same_bits(
@@ -196,49 +201,28 @@ def test_an_interrupted_run_resumes_to_the_same_bits(
     assert whole.report.geometry == resumed.report.geometry
 
 
-def test_a_killed_run_resumes_from_the_last_checkpoint(
-    student: Splats, targets: TeacherRenders, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    config = RecoverConfig(steps=30, regularizers=replace(REGULARIZERS["lift"], period=10))
-    whole = recover(student, targets, config)
-    monkeypatch.setattr(checkpoint_module, "PERIOD", 0.0)  # a minute has always passed
-
-    def fall_over(stage: str, done: int, total: int, info: Any = None) -> None:
-        if stage == "recover" and done == 21:
-            raise RuntimeError("power cut")
-
-    checkpoint = tmp_path / "c.npz"
-    with pytest.raises(RuntimeError, match="power cut"):
-        recover(student, targets, config, checkpoint=checkpoint, progress=fall_over)
-    meta, _ = checkpoint_module.load(checkpoint, json.loads(str(np.load(checkpoint)["meta"]))["key"])
-    assert meta["done"] == 20
-    resumed = recover(student, targets, config, checkpoint=checkpoint)
-    assert_same_bits(whole.splats, resumed.splats)
-    assert whole.report.geometry == resumed.report.geometry
-
-
 def test_resume_refuses_other_options(student: Splats, targets: TeacherRenders, tmp_path: Path) -> None:
     checkpoint = tmp_path / "c.npz"
     config = RecoverConfig(steps=40)
     moved = replace(student, means=student.means + 1)
     with pytest.raises(KeyboardInterrupt):
         recover(student, targets, config, checkpoint=checkpoint, progress=press_ctrl_c_at("recover", 5))
-    with pytest.raises(InputError, match="other options"):
-        recover(student, targets, replace(config, seed=1), checkpoint=checkpoint)
-    with pytest.raises(InputError, match="other options"):  # another teacher, the same views
-        recover(student, TeacherRenders(student, VIEWS), config, checkpoint=checkpoint)
-    with pytest.raises(InputError, match="other options"):
-        recover(student, targets, config, checkpoint=checkpoint, anchors=Anchors.of(moved))
-    with pytest.raises(InputError, match="other options"):
-        recover(student, targets, config, checkpoint=checkpoint, weights=UNEVEN)
+    ask = {"student": student, "targets": targets, "config": config, "checkpoint": checkpoint}
     for other in (
+        {"config": replace(config, seed=1)},
+        {"targets": TeacherRenders(student, VIEWS)},
+        {"anchors": Anchors.of(moved)},
+        {"weights": UNEVEN},
         {"frozen": np.arange(len(student)) < 250},
         {"validation": TeacherRenders(TEACHER, around(3))},
         {"student": replace(student, sh0=student.sh0 + np.float32(0.1))},
         {"targets": Subset(targets, range(len(VIEWS) - 1))},
     ):
         with pytest.raises(InputError, match="other options"):
-            recover(**{"student": student, "targets": targets, **other}, config=config, checkpoint=checkpoint)
+            recover(**ask | other)
+    checkpoint.write_bytes(checkpoint.read_bytes()[:100])
+    with pytest.raises(InputError, match="not a checkpoint"):
+        recover(**ask)
 
 
 def test_trials_choose_rates_that_suit_the_scene(student: Splats, targets: TeacherRenders) -> None:
@@ -267,20 +251,6 @@ def test_layers_as_wide_as_the_sky_do_not_shake_the_image() -> None:
     assert held.report.psnr.after > free.report.psnr.after + 0.5
     moved = [np.abs(done.splats.means - start.means)[-300:].max() for done in (held, free)]
     assert moved[0] < 0.01 * moved[1]
-
-
-def test_both_engines_limit_the_same_gaussians(student: Splats, targets: TeacherRenders) -> None:
-    tight = replace(TUNED, multiplier=1.0, reach=0.02)
-    fused, torch = (
-        recover(student, targets, RecoverConfig(schedule=tight, steps=30, engine=e)).splats
-        for e in ("fused", "torch")
-    )
-    free = recover(student, targets, RecoverConfig(schedule=replace(tight, reach=math.inf), steps=30)).splats
-    for name in ("means", "scales", "sh0"):
-        ours, theirs = getattr(fused, name), getattr(torch, name)
-        moved = np.linalg.norm(ours - getattr(student.with_sh_degree(fused.sh_degree), name))
-        assert np.linalg.norm(ours - theirs) < 1e-2 * moved, name
-    assert np.linalg.norm(fused.means - student.means) < 0.8 * np.linalg.norm(free.means - student.means)
 
 
 @pytest.mark.parametrize("engine", ["fused", "torch", "gpu"], indirect=True)
@@ -315,14 +285,9 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("clock")
-def test_trials_stop_where_the_clock_is_short(student: Splats, targets: TeacherRenders) -> None:
-    report = recover(student, targets, RecoverConfig(recovery_time=0.05)).report
-    assert report.trials == ()
-    assert report.seconds < 0.3
-
-
-@pytest.mark.usefixtures("clock")
 def test_a_recovery_time_sets_the_horizon(student: Splats, targets: TeacherRenders) -> None:
+    short = recover(student, targets, RecoverConfig(recovery_time=0.05)).report
+    assert (short.trials, short.seconds < 0.3) == ((), True)  # no time to try rates
     report = recover(student, targets, RecoverConfig(recovery_time=6.0)).report
     assert 50 < report.steps < 600
     assert 6.0 <= report.seconds < 6.1
@@ -349,21 +314,6 @@ def test_progress_figures(student: Splats, targets: TeacherRenders, monkeypatch:
     for value, step in shown:  # each is of the step it names
         want = probe.Probe(targets, (0.0, 0.0, 0.0)).all_of(scenes[int(step)])
         assert float(value) == pytest.approx(want, abs=0.0051)
-
-
-def test_a_far_offset_changes_nothing_but_the_offset(student: Splats, targets: TeacherRenders) -> None:
-    far = np.array([447_000.0, 5_411_000.0, 130.0])
-    moved = replace(student, offset=student.offset + far)
-    views = VIEWS.recentred(-far)
-    teacher = replace(TEACHER, offset=TEACHER.offset + far)
-    here = recover(student, targets, RecoverConfig(steps=20)).report.psnr.after
-    there = recover(moved, TeacherRenders(teacher, views), RecoverConfig(steps=20)).report.psnr.after
-    assert there == pytest.approx(here, abs=0.05)
-
-
-def test_an_empty_scene_is_rejected(student: Splats, targets: TeacherRenders) -> None:
-    with pytest.raises(InputError, match="0 Gaussians"):
-        recover(student.take(slice(0, 0)), targets)
 
 
 def test_a_start_that_cannot_be_bettered_is_kept(targets: TeacherRenders) -> None:
@@ -527,7 +477,10 @@ def test_a_recovery_that_only_harms_validation_views_stops_at_half(targets: Teac
 
 def test_other_views_gain_where_training_views_can_spare_it(student: Splats, tmp_path: Path) -> None:
     cap = around(40).take(np.arange(8))  # from above alone
-    targets, near = TeacherRenders(TEACHER, cap), TeacherRenders(TEACHER, around(6, (64, 48), 2.0))
+    kinds = ("near",) * 3 + ("anywhere",) * 3
+    targets, near = (
+        TeacherRenders(TEACHER, views) for views in (cap, replace(around(6, (64, 48), 2.0), kinds=kinds))
+    )
     config = RecoverConfig(steps=100)
     plain = recover(student, targets, config)
     held = recover(student, targets, config, validation=near)
@@ -538,17 +491,12 @@ def test_other_views_gain_where_training_views_can_spare_it(student: Splats, tmp
     assert gains[0] > -0.3
     assert gains[1] >= -min(0.0, gains[0])
     last = held.report.validation.looks[-1].psnr
-    assert last == {"usual": pytest.approx(evaluate(held.splats, near).psnr, abs=1e-3)}
+    of = {kind: Subset(near, [row for row in range(6) if kinds[row] == kind]) for kind in kinds}
+    assert last == {k: pytest.approx(evaluate(held.splats, views).psnr, abs=1e-3) for k, views in of.items()}
     checkpoint = tmp_path / "c.npz"
+    stop = press_ctrl_c_at("recover", 60)
     with pytest.raises(KeyboardInterrupt):
-        recover(
-            student,
-            targets,
-            config,
-            validation=near,
-            checkpoint=checkpoint,
-            progress=press_ctrl_c_at("recover", 60),
-        )
+        recover(student, targets, config, validation=near, checkpoint=checkpoint, progress=stop)
     with pytest.raises(InputError, match="other options"):
         recover(student, targets, config, checkpoint=checkpoint)
     resumed = recover(student, targets, config, validation=near, checkpoint=checkpoint)
@@ -581,48 +529,16 @@ def test_the_guard_goes_by_the_kind_of_view_that_loses_most() -> None:
     assert guard(99, 16).look(end, 0.5, 50) == "on"
 
 
-def test_validation_views_are_scored_by_kind(student: Splats) -> None:
-    from g2ard.stages.recover.probe import Probe, score_by_kind
-
-    kinds = ("near",) * 10 + ("anywhere",) * 3
-    targets = TeacherRenders(TEACHER, replace(around(13, (32, 24)), kinds=kinds))
-    found = score_by_kind(targets, (0.0, 0.0, 0.0))(student)
-    assert list(found) == ["near", "anywhere"]
-    near = TeacherRenders(TEACHER, targets.cameras.take(range(10)))
-    assert found["near"] == Probe(near, (0.0, 0.0, 0.0)).all_of(student)
+def test_invalid_options_are_named() -> None:
+    for wrong in ({"steps": 0}, {"recovery_time": 0.0}, {"recovery_time": math.nan}, {"ssim_weight": 2.0}):
+        with pytest.raises(InputError, match=next(iter(wrong))):
+            RecoverConfig(**wrong)  # type: ignore[arg-type]
 
 
-def test_both_engines_count_the_same_steps(student: Splats, targets: TeacherRenders) -> None:
-    counts = []
-    for name in ("fused", "torch"):
-        config = RecoverConfig(steps=12, engine=name)  # type: ignore[arg-type]
-        last: list[Any] = []
-        recover(student, targets, config, watch=lambda *told, into=last: into.append(told[2]))
-        counts.append(last[-1].__self__.counts)
-    assert counts[0].max() == 12
-    assert (counts[0] != counts[1]).mean() < 0.01
-
-
-@pytest.mark.parametrize(
-    "wrong",
-    [
-        {"steps": 0},
-        {"steps": -1},
-        {"recovery_time": 0.0},
-        {"recovery_time": float("nan")},
-        {"ssim_weight": 2.0},
-    ],
-)
-def test_invalid_options_are_named(wrong: dict[str, Any]) -> None:
-    with pytest.raises(InputError, match=next(iter(wrong))):
-        RecoverConfig(**wrong)
-
-
-def test_views_that_see_nothing_of_the_scene_are_refused() -> None:
+def test_scenes_that_no_view_sees_are_refused(student: Splats, targets: TeacherRenders) -> None:
+    with pytest.raises(InputError, match="0 Gaussians"):
+        recover(student.take(slice(0, 0)), targets)
     ahead = VIEWS.take([0])
     behind = replace(TEACHER, means=(TEACHER.means - 99 * ahead.forwards[0]).astype(np.float32))
-    with pytest.raises(
-        InputError,
-        match="none of 1 view sees the scene; the views and the scene must use the same coordinates",
-    ):
+    with pytest.raises(InputError, match="none of 1 view sees the scene"):
         recover(behind, TeacherRenders(TEACHER, ahead), RecoverConfig(steps=2))

@@ -4,7 +4,6 @@ import sys
 from importlib.util import find_spec
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import pytest
 import torch
@@ -22,8 +21,8 @@ from g2ard.stages.recover import RecoverConfig, gsplat_engine, recover
 from g2ard.stages.recover.losses import l1_ssim, l1_ssim_anywhere
 from g2ard.stages.simplify import simplify
 from helpers.commands import CommandLine, refused
+from helpers.raster_cases import gsplat_rasterization
 from helpers.scenes import around, checkered_ball
-from reference import raster as reference
 
 BALL = checkered_ball(1200)
 TARGETS = TeacherRenders(BALL, around(6, (40, 30)))
@@ -47,27 +46,8 @@ def test_gsplat_recovers_like_the_cpu() -> None:
     assert scores[1].after == pytest.approx(scores[0].after, abs=0.3)
 
 
-def oracle_rasterization(**given: Any) -> tuple[torch.Tensor, None, None]:
-    """Render gsplat's documented arguments with the naive oracle."""
-    assert given["packed"] is False
-    assert given["colors"].shape[1] == (given["sh_degree"] + 1) ** 2
-    out = reference.render(
-        *(given[k].double() for k in ("means", "quats")),
-        given["scales"].double().log(),
-        torch.logit(given["opacities"].double()),
-        given["colors"][:, :1].double(),
-        given["colors"][:, 1:].double(),
-        viewmat=given["viewmats"][0].double(),
-        K=given["Ks"][0].double(),
-        width=given["width"],
-        height=given["height"],
-        background=tuple(given["backgrounds"][0].tolist()),
-    )
-    return out.image[None].float(), None, None
-
-
 def test_the_engine_passes_gsplats_documented_arguments(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "gsplat", SimpleNamespace(rasterization=oracle_rasterization))
+    monkeypatch.setitem(sys.modules, "gsplat", SimpleNamespace(rasterization=gsplat_rasterization))
     monkeypatch.setattr(gsplat_engine, "check_cuda", lambda: None)
     monkeypatch.setattr(gsplat_engine.GsplatEngine, "device", torch.device("cpu"))
     student = simplify(BALL, 60, method="paper").splats
@@ -79,7 +59,7 @@ def test_the_engine_passes_gsplats_documented_arguments(monkeypatch: pytest.Monk
 
 
 def test_scores_on_the_gpu_are_those_of_the_cpu(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "gsplat", SimpleNamespace(rasterization=oracle_rasterization))
+    monkeypatch.setitem(sys.modules, "gsplat", SimpleNamespace(rasterization=gsplat_rasterization))
     monkeypatch.setattr(cuda, "DEVICE", "cpu")
     small = simplify(BALL, 60, method="paper").splats
     found = [evaluate(small, TARGETS, device=device).psnr for device in ("cpu", "cuda")]

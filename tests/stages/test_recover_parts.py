@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import replace
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -12,7 +11,6 @@ import torch
 from g2ard.errors import InputError
 from g2ard.scene.shape import effective_rank, needle_share
 from g2ard.scene.splats import Splats
-from g2ard.stages.recover import checkpoint
 from g2ard.stages.recover.anchors import (
     PAPER_REGULARIZERS,
     REGULARIZERS,
@@ -205,19 +203,6 @@ def test_a_scaled_schedule_keeps_its_proportions() -> None:
     assert (small.steps, small.round_steps) == (3000, 800)
     assert small.rates == PAPER.rates
     assert Schedule.named("fast").scaled(50).round_steps == 0
-
-
-def test_checkpoint_round_trips_and_refuses_another_run(tmp_path: Path) -> None:
-    path = tmp_path / "c.npz"
-    checkpoint.save(path, "mine", {"done": 3}, {"a": np.arange(4.0)})
-    meta, arrays = checkpoint.load(path, "mine")
-    assert meta == {"done": 3}
-    np.testing.assert_array_equal(arrays["a"], np.arange(4.0))
-    with pytest.raises(InputError, match="another scene or other options"):
-        checkpoint.load(path, "yours")
-    path.write_bytes(path.read_bytes()[:100])
-    with pytest.raises(InputError, match="not a checkpoint"):
-        checkpoint.load(path, "mine")
 
 
 @pytest.mark.parametrize("rows", [1, 16, 50])

@@ -1,6 +1,5 @@
 """The fused trainer, on CPU and GPU, does what rasterize + l1_ssim + torch's Adam do, sparsely."""
 
-import copy
 import math
 from collections.abc import Iterator
 from typing import Any
@@ -173,7 +172,7 @@ def test_steps_are_torch_s(degree: int, on: str) -> None:
     assert trainer.skipped == 0
 
 
-@every_isa
+@on_both
 @pytest.mark.parametrize(("reach", "finest"), [(3.0, 0.0), (6.0, 2.0), (math.inf, 2.0)])
 def test_what_a_view_shows_too_large_or_cannot_resolve_moves_less(
     on: str, reach: float, finest: float
@@ -216,31 +215,6 @@ def test_sizes_on_the_screen_are_the_naive_ones() -> None:
 
 
 @on_both
-def test_dense_steps_are_torch_optim_s(on: str) -> None:
-    """Sparse Adam equals `torch.optim.Adam` if every Gaussian is in view."""
-    p, cameras, targets = problem(n=60)
-    p["means"] *= 0.5
-    p["logit_opacities"] = np.abs(p["logit_opacities"])
-    p["sh0"] = np.abs(
-        p["sh0"]
-    )  # a colour clamped at 0 gets no gradient, and dense Adam goes on with its momentum
-    p["shN"] *= 0
-    mine = tensors_of(copy.deepcopy(p))  # the optimiser writes into them
-    groups = [{"params": [m], "lr": RATES[k]} for k, m in zip(NAMES, mine, strict=True)]
-    adam = torch.optim.Adam(groups, betas=(0.9, 0.999), eps=1e-15)
-    trainer = trainer_of(p, on=on)
-    for _ in range(4):
-        adam.zero_grad()
-        image, _, _ = rasterize(*mine, cameras[0], 0, background=BACKGROUND)
-        l1_ssim(image, torch.from_numpy(targets[0]), 0.2).backward()
-        adam.step()
-        _, updated = step(trainer, cameras[0], targets[0])
-        assert updated == 60
-    want = {k: m.detach().double().numpy() for k, m in zip(NAMES, mine, strict=True)}
-    assert_close(trainer.arrays(), want, p, to=2e-2)
-
-
-@on_both
 def test_untouched_gaussians_do_not_move(on: str) -> None:
     p, cameras, targets = problem()
     p["means"][:50] += 100
@@ -261,23 +235,6 @@ def test_relative_steps_descend_the_logarithm_of_the_loss(on: str) -> None:
     assert relative.step(view_of(view, 0, SETTINGS), target, Rates(**RATES), relative=0.02)[0] == loss
     want = plain.state()["first"] * np.float32(0.02 / loss)
     np.testing.assert_allclose(relative.state()["first"], want, rtol=1e-3, atol=1e-3 * np.abs(want).max())
-
-
-@on_both
-def test_resume_is_bitwise(on: str) -> None:
-    p, cameras, targets = problem()
-    straight = trainer_of(p, np.full(200, 0.5, np.float32), on)
-    for i in range(6):
-        step(straight, cameras[i % 3], targets[i % 3])
-        if i == 2:
-            state = copy.deepcopy(straight.state())
-            middle = dict(zip(NAMES, straight.arrays(), strict=True))
-    resumed = trainer_of(middle, on=on)
-    resumed.load(state)
-    for i in range(3, 6):
-        step(resumed, cameras[i % 3], targets[i % 3])
-    for key, value in straight.state().items():
-        assert value.tobytes() == resumed.state()[key].tobytes(), key
 
 
 @pytest.mark.parametrize(

@@ -76,10 +76,8 @@ def test_names_match_whole_then_by_unambiguous_stems() -> None:
     assert matched({"a/1.png": 1, "2": 2}, ["a/1.png", "x/2.jpg", "y/2.jpg"]) == {"a/1.png": 1}
     assert matched({"1": 1}, ["s/1.jpg"]) == {"s/1.jpg": 1}
     aces = {"seq2_frame1.png": 2, "seq3_frame1.png": 3}
-    assert matched(aces, ["seq3/frame1.png", "seq2/frame1.png"]) == {
-        "seq3/frame1.png": 3,
-        "seq2/frame1.png": 2,
-    }
+    found = matched(aces, ["seq3/frame1.png", "seq2/frame1.png"])
+    assert found == {"seq3/frame1.png": 3, "seq2/frame1.png": 2}
 
 
 def test_a_broken_photo_is_one_refused_row(site: Path, tmp_path: Path) -> None:
@@ -179,11 +177,7 @@ def test_the_command_writes_and_scores_views(site: Path, command_line: CommandLi
         ("--images views.json --protocol gs-cpr --passes 2", 2, "--passes: expected 1 with gs-cpr, got 2"),
         ("--images views.json --report page.txt", 1, "ends in .html"),
         ("--images empty --focal 128", 1, "neither photos nor views in this folder"),
-        (
-            "--images views.json --protocol gs-cpr --matcher direct",
-            2,
-            "--matcher: expected matched features",
-        ),
+        ("--images views.json --protocol gs-cpr --matcher direct", 2, "--matcher: expected matched"),
         ("--images views.json --report scene.ply -w", 2, "is both an input and the output"),
         ("--images views.json --pool absent.json", 1, "absent.json"),
         ("--images views.json --poses away.txt", 1, "none of 4 photos was registered"),
@@ -267,9 +261,8 @@ def test_keep_all_writes_the_start_of_photos_without_a_pose(site: Path) -> None:
     photos = photos_of(site / "views.json")
     starts = {name: off(pose, 0.05, 1, 3) for name, pose in read_poses(site / "views.json").items()}
     none = RegisterConfig(size=128, matcher="sift", min_inliers=10_000, fallback=False)
-    found = register(
-        g2ard.io.read_splats(site / "scene.ply"), photos, starts=starts, truth=starts, config=none, keep="all"
-    )
+    scene = g2ard.load(site / "scene.ply")
+    found = register(scene, photos, starts=starts, truth=starts, config=none, keep="all")
     assert found.report.count("refused") == 4
     assert "fewer than 10000 matches" in str(found.report.photos[0].reason)
     np.testing.assert_array_equal(found.cameras.viewmats, np.stack([starts[n] for n in photos.names]))
@@ -290,39 +283,11 @@ def test_the_protocol_of_gs_cpr(site: Path, command_line: CommandLine, tmp_path:
     )
 
 
-def test_broken_photos_are_refused_rows(site: Path, command_line: CommandLine, tmp_path: Path) -> None:
-    (tmp_path / "photos").mkdir()
-    (tmp_path / "photos/view_000.png").write_bytes(b"\x89PNG broken")
-    for lens in (("--focal", "128"), ("--intrinsics", site / "truth.json")):
-        status, out, err = command_line(
-            *("register", site / "scene.ply", "--images", "photos", *lens, "--poses", site / "coarse.txt"),
-            *("-o", "poses.json", "--report", "page.html", "--json", "-", "-w"),
-            cwd=tmp_path,
-        )
-        assert status == 1, err
-        assert "none of 1 photo was registered; view_000.png" in err
-        assert json.loads(out)["photos"][0]["status"] == "refused"
-        assert (tmp_path / "page.html").is_file()
-
-
 def test_python_registers_as_the_command_does(site: Path, command_line: CommandLine, tmp_path: Path) -> None:
-    ask = (
-        "--images",
-        site / "views.json",
-        "--poses",
-        site / "coarse.txt",
-        "--size",
-        96,
-        "--matcher",
-        "direct",
-    )
-    out = succeeds(
-        command_line, tmp_path, "register", site / "scene.ply", *ask, "-o", "a.json", "--json", "-"
-    )
-    settings = {"size": 96, "matcher": "direct"}
-    found = g2ard.register(
-        site / "scene.ply", site / "views.json", poses=site / "coarse.txt", settings=settings
-    )
+    scene, photos, poses = (site / name for name in ("scene.ply", "views.json", "coarse.txt"))
+    ask = ("--images", photos, "--poses", poses, "--size", 96, "--matcher", "direct", "-o", "a.json")
+    out = succeeds(command_line, tmp_path, "register", scene, *ask, "--json", "-")
+    found = g2ard.register(scene, photos, poses=poses, settings={"size": 96, "matcher": "direct"})
     poses = [row["camera_from_world"] for row in json.loads(out.out)["photos"]]
     assert poses == [row.as_dict()["camera_from_world"] for row in found.report.photos]
     np.testing.assert_array_equal(found.cameras.viewmats, read_views(tmp_path / "a.json").viewmats)

@@ -1,7 +1,6 @@
 """Features: matches against a naive twin, lifted points, solved poses, and invalid matchers."""
 
 import re
-import subprocess
 import sys
 import tomllib
 from dataclasses import replace
@@ -14,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from g2ard.errors import InputError, MissingDependencyError
-from g2ard.io import read_views
+from g2ard.io import read_views, write_splats, write_views
 from g2ard.io.images import write_png
 from g2ard.rendering.renderer import Rendered, Renderer
 from g2ard.scene.cameras import Camera, Cameras
@@ -28,6 +27,7 @@ from helpers.feature_scenes import BALL, CONFIG, _photographed, blotched
 from helpers.project import ROOT
 from helpers.registration import off
 from helpers.scenes import around
+from helpers.threads import on_threads
 
 
 @settings(max_examples=40, deadline=None)
@@ -146,9 +146,9 @@ def test_features_find_the_pose(tmp_path: Path) -> None:
 
 def test_features_and_alignment_are_no_worse_than_either(tmp_path: Path) -> None:
     pytest.importorskip("pycolmap")
-    views = _photographed(tmp_path)
+    views = _photographed(tmp_path, 1)
     truth = dict(zip(views.names, views.viewmats, strict=True))
-    starts = {name: off(pose, 0.2, 6, i) for i, (name, pose) in enumerate(truth.items())}
+    starts = {name: off(pose, 0.2, 6, 0) for name, pose in truth.items()}
     errors = {}
     for refine in ("auto", "none", "photometric"):
         config = replace(CONFIG, refine=refine)  # type: ignore[arg-type]
@@ -159,26 +159,13 @@ def test_features_and_alignment_are_no_worse_than_either(tmp_path: Path) -> None
 
 def test_results_do_not_depend_on_threads(tmp_path: Path) -> None:
     pytest.importorskip("pycolmap")
-    code = f"""
-import sys; sys.path[:0] = ["tests"]
-from g2ard import _core; _core.set_num_threads(int(sys.argv[1]))
-from pathlib import Path
-from helpers import feature_scenes as t
-from helpers.registration import off
-from g2ard.stages.register import register
-views = t._photographed(Path({str(tmp_path)!r}), 1)
-starts = {{views.names[0]: off(views.viewmats[0], .2, 6, 1)}}
-row = register(t.BALL, views, starts=starts, config=t.CONFIG).report.photos[0]
-print(row.camera_from_world, row.covariance, row.matches, row.inliers)
-"""
-    told = []
-    for threads in ("1", "2"):
-        for file in tmp_path.iterdir():
-            file.unlink()
-        call = [sys.executable, "-c", code, threads]
-        told.append(subprocess.run(call, capture_output=True, text=True, check=True, cwd=ROOT).stdout)
-    assert told[0] == told[1]
-    assert len(told[0]) > 500
+    views = _photographed(tmp_path, 1)
+    starts = {views.names[0]: off(views.viewmats[0], 0.2, 6, 1)}
+    found = on_threads(lambda: register(BALL, views, starts=starts, config=CONFIG).report, (1, 2))
+    one, two = (report.photos[0] for report in found)
+    assert one.inliers == two.inliers > 0
+    np.testing.assert_array_equal(one.camera_from_world, two.camera_from_world)
+    np.testing.assert_array_equal(one.covariance, two.covariance)
 
 
 @pytest.mark.parametrize(
@@ -198,23 +185,19 @@ def test_invalid_pairs_of_a_matcher_are_named(pairs: object, words: str) -> None
         checked_pairs("matcher m:f", pairs, (9, 9, 3), (9, 9, 3))
 
 
-def test_without_pycolmap_direct_alignment_is_left(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "find_spec", lambda name: None)
-    assert matcher_named("auto", 0.85, 100) is None
-    for name in ("sift", "json:dumps"):
-        with pytest.raises(MissingDependencyError, match="pip install pycolmap"):
-            matcher_named(name, 0.85, 100)
-
-
 @pytest.mark.parametrize(
-    ("machine", "words"), [("x86_64", ""), ("aarch64", ", and has no wheel for linux aarch64")]
+    ("machine", "words"), [("x86_64", r"\)"), ("aarch64", ", and has no wheel for linux aarch64")]
 )
-def test_systems_without_a_pycolmap_wheel(machine: str, words: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_pycolmap_direct_alignment_is_left(
+    machine: str, words: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(module, "find_spec", lambda name: None)
     monkeypatch.setattr(module.sys, "platform", "linux")
     monkeypatch.setattr(module.platform, "machine", lambda: machine)
-    with pytest.raises(MissingDependencyError, match=rf"\(pycolmap is not installed{words}\)"):
-        matcher_named("sift", 0.85, 100)
+    assert matcher_named("auto", 0.85, 100) is None
+    for name in ("sift", "json:dumps"):
+        with pytest.raises(MissingDependencyError, match=rf"pycolmap is not installed{words}"):
+            matcher_named(name, 0.85, 100)
 
 
 def test_extras_name_pycolmap_where_it_has_wheels() -> None:
@@ -283,15 +266,13 @@ _CALL = [
 
 
 def _one_view(folder: Path) -> None:
-    from g2ard.io import write_splats, write_views
-
     views = _photographed(folder, 1)
     write_splats(folder / "scene.ply", BALL)
     write_views(folder / "views.json", views)
     write_views(folder / "coarse.json", replace(views, viewmats=off(views.viewmats[0], 0.1, 3, 0)[None]))
 
 
-@pytest.mark.parametrize(("gain", "bias"), [(0.6, 0.0), (1.6, 0.0), (1.0, 0.1), (1.0, -0.1)])
+@pytest.mark.parametrize(("gain", "bias"), [(1.6, 0.0), (1.0, -0.1)])
 def test_a_change_of_light_does_not_move_the_pose(gain: float, bias: float, tmp_path: Path) -> None:
     """The pose changes by less than a tenth of what registration corrects."""
     pytest.importorskip("pycolmap")
@@ -308,30 +289,27 @@ def test_an_occluder_does_not_move_the_pose(tmp_path: Path) -> None:
     """The pose is right within 2σ although a fifth of the photo is foreign."""
     pytest.importorskip("pycolmap")
     rng = np.random.default_rng(4)
-    for i in range(2):
-        view = around(2, (400, 300), 2.5)[i]
-        image = np.clip(Renderer(BALL).image(view), 0, 1)
-        image[60:210, 120:280] = rng.random((15, 16, 3)).repeat(10, 0).repeat(10, 1)
-        write_png(tmp_path / "photo.png", image, overwrite=True)
-        row = _registered(view, tmp_path)
-        assert row.status == "registered"
-        assert row.error.position < 2 * row.sigma.position
-        assert row.error.rotation < 2 * row.sigma.rotation
+    view = around(2, (400, 300), 2.5)[0]
+    image = np.clip(Renderer(BALL).image(view), 0, 1)
+    image[60:210, 120:280] = rng.random((15, 16, 3)).repeat(10, 0).repeat(10, 1)
+    write_png(tmp_path / "photo.png", image)
+    row = _registered(view, tmp_path)
+    assert row.status == "registered"
+    assert row.error.position < 2 * row.sigma.position
+    assert row.error.rotation < 2 * row.sigma.rotation
 
 
 def test_a_photo_of_another_scene_is_refused(tmp_path: Path) -> None:
     pytest.importorskip("pycolmap")
-    for i, view in enumerate(around(3, (400, 300), 2.5)):
-        write_png(
-            tmp_path / "photo.png", np.clip(Renderer(blotched(seed=9)).image(view), 0, 1), overwrite=True
-        )
-        assert _registered(view, tmp_path, seed=i).status != "registered"
+    view = around(3, (400, 300), 2.5)[1]
+    write_png(tmp_path / "photo.png", np.clip(Renderer(blotched(seed=9)).image(view), 0, 1))
+    assert _registered(view, tmp_path).status != "registered"
 
 
-def _registered(view: Camera, folder: Path, seed: int = 0) -> PhotoReport:
+def _registered(view: Camera, folder: Path) -> PhotoReport:
     """Register photo.png from a start that is 0.1 units and 3° off."""
     views = Cameras.of([replace(view, image_path=folder / "photo.png", name="photo")])
-    starts = {"photo": off(view.viewmat, 0.1, 3, seed)}
+    starts = {"photo": off(view.viewmat, 0.1, 3, 0)}
     truth = {"photo": view.viewmat}
     return register(BALL, views, starts=starts, truth=truth, config=CONFIG).report.photos[0]
 

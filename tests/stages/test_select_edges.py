@@ -1,4 +1,4 @@
-"""Degenerate pools, through the function and through the command."""
+"""Degenerate pools."""
 
 import json
 from dataclasses import replace
@@ -10,12 +10,11 @@ import pytest
 from g2ard.config.choices import POLICIES
 from g2ard.errors import InputError
 from g2ard.io import read_view_set, write_splats, write_views
-from g2ard.progress import plural
 from g2ard.scene.cameras import look_at
 from g2ard.scene.splats import Splats
 from g2ard.scene.transform import join
 from g2ard.stages.select import CoverageOptions, select
-from helpers.commands import CommandLine
+from helpers.commands import CommandLine, refused, succeeds
 from helpers.scenes import around, checkered_ball, views_at
 
 OPTIONS = CoverageOptions(cells=500)
@@ -55,15 +54,6 @@ def test_duplicate_poses_are_chosen_last(policy: str) -> None:
     np.testing.assert_array_equal(chosen.order, again.order)
 
 
-def test_only_duplicates() -> None:
-    pool = views_at([around(3).viewmats[0]] * 6)
-    for policy in POLICIES:
-        chosen = select(BALL, pool, 3, policy=policy, options=OPTIONS)
-        assert len(set(chosen.order.tolist())) == 3
-        assert np.isfinite(chosen.gains).all()
-        np.testing.assert_allclose(chosen.weights.sum(), 3)
-
-
 def test_the_curve_is_where_k_can_be_read_off() -> None:
     whole = select(BALL, around(12), 12)
     few = select(BALL, around(12), 4)
@@ -88,35 +78,16 @@ def test_invalid_poses_are_rejected() -> None:
         select(BALL, pool.take([]), 1)
 
 
-@pytest.fixture
-def folder(tmp_path: Path) -> Path:
+def test_the_command_says_which_views_see_nothing(command_line: CommandLine, tmp_path: Path) -> None:
     write_splats(tmp_path / "ball.ply", BALL)
-    return tmp_path
-
-
-def ask(command_line: CommandLine, folder: Path, k: object, *more: object) -> tuple[int, str, str]:
-    words = ["select", "ball.ply", "--views", "pool.json", "-o", "out.json", "--json", "-"]
-    return command_line(*words, "-k", k, *more, cwd=folder)
-
-
-def test_the_command_on_pools_of_all_shapes(command_line: CommandLine, folder: Path) -> None:
     away = look_at([30.0, 0, 0], [60, 0, 0])
-    shapes = {
-        "one": ([around(4).viewmats[0]], 1, 1, 0),
-        "duplicates": ([around(4).viewmats[0]] * 5, 3, 3, 0),
-        "all and more": (list(around(6).viewmats), 50, 6, 0),
-        "some see nothing": ([*around(4).viewmats, away], 5, 4, 1),
-    }
-    for name, (poses, k, count, refused) in shapes.items():
-        write_views(folder / "pool.json", views_at(poses), overwrite=True)
-        status, out, error = ask(command_line, folder, k, "-w", "--split", "all")
-        assert status == 0, (name, error)
-        said = json.loads(out)
-        assert len(said["views"]) == count == len(read_view_set(folder / "out.json").cameras)
-        assert len(said["refused"]) == refused
-        assert (f"{plural(refused, 'view')} not used" in error) == bool(refused)
-        assert len(said["curve"]) == len(poses) - refused
-    write_views(folder / "pool.json", views_at([away]), overwrite=True)
-    status, _, error = ask(command_line, folder, 1, "-w", "--split", "all")
-    assert status == 1
+    ask = ("select", "ball.ply", "--views", "pool.json", "-k", 5, "--split", "all", "-o", "out.json")
+    write_views(tmp_path / "pool.json", views_at([*around(4).viewmats, away]))
+    out, told = succeeds(command_line, tmp_path, *ask, "--json", "-")
+    said = json.loads(out)
+    assert len(said["views"]) == len(said["curve"]) == len(read_view_set(tmp_path / "out.json").cameras) == 4
+    assert len(said["refused"]) == 1
+    assert "1 view not used" in told
+    write_views(tmp_path / "pool.json", views_at([away]), overwrite=True)
+    error = refused(command_line, tmp_path, *ask, "-w", "-q", status=1)
     assert "none of 1 view sees the scene" in error

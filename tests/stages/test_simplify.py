@@ -1,15 +1,13 @@
 """Simplification: properties of every method, and the command."""
 
-import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-import g2ard
 from g2ard.config.choices import METHODS
 from g2ard.errors import InputError
-from g2ard.scene.splats import ARRAYS, Splats
+from g2ard.scene.splats import Splats
 from g2ard.stages.simplify import SimplifyConfig, round_counts, simplify
 from helpers.scenes import assert_same_bits
 from helpers.simplify_cases import Views, all_alike, assert_sound, scene
@@ -17,7 +15,7 @@ from helpers.threads import on_threads
 
 
 @pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize("budget", [1, 2, 77, 500, 1234, 1999, 2000])
+@pytest.mark.parametrize("budget", [1, 2, 500, 1999, 2000])
 def test_exact_count(method, budget):
     assert_sound(simplify(scene(), budget, method=method), 2000, budget)
 
@@ -30,8 +28,8 @@ def test_any_sh_degree(method, rest):
 
 @pytest.mark.parametrize("method", METHODS)
 def test_threads_do_not_matter(method):
-    prior = scene(20_000)
-    first, *others = on_threads(lambda: simplify(prior, 3000, method=method))
+    prior = scene(9_000)
+    first, *others = on_threads(lambda: simplify(prior, 1000, method=method))
     for other in others:
         assert_same_bits(first.splats, other.splats)
         np.testing.assert_array_equal(first.parents, other.parents)
@@ -201,8 +199,9 @@ def test_bad_input_is_named():
         simplify(prior, 5, protected=np.zeros(49, bool))
     with pytest.raises(InputError, match="none of the 50 rows is finite"):
         simplify(replace(prior, means=prior.means * np.nan), 5)
-    with pytest.raises(InputError, match="retention: expected"):
-        SimplifyConfig(retention=1.0)
+    for wrong in ({"retention": 1.0}, {"morton_premerge_ratio": np.nan}, {"morton_premerge_steps": 0}):
+        with pytest.raises(InputError, match=next(iter(wrong))):
+            SimplifyConfig(**wrong)
 
 
 def test_schedule():
@@ -240,40 +239,3 @@ def test_an_invisible_scene_shrinks_evenly(method, logit):
     assert_sound(out, 2000, 1000)
     octants = np.bincount((out.splats.means > 0) @ [1, 2, 4], minlength=8)
     assert octants.min() > 80  # of 125
-
-
-def test_command_line(tmp_path, command_line):
-    from g2ard.io import read_splats, write_splats
-
-    write_splats(tmp_path / "prior.ply", scene(1000))
-
-    def run(*arguments):
-        return command_line("simplify", "prior.ply", *arguments, cwd=tmp_path)
-
-    status, out, err = run("-r", "10", "-o", "small.ply", "--no-views", "--json", "-")
-    assert status == 0, err
-    report = json.loads(out)
-    assert (report["input_count"], report["output_count"]) == (1000, 100)
-    assert set(report["seconds"]) == {"read", "simplify", "write", "total"}
-    assert report["peak_rss_bytes"] > 1e6
-    small, want = (
-        read_splats(tmp_path / "small.ply"),
-        g2ard.simplify(tmp_path / "prior.ply", count=100, blind=True).splats,
-    )
-    for name in ARRAYS:  # files hold logarithms of the scales
-        np.testing.assert_allclose(getattr(small, name), getattr(want, name), rtol=1e-5, err_msg=name)
-    status, _, err = run("-r", "10", "-o", "seen.ply", "-q")
-    assert status == 0, err
-    assert len(read_splats(tmp_path / "seen.ply")) == 100
-    for arguments, want, part in (
-        (("-r", "10", "-o", "small.ply"), 1, "small.ply"),  # exists
-        (("-n", "5", "-o", "b.ply", "--no-views", "--views", "x"), 2, "exclude"),
-        (("-n", "1001", "-o", "b.ply"), 1, "prior.ply: expected a budget of at most"),
-        (("-n", "0", "-o", "b.ply"), 2, "positive count"),
-        (("-o", "b.ply"), 2, "one of -n COUNT, -r RATIO"),
-        (("-n", "5", "-o", "b.ply", "--method", "best"), 2, "method"),
-    ):
-        status, _, err = run(*arguments)
-        assert (status, part in err) == (want, True), (arguments, err)
-        assert len(err.splitlines()) == 1
-        assert not (tmp_path / "b.ply").exists()
