@@ -73,7 +73,7 @@ def naive(s: Splats, budget: int) -> list[dict]:
     return g
 
 
-@pytest.mark.parametrize("budget", [33, 20, 7, 1])
+@pytest.mark.parametrize("budget", [33, 7])
 def test_nanogs_equals_a_naive_twin(budget: int) -> None:
     found, expected = unpack(nanogs(SCENE, budget)), naive(SCENE, budget)
     assert len(found) == len(expected) == budget

@@ -65,15 +65,8 @@ def test_every_arm_runs_once_and_never_again(scene: SceneSpec, tmp_path: Path) -
 
 
 def test_gains_are_over_random_on_the_same_pool() -> None:
-    base: Row = {
-        "scene": "s",
-        "pool": "even",
-        "arm": "random",
-        "percent": 10.0,
-        "seed": 0,
-        "psnr_in": 20.0,
-        "psnr_out": 18.0,
-    }
+    base: Row = {"scene": "s", "pool": "even", "arm": "random", "percent": 10.0, "seed": 0}
+    base |= {"psnr_in": 20.0, "psnr_out": 18.0}
     rows = [
         base,
         {**base, "draw": 1, "psnr_in": 22.0},

@@ -7,7 +7,7 @@ from helpers.studies import ball_of, measured
 
 def test_formats_lose_as_much_as_their_quanta(tmp_path: Path) -> None:
     ball = ball_of(tmp_path, 600, views=False)
-    rows = measured("ship", ball, tmp_path / "out", ratios="1,5", methods="sog,splat")
+    rows = measured("ship", ball, tmp_path / "out", ratios="1,5", methods="sog,splat", size="64")
     pool = {(r["ratio"], r["format"]): r for r in rows if r["views_kind"] == "pool"}
     assert set(pool) == {(r, f) for r in (1, 5) for f in ("ply", "sog", "splat")}
     assert pool[1, "ply"]["psnr"] > 90

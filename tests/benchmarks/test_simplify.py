@@ -53,7 +53,7 @@ def test_measures_writes_and_resumes(tmp_path: Path, monkeypatch: pytest.MonkeyP
 
 @needs_processes
 def test_every_kind_of_view_is_scored(tmp_path: Path) -> None:
-    scene, path = ball_of(tmp_path, 3000, views=False), tmp_path / "ball.ply"
+    scene, path = ball_of(tmp_path, 1200, views=False), tmp_path / "ball.ply"
     rows = ask(scene, tmp_path / "out", "default,fast", protocol="all")
     kinds = ["pool", "near", "standing", "anywhere"]
     assert [(r["method"], r["views_kind"]) for r in rows] == [
@@ -94,7 +94,7 @@ def test_a_standing_file_beside_the_scene_takes_precedence(tmp_path: Path) -> No
 @pytest.mark.parametrize("make", [naive.statue, naive.room, naive.town])
 def test_made_standing_views_are_of_another_kind(make) -> None:
     splats, nowhere = make(), Path("nowhere.ply")
-    found, pool = standing_views(splats, nowhere), make_pool(splats, 128)
+    found, pool = standing_views(splats, nowhere), make_pool(splats, 48)
     assert set(found) == {"near", "standing"}
     for kind, cameras in found.items():
         assert all(name.startswith(kind) for name in cameras.names)
@@ -138,7 +138,7 @@ def test_the_study_of_growth_has_every_growth_that_is_chosen_from() -> None:
 
 @needs_processes
 def test_fixed_growths_are_compared_in_other_views_than_those_that_choose(tmp_path: Path) -> None:
-    scene = ball_of(tmp_path, 2000, views=False)
+    scene = ball_of(tmp_path, 1200, views=False)
     rows = measured("growth", scene, tmp_path / "out", ratios="10", methods="growth-1.25,growth-4", size="64")
     first, last = (rows[i : i + 3] for i in (0, 3))
     assert [row["views_kind"] for row in first] == ["near", "standing", "anywhere"]

@@ -138,9 +138,9 @@ def test_the_report_shows_rows_seeds_and_failures(tmp_path: Path) -> None:
         (("ratios = [4]", "ratios = 10"), "ratios: expected a list"),
         (("ratios = [4]", "ratios = [4]\nkeep = [0.1]"), "keep and ratios exclude each other"),
         (("ratios = [4]", "keep = [1.5]"), "keep: expected a list of shares"),
-        (("steps = [9]\nseconds = [2]\n", ""), "nothing to measure"),
+        (("steps = [9]\nseconds = [1]\n", ""), "nothing to measure"),
         (("steps = [9]", "steps = [2.5]"), "steps: expected a whole number"),
-        (("seconds = [2]", "seconds = [nan]"), "seconds"),
+        (("seconds = [1]", "seconds = [nan]"), "seconds"),
         (("steps = [9]", "size = 0"), "size"),
         (("steps = [9]", 'schedule = "nope"'), "schedule"),
         (("[[scene]]", '[[scene]]\nname = "ball"\n[[scene]]'), "the name is used twice"),
@@ -208,7 +208,7 @@ def test_recorded_rows_are_read(tmp_path: Path) -> None:
 
 
 @needs_processes
-def test_command(command_line: CommandLine, tmp_path: Path) -> None:
+def test_command(command_line: CommandLine, tmp_path: Path, programs: None) -> None:
     study(tmp_path)
     few = ["--methods", "g2ard,random", "--ratios", "5", "--steps", "3"]
     ask = ("benchmarks", "run", "matched", "ball.ply", "--views", "views.json", *few, "-o", "out")
@@ -222,10 +222,7 @@ def test_command(command_line: CommandLine, tmp_path: Path) -> None:
         (("nothing",), "no study 'nothing'"),
         (("balls.toml", "--views", "views.json"), "go with scenes"),
         (("balls.toml", "--set", "ratios"), "expected KEY=VALUE"),
-        (
-            ("simplify", "ball.ply", "--set", "protocol=sitting"),
-            "protocol: expected one of all, pool",
-        ),
+        (("simplify", "ball.ply", "--set", "protocol=sitting"), "protocol: expected one of all, pool"),
     ):
         status, _, err = command_line("benchmarks", "run", *wrong, "-o", "x", cwd=tmp_path)
         assert status in (1, 2)

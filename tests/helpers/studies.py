@@ -18,7 +18,7 @@ STUDY = """
 title = "Balls"
 ratios = [4]
 steps = [9]
-seconds = [2]
+seconds = [1]
 methods = ["g2ard", "pup", "rounds", "nanogs"]
 
 [method.rounds]
