@@ -16,11 +16,13 @@ WRONG: tuple[Any, ...] = (None, True, "x", "", -1, 1e300, [], {}, [[]], ["x"])
 RAW = ("NaN", "1e999", "1" + "0" * 400)
 """The same as text, for what no program writes."""
 
-_PLACES = 4
+_PLACES = 3
 """Entries of a list that are changed: the rest are like them."""
-_HEAD = 48
+_HEAD = 32
 """Words of a binary file that are changed."""
-_CUTS = 40
+_WORDS = 30
+"""Words, and lines, of a text that are changed: evenly over it."""
+_CUTS = 20
 
 
 def malformed(content: bytes) -> Iterator[tuple[str, bytes]]:
@@ -83,12 +85,13 @@ def _changed(document: Any, path: tuple[Any, ...], *value: Any) -> Any:
 
 
 def _text(content: bytes) -> Iterator[tuple[str, bytes]]:
-    for word in list(re.finditer(rb"[^\s,:\[\]{}\"']+", content))[:60]:
+    words = list(re.finditer(rb"[^\s,:\[\]{}\"']+", content))
+    for word in words[:: -(-len(words) // _WORDS)]:
         for wrong in (b"", b"x", b"-1", b"nan", b"1e999", b"9" * 30, b"1 1", b"\xff", b"\0"):
             changed = content[: word.start()] + wrong + content[word.end() :]
             yield f"{word[0].decode()} at {word.start()} is {wrong!r}", changed
     lines = content.splitlines(keepends=True)
-    for at in range(min(len(lines), 40)):
+    for at in range(min(len(lines), _WORDS)):
         yield f"lacks line {at + 1}", b"".join(lines[:at] + lines[at + 1 :])
         yield f"line {at + 1} twice", b"".join(lines[: at + 1] + lines[at:])
 

@@ -9,7 +9,8 @@ import numpy as np
 from g2ard.io import write_splats, write_views
 from helpers.cloud_files import columns, las, ply
 from helpers.dataset_files import cambridge, llff, polycam
-from helpers.packed_files import compressed, save_spz, truth, unpacked_ksplat
+from helpers.packed_files import saved as packed
+from helpers.packed_files import truth, unpacked_ksplat
 from helpers.sog_files import folder as sog_folder
 from helpers.sog_files import parts, zipped
 from helpers.trainer_files import data_of, export, inria, result_of, run_of
@@ -78,9 +79,9 @@ def result(folder: Path) -> Path:
 
 MAKERS: dict[str, Callable[[Path], Path]] = {
     "scene": lambda f: saved(f / "a.ply", write_splats, truth(9, 1)),
-    "compressed": lambda f: compressed(f / "a.ply", truth(9, 1)),
-    "spz 3": lambda f: save_spz(f / "a.spz", truth(9, 1), 3),
-    "spz 4": lambda f: save_spz(f / "a.spz", truth(9, 1), 4),
+    "compressed": lambda f: packed(f, "compressed.ply", truth(9, 1)),
+    "spz 3": lambda f: packed(f, "spz", truth(9, 1), spz_version=3),
+    "spz 4": lambda f: packed(f, "spz", truth(9, 1), spz_version=4),
     "splat": lambda f: saved(f / "a.splat", write_splats, truth(9, 0)),
     "ksplat": lambda f: unpacked_ksplat("level2-sh2", f),
     "sog": lambda f: zipped(f / "a.sog", parts()),

@@ -16,13 +16,21 @@ from helpers.scenes import checkered_ball
 from helpers.systems import needs_links, needs_modes
 
 
-def test_whole_file_appears(tmp_path: Path) -> None:
-    with atomic_output(tmp_path / "a.ply") as temporary:
-        assert temporary.parent == tmp_path
-        assert temporary.suffix == ".ply"
-        temporary.write_text("new")
+@pytest.mark.parametrize("folder", [False, True])
+def test_an_output_appears_whole(tmp_path: Path, folder: bool) -> None:
+    with (atomic_folder if folder else atomic_output)(tmp_path / "a.ply") as temporary:
+        assert (temporary.parent, temporary.suffix) == (tmp_path, ".ply")
+        part = temporary / "deep" / "a" if folder else temporary
+        part.parent.mkdir(exist_ok=True)
+        part.write_text("new")
         assert not (tmp_path / "a.ply").exists()
-    assert [p.name for p in tmp_path.iterdir()] == ["a.ply"]
+    assert [path.name for path in tmp_path.rglob("*")] == ["a.ply", "deep", "a"][: 3 if folder else 1]
+    with pytest.raises(OutputError, match="exists; overwrite=True" if not folder else "is a folder"):
+        check_output(tmp_path / "a.ply")
+    if not folder:
+        with atomic_output(tmp_path / "a.ply", overwrite=True) as temporary:
+            temporary.write_text("newer")
+        assert (tmp_path / "a.ply").read_text() == "newer"
 
 
 def test_permissions_follow_the_umask(tmp_path: Path) -> None:
@@ -55,15 +63,6 @@ def test_a_failing_input_keeps_its_own_error(tmp_path: Path) -> None:
         (tmp_path / "input").read_text()
 
 
-def test_existing_needs_overwrite(tmp_path: Path) -> None:
-    (tmp_path / "a").write_text("old")
-    with pytest.raises(OutputError, match="exists; overwrite=True"):
-        check_output(tmp_path / "a")
-    with atomic_output(tmp_path / "a", overwrite=True) as temporary:
-        temporary.write_text("new")
-    assert (tmp_path / "a").read_text() == "new"
-
-
 def test_absent_folders_are_made_with_the_output_and_not_before(tmp_path: Path) -> None:
     path = tmp_path / "no" / "where" / "a.ply"
     assert check_output(path) == path
@@ -94,15 +93,6 @@ def test_another_kind_in_the_way(tmp_path: Path) -> None:
     (tmp_path / "out").write_text("a file")
     with pytest.raises(OutputError, match="is a file"), atomic_folder(tmp_path / "out", overwrite=True):
         pass
-
-
-def test_folder_appears_whole(tmp_path: Path) -> None:
-    with atomic_folder(tmp_path / "out") as temporary:
-        (temporary / "deep").mkdir()
-        (temporary / "deep" / "a").write_text("new")
-        assert not (tmp_path / "out").exists()
-    assert (tmp_path / "out" / "deep" / "a").read_text() == "new"
-    assert [p.name for p in tmp_path.iterdir()] == ["out"]
 
 
 def test_folder_overwrites_only_its_own_names(tmp_path: Path) -> None:

@@ -103,13 +103,3 @@ def test_names_and_formats_of_outputs(command_line: CommandLine, tmp_path: Path)
     assert "as a folder for COLMAP" in refused(command_line, tmp_path, *given, "b.txt", status=1)
     select = "select", "ball.ply", "--views", "a.json", "-k", "3", "-o", "transforms_3.json"
     assert "sampling weights" in succeeds(command_line, tmp_path, *select).err
-
-
-def test_distill_writes_its_pool_in_another_format_too(command_line: CommandLine, tmp_path: Path) -> None:
-    write_splats(tmp_path / "ball.ply", checkered_ball(800))
-    given = "distill", "ball.ply", "-r", "4", "--steps", "2", "--size", "32", "--no-page"
-    succeeds(command_line, tmp_path, *given, "-o", "run", "--views-format", "inria")
-    same(
-        read_view_set(tmp_path / "run" / "cameras.json").cameras,
-        read_view_set(tmp_path / "run" / "views.json").cameras,
-    )

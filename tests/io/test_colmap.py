@@ -1,6 +1,5 @@
 """COLMAP's models as views and as points."""
 
-import json
 import struct
 from pathlib import Path
 
@@ -10,7 +9,6 @@ import pytest
 from g2ard.errors import InputError, damaged
 from g2ard.io import kind, read_points, read_views
 from helpers.faults import Fault, check_fault, faulty
-from helpers.realdata import real
 from helpers.view_files import MODELS, colmap, orbit, photo, quaternion
 
 
@@ -164,24 +162,6 @@ def test_points_that_all_lack_a_column(tmp_path: Path, rows: int) -> None:
     points.write_text("".join(f"{i} 1 2 3 9 9\n" for i in range(rows)))
     with faulty(points, ("B", 0)):
         read_points(points)
-
-
-def test_caliterra() -> None:
-    folder = real("caliterra")
-    cameras = read_views(folder)
-    assert len(cameras) == 75
-    assert all(p is not None and p.is_file() for p in cameras.image_paths)
-    points = read_points(folder)
-    assert len(points) == 41_590
-    split = json.loads((folder / "split.json").read_text())
-    for which in ("train", "test"):
-        assert sorted(read_views(folder, split=which).names) == sorted(split[which])
-    # every point in front of some camera lands in its image: axes and intrinsics agree
-    X = np.c_[points.positions, np.ones(len(points))] @ cameras.viewmats[30].T
-    seen = X[:, 2] > 0
-    uv = (X[seen, :3] @ cameras.Ks[30].T) / X[seen, 2:3]
-    inside = (uv[:, 0] > 0) & (uv[:, 0] < 1000) & (uv[:, 1] > 0) & (uv[:, 1] < 751)
-    assert inside.sum() > 1000
 
 
 def rig_model(folder: Path, text: bool) -> Path:

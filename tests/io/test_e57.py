@@ -138,10 +138,3 @@ def test_needs_pye57(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(__import__("sys").modules, "pye57", None)
     with pytest.raises(MissingDependencyError, match="pip install pye57"):
         read_cloud(path)
-
-
-@pytest.mark.parametrize("suffix", [".pcd", ".pts", ".ptx", ".xyz"])
-def test_other_clouds_name_their_converter(tmp_path: Path, suffix: str) -> None:
-    (tmp_path / f"a{suffix}").write_text("1 2 3 255 0 0\n")
-    with pytest.raises(InputError, match=rf"a\{suffix}: .*pdal translate"):
-        read_cloud(tmp_path / f"a{suffix}")

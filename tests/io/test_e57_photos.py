@@ -180,6 +180,6 @@ def test_a_scan_without_photos_and_notes(tmp_path: Path) -> None:
 
 def test_a_scan_and_its_panoramas_distil_from_one_command(tmp_path: Path, command_line: CommandLine) -> None:
     written(tmp_path / "a.e57", *[posed("spherical", k) for k in range(3)])
-    ask = ("distill", "a.e57", "--views", "a.e57", "-n", 9, "--steps", 3, "--photos", "-o", "run")
-    succeeds(command_line, tmp_path, *ask)
+    ask = ("--views", "a.e57", "--photos", "-n", 9, "--steps", 3, "--size", 40, "-o", "run")
+    succeeds(command_line, tmp_path, "distill", "a.e57", *ask)
     assert len(g2ard.load(tmp_path / "run" / "scene.ply")) == 9

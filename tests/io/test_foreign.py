@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 
 from g2ard.errors import InputError
-from g2ard.io import kind, read_scene
+from g2ard.io import kind, read_cloud, read_scene
 
 TILESET = {"asset": {"version": "1.1"}, "geometricError": 9, "root": {"children": []}}
 
@@ -57,3 +57,17 @@ def test_folders_with_a_file_of_another_program(tmp_path: Path, suffix: str, bes
         assert suffix.strip(".").lower() in str(caught.value).lower()
         assert "looked for" not in str(caught.value)
         assert "unknown format" not in str(caught.value)
+
+
+CONVERTERS = {
+    **dict.fromkeys((".pcd", ".pts", ".ptx", ".xyz"), "pdal translate"),
+    **{".lcc": "splat-transform", ".rad": "Spark"},
+}
+
+
+@pytest.mark.parametrize("suffix", CONVERTERS)
+def test_a_format_that_is_not_read_names_what_converts_it(suffix: str, tmp_path: Path) -> None:
+    (tmp_path / f"a{suffix}").write_text("1 2 3 255 0 0\n")
+    for read in (read_scene, read_cloud):
+        with pytest.raises(InputError, match=rf"a\{suffix}: .*{CONVERTERS[suffix]}"):
+            read(tmp_path / f"a{suffix}")

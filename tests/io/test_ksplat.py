@@ -46,10 +46,3 @@ def test_a_section_may_have_room_for_more_rows(rows: int, tmp_path: Path) -> Non
     else:
         with pytest.raises(InputError, match="Gaussian"):
             read_scene(path)
-
-
-@pytest.mark.parametrize(("name", "tool"), [("a.lcc", "splat-transform"), ("a.rad", "Spark")])
-def test_a_format_that_is_not_read_names_what_converts_it(name: str, tool: str, tmp_path: Path) -> None:
-    (tmp_path / name).write_bytes(b"data")
-    with pytest.raises(InputError, match=tool):
-        read_scene(tmp_path / name)

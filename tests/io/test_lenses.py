@@ -110,11 +110,12 @@ def test_a_panorama_becomes_six_faces(tmp_path: Path, longest: int | None) -> No
     check_faces(found.cameras.take(range(6)).resized(longest), orbit(9), 6 * min(longest or 163, 163) ** 2)
 
 
+FISHEYE = {"fl_x": 80.0, "fl_y": 80.0, "cx": 150, "cy": 150, "w": 300, "h": 300}
+
+
 @pytest.mark.parametrize("how", [{"camera_model": "OPENCV_FISHEYE"}, {"is_fisheye": True}])
 def test_a_fisheye_becomes_the_faces_that_it_saw(tmp_path: Path, how: dict) -> None:
-    focal = 80.0
-    lens = {"fl_x": focal, "fl_y": focal, "cx": 150, "cy": 150, "w": 300, "h": 300}
-    path = captured(tmp_path, fisheye(300, focal), **lens, **how)
+    path = captured(tmp_path, fisheye(300, 80.0), **FISHEYE, **how)
     views = read_views(path)
     first = views.take([i for i, name in enumerate(views.names) if name.startswith("000.png")])
     assert [name.rpartition("#")[2] for name in first.names] == ["front", "right", "left", "up", "down"]
@@ -164,15 +165,7 @@ def test_masks_go_through_the_lens(tmp_path: Path, kind: str, place: str) -> Non
         size, lens = (256, 128), {"camera_model": "EQUIRECTANGULAR", "w": 256, "h": 128}
         path = captured(tmp_path, panorama(256), 1, **lens)
     else:
-        lens = {
-            "camera_model": "OPENCV_FISHEYE",
-            "fl_x": 80,
-            "fl_y": 80,
-            "cx": 150,
-            "cy": 150,
-            "w": 300,
-            "h": 300,
-        }
+        lens = {"camera_model": "OPENCV_FISHEYE", **FISHEYE}
         size, path = (300, 300), captured(tmp_path, fisheye(300, 80.0), 1, **lens)
     mask = Image.fromarray(
         np.repeat(255 * (np.arange(size[0]) >= size[0] / 2), size[1]).reshape(size).T.astype(np.uint8)

@@ -22,7 +22,7 @@ from g2ard.stages.simplify import simplify
 from helpers.commands import CommandLine
 from helpers.faults import Fault, faulty
 from helpers.glb_files import glb_parts, write_glb
-from helpers.packed_files import save_spz, truth
+from helpers.packed_files import truth
 from helpers.sog_files import parts, zipped
 from helpers.trainer_files import inria
 from helpers.view_files import colmap, edit, orbit, transforms, views
@@ -155,7 +155,7 @@ def sog_count(path: Path, count: int) -> Path:
 
 def spz_claim(path: Path, version: int, count: int) -> Path:
     """An .spz that says it holds `count` Gaussians, and does: all zeros."""
-    save_spz(path, truth(9, 0), version)
+    write_splats(path, truth(9, 0), spz_version=version)
     if version == 4:
         data = bytearray(path.read_bytes())
         struct.pack_into("<I", data, 8, count)

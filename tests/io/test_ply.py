@@ -221,11 +221,11 @@ def with_header(path: Path, change: Any) -> Path:
     return path
 
 
-REMARKS = ["Prüfstand – Büro", "导出", "\U0001f600 ok", "a\u2028b", "end_header é"]
+REMARKS = ["Prüfstand – Büro", "导出", "\U0001f600 ok", "a\u2028b", "end_header é", "\x85 end_header", "µm²"]
 
 
 @pytest.mark.parametrize("keyword", ["comment", "obj_info"])
-@pytest.mark.parametrize("encoding", ["utf-8", "utf-16-le", "latin-1"])
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-16-le", "latin-1", "gb18030"])
 @pytest.mark.parametrize("options", [{"byte_order": "<"}, {"byte_order": ">"}, {"text": True}])
 def test_remarks_in_any_language(tmp_path: Path, keyword: str, encoding: str, options: dict) -> None:
     truth = scene(count=7)
