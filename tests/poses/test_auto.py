@@ -116,11 +116,10 @@ def test_a_coarse_object_is_still_seen_from_around() -> None:
     assert pool.kind == "orbit"
 
 
-@pytest.mark.parametrize("every", [40, 160])
-def test_a_thinned_object_is_still_seen_from_around(every) -> None:
+def test_a_thinned_object_is_still_seen_from_around() -> None:
     scene = read_splats(real("playbot/0_0"))
-    thin = scene.take(np.arange(0, len(scene), every))
-    thin = replace(thin, scales=thin.scales * np.float32(np.sqrt(every)))  # each is larger in its stead
+    thin = scene.take(np.arange(0, len(scene), 160))
+    thin = replace(thin, scales=thin.scales * np.float32(np.sqrt(160)))  # each is larger in its stead
     pool = plan_pool(thin, 24)
     assert len(pool.cameras) == 24
     assert pool.kind.startswith("orbit")

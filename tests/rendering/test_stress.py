@@ -5,9 +5,7 @@ from collections.abc import Iterator
 import pytest
 import torch
 
-from helpers.threads import on_threads
 from stress.gradients import Tally, check_problem
-from stress.results import lines, random_scene
 from stress.run import Outcome, stress
 from stress.scenes import NAMES, Problem
 
@@ -21,10 +19,10 @@ def _one_torch_thread() -> Iterator[None]:
 
 
 def test_a_slice_of_the_stress_test() -> None:
-    outcome = stress(400, first_seed=50_000, large=2)
+    outcome = stress(150, first_seed=50_000, large=1)
     assert not outcome.failures, "\n".join(outcome.failures)
-    assert outcome.checked >= 400
-    assert sum(tally.lively for tally in outcome.tallies.values()) > 200
+    assert outcome.checked >= 150
+    assert sum(tally.lively for tally in outcome.tallies.values()) > 75
     assert outcome.table().count("\n") == len(NAMES) + 3
 
 
@@ -48,12 +46,3 @@ def test_an_image_off_by_a_little_fails() -> None:
     outcome = Outcome()
     outcome.close([np.full(1000, 3e-6)])
     assert outcome.failures == ["image: 99.9th percentile 3.00e-06"]
-
-
-def test_the_record_of_results_is_the_same_at_any_number_of_threads() -> None:
-    found = on_threads(lambda: list(lines("discs", random_scene(4, 1_500))), (1, 3))
-    assert found[0] == found[1]
-    stages = {line.split("/")[1] for line in found[0]}
-    assert stages == {"simplify", "select", "recover", "render", "visibility"}
-    different = list(lines("discs", random_scene(5, 1_500)))
-    assert len(set(found[0]) & set(different)) < len(different) / 4  # what is the same: offsets, refusals

@@ -37,7 +37,7 @@ def run(command_line: CommandLine, folder: Path, *arguments: object) -> tuple[di
 
 
 def test_distill_learns_from_photos_and_renders(folder: Path, command_line: CommandLine) -> None:
-    ask = ("distill", "ball.ply", "-r", 3, "--views", "v.json", "-o", "run", "--steps", 4)
+    ask = ("distill", "ball.ply", "-r", 3, "--views", "v.json", "-o", "run", "--steps", 4, "--size", 48)
     report, told = run(command_line, folder, *ask)
     assert "8 training views against 4 photos and 4 teacher renders" in told
     assert "skipped" not in told
@@ -52,8 +52,7 @@ def test_distill_learns_from_photos_and_renders(folder: Path, command_line: Comm
 
 
 def test_a_distillation_in_python_has_both_targets(folder: Path) -> None:
-    told: list[str] = []
-    done = g2ard.distill(folder / "ball.ply", ratio=3, views=folder / "v.json", steps=4, say=told.append)
+    done = g2ard.distill(folder / "ball.ply", ratio=3, views=folder / "v.json", steps=4, size=48)
     kinds = [done.held_out.against(view) for view in range(4)]  # type: ignore[attr-defined]
     assert kinds == ["photo", "teacher"] * 2
     assert done.held_out[0][..., 1:].max() == 0

@@ -1,6 +1,5 @@
 """Axes by name: the same world in every system, harmonics included, and in the files that name them."""
 
-import gzip
 import struct
 from pathlib import Path
 
@@ -18,12 +17,6 @@ from helpers.commands import CommandLine, refused, succeeds
 from helpers.peers import adobe_spz, splat_transform
 from reference.raster import sh_basis
 from reference.rotations import covariances
-
-
-def decoded_spz(path: Path) -> bytes:
-    """Bytes of an .spz of version 2 or 3."""
-    return gzip.decompress(path.read_bytes())
-
 
 WORLD = {"R": [1, 0, 0], "L": [-1, 0, 0], "U": [0, 1, 0], "D": [0, -1, 0], "B": [0, 0, 1], "F": [0, 0, -1]}
 """Directions of the letters, written out, in the world right, up, back."""
@@ -139,27 +132,6 @@ def test_convert_stores_other_axes(command_line: CommandLine, tmp_path: Path) ->
     assert (tmp_path / "b.spz").read_bytes()[:8] == b"NGSP\4\0\0\0"
     given = "convert", "a.ply", "c.spz", "--spz-version", "3", "--to-axes", "RFU"
     assert "version 3 has RUB axes, or RDF" in refused(command_line, tmp_path, *given, status=1)
-
-
-def test_spz_with_the_axes_of_a_ply(command_line: CommandLine, tmp_path: Path) -> None:
-    write_splats(tmp_path / "a.ply", scene())
-    printed = succeeds(command_line, tmp_path, "convert", "a.ply", "usual.spz")
-    assert "--to-axes RDF" in printed.err
-    printed = succeeds(command_line, tmp_path, "convert", "a.ply", "theirs.spz", "--to-axes", "RDF")
-    assert "half a turn" in printed.err
-    assert "warning" not in printed.err
-    usual, theirs = (decoded_spz(tmp_path / name) for name in ("usual.spz", "theirs.spz"))
-    assert theirs[4] == usual[4] == 3
-    assert not theirs[14] & 2
-    succeeds(command_line, tmp_path, "convert", "theirs.spz", "back.ply", "--from-axes", "RDF")
-    succeeds(command_line, tmp_path, "convert", "usual.spz", "same.ply")
-    read = [read_splats(tmp_path / f"{name}.ply") for name in ("back", "same")]
-    back, same = (splats.take(np.lexsort(splats.means.T)) for splats in read)
-    np.testing.assert_array_equal(back.means, same.means)
-    for mine, other in zip(world(back, "RDF"), world(same, "RDF"), strict=True):
-        np.testing.assert_allclose(mine, other, atol=0.05)
-    turned = read_splats(tmp_path / "theirs.spz")  # as readers of the definition see it
-    np.testing.assert_array_equal(turned.means, read[0].means * (1, -1, -1))
     write_splats(tmp_path / "named.spz", scene(), spz_version=4, axes="RFU")
     given = "convert", "named.spz", "c.ply", "--from-axes", "RDF"
     assert "names its axes" in refused(command_line, tmp_path, *given, status=1)

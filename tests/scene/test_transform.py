@@ -1,16 +1,14 @@
 """Moving and cropping scenes."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from g2ard.errors import InputError
-from g2ard.io import write_splats
 from g2ard.rendering.renderer import render
 from g2ard.scene.transform import in_box, in_sphere, rotate_harmonics, similarity, transform
-from helpers.scenes import around, checkered_ball
+from helpers.scenes import around
 from helpers.similarities import directional, matrix, turn
 
 
@@ -74,12 +72,3 @@ def test_crops_are_in_world_coordinates() -> None:
     np.testing.assert_array_equal(in_sphere(splats, [10, 0, 1], 0.5), near)
     with pytest.raises(InputError, match="holds nothing"):
         in_box(splats, [1, 0, 0], [0, 1, 1])
-
-
-@pytest.mark.parametrize("degree", range(4))
-def test_nbytes_are_those_of_a_ply(degree: int, tmp_path: Path) -> None:
-    scene = checkered_ball(7).with_sh_degree(degree)
-    write_splats(tmp_path / "a.ply", scene)
-    header, _, rows = (tmp_path / "a.ply").read_bytes().partition(b"end_header\n")
-    assert header
-    assert scene.nbytes == len(rows)
