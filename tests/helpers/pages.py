@@ -1,8 +1,12 @@
 """Viewer pages opened in a browser."""
 
 import base64
+import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
 import numpy as np
@@ -14,12 +18,23 @@ from g2ard.scene.splats import Splats
 from helpers.browser import Browser
 
 WIDTH, HEIGHT = 480, 360
-
-
 GREY = (0.2, 0.3, 0.4)
-
-
 FRONT = Camera.facing([1.8, -1.6, 0.9], [0, 0, 0], width=WIDTH, height=HEIGHT, fov=55, name="front")
+
+
+class _Quiet(SimpleHTTPRequestHandler):
+    def log_message(self, *_: object) -> None:
+        pass
+
+
+@contextmanager
+def served(folder: Path) -> Iterator[str]:
+    """Serve a folder, whose pages may not read the files beside them otherwise; give its address."""
+    server = ThreadingHTTPServer(("127.0.0.1", 0), partial(_Quiet, directory=str(folder)))
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    yield f"http://127.0.0.1:{server.server_port}"
+    server.shutdown()
+    server.server_close()
 
 
 def show(browser: Browser, page: Path | str) -> None:

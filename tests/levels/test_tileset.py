@@ -147,8 +147,6 @@ def test_the_command_writes_3d_tiles(tmp_path: Path, command_line: CommandLine) 
     assert tileset["extras"]["counts"] == [800, 200]
     origin = np.array(tileset["root"]["transform"][12:15])
     np.testing.assert_allclose(origin, geocentric(24.75, 59.43, 31.5), atol=1e-6)
-    succeeds(command_line, tmp_path, *words, "out", *there, "--resume")
-    assert "up is 0,-1,0" in succeeds(command_line, tmp_path, *words, "down", "--up=-0,-1,-0").err
     succeeds(command_line, tmp_path, *words, "tiled", *there, "--tile-rows", "300")
     tiled = json.loads((tmp_path / "tiled" / "tileset.json").read_text())
     assert tiled["root"]["transform"] == tileset["root"]["transform"]

@@ -1,10 +1,7 @@
 """Files shown by Spark, a viewer of other people's, which tells the axes that it takes each format in."""
 
 import json
-import threading
 from collections.abc import Iterator
-from functools import partial
-from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +12,7 @@ from g2ard.rendering.metrics import psnr
 from g2ard.rendering.renderer import Renderer
 from g2ard.scene.cameras import Camera
 from helpers.browser import Browser
+from helpers.pages import served
 from helpers.peers import package
 from helpers.scenes import checkered_ball
 
@@ -50,11 +48,6 @@ window.show = async (url, turned, matrix, fov) => {
 </script>"""
 
 
-class _Quiet(SimpleHTTPRequestHandler):
-    def log_message(self, *_: object) -> None:
-        pass
-
-
 @pytest.fixture(scope="module")
 def shown(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, Browser]]:
     """A folder, and a browser with Spark's page in it."""
@@ -62,16 +55,12 @@ def shown(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, Brow
     (folder / "three").symlink_to(package("three"))
     (folder / "spark").symlink_to(package("@sparkjsdev", "spark", "dist"))
     (folder / "index.html").write_text(PAGE)
-    server = ThreadingHTTPServer(("127.0.0.1", 0), partial(_Quiet, directory=str(folder)))
-    threading.Thread(target=server.serve_forever, daemon=True).start()
-    with Browser(WIDTH, HEIGHT) as browser:
-        browser.open(f"http://127.0.0.1:{server.server_port}/")
+    with served(folder) as address, Browser(WIDTH, HEIGHT) as browser:
+        browser.open(f"{address}/")
         browser.run(
             "new Promise(done => { const look = () => window.show ? done() : setTimeout(look, 50); look(); })"
         )
         yield folder, browser
-    server.shutdown()
-    server.server_close()
 
 
 @pytest.mark.parametrize(
