@@ -26,6 +26,13 @@ SCENES = {"statue": naive.statue, "room": naive.room, "town": naive.town}
 KINDS = {"statue": {"orbit"}, "room": {"inside"}, "town": {"walk", "aerial"}}
 
 
+@pytest.fixture(autouse=True)
+def coarse_grids(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> None:
+    """Take coarser occupancy grids than in real scenes: of small ones they are most of the time."""
+    if request.function is not test_real_scenes:
+        monkeypatch.setattr("g2ard.poses.matter._CELLS", (200_000, 6_000_000))
+
+
 @pytest.fixture(scope="module")
 def scenes() -> dict[str, Splats]:
     return {name: make() for name, make in SCENES.items()}
