@@ -4,18 +4,19 @@ import ast
 import importlib.util
 import json
 import re
-import shlex
-from functools import cache, partial
+import runpy
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 import g2ard
-from g2ard.errors import InputError
-from g2ard.stages.recover.anchors import PAPER_REGULARIZERS, REGULARIZERS
+from benchmarks import synth
+from benchmarks.synth import city
+from helpers.commands import CommandLine, succeeds
 from helpers.project import ROOT
-from helpers.scenes import around, checkered_ball
+from helpers.scenes import checkered_ball
 
 PAGES = sorted(
     page for pattern in ("*.md", "docs/**/*.md", "benchmarks/record/*.md") for page in ROOT.glob(pattern)
@@ -50,74 +51,33 @@ def test_relative_links_lead_somewhere(name: str) -> None:
             assert fragment in anchors(there), f"{name}: {target}"
 
 
-@cache
-def command_options() -> dict[str, set[str]]:
-    """Return the options of each command."""
-    from typer.main import get_command
-
-    from g2ard.cli.app import register_commands
-    from g2ard.cli.frame import app
-
-    register_commands()
-    found: dict[str, set[str]] = {}
-
-    def walk(command: Any, path: str) -> None:
-        options = {o for p in command.params for o in (*p.opts, *p.secondary_opts) if o.startswith("-")}
-        found[path] = options | {"-h", "--help", "--help-all"}
-        for name, inner in getattr(command, "commands", {}).items():
-            walk(inner, f"{path} {name}".strip())
-
-    walk(get_command(app), "")
-    return found
-
-
-def shell_lines(text: str) -> list[str]:
-    """Return the lines of a page's shell blocks, and calls quoted in its text."""
-    blocks = re.findall(r"(?ms)^```sh\n(.*?)^```", text)
-    quoted = re.findall(r"`(g2ard [^`\n]+)`", re.sub(r"(?ms)^```.*?^```", "", text))
-    return [line for block in blocks for line in block.splitlines()] + quoted
-
-
-def calls_in(text: str) -> list[list[str]]:
-    """Return the arguments of every `g2ard …` in a page."""
-    parts = [part for line in shell_lines(text) for part in re.split(r"&&|\|", line)]
-    calls = [part.replace("…", "") for part in parts if re.match(r"\s*g2ard\s", part)]
-    return [shlex.split(call, comments=True)[1:] for call in calls]
-
-
-def unknown_in(arguments: list[str]) -> str:
-    """Return the first unknown command or option; "" if all are known."""
-    commands = command_options()
-    path = ""
-    while arguments and f"{path} {arguments[0]}".strip() in commands:
-        path = f"{path} {arguments[0]}".strip()
-        arguments = arguments[1:]
-    if not path and arguments and not arguments[0].startswith("-") and arguments[0] != "COMMAND":
-        return arguments[0]
-    known = commands[path] if path else set().union(*commands.values())
-    for argument in arguments:
-        option = argument.split("=")[0]
-        if re.match(r"--?[a-zA-Z]", option) and option not in known:
-            return f"{path} {option}"
-    return ""
-
-
 CURRENT = [n for n in NAMES if not n.startswith(("benchmarks/record", "docs/decisions/", "CHANGELOG"))]
 
 
+@cache
+def all_help(command: str, command_line: CommandLine) -> str:
+    return succeeds(command_line, ROOT, *command.split(), "--help-all").out
+
+
+def unknown_in(text: str, command_line: CommandLine) -> list[str]:
+    """Return the options in calls quoted in a page's text that their command does not have."""
+    quoted = re.findall(r"`g2ard ([a-z]+ )([^`\n]*)`", re.sub(r"(?ms)^```.*?^```", "", text))
+    return [
+        f"{command}{option}"
+        for command, rest in quoted
+        for option in re.findall(r"(?:^| )(--?[a-zA-Z][\w-]*)", rest)
+        if not re.search(rf"(?m)(^|[ ,/]){option}\b", all_help(command, command_line))
+    ]
+
+
 @pytest.mark.parametrize("name", CURRENT)
-def test_commands_and_options_named_exist(name: str) -> None:
-    for arguments in calls_in((ROOT / name).read_text(encoding="utf-8")):
-        assert not unknown_in(list(arguments)), f"{name}: g2ard {shlex.join(arguments)}"
+def test_options_of_commands_in_sentences_exist(name: str, command_line: CommandLine) -> None:
+    """tests/test_documented_commands.py runs the commands that stand alone."""
+    assert unknown_in((ROOT / name).read_text(encoding="utf-8"), command_line) == []
 
 
-def test_a_wrong_option_would_be_found() -> None:
-    (good,) = calls_in("```sh\ng2ard simplify a.ply -r 10 -o b.ply   # --nothing\n```")
-    (bad,) = calls_in("```sh\ng2ard simplify a.ply --ratioo 10\n```")
-    assert unknown_in(good) == ""
-    assert unknown_in(bad) == "simplify --ratioo"
-    assert unknown_in(["simplfy", "a.ply"]) == "simplfy"
-    assert len(calls_in((ROOT / "README.md").read_text(encoding="utf-8"))) > 5
+def test_a_wrong_option_would_be_found(command_line: CommandLine) -> None:
+    assert unknown_in("Type `g2ard simplify a.ply -r 10 --ratioo 9`.", command_line) == ["simplify --ratioo"]
 
 
 def test_make_targets_named_exist() -> None:
@@ -140,6 +100,14 @@ def test_python_examples_parse_and_their_names_exist(name: str) -> None:
                 assert node.attr in g2ard.__all__, f"{name}: g2ard.{node.attr}"
 
 
+@pytest.fixture
+def short(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Run in a folder of its own, where distillations are small."""
+    distill, quick = g2ard.distill, {"steps": 5, "size": 48, "settings": {"focus": "far"}}
+    monkeypatch.setattr(g2ard, "distill", lambda *given, **named: distill(*given, **{**named, **quick}))
+    monkeypatch.chdir(tmp_path)
+
+
 def run_guide(name: str, *, alone: bool = False) -> dict[str, Any]:
     """Run the Python of a page, which finds a scene.ply, and return the names of its last block.
 
@@ -154,42 +122,36 @@ def run_guide(name: str, *, alone: bool = False) -> dict[str, Any]:
     return names
 
 
-def test_the_readmes_python_runs_block_by_block(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(g2ard, "distill", partial(g2ard.distill, steps=20, size=48))
+def test_the_readmes_python_runs_block_by_block(short: None) -> None:
     names = run_guide("README.md", alone=True)
     assert names["scene"][0].grad.abs().max() > 0
     assert len(names["better"].splats) == len(BALL) // 10
 
 
-def test_the_python_guide_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_the_python_guide_runs(short: None) -> None:
     names = run_guide("docs/how-to/from-python.md")
     assert len(names["better"].splats) == len(names["small"].splats) == len(BALL) // 10
     assert g2ard.load("better.sog").means.shape == (len(BALL) // 10, 3)
 
 
-def test_the_guide_to_own_views_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_the_guide_to_own_views_runs(short: None) -> None:
     names = run_guide("docs/how-to/own-views.md")
     assert (names["image"] > 0.05).any(axis=2).mean() > 0.1  # it shows the scene
     assert abs(names["view"].viewmat[1, :3] @ names["up"]) > 0.99  # upright
     assert len(names["result"].splats) == len(BALL) // 10
 
 
-def test_the_rasteriser_guide_trains_a_scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_the_rasteriser_guide_trains_a_scene(short: None) -> None:
     names = run_guide("docs/how-to/rasteriser.md")
     before, after = (g2ard.evaluate(names[scene], names["targets"]).psnr for scene in ("small", "trained"))
     assert after > before
 
 
-def test_the_notebook_runs_and_holds_its_output(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_notebook_runs_and_holds_its_output(short: None, monkeypatch: pytest.MonkeyPatch) -> None:
     cells = json.loads((ROOT / "examples/quickstart.ipynb").read_text(encoding="utf-8"))["cells"]
     code = [cell for cell in cells if cell["cell_type"] == "code"]
     assert [cell["execution_count"] for cell in code] == [*range(1, len(code) + 1)]
     assert not [cell for cell in code if any(out["output_type"] == "error" for out in cell["outputs"])]
-    monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("G2ARD_SCENE", raising=False)
     monkeypatch.delenv("G2ARD_DATA", raising=False)
     names: dict[str, Any] = {}
@@ -201,6 +163,12 @@ def test_the_notebook_runs_and_holds_its_output(tmp_path: Path, monkeypatch: pyt
         exec(compile(source, "quickstart.ipynb", "exec"), names)
     assert len(names["result"].splats) == len(BALL) // 10
     assert g2ard.load("small.sog").means.shape == (len(BALL) // 10, 3)
+
+
+def test_the_example_runs(short: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(synth, "city", lambda **given: city(**{**given, "points": 10_000}))
+    before, after = runpy.run_path(str(ROOT / "examples" / "02_from_python.py"))["main"]()
+    assert after > before + 1
 
 
 def test_the_api_page_has_every_public_name_once() -> None:
@@ -262,12 +230,3 @@ def test_scripts_need_no_deep_imports() -> None:
         if re.match(r"\s*(from g2ard\.(?!synth import)|import g2ard\.)", line)
     ]
     assert deep == []
-    assert g2ard.Regularizers.of("lift") == REGULARIZERS["lift"]
-    assert g2ard.Regularizers.of("noisy", paper=True) == PAPER_REGULARIZERS["noisy"]
-    with pytest.raises(InputError, match="one of trained, lift, noisy, got 'lifted'"):
-        g2ard.Regularizers.of("lifted")
-    targets = g2ard.TeacherRenders(BALL, around(4, (32, 24)))
-    found = g2ard.distill_against(
-        BALL, 50, targets, g2ard.DistillConfig(recover=g2ard.RecoverConfig(steps=2))
-    )
-    assert len(found.splats) == 50

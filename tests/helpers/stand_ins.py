@@ -30,12 +30,12 @@ FOCAL = 1200
 SHRUNK = """
 [distill]
 size = 48
-steps = 12
+steps = 5
 [lod]
 size = 48
-steps = 12
+steps = 5
 [adapt]
-steps = 12
+steps = 5
 [recover]
 size = 48
 [compare]
@@ -68,18 +68,14 @@ def shrunk(words: Sequence[str]) -> list[str]:
     return found
 
 
-def _scene(path: Path) -> None:
-    g2ard.save(path, SCENE)
-
-
-def _scene_with_views(path: Path) -> None:
-    """A scene that was trained in a few small views, for devices that take seconds for a picture."""
-    _scene(path)
+def _trained(path: Path, scene: g2ard.Splats = SCENE) -> None:
+    """A scene beside the few small views in which it was trained: to plan views takes seconds."""
+    g2ard.save(path, scene)
     g2ard.save_views(path.with_name("cameras.json"), around(8, (48, 36)))
 
 
 def _small(path: Path) -> None:
-    g2ard.save(path, blotched())
+    _trained(path, blotched())
 
 
 def _simplified(path: Path) -> None:
@@ -167,7 +163,7 @@ def _views(path: Path) -> None:
 
 
 def _sky(path: Path) -> None:
-    g2ard.save(path, under_a_sky(SCENE))
+    _trained(path, under_a_sky(SCENE))
 
 
 def _matrix_city(folder: Path) -> None:
@@ -189,8 +185,8 @@ def _lpips(folder: Path) -> None:
 
 
 STAND_INS: dict[str, Callable[[Path], None]] = {
-    **dict.fromkeys(("scene.ply", "scan.ply", "dense.ply", "city.ply", "room.ply", "tree.spz"), _scene),
-    **dict.fromkeys(("guitar.compressed.ply", "park24.ply"), _scene),
+    **dict.fromkeys(("scene.ply", "scan.ply", "dense.ply", "city.ply", "room.ply", "tree.spz"), _trained),
+    **dict.fromkeys(("guitar.compressed.ply", "park24.ply"), _trained),
     "cloud.ply": _cloud,
     **dict.fromkeys(("city.laz", "map.laz", "east.laz", "west.laz"), _map_cloud),
     **dict.fromkeys(("photos", "fox"), _photos),
@@ -204,7 +200,7 @@ STAND_INS: dict[str, Callable[[Path], None]] = {
     "rough.json": _rough,
     "park.ply": _sky,
     "PATH.json": _views,
-    "teacher.ply": _scene,
+    "teacher.ply": _trained,
     "theirs.spz": lambda path: g2ard.save(path, SCENE, axes="RDF"),
     "small_city": _matrix_city,
     "KingsCollege": _kings_college,
@@ -228,7 +224,6 @@ OF_PAGE: dict[str, dict[str, Callable[[Path], None]]] = {
     "docs/how-to/web-delivery.md": {"project": _map_colmap},
     "docs/how-to/lidar-map.md": {"project": _map_colmap},
     "docs/how-to/clean-floaters.md": {"scene.ply": _sky},
-    "docs/how-to/gpus.md": {"scene.ply": _scene_with_views},
     "docs/how-to/own-views.md": {"views.json": _views},
     "docs/how-to/rasteriser.md": {"small.ply": _simplified},
 }
