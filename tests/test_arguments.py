@@ -1,7 +1,10 @@
-"""Arguments of public functions: invalid ones are named, and images are taken as people have them."""
+"""Arguments of public functions and configs: wrong ones are named; images are taken as people have them."""
 
+import inspect
+import re
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, get_origin
 
 import numpy as np
 import pytest
@@ -9,6 +12,7 @@ import torch
 from PIL import Image
 
 import g2ard
+from g2ard.config import checks
 from helpers.scenes import around, checkered_ball
 
 BALL, VIEWS = checkered_ball(300), around(8, (48, 36))
@@ -28,9 +32,10 @@ class Own:
 
 
 COLOUR = "expected 3 numbers from 0 to 1"
-# What the type or limits of an argument exclude is in test_wrong_arguments.py, for all of them.
 WRONG: list[tuple[str, dict[str, Any], str, str]] = [
     ("distill", {"format": "foo"}, "format", "expected one of ply, sog"),
+    ("distill", {"preset": "nope"}, "preset", "nope"),
+    ("recover", {"targets": None, "views": VIEWS, "teacher": BALL, "preset": "nope"}, "preset", "nope"),
     ("distill", {"background": (300, 0, 0)}, "background", COLOUR),
     (
         "distill",
@@ -57,15 +62,82 @@ WRONG: list[tuple[str, dict[str, Any], str, str]] = [
     ("Photos", {"images": 255 * IMAGES}, "images", "divide by 255, or pass uint8"),
     ("Photos", {"images": IMAGES[:, :30]}, "images", "expected shape (36, 48, 3), got (30, 48, 3)"),
 ]
+CONFIGS = [name for name in g2ard.__all__ if name.endswith(("Config", "Options", "Settings"))]
 VALID: dict[str, dict[str, Any]] = {
-    "distill": {"scene": BALL, "ratio": 10, "views": VIEWS, "steps": 2},
-    "simplify": {"scene": BALL, "ratio": 10},
-    "recover": {"student": SMALL, "targets": TARGETS},
     "adapt": {"compact": SMALL, "targets": TARGETS},
+    "clean": {"scene": BALL, "only": ()},
+    "convert": {"scenes": BALL},
+    "distill": {"scene": BALL, "ratio": 4, "views": VIEWS, "steps": 1},
+    "distill_against": {"prior": BALL, "budget": 9, "targets": TARGETS},
     "evaluate": {"splats": SMALL, "targets": TARGETS},
+    "ingest": {"source": "ball.ply", "folder": "tiles"},
+    "lift": {"points": BALL.means, "colors": np.full((300, 3), 0.5)},
+    "load": {"path": "ball.ply"},
+    "load_points": {"path": "ball.ply"},
+    "load_views": {"path": "views.json"},
+    "lod": {"scene": BALL, "ratios": (4,)},
+    "look_at": {"position": (0, -3, 0), "target": (0, 0, 0)},
+    "make_pool": {"splats": BALL, "count": 2},
+    "preset": {},
+    "orbit": {"scene": BALL, "count": 2},
+    "recover": {"student": SMALL, "targets": TARGETS},
+    "register": {"scene": BALL, "photos": VIEWS},
     "render": {"splats": BALL, "camera": VIEWS[0]},
-    "Photos": {"cameras": VIEWS},
+    "save": {"path": "out.ply", "splats": BALL},
+    "save_levels": {"path": "levels", "levels": [BALL, SMALL]},
+    "save_tileset": {"path": "tileset", "levels": [BALL, SMALL]},
+    "save_views": {"path": "out.json", "cameras": VIEWS},
+    "select": {"splats": BALL, "cameras": VIEWS, "k": 2},
+    "show_progress": {"stage": "read", "done": 1, "total": 2},
+    "simplify": {"scene": BALL, "ratio": 4},
+    "up_of": {"scene": BALL},
+    "Camera": {"viewmat": np.eye(4), "K": np.eye(3), "width": 8, "height": 6},
+    "Georeference": {"longitude": 25, "latitude": 59, "height": 30},
+    "Photos": {"cameras": VIEWS, "images": IMAGES},
+    "Regularizers": {"anchor": 1.0, "shape": 1.0, "effective_rank": True},
+    "Renderer": {"splats": BALL},
+    "TeacherRenders": {"teacher": BALL, "cameras": VIEWS},
+    **{name: {} for name in CONFIGS},
 }
+BUDGETS = ("count", "fit", "min_psnr", "min_ssim")
+SIGNED = {("Georeference", name) for name in ("longitude", "latitude", "height", "heading")} | {
+    ("Camera", name) for name in ("width", "height")
+}
+"""Numbers that may be negative; `Cameras` checks sizes."""
+VECTORS = ("up", "position", "target", "background")
+NAN = float("nan")
+
+
+def _bare(kind: str) -> str:
+    """Return the name of a type without its limits."""
+    kind = re.sub(r"Annotated\[(\w+).*", r"\1", kind)
+    limited = getattr(checks, kind, None)
+    return limited.__origin__.__name__ if get_origin(limited) is Annotated else kind
+
+
+def _wrong(name: str, parameter: str, annotation: str) -> Iterator[Any]:
+    """Yield values that an argument of this type must not have."""
+    kinds = [_bare(kind.strip()) for kind in annotation.split("|")]
+    yield object()
+    if {"int", "float"} & {*kinds}:
+        yield from (NAN, True)
+        yield from [] if "str" in kinds else ["3"]
+        yield from [] if "float" in kinds else [2.5]
+        yield from [] if (name, parameter) in SIGNED else [-1]
+    elif annotation.startswith(("Splats", "Cameras", "Targets", "Camera")):
+        yield from ([BALL, BALL], [1, 2], 3.5)
+    elif annotation.startswith(("ArrayLike", "NDArray", "Sequence[float]", "Colour")):
+        yield from ("x", -1)
+        yield from [(NAN, 0, 0), (1, 2)] if parameter in VECTORS else []
+    elif not annotation.startswith("str"):
+        yield -1.5
+
+
+def _cases() -> Iterator[tuple[str, str]]:
+    for name in VALID:
+        for parameter in inspect.signature(getattr(g2ard, name)).parameters.values():
+            if parameter.name not in ("progress", "say", "watch") and parameter.kind != parameter.VAR_KEYWORD:
+                yield name, parameter.name
 
 
 @pytest.mark.parametrize(("name", "wrong", "parameter", "words"), WRONG)
@@ -146,3 +218,31 @@ def test_files_and_alpha_as_images(tmp_path: Path) -> None:
         assert photos.source == g2ard.Photos(VIEWS, paths).source != g2ard.Photos(VIEWS, BYTES).source
     clear = np.concatenate([BYTES, np.zeros((*BYTES.shape[:3], 1), np.uint8)], axis=3)
     assert g2ard.Photos(VIEWS, clear, background=(1, 0.5, 0))[0][0, 0].tolist() == [1, 0.5, 0]
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("files")
+    g2ard.save(folder / "ball.ply", BALL)
+    g2ard.save_views(folder / "views.json", VIEWS)
+    return folder
+
+
+@pytest.mark.parametrize(("name", "parameter"), list(_cases()))
+def test_wrong_values_are_refused(
+    name: str, parameter: str, files: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(files)
+    function = getattr(g2ard, name)
+    annotation = str(inspect.signature(function).parameters[parameter].annotation)
+    others = {**VALID[name], **({"ratio": None} if parameter in BUDGETS and "ratio" in VALID[name] else {})}
+    for value in _wrong(name, parameter, annotation):
+        with pytest.raises(g2ard.G2ardError) as caught:
+            function(**{**others, parameter: value})
+        assert str(caught.value.parameter).rpartition(".")[2] == parameter, (value, caught.value)
+        assert "\n" not in str(caught.value)
+
+
+def test_every_public_function_has_a_row() -> None:
+    functions = {name for name in g2ard.__all__ if inspect.isfunction(getattr(g2ard, name))}
+    assert functions - {"rasterize"} <= {*VALID}  # rasterize takes tensors, inside a loop

@@ -22,19 +22,19 @@ BALL = checkered_ball(400)
 VIEWS = around(4, (40, 30))
 
 
-@pytest.mark.parametrize("length", [1e-24, 1e-12, 3.0, 1e20, 1e37])
+@pytest.mark.parametrize("length", [1e-24, 1e37])
 @pytest.mark.parametrize("engine", ["fused", "torch"])
 def test_quaternions_of_any_length_recover_like_unit_ones(engine: Any, length: float) -> None:
-    student = g2ard.simplify(BALL, ratio=4).splats
+    student = g2ard.simplify(BALL, ratio=4, blind=True).splats
     scaled = replace(student, quats=(student.quats * np.float32(length)).astype(np.float32))
     targets = TeacherRenders(BALL, VIEWS)
-    config = g2ard.RecoverConfig(steps=15, engine=engine)
+    config = g2ard.RecoverConfig(steps=8, engine=engine)
     unit, odd = (g2ard.recover(scene, targets, config) for scene in (student, scaled))
     assert unit.report.psnr.after > unit.report.psnr.before
     assert odd.report.psnr.after == pytest.approx(unit.report.psnr.after, abs=0.2)
 
 
-@pytest.mark.parametrize("length", [1e-24, 1e20, 1e37])
+@pytest.mark.parametrize("length", [1e-24, 1e37])
 def test_quaternions_of_any_length_render_simplify_and_select_like_unit_ones(length: float) -> None:
     scaled = replace(BALL, quats=(BALL.quats * np.float32(length)).astype(np.float32))
     np.testing.assert_allclose(render(scaled, VIEWS[0]).image, render(BALL, VIEWS[0]).image, atol=1e-4)
@@ -113,7 +113,7 @@ def test_arrays_of_any_number_type_work(name: str, kind: str) -> None:
         values = values.astype(kind)
     scene = replace(BALL, **{name: values})
     assert getattr(scene, name).dtype == np.float32 or name == "means"
-    assert len(g2ard.simplify(scene, ratio=4).splats) == 100
+    assert len(g2ard.simplify(scene, ratio=4, blind=True).splats) == 100
     assert len(g2ard.select(scene, VIEWS, 2).order) == 2
 
 
@@ -123,17 +123,6 @@ def test_what_is_no_array_of_numbers_is_refused_by_name(name: str, values: Any) 
     with pytest.raises(InputError) as caught:
         replace(BALL, **{name: values})
     assert caught.value.parameter == name
-
-
-@pytest.mark.parametrize("name", ["recover", "distill", "preset"])
-def test_unknown_presets_are_refused(name: str) -> None:
-    calls: dict[str, Any] = {
-        "recover": lambda: g2ard.recover(BALL, views=VIEWS, teacher=BALL, preset="nope"),
-        "distill": lambda: g2ard.distill(BALL, count=50, preset="nope"),
-        "preset": lambda: g2ard.preset("nope"),
-    }
-    with pytest.raises(InputError, match="nope"):
-        calls[name]()
 
 
 @pytest.mark.parametrize("array", ["means", "quats", "scales", "sh0"])
@@ -153,7 +142,7 @@ def test_rows_that_are_not_finite_are_counted_and_named(array: str, tmp_path: Pa
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="names have another limit")
-@pytest.mark.parametrize("length", [200, 240, 255])
+@pytest.mark.parametrize("length", [240, 255])
 @pytest.mark.parametrize("letter", ["a", "ü"])
 def test_long_names_can_be_written(tmp_path: Path, length: int, letter: str) -> None:
     for suffix in (".ply", ".sog", ".compressed.ply"):

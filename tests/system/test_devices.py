@@ -14,7 +14,6 @@ import pytest
 
 from g2ard import _core
 from g2ard.cli.frame import Run
-from g2ard.errors import InputError
 from g2ard.io import read_splats, write_splats, write_views
 from g2ard.poses import make_pool
 from g2ard.rendering.metrics import psnr
@@ -126,7 +125,7 @@ def test_a_real_scene_is_nearly_the_same(gpu: None) -> None:
 
 def test_looks_of_the_default_method_run_on_the_gpu(gpu: None) -> None:
     """Σ αT² within 10⁻⁴ of its sum; the budget exactly, and renders as good."""
-    ball, views = checkered_ball(3000), around(20, (160, 120))
+    ball, views = checkered_ball(1500), around(20, (80, 60))
     there = visibility_source(views)(ball)
     assert served() == 2  # two rounds of views
     again = visibility_source(views)(ball)
@@ -137,25 +136,6 @@ def test_looks_of_the_default_method_run_on_the_gpu(gpu: None) -> None:
     np.testing.assert_array_equal(there.pixel_size, here.pixel_size)
     assert np.abs(there.weight - here.weight).sum() <= 1e-4 * here.weight.sum()
     assert_close(made, simplify(ball, 300, visibility=visibility_source(views)), ball, views.take(range(4)))
-
-
-def test_simplify_reports_that_the_gpu_looked(
-    tmp_path: Path, command_line: CommandLine, gpu: None, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    write_splats(tmp_path / "a.ply", checkered_ball(1000))
-    write_views(tmp_path / "v.json", around(6))
-    default = ("simplify", "a.ply", "-n", "100", "--views", "v.json", "-w", "--json", "-", "--device", "gpu")
-    status, out, told = command_line(*default, "-o", "b.ply", cwd=tmp_path)
-    assert status == 0, told
-    assert json.loads(out)["device"]["kernels"] >= 1
-    assert len(read_splats(tmp_path / "b.ply")) == 100
-    for name in ("VK_ICD_FILENAMES", "VK_DRIVER_FILES"):
-        monkeypatch.setitem(os.environ, name, str(tmp_path / "none.json"))
-    status, out, told = command_line(*default, "-o", "c.ply", cwd=tmp_path)
-    assert status == 0, told
-    if "no adapter" in told:
-        assert "device" not in json.loads(out)
-        assert len(read_splats(tmp_path / "c.ply")) == 100
 
 
 IMAGES = [
@@ -224,57 +204,42 @@ def test_threads_share_a_renderer_on_the_gpu(gpu: None) -> None:
     assert served() == 1
 
 
-DRAWING = {
-    "render": "render a.ply -o out",
-    "evaluate": "evaluate b.ply --teacher a.ply --split all",
-    "compare": "compare a.ply b.ply",
-    "recover": "recover b.ply --teacher a.ply --steps 4 -o c.ply",
-    "adapt": "adapt b.ply --teacher a.ply --steps 4 -o c.ply",
+COMMANDS = {
+    "simplify a.ply -n 100 --views v.json -o out.ply": 1,
+    "simplify a.ply -r 10 --method paper -o out.ply": 11,
+    "select a.ply --views v.json -k 3 --policy coverage --set cells=300 -o out.json": 1,
+    "render a.ply --views v.json -o out": 1,
+    "evaluate b.ply --views v.json --teacher a.ply --split all": 1,
+    "compare a.ply b.ply --views v.json": 1,
+    "recover b.ply --views v.json --teacher a.ply --steps 4 -o out.ply": 3,
+    "adapt b.ply --views v.json --teacher a.ply --steps 4 -o out.ply": 3,
 }
+"""Command → the fewest kernels that it runs on a GPU."""
 
 
-@pytest.mark.parametrize("name", DRAWING)
-def test_commands_draw_on_the_gpu(name: str, tmp_path: Path, command_line: CommandLine, gpu: None) -> None:
-    write_splats(tmp_path / "a.ply", checkered_ball(300))
+@pytest.mark.parametrize("words", COMMANDS)
+def test_commands_say_what_the_gpu_did(
+    words: str, tmp_path: Path, command_line: CommandLine, gpu: None
+) -> None:
+    write_splats(tmp_path / "a.ply", checkered_ball(500))
     write_splats(tmp_path / "b.ply", checkered_ball(200))
     write_views(tmp_path / "v.json", around(4, (48, 36)))
-    run = (*DRAWING[name].split(), "--views", "v.json", "--json", "-", "--device", "gpu")
-    out, told = succeeds(command_line, tmp_path, *run)
-    assert "on the CPU" not in told
-    assert json.loads(out)["device"]["kernels"] >= (3 if name in ("recover", "adapt") else 1)
-
-
-def test_refuses_other_names() -> None:
-    with pytest.raises(InputError, match="abacus"):
-        devices.use("abacus")
-    with pytest.raises(ValueError, match="abacus"):
-        _core.set_device("abacus")
-
-
-def test_commands_say_what_the_gpu_did(tmp_path: Path, command_line: CommandLine, gpu: None) -> None:
-    write_splats(tmp_path / "a.ply", checkered_ball(1000))
-    write_views(tmp_path / "v.json", around(6))
-    paper = ("simplify", "a.ply", "-r", "10", "--method", "paper", "-w", "--json", "-")
-    chosen = ("select", "a.ply", "--views", "v.json", "-k", 3, "--policy", "coverage", "-w")
-    chosen = (*chosen, "--set", "cells=300")
-    made = {}
-    for device in ("cpu", "gpu"):
-        out, told = succeeds(command_line, tmp_path, *paper, "-o", f"{device}.ply", "--device", device, "-v")
-        assert ("kernels on" in told) == (device == "gpu")
+    ask, made = (*words.split(), "-w", "-v", "--json", "-", "--device"), set()
+    for device in ("cpu", "gpu") if words.startswith(("simplify", "select")) else ("gpu",):
+        out, told = succeeds(command_line, tmp_path, *ask, device)
+        if not words.startswith("render"):
+            assert ("kernels on" in told) == (device == "gpu")
+        assert "on the CPU" not in told
+        if (tmp_path / "out.ply").exists():
+            made.add(len(read_splats(tmp_path / "out.ply")))
         used = json.loads(out).get("device")
         if device == "cpu":
             assert used is None
         else:
             assert used["adapter"] == devices.adapters()[0].name  # type: ignore[index]
-            assert used["kernels"] > 10
-            assert used["uploaded_bytes"] > 72_000
-        told = succeeds(command_line, tmp_path, *chosen, "-o", f"{device}.json", "--device", device, "-v").err
-        assert ("kernels on" in told) == (device == "gpu")
-        made[device] = (
-            len(read_splats(tmp_path / f"{device}.ply")),
-            (tmp_path / f"{device}.json").read_bytes(),
-        )
-    assert made["cpu"] == made["gpu"]
+            assert used["kernels"] >= COMMANDS[words]
+            assert used["uploaded_bytes"] > 10_000
+    assert len(made) <= 1
 
 
 def test_failures_are_reported_at_once(capsys: pytest.CaptureFixture, gpu: None) -> None:
@@ -301,21 +266,6 @@ def test_recovery_continues_on_the_cpu_if_a_gpu_has_no_room(most: int, gpu: None
     assert all(note.endswith("goes on on the CPU") for note in notes)
     assert_same_bits(want.splats, found.splats)
     assert want.report.loss == found.report.loss
-
-
-def test_recover_says_that_the_gpu_took_its_steps(
-    tmp_path: Path, command_line: CommandLine, gpu: None
-) -> None:
-    write_splats(tmp_path / "a.ply", checkered_ball(300))
-    write_splats(tmp_path / "b.ply", checkered_ball(200))
-    write_views(tmp_path / "v.json", around(4))
-    run = ("recover", "b.ply", "--teacher", "a.ply", "--views", "v.json", "--steps", 4, "-w", "-v")
-    told = {
-        device: succeeds(command_line, tmp_path, *run, "-o", f"{device}.ply", "--device", device).err
-        for device in ("cpu", "gpu")
-    }
-    assert "on the CPU" not in told["gpu"]
-    assert ("GPU: " in told["gpu"], "GPU: " in told["cpu"]) == (True, False)
 
 
 @pytest.mark.parametrize("kilobytes", [600_000, 3_000_000])

@@ -34,10 +34,6 @@ from g2ard import _core
 """
 
 _CASES = {
-    "a child": """
-here = digests()
-in_child(digests, here)
-""",
     "a child of a child": """
 here = digests()
 def deeper():
