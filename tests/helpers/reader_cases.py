@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from g2ard.io import write_splats, write_views
+from g2ard.tiles.ingest import ingest
 from helpers.cloud_files import columns, las, ply
 from helpers.dataset_files import cambridge, llff, polycam
 from helpers.packed_files import saved as packed
@@ -77,6 +78,14 @@ def result(folder: Path) -> Path:
     return result_of(folder)
 
 
+def tiles(folder: Path) -> Path:
+    """Return the manifest of a folder of tiles."""
+    return (
+        ingest(saved(folder / "a.ply", write_splats, truth(30, 1)), folder / "tiles", tile_rows=12).folder
+        / "tiles.json"
+    )
+
+
 MAKERS: dict[str, Callable[[Path], Path]] = {
     "scene": lambda f: saved(f / "a.ply", write_splats, truth(9, 1)),
     "compressed": lambda f: packed(f, "compressed.ply", truth(9, 1)),
@@ -110,6 +119,7 @@ MAKERS: dict[str, Callable[[Path], Path]] = {
     "ns-export": exports,
     "cfg.yml": result,
     "views": lambda f: saved(f / "a.json", write_views, views(2)),
+    "tiles": tiles,
 }
 
 
@@ -118,5 +128,6 @@ READ = {
     "dataset_train.txt": "college",
     "reconstruction.nvm": "college",
     "Polycam": "capture",
+    "tiles": "tiles",
 }
 """The path to read instead of the damaged file, in the test's folder."""

@@ -112,9 +112,11 @@ def test_schedule_and_preset_differ_in_recover(folder: Path, command_line: Comma
 
 
 def test_the_other_commands_know_it(folder: Path, command_line: CommandLine) -> None:
-    for asked in (("--method", "paper"), ("--preset", "paper")):
+    (folder / "c.toml").write_text('preset = "paper-lift"\n[recover]\nsteps = 2\n')
+    for asked in (("--method", "paper"), ("--preset", "paper"), ("--config", "c.toml")):
         run(command_line, folder, "simplify", "ball.ply", "-r", 3, "-o", f"{asked[0][2:]}.ply", *asked)
-    assert (folder / "method.ply").read_bytes() == (folder / "preset.ply").read_bytes()
+    made = {(folder / f"{name}.ply").read_bytes() for name in ("method", "preset", "config")}
+    assert len(made) == 1
     found = run(
         command_line, folder, "select", "ball.ply", "--views", "v.json", "-o", "k.json", "--preset", "paper"
     )
@@ -183,7 +185,7 @@ def test_the_paper_s_rates_do_not_depend_on_the_unit() -> None:
 
 
 def test_a_kept_scene_reproduces_the_drift(folder: Path, command_line: CommandLine) -> None:
-    report = run(command_line, folder, *DISTILL, "--preset", "paper", "--keep")
+    report = run(command_line, folder, *SHORT, "--preset", "paper", "--keep")
     kept = folder / "run" / "simplified" / "scene.ply"
     ask = ("evaluate", "run/scene.ply", "--views", "v.json", "--teacher", "ball.ply", "--anchors", kept)
     found = run(command_line, folder, *ask)["scenes"][0]["drift95"]
@@ -214,14 +216,3 @@ def test_the_paper_s_adaptation_blends_nothing(folder: Path, command_line: Comma
     assert g2ard.preset("paper", g2ard.AdaptConfig()).prior_views == 0
     out = succeeds(command_line, folder, *ask).out
     assert json.loads(out)["prior_share"] > 0
-
-
-def test_a_preset_for_all_commands(folder: Path, command_line: CommandLine) -> None:
-    (folder / "c.toml").write_text('preset = "paper-lift"\n[recover]\nsteps = 2\n')
-    config = ("-w", "--json", "-", "--config", "c.toml")
-    out = succeeds(
-        command_line, folder, "select", "ball.ply", "-k", 3, "--views", "v.json", "-o", "k.json", *config
-    ).out
-    assert json.loads(out)["policy"] == "directional"
-    out = succeeds(command_line, folder, "simplify", "ball.ply", "-r", 9, "-o", "s.ply", *config).out
-    assert json.loads(out)["method"] == "paper"

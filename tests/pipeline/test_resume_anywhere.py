@@ -136,8 +136,8 @@ def counted(do: Callable[[], None]) -> tuple[list[int], Callable[..., Any]]:
 
 
 def moments(total: int) -> list[int]:
-    """Return up to eight moments among `total`, the first, the last and others between."""
-    return sorted({1 + round(i * (total - 1) / 7) for i in range(8)})
+    """Return up to five moments among `total`, the first, the last and others between."""
+    return sorted({1 + round(i * (total - 1) / 4) for i in range(5)})
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -198,11 +198,29 @@ def test_after_a_power_cut_at_any_file(name: str, tmp_path: Path, monkeypatch: p
 
 def test_runs_that_share_a_folder_do_not_mix(tmp_path: Path) -> None:
     config, brighter = AdaptConfig(steps=9), replace(SMALL, sh0=SMALL.sh0 + np.float32(0.1))
-    for scene, targets, how in (
-        (SMALL, TARGETS, config),
-        (SMALL, TARGETS, replace(config, seed=1)),
-        (brighter, TARGETS, config),
-        (SMALL, NEAR, config),
-    ):
-        found, alone = (content(adapt(scene, targets, how, work=work)) for work in (tmp_path, None))
-        assert_same(found, alone, repr(how))
+    rounds = replace(PAPER, recover=replace(PAPER.recover, seed=1))
+    calls: list[Call] = [
+        *(
+            partial(adapt, scene, targets, how)
+            for scene, targets, how in (
+                (SMALL, TARGETS, config),
+                (SMALL, TARGETS, replace(config, seed=1)),
+                (brighter, TARGETS, config),
+                (SMALL, NEAR, config),
+            )
+        ),
+        *(
+            partial(distill, scene, budget, targets, how, weights=weights)
+            for scene, budget, targets, how, weights in (
+                (BALL, 30, TARGETS, PAPER, None),
+                (BALL, 30, TARGETS, rounds, None),
+                (BALL, 29, TARGETS, PAPER, None),
+                (BALL, 30, TARGETS, PAPER, WEIGHTS),
+                (replace(BALL, sh0=BALL.sh0 + np.float32(0.1)), 30, TARGETS, PAPER, None),
+                (BALL, 30, NEAR, PAPER, None),
+            )
+        ),
+    ]
+    for number, call in enumerate(calls):
+        found, alone = (content(call(work=work)) for work in (tmp_path, None))
+        assert_same(found, alone, f"call {number}")

@@ -2,7 +2,8 @@
 
 import json
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +15,11 @@ from benchmarks.workspace import Workspace
 from g2ard.errors import InputError
 from g2ard.io import read_view_set, write_splats, write_views
 from g2ard.io.splits import for_scores, for_training, not_held_out, split_mask, splits_of
-from helpers.commands import CommandLine, refused, succeeds
+from helpers.commands import CommandLine, Printed, refused, succeeds
 from helpers.photos import cloud_of, photos_of
 from helpers.scenes import around, checkered_ball
 
-Program = Callable[..., None]
+Program = Callable[..., Printed]
 BALL = checkered_ball(1500)
 VIEWS = around(16)
 TEST = {"001.png", "005.png", "009.png", "013.png"}
@@ -39,27 +40,18 @@ def folder(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def g2ard(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Program:
-    """The program in this process and in the folder, so that stages can be watched."""
-    from g2ard.cli.app import register_commands
-    from g2ard.cli.frame import app
-
-    monkeypatch.chdir(folder)
-    register_commands(None)
-
-    def run(*arguments: object) -> None:
-        app([str(a) for a in (*arguments, "-q")], prog_name="g2ard", standalone_mode=False)
-
-    return run
+def g2ard(folder: Path, command_line: CommandLine) -> Program:
+    """The program in the folder."""
+    return partial(succeeds, command_line, folder)
 
 
+@dataclass
 class Watch:
     """Names of the views that each stage used."""
 
-    def __init__(self) -> None:
-        self.trained: list[set[str]] = []
-        self.looked: list[set[str]] = []
-        self.scored: list[set[str]] = []
+    trained: list[set[str]] = field(default_factory=list)
+    looked: list[set[str]] = field(default_factory=list)
+    scored: list[set[str]] = field(default_factory=list)
 
 
 @pytest.fixture

@@ -9,13 +9,14 @@ import pytest
 from g2ard.errors import InputError, OutputError
 from g2ard.io.lock import LOCK, locked
 from g2ard.io.tiles import StoredScene, TileStore
+from g2ard.jobs.distill_options import DistillOptions
+from g2ard.jobs.tiling import needs_whole
 from g2ard.levels import Cut, save_levels
 from g2ard.tiles import ingest as ingest_module
 from g2ard.tiles.ingest import ingest
 from helpers.commands import CommandLine, refused, succeeds
 from helpers.interruptions import interrupt_at
-from helpers.level_files import files_of, scattered
-from helpers.project import ROOT
+from helpers.level_files import files_of
 from helpers.tiled_scenes import reduced, town_in
 
 BLIND = ("--no-views", "--workers", "1", "--tile-rows", "700")
@@ -130,34 +131,6 @@ def test_levels_are_not_written_from_damaged_tiles(place: Path, tmp_path: Path) 
     assert not (tmp_path / "out").exists()
 
 
-def test_killed_levels_leave_nothing_beside_the_output(tmp_path: Path) -> None:
-    levels, work = [scattered(2000), scattered(300, 1)], tmp_path / "work"
-    work.mkdir()
-    save_levels(tmp_path / "whole", levels, cut=Cut(most=200))
-    killed = (
-        "import os, sys; sys.path.insert(0, sys.argv[1])\n"
-        "from pathlib import Path; from helpers.level_files import scattered\n"
-        "from g2ard.levels import Cut, save_levels, streamed_sog\n"
-        "link, done = streamed_sog._linked, []\n"
-        "def dies(*names):\n"
-        "    done.append(link(*names))\n"
-        "    if len(done) == 9: os._exit(9)\n"
-        "streamed_sog._linked = dies\n"
-        "save_levels(Path('out'), [scattered(2000), scattered(300, 1)], cut=Cut(most=200), work=Path('work'))"
-    )
-    call = [sys.executable, "-c", killed, str(ROOT / "tests")]
-    assert subprocess.run(call, cwd=tmp_path, check=False).returncode == 9
-    assert [path.name[:5] for path in tmp_path.iterdir() if path.name.startswith(".")] == [".out."]
-    (work / ".0_9.0123456789ab").mkdir()  # killed within a file
-    before = {path: path.stat().st_mtime_ns for path in work.rglob("*.webp")}
-    save_levels(tmp_path / "out", levels, cut=Cut(most=200), work=work)
-    assert files_of(tmp_path / "out") == files_of(tmp_path / "whole")
-    moved = {path.stat().st_mtime_ns for path in (tmp_path / "out").rglob("*.webp")}
-    assert set(before.values()) == moved
-    assert {path.name for path in tmp_path.iterdir()} == {"out", "whole", "work"}
-    assert [path.name for path in work.iterdir()] == []
-
-
 @pytest.mark.parametrize(
     ("options", "told"),
     [
@@ -229,11 +202,6 @@ def test_an_unfinished_ingest_is_named(command_line: CommandLine, place: Path, t
         )
     (tmp_path / "empty").mkdir()
     assert "tiles.json" in command_line("info", "empty", cwd=tmp_path)[2]
-    ingest(place / "town.ply", tmp_path / "begun", tile_rows=700)
-    before = files_of(tmp_path / "begun")
-    with pytest.raises(OutputError, match=r"\(tile_rows 700 instead of 800\); overwrite=True replaces it"):
-        ingest(place / "town.ply", tmp_path / "begun", tile_rows=800)
-    assert files_of(tmp_path / "begun") == before
 
 
 def test_tiles_are_not_too_many(place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -242,3 +210,26 @@ def test_tiles_are_not_too_many(place: Path, tmp_path: Path, monkeypatch: pytest
         ingest(place / "town.ply", tmp_path / "tiles", tile_rows=159)
     assert not (tmp_path / "tiles").exists()
     assert ingest(place / "town.ply", tmp_path / "tiles", tile_rows=160).count == 1600
+
+
+def test_several_whole_options_are_named_together(command_line: CommandLine, place: Path) -> None:
+    ask = ("distill", "-r", "10", "-o", "x", "--views", "views.json")
+    told = refused(command_line, place, *ask, "tiles", "--clean", "--photos", status=1)
+    assert "tiles: --clean and --photos need the whole scene in memory" in told
+    assert "use `g2ard ingest tiles -o DIR --tile-rows 1,600` for one piece" in told
+    assert needs_whole(DistillOptions().config) == []
+    assert needs_whole(DistillOptions(settings={"engine": "gsplat"}).config) == ["--engine"]
+
+
+def test_rows_of_tiles_that_lie_in_a_folder_are_theirs(command_line: CommandLine, place: Path) -> None:
+    ask = ("simplify", "tiles", "-r", "10", "-o", "x.ply", "--tile-rows")
+    told = refused(command_line, place, *ask, "1k")
+    assert "--tile-rows: tiles already has tiles of 700; to change them, run `g2ard ingest tiles" in told
+    told = refused(command_line, place, *ask, "700", "--method", "fast", status=1)
+    assert "--method fast" in told  # the same rows are no other
+
+
+@pytest.mark.parametrize("extent", ["inf", "nan", "0", "-1"])
+def test_extents_are_finite(extent: str) -> None:
+    with pytest.raises(InputError, match="extent: expected a finite number"):
+        Cut(extent=float(extent))

@@ -31,7 +31,7 @@ def snapped(count: int, seed: int) -> Splats:
 
 @pytest.fixture(scope="module")
 def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return town_in(tmp_path_factory.mktemp("lod"), 6000)
+    return town_in(tmp_path_factory.mktemp("lod"), 3000)
 
 
 def sorted_cut(means: np.ndarray, rows: np.ndarray, most: int) -> list[set[int]]:
@@ -82,14 +82,14 @@ def test_levels_on_disk_give_the_files_of_levels_in_memory(tmp_path: Path, degre
 def levels_in_tiles(place: Path, folder: Path, say: Say = unsaid) -> Levels[StoredScene]:
     options: dict[str, Any] = {"ratios": (1, 3, 12), "recover": True, "steps": 12, "background": (0, 0, 0)}
     options |= {"split_sky": False, "seed": 0, "views": place / "views.json", "size": 64, "say": say}
-    tiling = Tiling(tile_rows=1700, workers=1, folder=folder)
+    tiling = Tiling(tile_rows=850, workers=1, folder=folder)
     with preparing_levels(place / "town.ply", tiling, **options) as job:
         return job.run()
 
 
 def test_levels_have_exact_counts_and_a_stopped_chain_goes_on(place: Path, tmp_path: Path) -> None:
     whole = levels_in_tiles(place, tmp_path / "whole")
-    assert [len(level) for level in whole.splats] == [6000, 2000, 500]
+    assert [len(level) for level in whole.splats] == [3000, 1000, 250]
     assert [len(level.store.tiles) for level in whole.splats] == [4, 2, 1]
     for report in whole.reports[1:]:
         assert report.recovered > report.simplified > 15
@@ -107,7 +107,7 @@ def test_levels_have_exact_counts_and_a_stopped_chain_goes_on(place: Path, tmp_p
     before = {path: path.stat().st_mtime_ns for path in steps.iterdir()}
     again = levels_in_tiles(place, tmp_path / "again")
     assert all(path.stat().st_mtime_ns == time for path, time in before.items())
-    rows = np.arange(500)
+    rows = np.arange(250)
     one, other = (levels.splats[2].take(rows).fingerprint() for levels in (whole, again))
     assert one == other
     assert [level.store.key for level in whole.splats] == [level.store.key for level in again.splats]
@@ -115,18 +115,18 @@ def test_levels_have_exact_counts_and_a_stopped_chain_goes_on(place: Path, tmp_p
 
 def test_the_command_in_tiles(place: Path, tmp_path: Path, command_line) -> None:
     given = ["lod", place / "town.ply", "-o", "out", "-r", "1,4,16", "--merge-only", "--chunk-count", "1"]
-    tiled = [*given, "--tile-rows", "1700", "--views", place / "views.json"]
+    tiled = [*given, "--tile-rows", "850", "--views", place / "views.json"]
     succeeds(command_line, tmp_path, *tiled, "--workers", "2", "--json", "told.json")
     told = json.loads((tmp_path / "told.json").read_text())
-    assert [level["count"] for level in told["levels"]] == [6000, 1500, 375]
+    assert [level["count"] for level in told["levels"]] == [3000, 750, 188]
     own = peak_rss()
     assert own is None or told["peak_rss_bytes"] > own + 2e7  # the workers' too
     meta = json.loads((tmp_path / "out" / "lod-meta.json").read_text())
     files = [sog.Stream(tmp_path / "out" / name).whole().splats for name in meta["filenames"]]
     levels = [name.split("_")[0] for name in meta["filenames"]]
     counts = {at: sum(len(f) for f, of in zip(files, levels, strict=True) if of == at) for at in "012"}
-    assert counts == {"0": 6000, "1": 1500, "2": 375}
-    assert len(io.read_splats(tmp_path / "out")) == 6000
+    assert counts == {"0": 3000, "1": 750, "2": 188}
+    assert len(io.read_splats(tmp_path / "out")) == 3000
     assert {path.name for path in tmp_path.iterdir()} == {"out", "told.json"}  # nothing hidden stays
     assert "already finished" in succeeds(command_line, tmp_path, *tiled, "--resume").err
     (tmp_path / ".z.tiles" / "steps").mkdir(parents=True)
@@ -135,6 +135,6 @@ def test_the_command_in_tiles(place: Path, tmp_path: Path, command_line) -> None
     assert (status, "starting over" in said) == (0, False), said
     assert files_of(tmp_path / "z") == files_of(tmp_path / "out")  # one worker or two
     assert not (tmp_path / ".z.tiles").exists()
-    more = [*given[:3], "y", *given[4:], "--tile-rows", "1700", "--memory", "100MB"]
+    more = [*given[:3], "y", *given[4:], "--tile-rows", "850", "--memory", "100MB"]
     assert "--tile-rows" in refused(command_line, tmp_path, *more, status=1)
     assert not (tmp_path / "y").exists()

@@ -124,8 +124,6 @@ def test_exact_count_and_quality(store: TileStore, scene: Path, tmp_path: Path, 
     assert len(small) == 900
     assert small.finite_rows().all()
     dense = read_splats(scene)
-    from g2ard.rendering.visibility import visibility_source
-
     whole = simplify(dense, 900, visibility=None if blind else visibility_source(views)).splats
     targets = TeacherRenders(dense, ring(5))
     tiled_db, whole_db = (evaluate(splats, targets).psnr for splats in (small, whole))
