@@ -11,20 +11,13 @@ import pytest
 
 from helpers.killed import command, forked
 from helpers.project import environment
-from helpers.writing_commands import COMMANDS, TRAIN, write_inputs
+from helpers.writing_commands import COMMANDS, TRAIN
 
 pytestmark = pytest.mark.skipif(os.name == "nt", reason="needs a POSIX shell")
 
 APART = ("--version", "info ball.ply --json -", "info missing.ply")
 """Commands that are started as programs."""
 NUMBERS = {"<&-": 0, ">&-": 1, "2>&-": 2}
-
-
-@pytest.fixture(scope="module")
-def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("inputs")
-    write_inputs(folder)
-    return folder
 
 
 def run_apart(folder: Path, words: str, closed: str) -> tuple[int, str]:
@@ -54,7 +47,8 @@ def run(folder: Path, words: str, closed: str) -> tuple[int, str]:
 @pytest.mark.parametrize("output", COMMANDS)
 def test_every_command_writes_its_result(output: str, inputs: Path, tmp_path: Path) -> None:
     folder = shutil.copytree(inputs, tmp_path / "a")
-    assert run(folder, f"{COMMANDS[output]} --json told.json", ">&- 2>&-") == (0, "")
+    words = COMMANDS[output].replace("--workers 1", "--workers 2")  # processes that inherit the streams
+    assert run(folder, f"{words} --json told.json", ">&- 2>&-") == (0, "")
     assert (folder / output).exists()
     assert (folder / "told.json").read_text()[0] == "{"
 

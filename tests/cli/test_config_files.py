@@ -9,23 +9,6 @@ import pytest
 from helpers.commands import CommandLine, refused, succeeds
 
 
-def test_a_config_file_is_written_and_read_by_flags_names(command_line: CommandLine, folder: Path) -> None:
-    ask = ("distill", "ball.ply", "-r", "10", "-o", "r10", "--schedule", "fast", "--steps", 4)
-    ask = (*ask, "--size", 48, "--background", "0.5,0,1", "--set", "rates.means=1e-4")
-    out = succeeds(command_line, folder, *ask, "--print-config").out
-    assert not (folder / "r10").exists()
-    for line in ("ratio = 10", 'schedule = "fast"', "steps = 4", "background = [0.5, 0, 1]"):
-        assert line in out
-    wrong = command_line(*ask, "--set", "steps=-3", "--print-config", cwd=folder)
-    assert wrong[0] == 2
-    assert "--set: recover.steps: expected a whole number of at least 1 or none, got -3" in wrong[2]
-    (folder / "c.toml").write_text(out)
-    again = command_line("distill", "ball.ply", "--config", "c.toml", "--print-config", cwd=folder)
-    assert again == (0, out, "")
-    succeeds(command_line, folder, "distill", "ball.ply", "--config", "c.toml")
-    assert (folder / "r10" / "scene.ply").exists()
-
-
 @pytest.mark.parametrize(
     ("text", "words"),
     [
@@ -40,6 +23,8 @@ def test_a_config_file_is_written_and_read_by_flags_names(command_line: CommandL
         ("[simplify]\nratio = 4\n[distill]\nhold_out = 3", "held-out"),
         ("[simplify]\nn = 9", "`simplify` has no option n (write count)"),
         ("n = 9", "has no option n (write count)"),
+        ("[simplify]\nmin-psnr = true", "'--min-psnr': expected a number of at least 1, got 'true'"),
+        ("[simplify\n", "c.toml: "),
     ],
 )
 def test_wrong_names_and_values_are_named(
@@ -64,6 +49,11 @@ def test_keys_above_tables_apply_to_every_command(command_line: CommandLine, fol
         ("simplify ball.ply -o s.ply -r 20", {"ratio": 20}),
         ("simplify ball.ply -o s{count}.ply -n 50 -n 2k,10%", {"count": [50, "2k", "10%"]}),
         ("lod ball.ply -o lod", {"scene": "ball.ply", "ratios": [1, 2, 4, 8, 16]}),
+        (
+            "distill ball.ply -r 9 -o run --schedule fast --steps 4 --background 0.5,0,1",
+            {"ratio": 9, "schedule": "fast", "steps": 4, "background": [0.5, 0, 1]},
+        ),
+        ("distill ball.ply -r 9 -o run --recovery-time 2m", {"recovery-time": 120}),
         ("info ball.ply views.json", {"paths": ["ball.ply", "views.json"]}),
         (
             "poses ball.ply -o p.json --resolution 320x240 --up 0,0,1",

@@ -49,8 +49,6 @@ def test_convert_takes_its_output_with_or_without_o(command_line: CommandLine, f
     assert len(one) == 1
     assert command_line("convert", "ball.ply", "ball.ply", "-o", "two.ply", cwd=folder)[0] == 0
     assert len(g2ard.load(folder / "two.ply")) == 800
-    for arguments in (("ball.ply", "./ball.ply"), ("ball.ply", "-o", "ball.ply")):
-        assert "is both an input and the output" in refused(command_line, folder, "convert", *arguments, "-w")
 
 
 def test_convert_keeps_what_fulfils_a_condition(tmp_path: Path, command_line: CommandLine) -> None:

@@ -61,86 +61,74 @@ BASES = {
     ),
     "info": "info ball.ply --json -",
 }
+COMMON = {
+    "views": "--views few.json",
+    "images": "--images nowhere",
+    "size": "--size 20",
+    "background": "--background 1,1,1",
+    "up": "--up 1,0,0",
+    "render_model": "--render-model antialiased",
+    "count": "-n 40",
+    "ratio": "-r 9",
+    "fit": "--fit 9kB",
+    "min_psnr": "--min-psnr 20",
+    "min_ssim": "--min-ssim 0.6",
+    "method": "--method fast",
+    "keep_region": "--keep-region 0,0,1,0.5",
+    "schedule": "--schedule paper",
+    "steps": "--steps 4",
+    "tile_rows": "--tile-rows 100",
+    "sh_degree": "--sh-degree 0",
+    "split": "--split test",
+    "preset": "--preset paper",
+    "looks": "-k 9",
+    "format": "--format inria",
+    "teacher": "--teacher sky.ply",
+    "alpha": "--alpha mask",
+    "photos": "--photos",
+    "convention": "--convention inria",
+}
+"""Words that are tried of options that several commands have."""
+
+
+def _common(names: str) -> dict[str, str]:
+    return {name: COMMON[name] for name in names.split()}
+
+
 OPTIONS: dict[str, dict[str, str]] = {
     "distill": {
-        "count": "-n 40",
-        "ratio": "-r 9",
-        "fit": "--fit 9kB",
-        "min_psnr": "--min-psnr 20",
-        "min_ssim": "--min-ssim 0.6",
-        "views": "--views few.json",
+        **_common("count ratio fit min_psnr min_ssim views alpha photos method keep_region schedule"),
+        **_common("steps sh_degree size background up tile_rows render_model"),
         "images": "--images other --photos",
-        "alpha": "--alpha mask",
-        "photos": "--photos",
         "held_out": "--held-out few.json",
-        "method": "--method fast",
-        "keep_region": "--keep-region 0,0,1,0.5",
         "preset": "--preset lift",
-        "schedule": "--schedule paper",
-        "steps": "--steps 4",
         "keep": "--keep",
         "format": "--format splat",
         "views_format": "--views-format inria",
         "clean": "--clean",
         "page": "--page",
-        "sh_degree": "--sh-degree 0",
-        "size": "--size 20",
         "focus": "--focus far",
-        "background": "--background 1,1,1",
-        "up": "--up 1,0,0",
-        "tile_rows": "--tile-rows 100",
-        "render_model": "--render-model antialiased",
     },
     "simplify": {
-        "count": "-n 40",
-        "ratio": "-r 9",
-        "fit": "--fit 9kB",
-        "min_psnr": "--min-psnr 20",
-        "min_ssim": "--min-ssim 0.6",
-        "views": "--views few.json",
-        "images": "--images nowhere",
+        **_common("count ratio fit min_psnr min_ssim views images preset method keep_region up"),
+        **_common("tile_rows render_model"),
         "no_views": "--no-views",
-        "preset": "--preset paper",
-        "method": "--method fast",
-        "keep_region": "--keep-region 0,0,1,0.5",
-        "up": "--up 1,0,0",
         "parents": "--parents rows.npy",
-        "tile_rows": "--tile-rows 100",
-        "render_model": "--render-model antialiased",
     },
     "recover": {
-        "views": "--views few.json",
+        **_common("views teacher photos schedule steps sh_degree split size background render_model"),
         "images": "--images other --photos",
         "alpha": "--alpha mask --photos",
-        "teacher": "--teacher sky.ply",
-        "photos": "--photos",
         "anchors": "--anchors fewer.ply --set period=1",
         "preset": "--preset lift --steps 200",
-        "schedule": "--schedule paper",
-        "steps": "--steps 4",
-        "sh_degree": "--sh-degree 0",
-        "split": "--split test",
         "weighted": "--no-weights",
-        "size": "--size 20",
-        "background": "--background 1,1,1",
-        "render_model": "--render-model antialiased",
     },
     "adapt": {
-        "views": "--views few.json",
-        "photos": "--photos",
+        **_common("views photos alpha teacher steps schedule sh_degree split size background preset"),
+        **_common("render_model"),
         "images": "--images other",
-        "alpha": "--alpha mask",
-        "teacher": "--teacher sky.ply",
-        "steps": "--steps 4",
         "tolerance": "--tolerance 0 --steps 600",
-        "schedule": "--schedule paper",
         "prior_views": "--prior-views 9",
-        "sh_degree": "--sh-degree 0",
-        "split": "--split test",
-        "size": "--size 20",
-        "background": "--background 1,1,1",
-        "preset": "--preset paper",
-        "render_model": "--render-model antialiased",
     },
     "lift": {
         "neighbors": "--neighbors 5",
@@ -150,6 +138,7 @@ OPTIONS: dict[str, dict[str, str]] = {
         "opacity": "--opacity 0.9",
     },
     "convert": {
+        **_common("sh_degree render_model"),
         "box": "--box -1,-1,0,1,1,1",
         "sphere": "--sphere 0,0,1,0.5",
         "where": "--where z<0",
@@ -162,60 +151,42 @@ OPTIONS: dict[str, dict[str, str]] = {
         "translate": "--translate 1,0,0",
         "recentre": "--recentre --translate 5,0,0",
         "to_axes": "--to-axes RUB",
-        "sh_degree": "--sh-degree 0",
         "spz_version": "--spz-version 3",
         "compress": "--compress",
-        "render_model": "--render-model antialiased",
     },
     "clean": {
+        **_common("render_model"),
         "only": "--only none",
         "split_sky": "--split-sky sky_alone.ply",
         "strength": "--strength 0.9",
         "preview": "--preview found.png",
-        "render_model": "--render-model antialiased",
     },
     "poses": {
-        "format": "--format inria",
+        **_common("format looks up"),
         "kind": "--kind aerial",
-        "looks": "-k 9",
         "resolution": "--resolution 64x48",
         "fov": "--fov 30",
-        "up": "--up 1,0,0",
     },
     "select": {
-        "format": "--format inria",
+        **_common("format views images preset"),
         "k": "-k 5",
-        "views": "--views few.json",
-        "images": "--images nowhere",
         "policy": "--policy uniform",
         "split": "--split all",
-        "preset": "--preset paper",
     },
     "render": {
-        "views": "--views few.json",
-        "images": "--images nowhere",
+        **_common("views images looks convention split size background up render_model"),
         "turn": "--orbit 8 -o out.webp",
         "fps": "--fps 9",
         "sheet": "--sheet look.png",
         "depth": "--depth",
-        "looks": "-k 9",
         "around": "--panorama",
-        "convention": "--convention inria",
-        "split": "--split test",
-        "size": "--size 20",
-        "background": "--background 1,1,1",
-        "up": "--up 1,0,0",
-        "render_model": "--render-model antialiased",
     },
     "view": {
-        "views": "--views few.json",
-        "images": "--images nowhere",
+        **_common("views images background up render_model"),
         "start": "--start 3,0,0",
-        "background": "--background 1,1,1",
-        "up": "--up 1,0,0",
-        "render_model": "--render-model antialiased",
     },
     "lod": {
+        **_common("views images steps size background up tile_rows render_model"),
         "ratios": "-r 2,5",
         "recover": "--recover --steps 30",
         "environment": "--environment --ratios 2,4",
@@ -224,41 +195,26 @@ OPTIONS: dict[str, dict[str, str]] = {
         "least": "--chunk-min 1 --chunk-extent 0.5",
         "kind": "--format 3dtiles",
         "place": "--georeference 25,59,30",
-        "views": "--views few.json",
-        "images": "--images nowhere",
-        "steps": "--steps 4",
-        "size": "--size 20",
-        "background": "--background 1,1,1",
-        "up": "--up 1,0,0",
-        "tile_rows": "--tile-rows 100",
-        "render_model": "--render-model antialiased",
     },
     "evaluate": {
-        "views": "--views few.json",
+        **_common("views alpha convention size background render_model"),
         "images": "--images other",
-        "alpha": "--alpha mask",
         "teacher": "--teacher ball.ply",
         "anchors": "--anchors fewer.ply",
-        "convention": "--convention inria",
         "eight_bit": "--8bit",
         "split": "--split all",
-        "size": "--size 20",
-        "background": "--background 1,1,1",
-        "render_model": "--render-model antialiased",
     },
     "compare": {
+        **_common("views images size background render_model"),
         "output": "-o page.html",
-        "views": "--views few.json",
-        "images": "--images nowhere",
         "looks": "-k 5",
-        "size": "--size 20",
-        "background": "--background 1,1,1",
-        "render_model": "--render-model antialiased",
     },
-    "ingest": {"tile_rows": "--tile-rows 100", "render_model": "--render-model antialiased"},
+    "ingest": {
+        **_common("tile_rows render_model"),
+    },
     "register": {
+        **_common("format split alpha background render_model"),
         "photos": "--photos photos.json",
-        "format": "--format inria",
         "poses": "--poses photos.json",
         "intrinsics": "--intrinsics few.json",
         "focal": "--focal 50",
@@ -270,13 +226,12 @@ OPTIONS: dict[str, dict[str, str]] = {
         "protocol": "--protocol gs-cpr",
         "truth": "--truth few.json --json told.json",
         "metres_per_unit": "--metres-per-unit 2",
-        "split": "--split test",
         "report": "--report page.html",
-        "alpha": "--alpha mask",
-        "background": "--background 1,1,1",
-        "render_model": "--render-model antialiased",
     },
-    "info": {"images": "--images other", "devices": "--devices"},
+    "info": {
+        "images": "--images other",
+        "devices": "--devices",
+    },
 }
 
 
@@ -335,10 +290,8 @@ def _timeless(content: Any) -> Any:
 
 def _base(command: str, preset: str) -> str:
     words = BASES[command] + preset
-    unused = (
-        " --views photos.json" if command == "simplify" and preset else ""
-    )  # the paper's method has no views
-    return words.replace(unused, "")
+    blind = command == "simplify" and preset  # the paper's method has no views
+    return words.replace(" --views photos.json", "") if blind else words
 
 
 class Runner:
@@ -372,20 +325,13 @@ def runner(inputs: Path, tmp_path_factory: pytest.TempPathFactory, command_line:
     return Runner(inputs, tmp_path_factory.mktemp("runs"), command_line)
 
 
-PRESETS = {
-    " --preset paper": ("distill", "simplify", "recover", "adapt", "select"),
-    " --preset lift": ("distill", "recover"),
-}
-"""Preset → the commands that take it; `trained` and `noisy` set what `lift` sets, to other numbers."""
-OF_THE_PAPER = ("schedule", "weighted", "no_views")
+OF_THE_PAPER = ("preset", "schedule", "weighted", "no_views")
 """Options that `--preset paper` sets itself."""
-
 CASES = [(command, name, "") for command, table in OPTIONS.items() for name in table] + [
-    (command, name, preset)
-    for preset, commands in PRESETS.items()
-    for command in commands
+    (command, name, " --preset paper")
+    for command in ("distill", "simplify", "recover", "adapt", "select")
     for name in OPTIONS[command]
-    if name != "preset" and not (preset == " --preset paper" and name in OF_THE_PAPER)
+    if name not in OF_THE_PAPER
 ]
 
 

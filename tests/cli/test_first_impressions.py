@@ -113,16 +113,16 @@ def test_progress_and_summary_use_the_same_words(tmp_path: Path) -> None:
 
     with pytest.raises(KeyboardInterrupt):
         g2ard.distill(
-            BALL, count=40, views=around(8, (48, 36)), steps=20, work=tmp_path / "work", progress=stopped
+            BALL,
+            count=40,
+            views=around(8, (48, 36)),
+            steps=20,
+            work=tmp_path / "work",
+            progress=stopped,
+            settings={"focus": "far"},
         )
     assert {"targets", "simplify", "recover"} <= stages  # as in the seconds of the summary
     assert not {"teacher", "rates"} & stages
     told: list[str] = []
     say_from(SimpleNamespace(say=told.append), tmp_path / "work", Path("run"))  # type: ignore[arg-type]
     assert re.fullmatch(r"run: continues (after [\w, -]+|from step \d+|after .* from step \d+)", told[0])
-
-
-def test_sh_degree_is_an_option_of_distill(folder: Path, command_line: CommandLine) -> None:
-    ask = ("distill", "ball.ply", "-n", 40, "--views", "views.json", "--steps", 2, "--no-page", "-o", "run")
-    succeeds(command_line, folder, *ask, "--sh-degree", 0)
-    assert g2ard.load(folder / "run" / "scene.ply").sh_degree == 0

@@ -26,26 +26,26 @@ _COMMANDS = {
     "recover-folder": f"recover small.ply {_TAUGHT} -o out/meta.json --resume",
     "adapt": f"adapt small.ply {_TAUGHT} -o out.ply --resume",
     "distill": "distill ball.ply -n 60 --views views.json --steps 6 --size 32 -o run --resume",
-    "distill-tiles": "distill ball.ply -n 60 --views views.json --steps 6 --size 32 --tile-rows 150 -o run "
-    "--resume",
+    "distill-tiles": "distill ball.ply -n 60 --views views.json --steps 6 --size 32 --focus far --no-page "
+    "--tile-rows 80 --workers 1 -o run --resume",
     "lod": "lod ball.ply -r 1,4 --views views.json --steps 4 --size 32 -o out --resume",
     "lod-merged": "lod ball.ply -r 1,4 --views views.json --merge-only --format 3dtiles -o out --resume",
-    "ingest": "ingest ball.ply small.ply -o tiles --tile-rows 150",
-    "ingest-cloud": "ingest cloud.ply -o tiles --tile-rows 150",
+    "ingest": "ingest ball.ply small.ply -o tiles --tile-rows 80",
+    "ingest-cloud": "ingest cloud.ply -o tiles --tile-rows 80",
 }
 _COUNTED = ("replace", "link", "rename", "unlink", "rmdir")
-_MOMENTS = 6
+_MOMENTS = 3
 _TIMES = re.compile(r"seconds|time|rss|resumed|peak|^share$|^bytes$")
 
 
 @pytest.fixture(scope="module")
 def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("inputs")
-    ball = checkered_ball(400)
+    ball = checkered_ball(200)
     g2ard.save(folder / "ball.ply", ball)
-    g2ard.save(folder / "small.ply", checkered_ball(100, seed=7))
+    g2ard.save(folder / "small.ply", checkered_ball(60, seed=7))
     ply(folder / "cloud.ply", columns("f4", "u1"), np.hstack([ball.means, np.full((len(ball), 3), 90)]))
-    write_views(folder / "views.json", around(16, (32, 24)))
+    write_views(folder / "views.json", around(8, (32, 24)))
     return folder
 
 

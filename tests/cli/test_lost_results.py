@@ -18,7 +18,7 @@ from helpers.commands import CommandLine, refused, succeeds
 from helpers.faults import INJECTED, stages_after
 from helpers.photos import photographed
 from helpers.scenes import around, checkered_ball
-from helpers.writing_commands import COMMANDS, write_inputs
+from helpers.writing_commands import COMMANDS
 
 SLOW = {
     "distill": ("g2ard.jobs.distill.prepare", "g2ard.jobs.distill.DistillJob.run"),
@@ -27,13 +27,6 @@ SLOW = {
     "register": ("g2ard.stages.register.register",),
 }
 """Functions before the first output; they are called once, because only what follows is tested."""
-
-
-@pytest.fixture(scope="module")
-def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("inputs")
-    write_inputs(folder)
-    return folder
 
 
 def _once(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -82,6 +75,7 @@ def test_a_run_whose_scores_failed_is_resumed(
 ) -> None:
     folder = shutil.copytree(inputs, tmp_path / "inputs")
     ask = ("distill", "ball.ply", "-r", 8, "--steps", 2, "--views", "views.json", "--no-page", "-o", "run")
+    ask = (*ask, "--focus", "far")
     with stages_after(folder / "run" / "scene.ply", failing="g2ard.jobs.distill.DistillJob.report"):
         line = refused(command_line, folder, *ask, "-q", status=1)
     assert line == (

@@ -42,6 +42,7 @@ USAGE = [
     ),
     ("recover ball.ply --views made -o o.ply", "generated views have no photos; give --teacher SCENE"),
     ("recover ball.ply -o o.ply --steps 3 --recovery-time 9", "; give one"),
+    ("recover ball.ply -o o.ply --engine jax", "expected one of fused, torch, gsplat"),
     ("select absent.ply --views v -k auto -o out --policy random", "policy random does not measure"),
     ("select absent.ply --views v -k auto -o out --policy uniform", "policy uniform does not measure"),
     ("distill absent.ply -r 2 -o run --set views_count=auto --set policy=random", "does not measure"),
@@ -56,6 +57,30 @@ USAGE = [
     ("distill ball.ply -n many -o run", "many"),
     ("distill ball.ply -r 0.5 -o run", "0.5"),
     ("distill ball.ply -r 2,5 -o run", "give one budget"),
+    ("distill ball.ply -n 9,20 -o run", "give one budget"),
+    ("distill ball.ply -r 4 -r 5 -o run", "give one budget"),
+    ("simplify ball.ply -r 20,20 -o {ratio}.ply", "given twice"),
+    ("simplify ball.ply -r 20,20.01 -o {count}.ply", "the same output"),
+    ("simplify ball.ply --fit 5 -o b.ply", "--fit"),
+    ("simplify ball.ply --fit 5MB -n 10 -o b.ply", "--fit"),
+    ("simplify ball.ply --fit web --min-psnr 30 -o b.ply", "--fit"),
+    ("simplify ball.ply --fit 20kB -o b_{count}.ply", "{count}"),
+    ("simplify ball.ply --min-psnr 25 -o b_{count}.ply", "{count}"),
+    ("simplify ball.ply -n 5 -o o.ply --memory much", "a size such as 4GB"),
+    ("simplify ball.ply -n 5 -o o.ply --tile-rows 25%", "'--tile-rows': expected a positive count"),
+    ("ingest ball.ply -o tiles --tile-rows 0", "'--tile-rows': expected a positive count"),
+    ("simplify ball.ply -n 5 -o o.ply --config absent.toml", "absent.toml: No such file"),
+    ("simplify ball.ply -n 5 -o o.ply --config ball.ply", "ball.ply: not a text file"),
+    ("simplify ball.ply -n 5 -o o.ply --keep-region 0,0,1", "expected X,Y,Z,R or X,Y,Z,X,Y,Z"),
+    ("simplify ball.ply -n 5 -o o.ply --keep-region 0,0,0,-1", "expected a radius > 0"),
+    ("simplify ball.ply -n 5 -o o.ply --keep-region 0,0,0,1 --no-views", "--keep-region needs views"),
+    ("simplify ball.ply -n 5 -o o.ply --keep-region 0,0,0,1 --method paper", "--keep-region: has no effect"),
+    ("lod ball.ply -o x -r 2,1", "--ratios: expected rising numbers of at least 1"),
+    ("lod ball.ply -o x --chunk-extent inf", "--chunk-extent: expected a finite number above 0"),
+    (
+        "lod ball.ply -o x --chunk-extent 0 --tile-rows 150",
+        "--chunk-extent: expected a finite number above 0",
+    ),
     ("distill ball.ply -r 2 -o run --schedule hasty", "hasty"),
     ("distill ball.ply -r 2 -o run --preset gentle", "gentle"),
 ]
@@ -87,6 +112,9 @@ INPUT = [
     ("distill absent.ply -r 10 -o run", "absent.ply"),
     ("distill absent.ply -n 9 --format SOG -o run", "absent.ply: no such file"),
     ("distill ball.ply -n 401 -o run", "401"),
+    ("distill ball.ply -n 9 -o run --set lift.spread=2", "lift.spread: has no effect on a trained scene"),
+    ("distill ball.ply -n 9 -o run --set lift.spread=2 --tile-rows 150", "lift.spread: has no effect"),
+    ("simplify ball.ply -n 5 -o o.ply --keep-region 0,0,90,1", "contains none of the 400 Gaussians"),
     ("distill ball.ply -r 2 -o run --views none.json", "none.json"),
     ("distill ball.ply -r 2 -o ball.ply/run", "ball.ply is a file"),
     ("distill ball.ply -r 2 -o run --json ball.ply/where.json", "where.json"),
@@ -101,6 +129,33 @@ INPUT = [
     ),
 ]
 """Exit status 1."""
+
+WHOLE = {
+    "simplify ball.ply -r 10 -o x.ply --tile-rows 150": (
+        ("--method fast", "--method fast"),
+        ("--preset paper", "--preset paper"),
+        ("--parents p.npy", "--parents"),
+        ("--set morton_premerge_steps=3", "--set simplify.morton_premerge_steps"),
+    ),
+    "distill ball.ply -r 10 -o x --views views.json --tile-rows 150": (
+        ("--method fast", "--method fast"),
+        ("--preset paper-lift", "--preset paper-lift"),
+        ("--schedule paper", "--schedule paper"),
+        ("--photos", "--photos"),
+        ("--set views_count=10", "--set select.views_count"),
+        ("--clean", "--clean"),
+        ("--set morton_premerge_steps=3", "--set simplify.morton_premerge_steps"),
+        ("--recovery-time 5m", "--recovery-time"),
+    ),
+    "simplify ball.ply -o x.ply --tile-rows 150": (("--min-ssim 0.9", "--min-ssim 0.9"),),
+    "distill ball.ply -o x --tile-rows 150": (("--fit 50kB", "--fit 50kB"),),
+}
+"""Command in tiles → options that need the whole scene, and how they are named."""
+INPUT += [
+    (f"{command} {given}", f"ball.ply: {named} needs the whole scene in memory")
+    for command, options in WHOLE.items()
+    for given, named in options
+]
 
 
 @pytest.mark.parametrize(

@@ -10,8 +10,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from g2ard.cli.frame import Run
-from g2ard.cli.resume import stoppable
 from g2ard.errors import InputError
 from g2ard.io import write_splats, write_views
 from g2ard.jobs.distill import DistillJob
@@ -24,7 +22,10 @@ from helpers.scenes import around, checkered_ball
 LEFT = [
     ("recover a.ply --steps 3 -o out.ply", ".out.ply.checkpoint.npz"),
     ("adapt a.ply --steps 3 -o out.ply", ".out.ply.work/stretch-1-0123456789abcdef.npz"),
-    ("distill a.ply -r 2 --steps 3 -o run", "run/.unfinished/simplified-1-0123456789abcdef.npz"),
+    (
+        "distill a.ply -r 2 --steps 3 --focus far --no-page -o run",
+        "run/.unfinished/simplified-1-0123456789abcdef.npz",
+    ),
 ]
 
 
@@ -62,29 +63,6 @@ def test_messages_name_the_split(folder: Path, command_line: CommandLine, comman
         assert words in succeeds(command_line, folder, *ask, "--split", split).err
 
 
-@pytest.mark.parametrize("kind", ["file", "folder"])
-def test_an_interrupt_names_resume(tmp_path: Path, capsys: pytest.CaptureFixture[str], kind: str) -> None:
-    common = ("overwrite", "seed", "threads", "device", "verbose", "json", "quiet", "config")
-    run, place = Run("recover", dict.fromkeys(common), {}), tmp_path / "place"
-    with pytest.raises(KeyboardInterrupt), stoppable(run, place, resume=False, output=tmp_path / "out"):
-        raise KeyboardInterrupt  # before any checkpoint
-    assert capsys.readouterr().err == ""
-
-    def stopped_later() -> None:
-        if kind == "folder":
-            place.mkdir()
-        (place / "file" if kind == "folder" else place).touch()
-        raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt), stoppable(run, place, resume=False, output=tmp_path / "out"):
-        stopped_later()
-    assert run.kept == [f"run the same command with --resume to continue from {place}"]
-    assert place.exists()
-    with stoppable(run, place, resume=True, output=tmp_path / "out"):
-        assert place.exists()
-    assert not place.exists()
-
-
 def bytes_of(save: Callable[[io.BytesIO], None]) -> bytes:
     buffer = io.BytesIO()
     save(buffer)
@@ -112,7 +90,7 @@ def test_a_file_that_is_not_a_checkpoint_is_named(tmp_path: Path, content: bytes
     assert str(caught.value).startswith(f"{path}: not a checkpoint of g2ard, or a damaged one; ")
 
 
-@pytest.mark.parametrize("options", [(), ("--set", "select.views_count=2"), ("--views", "v.json")])
+@pytest.mark.parametrize("options", [("--set", "select.views_count=2"), ("--views", "v.json")])
 def test_a_recovered_run_renders_only_views_that_are_scored(
     folder: Path, command_line: CommandLine, monkeypatch: pytest.MonkeyPatch, options: tuple[str, ...]
 ) -> None:
@@ -155,7 +133,8 @@ def test_the_total_of_a_resumed_run_holds_what_was_done_before(
         return replace(done, report=replace(done.report, seconds=seconds))
 
     monkeypatch.setattr(DistillJob, "run", resumed)
-    ask = ("distill", "a.ply", "-r", 2, "--steps", 2, "--size", 32, "--no-page", "-o", "run", "--json", "-")
+    ask = ("distill", "a.ply", "-r", 2, "--views", "views.json", "--steps", 2, "--focus", "far", "--no-page")
+    ask = (*ask, "-o", "run", "--json", "-")
     out, error = succeeds(command_line, folder, *ask)
     seconds = json.loads(out)["seconds"]
     assert seconds["total"] > seconds["resumed"] == 50.0

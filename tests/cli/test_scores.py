@@ -162,6 +162,9 @@ def test_every_score_has_its_size(runs: Path, command_line: CommandLine) -> None
     assert f"gaps: surfaces let {100 * report['opacity_lost']:.1f} %" in printed
     assert "32×24 px" in (runs / "run" / "report.html").read_text()
     assert "32×24 px" in succeeds(command_line, runs, "info", "run").out
+    ask = ("evaluate", "run/scene.sog", "--views", "photos.json", "--size", 32, "--json", "-")
+    (row,) = json.loads(succeeds(command_line, runs, *ask).out)["scenes"]
+    assert row["own_size"]["scored_in"] == report["own_size"]["recovered"]["scored_in"]
     ask = ("--views", "photos.json", "--size", 32, "--steps", 2)
     for command in ("recover", "adapt"):
         told = succeeds(command_line, runs, command, "ball.ply", *ask, "-o", f"{command}.ply").err
@@ -172,8 +175,7 @@ def test_every_score_has_its_size(runs: Path, command_line: CommandLine) -> None
 def test_no_second_score_without_a_size(runs: Path, command_line: CommandLine) -> None:
     g2ard.save_views("photos.json", photographed(runs / "better", BALL, around(8, (64, 48))))
     ask = ("distill", "ball.ply", "-n", 40, "--views", "photos.json", "--photos", "--steps", 2, "--no-page")
-    for size in ((), ("--size", 64)):
-        assert "own size" not in succeeds(command_line, runs, *ask, *size, "-wo", "run").err
+    assert "own size" not in succeeds(command_line, runs, *ask, "--size", 64, "-o", "run").err
 
 
 @pytest.mark.parametrize("runs", ["renders", "photos"], indirect=True)
@@ -198,17 +200,6 @@ def test_evaluate_scores_once_more_at_the_views_own_size(
         assert len(scenes) == 1 or Path(row["scene"]).name in line
 
 
-def test_a_run_at_a_size_is_evaluated_at_the_photos_own_size(runs: Path, command_line: CommandLine) -> None:
-    photos = photographed(runs / "better", BALL, around(8, (64, 48)))
-    g2ard.save_views("photos.json", photos)
-    ask = ("distill", "ball.ply", "-n", 40, "--views", "photos.json", "--photos", "--steps", 2, "--no-page")
-    succeeds(command_line, runs, *ask, "--size", 32, "-o", "run")
-    expected = json.loads((runs / "run" / "report.json").read_text())["own_size"]["recovered"]
-    ask = ("evaluate", "run/scene.ply", "--views", "photos.json", "--size", 32, "--json", "-")
-    (row,) = json.loads(succeeds(command_line, runs, *ask).out)["scenes"]
-    assert row["own_size"] == expected
-
-
 def test_only_some_large_views_are_scored_at_their_own_size(
     runs: Path, command_line: CommandLine, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -218,12 +209,3 @@ def test_only_some_large_views_are_scored_at_their_own_size(
     (row,) = json.loads(succeeds(command_line, runs, *ask, "--size", 32, "--json", "-").out)["scenes"]
     assert row["own_size"]["scored_in"].startswith("3 views")
     assert row["scored_in"].startswith("8 views")
-
-
-def test_results_say_their_size() -> None:
-    views = around(8, (64, 48))
-    targets = g2ard.TeacherRenders(BALL, views)
-    assert "8 views against teacher renders, 64×48 px" in repr(g2ard.evaluate(BALL, targets))
-    recovered = g2ard.recover(BALL.take(range(99)), targets, g2ard.RecoverConfig(steps=2))
-    assert "64×48 px" in repr(recovered)
-    assert "64×48 px" in repr(recovered.report)

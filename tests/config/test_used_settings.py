@@ -323,10 +323,6 @@ def test_a_setting_changes_the_result_or_is_refused(run: str, setting: str) -> N
 @pytest.mark.parametrize(
     ("settings", "words"),
     [
-        ({"simplify.max_energy": 0.5}, "simplify.max_energy: has no effect on the method default"),
-        ({"method": "paper", "max_growth": 2.0}, "simplify.max_growth: has no effect on the method paper"),
-        ({"method": "fast", "retention": 0.5}, "simplify.retention: has no effect on the method fast"),
-        ({"kappa": 3.0}, "select.kappa: has no effect on the policy auto"),
         ({"policy": "coverage"}, "select.policy: has no effect without views_count"),
         ({"pixel_scale": 2.0}, "simplify.pixel_scale: has no effect with views"),
     ],
@@ -384,19 +380,18 @@ def test_a_variant_has_only_its_own_settings(root: Any) -> None:
 
 def test_given_weights_of_regularisers_are_used() -> None:
     weights = g2ard.Regularizers.of("lift")
-    given: dict[str, Any] = {"settings": {"recover.regularizers": weights}, "views": VIEWS, "steps": 2}
+    common: dict[str, Any] = {"views": VIEWS, "steps": 2}
     told: list[str] = []
-    whole = g2ard.distill(SCENE, ratio=10, say=told.append, **given)
-    named = g2ard.distill(SCENE, ratio=10, regularizers="lift", views=VIEWS, steps=2)
+    settings = {"recover.regularizers": weights, **FAR}
+    whole = g2ard.distill(SCENE, ratio=10, say=told.append, settings=settings, **common)
+    named = g2ard.distill(SCENE, ratio=10, regularizers="lift", settings=FAR, **common)
     assert whole.splats.fingerprint() == named.splats.fingerprint()
     assert "regularisers: as given" in told
-    again = g2ard.recover(SMALL, teacher=SCENE, **given)
-    assert (
-        again.splats.fingerprint()
-        == g2ard.recover(
-            SMALL, teacher=SCENE, views=VIEWS, steps=2, settings={"regularizers": "lift"}
-        ).splats.fingerprint()
+    again, named = (
+        g2ard.recover(SMALL, teacher=SCENE, **common, settings={"recover.regularizers": value})
+        for value in (weights, "lift")
     )
+    assert again.splats.fingerprint() == named.splats.fingerprint()
 
 
 def test_recover_measures_which_weights_suit_the_scene() -> None:

@@ -15,7 +15,7 @@ COMMANDS = {
     "adapted.ply": f"adapt ball.ply {TRAIN} -o adapted.ply",
     "small.ply": "simplify ball.ply -r 8 --no-views --parents rows.npy -o small.ply",
     "clean.ply": "clean ball.ply --preview found.png -o clean.ply",
-    "tiled.ply": "simplify ball.ply -r 8 --no-views --tile-rows 150 -o tiled.ply",
+    "tiled.ply": "simplify ball.ply -r 8 --no-views --tile-rows 150 --workers 1 -o tiled.ply",
     "rest.ply": "clean sky.ply --split-sky far.ply -o rest.ply",
     "copy.splat": "convert ball.ply copy.splat",
     "lifted.ply": "lift cloud.ply -o lifted.ply",

@@ -20,18 +20,17 @@ from helpers.scenes import checkered_ball
 from helpers.tiled_scenes import town_in
 
 
-def test_a_dry_run_counts_and_writes_nothing(tmp_path: Path, command_line: CommandLine) -> None:
-    g2ard.save(tmp_path / "ball.ply", checkered_ball(900))
+def test_a_dry_run_counts_and_writes_nothing(folder: Path, command_line: CommandLine) -> None:
     ask = ("distill", "ball.ply", "-r", "10", "-o", "run", "--steps", "12", "--size", "48", "--json", "-")
-    out, error = succeeds(command_line, tmp_path, *ask, "--dry-run")
-    assert [path.name for path in tmp_path.iterdir()] == ["ball.ply"]
+    before = set(folder.iterdir())
+    out, error = succeeds(command_line, folder, *ask, "--dry-run")
+    assert set(folder.iterdir()) == before
     assert "nothing is written" in error
     told = json.loads(out)
-    out = succeeds(command_line, tmp_path, *ask).out
-    ran = json.loads(out)
-    assert told["count"] == ran["output_count"] == 90
+    ran = json.loads(succeeds(command_line, folder, *ask).out)
+    assert told["count"] == ran["output_count"] == 40
     assert told["steps"] == ran["rounds"][-1]["recover"][-1]["steps"] == 12
-    views = len(g2ard.load_views(tmp_path / "run" / "views.json"))
+    views = len(g2ard.load_views(folder / "run" / "views.json"))
     assert views < told["views"] <= views + 72  # those of other kinds are in no file
     assert told["seconds"] == sum(seconds for _, seconds in told["stages"]) > 0
     assert told["pixels"] == 48 * 36
@@ -44,6 +43,7 @@ def test_a_dry_run_plans_tiles_like_the_run(scene: str, tmp_path: Path, command_
     store = [] if scene == "town.ply" else succeeds(command_line, folder, *words)
     before = sorted(folder.rglob("*"))
     ask = ("distill", scene, "-r", 10, "--views", "views.json", "--size", 24, "--steps", 2, "--json", "-")
+    ask += ("--focus", "far")
     ask += ("--workers", 1) if store else ("--workers", 1, "--tile-rows", 800)
     told = json.loads(succeeds(command_line, folder, *ask, "--dry-run").out)
     assert sorted(folder.rglob("*")) == before
@@ -97,7 +97,7 @@ def test_memory_is_close(source: str, tmp_path: Path) -> None:
     """The cost includes the program itself, which dominates for a small scene."""
     if source == "scene":
         g2ard.save(tmp_path / "ball.ply", checkered_ball(20_000))
-        ask = ["distill", "ball.ply", "-r", "4", "--steps", "12", "--size", "320"]
+        ask = ["distill", "ball.ply", "-r", "4", "--steps", "4", "--size", "320", "--focus", "far"]
     else:
         photos_of(tmp_path / "photos")
         ask = ["distill", "--views", "photos", "-n", "500", "--steps", "12"]

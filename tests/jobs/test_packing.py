@@ -14,7 +14,8 @@ from helpers.scenes import checkered_ball
 
 
 def test_distill_scores_the_packed_file(command_line: CommandLine, folder: Path) -> None:
-    ask = ("distill", "ball.ply", "-r", 4, "--steps", 20, "--size", 48, "--no-page", "--format", "splat")
+    ask = ("distill", "ball.ply", "-r", 4, "--steps", 20, "--size", 48, "--no-page", "--focus", "far")
+    ask = (*ask, "--format", "splat")
     error = succeeds(command_line, folder, *ask, "-o", "run").err
     report = json.loads((folder / "run" / "report.json").read_text())
     packed, unpacked = report["packed"]["psnr"], report["scores"]["recovered"]["psnr"]

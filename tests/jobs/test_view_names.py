@@ -23,7 +23,6 @@ TEST = np.arange(24) % 8 == 3
 WORDS = ("middle", "centre", "near", "far", "standing", "anywhere")
 NAMES = {
     "words": tuple(f"{WORDS[i % 6]}_{i:02d}" for i in range(24)),
-    "suffixes": tuple(f"{i:02d}_{WORDS[(5 * i) % 6]}" for i in range(24)),
     "permuted": tuple(VIEWS.names[(7 * i + 5) % 24] for i in range(24)),
 }
 

@@ -1,12 +1,15 @@
-"""`--resume` on a run that has finished, or with other options than those of the interrupted run."""
+"""Stopped and finished runs: what a signal or a closed pipe leaves, and what `--resume` makes of it."""
 
 import json
 import os
+import signal
 import subprocess
+import time
 from pathlib import Path
 
 import pytest
 
+import g2ard
 from g2ard.io import write_views
 from helpers.commands import CommandLine, interrupt_at_checkpoint, program, refused, succeeds
 from helpers.photos import photographed
@@ -82,8 +85,9 @@ def test_a_stopped_run_continues_with_other_options(command_line: CommandLine, f
     ask = ("distill", "ball.ply", "-r", 4, "-o", "run", "--size", 48)
     running = program(*ask, "--steps", 100_000, folder=folder, stderr=subprocess.PIPE)
     work = interrupt_at_checkpoint(running, folder)
-    running.communicate(timeout=120)
+    _, error = running.communicate(timeout=120)
     assert running.returncode == 130
+    assert b"g2ard: interrupted; run the same command with --resume to continue in run" in error
     out = succeeds(command_line, folder, "info", "run").out
     for words in ("stopped run", "simplified-1", "400 → 100", "ball.ply", "with --resume (-o run)"):
         assert words in out
@@ -100,11 +104,45 @@ def test_a_stopped_run_continues_with_other_options(command_line: CommandLine, f
     assert not work.exists()
 
 
-def test_a_run_killed_before_it_kept_anything(command_line: CommandLine, folder: Path) -> None:
-    work = folder / "run" / ".unfinished"
-    work.mkdir(parents=True)
-    (work / "options.json").write_text("{}")
-    assert (
-        "nothing to resume, starting over"
-        in succeeds(command_line, folder, *SHORT, "-r", 10, "-o", "run", "--resume").err
+@pytest.mark.parametrize("stream", ["stdout", "stderr"])
+def test_a_closed_pipe_loses_no_result(stream: str, folder: Path) -> None:
+    """The reader exits before anything is written, as with `| head -0`."""
+    reader, writer = os.pipe()
+    os.close(reader)
+    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE, stream: writer}
+    running = program(
+        "simplify", "ball.ply", "-r", 5, "-o", "s.ply", "--json", "-", "-v", folder=folder, **quiet
+    )
+    os.close(writer)
+    _, error = running.communicate(timeout=120)
+    assert running.returncode == 0, error
+    assert b"roken" not in (error or b"")
+    assert len(g2ard.load(folder / "s.ply")) == 80
+
+
+@needs_signals
+def test_a_terminated_run_says_what_was_kept(folder: Path) -> None:
+    ask = ("distill", "ball.ply", "-r", 4, "-o", "run", "--size", 48, "--steps", 100_000)
+    running = program(*ask, folder=folder, stderr=subprocess.PIPE)
+    interrupt_at_checkpoint(running, folder, signal.SIGTERM)
+    _, error = running.communicate(timeout=120)
+    assert running.returncode == 143, error
+    assert b"g2ard: interrupted; run the same command with --resume to continue in run" in error
+
+
+@needs_signals
+def test_stopped_workers_leave_one_line(folder: Path) -> None:
+    """Python would also report leaked semaphores after the program has ended."""
+    g2ard.save(folder / "large.ply", checkered_ball(20_000))
+    ask = ("simplify", "large.ply", "-r", 4, "--tile-rows", "3k", "--workers", 2, "-o", "s.ply")
+    running = program(*ask, folder=folder, stderr=subprocess.PIPE)
+    while not list(folder.glob(".s.ply.tiles/steps/light-*.npz")):  # workers are about to look
+        assert running.poll() is None
+        time.sleep(0.05)
+    time.sleep(0.3)
+    running.send_signal(signal.SIGTERM)
+    error = running.stderr.read()
+    assert running.wait(timeout=120) == 143, error
+    assert error.endswith(
+        b"g2ard: interrupted; finished steps are in .s.ply.tiles; run the same command to continue\n"
     )

@@ -1,0 +1,14 @@
+"""The inputs of a run of every command."""
+
+from pathlib import Path
+
+import pytest
+
+from helpers.writing_commands import write_inputs
+
+
+@pytest.fixture(scope="session")
+def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("inputs")
+    write_inputs(folder)
+    return folder
