@@ -228,6 +228,10 @@ def test_damage_is_named(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"halo-00000\.f32: No such file"):
         TileStore.open(folder)
 
+    for change, name in (({"count": 3}, "count"), ({"cells": [4, 0, None, None]}, "cells")):
+        manifest.write_text(json.dumps(json.loads(text) | change))
+        with pytest.raises(InputError, match=f"property '{name}'"):
+            TileStore.open(folder)
     manifest.write_text(text[:50])
     with pytest.raises(InputError, match="not JSON"):
         TileStore.open(folder)
