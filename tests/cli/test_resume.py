@@ -56,13 +56,6 @@ def test_checkpoints_are_kept(folder: Path, command_line: CommandLine, command: 
     assert not list(folder.glob(".*"))
 
 
-@pytest.mark.parametrize("command", ["recover", "adapt"])
-def test_messages_name_the_split(folder: Path, command_line: CommandLine, command: str) -> None:
-    ask = (command, "a.ply", "--steps", 2, "--views", "views.json", "--teacher", "t.ply", "-wo", "out.ply")
-    for split, words in (("train", "training views "), ("test", ", test views "), ("all", ", all views ")):
-        assert words in succeeds(command_line, folder, *ask, "--split", split).err
-
-
 def bytes_of(save: Callable[[io.BytesIO], None]) -> bytes:
     buffer = io.BytesIO()
     save(buffer)
