@@ -148,7 +148,7 @@ WHOLE = {
         ("--recovery-time 5m", "--recovery-time"),
     ),
     "simplify ball.ply -o x.ply --tile-rows 150": (("--min-ssim 0.9", "--min-ssim 0.9"),),
-    "distill ball.ply -o x --tile-rows 150": (("--fit 50kB", "--fit 50kB"),),
+    "distill ball.ply -o x --format sog --tile-rows 150": (("--fit 50kB", "--fit 50kB"),),
 }
 """Command in tiles → options that need the whole scene, and how they are named."""
 INPUT += [
