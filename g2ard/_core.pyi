@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard.rendering.renderer import RasterSettings
+from g2ard.rendering.visibility import SampledVisibility
 from g2ard.scene.splats import Splats
 from g2ard.stages.lift import LiftConfig
 from g2ard.stages.recover.anchors import Regularizers
@@ -14,7 +15,6 @@ from g2ard.stages.recover.engine import Photometric
 from g2ard.stages.recover.schedule import Rates
 from g2ard.stages.select.surfaces import SurfaceOptions
 from g2ard.stages.simplify.config import SimplifyConfig
-from g2ard.stages.simplify.pairs import Visibility
 
 __version__: str
 
@@ -65,7 +65,7 @@ def simplify_pairwise(
     schedule: list[int],
     config: SimplifyConfig,
     protected: NDArray[np.bool_] | None = None,
-    visibility: Visibility | None = None,
+    visibility: SampledVisibility | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> dict[str, Any]: ...
 
@@ -80,7 +80,11 @@ class TileFrame:
 
 class TileMerging:
     def __init__(
-        self, scene: Scene, frame: TileFrame, config: SimplifyConfig, visibility: Visibility | None = None
+        self,
+        scene: Scene,
+        frame: TileFrame,
+        config: SimplifyConfig,
+        visibility: SampledVisibility | None = None,
     ) -> None: ...
     def sums(self) -> tuple[float, float]: ...
     def run_costs(self) -> NDArray[np.float32]: ...

@@ -26,13 +26,13 @@ from g2ard.poses import plan_pool
 from g2ard.progress import Progress, Say, plural, silent, unsaid
 from g2ard.rendering.metrics import psnr, ssim
 from g2ard.rendering.renderer import Renderer
-from g2ard.rendering.visibility import overdraw, visibility_source
+from g2ard.rendering.visibility import SampledVisibility, overdraw, visibility_source
 from g2ard.report.run import Packed
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.samples import evenly_spaced
 from g2ard.scene.splats import Splats
 from g2ard.scene.transform import change_of_axes, with_axes
-from g2ard.stages.simplify import Pairs, SimplifyConfig, Visibility, VisibilitySource, simplify
+from g2ard.stages.simplify import Pairs, SimplifyConfig, VisibilitySource, simplify
 from g2ard.system.cached import cached_property
 
 _QUALITY_VIEWS, _QUALITY_SIDE = 12, 400
@@ -223,9 +223,9 @@ class _Remembering:
 
     def __init__(self, source: VisibilitySource, views: Cameras) -> None:
         self.source, self.views = source, views
-        self.first: tuple[Splats, Visibility] | None = None
+        self.first: tuple[Splats, SampledVisibility] | None = None
 
-    def __call__(self, scene: Splats) -> Visibility:
+    def __call__(self, scene: Splats) -> SampledVisibility:
         if self.first is not None and _same(self.first[0], scene):
             return self.first[1]
         seen = self.source(scene)

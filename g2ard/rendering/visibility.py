@@ -40,7 +40,22 @@ _Floats = NDArray[np.float32]
 
 
 @dataclass(frozen=True, eq=False)
-class Visibility:
+class SampledVisibility:
+    """Visibility sampled from a few small renders, for the weights of simplification.
+
+    Args:
+        weight: (N,) float32, Σ αT²: behind transmittance T, a change adds to a squared error with T².
+        pixel_size: (N,) float32, the smallest depth / focal length over the views whose image contains the
+            Gaussian's mean: the size of a pixel there, scene units; ∞ if no view contains it. It is that of
+            the full-size image.
+    """
+
+    weight: NDArray[Any]
+    pixel_size: _Floats
+
+
+@dataclass(frozen=True, eq=False)
+class Visibility(SampledVisibility):
     """Contribution of each Gaussian to a set of views, summed over their pixels.
 
     Args:
@@ -49,16 +64,12 @@ class Visibility:
         hits: (N,) uint64, pixels it touches (α ≥ 1/255, before the light is used up).
         dominant: (N,) uint64, pixels where no other Gaussian has a larger αT.
         peak: (N,) float32, its largest αT.
-        pixel_size: (N,) float32, the smallest depth / focal length over the views whose image contains its
-            mean: the size of a pixel there, scene units; ∞ if no view contains it.
     """
 
-    weight: NDArray[np.float64]
     transmittance: NDArray[np.float64]
     hits: NDArray[np.uint64]
     dominant: NDArray[np.uint64]
     peak: _Floats
-    pixel_size: _Floats
 
 
 def visibility(
@@ -103,19 +114,6 @@ def overdraw(splats: Splats, cameras: Cameras, progress: Progress = silent) -> f
     faint = RasterSettings(alpha_max=1 / 255)  # comes after the test, so that light is never used up
     seen = visibility(splats, cameras, progress, settings=faint)
     return float(seen.hits.sum() / (cameras.widths.astype(np.int64) * cameras.heights).sum())
-
-
-@dataclass(frozen=True, eq=False)
-class SampledVisibility:
-    """Visibility sampled from a few small renders, for the weights of simplification.
-
-    Args:
-        weight: (N,) float32, Σ αT²: behind transmittance T, a change adds to a squared error with T².
-        pixel_size: (N,) float32, as in `Visibility`, for the full-size image.
-    """
-
-    weight: _Floats
-    pixel_size: _Floats
 
 
 def visibility_source(cameras: Cameras, *, longest: int = LONGEST, progress: Progress = silent) -> _Sampler:

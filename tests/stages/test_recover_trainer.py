@@ -16,7 +16,7 @@ from g2ard.scene.cameras import Cameras
 from g2ard.stages.recover.anchors import Anchors, Regularizers
 from g2ard.stages.recover.engine import Photometric
 from g2ard.stages.recover.extent import extents, share_of_rate
-from g2ard.stages.recover.losses import TorchAnchors, l1_ssim, regularization
+from g2ard.stages.recover.losses import l1_ssim, regularization
 from g2ard.stages.recover.rasterize import rasterize
 from g2ard.stages.recover.schedule import Rates
 from g2ard.system import devices
@@ -258,10 +258,9 @@ def test_regularizers_are_torch_s(weights: Regularizers, on: str) -> None:
     p["log_scales"] += rng.normal(size=p["log_scales"].shape).astype(np.float32)
     p["log_scales"][::5, 1:] -= 6
     p["quats"] += (0.3 * rng.normal(size=p["quats"].shape)).astype(np.float32)
-    torch_anchors = TorchAnchors(anchors)
 
     def extra(q: dict[str, torch.Tensor]) -> torch.Tensor:
-        return regularization(q["means"], q["quats"], q["log_scales"], torch_anchors, weights)
+        return regularization(q["means"], q["quats"], q["log_scales"], anchors, weights)
 
     trainer, twin = trainer_of(p, on=on), Twin(p)
     trainer.anchor(anchors.means, np.ascontiguousarray(anchors.frames), anchors.r_parallel, anchors.r_perp)

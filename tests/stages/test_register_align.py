@@ -1,6 +1,7 @@
 """Direct alignment and polishing: against naive twins, rendered differences, and poses that are known."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from g2ard import _core
 from g2ard.rendering.renderer import Renderer
 from g2ard.stages.register.align import Aligned, Shot, align, level_of, normal_equations, shot_of
 from g2ard.stages.register.grey import blurred, blurred_back, grey_of, local_zncc, shift_between, zncc
-from g2ard.stages.register.polish import Energy, Prior, polish
+from g2ard.stages.register.polish import Energy, polish
 from g2ard.stages.register.pose import moved, pose_error
 from helpers.registration import BALL, CONFIG, off, pyramid_of
 from helpers.scenes import around
@@ -176,7 +177,7 @@ def test_its_slope_is_how_the_energy_changes() -> None:
     camera, renderer = around(5, (160, 120), 2.5)[1], Renderer(BALL)
     level = pyramid_of(camera, np.clip(0.9 * renderer.image(camera), 0, 1), CONFIG)[-1][1]
     start = off(camera.viewmat, 0.02, 0.4, 3)
-    prior = Prior(off(camera.viewmat, 0.01, 0.2, 4), 50 * np.eye(6))
+    prior = SimpleNamespace(viewmat=off(camera.viewmat, 0.01, 0.2, 4), information=50 * np.eye(6))
     energy = Energy(renderer, camera, level, prior, CONFIG)
     here = energy.at(start, 1.0, 0.0)
     along = here.slope / np.sqrt(np.diag(here.hessian))
@@ -196,7 +197,7 @@ def test_it_ends_at_the_pose(view: int) -> None:
     distance, angle = pose_error(found.viewmat, camera.viewmat)
     assert distance < 3e-3
     assert angle < 0.1
-    held = Prior(start.viewmat, 1e9 * np.eye(6))
+    held = SimpleNamespace(viewmat=start.viewmat, information=1e9 * np.eye(6))
     stays = polish(renderer, start, camera, level, held, CONFIG)
     assert pose_error(stays.viewmat, start.viewmat)[0] < 1e-4
 

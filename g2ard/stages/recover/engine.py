@@ -1,7 +1,6 @@
-"""Objective and interface of the engines that run recovery's steps."""
+"""Objective of the engines that run recovery's steps."""
 
 from dataclasses import dataclass
-from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +9,6 @@ from g2ard.rendering.renderer import RasterSettings
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
 from g2ard.stages.recover.anchors import Anchors, Regularizers
-from g2ard.stages.recover.schedule import Rates
 
 TYPICAL_LOSS, LEAST_LOSS = 0.02, 0.005
 """Loss to which the gradients of views are scaled if they count alike, and the loss below which errors are
@@ -51,38 +49,3 @@ class Objective(Photometric):
     means_in_scales: bool
     frozen: NDArray[np.bool_] | None = None
     relative: bool = False
-
-
-class Engine(Protocol):
-    """Parameters and optimiser state of a recovery, advanced one view at a time."""
-
-    def step(
-        self,
-        view: int,
-        target: NDArray[np.float32],
-        rates: Rates,
-        *,
-        regularize: bool,
-        mask: NDArray[np.bool_] | None = None,
-    ) -> float:
-        """Take one optimiser step on one view; return its photometric loss.
-
-        A view's target and mask are the same in all steps, so an engine may keep them.
-        """
-
-    def splats(self) -> Splats:
-        """Return the current scene, with normalised quaternions."""
-
-    def state(self) -> dict[str, NDArray[Any]]:
-        """Return everything that a bitwise resume needs."""
-
-    def load(self, state: dict[str, NDArray[Any]]) -> None:
-        """Restore a `state`."""
-
-    @property
-    def counts(self) -> NDArray[Any]:
-        """Number of steps that each Gaussian has taken, (N,)."""
-
-    @property
-    def skipped(self) -> int:
-        """Number of single-Gaussian steps skipped because a gradient was not finite."""

@@ -15,9 +15,10 @@ from g2ard.stages.recover.sizes import radii
 
 
 class FusedEngine:
-    """Engine equivalent to `TorchEngine` up to rounding, on the device in use (`system.devices`).
+    """Parameters and optimiser state of a recovery, advanced one view at a time.
 
-    Its state is the same on every device. After a `DeviceError` new engines run on the CPU.
+    Equivalent to `TorchEngine` up to rounding, on the device in use (`system.devices`). Its state is the same
+    on every device. After a `DeviceError` new engines run on the CPU.
     """
 
     def __init__(self, objective: Objective) -> None:
@@ -45,6 +46,10 @@ class FusedEngine:
         regularize: bool,
         mask: NDArray[np.bool_] | None = None,
     ) -> float:
+        """Take one optimiser step on one view; return its photometric loss.
+
+        A view's target and mask are the same in all steps, so that the device may keep them.
+        """
         objective = self._objective
         loss, _ = self._trainer.step(
             view_of(objective.cameras, view, objective.settings),
@@ -58,6 +63,7 @@ class FusedEngine:
         return loss
 
     def splats(self) -> Splats:
+        """Return the current scene, with normalised quaternions."""
         means, quats, log_scales, logit_opacities, sh0, shN = self._trainer.arrays()
         length = np.linalg.norm(quats, axis=1, keepdims=True)
         quats = np.where(length > 0, quats / np.where(length > 0, length, 1), [1.0, 0.0, 0.0, 0.0])
@@ -72,6 +78,7 @@ class FusedEngine:
         )
 
     def state(self) -> dict[str, NDArray[Any]]:
+        """Return everything that a bitwise resume needs."""
         return {**self._trainer.state(), "skipped": np.array(self.skipped)}
 
     def load(self, state: dict[str, NDArray[Any]]) -> None:
@@ -81,8 +88,10 @@ class FusedEngine:
 
     @property
     def counts(self) -> NDArray[Any]:
+        """Number of steps that each Gaussian has taken, (N,)."""
         return self._trainer.state()["steps"]
 
     @property
     def skipped(self) -> int:
+        """Number of single-Gaussian steps skipped because a gradient was not finite."""
         return self._skipped_before + self._trainer.skipped

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from g2ard.rendering.renderer import arrays_of
-from g2ard.scene.splats import ARRAYS, Splats, unit_quats
+from g2ard.scene.splats import ARRAYS, Splats
 
 LOOKS = (0.1, 0.3, 0.5, 0.75)
 """Shares of the horizon at which the scene is scored."""
@@ -129,29 +129,30 @@ class Guard:
         """
         if self.others is None:
             return result, 0.0
-        best, chosen, scores = result, 0.0, self.others(result)
+        best, scores, mean = self._judged(result)
+        kept: float | None = 0.0
         self.validation.append({"step": step, "psnr": scores})
-        mean = self._mean(self.score(result), scores)
         for k in _PRIOR_VIEWS:
-            part = blended(self.start, result, views / (views + k))
-            found = self.others(part)
-            value = self._mean(self.score(part), found)
-            if not value > mean + _LEAST_GAIN:
+            other = self._judged(blended(self.start, result, views / (views + k)))
+            if not other[2] > mean + _LEAST_GAIN:
                 break
-            best, chosen, scores, mean = part, k, found, value
+            kept, (best, scores, mean) = k, other
         if (harmful := self.harmful(best)) is not None:
-            part = blended(self.start, best, ~harmful)
-            found = self.others(part)
-            value = self._mean(self.score(part), found)
-            if value > mean:
-                best, scores, mean = part, found, value
-        kept: float | None = chosen
+            other = self._judged(blended(self.start, best, ~harmful))
+            if other[2] > mean:
+                best, scores, mean = other
         gain = mean - self._mean(self.before, self.validation[0]["psnr"])
         if self._gain(scores) < -_TOLERATED_LOSS or not gain > _LEAST_GAIN:
             best, kept, scores = self._least_harm(result, views)
         if best is not result:
             self.validation.append({"step": step, "psnr": scores})
         return best, kept
+
+    def _judged(self, scene: Splats) -> tuple[Splats, dict[str, float], float]:
+        """Return a scene, its scores by kind of validation view, and their mean with the training views'."""
+        assert self.others is not None
+        scores = self.others(scene)
+        return scene, scores, self._mean(self.score(scene), scores)
 
     def _mean(self, trained: float, scores: dict[str, float]) -> float:
         """Return the mean PSNR over training views, `trained`, and the kinds of validation views."""
@@ -230,7 +231,6 @@ def blended(start: Splats, end: Splats, share: ArrayLike) -> Splats:
     end = end.narrowed()
     start = start.narrowed(end.offset)
     (m0, q0, l0, o0, d0, n0), (m1, q1, l1, o1, d1, n1) = (arrays_of(scene) for scene in (start, end))
-    q0, q1 = unit_quats(q0), unit_quats(q1)
     q0 = q0 * np.where((q0 * q1).sum(1, keepdims=True) < 0, -1, 1)
     pairs = (m0, m1), (q0, q1), (l0, l1), (o0, o1), (d0, d1), (n0, n1)
     weight = np.broadcast_to(np.asarray(share, np.float32), (len(start),))

@@ -1,5 +1,7 @@
 """Steps of one recovery, the choice of rates before them, and checkpoints."""
 
+from __future__ import annotations
+
 import copy
 import hashlib
 import math
@@ -7,7 +9,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,13 +25,20 @@ from g2ard.scene.splats import Splats
 from g2ard.stages.recover.anchors import Anchors, drift95
 from g2ard.stages.recover.config import RecoverConfig
 from g2ard.stages.recover.draw import drawn
-from g2ard.stages.recover.engine import Engine, Objective
+from g2ard.stages.recover.engine import Objective
+from g2ard.stages.recover.fused_engine import FusedEngine
 from g2ard.stages.recover.guard import Guard
 from g2ard.stages.recover.probe import Probe
+from g2ard.stages.recover.report import Regularized
 from g2ard.stages.recover.schedule import multiplier_for, reach_for
 from g2ard.stages.recover.sizes import typical_share
 from g2ard.stages.recover.trials import MULTIPLIERS, Trials, trial_steps
 from g2ard.system.cached import cached_property
+
+if TYPE_CHECKING:
+    from g2ard.stages.recover.torch_engine import TorchEngine
+
+    Engine = FusedEngine | TorchEngine
 
 _SHORTEST_WITH_GUARD = 20
 """Fewest steps for going back to an earlier scene; shorter recoveries have no steps left to repeat."""
@@ -292,17 +301,15 @@ class Loop:
             self.geometry.append({"step": self.done, **figures})
 
     @property
-    def regularizers(self) -> dict[str, float]:
-        """Number of regularised steps, the share of all steps' time that regularising them added, and their
-        period in steps (0 if inactive)."""
+    def regularizers(self) -> Regularized:
+        """Steps and cost of the regularisers."""
         (plain, plain_seconds), (regularized, regularized_seconds) = self.tally
         extra = regularized_seconds - regularized * plain_seconds / plain if plain and regularized else 0.0
-        weights = self.config.regularizers
-        return {
-            "steps": regularized,
-            "share": max(0.0, extra) / max(plain_seconds + regularized_seconds, 1e-9),
-            "period": weights.period if weights.active else 0,
-        }
+        share, weights = (
+            max(0.0, extra) / max(plain_seconds + regularized_seconds, 1e-9),
+            self.config.regularizers,
+        )
+        return Regularized(int(regularized), share, weights.period if weights.active else 0)
 
     def _tell(self, progress: Progress, stage: str) -> None:
         speed = self.done / max(self.seconds, 1e-9)
@@ -355,11 +362,9 @@ def finite(reach: float) -> float | None:
     return None if math.isinf(reach) else reach
 
 
-def _engine_class(name: str) -> Callable[[Objective], Engine]:
+def _engine_class(name: str) -> type[Engine]:
     """Return the engine class of a name in `RecoverConfig.engine`, importing its packages on demand."""
     if name == "fused":
-        from g2ard.stages.recover.fused_engine import FusedEngine
-
         return FusedEngine
     if name == "torch":
         require_torch("engine 'torch'")

@@ -96,29 +96,21 @@ def l1_ssim_anywhere(
     return torch.where(counts, loss, 0.0).sum() / (counts.sum().clamp_min(1) * len(x))
 
 
-class TorchAnchors:
-    """`Anchors` as tensors."""
-
-    def __init__(self, anchors: Anchors, device: torch.device | None = None) -> None:
-        self.means = torch.from_numpy(anchors.means).to(device)
-        self.frames = torch.from_numpy(anchors.frames).to(device)
-        self.r_parallel = torch.from_numpy(anchors.r_parallel).to(device)
-        self.r_perp = torch.from_numpy(anchors.r_perp).to(device)
-
-
-def anchor_loss(means: Tensor, anchors: TorchAnchors) -> Tensor:
+def anchor_loss(means: Tensor, anchors: Anchors) -> Tensor:
     """Return (1/N) Σ log(1 + [D² − 1]₊): zero inside the trust region, robust outside."""
-    local = torch.einsum("nji,nj->ni", anchors.frames, means - anchors.means)
-    inside = (local[:, :2] / anchors.r_parallel[:, None]).square().sum(1)
-    squared = inside + (local[:, 2] / anchors.r_perp).square()
+    arrays = anchors.frames, anchors.means, anchors.r_parallel, anchors.r_perp
+    frames, places, r_parallel, r_perp = (torch.from_numpy(array).to(means) for array in arrays)
+    local = torch.einsum("nji,nj->ni", frames, means - places)
+    inside = (local[:, :2] / r_parallel[:, None]).square().sum(1)
+    squared = inside + (local[:, 2] / r_perp).square()
     return torch.log1p((squared - 1).clamp_min(0)).mean()
 
 
-def shape_loss(log_scales: Tensor, quats: Tensor, anchors: TorchAnchors, weights: Regularizers) -> Tensor:
+def shape_loss(log_scales: Tensor, quats: Tensor, anchors: Anchors, weights: Regularizers) -> Tensor:
     """Return (1/N) Σ max(0, −log(r_eff − 1 + ε)) + β[log s⊥ − log s̄⊥]₊, with s⊥ along the anchor's normal."""
-    normal = anchors.frames[:, :, 2]
+    normal, r_perp = (torch.from_numpy(a).to(quats) for a in (anchors.frames[:, :, 2], anchors.r_perp))
     extent = torch.einsum("nji,nj->ni", rotations(quats), normal) * log_scales.exp()
-    thickness = extent.square().sum(1).clamp_min(1e-38).log() / 2 - anchors.r_perp.log()
+    thickness = extent.square().sum(1).clamp_min(1e-38).log() / 2 - r_perp.log()
     total = weights.thickness * thickness.clamp_min(0)
     if weights.effective_rank:
         log_q = torch.log_softmax(log_scales, dim=1)  # log(s / Σs)
@@ -128,13 +120,12 @@ def shape_loss(log_scales: Tensor, quats: Tensor, anchors: TorchAnchors, weights
 
 
 def regularization(
-    means: Tensor, quats: Tensor, log_scales: Tensor, anchors: TorchAnchors, weights: Regularizers
+    means: Tensor, quats: Tensor, log_scales: Tensor, anchors: Anchors, weights: Regularizers
 ) -> Tensor:
     """Return λ_a·L_anchor + λ_s·L_shape."""
     total = means.new_zeros(())
     if weights.anchor > 0:
         total = total + weights.anchor * anchor_loss(means, anchors)
     if weights.shape > 0:
-        shape = shape_loss(log_scales, quats, anchors, weights)
-        total = total + weights.shape * shape
+        total = total + weights.shape * shape_loss(log_scales, quats, anchors, weights)
     return total

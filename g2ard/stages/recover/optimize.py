@@ -21,16 +21,7 @@ from g2ard.stages.recover.draw import checked_weights
 from g2ard.stages.recover.guard import Guard
 from g2ard.stages.recover.loop import Loop, Watch, finite
 from g2ard.stages.recover.probe import Probe, harmful_changes, score_by_kind
-from g2ard.stages.recover.report import (
-    Gain,
-    Geometry,
-    KindLook,
-    Look,
-    RecoverReport,
-    Regularized,
-    Trial,
-    Validation,
-)
+from g2ard.stages.recover.report import Gain, Geometry, Look, RecoverReport, Trial, Validation
 
 __all__ = ["Recovered", "Watch", "recover"]
 
@@ -137,6 +128,10 @@ def recover(
         result, prior_views = guard.choose_by_validation(end, seen, loop.done)
         if result is not end:
             after, blend = probe.all_of(result), float(result is not student)
+    validated = None
+    if validation is not None:
+        shrunk = None if prior_views is None else finite(prior_views)
+        validated = Validation(tuple(map(Look.of, guard.validation)), shrunk)
     return Recovered(
         result,
         RecoverReport(
@@ -151,17 +146,12 @@ def recover(
             drift95=drift95(anchors, result.means),
             needle=needle_share(result.scales),
             geometry=tuple(map(Geometry.of, loop.geometry)),
-            regularizers=Regularized.of(loop.regularizers),
+            regularizers=loop.regularizers,
             backed_off=tuple(map(Look.of, loop.guard.backed_off)),
             stopped=loop.guard.stopped,
             blend=blend,
             kept_start=blend == 0,
-            validation=None
-            if validation is None
-            else Validation(
-                tuple(map(KindLook.of, guard.validation)),
-                None if prior_views is None else finite(prior_views),
-            ),
+            validation=validated,
             skipped={"non_finite": loop.skipped},
             resumed=loop.resumed,
         ),

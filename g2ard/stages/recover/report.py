@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 from g2ard.io.reports import LEFT_OUT, Report
 from g2ard.progress import plural
@@ -31,18 +32,10 @@ class Trial(Report):
 
 @dataclass(frozen=True)
 class Look(Report):
-    """PSNR at a step, dB."""
+    """PSNR at a step, dB: a number, or the numbers by kind of validation view."""
 
     step: int
-    psnr: float
-
-
-@dataclass(frozen=True)
-class KindLook(Report):
-    """PSNR by kind of validation view at a step, dB."""
-
-    step: int
-    psnr: dict[str, float]
+    psnr: Any
 
 
 @dataclass(frozen=True)
@@ -74,7 +67,7 @@ class Validation(Report):
             change; None if all keep the same share, or none.
     """
 
-    looks: tuple[KindLook, ...]
+    looks: tuple[Look, ...]
     prior_views: float | None
 
 
@@ -180,7 +173,7 @@ def unregularized(rounds: Sequence[Sequence[RecoverReport]]) -> str | None:
         f"round {number}" if k == 0 else f"the last recovery of round {number}": done
         for number, entry in enumerate(rounds, 1)
         for k, done in enumerate(entry)
-        if _idle(done)
+        if not done.kept_start and not done.regularizers.steps and done.regularizers.period and done.steps
     }
     if not idle:
         return None
@@ -192,8 +185,3 @@ def unregularized(rounds: Sequence[Sequence[RecoverReport]]) -> str | None:
         f"the regularisers never acted{where}: they act every {period} steps, and there were {least} "
         "(--set regularizers.period=…)"
     )
-
-
-def _idle(report: RecoverReport) -> bool:
-    held = report.regularizers
-    return not report.kept_start and not held.steps and bool(held.period) and bool(report.steps)

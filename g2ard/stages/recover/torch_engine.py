@@ -14,7 +14,7 @@ from torch import Tensor
 from g2ard.scene.splats import Splats
 from g2ard.stages.recover.engine import LEAST_LOSS, TYPICAL_LOSS, Objective
 from g2ard.stages.recover.extent import extents, share_of_rate
-from g2ard.stages.recover.losses import TorchAnchors, l1_ssim, regularization
+from g2ard.stages.recover.losses import l1_ssim, regularization
 from g2ard.stages.recover.rasterize import rasterize
 from g2ard.stages.recover.schedule import Rates
 from g2ard.stages.recover.selective_adam import SelectiveAdam
@@ -23,8 +23,23 @@ from g2ard.stages.recover.sizes import radii
 _NAMES = ("means", "log_scales", "quats", "logit_opacities", "sh0", "shN")
 
 
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """Run torch's own operations on one thread.
+
+    The rasteriser, the loss and Adam have threads of their own, for which torch's would wait in busy loops
+    that cost several times the step.
+    """
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+
+
 class TorchEngine:
-    """Parameters and `SelectiveAdam`'s moments, advanced by one `step` per view.
+    """`FusedEngine` in torch, with the moments of `SelectiveAdam`.
 
     With `means_in_scales` the means are optimised as multiples of each Gaussian's initial radius (`radii`):
     Adam ignores the scale of gradients, so a rate of 0.05 moves a Gaussian by 5 % of its size. Subclasses
@@ -35,8 +50,7 @@ class TorchEngine:
 
     def __init__(self, objective: Objective) -> None:
         self._objective = objective
-        splats, anchors = objective.start, objective.anchors
-        self._anchors = TorchAnchors(anchors, self.device)
+        splats = objective.start
         self._settings = objective.settings
         self._base = torch.from_numpy(splats.means.astype(np.float32)).to(self.device)
         unit = radii(splats) if objective.means_in_scales else np.ones(len(splats), np.float32)
@@ -54,6 +68,7 @@ class TorchEngine:
         }
         self._adam = SelectiveAdam({name: p for name, p in self._parameters.items() if p.numel()})
 
+    @_one_thread()
     def step(
         self,
         view: int,
@@ -63,17 +78,6 @@ class TorchEngine:
         regularize: bool,
         mask: NDArray[np.bool_] | None = None,
     ) -> float:
-        with _one_thread():
-            return self._step(view, target, rates, regularize, mask)
-
-    def _step(
-        self,
-        view: int,
-        target: NDArray[np.float32],
-        rates: Rates,
-        regularize: bool,
-        mask: NDArray[np.bool_] | None,
-    ) -> float:
         p = self._parameters
         means = self._base + self._unit * p["means"]
         image = self._render(means, view)
@@ -82,9 +86,9 @@ class TorchEngine:
         total = loss
         if self._objective.relative:
             total = total * (TYPICAL_LOSS / max(float(loss.detach()), LEAST_LOSS))
-        weights = self._objective.regularizers
-        if regularize and weights.active:
-            total = total + regularization(means, p["quats"], p["log_scales"], self._anchors, weights)
+        if regularize:
+            anchors, weights = self._objective.anchors, self._objective.regularizers
+            total = total + regularization(means, p["quats"], p["log_scales"], anchors, weights)
         self._adam.zero_grad(set_to_none=True)
         torch.autograd.backward(total)
         shares = self._shares(means.detach(), view, rates)
@@ -166,18 +170,3 @@ class TorchEngine:
     @property
     def skipped(self) -> int:
         return self._adam.skipped
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """Run torch's own operations on one thread.
-
-    The rasteriser, the loss and Adam have threads of their own, for which torch's would wait in busy loops
-    that cost several times the step.
-    """
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)

@@ -13,7 +13,7 @@ from g2ard.stages.register.align import Aligned, Level, align, inverse, level_of
 from g2ard.stages.register.config import RegisterConfig
 from g2ard.stages.register.grey import grey_of, local_zncc
 from g2ard.stages.register.matchers import Matcher
-from g2ard.stages.register.polish import Prior, polish
+from g2ard.stages.register.polish import polish
 from g2ard.stages.register.pose import motion_between, moved
 from g2ard.stages.register.solve import Solved, solve
 
@@ -114,7 +114,7 @@ class Search:
 
     def by_alignment(self, start: Start, photo: Photo) -> Candidate | None:
         """Align directly, coarse to fine; return None if the start does not see the scene."""
-        aligned = self._aligned(start.begins, photo, photo.pyramid)
+        aligned = self._aligned(start.begins, photo.pyramid)
         if aligned is not None and self.config.refine == "exact":
             aligned = self._polished(aligned, photo, None)
         return None if aligned is None else Candidate(start, aligned, self._likeness(aligned.viewmat, photo))
@@ -147,7 +147,7 @@ class Search:
         polishes that mean.
         """
         refine = self.config.refine
-        near = self._aligned(solved.viewmat, photo, photo.pyramid[-_REFINING_LEVELS:])
+        near = self._aligned(solved.viewmat, photo.pyramid[-_REFINING_LEVELS:])
         plain = Aligned(solved.viewmat, 1.0, 0.0, inverse(solved.information), 0.0, 0, solved.depth)
         if near is None:
             return Candidate(start, plain, self._likeness(solved.viewmat, photo), solved)
@@ -163,16 +163,16 @@ class Search:
                     refined, viewmat=moved(solved.viewmat, both @ of_light @ xi), covariance=both
                 )
         if refine == "exact":
-            refined = self._polished(refined, photo, Prior(solved.viewmat, solved.information))
+            refined = self._polished(refined, photo, solved)
         return Candidate(start, refined, self._likeness(refined.viewmat, photo), solved)
 
-    def _polished(self, start: Aligned, photo: Photo, prior: Prior | None) -> Aligned:
+    def _polished(self, start: Aligned, photo: Photo, prior: Solved | None) -> Aligned:
         """Polish by the exact gradient at the finest level; return the start if that fails."""
         polished = polish(self.renderer, start, *photo.pyramid[-1], prior, self.config)
         self.renders += 1 if polished is None else polished.steps
         return start if polished is None else polished
 
-    def _aligned(self, pose: Float, photo: Photo, levels: list[tuple[Camera, Level]]) -> Aligned | None:
+    def _aligned(self, pose: Float, levels: list[tuple[Camera, Level]]) -> Aligned | None:
         aligned = align(self.renderer, pose, levels, self.config)
         self.renders += 1 if aligned is None else aligned.steps
         return aligned

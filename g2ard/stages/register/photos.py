@@ -119,11 +119,7 @@ def _register_photo(
     pool: PoolRenders | None,
     true: Float | None,
 ) -> tuple[PhotoReport, Candidate | None]:
-    """Register one photo from the pose `given`, otherwise from the pool.
-
-    Returns:
-        The photo's report, with errors against the pose `true` if given, and its best candidate, if any.
-    """
+    """Register one photo from the pose `given`, otherwise from the pool; return its best candidate."""
     name = photos.names[index]
     start_error = None if given is None or true is None else PoseError(*pose_error(given.pose, true))
     refused = PhotoReport(name, "refused", start=given.name if given else None, start_error=start_error)
@@ -169,10 +165,9 @@ def _from_pose(search: Search, given: Start, photo: Photo) -> list[Candidate]:
     if not accepted(aligned):
         camera, grey = photo.small
         render = small_render(search.renderer, replace(camera, viewmat=given.pose), config)
-        there = turned(given.pose, render, band_passed(grey), camera.K)
+        pose, _, shift = turned(given.pose, render, band_passed(grey), camera.K)
         search.renders += 1
-        again = replace(given, begins=there.viewmat)
-        if there.pixels and (c := search.by_alignment(again, photo)):
+        if shift and (c := search.by_alignment(replace(given, begins=pose), photo)):
             aligned.append(c)
     return out + aligned + _featured(search, aligned, photo)
 
@@ -182,8 +177,8 @@ def _from_pool(search: Search, pool: PoolRenders, photo: Photo) -> list[Candidat
     order, renders = pool.ranked(*photo.small)
     search.renders += renders
     starts = [
-        Start(pool.pool.viewmats[at], there.viewmat, pool.pool.names[at], rank)
-        for rank, (at, there) in enumerate(order[: search.config.candidates], 1)
+        Start(pool.pool.viewmats[at], pose, pool.pool.names[at], rank)
+        for rank, (at, pose) in enumerate(order[: search.config.candidates], 1)
     ]
     first = [(s, start) for start in starts if (s := search.by_matches(start.begins, photo, 1))]
     if first:
@@ -206,15 +201,6 @@ def _featured(search: Search, aligned: list[Candidate], photo: Photo) -> list[Ca
 
 
 def _reported(name: str, best: Candidate, config: RegisterConfig, renders: int) -> PhotoReport:
-    """Build the report of a photo's best candidate.
-
-    `sigma` is the standard deviation of position (scene units) and rotation (degrees), None without a
-    covariance; fields of feature matching keep their defaults after direct alignment alone.
-
-    Args:
-        best: its best pose; rows and columns of the (6, 6) covariance are position, then rotation.
-        config: limits that decide between registered, uncertain and refused.
-    """
     estimate = best.found
     sigma = None
     if estimate.covariance is not None:
@@ -222,10 +208,8 @@ def _reported(name: str, best: Candidate, config: RegisterConfig, renders: int) 
         rotation = np.sqrt(np.trace(estimate.covariance[3:, 3:]))
         sigma = PoseError(float(position), float(np.degrees(rotation)))
     status, reason = _acceptance(best.zncc, sigma, estimate.depth, config)
-    names = ("matches", "inliers", "spread", "reprojection", "passes")
-    of_features: dict[str, Any] = {}
-    if best.solved is not None:
-        of_features = {name: getattr(best.solved, name) for name in names}
+    names = ("matches", "inliers", "spread", "reprojection", "passes") if best.solved else ()
+    of_features: dict[str, Any] = {name: getattr(best.solved, name) for name in names}
     return PhotoReport(
         name=name,
         status=status,
@@ -247,13 +231,7 @@ def _reported(name: str, best: Candidate, config: RegisterConfig, renders: int) 
 def _acceptance(
     zncc: float, sigma: PoseError | None, depth: float, config: RegisterConfig
 ) -> tuple[Status, str | None]:
-    """Return the status of a pose and the reason, None if it is registered.
-
-    Args:
-        zncc: median local ZNCC of photo and render.
-        sigma: standard deviations of the pose; None if the photo does not determine it.
-        depth: median depth of the render, scene units.
-    """
+    """Return the status of a pose and the reason, None if it is registered."""
     if sigma is None:
         return "refused", "the photo does not determine the pose"
     if zncc < min(config.doubt, config.accept):

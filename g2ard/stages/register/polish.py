@@ -19,6 +19,7 @@ from g2ard.stages.register.align import Aligned, Level, Shot, inverse, moves, no
 from g2ard.stages.register.config import RegisterConfig
 from g2ard.stages.register.grey import LUMA, blurred_back
 from g2ard.stages.register.pose import motion_between, moved
+from g2ard.stages.register.solve import Solved
 
 Float = NDArray[np.float64]
 
@@ -28,20 +29,6 @@ _DAMPING = 1e-3, 10.0
 """Initial damping, and its factor: multiplied after a step that raises the cost, divided otherwise."""
 _LEAST_DAMPING = 1e-6
 _MOST_DAMPING = 1e3
-
-
-@dataclass(frozen=True, eq=False)
-class Prior:
-    """Pose from features: (4, 4) camera_from_world, and its (6, 6) inverse covariance."""
-
-    viewmat: Float
-    information: Float
-
-    def at(self, viewmat: Float) -> tuple[float, Float]:
-        """Return ½ ξᵀ Λ ξ and Λ ξ, for small ξ."""
-        xi = motion_between(self.viewmat, viewmat)
-        slope = self.information @ xi
-        return float(xi @ slope) / 2, slope
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +50,7 @@ class Energy:
     """E of one photo; σ and the pixel count are fixed at the first evaluation."""
 
     def __init__(
-        self, renderer: Renderer, camera: Camera, photo: Level, prior: Prior | None, config: RegisterConfig
+        self, renderer: Renderer, camera: Camera, photo: Level, prior: Solved | None, config: RegisterConfig
     ) -> None:
         self._renderer, self._camera, self._photo = renderer, camera, photo
         self._prior, self._config = prior, config
@@ -83,7 +70,9 @@ class Energy:
         normal = normal_equations(photo, shot, camera.K, gain, bias, self._scale)
         if self._scale is None:
             self._scale, self._pixels = normal.scale, int(counted.sum())
-        by_residual = self._residual_gradient(photo.grey - gain * shot.grey - bias, counted)
+        share = (photo.grey - gain * shot.grey - bias) / self._scale
+        tukey = np.maximum(0.0, 1 - (share / _TUKEY) ** 2) ** 2 * share
+        by_residual = np.where(counted, tukey, 0.0) / (self._scale * config.correlated)
         by_grey = blurred_back(-gain * by_residual)
         unclipped = (out.image > 0) & (out.image < 1)
         by_colour = np.where(unclipped, by_grey[..., None] * LUMA, 0.0).astype(np.float32)
@@ -92,18 +81,12 @@ class Energy:
         hessian = normal.matrix / (normal.scale**2 * config.correlated)
         energy = normal.cost * self._pixels * _TUKEY**2 / 6 / config.correlated
         if self._prior is not None:
-            more, by_motion = self._prior.at(viewmat)
-            energy, slope[:6] = energy + more, slope[:6] + by_motion
+            xi = motion_between(self._prior.viewmat, viewmat)
+            by_motion = self._prior.information @ xi  # for small ξ
+            energy, slope[:6] = energy + float(xi @ by_motion) / 2, slope[:6] + by_motion
             hessian[:6, :6] += self._prior.information
         depth = float(np.median(shot.depth[counted]))
         return Point(viewmat, gain, bias, energy, slope, hessian, shot, float(counted.mean()), depth)
-
-    def _residual_gradient(self, residual: Float, counted: NDArray[np.bool_]) -> Float:
-        """Return (H, W) dE/dr of the residual r, 0 for pixels that do not count."""
-        assert self._scale is not None
-        share = residual / self._scale
-        weight = np.maximum(0.0, 1 - (share / _TUKEY) ** 2) ** 2
-        return np.where(counted, weight * share, 0.0) / (self._scale * self._config.correlated)
 
 
 def polish(
@@ -111,7 +94,7 @@ def polish(
     start: Aligned,
     camera: Camera,
     photo: Level,
-    prior: Prior | None,
+    prior: Solved | None,
     config: RegisterConfig,
 ) -> Aligned | None:
     """Minimise E from a pose and its light; return None if too few pixels are valid.

@@ -1,6 +1,6 @@
 """Starting poses for photos without one: pool poses whose small renders are most similar to the photo."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,21 +15,6 @@ from g2ard.stages.register.pose import rotation_of
 Float = NDArray[np.float64]
 
 
-@dataclass(frozen=True, eq=False)
-class Turned:
-    """A pose rotated so that its render fits a photo, estimated from an image shift.
-
-    Args:
-        viewmat: (4, 4) camera_from_world; the camera centre is unchanged.
-        likeness: similarity of the shifted render and the photo, see `shift_between`.
-        pixels: length of the shift in pixels.
-    """
-
-    viewmat: Float
-    likeness: float
-    pixels: float
-
-
 def small_render(renderer: Renderer, camera: Camera, config: RegisterConfig) -> Float:
     """Render (H, W) band-passed grey, 0 where alpha is too low."""
     out = renderer.render(camera)
@@ -37,14 +22,17 @@ def small_render(renderer: Renderer, camera: Camera, config: RegisterConfig) -> 
     return np.where(out.alpha >= config.min_alpha, grey, 0.0)
 
 
-def turned(viewmat: Float, render: Float, photo: Float, K: Float) -> Turned:
+def turned(viewmat: Float, render: Float, photo: Float, K: Float) -> tuple[Float, float, float]:
     """Rotate a pose by the shift s of its `small_render` onto the photo's band-passed grey, with K of both:
     ω = (−s_v/f_y, s_u/f_x, 0).
+
+    Returns:
+        The (4, 4) pose with the same centre, the likeness after the shift (`shift_between`), and |s|.
     """
     right, down, likeness = shift_between(render, photo)
     turn = np.eye(4)
     turn[:3, :3] = rotation_of([-down / K[1, 1], right / K[0, 0], 0])
-    return Turned(turn @ viewmat, likeness, float(np.hypot(right, down)))
+    return turn @ viewmat, likeness, float(np.hypot(right, down))
 
 
 class PoolRenders:
@@ -56,8 +44,8 @@ class PoolRenders:
         self._renderer, self.pool, self._config, self._progress = renderer, pool, config, progress
         self._kept: dict[bytes, list[Float]] = {}
 
-    def ranked(self, camera: Camera, grey: Float) -> tuple[list[tuple[int, Turned]], int]:
-        """Return poses by decreasing similarity, each rotated onto the photo, and the number of renders.
+    def ranked(self, camera: Camera, grey: Float) -> tuple[list[tuple[int, Float]], int]:
+        """Return indices by decreasing similarity with the poses rotated onto the photo, and the new renders.
 
         `camera` and `grey` are the photo at `pool_size`. Ties go by index.
         """
@@ -74,5 +62,5 @@ class PoolRenders:
             turned(view, render, photo, camera.K)
             for view, render in zip(self.pool.viewmats, self._kept[key], strict=True)
         ]
-        order = np.argsort([-each.likeness for each in similar], kind="stable").tolist()
-        return [(at, similar[at]) for at in order], renders
+        order = np.argsort([-likeness for _, likeness, _ in similar], kind="stable").tolist()
+        return [(at, similar[at][0]) for at in order], renders

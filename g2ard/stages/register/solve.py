@@ -83,7 +83,20 @@ def solve(
         T, inlying = after
         of, at, X = uv[known][inlying], seen[known][inlying], points[known][inlying]
         shift = _projected(T, there.K, X) - _projected(there.viewmat, there.K, X)
-        solution = _described(T, camera, int(known.sum()), of, X, at, number + 1, config)
+        cells = np.floor(4 * of / [camera.width, camera.height]).clip(0, 3) @ [1, 4]
+        distance = np.linalg.norm(_projected(T, camera.K, X) - of, axis=1)
+        solution = Solved(
+            viewmat=T,
+            matches=int(known.sum()),
+            inliers=len(of),
+            spread=len(np.unique(cells)) / 16,
+            reprojection=float(np.median(distance)),
+            information=information(T, camera.K, of, X) / config.alike,
+            depth=float(np.median(X @ T[2, :3] + T[2, 3])),
+            passes=number + 1,
+            pixels=of,
+            seen=at,
+        )
         if float(np.sqrt((shift**2).sum(1).mean())) < _STILL_PIXELS:
             break
     return solution
@@ -150,33 +163,6 @@ def solve_pnp(
     T[:3, :3] = U @ Vt
     T[:3, 3] -= T[:3, :3] @ middle
     return (T, np.asarray(answer["inlier_mask"], bool)) if np.isfinite(T).all() else None
-
-
-def _described(
-    T: Float,
-    camera: Camera,
-    matches: int,
-    uv: Float,
-    points: Float,
-    seen: Float,
-    passes: int,
-    config: RegisterConfig,
-) -> Solved:
-    """Describe a pose by its inliers: pixels `uv` of the photo, `points`, and pixels `seen` of the render."""
-    cells = np.floor(4 * uv / [camera.width, camera.height]).clip(0, 3) @ [1, 4]
-    distance = np.linalg.norm(_projected(T, camera.K, points) - uv, axis=1)
-    return Solved(
-        viewmat=T,
-        matches=matches,
-        inliers=len(uv),
-        spread=len(np.unique(cells)) / 16,
-        reprojection=float(np.median(distance)),
-        information=information(T, camera.K, uv, points) / config.alike,
-        depth=float(np.median(points @ T[2, :3] + T[2, 3])),
-        passes=passes,
-        pixels=uv,
-        seen=seen,
-    )
 
 
 def information(T: Float, K: Float, uv: Float, points: Float) -> Float:

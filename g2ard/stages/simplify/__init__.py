@@ -1,7 +1,7 @@
 """Simplification to an exact budget: rounds of drop, merge and trim (section 3.2 of the paper)."""
 
 from g2ard.stages.simplify.config import Default, Fast, Pairs, Paper, SimplifyConfig, round_counts
-from g2ard.stages.simplify.pairs import Visibility, VisibilitySource
+from g2ard.stages.simplify.pairs import VisibilitySource
 from g2ard.stages.simplify.reduce import Simplified, flag, simplify
 
 __all__ = [
@@ -11,7 +11,6 @@ __all__ = [
     "Paper",
     "Simplified",
     "SimplifyConfig",
-    "Visibility",
     "VisibilitySource",
     "flag",
     "round_counts",

@@ -94,7 +94,6 @@ def outside_views(scene: Splats) -> list[Camera]:
 
 
 def some_views(cameras: Cameras) -> list[Camera]:
-    """Return a few evenly spaced views."""
     return [cameras[i] for i in evenly_spaced(len(cameras), _VIEWS)]
 
 
@@ -144,6 +143,11 @@ class Renders:
             error, lost, opaque = error + differs, lost + misses, opaque + stops
         return error, lost, opaque
 
+    def lost_in(self, scene: Splats) -> float:
+        """Return the share of the light that opaque pixels stop but a simplified scene lets through."""
+        _, lost, opaque = self.compare(scene)
+        return lost / opaque if opaque else 0.0
+
 
 def _image(renderer: Renderer, view: Camera) -> NDArray[np.float32]:
     one = renderer.render(view)
@@ -165,8 +169,7 @@ def opacity_lost(dense: Splats, result: Splats, cameras: Cameras) -> float:
     (0.0, True)
     """
     some = cameras.take(evenly_spaced(len(cameras), _GAP_VIEWS)).resized(_GAP_PIXELS)
-    _, lost, opaque = Renders.of(dense, some).compare(result)
-    return lost / opaque if opaque else 0.0
+    return Renders.of(dense, some).lost_in(result)
 
 
 def gaps_line(lost: float | None, hint: str) -> str | None:

@@ -3,7 +3,7 @@ opacities."""
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,23 +33,13 @@ DRAWN_OPACITY = float(1 / (1 + np.exp(-DRAWN_LOGIT)))
 """Least α that renderers draw."""
 
 
-class Visibility(Protocol):
-    """Visibility of N Gaussians in views, such as `g2ard.rendering.visibility.visibility` returns."""
-
-    @property
-    def weight(self) -> NDArray[Any]:
-        """(N,) Σ αT² over the pixels of the views."""
-
-    @property
-    def pixel_size(self) -> NDArray[Any]:
-        """(N,) pixel size at the Gaussian, scene units; ∞ if no view contains it."""
-
-
-VisibilitySource = Callable[[Splats], Visibility]
+VisibilitySource = Callable[[Splats], SampledVisibility]
 """Function scene → visibility, such as `g2ard.rendering.visibility.visibility_source` returns."""
 
 
-def rows_of(visibility: Visibility, count: int, finite: NDArray[np.bool_] | slice) -> SampledVisibility:
+def rows_of(
+    visibility: SampledVisibility, count: int, finite: NDArray[np.bool_] | slice
+) -> SampledVisibility:
     for name in ("weight", "pixel_size"):
         shape = getattr(visibility, name).shape
         if shape != (count,):
@@ -58,7 +48,7 @@ def rows_of(visibility: Visibility, count: int, finite: NDArray[np.bool_] | slic
     return SampledVisibility(np.ascontiguousarray(weight), np.ascontiguousarray(pixel))
 
 
-def emphasised(scene: Splats, visibility: Visibility, config: Pairs) -> Visibility:
+def emphasised(scene: Splats, visibility: SampledVisibility, config: Pairs) -> SampledVisibility:
     """Emphasise the regions to keep, as if views were √keep_times times closer.
 
     Inside them, weights are multiplied by keep_times and pixel sizes divided by √keep_times.
@@ -74,7 +64,7 @@ def emphasised(scene: Splats, visibility: Visibility, config: Pairs) -> Visibili
 def merge(
     scene: PreparedScene,
     budget: int,
-    visibility: Visibility | None,
+    visibility: SampledVisibility | None,
     protected: NDArray[np.bool_] | None,
     config: Pairs,
     progress: Progress,

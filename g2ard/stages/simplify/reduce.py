@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 from g2ard import _core
 from g2ard.errors import InputError, require
 from g2ard.progress import Progress, counter, plural, silent
-from g2ard.scene.prepared import PreparedScene, finite_rows_of, with_some_opacity
+from g2ard.rendering.visibility import SampledVisibility
+from g2ard.scene.prepared import finite_rows_of, with_some_opacity
 from g2ard.scene.splats import DRAWN_LOGIT, Splats, unit_quats
 from g2ard.stages.simplify.config import Pairs, SimplifyConfig
 from g2ard.stages.simplify.growth import Renders, outside_views, some_views
 from g2ard.stages.simplify.pairs import (
-    Visibility,
     VisibilitySource,
     merge,
     merge_and_fit,
@@ -92,7 +92,7 @@ def simplify(
     budget: int,
     *,
     method: str | None = None,
-    visibility: Visibility | VisibilitySource | None = None,
+    visibility: SampledVisibility | VisibilitySource | None = None,
     protected: NDArray[np.bool_] | None = None,
     final_budget: int | None = None,
     compare: bool = False,
@@ -166,7 +166,14 @@ def simplify(
         views = outside_views(scene) if views is None else some_views(views)
         renders = Renders.of(scene.take(scene.core.order), views)  # ties in depth go by row
     if not isinstance(config, Pairs):
-        out = _paper(scene, budget, protected, final_budget or budget, config, progress)
+        out = _core.simplify_paper(
+            scene.core,
+            config.rounds(len(scene), budget),
+            final_budget or budget,
+            config.resolved(),
+            protected=protected,
+            progress=counter(progress, "simplify"),
+        )
     elif config.keep_region and visibility is None:
         raise InputError("needs views; `fast` uses only given ones", parameter="keep_region")
     elif callable(visibility):
@@ -174,32 +181,8 @@ def simplify(
     else:
         seen = None if visibility is None else rows_of(visibility, len(splats), finite)
         out = widen(scene, merge(scene, budget, seen, protected, config, progress), renders, config)
-    lost = None if renders is None else _share_lost(renders, splats_of(scene, out))
+    lost = None if renders is None else renders.lost_in(splats_of(scene, out))
     return _simplified(splats, finite, out, lost)
-
-
-def _paper(
-    scene: PreparedScene,
-    budget: int,
-    protected: NDArray[np.bool_] | None,
-    cells: int,
-    config: SimplifyConfig,
-    progress: Progress,
-) -> dict[str, Any]:
-    return _core.simplify_paper(
-        scene.core,
-        config.rounds(len(scene), budget),
-        cells,
-        config.resolved(),
-        protected=protected,
-        progress=counter(progress, "simplify"),
-    )
-
-
-def _share_lost(renders: Renders, small: Splats) -> float:
-    """Return the share of the light that the scene's opaque pixels stop but the result lets through."""
-    _, lost, opaque = renders.compare(small)
-    return lost / opaque if opaque else 0.0
 
 
 def _simplified(
