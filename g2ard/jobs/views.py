@@ -234,7 +234,7 @@ def _mixed(
     if focus is None and more is not None:
         compact, per_row = _compact(prior, count, represents, progress)
         least = round(_TRAINING_VIEWS * times)
-        done = complete(
+        order, _, unseen = complete(
             compact,
             train.cameras,
             more,
@@ -243,7 +243,7 @@ def _mixed(
             represents=per_row,
             progress=progress,
         )
-        more, unseen = more.take(done.order) if len(done.order) else None, done.unseen
+        more = more.take(order) if len(order) else None
     if more is None:
         return train, others, unseen
     weights = np.ones(usual) if train.weights is None else train.weights / train.weights.mean()

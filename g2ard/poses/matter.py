@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 from typing import Any
 
@@ -14,6 +14,7 @@ from g2ard.errors import InputError
 from g2ard.poses.numbers import Floats, canonical_order, middle, norms, quantile, turned
 from g2ard.scene.splats import Splats
 from g2ard.scene.transform import rotation_matrices
+from g2ard.system.cached import cached_property
 
 _FAR = 7.0
 """Distance of floaters and sky from the centre, as a multiple of the radius of two thirds of the opacity."""
@@ -41,27 +42,6 @@ along an axis for one wider than a cell."""
 
 _REACH = 12
 """Largest distance stored, in cells: enough for rays to stride through free space."""
-
-
-@dataclass(frozen=True, eq=False)
-class Sample:
-    """A fair sample of the matter, at most 200,000 rows.
-
-    Args:
-        points: (K, 3) means.
-        weights: (K,) mass.
-        normals: (K, 3) unit axes of the smallest scales, sign arbitrary.
-        faces: (K,) mass × flatness, where flatness is 1 − smallest / middle scale.
-    """
-
-    points: Floats
-    weights: Floats
-    normals: Floats
-    faces: Floats
-
-    def take(self, rows: Any) -> Sample:
-        """Return the rows that a mask, a slice or indices select."""
-        return Sample(self.points[rows], self.weights[rows], self.normals[rows], self.faces[rows])
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,10 +76,7 @@ class Matter:
     def of(cls, splats: Splats, limit: int | None = None, represents: float = 1.0) -> Matter:
         """Weigh a scene's rows, drop invisible and distant ones, and normalise the rest.
 
-        Args:
-            splats: the scene, or a fair sample of it.
-            limit: largest number of rows, taken as a fair sample; None means all.
-            represents: Gaussians per row of `splats`.
+        At most `limit` rows are used, as a fair sample. Each row of `splats` represents some Gaussians.
 
         Raises:
             InputError: nothing is visible.
@@ -139,12 +116,21 @@ class Matter:
             represents=represents,
         )
 
-    def sample(self) -> Sample:
-        """Return the first rows with their normals."""
-        some = slice(_SAMPLE)
-        thick = np.maximum(self.scales[some, 1], np.finfo(float).tiny)
-        faces = self.weights[some] * (1 - self.scales[some, 0] / thick)
-        return Sample(self.points[some], self.weights[some], self.axes(some)[:, 0], faces)
+    def first(self, count: int = _SAMPLE) -> Matter:
+        """Return the first rows, a fair sample."""
+        names = ("points", "weights", "scales", "quats", "order", "opacities")
+        return replace(self, **{name: getattr(self, name)[:count] for name in names})
+
+    @cached_property
+    def normals(self) -> Floats:
+        """(M, 3) unit axes of the smallest scales, sign arbitrary."""
+        return self.axes(slice(None))[:, 0]
+
+    @cached_property
+    def faces(self) -> Floats:
+        """(M,) mass × flatness, where flatness is 1 − smallest / middle scale."""
+        thick = np.maximum(self.scales[:, 1], np.finfo(float).tiny)
+        return self.weights * (1 - self.scales[:, 0] / thick)
 
     def axes(self, rows: Any) -> Floats:
         """Return (m, 3, 3) the unit axes of some rows, by ascending scale."""

@@ -276,7 +276,7 @@ def _sharp(survey: Survey, poses: Poses) -> NDArray[np.bool_]:
     site = survey.site
     away = norms(poses.eyes - site.box.mean(axis=0))
     reach = away + norms(site.box[1:] - site.box[:1]) / 2
-    usual = middle(site.grid.scale_at(site.points))  # unweighted: a sky has few rows and much area
+    usual = float(middle(site.grid.scale_at(site.points)))  # unweighted: a sky has few rows and much area
     coarse = survey.glance.of(survey.cameras(poses), site.size * reach)[2]
     return coarse < np.maximum(_SHARP, _SHARP_IN_SCALES * usual / np.maximum(away, np.finfo(float).tiny))
 

@@ -160,15 +160,11 @@ class Glance:
         return figures
 
     def clear(self, cameras: Cameras, aims: NDArray[np.int64], close: float) -> Floats:
-        """Return the mean transmittance in front of what views aim at.
+        """Return the (C,) mean transmittances in front of what C views have in the middle, over its pixels.
 
         Args:
-            cameras: C views.
-            aims: (C,) rows of `points` that they have in the middle.
+            aims: (C,) rows of `points` in the middle.
             close: distance within which matter is close, scene units.
-
-        Returns:
-            (C,) transmittances, over the pixels around the middle that show the aim.
         """
         renders = self._renders(cameras, _NEAR * close, crop=True)
         found = [
@@ -306,14 +302,9 @@ def gather(
     """Return the first `count` good poses of an endless even sequence, topped up with usable ones.
 
     Args:
-        survey: told the number of good poses.
-        count: number of poses requested.
         tried: returns the candidates from one index of the sequence to another, and their scores; a score of
             at least 1 is good.
         patience: candidates tried per requested pose, at most.
-
-    Returns:
-        At most `count` poses, in the order of the sequence.
     """
     parts, asked = [(Poses.joined([]), np.zeros(0))], 0
     while (good := sum(int((scores >= 1).sum()) for _, scores in parts)) < count and asked < patience * count:

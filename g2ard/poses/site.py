@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from g2ard.poses.matter import Grid, Matter, Sample
+from g2ard.poses.matter import Grid, Matter
 from g2ard.poses.numbers import Floats, along, between, fibonacci, halton, middle, moments, quantile, turned
 from g2ard.poses.up import Up, estimate_up, facing, given_up
 from g2ard.scene.splats import Splats
@@ -100,7 +100,7 @@ class Site:
             InputError: nothing is visible, or `up` is not a direction.
         """
         matter = Matter.of(splats, rows, represents)
-        some = matter.sample()
+        some = matter.first()
         up = splats.up if up is None else up
         found = estimate_up(some) if up is None else given_up(some, up)
         axes = _axes(some, found.axis)
@@ -163,7 +163,7 @@ class Site:
         return Inside(places, share, weight)
 
 
-def _axes(some: Sample, up: Floats) -> Floats:
+def _axes(some: Matter, up: Floats) -> Floats:
     """Return rows: along the scene if it is long, otherwise along a coordinate axis; to its left; up."""
     ahead = np.eye(3)[int(np.argmin(np.round(np.abs(up), 3)))]
     ahead = ahead - (ahead @ up) * up
@@ -191,10 +191,7 @@ class Terrain:
     def of(cls, points: Floats, weights: Floats, box: Floats) -> Terrain:
         """Estimate the ground as a low quantile of the heights per block, with roofs and canopies cut off.
 
-        Args:
-            points: (M, 3) matter that faces up or down, z up.
-            weights: (M,) its mass.
-            box: (2, 3) the scene's extents.
+        Points, (M, 3) with mass (M,), are the matter that faces up or down; the box is the scene's.
         """
         sides = np.maximum(box[1, :2] - box[0, :2], 1e-6)
         block = float(sides.max()) / _BLOCKS

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from g2ard.poses.matter import Sample
+from g2ard.poses.matter import Matter
 from g2ard.poses.numbers import Floats, along, fibonacci, moments, quantile
 from g2ard.scene.transform import unit_up
 
@@ -46,7 +46,7 @@ class Up:
     why: str
 
 
-def given_up(sample: Sample, up: ArrayLike) -> Up:
+def given_up(sample: Matter, up: ArrayLike) -> Up:
     """Return the axis given by the user, and check only whether there is a ground.
 
     Raises:
@@ -56,7 +56,7 @@ def given_up(sample: Sample, up: ArrayLike) -> Up:
     return Up(axis, _is_flat(sample)[0] or _layer(sample, axis)[0] > _GROUND_GIVEN, "up as given")
 
 
-def estimate_up(sample: Sample) -> Up:
+def estimate_up(sample: Matter) -> Up:
     """Estimate the axis from planes or the scene's shape, and its sign from where the matter lies.
 
     The first of these that applies decides: a flat scene lies on its ground; the strongest plane at the edge
@@ -66,7 +66,7 @@ def estimate_up(sample: Sample) -> Up:
     flat, thin, long = _is_flat(sample)
     if flat:
         return _signed(sample, _mean_normal(sample, thin, facing(sample, thin)), True, "the scene is flat")
-    few = sample.take(slice(_SEARCHED))
+    few = sample.first(_SEARCHED)
     directions = np.concatenate([np.eye(3), fibonacci(600)[:300]])
     shares, _, edges = np.array([_layer(few, axis) for axis in directions]).T
     axis = directions[int(np.argmax(edges * [_habit(axis) for axis in directions]))]
@@ -87,12 +87,12 @@ def estimate_up(sample: Sample) -> Up:
     return _signed(sample, np.array([0.0, -1.0, 0.0]), False, "no ground; a guess")
 
 
-def facing(sample: Sample, axis: Floats, least: float = _SLOPED) -> NDArray[np.bool_]:
+def facing(sample: Matter, axis: Floats, least: float = _SLOPED) -> NDArray[np.bool_]:
     """Return (K,) whether normals face along an axis, by default as on sloped ground."""
     return np.abs(along(sample.normals, axis)) > least
 
 
-def _is_flat(sample: Sample) -> tuple[bool, Floats, Floats | None]:
+def _is_flat(sample: Matter) -> tuple[bool, Floats, Floats | None]:
     """Return whether the scene is flat, its thinnest axis, and its longest axis if the scene is long."""
     w = sample.weights / sample.weights.sum()
     centred = sample.points - (w[:, None] * sample.points).sum(axis=0)
@@ -101,7 +101,7 @@ def _is_flat(sample: Sample) -> tuple[bool, Floats, Floats | None]:
     return bool(values[0] < _SHEET * values[1]), vectors[:, 0], long
 
 
-def _layer(sample: Sample, axis: Floats) -> tuple[float, float, float]:
+def _layer(sample: Matter, axis: Floats) -> tuple[float, float, float]:
     """Return the strongest layer that faces `axis`: its share of all matter, its height, and its edge.
 
     The edge is the share, reduced by matter on both sides: ground and walls have it on one side.
@@ -127,7 +127,7 @@ def _habit(axis: Floats) -> float:
     return 1.2 if np.abs(axis[1:]).max() > np.cos(np.radians(15)) else 1.0
 
 
-def _mean_normal(sample: Sample, axis: Floats, rows: NDArray[np.bool_]) -> Floats:
+def _mean_normal(sample: Matter, axis: Floats, rows: NDArray[np.bool_]) -> Floats:
     weights = sample.faces[rows]
     if not weights.sum() > 0:
         return axis
@@ -135,7 +135,7 @@ def _mean_normal(sample: Sample, axis: Floats, rows: NDArray[np.bool_]) -> Float
     return mean * np.copysign(1.0, mean @ axis)
 
 
-def _signed(sample: Sample, axis: Floats, grounded: bool, why: str) -> Up:
+def _signed(sample: Matter, axis: Floats, grounded: bool, why: str) -> Up:
     """Turn the axis to where the matter is on its ground, or away from an object's heavier end."""
     heights = along(sample.points, axis)
     ends = quantile(heights, sample.weights, [0.01, 0.99])
@@ -154,7 +154,7 @@ def _lowness(heights: Floats, weights: Floats, low: float, high: float) -> float
     return float(1 - 2 * (mean - low) / max(high - low, np.finfo(float).tiny))
 
 
-def _lean(sample: Sample, axis: Floats, heights: Floats) -> float:
+def _lean(sample: Matter, axis: Floats, heights: Floats) -> float:
     """Return how far the matter stands on the side of `axis`, from −1 to 1, relative to what faces it.
 
     Between a floor and a ceiling, the matter in between decides: furniture stands on floors. Otherwise

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from g2ard.poses.numbers import Floats, between, directions, fibonacci, halton, norms
+from g2ard.poses.numbers import Floats, between, directions, fibonacci, halton, joined, norms
 from g2ard.poses.sight import SIGHT_ROWS, Glance, Poses, Rays, Survey, gather
 from g2ard.poses.site import Site
 
@@ -145,13 +145,7 @@ def _together(site: Site, points: Floats) -> NDArray[np.bool_]:
     ways = points[stop] - points[start]
     lengths = np.linalg.norm(ways, axis=1)
     seen = site.grid.cast(points[start], ways / np.where(lengths > 0, lengths, 1.0)[:, None]) >= lengths
-    start, stop = start[seen], stop[seen]
-    label, low = np.arange(count), np.full(count, -1)
-    while (low != label).any():
-        low = label.copy()
-        np.minimum.at(label, start, low[stop])
-        np.minimum.at(label, stop, low[start])
-        label = label[label]
+    label = joined(np.arange(count), start[seen], stop[seen])
     return np.bincount(label, minlength=count)[label] >= max(2.0, _HALLS * count)
 
 

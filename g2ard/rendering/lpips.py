@@ -48,11 +48,11 @@ class Lpips:
         device: str = "cpu",
     ) -> None:
         self.net, self.scaled, self.device = net, scaled, device
-        self._layers: dict[int, tuple[Any, Any]] = {}
         try:
-            for i in _CONV[net]:
-                weight, bias = (backbone[f"features.{i}.{name}"].to(device) for name in ("weight", "bias"))
-                self._layers[i] = (weight, bias)
+            self._layers = {
+                i: [backbone[f"features.{i}.{name}"].to(device) for name in ("weight", "bias")]
+                for i in _CONV[net]
+            }
             self._linear = [
                 linear[f"lin{i}.model.1.weight"].reshape(1, -1, 1, 1).to(device) for i in range(5)
             ]
@@ -97,10 +97,6 @@ def load_lpips(folder: Path, *, scaled: bool = True, device: str = "cpu") -> dic
     """Load the networks whose weights are in a folder: alexnet*.pth with alex.pth, vgg16*.pth with vgg.pth.
 
     The first of each pair holds torchvision's ImageNet weights, the second LPIPS's linear layers (v0.1).
-
-    Args:
-        scaled: see `Lpips`.
-        device: see `Lpips`.
 
     Raises:
         InputError: neither pair is in the folder, or a file is not a state dict.

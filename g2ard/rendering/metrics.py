@@ -1,4 +1,4 @@
-"""Image metrics: PSNR, PSNR of gradients and SSIM of float images in [0, 1]."""
+"""PSNR, PSNR of gradients and SSIM of float images in [0, 1]; all take the arguments of `psnr`."""
 
 from typing import Any
 
@@ -19,9 +19,6 @@ def psnr(image: _Image, target: _Image, mask: NDArray[np.bool_] | None = None) -
         target: of the same shape.
         mask: (H, W), True for pixels that count; None means all.
 
-    Returns:
-        dB.
-
     Raises:
         InputError: shapes that differ.
 
@@ -37,18 +34,8 @@ def edge_psnr(image: _Image, target: _Image, mask: NDArray[np.bool_] | None = No
     """Return the PSNR of the images' gradients: how well edges, wires and text are kept.
 
     It is −10·log₁₀ of the mean squared error of the differences between neighbouring pixels, along rows and
-    columns, for a peak of 1, at most 100 dB. A smooth error of colour hardly counts, a lost line does.
-
-    Args:
-        image: (H, W, C) in [0, 1].
-        target: of the same shape.
-        mask: (H, W), True for pixels that count; a difference counts if both its pixels do. None means all.
-
-    Returns:
-        dB; 100 if no difference counts.
-
-    Raises:
-        InputError: shapes that differ.
+    columns, for a peak of 1, at most 100 dB, also if none counts. A smooth error of colour hardly counts, a
+    lost line does. With a mask, a difference counts if both its pixels do.
 
     >>> flat, shifted = np.full((4, 4, 3), 0.4), np.full((4, 4, 3), 0.6)
     >>> line = flat.copy()
@@ -77,17 +64,8 @@ def ssim(image: _Image, target: _Image, mask: NDArray[np.bool_] | None = None) -
     Without a mask, pixels beyond the image's edge are black. With one, they have no part, like all pixels
     outside it, so that even a mask of the whole image changes the score near the edge.
 
-    Args:
-        image: (H, W, C) in [0, 1].
-        target: of the same shape.
-        mask: (H, W), True for pixels that count; others have no part. Each window's weights are multiplied by
-            the mask and divided by their sum, and the mean is over the pixels that count. None means all.
-
-    Returns:
-        Mean over pixels and channels, in [−1, 1]; 1 if no pixel counts.
-
-    Raises:
-        InputError: shapes that differ.
+    The result is the mean over pixels and channels that count, in [−1, 1]; 1 if none does. Each window's
+    weights are multiplied by the mask and divided by their sum.
 
     >>> black, white, mask = np.zeros((16, 16, 1)), np.ones((16, 16, 1)), np.zeros((16, 16), bool)
     >>> mask[:4, 12:] = True

@@ -196,7 +196,10 @@ class Renderer:
         Raises:
             InputError: an invalid camera, see `Cameras`.
         """
-        image, alpha, depth, middle = self._forward(camera, 2 if median else 1)
+        view, depths = self._view(camera), 2 if median else 1
+        image, alpha, depth, middle = self._rasterizer.forward(
+            self._arrays, view, self._settings, self.background, depths
+        )
         assert depth is not None
         return Rendered(image, alpha, depth, middle)
 
@@ -248,12 +251,6 @@ class Renderer:
             InputError: no render before, or another thread's.
         """
         return np.array(self._rasterizer.pose_gradient(self._arrays, np.ascontiguousarray(gradient)))
-
-    def _forward(
-        self, camera: Camera, depths: int
-    ) -> tuple[_Floats, _Floats, _Floats | None, _Floats | None]:
-        view = self._view(camera)
-        return self._rasterizer.forward(self._arrays, view, self._settings, self.background, depths)
 
     def _view(self, camera: Camera) -> View:
         return view_of(Cameras.of([camera]).recentred(self._offset), 0, self._settings)

@@ -123,12 +123,10 @@ def as_image(image: Any, cameras: Cameras, view: int, parameter: str) -> NDArray
 
     Args:
         image: a numpy array or torch tensor: uint8 from 0 to 255, or floats from 0 to 1.
-        cameras: the views, whose sizes the images have.
-        view: its row.
         parameter: the argument that the image comes from, for errors.
 
     Raises:
-        InputError: another shape, type or range.
+        InputError: another shape than the view's, type or range.
     """
     if hasattr(image, "detach"):
         image = image.detach().cpu().numpy()
@@ -187,12 +185,10 @@ class _Chosen:
 
     def _parts(self, views: Sequence[int] | None = None) -> list[tuple[Targets, list[int]]]:
         """Return the other targets and the rows in them of some views, of all by default."""
-        rows: dict[int, list[int]] = {}
-        places = self._places if views is None else [self._places[view] for view in views]
-        for targets, row in places:
-            rows.setdefault(id(targets), []).append(row)
-        parts = {id(targets): targets for targets, _ in places}
-        return [(parts[key], rows[key]) for key in parts]
+        parts: dict[int, tuple[Targets, list[int]]] = {}
+        for targets, row in self._places if views is None else [self._places[view] for view in views]:
+            parts.setdefault(id(targets), (targets, []))[1].append(row)
+        return list(parts.values())
 
     def fill(self, progress: Progress, views: Sequence[int] | None = None) -> None:
         """Render some views, see `TeacherRenders.fill`."""
@@ -348,14 +344,9 @@ class Photos(_Cached):
             else:
                 self._images = [as_image(image, cameras, i, "images") for i, image in enumerate(images)]
                 cameras = replace(cameras, image_paths=(), mask_paths=())
-        missing = (
-            None
-            if self._images
-            else next((n for n, p in zip(cameras.names, cameras.image_paths, strict=True) if p is None), None)
-        )
-        if missing is not None:
+        if self._images is None and None in cameras.image_paths:
             raise InputError(
-                f"view {missing} has no photo",
+                f"view {cameras.names[cameras.image_paths.index(None)]} has no photo",
                 hint="pass views with photos, their {images=DIR}, or render them from {teacher=SCENE}",
             )
         super().__init__(cameras, limit)

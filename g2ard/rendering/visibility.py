@@ -82,15 +82,6 @@ def visibility(
     """Sum each Gaussian's contributions αT over all pixels of all views.
 
     Summation has a fixed order, so the result does not depend on the number of threads.
-
-    >>> import numpy as np
-    >>> from g2ard.scene.cameras import Cameras, look_at
-    >>> pair = Splats.create([[0, 0, 0], [0, 9, 0]], scales=np.full((2, 3), 0.1), logit_opacities=[9, 9])
-    >>> K = [[50, 0, 16], [0, 50, 12], [0, 0, 1]]
-    >>> views = Cameras.from_lists([look_at([0, -2, 0], [0, 0, 0])], [K], [(32, 24)], ["front"])
-    >>> seen = visibility(pair, views)
-    >>> bool(seen.weight[0] > 30 * seen.weight[1]), np.round(seen.pixel_size.astype(float), 3).tolist()
-    (True, [0.04, 0.22])
     """
     splats, cameras = centred(splats, cameras)
     settings = settings_for(splats.means, settings, antialiased=splats.antialiased)
@@ -128,12 +119,10 @@ def visibility_source(cameras: Cameras, *, longest: int = LONGEST, progress: Pro
         cameras: the views; at most 96 usual ones are used, evenly spaced, and at most 32 of other kinds,
             which together weigh a tenth of the usual ones. Without usual views, all are equal.
         longest: longer side of the renders, pixels; `pixel_size` refers to the full image.
-        progress: called after each view.
 
     Returns:
-        scene → `SampledVisibility`, with the attribute `views`, the usual views at this size. The scene's
-        arrays are C-contiguous and float32, except its means. A `g2ard.scene.prepared.PreparedScene` is not
-        sorted again.
+        scene → `SampledVisibility`, with the attribute `views`, the usual views at this size. A
+        `g2ard.scene.prepared.PreparedScene` is not sorted again.
     """
     return _Sampler(cameras, longest, progress)
 

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from g2ard import _core
 from g2ard.errors import InputError, require
+from g2ard.poses.numbers import joined
 from g2ard.progress import Progress, counter, silent
 from g2ard.rendering.renderer import Renderer
 from g2ard.scene.cameras import Camera, Cameras
@@ -30,6 +31,8 @@ from g2ard.scene.transform import rotation_matrices
 KINDS = ("invisible", "giant", "needle", "floater", "haze", "streak")
 FLOATING = ("haze", "streak")
 """Kinds that are found only with a strength."""
+
+_Floating = tuple[NDArray[np.float64], NDArray[np.float64]]
 
 _HALF_STEP = 0.5 / 255
 """Half an 8-bit step."""
@@ -71,7 +74,7 @@ def find_clutter(
     pixels: int,
     kinds: tuple[str, ...] = KINDS,
     *,
-    floating: Floating | None = None,
+    floating: _Floating | None = None,
     strength: float = 0.0,
     progress: Progress = silent,
 ) -> Cleaning:
@@ -79,13 +82,11 @@ def find_clutter(
 
     Args:
         splats: N Gaussians, finite.
-        seen: their visibility (`g2ard.rendering.visibility.visibility`); uses `weight` and `peak`.
+        seen: their visibility (`g2ard.rendering.visibility.visibility`).
         unoccluded: (N,) mask from `compare_depths`: only these can be invisible, apart from α below 1/255.
         pixels: number of pixels of all views together.
-        kinds: kinds to find.
         floating: from `compare_depths`; None finds neither haze nor streaks.
         strength: 0 to 1: haze and streaks float in more than 1 − `strength` of the views.
-        progress: called before each kind, and for groups of floaters.
 
     Raises:
         InputError: an unknown kind, or `seen` or `unoccluded` of another length.
@@ -103,8 +104,8 @@ def find_clutter(
         "floater": lambda rest: _floaters(splats, rest, seen.weight, unoccluded, progress),
     }
     if floating is not None:
-        finders["haze"] = lambda rest: floating.middle > 1 - strength
-        finders["streak"] = lambda rest: floating.ends > 1 - strength
+        finders["haze"] = lambda rest: floating[0] > 1 - strength
+        finders["streak"] = lambda rest: floating[1] > 1 - strength
     for number, name in enumerate(KINDS):
         progress("clutter", number, len(KINDS))
         if name in kinds and name in finders:
@@ -129,22 +130,9 @@ def _invisible(splats: Splats, seen: Any, unoccluded: NDArray[np.bool_], pixels:
     return out
 
 
-@dataclass(frozen=True, eq=False)
-class Floating:
-    """Share of the views in which each Gaussian floats.
-
-    Args:
-        middle: (N,) float64, share for its mean.
-        ends: (N,) float64, the larger share of its two ends (2σ); 0 unless it is ten times as long as wide.
-    """
-
-    middle: NDArray[np.float64]
-    ends: NDArray[np.float64]
-
-
 def compare_depths(
     splats: Splats, cameras: Cameras, *, floating: bool = True, progress: Progress = silent
-) -> tuple[NDArray[np.bool_], Floating | None]:
+) -> tuple[NDArray[np.bool_], _Floating | None]:
     """Compare the Gaussians' depths in each view with those of the visible surface.
 
     The surface is where half of a pixel's light is blocked. A mean is unoccluded if it is in the frame of a
@@ -157,7 +145,8 @@ def compare_depths(
     as not floating, so that few views are weak evidence.
 
     Returns:
-        The (N,) mask of unoccluded means, and the shares of views in which Gaussians float, or None.
+        The (N,) mask of unoccluded means, and if wanted two (N,) shares of the views in which a Gaussian
+        floats: with its mean, and with that of its ends (2σ) which floats more often, 0 without ends.
     """
     count, points, owners = len(splats), splats.means.astype(np.float64), np.arange(len(splats))
     if floating:
@@ -190,7 +179,7 @@ def compare_depths(
     shares = floats / views
     ends = np.zeros(count)
     ends[long] = shares[count:].reshape(2, -1).max(axis=0)
-    return unoccluded, Floating(shares[:count], ends)
+    return unoccluded, (shares[:count], ends)
 
 
 def _in_frame(
@@ -274,7 +263,7 @@ def _floaters(
         other = near[block]
         away = np.sqrt(sum((axis[other] - axis[block, None]) ** 2 for axis in means.T))
         a, b = np.nonzero(away <= reach[block, None] + reach[other])
-        group = _joined(group, a + first, other[a, b])
+        group = joined(group, a + first, other[a, b])
     progress("groups", len(rows), len(rows))
     count = np.bincount(group, minlength=len(rows))
     light = np.bincount(group, weight[rows], minlength=len(rows))
@@ -282,21 +271,3 @@ def _floaters(
     small &= np.bincount(group, unoccluded[rows], minlength=len(rows)) > 0
     out[rows[small[group]]] = True
     return out
-
-
-def _joined(root: NDArray[np.int64], a: NDArray[Any], b: NDArray[Any]) -> NDArray[np.int64]:
-    """Join groups by edges a–b, where `root` is the smallest row of each row's group.
-
-    >>> _joined(np.arange(5), np.array([3, 1]), np.array([4, 3])).tolist()
-    [0, 1, 2, 1, 1]
-    """
-    root = root.copy()
-    while True:
-        a, b = root[a], root[b]
-        apart = a != b
-        if not apart.any():
-            return root
-        a, b = a[apart], b[apart]
-        np.minimum.at(root, np.maximum(a, b), np.minimum(a, b))
-        while not np.array_equal(further := root[root], root):
-            root = further

@@ -15,6 +15,7 @@ from g2ard import _core
 from g2ard.config.checks import Within, checks_arguments
 from g2ard.config.schema import Settings
 from g2ard.errors import InputError, require
+from g2ard.poses.numbers import middle
 from g2ard.progress import Progress, counter, silent
 from g2ard.scene.splats import SH_C0, Splats, unit_colors
 
@@ -105,21 +106,22 @@ def lift_rows(
     rows = np.flatnonzero(finite)
     if not finite.all():
         xyz, rgb = xyz[finite], rgb[finite]
-    middle = _middle(xyz)
-    centered = xyz - middle
+    origin = middle(xyz)
+    centered = xyz - origin
     if merge:
         firsts, rgb = merged(centered, rgb)
         xyz, centered, rows = xyz[firsts], centered[firsts], rows[firsts]
     quats, scales = _core.lift_points(xyz - _anchor(xyz), config, counter(progress, "lift"))
     n = len(centered)
-    near = _fits_float32(xyz, scales)
+    step = np.spacing(np.float32(np.abs(xyz).max()))
+    near = step <= 0.01 * np.median(scales[:, 0])  # of a disc; other programs ignore offsets
     splats = Splats.create(
         (xyz if near else centered).astype(np.float32),
         quats=quats,
         scales=scales,
         logit_opacities=np.full(n, np.log(opacity / (1 - opacity))),
         sh0=((rgb - 0.5) / SH_C0)[:, None],
-        offset=np.zeros(3) if near else middle,
+        offset=np.zeros(3) if near else origin,
     )
     return splats, rows
 
@@ -127,20 +129,10 @@ def lift_rows(
 def merged(points: NDArray[np.float64], colors: NDArray[Any]) -> tuple[NDArray[np.intp], NDArray[Any]]:
     """Return the first row of each position, ascending, and the mean colour there.
 
+    Positions are equal if their float32 values are, which is all that a scene can hold.
+
     Args:
         points: (N, 3) relative to a point amid them.
-    """
-    firsts, group = _positions(points)
-    if len(firsts) == len(points):
-        return firsts, colors
-    totals = [np.bincount(group, channel) for channel in colors.T]
-    return firsts, np.stack(totals, axis=1) / np.bincount(group)[:, None]
-
-
-def _positions(points: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return the first row of each position, ascending, and the number of each row's position.
-
-    Positions are equal if their float32 values are, which is all that a scene can hold.
     """
     with np.errstate(over="ignore"):
         x, y, z = (points.astype(np.float32) + np.float32(0)).T  # -0 is 0
@@ -148,17 +140,14 @@ def _positions(points: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArray[n
     new = np.ones(len(points), bool)
     new[1:] = np.any([axis[order[1:]] != axis[order[:-1]] for axis in (x, y, z)], axis=0)
     firsts = order[new]
+    if new.all():
+        return np.arange(len(points)), colors
     number = np.empty(len(firsts), np.intp)
     number[np.argsort(firsts)] = np.arange(len(firsts))
     group = np.empty(len(points), np.intp)
     group[order] = number[np.cumsum(new) - 1]
-    return np.sort(firsts), group
-
-
-def _fits_float32(points: NDArray[np.float64], scales: NDArray[np.float32]) -> bool:
-    """Return whether float32 holds the coordinates to 1 % of a disc; other programs ignore offsets."""
-    step = np.spacing(np.float32(np.abs(points).max()))
-    return bool(step <= 0.01 * np.median(scales[:, 0]))
+    totals = [np.bincount(group, channel) for channel in colors.T]
+    return np.sort(firsts), np.stack(totals, axis=1) / np.bincount(group)[:, None]
 
 
 def _anchor(points: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -170,9 +159,3 @@ def _anchor(points: NDArray[np.float64]) -> NDArray[np.float64]:
     step = np.exp2(np.frexp(np.max(high - low) or 1.0)[1] - 2)
     anchor: NDArray[np.float64] = np.rint(low / step) * step
     return anchor
-
-
-def _middle(points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the lower median per axis: it is an input value, so shifting the points shifts it exactly."""
-    rank = (len(points) - 1) // 2
-    return np.partition(points, rank, axis=0)[rank]

@@ -213,7 +213,7 @@ def test_up_is_found_by_layers_when_noise_lies_behind_floor_and_ceiling() -> Non
     )
     table = naive.box((3, 2, 0), (5, 4, 0.7), 0.1, floor=False)
     scene = naive.joined(naive.box((0, 0, 0), (9, 7, 2.5), 0.1), table, noise)
-    found = estimate_up(Matter.of(scene).sample())
+    found = estimate_up(Matter.of(scene).first())
     assert "layers" in found.why
     assert found.grounded
     assert abs(found.axis[2]) > np.cos(np.radians(5))

@@ -65,7 +65,7 @@ def agreement(splats, surface, cameras, seen, cells, tolerance):
         smooth = (far - near < 0.01 * np.maximum(near, 1e-300)) | (far == 0)
         z = z[there]
         want = (depth[:, 0] > 0) & (np.abs(z - depth[:, 0]) <= np.maximum(surface.size, tolerance * z))
-        got = np.isin(np.asarray(cells)[there], seen.of(i))
+        got = np.isin(np.asarray(cells)[there], seen[1][slice(*seen[0][i : i + 2])])
         agree += int((want == got)[smooth].sum())
         kept, total = kept + int(smooth.sum()), total + len(z)
     return agree, kept, total

@@ -209,17 +209,17 @@ def test_adam_by_rows_in_rust_is_that_in_torch(rows: int) -> None:
         for grad in grads.values():
             grad[still] = 0
         grads["means"][broken] = np.nan
-        for leaves, adam in adams:
-            shares = {
-                "means": torch.linspace(0.1, 1, rows)[:, None],
-                "shN": torch.linspace(0, 1, 24 * rows).reshape(rows, 8, 3),
-            }
-            for group in adam.param_groups:
-                leaves[group["name"]].grad = torch.from_numpy(grads[group["name"]].copy())
-                group["lr"], group["share"] = 0.1, shares.get(group["name"])
-        adams[0][1].step()
+        for leaves, _ in adams:
+            for name, leaf in leaves.items():
+                leaf.grad = torch.from_numpy(grads[name].copy())
+        rates = dict.fromkeys(shapes, 0.1)
+        shares = {
+            "means": torch.linspace(0.1, 1, rows)[:, None],
+            "shN": torch.linspace(0, 1, 24 * rows).reshape(rows, 8, 3),
+        }
+        adams[0][1].step(rates, shares)
         with torch.no_grad():
-            adams[1][1]._step_in_torch(adams[1][1].param_groups)
+            adams[1][1]._step_in_torch(rates, shares)
     (rust, kernel), (naive, twin) = adams
     assert kernel.skipped == twin.skipped == 5 * (rows > 7)
     assert torch.equal(kernel.counts, twin.counts)

@@ -91,14 +91,11 @@ REGULARIZERS = {
     "noisy": Regularizers(anchor=5e-2, shape=1.0, effective_rank=True),
 }
 """Weights for g2ard's schedule of a thousand steps, only ten of them regularised, so that larger weights are
-needed (decision 0019).
-"""
-
+needed (decision 0019)."""
 
 FREE = Regularizers(anchor=0.0, shape=0.0, effective_rank=False)
 """No regularisers, for points found in photos: their places are guesses. On held-out photos this gains 1.7 dB
-for an object with a visual hull, and 0.3 dB for a room with sparse points.
-"""
+for an object with a visual hull, and 0.3 dB for a room with sparse points."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,14 +17,12 @@ _LIFT_THICKNESS = 0.2
 _LIFT_SPREAD = 2.5
 """Limits for a lift, whose discs are all alike: the normal scale is about a tenth of the tangential ones.
 Measured median and spread: lifts .12 and 1.2, simplified tenfold .10–.14 and 1.9–2.3; trained scenes .17–.30
-and 3.5–7.3, simplified .44–.49 and 2.2–2.7.
-"""
+and 3.5–7.3, simplified .44–.49 and 2.2–2.7."""
 
 _MANY_NEEDLES = 0.10
 _LEAST_CONSISTENCY = 0.95
 """Least view consistency of a faithful scene. Trained scenes have .977–.988; with a tenth of the Gaussians
-displaced .81–.97.
-"""
+displaced .81–.97."""
 
 _SAMPLE_VIEWS = 4
 _SAMPLE_PIXELS = 160
@@ -130,10 +128,7 @@ def regularizers_for(
         paper: use the paper's weights, for its schedule.
 
     Returns:
-        The weights, a line that names and explains the choice, and the measures.
-
-    Raises:
-        InputError: an unknown preset.
+        The weights, a line that explains the choice, and the measures.
     """
     if isinstance(given, Regularizers):
         return given, "as given", measure_prior(prior, cameras)

@@ -42,13 +42,7 @@ def extents(
 
 
 def share_of_rate(variance: Tensor, reach: float, finest: float = 0.0) -> Tensor:
-    """Return σ²/(σ² + finest²) · 1/(1 + (σ/reach)¹⁶) for the variance σ², all in pixels.
-
-    >>> share_of_rate(torch.tensor([0.0, 1.0, 4.0, 16.0]), 2.0).tolist()
-    [1.0, 0.99998..., 0.5, 1.5258...e-05]
-    >>> share_of_rate(torch.tensor([0.0, 1.0, 4.0]), float("inf"), 1.0).tolist()
-    [0.0, 0.5, 0.8...]
-    """
+    """Return σ²/(σ² + finest²) · 1/(1 + (σ/reach)¹⁶) for the variance σ², all in pixels."""
     ratio = (variance * (1 / reach) * (1 / reach)).clamp(max=100.0)
     seen = variance / (variance + finest**2) if finest else 1.0
     return seen / (1 + ratio**8)

@@ -114,15 +114,11 @@ class Guard:
     ) -> tuple[Splats, float | None]:
         """Decide how much of a result's changes to keep, by the validation views.
 
-        Each Gaussian's change is multiplied by v/(v + k), where v views touched it (shrinkage towards the
+        Each Gaussian's change is multiplied by v/(v + k), where v `views` touched it (shrinkage towards the
         start). k rises from 0 while the mean over the kinds rises, training views being one of them. Then
         Gaussians that made validation views worse go back. If a kind still loses more than 0.1 dB against the
         start, the candidate is kept whose worst kind gains most: one of the shrinkages, the same share of
         every change, or the start.
-
-        Args:
-            views: (N,) number of views that touched each Gaussian.
-            step: number of the last step, for the log.
 
         Returns:
             The scene and its k: 0 shrinks nothing, ∞ keeps the start, None the same share for all Gaussians.
@@ -180,8 +176,7 @@ class Guard:
         """Choose between the result, the best earlier scene, and blends of start and result.
 
         A result that is at least as good as all earlier scenes is kept. Otherwise the best earlier scene is
-        returned if it beats the start. If nothing beats the start, the first blend that does is returned, or
-        the start itself.
+        returned if it beats the start, then the first blend that does, or the start itself.
 
         Returns:
             The scene, its score, and the weight of the last step's scene in it: 1, also for an earlier best
@@ -221,12 +216,6 @@ def blended(start: Splats, end: Splats, share: ArrayLike) -> Splats:
     """Blend two scenes of the same Gaussians, each attribute in the space it is optimised in.
 
     `share` is the weight of `end`, one for all or (N,).
-
-    >>> a = Splats.create([[0, 0, 0]], scales=[[1, 1, 1]])
-    >>> b = Splats.create([[2, 0, 0]], scales=[[4, 1, 1]])
-    >>> half = blended(a, b, 0.5)
-    >>> half.means.tolist(), half.scales.tolist()
-    ([[1.0, 0.0, 0.0]], [[2.0, 1.0, 1.0]])
     """
     end = end.narrowed()
     start = start.narrowed(end.offset)

@@ -70,7 +70,6 @@ class Loop:
     Args:
         validation_key: fingerprint of the validation views, for `key`.
         resumed: the part of `seconds` before this call.
-        skipped_before: steps skipped by earlier engines.
         tally: number of steps and their seconds, without and with regularisers.
     """
 

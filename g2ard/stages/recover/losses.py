@@ -37,20 +37,11 @@ def l1_ssim(image: Tensor, target: Tensor, ssim_weight: float = 0.2, mask: Tenso
 
     Args:
         image: (H, W, C) float32 on the CPU; the loss is differentiated with respect to it.
-        target: (H, W, C) float32 on the CPU.
-        ssim_weight: λ in [0, 1].
-        mask: (H, W) bool, True for pixels that count in both means; others have no part. None means all.
-
-    Returns:
-        The loss, a scalar.
+        target: the same.
+        mask: (H, W) bool, True for pixels that count in both means; None means all.
 
     Raises:
         InputError: wrong shapes or dtypes.
-
-    >>> import torch
-    >>> x = torch.rand(20, 30, 3, requires_grad=True)
-    >>> l1_ssim(x, x.detach()).item()
-    0.0
     """
     for name, tensor in (("image", image), ("target", target)):
         fits = tensor.dtype == torch.float32 and tensor.device.type == "cpu" and tensor.ndim == 3
@@ -63,13 +54,7 @@ def l1_ssim(image: Tensor, target: Tensor, ssim_weight: float = 0.2, mask: Tenso
 def l1_ssim_anywhere(
     image: Tensor, target: Tensor, ssim_weight: float = 0.2, mask: Tensor | None = None
 ) -> Tensor:
-    """Compute `l1_ssim` with torch operations, on any device.
-
-    >>> import torch
-    >>> x, y = torch.rand(2, 20, 30, 3)
-    >>> bool((l1_ssim_anywhere(x, y) - l1_ssim(x, y)).abs() < 1e-5)
-    True
-    """
+    """Compute `l1_ssim` with torch operations, on any device."""
     counts = torch.ones_like(image[..., 0], dtype=torch.bool) if mask is None else mask
     x, y = (torch.where(counts, t.permute(2, 0, 1), 0.0)[:, None] for t in (image, target))
     offsets = torch.arange(_SSIM_WINDOW, device=image.device, dtype=image.dtype) - _SSIM_WINDOW // 2

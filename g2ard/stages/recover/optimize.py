@@ -63,22 +63,16 @@ def recover(
 ) -> Recovered:
     """Optimise every attribute of a fixed set of Gaussians against targets (`eq:objective`).
 
-    L = (1−λ)·L1 + λ·(1−SSIM), plus λ_a·L_anchor + λ_s·L_shape every `period` steps. No Gaussian is added or
-    removed. If PSNR on a sample of training views falls below the student's, recovery returns to the best
-    scene and continues at a third of the learning rates. A student that only gets worse is returned
-    unchanged. A schedule that is not `guarded`, such as the paper's, always takes all its steps.
+    L = (1−λ)·L1 + λ·(1−SSIM), plus λ_a·L_anchor + λ_s·L_shape every `period` steps. If PSNR on a sample of
+    training views falls below the student's, recovery returns to the best scene and continues at a third of
+    the learning rates. A schedule that is not `guarded`, such as the paper's, always takes all its steps.
 
     Args:
         student: the scene; the result has the offset and float32 means of `student.narrowed()`.
-        weights: (C,) sampling weight of each view; None draws all equally often.
-        anchors: frozen geometry; None takes the student's. For a student that was recovered before, pass the
-            anchors of its construction.
         validation: views of other kinds (`Cameras.kinds`) than `targets`, such as near ones, not trained on.
             Changes are scaled back per Gaussian by how often it was seen, as far as these views gain, and
-            Gaussians that made them worse go back (`recover.guard`). A recovery that only harms a kind ends
-            early. At most eight views per kind are scored during the steps.
-        frozen: (N,) bool, mask of Gaussians that stay unchanged, such as those of another tile; requires the
-            engine `fused`. None freezes none.
+            Gaussians that made them worse go back (`recover.guard`). At most eight views per kind are scored
+            during the steps.
         stage: stage name for progress.
         skip_same: take no step if the student already renders as the targets.
 

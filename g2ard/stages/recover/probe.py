@@ -2,7 +2,7 @@
 
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -101,24 +101,18 @@ def harmful_changes(
     pixels of a Gaussian is positive if views became worse where it is seen. It must be so over the validation
     views that lost, and over all of them together with 64 training views: what few validation views say about
     a Gaussian is mostly chance.
-
-    Args:
-        start: the scene before.
-        result: the scene after, of the same Gaussians.
-        validation: views that were not trained on.
-        training: views that were.
     """
-    held = _Comparison(start, result, validation, background)
-    losing = [lost > _TOLERATED_LOSS for lost in held.lost()]
+    held, views = _Comparison(start, result, validation, background), range(len(validation.cameras))
+    losing = [lost > _TOLERATED_LOSS for lost in in_threads(held.lost, views)]
     if not any(losing):
         return None
     compared = Subset(training, evenly_spaced(len(training.cameras), _COMPARED_VIEWS))
     trained = _Comparison(start, result, compared, background)
     total, worse = np.zeros((2, len(result)))
-    for light, loses in zip(held.light(), losing, strict=True):
+    for light, loses in zip(in_threads(held.light, views), losing, strict=True):
         total += light
         worse += light * loses
-    for light in trained.light():
+    for light in in_threads(trained.light, range(len(compared.cameras))):
         total += light
     return (total > 0) & (worse > 0)
 
@@ -145,19 +139,13 @@ class _Comparison:
         ]
         return errors if mask is None else [error * mask for error in errors]
 
-    def lost(self) -> Iterator[float]:
-        """Yield each view's loss in dB."""
-        return in_threads(self._lost, range(len(self._cameras)))
-
-    def light(self) -> Iterator[NDArray[np.float32]]:
-        """Yield each view's (N,) Σ αT·E, with E the change of the error relative to the mean before."""
-        return in_threads(self._light, range(len(self._cameras)))
-
-    def _lost(self, view: int) -> float:
+    def lost(self, view: int) -> float:
+        """Return a view's loss in dB."""
         before, after = (max(float(error.mean()), _LEAST_MSE) for error in self._errors(view))
         return 10 * math.log10(after / before)
 
-    def _light(self, view: int) -> NDArray[np.float32]:
+    def light(self, view: int) -> NDArray[np.float32]:
+        """Return a view's (N,) Σ αT·E, with E the change of the error relative to the mean before."""
         before, after = self._errors(view)
         image = np.zeros((*before.shape, 3), np.float32)
         image[..., 0] = (after - before) / (max(float(before.mean()), _INVISIBLE_MSE) * before.size)

@@ -77,19 +77,6 @@ class Rates(Settings):
     reach: AboveZero = field(default=math.inf, metadata={"setting": False})
     finest: NotNegative = field(default=0.0, metadata={"setting": False})
 
-    def scaled(self, geometry: float, appearance: float) -> Rates:
-        """Multiply rates of means, scales and rotations by `geometry`, of opacity and SH by `appearance`."""
-        return Rates(
-            self.means * geometry,
-            self.log_scales * geometry,
-            self.quats * geometry,
-            self.logit_opacities * appearance,
-            self.sh0 * appearance,
-            self.shN * appearance,
-            self.reach,
-            self.finest,
-        )
-
 
 @dataclass(frozen=True)
 class Schedule(Settings):
@@ -167,8 +154,17 @@ class Schedule(Settings):
         if self.cosine_floor is not None:
             cosine = self.cosine_floor + (1 - self.cosine_floor) * 0.5 * (1 + math.cos(math.pi * t))
         decay = self.appearance_decay[1 if final else 0] ** t
-        rates = self.rates.scaled(cosine * multiplier, cosine * decay * multiplier)
-        return replace(rates, reach=reach, finest=self.finest)
+        geometry, appearance, first = cosine * multiplier, cosine * decay * multiplier, self.rates
+        return Rates(
+            first.means * geometry,
+            first.log_scales * geometry,
+            first.quats * geometry,
+            first.logit_opacities * appearance,
+            first.sh0 * appearance,
+            first.shN * appearance,
+            reach,
+            self.finest,
+        )
 
 
 TUNED = Schedule(
@@ -192,8 +188,7 @@ PAPER = Schedule(
 )
 """The paper's schedule (supplement, `tab:s_config`): 8,000 steps per round and 30,000 at the end, with 3DGS's
 rates where the paper states none. Its rate of means lacks a unit; 9.2e-4 is 3DGS's 1.6e-4 × extent at an
-extent of 5.75, so it is read that way (decision 0023). `PAPER.scaled(3000)` has a tenth of the steps.
-"""
+extent of 5.75, so it is read that way (decision 0023). `PAPER.scaled(3000)` has a tenth of the steps."""
 
 SCHEDULES: dict[str, Schedule] = {
     "fast": replace(TUNED, steps=300),

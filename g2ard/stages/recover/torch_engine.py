@@ -20,8 +20,6 @@ from g2ard.stages.recover.schedule import Rates
 from g2ard.stages.recover.selective_adam import SelectiveAdam
 from g2ard.stages.recover.sizes import radii
 
-_NAMES = ("means", "log_scales", "quats", "logit_opacities", "sh0", "shN")
-
 
 @contextmanager
 def _one_thread() -> Iterator[None]:
@@ -64,7 +62,8 @@ class TorchEngine:
             "shN": splats.shN,
         }
         self._parameters = {
-            name: torch.from_numpy(start[name].copy()).to(self.device).requires_grad_() for name in _NAMES
+            name: torch.from_numpy(array.copy()).to(self.device).requires_grad_()
+            for name, array in start.items()
         }
         self._adam = SelectiveAdam({name: p for name, p in self._parameters.items() if p.numel()})
 
@@ -89,12 +88,10 @@ class TorchEngine:
         if regularize:
             anchors, weights = self._objective.anchors, self._objective.regularizers
             total = total + regularization(means, p["quats"], p["log_scales"], anchors, weights)
-        self._adam.zero_grad(set_to_none=True)
+        for parameter in p.values():
+            parameter.grad = None
         torch.autograd.backward(total)
-        shares = self._shares(means.detach(), view, rates)
-        for group in self._adam.param_groups:
-            group["lr"], group["share"] = getattr(rates, group["name"]), shares.get(group["name"])
-        self._adam.step()
+        self._adam.step(vars(rates), self._shares(means.detach(), view, rates))
         return float(loss.detach())
 
     def _shares(self, means: Tensor, view: int, rates: Rates) -> dict[str, Tensor]:
@@ -109,20 +106,14 @@ class TorchEngine:
 
     def _render(self, means: Tensor, view: int) -> Tensor:
         """Render one view (H, W, 3), differentiably."""
-        p = self._parameters
-        image, _, _ = rasterize(
-            means,
-            p["quats"],
-            p["log_scales"],
-            p["logit_opacities"],
-            p["sh0"],
-            p["shN"],
-            self._objective.cameras,
-            view,
-            background=self._objective.background,
+        objective, parameters = self._objective, {**self._parameters, "means": means}
+        return rasterize(
+            **parameters,
+            cameras=objective.cameras,
+            index=view,
+            background=objective.background,
             settings=self._settings,
-        )
-        return image
+        )[0]
 
     def _loss(self, image: Tensor, target: Tensor, mask: Tensor | None) -> Tensor:
         return l1_ssim(image, target, self._objective.ssim_weight, mask)
@@ -143,9 +134,7 @@ class TorchEngine:
         arrays = {f"p.{name}": value.detach().cpu().numpy() for name, value in self._parameters.items()}
         arrays["base"], arrays["unit"] = self._base.cpu().numpy(), self._unit.cpu().numpy()
         arrays["skipped"], arrays["counts"] = np.array(self._adam.skipped), self.counts
-        for name, key, moment in self._moments():
-            arrays[f"{key}.{name}"] = moment.cpu().numpy()
-        return arrays
+        return arrays | {name: moment.cpu().numpy() for name, moment in self._adam.moments.items()}
 
     def load(self, state: dict[str, NDArray[Any]]) -> None:
         with torch.no_grad():
@@ -155,13 +144,8 @@ class TorchEngine:
         self._unit = torch.from_numpy(state["unit"]).to(self.device)
         self._adam.skipped = int(state["skipped"])
         self._adam.counts.copy_(torch.from_numpy(state["counts"]))
-        for name, key, moment in self._moments():
-            moment.copy_(torch.from_numpy(state[f"{key}.{name}"]))
-
-    def _moments(self) -> Iterator[tuple[str, str, Tensor]]:
-        for group in self._adam.param_groups:
-            for key, moment in self._adam.state[group["params"][0]].items():
-                yield group["name"], key, moment
+        for name, moment in self._adam.moments.items():
+            moment.copy_(torch.from_numpy(state[name]))
 
     @property
     def counts(self) -> NDArray[Any]:

@@ -125,11 +125,9 @@ class Search:
         return None if solved is None else self._refined(start, solved, photo)
 
     def by_matches(self, pose: Float, photo: Photo, passes: int) -> Solved | None:
-        """Match a photo with up to `passes` renders, the first from `pose` (4 × 4, camera from world), and
-        solve PnP.
+        """Match a photo with up to `passes` renders, the first from `pose`, and solve PnP.
 
-        Returns:
-            The pose with its matches; None without a matcher or with fewer than `min_inliers` inliers.
+        None without a matcher or with fewer than `min_inliers` inliers.
         """
         if self.match is None:
             return None

@@ -81,13 +81,7 @@ def shift_between(a: Float, b: Float) -> tuple[int, int, float]:
     The likeness is Σ a(x − s)·b(x) / √(Σa²·Σb²): pixels shifted out count as 0. Shifts are at most half an
     image; ties go to the first in row order.
 
-    Args:
-        a: (H, W), with mean near 0, and 0 where invalid.
-        b: (H, W), likewise.
-
-    >>> a = np.zeros((8, 8)); a[2, 3] = 1
-    >>> shift_between(a, np.roll(a, (1, -2), (0, 1)))[:2]
-    (-2, 1)
+    Both are (H, W), with mean near 0, and 0 where invalid.
     """
     height, width = a.shape
     scale = np.sqrt((a * a).sum() * (b * b).sum())

@@ -36,8 +36,8 @@ def matcher_named(name: str, ratio: float, most: int) -> Matcher | None:
 
     Args:
         name: "auto" (SIFT if the extra `register` is installed), "sift", "direct" or "MODULE:FUNCTION".
-        ratio: SIFT's ratio test, see `mutual`.
-        most: maximum SIFT features per image.
+        ratio: see `Sift`.
+        most: see `Sift`.
 
     Raises:
         InputError: an unknown name, module or function.
@@ -182,14 +182,7 @@ def mutual(
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return mutual nearest rows of `a` and `b` that are nearer than `ratio` times a's second nearest.
 
-    Args:
-        a: (M, D) integers whose dot products are below 2²⁴.
-        b: (N, D), likewise.
-        ratio: largest ratio of distances.
-
-    >>> a = np.array([[9, 0], [0, 9]], np.float32)
-    >>> [i.tolist() for i in mutual(a, np.array([[0, 8], [9, 1], [4, 4]], np.float32), 0.8)]
-    [[0, 1], [1, 0]]
+    Both are (…, D) integers whose dot products are below 2²⁴.
     """
     if not len(a) or not len(b):
         return np.zeros(0, np.int64), np.zeros(0, np.int64)

@@ -26,10 +26,7 @@ from g2ard.stages.register.report import KEPT, PhotoReport, PoseError, Registere
 
 Float = NDArray[np.float64]
 _FEATURES_BONUS = 0.05
-"""Bonus in likeness for a pose confirmed by features.
-
-Likeness detects poses that are wrong by metres, features those that are wrong by decimetres.
-"""
+"""Bonus in likeness for a pose confirmed by features: they detect errors of decimetres, ZNCC of metres."""
 
 
 def register(
@@ -53,15 +50,10 @@ def register(
 
     A photo without a pose starts from the `candidates` poses of `pool` whose renders at `pool_size` pixels,
     rotated likewise, are most similar: by features from the pose with the most inliers, or by alignment from
-    each. The result with the highest median local ZNCC is kept, and the ZNCC decides its status.
-    An unreadable photo gets status "refused"; the others are still registered.
+    each. The result with the highest median local ZNCC is kept. An unreadable photo gets status "refused".
 
-    Args:
-        photos: C views with photos, K, size and distortion; their poses are ignored.
-        starts: name → (4, 4) camera_from_world.
-        truth: name → (4, 4) camera_from_world, used only for scoring.
-
-    Other arguments, results and errors are those of `g2ard.register`.
+    Other arguments, results and errors are those of `g2ard.register`; `starts` and `truth` are its poses,
+    name → (4, 4) camera_from_world.
     """
     config = config or RegisterConfig()
     if not len(photos):

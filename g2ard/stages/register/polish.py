@@ -35,15 +35,11 @@ _MOST_DAMPING = 1e3
 class Point:
     """E at one pose and light, with gradient and Hessian over (v, ω, g, b)."""
 
-    viewmat: Float
-    gain: float
-    bias: float
+    at: Aligned
     energy: float
     slope: Float
     hessian: Float
     shot: Shot
-    overlap: float
-    depth: float
 
 
 class Energy:
@@ -85,8 +81,11 @@ class Energy:
             by_motion = self._prior.information @ xi  # for small ξ
             energy, slope[:6] = energy + float(xi @ by_motion) / 2, slope[:6] + by_motion
             hessian[:6, :6] += self._prior.information
-        depth = float(np.median(shot.depth[counted]))
-        return Point(viewmat, gain, bias, energy, slope, hessian, shot, float(counted.mean()), depth)
+        depth, covariance = float(np.median(shot.depth[counted])), inverse(hessian)
+        covariance = None if covariance is None else covariance[:6, :6]
+        overlap = float(counted.mean())
+        aligned = Aligned(viewmat, gain, bias, covariance, overlap, self.renders, depth)
+        return Point(aligned, energy, slope, hessian, shot)
 
 
 def polish(
@@ -110,23 +109,13 @@ def polish(
         unit = 1 / np.sqrt(np.maximum(np.diag(here.hessian), 1e-30))
         scaled = here.hessian * unit[:, None] * unit[None, :] + damping * np.eye(8)
         step = -unit * np.linalg.solve(scaled, unit * here.slope)
-        after = energy.at(moved(here.viewmat, step[:6]), here.gain + step[6], here.bias + step[7])
+        pose, light = moved(here.at.viewmat, step[:6]), (here.at.gain + step[6], here.at.bias + step[7])
+        after = energy.at(pose, *light)
         still = moves(here.shot, camera.K, step[:6]) < config.still
-        if after is not None and after.gain > 0 and after.energy < here.energy:
+        if after is not None and light[0] > 0 and after.energy < here.energy:
             here, damping = after, max(damping / _DAMPING[1], _LEAST_DAMPING)
         else:
             damping *= _DAMPING[1]
         if still or damping > _MOST_DAMPING:
             break
-    if here is None:
-        return None
-    covariance = inverse(here.hessian)
-    return Aligned(
-        here.viewmat,
-        here.gain,
-        here.bias,
-        None if covariance is None else covariance[:6, :6],
-        here.overlap,
-        energy.renders,
-        here.depth,
-    )
+    return None if here is None else replace(here.at, steps=energy.renders)

@@ -171,12 +171,6 @@ def summarize(
     """Count photos by status and, if `true` photos have reference poses, score starting poses and results.
 
     Results are those that `keep` keeps. `metres_per_unit` is the scale of the scene, None if unknown.
-
-    >>> near = PhotoReport("a", "registered", start_error=PoseError(1, 3), error=PoseError(0.04, 0.1))
-    >>> lost = PhotoReport("b", "refused", start_error=PoseError(2, 3))
-    >>> found = summarize([near, lost], true=2, metres_per_unit=1).found
-    >>> found.photos, found.median.position, found.recalls[0].share
-    (1, 0.04, 0.5)
     """
     if metres_per_unit is not None:
         fits = 0 < metres_per_unit < float("inf")

@@ -1,7 +1,6 @@
 """View selection by light: views that resolve the Gaussians which other views leave unresolved."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,21 +24,6 @@ _BATCH = 32
 """Views rendered together."""
 
 
-@dataclass(frozen=True, eq=False)
-class Completion:
-    """Views that complete others.
-
-    Args:
-        order: (K,) indices into the offered views, best first.
-        gains: (K,) what each added to the objective, per Gaussian.
-        unseen: share of the Gaussians that neither the given nor the chosen views show with a pixel of light.
-    """
-
-    order: NDArray[np.int64]
-    gains: NDArray[np.float64]
-    unseen: float
-
-
 def complete(
     scene: Splats,
     given: Cameras,
@@ -49,7 +33,7 @@ def complete(
     least_views: int = 1,
     represents: float = 1.0,
     progress: Progress = silent,
-) -> Completion:
+) -> tuple[NDArray[np.int64], NDArray[np.float64], float]:
     """Choose offered views greedily by what they resolve beyond the given ones (decision 0034).
 
     The objective is F = Σ_i log(1 + Σ_v A_vi/16) over the given and the chosen views v, where A_vi is the
@@ -58,17 +42,19 @@ def complete(
     average, where B_i is the sum over these.
 
     Args:
-        scene: a compact scene, such as the one to be trained.
-        given: views that are used in any case.
         least_views: n is at least this, so that few given views do not end the choice early.
         represents: Gaussians to be trained per row of `scene`.
+
+    Returns:
+        (K,) indices of the chosen views, best first; (K,) what each added to the objective, per Gaussian; and
+        the share of the Gaussians that neither the given nor the chosen views show with a pixel of light.
 
     >>> from g2ard.scene.cameras import Camera
     >>> pair = Splats.create([[0, 0, 0], [9, 0, 0]], scales=np.full((2, 3), 0.1), logit_opacities=[9, 9])
     >>> left = Cameras.of([Camera.facing([0, -2, 0], [0, 0, 0], width=64, height=48)])
     >>> both = [Camera.facing([x, -3, 0], [x, 0, 0], width=64, height=48, name=str(x)) for x in (0, 9)]
-    >>> done = complete(pair, left, Cameras.of(both), 1)
-    >>> done.order.tolist(), done.unseen
+    >>> order, _, unseen = complete(pair, left, Cameras.of(both), 1)
+    >>> order.tolist(), unseen
     ([1], 0.0)
     """
     some = np.array(evenly_spaced(len(scene), _SAMPLED_ROWS), np.int64)
@@ -86,11 +72,8 @@ def complete(
     again = float((before / (1 + before)).sum()) / max(len(given), least_views)
     count = int(np.searchsorted(-gains, -again))  # gains fall
     total = before + received[order[:count]].sum(axis=0, dtype=np.float64)
-    return Completion(
-        order[:count].astype(np.int64),
-        gains[:count] / len(some),
-        float((total * _RESOLVING_PIXELS < 1).mean()),
-    )
+    unseen = float((total * _RESOLVING_PIXELS < 1).mean())
+    return order[:count].astype(np.int64), gains[:count] / len(some), unseen
 
 
 def _light(

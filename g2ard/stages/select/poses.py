@@ -117,9 +117,6 @@ def facility_location(alike: Float, pose_weights: Float, usable: NDArray[np.bool
         pose_weights: (C,) from `inverse_density`, 0 for unusable views.
         usable: (C,) mask of views that may be chosen.
         shares: (C,) from `outlooks`.
-
-    Returns:
-        The usable views in order.
     """
     away, worth = _bandwidths_apart(alike), shares**_SCENE_SHARE_EXPONENT
     best, left = np.zeros(len(alike)), usable.copy()

@@ -85,17 +85,6 @@ class Surface:
         return self.centers, self.normals, self.confidence, self.weights, self.size
 
 
-@dataclass(frozen=True, eq=False)
-class Visible:
-    """Visible cells of C views: view v sees cells[starts[v]:starts[v + 1]], ascending."""
-
-    starts: NDArray[np.uint64]
-    cells: NDArray[np.uint32]
-
-    def of(self, view: int) -> NDArray[np.uint32]:
-        return self.cells[int(self.starts[view]) : int(self.starts[view + 1])]
-
-
 def surface(splats: Splats, cells: int = 300_000) -> Surface:
     """Partition a scene into about `cells` surface cells.
 
@@ -104,10 +93,7 @@ def surface(splats: Splats, cells: int = 300_000) -> Surface:
     """
     require("cells", cells, cells >= 1, "at least 1")
     scene, origin = core_scene(splats)
-    arrays = _core.select_surface(scene, cells)
-    return Surface(
-        arrays["centers"], arrays["normals"], arrays["confidence"], arrays["weights"], arrays["size"], origin
-    )
+    return Surface(**_core.select_surface(scene, cells), origin=origin)
 
 
 def visible_cells(
@@ -117,21 +103,23 @@ def visible_cells(
     *,
     depth_tolerance: float = SurfaceOptions.depth_tolerance,
     progress: Progress = silent,
-) -> Visible:
+) -> tuple[NDArray[np.uint64], NDArray[np.uint32]]:
     """Compute the visibility ν_jv of a scene's cells in C views, world coordinates, from its median depth.
 
     A cell is visible if its centre projects into the image and lies within max(cell size, depth_tolerance ·
     depth) of the pixel's median depth (gsplat's convention).
+
+    Returns:
+        (C + 1,) starts and the rows of cells: view v sees cells[starts[v]:starts[v + 1]], ascending.
     """
     scene, origin = core_scene(splats)
-    starts, seen = _core.select_visible(
+    return _core.select_visible(
         scene,
         cells.parts,
         core_views(cameras, origin, scene),
         tolerance=depth_tolerance,
         progress=counter(progress, "visibility"),
     )
-    return Visible(starts, seen)
 
 
 def core_scene(splats: Splats) -> tuple[tuple[Any, ...], Float]:
@@ -165,13 +153,15 @@ def greedy(
     cells = surface(splats, options.cells)
     seconds["surface"] = time.perf_counter() - began
     began = time.perf_counter()
-    seen = visible_cells(splats, cells, cameras, depth_tolerance=options.depth_tolerance, progress=progress)
+    starts, seen = visible_cells(
+        splats, cells, cameras, depth_tolerance=options.depth_tolerance, progress=progress
+    )
     seconds["visibility"] = time.perf_counter() - began
-    usable = np.diff(seen.starts.astype(np.int64)) > 0
+    usable = np.diff(starts.astype(np.int64)) > 0
     began = time.perf_counter()
     order, gains, evaluations = _core.select_greedy(
         cells.parts,
-        (seen.starts, seen.cells, np.ascontiguousarray(cameras.recentred(cells.origin).positions)),
+        (starts, seen, np.ascontiguousarray(cameras.recentred(cells.origin).positions)),
         len(cameras),
         policy == "directional",
         options,

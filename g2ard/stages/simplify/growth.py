@@ -51,12 +51,7 @@ _LEAST_ERROR = 1e-9
 
 
 def widened(scene: Splats, needed: NDArray[np.float32], growth: float) -> Splats:
-    """Widen merged rows from the first of `GROWTHS` to what they need, at most `growth`.
-
-    >>> disc = Splats.create([[0, 0, 0]] * 2, scales=[[4, 4, 1]] * 2)
-    >>> widened(disc, np.array([1, 2], np.float32), 2.0).scales.round(2).tolist()
-    [[4.0, 4.0, 1.0], [5.059999942779541, 5.059999942779541, 1.0]]
-    """
+    """Widen merged rows from the first of `GROWTHS` to what they need, at most `growth`."""
     needed = needed.astype(np.float64)
     area = np.clip(needed, 1, growth) / np.clip(needed, 1, GROWTHS[0])
     longer = np.arange(3) != np.argmin(scene.scales, axis=1)[:, None]
@@ -65,11 +60,7 @@ def widened(scene: Splats, needed: NDArray[np.float32], growth: float) -> Splats
 
 
 def best_growth(error: Callable[[float], float]) -> float:
-    """Return the growth from which the next one is no better.
-
-    >>> best_growth(lambda growth: abs(growth - 2.2)), best_growth(lambda growth: growth)
-    (2.0, 1.25)
-    """
+    """Return the growth from which the next one is no better."""
     best, least = GROWTHS[0], error(GROWTHS[0])
     for growth in GROWTHS[1:]:
         if (now := error(growth)) >= least:

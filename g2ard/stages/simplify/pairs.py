@@ -20,8 +20,7 @@ from g2ard.stages.simplify.growth import GROWTHS, Renders, best_growth, widened
 
 _OPACITY_FIT_EXPONENT = 1 / 4
 """Exponent of the ratio of wanted to current visibility: ½ fits the given views by up to 0.1 dB better, and
-others by up to 0.7 dB worse (decision 0009).
-"""
+others by up to 0.7 dB worse (decision 0009)."""
 
 _OPACITY_FIT_LIMITS = (0.5, 2.0)
 """Limits of that ratio."""
@@ -137,8 +136,7 @@ def fit_opacities(
     Args:
         scene: M merged Gaussians.
         members: (M,) number of Gaussians merged into each.
-        wanted: (M,) Σ αT² of those Gaussians.
-        now: (M,) Σ αT² of the merged Gaussians.
+        wanted: (M,) Σ αT² of those Gaussians; `now` that of the merged ones.
         mean: mean of `wanted`, for tiles over all of them.
     """
     if mean <= 0:  # no view sees anything

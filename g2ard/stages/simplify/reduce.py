@@ -63,20 +63,12 @@ def flag(
         splats: the raw prior; in a recovered scene fitting hides the residual.
         budget: the final count N_S, which sets the cell size.
         config: uses `flag_threshold` and `flag_members`.
-        progress: called when done.
 
     Returns:
         (N,) bool; False for rows that are not finite.
 
     Raises:
         InputError: no finite row, or a budget below 1.
-
-    >>> plane = np.stack(np.meshgrid(range(20), range(20), [0]), -1).reshape(-1, 3)
-    >>> noise = np.random.default_rng(0).normal(size=(400, 1, 3)) * (plane[:, :1, None] > 9)
-    >>> scene = Splats.create(plane, scales=np.ones((400, 3)), sh0=noise)
-    >>> flags = flag(scene, 40)
-    >>> float(flags[plane[:, 0] < 8].mean()), float(flags[plane[:, 0] > 12].mean())
-    (0.0, 1.0)
     """
     require("budget", budget, budget >= 1, "at least 1")
     scene, finite = finite_rows_of(splats)
@@ -132,15 +124,10 @@ def simplify(
         compare: for `default` and `fast`: compare small renders with the dense scene's, to choose
             `max_growth` unless the config does, and to measure the opacity lost; for results that are not
             recovered. Views are those of `visibility`, if it has the attribute `views`, or six from outside.
-        config: the constants.
         progress: called with the number of Gaussians removed.
 
-    Returns:
-        The scene, the new row of each row, the inherited flags and a report.
-
     Raises:
-        InputError: a budget below 1 or above the count of finite rows, arrays of another length, or an
-            unknown method.
+        InputError: a budget below 1 or above the count of finite rows, or arrays of another length.
 
     >>> rng = np.random.default_rng(0)
     >>> scene = Splats.create(rng.normal(size=(1000, 3)), scales=np.full((1000, 3), 0.1))
