@@ -152,19 +152,15 @@ def plan_pool(
 ) -> Pool:
     """Plan a pool like `make_pool`, and return it with the reasons and statistics.
 
-    Arguments not listed here are those of `make_pool`.
+    Other arguments and errors are those of `make_pool`.
 
     Args:
-        splats: the scene, or a fair sample of it (see `represents`).
         count: number of poses if a view holds the whole scene.
         grow: largest factor on `count`; if a view holds a share h of the scene, the factor is 1/√h.
         near: largest share of the poses that step nearer to what the others see. The actual share is near·s,
             where s is at least 1−h and rises to 1 with the share of the matter that is only seen below a
             pixel.
         represents: Gaussians of the scene per row of `splats`.
-
-    Raises:
-        InputError: as for `make_pool`.
     """
     lens = Lens(size, _FOV if fov is None else fov)
     require("count", count, count >= 1, "at least 1 pose")

@@ -105,9 +105,5 @@ def renderer_on(
     device: str, splats: Splats, background: Sequence[float], settings: RasterSettings | None
 ) -> Renderer | CudaRenderer:
     """Return a renderer for scores: gsplat's on "cuda", unless the settings ask for INRIA's conventions."""
-    kind = (
-        CudaRenderer
-        if device == "cuda" and (settings or RasterSettings()).convention == "gsplat"
-        else Renderer
-    )
-    return kind(splats, background=background, settings=settings)
+    fits = device == "cuda" and (settings or RasterSettings()).convention == "gsplat"
+    return (CudaRenderer if fits else Renderer)(splats, background=background, settings=settings)

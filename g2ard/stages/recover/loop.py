@@ -128,12 +128,6 @@ class Loop:
         """Number of single-Gaussian steps skipped because a gradient was not finite."""
         return self.skipped_before + self.engine.skipped
 
-    @property
-    def _views_seen(self) -> NDArray[np.float64]:
-        """Estimated number of views that contributed to each Gaussian, (N,), from its steps."""
-        steps = self.done - (int(self.guard.backed_off[-1]["step"]) if self.guard.backed_off else 0)
-        return self.engine.counts * (len(self.targets.cameras) / max(1, steps))
-
     def _new_engine(self, start: Splats | None = None) -> Engine:
         """Create an engine that begins at `start`, by default at the student."""
         config, student = self.config, self.student if start is None else start
@@ -220,7 +214,8 @@ class Loop:
     ) -> tuple[Splats, NDArray[np.float64] | None]:
         """Take all steps, after those of a checkpoint if it exists.
 
-        Return the scene, and with validation views the number of views that each Gaussian was seen in.
+        Return the scene, and with validation views the (N,) number of views that each Gaussian was seen in,
+        estimated from its steps.
 
         If a GPU fails, the CPU continues from the last checkpoint, or from the start.
         """
@@ -230,7 +225,11 @@ class Loop:
         while True:
             try:
                 self._run(checkpoint, progress, stage, watch)
-                return self.engine.splats(), None if self.validation_key is None else self._views_seen
+                if self.validation_key is None:
+                    return self.engine.splats(), None
+                steps = self.done - (int(self.guard.backed_off[-1]["step"]) if self.guard.backed_off else 0)
+                seen = self.engine.counts * (len(self.targets.cameras) / max(1, steps))
+                return self.engine.splats(), seen
             except DeviceError:  # `system.devices.notes` has the reason
                 del self.engine
                 seconds, resumed = self.seconds, self.resumed

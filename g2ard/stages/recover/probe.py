@@ -64,10 +64,8 @@ class Probe:
         if seconds >= self._next:
             began = time.monotonic()
             self._latest = self.all_of(splats()), step
-            first = self._next == 0.0  # the starting score is outdated soon
-            self._next = seconds + (time.monotonic() - began) / (
-                _FIRST_SCORING_SHARE if first else _SCORING_TIME_SHARE
-            )
+            share = _SCORING_TIME_SHARE if self._next else _FIRST_SCORING_SHARE  # the start is outdated soon
+            self._next = seconds + (time.monotonic() - began) / share
         return self._latest
 
     def _score(self, renderer: Renderer, view: int) -> float:

@@ -21,9 +21,8 @@ from g2ard.rendering.renderer import Rendered, Renderer
 from g2ard.scene.cameras import Camera
 from g2ard.stages.register.config import RegisterConfig
 from g2ard.stages.register.grey import blurred, gradient
-from g2ard.stages.register.pose import moved
+from g2ard.stages.register.pose import Float, moved
 
-Float = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 _DAMPING = 1e-6

@@ -14,10 +14,9 @@ from g2ard.stages.register.config import RegisterConfig
 from g2ard.stages.register.grey import grey_of, local_zncc
 from g2ard.stages.register.matchers import Matcher
 from g2ard.stages.register.polish import polish
-from g2ard.stages.register.pose import motion_between, moved
+from g2ard.stages.register.pose import Float, motion_between, moved
 from g2ard.stages.register.solve import Solved, solve
 
-Float = NDArray[np.float64]
 _REFINING_LEVELS = 2
 """Finest levels of direct alignment that refine a pose from features."""
 

@@ -86,10 +86,9 @@ class RegisterConfig(Settings):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.matcher == "direct":
-            unused = [
-                name for name in _FEATURE_FIELDS if getattr(self, name) != getattr(RegisterConfig, name)
-            ]
-            unused += ["refine"] if self.refine in ("none", "photometric") else []
+            unused = [n for n in _FEATURE_FIELDS if getattr(self, n) != getattr(RegisterConfig, n)]
+            if self.refine in ("none", "photometric"):
+                unused.append("refine")
             if unused:
                 raise InputError("has no effect on the matcher direct", parameter=unused[0])
         require("window", self.window, self.window % 2 == 1, "an odd number")

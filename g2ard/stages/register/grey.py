@@ -6,8 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard import _core
-
-Float = NDArray[np.float64]
+from g2ard.stages.register.pose import Float
 
 LUMA = np.array([0.299, 0.587, 0.114])
 

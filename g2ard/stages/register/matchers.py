@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from g2ard.errors import InputError, MissingDependencyError
 from g2ard.stages.register.grey import grey_of
+from g2ard.stages.register.pose import Float
 
-Float = NDArray[np.float64]
 Image = NDArray[np.float32]
 Pairs = tuple[Float, Float]
 Matcher = Callable[[Image, Image], Pairs]

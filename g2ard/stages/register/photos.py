@@ -8,7 +8,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from g2ard.config.choices import BLACK, Keep
 from g2ard.errors import InputError, require
@@ -21,10 +21,9 @@ from g2ard.stages.register.config import RegisterConfig
 from g2ard.stages.register.grey import band_passed
 from g2ard.stages.register.matchers import matcher_named
 from g2ard.stages.register.pool import PoolRenders, small_render, turned
-from g2ard.stages.register.pose import pose_error
+from g2ard.stages.register.pose import Float, pose_error
 from g2ard.stages.register.report import KEPT, PhotoReport, PoseError, Registered, RegisterReport, Status
 
-Float = NDArray[np.float64]
 _FEATURES_BONUS = 0.05
 """Bonus in likeness for a pose confirmed by features: they detect errors of decimetres, ZNCC of metres."""
 

@@ -11,17 +11,14 @@ with alignment's matrix as the Hessian.
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from g2ard.rendering.renderer import Renderer
 from g2ard.scene.cameras import Camera
 from g2ard.stages.register.align import Aligned, Level, Shot, inverse, moves, normal_equations, shot_of
 from g2ard.stages.register.config import RegisterConfig
 from g2ard.stages.register.grey import LUMA, blurred_back
-from g2ard.stages.register.pose import motion_between, moved
+from g2ard.stages.register.pose import Float, motion_between, moved
 from g2ard.stages.register.solve import Solved
-
-Float = NDArray[np.float64]
 
 _TUKEY = 4.685
 """Tukey's constant, as in the normal equations' weights."""

@@ -3,16 +3,13 @@
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from g2ard.progress import Progress, silent
 from g2ard.rendering.renderer import Renderer
 from g2ard.scene.cameras import Camera, Cameras
 from g2ard.stages.register.config import RegisterConfig
 from g2ard.stages.register.grey import band_passed, grey_of, shift_between
-from g2ard.stages.register.pose import rotation_of
-
-Float = NDArray[np.float64]
+from g2ard.stages.register.pose import Float, rotation_of
 
 
 def small_render(renderer: Renderer, camera: Camera, config: RegisterConfig) -> Float:

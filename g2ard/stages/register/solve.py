@@ -15,8 +15,7 @@ from g2ard.rendering.renderer import Rendered, Renderer
 from g2ard.scene.cameras import Camera
 from g2ard.stages.register.config import RegisterConfig
 from g2ard.stages.register.matchers import Matcher
-
-Float = NDArray[np.float64]
+from g2ard.stages.register.pose import Float
 
 _LEAST_MATCHES = 6
 """Least matches and inliers for a pose; three determine it, the rest confirm it."""

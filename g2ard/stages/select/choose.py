@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from g2ard.config.checks import checks_arguments
 from g2ard.config.choices import POLICIES, UNMEASURED
@@ -16,10 +15,7 @@ from g2ard.progress import Progress, plural, silent
 from g2ard.scene.cameras import Cameras, unseeing
 from g2ard.scene.splats import Splats
 from g2ard.stages.select import poses
-from g2ard.stages.select.surfaces import SurfaceOptions, greedy, surface
-
-Float = NDArray[np.float64]
-Order = NDArray[np.int64]
+from g2ard.stages.select.surfaces import Float, Order, SurfaceOptions, greedy, surface
 
 _LEAST_CURVE_BEND = 0.02
 """Height above its chord below which a curve counts as straight, so that no K stands out."""

@@ -9,10 +9,7 @@ from g2ard import _core
 from g2ard.progress import Progress, counter
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
-from g2ard.stages.select.surfaces import Surface, core_scene, core_views
-
-Float = NDArray[np.float64]
-Order = NDArray[np.int64]
+from g2ard.stages.select.surfaces import Float, Order, Surface, core_scene, core_views
 
 _KERNEL_BANDWIDTH = 0.35
 """Bandwidth of the kernel exp(−(d/0.35)²): neighbours 20° apart on an orbit have similarity ½."""
