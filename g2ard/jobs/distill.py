@@ -25,6 +25,7 @@ from g2ard.jobs.clean import clean as remove_clutter
 from g2ard.jobs.distill_options import DistillOptions
 from g2ard.jobs.inputs import Views, load_scene, make_targets, scorable
 from g2ard.jobs.measured_budget import Reduction, ResolvedBudget
+from g2ard.jobs.memory import RECOVERY_TIMES
 from g2ard.jobs.photos import distinct, sparse_file, sparse_points, topped_up
 from g2ard.jobs.view_checks import check_photos, propose_background
 from g2ard.jobs.views import Use, views_of, within_pixels
@@ -421,20 +422,19 @@ def preparing(
 
     Args:
         tiling: how to process the scene, a path, in tiles; None for one piece.
-        planned: whether tiles are only planned.
+        planned: whether tiles are only planned: the job has a cost, but cannot run.
     """
     callbacks: dict[str, Any] = {"progress": progress, "say": say}
     if tiling is None:
         yield prepare(scene, budget, options, use=use, **callbacks)
         return
-    from g2ard.jobs.tiled import preparing_tiles
+    from g2ard.jobs.tiled import opened, prepare_tiles
 
     assert isinstance(scene, Path)
-    recovers = use != "merging"
-    with preparing_tiles(
-        scene, budget, options, tiling, recovers=recovers, planned=planned, **callbacks
-    ) as job:
-        yield job
+    began, model = time.monotonic(), options.render_model
+    options.check_trained()
+    with opened(scene, tiling, RECOVERY_TIMES, render_model=model, planned=planned, **callbacks) as tiles:
+        yield prepare_tiles(tiles, budget, options, recovers=use != "merging", began=began, **callbacks)
 
 
 def prepare(

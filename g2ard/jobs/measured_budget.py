@@ -78,7 +78,7 @@ class Reduction:
         cameras: cameras that give visibility weights to every method, instead of `views`.
         recovered: whether the results are recovered afterwards, so that their growth is not measured.
         notes: notes on the scene's file.
-        tiles: the scene, if it is in tiles.
+        tiles: the scene, if it is in tiles; `splats` is then a sample.
     """
 
     splats: Splats
@@ -125,6 +125,8 @@ class Reduction:
 
     def made(self, count: int) -> Any:
         """Simplify the scene."""
+        if self.tiles is not None:
+            return self.tiles.simplified(count, self.seen if count < self.total else None, self.config)
         return simplify(
             self.splats,
             count,

@@ -48,13 +48,13 @@ def reducing(
     callbacks: dict[str, Any] = {"progress": progress, "say": say}
     beside = beside if isinstance(scene, Splats) else beside or scene
     if tiling is not None:
-        from g2ard.jobs.tiled import TiledReduction, opened
+        from g2ard.jobs.tiled import opened
 
         how: dict[str, Any] = {"render_model": render_model, "planned": planned, **callbacks}
         with opened(Path(str(scene)), tiling, 1.0, **how) as tiles:
             counted(tiles.plan.count)
             options |= {"beside": beside, "notes": tiles.store.notes if tiles.store else (), **callbacks}
-            yield TiledReduction(tiles.sample(options["config"]), tiles=tiles, **options)
+            yield Reduction(tiles.sample(options["config"]), tiles=tiles, **options)
         return
     notes: Sequence[Note] = ()
     if not isinstance(scene, Splats):

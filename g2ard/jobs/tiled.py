@@ -7,7 +7,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -21,14 +20,15 @@ from g2ard.io.tiles import StoredScene, TileStore
 from g2ard.jobs.budget import Budget
 from g2ard.jobs.distill_options import DistillOptions
 from g2ard.jobs.inputs import say_regions
-from g2ard.jobs.measured_budget import Reduction, ResolvedBudget, resolved_in_tiles
-from g2ard.jobs.memory import RECOVERY_TIMES, TilePlan, plan_tiles
+from g2ard.jobs.measured_budget import ResolvedBudget, resolved_in_tiles
+from g2ard.jobs.memory import TilePlan, plan_tiles
 from g2ard.jobs.tiling import Tiling
 from g2ard.jobs.views import pool_times, views_of
 from g2ard.pipeline.config import DistillConfig
 from g2ard.pipeline.distill import RunViews, selected
 from g2ard.progress import Progress, Say, silent, unsaid
 from g2ard.report.run import TiledReport, TiledScores
+from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
 from g2ard.scene.transform import join
 from g2ard.stages.recover.auto_preset import regularizers_for
@@ -39,7 +39,7 @@ from g2ard.tiles.executor import Workers, executor
 from g2ard.tiles.ingest import ingest
 from g2ard.tiles.merging import TiledScene, simplify_tiles
 from g2ard.tiles.recover import recover_tiles
-from g2ard.tiles.sights import Surroundings
+from g2ard.tiles.sights import Sights
 from g2ard.tiles.simplify import TiledRun, sample_stride
 
 
@@ -69,6 +69,12 @@ class Tiles:
         """Begin to simplify the tiles, or those of a scene derived from them."""
         assert self.workers is not None
         return TiledRun(store or self.written, self.workers, config)
+
+    def simplified(self, count: int, views: Cameras | None, config: SimplifyConfig) -> TiledSimplified:
+        """Simplify the scene; finished steps are in the folder of its workers."""
+        small = simplify_tiles(self.run(config), count, views, compare=True)
+        parts = list(small.counts), small.views, small.unseen, small.growth, small.opacity_lost
+        return TiledSimplified(small, TiledSimplifyReport(self.plan.count, len(small), *parts))
 
     def sample(self, config: SimplifyConfig) -> Splats:
         """Return a sample of the Gaussians, from which views are planned and constants chosen."""
@@ -150,19 +156,6 @@ class TiledSimplified:
     report: TiledSimplifyReport
 
 
-class TiledReduction(Reduction):
-    """Reductions of a scene in `tiles`; `splats` is a sample."""
-
-    tiles: Tiles
-
-    def made(self, count: int) -> TiledSimplified:
-        """Simplify the scene; finished steps are in the folder of its workers."""
-        views = self.seen if count < self.total else None
-        small = simplify_tiles(self.tiles.run(self.config), count, views, compare=True)
-        parts = list(small.counts), small.views, small.unseen, small.growth, small.opacity_lost
-        return TiledSimplified(small, TiledSimplifyReport(self.total, len(small), *parts))
-
-
 @dataclass(frozen=True, eq=False)
 class TiledDistilled:
     """A distilled scene in tiles, with its unrecovered version and its scores."""
@@ -182,7 +175,7 @@ class TiledJob:
         sample: of the dense scene.
         recovers: whether anything is recovered, or only scored.
         began: when the preparation began.
-        around: placement of the dense tiles, once they have been seen.
+        around: visibility of the dense tiles, once they have been seen.
     """
 
     tiles: Tiles
@@ -193,7 +186,7 @@ class TiledJob:
     recovers: bool
     began: float
     say: Say = unsaid
-    around: Surroundings | None = None
+    around: Sights | None = None
     targets = None
     photos = ()
 
@@ -252,7 +245,7 @@ class TiledJob:
         run = self.tiles.run(self.config.simplify, store)
         small = simplify_tiles(run, count, seen.train.cameras, compare=not self.recovers)
         say_gaps(small.opacity_lost, self.say)
-        self.around = self.around or small.surroundings  # the first is made from the dense scene itself
+        self.around = self.around or small.sights  # the first is made from the dense scene itself
         assert self.around is not None  # views are given
         dense = self.tiles.written
         student = self._stored(small, "student", like=dense)
@@ -268,50 +261,42 @@ class TiledJob:
         return ingest(scene.stream(), folder, tile_rows=self.tiles.tiling.most_rows, like=like)
 
 
-@contextmanager
-def preparing_tiles(
-    scene: Path,
+def prepare_tiles(
+    tiles: Tiles,
     budget: Budget,
     options: DistillOptions,
-    tiling: Tiling,
     *,
-    recovers: bool = True,
-    planned: bool = False,
-    progress: Progress = silent,
-    say: Say = unsaid,
-) -> Iterator[TiledJob]:
-    """Open the tiles, start workers, and decide everything that a distillation needs.
+    recovers: bool,
+    began: float,
+    progress: Progress,
+    say: Say,
+) -> TiledJob:
+    """Decide everything that a distillation in tiles needs.
 
     Args:
         options: as for `g2ard.distill`, without what `needs_whole` returns.
-        planned: only plan it: the job has a cost, but cannot run.
     """
-    began = time.monotonic()
-    options.check_trained()
-    callbacks: dict[str, Any] = {"progress": progress, "say": say}
-    model = options.render_model
-    with opened(scene, tiling, RECOVERY_TIMES, render_model=model, planned=planned, **callbacks) as tiles:
-        total = tiles.plan.count
-        sample = tiles.sample(options.config.simplify)
-        degree = options.config.recover.sh_degree
-        stored = sample if degree is None else sample.with_sh_degree(degree)
-        wanted = resolved_in_tiles(budget, total, stored, str(scene), f"scene.{options.format}", say)
-        say_regions(sample, options.config.simplify, "a sample of the scene", unsaid)
-        views = views_of(
-            sample,
-            options,
-            wanted.count,
-            beside=options.beside or scene,
-            use="tiles" if recovers else "merging",
-            represents=total / len(sample),
-            **callbacks,
-        )
-        regularizers, why, _ = regularizers_for(options.named("recover.regularizers"), sample)
-        config = options.configured(regularizers)
-        if recovers:
-            say(f"regularisers: {why}")
-            views = _weighted(views, sample, config, progress)
-        yield TiledJob(tiles, wanted, sample, views, config, recovers, began, say)
+    total, sample = tiles.plan.count, tiles.sample(options.config.simplify)
+    degree = options.config.recover.sh_degree
+    stored = sample if degree is None else sample.with_sh_degree(degree)
+    wanted = resolved_in_tiles(budget, total, stored, str(tiles.scene), f"scene.{options.format}", say)
+    say_regions(sample, options.config.simplify, "a sample of the scene", unsaid)
+    views = views_of(
+        sample,
+        options,
+        wanted.count,
+        beside=options.beside or tiles.scene,
+        use="tiles" if recovers else "merging",
+        represents=total / len(sample),
+        progress=progress,
+        say=say,
+    )
+    regularizers, why, _ = regularizers_for(options.named("recover.regularizers"), sample)
+    config = options.configured(regularizers)
+    if recovers:
+        say(f"regularisers: {why}")
+        views = _weighted(views, sample, config, progress)
+    return TiledJob(tiles, wanted, sample, views, config, recovers, began, say)
 
 
 def _weighted(views: RunViews, sample: Splats, config: DistillConfig, progress: Progress) -> RunViews:

@@ -18,12 +18,12 @@ from g2ard.io.atomic import drop_empty, drop_temporaries, parents_made
 from g2ard.io.detect import MANIFEST
 from g2ard.io.jsonfile import Place, checked, read_json
 from g2ard.io.lock import LOCK, check_unlocked, locked
-from g2ard.io.stream import SceneStream
+from g2ard.io.stream import PointStream, SceneStream
 from g2ard.io.tiles import VERSION, TileStore
 from g2ard.io.types import Note
 from g2ard.progress import Progress, Say, plural, silent, unsaid
 from g2ard.stages.lift import LiftConfig
-from g2ard.tiles.writer import PointFeed, SceneFeed, TileWriter, clear, is_tile_file, lift_tiles, pour
+from g2ard.tiles.writer import TileWriter, clear, is_tile_file, lift_tiles, pour, row_bytes
 
 TILE_ROWS = 5_000_000
 """Default largest number of rows per tile."""
@@ -93,21 +93,23 @@ def ingest(
     folder = Path(folder)
     require("tile_rows", tile_rows, tile_rows >= 1, "at least 1")
     require("block_rows", block_rows, block_rows is None or block_rows >= 1, "at least 1")
-    feed, sources = _feed(source, lift or LiftConfig(), render_model)
-    fewest = -(-feed.stream.count // MOST_TILES)
+    stream, sources = _opened(source, render_model)
+    fewest = -(-stream.count // MOST_TILES)
     if like is None and tile_rows < fewest:
         raise InputError(
-            f"{feed.stream.count:,} rows are too many for tiles of {tile_rows:,}; "
+            f"{stream.count:,} rows are too many for tiles of {tile_rows:,}; "
             f"use at least {fewest:,} rows per tile",
-            path=feed.stream.path,
+            path=stream.path,
             parameter="tile_rows",
         )
     settings: dict[str, Any] = {"tile_rows": tile_rows} if like is None else {"like": like.key}
-    if isinstance(feed, PointFeed):
-        settings["lift"] = asdict(feed.config)
-    if feed.render_model != "classic":
-        settings["render_model"] = feed.render_model
-    key = _key(feed.stream.identity(), settings)
+    lift = lift or LiftConfig()
+    if not isinstance(stream, SceneStream):
+        settings["lift"] = asdict(lift)
+    elif stream.render_model != "classic":
+        settings["render_model"] = stream.render_model
+    decisive = {"version": VERSION, "source": stream.identity(), **settings}
+    key = hashlib.sha256(json.dumps(decisive, sort_keys=True).encode()).hexdigest()
     done = _done(folder, key, overwrite)
     if done is not None:
         with suppress(OutputError):  # another call may be about to end
@@ -121,7 +123,13 @@ def ingest(
             _check_tiles(folder, key, settings, overwrite, say)
             clear(folder)
             try:
-                _write(folder, key, feed, sources, settings, tile_rows, block_rows, like, progress, say)
+                rows = block_rows or max(1, _BLOCK_BYTES // row_bytes(stream))
+                if isinstance(stream, SceneStream):
+                    writer = pour(folder, stream, tile_rows, rows, progress, say, like)
+                else:
+                    writer = lift_tiles(folder, stream, lift, tile_rows, rows, progress, say)
+                notes = [*stream.all_notes(), *([] if like else _overfull_note(writer, tile_rows))]
+                writer.finish(key, _manifest(stream, sources, settings, notes))
             except BaseException:
                 clear(folder)
                 raise
@@ -130,56 +138,33 @@ def ingest(
     return TileStore.open(folder)
 
 
-def _write(
-    folder: Path,
-    key: str,
-    feed: SceneFeed | PointFeed,
-    sources: list[str],
-    settings: dict[str, Any],
-    tile_rows: int,
-    block_rows: int | None,
-    like: TileStore | None,
-    progress: Progress,
-    say: Say,
-) -> None:
-    """Write the tiles and their manifest into an empty folder."""
-    rows = block_rows or max(1, _BLOCK_BYTES // feed.row_bytes)
-    if isinstance(feed, PointFeed):
-        writer = lift_tiles(folder, feed, tile_rows, rows, progress, say)
-    else:
-        writer = pour(folder, feed, tile_rows, rows, progress, say, like)
-    notes = [*feed.stream.all_notes(), *([] if like else _overfull_note(writer, tile_rows))]
+def _manifest(
+    stream: SceneStream | PointStream, sources: list[str], settings: dict[str, Any], notes: list[Note]
+) -> dict[str, Any]:
+    """Describe what the tiles hold."""
+    scene = stream if isinstance(stream, SceneStream) else None
     manifest = {
-        "sh_degree": feed.sh_degree,
-        "render_model": feed.render_model,
-        "offset": feed.stream.offset.tolist(),
+        "sh_degree": scene.sh_degree if scene else 0,
+        "render_model": scene.render_model if scene else "classic",
+        "offset": stream.offset.tolist(),
         "source": sources,
         "settings": settings,
         "notes": [asdict(note) for note in notes],
     }
-    if isinstance(feed, SceneFeed) and feed.stream.up is not None:
-        manifest["up"] = feed.stream.up
-    writer.finish(key, manifest)
+    return manifest if scene is None or scene.up is None else {**manifest, "up": scene.up}
 
 
-def _feed(
-    source: str | Path | Sequence[str | Path] | SceneStream,
-    config: LiftConfig,
-    render_model: RenderModel | None,
-) -> tuple[SceneFeed | PointFeed, list[str]]:
-    """Return the feed of a source and the names of its files."""
+def _opened(
+    source: str | Path | Sequence[str | Path] | SceneStream, render_model: RenderModel | None
+) -> tuple[SceneStream | PointStream, list[str]]:
+    """Open a source, and return the names of its files."""
     if isinstance(source, SceneStream):
-        return SceneFeed(source), [str(source.path)]
+        return source, [str(source.path)]
     sources: list[str | Path] = [source] if isinstance(source, str | Path) else list(source)
     names = [str(path) for path in sources]
     if sources and all(kind(path) == "points" for path in sources):
-        return PointFeed(open_point_stream(sources), config), names
-    return SceneFeed(open_stream(sources, render_model=render_model)), names
-
-
-def _key(identity: list[Any], settings: dict[str, Any]) -> str:
-    decisive = {"version": VERSION, "source": identity, **settings}
-    return hashlib.sha256(json.dumps(decisive, sort_keys=True).encode()).hexdigest()
+        return open_point_stream(sources), names
+    return open_stream(sources, render_model=render_model), names
 
 
 def _done(folder: Path, key: str, overwrite: bool) -> TileStore | None:
@@ -249,6 +234,6 @@ def _key_in(path: Path) -> str | None:
 
 
 def _overfull_note(writer: TileWriter, tile_rows: int) -> list[Note]:
-    over = sum(count > tile_rows for count in writer.tiles.rows)
+    over = sum(count > tile_rows for count in writer.counts)
     text = f"{plural(over, 'tile')} of more than {tile_rows:,} Gaussians: many share one position"
     return [Note("overfull_tiles", over, text)] if over else []

@@ -17,7 +17,7 @@ from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats, unit_quats
 from g2ard.scene.transform import join
 from g2ard.stages.simplify.growth import GROWTHS, best_growth
-from g2ard.tiles.sights import Sights, Surroundings
+from g2ard.tiles.sights import Sights
 from g2ard.tiles.simplify import TiledRun
 from g2ard.tiles.tasks import load, small_scene
 
@@ -39,7 +39,7 @@ class TiledScene:
         growth: largest growth of merged Gaussians; None if nothing was merged.
         opacity_lost: share of the light that opaque pixels stop but let through in the merged scene, before
             opacities are fitted; None if not measured.
-        surroundings: placement of the dense tiles, for recovery; None without views.
+        sights: visibility of the dense tiles, for recovery; None without views.
     """
 
     counts: tuple[int, ...]
@@ -51,7 +51,7 @@ class TiledScene:
     unseen: int | None = None
     growth: float | None = None
     opacity_lost: float | None = None
-    surroundings: Surroundings | None = None
+    sights: Sights | None = None
     render_model: RenderModel = "classic"
 
     def __len__(self) -> int:
@@ -181,7 +181,7 @@ def _scene(
         store.offset,
         key,
         views=0 if sights is None else len(sights.cameras),
-        surroundings=None if sights is None else sights.surroundings,
+        sights=sights,
         render_model=store.render_model,
     )
 

@@ -25,7 +25,7 @@ from g2ard.stages.recover.anchors import Anchors
 from g2ard.stages.recover.draw import checked_weights
 from g2ard.tiles.executor import Workers
 from g2ard.tiles.merging import TiledScene, finished
-from g2ard.tiles.sights import Surroundings, in_sight, light_of, written
+from g2ard.tiles.sights import Sights, in_sight, light_of, written
 from g2ard.tiles.tasks import (
     Arguments,
     Arrays,
@@ -163,7 +163,7 @@ def _errors(
 def recover_tiles(
     store: TileStore,
     student: TileStore,
-    around: Surroundings,
+    around: Sights,
     views: RunViews,
     config: RecoverConfig,
     steps: int,
@@ -177,7 +177,7 @@ def recover_tiles(
 
     Args:
         student: the scene to recover, in the same boxes (`ingest(…, like=store)`).
-        around: placement of the dense tiles, from `simplify_tiles` with views.
+        around: visibility of the dense tiles, from `simplify_tiles` with views.
         views: views for training with their sampling weights, for scoring, and of another kind for
             validation.
         config: constants of recovery; its steps are ignored.
@@ -194,7 +194,7 @@ def recover_tiles(
     count = len(views.train.cameras)
     weights = checked_weights(views.train.weights, count)
     weights = np.ones(count) if weights is None else weights
-    tasks = []
+    coarse, levels, tasks = around.run.coarse, around.levels(), []
     for tile in range(len(store.tiles)):
         seen = {name: by_tile[tile] for name, (_, by_tile) in sight.items()}
         seen["train"] = [view for view in seen["train"] if weights[view] > 0]
@@ -203,13 +203,13 @@ def recover_tiles(
             "store": store.key,
             "student": student.key,
             "tile": tile,
-            "levels": around.levels[tile],
+            **levels[tile],
             "steps": round(steps / max(1, count) * float(drawn.sum())),
             "weights": drawn.tolist(),
             "config": values_of(config),
             **seen,
         }
-        inputs: dict[str, Path | list[Path]] = {"own": around.coarse[tile], "coarse": around.coarse}
+        inputs: dict[str, Path | list[Path]] = {"own": coarse[tile], "coarse": coarse}
         tasks.append(
             Task(
                 "g2ard.tiles.recover:recover_tile",
@@ -244,7 +244,6 @@ def recover_tiles(
         degree,
         store.offset,
         key_of([paths, degree]),
-        surroundings=around,
         render_model=store.render_model,
     )
     return scene, scores
@@ -256,9 +255,9 @@ def _psnr(errors: NDArray[np.float64]) -> tuple[float, float]:
     return before, after
 
 
-def _seen(store: TileStore, around: Surroundings, cameras: Cameras, workers: Workers) -> list[list[int]]:
+def _seen(store: TileStore, around: Sights, cameras: Cameras, workers: Workers) -> list[list[int]]:
     """Return the views that see each tile."""
     if not len(cameras):
         return [[] for _ in store.tiles]
-    light = light_of(store, around.coarse, cameras, workers)
+    light = light_of(store, around.run.coarse, cameras, workers)
     return [in_sight(light, tile).tolist() for tile in range(len(store.tiles))]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -31,19 +30,6 @@ _VIEWS_PER_TASK = 64
 
 _BOX_PERCENTILES = 1, 99
 """Percentiles of its Gaussians that bound a tile's box, to ignore floaters."""
-
-
-@dataclass(frozen=True, eq=False)
-class Surroundings:
-    """Placement of tiles.
-
-    Args:
-        coarse: coarse Gaussians of each tile (file).
-        levels: per tile, the coarse level of every other tile around it; None for itself.
-    """
-
-    coarse: list[Path]
-    levels: list[list[str | None]]
 
 
 class Sights:
@@ -74,11 +60,6 @@ class Sights:
             pixel = weighted_quantile(pixels[known], np.array(run.sizes)[known], 0.5)
             self.frame = _core.TileFrame(*frame).with_views(pixel, *map(float, sums)).values()
 
-    @property
-    def surroundings(self) -> Surroundings:
-        """Placement of the tiles."""
-        return Surroundings(self.run.coarse, [given["levels"] for given in self.arguments])
-
     def again(self, merged: list[Path], growth: float) -> list[Path]:
         """Measure what the same views see of the merged tiles, widened by up to `growth`."""
         given = [{**levels, "growth": growth} for levels in self.levels()]
@@ -87,7 +68,7 @@ class Sights:
         )
 
     def levels(self) -> list[dict[str, Any]]:
-        """Return the coarse level of all tiles around each, as argument of its tasks."""
+        """Return the coarse level of all tiles around each, None for itself, as argument of its tasks."""
         return [{"levels": given["levels"]} for given in self.arguments]
 
     def beside(self, merged: list[Path]) -> list[dict[str, Any]]:

@@ -4,7 +4,6 @@ import json
 import re
 import shutil
 import zlib
-from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -13,7 +12,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from g2ard.config.choices import RenderModel
 from g2ard.errors import OutputError
 from g2ard.io.atomic import atomic_output, drop_temporaries
 from g2ard.io.detect import MANIFEST, POINTS
@@ -57,62 +55,20 @@ def clear(folder: Path) -> None:
             path.unlink()
 
 
-class Feed(ABC):
-    """Source of rows for tiles, as bytes, each with a position.
-
-    Attributes:
-        stream: the source.
-        row_bytes: bytes per row; a row begins with its float32 position.
-        room: bytes on disk per row in the end, including all copies.
-        render_model: see `Splats`.
-    """
-
-    stream: SceneStream | PointStream
-    row_bytes: int
-    room: int
-    sh_degree = 0
-    render_model: RenderModel = "classic"
-
-    @abstractmethod
-    def rows(self, rows: int) -> Iterator[tuple[NDArray[Any], Points]]:
-        """Yield the rows to keep with their positions, reading `rows` at a time."""
+def row_bytes(stream: SceneStream | PointStream) -> int:
+    """Return the bytes of a Gaussian or of a point to be lifted, which begin with its float32 position."""
+    return 4 * row_width(stream.sh_degree) if isinstance(stream, SceneStream) else _POINT_DTYPE.itemsize
 
 
-class SceneFeed(Feed):
-    """Feed of a scene's Gaussians."""
-
-    def __init__(self, stream: SceneStream) -> None:
-        self.stream: SceneStream = stream
-        self.row_bytes = self.room = 4 * row_width(stream.sh_degree)
-        self.sh_degree, self.render_model = stream.sh_degree, stream.render_model
-
-    def rows(self, rows: int) -> Iterator[tuple[NDArray[Any], Points]]:
-        return ((packed(splats), splats.means) for splats in self.stream.blocks(rows))
-
-
-class PointFeed(Feed):
-    """Feed of a point cloud's points, for tiles to be lifted."""
-
-    row_bytes = _POINT_DTYPE.itemsize
-    room = _POINT_DTYPE.itemsize + 4 * row_width(0)
-
-    def __init__(self, stream: PointStream, config: LiftConfig) -> None:
-        self.stream: PointStream = stream
-        self.config = config
-
-    def rows(self, rows: int) -> Iterator[tuple[NDArray[Any], Points]]:
-        for far, colors in self.stream.blocks(rows):
-            block = np.empty(len(far), _POINT_DTYPE)
-            block["near"], block["rgb"], block["far"] = self.stream.near(far), colors, far
-            yield block, np.ascontiguousarray(block["near"])
-
-
-@dataclass
-class _Files:
-    """Row counts and checksums of the written files of one kind."""
-
-    rows: list[int]
-    checks: list[int]
+def _rows(stream: SceneStream | PointStream, rows: int) -> Iterator[tuple[NDArray[Any], Points]]:
+    """Yield the rows to keep with their positions, reading `rows` at a time."""
+    if isinstance(stream, SceneStream):
+        yield from ((packed(splats), splats.means) for splats in stream.blocks(rows))
+        return
+    for far, colors in stream.blocks(rows):
+        block = np.empty(len(far), _POINT_DTYPE)
+        block["near"], block["rgb"], block["far"] = stream.near(far), colors, far
+        yield block, np.ascontiguousarray(block["near"])
 
 
 @dataclass
@@ -131,11 +87,17 @@ class TileWriter:
     high: list[float] = field(default_factory=lambda: [-np.inf] * 3)
 
     def __post_init__(self) -> None:
-        count = self.tree.leaves
-        self.tiles, self.halos = (_Files([0] * count, [0] * count) for _ in range(2))
-        for index in range(count):
+        self.rows: dict[str, int] = {}  # file → rows written
+        self.checks: dict[str, int] = {}
+        for index in range(self.tree.leaves):
             for name in (tile_name(index), halo_name(index)):
                 (self.folder / name).write_bytes(b"")
+                self.rows[name] = self.checks[name] = 0
+
+    @property
+    def counts(self) -> list[int]:
+        """Rows of each tile."""
+        return [self.rows[tile_name(index)] for index in range(self.tree.leaves)]
 
     def positions(self, name: str, count: int) -> Points:
         """Return the (count, 3) float32 positions in a file, the first three numbers of each row."""
@@ -149,12 +111,10 @@ class TileWriter:
         self.low = np.minimum(self.low, means.min(axis=0).astype(np.float64)).tolist()
         self.high = np.maximum(self.high, means.max(axis=0).astype(np.float64)).tolist()
         for index, (core, halo) in enumerate(self.tree.route(means, self.margin)):
-            self._append(self.tiles, index, tile_name(index), rows, core)
-            self._append(self.halos, index, halo_name(index), rows, halo)
+            self._append(tile_name(index), rows, core)
+            self._append(halo_name(index), rows, halo)
 
-    def _append(
-        self, files: _Files, index: int, name: str, rows: NDArray[Any], chosen: NDArray[np.intp]
-    ) -> None:
+    def _append(self, name: str, rows: NDArray[Any], chosen: NDArray[np.intp]) -> None:
         if not len(chosen):
             return
         data = (rows if len(chosen) == len(rows) else rows[chosen]).view(np.uint8).data
@@ -163,19 +123,19 @@ class TileWriter:
                 file.write(data)
         except OSError as error:
             raise OutputError(f"cannot write: {error.strerror or error}", path=self.folder / name) from error
-        files.rows[index] += len(chosen)
-        files.checks[index] = zlib.crc32(data, files.checks[index])
+        self.rows[name] += len(chosen)
+        self.checks[name] = zlib.crc32(data, self.checks[name])
 
     def finish(self, key: str, manifest: dict[str, Any]) -> None:
         """Write the manifest, which makes the folder a store."""
         low, high = np.array(self.low), np.array(self.high)
         tiles = [
             {
-                "rows": self.tiles.rows[i],
-                "halo": self.halos.rows[i],
+                "rows": self.rows[tile_name(i)],
+                "halo": self.rows[halo_name(i)],
                 "low": np.clip(box[0], low, high).tolist(),
                 "high": np.clip(box[1], low, high).tolist(),
-                "crc32": [self.tiles.checks[i], self.halos.checks[i]],
+                "crc32": [self.checks[tile_name(i)], self.checks[halo_name(i)]],
             }
             for i, box in enumerate(self.tree.boxes())
         ]
@@ -183,7 +143,7 @@ class TileWriter:
             "format": FORMAT,
             "version": VERSION,
             "key": key,
-            "count": sum(self.tiles.rows),
+            "count": sum(self.counts),
             **manifest,
             "margin": self.margin,
             "cells": self.tree.to_json(),
@@ -195,25 +155,24 @@ class TileWriter:
 
 def pour(
     folder: Path,
-    feed: Feed,
+    stream: SceneStream | PointStream,
     tile_rows: int,
     rows: int,
     progress: Progress,
     say: Say,
     like: TileStore | None = None,
 ) -> TileWriter:
-    """Write all tiles and halos of a feed into an existing folder.
+    """Write all tiles and halos of a stream into an existing folder.
 
     Args:
         rows: rows in memory at a time.
         like: reuse the tree and margin of these tiles, ignoring `tile_rows`.
     """
-    stream: Any = feed.stream
-    tree, margin = _planned(folder, feed, tile_rows, rows, progress, like)
+    tree, margin = _planned(folder, stream, tile_rows, rows, progress, like)
     while True:
-        writer = TileWriter(folder, tree, margin, feed.row_bytes)
+        writer = TileWriter(folder, tree, margin, row_bytes(stream))
         stream.tally = Tally(stream.tally.item)
-        for block, positions in feed.rows(rows):
+        for block, positions in _rows(stream, rows):
             writer.add(block, positions)
             progress("tiles", stream.tally.rows, stream.count)
         stream.all_notes()
@@ -222,21 +181,28 @@ def pour(
             return writer
         say(f"{plural(len(parts), 'tile')} hold more than {tile_rows:,} rows; cutting again")
         tree = writer.tree.refined(parts)
-        margin = margin_of(tree, _sampled(feed, rows, progress)[0])
+        margin = margin_of(tree, _sampled(stream, rows, progress)[0])
 
 
 def _planned(
-    folder: Path, feed: Feed, tile_rows: int, rows: int, progress: Progress, like: TileStore | None
+    folder: Path,
+    stream: SceneStream | PointStream,
+    tile_rows: int,
+    rows: int,
+    progress: Progress,
+    like: TileStore | None,
 ) -> tuple[KdTree, float]:
     """Return the tree of tiles and their margin; check that the disk has room."""
     tree, points, each = like.tree if like else KdTree(), np.empty((0, 3), np.float32), 1.0
-    if like or feed.stream.count > tile_rows:
-        points, each = _sampled(feed, rows, progress)
+    if like or stream.count > tile_rows:
+        points, each = _sampled(stream, rows, progress)
     if not like:
         tree = cut_tree(points, each, tile_rows)
     margin = like.margin if like else margin_of(tree, points)
     around = each * sum(len(halo) for _, halo in tree.route(points, margin))
-    needed, free = int((feed.stream.count + around) * feed.room), shutil.disk_usage(folder).free
+    lifted = 0 if isinstance(stream, SceneStream) else 4 * row_width(0)
+    room = row_bytes(stream) + lifted  # of a row on the disk, including all copies
+    needed, free = int((stream.count + around) * room), shutil.disk_usage(folder).free
     if needed > free:
         raise OutputError(
             f"the tiles need {needed / 1e9:,.1f} GB, the disk has {free / 1e9:,.1f} GB free", path=folder
@@ -244,19 +210,19 @@ def _planned(
     return tree, margin
 
 
-def _sampled(feed: Feed, rows: int, progress: Progress) -> tuple[Points, float]:
-    sampler, done = Sampler(feed.stream.count, _TREE_SAMPLE), 0
-    for points in feed.stream.positions(rows):
+def _sampled(stream: SceneStream | PointStream, rows: int, progress: Progress) -> tuple[Points, float]:
+    sampler, done = Sampler(stream.count, _TREE_SAMPLE), 0
+    for points in stream.positions(rows):
         sampler.add(points)
         done += len(points)
-        progress("sample", done, feed.stream.count)
+        progress("sample", done, stream.count)
     return sampler.result()
 
 
 def _overfull(writer: TileWriter, tile_rows: int) -> dict[int, KdTree]:
     """Plan cuts of the tiles that exceed `tile_rows`."""
     parts = {}
-    for index, count in enumerate(writer.tiles.rows):
+    for index, count in enumerate(writer.counts):
         if count > tile_rows:
             tree = cut_tree(writer.positions(tile_name(index), count), 1.0, tile_rows)
             if tree.leaves > 1:
@@ -265,7 +231,13 @@ def _overfull(writer: TileWriter, tile_rows: int) -> dict[int, KdTree]:
 
 
 def lift_tiles(
-    folder: Path, feed: PointFeed, tile_rows: int, rows: int, progress: Progress, say: Say
+    folder: Path,
+    cloud: PointStream,
+    config: LiftConfig,
+    tile_rows: int,
+    rows: int,
+    progress: Progress,
+    say: Say,
 ) -> TileWriter:
     """Write points to tiles in a subfolder, then lift each tile with its halo and write the result.
 
@@ -273,11 +245,11 @@ def lift_tiles(
     """
     within = folder / POINTS
     within.mkdir(exist_ok=True)
-    points = pour(within, feed, tile_rows, rows, progress, say)
+    points = pour(within, cloud, tile_rows, rows, progress, say)
     writer = TileWriter(folder, points.tree, points.margin, 4 * row_width(0))
-    total, done = sum(points.tiles.rows), 0
-    for index, count in enumerate(points.tiles.rows):
-        splats = _lifted(points, index, feed)
+    total, done = sum(points.counts), 0
+    for index, count in enumerate(points.counts):
+        splats = _lifted(points, index, cloud, config)
         for start in range(0, len(splats), _ROWS_AT_ONCE):
             part = splats.take(slice(start, start + _ROWS_AT_ONCE))
             writer.add(packed(part), part.means)
@@ -287,19 +259,16 @@ def lift_tiles(
     return writer
 
 
-def _lifted(points: TileWriter, index: int, feed: PointFeed) -> Splats:
+def _lifted(points: TileWriter, index: int, cloud: PointStream, config: LiftConfig) -> Splats:
     """Lift a tile's points with those of its halo as neighbours."""
-    core = _read(points.folder / tile_name(index), points.tiles.rows[index])
+    core, halo = (
+        np.fromfile(points.folder / name, _POINT_DTYPE) for name in (tile_name(index), halo_name(index))
+    )
     if not len(core):
         return Splats.create(np.empty((0, 3)), scales=np.empty((0, 3)))
-    halo = _read(points.folder / halo_name(index), points.halos.rows[index])
     both = np.concatenate([core, halo])
-    colors = np.clip(both["rgb"] / np.float32(feed.stream.divisor), 0, 1)
-    discs, rows = lift_rows(both["far"], colors, feed.config)
+    colors = np.clip(both["rgb"] / np.float32(cloud.divisor), 0, 1)
+    discs, rows = lift_rows(both["far"], colors, config)
     rows = rows[rows < len(core)]
     means = np.ascontiguousarray(core["near"][rows])
-    return replace(discs.take(slice(0, len(rows))), means=means, offset=feed.stream.offset)
-
-
-def _read(path: Path, count: int) -> NDArray[Any]:
-    return np.fromfile(path, _POINT_DTYPE, count)
+    return replace(discs.take(slice(0, len(rows))), means=means, offset=cloud.offset)
