@@ -27,78 +27,31 @@ _POSE_DIGITS = 6
 
 @dataclass(frozen=True, eq=False)
 class Common:
-    """Source of common scores.
+    """Source of the scores of a run, as its report states it, or of several runs.
 
     Args:
-        views: views that no run trained on, of split `test`, at one size; the folder of a single run.
+        path: folder of the run, or of the first one.
+        views: that folder; of several runs, views of split `test` at one size that none trained on.
         teacher: the scene to render; None if all targets are photos.
         photos: use photos where views have them.
         size: longer side, for a single run.
     """
 
+    path: Path
     views: Views
     teacher: Path | None
     photos: bool
     size: int | None
 
-
-def is_run(path: Path) -> bool:
-    """Return whether a path is the folder of a finished run with its views."""
-    return run_scene(path) != path and run_views(path) != path
-
-
-def source_of(path: Path) -> Path | None:
-    """Return the real path of the scene that a run renders its targets from, or None."""
-    teacher = _Run.of(path).teacher if is_run(path) else None
-    return teacher and real_path(teacher)
-
-
-def common_of(paths: Sequence[Path], *, background: bool = False) -> Common | None:
-    """Return the views and targets in which the results of all runs among `paths` can be scored.
-
-    They are those of a single run. Several runs share the views that one of them held out and none trained
-    on, at the size of the largest. The order of the runs has no effect. None without a run.
-
-    Args:
-        background: whether the user gave the background, so that runs with different ones are accepted.
-
-    Raises:
-        InputError: the runs show different scenes, or have no such view in common.
-    """
-    folders = sorted({real_path(path): path for path in paths if is_run(path)}.items())
-    runs = [_Run.of(path) for _, path in folders]
-    if not runs:
-        return None
-    first, *others = runs
-    for other in others:
-        first.check_same(other, background=background)
-    if first.teacher is not None and not first.teacher.exists():
-        raise InputError(
-            f"was made from {first.teacher}, which is not there", path=first.path, hint="give {teacher=SCENE}"
-        )
-    if not others:
-        return Common(first.path, first.teacher, first.photos, first.size)
-    views = _common_views(runs, first.teacher is not None and not first.photos)
-    return Common(ViewSet(views, splits=("test",) * len(views)), first.teacher, first.photos, None)
-
-
-@dataclass(frozen=True, eq=False)
-class _Run:
-    """The targets of a run, as its report states them."""
-
-    path: Path
-    teacher: Path | None
-    photos: bool
-    size: int | None
-
     @classmethod
-    def of(cls, path: Path) -> _Run:
+    def of(cls, path: Path) -> Common:
+        """Read the source of a run's own scores."""
         report = read_json(path / "report.json")
         against, config = report.get("against", "teacher renders"), report["config"]
         teacher = None if against == "photos" else Path(config["scene"])
-        return cls(path, teacher, teacher is not None and "photo" in against, config["size"])
+        return cls(path, path, teacher, teacher is not None and "photo" in against, config["size"])
 
-    def check_same(self, other: _Run, *, background: bool) -> None:
+    def check_same(self, other: Common, *, background: bool) -> None:
         """Raise an `InputError` unless both runs can have the same targets."""
         told = {
             run: "photos" if run.teacher is None else f"renders of {run.teacher}" for run in (self, other)
@@ -116,12 +69,52 @@ class _Run:
                 f"has another background than {self.path}", path=other.path, hint="give {background=COLOUR}"
             )
 
-    def views(self) -> Iterator[tuple[Camera, str]]:
-        """Yield each view with its split; the scored ones also from scored.json."""
+    def each_view(self) -> Iterator[tuple[Camera, str]]:
+        """Yield each view of a run with its split; the scored ones also from scored.json."""
         for place in (run_views(self.path), self.path / "scored.json"):
             if place.is_file():
                 found, _ = load_split_views(place, "all", unpictured=self.teacher is not None)
                 yield from zip(found.cameras, (split or "train" for split in found.splits), strict=True)
+
+
+def is_run(path: Path) -> bool:
+    """Return whether a path is the folder of a finished run with its views."""
+    return run_scene(path) != path and run_views(path) != path
+
+
+def source_of(path: Path) -> Path | None:
+    """Return the real path of the scene that a run renders its targets from, or None."""
+    teacher = Common.of(path).teacher if is_run(path) else None
+    return teacher and real_path(teacher)
+
+
+def common_of(paths: Sequence[Path], *, background: bool = False) -> Common | None:
+    """Return the views and targets in which the results of all runs among `paths` can be scored.
+
+    They are those of a single run. Several runs share the views that one of them held out and none trained
+    on, at the size of the largest. The order of the runs has no effect. None without a run.
+
+    Args:
+        background: whether the user gave the background, so that runs with different ones are accepted.
+
+    Raises:
+        InputError: the runs show different scenes, or have no such view in common.
+    """
+    folders = sorted({real_path(path): path for path in paths if is_run(path)}.items())
+    runs = [Common.of(path) for _, path in folders]
+    if not runs:
+        return None
+    first, *others = runs
+    for other in others:
+        first.check_same(other, background=background)
+    if first.teacher is not None and not first.teacher.exists():
+        raise InputError(
+            f"was made from {first.teacher}, which is not there", path=first.path, hint="give {teacher=SCENE}"
+        )
+    if not others:
+        return first
+    views = _common_views(runs, first.teacher is not None and not first.photos)
+    return replace(first, views=ViewSet(views, splits=("test",) * len(views)), size=None)
 
 
 _Key = tuple[object, ...]
@@ -135,14 +128,14 @@ def _key(view: Camera) -> _Key:
     return (*(view.viewmat.round(_POSE_DIGITS) + 0.0).ravel().tolist(), *(lens + 0.0).ravel().tolist())
 
 
-def _common_views(runs: Sequence[_Run], rendered: bool) -> Cameras:
+def _common_views(runs: Sequence[Common], rendered: bool) -> Cameras:
     """Return the views that a run held out and none trained on, at one size."""
     held_out: dict[_Key, Camera] = {}
     trained: set[_Key] = set()
     seen: list[dict[_Key, Camera]] = []
     for run in runs:
         own: dict[_Key, Camera] = {}
-        for view, split in run.views():
+        for view, split in run.each_view():
             key = _key(view)
             own[key] = view
             if split != "test":

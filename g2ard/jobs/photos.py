@@ -83,7 +83,7 @@ def visual_hull(cameras: Cameras, outlines: Sequence[Mask | None], middle: Float
     for count in (_COARSE_VOXELS, _FINE_VOXELS):
         side = size / count
         middle = low + size / 2
-        views = [_Outlined.of(cameras, view, outlines[view], middle, side) for view in told]
+        views = [_outlined(cameras, view, outlines[view], middle, side) for view in told]
         filled = _carved(views, low, side, count)
         if not filled.any():
             return None
@@ -93,24 +93,19 @@ def visual_hull(cameras: Cameras, outlines: Sequence[Mask | None], middle: Float
     return hull
 
 
-@dataclass(frozen=True, eq=False)
-class _Outlined:
-    """A view's (3, 4) projection to pixels, and the pixels that a voxel touching the object may have."""
-
-    projection: Float
-    shown: Mask
-
-    @classmethod
-    def of(cls, cameras: Cameras, view: int, outline: Mask | None, middle: Float, side: Float) -> _Outlined:
-        """Grow the outline by half the diagonal of a voxel."""
-        assert outline is not None
-        projection = cameras.Ks[view] @ cameras.viewmats[view, :3]
-        depth = float(projection[2, :3] @ middle + projection[2, 3])
-        radius = 0.5 * float(np.linalg.norm(side)) * cameras.Ks[view, 0, 0] / max(depth, side.max())
-        return cls(projection, grown(outline, int(np.ceil(radius))))
+def _outlined(
+    cameras: Cameras, view: int, outline: Mask | None, middle: Float, side: Float
+) -> tuple[Float, Mask]:
+    """Return a view's (3, 4) projection to pixels, and the pixels that a voxel touching the object may have:
+    the outline, grown by half the diagonal of a voxel."""
+    assert outline is not None
+    projection = cameras.Ks[view] @ cameras.viewmats[view, :3]
+    depth = float(projection[2, :3] @ middle + projection[2, 3])
+    radius = 0.5 * float(np.linalg.norm(side)) * cameras.Ks[view, 0, 0] / max(depth, side.max())
+    return projection, grown(outline, int(np.ceil(radius)))
 
 
-def _carved(views: Sequence[_Outlined], low: Float, side: Float, count: int) -> Mask:
+def _carved(views: Sequence[tuple[Float, Mask]], low: Float, side: Float, count: int) -> Mask:
     """Return the (count, count, count) voxels that are in sight and within the outlines."""
     steps = np.arange(count) + 0.5
     filled = np.zeros((count, count * count), bool)
@@ -118,8 +113,7 @@ def _carved(views: Sequence[_Outlined], low: Float, side: Float, count: int) -> 
     for slab, x in enumerate(low[0] + steps * side[0]):
         points, left = plane, np.arange(len(plane))
         empty, seen = np.zeros(len(plane), np.int16), np.zeros(len(plane), np.int16)
-        for view in views:
-            P, shown = view.projection, view.shown
+        for P, shown in views:
             ahead = points @ P[:, 1:3].T + (P[:, 0] * x + P[:, 3])
             depth = np.maximum(ahead[:, 2], 1e-9)
             u, v = (ahead[:, :2] / depth[:, None]).T
