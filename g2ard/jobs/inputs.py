@@ -103,18 +103,6 @@ def drop_held_out(train: ViewSet, held_out: Cameras, say: Say = unsaid) -> ViewS
     return train.take(keep)
 
 
-def load_trained(
-    views: Views, split: str, size: int | None, say: Say = unsaid, *, unpictured: bool = False
-) -> ViewSet:
-    """Read the training views of a split, shrunk to `size`; report test views among them."""
-    pool, mask = load_split_views(views, split, say, unpictured=unpictured)
-    chosen = pool.take(mask)
-    held_out = chosen.splits.count("test")
-    if held_out:
-        say(f"split {split}: {held_out} of the {len(chosen.cameras)} views trained on are test views")
-    return chosen.resized(size)
-
-
 def load_split_views(
     views: Views, split: str, say: Say = unsaid, *, unpictured: bool = False
 ) -> tuple[ViewSet, NDArray[np.bool_]]:

@@ -7,7 +7,7 @@ from typing import Any
 from g2ard.config.choices import Colour, RenderModel, is_made
 from g2ard.errors import InputError
 from g2ard.io.types import ViewSet
-from g2ard.jobs.inputs import Views, load_scene, load_split_views, load_trained, make_targets, scorable
+from g2ard.jobs.inputs import Views, load_scene, load_split_views, make_targets, scorable
 from g2ard.jobs.view_checks import check_photos, propose_background, warn_of_sight
 from g2ard.jobs.views import shrunk, views_or_pool, within_pixels
 from g2ard.progress import Progress, Say, silent, unsaid
@@ -72,7 +72,11 @@ class Teaching:
 
     def training(self, scene: Splats, views: Views, split: str, size: int | None) -> tuple[ViewSet, Targets]:
         """Read a split of the views and return it with its targets; reject photos of another scene."""
-        chosen = load_trained(views, split, size, self.say, unpictured=self.dense is not None)
+        pool, mask = load_split_views(views, split, self.say, unpictured=self.dense is not None)
+        chosen = pool.take(mask).resized(size)
+        if held_out := chosen.splits.count("test"):
+            count = len(chosen.cameras)
+            self.say(f"split {split}: {held_out} of the {count} views trained on are test views")
         warn_of_sight(scene, chosen.cameras, self.say)
         targets = self.targets(chosen.cameras)
         self.check_photos(scene, chosen.cameras)

@@ -6,10 +6,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from g2ard.config.choices import Colour
+from g2ard.config.choices import Colour, is_made
 from g2ard.errors import InputError
 from g2ard.io import find_views, read_view_set
 from g2ard.io.splits import split_mask
+from g2ard.jobs.inputs import Views
 from g2ard.progress import Say, plural, unsaid
 from g2ard.rendering.renderer import Renderer
 from g2ard.rendering.targets import Photos, mask_of
@@ -44,25 +45,34 @@ _BLIND_VIEWS_SHARE = 0.1
 """Share of given views that may see nothing of the scene without a warning."""
 
 
-def found_views(
+def given_or_found(
+    views: Views | None,
     scene: str | Path | None,
     splats: Splats,
     splits: Sequence[str],
-    say: Say = unsaid,
+    say: Say,
     *,
-    turned: bool = False,
-) -> Path | None:
-    """Find views beside a scene (`g2ard.io.find_views`) that see it.
+    up: Sequence[float] | None,
+) -> tuple[Views | None, bool]:
+    """Return given views, or those found beside a scene, and whether they were found; None to generate some.
 
     Args:
-        scene: its path; None finds nothing.
-        splits: splits that must not be empty.
-        turned: whether an up direction was given, which found views do not need.
-
-    Returns:
-        A path for `load_views`, or None.
+        views: None asks for views found beside the scene that see it (`g2ard.io.find_views`), "made" for
+            generated ones.
+        scene: path of the scene; None finds nothing.
+        splits: splits of found views that must not be empty.
+        up: an up direction, which only generated views need.
     """
-    path = None if scene is None else find_views(scene)
+    if views is not None:
+        return None if is_made(views) else views, False
+    found = None if scene is None else _found(scene, splats, splits, say, turned=up is not None)
+    return found, found is not None
+
+
+def _found(
+    scene: str | Path, splats: Splats, splits: Sequence[str], say: Say, *, turned: bool
+) -> Path | None:
+    path = find_views(scene)
     if path is None:
         return None
     try:

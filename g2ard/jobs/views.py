@@ -11,12 +11,11 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from g2ard.config.checks import AtLeastOne, checks_arguments
-from g2ard.config.choices import is_made
 from g2ard.errors import InputError
 from g2ard.io.splits import for_scores, for_training, split_mask, splits_of
 from g2ard.io.types import ViewSet
 from g2ard.jobs.inputs import Views, drop_held_out, load_view_sets, load_views
-from g2ard.jobs.view_checks import as_pool, check_sight, found_views, opaque_points, warn_of_sight
+from g2ard.jobs.view_checks import as_pool, check_sight, given_or_found, opaque_points, warn_of_sight
 from g2ard.pipeline.config import SelectConfig
 from g2ard.pipeline.distill import RunViews
 from g2ard.progress import Progress, Say, direction, silent, unsaid
@@ -84,11 +83,8 @@ def views_of(
         use: what the message about generated views counts.
         represents: Gaussians per row if `prior` is a sample of a larger scene; the pool grows with it.
     """
-    views_beside = None
-    if options.views is None:
-        wanted = ["train"] if options.held_out is not None else ["train", "test"]
-        views_beside = found_views(beside, prior, wanted, say, turned=options.up is not None)
-    given = views_beside or options.views
+    wanted = ["train"] if options.held_out is not None else ["train", "test"]
+    given, are_found = given_or_found(options.views, beside, prior, wanted, say, up=options.up)
     plan = partial(
         _planned,
         prior,
@@ -102,7 +98,7 @@ def views_of(
     mix = partial(
         _mixed, prior=prior, count=count, represents=represents, size=options.size, progress=progress, say=say
     )
-    if given is None or is_made(given):
+    if given is None:
         if not teach:
             raise InputError(
                 "generated views have no photos", parameter="photos", hint="give {views} that have them"
@@ -121,7 +117,7 @@ def views_of(
     else:
         (train,), (test,) = load(given, [for_training]), load(options.held_out, [for_scores])
         train = drop_held_out(train, test.cameras, say)
-    if not views_beside:
+    if not are_found:
         check_sight(prior, train.cameras, say)
     else:
         train, test = (replace(part, cameras=as_pool(part.cameras)) for part in (train, test))
@@ -286,10 +282,9 @@ def views_or_pool(
 
     Other arguments are those of `views_of`.
     """
-    if views is not None and not is_made(views):
-        return views
-    if views is None and (found := found_views(beside, scene, [], say, turned=up is not None)):
-        return found
+    given, _ = given_or_found(views, beside, scene, [], say, up=up)
+    if given is not None:
+        return given
     grow = _POOL_GROWTH if count is None else 1.0
     size = _POOL_VIEWS if count is None else count
     planned = _planned(scene, size, up=up, seed=seed, progress=progress, grow=grow)
@@ -349,12 +344,13 @@ def cameras_for_weights(
     """
     if views is None and method != "default":
         return None
-    if views is None and (found := found_views(beside, scene, ["train"], say, turned=up is not None)):
-        return as_pool(load_views(found, "train", None, say))
-    if views is not None and not is_made(views):
-        given = load_views(views, "train", None, say)
-        warn_of_sight(scene, given, say)
-        return given
+    given, are_found = given_or_found(views, beside, scene, ["train"], say, up=up)
+    if given is not None:
+        cameras = load_views(given, "train", None, say)
+        if are_found:
+            return as_pool(cameras)
+        warn_of_sight(scene, cameras, say)
+        return cameras
     try:
         return _planned(
             scene,
