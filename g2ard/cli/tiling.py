@@ -70,8 +70,8 @@ def _check_rows(scene: Path, rows: int) -> None:
 
 
 @contextmanager
-def work_folder(run: Run, tiling: Tiling, *views: Any, again: str = "") -> Iterator[None]:
-    """Hold `tiling.folder`, created if absent, while a command works on tiles there.
+def work_folder(run: Run, tiling: Tiling | None, *views: Any, again: str = "") -> Iterator[None]:
+    """Hold `tiling.folder`, created if absent, while a command works on tiles there; do nothing for None.
 
     Finished tasks in it are not computed again, with or without --resume and --overwrite: their names hash
     all that they depend on. Success removes the folder unless the user named it. An error removes it if this
@@ -83,6 +83,9 @@ def work_folder(run: Run, tiling: Tiling, *views: Any, again: str = "") -> Itera
             takes long.
         again: option with which the same command continues.
     """
+    if tiling is None:
+        yield
+        return
     folder = tiling.folder
     _check_folder(folder)
     _check_given(tiling, views)

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from g2ard.config.checks import check_seed
 from g2ard.errors import InputError
 from g2ard.io import read_splats, write_splats
-from g2ard.io.reports import Report
 from g2ard.io.scene_formats import check_positions, scene_format, written_bytes
 from g2ard.io.types import Note
 from g2ard.jobs.budget import Budget
@@ -356,23 +355,16 @@ def count_for_layers(count: int, most: float, reduce: Callable[[int], Splats]) -
     """
     for _ in range(_LAYER_TRIALS):
         near = close_up(reduce(count))
-        layers = 0.0 if near is None else near.mean
+        layers = 0.0 if near is None else near["mean"]
         if layers <= most or count <= _FEWEST_GAUSSIANS:
             break
         count = max(_FEWEST_GAUSSIANS, int(count * min((_BYTES_GOAL * most / layers) ** 2, 0.95)))
     return count, layers
 
 
-@dataclass(frozen=True)
-class CloseUp(Report):
-    """Mean Gaussians per pixel with α ≥ 1/255 in near views: over all of them, and in the worst."""
-
-    mean: float
-    worst: float
-
-
-def close_up(splats: Splats) -> CloseUp | None:
-    """Measure the overdraw in six near views, or return None for a scene without a place for them.
+def close_up(splats: Splats) -> dict[str, float] | None:
+    """Return the mean Gaussians per pixel with α ≥ 1/255 over six near views, and in the worst; None for a
+    scene without a place for them.
 
     Near views stand where what they look at has a standard deviation of about 1.5 pixels, at a quarter to six
     tenths of the distance of usual ones. A headset draws such views when its wearer steps closer.
@@ -382,7 +374,7 @@ def close_up(splats: Splats) -> CloseUp | None:
     except InputError:
         return None
     found = [overdraw(splats, Cameras.of([view])) for view in near]
-    return CloseUp(sum(found) / len(found), max(found)) if found else None
+    return {"mean": sum(found) / len(found), "worst": max(found)} if found else None
 
 
 def _images(splats: Splats, cameras: Cameras) -> list[NDArray[Any]]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -122,16 +121,14 @@ def distill(
         settings=settings,
     )
     tiling = tiling_of(run, scene, output)
-    tiled = scene is not None and is_tiled(scene, tiling)
-    held: AbstractContextManager[None] = nullcontext()
-    if scene is not None and tiled:
+    how = tiling if scene is not None and is_tiled(scene, tiling) else None
+    if scene is not None and how is not None:
         whole = needs_whole(options.config, preset, [budget], f"scene.{format}", clean=clean, photos=photos)
         refuse_whole(scene, whole)
-        if not dry_run:
-            held = work_folder(run, tiling, options.views, options.held_out, again=" with --resume")
     elif scene is not None:
         say_fit(run, scene, budget, f"scene.{format}")
-    how = tiling if tiled else None
+    written = None if dry_run else how
+    held = work_folder(run, written, options.views, options.held_out, again=" with --resume")
     with held, preparing(scene, budget, options, how, planned=dry_run, **run.callbacks) as job:
         cost = cost_of(job, job.budget.count, page=page)
         if dry_run:

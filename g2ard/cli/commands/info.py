@@ -102,7 +102,7 @@ def _overdraw(splats: Splats) -> dict[str, Any]:
     from g2ard.jobs.measured_budget import close_up
 
     found = close_up(splats)
-    return {} if found is None else {"close_overdraw": found.as_dict()}
+    return {} if found is None else {"close_overdraw": found}
 
 
 def _scores(report: dict[str, Any]) -> tuple[str, dict[str, dict[str, float]]]:

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from contextlib import AbstractContextManager, nullcontext
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -16,7 +15,7 @@ from g2ard.cli.budget_options import Ratios
 from g2ard.cli.frame import Run, command
 from g2ard.cli.outputs import refuse_file
 from g2ard.cli.tiling import tiling_of, work_folder
-from g2ard.config.choices import BLACK, Colour
+from g2ard.config.choices import BLACK
 from g2ard.errors import OutputError
 from g2ard.io.atomic import hidden_name
 from g2ard.progress import plural
@@ -25,7 +24,6 @@ if TYPE_CHECKING:
     from g2ard.jobs.levels import Levels, LevelsJob
     from g2ard.jobs.tiling import Tiling
     from g2ard.levels import Cut, Georeference
-    from g2ard.levels.tree import Level
     from g2ard.scene.splats import Splats
 
 
@@ -121,10 +119,17 @@ def lod(
     """
     from g2ard.cli.resume import began_output, check_stopped, drop_ended, is_finished, stoppable
     from g2ard.io.atomic import check_output
-    from g2ard.jobs.levels import check_ratios, check_trained, preparing_levels
+    from g2ard.jobs.levels import (
+        check_ratios,
+        check_trained,
+        preparing_levels,
+        save_tileset,
+        tileset_up,
+        write_level_page,
+    )
     from g2ard.jobs.memory import LEVELS_TIMES, RECOVERY_TIMES, check_whole_memory
     from g2ard.jobs.tiling import is_tiled
-    from g2ard.levels import Cut
+    from g2ard.levels import Cut, save_levels
     from g2ard.system.peak_memory import peak_rss_of_all
 
     refuse_file(output, "levels of detail")
@@ -144,24 +149,23 @@ def lod(
     if environment and tiled:
         raise typer.BadParameter("--environment needs a scene that fits into memory")
     views, colour = opt.with_images(views, images), background or BLACK
-    writer = _Writer(run, scene, output, kind, rule, spot, up, views, colour)
+    meta, page = output / ("lod-meta.json" if kind == "sog" else "tileset.json"), output / "index.html"
     stopped = output.with_name(hidden_name(output.name, ".unfinished"))
-    run.spare_inputs(writer.meta)
+    run.spare_inputs(meta)
     run.claim("--output", output, folder=True)
     run.claim("--resume", stopped, folder=True)
     work = tiling.folder if tiled else stopped
-    finished = not dry_run and is_finished(run, stopped, resume, writer.page)
+    finished = not dry_run and is_finished(run, stopped, resume, page)
     if not (dry_run or (tiled and tiling.keep)):
-        finished |= drop_ended(run, work, resume or tiled, writer.page)
+        finished |= drop_ended(run, work, resume or tiled, page)
     if finished:
-        _check_same(writer.meta, ratios)
+        _check_same(meta, ratios)
     elif not dry_run:
-        run.overwrite |= (tiled or resume) and began_output(work, output) and not writer.page.exists()
+        run.overwrite |= (tiled or resume) and began_output(work, output) and not page.exists()
         check_output(output, run.overwrite, folder=True)
     if finished or not (tiled or dry_run):
-        check_stopped(run, stopped, resume or finished, writer.meta)
+        check_stopped(run, stopped, resume or finished, meta)
     given: Path | Splats = scene
-    held: AbstractContextManager[None] = nullcontext()
     if not tiled:
         check_whole_memory(scene, tiling, LEVELS_TIMES, RECOVERY_TIMES)
         if kind == "3dtiles" and not dry_run:
@@ -169,12 +173,14 @@ def lod(
 
             given = run.load(scene)
             check_tiles(output, given, max(ratios), rule)
-    if not dry_run:
-        held = work_folder(run, tiling, views) if tiled else stoppable(run, stopped, resume, writer.meta)
+    how = tiling if tiled else None
+    if dry_run or tiled:
+        held = work_folder(run, None if dry_run else how, views)
+    else:
+        held = stoppable(run, stopped, resume, meta)
     options: dict[str, Any] = {"ratios": ratios, "recover": recover, "steps": steps, "background": colour}
     options |= {"split_sky": environment, "seed": run.seed, **run.callbacks}
     options |= {"views": views, "size": size, "up": up, "render_model": run.render_model, "beside": scene}
-    how = tiling if tiled else None
     with held, preparing_levels(given, how, planned=dry_run, photos=False, **options) as job:
         if dry_run:
             _tell_costs(run, job)
@@ -186,9 +192,24 @@ def lod(
             stopped.mkdir(parents=True, exist_ok=True)
         levels = job.run(stopped)
         begun = _begun(tiling, levels, rule) if tiled else None
-        written = writer.save(levels.splats, begun, levels.sky)
+        common: dict[str, Any] = {"cut": rule, "overwrite": run.overwrite, "work": begun, **run.callbacks}
+        axis: Sequence[float] | None = up
+        if kind == "sog":
+            written = save_levels(output, levels.splats, environment=levels.sky, **common)
+        else:
+            axis = tileset_up(levels.splats, up, run.say).tolist()
+            written = save_tileset(output, levels.splats, up=axis, place=spot, **common)
+        run.kept.append(f"{output} is written")
+        frame: dict[str, Any] = {"views": views, "beside": scene, "up": axis, "seed": run.seed}
+        with run.finishing("the page"):
+            written += write_level_page(
+                output, levels.splats, kind, background=colour, progress=run.progress, **frame
+            )
+            query = "" if kind == "sog" else "/?cesium=URL (a folder of CesiumJS)"
+            run.say(f"page: python -m http.server --directory {output}, then http://localhost:8000{query}")
         peak = {"peak_rss_bytes": peak_rss_of_all()} if tiled else {}
-        _tell(run, output, levels, written, **peak)
+        run.say(f"{output}: {plural(len(levels.reports), 'level')}, {written / 1e6:.2f} MB")
+        run.result({"output": str(output), "bytes": written, "levels": levels.reports, **peak})
 
 
 def _begun(tiling: Tiling, levels: Levels[Any], rule: Cut) -> Path:
@@ -220,60 +241,6 @@ def _tell_costs(run: Run, job: LevelsJob) -> None:
     run.result({"levels": levels, "total": {"seconds": seconds, "bytes": most}})
 
 
-@dataclass(frozen=True)
-class _Writer:
-    """Writer of the output folder.
-
-    Args:
-        kind: "sog" or "3dtiles".
-        spot: place on the globe, or the name of the map system in which the scene's offset is the place.
-    """
-
-    run: Run
-    scene: Path
-    output: Path
-    kind: Literal["sog", "3dtiles"]
-    cut: Cut
-    spot: Georeference | str | None
-    up: Sequence[float] | None
-    views: Any
-    background: Colour
-
-    @property
-    def meta(self) -> Path:
-        """File that lists the levels."""
-        return self.output / ("lod-meta.json" if self.kind == "sog" else "tileset.json")
-
-    @property
-    def page(self) -> Path:
-        """Page that shows them, written last."""
-        return self.output / "index.html"
-
-    def save(self, levels: Sequence[Level], work: Path | None = None, sky: Splats | None = None) -> int:
-        """Write the levels and a page that shows them, and return their bytes."""
-        from g2ard.jobs.levels import save_tileset, tileset_up, write_level_page
-        from g2ard.levels import save_levels
-
-        run = self.run
-        common: dict[str, Any] = {"cut": self.cut, "overwrite": run.overwrite, "work": work}
-        common |= run.callbacks
-        if self.kind == "sog":
-            axis, written = self.up, save_levels(self.output, levels, environment=sky, **common)
-        else:
-            axis = tileset_up(levels, self.up, run.say).tolist()
-            written = save_tileset(self.output, levels, up=axis, place=self.spot, **common)
-        run.kept.append(f"{self.output} is written")
-        frame: dict[str, Any] = {"views": self.views, "beside": self.scene, "up": axis, "seed": run.seed}
-        frame |= {"background": self.background, "progress": run.progress}
-        with run.finishing("the page"):
-            written += write_level_page(self.output, levels, self.kind, **frame)
-            query = "" if self.kind == "sog" else "/?cesium=URL (a folder of CesiumJS)"
-            run.say(
-                f"page: python -m http.server --directory {self.output}, then http://localhost:8000{query}"
-            )
-        return written
-
-
 def _georeference(text: str) -> Georeference | str:
     """Return the place, or the name of the map system in which the scene's offset is the place."""
     from g2ard.levels import Georeference
@@ -295,9 +262,3 @@ def _check_same(meta: Path, ratios: Sequence[float]) -> None:
         raise OutputError(
             f"was written with another -r (levels of {levels} Gaussians); -w replaces it", path=meta
         )
-
-
-def _tell(run: Run, output: Path, levels: Levels[Any], size: int, **more: Any) -> None:
-    run.say(f"{output}: {plural(len(levels.reports), 'level')}, {size / 1e6:.2f} MB")
-    result: dict[str, Any] = {"output": str(output), "bytes": size}
-    run.result({**result, "levels": levels.reports, **more})

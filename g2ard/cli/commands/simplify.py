@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -84,11 +83,9 @@ def simplify(
     outputs = None if dry_run else Outputs(output, budgets, run.claim_scene)
     if outputs is not None:
         outputs.check()
-    tiled, maps = is_tiled(scene, tiling), None
-    held: AbstractContextManager[None] = nullcontext()
-    if tiled:
+    how, maps = tiling if is_tiled(scene, tiling) else None, None
+    if how is not None:
         refuse_whole(scene, needs_whole(config, preset, budgets, name, parents=parents))
-        held = nullcontext() if dry_run else work_folder(run, tiling, given)
     else:
         say_fit(run, scene, budgets[0], name)
         check_whole_memory(scene, tiling, WHOLE_TIMES)
@@ -103,27 +100,28 @@ def simplify(
     def counted(total: int) -> None:
         for each in named:
             each.check(total)
-        if tiled:
+        if how is not None:
             for budget in filter(lambda one: one.bytes is None, budgets):
                 budget.of(total, str(scene))
 
     began, reports = time.perf_counter(), []
     inputs: dict[str, Any] = {"views": given, "blind": no_views, "up": up, "seed": run.seed}
     inputs |= {"render_model": run.render_model, "planned": dry_run, "counted": counted, **run.callbacks}
-    with held, reducing(scene, tiling if tiled else None, config=config, **inputs) as reduce:
+    held = work_folder(run, None if dry_run else how, given)
+    with held, reducing(scene, how, config=config, **inputs) as reduce:
         reading = (started := time.perf_counter()) - began  # shared by all budgets
         wanted = [reduce.resolved(budget, str(scene), name) for budget in budgets]
         if outputs is None:
             _tell_plan(run, reduce, [one.count for one in wanted])
             return
-        if tiled:
+        if how is not None:
             costs = [cost_of_reduction(reduce, one.count) for one in wanted]
             run.console.expect([stage for cost in costs for stage in cost.stages])
         rows = maps.paths(reduce.total) if maps else [None] * len(wanted)
         for one, place, parents in zip(wanted, outputs.paths(reduce.total), rows, strict=True):
             small = reduce(one.count)
             simplified = time.perf_counter()
-            run.write(place, small.splats, compare=tiled)
+            run.write(place, small.splats, compare=how is not None)
             if parents is not None:
                 with run.finishing("--parents"):
                     _write_parents(run, parents, small)
