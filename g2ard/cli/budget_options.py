@@ -24,10 +24,6 @@ class Count:
     value: int | float
     text: str
 
-    @property
-    def is_share(self) -> bool:
-        return isinstance(self.value, float)
-
     @classmethod
     def parse(cls, text: str, shares: bool = True) -> Count:
         """Read 250000, 250,000, 250_000, 250k, 1.5M or 25%.
@@ -71,7 +67,7 @@ class Count:
         return cls.parse(text, shares=False)
 
     def budget(self) -> Budget:
-        return Budget(share=self.value) if self.is_share else Budget(count=int(self.value))
+        return Budget(share=self.value) if isinstance(self.value, float) else Budget(count=self.value)
 
     def __str__(self) -> str:
         return self.text

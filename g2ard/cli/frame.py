@@ -478,21 +478,16 @@ def command(
 
     def register(fn: Callable[..., None]) -> Callable[..., None]:
         own = list(inspect.signature(fn, eval_str=True).parameters.values())[1:]
-        given = BUDGETS if budgets else {}
-        set_by_flags = {
+        shared_options = {**(BUDGETS if budgets else {}), **(TILES if tiles else {})}
+        shared_options |= {
             path.rpartition(".")[2]: (kind | None, option)
             for path, (kind, option) in FIELDS.items()
             if path in fields
         }
-        common = {key: value for key, value in _COMMON_OPTIONS.items() if key not in without}
-        taken = {**(TILES if tiles else {}), **common}
-        taken |= {**(_SETTINGS if settings is not None else {}), **(_SCENE_OPTIONS if scenes else {})}
-        shared_options = {**given, **set_by_flags, **taken}
-        first, middle, last = (
-            [_parameter(key, *options) for key, options in part.items()]
-            for part in (given, set_by_flags, taken)
-        )
-        all_parameters = [*first, *own, *middle, *last]
+        shared_options |= {key: value for key, value in _COMMON_OPTIONS.items() if key not in without}
+        shared_options |= {} if settings is None else _SETTINGS
+        shared_options |= _SCENE_OPTIONS if scenes else {}
+        all_parameters = [*own, *(_parameter(key, *options) for key, options in shared_options.items())]
         if parent is app:
             all_parameters = [in_panel(name, p) for p in ordered(name, all_parameters)]
 

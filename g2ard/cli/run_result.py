@@ -177,16 +177,10 @@ def say_weight(run: Run, source: Path, output: Path, splats: Splats, *, lifted: 
     given, what = min(inputs, default=(made + 1, ""))
     if made < given:
         return
-    sizes = f"{output}: {made / 1e6:.2f} MB, {what} {given / 1e6:.2f} MB"
-    run.say(f"{sizes}: {why_large(splats)}")
-
-
-def why_large(splats: Splats) -> str:
-    """Explain a scene that is larger than its source, or say what makes it smaller."""
-    share = splats.shN.nbytes / splats.nbytes
-    if not share:
-        return "packed formats are smaller than .ply"
-    return f"{share:.0%} of it is SH above degree 0; --sh-degree 0 removes it"
+    why = "packed formats are smaller than .ply"
+    if share := splats.shN.nbytes / splats.nbytes:
+        why = f"{share:.0%} of it is SH above degree 0; --sh-degree 0 removes it"
+    run.say(f"{output}: {made / 1e6:.2f} MB, {what} {given / 1e6:.2f} MB: {why}")
 
 
 def tell_quality(run: Run, budget: ResolvedBudget, splats: Splats) -> None:

@@ -616,7 +616,11 @@ def _read(scene: Scene, budget: Budget, options: DistillOptions, progress: Progr
     if views is None or is_made(views):
         if scene is None:
             raise InputError("missing; without a scene, pass photos with poses as views", parameter="scene")
-        return _lifted_alone(scene, options, progress, say)
+        points, name, _ = _points(scene, None, say)
+        assert points is not None
+        say("no photos: the lifted points render the training images; photos, given as views, show more")
+        lifted = lift(points.positions, points.colors, **vars(options.config.lift), progress=progress)
+        return _Read(lifted, False, options.beside, name, len(lifted))
     points, name, of_photos = _points(scene, views, say)
     points = points and distinct(points)
     given = 0 if points is None or scene is None else len(points)
@@ -644,16 +648,6 @@ def _read(scene: Scene, budget: Budget, options: DistillOptions, progress: Progr
     config = options.config.lift
     lifted, _ = lift_rows(points.positions, points.colors, config, progress, merge=False)
     return _Read(lifted, True, options.beside, name, given, of_photos)
-
-
-def _lifted_alone(scene: Points | str | Path, options: DistillOptions, progress: Progress, say: Say) -> _Read:
-    """Lift points without photos; the lift is then the dense scene that renders training images."""
-    points, name, _ = _points(scene, None, say)
-    assert points is not None
-    say("no photos: the lifted points render the training images; photos, given as views, show more")
-    lift_config = vars(options.config.lift)
-    lifted = lift(points.positions, points.colors, **lift_config, progress=progress)
-    return _Read(lifted, False, options.beside, name, len(lifted))
 
 
 def _points(

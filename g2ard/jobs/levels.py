@@ -31,7 +31,6 @@ from g2ard.levels.tileset import TILE_OF_SCENE, Georeference, map_system
 from g2ard.levels.tileset import save_tileset as write_tileset
 from g2ard.levels.tree import Cut, Level, aligned
 from g2ard.progress import Progress, Say, direction, plural, silent, unsaid
-from g2ard.scene.cameras import Cameras
 from g2ard.scene.regions import sky_mask
 from g2ard.scene.samples import evenly_spaced
 from g2ard.scene.splats import Splats
@@ -116,7 +115,10 @@ class LevelsJob:
     @property
     def sizes(self) -> list[int]:
         """Longer side in pixels of each level's views."""
-        return [level_size(self.job.views.train.cameras, ratio) for ratio in self.ratios]
+        cameras = self.job.views.train.cameras
+        longest = int(max(cameras.widths.max(), cameras.heights.max()))
+        shrunk = (max(_SMALLEST_VIEW_SIDE, round(longest / ratio**0.25)) for ratio in self.ratios)
+        return [longest if ratio == 1 else size for ratio, size in zip(self.ratios, shrunk, strict=True)]
 
     @property
     def costs(self) -> list[Cost]:
@@ -376,12 +378,6 @@ def tileset_up(
         axis = up_of(coarse.take(rows), up)
     say(f"up is {direction(axis)}" + ("" if up else "; --up X,Y,Z changes it"))
     return axis
-
-
-def level_size(cameras: Cameras, ratio: float) -> int:
-    """Return the longer side of a level's views in pixels."""
-    longest = int(max(cameras.widths.max(), cameras.heights.max()))
-    return longest if ratio == 1 else max(_SMALLEST_VIEW_SIDE, round(longest / ratio**0.25))
 
 
 _ROWS = 500_000

@@ -147,7 +147,9 @@ def frame_with(
     axis = _level(cameras) if up is None else None
     stand = ViewerFrame(_turn(up_of(scene, up) if axis is None else axis), _middle(scene))
     points = opaque_points(scene)
-    view = cameras[_named(cameras, start)] if start else _typical(scene, cameras, stand.up, points)
+    if start and start not in cameras.names:
+        raise InputError(f"no view {start!r} among {', '.join(cameras.names[:4])}, …", parameter="start")
+    view = cameras[cameras.names.index(start)] if start else _typical(scene, cameras, stand.up, points)
     if not start and len(cameras) > 1:
         view = _with_subject(view, points)
     return replace(stand, start=stand.start_at(view, points), name=view.name)
@@ -208,12 +210,6 @@ def _turn(up: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _middle(scene: Splats) -> NDArray[np.float64]:
     return np.median(opaque_points(scene), axis=0)
-
-
-def _named(cameras: Cameras, name: str) -> int:
-    if name not in cameras.names:
-        raise InputError(f"no view {name!r} among {', '.join(cameras.names[:4])}, …", parameter="start")
-    return cameras.names.index(name)
 
 
 def _typical(scene: Splats, cameras: Cameras, up: NDArray[np.float64], points: NDArray[np.float64]) -> Camera:

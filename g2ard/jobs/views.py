@@ -299,17 +299,13 @@ def views_or_pool(
             progress=progress,
             say=say,
         )
-        return _with_apart(_generated(planned, None, None, mix, "distil", say))
+        made = _generated(planned, None, None, mix, "distil", say)
+        assert made.pool is not None
+        apart = made.apart or ()
+        splits = tuple("val" if row % 2 == 0 else "test" for row in range(len(apart)))
+        return ViewSet(Cameras.of([*made.pool.cameras, *apart]), splits=made.pool.splits + splits)
     say(f"views: {len(planned.cameras)} generated; {_of(planned, planned.cameras)}")
     return ViewSet(planned.cameras, splits=splits_of(None, planned.cameras.names))
-
-
-def _with_apart(views: RunViews) -> ViewSet:
-    """Return a generated pool, and the views of other kinds that do not train as splits `val` and `test`."""
-    assert views.pool is not None
-    apart = views.apart or ()
-    splits = tuple("val" if row % 2 == 0 else "test" for row in range(len(apart)))
-    return ViewSet(Cameras.of([*views.pool.cameras, *apart]), splits=views.pool.splits + splits)
 
 
 def _of(pool: Pool, cameras: Cameras) -> str:

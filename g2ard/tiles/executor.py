@@ -66,7 +66,11 @@ class Workers:
                         "lower --memory or --workers"
                     ) from None
             else:
-                _check_written(todo)
+                if absent := [task.output for task in todo if not task.done]:
+                    raise InputError(
+                        "written by a worker but missing here; share the folder with all workers",
+                        path=absent[0],
+                    )
         self.progress(stage, total, total)
         return [task.output for task in tasks]
 
@@ -81,13 +85,6 @@ class Workers:
 
         self.progress(stage, before, total)
         self.executor(todo, told)
-
-
-def _check_written(tasks: Sequence[Task]) -> None:
-    if missing := [task.output for task in tasks if not task.done]:
-        raise InputError(
-            "written by a worker but missing here; share the folder with all workers", path=missing[0]
-        )
 
 
 @contextmanager

@@ -10,13 +10,12 @@ Between steps the tiles agree on a common frame for costs and on how many Gaussi
 - inputs: `own`, the output of `coarse` for this tile (not for `coarse` itself); `coarse`, the same for every
   tile; `views`, cameras in world coordinates; `visibility`, the output of `visibility` for this tile, absent
   without views.
-- places: `store`, the folder of the tiled scene.
+- places: `store`, the folder of the tiled scene, the same for all functions that read the tile.
 
 N counts the tile's rows with finite values; "ordered rows" are these in Morton order.
 """
 
 import math
-from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -76,8 +75,6 @@ def coarse(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
 
     Args:
         arguments: `tile`, `config`; `sampled`, the rows of which one is in the sample.
-        inputs: none.
-        places: `store`.
 
     Returns:
         Three scenes (`scene_of`): `near`, `far`, `sample`; `order`, (N,) the tile's rows in Morton order, and
@@ -106,7 +103,6 @@ def light(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
         arguments: `views`, numbers of V cameras; `level`, the coarse scene used for all tiles; `near`, the
             near plane, None for the renderer's default.
         inputs: `coarse`, `views`.
-        places: none.
 
     Returns:
         `weights`, (V, T) float64 Σ αT².
@@ -135,7 +131,6 @@ def visibility(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
             `light`, (V,) Σ αT² that each gets from it (`light`); `all_light`, its sum over all views;
             `shrunk`, the ratio of these images' width to the full width.
         inputs: `coarse`, `views`.
-        places: `store`.
 
     Returns:
         `weight`, (N,) float32 Σ αT² over all views; `pixel_size`, (N,) float32 size of a full-image pixel,
@@ -157,7 +152,8 @@ def visibility(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
     weight = weight / np.float32(share or 1.0)
     pixel_size = pixel_size * np.float32(arguments["shrunk"])  # in pixels of the full image
     pixel = _median(pixel_size[np.isfinite(pixel_size) & (pixel_size > 0)])
-    frame = _with_pixel_size(arguments["frame"], 1.0 if math.isnan(pixel) else pixel)
+    unit, _, *others = arguments["frame"]  # with the tile's own pixel size
+    frame = _core.TileFrame(unit, 1.0 if math.isnan(pixel) else pixel, *others)
     tile = _merging(own, _config(arguments), frame, SampledVisibility(weight, pixel_size))
     return {
         "weight": weight,
@@ -199,7 +195,6 @@ def run_costs(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
     Args:
         arguments: `tile`, `config`, `frame`.
         inputs: `visibility`.
-        places: `store`.
 
     Returns:
         `costs`, (R − 1,) float32, one per gap between the R ordered rows that a renderer draws.
@@ -215,7 +210,6 @@ def pair_plan(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
         arguments: `tile`, `config`, `frame`; `runs`, the number of runs; `last`, the Gaussians that remain
             after all merges.
         inputs: `visibility`; `costs`, the output of `run_costs`.
-        places: `store`.
 
     Returns:
         `of`, (N,) uint32 the run of each ordered row, or `GONE`; `a`, `b`, (M,) merges in order: run b joins
@@ -238,7 +232,6 @@ def merge(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
         arguments: `tile`, `config`, `frame`; `runs`, as for `pair_plan`; `merges`, the number to apply;
             `faint`, the number of rows to keep that no renderer draws.
         inputs: `plan`, the output of `pair_plan`; `visibility`.
-        places: `store`.
 
     Returns:
         `scene`, n = runs − merges + faint Gaussians (`scene_of`), opacities unfitted; `members`, (n,) rows
@@ -279,7 +272,6 @@ def merged_visibility(arguments: Arguments, inputs: Inputs, places: Places) -> A
     Args:
         arguments: `tile`, `levels`; `growth`, the largest growth of merged Gaussians.
         inputs: `coarse`, `views`, `visibility`; `merged`, the output of `merge`.
-        places: `store`.
 
     Returns:
         `weight`, (n,) float32 Σ αT², scaled like those of `visibility`.
@@ -302,7 +294,6 @@ def growths(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
     Args:
         arguments: `tile`; with views `levels`.
         inputs: `merged`, the output of `merge`; with views `coarse`, `views` and `visibility`.
-        places: `store`.
 
     Returns:
         `compared`, (G, 3) for the G growths, what `g2ard.stages.simplify.growth.Renders.compare` returns.
@@ -332,12 +323,6 @@ def _merging(
 ) -> _core.TileMerging:
     seen = None if visibility is None else emphasised(scene, visibility, config)
     return _core.TileMerging(scene.core, frame, config, seen)
-
-
-def _with_pixel_size(frame: Sequence[float], pixel_size: float) -> _core.TileFrame:
-    """Return the frame with the tile's own pixel size."""
-    unit, _, floor, exponent, usual = frame
-    return _core.TileFrame(unit, pixel_size, floor, exponent, usual)
 
 
 def _seen_tile(scene: PreparedScene, arguments: Arguments, inputs: Inputs) -> _core.TileMerging:

@@ -106,8 +106,10 @@ def distill(
         drop_work(tiling_of(run, scene, output))
         run.result(finished)
         return
-    if scene is not None:
-        _check_kind(scene)
+    if scene is not None and kind(scene) == "views":
+        raise typer.BadParameter(
+            f"{scene} holds views, not a scene; to start from photos, pass it as --views with -n COUNT"
+        )
     options = DistillOptions(
         views=opt.with_images(views, images, alpha),
         photos=photos,
@@ -162,11 +164,3 @@ def _check_options(
         raise typer.BadParameter("--photos: generated views have no photos; give --views VIEWS")
     if scene is None and photos is False:
         raise typer.BadParameter("--renders needs a SCENE to render; give one or remove --renders")
-
-
-def _check_kind(scene: Path) -> None:
-    """Reject a file of views as the scene."""
-    if kind(scene) == "views":
-        raise typer.BadParameter(
-            f"{scene} holds views, not a scene; to start from photos, pass it as --views with -n COUNT"
-        )

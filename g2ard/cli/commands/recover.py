@@ -1,9 +1,7 @@
 """`g2ard recover`."""
 
-from __future__ import annotations
-
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
@@ -14,11 +12,6 @@ from g2ard.cli.run_result import loss, tell_plan
 from g2ard.config.schema import listed
 from g2ard.io.scene_formats import check_positions
 from g2ard.progress import plural
-
-if TYPE_CHECKING:
-    from g2ard.jobs.recover import RecoverJob
-    from g2ard.report.run import KindScore
-    from g2ard.stages.recover import Recovered
 
 _FIELDS = "schedule steps recovery_time sh_degree engine background seed"
 
@@ -58,7 +51,10 @@ def recover(
     """Optimise a fixed set of Gaussians against photos or a teacher's renders."""
     from g2ard.jobs.recover import prepare
     from g2ard.jobs.teaching import check_teacher
+    from g2ard.rendering.targets import kinds_of
+    from g2ard.report.run import COLUMNS, cells
     from g2ard.stages.recover import RecoverConfig
+    from g2ard.stages.recover.report import outcome, unregularized
 
     if teacher is not None and not photos:
         run.refuse_typed("with --teacher, unless --photos is given", "alpha")
@@ -93,36 +89,20 @@ def recover(
     with stoppable(run, checkpoint, resume, output):
         result = job.run(checkpoint)
         run.write(output, result.splats)
-    _tell_outcome(run, result)
+    lines = [outcome(result.report), unregularized([[result.report]]) if run.verbose else None]
+    for line in filter(None, lines):
+        run.say(line)
     with run.finishing("scoring"):
-        kinds = _score(run, job, result)
+        kinds = job.score(result)
+        if job.held_out is not None:
+            pixels = job.held_out.cameras.size_text
+            title = f"held-out views against {kinds_of(job.held_out)}, {pixels}, before → after:"
+            run.console.table(title, list(COLUMNS), cells(kinds))
+        for line in filter(None, (loss(kind, "the student is better there") for kind in kinds)):
+            run.say(line)
     gain, count = result.report.psnr, plural(len(job.student), "Gaussian")
     where = f"{opt.trained_on(split)} {job.views.cameras.size_text}"
     run.say(f"{output}: {count}, {where}: {gain.before:.2f} → {gain.after:.2f} dB")
     report = {**result.report.as_dict(), "preset": job.preset, "prior": job.measures}
     report |= {"kinds": kinds, "settings": listed(job.config)}
     run.result({**report, "output": str(output)})
-
-
-def _tell_outcome(run: Run, result: Recovered) -> None:
-    """Report an unusual recovery and, with --verbose, idle regularisers."""
-    from g2ard.stages.recover.report import outcome, unregularized
-
-    lines = [outcome(result.report), unregularized([[result.report]]) if run.verbose else None]
-    for line in filter(None, lines):
-        run.say(line)
-
-
-def _score(run: Run, job: RecoverJob, result: Recovered) -> tuple[KindScore, ...]:
-    """Score held-out views, and print the table and losses."""
-    from g2ard.rendering.targets import kinds_of
-    from g2ard.report.run import COLUMNS, cells
-
-    kinds = job.score(result)
-    if job.held_out is not None:
-        size = job.held_out.cameras.size_text
-        title = f"held-out views against {kinds_of(job.held_out)}, {size}, before → after:"
-        run.console.table(title, list(COLUMNS), cells(kinds))
-    for line in filter(None, (loss(kind, "the student is better there") for kind in kinds)):
-        run.say(line)
-    return kinds

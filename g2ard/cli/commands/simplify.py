@@ -23,7 +23,7 @@ from g2ard.system.peak_memory import peak_rss_of_all
 
 if TYPE_CHECKING:
     from g2ard.jobs.measured_budget import Reduction
-    from g2ard.stages.simplify import Simplified, SimplifyConfig
+    from g2ard.stages.simplify import Simplified
 
 
 @command(
@@ -60,6 +60,8 @@ def simplify(
     generated views. The fast method uses views only if --views is given; the paper's method uses none.
     Scenes larger than memory and folders of tiles are simplified tile by tile to the same exact budget.
     """
+    import numpy as np
+
     from g2ard.jobs.cost import cost_of_reduction
     from g2ard.jobs.memory import WHOLE_TIMES, check_whole_memory
     from g2ard.jobs.simplify import reducing
@@ -123,12 +125,25 @@ def simplify(
             simplified = time.perf_counter()
             run.write(place, small.splats, compare=how is not None)
             if parents is not None:
-                with run.finishing("--parents"):
-                    _write_parents(run, parents, small)
+                with (
+                    run.finishing("--parents"),
+                    atomic_output(parents, overwrite=run.overwrite) as temporary,
+                    temporary.open("wb") as file,
+                ):
+                    np.save(file, small.parents)  # (N,) int64 in the scene's row order
             written = time.perf_counter()
             seconds = {"read": reading, "simplify": simplified - started, "write": written - simplified}
             seconds["total"], started = sum(seconds.values()), written
-            reports.append(_report(reduce, small, config, seconds))
+            reports.append(
+                {
+                    **small.report.as_dict(),
+                    "method": config.method,
+                    "settings": listed(config.resolved(antialiased=reduce.splats.antialiased)),
+                    "notes": {note.code: note.count for note in reduce.notes},
+                    "seconds": seconds,
+                    "peak_rss_bytes": peak_rss_of_all(),
+                }
+            )
             _tell(run, scene, reduce, small, place, seconds["total"])
             if one.bytes is not None:
                 run.say(f"{place}: {written_bytes(place):,} of {one.bytes:,} bytes")
@@ -151,27 +166,6 @@ def _tell_plan(run: Run, reduce: Reduction, counts: Sequence[int]) -> None:
         plans.append({**told, "bytes": cost.bytes, "seconds": cost.seconds, **tiles_of(reduce.tiles)})
     run.say_dry()
     run.results(plans)
-
-
-def _report(
-    reduce: Reduction, small: Simplified, config: SimplifyConfig, seconds: dict[str, float]
-) -> dict[str, Any]:
-    return {
-        **small.report.as_dict(),
-        "method": config.method,
-        "settings": listed(config.resolved(antialiased=reduce.splats.antialiased)),
-        "notes": {note.code: note.count for note in reduce.notes},
-        "seconds": seconds,
-        "peak_rss_bytes": peak_rss_of_all(),
-    }
-
-
-def _write_parents(run: Run, path: Path, small: Simplified) -> None:
-    """Write the parents, (N,) int64 in the scene's row order."""
-    import numpy as np
-
-    with atomic_output(path, overwrite=run.overwrite) as temporary, temporary.open("wb") as file:
-        np.save(file, small.parents)
 
 
 def _tell(run: Run, scene: Path, reduce: Reduction, small: Simplified, output: Path, seconds: float) -> None:

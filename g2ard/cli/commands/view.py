@@ -5,7 +5,7 @@ from __future__ import annotations
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
@@ -15,9 +15,6 @@ from g2ard.config.choices import BLACK
 from g2ard.io.detect import run_scene
 from g2ard.io.paths import short_names
 from g2ard.progress import plural
-
-if TYPE_CHECKING:
-    from g2ard.scene.splats import Splats
 
 _LARGEST_DENSE = 2_000_000
 """Largest dense scene that is shown beside a run's result."""
@@ -128,18 +125,14 @@ def _write(
         {
             "output": str(output),
             "bytes": written,
-            "scenes": _told(paths, loaded, scene_sizes),
+            "scenes": [
+                {"scene": str(path), "count": len(splats), "bytes": size}
+                for path, splats, size in zip(paths, loaded, scene_sizes, strict=True)
+            ],
             "start": stand.name,
             "up": stand.up.tolist(),
         }
     )
-
-
-def _told(paths: list[Path], scenes: list[Splats], sizes: tuple[int, ...]) -> list[dict[str, Any]]:
-    return [
-        {"scene": str(path), "count": len(splats), "bytes": size}
-        for path, splats, size in zip(paths, scenes, sizes, strict=True)
-    ]
 
 
 def _show(run: Run, folder: Path, page: str) -> None:
