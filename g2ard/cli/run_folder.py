@@ -194,13 +194,11 @@ class RunFolder:
     def write_pages(
         self, title: str, job: Any, done: Any, report: RunReport | TiledReport, told: Sequence[str]
     ) -> tuple[RunReport | TiledReport, str]:
-        """Write report.html and, in one piece, preview.png and with --page view.html.
+        """Write report.html and, in one piece, preview.png and with --page view.html; return the report with
+        the size of that page, and a line about it.
 
         Args:
             told: the summary that the command prints.
-
-        Returns:
-            The report with the size of the page, and a line about the page.
         """
         from g2ard.report.distilled import distill_report, preview, tiled_report
         from g2ard.report.run import TiledReport
@@ -232,13 +230,11 @@ class RunFolder:
     def write_view(
         self, splats: Splats, dense: Splats | None, cameras: Cameras, background: Colour
     ) -> tuple[int | None, str]:
-        """Write view.html unless browsers would not draw the scene smoothly.
+        """Write view.html unless browsers would not draw the scene smoothly; return its bytes, None if it was
+        not written, and a line to print.
 
         Args:
             dense: the dense scene, shown beside the result unless it would make the page large.
-
-        Returns:
-            Size of the page in bytes, None if it was not written, and a line to print.
         """
         count, most = len(splats), DEVICES["web"]
         if count > most:

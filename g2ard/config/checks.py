@@ -62,11 +62,7 @@ AtLeastOne = Annotated[int, Within("[1, inf)")]
 
 
 def check_fields(config: Any) -> None:
-    """Reject values of a dataclass that do not have the types of their fields.
-
-    Raises:
-        InputError: the first such field.
-    """
+    """Reject the first value of a dataclass that does not have the type of its field."""
     owner: Any = type(config)
     kinds = _hints(owner)
     for field in fields(config):
@@ -78,9 +74,6 @@ def check_type(name: str, value: Any, kind: Any) -> None:
 
     Whole numbers are also numbers, NaN is no number, and a list can be a tuple. Types that cannot be tested,
     such as protocols and arrays, are not checked.
-
-    Raises:
-        InputError: another type.
 
     >>> check_type("seed", 3, int)
     >>> check_type("seed", 2.5, int | None)

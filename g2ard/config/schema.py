@@ -89,16 +89,10 @@ def _names(kind: Any) -> dict[str, None]:
 
 
 def parse_settings(texts: Iterable[str], config: Any) -> dict[str, Any]:
-    """Parse `PATH=VALUE` texts for a config; the last value of a repeated path wins.
+    """Return full path → value of `PATH=VALUE` texts for a config; the last value of a repeated path wins.
 
     Values are checked against the field's type: numbers (`1e-3`, `inf`), `true` or `false`, names, `0.36,0.1`
     for tuples, `1,2;3,4` for tuples of tuples, and `none` if the field may be None.
-
-    Returns:
-        Full path → value, for `changed`.
-
-    Raises:
-        InputError: no `=`, an unknown or ambiguous path, or a value of another type.
 
     >>> from g2ard.stages.recover.config import RecoverConfig
     >>> parse_settings(["regularizers.anchor=1e-3", "period=50", "schedule=fast"], RecoverConfig())
@@ -116,10 +110,7 @@ def parse_settings(texts: Iterable[str], config: Any) -> dict[str, Any]:
 
 
 def full_paths(values: Mapping[str, Any], config: Any) -> dict[str, Any]:
-    """Expand the keys of `values` to full paths.
-
-    Raises:
-        InputError: an unknown or ambiguous path, or a value of another type.
+    """Expand the keys of `values` to full paths, and check the types of the values.
 
     >>> from g2ard.stages.recover.config import RecoverConfig
     >>> full_paths({"rates.means": 1e-3, "steps": 100}, RecoverConfig())
@@ -144,9 +135,6 @@ def changed(config: Config, values: Mapping[str, Any]) -> Config:
 
     Args:
         values: by full path; paths that the config does not have are ignored.
-
-    Raises:
-        InputError: a value out of its range, or an unknown name.
 
     >>> from g2ard.stages.recover.config import RecoverConfig
     >>> config = changed(RecoverConfig(), {"recover.schedule": "paper", "recover.schedule.rates.means": 1e-3})

@@ -148,13 +148,7 @@ def kinds_of(only: Sequence[str] | None, strength: float) -> tuple[str, ...]:
 
 
 def painted(splats: Splats, colors: ArrayLike) -> Splats:
-    """Recolour a scene, view-independently, shaded by the luma of its own colours.
-
-    Args:
-        colors: (N, 3) in [0, 1].
-
-    Returns:
-        The same geometry and opacities, SH degree 0.
+    """Recolour a scene by (N, 3) colours in [0, 1], at SH degree 0, shaded by the luma of its own colours.
 
     >>> scene = Splats.create(np.zeros((2, 3)), scales=np.ones((2, 3)), sh0=np.full((2, 1, 3), 9.0))
     >>> painted(scene, [[1, 0, 0], [0, 0, 1]]).colors.round(3).tolist() == [[1, 0, 0], [0, 0, 1]]

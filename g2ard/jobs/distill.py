@@ -17,7 +17,7 @@ from g2ard.config.checks import AtLeastOne, checks_arguments
 from g2ard.config.choices import FormatName, RenderModel, is_made
 from g2ard.config.schema import listed
 from g2ard.errors import InputError
-from g2ard.io import read_splats
+from g2ard.io import kind, read_cloud, read_splats
 from g2ard.io.paths import real_path
 from g2ard.io.types import Points
 from g2ard.jobs.budget import Budget
@@ -603,8 +603,6 @@ class _Read:
 
 def _read(scene: Scene, budget: Budget, options: DistillOptions, progress: Progress, say: Say) -> _Read:
     """Read the dense scene, or lift points; with photos they are topped up to the budget."""
-    from g2ard.io import kind
-
     if isinstance(scene, Splats):
         options.check_trained()
         return _Read(scene.narrowed(), False, options.beside, "scene", len(scene))
@@ -655,8 +653,6 @@ def _points(
 ) -> tuple[Points | None, str, bool]:
     """Return the points of a cloud or stored with the views, their name in errors, and whether they were
     found in photos."""
-    from g2ard.io import kind, read_cloud
-
     if isinstance(scene, Points):
         return scene, "cloud", False
     sparse = None if views is None else sparse_file(views)

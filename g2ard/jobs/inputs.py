@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,9 +23,8 @@ from g2ard.rendering.targets import Photos, PhotosOrRenders, Targets, TeacherRen
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.regions import in_any
 from g2ard.scene.splats import Splats
+from g2ard.stages.simplify import Pairs, SimplifyConfig
 
-if TYPE_CHECKING:
-    from g2ard.stages.simplify import SimplifyConfig
 Views = Cameras | ViewSet | ViewFiles | str | Path  # cameras, or the path of views
 Split = str | Callable[..., "NDArray[np.bool_]"]  # of `split_mask`, or a function like `for_training`
 
@@ -53,8 +52,6 @@ def say_notes(path: str | Path, notes: Sequence[Note], say: Say) -> None:
 
 def say_regions(splats: Splats, config: SimplifyConfig, name: str, say: Say) -> None:
     """Say how many Gaussians lie in the regions to keep; raise InputError if none do."""
-    from g2ard.stages.simplify import Pairs
-
     if isinstance(config, Pairs) and config.keep_region:
         inside = int(in_any(splats, config.keep_region).sum())
         if not inside:

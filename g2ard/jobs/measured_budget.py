@@ -396,16 +396,14 @@ def count_for_quality(
 ) -> tuple[int, Quality]:
     """Return approximately the fewest Gaussians that keep a quality in these views, and their quality.
 
+    They are all if no smaller count tried keeps it.
+
     The excess in dB over the wanted quality is nearly linear in the logarithm of the count. The search starts
     at a quarter of the scene, follows the slope, then interpolates between counts on both sides, until the
     excess is at most 0.25 dB.
 
     Args:
-        wanted: mean PSNR and SSIM; 0 means no requirement.
         reduce: count → scene, by the method that makes the result.
-
-    Returns:
-        The count and its quality; N if no smaller count tried keeps it.
     """
     renders = _images(splats, cameras)
     met, good, missed = len(splats), Quality(float("inf"), 1.0), 0
@@ -508,11 +506,10 @@ def score_lines(packed: Packed, size: int, unpacked: float, pixels: str) -> list
 
 
 def loss_warning(path: Path, splats: Splats, options: dict[str, Any]) -> str | None:
-    """Compare a written file with its scene in a few small generated views.
+    """Compare a written file with its scene in a few small generated views; return a warning if a scene of
+    35 dB would lose more than 1 dB.
 
-    Returns:
-        A warning if a scene of 35 dB would lose more than 1 dB. None otherwise, and without a comparison if
-        the format is exact, the scene is large or no view shows it.
+    Nothing is compared if the format is exact, the scene is large or no view shows it.
     """
     if not (scene_format(path).lossy or options.get("compress")) or len(splats) > _MOST_COMPARED_GAUSSIANS:
         return None

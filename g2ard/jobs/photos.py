@@ -16,9 +16,13 @@ from numpy.typing import NDArray
 
 from g2ard.config.choices import BLACK, Colour
 from g2ard.errors import G2ardError, InputError
+from g2ard.io import read_points
+from g2ard.io.detect import file_format
+from g2ard.io.finding import Finder
 from g2ard.io.images import composited, load_premultiplied
+from g2ard.io.jsonfile import read_json
 from g2ard.io.splits import for_training
-from g2ard.io.types import Points, ViewSet
+from g2ard.io.types import Points, ViewFiles, ViewSet
 from g2ard.jobs.inputs import Split, Views, load_view_sets
 from g2ard.progress import Progress, Say, plural, silent, unsaid
 from g2ard.scene.cameras import Cameras
@@ -71,8 +75,7 @@ def visual_hull(cameras: Cameras, outlines: Sequence[Mask | None], middle: Float
         outlines: (H, W) pixels that show the object, per view; None for a view that does not say.
         middle: (3,) a point that the cameras look at.
 
-    Returns:
-        The hull, or None if nothing remains or the object is not outlined in enough views.
+    Returns None if nothing remains, or the object is not outlined in enough views.
     """
     told = [v for v, outline in enumerate(outlines) if outline is not None and not bool(outline.all())]
     if len(told) < max(3, _SEEING_VIEWS_SHARE * len(cameras)):
@@ -218,8 +221,6 @@ def distinct(points: Points) -> Points:
 
 def sparse_points(file: Path | None, say: Say = unsaid) -> Points | None:
     """Read the points of `sparse_file`; return None, and say why, if they cannot be used."""
-    from g2ard.io import read_points
-
     try:
         points = None if file is None else read_points(file)
     except G2ardError as error:
@@ -235,10 +236,6 @@ def sparse_file(views: Views) -> Path | None:
     """Return the file of points of a COLMAP model, of a gsplat run's, of a transforms.json's `ply_file_path`,
     or the input.ply beside INRIA's cameras.json, which may not exist; None for other views."""
     from g2ard.io import colmap, gsplat_run, transforms
-    from g2ard.io.detect import file_format
-    from g2ard.io.finding import Finder
-    from g2ard.io.jsonfile import read_json
-    from g2ard.io.types import ViewFiles
 
     given = views.path if isinstance(views, ViewFiles) else views
     if not isinstance(given, str | Path):
@@ -276,9 +273,6 @@ def points_along_rays(
 
     Returns:
         `count` points at different positions in world coordinates, with the colour of their ray's pixel.
-
-    Raises:
-        InputError: fewer than three views, a view without a photo, or too few points seen by three views.
     """
     if len(cameras) < 3:
         raise InputError(f"photos: expected at least 3 views, got {len(cameras)}; pass more, or a scene")
@@ -306,15 +300,16 @@ def points_along_rays(
                 hint="pass a point cloud" + (", or ask for fewer Gaussians" if len(found) else ""),
             )
         view = int(rng.integers(len(cameras)))
-        rays = min(_RAYS, max(64, -(-count // len(cameras))))
-        pixels = _pixels(photos[view], outlines[view], rays, background, rng)
+        some = min(_RAYS, max(64, -(-count // len(cameras))))
+        pixels = _pixels(photos[view], outlines[view], some, background, rng)
         if hull is None:
             depths = distances[view] / np.linspace(1 / _NEAREST_DEPTH, 1 / _FARTHEST_DEPTH, _TRIAL_DEPTHS)
         else:
             depths = hull.depths(cameras, view, _HULL_DEPTHS)
         slack = 2.0 ** (tried // (_RAYS_PER_DOUBLING * max(count, _RAYS)))
-        xyz, rgb = _swept(cameras, photos, view, near[view], pixels, depths, hull, slack)
-        tried += rays
+        rays = _Rays.of(cameras, photos, view, near[view], pixels)
+        xyz, rgb = _swept(rays, depths, hull, slack)
+        tried += some
         found = distinct(Points(np.concatenate([found.positions, xyz]), np.concatenate([found.colors, rgb])))
         progress("points", min(len(found), count), count)
     return Points(found.positions[:count], np.ascontiguousarray(found.colors[:count]))
@@ -359,23 +354,15 @@ def _pixels(
 
 
 def _swept(
-    cameras: Cameras,
-    photos: list[NDArray[np.float32]],
-    view: int,
-    others: NDArray[np.int64],
-    pixels: NDArray[np.int64],
-    depths: Float,
-    hull: VisualHull | None,
-    slack: float,
+    ray: _Rays, depths: Float, hull: VisualHull | None, slack: float
 ) -> tuple[Float, NDArray[np.float32]]:
-    """Return points on the rays of some pixels of a view, with colours.
+    """Return points on rays, with colours.
 
     Points lie within the hull if there is one. Without one, a point must agree with other photos, and
     clearly better than most depths of its ray; `slack` multiplies both limits.
     """
-    ray = _Rays.of(cameras, photos, view, pixels)
     trial = np.broadcast_to(depths, (len(ray.colors), len(depths)))
-    cost = ray.costs(cameras, photos, others, trial)
+    cost = ray.costs(trial)
     rows = np.arange(len(cost))
     if hull is not None:
         cost[~hull.holds(ray.at(trial))] = np.inf
@@ -388,19 +375,12 @@ def _swept(
         finite = np.isfinite(cost)
         middle = np.maximum(finite.sum(1) // 2, 1) - 1
         usual = np.sort(cost, axis=1)[rows, middle]  # the median, since infinities are sorted last
-        depth, least = _refined(cameras, photos, others, ray, trial, cost)
+        depth, least = _refined(ray, trial, cost)
         kept = finite.any(1) & (least <= slack * np.minimum(_MOST_POINT_COST, _MOST_POINT_COST_SHARE * usual))
     return ray.at(depth[:, None])[kept, 0], ray.colors[kept]
 
 
-def _refined(
-    cameras: Cameras,
-    photos: list[NDArray[np.float32]],
-    others: NDArray[np.int64],
-    ray: _Rays,
-    trial: Float,
-    cost: Float,
-) -> tuple[Float, Float]:
+def _refined(ray: _Rays, trial: Float, cost: Float) -> tuple[Float, Float]:
     """Return the (N,) best depths and their costs, from finer trials around the best minima of each ray.
 
     `trial` and `cost` are (N, D); depths are evenly spaced in 1/depth. The finer trials reach three quarters
@@ -415,7 +395,7 @@ def _refined(
     offsets = np.linspace(-0.75, 0.75, _FINER_DEPTHS)
     tried = inverse_depth[:, :, None] + offsets * spacing[:, :, None]
     finer = (1 / np.maximum(tried, 1e-3 * inverse_depth[:, :, None])).reshape(len(cost), -1)
-    costs = ray.costs(cameras, photos, others, finer)
+    costs = ray.costs(finer)
     best = costs.argmin(1)
     return finer[rows[:, 0], best], costs[rows[:, 0], best]
 
@@ -425,18 +405,27 @@ class _Rays:
     """Rays of some pixels of a view, each with the rays of its neighbours.
 
     Args:
+        others: views to compare with.
         origin: (3,) the camera's centre.
         aims: (N, P, 3) world directions at depth 1; the pixel's own first.
         patches: (N, P, 3) colours.
     """
 
+    cameras: Cameras
+    photos: list[NDArray[np.float32]]
+    others: NDArray[np.int64]
     origin: Float
     aims: Float
     patches: Float
 
     @classmethod
     def of(
-        cls, cameras: Cameras, photos: list[NDArray[np.float32]], view: int, pixels: NDArray[np.int64]
+        cls,
+        cameras: Cameras,
+        photos: list[NDArray[np.float32]],
+        view: int,
+        others: NDArray[np.int64],
+        pixels: NDArray[np.int64],
     ) -> _Rays:
         photo, pose = photos[view], cameras.viewmats[view]
         patch = _PATCH * max(1, round(max(photo.shape) / _PATCH_SPACING))
@@ -444,7 +433,8 @@ class _Rays:
         columns = np.clip(pixels[1][:, None] + patch[:, 1], 0, photo.shape[1] - 1)
         seen = np.stack([columns + 0.5, rows + 0.5, np.ones(rows.shape)], -1)
         aims = seen @ np.linalg.inv(cameras.Ks[view]).T @ pose[:3, :3]
-        return cls(cameras.positions[view], aims, photo[rows, columns].astype(np.float64))
+        patches = photo[rows, columns].astype(np.float64)
+        return cls(cameras, photos, others, cameras.positions[view], aims, patches)
 
     @property
     def colors(self) -> NDArray[np.float32]:
@@ -455,33 +445,28 @@ class _Rays:
         """Return the (N, D, 3) world points of the pixels at (N, D) depths."""
         return self.origin + self.aims[:, :1] * depths[..., None]
 
-    def costs(
-        self, cameras: Cameras, photos: list[NDArray[np.float32]], others: NDArray[np.int64], depths: Float
-    ) -> Float:
+    def costs(self, depths: Float) -> Float:
         """Return (N, D) differences of the patches to the views that agree best; ∞ if too few see them."""
-        own_costs = np.full((len(others), *depths.shape), np.inf)
-        for k, other in enumerate(others):
+        own_costs = np.full((len(self.others), *depths.shape), np.inf)
+        for k, other in enumerate(self.others):
             total, inside = np.zeros(depths.shape), np.ones(depths.shape, bool)
             for p in range(self.aims.shape[1]):
                 world = self.origin + self.aims[:, p : p + 1] * depths[..., None]
-                color, held = _sampled(cameras, photos, int(other), world)
+                color, held = self._sampled(int(other), world)
                 total += np.abs(color - self.patches[:, p : p + 1]).mean(-1)
                 inside &= held
             own_costs[k][inside] = total[inside] / self.aims.shape[1]
         own_costs.sort(axis=0)
         return own_costs[:_AGREEING_VIEWS].mean(0)
 
-
-def _sampled(
-    cameras: Cameras, photos: list[NDArray[np.float32]], view: int, world: Float
-) -> tuple[Float, NDArray[np.bool_]]:
-    """Return the colours of world points in a photo, black outside of it, and whether they are inside."""
-    photo, pose, K = photos[view], cameras.viewmats[view], cameras.Ks[view]
-    local = world @ pose[:3, :3].T + pose[:3, 3]
-    ahead = local[..., 2] > 0
-    depth = np.where(ahead, local[..., 2], 1.0)
-    u = np.floor(K[0, 0] * local[..., 0] / depth + K[0, 2])
-    v = np.floor(K[1, 1] * local[..., 1] / depth + K[1, 2])
-    held = ahead & (u >= 0) & (v >= 0) & (u < photo.shape[1]) & (v < photo.shape[0])
-    color = photo[np.where(held, v, 0).astype(int), np.where(held, u, 0).astype(int)]
-    return np.where(held[..., None], color, 0.0), held
+    def _sampled(self, view: int, world: Float) -> tuple[Float, Mask]:
+        """Return the colours of world points in a photo, black outside of it, and whether they are inside."""
+        photo, pose, K = self.photos[view], self.cameras.viewmats[view], self.cameras.Ks[view]
+        local = world @ pose[:3, :3].T + pose[:3, 3]
+        ahead = local[..., 2] > 0
+        depth = np.where(ahead, local[..., 2], 1.0)
+        u = np.floor(K[0, 0] * local[..., 0] / depth + K[0, 2])
+        v = np.floor(K[1, 1] * local[..., 1] / depth + K[1, 2])
+        held = ahead & (u >= 0) & (v >= 0) & (u < photo.shape[1]) & (v < photo.shape[0])
+        color = photo[np.where(held, v, 0).astype(int), np.where(held, u, 0).astype(int)]
+        return np.where(held[..., None], color, 0.0), held

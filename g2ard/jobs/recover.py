@@ -56,14 +56,13 @@ class RecoverJob:
     scored: Views | None
     size: int | None
     validation: Targets | None = None
-    progress: Progress = silent
 
     def run(self, checkpoint: Path | None = None, watch: Watch | None = None) -> Recovered:
         """Recover the student; see `g2ard.recover`."""
         built, in_plane = self.anchors, self.config.regularizers.in_plane
         if not self._same:
             for targets in filter(None, (self.targets, self.validation)):
-                fill(targets, self.progress)
+                fill(targets, self.teaching.progress)
         return optimize(
             self.student,
             self.targets,
@@ -72,7 +71,7 @@ class RecoverJob:
             anchors=None if built is None else Anchors.of(built, in_plane),
             validation=self.validation,
             checkpoint=checkpoint,
-            progress=self.progress,
+            progress=self.teaching.progress,
             watch=watch,
             skip_same=True,
         )
@@ -112,7 +111,7 @@ class RecoverJob:
                 splats,
                 self.held_out,
                 background=self.config.background,
-                progress=self.progress,
+                progress=self.teaching.progress,
                 stage=f"score {name}",
             ).views
             for name, splats in (("simplified", self.student), ("recovered", result.splats))
@@ -321,7 +320,6 @@ def prepare(
         pool if split == "train" else None,
         size,
         teaching.validation(pool, size) if split == "train" and config.schedule.guarded else None,
-        progress,
     )
 
 

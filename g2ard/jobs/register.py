@@ -23,6 +23,7 @@ from g2ard.io.photos import exif_focal, has_alpha, photo_size
 from g2ard.jobs.inputs import load_scene
 from g2ard.jobs.view_checks import propose_background
 from g2ard.pipeline.presets import GS_CPR
+from g2ard.poses import plan_pool
 from g2ard.progress import Progress, Say, plural, silent, unsaid
 from g2ard.scene.cameras import Camera, Cameras
 from g2ard.scene.splats import Splats
@@ -184,10 +185,8 @@ def photos_of(
 ) -> Cameras:
     """Read views with photos, or a folder of photos with their intrinsics; see `register` for the arguments.
 
-    `focal` is in pixels of the stored photo, with a centred principal point and no distortion.
-
-    Returns:
-        C cameras; photos from a folder have the identity as pose.
+    `focal` is in pixels of the stored photo, with a centred principal point and no distortion. Photos from a
+    folder have the identity as pose.
     """
     files = _photos_in(path)
     if not files:
@@ -366,8 +365,6 @@ def pool_of(
     """Return poses from a file of views, or plan as many as a number says, and `say` so."""
     if not isinstance(pool, int) and not str(pool).strip().isdigit():
         return read_view_set(Path(str(pool)), unpictured=True).cameras
-    from g2ard.poses import plan_pool
-
     count = int(str(pool))
     require("pool", count, count >= 1, "at least 1 view")
     planned = plan_pool(scene, count, seed=seed, rows=_POSE_SAMPLE, progress=progress)

@@ -6,18 +6,16 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from g2ard.errors import InputError
 from g2ard.io import open_stream
 from g2ard.io.detect import MANIFEST, kind
 from g2ard.io.scene_formats import scene_format
 from g2ard.io.tiles import TileStore
-
-if TYPE_CHECKING:
-    from g2ard.jobs.budget import Budget
-    from g2ard.pipeline.config import DistillConfig
-    from g2ard.stages.simplify import SimplifyConfig
+from g2ard.jobs.budget import Budget
+from g2ard.pipeline.config import DistillConfig
+from g2ard.stages.simplify import Default, SimplifyConfig
+from g2ard.tiles.ingest import TILE_ROWS
 
 _LEAST_FILE_ROW_BYTES = 4
 """Least bytes per Gaussian in a file: a smaller file is known to be small without opening it."""
@@ -48,8 +46,6 @@ class Tiling:
     @property
     def most_rows(self) -> int:
         """Largest number of Gaussians per tile."""
-        from g2ard.tiles.ingest import TILE_ROWS
-
         return self.tile_rows or TILE_ROWS
 
     @property
@@ -138,9 +134,6 @@ def needs_whole(
     >>> needs_whole(SimplifyConfig("fast"), budgets=[Budget(min_psnr=30, min_ssim=0.9)], clean=True)
     ['--method fast', '--min-psnr 30', '--min-ssim 0.9', '--clean']
     """
-    from g2ard.pipeline.config import DistillConfig
-    from g2ard.stages.simplify import Default
-
     simplify = config.simplify if isinstance(config, DistillConfig) else config
     usual, given = Default().resolved().morton_premerge_steps, {}
     if preset is not None and preset.startswith("paper"):

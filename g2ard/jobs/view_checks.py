@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from g2ard.config.choices import Colour, is_made
 from g2ard.errors import InputError
 from g2ard.io import find_views, read_view_set
+from g2ard.io.images import colour_text, photo_traits
 from g2ard.io.splits import split_mask
 from g2ard.jobs.inputs import Views
 from g2ard.progress import Say, plural, unsaid
@@ -152,12 +153,8 @@ def check_photos(
 
 
 def _likeness(splats: Splats, photos: Photos, background: Colour) -> tuple[list[float], list[float]]:
-    """Compare renders with small photos where the scene covers enough of them.
-
-    Returns:
-        Per view, the correlation of brightness with its own photo, and the share of the others whose
-        correlation is lower; the latter is empty for a single photo.
-    """
+    """Return per view that the scene covers enough the correlation of brightness with its own small photo,
+    and the share of the others whose correlation is lower, which is empty for a single photo."""
     renderer = Renderer(splats, background=background)
     images = [photos[view].mean(axis=2) for view in range(len(photos.cameras))]
     own, beaten = [], []
@@ -193,8 +190,6 @@ def propose_background(cameras: Cameras, background: Colour, given: bool, say: S
     Args:
         given: whether it was chosen rather than the default.
     """
-    from g2ard.io.images import colour_text, photo_traits
-
     pairs = zip(cameras.image_paths, cameras.mask_paths, strict=True)
     photos = [photo for photo, mask in pairs if photo is not None and mask != photo]
     traits = photo_traits(photos)

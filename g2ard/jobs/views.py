@@ -18,6 +18,7 @@ from g2ard.jobs.inputs import Views, drop_held_out, load_view_sets, load_views
 from g2ard.jobs.view_checks import as_pool, check_sight, given_or_found, opaque_points, warn_of_sight
 from g2ard.pipeline.config import SelectConfig
 from g2ard.pipeline.distill import RunViews
+from g2ard.poses import Pool, plan_pool
 from g2ard.progress import Progress, Say, direction, silent, unsaid
 from g2ard.scene.cameras import USUAL, Camera, Cameras, look_at, rows_by_kind
 from g2ard.scene.samples import evenly_spaced
@@ -27,7 +28,6 @@ from g2ard.stages.simplify import simplify
 
 if TYPE_CHECKING:
     from g2ard.jobs.distill_options import DistillOptions
-    from g2ard.poses import Pool
 Up = Sequence[float] | None
 Use = Literal["distil", "levels", "tiles", "merging"]
 """Use of generated views. Levels and tiles are scored in usual views alone; merging has no recovery."""
@@ -333,10 +333,7 @@ def cameras_for_weights(
         views: as for `views_of`; the training split is used.
         method: those other than `default` use only given or requested views.
 
-    Other arguments are those of `views_of`.
-
-    Returns:
-        The cameras, or None for no views.
+    Other arguments are those of `views_of`. None means no views.
     """
     if views is None and method != "default":
         return None
@@ -372,8 +369,6 @@ def _planned(
     **options: Any,
 ) -> Pool:
     """Plan a pool as `plan_pool` does, but larger in proportion to a tiled scene's size."""
-    from g2ard.poses import plan_pool
-
     times = _times(prior, represents)
     return plan_pool(prior, round(count * times), rows=round(rows * times), represents=represents, **options)
 
@@ -404,10 +399,8 @@ def orbit(
 ) -> Cameras:
     """Return views at equal angles on a level circle around a scene, like `g2ard render --orbit`.
 
-    All look at the circle's middle.
-
-    The first view is the generated one that shows most of the scene; the circle's middle is what lies at the
-    median depth in its direction.
+    All look at the circle's middle. The first view is the generated one that shows most of the scene; the
+    circle's middle is what lies at the median depth in its direction.
 
     Args:
         scene: the scene.
@@ -430,8 +423,6 @@ def orbit(
     >>> len(orbit(scene, 4, size=(64, 48)))
     4
     """
-    from g2ard.poses import plan_pool
-
     pool = plan_pool(scene, _TURN_POOL, size=size, up=up, seed=seed, progress=progress)
     points, axis = opaque_points(scene), np.asarray(pool.up, np.float64)
     if up is None:

@@ -58,11 +58,8 @@ def colour_change(splats: Splats, targets: Targets, background: tuple[float, flo
     """Fit the affine colour map (exposure, white balance) from a scene's renders to images.
 
     A pixel is C + (1 − A)·background, C = Σ αT·c and A = Σ αT, and matrix·C + A·shift + (1 − A)·background
-    after the map: linear least squares with twelve unknowns and a small weight on no change.
-
-    Args:
-        targets: images; masked pixels are ignored.
-        background: RGB behind the scene, which stays unchanged.
+    after the map: linear least squares with twelve unknowns and a small weight on no change, over pixels that
+    are not masked.
     """
     cameras = targets.cameras
     behind = np.asarray(background)
@@ -142,9 +139,6 @@ class AdaptConfig(FitConfig, tag="schedule"):
             steps at once, with rates that decay to a tenth, without colour change or blending.
         steps: maximum number of steps; 7,000 as in the paper.
         recovery: rates and decay of a stretch with frozen geometry, see `appearance_only`.
-
-    Raises:
-        InputError: a value out of range.
     """
 
     schedule: AdaptSchedule = "default"

@@ -51,13 +51,8 @@ def configured(config: Config, preset: str = "auto", settings: Mapping[str, Any]
     A schedule given by name is scaled to `recover.steps`. The paper's schedule implies SH degree 3.
 
     Args:
-        config: config of one stage or of several.
-        preset: a key of `PRESETS`; its values for other configs are ignored.
+        config: config of one stage or of several; the preset's values for others are ignored.
         settings: values by path or unambiguous tail.
-
-    Raises:
-        InputError: an unknown preset or setting, a value out of its range, or a constant that the method of
-            simplification does not use.
 
     >>> from g2ard.stages.recover.config import RecoverConfig
     >>> config = configured(RecoverConfig(), "paper", {"steps": 3000})

@@ -55,10 +55,8 @@ def adapters() -> list[Adapter] | None:
 def use(device: str, *, timed: bool = False) -> None:
     """Select the device for all kernels of this process.
 
-    GPU kernels exist for what views see of a scene (`select`, `simplify` by the default method), for
-    `simplify` by the paper's method, for the steps of recovery and for images alone (`Renderer.image`: the
-    teacher's renders, scores); all others run on the CPU. If the device
-    fails, the CPU takes over for good and `notes()` says so.
+    What has no GPU kernel runs on the CPU. If the device fails, the CPU takes over for good and `notes()`
+    says so.
 
     Args:
         device: "cpu" (the initial device); "gpu", the best adapter, even a software one; or "auto", a

@@ -178,8 +178,6 @@ def recover_tiles(
     Args:
         student: the scene to recover, in the same boxes (`ingest(…, like=store)`).
         around: visibility of the dense tiles, from `simplify_tiles` with views.
-        views: views for training with their sampling weights, for scoring, and of another kind for
-            validation.
         config: constants of recovery; its steps are ignored.
         steps: steps of a recovery of the whole scene; 0 only scores.
     """

@@ -21,7 +21,7 @@ from g2ard.scene.splats import Splats
 
 FOLDER = "G2ARD_TEST_PLANS"
 """Variable of the environment: a folder in which all processes of a run of the tests keep plans."""
-_IMPORTERS = ("poses", "jobs.clean", "jobs.measured_budget")
+_IMPORTERS = ("poses", "jobs.clean", "jobs.measured_budget", "jobs.register", "jobs.views")
 """Modules in which jobs find `plan_pool`."""
 _MOST = 100
 """Plans that are kept in memory."""
