@@ -244,8 +244,12 @@ class Run:
         """Write the result and the resolved options to --json."""
         if self.json is None:
             return
+        state = devices.state() if self.device in ("auto", "gpu") else None
+        if state is not None and state.served:
+            used = {"adapter": state.adapter, "kernels": state.served, "uploaded_bytes": state.uploaded_bytes}
+            data = {**data, "device": used}
         with self.finishing("--json"):
-            text = json.dumps({**data, **self._used(), "config": self.config}, indent=2, default=plain)
+            text = json.dumps({**data, "config": self.config}, indent=2, default=plain)
             if self.json == "-":
                 self.console.print(text)
                 return
@@ -256,17 +260,6 @@ class Run:
     def results(self, reports: list[dict[str, Any]]) -> None:
         """Write the result of one budget, or of several under `runs`."""
         self.result(reports[0] if len(reports) == 1 else {"runs": reports})
-
-    def _used(self) -> dict[str, Any]:
-        """Describe GPU use, if any."""
-        if self.device not in ("auto", "gpu"):
-            return {}
-
-        state = devices.state()
-        if not state.served:
-            return {}
-        used = {"adapter": state.adapter, "kernels": state.served, "uploaded_bytes": state.uploaded_bytes}
-        return {"device": used}
 
     def load(self, path: Path) -> Splats:
         """Read a scene with --render-model, and report its notes."""
@@ -412,11 +405,6 @@ class Run:
         """Cameras that are read because they are beside an input scene."""
         found = (find_views(path) for path in self._inputs)
         return frozenset(real_path(path) for path in found if path is not None)
-
-    def input_newer_than(self, output: Path) -> Path | None:
-        """Return an input file that was modified after an output, or None."""
-        made = output.stat().st_mtime_ns
-        return next((path for path in self.input_files() if path.stat().st_mtime_ns > made), None)
 
     def input_files(self) -> list[Path]:
         """Return the inputs that are files, or runs with a scene's file."""

@@ -22,8 +22,10 @@ def is_finished(run: Run, place: Path, resume: bool, output: Path) -> bool:
     """Return whether --resume finds `output` finished; raise an error if an input changed since then."""
     if not resume or run.overwrite or left_at(place) or not is_taken(output):
         return False
-    if changed := run.input_newer_than(output):
-        raise finished_before(output, changed)
+    made = output.stat().st_mtime_ns
+    for path in run.input_files():
+        if path.stat().st_mtime_ns > made:
+            raise finished_before(output, path)
     return True
 
 

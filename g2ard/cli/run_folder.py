@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -288,14 +288,9 @@ def _others(run: Run, before: Mapping[str, Any], budget: Budget) -> list[str]:
     found = [name.replace("_", "-") for name in names if now[name] != then[name]]
     if "cuda" in (now["device"], then.get("device")) and now["device"] != then.get("device"):
         found.append("device")
-    return found if _is_budget(budget, before) else ["budget", *found]
-
-
-def _is_budget(budget: Budget, before: Mapping[str, Any]) -> bool:
-    """Return whether a run's count is that of the budget; measured budgets are compared by their options."""
-    if budget.is_measured or "output_count" not in before:
-        return True
-    try:
-        return budget.of(before["input_count"]) == before["output_count"]
-    except InputError:
-        return False
+    if budget.is_measured or "output_count" not in before:  # measured ones are compared by their options
+        return found
+    with suppress(InputError):
+        if budget.of(before["input_count"]) == before["output_count"]:
+            return found
+    return ["budget", *found]

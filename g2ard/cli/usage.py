@@ -95,7 +95,9 @@ def usage_line(error: typer.TyperException) -> str:
     if refused is None or parameter is None:
         return " ".join(error.format_message().split())
     given = refused()[0]["input"]
-    source = _config_of(error, parameter.name)
+    ctx = getattr(error, "ctx", None)
+    in_file = ctx is not None and _source(ctx, parameter.name) == "DEFAULT_MAP"
+    source = f" (from {ctx.params['config']})" if ctx and in_file else ""
     expected = f"expected {_allowed(parameter)}, got {given!r}"
     return f"Invalid value for {parameter.get_error_hint()}: {expected}{source}"
 
@@ -133,11 +135,6 @@ def typed(ctx: typer.Context, name: str) -> bool:
 
 def _source(ctx: typer.Context, name: str) -> str:
     return getattr(ctx.get_parameter_source(name), "name", "")
-
-
-def _config_of(error: typer.TyperException, name: str) -> str:
-    ctx = getattr(error, "ctx", None)
-    return f" (from {ctx.params['config']})" if ctx and _source(ctx, name) == "DEFAULT_MAP" else ""
 
 
 def _allowed(parameter: Any) -> str:

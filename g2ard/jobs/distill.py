@@ -43,7 +43,6 @@ from g2ard.stages.evaluate import Evaluation, evaluate
 from g2ard.stages.lift import lift, lift_rows
 from g2ard.stages.recover.anchors import FREE, Regularizers
 from g2ard.stages.recover.auto_preset import PriorMeasures, measure_prior, regularizers_for
-from g2ard.stages.recover.config import RecoverConfig
 from g2ard.stages.recover.schedule import Schedule
 from g2ard.stages.simplify import simplify
 from g2ard.stages.simplify.growth import opacity_lost, say_gaps
@@ -502,7 +501,11 @@ def prepare(
         say(f"regularisers: {preset_label}")
     config = options.configured(regularizers, default_degree)
     if read.from_photos:
-        config = replace(config, recover=_from_points(options, config.recover))
+        schedule = config.recover.schedule
+        asked = isinstance(options.named("recover.schedule"), Schedule)
+        if not asked and options.named("recover.schedule.finest") is None:
+            schedule = replace(schedule, finest=0.0)
+        config = replace(config, recover=replace(config.recover, schedule=schedule, from_points=True))
     return DistillJob(
         prior=prior,
         budget=wanted,
@@ -560,15 +563,6 @@ def _regularizers(
     if read.lifted and kind == "paper":
         kind = "paper-lift"
     return regularizers_for(kind, prior, photos, paper=paper)
-
-
-def _from_points(options: DistillOptions, config: RecoverConfig) -> RecoverConfig:
-    """Return the configuration for points of photos: unless asked, their `finest` size is 0."""
-    schedule = config.schedule
-    asked = isinstance(options.named("recover.schedule"), Schedule)
-    if not asked and options.named("recover.schedule.finest") is None:
-        schedule = replace(schedule, finest=0.0)
-    return replace(config, schedule=schedule, from_points=True)
 
 
 def _task(prior: Splats, count: int, train: Cameras | None, photos: bool, *, alone: bool) -> str:

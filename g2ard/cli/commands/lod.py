@@ -21,9 +21,8 @@ from g2ard.io.atomic import hidden_name
 from g2ard.progress import plural
 
 if TYPE_CHECKING:
-    from g2ard.jobs.levels import Levels, LevelsJob
-    from g2ard.jobs.tiling import Tiling
-    from g2ard.levels import Cut, Georeference
+    from g2ard.jobs.levels import LevelsJob
+    from g2ard.levels import Georeference
     from g2ard.scene.splats import Splats
 
 
@@ -130,6 +129,7 @@ def lod(
     from g2ard.jobs.memory import LEVELS_TIMES, RECOVERY_TIMES, check_whole_memory
     from g2ard.jobs.tiling import is_tiled
     from g2ard.levels import Cut, save_levels
+    from g2ard.pipeline.steps import key_of
     from g2ard.system.peak_memory import peak_rss_of_all
 
     refuse_file(output, "levels of detail")
@@ -191,7 +191,11 @@ def lod(
         if not tiled:
             stopped.mkdir(parents=True, exist_ok=True)
         levels = job.run(stopped)
-        begun = _begun(tiling, levels, rule) if tiled else None
+        begun = None  # folder for files of these levels that are begun
+        if tiled:
+            content = [[one.store.key for one in levels.splats], asdict(rule)]
+            begun = tiling.folder / f"written-{key_of(content)}"
+            begun.mkdir(exist_ok=True)
         common: dict[str, Any] = {"cut": rule, "overwrite": run.overwrite, "work": begun, **run.callbacks}
         axis: Sequence[float] | None = up
         if kind == "sog":
@@ -210,16 +214,6 @@ def lod(
         peak = {"peak_rss_bytes": peak_rss_of_all()} if tiled else {}
         run.say(f"{output}: {plural(len(levels.reports), 'level')}, {written / 1e6:.2f} MB")
         run.result({"output": str(output), "bytes": written, "levels": levels.reports, **peak})
-
-
-def _begun(tiling: Tiling, levels: Levels[Any], rule: Cut) -> Path:
-    """Return the folder for files of these levels that are begun."""
-    from g2ard.pipeline.steps import key_of
-
-    content = [[one.store.key for one in levels.splats], asdict(rule)]
-    begun = tiling.folder / f"written-{key_of(content)}"
-    begun.mkdir(exist_ok=True)
-    return begun
 
 
 def _tell_costs(run: Run, job: LevelsJob) -> None:
