@@ -23,7 +23,7 @@ from g2ard.io.tiles import VERSION, TileStore
 from g2ard.io.types import Note
 from g2ard.progress import Progress, Say, plural, silent, unsaid
 from g2ard.stages.lift import LiftConfig
-from g2ard.tiles.writer import TileWriter, clear, is_tile_file, lift_tiles, pour, row_bytes
+from g2ard.tiles.writer import clear, is_tile_file, lift_tiles, pour, row_bytes
 
 TILE_ROWS = 5_000_000
 """Default largest number of rows per tile."""
@@ -128,7 +128,11 @@ def ingest(
                     writer = pour(folder, stream, tile_rows, rows, progress, say, like)
                 else:
                     writer = lift_tiles(folder, stream, lift, tile_rows, rows, progress, say)
-                notes = [*stream.all_notes(), *([] if like else _overfull_note(writer, tile_rows))]
+                notes = [*stream.all_notes()]
+                if not like and (over := sum(count > tile_rows for count in writer.counts)):
+                    tiles = plural(over, "tile")
+                    text = f"{tiles} of more than {tile_rows:,} Gaussians: many share one position"
+                    notes.append(Note("overfull_tiles", over, text))
                 writer.finish(key, _manifest(stream, sources, settings, notes))
             except BaseException:
                 clear(folder)
@@ -231,9 +235,3 @@ def _key_in(path: Path) -> str | None:
         return str(read_json(path)["key"])
     except (InputError, KeyError):
         return ""
-
-
-def _overfull_note(writer: TileWriter, tile_rows: int) -> list[Note]:
-    over = sum(count > tile_rows for count in writer.counts)
-    text = f"{plural(over, 'tile')} of more than {tile_rows:,} Gaussians: many share one position"
-    return [Note("overfull_tiles", over, text)] if over else []

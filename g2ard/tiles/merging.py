@@ -17,9 +17,10 @@ from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats, unit_quats
 from g2ard.scene.transform import join
 from g2ard.stages.simplify.growth import GROWTHS, best_growth
+from g2ard.stages.simplify.pairs import fit_opacities
 from g2ard.tiles.sights import Sights
 from g2ard.tiles.simplify import TiledRun
-from g2ard.tiles.tasks import load, small_scene
+from g2ard.tiles.tasks import load, merged_scene
 
 _HALF = 1 << 16
 
@@ -110,7 +111,12 @@ def simplify_tiles(
         mean = sum(float(load(path, "wanted")[0].sum()) for path in merged) / budget
 
     def tile(i: int) -> Splats:
-        return finished(small_scene(files[i], growth, mean), store.sh_degree)
+        small = merged_scene(merged[i], growth)
+        if mean is not None:  # with views, opacities fit what these see
+            members, wanted = load(merged[i], "members", "wanted")
+            (weight,) = load(files[i]["visibility"], "weight")
+            small = fit_opacities(small, members, wanted, weight, mean)
+        return finished(small, store.sh_degree)
 
     scene = _scene(store, counts, tile, key_of([files, growth]), sights)
     scene = replace(scene, growth=growth, opacity_lost=lost)

@@ -16,7 +16,6 @@ from g2ard.rendering.renderer import RasterSettings, Renderer, settings_for
 from g2ard.rendering.targets import TeacherRenders
 from g2ard.report.run import TiledScores, TileScore, by_kind
 from g2ard.scene.cameras import USUAL, Cameras
-from g2ard.scene.prepared import PreparedScene
 from g2ard.scene.splats import SH_C0, Splats
 from g2ard.scene.transform import join
 from g2ard.stages.evaluate import ViewScore
@@ -104,10 +103,12 @@ def recover_tile(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays
     student = join([part for part in (small, beside, *far) if len(part)])
     frozen = np.arange(len(student)) >= len(small)
     config = changed(RecoverConfig(), arguments["config"])
-    background = config.background
+    background, settings = config.background, settings_for(core.means, RasterSettings())
 
     def targets(name: str) -> TileTargets | None:
-        cameras = _cropped(cameras_of(inputs[name]).take(arguments[name]), core, store.offset)
+        cameras = cameras_of(inputs[name]).take(arguments[name]).recentred(store.offset)
+        # Means are relative to the store's offset, target cameras are in world coordinates.
+        cameras = cropped(cameras, core, settings, _SSIM_MARGIN).recentred(-store.offset)
         tile_targets = TileTargets(teacher, len(core), cameras, background)
         return tile_targets if len(tile_targets.cameras) else None
 
@@ -135,13 +136,6 @@ def recover_tile(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays
         "errors": np.array([before, after]),
         "steps": np.array(done.report.steps),
     }
-
-
-def _cropped(cameras: Cameras, core: PreparedScene, offset: NDArray[np.float64]) -> Cameras:
-    """Crop the cameras' images to a tile."""
-    settings = settings_for(core.means, RasterSettings())
-    # Means are relative to the store's `offset`, target cameras are in world coordinates.
-    return cropped(cameras.recentred(offset), core, settings, _SSIM_MARGIN).recentred(-offset)
 
 
 def _errors(

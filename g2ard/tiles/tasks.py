@@ -25,7 +25,6 @@ from g2ard.scene.prepared import PreparedScene, as_prepared, finite_rows_of
 from g2ard.scene.splats import Splats
 from g2ard.scene.transform import join
 from g2ard.stages.simplify.growth import widened
-from g2ard.stages.simplify.pairs import fit_opacities
 
 Arrays = dict[str, NDArray[Any]]
 """Output of a task: arrays by name, stored as one .npz file."""
@@ -169,21 +168,6 @@ def merged_scene(path: Path, growth: float) -> Splats:
     return widened(scene_of(path, "scene"), load(path, "needed")[0], growth)
 
 
-def small_scene(files: Mapping[str, Path], growth: float, mean: float | None) -> Splats:
-    """Return a tile's merged Gaussians, widened, and with views with opacities fitted to what these see.
-
-    Args:
-        files: "merged", and with views "visibility" from `merged_visibility`.
-        growth: their largest growth.
-        mean: mean weight in the views over all tiles; None without views.
-    """
-    small = merged_scene(files["merged"], growth)
-    if mean is None:
-        return small
-    members, wanted = load(files["merged"], "members", "wanted")
-    return fit_opacities(small, members, wanted, load(files["visibility"], "weight")[0], mean)
-
-
 def scene_of(path: Path, name: str) -> Splats:
     """Read a scene from a task's file."""
     *arrays, model = load(path, *(f"{name}_{field}" for field in _SCENE_ARRAYS))
@@ -225,19 +209,14 @@ def amid(core: Splats, around: list[Splats]) -> Splats:
 
 def far_around(store: TileStore, arguments: Arguments, inputs: Inputs) -> list[Splats]:
     """Return coarse Gaussians of all other tiles beyond the reach of a tile's halo."""
-    parts = []
+    own, parts = store.tiles[arguments["tile"]], []
+    low, high = np.array(own.low) - store.margin, np.array(own.high) + store.margin
     for path, level in zip(inputs["coarse"], arguments["levels"], strict=True):
         if level:
             other = scene_of(path, level)
-            parts.append(other.take(~within_halo(store, arguments["tile"], other.means)))
+            within = ((other.means >= low) & (other.means <= high)).all(axis=1)
+            parts.append(other.take(~within))
     return parts
-
-
-def within_halo(store: TileStore, tile: int, means: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """Return the (N,) mask of positions in a tile's box or within the margin around it."""
-    low = np.array(store.tiles[tile].low) - store.margin
-    high = np.array(store.tiles[tile].high) + store.margin
-    return np.asarray(((means >= low) & (means <= high)).all(axis=1))
 
 
 def cropped(
