@@ -66,32 +66,25 @@ def given_or_found(
     """
     if views is not None:
         return None if is_made(views) else views, False
-    found = None if scene is None else _found(scene, splats, splits, say, turned=up is not None)
-    return found, found is not None
-
-
-def _found(
-    scene: str | Path, splats: Splats, splits: Sequence[str], say: Say, *, turned: bool
-) -> Path | None:
-    path = find_views(scene)
+    path = None if scene is None else find_views(scene)
     if path is None:
-        return None
+        return None, False
     try:
-        views = read_view_set(path, unpictured=True)
+        found = read_view_set(path, unpictured=True)
         for split in splits:
-            split_mask(path, views.cameras.names, split, stated=views.splits)
+            split_mask(path, found.cameras.names, split, stated=found.splits)
     except InputError as error:
         say(f"views beside the scene are not used: {error}")
-        return None
-    count = len(views.cameras)
-    seeing = int(views.cameras.facing(opaque_points(splats)).sum())
+        return None, False
+    count = len(found.cameras)
+    seeing = int(found.cameras.facing(opaque_points(splats)).sum())
     if seeing < _SEEING_CAMERA_SHARE * count:
         say(f"views beside the scene are not used: {path}: {seeing} of {plural(count, 'camera')} see it")
-        return None
+        return None, False
     cameras = plural(count, "camera")
-    idle = "; --up turns generated views only" if turned else ""
+    idle = "" if up is None else "; --up turns generated views only"
     say(f"views: {cameras} of {path} (found beside the scene{idle}; --views made for a pool of its own)")
-    return path
+    return path, True
 
 
 def warn_of_sight(splats: Splats, cameras: Cameras, say: Say) -> None:
