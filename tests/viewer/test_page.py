@@ -82,7 +82,7 @@ def test_the_bundle_is_the_one_its_readme_names() -> None:
 def test_a_page_holds_viewer_and_scene_and_names_no_address(tmp_path: Path) -> None:
     ball = checkered_ball(200)
     start = Start((1.0, 2.0, 3.0), (0.0, 0.0, 0.5), (42.0, 30.0))
-    written = write_page(
+    written, sizes = write_page(
         tmp_path / "a.html",
         [("a </script> & b", ball)],
         start=start,
@@ -90,7 +90,7 @@ def test_a_page_holds_viewer_and_scene_and_names_no_address(tmp_path: Path) -> N
         background=(1.0, 0.5, 0.25),
     )
     parts = Parts(tmp_path / "a.html")
-    assert written.bytes == (tmp_path / "a.html").stat().st_size
+    assert written == (tmp_path / "a.html").stat().st_size
     assert parts.addresses == ["data:,"]
     assert parts.labels == ["a </script> & b"]
     view = json.loads(parts.scripts["view"])
@@ -106,7 +106,7 @@ def test_a_page_holds_viewer_and_scene_and_names_no_address(tmp_path: Path) -> N
     back = parts.scene(0, tmp_path)
     assert len(back) == 200
     assert back.sh_degree == ball.sh_degree
-    assert written.scenes == ((tmp_path / "back0.sog").stat().st_size,)
+    assert sizes == ((tmp_path / "back0.sog").stat().st_size,)
     assert "createViewer" in parts.scripts["module"]
     text = (tmp_path / "a.html").read_text(encoding="utf-8")
     assert "Permission is hereby granted" in text
