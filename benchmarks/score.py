@@ -13,8 +13,7 @@ from benchmarks.rows import Row
 from g2ard.config.choices import BLACK, Colour
 from g2ard.io.images import as_saved, to_bytes
 from g2ard.rendering.cuda import renderer_on
-from g2ard.rendering.lpips import Lpips
-from g2ard.rendering.metrics import edge_psnr, psnr, ssim
+from g2ard.rendering.metrics import Lpips, edge_psnr, psnr, ssim
 from g2ard.rendering.renderer import RasterSettings
 from g2ard.rendering.targets import Targets, mask_of
 from g2ard.scene.samples import evenly_spaced

@@ -11,8 +11,8 @@ from g2ard.rendering.visibility import SampledVisibility
 from g2ard.scene.splats import Splats
 from g2ard.stages.lift import LiftConfig
 from g2ard.stages.recover.anchors import Regularizers
+from g2ard.stages.recover.config import Rates
 from g2ard.stages.recover.engine import Photometric
-from g2ard.stages.recover.schedule import Rates
 from g2ard.stages.select.surfaces import SurfaceOptions
 from g2ard.stages.simplify.config import SimplifyConfig
 

@@ -67,6 +67,17 @@ def test_architecture_lists_the_layers() -> None:
     assert ", ".join(f"`{layer}`" for layer in LAYERS) in text
 
 
+def test_architecture_names_files_that_exist() -> None:
+    text = (ROOT.parent / "ARCHITECTURE.md").read_text(encoding="utf-8")
+    code = [
+        path.as_posix()
+        for name in ("g2ard", "rust", "tests", "benchmarks")
+        for path in (ROOT.parent / name).rglob("*")
+    ]
+    named = set(re.findall(r"`([\w/.-]+\.(?:py|rs|pyi))`", text))
+    assert [name for name in sorted(named) if not any(path.endswith(f"/{name}") for path in code)] == []
+
+
 def rust_modules(source: Path) -> dict[str, Path]:
     """Every module of a crate by its path from the crate's root; the root itself is ''."""
     found = {}

@@ -24,7 +24,7 @@ from g2ard.scene.cameras import Cameras
 from g2ard.scene.samples import evenly_spaced
 from g2ard.scene.splats import Splats
 from g2ard.scene.transform import transform
-from g2ard.stages.recover.draw import drawn
+from g2ard.stages.recover.loop import drawn
 from g2ard.stages.recover.optimize import Watch
 
 if TYPE_CHECKING:

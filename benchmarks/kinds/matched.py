@@ -33,14 +33,13 @@ from g2ard.config.choices import ADAPT_SCHEDULES, CONVENTIONS, ENGINES, LPIPS_IN
 from g2ard.config.choices import METHODS as SIMPLIFIERS
 from g2ard.errors import InputError
 from g2ard.io.splits import states_splits
-from g2ard.rendering.lpips import Lpips, load_lpips
+from g2ard.rendering.metrics import Lpips, load_lpips
 from g2ard.rendering.renderer import RasterSettings
 from g2ard.rendering.targets import Targets
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.shape import needle_share
 from g2ard.scene.splats import Splats
-from g2ard.stages.recover.anchors import REGULARIZERS
-from g2ard.stages.recover.auto_preset import regularizers_for
+from g2ard.stages.recover.anchors import REGULARIZERS, regularizers_for
 from g2ard.stages.simplify import round_counts
 
 __all__ = ["Matched", "MatchedWorkspace"]
@@ -65,7 +64,7 @@ class Matched(Study):
         fold: the paper's rounds end with the one before if the last removes less than this share; the
             text has 0.
         lpips: folder of LPIPS weights.
-        lpips_input: "scaled" to [−1, 1], or "unscaled" as in 3DGS's evaluation (`g2ard.rendering.lpips`).
+        lpips_input: "scaled" to [−1, 1], or "unscaled" as in 3DGS's evaluation (`g2ard.rendering.metrics`).
     """
 
     METHODS: ClassVar[Mapping[str, Any]] = METHODS

@@ -21,8 +21,8 @@ from g2ard.progress import plural
 from g2ard.rendering.renderer import RasterSettings, arrays_of, view_of
 from g2ard.scene.cameras import Cameras, look_at
 from g2ard.scene.splats import Splats
+from g2ard.stages.recover.config import Rates
 from g2ard.stages.recover.engine import Photometric
-from g2ard.stages.recover.schedule import Rates
 from g2ard.system import devices
 
 __all__ = ["GPU", "Raster", "built_in_view", "drawn", "timed_step"]

@@ -19,16 +19,14 @@ from benchmarks.study import SceneSpec, Study, key
 from benchmarks.workspace import PROTOCOLS, Workspace, budget_of, kinds_for
 from g2ard.config.choices import ENGINES
 from g2ard.errors import InputError
-from g2ard.pipeline.config import DistillConfig
+from g2ard.pipeline.config import PRESETS, DistillConfig, configured
 from g2ard.pipeline.distill import distill
-from g2ard.pipeline.presets import PRESETS, configured
 from g2ard.rendering.targets import Targets
 from g2ard.rendering.visibility import visibility_source
 from g2ard.scene.shape import effective_rank, needle_share
 from g2ard.scene.splats import Splats
 from g2ard.stages.recover import recover
-from g2ard.stages.recover.anchors import Anchors, drift95
-from g2ard.stages.recover.auto_preset import regularizers_for
+from g2ard.stages.recover.anchors import Anchors, drift95, regularizers_for
 from g2ard.stages.recover.report import RecoverReport
 from g2ard.stages.simplify import simplify
 

@@ -23,7 +23,7 @@ from g2ard.io.images import to_bytes
 from g2ard.rendering.targets import CACHE_BYTES, Targets, against_of, mask_of
 from g2ard.scene.cameras import Cameras
 from g2ard.stages.recover.anchors import Anchors, Regularizers
-from g2ard.stages.recover.schedule import Rates, Schedule
+from g2ard.stages.recover.config import Rates, Schedule
 
 __all__ = ["StoredTargets", "store_targets"]
 

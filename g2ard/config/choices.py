@@ -29,13 +29,13 @@ Focus = Literal["far", "near", "standing", "anywhere"]
 """Kinds of training views that `distill --focus` adds; `far` adds none (`g2ard.SelectConfig`)."""
 
 ScheduleName = Literal["fast", "default", "best", "paper"]
-"""Schedules of recovery (`g2ard.stages.recover.schedule`)."""
+"""Schedules of recovery (`g2ard.stages.recover.config`)."""
 SCHEDULE_NAMES: tuple[ScheduleName, ...] = get_args(ScheduleName)
 
 PaperPresetName = Literal["paper", "paper-trained", "paper-lift", "paper-noisy"]
 """The paper's regularisers, for a prior that is measured or named."""
 PresetName = Literal["auto", "trained", "lift", "noisy", PaperPresetName]
-"""Regularisers for each kind of prior (`g2ard.stages.recover.auto_preset`)."""
+"""Regularisers for each kind of prior (`g2ard.stages.recover.anchors`)."""
 
 Engine = Literal["fused", "torch", "gsplat"]
 """Engines that run recovery's steps (`g2ard.stages.recover.engine`)."""
@@ -75,7 +75,7 @@ AxesName = Literal[Axes, "y-up", "z-up"]
 NAMED_AXES: dict[str, Axes] = {"y-up": "RUB", "z-up": "RFU"}
 
 LpipsInput = Literal["scaled", "unscaled"]
-"""Value range of the images passed to LPIPS's networks (`g2ard.rendering.lpips`)."""
+"""Value range of the images passed to LPIPS's networks (`g2ard.rendering.metrics`)."""
 LPIPS_INPUTS: tuple[LpipsInput, ...] = get_args(LpipsInput)
 
 ViewFormat = Literal["g2ard", "inria", "nerfstudio", "colmap"]

@@ -41,9 +41,8 @@ from g2ard.scene.samples import evenly_spaced
 from g2ard.scene.splats import Splats
 from g2ard.stages.evaluate import Evaluation, evaluate
 from g2ard.stages.lift import lift, lift_rows
-from g2ard.stages.recover.anchors import FREE, Regularizers
-from g2ard.stages.recover.auto_preset import PriorMeasures, measure_prior, regularizers_for
-from g2ard.stages.recover.schedule import Schedule
+from g2ard.stages.recover.anchors import FREE, PriorMeasures, Regularizers, measure_prior, regularizers_for
+from g2ard.stages.recover.config import Schedule
 from g2ard.stages.simplify import simplify
 from g2ard.stages.simplify.growth import opacity_lost, say_gaps
 from g2ard.system.cached import cached_property

@@ -31,7 +31,7 @@ from g2ard.report.run import TiledReport, TiledScores
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
 from g2ard.scene.transform import join
-from g2ard.stages.recover.auto_preset import regularizers_for
+from g2ard.stages.recover.anchors import regularizers_for
 from g2ard.stages.simplify import SimplifyConfig
 from g2ard.stages.simplify.growth import say_gaps
 from g2ard.system.peak_memory import peak_rss_of_all

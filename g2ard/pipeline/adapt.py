@@ -24,10 +24,9 @@ from g2ard.scene.samples import evenly_spaced
 from g2ard.scene.splats import SH_C0, Splats
 from g2ard.stages.recover import RecoverConfig
 from g2ard.stages.recover.anchors import FREE
-from g2ard.stages.recover.config import FitConfig
+from g2ard.stages.recover.config import PAPER, TUNED, FitConfig, Schedule
 from g2ard.stages.recover.probe import Probe
 from g2ard.stages.recover.report import Gain, RecoverReport
-from g2ard.stages.recover.schedule import PAPER, TUNED, Schedule
 
 _FITTED_VIEWS = 16
 """Number of evenly spaced targets used to fit the change of colours."""

@@ -22,11 +22,11 @@ from g2ard.report.run import DistillReport, RoundReport, StageSeconds, ViewsRepo
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
 from g2ard.stages.recover import RecoverConfig
-from g2ard.stages.recover.draw import checked_weights
+from g2ard.stages.recover.loop import checked_weights
 from g2ard.stages.recover.optimize import Watch
 from g2ard.stages.select import SurfaceOptions, select
 from g2ard.stages.simplify import simplify
-from g2ard.stages.simplify.report import SimplifyReport
+from g2ard.stages.simplify.reduce import SimplifyReport
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,7 +18,7 @@ from g2ard.scene.splats import ARRAYS, Splats
 from g2ard.stages.recover import RecoverConfig, checkpoint, recover
 from g2ard.stages.recover.anchors import Anchors
 from g2ard.stages.recover.report import RecoverReport
-from g2ard.stages.simplify.report import SimplifyReport
+from g2ard.stages.simplify.reduce import SimplifyReport
 
 R = TypeVar("R", RecoverReport, SimplifyReport)
 _Result = tuple[Splats, R, dict[str, NDArray[Any]]]

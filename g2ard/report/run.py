@@ -12,9 +12,9 @@ from g2ard.io.reports import LEFT_OUT, Report
 from g2ard.progress import plural
 from g2ard.scene.cameras import USUAL, rows_by_kind
 from g2ard.stages.evaluate import Evaluation, Means, ViewScore
-from g2ard.stages.recover.auto_preset import PriorMeasures
+from g2ard.stages.recover.anchors import PriorMeasures
 from g2ard.stages.recover.report import RecoverReport
-from g2ard.stages.simplify.report import SimplifyReport
+from g2ard.stages.simplify.reduce import SimplifyReport
 
 LOST = 0.05
 """Loss of a view in dB that counts."""

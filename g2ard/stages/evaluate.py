@@ -16,8 +16,7 @@ from g2ard.io.images import as_saved
 from g2ard.io.reports import Report
 from g2ard.progress import Progress, plural, silent
 from g2ard.rendering.cuda import renderer_on
-from g2ard.rendering.lpips import Lpips
-from g2ard.rendering.metrics import edge_psnr, psnr, ssim
+from g2ard.rendering.metrics import Lpips, edge_psnr, psnr, ssim
 from g2ard.rendering.renderer import RasterSettings
 from g2ard.rendering.targets import Targets, against_of, checked_targets, fill, mask_of, scored_in
 from g2ard.scene.cameras import USUAL
@@ -148,7 +147,7 @@ def evaluate(
         splats: the scene; cameras are in world coordinates, including its offset.
         targets: photos or teacher renders; scores against the two are not comparable.
         background: RGB in [0, 1] behind the scene.
-        lpips: networks to score with, from `g2ard.rendering.lpips.load_lpips`.
+        lpips: networks to score with, from `g2ard.rendering.metrics.load_lpips`.
         settings: the renderer's conventions; None means gsplat's. Teacher renders have their own, see
             `g2ard.rendering.targets.TeacherRenders`.
         eight_bit: round renders and targets to multiples of 1/255, as in evaluations from saved PNGs.

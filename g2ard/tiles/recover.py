@@ -21,7 +21,7 @@ from g2ard.scene.transform import join
 from g2ard.stages.evaluate import ViewScore
 from g2ard.stages.recover import RecoverConfig, recover
 from g2ard.stages.recover.anchors import Anchors
-from g2ard.stages.recover.draw import checked_weights
+from g2ard.stages.recover.loop import checked_weights
 from g2ard.tiles.executor import Workers
 from g2ard.tiles.merging import TiledScene, finished
 from g2ard.tiles.sights import Sights, in_sight, light_of, written

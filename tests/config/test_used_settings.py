@@ -21,10 +21,10 @@ from g2ard.jobs.distill_options import DistillOptions
 from g2ard.jobs.simplify import reducing
 from g2ard.jobs.tiling import Tiling, needs_whole, refuse_whole
 from g2ard.pipeline.adapt import appearance_only
-from g2ard.pipeline.presets import configured
+from g2ard.pipeline.config import configured
 from g2ard.scene.splats import SH_C0
 from g2ard.stages.lift import LiftConfig
-from g2ard.stages.recover.schedule import Schedule
+from g2ard.stages.recover.config import Schedule
 from g2ard.stages.simplify import Default, Fast, Paper
 from g2ard.tiles.ingest import ingest
 from helpers.feature_scenes import blotched

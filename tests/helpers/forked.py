@@ -14,7 +14,7 @@ from g2ard.rendering.renderer import RasterSettings, Renderer, arrays_of, view_o
 from g2ard.rendering.visibility import visibility, visibility_source
 from g2ard.scene.prepared import finite_rows_of
 from g2ard.stages.lift import lift
-from g2ard.stages.recover.schedule import Rates
+from g2ard.stages.recover.config import Rates
 from g2ard.stages.select import select
 from g2ard.stages.simplify import SimplifyConfig, flag, simplify
 from helpers.scenes import around, checkered_ball

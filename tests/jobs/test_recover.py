@@ -9,7 +9,7 @@ import g2ard
 from g2ard.errors import InputError
 from g2ard.io import write_views
 from g2ard.jobs.recover import prepare
-from g2ard.stages.recover.schedule import steps_for
+from g2ard.stages.recover.config import steps_for
 from helpers.commands import CommandLine, succeeds
 from helpers.photos import photographed
 from helpers.scenes import around, checkered_ball

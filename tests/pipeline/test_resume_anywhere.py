@@ -15,15 +15,14 @@ import pytest
 
 from g2ard.config.schema import changed
 from g2ard.pipeline.adapt import AdaptConfig, adapt
-from g2ard.pipeline.config import DistillConfig, SelectConfig
+from g2ard.pipeline.config import DistillConfig, SelectConfig, configured
 from g2ard.pipeline.distill import distill
-from g2ard.pipeline.presets import configured
 from g2ard.rendering.targets import Photos, TeacherRenders
 from g2ard.scene.splats import ARRAYS
 from g2ard.stages.recover import RecoverConfig, checkpoint, recover
 from g2ard.stages.recover.anchors import REGULARIZERS
-from g2ard.stages.recover.schedule import PAPER as PAPER_SCHEDULE
-from g2ard.stages.recover.schedule import TUNED
+from g2ard.stages.recover.config import PAPER as PAPER_SCHEDULE
+from g2ard.stages.recover.config import TUNED
 from helpers.scenes import around, checkered_ball
 
 Call = Callable[..., Any]

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from g2ard.errors import InputError
-from g2ard.rendering.lpips import Lpips, load_lpips
+from g2ard.rendering.metrics import Lpips, load_lpips
 from g2ard.rendering.targets import TeacherRenders
 from g2ard.stages.evaluate import evaluate
 from helpers.lpips_weights import ALEX, weights

@@ -12,7 +12,7 @@ import g2ard
 from g2ard.errors import InputError
 from g2ard.rendering.targets import TeacherRenders
 from g2ard.scene.splats import Splats, far_middle
-from g2ard.stages.recover.schedule import PAPER
+from g2ard.stages.recover.config import PAPER
 from helpers.scenes import around, checkered_ball
 
 UTM = np.array([500_123.0, 6_600_456.0, 40.0])

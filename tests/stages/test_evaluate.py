@@ -10,8 +10,7 @@ from PIL import Image
 from g2ard import io
 from g2ard.errors import InputError
 from g2ard.io.images import as_saved, write_png
-from g2ard.rendering.lpips import Lpips
-from g2ard.rendering.metrics import psnr
+from g2ard.rendering.metrics import Lpips, psnr
 from g2ard.rendering.renderer import RasterSettings, render
 from g2ard.rendering.targets import PhotosOrRenders, TeacherRenders
 from g2ard.stages.evaluate import evaluate

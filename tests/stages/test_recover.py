@@ -23,10 +23,10 @@ from g2ard.stages.evaluate import evaluate
 from g2ard.stages.recover import RecoverConfig, loop, probe, recover, trials
 from g2ard.stages.recover import checkpoint as checkpoint_module
 from g2ard.stages.recover.anchors import REGULARIZERS, Anchors
-from g2ard.stages.recover.fused_engine import FusedEngine
+from g2ard.stages.recover.config import TUNED
+from g2ard.stages.recover.engine import FusedEngine
 from g2ard.stages.recover.guard import Guard, blended
 from g2ard.stages.recover.report import outcome
-from g2ard.stages.recover.schedule import TUNED
 from g2ard.stages.simplify import simplify
 from g2ard.system import devices
 from helpers.gpus import skip_without_gpu

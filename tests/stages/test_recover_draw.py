@@ -16,7 +16,7 @@ from g2ard.rendering.targets import TeacherRenders
 from g2ard.scene.splats import Splats
 from g2ard.stages.evaluate import evaluate
 from g2ard.stages.recover import RecoverConfig, recover
-from g2ard.stages.recover.draw import checked_weights, drawn
+from g2ard.stages.recover.loop import checked_weights, drawn
 from g2ard.stages.simplify import simplify
 from helpers.commands import succeeds
 from helpers.scenes import around, checkered_ball

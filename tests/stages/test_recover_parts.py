@@ -17,11 +17,12 @@ from g2ard.stages.recover.anchors import (
     Anchors,
     Regularizers,
     drift95,
+    regularizers_for,
+    view_consistency,
 )
-from g2ard.stages.recover.auto_preset import regularizers_for, view_consistency
+from g2ard.stages.recover.config import PAPER, TUNED, Schedule
 from g2ard.stages.recover.losses import anchor_loss, regularization, shape_loss
-from g2ard.stages.recover.schedule import PAPER, TUNED, Schedule
-from g2ard.stages.recover.selective_adam import SelectiveAdam
+from g2ard.stages.recover.torch_engine import SelectiveAdam
 from helpers.scenes import around, checkered_ball
 from reference.rotations import rotations
 
@@ -184,7 +185,7 @@ def test_depths_agree_within_a_twentieth(ratio: float, agree: int, monkeypatch: 
         def render(self, view: object, median: bool) -> SimpleNamespace:
             return SimpleNamespace(median=np.full((24, 32), next(depths)))
 
-    monkeypatch.setattr("g2ard.stages.recover.auto_preset.Renderer", Renders)
+    monkeypatch.setattr("g2ard.stages.recover.anchors.Renderer", Renders)
     assert view_consistency(checkered_ball(10), views) == agree
 
 

@@ -14,11 +14,10 @@ from g2ard.errors import InputError
 from g2ard.rendering.renderer import RasterSettings, view_of
 from g2ard.scene.cameras import Cameras
 from g2ard.stages.recover.anchors import Anchors, Regularizers
+from g2ard.stages.recover.config import Rates
 from g2ard.stages.recover.engine import Photometric
-from g2ard.stages.recover.extent import extents, share_of_rate
-from g2ard.stages.recover.losses import l1_ssim, regularization
+from g2ard.stages.recover.losses import extents, l1_ssim, regularization, share_of_rate
 from g2ard.stages.recover.rasterize import rasterize
-from g2ard.stages.recover.schedule import Rates
 from g2ard.system import devices
 from helpers.gpus import skip_without_gpu
 from helpers.raster_cases import NAMES, Params, camera, scene, splats_of, tensors_of

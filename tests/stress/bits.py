@@ -4,8 +4,8 @@ import numpy as np
 
 from g2ard import _core
 from g2ard.rendering.renderer import view_of
+from g2ard.stages.recover.config import Rates
 from g2ard.stages.recover.engine import Photometric
-from g2ard.stages.recover.schedule import Rates
 from helpers.threads import on_threads
 from stress.scenes import NAMES, Problem, random_problem
 

@@ -10,7 +10,7 @@ import pytest
 import g2ard
 from g2ard import errors
 from g2ard.errors import MissingDependencyError
-from g2ard.rendering.lpips import load_lpips
+from g2ard.rendering.metrics import load_lpips
 from helpers.commands import CommandLine, refused
 from helpers.project import ROOT
 from helpers.scenes import around, checkered_ball

@@ -19,7 +19,7 @@ from g2ard.jobs.tiling import Tiling, is_tiled
 from g2ard.rendering.targets import TeacherRenders
 from g2ard.stages.evaluate import evaluate
 from g2ard.stages.recover import RecoverConfig, recover
-from g2ard.stages.recover.schedule import Schedule
+from g2ard.stages.recover.config import Schedule
 from g2ard.stages.simplify import simplify
 from g2ard.tiles.ingest import ingest
 from helpers.cloud_files import columns, ply

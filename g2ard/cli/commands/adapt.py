@@ -11,7 +11,7 @@ from g2ard.cli.resume import check_scene_run, checkpoint_beside, stoppable
 from g2ard.cli.run_result import tell_plan
 from g2ard.config.schema import listed
 from g2ard.io.scene_formats import check_positions
-from g2ard.pipeline.presets import configured
+from g2ard.pipeline.config import configured
 from g2ard.progress import plural
 
 _FIELDS = "steps tolerance schedule prior_views sh_degree engine background seed"
@@ -43,7 +43,7 @@ def adapt(
 ) -> None:
     """Refit colours and opacities to new images; means, rotations and scales stay fixed."""
     from g2ard.jobs.cost import cost_of_recovery
-    from g2ard.jobs.teaching import Teaching
+    from g2ard.jobs.recover import Teaching
     from g2ard.pipeline.adapt import AdaptConfig
     from g2ard.pipeline.adapt import adapt as refit
 

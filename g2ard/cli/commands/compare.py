@@ -129,7 +129,7 @@ def _closer(
     from g2ard.errors import InputError
     from g2ard.jobs.comparison import better_line, common_of, is_run, source_of
     from g2ard.jobs.inputs import load_views, scorable
-    from g2ard.jobs.teaching import Teaching
+    from g2ard.jobs.recover import Teaching
     from g2ard.stages.evaluate import evaluate
 
     if real_path(first) == source_of(second) or real_path(second) == source_of(first):

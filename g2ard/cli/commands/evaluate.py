@@ -69,9 +69,9 @@ def evaluate(
     from g2ard.io.describe import bytes_of
     from g2ard.jobs.comparison import better_line, common_of
     from g2ard.jobs.inputs import load_views, scorable
-    from g2ard.jobs.teaching import Teaching, check_teacher
+    from g2ard.jobs.recover import Teaching, check_teacher
     from g2ard.jobs.view_checks import check_sight
-    from g2ard.rendering.lpips import load_lpips
+    from g2ard.rendering.metrics import load_lpips
     from g2ard.rendering.renderer import RasterSettings
     from g2ard.rendering.targets import scored_in
     from g2ard.rendering.visibility import overdraw

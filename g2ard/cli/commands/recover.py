@@ -49,8 +49,7 @@ def recover(
     dry_run: opt.DryRunOption = False,
 ) -> None:
     """Optimise a fixed set of Gaussians against photos or a teacher's renders."""
-    from g2ard.jobs.recover import prepare
-    from g2ard.jobs.teaching import check_teacher
+    from g2ard.jobs.recover import check_teacher, prepare
     from g2ard.rendering.targets import kinds_of
     from g2ard.report.run import COLUMNS, cells
     from g2ard.stages.recover import RecoverConfig

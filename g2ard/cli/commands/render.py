@@ -85,8 +85,7 @@ def render(
     from g2ard.jobs.inputs import load_views
     from g2ard.jobs.view_checks import warn_of_sight
     from g2ard.jobs.views import orbit, views_or_pool
-    from g2ard.rendering.panorama import stations
-    from g2ard.rendering.renderer import RasterSettings, Renderer
+    from g2ard.rendering.renderer import RasterSettings, Renderer, stations
 
     if output is None and sheet is None:
         raise typer.BadParameter("give -o DIR, --sheet FILE.png or both")

@@ -1,4 +1,4 @@
-"""Construction-time anchors, weights of the two regularisers, and drift from the anchors."""
+"""Construction-time anchors, drift from them, and weights of the two regularisers, chosen by measuring."""
 
 from __future__ import annotations
 
@@ -10,7 +10,12 @@ from numpy.typing import NDArray
 
 from g2ard.config.checks import AtLeastOne, NotNegative, Positive, Within
 from g2ard.config.schema import Settings
-from g2ard.errors import require
+from g2ard.errors import InputError, require
+from g2ard.io.reports import Report
+from g2ard.rendering.renderer import RasterSettings, Renderer
+from g2ard.scene.cameras import Cameras
+from g2ard.scene.samples import evenly_spaced
+from g2ard.scene.shape import needle_share
 from g2ard.scene.splats import Splats
 from g2ard.scene.transform import rotation_matrices
 
@@ -142,3 +147,145 @@ def drift95(anchors: Anchors, means: NDArray[np.float32]) -> float:
     delta = means.astype(np.float64) - anchors.means
     local = np.einsum("nji,nj->ni", anchors.frames.astype(np.float64), delta)
     return float(np.percentile(np.abs(local[:, 2]) / anchors.r_perp, 95))
+
+
+_LIFT_THICKNESS = 0.2
+_LIFT_SPREAD = 2.5
+"""Limits for a lift, whose discs are all alike: the normal scale is about a tenth of the tangential ones.
+Measured median and spread: lifts .12 and 1.2, simplified tenfold .10–.14 and 1.9–2.3; trained scenes .17–.30
+and 3.5–7.3, simplified .44–.49 and 2.2–2.7."""
+
+_MANY_NEEDLES = 0.10
+_LEAST_CONSISTENCY = 0.95
+"""Least view consistency of a faithful scene. Trained scenes have .977–.988; with a tenth of the Gaussians
+displaced .81–.97."""
+
+_SAMPLE_VIEWS = 4
+_SAMPLE_PIXELS = 160
+_SAME_DEPTH = 0.05
+
+
+@dataclass(frozen=True)
+class PriorMeasures(Report):
+    """Measures that distinguish a lift, a faithful and a noisy trained scene.
+
+    Args:
+        needle: share of Gaussians with an effective rank below 1.1.
+        thickness: median of smallest scale over middle scale.
+        thickness_spread: upper over lower quartile of the thickness; a lift's discs are all alike.
+        view_dependent: whether any colour depends on the view.
+        consistency: see `view_consistency`; None without two views to compare.
+    """
+
+    needle: float
+    thickness: float
+    thickness_spread: float
+    view_dependent: bool
+    consistency: float | None
+
+
+def measure_prior(prior: Splats, cameras: Cameras | None = None) -> PriorMeasures:
+    """Measure a scene, including its view consistency if there are views.
+
+    >>> flat = Splats.create(np.zeros((4, 3)), scales=[[1, 1, 0.1]] * 4)
+    >>> found = measure_prior(flat)
+    >>> round(found.thickness, 3), round(found.thickness_spread, 3), found.consistency
+    (0.1, 1.0, None)
+    """
+    scales = np.sort(prior.scales.astype(np.float64), axis=1)
+    tiny = np.finfo(np.float32).tiny
+    thickness = scales[:, 0] / np.maximum(scales[:, 1], tiny)
+    low, middle, high = np.quantile(thickness, [0.25, 0.5, 0.75]) if len(prior) else (1.0, 1.0, 1.0)
+    return PriorMeasures(
+        needle=needle_share(prior.scales),
+        thickness=float(middle),
+        thickness_spread=float(high / max(low, tiny)),
+        view_dependent=bool(prior.shN.any()),
+        consistency=view_consistency(prior, cameras) if cameras is not None else None,
+    )
+
+
+def view_consistency(scene: Splats, cameras: Cameras) -> float | None:
+    """Return the share of surface points of a view that its nearest neighbour does not see through.
+
+    The median depth of a few small views is projected into the nearest other view. Points within 5 % of that
+    view's depth agree, points in front of it float, and points behind it are hidden and ignored. The
+    result is agreeing over agreeing and floating points, in [0, 1]; None if no point is in two views.
+    """
+    if len(cameras) < 2 or not len(scene):
+        return None
+    small = cameras.resized(_SAMPLE_PIXELS)
+    renderer = Renderer(scene, settings=RasterSettings(antialiased=False))
+    agreeing = floating = 0
+    for a in evenly_spaced(len(small), _SAMPLE_VIEWS):
+        distance = np.linalg.norm(small.positions - small.positions[a], axis=1)
+        distance[a] = np.inf
+        b = int(distance.argmin())
+        depth, other = (renderer.render(small[view], median=True).median for view in (a, b))
+        assert depth is not None
+        assert other is not None
+        expected, seen = _carried(depth, other, small, a, b)
+        ratio = np.where(seen > 0, seen, np.inf) / expected
+        agreeing += int((np.abs(ratio - 1) <= _SAME_DEPTH).sum())
+        floating += int((ratio > 1 + _SAME_DEPTH).sum())
+    return agreeing / (agreeing + floating) if agreeing + floating else None
+
+
+def _carried(
+    depth: np.ndarray, other: np.ndarray, cameras: Cameras, a: int, b: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Project points of view `a` into view `b`; return their depth there, and the depth that `b` sees."""
+    rows, columns = np.nonzero(depth > 0)
+    pixels = np.stack([columns + 0.5, rows + 0.5, np.ones(len(rows))])
+    rays = np.linalg.inv(cameras.Ks[a]) @ pixels * depth[rows, columns]
+    b_from_a = cameras.viewmats[b] @ np.linalg.inv(cameras.viewmats[a])
+    points = b_from_a[:3, :3] @ rays + b_from_a[:3, 3:]
+    points = points[:, points[2] > 1e-6]
+    u, v, _ = np.floor(cameras.Ks[b] @ points / points[2])
+    height, width = other.shape
+    inside = (u >= 0) & (v >= 0) & (u < width) & (v < height)
+    return points[2, inside], other[v[inside].astype(int), u[inside].astype(int)]
+
+
+def regularizers_for(
+    given: Regularizers | str | None, prior: Splats, cameras: Cameras | None = None, *, paper: bool = False
+) -> tuple[Regularizers, str, PriorMeasures]:
+    """Return the value of the setting `recover.regularizers`: as given, by name, or by measuring the prior.
+
+    `auto` measures: uniform thin discs without view-dependent colour are an untrained lift. Over a tenth of
+    needles, or views that see through each other's surfaces, mean a noisy trained scene. Anything else is a
+    faithful one.
+
+    Args:
+        given: weights, or a name: auto (None), trained, lift or noisy; paper is auto with the paper's
+            weights; paper-trained, paper-lift and paper-noisy are rows of its table.
+        prior: the scene of the anchors, before simplification if available.
+        cameras: views for measuring consistency; None skips it.
+        paper: use the paper's weights, for its schedule.
+
+    Returns:
+        The weights, a line that explains the choice, and the measures.
+    """
+    if isinstance(given, Regularizers):
+        return given, "as given", measure_prior(prior, cameras)
+    name = given or "auto"
+    kind = {"paper": "auto"}.get(name, name.removeprefix("paper-"))
+    if kind != "auto" and kind not in REGULARIZERS:
+        raise InputError(f"expected auto, paper, {', '.join(REGULARIZERS)}, got {name!r}", parameter="preset")
+    paper = paper or name.startswith("paper")
+    measures = measure_prior(prior, cameras)
+    kind, why = (kind, "as requested") if kind != "auto" else _judged(measures)
+    said = f"the paper's for {kind}" if paper else kind
+    return Regularizers.of(kind, paper=paper), f"{said} ({why})", measures
+
+
+def _judged(m: PriorMeasures) -> tuple[str, str]:
+    needles = f"{m.needle:.1%} of the Gaussians are needles"
+    if not m.view_dependent and m.thickness <= _LIFT_THICKNESS and m.thickness_spread <= _LIFT_SPREAD:
+        return "lift", "thin discs of equal proportions and colours without view dependence: not trained yet"
+    if m.needle > _MANY_NEEDLES:
+        return "noisy", needles
+    if m.consistency is None:
+        return "trained", needles
+    agree = f"{m.consistency:.0%} of the surface agrees between neighbouring views"
+    return ("noisy" if m.consistency < _LEAST_CONSISTENCY else "trained"), f"{needles}, {agree}"

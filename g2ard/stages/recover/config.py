@@ -1,17 +1,258 @@
-"""Options of recovery."""
+"""Options of recovery: learning rates of each attribute, numbers of steps, and the rest."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import math
+from dataclasses import dataclass, field, replace
+from typing import Annotated
 
-from g2ard.config.checks import AtLeastOne, Degree, Positive, Share
+import numpy as np
+
+from g2ard.config.checks import AboveZero, AtLeastOne, Degree, NotNegative, Positive, Share, Within
 from g2ard.config.choices import BLACK, Colour, Engine
 from g2ard.config.schema import Settings
-from g2ard.errors import InputError
+from g2ard.errors import InputError, require
 from g2ard.scene.cameras import Cameras
+from g2ard.scene.samples import evenly_spaced
 from g2ard.scene.splats import Splats
 from g2ard.stages.recover.anchors import REGULARIZERS, Regularizers
-from g2ard.stages.recover.schedule import TUNED, Schedule, steps_for, steps_from_points
+
+_Decay = Annotated[float, Within("(0, 1]")]
+
+_DEFAULT_REACH = 0.01
+"""Default `reach`: Gaussians larger than a hundredth of the image hardly move, unless that is typical."""
+
+_DEFAULT_FINEST = 1.0
+"""Pixels, default `finest`: the sampling limit. Of a Gaussian with this standard deviation, exp(−π²/2), under
+1 %, of the spectrum's peak is left at the Nyquist frequency, so its pixels determine its shape."""
+
+_UNTRAINED_RMSE = 0.1
+"""Initial RMSE above which a scene counts as untrained, so that large Gaussians must move."""
+
+_SIGHT_SAMPLE = 4096
+"""Gaussians that `steps_for` measures views with."""
+
+_USUAL_VIEWS, _MOST_GROWTH, _VIEWS_PER_SCHEDULE = 112, 2.25, 140
+"""Usual views that train if each holds the whole scene, the largest factor if it holds less, and the views
+that the schedule's steps are for."""
+
+_FEW_POINTS = 1250
+"""Points of photos up to which the schedule's steps suffice."""
+
+_MOST_STEPS_FACTOR = 3.0
+"""Limit of the factor on the schedule's steps."""
+
+
+@dataclass(frozen=True)
+class Rates(Settings):
+    """Adam's learning rate of each attribute, in the space it is optimised in.
+
+    Large Gaussians hardly move: with σ the largest standard deviation in the view as a share of the image's
+    longer side, rates of means and rotations are multiplied by 1/(1 + (σ/reach)¹⁶), and that of each scale by
+    the same for its own axis (`recover.extent`). Otherwise many layers moving together, such as a sky's,
+    would move the image by the sum of their steps.
+
+    Gaussians below a pixel hardly move either: the same rates are multiplied by σ²/(σ² + finest²), with σ in
+    pixels before dilation. Adam divides by the gradient's own size, and would otherwise move what a view
+    cannot resolve as far as everything else.
+
+    Args:
+        means: in units of the Gaussian's radius if `means_in_scales`, otherwise scene units.
+        log_scales: natural-log units.
+        quats: components of the unnormalised quaternion.
+        logit_opacities: logits.
+        sh0: band-0 coefficients.
+        shN: higher-band coefficients.
+        reach: share of the image's longer side; infinite treats all sizes alike. Set by the schedule.
+        finest: pixels; 0 treats all sizes alike. Set by the schedule.
+
+    Raises:
+        InputError: a value out of range.
+    """
+
+    means: NotNegative
+    log_scales: NotNegative
+    quats: NotNegative
+    logit_opacities: NotNegative
+    sh0: NotNegative
+    shN: NotNegative
+    reach: AboveZero = field(default=math.inf, metadata={"setting": False})
+    finest: NotNegative = field(default=0.0, metadata={"setting": False})
+
+
+@dataclass(frozen=True)
+class Schedule(Settings):
+    """Rates and their decay over a fixed number of steps.
+
+    Args:
+        rates: rates at the first step.
+        steps: steps of the final (or only) recovery.
+        round_steps: recovery steps of each intermediate round; 0 recovers at the final count only.
+        means_in_scales: `rates.means` is a share of each Gaussian's radius, the geometric mean of its longer
+            scales, and thus independent of the scene's unit.
+        cosine_floor: rates follow a cosine down to this share; None keeps geometry rates constant.
+        appearance_decay: shares (rounds, final) to which appearance rates decay exponentially; 1 keeps them.
+        multiplier: factor on all rates; None chooses it by short trials, starting at `multiplier_for`.
+        reach: see `Rates`; None chooses it from the initial error (`reach_for`).
+        finest: see `Rates`. `distill` takes 0 for points found in photos, unless it is set.
+        reference_extent: `rates.means` is scaled by the cameras' extent (`Cameras.extent`) over this, so that
+            the scene's unit does not matter; None takes it in scene units.
+        guarded: whether a recovery that loses quality returns to the best scene or its start; otherwise all
+            steps are taken and kept.
+
+    Raises:
+        InputError: a value out of range.
+    """
+
+    rates: Rates
+    steps: AtLeastOne
+    round_steps: Annotated[int, Within("[0, inf)")] = 0
+    means_in_scales: bool = True
+    cosine_floor: Share | None = 0.01
+    appearance_decay: tuple[_Decay, _Decay] = (1.0, 1.0)
+    multiplier: AboveZero | None = None
+    reach: AboveZero | None = None
+    finest: NotNegative = _DEFAULT_FINEST
+    reference_extent: AboveZero | None = None
+    guarded: bool = True
+
+    @classmethod
+    def named(cls, name: str) -> Schedule:
+        """Return the schedule of this name in `SCHEDULES`.
+
+        Raises:
+            InputError: an unknown name.
+
+        >>> Schedule.named("default").steps
+        1000
+        """
+        require("schedule", repr(name), name in SCHEDULES, f"one of {', '.join(SCHEDULES)}")
+        return SCHEDULES[name]
+
+    def within(self, extent: float) -> Schedule:
+        """Return the schedule for cameras of this extent; an extent of 0 changes nothing.
+
+        >>> PAPER.within(11.5).rates.means / PAPER.rates.means, TUNED.within(11.5) == TUNED
+        (2.0, True)
+        """
+        if self.reference_extent is None or not extent > 0:
+            return self
+        means = self.rates.means * extent / self.reference_extent
+        return replace(self, rates=replace(self.rates, means=means))
+
+    def scaled(self, steps: int) -> Schedule:
+        """Return the schedule with `steps` final steps, and rounds in proportion.
+
+        >>> PAPER.scaled(3000).round_steps
+        800
+        """
+        share = steps / self.steps
+        rounds = max(1, round(self.round_steps * share)) if self.round_steps else 0
+        return replace(self, steps=steps, round_steps=rounds)
+
+    def at(self, t: float, *, final: bool, multiplier: float = 1.0, reach: float = math.inf) -> Rates:
+        """Return the rates at the share `t` of the steps, from 0 at the first to 1 after the last."""
+        cosine = 1.0
+        if self.cosine_floor is not None:
+            cosine = self.cosine_floor + (1 - self.cosine_floor) * 0.5 * (1 + math.cos(math.pi * t))
+        decay = self.appearance_decay[1 if final else 0] ** t
+        geometry, appearance, first = cosine * multiplier, cosine * decay * multiplier, self.rates
+        return Rates(
+            first.means * geometry,
+            first.log_scales * geometry,
+            first.quats * geometry,
+            first.logit_opacities * appearance,
+            first.sh0 * appearance,
+            first.shN * appearance,
+            reach,
+            self.finest,
+        )
+
+
+TUNED = Schedule(
+    rates=Rates(means=0.05, log_scales=6e-2, quats=1.5e-2, logit_opacities=7e-2, sh0=3e-2, shN=3e-3),
+    steps=1000,
+)
+"""g2ard's schedule: rates in units of each Gaussian and a cosine to 1 % (figures in decision 0016)."""
+
+PAPER = Schedule(
+    rates=Rates(means=9.2e-4, log_scales=5e-3, quats=1e-3, logit_opacities=5e-3, sh0=2.5e-3, shN=1.25e-4),
+    steps=30_000,
+    round_steps=8_000,
+    means_in_scales=False,
+    cosine_floor=None,
+    appearance_decay=(0.36, 0.1),
+    multiplier=1.0,
+    reach=math.inf,
+    finest=0.0,
+    reference_extent=5.75,
+    guarded=False,
+)
+"""The paper's schedule (supplement, `tab:s_config`): 8,000 steps per round and 30,000 at the end, with 3DGS's
+rates where the paper states none. Its rate of means lacks a unit; 9.2e-4 is 3DGS's 1.6e-4 × extent at an
+extent of 5.75, so it is read that way (decision 0023). `PAPER.scaled(3000)` has a tenth of the steps."""
+
+SCHEDULES: dict[str, Schedule] = {
+    "fast": replace(TUNED, steps=300),
+    "default": TUNED,
+    "best": replace(TUNED, steps=6000),
+    "paper": PAPER,
+}
+
+
+def multiplier_for(start_rmse: float, least: float = 1 / 3) -> float:
+    """Guess the rate multiplier from the RMSE before recovery: 1 from 0.039 up, a third from 0.013 down.
+
+    Better starts need smaller steps. Trials start at no less than a third (`least`); without time for trials,
+    nearly fitted starts need less.
+
+    >>> multiplier_for(0.05), round(multiplier_for(0.026), 3), round(multiplier_for(0.001), 3)
+    (1.0, 0.667, 0.333)
+    """
+    return min(1.0, max(least, start_rmse / 0.039))
+
+
+def reach_for(start_rmse: float, typical: float) -> float:
+    """Return the reach for a start: .01, or the `typical_share` if larger; infinite for an untrained start.
+
+    >>> reach_for(0.02, 0.005), reach_for(0.05, 0.04), reach_for(0.15, 0.005)
+    (0.01, 0.04, inf)
+    """
+    return max(_DEFAULT_REACH, typical) if start_rmse < _UNTRAINED_RMSE else math.inf
+
+
+def steps_from_points(count: int, steps: int) -> int:
+    """Return `steps` times √(count / 1,250), or `steps` if that is more, for a start from points of photos.
+
+    Such points are misplaced by a length that does not depend on their count. A mean moves by a share of its
+    radius per step, and radii shrink with the root of the count, so that the way takes as many more steps.
+
+    >>> steps_from_points(1_000, 1000), steps_from_points(20_000, 1000), steps_from_points(20_000, 300)
+    (1000, 4000, 1200)
+    """
+    return round(steps * math.sqrt(max(1.0, count / _FEW_POINTS)))
+
+
+def steps_for(scene: Splats, cameras: Cameras, steps: int) -> int:
+    """Return the steps for views against renders, 1 to 3 times `steps`.
+
+    `steps` are for 140 views, each used about seven times. However many usual views there are, they count as
+    112/√h, at most 252, if one holds a share h of the scene: a view of an orbit shows the whole object, but a
+    view in a room a tenth of it. Views of other kinds count in proportion.
+
+    >>> from g2ard.scene.cameras import look_at
+    >>> line = Splats.create([[0, 0, 0], [9, 0, 0], [0, 0, 9], [-9, 0, 0]], scales=np.ones((4, 3)))
+    >>> K = [[50, 0, 32], [0, 50, 32], [0, 0, 1]]
+    >>> view = Cameras.from_lists([look_at([0, -3, 0], [0, 0, 0])], [K], [(64, 64)], ["a"])
+    >>> steps_for(line, view, 1000)
+    1600
+    """
+    usual = cameras.usual()
+    some = evenly_spaced(len(scene), _SIGHT_SAMPLE)
+    points = scene.means[some].astype(np.float64) + scene.offset
+    share = max(usual.usual_share(points), 1 / _MOST_GROWTH**2)
+    views = _USUAL_VIEWS / math.sqrt(share) * (len(cameras) / len(usual))
+    return round(steps * min(max(1.0, views / _VIEWS_PER_SCHEDULE), _MOST_STEPS_FACTOR))
 
 
 @dataclass(frozen=True)

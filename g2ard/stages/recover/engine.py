@@ -1,14 +1,63 @@
-"""Objective of the engines that run recovery's steps."""
+"""Objective of recovery's engines, and the engine in Rust or on a GPU, which runs whole steps."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from g2ard.rendering.renderer import RasterSettings
+from g2ard import _core
+from g2ard.rendering.renderer import RasterSettings, arrays_of, view_of
 from g2ard.scene.cameras import Cameras
+from g2ard.scene.samples import evenly_spaced
+from g2ard.scene.shape import NEEDLE_UNIT, longer_axes
 from g2ard.scene.splats import Splats
 from g2ard.stages.recover.anchors import Anchors, Regularizers
+from g2ard.stages.recover.config import Rates
+
+_MEASURED_VIEWS = 8
+
+
+def radii(splats: Splats) -> NDArray[np.float32]:
+    """Return (N,) √(s₁·s₂) of the two longer scales s₁ ≥ s₂, with s₂ at least s₁/100: the unit of a mean's
+    rate.
+
+    With the largest scale as unit, needles would move by several widths.
+
+    >>> radii(Splats.create([[0, 0, 0]], scales=[[9.0, 1e-9, 4.0]])).tolist()
+    [6.0]
+    """
+    middle, largest = longer_axes(splats.scales.astype(np.float64)).T
+    middle = np.maximum(middle, NEEDLE_UNIT * largest)
+    return np.ascontiguousarray(np.sqrt(middle * largest).astype(np.float32))
+
+
+def typical_share(splats: Splats, cameras: Cameras) -> float:
+    """Return the median of f·s₁/z over Gaussians and a few views, as a share of the longer side.
+
+    Views are evenly spaced, and occlusion is ignored. The share is 0 if no view shows a Gaussian.
+
+    >>> from g2ard.scene.cameras import look_at
+    >>> dot = Splats.create([[0, 0, 0]], scales=[[0.1, 0.2, 0.01]])
+    >>> views = Cameras.from_lists(
+    ...     [look_at([0, -2, 0], [0, 0, 0])], [[[50, 0, 16], [0, 50, 12], [0, 0, 1]]], [(40, 24)], ["v"])
+    >>> round(typical_share(dot, views), 6)  # 50 · 0.2 / 2 = 5 pixels of 40
+    0.125
+    """
+    cameras = cameras.recentred(splats.offset)
+    largest, view_shares = splats.scales.max(1, initial=0.0).astype(np.float64), []
+    for view in evenly_spaced(len(cameras), _MEASURED_VIEWS):
+        pose, K = cameras.viewmats[view], cameras.Ks[view]
+        size = np.array([cameras.widths[view], cameras.heights[view]], np.float64)
+        at = (splats.means @ pose[:3, :3].T + pose[:3, 3]) @ K.T
+        front = at[:, 2] > 0
+        depth = np.where(front, at[:, 2], 1.0)
+        pixel = at[:, :2] / depth[:, None]
+        inside = front & ((pixel >= 0) & (pixel < size)).all(1)
+        view_shares.append(largest[inside] / depth[inside] * (K[0, 0] / size.max()))
+    shares = np.concatenate(view_shares)
+    return float(np.median(shares)) if len(shares) else 0.0
+
 
 TYPICAL_LOSS, LEAST_LOSS = 0.02, 0.005
 """Loss to which the gradients of views are scaled if they count alike, and the loss below which errors are
@@ -49,3 +98,86 @@ class Objective(Photometric):
     means_in_scales: bool
     frozen: NDArray[np.bool_] | None = None
     relative: bool = False
+
+
+class FusedEngine:
+    """Parameters and optimiser state of a recovery, advanced one view at a time.
+
+    Equivalent to `TorchEngine` up to rounding, on the device in use (`system.devices`). Its state is the same
+    on every device. After a `DeviceError` new engines run on the CPU.
+    """
+
+    def __init__(self, objective: Objective) -> None:
+        self._objective = objective
+        start, anchors = objective.start, objective.anchors
+        units = radii(start) if objective.means_in_scales else None
+        self._trainer = _core.Trainer(arrays_of(start), objective, units)
+        self._skipped_before = 0
+        self._anchors = (
+            anchors.means,
+            np.ascontiguousarray(anchors.frames),
+            anchors.r_parallel,
+            anchors.r_perp,
+        )
+        self._trainer.anchor(*self._anchors)
+        if objective.frozen is not None:
+            self._trainer.freeze(objective.frozen)
+
+    def step(
+        self,
+        view: int,
+        target: NDArray[np.float32],
+        rates: Rates,
+        *,
+        regularize: bool,
+        mask: NDArray[np.bool_] | None = None,
+    ) -> float:
+        """Take one optimiser step on one view; return its photometric loss.
+
+        A view's target and mask are the same in all steps, so that the device may keep them.
+        """
+        objective = self._objective
+        loss, _ = self._trainer.step(
+            view_of(objective.cameras, view, objective.settings),
+            target,
+            rates,
+            objective.regularizers if regularize else None,
+            mask,
+            TYPICAL_LOSS if objective.relative else None,
+            view,
+        )
+        return loss
+
+    def splats(self) -> Splats:
+        """Return the current scene, with normalised quaternions."""
+        means, quats, log_scales, logit_opacities, sh0, shN = self._trainer.arrays()
+        length = np.linalg.norm(quats, axis=1, keepdims=True)
+        quats = np.where(length > 0, quats / np.where(length > 0, length, 1), [1.0, 0.0, 0.0, 0.0])
+        return replace(
+            self._objective.start,
+            means=means,
+            quats=quats.astype(np.float32),
+            scales=np.exp(log_scales.astype(np.float64)).astype(np.float32),
+            logit_opacities=logit_opacities,
+            sh0=sh0,
+            shN=shN,
+        )
+
+    def state(self) -> dict[str, NDArray[Any]]:
+        """Return everything that a bitwise resume needs."""
+        return {**self._trainer.state(), "skipped": np.array(self.skipped)}
+
+    def load(self, state: dict[str, NDArray[Any]]) -> None:
+        self._skipped_before = int(state["skipped"]) - self._trainer.skipped
+        self._trainer.load(state)
+        self._trainer.anchor(*self._anchors)
+
+    @property
+    def counts(self) -> NDArray[Any]:
+        """Number of steps that each Gaussian has taken, (N,)."""
+        return self._trainer.state()["steps"]
+
+    @property
+    def skipped(self) -> int:
+        """Number of single-Gaussian steps skipped because a gradient was not finite."""
+        return self._skipped_before + self._trainer.skipped

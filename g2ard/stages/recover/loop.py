@@ -12,26 +12,22 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 import g2ard.stages.recover.checkpoint as checkpoints
 from g2ard.config.choices import ENGINES
-from g2ard.errors import DeviceError, InputError, require_torch
+from g2ard.errors import DeviceError, InputError, require, require_torch
 from g2ard.progress import Progress, silent
 from g2ard.rendering.renderer import settings_for
 from g2ard.rendering.targets import Targets, fingerprint_of, mask_of
 from g2ard.scene.shape import needle_share
 from g2ard.scene.splats import Splats
 from g2ard.stages.recover.anchors import Anchors, drift95
-from g2ard.stages.recover.config import RecoverConfig
-from g2ard.stages.recover.draw import drawn
-from g2ard.stages.recover.engine import Objective
-from g2ard.stages.recover.fused_engine import FusedEngine
+from g2ard.stages.recover.config import RecoverConfig, multiplier_for, reach_for
+from g2ard.stages.recover.engine import FusedEngine, Objective, typical_share
 from g2ard.stages.recover.guard import Guard
 from g2ard.stages.recover.probe import Probe
 from g2ard.stages.recover.report import Regularized
-from g2ard.stages.recover.schedule import multiplier_for, reach_for
-from g2ard.stages.recover.sizes import typical_share
 from g2ard.stages.recover.trials import MULTIPLIERS, Trials, trial_steps
 from g2ard.system.cached import cached_property
 
@@ -39,6 +35,7 @@ if TYPE_CHECKING:
     from g2ard.stages.recover.torch_engine import TorchEngine
 
     Engine = FusedEngine | TorchEngine
+
 
 _SHORTEST_WITH_GUARD = 20
 """Fewest steps for going back to an earlier scene; shorter recoveries have no steps left to repeat."""
@@ -371,7 +368,45 @@ def _engine_class(name: str) -> type[Engine]:
         return TorchEngine
     if name == "gsplat":
         require_torch("engine 'gsplat'", "torch gsplat")
-        from g2ard.stages.recover.gsplat_engine import GsplatEngine
+        from g2ard.stages.recover.torch_engine import GsplatEngine
 
         return GsplatEngine
     raise InputError(f"expected {', '.join(ENGINES)}, got {name!r}", parameter="engine")
+
+
+def checked_weights(weights: ArrayLike | None, count: int) -> NDArray[np.float64] | None:
+    """Check the weights of `count` views and return them with mean 1; None stays None.
+
+    Raises:
+        InputError: another length, or values that are negative, not finite, or all zero.
+    """
+    if weights is None:
+        return None
+    values = np.asarray(weights, np.float64)
+    require("weights", f"shape {values.shape}", values.shape == (count,), f"{count} weights, one per view")
+    bad = np.flatnonzero(~(np.isfinite(values) & (values >= 0)))
+    if len(bad):
+        raise InputError(f"view {bad[0]}: {values[bad[0]]} is not a number ≥ 0", parameter="weights")
+    if not values.any():
+        raise InputError("all are zero, so no view can be drawn", parameter="weights")
+    values = values / values.max()  # their sum must not overflow
+    return values / values.mean()
+
+
+def drawn(seed: int, epoch: int, count: int, weights: NDArray[np.float64] | None = None) -> NDArray[np.int64]:
+    """Return the `count` views of an epoch, in a random order that depends only on the arguments.
+
+    Without weights, every view appears once. With (count,) weights w from `checked_weights`, view v appears
+    ⌊w_v⌋ or ⌈w_v⌉ times, w_v on average (systematic sampling). This is far less noisy than independent draws,
+    and equal weights change no bit.
+
+    >>> import numpy as np
+    >>> np.bincount(drawn(0, 0, 4, np.array([2.0, 1.0, 1.0, 0.0]))).tolist()
+    [2, 1, 1]
+    """
+    views = np.arange(count)
+    if weights is not None:
+        ends = np.cumsum(weights)
+        ticks = (views + np.random.default_rng((seed, epoch, 1)).random()) * (ends[-1] / count)
+        views = np.minimum(np.searchsorted(ends, ticks, side="right"), np.flatnonzero(weights)[-1])
+    return np.random.default_rng((seed, epoch)).permutation(views)

@@ -17,9 +17,8 @@ from g2ard.scene.shape import needle_share
 from g2ard.scene.splats import Splats, unit_quats
 from g2ard.stages.recover.anchors import Anchors, drift95
 from g2ard.stages.recover.config import RecoverConfig
-from g2ard.stages.recover.draw import checked_weights
 from g2ard.stages.recover.guard import Guard
-from g2ard.stages.recover.loop import Loop, Watch, finite
+from g2ard.stages.recover.loop import Loop, Watch, checked_weights, finite
 from g2ard.stages.recover.probe import Probe, harmful_changes, score_by_kind
 from g2ard.stages.recover.report import Gain, Geometry, Look, RecoverReport, Trial, Validation
 

@@ -16,11 +16,19 @@ from g2ard.progress import Progress, silent
 from g2ard.rendering.renderer import Renderer
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
-from g2ard.stages.register.attempts import Candidate, Photo, Search, Start, loaded
+from g2ard.stages.register.attempts import (
+    Candidate,
+    Photo,
+    PoolRenders,
+    Search,
+    Start,
+    loaded,
+    small_render,
+    turned,
+)
 from g2ard.stages.register.config import RegisterConfig
 from g2ard.stages.register.grey import band_passed
 from g2ard.stages.register.matchers import matcher_named
-from g2ard.stages.register.pool import PoolRenders, small_render, turned
 from g2ard.stages.register.pose import Float, pose_error
 from g2ard.stages.register.report import KEPT, PhotoReport, PoseError, Registered, RegisterReport, Status
 

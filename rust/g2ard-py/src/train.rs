@@ -22,7 +22,7 @@ use crate::raster::{Arrays, Floats, isa_named};
 use crate::views::{RasterOptions, View};
 use crate::work;
 
-/// A `g2ard.stages.recover.schedule.Rates`.
+/// A `g2ard.stages.recover.config.Rates`.
 #[derive(FromPyObject)]
 struct PyRates {
     means: f32,
