@@ -322,11 +322,11 @@ def count_for_bytes(splats: Splats, wanted: int, name: str, reduce: Callable[[in
     sample = splats.take(np.array(evenly_spaced(most, _PROBE_ROWS, floor=True)))
     count = int(len(sample) * wanted / file_bytes(sample, name))
     fits, over = (0, 0), (most + 1, 0)  # (count, bytes); 0 bytes means no such file yet
-    probes = 0
-    while probes < _BYTES_PROBES or not fits[0]:
-        probes += 1
+    files: list[tuple[int, int]] = []
+    while len(files) < _BYTES_PROBES or not fits[0]:
         count = min(max(count, fits[0] + 1, fewest), over[0] - 1, most)
         size = file_bytes(reduce(count) if count < most else splats, name)
+        files.append((count, size))
         if size <= wanted:
             fits = (count, size)
             if size >= _BYTES_ACCEPTED * wanted or count == most:
@@ -343,8 +343,15 @@ def count_for_bytes(splats: Splats, wanted: int, name: str, reduce: Callable[[in
             share = (_BYTES_GOAL * wanted - fits[1]) / (over[1] - fits[1])
             count = round(fits[0] + min(max(share, 0.1), 0.9) * (over[0] - fits[0]))
         else:
-            count = int(count * _BYTES_GOAL * wanted / size)
+            near = count * _BYTES_GOAL * wanted / size
+            if len(files) > 1 and (slope := _slope(*files[-2:])) > 0:  # a file has a head too
+                near = count + (_BYTES_GOAL * wanted - size) / slope
+            count = int(min(max(near, count / 4), 4 * count))
     return fits[0]
+
+
+def _slope(before: tuple[int, int], after: tuple[int, int]) -> float:
+    return (after[1] - before[1]) / (after[0] - before[0])
 
 
 def count_for_layers(count: int, most: float, reduce: Callable[[int], Splats]) -> tuple[int, float]:

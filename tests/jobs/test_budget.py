@@ -40,6 +40,18 @@ def test_bytes_too_few_for_a_gaussian_in_tiles() -> None:
         resolved_in_tiles(Budget(fit="0.1kB"), 6000, checkered_ball(9), "scene", "a.ply", print)
 
 
+def test_a_small_file_of_a_format_with_a_head_takes_few_trials() -> None:
+    scene, tried = checkered_ball(6000), []
+
+    def reduce(count: int) -> Splats:
+        tried.append(count)
+        return fast(scene, count)
+
+    count = count_for_bytes(scene, 20_000, "a.sog", reduce)
+    assert 0.97 * 20_000 < file_bytes(fast(scene, count), "a.sog") <= 20_000
+    assert len(tried) <= 6
+
+
 @pytest.mark.parametrize("name", ["a.ply", "a.SOG", "a.spz", "a.compressed.ply", "x/meta.json"])
 def test_the_count_fills_the_bytes(name: str) -> None:
     scene = checkered_ball(6000)
