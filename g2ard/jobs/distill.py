@@ -26,7 +26,7 @@ from g2ard.jobs.distill_options import DistillOptions
 from g2ard.jobs.inputs import Views, load_scene, make_targets, scorable
 from g2ard.jobs.measured_budget import Reduction, ResolvedBudget
 from g2ard.jobs.memory import RECOVERY_TIMES
-from g2ard.jobs.photos import distinct, sparse_file, sparse_points, topped_up
+from g2ard.jobs.photo_points import distinct, sparse_file, sparse_points, topped_up
 from g2ard.jobs.view_checks import check_photos, propose_background
 from g2ard.jobs.views import Use, views_of, within_pixels
 from g2ard.pipeline.config import DistillConfig
@@ -321,7 +321,7 @@ def distill(
     Args:
         scene: the dense scene, a coloured point cloud, or the path of either. None starts from photos alone:
             from COLMAP's sparse points, or as a fallback from points along camera rays
-            (`g2ard.jobs.photos`).
+            (`g2ard.jobs.photo_points`).
         count: Gaussians of the result, at most those of the scene.
         ratio: reduction factor, at least 1.
         fit: largest file, such as "5MB", or a device (see `Budget`).

@@ -14,7 +14,7 @@ from g2ard.io.types import Points
 from g2ard.jobs.budget import Budget
 from g2ard.jobs.distill import prepare
 from g2ard.jobs.distill_options import DistillOptions
-from g2ard.jobs.photos import distinct, points_along_rays, topped_up, visual_hull
+from g2ard.jobs.photo_points import distinct, points_along_rays, topped_up, visual_hull
 from g2ard.progress import silent, unsaid
 from g2ard.stages.recover.config import TUNED
 from helpers.commands import CommandLine, refused, succeeds

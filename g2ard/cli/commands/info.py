@@ -75,7 +75,7 @@ def _described(path: Path, images: Path | None) -> tuple[dict[str, Any], list[li
     if scene == path:
         figures = describe(path, _overdraw, images=images)
         if figures["kind"] == "views":
-            from g2ard.jobs.photos import sparse_file, sparse_points
+            from g2ard.jobs.photo_points import sparse_file, sparse_points
 
             points = sparse_points(sparse_file(path), partial(_noted, figures))
             figures["sparse_points"] = 0 if points is None else len(points)

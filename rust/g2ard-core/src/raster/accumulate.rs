@@ -3,6 +3,7 @@
 use rayon::prelude::*;
 
 use super::BATCH;
+use super::bins::Pair;
 use super::blocks::{MOST_BLOCKS, blocks, by_pair, row_and_part};
 use super::disjoint::DisjointSlice;
 use super::grid::TileRect;
@@ -10,7 +11,6 @@ use super::params::Params;
 use super::project::Splat;
 use super::simd::{Kernel, LANES, Lanes, Lanes16, Mask, Real, Vector};
 use super::tile_batch::{TileBatch, alpha, block_coordinates, log2_alpha};
-use super::tiles::Pair;
 use super::{ALPHA_MIN, Camera, ROWS, Settings};
 
 /// Per-Gaussian sums over the pixels of the views added so far.

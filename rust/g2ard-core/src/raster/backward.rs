@@ -1,6 +1,7 @@
 //! One tile from back to front, Gaussian by Gaussian. Every pair's ten sums go to its own slot.
 
 use super::BATCH;
+use super::bins::Pair;
 use super::blocks::{BlockMasks, MOST_BLOCKS, blocks, by_pair, row_and_part};
 use super::disjoint::DisjointSlice;
 use super::grid::TileRect;
@@ -10,7 +11,6 @@ use super::simd::{Kernel, Lanes, Lanes16, Mask, Real, Vector};
 use super::tile_batch::{
     TileSplat, TileSplats, alpha, block_coordinates, for_stretches, load_batch, log2_alpha,
 };
-use super::tiles::Pair;
 use super::{ALPHA_MIN, ROWS, Settings, TILE};
 
 /// Sums per pair: Σ h·(1, u, v, u², uv, v²), Σ w·(dR, dG, dB), Σ w·dDepth; h = dL/d(ln α), w = αT.

@@ -1,12 +1,12 @@
 //! Blending one tile from front to back: per batch of 64 pairs, per block of pixels, the block's state in registers.
 
 use super::BATCH;
+use super::bins::Pair;
 use super::blocks::{BlockMasks, blocks, row_and_part};
 use super::grid::TileRect;
 use super::project::Splat;
 use super::simd::{Kernel, LANES, Lanes, Lanes16, Mask, Real, Vector};
 use super::tile_batch::{TileBatch, alpha, block_coordinates, log2_alpha};
-use super::tiles::Pair;
 use super::{ALPHA_MIN, ROWS, Settings};
 
 /// One tile's pixels, a row of 16 lanes for every 4×4 of them.

@@ -1,7 +1,7 @@
 //! The tiled differentiable rasteriser: one file per pass.
 //!
 //! [`project`] turns 16 Gaussians at a time into screen splats, and [`tile_lists`] lists the 16×16 tiles that each one's
-//! ellipse at α = 1/255 meets; [`depth_sort`] sorts them by depth once; [`tiles`] scatters them stably into their tiles;
+//! ellipse at α = 1/255 meets; [`depth_sort`] sorts them by depth once; [`bins`] scatters them stably into their tiles;
 //! [`tile_batch`] holds a tile's pairs in the tile's coordinates; [`forward`] blends each tile, 4×4 or 4×2 pixels to a register; [`backward`] walks the same pairs from back to front, each pair summing into its own slot; [`gradients`]
 //! adds a Gaussian's slots in order and goes back through the projection, [`pose`] to the camera. No atomics: the bits do not depend on threads.
 //!
@@ -10,6 +10,7 @@
 
 pub(crate) mod accumulate;
 pub(crate) mod backward;
+mod bins;
 mod blocks;
 pub(crate) mod depth_sort;
 pub(crate) mod disjoint;
@@ -28,7 +29,6 @@ pub mod simd;
 pub(crate) mod small;
 mod tile_batch;
 mod tile_lists;
-mod tiles;
 pub mod visibility;
 
 pub use accumulate::Accumulated;

@@ -13,6 +13,7 @@ use rayon::prelude::*;
 
 use super::BATCH;
 use super::backward::SUMS;
+use super::bins::Bins;
 use super::blocks::BlockMasks;
 use super::depth_sort::{self, Key};
 use super::disjoint::DisjointSlice;
@@ -23,7 +24,6 @@ use super::params::{Params, Source};
 use super::project::{Project, Splat, View};
 use super::simd::{Isa, LANES, Lanes16, dispatch};
 use super::tile_lists::{TileIntersector, TileList};
-use super::tiles::Bins;
 use super::{Camera, ROWS, Settings};
 use crate::{Error, Result};
 

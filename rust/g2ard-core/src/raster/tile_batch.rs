@@ -1,11 +1,11 @@
 //! Sixty-four of a tile's pairs in the tile's own coordinates, and the blocks of pixels each of them reaches.
 
+use super::bins::Pair;
 use super::blocks::{BlockMasks, blocks, row_and_part};
 use super::grid::{TileRect, pixel_of};
 use super::memory::prefetch;
 use super::project::Splat;
 use super::simd::{LANES, Lanes, Lanes16, Mask, Vector};
-use super::tiles::Pair;
 use super::{ALPHA_MIN, BATCH, ROWS, TILE};
 
 /// A tile's splats lie scattered in memory: each is prefetched this many pairs before it is needed.

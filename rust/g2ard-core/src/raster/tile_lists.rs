@@ -133,7 +133,7 @@ pub struct TileIntersector {
     pub list: Vec<u32>,
     /// The ends of sixteen ellipses in one row of tiles after another.
     ends: Vec<[Lanes16; 2]>,
-    /// Slots numbered so far; [`super::tiles::Bins::fill`] refuses more than a u32 counts.
+    /// Slots numbered so far; [`super::bins::Bins::fill`] refuses more than a u32 counts.
     pub slots: u64,
 }
 
