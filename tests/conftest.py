@@ -134,7 +134,7 @@ def _here(words: list[str], cwd: Path, env: dict[str, str]) -> Said:
         finally:
             os.chdir(before)
             for name in set(sys.modules) - known:  # a user's module of that name may be another's next time
-                if str(getattr(sys.modules[name], "__file__", None)).startswith(str(cwd)):
+                if Path(str(getattr(sys.modules[name], "__file__", None))).parent == cwd:
                     del sys.modules[name]
     return int(status or 0) if isinstance(status, int | None) else 1, out.getvalue(), err.getvalue()
 

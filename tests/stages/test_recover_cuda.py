@@ -17,7 +17,7 @@ from g2ard.rendering.cuda import renderer_on
 from g2ard.rendering.renderer import RasterSettings, Renderer
 from g2ard.rendering.targets import TeacherRenders
 from g2ard.stages.evaluate import evaluate
-from g2ard.stages.recover import RecoverConfig, gsplat_engine, recover
+from g2ard.stages.recover import RecoverConfig, recover, torch_engine
 from g2ard.stages.recover.losses import l1_ssim, l1_ssim_anywhere
 from g2ard.stages.simplify import simplify
 from helpers.commands import CommandLine, refused
@@ -48,8 +48,8 @@ def test_gsplat_recovers_like_the_cpu() -> None:
 
 def test_the_engine_passes_gsplats_documented_arguments(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "gsplat", SimpleNamespace(rasterization=gsplat_rasterization))
-    monkeypatch.setattr(gsplat_engine, "check_cuda", lambda: None)
-    monkeypatch.setattr(gsplat_engine.GsplatEngine, "device", torch.device("cpu"))
+    monkeypatch.setattr(torch_engine, "check_cuda", lambda: None)
+    monkeypatch.setattr(torch_engine.GsplatEngine, "device", torch.device("cpu"))
     student = simplify(BALL, 60, method="paper").splats
     reports = [
         recover(student, TARGETS, RecoverConfig(steps=4, engine=engine, background=(0.2, 0.4, 0.1))).report

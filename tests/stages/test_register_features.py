@@ -146,9 +146,9 @@ def test_features_find_the_pose(tmp_path: Path) -> None:
 
 def test_features_and_alignment_are_no_worse_than_either(tmp_path: Path) -> None:
     pytest.importorskip("pycolmap")
-    views = _photographed(tmp_path, 1)
+    views = _photographed(tmp_path)
     truth = dict(zip(views.names, views.viewmats, strict=True))
-    starts = {name: off(pose, 0.2, 6, 0) for name, pose in truth.items()}
+    starts = {name: off(pose, 0.2, 6, i) for i, (name, pose) in enumerate(truth.items())}
     errors = {}
     for refine in ("auto", "none", "photometric"):
         config = replace(CONFIG, refine=refine)  # type: ignore[arg-type]
