@@ -61,9 +61,10 @@ if TYPE_CHECKING:
     from g2ard.jobs.views import orbit
     from g2ard.levels import Georeference, save_levels
     from g2ard.pipeline.adapt import AdaptConfig, Adapted, adapt
-    from g2ard.pipeline.config import DistillConfig, SelectConfig, preset
+    from g2ard.pipeline.config import DistillConfig, SelectConfig
     from g2ard.pipeline.distill import Distilled
     from g2ard.pipeline.distill import distill as distill_against
+    from g2ard.pipeline.presets import preset
     from g2ard.poses import make_pool
     from g2ard.progress import show_progress
     from g2ard.rendering.renderer import RasterSettings, Rendered, Renderer, render
@@ -151,7 +152,8 @@ _HOMES = {
     "scene.cameras": ("Camera", "Cameras", "look_at"),
     "errors": ("G2ardError", "InputError", "MissingDependencyError", "OutputError"),
     "io.types": ("Points",),
-    "pipeline.config": ("DistillConfig", "SelectConfig", "preset"),
+    "pipeline.config": ("DistillConfig", "SelectConfig"),
+    "pipeline.presets": ("preset",),
     "pipeline.distill": ("Distilled",),
     "levels": ("Georeference", "save_levels"),
     "jobs.clean": ("Cleaned", "clean"),

@@ -19,8 +19,9 @@ from benchmarks.study import SceneSpec, Study, key
 from benchmarks.workspace import PROTOCOLS, Workspace, budget_of, kinds_for
 from g2ard.config.choices import ENGINES
 from g2ard.errors import InputError
-from g2ard.pipeline.config import PRESETS, DistillConfig, configured
+from g2ard.pipeline.config import DistillConfig
 from g2ard.pipeline.distill import distill
+from g2ard.pipeline.presets import PRESETS, configured
 from g2ard.rendering.targets import Targets
 from g2ard.rendering.visibility import visibility_source
 from g2ard.scene.shape import effective_rank, needle_share

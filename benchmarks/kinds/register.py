@@ -21,7 +21,7 @@ from g2ard.config.choices import Keep
 from g2ard.config.schema import changed
 from g2ard.errors import InputError
 from g2ard.jobs.register import photos_of, poses_for
-from g2ard.pipeline.config import GS_CPR
+from g2ard.pipeline.presets import GS_CPR
 from g2ard.rendering.renderer import Renderer
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats

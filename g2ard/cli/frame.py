@@ -38,7 +38,7 @@ from g2ard.io.paths import is_photo, real_path
 from g2ard.io.reports import plain
 from g2ard.io.scene_formats import axes_note, files_of, scene_format
 from g2ard.io.scenes import tell, write_scene
-from g2ard.pipeline.config import configured
+from g2ard.pipeline.presets import configured
 from g2ard.progress import plural
 from g2ard.system import devices, interrupt
 from g2ard.system.cached import cached_property

@@ -12,7 +12,8 @@ from g2ard.config.choices import Focus, FormatName, RenderModel
 from g2ard.config.schema import Settings, full_paths, values_of
 from g2ard.errors import InputError
 from g2ard.jobs.inputs import Views
-from g2ard.pipeline.config import PRESETS, DistillConfig, configured
+from g2ard.pipeline.config import DistillConfig
+from g2ard.pipeline.presets import PRESETS, configured
 from g2ard.stages.lift import LiftConfig
 from g2ard.stages.recover.anchors import Regularizers
 from g2ard.system.cached import cached_property

@@ -18,7 +18,7 @@ from g2ard.jobs.cost import Cost, cost_of_recovery
 from g2ard.jobs.inputs import Views, load_scene, load_split_views, make_targets, scorable
 from g2ard.jobs.view_checks import check_photos, propose_background, warn_of_sight
 from g2ard.jobs.views import shrunk, views_or_pool, within_pixels
-from g2ard.pipeline.config import PRESETS, configured
+from g2ard.pipeline.presets import PRESETS, configured
 from g2ard.progress import Progress, Say, plural, silent, unsaid
 from g2ard.rendering.targets import Targets, checked_targets, fill, kinds_of, kinds_told
 from g2ard.report.run import KindScore, by_kind

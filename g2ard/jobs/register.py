@@ -22,7 +22,7 @@ from g2ard.io.paths import is_photo
 from g2ard.io.photos import exif_focal, has_alpha, photo_size
 from g2ard.jobs.inputs import load_scene
 from g2ard.jobs.view_checks import propose_background
-from g2ard.pipeline.config import GS_CPR
+from g2ard.pipeline.presets import GS_CPR
 from g2ard.poses import plan_pool
 from g2ard.progress import Progress, Say, plural, silent, unsaid
 from g2ard.scene.cameras import Camera, Cameras

@@ -14,7 +14,7 @@ from g2ard.io.types import Note
 from g2ard.jobs.budget import Budget
 from g2ard.jobs.inputs import Views, say_notes
 from g2ard.jobs.measured_budget import Reduction
-from g2ard.pipeline.config import configured
+from g2ard.pipeline.presets import configured
 from g2ard.progress import Progress, Say, silent, unsaid
 from g2ard.scene.splats import Splats
 from g2ard.stages.simplify import Simplified, SimplifyConfig

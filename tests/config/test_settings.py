@@ -12,7 +12,8 @@ from g2ard.config.schema import changed, listed, parse_settings
 from g2ard.errors import InputError
 from g2ard.io import write_splats, write_views
 from g2ard.io.scene_formats import FORMATS
-from g2ard.pipeline.config import DistillConfig, preset
+from g2ard.pipeline.config import DistillConfig
+from g2ard.pipeline.presets import preset
 from g2ard.stages.recover.anchors import PAPER_REGULARIZERS, REGULARIZERS
 from g2ard.stages.recover.config import PAPER, SCHEDULES
 from g2ard.stages.simplify import SimplifyConfig

@@ -15,8 +15,9 @@ import pytest
 
 from g2ard.config.schema import changed
 from g2ard.pipeline.adapt import AdaptConfig, adapt
-from g2ard.pipeline.config import DistillConfig, SelectConfig, configured
+from g2ard.pipeline.config import DistillConfig, SelectConfig
 from g2ard.pipeline.distill import distill
+from g2ard.pipeline.presets import configured
 from g2ard.rendering.targets import Photos, TeacherRenders
 from g2ard.scene.splats import ARRAYS
 from g2ard.stages.recover import RecoverConfig, checkpoint, recover

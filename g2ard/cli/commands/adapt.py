@@ -11,7 +11,7 @@ from g2ard.cli.resume import check_scene_run, checkpoint_beside, stoppable
 from g2ard.cli.run_result import tell_plan
 from g2ard.config.schema import listed
 from g2ard.io.scene_formats import check_positions
-from g2ard.pipeline.config import configured
+from g2ard.pipeline.presets import configured
 from g2ard.progress import plural
 
 _FIELDS = "steps tolerance schedule prior_views sh_degree engine background seed"

@@ -11,7 +11,7 @@ from g2ard.cli import options as opt
 from g2ard.cli.budget_options import Count
 from g2ard.cli.frame import Run, command
 from g2ard.config.schema import listed
-from g2ard.pipeline.config import configured
+from g2ard.pipeline.presets import configured
 from g2ard.progress import plural
 
 if TYPE_CHECKING:
