@@ -186,12 +186,20 @@ class TileStore:
         return self._read(tile_name(index), tile.rows, tile.checks[0], sh)
 
     def read_halo(self, index: int, *, sh: bool = True) -> Splats:
-        """Read the rows of a tile's halo like those of `read`."""
+        """Read the rows of a tile's halo, in the order of the source; `sh` as for `read`.
+
+        Raises:
+            InputError: as for `read`.
+        """
         tile = self.tiles[index]
         return self._read(halo_name(index), tile.halo, tile.checks[1], sh)
 
     def rows(self, index: int) -> NDArray[np.float32]:
-        """Return a (rows, 14 + 3K) memory map of a tile's own rows; `check` verifies its contents."""
+        """Return a (rows, 14 + 3K) memory map of a tile's own rows; `check` verifies its contents.
+
+        Raises:
+            InputError: the file is missing or has another size.
+        """
         tile = self.tiles[index]
         shape = (tile.rows, row_width(self.sh_degree))
         if not tile.rows:
@@ -200,7 +208,11 @@ class TileStore:
         return np.memmap(self.folder / tile_name(index), "<f4", "r", shape=shape)
 
     def check(self, index: int) -> None:
-        """Verify the checksum of a tile's own rows."""
+        """Verify the checksum of a tile's own rows.
+
+        Raises:
+            InputError: as for `read`.
+        """
         rows, crc = self.rows(index), 0
         for start in range(0, len(rows), _ROWS_AT_ONCE):
             crc = zlib.crc32(rows[start : start + _ROWS_AT_ONCE].data, crc)

@@ -21,7 +21,20 @@ from g2ard.system.cached import cached_property
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class DistillOptions(Settings):
-    """Inputs and settings of a distillation; the fields are arguments of `g2ard.distill`."""
+    """Inputs and settings of a distillation.
+
+    Args:
+        photos: targets: True for photos, skipping views without one; False for renders of the scene; None for
+            each view's photo, or a render if it has none (sec. 3.1). A point cloud given with views needs
+            their photos; without views, its lift renders the training images.
+        format: file format for a budget in bytes: ply, compressed.ply, sog, spz, glb, splat, usda or usdc.
+        settings: values of `DistillConfig` by path, which override the preset.
+
+    Others are those of `g2ard.distill`.
+
+    Raises:
+        InputError: a value of another type, or out of range.
+    """
 
     views: Views | None = None
     photos: bool | None = None

@@ -301,6 +301,8 @@ def resolved_in_tiles(
         sample: some of them, with the SH degree of the result.
         file: name of a .ply, in which all Gaussians take as many bytes.
     """
+    if budget.layers is not None:
+        say(f"note: {budget.fit}: in tiles, Gaussians per pixel of near views are not measured")
     if budget.bytes is None:
         return ResolvedBudget(budget.of(total, name))
     one, two = (file_bytes(sample.take(np.arange(rows)), file) for rows in (1, 2))

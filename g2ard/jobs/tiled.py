@@ -276,7 +276,10 @@ def prepare_tiles(
     Args:
         options: as for `g2ard.distill`, without what `needs_whole` returns.
     """
-    total, sample = tiles.plan.count, tiles.sample(options.config.simplify)
+    total = tiles.plan.count
+    if budget.bytes is None:
+        budget.of(total, str(tiles.scene))  # refused before any work
+    sample = tiles.sample(options.config.simplify)
     degree = options.config.recover.sh_degree
     stored = sample if degree is None else sample.with_sh_degree(degree)
     wanted = resolved_in_tiles(budget, total, stored, str(tiles.scene), f"scene.{options.format}", say)

@@ -138,6 +138,9 @@ class AdaptConfig(FitConfig, tag="schedule"):
             steps at once, with rates that decay to a tenth, without colour change or blending.
         steps: maximum number of steps; 7,000 as in the paper.
         recovery: rates and decay of a stretch with frozen geometry, see `appearance_only`.
+
+    Raises:
+        InputError: a value out of range.
     """
 
     schedule: AdaptSchedule = "default"

@@ -95,6 +95,9 @@ class DistillConfig(Settings):
             and more if a view shows little of the scene (`g2ard.stages.recover.config`). Rounds share
             `recovery_time` in proportion to their steps.
         lift: lifting of point clouds.
+
+    Raises:
+        InputError: an invalid value.
     """
 
     select: SelectConfig = field(default_factory=SelectConfig)

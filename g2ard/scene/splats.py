@@ -188,7 +188,11 @@ class Splats:
         return replace(self, **{name: getattr(self, name)[index] for name in ARRAYS})
 
     def with_sh_degree(self, degree: int) -> Splats:
-        """Return the scene with higher bands cut off or padded with zeros; the degree is 0–3."""
+        """Return the scene with higher bands cut off or padded with zeros.
+
+        Raises:
+            InputError: the degree is not 0–3.
+        """
         if degree not in range(4):
             raise InputError(f"SH degree: expected 0 to 3, got {degree}")
         rest = (degree + 1) ** 2 - 1

@@ -20,9 +20,12 @@ def imported_by(statement: str, *heavy: str) -> list[str]:
 
 def test_import_and_help_load_nothing_heavy() -> None:
     assert imported_by("import g2ard", "torch", "numpy", "PIL", "typer", "rich", "g2ard._core") == []
-    show_help = "import contextlib, io\nfrom g2ard.cli.main import main\nsys.argv = ['g2ard', '--help']\n"
+    show_help = "import contextlib, io\nfrom g2ard.cli.main import main\nsys.argv = ['g2ard', {words}]\n"
     show_help += "with contextlib.redirect_stdout(io.StringIO()), contextlib.suppress(SystemExit): main()\n"
-    assert imported_by(show_help, "torch", "numpy", "PIL", "g2ard.cli.commands.") == []
+    heavy = "torch", "numpy", "PIL"
+    assert imported_by(show_help.format(words="'--help'"), *heavy, "g2ard.cli.commands.") == []
+    for command in COMMANDS:
+        assert imported_by(show_help.format(words=f"'{command}', '--help'"), *heavy) == []
 
 
 @pytest.mark.parametrize("mark", [b"", b"\xef\xbb\xbf"])

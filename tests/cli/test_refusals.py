@@ -123,8 +123,6 @@ INPUT = [
         "--photos: generated views have no photos; give --views that have them",
     ),
     ("distill --views views.json --fit 1kB -o run", "--fit: views.json: "),
-    ("distill ball.ply -r 10 -o x --set lift.spread=2", "lift.spread: has no effect on a trained scene"),
-    ("distill ball.ply -r 10 -o x --set lift.spread=2 --tile-rows 150", "lift.spread: has no effect"),
     (
         "distill --views views.json --min-psnr 30 -o run",
         "--min-psnr: views.json: needs sparse points, and there are none; give --count COUNT",

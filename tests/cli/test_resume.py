@@ -136,3 +136,8 @@ def test_the_total_of_a_resumed_run_holds_what_was_done_before(
     assert min(stages.values()) >= 0
     told = ", ".join(f"{name} {value:.1f} s" for name, value in seconds.items() if name != "resumed")
     assert f"; {told}" in " ".join((out + error).split())
+
+
+def test_a_resumed_command_that_kept_nothing_says_so(command_line: CommandLine, folder: Path) -> None:
+    words = "recover a.ply --views views.json --teacher t.ply --steps 2 --size 24 -o new.ply --resume"
+    assert "new.ply: nothing to resume, starting over" in succeeds(command_line, folder, *words.split()).err

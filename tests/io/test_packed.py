@@ -1,4 +1,4 @@
-""".compressed.ply, .spz and .splat as other programs write them; `test_write.py` has what we write."""
+""".compressed.ply, .spz and .splat: their fields, damage, and a scene that others packed in both ways."""
 
 import gzip
 import struct
@@ -12,11 +12,12 @@ import pytest
 from plyfile import PlyData, PlyElement
 
 from g2ard.errors import InputError, MissingDependencyError
-from g2ard.io import read_splats, write_splats
+from g2ard.io import read_scene, read_splats, write_splats
 from g2ard.io.sanitize import LOGIT_LIMIT
 from g2ard.scene.splats import SH_C0
 from helpers.faults import faulty
 from helpers.packed_files import saved, truth
+from helpers.realdata import real
 
 
 def test_compressed_ply_of_other_chunks(tmp_path: Path) -> None:
@@ -90,3 +91,17 @@ def test_splat_round_trip(tmp_path: Path) -> None:
     np.testing.assert_allclose(found.opacities, expected.opacities, atol=0.5 / 255 + 1e-6)
     np.testing.assert_allclose(found.colors, np.clip(expected.colors, 0, 1), atol=0.5 / 255 + 1e-6)
     assert np.abs((found.quats * expected.quats).sum(1)).min() > 0.97
+
+
+def test_spz_equals_compressed_ply_of_the_same_scene() -> None:
+    a = read_scene(real("format_samples", "biker.spz"))
+    b = read_scene(real("format_samples", "biker.compressed.ply"))
+    assert len(a.splats) == len(b.splats) == 152_746
+    for scene in (a, b):
+        assert {n.code: n.count for n in scene.notes} == {"clamped_logits": 198}
+    np.testing.assert_allclose(a.splats.means, b.splats.means, atol=0.5 / 4096 + 1e-6)
+    coarse = np.maximum(b.splats.log_scales, -10)  # SPZ's floor
+    np.testing.assert_allclose(a.splats.log_scales, coarse, atol=0.5 / 16 + 1e-5)
+    np.testing.assert_allclose(a.splats.opacities, b.splats.opacities, atol=1e-6)
+    np.testing.assert_allclose(a.splats.sh0, b.splats.sh0, atol=0.5 / 255 / 0.15 + 1e-6)
+    assert np.abs((a.splats.quats * b.splats.quats).sum(1)).min() > 0.9999

@@ -1,5 +1,6 @@
 """SOG: built here byte by byte, then compared with an independent decoder on real scenes."""
 
+import importlib.util
 import io
 import json
 from pathlib import Path
@@ -13,6 +14,7 @@ from g2ard.errors import InputError
 from g2ard.io import kind, read_scene, read_splats
 from g2ard.io.sanitize import LOGIT_LIMIT
 from helpers.faults import Fault, check_fault, faulty
+from helpers.realdata import real
 from helpers.scenes import assert_same_bits
 from helpers.sog_files import folder, parts, square, webp, zipped
 
@@ -229,3 +231,25 @@ def test_an_archive_without_a_scene_is_named(tmp_path: Path) -> None:
     zipped(tmp_path / "b.sog", {"other.txt": b"x"})
     with pytest.raises(InputError, match=r"no meta\.json"):
         read_splats(tmp_path / "b.sog")
+
+
+def independent(chunk: Path) -> np.ndarray:
+    """The columns x y z, f_dc, f_rest, opacity, scale, rot that sog2ply.py decodes."""
+    spec = importlib.util.spec_from_file_location("sog2ply", real("sog2ply.py"))
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module.decode(str(chunk))[0]
+
+
+def test_equals_the_independent_decoder() -> None:
+    splats = read_splats(real("taebak_park", "0_0"))
+    table = independent(real("taebak_park", "0_0"))
+    rest = 3 * splats.shN.shape[1]
+    np.testing.assert_array_equal(splats.means, table[:, :3])
+    np.testing.assert_array_equal(splats.sh0[:, 0], table[:, 3:6])
+    channel_major = splats.shN.transpose(0, 2, 1).reshape(len(splats), -1)
+    np.testing.assert_array_equal(channel_major, table[:, 6 : 6 + rest])
+    alpha = 1 / (1 + np.exp(-table[:, 6 + rest].astype(float)))
+    np.testing.assert_allclose(splats.opacities, alpha, atol=2e-6)  # it clips opacities at 1e-6
+    np.testing.assert_allclose(splats.log_scales, table[:, 7 + rest : 10 + rest], atol=2e-6)
+    np.testing.assert_array_equal(splats.quats, table[:, 10 + rest : 14 + rest])

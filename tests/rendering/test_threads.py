@@ -5,14 +5,18 @@ import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
+from g2ard import _core
 from g2ard.errors import InputError
-from g2ard.rendering.renderer import Renderer
+from g2ard.rendering.renderer import RasterSettings, Renderer, arrays_of, view_of
 from g2ard.rendering.targets import Photos, Targets, TeacherRenders
+from g2ard.scene.prepared import finite_rows_of
+from g2ard.stages.recover.config import Rates
 from helpers.photos import photographed
 from helpers.project import ROOT
 from helpers.scenes import around, checkered_ball
@@ -96,6 +100,44 @@ def test_targets_can_be_sent_to_another_process() -> None:
     for targets in (_renders(Path(), 0), _images(Path(), 0)):
         there: Any = pickle.loads(pickle.dumps(targets))
         np.testing.assert_array_equal(there[2], targets[2])
+
+
+def test_sums_of_visibility_lose_no_view() -> None:
+    scene, _ = finite_rows_of(BALL)
+    settings = RasterSettings(antialiased=False)
+    views = [view_of(VIEWS, i, settings) for i in range(len(VIEWS))]
+    alone, shared = _core.VisibilityAccumulator(scene.core), _core.VisibilityAccumulator(scene.core)
+    for _ in range(THREADS):
+        alone.add(views, settings, None)
+
+    def add(thread: int) -> None:
+        for i in in_turn(8, thread):
+            shared.add([views[i]], settings, None)
+            shared.by_row()
+
+    at_once(add)
+    for got, want in zip(shared.by_row(), alone.by_row(), strict=True):
+        np.testing.assert_allclose(got, want, rtol=1e-5)
+
+
+def test_a_trainer_takes_every_step() -> None:
+    objective: Any = SimpleNamespace(
+        settings=RasterSettings(antialiased=False), background=(0.0, 0.0, 0.0), ssim_weight=0.2
+    )
+    trainer = _core.Trainer(arrays_of(BALL), objective)
+    target = np.zeros((72, 96, 3), np.float32)
+    view = view_of(VIEWS, 0, objective.settings)
+    rates = Rates(1e-4, 1e-4, 1e-4, 1e-4, 1e-4, 1e-4)
+
+    def step(thread: int) -> None:
+        for _ in range(3):
+            trainer.step(view, target, rates)
+            trainer.arrays()
+            trainer.state()
+
+    at_once(step)
+    assert trainer.state()["steps"].max() == 3 * THREADS
+    assert trainer.skipped == 0
 
 
 def test_every_class_of_the_extension_is_usable_from_threads() -> None:

@@ -50,11 +50,17 @@ def test_scenes_around_the_origin_keep_their_offset() -> None:
     assert not far_middle(outlier).any()
 
 
-@pytest.mark.parametrize("paper", [False, True])
-def test_recovery_in_map_coordinates_is_that_of_the_centred_scene(paper: bool) -> None:
+@pytest.mark.parametrize(
+    "config",
+    [
+        g2ard.RecoverConfig(steps=40),
+        g2ard.RecoverConfig(steps=40, engine="torch"),
+        g2ard.RecoverConfig(schedule=PAPER.scaled(60)),
+    ],
+)
+def test_recovery_in_map_coordinates_is_that_of_the_centred_scene(config: g2ard.RecoverConfig) -> None:
     student = g2ard.simplify(BALL, ratio=5).splats
     far_views = VIEWS.recentred(-UTM)
-    config = g2ard.RecoverConfig(schedule=PAPER.scaled(60)) if paper else g2ard.RecoverConfig(steps=40)
     near = g2ard.recover(student, TeacherRenders(BALL, VIEWS), config)
     far = g2ard.recover(far_of(student), TeacherRenders(far_of(BALL), far_views), config)
     assert near.report.psnr.after > near.report.psnr.before + 1

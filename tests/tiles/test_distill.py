@@ -129,6 +129,23 @@ def test_tiles_are_read_as_one_scene(command_line: CommandLine, folder: Path, tm
     assert [tile.rows for tile in again.tiles] == [tile.rows for tile in whole.tiles]
 
 
+def test_a_killed_command_resumes(folder: Path, tmp_path: Path) -> None:
+    words = ["simplify", folder / "town.ply", "-r", "10", "-o", tmp_path / "x.ply", "--tile-rows", "700"]
+    command = [sys.executable, "-m", "g2ard", *map(str, words), "--workers", "2", "--no-views"]
+    steps = tmp_path / ".x.ply.tiles" / "steps"
+    with subprocess.Popen(command, env=environment(), stderr=subprocess.DEVNULL) as running:
+        until = time.monotonic() + 120
+        while running.poll() is None and time.monotonic() < until and len(list(steps.glob("[!.]*.npz"))) < 3:
+            time.sleep(0.01)
+        running.kill()
+    done = {path.name: path.stat().st_mtime_ns for path in steps.glob("[!.]*.npz")}
+    assert done
+    again = subprocess.run([*command, "--work", str(steps.parent)], env=environment(), check=False)
+    assert again.returncode == 0
+    assert len(read_splats(tmp_path / "x.ply")) == 900
+    assert all((steps / name).stat().st_mtime_ns == at for name, at in done.items())
+
+
 @needs_proc
 @pytest.mark.parametrize("seconds", [0.0, 0.3])
 def test_workers_end_with_a_killed_command(folder: Path, tmp_path: Path, seconds: float) -> None:

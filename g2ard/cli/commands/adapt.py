@@ -57,6 +57,8 @@ def adapt(
     if not dry_run:
         check_scene_run(run, work, resume, output)
     splats = run.load(compact)
+    if output != opt.UNWRITTEN:
+        check_positions(output, splats)
     teaching = Teaching(
         teacher,
         config.background,
@@ -71,7 +73,6 @@ def adapt(
     if dry_run:
         tell_plan(run, len(splats), cost)
         return
-    check_positions(output, splats)
     run.console.expect(cost.stages)
     with stoppable(run, work, resume, output):
         work.mkdir(parents=True, exist_ok=True)

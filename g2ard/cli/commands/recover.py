@@ -79,11 +79,12 @@ def recover(
         anchors=anchors,
         **run.callbacks,
     )
+    if output != opt.UNWRITTEN:
+        check_positions(output, job.student)
     cost = job.cost
     if dry_run:
         tell_plan(run, len(job.student), cost)
         return
-    check_positions(output, job.student)
     run.console.expect(cost.stages)
     with stoppable(run, checkpoint, resume, output):
         result = job.run(checkpoint)

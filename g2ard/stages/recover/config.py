@@ -49,8 +49,8 @@ class Rates(Settings):
 
     Large Gaussians hardly move: with σ the largest standard deviation in the view as a share of the image's
     longer side, rates of means and rotations are multiplied by 1/(1 + (σ/reach)¹⁶), and that of each scale by
-    the same for its own axis (`recover.extent`). Otherwise many layers moving together, such as a sky's,
-    would move the image by the sum of their steps.
+    the same for its own axis (`recover.losses.extents`). Otherwise many layers moving together, such as a
+    sky's, would move the image by the sum of their steps.
 
     Gaussians below a pixel hardly move either: the same rates are multiplied by σ²/(σ² + finest²), with σ in
     pixels before dilation. Adam divides by the gradient's own size, and would otherwise move what a view
