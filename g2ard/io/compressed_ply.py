@@ -25,7 +25,7 @@ from g2ard.io.packing import (
     writable,
 )
 from g2ard.io.sanitize import Raw, logits_of
-from g2ard.io.stream import SceneStream
+from g2ard.io.stream import RawStream
 from g2ard.progress import plural
 from g2ard.scene.splats import SH_C0, Splats
 
@@ -37,7 +37,7 @@ _VECTOR_BITS = 11, 10, 11  # bits of the three components of a position or scale
 _PACKED = ["packed_position", "packed_rotation", "packed_scale", "packed_color"]
 
 
-class Stream(SceneStream):
+class Stream(RawStream):
     """Scene in blocks; memory holds all chunk bounds, 72 bytes per 256 Gaussians."""
 
     def __init__(self, path: Path) -> None:

@@ -15,7 +15,7 @@ from g2ard.errors import InputError, require
 from g2ard.io import plyfiles
 from g2ard.io.packing import rounding
 from g2ard.io.sanitize import BLOCK, LOG_SCALE_LIMIT, Raw
-from g2ard.io.stream import SceneStream
+from g2ard.io.stream import RawStream, SceneStream
 from g2ard.io.types import Note
 from g2ard.progress import plural
 from g2ard.scene.splats import SH_C0, Splats, far_middle, unit_quats
@@ -32,7 +32,7 @@ _FLAT_LOG_RATIO = np.log(np.float32(1e-3))
 """Logarithm of the thickness of 2D Gaussians over their shorter scale."""
 
 
-class Stream(SceneStream):
+class Stream(RawStream):
     """3DGS .ply of any SH degree, property order, scalar type and byte order, or ascii.
 
     Also read: RGB instead of `f_dc`; one or two scales; names with the prefix `scalar_` of CloudCompare; the

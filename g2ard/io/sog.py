@@ -28,7 +28,7 @@ from g2ard.io.packing import from_smallest_three
 from g2ard.io.paths import check_regular, check_unpacked, decoded, file_identity
 from g2ard.io.photos import opened_image
 from g2ard.io.sanitize import BLOCK, Raw, logits_of
-from g2ard.io.stream import SceneStream, from_row
+from g2ard.io.stream import RawStream, from_row
 from g2ard.io.types import Note
 from g2ard.progress import plural
 from g2ard.scene.transform import one_model
@@ -379,7 +379,7 @@ def _left_out(path: Path, read_count: int) -> list[Note]:
     return [Note("ignored_chunks", others, text)] if others > 0 else []
 
 
-class Stream(SceneStream):
+class Stream(RawStream):
     """SOG scene, version 1 or 2: a .sog, a meta.json or its folder, or a folder of chunks.
 
     Chunks are padded with zeros to the highest SH degree, and blocks do not cross chunks. Memory holds a

@@ -9,13 +9,13 @@ from g2ard.errors import InputError, damaged
 from g2ard.io.atomic import atomic_output
 from g2ard.io.packing import as_bytes, world_means, writable
 from g2ard.io.sanitize import Raw
-from g2ard.io.stream import SceneStream
+from g2ard.io.stream import RawStream
 from g2ard.scene.splats import SH_C0, Splats, unit_quats
 
 _ROW = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
 
 
-class Stream(SceneStream):
+class Stream(RawStream):
     """Rows of a .splat: linear scales, 8-bit colour and opacity, quaternions as bytes around 128."""
 
     def __init__(self, path: Path) -> None:

@@ -76,7 +76,7 @@ class Stream(ABC, Generic[Block]):
 
 
 class SceneStream(Stream[Splats]):
-    """Scene in blocks. Readers yield its `raw` rows, which are cleaned as in `g2ard.io.read_scene`.
+    """Scene in blocks.
 
     Attributes:
         sh_degree: 0–3.
@@ -97,9 +97,22 @@ class SceneStream(Stream[Splats]):
         self.render_model, self.sh_degree = render_model, _DEGREE_OF_REST[rest]
         self.up: tuple[float, float, float] | None = None
 
+    def whole(self) -> Scene:
+        """Read all rows into memory."""
+        raw, kept = Raw.empty(self.count, (self.sh_degree + 1) ** 2 - 1), 0
+        for block in self.blocks(BLOCK):
+            rows = raw.take(slice(kept, kept := kept + len(block)))
+            rows.fill(getattr(block, name) for name in ARRAYS)
+        notes = self.all_notes()
+        return Scene(raw.take(slice(kept)).activated(self.render_model, self.offset, self.up), notes)
+
+
+class RawStream(SceneStream):
+    """Scene of a file's `raw` rows, which are cleaned as in `g2ard.io.read_scene`."""
+
+    @abstractmethod
     def raw(self, rows: int, start: int) -> Iterator[Raw]:
         """Yield the source's rows from `start`, at most `rows` at a time; callers may change the arrays."""
-        raise NotImplementedError
 
     def positions(self, rows: int) -> Iterator[NDArray[np.float32]]:
         return (raw.means for raw in self.raw(rows, 0))
@@ -109,15 +122,6 @@ class SceneStream(Stream[Splats]):
             before, keep = self.tally.dropped, self.tally.clean(raw)
             splats = raw.activated(self.render_model, self.offset)
             yield splats if self.tally.dropped == before else splats.take(keep)
-
-    def whole(self) -> Scene:
-        """Read all rows into memory."""
-        raw, kept = Raw.empty(self.count, (self.sh_degree + 1) ** 2 - 1), 0
-        for block in self.blocks(BLOCK):
-            rows = raw.take(slice(kept, kept := kept + len(block)))
-            rows.fill(getattr(block, name) for name in ARRAYS)
-        notes = self.all_notes()
-        return Scene(raw.take(slice(kept)).activated(self.render_model, self.offset, self.up), notes)
 
 
 class PartsStream(SceneStream):
