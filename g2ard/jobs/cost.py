@@ -26,21 +26,24 @@ if TYPE_CHECKING:
 
 _USUAL_PIXELS = 480_000
 """Pixels of a generated view."""
-_RENDER, _VISIBILITY, _SCORE = 0.03, 0.01, 0.06
-"""Seconds per view of these pixels: a target, a small render for visibility, and a score. These and the next
-were measured on playbot, 500,000 → 50,000 Gaussians on two cores."""
-_SIMPLIFY, _STEP, _REPORT, _PAGE = 1.2 / 500_000, 0.02, 1.5, 1.0
-"""Seconds per Gaussian of simplification, per step of recovery, of the report, and of the viewer page."""
+_RENDER, _STEP, _SCORE = (0.009, 8e-8), (0.016, 3e-7), (0.05, 3.5e-7)
+"""Seconds per view of these pixels, and per Gaussian: of a target, of a step of recovery, and of scoring a
+scene before and after. Measured, like the next, on two cores of a virtual machine: estimates are 0.68 to 1.09
+times what guitar 90,854 → 5,000, biker 152,746 → 10,000, playbot 500,000 → 50,000, showroom/0_7 542,681 →
+20,000 and taebak_park/0_0 532,101 → 20,000 take.
+"""
+_SIMPLIFY, _VISIBILITY, _REPORT, _PAGE = 7e-6, 0.006, 1.5, 1.0
+"""Seconds per Gaussian of simplification, per view for visibility, of the report and of the page."""
 
 _TILED = {
     **{"tiles": 2, "coarse": 3, "light": 0, "visibility": 11, "costs": 1},
     **{"plans": 2, "merge": 1, "growth": 8, "merged visibility": 4},
 }
-"""Microseconds per Gaussian of stages in tiles, in order. These and the next were measured on 150,000
-Gaussians in three tiles."""
-_LIGHT, _TILED_TIMES, _SEEN_TILES = 0.0025, 3.5, 4
+"""Microseconds per Gaussian of stages in tiles, in order, measured on 150,000 Gaussians in three tiles."""
+_LIGHT, _TILED_TIMES, _SEEN_TILES = 0.0025, 1.2, 4
 """Seconds per view of `light`; time of a step in a tile relative to one in one piece, as surroundings are
-drawn too; and the most tiles that a view is expected to see, each of which takes steps."""
+drawn too (0.6 on guitar and 2.1 on playbot, in four tiles by two workers); and the most tiles that a view is
+expected to see, each of which takes steps."""
 
 _PAGE_BYTES, _PAGE_FULL = 170, 130_000
 """Memory of packing the viewer page: bytes per Gaussian and SH coefficient above degree 0, and the count from
@@ -90,18 +93,22 @@ def cost_of(job: DistillJob | TiledJob, count: int, *, page: bool = True) -> Cos
     kept, size = job.is_kept(count), pixels / _USUAL_PIXELS
     steps = 0 if kept or not job.recovers else job.steps(count)
     views = len(test) + apart + (len(train) if job.recovers else 0)
-    recovery = job.config.recover.recovery_time or _STEP * size * steps
+    tiles = 1 if job.tiles is None else job.tiles.plan.tiles
+    recovery = job.config.recover.recovery_time or _each(_STEP, size, count / tiles) * steps
     if job.tiles is not None:
+        seen = min(tiles, _SEEN_TILES)
+        render = _each(_RENDER, size, job.tiles.plan.count * seen / tiles)
         stages = _tiled_stages(job.tiles, len(train), compare=not job.recovers)
         stages.append(("light", _LIGHT * views))
-        times, drawn = _TILED_TIMES * min(job.tiles.plan.tiles, _SEEN_TILES), 2 * _RENDER * size * views
+        times, drawn = _TILED_TIMES * seen, 2 * render * views
         stages.append(("recover", times * recovery + drawn) if job.recovers else ("score", drawn))
         return Cost(views, pixels, steps, tuple(stages), job.tiles.plan.bytes)
-    stages = [("targets", _RENDER * size * (views if steps else len(test) + apart))]
+    target = _each(_RENDER, size, 0 if job.teacher is None else len(job.prior))
+    stages = [("targets", target * (views if steps else len(test) + apart))]
     if not kept:
         stages += [("visibility", _VISIBILITY * len(train)), ("simplify", _SIMPLIFY * len(job.prior))]
         stages += [("recover", recovery)] if job.recovers else []
-    stages.append(("scoring", _SCORE * size * len(test)))
+    stages.append(("scoring", _each(_SCORE, size, len(job.prior)) * len(test)))
     stages += [("report.html", _REPORT), ("view.html", _PAGE)] if page else []
     return Cost(views, pixels, steps, tuple(stages), _peak_bytes(job, count, views * pixels, page))
 
@@ -127,13 +134,19 @@ def cost_of_recovery(
     """
     pixels, views = _mean_pixels(training), len(training) + others
     size = pixels / _USUAL_PIXELS
-    stages = [] if teacher is None else [("targets", _RENDER * size * views)]
-    stages.append((stage, seconds or _STEP * size * steps))
-    stages += [("scoring", 2 * _SCORE * size * scored)] if scored else []
+    stages = [] if teacher is None else [("targets", _each(_RENDER, size, len(teacher)) * views)]
+    stages.append((stage, seconds or _each(_STEP, size, len(scene)) * steps))
+    stages += [("scoring", _each(_SCORE, size, len(scene)) * scored)] if scored else []
     dense = 0 if teacher is None else teacher.nbytes
     targets = min(CACHE_BYTES, views * pixels * (3 if teacher is None else 12))
     memory = _PROGRAM_BYTES + targets + dense + 3 * scene.nbytes + _TRAINER_BYTES * len(scene)
     return Cost(views, pixels, steps, tuple(stages), memory)
+
+
+def _each(seconds: tuple[float, float], size: float, count: float) -> float:
+    """Return the seconds for a view of `size` times the usual pixels, or for a step on it."""
+    per_view, per_gaussian = seconds
+    return per_view * size + per_gaussian * count
 
 
 def _mean_pixels(cameras: Cameras) -> int:

@@ -94,7 +94,7 @@ def simplify(
         if parents is not None and not dry_run:
             maps = Outputs(parents, budgets, run.claim_file, name="--parents")
         seen = [("read", 0.2), ("poses", 1.0), ("visibility", 2.0)]  # seconds for playbot
-        run.console.expect([*seen, *[("simplify", 1.2), ("visibility", 0.5), ("write", 0.1)] * len(budgets)])
+        run.console.expect([*seen, *[("simplify", 3.5), ("visibility", 0.5), ("write", 0.1)] * len(budgets)])
     named = list(filter(None, (outputs, maps)))
     for each in named:
         each.check()
