@@ -199,7 +199,8 @@ class Grid:
                 share, size = optical[rows[inside]] / count**2, sizes[rows[inside]]
                 np.add.at(filled, index[inside], share)
                 np.add.at(logs, index[inside], share * size)
-        scale = np.where(filled > 0, np.exp(logs / np.where(filled > 0, filled, 1)), 0).astype(np.float32)
+        scale, some = np.zeros(len(filled), np.float32), filled > 0
+        scale[some] = np.exp(logs[some] / filled[some])
         opaque, murky = (_steps((filled > limit).reshape(shape)) for limit in (_OPAQUE, _MURKY))
         return cls(low, cell, opaque, murky, scale.reshape(shape))
 
@@ -244,13 +245,14 @@ def _index(points: Floats, low: Floats, cell: float, shape: NDArray[Any]) -> tup
 
 def _steps(filled: NDArray[np.bool_]) -> NDArray[np.int8]:
     """Return king's moves to the nearest filled cell, at most `_REACH`."""
-    steps = np.where(filled, 0, _REACH).astype(np.int8)
-    for reach in range(1, _REACH):
+    steps = np.full(filled.shape, _REACH, np.int8)
+    steps -= filled
+    for _ in range(1, _REACH):
         for axis in range(3):
             wider = filled.copy()
             after, before = (np.moveaxis(cells, axis, 0) for cells in (wider, filled))
             after[1:] |= before[:-1]
             after[:-1] |= before[1:]
             filled = wider
-        steps[filled & (steps == _REACH)] = reach
+        steps -= filled
     return steps

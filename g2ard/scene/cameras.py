@@ -22,6 +22,7 @@ USUAL = "usual"
 
 LARGEST_IMAGE = 160_000_000
 """Maximum pixels of an image or view; a decoded pixel takes 12 bytes."""
+_TOO_LARGE = "has {width:,}×{height:,} pixels; the limit is {limit:,}"
 
 _LARGEST_CAMERA_VALUE = 1e12
 """Largest value of poses and intrinsics; larger ones are damaged data and overflow when squared."""
@@ -37,7 +38,7 @@ _TUPLE_FIELDS = ("names", "image_paths", "mask_paths", "kinds", "lenses")
 def check_image(width: int, height: int, **fields: Any) -> None:
     """Raise an `InputError` with `fields` for an image of more than `LARGEST_IMAGE` pixels."""
     if width * height > LARGEST_IMAGE:
-        raise InputError(f"has {width:,}×{height:,} pixels; the limit is {LARGEST_IMAGE:,}", **fields)
+        raise InputError(_TOO_LARGE.format(width=width, height=height, limit=LARGEST_IMAGE), **fields)
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,22 +180,38 @@ class Cameras:
         if len(set(self.names)) < n:
             twice = next(name for name in self.names if self.names.count(name) > 1)
             raise InputError(f"{twice!r} is given twice; every view needs its own name", parameter="names")
-        for i in range(n):
-            given = (self.viewmats[i], self.Ks[i], self.distortions[i])
-            if not all(np.isfinite(values).all() for values in given):
-                raise self._error(i, "has a pose or intrinsics that are not finite")
-            if max(np.abs(values).max() for values in given) > _LARGEST_CAMERA_VALUE:
-                raise self._error(i, f"has a pose or intrinsics above {_LARGEST_CAMERA_VALUE:.0e}")
-            if fault := _not_rigid(self.viewmats[i]):
-                raise self._error(i, f"has a pose that {fault}; expected a rotation and a translation")
-            if self.widths[i] < 1 or self.heights[i] < 1:
-                raise self._error(i, f"has an empty image, {self.widths[i]}×{self.heights[i]}")
-            check_image(int(self.widths[i]), int(self.heights[i]), index=i, item="view")
-            if self.Ks[i, 0, 0] <= 0 or self.Ks[i, 1, 1] <= 0:
-                raise self._error(i, "has a focal length that is not positive")
+        with np.errstate(all="ignore"):  # from values that are rejected
+            scales = np.sqrt((self.viewmats[:, :3, :3] ** 2).sum((1, 2)) / 3)  # 1 in a rigid transform
+            faults = self._faults(scales)
+        wrong = np.array(list(faults.values()))
+        if wrong.any():
+            i = int(wrong.any(0).argmax())
+            fault = list(faults)[int(wrong[:, i].argmax())]
+            size = {"width": int(self.widths[i]), "height": int(self.heights[i]), "limit": LARGEST_IMAGE}
+            message = fault.format(scale=scales[i], **size)
+            raise InputError(f"({self.names[i]}) {message}", index=i, item="view")
 
-    def _error(self, index: int, message: str) -> InputError:
-        return InputError(f"({self.names[index]}) {message}", index=index, item="view")
+    def _faults(self, scales: NDArray[np.float64]) -> dict[str, NDArray[np.bool_]]:
+        """Return a (C,) mask for each fault, given as a template of its message; a view's first is told."""
+        n, rotations = len(self), self.viewmats[:, :3, :3]
+        largest = np.abs(
+            np.hstack([self.viewmats.reshape(n, 16), self.Ks.reshape(n, 9), self.distortions])
+        ).max(1)
+        last_row = np.abs(self.viewmats[:, 3] - (0, 0, 0, 1)).max(1)
+        square, unit = rotations @ rotations.transpose(0, 2, 1), scales**2
+        skew = np.abs(square - unit[:, None, None] * np.eye(3)).max((1, 2))
+        pose = "has a pose that {}; expected a rotation and a translation".format
+        return {
+            "has a pose or intrinsics that are not finite": ~np.isfinite(largest),
+            f"has a pose or intrinsics above {_LARGEST_CAMERA_VALUE:.0e}": largest > _LARGEST_CAMERA_VALUE,
+            pose("has another last row than 0 0 0 1"): last_row > _POSE_SLACK,
+            pose("skews"): (skew > 2 * _POSE_SLACK * unit) | ~(scales > 0),
+            pose("scales by {scale:.4g}"): np.abs(scales - 1) > _POSE_SLACK,
+            pose("mirrors"): np.linalg.det(rotations) < 0,
+            "has an empty image, {width}×{height}": np.minimum(self.widths, self.heights) < 1,
+            _TOO_LARGE: self.widths.astype(np.float64) * self.heights > LARGEST_IMAGE,
+            "has a focal length that is not positive": (self.Ks[:, [0, 1], [0, 1]] <= 0).any(1),
+        }
 
     def __repr__(self) -> str:
         return f"Cameras({plural(len(self), 'view')})"
@@ -389,20 +406,6 @@ class Cameras:
             kinds=tuple(kinds),
             lenses=tuple(lenses),
         )
-
-
-def _not_rigid(viewmat: NDArray[np.float64]) -> str | None:
-    """Return how a finite 4×4 matrix differs from a rigid transform, beyond rounding; None if it does not."""
-    R = viewmat[:3, :3]
-    square = R @ R.T
-    if np.abs(viewmat[3] - (0, 0, 0, 1)).max() > _POSE_SLACK:
-        return "has another last row than 0 0 0 1"
-    scale = float(np.sqrt(np.trace(square) / 3))
-    if np.abs(square - scale**2 * np.eye(3)).max() > 2 * _POSE_SLACK * scale**2 or not scale > 0:
-        return "skews"
-    if abs(scale - 1) > _POSE_SLACK:
-        return f"scales by {scale:.4g}"
-    return "mirrors" if np.linalg.det(R) < 0 else None
 
 
 def rows_by_kind(kinds: Sequence[str]) -> dict[str, list[int]]:

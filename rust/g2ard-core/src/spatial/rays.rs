@@ -63,7 +63,7 @@ impl Steps<'_> {
     /// Steps at a point, which is taken into the box if rounding put it beside.
     fn steps_at(&self, point: [f64; 3]) -> i8 {
         let index = (0..3).fold(0, |flat, k| {
-            let place = ((point[k] - self.low[k]) / self.cell).floor();
+            let place = (point[k] - self.low[k]) / self.cell;
             flat * self.shape[k] + (place.max(0.0) as usize).min(self.shape[k] - 1)
         });
         self.steps[index]
