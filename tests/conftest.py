@@ -10,15 +10,18 @@ import sys
 import tempfile
 from collections import Counter
 from collections.abc import Callable, Iterator
+from functools import cache
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
 import pytest
+import typer
+from typer.main import get_command as typer_parser
 
 import g2ard
 from g2ard.io import write_views
-from helpers.plans import FOLDER, share_plans
+from helpers.plans import FOLDER, SIZE, share_plans
 from helpers.project import environment
 from helpers.scenes import around, checkered_ball
 
@@ -95,6 +98,12 @@ def _program(words: list[str]) -> list[str]:
     return words if words[:1] == ["benchmarks"] else ["g2ard", *words]
 
 
+@cache
+def _parser(app: typer.Typer, commands: int) -> Any:
+    """Return typer's parser, made once: the program registers one command, tests in time all of them."""
+    return typer_parser(app)
+
+
 def _apart(words: list[str], cwd: Path, env: dict[str, str]) -> Said:
     done = subprocess.run(
         [sys.executable, "-m", *_program(words)],
@@ -124,6 +133,7 @@ def _here(words: list[str], cwd: Path, env: dict[str, str]) -> Said:
         contextlib.redirect_stderr(err),
         patch("g2ard.system.interrupt.ends_the_program"),  # signals stay those of pytest
         patch("gc.freeze"),  # `main` takes it that the program ends
+        patch("typer.main.get_command", lambda app: _parser(app, len(app.registered_commands))),
         patch("webbrowser.open", side_effect=KeyboardInterrupt),  # a page that is shown is closed at once
     ):
         os.chdir(cwd)
@@ -139,11 +149,17 @@ def _here(words: list[str], cwd: Path, env: dict[str, str]) -> Said:
     return int(status or 0) if isinstance(status, int | None) else 1, out.getvalue(), err.getvalue()
 
 
-@pytest.fixture(autouse=True)
-def shared_plans(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+_USUAL_VIEWS = {"test_generated_views", "test_notes", "test_stopped_runs"}
+"""Modules whose generated views have the usual size, as their numbers and kinds depend on it."""
+
+
+@pytest.fixture(scope="module", autouse=True)
+def shared_plans(request: pytest.FixtureRequest) -> Iterator[None]:
     """Share planned views between all tests but those of planning."""
-    if request.path.parent.name != "poses":
-        share_plans(monkeypatch)
+    with pytest.MonkeyPatch.context() as patches:
+        if request.path.parent.name != "poses":
+            share_plans(patches, **{} if request.path.stem in _USUAL_VIEWS else {"size": SIZE})
+        yield
 
 
 @pytest.fixture

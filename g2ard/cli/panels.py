@@ -110,8 +110,9 @@ class Command(TyperCommand):
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Show all options for `--help-all`; take a flag by its former spelling."""
         args = [_FORMER.get((str(self.name), word), word) for word in args]
-        if "--help-all" in args:
-            self._all, args = True, ["--help"]
+        self._all = "--help-all" in args
+        if self._all:
+            args = ["--help"]
         return super().parse_args(ctx, args)
 
     def format_help(self, ctx: Any, formatter: Any) -> None:

@@ -7,7 +7,8 @@ import tempfile
 from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
+from importlib import import_module
 from os import replace as put_in_place  # the original: tests of interruptions count its calls
 from pathlib import Path
 from typing import Any
@@ -21,18 +22,25 @@ from g2ard.scene.splats import Splats
 
 FOLDER = "G2ARD_TEST_PLANS"
 """Variable of the environment: a folder in which all processes of a run of the tests keep plans."""
-_IMPORTERS = ("poses", "jobs.clean", "jobs.measured_budget", "jobs.register", "jobs.views")
-"""Modules in which jobs find `plan_pool`."""
+_IMPORTERS = [
+    *("g2ard.poses", "g2ard.jobs.clean", "g2ard.jobs.measured_budget", "g2ard.jobs.register"),
+    *("g2ard.jobs.views", "benchmarks.views", "benchmarks.kinds.select"),
+]
+"""Modules that have `plan_pool`."""
 _MOST = 100
 """Plans that are kept in memory."""
+SIZE = (440, 330)
+"""Size of generated views in tests that draw hundreds: a third of the usual pixels; `clean` draws at 400."""
 
 _plans: OrderedDict[str, Any] = OrderedDict()
 
 
-def share_plans(monkeypatch: pytest.MonkeyPatch) -> None:
+def share_plans(monkeypatch: pytest.MonkeyPatch, **options: Any) -> None:
     """Plan a scene's views once for all processes; tests/poses tests that plans are the same each time."""
+    for name in _IMPORTERS:  # first all, or one would import another's patch for good
+        import_module(name)
     for name in _IMPORTERS:
-        monkeypatch.setattr(f"g2ard.{name}.plan_pool", _shared)
+        monkeypatch.setattr(f"{name}.plan_pool", partial(_shared, **options))
 
 
 def _shared(splats: Splats, *count: int, progress: Progress = silent, **options: Any) -> Pool:
