@@ -104,7 +104,7 @@ def test_made_standing_views_are_of_another_kind(make) -> None:
         nearest = np.linalg.norm(splats.means[:, None] - cameras.positions, axis=2).min(axis=0)
         assert nearest.min() > 0.05
     standing = found["standing"]
-    assert standing.Ks[0, 0, 0] == pytest.approx(400 / np.tan(np.radians(35)))
+    assert standing.Ks[0, 0, 0] == pytest.approx(standing.widths[0] / 2 / np.tan(np.radians(35)))
     if make is naive.statue:
         middle = np.array([0, 0, 0.5])
         away = [np.linalg.norm(c.positions - middle, axis=1).mean() for c in (*found.values(), pool)]
