@@ -530,19 +530,25 @@ def _execute(run: Run, fn: Callable[..., None], options: dict[str, Any], cuda: b
         with run.console, _device(run):
             fn(run, **options)
     except KeyboardInterrupt:
-        run.console.error(f"interrupted; {'; '.join(run.kept) or 'nothing was written'}")
-        raise typer.Exit(interrupt.status()) from None
+        _stopped(run)
     except (G2ardError, OSError, MemoryError) as e:
         run.console.error(run.failure(one_line(e, run.flags)))
         raise typer.Exit(1) from None
     except (typer.Exit, typer.BadParameter):
         raise
     except Exception as e:
+        if isinstance(e.__cause__, KeyboardInterrupt):  # Python wraps it in a class that is being made
+            _stopped(run)
         if run.verbose:
             traceback.print_exc()
         reason = run.failure(f"{type(e).__name__}: {' '.join(str(e).split())}")
         run.console.error(f"internal error, please report it: {reason} (-v shows the traceback)")
         raise typer.Exit(1) from None
+
+
+def _stopped(run: Run) -> NoReturn:
+    run.console.error(f"interrupted; {'; '.join(run.kept) or 'nothing was written'}")
+    raise typer.Exit(interrupt.status()) from None
 
 
 @contextmanager

@@ -9,7 +9,7 @@ import pytest
 
 from g2ard.cli.app import COMMANDS
 from g2ard.cli.console import Console
-from helpers.commands import CommandLine, succeeds
+from helpers.commands import CommandLine, refused, succeeds
 
 
 def imported_by(statement: str, *heavy: str) -> list[str]:
@@ -91,6 +91,20 @@ main()
     command = [sys.executable, "-m", "stopped"]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout) == (130, "kept\n")
+
+
+def test_an_interrupt_while_a_class_is_made_is_one(
+    folder: Path, command_line: CommandLine, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Modules are loaded late, and before Python 3.12 its own error hides what a descriptor raises."""
+
+    class Stopped:
+        def __set_name__(self, owner: type, name: str) -> None:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr("g2ard.jobs.clean.clean", lambda *_, **__: type("Made", (), {"field": Stopped()}))
+    error = refused(command_line, folder, "clean", "ball.ply", "-o", "clean.ply", status=130)
+    assert error == "g2ard: interrupted; nothing was written\n"
 
 
 def test_version_has_a_letter(command_line: CommandLine, folder: Path) -> None:
