@@ -3,7 +3,9 @@
 import itertools
 import math
 import re
+import signal
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -199,6 +201,24 @@ def test_an_interrupted_run_resumes_to_the_same_bits(
     assert whole.report.regularizers.steps == resumed.report.regularizers.steps
     assert bool(whole.report.trials) == (steps >= 100)
     assert whole.report.geometry == resumed.report.geometry
+
+
+def test_an_interrupt_during_trials_is_kept(
+    targets: TeacherRenders, student: Splats, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Even if what runs at that moment hides it."""
+    learn = loop.Loop._learn
+
+    def interrupted(*arguments: Any, **options: Any) -> float:
+        with suppress(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+        return learn(*arguments, **options)
+
+    monkeypatch.setattr(loop.Loop, "_learn", interrupted)
+    told, config = [], RecoverConfig(steps=150)
+    with pytest.raises(KeyboardInterrupt):
+        recover(student, targets, config, progress=lambda stage, done, *_: told.append(done))
+    assert told == [0]
 
 
 def test_resume_refuses_other_options(student: Splats, targets: TeacherRenders, tmp_path: Path) -> None:

@@ -65,7 +65,10 @@ def steps_at(path: Path) -> int | None:
 
 @contextmanager
 def deferred_interrupt() -> Iterator[threading.Event]:
-    """Turn Ctrl-C (and SIGTERM in the program) into an event that the loop checks between steps."""
+    """Turn Ctrl-C (and SIGTERM in the program) into an event that the loop checks between steps.
+
+    If no check has seen it, the end of the context raises KeyboardInterrupt.
+    """
     asked = threading.Event()
     if threading.current_thread() is not threading.main_thread():
         yield asked
@@ -84,3 +87,5 @@ def deferred_interrupt() -> Iterator[threading.Event]:
     finally:
         for number, handler in before:
             signal.signal(number, handler)
+    if asked.is_set():
+        raise KeyboardInterrupt

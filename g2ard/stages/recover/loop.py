@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
+from threading import Event
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -161,9 +162,10 @@ class Loop:
             return
         self.multiplier = multiplier_for(rmse)
         if steps := trial_steps(self.config.horizon, limit):
-            trials = Trials(lambda multiplier, end: self._trial(multiplier, steps, end), start, limit)
             tight = reach_for(0.0, typical) if schedule.reach is None else self.reach
-            self._choose_by_trials(trials, rmse, tight)
+            with checkpoints.deferred_interrupt() as stop:
+                trials = Trials(lambda rate, end: self._trial(rate, steps, end, stop), start, limit)
+                self._choose_by_trials(trials, rmse, tight)
             self.trials = [{"multiplier": m, "psnr": value} for m, value in sorted(trials.scores.items())]
             self.seconds = trials.seconds
 
@@ -185,17 +187,19 @@ class Loop:
             elif nearly_fitted:
                 self.multiplier = min(best / 3, multiplier_for(rmse, 0.01))
 
-    def _trial(self, multiplier: float, steps: int, end: float) -> float:
+    def _trial(self, multiplier: float, steps: int, end: float, interrupted: Event) -> float:
         """Return the PSNR after a few steps from the start; raise TimeoutError at `end` (monotonic)."""
         engine = self._new_engine()
         try:
             for step in range(steps):
+                if interrupted.is_set():
+                    raise KeyboardInterrupt
                 if time.monotonic() > end:
                     raise TimeoutError
                 self._learn(engine, step, step / steps, multiplier)
             return self.probe.all_of(engine.splats())
         except DeviceError:
-            return self._trial(multiplier, steps, end)
+            return self._trial(multiplier, steps, end, interrupted)
 
     def _learn(
         self, engine: Engine, step: int, share: float, multiplier: float, *, regularize: bool = False
