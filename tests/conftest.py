@@ -100,7 +100,7 @@ def _program(words: list[str]) -> list[str]:
 
 @cache
 def _parser(app: typer.Typer, commands: int) -> Any:
-    """Return typer's parser, made once: the program registers one command, tests in time all of them."""
+    """Return typer's parser. The program registers one command, a process of tests nearly all."""
     return typer_parser(app)
 
 

@@ -537,7 +537,7 @@ def _execute(run: Run, fn: Callable[..., None], options: dict[str, Any], cuda: b
     except (typer.Exit, typer.BadParameter):
         raise
     except Exception as e:
-        if isinstance(e.__cause__, KeyboardInterrupt):  # Python wraps it in a class that is being made
+        if isinstance(e.__cause__, KeyboardInterrupt):  # before Python 3.12, in `__set_name__`
             _stopped(run)
         if run.verbose:
             traceback.print_exc()

@@ -192,11 +192,10 @@ class Cameras:
             raise InputError(f"({self.names[i]}) {message}", index=i, item="view")
 
     def _faults(self, scales: NDArray[np.float64]) -> dict[str, NDArray[np.bool_]]:
-        """Return a (C,) mask for each fault, given as a template of its message; a view's first is told."""
+        """Return the (C,) mask of each fault, the most basic first; keys are templates of messages."""
         n, rotations = len(self), self.viewmats[:, :3, :3]
-        largest = np.abs(
-            np.hstack([self.viewmats.reshape(n, 16), self.Ks.reshape(n, 9), self.distortions])
-        ).max(1)
+        values = np.hstack([self.viewmats.reshape(n, 16), self.Ks.reshape(n, 9), self.distortions])
+        largest = np.abs(values).max(1)
         last_row = np.abs(self.viewmats[:, 3] - (0, 0, 0, 1)).max(1)
         square, unit = rotations @ rotations.transpose(0, 2, 1), scales**2
         skew = np.abs(square - unit[:, None, None] * np.eye(3)).max((1, 2))

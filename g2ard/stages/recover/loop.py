@@ -8,6 +8,7 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from threading import Event
 from typing import TYPE_CHECKING, Any
@@ -163,8 +164,8 @@ class Loop:
         self.multiplier = multiplier_for(rmse)
         if steps := trial_steps(self.config.horizon, limit):
             tight = reach_for(0.0, typical) if schedule.reach is None else self.reach
-            with checkpoints.deferred_interrupt() as stop:
-                trials = Trials(lambda rate, end: self._trial(rate, steps, end, stop), start, limit)
+            with checkpoints.deferred_interrupt() as interrupted:
+                trials = Trials(partial(self._trial, steps, interrupted), start, limit)
                 self._choose_by_trials(trials, rmse, tight)
             self.trials = [{"multiplier": m, "psnr": value} for m, value in sorted(trials.scores.items())]
             self.seconds = trials.seconds
@@ -187,7 +188,7 @@ class Loop:
             elif nearly_fitted:
                 self.multiplier = min(best / 3, multiplier_for(rmse, 0.01))
 
-    def _trial(self, multiplier: float, steps: int, end: float, interrupted: Event) -> float:
+    def _trial(self, steps: int, interrupted: Event, multiplier: float, end: float) -> float:
         """Return the PSNR after a few steps from the start; raise TimeoutError at `end` (monotonic)."""
         engine = self._new_engine()
         try:
@@ -199,7 +200,7 @@ class Loop:
                 self._learn(engine, step, step / steps, multiplier)
             return self.probe.all_of(engine.splats())
         except DeviceError:
-            return self._trial(multiplier, steps, end, interrupted)
+            return self._trial(steps, interrupted, multiplier, end)
 
     def _learn(
         self, engine: Engine, step: int, share: float, multiplier: float, *, regularize: bool = False
