@@ -22,7 +22,6 @@ from benchmarks.study import SceneSpec, Study, key
 from benchmarks.workspace import PROTOCOLS, Workspace, budget_of, kinds_for
 from g2ard import io
 from g2ard.scene.splats import Splats
-from g2ard.stages.simplify.growth import GROWTHS
 
 __all__ = ["Simplify"]
 
@@ -35,9 +34,12 @@ _FLAGS = {
     "paper": ["--method", "paper"],
 }
 """Method of g2ard → its flags."""
-_GROWTHS = {f"growth-{growth:g}": growth for growth in GROWTHS}
-"""`default` with one growth of merged Gaussians, instead of the one that it chooses."""
-_FLAGS |= {name: ["--set", f"max_growth={growth:g}"] for name, growth in _GROWTHS.items()}
+_GROWTHS = {f"growth-{growth:g}": growth for growth in (1, 1.25, 1.6, 2, 2.5, 3.2, 4)}
+"""`default` with one growth for all merged Gaussians, instead of one that depends on their surroundings."""
+_FLAGS |= {
+    name: ["--set", "surface_depth=inf", "--set", f"max_growth={growth:g}"]
+    for name, growth in _GROWTHS.items()
+}
 _OWN = ("default", *_GROWTHS)
 """Methods that look from views of their own."""
 

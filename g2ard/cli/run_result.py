@@ -99,7 +99,7 @@ def told(report: RunReport | TiledReport, *, verbose: bool = False) -> list[str]
         return [line for line in map(loss, report.kinds) if line]
     from g2ard.jobs.measured_budget import score_lines
     from g2ard.stages.recover.report import outcome, unregularized
-    from g2ard.stages.simplify.growth import RECOVERED_GAPS, gaps_line
+    from g2ard.stages.simplify.gaps import RECOVERED_GAPS, gaps_line
 
     rounds = [entry.recover for entry in report.rounds]
     lines = [outcome(one) for entry in rounds for one in entry]

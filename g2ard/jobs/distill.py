@@ -44,7 +44,7 @@ from g2ard.stages.lift import lift, lift_rows
 from g2ard.stages.recover.anchors import FREE, PriorMeasures, Regularizers, measure_prior, regularizers_for
 from g2ard.stages.recover.config import Schedule
 from g2ard.stages.simplify import simplify
-from g2ard.stages.simplify.growth import opacity_lost, say_gaps
+from g2ard.stages.simplify.gaps import opacity_lost, say_gaps
 from g2ard.system.cached import cached_property
 
 if TYPE_CHECKING:
@@ -202,7 +202,7 @@ class DistillJob:
 
         if not self.recovers:
             visibility = visibility_source(self.views.train.cameras, progress=self.progress)
-            merged = simplify(finer, count, visibility=visibility, compare=True, progress=self.progress)
+            merged = simplify(finer, count, visibility=visibility, gaps=True, progress=self.progress)
             say_gaps(merged.report.opacity_lost, self.say)
             return merged.splats, merged.splats, score(merged.splats), None
         done = job._reduced(finer, count, work)

@@ -75,7 +75,7 @@ class Reduction:
 
     Args:
         cameras: cameras that give visibility weights to every method, instead of `views`.
-        recovered: whether the results are recovered afterwards, so that their growth is not measured.
+        recovered: whether the results are recovered afterwards, so that their gaps are not measured.
         notes: notes on the scene's file.
         tiles: the scene, if it is in tiles; `splats` is then a sample.
     """
@@ -130,7 +130,7 @@ class Reduction:
             self.splats,
             count,
             visibility=self._visibility if count < self.total else None,
-            compare=not self.recovered,
+            gaps=not self.recovered,
             config=self.config,
             progress=self.progress,
         )

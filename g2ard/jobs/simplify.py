@@ -18,7 +18,7 @@ from g2ard.pipeline.presets import configured
 from g2ard.progress import Progress, Say, silent, unsaid
 from g2ard.scene.splats import Splats
 from g2ard.stages.simplify import Simplified, SimplifyConfig
-from g2ard.stages.simplify.growth import say_gaps
+from g2ard.stages.simplify.gaps import say_gaps
 
 if TYPE_CHECKING:
     from g2ard.jobs.tiling import Tiling

@@ -33,7 +33,7 @@ from g2ard.scene.splats import Splats
 from g2ard.scene.transform import join
 from g2ard.stages.recover.anchors import regularizers_for
 from g2ard.stages.simplify import SimplifyConfig
-from g2ard.stages.simplify.growth import say_gaps
+from g2ard.stages.simplify.gaps import say_gaps
 from g2ard.system.peak_memory import peak_rss_of_all
 from g2ard.tiles.executor import Workers, executor
 from g2ard.tiles.ingest import ingest
@@ -72,8 +72,8 @@ class Tiles:
 
     def simplified(self, count: int, views: Cameras | None, config: SimplifyConfig) -> TiledSimplified:
         """Simplify the scene; finished steps are in the folder of its workers."""
-        small = simplify_tiles(self.run(config), count, views, compare=True)
-        parts = list(small.counts), small.views, small.unseen, small.growth, small.opacity_lost
+        small = simplify_tiles(self.run(config), count, views, gaps=True)
+        parts = list(small.counts), small.views, small.unseen, small.opacity_lost
         return TiledSimplified(small, TiledSimplifyReport(self.plan.count, len(small), *parts))
 
     def sample(self, config: SimplifyConfig) -> Splats:
@@ -143,7 +143,6 @@ class TiledSimplifyReport(Report):
     tiles: list[int]
     views: int
     unseen: int | None
-    growth: float | None
     opacity_lost: float | None
     rounds = ()
 
@@ -243,7 +242,7 @@ class TiledJob:
         """Simplify the dense scene or one derived from it, recover it unless nothing is, and score it."""
         seen = views if self.recovers else self.views
         run = self.tiles.run(self.config.simplify, store)
-        small = simplify_tiles(run, count, seen.train.cameras, compare=not self.recovers)
+        small = simplify_tiles(run, count, seen.train.cameras, gaps=not self.recovers)
         say_gaps(small.opacity_lost, self.say)
         self.around = self.around or small.sights  # the first is made from the dense scene itself
         assert self.around is not None  # views are given

@@ -16,11 +16,10 @@ from g2ard.pipeline.steps import key_of
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats, unit_quats
 from g2ard.scene.transform import join
-from g2ard.stages.simplify.growth import GROWTHS, best_growth
 from g2ard.stages.simplify.pairs import fit_opacities
 from g2ard.tiles.sights import Sights
 from g2ard.tiles.simplify import TiledRun
-from g2ard.tiles.tasks import load, merged_scene
+from g2ard.tiles.tasks import load, scene_of
 
 _HALF = 1 << 16
 
@@ -37,7 +36,6 @@ class TiledScene:
         tiles: reads the Gaussians of a tile, with fitted opacities.
         key: hash of the names of its files.
         unseen: Gaussians of the dense scene that no view sees; None without views.
-        growth: largest growth of merged Gaussians; None if nothing was merged.
         opacity_lost: share of the light that opaque pixels stop but let through in the merged scene, before
             opacities are fitted; None if not measured.
         sights: visibility of the dense tiles, for recovery; None without views.
@@ -50,7 +48,6 @@ class TiledScene:
     key: str
     views: int = 0
     unseen: int | None = None
-    growth: float | None = None
     opacity_lost: float | None = None
     sights: Sights | None = None
     render_model: RenderModel = "classic"
@@ -73,7 +70,7 @@ class TiledScene:
 
 
 def simplify_tiles(
-    run: TiledRun, budget: int, views: Cameras | None = None, *, compare: bool = False
+    run: TiledRun, budget: int, views: Cameras | None = None, *, gaps: bool = False
 ) -> TiledScene:
     """Reduce a tiled scene to exactly `budget` Gaussians with method `default`.
 
@@ -85,9 +82,8 @@ def simplify_tiles(
     3. Each tile computes the costs of merging along Morton order. The cheapest merges of all tiles are done,
        down to three times the budget. Then each tile plans more merges of pairs than needed, and the cheapest
        of all plans are done, down to the budget (`_merged`).
-    4. If `compare` is true, a common growth of merged Gaussians is chosen as in one piece, by comparing
-       renders of each tile in these views, or without views from outside (`_growth`).
-    5. Opacities are fitted to what the same views see of the result.
+    4. Opacities are fitted to what the same views see of the result, and if `gaps` is true, these views
+       measure the opacity lost.
 
     Every step is a task with a file in the folder of the run's workers, so the same call resumes. The result
     depends only on the scene, the tiles and the views, not on where, in which order or how often tasks ran.
@@ -102,43 +98,32 @@ def simplify_tiles(
     if budget == store.count:
         return _scene(store, run.sizes, store.read, key_of(store.key), sights)
     merged, counts = _merged(run, budget, frame if sights is None else sights.frame, sights)
-    growth, lost = _growth(run, merged, sights, compare=compare)
     if sights is None:
         files, mean = [{"merged": path} for path in merged], None
     else:
-        seen = sights.again(merged, growth)
+        seen = sights.again(merged)
         files = [{"merged": one, "visibility": other} for one, other in zip(merged, seen, strict=True)]
         mean = sum(float(load(path, "wanted")[0].sum()) for path in merged) / budget
 
     def tile(i: int) -> Splats:
-        small = merged_scene(merged[i], growth)
+        small = scene_of(merged[i], "scene")
         if mean is not None:  # with views, opacities fit what these see
             members, wanted = load(merged[i], "members", "wanted")
             (weight,) = load(files[i]["visibility"], "weight")
             small = fit_opacities(small, members, wanted, weight, mean)
         return finished(small, store.sh_degree)
 
-    scene = _scene(store, counts, tile, key_of([files, growth]), sights)
-    scene = replace(scene, growth=growth, opacity_lost=lost)
+    scene = _scene(store, counts, tile, key_of(files), sights)
     if sights is None:
         return scene
-    return replace(scene, unseen=sum(int(load(path, "unseen")[0]) for path in merged))
+    lost = _opacity_lost(run, merged, sights) if gaps else None
+    return replace(scene, opacity_lost=lost, unseen=sum(int(load(path, "unseen")[0]) for path in merged))
 
 
-def _growth(
-    run: TiledRun, merged: list[Path], sights: Sights | None, *, compare: bool
-) -> tuple[float, float | None]:
-    """Return the growth of merged Gaussians, and if renders were compared the share of opacity lost."""
-    growth = run.max_growth
-    if not compare or growth is not None:
-        return growth or GROWTHS[0], None
-    levels = None if sights is None else sights.levels()
-    inputs = [{"merged": path} for path in merged] if sights is None else sights.beside(merged)
-    done = run.each("growths", "growth", per_tile=levels, inputs=inputs)
-    errors, lost, opaque = np.sum([load(path, "compared")[0] for path in done], axis=0).T
-    growth = best_growth(lambda growth: errors[GROWTHS.index(growth)])
-    at = GROWTHS.index(growth)
-    return growth, float(lost[at] / opaque[at]) if opaque[at] else 0.0
+def _opacity_lost(run: TiledRun, merged: list[Path], sights: Sights) -> float:
+    done = run.each("gaps", "gaps", per_tile=sights.levels(), inputs=sights.beside(merged))
+    lost, opaque = np.sum([load(path, "light")[0] for path in done], axis=0)
+    return float(lost / opaque) if opaque else 0.0
 
 
 def _merged(

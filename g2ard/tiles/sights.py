@@ -60,12 +60,10 @@ class Sights:
             pixel = weighted_quantile(pixels[known], np.array(run.sizes)[known], 0.5)
             self.frame = _core.TileFrame(*frame).with_views(pixel, *map(float, sums)).values()
 
-    def again(self, merged: list[Path], growth: float) -> list[Path]:
-        """Measure what the same views see of the merged tiles, widened by up to `growth`."""
-        given = [{**levels, "growth": growth} for levels in self.levels()]
-        return self.run.each(
-            "merged_visibility", "merged visibility", per_tile=given, inputs=self.beside(merged)
-        )
+    def again(self, merged: list[Path]) -> list[Path]:
+        """Measure what the same views see of the merged tiles."""
+        levels, inputs = self.levels(), self.beside(merged)
+        return self.run.each("merged_visibility", "merged visibility", per_tile=levels, inputs=inputs)
 
     def levels(self) -> list[dict[str, Any]]:
         """Return the coarse level of all tiles around each, None for itself, as argument of its tasks."""

@@ -32,7 +32,7 @@ from g2ard.scene.prepared import PreparedScene, as_prepared, finite_rows_of
 from g2ard.scene.splats import Splats
 from g2ard.scene.transform import join
 from g2ard.stages.simplify import Default, SimplifyConfig, simplify
-from g2ard.stages.simplify.growth import GROWTHS, Renders, outside_views, some_views
+from g2ard.stages.simplify.gaps import light_lost, some_views
 from g2ard.stages.simplify.pairs import emphasised, splats_of
 from g2ard.tiles.executor import Workers
 from g2ard.tiles.tasks import (
@@ -46,7 +46,6 @@ from g2ard.tiles.tasks import (
     cameras_of,
     cropped,
     load,
-    merged_scene,
     scene_of,
     surroundings,
     tile_of,
@@ -236,8 +235,7 @@ def merge(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
     Returns:
         `scene`, n = runs − merges + faint Gaussians (`scene_of`), opacities unfitted; `members`, (n,) rows
         merged into each; `clamped`, the number of clamped opacities; with views also `wanted`, (n,) Σ αT² of
-        the members, and `unseen`, the number of rows that no view sees. `needed`, (n,) float32 growth with
-        which α ≤ 0.99 would hold each one's mass.
+        the members, and `unseen`, the number of rows that no view sees.
     """
     scene = tile_of(arguments, inputs, places)
     runs, merges = arguments["runs"], arguments["merges"]
@@ -250,13 +248,11 @@ def merge(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
     dropped = of == GONE
     of = np.where(dropped, GONE, name[np.where(dropped, 0, of)]).astype(np.uint32)
     out = _seen_tile(scene, arguments, inputs).assemble(of, len(clusters))
-    small, needed = splats_of(scene, out), out["needed_growth"]
+    small = splats_of(scene, out)
     if faint := np.flatnonzero(dropped)[: arguments["faint"]].tolist():
         of[faint], dropped[faint] = np.arange(len(small), len(small) + len(faint)), False
         small = join([small, scene.take(scene.core.order[faint])])
-        needed = np.concatenate([needed, np.ones(len(faint), np.float32)])
     kept, made = ~dropped, arrays_of(small, "scene")
-    made["needed"] = needed
     made["members"] = np.bincount(of[kept], minlength=len(small))
     if "visibility" in inputs:
         (weight,) = load(inputs["visibility"], "weight")
@@ -270,13 +266,13 @@ def merged_visibility(arguments: Arguments, inputs: Inputs, places: Places) -> A
     """Measure what the same views see of a tile's merged Gaussians.
 
     Args:
-        arguments: `tile`, `levels`; `growth`, the largest growth of merged Gaussians.
+        arguments: `tile`, `levels`.
         inputs: `coarse`, `views`, `visibility`; `merged`, the output of `merge`.
 
     Returns:
         `weight`, (n,) float32 Σ αT², scaled like those of `visibility`.
     """
-    core = as_prepared(merged_scene(inputs["merged"], arguments["growth"]).with_sh_degree(0))
+    core = as_prepared(scene_of(inputs["merged"], "scene").with_sh_degree(0))
     used, share, near = load(inputs["visibility"], "used", "share", "near")
     cameras = cameras_of(inputs["views"]).recentred(core.offset).take(used)
     settings = RasterSettings(antialiased=core.antialiased, near=float(near))
@@ -286,32 +282,25 @@ def merged_visibility(arguments: Arguments, inputs: Inputs, places: Places) -> A
     return {"weight": sums.by_row()[0][: len(core)] / np.float32(share)}
 
 
-def growths(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
-    """Compare renders of a tile's merged Gaussians with the dense ones', for each growth to choose from.
-
-    Without views, the tile is seen alone, from outside.
+def gaps(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:
+    """Measure the light that a tile's merged Gaussians let through and the dense ones stop.
 
     Args:
-        arguments: `tile`; with views `levels`.
-        inputs: `merged`, the output of `merge`; with views `coarse`, `views` and `visibility`.
+        arguments: `tile`, `levels`.
+        inputs: `merged`, the output of `merge`; `coarse`, `views` and `visibility`.
 
     Returns:
-        `compared`, (G, 3) for the G growths, what `g2ard.stages.simplify.growth.Renders.compare` returns.
+        `light`, (2,) what `g2ard.stages.simplify.gaps.light_lost` returns.
     """
     dense = tile_of(arguments, inputs, places, sh=False)
-    settings = settings_for(dense.means, antialiased=dense.antialiased)
-    around: list[Splats] = []
-    if "views" in inputs:
-        used, near = load(inputs["visibility"], "used", "near")
-        settings = replace(settings, near=float(near))
-        here = cameras_of(inputs["views"]).recentred(dense.offset).take(used)
-        views = some_views(cropped(here, dense, settings).recentred(-dense.offset))
-        around = surroundings(arguments, inputs, places)
-    else:
-        views = outside_views(dense)
-    renders = Renders.of(amid(dense.take(dense.core.order), around), views, settings)
-    compared = [renders.compare(amid(merged_scene(inputs["merged"], growth), around)) for growth in GROWTHS]
-    return {"compared": np.array(compared)}
+    used, near = load(inputs["visibility"], "used", "near")
+    settings = replace(settings_for(dense.means, antialiased=dense.antialiased), near=float(near))
+    here = cameras_of(inputs["views"]).recentred(dense.offset).take(used)
+    views = some_views(cropped(here, dense, settings).recentred(-dense.offset))
+    around = surroundings(arguments, inputs, places)
+    before = amid(dense.take(dense.core.order), around)
+    after = amid(scene_of(inputs["merged"], "scene"), around)
+    return {"light": np.array(light_lost(before, after, views, settings))}
 
 
 def _config(arguments: Arguments) -> Default:
@@ -356,8 +345,6 @@ class TiledRun:
         model = store.render_model
         merging = config.turned("default")
         assert isinstance(merging, Default)
-        self.max_growth = merging.max_growth
-        merging = replace(merging, max_growth=None)  # applied after merging
         self.config = asdict(merging.resolved(antialiased=model == "antialiased"))
         self.sizes = [tile.rows for tile in store.tiles]
         self.coarse: list[Path] = []

@@ -24,7 +24,6 @@ from g2ard.scene.cameras import Cameras
 from g2ard.scene.prepared import PreparedScene, as_prepared, finite_rows_of
 from g2ard.scene.splats import Splats
 from g2ard.scene.transform import join
-from g2ard.stages.simplify.growth import widened
 
 Arrays = dict[str, NDArray[Any]]
 """Output of a task: arrays by name, stored as one .npz file."""
@@ -161,11 +160,6 @@ def load(path: Path, *names: str) -> list[NDArray[Any]]:
         raise InputError(
             "its contents changed after writing; remove it and run the same command again", path=path
         ) from error
-
-
-def merged_scene(path: Path, growth: float) -> Splats:
-    """Read the output of `merge`, its Gaussians widened by up to `growth`."""
-    return widened(scene_of(path, "scene"), load(path, "needed")[0], growth)
 
 
 def scene_of(path: Path, name: str) -> Splats:

@@ -56,6 +56,7 @@ SIMPLIFY: dict[str, Any] = {
     "geometric_weight": 0.0,
     "dilation": 2.0,
     "pixel_scale": 20.0,
+    "surface_depth": 30.0,
     "max_growth": 1.0,
     "keep_region": ((0, 0, 1, 0.8),),
     "keep_times": 16.0,

@@ -82,6 +82,21 @@ def priority(splats, protected, weight=10.0):
     return mass * (1 + weight * protected)
 
 
+def surface_depths(splats):
+    """Return Σ α exp(−½ dᵀ Σ⁻¹ d) of each Gaussian and its 24 nearest, across its shortest axis."""
+    means = splats.means.astype(np.float64)
+    covs = np.array([covariance(splats, i) for i in range(len(splats))])
+    alphas = np.minimum(0.99, 1 / (1 + np.exp(-splats.logit_opacities.astype(np.float64))))
+    out = alphas.copy()
+    for i, cov in enumerate(covs):
+        plane = np.linalg.eigh(cov)[1][:, 1:]
+        for j in np.argsort(np.linalg.norm(means - means[i], axis=1), kind="stable")[:25]:
+            if j != i:
+                d = plane.T @ (means[i] - means[j])
+                out[i] += alphas[j] * np.exp(-0.5 * d @ np.linalg.solve(plane.T @ covs[j] @ plane, d))
+    return out
+
+
 def rendered_area(cov, e2):
     """√tr adj(Σ + e²I): adj has the products of pairs of eigenvalues."""
     a, b, c = np.linalg.eigvalsh(cov + e2 * np.eye(3))

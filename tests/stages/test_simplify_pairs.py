@@ -62,7 +62,7 @@ def test_unseen_gaussians_are_counted():
 @pytest.mark.parametrize("method", ["default", "fast"])
 def test_clusters_conserve_mass_mean_and_covariance(method, growth):
     prior = scene(3000, dtype=np.float64)
-    config = SimplifyConfig(max_growth=growth)
+    config = SimplifyConfig(max_growth=growth, surface_depth=np.inf)
     e2 = (0.4 * 0.01) ** 2
     seen = Views(np.ones(3000), np.full(3000, 0.01))
     out = simplify(prior, 1500, method=method, visibility=seen, config=config)

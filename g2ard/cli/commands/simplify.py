@@ -169,7 +169,7 @@ def _tell_plan(run: Run, reduce: Reduction, counts: Sequence[int]) -> None:
 
 
 def _tell(run: Run, scene: Path, reduce: Reduction, small: Simplified, output: Path, seconds: float) -> None:
-    from g2ard.stages.simplify.growth import say_gaps
+    from g2ard.stages.simplify.gaps import say_gaps
 
     if run.verbose and small.report.rounds:
         _table(run, small)

@@ -94,9 +94,10 @@ class Pairs(SimplifyConfig):
         dilation: standard deviation of the renderer's blur, in pixels. The renderer's is √0.3 ≈ 0.55; 0.4
             measured best. 0 for antialiased scenes.
         pixel_scale: without views: pixel size over the median of the largest scales.
-        max_growth: factor by which a cluster's area may grow, along its two longer axes, if α ≤ 0.99 cannot
-            hold its mass. With 1, opaque surfaces show gaps. None means 1.25 for what is recovered
-            afterwards, and otherwise what brings renders closest to the dense scene's, 1.25 to 4.
+        surface_depth: merged Gaussians whose mass α ≤ 0.99 cannot hold widen along their two longer axes
+            until the optical depth of the surface at their centre reaches this, so that it stays closed. 3
+            stops 95 % of the light; infinity keeps all mass, which blurs where layers lie on each other.
+        max_growth: largest factor by which their area grows. With 1, opaque surfaces show gaps.
         keep_region: with views: spheres (x, y, z, r) and boxes (x, y, z, x, y, z), in world coordinates, that
             get more of the budget.
         keep_times: weight of these regions: views count as if √keep_times times closer, so that each Gaussian
@@ -108,7 +109,8 @@ class Pairs(SimplifyConfig):
     geometric_weight: Annotated[float, Within("[0, inf]")] = _PAIRWISE["geometric_weight"]
     dilation: Annotated[float, Within("[0, inf]")] = _PAIRWISE["dilation"]
     pixel_scale: Positive = _PAIRWISE["pixel_scale"]
-    max_growth: Annotated[float, Within("[1, inf]")] | None = None
+    surface_depth: Annotated[float, Within("(0, inf]")] = _PAIRWISE["surface_depth"]
+    max_growth: Annotated[float, Within("[1, inf]")] = _PAIRWISE["max_growth"]
     keep_region: tuple[Region, ...] = ()
     keep_times: Positive = 4.0
 

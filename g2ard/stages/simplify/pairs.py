@@ -16,7 +16,6 @@ from g2ard.scene.prepared import MAX_OPACITY, PreparedScene
 from g2ard.scene.regions import in_any
 from g2ard.scene.splats import DRAWN_LOGIT, Splats
 from g2ard.stages.simplify.config import Pairs
-from g2ard.stages.simplify.growth import GROWTHS, Renders, best_growth, widened
 
 _OPACITY_FIT_EXPONENT = 1 / 4
 """Exponent of the ratio of wanted to current visibility: ½ fits the given views by up to 0.1 dB better, and
@@ -80,32 +79,18 @@ def merge(
     )
 
 
-def widen(
-    scene: PreparedScene, out: dict[str, Any], renders: Renders | None, config: Pairs
-) -> dict[str, Any]:
-    """Widen merged rows by the config's growth, or by the one whose renders are closest to `renders`."""
-    growth, needed = config.max_growth, out["needed_growth"]
-    if growth is not None or renders is None:
-        return {**out, "growth": GROWTHS[0] if growth is None else growth}
-    merged, growth = splats_of(scene, out), GROWTHS[0]
-    if (needed > growth).any():
-        growth = best_growth(lambda growth: renders.compare(widened(merged, needed, growth))[0])
-    return {**out, "growth": growth, "scales": widened(merged, needed, growth).scales}
-
-
 def merge_and_fit(
     scene: PreparedScene,
     budget: int,
     source: VisibilitySource,
     protected: NDArray[np.bool_] | None,
-    renders: Renders | None,
     config: Pairs,
     progress: Progress,
 ) -> dict[str, Any]:
     """Merge by visibility, then fit each merged Gaussian's opacity so that views see as much of it as of its
     members."""
     visibility = rows_of(source(scene), len(scene), slice(None))
-    out = widen(scene, merge(scene, budget, visibility, protected, config, progress), renders, config)
+    out = merge(scene, budget, visibility, protected, config, progress)
     merged, parents = splats_of(scene, out), out["parents"]
     order = scene.core.order  # sums in this order do not depend on the order of the scene's rows
     row, weight = parents[order], visibility.weight[order]

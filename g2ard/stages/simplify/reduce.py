@@ -17,14 +17,13 @@ from g2ard.rendering.visibility import SampledVisibility
 from g2ard.scene.prepared import finite_rows_of, with_some_opacity
 from g2ard.scene.splats import DRAWN_LOGIT, Splats, unit_quats
 from g2ard.stages.simplify.config import Pairs, SimplifyConfig
-from g2ard.stages.simplify.growth import Renders, outside_views, some_views
+from g2ard.stages.simplify.gaps import opacity_lost
 from g2ard.stages.simplify.pairs import (
     VisibilitySource,
     merge,
     merge_and_fit,
     rows_of,
     splats_of,
-    widen,
 )
 
 
@@ -63,8 +62,7 @@ class SimplifyReport(Report):
         protected: flagged output rows.
         nonfinite_rows: input rows dropped because they are not finite.
         infinite_logits: infinite logits, taken as α = 0 or 1.
-        clamped_opacities: merged rows whose α was limited to 0.99, losing what `max_growth` could not absorb.
-        growth: `default`, `fast`: the largest growth of a merged row's area, see `SimplifyConfig.max_growth`.
+        clamped_opacities: merged rows whose α was limited to 0.99, losing what `surface_depth` does not keep.
         opacity_lost: share of the light that the scene's opaque pixels stop but the result lets through, if
             it was measured.
         fitted: rows whose opacity (or area, at full opacity) was fitted to visibility.
@@ -87,7 +85,6 @@ class SimplifyReport(Report):
     unseen: int | None
     faded: int
     skipped: dict[str, int]
-    growth: float | None = field(default=None, metadata=LEFT_OUT)
     opacity_lost: float | None = field(default=None, metadata=LEFT_OUT)
     seconds: float | None = field(default=None, metadata=LEFT_OUT)
 
@@ -152,7 +149,7 @@ def simplify(
     visibility: SampledVisibility | VisibilitySource | None = None,
     protected: NDArray[np.bool_] | None = None,
     final_budget: int | None = None,
-    compare: bool = False,
+    gaps: bool = False,
     config: SimplifyConfig = _DEFAULTS,
     progress: Progress = silent,
 ) -> Simplified:
@@ -186,9 +183,7 @@ def simplify(
             do not use them.
         final_budget: for `paper`: N_S, if this call is one round on the way to a smaller count; it sets the
             size of cells. None means `budget`.
-        compare: for `default` and `fast`: compare small renders with the dense scene's, to choose
-            `max_growth` unless the config does, and to measure the opacity lost; for results that are not
-            recovered. Views are those of `visibility`, if it has the attribute `views`, or six from outside.
+        gaps: measure the opacity lost in the views of `visibility`, if it has the attribute `views`.
         progress: called with the number of Gaussians removed.
 
     Raises:
@@ -212,11 +207,6 @@ def simplify(
         protected = np.ascontiguousarray(protected[finite])
     if not (scene.opacities >= (config.resolved().min_opacity or 0.0)).any():
         scene, config = with_some_opacity(scene), replace(config, min_opacity=0.0)
-    renders = None
-    if compare and isinstance(config, Pairs) and budget < len(scene):
-        views = getattr(visibility, "views", None)
-        views = outside_views(scene) if views is None else some_views(views)
-        renders = Renders.of(scene.take(scene.core.order), views)  # ties in depth go by row
     if not isinstance(config, Pairs):
         out = _core.simplify_paper(
             scene.core,
@@ -229,11 +219,15 @@ def simplify(
     elif config.keep_region and visibility is None:
         raise InputError("needs views; `fast` uses only given ones", parameter="keep_region")
     elif callable(visibility):
-        out = merge_and_fit(scene, budget, visibility, protected, renders, config, progress)
+        out = merge_and_fit(scene, budget, visibility, protected, config, progress)
     else:
         seen = None if visibility is None else rows_of(visibility, len(splats), finite)
-        out = widen(scene, merge(scene, budget, seen, protected, config, progress), renders, config)
-    lost = None if renders is None else renders.lost_in(splats_of(scene, out))
+        out = merge(scene, budget, seen, protected, config, progress)
+    views = getattr(visibility, "views", None)
+    lost = None
+    if gaps and views is not None and budget < len(scene):
+        dense = scene.take(scene.core.order)  # ties in depth go by row
+        lost = opacity_lost(dense, splats_of(scene, out), views)
     return _simplified(splats, finite, out, lost)
 
 
@@ -264,7 +258,6 @@ def _simplified(
             "sh_bands": splats.sh_degree - math.isqrt(out["sh"].shape[1]) + 1,
             **_spared(out["rounds"]),
         },
-        growth=out.get("growth"),
         opacity_lost=lost,
     )
     return Simplified(small, parents, protected, report)

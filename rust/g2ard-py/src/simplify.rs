@@ -158,7 +158,6 @@ pub fn outcome_dict<'py, R>(
     out.set_item("parents", PyArray1::from_vec(py, outcome.parents))?;
     out.set_item("protected", PyArray1::from_vec(py, outcome.protected))?;
     out.set_item("clamped_opacities", outcome.clamped_opacities)?;
-    out.set_item("needed_growth", PyArray1::from_vec(py, outcome.needed))?;
     out.set_item("infinite_logits", outcome.infinite_logits)?;
     out.set_item("rounds", rounds)?;
     Ok(out)

@@ -50,19 +50,19 @@ impl Partition {
     /// One Gaussian per cluster, in the order of the clusters; a cluster of one is a copy of its member.
     ///
     /// Mass is α·A as rendered, A with the row's dilation `blur` (a variance), and is conserved: α of a
-    /// cluster is Σm / A. Where that passes 0.99, the cluster grows instead along its two longer axes, to at
-    /// most `growth` times the area.
+    /// cluster is Σm / A. Where that passes 0.99, the cluster can grow instead along its two longer axes: `widened`
+    /// is called with the Gaussians and the growth that each one's mass needs.
     pub fn assemble(
         &self,
         scene: &SceneRef,
         ordered: &Ordered,
-        growth: f64,
         blur: &[f32],
+        widened: impl FnOnce(&mut Splats, &[f64]) -> Result<()>,
         control: &Control,
     ) -> Result<Step> {
         let (starts, rows) = self.members();
         let members = |c: usize| &rows[starts[c] as usize..starts[c + 1] as usize];
-        let make = |c: usize| make(scene, ordered, members(c), growth, blur);
+        let make = |c: usize| make(scene, ordered, members(c), blur);
         let made = in_chunks(self.count, control, make)?;
         let mut step = Step {
             splats: Splats {
@@ -72,6 +72,7 @@ impl Partition {
             parents: self.of.clone(),
             ..Step::default()
         };
+        let mut needed = Vec::with_capacity(self.count);
         step.splats.sh.reserve(self.count * (scene.rest + 1));
         for (c, made) in made.enumerate() {
             step.clamped += usize::from(made.clamped);
@@ -79,7 +80,7 @@ impl Partition {
             step.splats.quats.push(made.quat);
             step.splats.scales.push(made.scales);
             step.splats.logit_opacities.push(made.logit);
-            step.needed.push(made.needed);
+            needed.push(made.needed);
             average_sh(
                 scene,
                 ordered,
@@ -88,6 +89,7 @@ impl Partition {
                 &mut step.splats.sh,
             );
         }
+        widened(&mut step.splats, &needed)?;
         Ok(step)
     }
 }
@@ -101,12 +103,12 @@ struct Made {
     /// Share of each member in the mass; empty for a copy.
     weights: Vec<f64>,
     clamped: bool,
-    /// See [`Step::needed`].
-    needed: f32,
+    /// Growth of the area with which α ≤ 0.99 holds the mass.
+    needed: f64,
 }
 
 /// Merges a cluster's `members`; parameters are those of [`Partition::assemble`].
-fn make(scene: &SceneRef, ordered: &Ordered, members: &[u32], growth: f64, blur: &[f32]) -> Made {
+fn make(scene: &SceneRef, ordered: &Ordered, members: &[u32], blur: &[f32]) -> Made {
     if let [only] = members {
         let row = ordered.rows[*only as usize] as usize;
         return Made {
@@ -138,8 +140,7 @@ fn make(scene: &SceneRef, ordered: &Ordered, members: &[u32], growth: f64, blur:
     let (mean, cov) = pool(&parts);
     let alpha = mass / rendered_area(&cov, least_blur);
     let total: f64 = parts.iter().map(|p| p.0).sum();
-    let mut gaussian = Gaussian::from_moments(mean, &cov);
-    gaussian.widen((alpha / MAX_OPACITY).clamp(1.0, growth));
+    let gaussian = Gaussian::from_moments(mean, &cov);
     Made {
         mean: ordered.on_grid(mean),
         quat: gaussian.quat(),
@@ -147,7 +148,7 @@ fn make(scene: &SceneRef, ordered: &Ordered, members: &[u32], growth: f64, blur:
         logit: logit_of(alpha.min(MAX_OPACITY)),
         weights: parts.iter().map(|p| p.0 / total).collect(),
         clamped: alpha > MAX_OPACITY,
-        needed: (alpha / MAX_OPACITY).max(1.0) as f32,
+        needed: (alpha / MAX_OPACITY).max(1.0),
     }
 }
 

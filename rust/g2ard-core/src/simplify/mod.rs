@@ -17,6 +17,7 @@ mod pairwise;
 mod paper;
 mod protection;
 mod rows;
+mod surface;
 mod tile;
 mod trim;
 
@@ -45,7 +46,4 @@ pub struct Step {
     pub parents: Vec<u32>,
     /// Merged rows whose α was clipped, so that some of their mass is lost.
     pub clamped: usize,
-    /// Growth of each row's area over its moments with which α ≤ 0.99 holds its mass; empty for other methods than
-    /// the pairwise.
-    pub needed: Vec<f32>,
 }

@@ -15,8 +15,6 @@ pub struct Outcome<R> {
     pub rounds: Vec<R>,
     /// See [`Step::clamped`].
     pub clamped_opacities: usize,
-    /// See [`Step::needed`].
-    pub needed: Vec<f32>,
     /// Infinite logits, clamped.
     pub infinite_logits: usize,
 }
@@ -87,7 +85,6 @@ impl Step {
             protected,
             rounds,
             clamped_opacities: self.clamped,
-            needed: self.needed,
             infinite_logits: ordered.infinite_logits,
         }
     }

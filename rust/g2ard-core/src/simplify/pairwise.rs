@@ -14,10 +14,10 @@ use super::moments::sigmoid;
 use super::morton_tree::{cut, merge_costs};
 use super::rows::{Rows, Shuffled};
 use super::trim::best;
-use super::{GONE, Outcome};
+use super::{GONE, Outcome, Step, surface};
 use crate::constants::constants;
 use crate::scene::{Ordered, SceneRef};
-use crate::{Control, Error, Result};
+use crate::{Control, Error, Result, Splats};
 
 constants! {
     /// The constants, named as in Python, which takes its defaults from here. They are what measured best
@@ -37,8 +37,10 @@ constants! {
         pub dilation: f64 = 0.4,
         /// Without views: size of a pixel over the median largest scale.
         pub pixel_scale: f64 = 0.2,
-        /// Largest growth of a cluster's area over its moments, where α alone cannot hold its mass.
-        pub max_growth: f64 = 1.25,
+        /// Optical depth at a merged Gaussian up to which it widens, where α alone cannot hold its mass.
+        pub surface_depth: f64 = 3.0,
+        /// Largest growth of its area.
+        pub max_growth: f64 = f64::INFINITY,
     }
 }
 
@@ -116,9 +118,24 @@ impl Pairwise {
         }
         partition.count = nodes.len();
         drop(nodes);
-        let step = partition.assemble(scene, ordered, self.max_growth, &blur, control)?;
+        let step = self.assembled(&partition, scene, ordered, &blur, control)?;
         let protected = step.inherited(&protected);
         Ok(step.finish(scene, ordered, protected, rounds))
+    }
+
+    /// The Gaussians of a partition, widened where a surface would show gaps.
+    pub(super) fn assembled(
+        &self,
+        partition: &Partition,
+        scene: &SceneRef,
+        ordered: &Ordered,
+        blur: &[f32],
+        control: &Control,
+    ) -> Result<Step> {
+        let widened = |splats: &mut Splats, needed: &[f64]| {
+            surface::close(splats, needed, self.surface_depth, self.max_growth, control)
+        };
+        partition.assemble(scene, ordered, blur, widened, control)
     }
 
     /// Merge the cheapest pairs of neighbours in rounds, down to each count of `schedule`. After a round `on_pairs`
@@ -204,6 +221,8 @@ impl Pairwise {
         ] {
             refuse!(value.is_nan() || value < 1.0 => name, "at least 1", value);
         }
+        let depth = self.surface_depth;
+        refuse!(depth.is_nan() || depth <= 0.0 => "surface_depth", "above 0", depth);
         Ok(())
     }
 

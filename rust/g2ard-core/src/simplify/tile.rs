@@ -140,14 +140,11 @@ impl Tile<'_> {
         control: &Control,
     ) -> Result<Outcome<PairwiseRound>> {
         Error::unless_equal("of", of.len(), self.scene.len(), "rows")?;
-        let growth = self.policy.max_growth;
-        let step = Partition { of, count }.assemble(
-            self.scene,
-            self.ordered,
-            growth,
-            &self.blurs(),
-            control,
-        )?;
+        let partition = Partition { of, count };
+        let blur = self.blurs();
+        let step = self
+            .policy
+            .assembled(&partition, self.scene, self.ordered, &blur, control)?;
         Ok(step.finish(self.scene, self.ordered, vec![false; count], Vec::new()))
     }
 
