@@ -10,10 +10,12 @@ folder and processes, forked from this one, which has imported g2ard but called 
 of every file and of the printed text, with durations, dates, paths and sizes of memory masked.
 
 Bits depend on the processor and on libraries. On another machine than that of the record, only exit statuses,
-names of files, and texts without their numbers are compared.
+names of files and keys of JSON are compared. `--isa portable` or a variable in `CHOOSING` makes this machine
+another.
 """
 
 import argparse
+import contextlib
 import dataclasses
 import hashlib
 import importlib
@@ -51,8 +53,14 @@ RECORD, TABLE = (Path(__file__).with_suffix(suffix) for suffix in (".json", ".tx
 MOMENTS = (0.2, 0.7)
 """Shares of a command's renamed files, or of a call's progress, after which it is interrupted."""
 
+CHOOSING = ("OPENBLAS_CORETYPE", "NPY_DISABLE_CPU_FEATURES", "GLIBC_TUNABLES")
+"""Variables by which OpenBLAS, numpy and the C library choose other code, as they do on other processors."""
+
 SAME = "same"
 """Expected outcome of an interrupted run."""
+
+ELSEWHERE = "recorded on another machine"
+COMPARED = "only exit statuses, names of files and keys of JSON are compared"
 
 Found = dict[str, Any]
 
@@ -81,9 +89,16 @@ def masked(text: str, root: Path) -> str:
     return text
 
 
-def plain(text: str) -> str:
-    """Return a text without its numbers, which depend on the processor."""
-    return re.sub(r"[ \t]+", " ", re.sub(r"[-+]?\d[\d.,]*(?:e[-+]?\d+)?", "#", text))
+def keys(text: bytes | str, before: str = "") -> Iterator[str]:
+    """Yield the keys of JSON objects, except in lists, whose rows may depend on numbers."""
+    with contextlib.suppress(ValueError):
+        yield from _keys(json.loads(text), before)
+
+
+def _keys(value: Any, before: str) -> Iterator[str]:
+    for name in sorted(value) if isinstance(value, dict) else ():
+        yield f"{before}.{name}"
+        yield from _keys(value[name], f"{before}.{name}")
 
 
 def canonical(value: Any, root: Path) -> Any:
@@ -162,14 +177,14 @@ def found(place: Place, done: list[tuple[int, str, str]]) -> Found:
     """Return the line of the record: what commands printed and which files they left."""
     files = place.files()
     errors = [error.strip()[:200] for status, _, error in done if status]
-    texts = [plain(text) for row in done for text in row[1:]]
-    texts += [plain(data.decode()) for name, data in files.items() if name.endswith(".json")]
+    json_keys = [key for i, row in enumerate(done) for key in keys(row[1], str(i))]
+    json_keys += [key for name, data in files.items() if name.endswith(".json") for key in keys(data, name)]
     return {
         "status": [row[0] for row in done],
         **({"errors": errors} if errors else {}),
         "out": digest("\0".join(row[1] for row in done)),
         "err": digest("\0".join(row[2] for row in done)),
-        "plain": digest("\0".join([*files, *texts])),
+        "keys": digest("\0".join(json_keys)),
         "files": {name: digest(data) for name, data in files.items()},
     }
 
@@ -299,25 +314,31 @@ def table() -> Iterator[tuple[str, str, list[list[str]]]]:
 # ── the record ────────────────────────────────────────────────────────────────────────────────────────
 
 
-def machine() -> dict[str, str]:
-    """Return what bits depend on."""
+def machine(isa: str | None) -> dict[str, str]:
+    """Return what bits depend on; `isa` is the kernels' instruction set unless it is the fastest."""
     info = Path("/proc/cpuinfo")
     rows = dict(re.findall(r"(?m)^([\w ]+?)\s*: (.*)$", info.read_text() if info.exists() else ""))
     flags = [flag for flag in ("fma", "avx2", "avx512f", "avx512bw") if flag in rows.get("flags", "").split()]
     model = [rows.get(key, "") for key in ("vendor_id", "cpu family", "model")]
+    chosen = [f"{name}={os.environ[name]}" for name in CHOOSING if os.environ.get(name)]
     versions = [f"{name} {version(name)}" for name in ("numpy", "pillow", "plyfile", "torch")]
     return {
-        "processor": " ".join([platform.machine(), *model, *flags]),
+        "processor": " ".join([platform.machine(), *model, *flags, *chosen, *filter(None, [isa])]),
         "versions": ", ".join(
             [*versions, f"zlib {zlib.ZLIB_RUNTIME_VERSION}", f"Python {sys.version.split()[0]}"]
         ),
     }
 
 
-def run_all(chosen: list[Case], root: Path, jobs: int) -> dict[str, Found]:
+def run_all(chosen: list[Case], root: Path, jobs: int, isa: str | None) -> dict[str, Found]:
     """Run cases, `jobs` at a time, and return their lines of the record."""
     importlib.import_module("g2ard.__main__")
     import g2ard
+    from g2ard import _core
+
+    if isa:
+        for name in ("Rasterizer", "Trainer"):
+            setattr(_core, name, partial(getattr(_core, name), isa=isa))
 
     for name in g2ard.__all__:
         if name != "rasterize":  # needs torch
@@ -372,9 +393,9 @@ def differences(was: Found, now: Found, elsewhere: bool) -> list[str]:
     pairs = zip(was.get("again", []), now.get("again", []), strict=False)
     again = [end for before, end in pairs if before == SAME != end]
     if elsewhere:
-        keys = [key for key in ("status", "plain") if was[key] != now[key]]
-        return [*keys, *sorted(was["files"].keys() ^ now["files"].keys()), *again]
-    lines = [*again, *(key for key in ("status", "out", "err") if was[key] != now[key])]
+        lines = [key for key in ("status", "keys") if was[key] != now[key]]
+        return [*lines, *sorted(was["files"].keys() ^ now["files"].keys()), *again]
+    lines = [*again, *(key for key in ("status", "keys", "out", "err") if was[key] != now[key])]
     old, new = was.get("errors", []), now.get("errors", [])
     lines += [f"- {error}" for error in old if error not in new]
     lines += [f"+ {error}" for error in new if error not in old]
@@ -397,14 +418,15 @@ def main() -> int:
     add("--to", "--with", dest="record", type=Path, default=RECORD, help="file of the record")
     add("--keep", type=Path, metavar="DIR", help="keep everything that was written in a new folder")
     add("--jobs", type=int, default=os.cpu_count() or 1, help="cases at a time")
+    add("--isa", help="instruction set of the rasteriser and the trainer: avx2, portable")
     asked = parser.parse_args()
     chosen = [c for c in all_cases() if re.search(asked.only, c.name) and (c.sliced or not asked.slice)]
     with tempfile.TemporaryDirectory(prefix="goldens") as temporary:
         root = asked.keep or Path(temporary)
         root.mkdir(parents=True, exist_ok=asked.keep is None)
-        results = run_all(chosen, root.resolve(), asked.jobs)
+        results = run_all(chosen, root.resolve(), asked.jobs, asked.isa)
     failed = [f"{name}: {text}" for name, line in results.items() for text in line.pop("failed", [])]
-    here = {"machine": machine(), "cases": results}
+    here = {"machine": machine(asked.isa), "cases": results}
     known = json.loads(asked.record.read_text()) if asked.record.exists() else None
     if asked.action == "record":
         if len(chosen) < len(list(all_cases())) and known:
@@ -421,7 +443,7 @@ def main() -> int:
     else:
         elsewhere = known["machine"] != here["machine"]
         if elsewhere:
-            print(f"recorded on another machine ({known['machine']}): numbers are not compared")
+            print(f"{ELSEWHERE} ({known['machine']}): {COMPARED}")
         for name, line in results.items():
             was = known["cases"].get(name)
             if "files" in line:

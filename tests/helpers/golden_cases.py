@@ -6,6 +6,7 @@ The inputs are written without g2ard, so that a change of its writers changes no
 import gzip
 import json
 from collections.abc import Callable
+from datetime import date
 from pathlib import Path
 from typing import Any
 
@@ -227,6 +228,7 @@ def _write_scene(path: Path, columns: dict[str, np.ndarray]) -> None:
 def _write_las(path: Path, points: np.ndarray, colors: np.ndarray) -> None:
     header = laspy.LasHeader(point_format=2, version="1.2")
     header.offsets, header.scales = points.min(0), np.full(3, 0.001)
+    header.creation_date = date(2026, 1, 1)  # today's by default
     data = laspy.LasData(header)
     data.x, data.y, data.z = points.T
     data.red, data.green, data.blue = colors.astype(np.uint16).T * 257
