@@ -149,7 +149,7 @@ def _here(words: list[str], cwd: Path, env: dict[str, str]) -> Said:
     return int(status or 0) if isinstance(status, int | None) else 1, out.getvalue(), err.getvalue()
 
 
-_USUAL_VIEWS = {"test_generated_views", "test_notes", "test_stopped_runs"}
+_USUAL_VIEWS = {"test_floors", "test_generated_views", "test_notes", "test_stopped_runs"}
 """Modules whose generated views have the usual size, as their numbers and kinds depend on it."""
 
 
