@@ -119,12 +119,11 @@ def missing(what: str, package: str, **fields: Any) -> MissingDependencyError:
     Args:
         package: the package itself, which pip installs wherever g2ard came from; an extra of g2ard would not.
 
-    >>> str(missing("reading .las and .laz", "laspy[lazrs]"))
-    "reading .las and .laz needs a package that is not installed; pip install 'laspy[lazrs]'"
+    >>> str(missing("reading .e57", "pye57"))
+    'reading .e57 needs a package that is not installed; pip install pye57'
     """
-    quoted = f"'{package}'" if "[" in package else package
     return MissingDependencyError(
-        f"{what} needs a package that is not installed", hint=f"pip install {quoted}", **fields
+        f"{what} needs a package that is not installed", hint=f"pip install {package}", **fields
     )
 
 

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 COMMANDS = {
-    "distill": "Distil a dense scene, or a point cloud with photos, into a compact scene.",
+    "distill": "Distil a dense scene, or a coloured point cloud, into a compact scene.",
     "simplify": "Reduce a scene to an exact number of Gaussians; no images needed.",
     "recover": "Optimise a fixed set of Gaussians against photos or a teacher's renders.",
     "adapt": "Refit colours and opacities to new images; means, rotations and scales stay fixed.",

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from g2ard.errors import InputError, damaged, missing
+from g2ard.errors import InputError, damaged
 from g2ard.io.paths import check_unpacked
 from g2ard.io.stream import MarkedPoints, PointStream, full_scales
 
@@ -60,11 +60,8 @@ def _points(las: Any) -> MarkedPoints:
 @contextmanager
 def _opened(path: Path) -> Iterator[Any]:
     """Open a file with laspy, after checking its header against the file's size."""
-    try:
-        import laspy
-        import lazrs  # noqa: F401 - used by laspy for .laz
-    except ImportError as error:
-        raise missing("reading .las and .laz", "laspy[lazrs]", path=path) from error
+    import laspy
+
     _check_records(path)
     try:
         with laspy.open(path) as reader:

@@ -211,7 +211,7 @@ def read_points(path: str | Path) -> Points:
 
     Raises:
         InputError: the file is missing, damaged, has no colours, or no finite point.
-        MissingDependencyError: .las or .laz without laspy and lazrs, .e57 without pye57.
+        MissingDependencyError: .e57 without pye57.
 
     >>> import tempfile, g2ard
     >>> path = Path(tempfile.mkdtemp()) / "cloud.ply"

@@ -312,7 +312,7 @@ def distill(
     say: Say = unsaid,
     **fields: Any,
 ) -> Distilled:
-    """Distil a dense scene, or a coloured point cloud with photos, exactly like the command `g2ard distill`.
+    """Distil a dense scene, or a coloured point cloud, exactly like the command `g2ard distill`.
 
     The scene is simplified and then recovered against photos or renders of the dense scene, in given, found
     or generated views; the simplified geometry serves as anchors. `g2ard.pipeline.distill` is the lower-level
@@ -355,8 +355,8 @@ def distill(
         The compact scene, its unrecovered version, a report, and the held-out targets.
 
     Raises:
-        InputError: no budget or several, a budget that does not fit, a point cloud without views, an
-            unreadable file, an unknown setting, or a value out of range.
+        InputError: no budget or several, a budget that does not fit, a point cloud with views but no photos,
+            an unreadable file, an unknown setting, or a value out of range.
         KeyboardInterrupt: after Ctrl-C; the same call resumes from `work`.
 
     >>> import numpy as np
@@ -378,9 +378,10 @@ def distill(
     >>> 0 < small.splats.nbytes < 20_000
     True
 
-    From files, and from a point cloud with photos:
+    From files: a scene, a point cloud, and one with photos:
 
     >>> small = distill("scene.ply", ratio=10)  # doctest: +SKIP
+    >>> small = distill("cloud.laz", ratio=10)  # doctest: +SKIP
     >>> small = distill("cloud.ply", count=100_000, views="photos/", size=1600)  # doctest: +SKIP
     """
     budget = Budget(count, ratio, fit=fit, min_psnr=min_psnr, min_ssim=min_ssim)

@@ -5,6 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import ArrayLike
 from PIL import Image
 
 import g2ard
@@ -12,6 +13,7 @@ from g2ard.io import write_points
 from g2ard.io.images import write_png
 from g2ard.io.types import Points
 from g2ard.scene.splats import SH_C0
+from helpers.cloud_files import las
 from helpers.scenes import around, checkered_ball
 from helpers.view_files import edit, transforms
 
@@ -30,10 +32,14 @@ def photographed(
     return replace(views, image_paths=paths)
 
 
-def cloud_of(path: Path, scene: g2ard.Splats) -> None:
-    """Write the means of a scene as a coloured cloud."""
+def cloud_of(path: Path, scene: g2ard.Splats, origin: ArrayLike = 0) -> None:
+    """Write the means of a scene, moved to `origin`, as a coloured .ply, .las or .laz cloud."""
     colors = np.clip(0.5 + SH_C0 * scene.sh0[:, 0], 0, 1).astype(np.float32)
-    write_points(path, Points(scene.means.astype(np.float64), colors))
+    points = scene.means.astype(np.float64) + np.asarray(origin)
+    if path.suffix == ".ply":
+        write_points(path, Points(points, colors))
+    else:
+        las(path, points, np.rint(colors * 65535).astype(np.uint16))
 
 
 def cloud_with_photos(folder: Path, scene: g2ard.Splats) -> None:

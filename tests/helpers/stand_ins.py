@@ -15,8 +15,7 @@ import torch
 
 import g2ard
 from g2ard.io import write_views
-from g2ard.scene.splats import SH_C0
-from helpers import cloud_files, dataset_files, lpips_weights
+from helpers import dataset_files, lpips_weights
 from helpers.feature_scenes import blotched
 from helpers.photos import cloud_of, photographed, photos_of, rgba_photos_of
 from helpers.scenes import around, checkered_ball, under_a_sky
@@ -87,8 +86,7 @@ def _cloud(path: Path) -> None:
 
 
 def _map_cloud(path: Path) -> None:
-    colors = np.clip(0.5 + SH_C0 * SCENE.sh0[:, 0], 0, 1)
-    cloud_files.las(path, SCENE.means + ESTONIA, np.rint(colors * 65535).astype(np.uint16))
+    cloud_of(path, SCENE, ESTONIA)
 
 
 def _photos(folder: Path) -> None:
@@ -188,7 +186,7 @@ STAND_INS: dict[str, Callable[[Path], None]] = {
     **dict.fromkeys(("scene.ply", "scan.ply", "dense.ply", "city.ply", "room.ply", "tree.spz"), _trained),
     **dict.fromkeys(("guitar.compressed.ply", "park24.ply"), _trained),
     "cloud.ply": _cloud,
-    **dict.fromkeys(("city.laz", "map.laz", "east.laz", "west.laz"), _map_cloud),
+    **dict.fromkeys(("cloud.laz", "city.laz", "map.laz", "east.laz", "west.laz"), _map_cloud),
     **dict.fromkeys(("photos", "fox"), _photos),
     **dict.fromkeys(("project", "caliterra"), _colmap),
     "chair": _photos_with_alpha,

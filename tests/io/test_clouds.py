@@ -1,14 +1,13 @@
 """Coloured clouds from .ply, .las and .laz."""
 
 import struct
-import sys
 from pathlib import Path
 
 import laspy
 import numpy as np
 import pytest
 
-from g2ard.errors import InputError, MissingDependencyError, OutputError
+from g2ard.errors import InputError, OutputError
 from g2ard.io import kind, open_point_stream, read_cloud, read_points, write_points
 from g2ard.io.types import Points
 from helpers.cloud_files import FAR, columns, las, ply
@@ -281,13 +280,6 @@ def test_a_panic_in_lazrs_is_one_line(laz: Path, monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(laspy.LasReader, "read_points", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
     with pytest.raises(KeyboardInterrupt):
         read_points(laz)
-
-
-def test_las_needs_laspy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = las(tmp_path / "a.las", np.zeros((3, 3)), np.ones((3, 3), int))
-    monkeypatch.setitem(sys.modules, "laspy", None)
-    with pytest.raises(MissingDependencyError, match=r"pip install 'laspy\[lazrs\]'"):
-        read_points(path)
 
 
 def test_scene_is_not_a_cloud(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""PSNR that `simplify` has reached, in views it has not seen: a change that loses more than `TOLERANCE` fails."""
+"""PSNR that `simplify` has reached, in views that it has not seen."""
 
 import numpy as np
 import pytest
@@ -29,7 +29,7 @@ def pattern(places: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def layers(count: int = 15_000) -> Splats:
-    """Return a bumpy ball as training leaves it: faint and opaque discs of all sizes, many behind each other."""
+    """Return a bumpy ball as training leaves it: faint and opaque discs, many behind each other."""
     rng = np.random.default_rng(0)
     towards = rng.normal(size=(count, 3))
     towards /= np.linalg.norm(towards, axis=1, keepdims=True)

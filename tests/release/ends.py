@@ -31,7 +31,7 @@ distill scene.ply -r 4 --steps 3 --size 48 -o run
 recover tiny.ply --teacher scene.ply --views photos --steps 2 -o recovered.ply
 adapt tiny.ply --views photos --steps 2 -o adapted.ply
 register small.ply --images new --focal 1200 --poses rough.json --keep uncertain -o poses.json
-lift cloud.ply -o lifted.ply
+lift cloud.laz -o lifted.ply
 ingest scene.ply -o tiles
 convert scene.ply scene.sog
 clean scene.ply -o clean.ply
@@ -100,7 +100,7 @@ def main(end: str, wheel: Path) -> None:
         variables = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
         variables |= {"TERM": "xterm-256color", "COLUMNS": "80", "LINES": "24"}
         work.mkdir()
-        for name in ("scene.ply", "small.ply", "cloud.ply", "photos", "new", "rough.json"):
+        for name in ("scene.ply", "small.ply", "cloud.laz", "photos", "new", "rough.json"):
             provide(name, work, "", Path(temporary, "store"))
         calls = [shlex.split(line) for line in COMMANDS.strip().splitlines()]
         for words in calls:

@@ -17,12 +17,13 @@ from helpers.scenes import around
 
 
 def main(folder: Path) -> None:
-    """Write scene.ply, room.ply, tree.spz, cloud.ply, photos/, new/ and rough.json."""
+    """Write scene.ply, room.ply, tree.spz, cloud.laz, cloud.ply, photos/, new/ and rough.json."""
     folder.mkdir(parents=True, exist_ok=True)
     scene = blotched(6000).with_sh_degree(0)
     g2ard.save(folder / "scene.ply", scene)
     g2ard.save(folder / "room.ply", scene.take(slice(900)))
     g2ard.save(folder / "tree.spz", scene.take(slice(900, 1600)))
+    cloud_of(folder / "cloud.laz", scene)
     cloud_of(folder / "cloud.ply", blotched(260_000))
     photos_of(folder / "photos", scene=scene, views=around(24, (96, 72)))
     photos_of(folder / "new", scene=scene, views=around(4, (400, 300), 2.6))

@@ -77,10 +77,11 @@ def distill(
     up: opt.UpOption = None,
     dry_run: opt.DryRunOption = False,
 ) -> None:
-    """Distil a dense scene, or a point cloud with photos, into a compact scene.
+    """Distil a dense scene, or a coloured point cloud, into a compact scene.
 
     The result has an exact number of Gaussians and standard 3DGS properties.
     Views come from --views, or from cameras found beside the scene, or are generated.
+    A point cloud needs no photos; with posed ones (--views), the result is as sharp as they are.
     Scenes larger than memory and folders of tiles are distilled tile by tile.
     """
     from g2ard.cli.run_folder import RunFolder
