@@ -32,8 +32,10 @@ _MODELS = (
     *("RAD_TAN_THIN_PRISM_FISHEYE", "SIMPLE_DIVISION", "DIVISION", "SIMPLE_FISHEYE", "FISHEYE", "EUCM"),
     "EQUIRECTANGULAR",
 )
-_PARAMETERS = {"SIMPLE_PINHOLE": 3, "PINHOLE": 4, "SIMPLE_RADIAL": 4, "RADIAL": 5, "OPENCV": 8}
-
+"""Names of models by their number in binary tables."""
+_PINHOLES = {"SIMPLE_PINHOLE": 3, "PINHOLE": 4, "SIMPLE_RADIAL": 4, "RADIAL": 5, "OPENCV": 8}
+_PARAMETERS = {**_PINHOLES, **PARAMETERS, "EQUIRECTANGULAR": 2}
+"""Supported models and their number of parameters; those of a panorama are its width and height."""
 
 _MODEL_FILES = tuple(
     f"{part}{suffix}" for suffix in (".bin", ".txt") for part in ("cameras", "images", "points3D")
@@ -286,7 +288,7 @@ class Table:
         """Return the name of a model of cameras, and its parameters, which come next."""
         number = int(model)
         name = _MODELS[number] if 0 <= number < len(_MODELS) else f"number {number}"
-        count = (_PARAMETERS | PARAMETERS).get(name, 0)
+        count = _PARAMETERS.get(name, 0)
         return name, self.take(Columns.of(count * "d", *_params(count)))
 
     def name(self) -> str:
@@ -401,17 +403,16 @@ def open_table(path: Path, item: str) -> Table:
 
 
 def _camera(path: Path, model: str, size: tuple[int, int], p: tuple[float, ...]) -> Lens:
-    known = _PARAMETERS | PARAMETERS
-    if model not in known:
+    if model not in _PARAMETERS:
         raise InputError(
-            f"unsupported camera model {model}; expected {', '.join(known)}",
+            f"unsupported camera model {model}; expected {', '.join(_PARAMETERS)}",
             path=path,
             hint="undistort with COLMAP",
         )
-    if len(p) != known[model] and model != "EQUIRECTANGULAR":
-        raise InputError(f"{model} takes {known[model]} parameters, got {len(p)}", path=path)
-    if model in PARAMETERS:
-        lens = PhotoLens(model, size, p)
+    if len(p) != _PARAMETERS[model]:
+        raise InputError(f"{model} takes {_PARAMETERS[model]} parameters, got {len(p)}", path=path)
+    if model not in _PINHOLES:
+        lens = PhotoLens(model, size, p[: PARAMETERS[model]])
         if min(size) < 1 or min(lens.focal) <= 0:
             raise InputError(f"invalid camera of {size[0]:,}×{size[1]:,} pixels", path=path)
         return Lens.of(lens)

@@ -8,6 +8,8 @@ import pytest
 
 from g2ard.errors import InputError, damaged
 from g2ard.io import kind, read_points, read_views
+from g2ard.io.colmap import _MODELS, _PARAMETERS
+from g2ard.scene.lenses import PhotoLens, photo_of
 from helpers.faults import Fault, check_fault, faulty
 from helpers.view_files import MODELS, colmap, orbit, photo, quaternion
 
@@ -247,3 +249,49 @@ def test_rigs_and_frames_give_poses_that_images_lack(
     else:
         with pytest.raises(InputError, match=r"images\."):
             read_views(tmp_path)
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("text", [False, True])
+def test_models_of_cameras_are_those_of_colmap(tmp_path: Path, text: bool, seed: int) -> None:
+    """Cameras of every model, in any order, as COLMAP's own library writes them."""
+    pycolmap = pytest.importorskip("pycolmap")
+    ids = [model for name, model in pycolmap.CameraModelId.__members__.items() if name != "INVALID"]
+    assert [model.name for model in sorted(ids, key=int)] == list(_MODELS)
+    rng = np.random.default_rng(seed)
+    cameras = {}
+    for number, place in enumerate(rng.permutation(len(ids)).tolist(), 1):
+        camera = pycolmap.Camera.create_from_model_id(number, ids[place], 90, 200, 150)
+        if camera.model_name != "EQUIRECTANGULAR":
+            camera.params = camera.params + rng.uniform(0, 0.01, len(camera.params))
+        cameras[number] = camera
+        assert _PARAMETERS.get(camera.model_name, len(camera.params)) == len(camera.params)
+
+    def written(numbers: list[int]) -> Path:
+        folder = tmp_path / str(len(numbers)) / str(numbers[0])
+        folder.mkdir(parents=True)
+        model = pycolmap.Reconstruction()
+        for number in numbers:
+            model.add_camera_with_trivial_rig(cameras[number])
+            pose = pycolmap.Rigid3d(pycolmap.Rotation3d(rng.normal(size=4)), rng.normal(size=3))
+            image = pycolmap.Image(name=f"{number:02}.png", camera_id=number, image_id=number)
+            model.add_image_with_trivial_frame(image, pose)
+        (model.write_text if text else model.write_binary)(folder)
+        return folder
+
+    for number, camera in cameras.items():
+        if camera.model_name not in _PARAMETERS:
+            with pytest.raises(InputError, match=f"unsupported camera model {camera.model_name};"):
+                read_views(written([number]))
+    known = [number for number, camera in cameras.items() if camera.model_name in _PARAMETERS]
+    found = {photo_of(view.name): view for view in read_views(written(known))}
+    rays = np.stack([*rng.uniform(-0.4, 0.4, (2, 50)), np.ones(50)], 1)
+    assert set(found) == {f"{number:02}.png" for number in known}
+    for number in known:
+        view, camera = found[f"{number:02}.png"], cameras[number]
+        if view.lens is None:
+            fx, fy, cx, cy = view.K[[0, 1, 0, 1], [0, 1, 2, 2]]
+            lens = PhotoLens("FULL_OPENCV", (200, 150), (fx, fy, cx, cy, *view.distortion, 0, 0, 0))
+        else:
+            lens = view.lens.turned(np.eye(3))
+        np.testing.assert_allclose(lens.project(rays)[0], camera.img_from_cam(rays), atol=1e-9)
