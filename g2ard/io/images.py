@@ -33,15 +33,22 @@ _BORDER_COLOUR_SLACK, _BORDER_SHARE = 3 / 255, 0.8
 _SHEET_GAP = 6  # pixels between the images of a contact sheet
 
 
-def load_image(cameras: Cameras, index: int, background: Sequence[float] = BLACK) -> NDArray[np.float32]:
-    """Read the photo of a view as an image of its pinhole camera.
+def load_photo(
+    cameras: Cameras, index: int, background: Sequence[float] | None = BLACK
+) -> tuple[NDArray[np.float32], NDArray[np.bool_] | None]:
+    """Read the photo of a view as an image of its pinhole camera, and its mask as `load_mask` does.
 
-    A distorted photo is undistorted at its own resolution, then resized by area. Beyond the photo's edge, the
-    edge is repeated; `load_mask` hides it. EXIF orientation counts only where the view's size needs it,
-    because poses usually refer to stored pixels. Grey becomes three equal channels, and alpha is composited
-    over the background. The result is (H, W, 3) float32 in [0, 1].
+    A distorted photo is undistorted at its own resolution, then resized by area. Pixels outside of the mask,
+    such as those beyond the photo's edge, have any colour. EXIF orientation counts only where the view's size
+    needs it, because poses usually refer to stored pixels. Grey becomes three equal channels, and alpha is
+    composited over the background. The image is (H, W, 3) float32 in [0, 1].
+
+    Args:
+        background: None keeps alpha, as premultiplied (H, W, 4) RGBA.
     """
-    return composited(load_premultiplied(cameras, index), background)
+    image = _image(cameras, index)
+    mask = _mask(cameras, index, image)
+    return (image if background is None else composited(image, background)), mask
 
 
 def composited(image: NDArray[np.float32], background: Sequence[float]) -> NDArray[np.float32]:
@@ -51,8 +58,7 @@ def composited(image: NDArray[np.float32], background: Sequence[float]) -> NDArr
     return np.ascontiguousarray(image)
 
 
-def load_premultiplied(cameras: Cameras, index: int) -> NDArray[np.float32]:
-    """Read a photo as `load_image` does, but with alpha as (H, W, 4) RGBA, whose RGB is premultiplied."""
+def _image(cameras: Cameras, index: int) -> NDArray[np.float32]:
     path, name = cameras.image_paths[index], cameras.names[index]
     if path is None:
         raise InputError(f"({name}) has no photo", index=index, item="view", hint="pass views with photos")
@@ -156,20 +162,25 @@ def find_exposures(cameras: Cameras) -> dict[str, NDArray[np.float64]]:
 
 
 def load_mask(cameras: Cameras, index: int) -> NDArray[np.bool_] | None:
-    """Read the (H, W) mask of a view's photo, in the pixels of `load_image`; None if all count.
+    """Read the (H, W) mask of a view's photo, in the pixels of `load_photo`; None if all count.
 
     Pixels count that the photo holds and whose mask is brighter than half; for a photo that is its own mask,
     those whose alpha is above half.
     """
+    return _mask(cameras, index, None)
+
+
+def _mask(cameras: Cameras, index: int, image: NDArray[np.float32] | None) -> NDArray[np.bool_] | None:
+    """Return the mask of a photo, which is read if it is its own mask and `image` is None."""
     held, path = _held(cameras, index), cameras.mask_paths[index]
     if path is None:
         return held
     if path == cameras.image_paths[index]:
-        own = load_premultiplied(cameras, index)
+        own = _image(cameras, index) if image is None else image
         mask = own[..., 3] > 0.5 if own.shape[2] == 4 else None
     else:
-        image = load_image(replace(cameras, image_paths=cameras.mask_paths), index)
-        mask = image.mean(2) > 0.5
+        shown = _image(replace(cameras, image_paths=cameras.mask_paths), index)
+        mask = composited(shown, BLACK).mean(2) > 0.5
     if mask is None or held is None:
         return held if mask is None else np.ascontiguousarray(mask)
     return np.ascontiguousarray(mask & held)
@@ -180,12 +191,13 @@ def _held(cameras: Cameras, index: int) -> NDArray[np.bool_] | None:
     photo, distortion, lens = cameras.image_paths[index], cameras.distortions[index], cameras.lenses[index]
     if photo is None or (lens is None and not distortion.any()):
         return None
-    if lens is not None:
-        size = int(cameras.widths[index]), int(cameras.heights[index])
-        held = _lens_lookup(lens, tuple(cameras.Ks[index].ravel()), size, 1)[1].reshape(size[::-1])
-        return None if held.all() else held.copy()
     target = int(cameras.widths[index]), int(cameras.heights[index])
-    width, height = photo_size(photo, cameras.source, target)
+    width, height = photo_size(photo, cameras.source, target if lens is None else lens.size)
+    if lens is not None:
+        times = _samples(lens, width, cameras.Ks[index])
+        samples = _lens_lookup(lens, tuple(cameras.Ks[index].ravel()), target, times)[1]
+        whole: NDArray[np.bool_] = np.all(samples.reshape(target[1], times, target[0], times), axis=(1, 3))
+        return None if whole.all() else whole
     K = cameras.Ks[index] * np.array([[width / target[0]], [height / target[1]], [1.0]])
     held = _held_at(width, height, tuple(K.ravel()), tuple(distortion), target)
     return None if held.all() else held
@@ -281,8 +293,7 @@ def _through(
     """Sample a photo through its lens for each pixel of a pinhole view: bilinearly at as many points a pixel
     as the photo is finer, which are averaged."""
     height, width = image.shape[:2]
-    finer = width / lens.size[0] * max(lens.focal) / min(K[0, 0], K[1, 1])
-    times = int(np.clip(np.ceil(finer - 0.01), 1, _MOST_SAMPLES))
+    times = _samples(lens, width, K)
     pixels, _ = _lens_lookup(lens, tuple(K.ravel()), size, times)
     u = pixels[:, 0] * (width / lens.size[0]) - 0.5
     v = np.clip(pixels[:, 1] * (height / lens.size[1]) - 0.5, 0, height - 1)
@@ -298,7 +309,13 @@ def _through(
     return resized((top * (1 - down) + bottom * down).reshape(shape), size)
 
 
-_MOST_SAMPLES = 8  # most samples of a photo along each side of a pixel
+_MOST_SAMPLES = 8
+
+
+def _samples(lens: PhotoLens, width: int, K: NDArray[np.float64]) -> int:
+    """Return the number of samples along each side of a pixel: the pixels of a photo of this width there."""
+    finer = width / lens.size[0] * max(lens.focal) / min(K[0, 0], K[1, 1])
+    return int(np.clip(np.ceil(finer - 0.01), 1, _MOST_SAMPLES))
 
 
 @lru_cache(maxsize=6)  # the faces of a cube

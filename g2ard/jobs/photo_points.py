@@ -19,7 +19,7 @@ from g2ard.errors import G2ardError, InputError
 from g2ard.io import read_points
 from g2ard.io.detect import file_format
 from g2ard.io.finding import Finder
-from g2ard.io.images import composited, load_premultiplied
+from g2ard.io.images import composited, load_photo
 from g2ard.io.jsonfile import read_json
 from g2ard.io.splits import for_training
 from g2ard.io.types import Points, ViewFiles, ViewSet
@@ -265,7 +265,7 @@ def points_along_rays(
     z* = argmin_z of the mean difference of a patch around the pixel from those of the two nearby views that
     agree best. Points on which no photo agrees, or on whose ray many depths agree, are dropped; these limits
     are relaxed if too few points remain. If photos have alpha, only pixels that show the object count, and
-    points lie in its visual hull.
+    points lie in its visual hull. Masked pixels show nothing, neither the object nor that it is elsewhere.
 
     Args:
         cameras: C ≥ 3 views with photos, in world coordinates.
@@ -281,11 +281,12 @@ def points_along_rays(
         raise InputError(
             f"view {bare[0]} has no photo", hint="pass views with photos, their {images=DIR}, or a scene"
         )
-    photos, outlines = [], []
+    photos, outlines = list[_Photo](), list[Mask | None]()
     for view in range(len(cameras)):
-        image = load_premultiplied(cameras, view)
-        photos.append(composited(image, background))
-        outlines.append(image[..., 3] > 0.5 if image.shape[2] == 4 else None)
+        image, mask = load_photo(cameras, view, None)
+        outline = image[..., 3] > 0.5 if image.shape[2] == 4 else None
+        photos.append(_Photo.of(composited(image, background), mask, outline, background))
+        outlines.append(outline if outline is None or mask is None else outline | ~mask)
         progress("photos", view + 1, len(cameras))
     rng = np.random.default_rng([seed, 11])
     centre = _common_centre(cameras)
@@ -301,7 +302,8 @@ def points_along_rays(
             )
         view = int(rng.integers(len(cameras)))
         some = min(_RAYS, max(64, -(-count // len(cameras))))
-        pixels = _pixels(photos[view], outlines[view], some, background, rng)
+        rows, columns = (rng.integers(side, size=some) for side in photos[view].starts.shape)
+        pixels = np.stack([rows, columns])[:, photos[view].starts[rows, columns]]
         if hull is None:
             depths = distances[view] / np.linspace(1 / _NEAREST_DEPTH, 1 / _FARTHEST_DEPTH, _TRIAL_DEPTHS)
         else:
@@ -337,20 +339,31 @@ def _neighbours(cameras: Cameras, view: int) -> NDArray[np.int64]:
     return order[order != view][:_COMPARED_VIEWS]
 
 
-def _pixels(
-    photo: NDArray[np.float32],
-    outline: NDArray[np.bool_] | None,
-    count: int,
-    background: Colour,
-    rng: np.random.Generator,
-) -> NDArray[np.int64]:
-    """Return rows and columns, (2, N ≤ count), of random pixels that show anything."""
-    rows, columns = rng.integers(photo.shape[0], size=count), rng.integers(photo.shape[1], size=count)
-    if outline is None:
-        kept = np.abs(photo[rows, columns] - background).max(1) > _EMPTY_COLOUR_SLACK
-    else:
-        kept = outline[rows, columns]
-    return np.stack([rows, columns])[:, kept]
+@dataclass(frozen=True, eq=False)
+class _Photo:
+    """A photo.
+
+    Args:
+        image: (H, W, 3) colours.
+        valid: (H, W) unmasked pixels.
+        starts: (H, W) pixels that show anything, in a patch without masked pixels.
+        step: pixels from a patch's middle to its sides.
+    """
+
+    image: NDArray[np.float32]
+    valid: Mask
+    starts: Mask
+    step: int
+
+    @classmethod
+    def of(
+        cls, image: NDArray[np.float32], mask: Mask | None, outline: Mask | None, background: Colour
+    ) -> _Photo:
+        step = max(1, round(max(image.shape) / _PATCH_SPACING))
+        shown = np.abs(image - background).max(2) > _EMPTY_COLOUR_SLACK if outline is None else outline
+        if mask is None:
+            return cls(image, np.ones_like(shown), shown, step)
+        return cls(image, mask, shown & ~grown(~mask, step), step)
 
 
 def _swept(
@@ -412,7 +425,7 @@ class _Rays:
     """
 
     cameras: Cameras
-    photos: list[NDArray[np.float32]]
+    photos: list[_Photo]
     others: NDArray[np.int64]
     origin: Float
     aims: Float
@@ -422,13 +435,13 @@ class _Rays:
     def of(
         cls,
         cameras: Cameras,
-        photos: list[NDArray[np.float32]],
+        photos: list[_Photo],
         view: int,
         others: NDArray[np.int64],
         pixels: NDArray[np.int64],
     ) -> _Rays:
-        photo, pose = photos[view], cameras.viewmats[view]
-        patch = _PATCH * max(1, round(max(photo.shape) / _PATCH_SPACING))
+        photo, pose = photos[view].image, cameras.viewmats[view]
+        patch = _PATCH * photos[view].step
         rows = np.clip(pixels[0][:, None] + patch[:, 0], 0, photo.shape[0] - 1)
         columns = np.clip(pixels[1][:, None] + patch[:, 1], 0, photo.shape[1] - 1)
         seen = np.stack([columns + 0.5, rows + 0.5, np.ones(rows.shape)], -1)
@@ -460,13 +473,15 @@ class _Rays:
         return own_costs[:_AGREEING_VIEWS].mean(0)
 
     def _sampled(self, view: int, world: Float) -> tuple[Float, Mask]:
-        """Return the colours of world points in a photo, black outside of it, and whether they are inside."""
-        photo, pose, K = self.photos[view], self.cameras.viewmats[view], self.cameras.Ks[view]
+        """Return the colours of world points in a photo, and whether it shows them; black if not."""
+        photo, valid = self.photos[view].image, self.photos[view].valid
+        pose, K = self.cameras.viewmats[view], self.cameras.Ks[view]
         local = world @ pose[:3, :3].T + pose[:3, 3]
         ahead = local[..., 2] > 0
         depth = np.where(ahead, local[..., 2], 1.0)
         u = np.floor(K[0, 0] * local[..., 0] / depth + K[0, 2])
         v = np.floor(K[1, 1] * local[..., 1] / depth + K[1, 2])
         held = ahead & (u >= 0) & (v >= 0) & (u < photo.shape[1]) & (v < photo.shape[0])
-        color = photo[np.where(held, v, 0).astype(int), np.where(held, u, 0).astype(int)]
+        rows, columns = np.where(held, v, 0).astype(int), np.where(held, u, 0).astype(int)
+        color, held = photo[rows, columns], held & valid[rows, columns]
         return np.where(held[..., None], color, 0.0), held

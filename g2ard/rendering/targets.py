@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from g2ard.config.checks import checks_arguments
 from g2ard.config.choices import BLACK, Colour
 from g2ard.errors import InputError, require
-from g2ard.io.images import load_image, load_mask
+from g2ard.io.images import load_mask, load_photo
 from g2ard.io.paths import file_identity
 from g2ard.progress import Progress, plural, silent
 from g2ard.rendering.renderer import RasterSettings, Renderer
@@ -384,7 +384,9 @@ class Photos(_Cached):
     def _make(self, view: int) -> NDArray[np.uint8 | np.float32]:
         if self._images is not None:
             return _over(self._images[view], self._background)
-        return np.rint(load_image(self.cameras, view, self._background) * 255).astype(np.uint8)
+        image, mask = load_photo(self.cameras, view, self._background)
+        self._cached(self._masks, view, lambda _: mask)
+        return np.rint(image * 255).astype(np.uint8)
 
     def __getitem__(self, view: int) -> NDArray[np.float32]:
         photo = _as_floats(self._stored(view))

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from g2ard.config.choices import Colour
 from g2ard.errors import InputError
-from g2ard.io.images import load_image, to_bytes
+from g2ard.io.images import load_photo, to_bytes
 from g2ard.progress import plural
 from g2ard.rendering.renderer import Renderer
 from g2ard.report.page import Page, Shown
@@ -56,7 +56,7 @@ def registration_report(
     for i in sorted(seen, key=lambda i: -1.0 if (zncc := rows[i].zncc) is None else zncc)[:_VIEWS]:
         row, one = rows[i], photos.take([i]).resized(_SIZE)
         try:
-            photo = to_bytes(load_image(one, 0, background))
+            photo = to_bytes(load_photo(one, 0, background)[0])
         except InputError:
             continue  # deleted since it was registered
         render = to_bytes(renderer.image(replace(one[0], viewmat=np.array(row.camera_from_world))))

@@ -10,7 +10,7 @@ import pytest
 from g2ard import io
 from g2ard.errors import InputError
 from g2ard.io.detect import KINDS
-from g2ard.io.images import load_image
+from g2ard.io.images import load_photo
 from helpers.dataset_files import POSES, cambridge, llff, mip_nerf_360, opengl, polycam
 from helpers.faults import faulty
 from helpers.view_files import photo
@@ -35,7 +35,7 @@ def test_matrix_citys_pose_folder_states_its_splits(tmp_path: Path) -> None:
     test = io.read_views(pose, split="test")
     np.testing.assert_allclose(test.viewmats, POSES[6:], atol=1e-9)
     assert test.Ks[0, 0, 0] == 231.8
-    assert load_image(test, 2)[0, 0, 0] == pytest.approx(80 / 255)
+    assert load_photo(test, 2)[0][0, 0, 0] == pytest.approx(80 / 255)
     assert len(io.read_views(pose / "transforms_train.json", split="train")) == 6
 
 
@@ -61,7 +61,7 @@ def test_mip_nerf_360_at_a_quarter(tmp_path: Path) -> None:
     assert (whole.widths[0], quarter.widths[0], quarter.heights[0]) == (400, 100, 75)
     np.testing.assert_allclose(quarter.Ks[0], [[95, 0, 50.25], [0, 95.25, 37.25], [0, 0, 1]])
     np.testing.assert_allclose(quarter.viewmats, POSES, atol=1e-9)
-    assert load_image(quarter, 0).shape == (75, 100, 3)
+    assert load_photo(quarter, 0)[0].shape == (75, 100, 3)
     half = io.read_views(tmp_path, images=tmp_path / "images_2", split="test")
     assert half.names == ("DSC0000.JPG", "DSC0008.JPG")  # every 8th: llffhold
     assert half.widths[0] == 200
@@ -104,7 +104,7 @@ def test_llff(tmp_path: Path) -> None:
         np.testing.assert_allclose(found.cameras.viewmats, POSES, atol=1e-9)
         np.testing.assert_allclose(found.cameras.Ks[0], [[95, 0, 50], [0, 95, 37.5], [0, 0, 1]])
         assert found.cameras.names[3] == "IMG_0003.JPG"
-        assert load_image(found.cameras, 3).shape == (75, 100, 3)
+        assert load_photo(found.cameras, 3)[0].shape == (75, 100, 3)
     photo(tmp_path / "images_4" / "IMG_0009.JPG", (100, 75))
     with pytest.raises(InputError, match=r"has 9 poses for 10 photos in .*images_4"):
         io.read_views(tmp_path)

@@ -12,7 +12,7 @@ from pye57 import libe57
 import g2ard
 from g2ard.errors import InputError
 from g2ard.io import read_cloud, read_views
-from g2ard.io.images import load_image, load_mask
+from g2ard.io.images import load_mask, load_photo
 from g2ard.io.view_sets import read_view_set
 from helpers.commands import CommandLine, succeeds
 from reference.rotations import rotations
@@ -123,7 +123,7 @@ def test_views_show_what_lies_in_their_directions(tmp_path: Path, kinds: list[st
         v, u = np.mgrid[0 : view.height, 0 : view.width] + 0.5
         local = np.stack([u, v, np.ones_like(u)], -1) @ np.linalg.inv(view.K).T
         expected = pattern(local @ view.viewmat[:3, :3])
-        assert np.abs(load_image(views, i) - expected).mean() < (0.01 if format == "PNG" else 0.02)
+        assert np.abs(load_photo(views, i)[0] - expected).mean() < (0.01 if format == "PNG" else 0.02)
 
 
 @pytest.mark.parametrize("without", ["rotation", "translation"])

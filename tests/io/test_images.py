@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 from g2ard.errors import InputError, OutputError
-from g2ard.io.images import contact_sheet, load_image, load_mask, to_bytes, write_png
+from g2ard.io.images import contact_sheet, load_mask, load_photo, to_bytes, write_png
 from g2ard.scene.cameras import Cameras
 from helpers.scenes import around
 
@@ -31,7 +31,7 @@ def save(path: Path, array: np.ndarray, **options: object) -> Path:
 @pytest.mark.parametrize("size", [(28, 21), (12, 9), (4, 3)])
 def test_shrinking_takes_the_mean_of_the_area(tmp_path: Path, size: tuple[int, int]) -> None:
     pixels, (width, height) = np.random.default_rng(2).integers(0, 256, (21, 28, 3), dtype=np.uint8), size
-    image = load_image(camera(save(tmp_path / "a.png", pixels), size), 0)
+    image = load_photo(camera(save(tmp_path / "a.png", pixels), size), 0)[0]
     fine = np.repeat(np.repeat(pixels / 255, height, axis=0), width, axis=1)  # both grids divide it
     np.testing.assert_allclose(image, fine.reshape(height, 21, width, 28, 3).mean((1, 3)), atol=1e-6)
     assert (image.dtype, image.flags.c_contiguous) == (np.float32, True)
@@ -39,7 +39,7 @@ def test_shrinking_takes_the_mean_of_the_area(tmp_path: Path, size: tuple[int, i
 
 def test_growing_stays_in_range(tmp_path: Path) -> None:
     pixels = np.random.default_rng(3).integers(0, 256, (6, 8, 3), dtype=np.uint8)
-    image = load_image(camera(save(tmp_path / "a.png", pixels), (16, 12)), 0)
+    image = load_photo(camera(save(tmp_path / "a.png", pixels), (16, 12)), 0)[0]
     assert image.shape == (12, 16, 3)
     assert pixels.min() / 255 <= image.min() <= image.max() <= pixels.max() / 255
 
@@ -54,7 +54,7 @@ def test_growing_stays_in_range(tmp_path: Path) -> None:
     ],
 )
 def test_other_pixel_types(tmp_path: Path, array: np.ndarray, expected: list[float]) -> None:
-    image = load_image(camera(save(tmp_path / "a.png", array), (4, 4)), 0)
+    image = load_photo(camera(save(tmp_path / "a.png", array), (4, 4)), 0)[0]
     assert (image.shape, image.dtype) == ((4, 4, 3), np.float32)
     np.testing.assert_allclose(image[2, 1], expected, atol=1e-6)
 
@@ -63,7 +63,7 @@ def test_palette_photo(tmp_path: Path) -> None:
     Image.new("RGB", (4, 4), (255, 0, 51)).convert("P", palette=Image.Palette.ADAPTIVE).save(
         tmp_path / "a.png"
     )
-    image = load_image(camera(tmp_path / "a.png", (4, 4)), 0)
+    image = load_photo(camera(tmp_path / "a.png", (4, 4)), 0)[0]
     np.testing.assert_allclose(image[0, 0], [1, 0, 0.2], atol=0.01)
 
 
@@ -98,7 +98,7 @@ def test_undistorted_photo_is_the_pinhole_picture(tmp_path: Path, scale: int) ->
         bx, by = bend(x, y, k)
         x, y = x + xd - bx, y + yd - by
     photo = save(tmp_path / "a.png", to_bytes(pattern(x, y)))
-    image = load_image(camera(photo, (width, height), [fx, fy, cx, cy], k), 0)
+    image = load_photo(camera(photo, (width, height), [fx, fy, cx, cy], k), 0)[0]
     v, u = np.mgrid[0:height, 0:width] + 0.5
     expected = pattern((u - cx) / fx, (v - cy) / fy)
     inside = (slice(14, -14), slice(14, -14))  # the edge is repeated where the lens saw no more
@@ -109,19 +109,19 @@ def test_undistorted_photo_is_the_pinhole_picture(tmp_path: Path, scale: int) ->
 
 def test_photos_that_cannot_be_loaded_are_named(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"view 0 \(view\) has no photo"):
-        load_image(camera(None, (4, 4)), 0)
+        load_photo(camera(None, (4, 4)), 0)
     with pytest.raises(InputError, match=r"gone\.png: no such photo"):
-        load_image(camera(tmp_path / "gone.png", (4, 4)), 0)
+        load_photo(camera(tmp_path / "gone.png", (4, 4)), 0)
     (tmp_path / "a.png").write_bytes(b"not an image")
     with pytest.raises(InputError, match=r"a\.png: is not an image"):
-        load_image(camera(tmp_path / "a.png", (4, 4)), 0)
+        load_photo(camera(tmp_path / "a.png", (4, 4)), 0)
     path = save(tmp_path / "b.png", np.random.default_rng(0).integers(0, 255, (64, 64, 3), dtype=np.uint8))
     path.write_bytes(path.read_bytes()[:500])
     with pytest.raises(InputError, match=r"b\.png: cannot be decoded"):
-        load_image(camera(path, (64, 64)), 0)
+        load_photo(camera(path, (64, 64)), 0)
     path = save(tmp_path / "c.png", np.zeros((40, 30, 3), np.uint8))
     with pytest.raises(InputError, match="the photo is 30×40, its view 40×30"):
-        load_image(camera(path, (40, 30)), 0)
+        load_photo(camera(path, (40, 30)), 0)
 
 
 def test_png_round_trip(tmp_path: Path) -> None:
@@ -154,10 +154,10 @@ def test_contact_sheet_holds_its_images() -> None:
 def test_float_photos_are_within_0_and_1(tmp_path: Path, value: float) -> None:
     pixels = np.full((6, 8), 0.5, np.float32)
     whole = camera(save(tmp_path / "a.tiff", pixels), (8, 6))
-    np.testing.assert_array_equal(load_image(whole, 0), 0.5)
+    np.testing.assert_array_equal(load_photo(whole, 0)[0], 0.5)
     pixels[2, 3] = value
     with pytest.raises(InputError, match=r"b\.tiff: expected values in \[0, 1\]"):
-        load_image(camera(save(tmp_path / "b.tiff", pixels), (8, 6)), 0)
+        load_photo(camera(save(tmp_path / "b.tiff", pixels), (8, 6)), 0)
 
 
 @pytest.mark.parametrize("own", [False, True])

@@ -1,5 +1,6 @@
 """Fisheye photos and panoramas become the pinhole views that they show."""
 
+import itertools
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +9,7 @@ from PIL import Image
 
 import g2ard
 from g2ard.io import read_views, write_views
-from g2ard.io.images import load_image, load_mask
+from g2ard.io.images import load_mask, load_photo
 from g2ard.io.view_sets import read_view_set
 from g2ard.scene.lenses import FACES, PhotoLens
 from helpers.view_files import colmap, edit, orbit, transforms
@@ -39,6 +40,28 @@ def test_models_are_those_of_colmap(model: str) -> None:
     seen, inside = PhotoLens(model, SIZE, LENSES[model]).project(rays())
     assert inside.sum() > 100
     np.testing.assert_allclose(seen, camera.img_from_cam(rays()), atol=1e-9)
+
+
+FALLING = {
+    "OPENCV_FISHEYE": (60, 61, 100, 74, -0.2, 0, 0, 0),
+    "FULL_OPENCV": (60, 61, 100, 74, -0.2, 0, 0, 0, 0, 0, 0, 0),
+    "SIMPLE_RADIAL_FISHEYE": (60, 100, 74, -0.2),
+    "RADIAL_FISHEYE": (60, 100, 74, -0.3, 0.02),
+    "THIN_PRISM_FISHEYE": (60, 61, 100, 74, -0.3, 0.02, 0, 0, 0, 0, 0, 0),
+}
+"""Lenses whose radius stops growing within the photo."""
+
+
+@pytest.mark.parametrize("model", FALLING)
+def test_a_lens_ends_where_its_radius_stops_growing(model: str) -> None:
+    angles = np.linspace(0.001, np.pi - 0.001, 5000)
+    sideways = np.stack([np.sin(angles), np.zeros_like(angles), np.cos(angles)], 1)
+    seen, inside = PhotoLens(model, SIZE, FALLING[model]).project(sideways)
+    held = int(inside.sum())
+    assert inside[:held].all()
+    assert (np.diff(seen[:held, 0]) > 0).all()
+    assert seen[held - 1, 0] < SIZE[0] - 20  # not at the photo's edge
+    assert 0.7 < angles[held] < 1.6
 
 
 @pytest.mark.parametrize("model", LENSES)
@@ -96,7 +119,7 @@ def check_faces(views: g2ard.Cameras, poses: list[np.ndarray], least: float) -> 
         mask = load_mask(views, i)
         mask = np.ones(u.shape, bool) if mask is None else mask
         shown += mask.sum()
-        assert np.abs(load_image(views, i) - expected)[mask].max() < 0.03
+        assert np.abs(load_photo(views, i)[0] - expected)[mask].max() < 0.03
     assert shown >= least
 
 
@@ -110,19 +133,33 @@ def test_a_panorama_becomes_six_faces(tmp_path: Path, longest: int | None) -> No
     check_faces(found.cameras.take(range(6)).resized(longest), orbit(9), 6 * min(longest or 163, 163) ** 2)
 
 
+def test_a_panorama_has_no_seam(tmp_path: Path) -> None:
+    """Each side of a photo is the side before it of the photo turned by a quarter, noise and all."""
+    noise = np.random.default_rng(0).random((64, 128, 3))
+    lens = {"camera_model": "EQUIRECTANGULAR", "w": 128, "h": 64}
+    sides = []
+    for name, image in (("as it is", noise), ("turned", np.roll(noise, 32, axis=1))):
+        (tmp_path / name).mkdir()
+        views = read_views(captured(tmp_path / name, image, 1, **lens))
+        sides.append({view.name.partition("#")[2]: load_photo(views, i)[0] for i, view in enumerate(views)})
+    for side, following in itertools.pairwise(("front", "right", "back", "left", "front")):
+        np.testing.assert_allclose(sides[0][side], sides[1][following], atol=1e-5)
+
+
 FISHEYE = {"fl_x": 80.0, "fl_y": 80.0, "cx": 150, "cy": 150, "w": 300, "h": 300}
 
 
+@pytest.mark.parametrize("longest", [None, 60, 33])
 @pytest.mark.parametrize("how", [{"camera_model": "OPENCV_FISHEYE"}, {"is_fisheye": True}])
-def test_a_fisheye_becomes_the_faces_that_it_saw(tmp_path: Path, how: dict) -> None:
+def test_a_fisheye_becomes_the_faces_that_it_saw(tmp_path: Path, how: dict, longest: int | None) -> None:
     path = captured(tmp_path, fisheye(300, 80.0), **FISHEYE, **how)
-    views = read_views(path)
+    views = read_views(path).resized(longest)
     first = views.take([i for i, name in enumerate(views.names) if name.startswith("000.png")])
     assert [name.rpartition("#")[2] for name in first.names] == ["front", "right", "left", "up", "down"]
     masks = [load_mask(first, i) for i in range(5)]
     assert masks[0] is None
     assert all(mask is not None and 0.3 < mask.mean() < 0.9 for mask in masks[1:])
-    check_faces(first, orbit(9), 3 * 160 * 160)
+    check_faces(first, orbit(9), 2.8 * min(longest or 160, 160) ** 2)
 
 
 def test_a_narrow_fisheye_becomes_one_view(tmp_path: Path) -> None:
@@ -152,7 +189,7 @@ def test_views_of_lenses_survive_writing(tmp_path: Path) -> None:
     write_views(tmp_path / "v.json", views)
     again = read_views(tmp_path / "v.json")
     assert (again.names, again.lenses) == (views.names, views.lenses)
-    np.testing.assert_array_equal(load_image(again, 3), load_image(views, 3))
+    np.testing.assert_array_equal(load_photo(again, 3)[0], load_photo(views, 3)[0])
     with pytest.warns(UserWarning, match="photos of 6 views"):
         write_views(tmp_path / "transforms_2.json", views)
 

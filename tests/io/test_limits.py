@@ -16,7 +16,7 @@ import pytest
 
 from g2ard.errors import InputError
 from g2ard.io import kind, read_scene, read_splats, read_view_set, write_splats, write_views
-from g2ard.io.images import load_image
+from g2ard.io.images import load_photo
 from g2ard.scene.splats import Splats, unit_quats
 from g2ard.stages.simplify import simplify
 from helpers.commands import CommandLine
@@ -309,7 +309,7 @@ def test_huge_photos_are_rejected_before_decoding(monkeypatch: pytest.MonkeyPatc
     image.write_bytes(head[:29] + crc + head[33:])
     cameras = views(1).take([0])
     with pytest.raises(InputError, match=r"0\.png.*1,001×1,001 pixels; the limit is 1,000,000"):
-        load_image(replace(cameras, image_paths=(image,)), 0)
+        load_photo(replace(cameras, image_paths=(image,)), 0)
 
 
 @pytest.mark.parametrize("place", ["images", "elsewhere"])
@@ -329,6 +329,6 @@ def test_a_broken_photo_is_named_with_its_list(tmp_path: Path, place: str, sized
 
     path = frames(tmp_path / "a.json", change)
     with pytest.raises(InputError, match="not an image") as caught:
-        load_image(read_view_set(path).cameras, 0)
+        load_photo(read_view_set(path).cameras, 0)
     assert str(path) in str(caught.value)
     assert str(folder / "notes.png") in str(caught.value)

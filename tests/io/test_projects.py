@@ -11,7 +11,7 @@ from PIL import Image
 from g2ard.errors import InputError
 from g2ard.io import kind, read_views
 from g2ard.io.finding import Finder
-from g2ard.io.images import load_image, load_mask
+from g2ard.io.images import load_mask, load_photo
 from g2ard.io.types import ViewFiles
 from g2ard.io.view_sets import read_view_set
 from g2ard.jobs.photo_points import sparse_file, sparse_points
@@ -279,7 +279,7 @@ def test_exif_turns_photos_where_only_that_fits(tmp_path: Path, orientation: int
     size = {"w": 6, "h": 8} if across else {"w": 8, "h": 6}
     path = transforms(tmp_path / "a.json", orbit(1), **size)
     edit(path, lambda content: content["frames"][0].update(file_path="images/0.png"))
-    image = load_image(read_views(path), 0)
+    image = load_photo(read_views(path), 0)[0]
     turns = {
         5: pixels.swapaxes(0, 1),
         6: np.rot90(pixels, -1),

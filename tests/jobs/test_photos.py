@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import g2ard
-from g2ard.io.images import load_premultiplied, write_png
+from g2ard.io.images import load_photo, write_png
 from g2ard.io.types import Points
 from g2ard.jobs.budget import Budget
 from g2ard.jobs.distill import prepare
@@ -101,7 +101,7 @@ def test_alpha_carves_the_start(tmp_path: Path) -> None:
 
 def test_a_hull_encloses_the_object_closely(tmp_path: Path) -> None:
     cameras = rgba_photos_of(tmp_path, distance=5)
-    outlines = [load_premultiplied(g2ard.load_views(tmp_path), i)[..., 3] > 0.5 for i in range(24)]
+    outlines = [load_photo(g2ard.load_views(tmp_path), i, None)[0][..., 3] > 0.5 for i in range(24)]
     hull = visual_hull(g2ard.load_views(tmp_path), outlines, np.zeros(3))
     assert hull is not None
     directions = np.random.default_rng(0).normal(size=(500, 3))

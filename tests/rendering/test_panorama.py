@@ -8,7 +8,7 @@ from PIL import Image
 
 import g2ard
 from g2ard.errors import InputError
-from g2ard.io.images import load_image, write_png
+from g2ard.io.images import load_photo, write_png
 from g2ard.scene.cameras import Camera, look_at
 from g2ard.scene.lenses import FACES, PhotoLens, panorama_rays
 from helpers.commands import CommandLine, succeeds
@@ -66,7 +66,7 @@ def test_faces_of_a_written_panorama_are_renders_of_the_scene(
     views = g2ard.load_views(path)
     assert len(views) == 2 * len(FACES)
     for i, view in enumerate(views):
-        off = load_image(views, i) - renderer.clipped(view)
+        off = load_photo(views, i)[0] - renderer.clipped(view)
         assert -10 * np.log10(np.mean(np.square(off))) > least, view.name
 
 

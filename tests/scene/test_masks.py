@@ -1,6 +1,7 @@
 """Masks and exposures: found beside photos, and respected by training and scores."""
 
 import json
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -8,17 +9,25 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from PIL import Image
 
 from g2ard import io
+from g2ard.config.choices import BLACK
 from g2ard.errors import InputError
+from g2ard.io import images
 from g2ard.io.images import find_exposures, load_mask, write_png
+from g2ard.io.types import ViewFiles
+from g2ard.jobs.photo_points import points_along_rays
 from g2ard.rendering.metrics import psnr, ssim
 from g2ard.rendering.renderer import render
 from g2ard.rendering.targets import Photos
 from g2ard.scene.cameras import Cameras
+from g2ard.scene.lenses import PhotoLens
 from g2ard.scene.splats import Splats
 from g2ard.stages.recover import RecoverConfig, recover
 from g2ard.stages.recover.anchors import Regularizers
+from g2ard.stages.register.attempts import loaded
+from g2ard.stages.register.config import RegisterConfig
 from g2ard.stages.simplify import simplify
 from helpers.scenes import around, assert_same_bits, checkered_ball
 
@@ -103,6 +112,74 @@ def test_masked_content_does_not_matter(student: Splats, tmp_path: Path, engine:
     assert_same_bits(found[0].splats, found[1].splats)
     assert found[0].report.loss == found[1].report.loss
     assert found[0].report.psnr == found[1].report.psnr
+
+
+def of_points(cameras: Cameras) -> list[NDArray[Any]]:
+    points = points_along_rays(cameras, 200)
+    return [points.positions, points.colors]
+
+
+def of_targets(cameras: Cameras) -> list[NDArray[Any]]:
+    return [Photos(cameras)[view] for view in range(len(cameras))]
+
+
+def of_registration(cameras: Cameras) -> list[NDArray[Any]]:
+    photos = [loaded(cameras, view, RegisterConfig(), BLACK) for view in range(len(cameras))]
+    levels = [level.grey for photo in photos for _, level in photo.pyramid]
+    return [array for photo in photos for array in (photo.image, photo.small[1], photo.whole)] + levels
+
+
+@pytest.mark.parametrize("reader", [of_points, of_targets, of_registration])
+@pytest.mark.parametrize("hidden", ["mask", "every second", "alpha", "lens", "distortion"])
+def test_hidden_pixels_do_not_matter(
+    reader: Callable[[Cameras], list[NDArray[Any]]], hidden: str, tmp_path: Path, monkeypatch: Any
+) -> None:
+    """Whatever hides pixels, and whatever they show: readers of photos give the same."""
+    cameras = photographed(tmp_path, spoil=0.5, masks=hidden in ("mask", "every second"))
+    if hidden == "every second":  # the others show the grey block
+        masked = tuple(path if i % 2 else None for i, path in enumerate(cameras.mask_paths))
+        cameras = replace(cameras, mask_paths=masked)
+    if hidden == "alpha":
+        for path in filter(None, cameras.image_paths):
+            rgba = np.full((48, 64, 4), 255, np.uint8)
+            rgba[..., :3] = np.asarray(Image.open(path))
+            rgba[10:30, 20:50, 3] = 0
+            Image.fromarray(rgba).save(path)
+        cameras = io.read_view_set(ViewFiles(tmp_path / "views.json", alpha="mask")).cameras
+    if hidden == "lens":
+        fisheye = PhotoLens("SIMPLE_RADIAL_FISHEYE", (64, 48), (60.0, 32.0, 24.0, -1.6))
+        cameras = replace(cameras, lenses=(fisheye,) * len(cameras))
+    if hidden == "distortion":
+        cameras = replace(cameras, distortions=np.tile([0.3, 0, 0, 0, 0], (len(cameras), 1)))
+    masks = [load_mask(cameras, view) for view in range(len(cameras))]
+    assert all(0.1 < mask.mean() < 0.9 for mask in masks[1::2] if mask is not None)
+    assert len([mask for mask in masks if mask is not None]) == (5 if hidden == "every second" else 10)
+    read, found = images._image, []
+    for colour in (0.2, 0.5):
+
+        def spoiled(own: Cameras, view: int, colour: float = colour) -> NDArray[np.float32]:
+            image = read(own, view)
+            mask = masks[view]
+            if mask is not None and (own.image_paths != own.mask_paths or hidden == "alpha"):
+                image[~mask, :3] = colour
+            return image
+
+        monkeypatch.setattr(images, "_image", spoiled)
+        found.append(reader(cameras))
+    for one, other in zip(*found, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_start_points_are_not_of_masked_pixels(tmp_path: Path) -> None:
+    cameras = photographed(tmp_path)
+    for path in filter(None, cameras.image_paths):
+        shown = np.asarray(Image.open(path)).copy()
+        shown[15:35, 25:45] = 255, 0, 0
+        Image.fromarray(shown).save(path)
+        mask = np.ones((48, 64))
+        mask[15:35, 25:45] = 0
+        write_png(tmp_path / "masks" / path.name, mask, overwrite=True)
+    assert not (points_along_rays(cameras, 300).colors == (1, 0, 0)).all(1).any()
 
 
 def test_metrics_use_unmasked_pixels_only() -> None:

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from g2ard.io.images import load_image, load_mask, resized
+from g2ard.io.images import load_photo, resized
 from g2ard.progress import Progress, silent
 from g2ard.rendering.renderer import Renderer
 from g2ard.scene.cameras import Camera, Cameras
@@ -124,15 +124,16 @@ class Candidate:
 
 
 def loaded(photos: Cameras, index: int, config: RegisterConfig, background: Sequence[float]) -> Photo:
-    """Read a photo, composited over the background, and shrink it to each size.
+    """Read a photo, composited over the background and grey outside of its mask, and shrink it to each size.
 
     Raises:
         InputError: it cannot be read.
     """
     sizes = config.levels()
     one = photos.take([index]).resized(max(config.size, sizes[-1]))
-    image, mask = load_image(one, 0, background), load_mask(one, 0)
+    image, mask = load_photo(one, 0, background)
     everywhere = np.ones(image.shape[:2], bool) if mask is None else mask
+    image[~everywhere] = 0.5
     planes = np.stack([grey_of(image), everywhere], 2).astype(np.float32)
     levels = [_shrunk(one, planes, sizes[-1])]
     for side in reversed(sizes[:-1]):  # each level from the previous one, which is fastest
