@@ -10,7 +10,8 @@ from typing import Any
 
 from g2ard.errors import InputError
 
-_HASHED_END_BYTES = 1 << 16  # bytes at each end of a file to hash
+_WHOLE_BYTES = 1 << 28  # largest file that is hashed as a whole, so any photo: 1 % of the time to decode it
+_HASHED_END_BYTES = 1 << 16  # bytes at each end of a larger file to hash
 _LONGEST_NAME = 200  # longest file name, bytes; systems allow 255, including suffixes and temporary names
 _PHOTO_SUFFIXES = (".png", ".jpg", ".jpeg", ".jfif", ".webp", ".tif", ".tiff", ".bmp")
 
@@ -120,15 +121,18 @@ def other_photo(path: Path) -> str | None:
 
 
 def file_identity(files: Iterable[Path]) -> list[Any]:
-    """Return name, size, modification time and a hash of both ends per file."""
+    """Return name, size, modification time and a hash per file: of both ends if it is over 256 MiB."""
     identity = []
     for path in files:
         try:
             state = path.stat()
             with path.open("rb") as file:
-                digest = hashlib.sha256(file.read(_HASHED_END_BYTES))
-                file.seek(max(0, state.st_size - _HASHED_END_BYTES))
-                digest.update(file.read(_HASHED_END_BYTES))
+                digest = hashlib.sha256()
+                if state.st_size > _WHOLE_BYTES:
+                    digest.update(file.read(_HASHED_END_BYTES))
+                    file.seek(state.st_size - _HASHED_END_BYTES)
+                while block := file.read(1 << 20):
+                    digest.update(block)
         except OSError as error:
             raise InputError(f"{error.strerror}", path=path) from error
         identity.append([path.name, state.st_size, state.st_mtime_ns, digest.hexdigest()])

@@ -223,8 +223,7 @@ def _simplified(
         drawn: targets that the recovery to come draws, rendered first.
     """
     blind = config.simplify.method == "paper" or count == len(scene)
-    kept = None if protected is None else np.packbits(protected).tobytes()
-    content = [config.simplify, count, budget, None if blind else cameras.fingerprint(), kept]
+    content = [config.simplify, count, budget, None if blind else cameras, protected]
 
     def step(_: Path | None) -> tuple[Splats, SimplifyReport, dict[str, Any]]:
         steps.fill(*drawn)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -19,21 +17,11 @@ from g2ard.stages.recover import RecoverConfig, checkpoint, recover
 from g2ard.stages.recover.anchors import Anchors
 from g2ard.stages.recover.report import RecoverReport
 from g2ard.stages.simplify.reduce import SimplifyReport
+from g2ard.system.keys import key_of
 
 R = TypeVar("R", RecoverReport, SimplifyReport)
 _Result = tuple[Splats, R, dict[str, NDArray[Any]]]
 _WITHIN = ".checkpoint.npz"
-
-
-def key_of(content: object) -> str:
-    """Return 16 hexadecimal digits of a hash of JSON values, of paths by their names (files of steps, whose
-    names hold such digits), and of anything else as it is printed."""
-
-    def told(value: object) -> str:
-        return value.name if isinstance(value, Path) else repr(value)
-
-    text = json.dumps(content, sort_keys=True, separators=(",", ":"), default=told)
-    return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
 class Steps:
@@ -60,12 +48,12 @@ class Steps:
         """Return the scene after a step, a report of this kind, and other arrays.
 
         Args:
-            settings: returns all that the result depends on besides `scene`, as it is printed.
+            settings: returns all that the result depends on besides `scene`, see `key_of`.
             step: takes the file for checkpoints within the step.
         """
         if self._folder is None:
             return step(None)
-        key = key_of([name, scene.fingerprint(), settings()])
+        key = key_of([name, scene, settings()])
         file, within = (self._folder / f"{name}-{key}{end}" for end in (".npz", _WITHIN))
         if file.exists():
             meta, arrays = checkpoint.load(file, key)
@@ -101,9 +89,8 @@ class Steps:
         """
 
         def settings() -> object:
-            views = [fingerprint_of(each) for each in (targets, validation) if each is not None]
-            before = None if built is None else built.fingerprint()
-            return config, views, before, None if weights is None else weights.tolist()
+            views = [None if each is None else fingerprint_of(each) for each in (targets, validation)]
+            return config, views, built, weights
 
         def step(within: Path | None) -> _Result[RecoverReport]:
             if filled:

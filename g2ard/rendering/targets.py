@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
@@ -24,6 +23,7 @@ from g2ard.rendering.renderer import RasterSettings, Renderer
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
 from g2ard.system.cached import cached_property
+from g2ard.system.keys import key_of
 from g2ard.system.threads import in_threads
 
 CACHE_BYTES = 2_000_000_000
@@ -92,11 +92,8 @@ def _source(targets: Targets) -> str:
 
 
 def _content(targets: Targets) -> str:
-    digest = hashlib.sha256()
-    for view in range(len(targets.cameras)):
-        for array in (targets[view], mask_of(targets, view)):
-            digest.update(b"" if array is None else np.ascontiguousarray(array).tobytes())
-    return f"images {digest.hexdigest()}"
+    views = range(len(targets.cameras))
+    return key_of([key_of([np.asarray(targets[view]), mask_of(targets, view)]) for view in views])
 
 
 def checked_targets(targets: Targets, parameter: str = "targets") -> Targets:
@@ -168,7 +165,24 @@ _BYTE_LIKE = 1.5
 """Largest value above which floats are probably bytes."""
 
 
-class _Chosen:
+class _Sourced:
+    """Targets identified by all their attributes except `_UNKEYED` and those that subclasses describe."""
+
+    cameras: Cameras
+    _UNKEYED: tuple[str, ...] = ()
+
+    @cached_property
+    def source(self) -> str:
+        """Identity of the images' source, which `fingerprint_of` joins with that of the cameras."""
+        own = {name: value for name, value in vars(self).items() if name not in ("cameras", *self._UNKEYED)}
+        return key_of([type(self).__name__, own, self._described()])
+
+    def _described(self) -> Any:
+        """Return what identifies attributes that are not keyed as they are."""
+        return None
+
+
+class _Chosen(_Sourced):
     """Views of other targets.
 
     Args:
@@ -178,10 +192,14 @@ class _Chosen:
     def __init__(self, cameras: Cameras, places: Sequence[tuple[Targets, int]]) -> None:
         self.cameras, self._places = cameras, places
 
-    @property
-    def source(self) -> str:
-        """Sources of the other targets, and the rows taken from each."""
-        return " | ".join(f"{_source(targets)} {rows}" for targets, rows in self._parts())
+    _UNKEYED: tuple[str, ...] = ("_places",)
+
+    def _described(self) -> Any:
+        """Return the sources of the other targets, and which of them has each view in which row."""
+        parts = [targets for targets, _ in self._parts()]
+        numbers = {id(targets): number for number, targets in enumerate(parts)}
+        places = [(numbers[id(targets)], row) for targets, row in self._places]
+        return [_source(targets) for targets in parts], places
 
     def _parts(self, views: Sequence[int] | None = None) -> list[tuple[Targets, list[int]]]:
         """Return the other targets and the rows in them of some views, of all by default."""
@@ -224,9 +242,10 @@ class _Converted(_Chosen):
         super().__init__(cameras, [(targets, view) for view in range(len(cameras))])
         self._parameter = parameter
 
-    @cached_property
-    def source(self) -> str:
-        """Hash of the converted images."""
+    _UNKEYED = ("_places", "_parameter")
+
+    def _described(self) -> Any:
+        """Return a hash of the converted images."""
         return _content(self)
 
     def __getitem__(self, view: int) -> NDArray[np.float32]:
@@ -262,8 +281,10 @@ _KEEPING = threading.Lock()
 """Held while targets change what they keep; one for all, so that targets can be pickled."""
 
 
-class _Cached(ABC):
+class _Cached(_Sourced, ABC):
     """Cache of what `_make` returns, up to `limit` bytes, first come first kept."""
+
+    _UNKEYED = ("_limit", "_kept", "_bytes", "_masks", "_renderer")
 
     def __init__(self, cameras: Cameras, limit: int) -> None:
         require("limit", limit, limit >= 0, "at least 0 bytes")
@@ -358,19 +379,10 @@ class Photos(_Cached):
             if exposures and name in exposures
         }
 
-    @cached_property
-    def source(self) -> str:
-        """Identity of the photos, masks and exposures; hashes the files."""
-        photos, masks = self.cameras.image_paths, self.cameras.mask_paths
-        files: list[Any] = [file_identity(filter(None, paths)) for paths in (photos, masks)]
-        masked = [path is not None for path in masks]
-        if self._images is not None:
-            digest = hashlib.sha256()
-            for image in self._images:
-                digest.update(np.ascontiguousarray(image).tobytes())
-            files.append(digest.hexdigest())
-        exposures = [(view, matrix.tolist()) for view, matrix in self._undo.items()]
-        return f"photos {files} {masked} {exposures} {self._background}"
+    def _described(self) -> Any:
+        """Return the identities of the files of photos and masks."""
+        paths = (*self.cameras.image_paths, *self.cameras.mask_paths)
+        return [path and file_identity([path]) for path in paths]
 
     def against(self, view: int) -> str:
         """Return the kind, see `against_of`."""
@@ -464,12 +476,6 @@ class TeacherRenders(_Cached):
         for number, _ in enumerate(in_threads(self._stored, missing[:count].tolist()), 1):
             progress("targets", number, count)
         self._renderer = None  # its buffers are larger than the scene
-
-    @property
-    def source(self) -> str:
-        """Identity of the renders; hashes the teacher."""
-        conventions = "" if self._settings is None else f" {self._settings}"
-        return f"teacher {self._teacher.fingerprint()} {self._background}{conventions}"
 
     def _make(self, view: int) -> NDArray[np.float32 | np.uint16]:
         image = self._shared_renderer().clipped(self.cameras[view])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -16,6 +15,7 @@ from g2ard.errors import InputError, require
 from g2ard.progress import plural
 from g2ard.scene.lenses import PhotoLens
 from g2ard.scene.samples import evenly_spaced
+from g2ard.system.keys import UNKEYED, key_of, keyed
 
 USUAL = "usual"
 """Kind of views that state none: given views, and the poses that suit the scene."""
@@ -158,10 +158,10 @@ class Cameras:
     widths: NDArray[np.int64]
     heights: NDArray[np.int64]
     names: tuple[str, ...]
-    image_paths: tuple[Path | None, ...] = ()
+    image_paths: tuple[Path | None, ...] = field(default=(), metadata=UNKEYED)  # targets key the photos
     distortions: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 5)))
-    mask_paths: tuple[Path | None, ...] = ()
-    source: Path | None = None
+    mask_paths: tuple[Path | None, ...] = field(default=(), metadata=UNKEYED)
+    source: Path | None = field(default=None, metadata=UNKEYED)
     kinds: tuple[str, ...] = ()
     lenses: tuple[PhotoLens | None, ...] = ()
 
@@ -293,11 +293,8 @@ class Cameras:
         return self.take(rows_by_kind(self.kinds).get(USUAL, range(len(self))))
 
     def fingerprint(self) -> str:
-        """Return a hash of poses, intrinsics, image sizes and kinds."""
-        digest = hashlib.sha256(str(self.kinds).encode())
-        for array in (self.viewmats, self.Ks, self.widths, self.heights):
-            digest.update(np.ascontiguousarray(array).tobytes())
-        return digest.hexdigest()
+        """Return a hash of the views without their photos and masks."""
+        return key_of(keyed(self))
 
     def resized(self, longest: int | None) -> Cameras:
         """Return the views with their longer side shrunk to at most `longest` pixels (None keeps them)."""

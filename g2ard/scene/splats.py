@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -13,6 +12,7 @@ from g2ard.config.choices import RENDER_MODELS, RenderModel
 from g2ard.errors import InputError, require
 from g2ard.progress import plural
 from g2ard.system.cached import cached_property
+from g2ard.system.keys import UNKEYED, key_of, keyed
 
 SH_C0 = 0.28209479177387814
 """Band-0 spherical harmonic: colour = 0.5 + SH_C0 · sh0."""
@@ -69,7 +69,7 @@ class Splats:
     shN: NDArray[np.float32]
     offset: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
     render_model: RenderModel = "classic"
-    up: tuple[float, float, float] | None = None
+    up: tuple[float, float, float] | None = field(default=None, metadata=UNKEYED)
 
     def __post_init__(self) -> None:
         for name in ARRAYS:
@@ -176,12 +176,7 @@ class Splats:
 
     @cached_property
     def _digest(self) -> str:
-        digest = hashlib.sha256()
-        for name in (*ARRAYS, "offset"):
-            digest.update(np.ascontiguousarray(getattr(self, name)).tobytes())
-        if self.antialiased:
-            digest.update(b"antialiased")
-        return digest.hexdigest()
+        return key_of(keyed(self))
 
     def take(self, index: Any) -> Splats:
         """Return the rows that `index` selects (a mask, a slice or indices), in its order."""

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import asdict
@@ -23,6 +21,7 @@ from g2ard.io.tiles import VERSION, TileStore
 from g2ard.io.types import Note
 from g2ard.progress import Progress, Say, plural, silent, unsaid
 from g2ard.stages.lift import LiftConfig
+from g2ard.system.keys import key_of
 from g2ard.tiles.writer import clear, is_tile_file, lift_tiles, pour, row_bytes
 
 TILE_ROWS = 5_000_000
@@ -109,7 +108,7 @@ def ingest(
     elif stream.render_model != "classic":
         settings["render_model"] = stream.render_model
     decisive = {"version": VERSION, "source": stream.identity(), **settings}
-    key = hashlib.sha256(json.dumps(decisive, sort_keys=True).encode()).hexdigest()
+    key = key_of(decisive)
     done = _done(folder, key, overwrite)
     if done is not None:
         with suppress(OutputError):  # another call may be about to end

@@ -12,11 +12,11 @@ from g2ard.config.choices import RenderModel
 from g2ard.errors import InputError
 from g2ard.io.stream import PartsStream
 from g2ard.io.tiles import TileStore
-from g2ard.pipeline.steps import key_of
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats, unit_quats
 from g2ard.scene.transform import join
 from g2ard.stages.simplify.pairs import fit_opacities
+from g2ard.system.keys import key_of
 from g2ard.tiles.sights import Sights
 from g2ard.tiles.simplify import TiledRun
 from g2ard.tiles.tasks import load, scene_of

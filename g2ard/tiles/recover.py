@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from g2ard.config.schema import changed, values_of
 from g2ard.io.tiles import TileStore
 from g2ard.pipeline.distill import RunViews
-from g2ard.pipeline.steps import key_of
 from g2ard.rendering.renderer import RasterSettings, Renderer, settings_for
 from g2ard.rendering.targets import TeacherRenders
 from g2ard.report.run import TiledScores, TileScore, by_kind
@@ -22,6 +21,7 @@ from g2ard.stages.evaluate import ViewScore
 from g2ard.stages.recover import RecoverConfig, recover
 from g2ard.stages.recover.anchors import Anchors
 from g2ard.stages.recover.loop import checked_weights
+from g2ard.system.keys import key_of
 from g2ard.tiles.executor import Workers
 from g2ard.tiles.merging import TiledScene, finished
 from g2ard.tiles.sights import Sights, in_sight, light_of, written

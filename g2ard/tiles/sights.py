@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,7 @@ from g2ard.io.tiles import TileStore
 from g2ard.rendering.visibility import LONGEST, MOST_VIEWS, NEAR
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.samples import evenly_spaced, weighted_quantile
+from g2ard.system.keys import key_of
 from g2ard.tiles.executor import Workers
 from g2ard.tiles.simplify import COARSE, TiledRun
 from g2ard.tiles.tasks import Task, is_whole, load, save, scene_of
@@ -119,8 +119,7 @@ def in_sight(light: NDArray[np.float64], tile: int) -> NDArray[np.intp]:
 def written(work: Path, cameras: Cameras) -> Path:
     """Write cameras to a file named by their content, as input of tasks."""
     arrays = {name: getattr(cameras, name) for name in ("viewmats", "Ks", "widths", "heights")}
-    content = b"".join(np.ascontiguousarray(array).tobytes() for array in arrays.values())
-    path = work / f"views-{hashlib.sha256(content).hexdigest()[:16]}.npz"
+    path = work / f"views-{key_of(arrays)}.npz"
     if not is_whole(path):
         save(path, arrays)
     return path

@@ -18,12 +18,12 @@ from numpy.typing import NDArray
 from g2ard.errors import InputError
 from g2ard.io.atomic import atomic_output
 from g2ard.io.tiles import TileStore
-from g2ard.pipeline.steps import key_of
 from g2ard.rendering.renderer import RasterSettings
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.prepared import PreparedScene, as_prepared, finite_rows_of
 from g2ard.scene.splats import Splats
 from g2ard.scene.transform import join
+from g2ard.system.keys import UNKEYED, key_of
 
 Arrays = dict[str, NDArray[Any]]
 """Output of a task: arrays by name, stored as one .npz file."""
@@ -66,17 +66,17 @@ class Task:
     """
 
     function: str
-    label: str
-    folder: Path
+    label: str = field(metadata=UNKEYED)
+    folder: Path = field(metadata=UNKEYED)
     arguments: Mapping[str, Any] = field(default_factory=dict)
     inputs: Mapping[str, Path | list[Path]] = field(default_factory=dict)
-    places: Mapping[str, Path] = field(default_factory=dict)
-    cost: int = 1
+    places: Mapping[str, Path] = field(default_factory=dict, metadata=UNKEYED)
+    cost: int = field(default=1, metadata=UNKEYED)
 
     @property
     def key(self) -> str:
         """16 hexadecimal digits that identify the task's output."""
-        return key_of([_OUTPUT_VERSION, self.function, dict(self.arguments), dict(self.inputs)])
+        return key_of([_OUTPUT_VERSION, self])
 
     @property
     def output(self) -> Path:

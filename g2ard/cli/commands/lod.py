@@ -129,7 +129,7 @@ def lod(
     from g2ard.jobs.memory import LEVELS_TIMES, RECOVERY_TIMES, check_whole_memory
     from g2ard.jobs.tiling import is_tiled
     from g2ard.levels import Cut, save_levels
-    from g2ard.pipeline.steps import key_of
+    from g2ard.system.keys import key_of
     from g2ard.system.peak_memory import peak_rss_of_all
 
     refuse_file(output, "levels of detail")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import hashlib
 import math
 import time
 from collections.abc import Callable
@@ -32,6 +31,7 @@ from g2ard.stages.recover.probe import Probe
 from g2ard.stages.recover.report import Regularized
 from g2ard.stages.recover.trials import MULTIPLIERS, Trials, trial_steps
 from g2ard.system.cached import cached_property
+from g2ard.system.keys import UNKEYED, key_of, keyed
 
 if TYPE_CHECKING:
     from g2ard.stages.recover.torch_engine import TorchEngine
@@ -77,21 +77,21 @@ class Loop:
     config: RecoverConfig
     weights: NDArray[np.float64] | None
     anchors: Anchors
-    probe: Probe
-    guard: Guard
+    probe: Probe = field(metadata=UNKEYED)
+    guard: Guard = field(metadata=UNKEYED)
     validation_key: str | None
     frozen: NDArray[np.bool_] | None
-    multiplier: float = 1.0
-    reach: float = math.inf
-    trials: list[dict[str, float]] = field(default_factory=list)
-    done: int = 0
-    seconds: float = 0.0
-    resumed: float | None = None
-    losses: list[float] = field(default_factory=list)
-    geometry: list[dict[str, float]] = field(default_factory=list)
-    skipped_before: int = 0
-    tally: list[list[float]] = field(default_factory=lambda: [[0, 0.0], [0, 0.0]])
-    _epoch: tuple[int, NDArray[np.int64]] | None = None
+    multiplier: float = field(default=1.0, metadata=UNKEYED)
+    reach: float = field(default=math.inf, metadata=UNKEYED)
+    trials: list[dict[str, float]] = field(default_factory=list, metadata=UNKEYED)
+    done: int = field(default=0, metadata=UNKEYED)
+    seconds: float = field(default=0.0, metadata=UNKEYED)
+    resumed: float | None = field(default=None, metadata=UNKEYED)
+    losses: list[float] = field(default_factory=list, metadata=UNKEYED)
+    geometry: list[dict[str, float]] = field(default_factory=list, metadata=UNKEYED)
+    skipped_before: int = field(default=0, metadata=UNKEYED)
+    tally: list[list[float]] = field(default_factory=lambda: [[0, 0.0], [0, 0.0]], metadata=UNKEYED)
+    _epoch: tuple[int, NDArray[np.int64]] | None = field(default=None, metadata=UNKEYED)
 
     def __post_init__(self) -> None:
         self.schedule = self.config.schedule.within(self.targets.cameras.extent)
@@ -99,23 +99,8 @@ class Loop:
     @cached_property
     def key(self) -> str:
         """Fingerprint of inputs and contents that a checkpoint must have; computed only with one."""
-        parts = [
-            repr(_CHECKPOINT_FIELDS),
-            repr(self.config),
-            self.student.fingerprint(),
-            fingerprint_of(self.targets),
-        ]
-        if self.weights is not None:
-            parts.append(repr(self.weights.tolist()))
-        if self.validation_key is not None:
-            parts.append(self.validation_key)
-        digest = hashlib.sha256("\n".join(parts).encode())
-        anchors = self.anchors
-        for array in (anchors.means, anchors.frames, anchors.r_parallel, anchors.r_perp):
-            digest.update(np.ascontiguousarray(array).tobytes())
-        if self.frozen is not None:
-            digest.update(self.frozen.tobytes())
-        return digest.hexdigest()
+        inputs = keyed(self) | {"targets": fingerprint_of(self.targets)}
+        return key_of([_CHECKPOINT_FIELDS, inputs])
 
     @cached_property
     def engine(self) -> Engine:
