@@ -213,6 +213,8 @@ def topped_up(
 
 def distinct(points: Points) -> Points:
     """Merge points of one position, as lifting does, so that what is missing can be counted."""
+    if not len(points):
+        return points
     rows, colors = merged(points.positions - np.median(points.positions, axis=0), points.colors)
     if len(rows) == len(points):
         return points
@@ -407,7 +409,9 @@ def _refined(ray: _Rays, trial: Float, cost: Float) -> tuple[Float, Float]:
     spacing = np.abs(1 / trial[:, :1] - 1 / trial[:, 1:2])
     offsets = np.linspace(-0.75, 0.75, _FINER_DEPTHS)
     tried = inverse_depth[:, :, None] + offsets * spacing[:, :, None]
-    finer = (1 / np.maximum(tried, 1e-3 * inverse_depth[:, :, None])).reshape(len(cost), -1)
+    finer = (1 / np.maximum(tried, 1e-3 * inverse_depth[:, :, None])).reshape(
+        len(cost), order.shape[1] * len(offsets)
+    )
     costs = ray.costs(finer)
     best = costs.argmin(1)
     return finer[rows[:, 0], best], costs[rows[:, 0], best]

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import g2ard
+from g2ard.errors import InputError
 from g2ard.io.images import load_photo, write_png
 from g2ard.io.types import Points
 from g2ard.jobs.budget import Budget
@@ -154,3 +155,14 @@ def test_points_that_no_second_photo_supports_are_dropped(tmp_path: Path) -> Non
     found = points_along_rays(cameras, 600)
     away = np.abs(np.linalg.norm(found.positions, axis=1) - 1)
     assert np.mean(away < 0.25) > 0.8
+
+
+def test_rays_may_give_no_point(tmp_path: Path) -> None:
+    photos_of(tmp_path / "photos")
+    cameras = g2ard.load_views(tmp_path / "photos").take([0, 8, 16])
+    for i, path in enumerate(filter(None, cameras.image_paths)):  # no two alike, until the limits are relaxed
+        write_png(path, np.full((48, 64, 3), 0.2 + 0.3 * i), overwrite=True)
+    assert len(points_along_rays(cameras, 70)) == 70
+    write_png(tmp_path / "mask.png", np.zeros((48, 64)))
+    with pytest.raises(InputError, match="found 0 points that three views see"):
+        points_along_rays(replace(cameras, mask_paths=(tmp_path / "mask.png",) * 3), 70)
