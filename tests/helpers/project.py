@@ -7,6 +7,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 def environment(**more: str) -> dict[str, str]:
-    """Return the variables of a process that runs these sources."""
+    """Return the variables of a process that runs these sources, where numpy's warnings are errors."""
     paths = filter(None, [str(ROOT), os.environ.get("PYTHONPATH")])
-    return {**os.environ, "PYTHONPATH": os.pathsep.join(paths), **more}
+    warned = {"PYTHONWARNINGS": "ignore,error::RuntimeWarning"}
+    return {**os.environ, **warned, "PYTHONPATH": os.pathsep.join(paths), **more}
