@@ -208,7 +208,7 @@ class RunFolder:
                 tiled_report(self.path / "report.html", title, report)
             return report, ""
         scenes = [("simplified", done.simplified), ("recovered", done.splats)]
-        targets = list(filter(None, (job.targets.held_out, job.targets.apart)))
+        targets = list(filter(None, (done.held_out, job.targets.apart)))
         recover, page = job.config.recover, self.path / "report.html"
         with self._run.finishing("report.html"):
             distill_report(page, title, scenes, targets, report, recover.background, told)

@@ -103,6 +103,7 @@ def told(report: RunReport | TiledReport, *, verbose: bool = False) -> list[str]
 
     rounds = [entry.recover for entry in report.rounds]
     lines = [outcome(one) for entry in rounds for one in entry]
+    lines += [str(one.exposure) for entry in rounds for one in entry[-1:] if one.exposure]
     lines += [unregularized(rounds)] if verbose else []
     lines += list(map(loss, report.kinds))
     lines.append(gaps_line(report.opacity_lost, RECOVERED_GAPS))

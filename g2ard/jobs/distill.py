@@ -173,7 +173,7 @@ class DistillJob:
             fill(scored, self.progress)
         done = self._reduced(self.prior, self.budget.count, work)
         splats = self.budget.shrink(done.splats, self.say)
-        return replace(done, splats=splats, held_out=self.targets.held_out)
+        return replace(done, splats=splats, held_out=done.scored_on(self.targets.held_out))
 
     def _reduced(self, scene: Splats, count: int, work: Path | None) -> Distilled:
         """Simplify and recover the dense scene, or one derived from it."""
@@ -196,9 +196,9 @@ class DistillJob:
         held_out = job.targets.held_out
         fill(held_out, self.progress)
 
-        def score(splats: Splats) -> float:
+        def score(splats: Splats, on: Targets = held_out) -> float:
             colour = self.config.recover.background
-            return evaluate(splats, held_out, stage="scoring", background=colour, progress=self.progress).psnr
+            return evaluate(splats, on, stage="scoring", background=colour, progress=self.progress).psnr
 
         if not self.recovers:
             visibility = visibility_source(self.views.train.cameras, progress=self.progress)
@@ -208,7 +208,8 @@ class DistillJob:
         done = job._reduced(finer, count, work)
         lost = opacity_lost(self.prior, done.splats, held_out.cameras)
         say_gaps(lost, self.say, f"give levels more Gaussians (--ratios), here {count:,}")
-        return done.splats, done.simplified, score(done.simplified), score(done.splats)
+        on = done.scored_on(held_out)
+        return done.splats, done.simplified, score(done.simplified, on), score(done.splats, on)
 
     def report(self, done: Distilled, file: Path) -> RunReport:
         """Score the simplified and the recovered scene in held-out views, and describe the run.
@@ -223,19 +224,20 @@ class DistillJob:
         def scored(targets: Targets) -> dict[str, Evaluation]:
             return {name: score(splats, targets, stage=f"score {name}") for name, splats in scenes.items()}
 
-        targets, cameras = self.targets, self.targets.held_out.cameras
-        scores, apart = scored(targets.held_out), None if targets.apart is None else scored(targets.apart)
+        held_out, targets = done.scored_on(self.targets.held_out), self.targets
+        cameras = held_out.cameras
+        scores, apart = scored(held_out), None if targets.apart is None else scored(targets.apart)
         before, after = (
             [view for part in (scores, apart) if part for view in part[name].views] for name in scenes
         )
-        full = None if targets.full is None else scored(targets.full)
+        full = None if targets.full is None else scored(done.scored_on(targets.full))
         made = self.views.pool is not None and "test" in self.views.pool.splits
         config = replace(
             self.config, simplify=self.config.simplify.resolved(antialiased=self.prior.antialiased)
         )
         packed = None
         if file.name != "scene.ply":
-            found = score(read_splats(file), targets.held_out, stage="score file")
+            found = score(read_splats(file), held_out, stage="score file")
             packed = Packed(file.name, found.psnr, found.ssim)
         return RunReport(
             input_count=len(self.prior),

@@ -20,7 +20,7 @@ from g2ard.jobs.view_checks import check_photos, propose_background, warn_of_sig
 from g2ard.jobs.views import shrunk, views_or_pool, within_pixels
 from g2ard.pipeline.presets import PRESETS, configured
 from g2ard.progress import Progress, Say, plural, silent, unsaid
-from g2ard.rendering.targets import Targets, checked_targets, fill, kinds_of, kinds_told
+from g2ard.rendering.targets import Exposed, Targets, checked_targets, fill, kinds_of, kinds_told
 from g2ard.report.run import KindScore, by_kind
 from g2ard.scene.cameras import USUAL, Cameras
 from g2ard.scene.splats import Splats
@@ -215,10 +215,11 @@ class RecoverJob:
         """Score student and result in held-out views, by kind of view; empty without such views."""
         if self.held_out is None:
             return ()
+        held_out = Exposed(self.held_out) if result.report.exposure else self.held_out
         before, after = (
             evaluate(
                 splats,
-                self.held_out,
+                held_out,
                 background=self.config.background,
                 progress=self.teaching.progress,
                 stage=f"score {name}",

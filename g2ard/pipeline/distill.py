@@ -16,7 +16,7 @@ from g2ard.io.types import ViewSet
 from g2ard.pipeline.config import DistillConfig, SelectConfig
 from g2ard.pipeline.steps import Steps
 from g2ard.progress import Progress, plural, silent
-from g2ard.rendering.targets import Photos, PhotosOrRenders, Subset, Targets, checked_targets
+from g2ard.rendering.targets import Exposed, Photos, PhotosOrRenders, Subset, Targets, checked_targets
 from g2ard.rendering.visibility import visibility_source
 from g2ard.report.run import DistillReport, RoundReport, StageSeconds, ViewsReport
 from g2ard.scene.cameras import Cameras
@@ -82,6 +82,11 @@ class Distilled:
         gain = self.report.rounds[-1].recover[-1:]
         scores = f", {gain[0].psnr}" if gain else ""
         return f"Distilled({plural(len(self.splats), 'Gaussian')}{scores})"
+
+    def scored_on(self, held_out: Targets) -> Targets:
+        """Return the targets, to be scored after a fit of exposures if the training photos differ."""
+        recoveries = (recovery for entry in self.report.rounds for recovery in entry.recover)
+        return Exposed(held_out) if any(done.exposure for done in recoveries) else held_out
 
 
 @checks_arguments

@@ -84,7 +84,7 @@ class CudaRenderer:
         import torch
 
         splats = splats.narrowed()
-        self._offset, self._background = splats.offset, [float(c) for c in background]
+        self._offset, self.background = splats.offset, [float(c) for c in background]
         self._settings = settings_for(splats.means, settings, antialiased=splats.antialiased)
         names = ("means", "quats", "log_scales", "logit_opacities", "sh0", "shN")
         arrays = ((name, np.asarray(getattr(splats, name), np.float32)) for name in names)
@@ -92,12 +92,16 @@ class CudaRenderer:
 
     def clipped(self, camera: Camera) -> NDArray[np.float32]:
         """Render the (H, W, 3) image clipped to [0, 1]."""
+        return self.image(camera).clip(0, 1)
+
+    def image(self, camera: Camera) -> NDArray[np.float32]:
+        """Render the (H, W, 3) image."""
         import torch
 
         here = Cameras.of([camera]).recentred(self._offset)
         with torch.inference_mode():
-            image = rasterized(self._parameters, here, 0, self._background, self._settings)
-        found: NDArray[np.float32] = image.clamp(0, 1).cpu().numpy()
+            image = rasterized(self._parameters, here, 0, self.background, self._settings)
+        found: NDArray[np.float32] = image.cpu().numpy()
         return found
 
 

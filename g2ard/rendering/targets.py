@@ -44,6 +44,12 @@ def mask_of(targets: Targets, view: int) -> NDArray[np.bool_] | None:
     return None if masks is None else masks(view)
 
 
+def alpha_of(targets: Targets, view: int) -> NDArray[np.float32] | None:
+    """Return the (H, W) alpha of a photo that was composited, or None."""
+    alphas = getattr(targets, "alpha", None)
+    return None if alphas is None else alphas(view)
+
+
 def against_of(targets: Targets, view: int) -> str | None:
     """Return the kind of a view's target, "photo" or "teacher", or None if unknown."""
     says: Callable[[int], str | None] | None = getattr(targets, "against", None)
@@ -77,7 +83,8 @@ def scored_in(targets: Targets, split: str = "") -> str:
     count, kinds = len(targets.cameras), kinds_of(targets)
     name = f"{split} {'photo' if kinds == 'photos' else 'view'}".strip()
     against = "" if kinds == "photos" else f" against {kinds}"
-    return f"{plural(count, name)}{against}, {targets.cameras.size_text}"
+    exposed = ", exposure fitted" * isinstance(targets, Exposed)
+    return f"{plural(count, name)}{against}, {targets.cameras.size_text}{exposed}"
 
 
 def fingerprint_of(targets: Targets) -> str:
@@ -221,6 +228,10 @@ class _Chosen(_Sourced):
         """Return the mask, see `mask_of`."""
         return mask_of(*self._places[view])
 
+    def alpha(self, view: int) -> NDArray[np.float32] | None:
+        """Return the alpha, see `alpha_of`."""
+        return alpha_of(*self._places[view])
+
     def against(self, view: int) -> str | None:
         """Return the kind, see `against_of`."""
         return against_of(*self._places[view])
@@ -232,6 +243,13 @@ class Subset(_Chosen):
     def __init__(self, targets: Targets, rows: ArrayLike) -> None:
         rows = np.asarray(rows, np.int64)
         super().__init__(targets.cameras.take(rows), [(targets, int(row)) for row in rows])
+
+
+class Exposed(Subset):
+    """Other targets, scored after the gain and offset of each channel that fit a render best to its photo."""
+
+    def __init__(self, targets: Targets) -> None:
+        super().__init__(targets, range(len(targets.cameras)))
 
 
 class _Converted(_Chosen):
@@ -373,6 +391,7 @@ class Photos(_Cached):
         super().__init__(cameras, limit)
         self._background = background
         self._masks: dict[int, NDArray[np.bool_] | None] = {}
+        self._alphas: dict[int, NDArray[np.float32] | None] = {}
         self._undo = {
             view: _inverse_exposure(name, exposures[name])
             for view, name in enumerate(cameras.names)
@@ -392,6 +411,15 @@ class Photos(_Cached):
         """Return the mask of valid pixels, or None."""
         mask: NDArray[np.bool_] | None = self._cached(self._masks, view, partial(load_mask, self.cameras))
         return mask
+
+    def alpha(self, view: int) -> NDArray[np.float32] | None:
+        """Return the alpha, see `alpha_of`."""
+        alpha: NDArray[np.float32] | None = self._cached(self._alphas, view, self._alpha)
+        return alpha
+
+    def _alpha(self, view: int) -> NDArray[np.float32] | None:
+        own = load_photo(self.cameras, view, None)[0] if self._images is None else self._images[view]
+        return _as_floats(own)[..., 3].copy() if own.shape[2] == 4 else None
 
     def _make(self, view: int) -> NDArray[np.uint8 | np.float32]:
         if self._images is not None:

@@ -10,6 +10,7 @@ import numpy as np
 from g2ard.config.choices import BLACK, Colour
 from g2ard.io.images import contact_sheet, to_bytes, write_png
 from g2ard.progress import plural
+from g2ard.rendering.exposure import rendered
 from g2ard.rendering.metrics import psnr
 from g2ard.rendering.renderer import Renderer
 from g2ard.rendering.targets import Targets
@@ -52,7 +53,7 @@ def distill_report(
         part, row = views[view]
         camera = part.cameras[row]
         shown = [
-            Shown(stage, to_bytes(renderer.image(camera)), f"{scores[stage][view].psnr:.2f} dB")
+            Shown(stage, to_bytes(rendered(renderer, part, row)), f"{scores[stage][view].psnr:.2f} dB")
             for stage, renderer in renderers
         ]
         title = f"{part.cameras.names[row]}, {camera.width}×{camera.height} px"
@@ -194,8 +195,7 @@ def preview(
     renderers = [Renderer(splats, background=background) for _, splats in scenes]
     for view in (max(map(int, third), key=share.__getitem__) for third in thirds):
         target = targets[view]
-        images = [renderer.image(cameras[view]) for renderer in renderers]
-        rows.append([target, *(np.clip(image, 0, 1) for image in images)])
+        rows.append([target, *(rendered(renderer, targets, view) for renderer in renderers)])
         scores = [
             f"{name} {psnr(image, target):.2f} dB"
             for (name, _), image in zip(scenes, rows[-1][1:], strict=True)

@@ -16,6 +16,7 @@ from g2ard.io.images import as_saved
 from g2ard.io.reports import Report
 from g2ard.progress import Progress, plural, silent
 from g2ard.rendering.cuda import renderer_on
+from g2ard.rendering.exposure import rendered
 from g2ard.rendering.metrics import Lpips, edge_psnr, psnr, ssim
 from g2ard.rendering.renderer import RasterSettings
 from g2ard.rendering.targets import Targets, against_of, checked_targets, fill, mask_of, scored_in
@@ -145,7 +146,8 @@ def evaluate(
 
     Args:
         splats: the scene; cameras are in world coordinates, including its offset.
-        targets: photos or teacher renders; scores against the two are not comparable.
+        targets: photos or teacher renders; scores against the two are not comparable. With
+            `g2ard.rendering.targets.Exposed` scores are measured after a fit of exposures.
         background: RGB in [0, 1] behind the scene.
         lpips: networks to score with, from `g2ard.rendering.metrics.load_lpips`.
         settings: the renderer's conventions; None means gsplat's. Teacher renders have their own, see
@@ -177,7 +179,7 @@ def evaluate(
 
     def score(view: int) -> ViewScore:
         name = cameras.names[view]
-        image, target = renderer.clipped(cameras[view]), targets[view]
+        image, target = rendered(renderer, targets, view), targets[view]
         if eight_bit:
             image, target = as_saved(image), as_saved(target)
         perceived = {net: model(image, target) for net, model in (lpips or {}).items()}

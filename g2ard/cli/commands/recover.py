@@ -89,7 +89,8 @@ def recover(
     with stoppable(run, checkpoint, resume, output):
         result = job.run(checkpoint)
         run.write(output, result.splats)
-    lines = [outcome(result.report), unregularized([[result.report]]) if run.verbose else None]
+    exposure = str(result.report.exposure or "")
+    lines = [outcome(result.report), exposure, unregularized([[result.report]]) if run.verbose else None]
     for line in filter(None, lines):
         run.say(line)
     with run.finishing("scoring"):

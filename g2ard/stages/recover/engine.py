@@ -131,10 +131,11 @@ class FusedEngine:
         *,
         regularize: bool,
         mask: NDArray[np.bool_] | None = None,
+        fixed: bool = True,
     ) -> float:
         """Take one optimiser step on one view; return its photometric loss.
 
-        A view's target and mask are the same in all steps, so that the device may keep them.
+        A view's target and mask are the same in all `fixed` steps, so that the device may keep them.
         """
         objective = self._objective
         loss, _ = self._trainer.step(
@@ -144,7 +145,7 @@ class FusedEngine:
             objective.regularizers if regularize else None,
             mask,
             TYPICAL_LOSS if objective.relative else None,
-            view,
+            view if fixed else None,
         )
         return loss
 

@@ -69,6 +69,10 @@ class Guard:
         if self.others is not None:
             self.validation.append({"step": 0, "psnr": self.others(self.start)})
 
+    def rescore(self) -> None:
+        """Score the best scene again, after a change of the score."""
+        self.best_score = self.before if self.best is self.start else self.score(self.best)
+
     def due(self, share: float) -> bool:
         """Return whether the scene should be scored at this share of the horizon."""
         return self.active and self.looked < len(LOOKS) and LOOKS[self.looked] <= share < 1

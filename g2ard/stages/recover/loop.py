@@ -19,6 +19,7 @@ import g2ard.stages.recover.checkpoint as checkpoints
 from g2ard.config.choices import ENGINES
 from g2ard.errors import DeviceError, InputError, require, require_torch
 from g2ard.progress import Progress, silent
+from g2ard.rendering.exposure import exposures_of, unexposed
 from g2ard.rendering.renderer import settings_for
 from g2ard.rendering.targets import Targets, fingerprint_of, mask_of
 from g2ard.scene.shape import needle_share
@@ -41,6 +42,9 @@ if TYPE_CHECKING:
 
 _SHORTEST_WITH_GUARD = 20
 """Fewest steps for going back to an earlier scene; shorter recoveries have no steps left to repeat."""
+
+_UNSEEN_UNTIL = 0.5
+"""Share of the horizon before which exposures are estimated only if each photo can have been trained on."""
 
 _LOG_POINTS = 10
 """Number of log entries of Drift95 and Needle per recovery."""
@@ -70,6 +74,7 @@ class Loop:
         validation_key: fingerprint of the validation views, for `key`.
         resumed: the part of `seconds` before this call.
         tally: number of steps and their seconds, without and with regularisers.
+        exposures: of the photos, (C, 3, 2); None while they agree, see `exposures_of`.
     """
 
     student: Splats
@@ -91,6 +96,7 @@ class Loop:
     geometry: list[dict[str, float]] = field(default_factory=list, metadata=UNKEYED)
     skipped_before: int = field(default=0, metadata=UNKEYED)
     tally: list[list[float]] = field(default_factory=lambda: [[0, 0.0], [0, 0.0]], metadata=UNKEYED)
+    exposures: NDArray[np.float64] | None = field(default=None, metadata=UNKEYED)
     _epoch: tuple[int, NDArray[np.int64]] | None = field(default=None, metadata=UNKEYED)
 
     def __post_init__(self) -> None:
@@ -193,8 +199,12 @@ class Loop:
         """Advance an engine by the view of this step, with the rates at this share of the horizon."""
         rates = self.schedule.at(share, final=self.config.final, multiplier=multiplier, reach=self.reach)
         view = self._view(step)
-        target, mask = self.targets[view], mask_of(self.targets, view)
-        return engine.step(view, target, rates, regularize=regularize, mask=mask)
+        if self.exposures is None:
+            target, mask = self.targets[view], mask_of(self.targets, view)
+        else:
+            target, mask = unexposed(self.targets, view, self.exposures[view], self.config.background)
+        fixed = self.exposures is None
+        return engine.step(view, target, rates, regularize=regularize, mask=mask, fixed=fixed)
 
     def run(
         self, checkpoint: Path | None, progress: Progress, stage: str, watch: Watch | None
@@ -272,11 +282,28 @@ class Loop:
         short = self.config.recovery_time is None and self.config.horizon < _SHORTEST_WITH_GUARD
         if short or not self.guard.due(share):
             return
-        if self.guard.look(self.engine.splats(), share, self.done) == "back":
+        scene = self.engine.splats()
+        self._look_at_exposures(scene, share)
+        if self.guard.look(scene, share, self.done) == "back":
             self.multiplier /= 3
             self.skipped_before += self.engine.skipped
             del self.engine  # two engines at once would double the memory
             self.engine = self._new_engine(self.guard.best)
+
+    def _look_at_exposures(self, scene: Splats, share: float) -> None:
+        """Estimate the exposures of photos, if they are known to differ or turn out to."""
+        decided = self.exposures is not None
+        if not decided and self.done < len(self.targets.cameras) and share < _UNSEEN_UNTIL:
+            return
+        found = exposures_of(scene, self.targets, self.config.background, decided=decided)
+        if found is not None and not decided:
+            self._score_exposed()
+            self.guard.rescore()
+        self.exposures = found
+
+    def _score_exposed(self) -> None:
+        self.probe.fit_exposures()
+        self.guard.before = self.probe.all_of(self.guard.start)
 
     def _log(self) -> None:
         """Log Drift95 and Needle at every tenth of the recovery."""
@@ -326,6 +353,8 @@ class Loop:
 
     def _save(self, path: Path) -> None:
         arrays = {**self.engine.state(), "losses": np.array(self.losses), **self.guard.arrays()}
+        if self.exposures is not None:
+            arrays["exposures"] = self.exposures
         checkpoints.save(path, self.key, self._meta(), arrays)
 
     def _resume(self, path: Path) -> None:
@@ -338,6 +367,9 @@ class Loop:
         """Restore all but the engine, whose arrays remain in `arrays`."""
         self.losses = arrays.pop("losses").tolist()
         self.guard.load(meta["guard"], arrays)
+        self.exposures = arrays.pop("exposures", None)
+        if self.exposures is not None:
+            self._score_exposed()
         for name in _CHECKPOINT_FIELDS:
             setattr(self, name, meta[name])
 

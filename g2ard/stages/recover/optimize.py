@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from g2ard.errors import InputError
 from g2ard.progress import Progress, plural, silent
+from g2ard.rendering.exposure import Exposure
 from g2ard.rendering.targets import Targets, fingerprint_of
 from g2ard.scene.cameras import unseeing
 from g2ard.scene.shape import needle_share
@@ -131,7 +132,7 @@ def recover(
             steps=loop.done,
             seconds=loop.seconds,
             loss=loop.curve(),
-            psnr=Gain(before, after, probe.scored_in),
+            psnr=Gain(guard.before, after, probe.scored_in),
             multiplier=loop.multiplier,
             reach=finite(loop.reach),
             extent=targets.cameras.extent,
@@ -146,6 +147,7 @@ def recover(
             kept_start=blend == 0,
             validation=validated,
             skipped={"non_finite": loop.skipped},
+            exposure=None if loop.exposures is None else Exposure.over(loop.exposures, targets),
             resumed=loop.resumed,
         ),
     )

@@ -8,9 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard import _core
+from g2ard.rendering.exposure import rendered
 from g2ard.rendering.metrics import psnr
 from g2ard.rendering.renderer import Renderer, arrays_of, centred, settings_for, view_of
-from g2ard.rendering.targets import Subset, Targets, mask_of, scored_in, with_pixels
+from g2ard.rendering.targets import Exposed, Subset, Targets, mask_of, scored_in, with_pixels
 from g2ard.scene.cameras import rows_by_kind
 from g2ard.scene.samples import evenly_spaced
 from g2ard.scene.splats import Splats
@@ -49,7 +50,12 @@ class Probe:
     @property
     def scored_in(self) -> str:
         """Number, kind and size of the views."""
-        return scored_in(Subset(self._targets, self._views), "training")
+        some = Subset(self._targets, self._views)
+        return scored_in(Exposed(some) if isinstance(self._targets, Exposed) else some, "training")
+
+    def fit_exposures(self) -> None:
+        """Score after a fit of exposures from now on."""
+        self._targets = Exposed(self._targets)
 
     def all_of(self, splats: Splats) -> float:
         """Return the mean PSNR over the views."""
@@ -69,7 +75,7 @@ class Probe:
         return self._latest
 
     def _score(self, renderer: Renderer, view: int) -> float:
-        image = renderer.clipped(self._targets.cameras[view])
+        image = rendered(renderer, self._targets, view)
         score = psnr(image, self._targets[view], mask_of(self._targets, view))
         return float(np.minimum(self._most, score))  # not `min`, which drops NaN
 

@@ -6,6 +6,7 @@ from typing import Any
 
 from g2ard.io.reports import LEFT_OUT, Report
 from g2ard.progress import plural
+from g2ard.rendering.exposure import Exposure
 from g2ard.scene.cameras import USUAL
 
 
@@ -93,6 +94,7 @@ class RecoverReport(Report):
             steps lost quality.
         kept_start: whether the result is the student, because all steps made it worse.
         skipped: `non_finite`: single-Gaussian steps whose gradient was not finite.
+        exposure: what was estimated of the photos' exposures; None if they agree.
         resumed: part of `seconds` before this call resumed; None if it did not resume.
     """
 
@@ -114,6 +116,7 @@ class RecoverReport(Report):
     kept_start: bool
     validation: Validation | None
     skipped: dict[str, int]
+    exposure: Exposure | None = field(default=None, metadata=LEFT_OUT)
     resumed: float | None = field(default=None, metadata=LEFT_OUT)
 
     def __repr__(self) -> str:

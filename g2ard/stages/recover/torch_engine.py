@@ -148,6 +148,7 @@ class TorchEngine:
         *,
         regularize: bool,
         mask: NDArray[np.bool_] | None = None,
+        fixed: bool = True,
     ) -> float:
         p = self._parameters
         means = self._base + self._unit * p["means"]

@@ -1,0 +1,197 @@
+"""Gain and offset per channel between renders and photos whose exposure or white balance differs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from g2ard.io.reports import Report
+from g2ard.rendering.cuda import CudaRenderer
+from g2ard.rendering.renderer import Renderer
+from g2ard.rendering.targets import Exposed, Targets, against_of, alpha_of, mask_of
+from g2ard.scene.samples import evenly_spaced
+from g2ard.scene.splats import Splats
+from g2ard.system.threads import in_threads
+
+_PRIOR = (1e-3, 1e-2)
+"""Weights of gain 1 and offset 0 against the pixels of a photo; a flat photo is explained by its gain."""
+_LEAST_GAIN = 0.05
+_SATURATED = 253.5 / 255
+"""Value from which a pixel may have been brighter than its photo can tell."""
+_BLACK = 1.5 / 255
+_EXPLAINED_SHARE = 1 / 3
+"""Share of the squared error that gains and offsets must explain for photos to count as different, 1.8 dB."""
+_COMPARED_VIEWS = 64
+"""Most photos compared for that."""
+
+Float = NDArray[np.float64]
+Background = Sequence[float]
+
+
+@dataclass(frozen=True)
+class Exposure(Report):
+    """Exposures estimated for photos, relative to their mean.
+
+    Args:
+        gain, offset: least and largest, over photos and channels.
+        photos: gain and offset of red, green and blue by name of the view.
+    """
+
+    gain: tuple[float, float]
+    offset: tuple[float, float]
+    photos: dict[str, list[list[float]]]
+
+    @classmethod
+    def over(cls, exposures: Float, targets: Targets) -> Exposure:
+        """Describe the exposures of the views that have a photo."""
+        names = targets.cameras.names
+        rows = [view for view in range(len(names)) if against_of(targets, view) == "photo"]
+        gain, offset = ((float(x.min()), float(x.max())) for x in np.moveaxis(exposures[rows], 2, 0))
+        return cls(gain, offset, {names[row]: exposures[row].tolist() for row in rows})
+
+    def __str__(self) -> str:
+        (dark, bright), (low, high) = self.gain, self.offset
+        return (
+            f"the photos differ in exposure: gains of {dark:.2f} to {bright:.2f} and offsets of {low:.2f} to "
+            f"{high:.2f} per photo and channel were estimated and undone; scores are after the best such fit"
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Moments:
+    """Sums over the pixels of a photo, from which the error of any gain and offset follows.
+
+    Args:
+        normal: (3, 2, 2) of a channel's render and alpha.
+        right: (3, 2) of these with photo − render.
+        total: (3,) of (photo − render)².
+        pixels: number of pixels.
+    """
+
+    normal: Float
+    right: Float
+    total: Float
+    pixels: int
+
+    def fit(self) -> Float:
+        """Return (3, 2), gain and offset of each channel: photo ≈ gain·render + offset·alpha."""
+        prior = np.diag(_PRIOR) * max(1, self.pixels)
+        found = np.linalg.solve(self.normal + prior, self.right[..., None])[..., 0] + [1.0, 0.0]
+        return np.maximum(found, [_LEAST_GAIN, -np.inf])
+
+    def error(self, exposure: Float) -> float:
+        """Return the squared error that (3, 2) gains and offsets leave."""
+        change = exposure - [1.0, 0.0]
+        squares = np.einsum("ci,cij,cj->c", change, self.normal, change)
+        return float((self.total - 2 * (change * self.right).sum(1) + squares).sum())
+
+
+def _beyond(alpha: NDArray[np.float32] | None, background: Background) -> NDArray[np.float32] | float:
+    """Return what of an image is background behind a photo with alpha."""
+    return 0.0 if alpha is None else (1 - alpha[..., None]) * np.asarray(background, np.float32)
+
+
+def _moments(image: NDArray[np.float32], targets: Targets, view: int, background: Background) -> Moments:
+    """Compare a render, not clipped, with a photo where neither too bright nor too dark to tell."""
+    photo, alpha = targets[view], alpha_of(targets, view)
+    beyond, mask = _beyond(alpha, background), mask_of(targets, view)
+    counts = ((photo > _BLACK) & (photo < _SATURATED)).astype(np.float64)
+    if mask is not None:
+        counts *= mask[..., None]
+    own = (image - beyond).astype(np.float64)
+    missing = photo - beyond - own
+    cover = np.ones((1, 1, 1)) if alpha is None else alpha[..., None].astype(np.float64)
+
+    def total(values: Float) -> Float:
+        return (counts * values).sum((0, 1))
+
+    mixed = total(own * cover)
+    normal = np.array([[total(own**2), mixed], [mixed, total(cover**2)]]).transpose(2, 0, 1)
+    right = np.stack([total(own * missing), total(cover * missing)], 1)
+    return Moments(normal, right, total(missing**2), int(counts.sum(dtype=np.int64)) // 3)
+
+
+def rendered(renderer: Renderer | CudaRenderer, targets: Targets, view: int) -> NDArray[np.float32]:
+    """Render a view of targets, clipped to [0, 1]; with `Exposed` targets, after the gain and offset of each
+    channel that fit it best to its photo."""
+    if not isinstance(targets, Exposed) or against_of(targets, view) != "photo":
+        return renderer.clipped(targets.cameras[view])
+    image, background = renderer.image(targets.cameras[view]), renderer.background
+    gain, offset = _moments(image, targets, view, background).fit().T.astype(np.float32)
+    alpha = alpha_of(targets, view)
+    beyond, cover = _beyond(alpha, background), np.float32(1) if alpha is None else alpha[..., None]
+    return np.clip((image - beyond) * gain + offset * cover + beyond, 0, 1)
+
+
+def unexposed(
+    targets: Targets, view: int, exposure: Float, background: Background
+) -> tuple[NDArray[np.float32], NDArray[np.bool_] | None]:
+    """Return a photo as the mean exposure would have made it, and its mask.
+
+    Pixels that a brighter exposure saturated do not count.
+    """
+    photo, mask, alpha = targets[view], mask_of(targets, view), alpha_of(targets, view)
+    gain, offset = exposure.T.astype(np.float32)
+    beyond, cover = _beyond(alpha, background), np.float32(1) if alpha is None else alpha[..., None]
+    lost = ((photo >= _SATURATED) & (gain > 1)).any(2)
+    if alpha is not None:
+        lost &= alpha > 0
+    if lost.any():
+        mask = ~lost if mask is None else mask & ~lost
+    made = np.ascontiguousarray((photo - beyond - offset * cover) / gain + beyond, np.float32)
+    if mask is not None:
+        made[~mask] = 0
+    return made, mask
+
+
+def exposures_of(
+    splats: Splats, targets: Targets, background: Background, *, decided: bool = False
+) -> Float | None:
+    """Estimate the exposures of photos against a scene: (C, 3, 2), gain and offset by view and channel.
+
+    Their mean is gain 1 (of logarithms) and offset 0, so that the scene gets the photos' mean exposure. Views
+    without a photo have exactly these. Colours do not depend on direction here, because higher SH bands soon
+    hold the exposures of the photos.
+
+    Returns None if exposures explain too little of the error beyond what one exposure of all explains, unless
+    `decided`.
+    """
+    photos = [view for view in range(len(targets.cameras)) if against_of(targets, view) == "photo"]
+    if len(photos) < 2:
+        return None
+    renderer = Renderer(splats.with_sh_degree(0), background=background)
+
+    def moments(view: int) -> Moments:
+        return _moments(renderer.image(targets.cameras[view]), targets, view, background)
+
+    if not decided:
+        some = [photos[i] for i in evenly_spaced(len(photos), _COMPARED_VIEWS)]
+        compared = list(in_threads(moments, some))
+        fits = np.array([each.fit() for each in compared])
+        common = _common(fits)
+        before = sum(each.error(common) for each in compared)
+        after = sum(each.error(fit) for each, fit in zip(compared, fits, strict=True))
+        if after >= (1 - _EXPLAINED_SHARE) * before:
+            return None
+        if len(some) == len(photos):
+            return _relative(fits, photos, len(targets.cameras))
+    fits = np.array([each.fit() for each in in_threads(moments, photos)])
+    return _relative(fits, photos, len(targets.cameras))
+
+
+def _common(fits: Float) -> Float:
+    """Return the (3, 2) exposure that all have in common."""
+    gain = np.exp(np.log(fits[..., 0]).mean(0))
+    return np.stack([gain, gain * fits[..., 1].mean(0) / fits[..., 0].mean(0)], 1)
+
+
+def _relative(fits: Float, photos: list[int], count: int) -> Float:
+    """Return the exposures of all views relative to what those of photos have in common."""
+    gain, offset = _common(fits).T
+    made = np.tile([1.0, 0.0], (count, 3, 1))
+    made[photos, :, 0] = fits[..., 0] / gain
+    made[photos, :, 1] = fits[..., 1] - made[photos, :, 0] * offset
+    return made
