@@ -24,6 +24,9 @@ _SATURATED = 253.5 / 255
 _BLACK = 1.5 / 255
 _EXPLAINED_SHARE = 1 / 3
 """Share of the squared error that gains and offsets must explain for photos to count as different, 1.8 dB."""
+_LEAST_STOPS = 0.15
+"""Least root mean square of the brightness of grey, in stops, for the same. Colours that depend on direction
+explain as much of a small error, but with little more than half of these stops."""
 _COMPARED_VIEWS = 64
 """Most photos compared for that."""
 
@@ -174,7 +177,9 @@ def exposures_of(
         common = _common(fits)
         before = sum(each.error(common) for each in compared)
         after = sum(each.error(fit) for each, fit in zip(compared, fits, strict=True))
-        if after >= (1 - _EXPLAINED_SHARE) * before:
+        grey = _relative(fits, list(range(len(fits))), len(fits)) @ [0.5, 1.0]
+        stops = np.log2(np.maximum(grey, 1e-3) / 0.5)
+        if after >= (1 - _EXPLAINED_SHARE) * before or np.sqrt((stops**2).mean()) < _LEAST_STOPS:
             return None
         if len(some) == len(photos):
             return _relative(fits, photos, len(targets.cameras))

@@ -83,6 +83,9 @@ CASES: dict[str, Call] = {
     "recover-trials": recovery(steps=100),
     "recover-back": recovery(schedule=WILD),
     "recover-validation": recovery(validation=NEAR),
+    "recover-exposures": recovery(
+        targets=Photos(VIEWS, [TARGETS[i] * 0.8 ** (i % 3) for i in range(len(VIEWS))]), steps=60
+    ),
     "recover-frozen": recovery(frozen=np.arange(len(SMALL)) % 3 == 0),
     "recover-skipping": recovery(targets=Broken(), schedule=PAPER_SCHEDULE),
     "distill": distillation(DistillConfig(recover=RecoverConfig(steps=12)), validation=NEAR),

@@ -1,0 +1,144 @@
+"""Exposures and white balances of photos: estimated during recovery, undone, and fitted for scores."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import g2ard
+from g2ard.rendering.exposure import exposures_of, rendered, unexposed
+from g2ard.rendering.targets import Exposed, Photos, PhotosOrRenders
+from g2ard.scene.cameras import Cameras
+from g2ard.stages.evaluate import evaluate
+from g2ard.stages.recover import RecoverConfig, recover
+from helpers.commands import CommandLine, succeeds
+from helpers.photos import photographed
+from helpers.scenes import around, assert_same_bits, checkered_ball
+
+VIEWS = around(12, (48, 36))
+BALL = checkered_ball(800)
+RENDERS = [g2ard.Renderer(BALL).clipped(view) for view in VIEWS]
+GAINS = 2 ** (0.8 * np.sin(2.3 * np.arange(12)))
+KINDS: dict[str, Any] = {
+    "exposure": np.tile(GAINS[:, None], 3),
+    "white balance": 2 ** np.random.default_rng(1).uniform(-0.6, 0.6, (12, 3)),
+    "one dark photo": np.where(np.arange(12)[:, None] == 5, 0.4, np.ones((12, 3))),
+}
+
+
+def start() -> g2ard.Splats:
+    """The ball with noise, half as bright: what all photos have in common is no difference."""
+    rng = np.random.default_rng(0)
+    moved = BALL.means + rng.normal(0, 0.01, BALL.means.shape).astype(np.float32)
+    return replace(BALL, means=moved, sh0=BALL.sh0 - np.float32(0.3))
+
+
+def photos(gains: Any, offset: Any = 0.0, **more: Any) -> Photos:
+    """Photos of half the ball's brightness, so that none is saturated."""
+    taken = [
+        np.rint(255 * np.clip(0.5 * image * gain + offset, 0, 1)).astype(np.uint8)
+        for image, gain in zip(RENDERS, gains, strict=True)
+    ]
+    return Photos(VIEWS, taken, **more)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("engine", ["fused", "torch"])
+def test_photos_that_differ_are_matched(kind: str, engine: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    if engine == "torch":
+        pytest.importorskip("torch")
+    targets = photos(KINDS[kind])
+    config = RecoverConfig(steps=150, engine=engine)  # type: ignore[arg-type]
+    done = recover(start(), targets, config)
+    found = done.report.exposure
+    assert found is not None
+    fits = np.array([found.photos[name] for name in VIEWS.names])
+    np.testing.assert_allclose(np.log(fits[..., 0]).mean(0), 0, atol=1e-12)
+    np.testing.assert_allclose(fits[..., 1].mean(0), 0, atol=1e-12)
+    brightness = np.log2(fits @ [0.3, 1.0] / 0.3)
+    wanted = np.log2(KINDS[kind])
+    np.testing.assert_allclose(brightness - brightness.mean(0), wanted - wanted.mean(0), atol=0.4)
+    monkeypatch.setattr("g2ard.stages.recover.loop.exposures_of", lambda *_, **__: None)
+    ignored = recover(start(), targets, config)
+    scores = [evaluate(each.splats, Exposed(targets)).psnr for each in (ignored, done)]
+    assert scores[1] > scores[0] + 0.3, scores
+
+
+def test_photos_that_agree_change_no_bit(monkeypatch: pytest.MonkeyPatch) -> None:
+    config = RecoverConfig(steps=80)
+    looked = recover(start(), photos(np.ones(12)), config)
+    monkeypatch.setattr("g2ard.stages.recover.loop.exposures_of", lambda *_, **__: None)
+    assert_same_bits(looked.splats, recover(start(), photos(np.ones(12)), config).splats)
+    assert "exposure" not in looked.report.as_dict()
+
+
+def test_offsets_masks_and_alpha_are_respected() -> None:
+    """Of a photo only what its mask and its alpha show is fitted and corrected."""
+    alphas = [g2ard.render(BALL, view).alpha[..., None] for view in VIEWS]
+    white = g2ard.Renderer(BALL, background=(1, 1, 1))
+    gains, offsets = 0.6 + 0.03 * np.arange(12), 0.01 * np.arange(12) - 0.05
+    taken = []
+    for image, alpha, gain, offset in zip(RENDERS, alphas, gains, offsets, strict=True):
+        colour = gain * image / np.maximum(alpha, 1e-3) + offset
+        taken.append(np.concatenate([colour.clip(0, 1), alpha], 2).astype(np.float32))
+    targets = Photos(VIEWS, taken, background=(1, 1, 1))
+    found = exposures_of(BALL.with_sh_degree(0), targets, (1, 1, 1), decided=True)
+    assert found is not None
+    common = np.exp(np.log(gains).mean())
+    np.testing.assert_allclose(found[:, 0, 0], gains / common, atol=0.04)
+    for view in range(12):
+        image, mask = unexposed(targets, view, np.array([[gains[view], offsets[view]]] * 3), (1, 1, 1))
+        shown = np.ones(image.shape[:2], bool) if mask is None else mask
+        inside = shown & (taken[view][..., :3].min(2) > 0) & (taken[view][..., :3].max(2) < 1)
+        np.testing.assert_allclose(image[inside], white.image(VIEWS[view])[inside], atol=0.01)
+        score = rendered(white, Exposed(targets), view)
+        np.testing.assert_allclose(score[inside], targets[view][inside], atol=0.03)
+
+
+def test_saturated_pixels_of_bright_photos_do_not_count() -> None:
+    taken = [np.full((36, 48, 3), 0.4, np.float32) for _ in VIEWS]
+    taken[3][:10] = 1.0
+    image, mask = unexposed(Photos(VIEWS, taken), 3, np.array([[2.0, 0.0]] * 3), (0, 0, 0))
+    assert mask is not None
+    assert not mask[:10].any()
+    assert mask[10:].all()
+    np.testing.assert_allclose(image[10:], 0.2, atol=1e-6)
+    assert unexposed(Photos(VIEWS, taken), 3, np.array([[0.5, 0.0]] * 3), (0, 0, 0))[1] is None
+
+
+def test_renders_among_photos_keep_their_exposure(tmp_path: Path) -> None:
+    pictured = photographed(tmp_path, BALL, VIEWS.take(range(6)), gain=0.6)
+    paths = (*pictured.image_paths, *[None] * 6)
+    targets = PhotosOrRenders(replace(VIEWS, image_paths=paths), BALL)
+    found = exposures_of(BALL, targets, (0, 0, 0), decided=True)
+    assert found is not None
+    np.testing.assert_array_equal(found[6:], np.tile([1.0, 0.0], (6, 3, 1)))
+
+
+def test_commands_say_what_was_undone(tmp_path: Path, command_line: CommandLine) -> None:
+    def taken(folder: str, gains: Any) -> Cameras:
+        (tmp_path / folder).mkdir()
+        made = [
+            photographed(tmp_path / folder, BALL, VIEWS.take([i]), gain=0.5 * float(g))
+            for i, g in enumerate(gains)
+        ]
+        return replace(VIEWS, image_paths=tuple(views.image_paths[0] for views in made))
+
+    g2ard.save(tmp_path / "scene.ply", start())
+    for name, gains in (("equal", np.ones(12)), ("unequal", GAINS)):
+        g2ard.save_views(tmp_path / f"{name}.json", taken(name, gains))
+    recovered = ["recover", "scene.ply", "--steps", "100", "-o"]
+    distilled = ["distill", "scene.ply", "-n", "700", "--steps", "100", "--no-page", "-o"]
+    for command in (recovered, distilled):
+        told = []
+        for name in ("equal", "unequal"):
+            output = f"{command[0]}-{name}{'.ply' * (command[0] == 'recover')}"
+            printed = succeeds(command_line, tmp_path, *command, output, "--views", f"{name}.json")
+            told.append("".join(printed))
+        assert "exposure" not in told[0]
+        assert "the photos differ in exposure" in told[1]
+    report = (tmp_path / "distill-unequal/report.json").read_text()
+    assert '"exposure"' in report
+    assert "differ in exposure" in (tmp_path / "distill-unequal/report.html").read_text()
