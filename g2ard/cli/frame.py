@@ -407,8 +407,10 @@ class Run:
         return frozenset(real_path(path) for path in found if path is not None)
 
     def input_files(self) -> list[Path]:
-        """Return the inputs that are files, or runs with a scene's file."""
-        return [path for path in map(run_scene, self._inputs) if path.is_file()]
+        """Return all files that the command reads: its inputs, files in input folders, photos and cameras."""
+        found = {*map(run_scene, self._inputs), *self._cameras}
+        inside = {path for folder in found if folder.is_dir() for path in folder.rglob("*")}
+        return sorted(path for path in found | inside | self._photos if path.is_file())
 
     def reads(self, scenes: list[Path], output: Path) -> None:
         """Record that the last positional path is the output."""

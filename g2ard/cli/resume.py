@@ -1,32 +1,120 @@
 """Resume an interrupted run, or discard it with `-w`."""
 
+import json
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import typer
 
 from g2ard.cli.frame import Run
 from g2ard.errors import InputError, OutputError
 from g2ard.io import check_scene_output
-from g2ard.io.atomic import drop_empty, drop_temporaries, hidden_name, is_taken, parents_made
+from g2ard.io.atomic import (
+    atomic_output,
+    drop_empty,
+    drop_temporaries,
+    hidden_name,
+    is_taken,
+    parents_made,
+)
+from g2ard.io.jsonfile import read_json
 from g2ard.io.lock import check_unlocked, lock_file, locked
+from g2ard.io.paths import file_identity, real_path
 from g2ard.io.scene_formats import files_of
 
 OPTIONS = "options.json"
 """File in a folder of checkpoints with the options of their run."""
 
 
+CALL_OPTIONS = (
+    *("output", "resume", "keep", "page", "dry_run", "threads", "device"),
+    *("memory", "workers", "scheduler", "work", "views_format", "count", "ratio"),
+)
+"""Options that may differ from a finished run's: `device` except CUDA, and budgets of the same count."""
+
+
+def record_file(place: Path, output: Path) -> Path:
+    """Return the hidden file that records with which options and inputs `output` was finished."""
+    return place.parent / hidden_name(_locked_name(place, output), ".finished")
+
+
 def is_finished(run: Run, place: Path, resume: bool, output: Path) -> bool:
-    """Return whether --resume finds `output` finished; raise an error if an input changed since then."""
-    if not resume or run.overwrite or left_at(place) or not is_taken(output):
+    """Return whether --resume finds `output` finished; raise an error for other options or inputs."""
+    if not resume or run.overwrite or left_at(place):
         return False
-    made = output.stat().st_mtime_ns
-    for path in run.input_files():
-        if path.stat().st_mtime_ns > made:
-            raise finished_before(output, path)
+    record = _record_of(place, output)
+    if record is None:
+        return False
+    check_same(run, record, output)
     return True
+
+
+def check_same(run: Run, record: Mapping[str, Any], output: Path, *others: str) -> None:
+    """Raise an `OutputError` unless a finished run had these options and input files.
+
+    Args:
+        others: further names of differing options.
+    """
+    then, now = record.get("config", {}), json.loads(json.dumps(run.config, default=str))
+    names = [name for name in now if name in then and name not in CALL_OPTIONS]
+    found = [*others, *(name.replace("_", "-") for name in names if now[name] != then[name])]
+    if "cuda" in (now["device"], then.get("device")) and now["device"] != then.get("device"):
+        found.append("device")
+    if found:
+        raise OutputError(
+            f"finished with other options ({', '.join(found)})",
+            path=output,
+            hint="-w without --resume starts over",
+        )
+    known = record.get("inputs", {})
+    present = [*run.input_files(), *(path for path in map(Path, known) if path.is_file())]
+    for name, identity in identities(present).items():
+        if identity != known.get(name):
+            raise OutputError(
+                f"finished before {name} changed", path=output, hint="-w without --resume starts over"
+            )
+
+
+def identities(files: Iterable[Path]) -> dict[str, Any]:
+    """Return the identity of each file by its path, relative to the working folder if it is inside."""
+    here = real_path(".")
+    absolute = {real_path(path) for path in files}
+    paths = sorted(path.relative_to(here) if path.is_relative_to(here) else path for path in absolute)
+    return dict(zip(map(str, paths), file_identity(paths), strict=True))
+
+
+def _record_of(place: Path, output: Path) -> dict[str, Any] | None:
+    """Return the record of a finished output, or None if there is none or the output is another file."""
+    file = record_file(place, output)
+    if not (file.is_file() and is_taken(output)):
+        return None
+    try:
+        record = read_json(file)
+    except InputError:
+        return None
+    known = isinstance(record, dict) and record.get("output") == _content(output)
+    return record if known else None
+
+
+def _content(output: Path) -> list[Any]:
+    """Return the identity of an output, whatever its time."""
+    ((name, size, _, digest),) = file_identity([output])
+    return [name, size, digest]
+
+
+@contextmanager
+def recorded(run: Run, place: Path, output: Path) -> Iterator[None]:
+    """Record options and inputs when `output` is written, so that --resume finds it finished."""
+    file, inputs = record_file(place, output), identities(run.input_files())
+    file.unlink(missing_ok=True)
+    yield
+    if is_taken(output):
+        record = {"config": run.config, "inputs": inputs, "output": _content(output)}
+        with atomic_output(file, overwrite=True) as temporary:
+            temporary.write_text(json.dumps(record, default=str), encoding="utf-8", newline="\n")
 
 
 def began_output(place: Path, output: Path) -> bool:
@@ -42,27 +130,22 @@ def began_output(place: Path, output: Path) -> bool:
     return bool(kept) and output.exists() and all(min(kept) <= time for time in written)  # or none yet
 
 
-def drop_ended(run: Run, place: Path, resume: bool, last: Path) -> bool:
-    """Remove checkpoints of a run that was killed after its last output `last`, and return whether it was."""
-    ended = resume and not run.overwrite and began_output(place, last)
-    if ended:
-        check_unlocked(place.parent, _locked_name(place, last))
-        _remove(place)
-        _drop_temporaries(place, last)
-    return ended
+def drop_ended(run: Run, place: Path, resume: bool, output: Path) -> bool:
+    """Remove checkpoints of a run that was killed after it recorded its output, and return whether it was."""
+    record = _record_of(place, output) if resume and not run.overwrite and place.exists() else None
+    if record is None:
+        return False
+    check_same(run, record, output)
+    check_unlocked(place.parent, _locked_name(place, output))
+    _remove(place)
+    _drop_temporaries(place, output)
+    return True
 
 
 def checkpoint_beside(output: Path, ending: str) -> Path:
     """Return the hidden place for checkpoints of a scene, beside its file or SOG folder."""
     whole = output.parent if output.name == "meta.json" else output
     return whole.parent / hidden_name(whole.name, ending)
-
-
-def finished_before(output: Path, changed: Path) -> OutputError:
-    """Return the error of a finished output whose input is another file now."""
-    return OutputError(
-        f"finished before {changed} changed", path=output, hint="-w without --resume starts over"
-    )
 
 
 def check_scene_run(run: Run, place: Path, resume: bool, output: Path) -> None:
@@ -78,10 +161,14 @@ def check_scene_run(run: Run, place: Path, resume: bool, output: Path) -> None:
 
 def check_stopped(run: Run, place: Path, resume: bool, output: Path) -> None:
     """Check that checkpoints at `place` may be resumed or replaced; exit if `output` is finished."""
+    from g2ard.stages.recover.checkpoint import drop_damaged
+
     check_unlocked(place.parent, _locked_name(place, output))
     if is_finished(run, place, resume, output):
         run.say(f"{output}: already finished; -w without --resume starts over")
         raise typer.Exit
+    if resume and place.is_file():
+        drop_damaged(place)
     left = left_at(place)
     if resume and not left:
         run.say(f"{output}: nothing to resume, starting over")
@@ -101,7 +188,7 @@ def stoppable(run: Run, place: Path, resume: bool, output: Path) -> Iterator[Non
             if is_taken(output) and not run.overwrite:  # another run wrote it since it was checked
                 raise OutputError("exists", path=output, hint="{overwrite=True} replaces it")
             _drop_temporaries(place, output)
-            with kept(run, place, resume, output, f"from {place}"):
+            with kept(run, place, resume, output, f"from {place}"), recorded(run, place, output):
                 yield
     finally:
         drop_empty(made)

@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING, Any
 from g2ard.cli.frame import Run
 from g2ard.cli.resume import (
     OPTIONS,
+    check_same,
     check_stopped,
-    finished_before,
     finished_steps,
-    is_finished,
+    identities,
     kept,
     left_at,
 )
@@ -26,7 +26,6 @@ from g2ard.io import write_views
 from g2ard.io.atomic import atomic_output, check_output, drop_empty, drop_temporaries
 from g2ard.io.jsonfile import read_json
 from g2ard.io.lock import check_unlocked, locked
-from g2ard.io.paths import file_identity
 from g2ard.io.reports import Report, plain
 from g2ard.io.scene_formats import FORMATS
 from g2ard.io.types import ViewSet
@@ -58,12 +57,6 @@ _VIEW_FILES: dict[ViewFormat, str] = {
 }
 """Names of generated views for other programs, beside views.json."""
 
-_CALL_OPTIONS = (
-    *("output", "resume", "keep", "page", "dry_run", "threads", "device"),
-    *("memory", "workers", "scheduler", "work", "views_format", "count", "ratio"),
-)
-"""Options that may be others than a finished run's: `device` except CUDA, and budgets of the same count."""
-
 
 class RunFolder:
     """Folder of a run with one budget.
@@ -88,7 +81,8 @@ class RunFolder:
         check_unlocked(self.path)
         left = left_at(self.unfinished)
         killed = self.path.is_dir() and [path.name for path in self.path.iterdir()] == [_WORK_FOLDER]
-        done = self.scene.exists() and is_finished(self._run, self.unfinished, self._resume, self._report)
+        done = self._resume and not self._run.overwrite and not left
+        done = done and self.scene.exists() and self._report.exists()
         if not left and not done and not killed:
             check_output(self.path, self._run.overwrite, folder=True)
         if left or not self._resume:
@@ -99,16 +93,7 @@ class RunFolder:
         """Return the finished run's report; raise an `OutputError` if its budget, options or input files were
         others."""
         record = read_json(self._report)
-        if others := _others(self._run, record, budget):
-            raise OutputError(
-                f"finished with other options ({', '.join(others)})",
-                path=self.path,
-                hint="-w without --resume starts over",
-            )
-        for name, known in record.get("inputs", {}).items():
-            path = Path(name)
-            if path.is_file() and file_identity([path]) != [known]:
-                raise finished_before(self.path, path)
+        check_same(self._run, record, self.path, *_other_budget(record, budget))
         self._run.say(f"{self.path}: already finished; -w without --resume starts over")
         return record
 
@@ -118,8 +103,7 @@ class RunFolder:
 
         In one piece, it holds checkpoints too, which are kept after an error or Ctrl-C.
         """
-        files = [*self._run.input_files(), *job.photos]
-        self._inputs = dict(zip(map(str, files), file_identity(files), strict=True))
+        self._inputs = identities([*self._run.input_files(), *job.photos])
         made = [] if self.path.exists() else [self.path]
         self.path.mkdir(parents=True, exist_ok=True)
         try:
@@ -280,17 +264,11 @@ def stopped_run(folder: Path) -> dict[str, Any] | None:
     return {"path": str(folder), "kind": "stopped run", "kept": finished_steps(work), **told}
 
 
-def _others(run: Run, before: Mapping[str, Any], budget: Budget) -> list[str]:
-    """Return the names of options whose values differ from those of an earlier run."""
-    then = before.get("config", {})
-    now = json.loads(json.dumps(run.config, default=str))
-    names = [name for name in now if name in then and name not in _CALL_OPTIONS]
-    found = [name.replace("_", "-") for name in names if now[name] != then[name]]
-    if "cuda" in (now["device"], then.get("device")) and now["device"] != then.get("device"):
-        found.append("device")
+def _other_budget(before: Mapping[str, Any], budget: Budget) -> list[str]:
+    """Return the name of the budget if an earlier run's was another one."""
     if budget.is_measured or "output_count" not in before:  # measured ones are compared by their options
-        return found
+        return []
     with suppress(InputError):
         if budget.of(before["input_count"]) == before["output_count"]:
-            return found
-    return ["budget", *found]
+            return []
+    return ["budget"]

@@ -55,6 +55,8 @@ class Steps:
             return step(None)
         key = key_of([name, scene, settings()])
         file, within = (self._folder / f"{name}-{key}{end}" for end in (".npz", _WITHIN))
+        for each in (file, within):
+            checkpoint.drop_damaged(each)
         if file.exists():
             meta, arrays = checkpoint.load(file, key)
             made = replace(scene, **{array: arrays.pop(array) for array in ARRAYS})

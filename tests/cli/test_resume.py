@@ -47,13 +47,10 @@ def test_checkpoints_are_kept(folder: Path, command_line: CommandLine, command: 
     place.write_bytes(b"junk")
     words = "left by an interrupted run; --resume continues it, -w starts over"
     assert words in refused(command_line, folder, *ask, "-q", status=1)
-    if place.parent == folder:  # others are named by their content
-        words = f"{left}: not a checkpoint of g2ard, or a damaged one"
-        assert words in refused(command_line, folder, *ask, "--resume", "-wq", status=1)
     assert place.read_bytes() == b"junk"
     succeeds(command_line, folder, *ask, "-w")
     assert not place.exists()
-    assert not list(folder.glob(".*"))
+    assert [path.name for path in folder.glob(".*")] in ([], [".out.ply.finished"])
 
 
 def bytes_of(save: Callable[[io.BytesIO], None]) -> bytes:

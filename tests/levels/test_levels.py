@@ -157,7 +157,7 @@ def test_a_finished_folder_tells_with_which_options(tmp_path: Path, command_line
     assert len(io.read_splats(tmp_path / "deep" / "out")) == 800
     assert "already finished" in succeeds(command_line, tmp_path, *given, "--resume").err
     for other in ("1,4", "1,4,16"):
-        assert "was written with another -r" in refused(
+        assert "finished with other options (ratios)" in refused(
             command_line, tmp_path, *given[:5], other, *given[6:], "--resume", status=1
         )
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -16,7 +16,6 @@ from g2ard.cli.frame import Run, command
 from g2ard.cli.outputs import refuse_file
 from g2ard.cli.tiling import tiling_of, work_folder
 from g2ard.config.choices import BLACK
-from g2ard.errors import OutputError
 from g2ard.io.atomic import hidden_name
 from g2ard.progress import plural
 
@@ -116,7 +115,15 @@ def lod(
     Each level is merged from the one before, then recovered.
     Scenes larger than memory and folders of tiles are processed tile by tile.
     """
-    from g2ard.cli.resume import began_output, check_stopped, drop_ended, is_finished, stoppable
+    from g2ard.cli.resume import (
+        began_output,
+        check_stopped,
+        drop_ended,
+        is_finished,
+        record_file,
+        recorded,
+        stoppable,
+    )
     from g2ard.io.atomic import check_output
     from g2ard.jobs.levels import (
         check_ratios,
@@ -149,19 +156,18 @@ def lod(
     if environment and tiled:
         raise typer.BadParameter("--environment needs a scene that fits into memory")
     views, colour = opt.with_images(views, images), background or BLACK
-    meta, page = output / ("lod-meta.json" if kind == "sog" else "tileset.json"), output / "index.html"
+    meta = output / ("lod-meta.json" if kind == "sog" else "tileset.json")
     stopped = output.with_name(hidden_name(output.name, ".unfinished"))
     run.spare_inputs(meta)
     run.claim("--output", output, folder=True)
     run.claim("--resume", stopped, folder=True)
     work = tiling.folder if tiled else stopped
-    finished = not dry_run and is_finished(run, stopped, resume, page)
+    finished = not dry_run and is_finished(run, stopped, resume, meta)
     if not (dry_run or (tiled and tiling.keep)):
-        finished |= drop_ended(run, work, resume or tiled, page)
-    if finished:
-        _check_same(meta, ratios)
-    elif not dry_run:
-        run.overwrite |= (tiled or resume) and began_output(work, output) and not page.exists()
+        finished |= drop_ended(run, work, resume or tiled, meta)
+    if not (finished or dry_run):
+        ended = record_file(stopped, meta).exists()
+        run.overwrite |= (tiled or resume) and not ended and began_output(work, output)
         check_output(output, run.overwrite, folder=True)
     if finished or not (tiled or dry_run):
         check_stopped(run, stopped, resume or finished, meta)
@@ -178,10 +184,11 @@ def lod(
         held = work_folder(run, None if dry_run else how, views)
     else:
         held = stoppable(run, stopped, resume, meta)
+    noted = recorded(run, stopped, meta) if tiled and not dry_run else nullcontext()
     options: dict[str, Any] = {"ratios": ratios, "recover": recover, "steps": steps, "background": colour}
     options |= {"split_sky": environment, "seed": run.seed, **run.callbacks}
     options |= {"views": views, "size": size, "up": up, "render_model": run.render_model, "beside": scene}
-    with held, preparing_levels(given, how, planned=dry_run, photos=False, **options) as job:
+    with held, noted, preparing_levels(given, how, planned=dry_run, photos=False, **options) as job:
         if dry_run:
             _tell_costs(run, job)
             return
@@ -244,15 +251,3 @@ def _georeference(text: str) -> Georeference | str:
         map_system(text)  # known?
         return text
     return Georeference(*opt.numbers("--georeference", text, 4 if text.count(",") == 3 else 3))
-
-
-def _check_same(meta: Path, ratios: Sequence[float]) -> None:
-    """Raise an error if a finished folder holds levels of other ratios."""
-    content = json.loads(meta.read_text(encoding="utf-8"))
-    counts = {**content.get("extras", {}), **content}.get("counts") or [0]
-    wanted = [counts[0] * ratios[0] / ratio for ratio in ratios]
-    if len(counts) != len(wanted) or any(abs(c - w) > ratios[0] for c, w in zip(counts, wanted, strict=True)):
-        levels = ", ".join(f"{count:,}" for count in counts)
-        raise OutputError(
-            f"was written with another -r (levels of {levels} Gaussians); -w replaces it", path=meta
-        )

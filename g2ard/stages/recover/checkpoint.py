@@ -53,6 +53,19 @@ def load(path: Path, key: str) -> tuple[dict[str, Any], dict[str, Any]]:
     return meta, arrays
 
 
+def drop_damaged(path: Path) -> None:
+    """Remove a checkpoint that cannot be read, such as one that a power cut left half-written."""
+    try:
+        with np.load(path) as data:
+            whole = "key" in json.loads(str(data["meta"])) and all(data[name] is not None for name in data)
+    except FileNotFoundError:
+        return
+    except Exception:  # as `load`
+        whole = False
+    if not whole:
+        path.unlink()
+
+
 def steps_at(path: Path) -> int | None:
     """Return the steps of a recovery's checkpoint, None if it is of a finished round or cannot be read."""
     try:
