@@ -57,7 +57,7 @@ impl Buffer {
     }
 }
 
-/// A uniform buffer.
+/// A buffer with the constants of a dispatch.
 #[derive(Debug, Clone)]
 pub struct Constants(pub(super) wgpu::Buffer);
 
@@ -168,7 +168,7 @@ impl Gpu {
     /// A uniform buffer with the constants of a dispatch.
     pub fn constants(&self, values: &[u32]) -> Constants {
         let bytes = 4 * values.len().next_multiple_of(4) as u64;
-        let usage = BufferUsages::UNIFORM | BufferUsages::COPY_DST;
+        let usage = BufferUsages::UNIFORM | BufferUsages::STORAGE | BufferUsages::COPY_DST;
         let buffer = Constants(self.create("constants", bytes, usage));
         self.set_constants(&buffer, values);
         buffer
@@ -215,13 +215,16 @@ impl Gpu {
             return Ok(pipeline.clone());
         }
         self.room.check(RESERVE)?;
+        let mut source = DISPATCH.to_owned() + &kernel.sources.concat();
+        if self.adapter.is_software() {
+            // Mesa's lavapipe clones a shader for each dispatch to insert uniforms of its branches, and keeps the clones.
+            source = source.replace("var<uniform>", "var<storage, read>");
+        }
         let module = self
             .device
             .create_shader_module(wgpu::ShaderModuleDescriptor {
                 label: Some(kernel.name),
-                source: wgpu::ShaderSource::Wgsl(
-                    (DISPATCH.to_owned() + &kernel.sources.concat()).into(),
-                ),
+                source: wgpu::ShaderSource::Wgsl(source.into()),
             });
         self.check()?;
         let pipeline = self
