@@ -152,6 +152,7 @@ def check_scene_run(run: Run, place: Path, resume: bool, output: Path) -> None:
     """Check that the command may write the scene `output`, or resume from the checkpoints at `place`."""
     run.claim("--output", *files_of(output))
     run.claim("--resume", place, folder=True)
+    run.claim("--resume", record_file(place, output))
     drop_ended(run, place, resume, output)
     if not is_finished(run, place, resume, output):
         run.overwrite |= resume and began_output(place, place.parent / _locked_name(place, output))

@@ -161,6 +161,7 @@ def lod(
     run.spare_inputs(meta)
     run.claim("--output", output, folder=True)
     run.claim("--resume", stopped, folder=True)
+    run.claim("--resume", record_file(stopped, meta))
     work = tiling.folder if tiled else stopped
     finished = not dry_run and is_finished(run, stopped, resume, meta)
     if not (dry_run or (tiled and tiling.keep)):
