@@ -29,6 +29,7 @@ from g2ard.scene.cameras import Camera, Cameras
 from g2ard.scene.splats import Splats
 from g2ard.stages.register import RegisterConfig, Registered
 from g2ard.stages.register import register as find_poses
+from g2ard.stages.register.config import ROUGH_FOCAL_SIGMA, STATED_FOCAL_SIGMA
 
 Poses = Mapping[str, ArrayLike]
 Found = TypeVar("Found")
@@ -90,6 +91,8 @@ def prepare(
         posed = not _photos_in(path)
         lens = None if intrinsics is None else Path(intrinsics)
         taken = photos_of(path, split=split, intrinsics=lens, focal=focal, alpha=alpha, say=say)
+        if not posed and intrinsics is None and config.focal_sigma == STATED_FOCAL_SIGMA:
+            config = replace(config, focal_sigma=ROUGH_FOCAL_SIGMA)
     if poses is None and pool is None and not posed:
         raise InputError("photos have no initial pose", path=path, hint="give {poses} or {pool}")
     if poses is None:

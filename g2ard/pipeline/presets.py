@@ -41,6 +41,7 @@ GS_CPR: dict[str, Any] = {
     "register.passes": 1,
     "register.min_inliers": 6,
     "register.fallback": False,
+    "register.focal_sigma": 1e-6,
 }
 """The protocol of GS-CPR for `g2ard register`: one pass of feature matching, without a fallback."""
 

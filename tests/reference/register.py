@@ -8,17 +8,18 @@ def cross(x):  # type: ignore[no-untyped-def]
 
 
 def pixel_row(u, v, depth, K, gradient):  # type: ignore[no-untyped-def]
-    """∇I · ∂π/∂X · [I | −[X]ₓ] of the pixel with centre (u, v)."""
+    """∇I · (∂π/∂X · [I | −[X]ₓ], change by the focal length's logarithm) of the pixel with centre (u, v)."""
     X = depth * (np.linalg.inv(K) @ np.array([u, v, 1.0]))
     x, y, z = X
     projection = np.array([[K[0, 0] / z, 0, -K[0, 0] * x / z**2], [0, K[1, 1] / z, -K[1, 1] * y / z**2]])
     motion = np.hstack([np.eye(3), -cross(X)])
-    return np.asarray(gradient) @ projection @ motion
+    zoom = [u - K[0, 2], v - K[1, 2]]
+    return np.asarray(gradient) @ np.column_stack([projection @ motion, zoom])
 
 
 def image_rows(depth, K, gradients):  # type: ignore[no-untyped-def]
-    """(6, H, W) of `pixel_row` for an image and its gradients (right, down)."""
-    out = np.zeros((6, *depth.shape))
+    """(7, H, W) of `pixel_row` for an image and its gradients (right, down)."""
+    out = np.zeros((7, *depth.shape))
     for i, j in np.ndindex(*depth.shape):
         out[:, i, j] = pixel_row(j + 0.5, i + 0.5, depth[i, j], K, [g[i, j] for g in gradients])
     return out
@@ -49,8 +50,8 @@ def shot(image, alpha, depth, min_alpha, max_edge):  # type: ignore[no-untyped-d
 
 
 def normal_equations(photo, shot, K, gain, bias, scale, tukey=4.685):  # type: ignore[no-untyped-def]
-    """Sums over pixels: matrix (8, 8), right side (8,), mean cost and the sum of weights."""
-    matrix, right, costs, weights = np.zeros((8, 8)), np.zeros(8), [], 0.0
+    """Sums over pixels: matrix (9, 9), right side (9,), mean cost and the sum of weights."""
+    matrix, right, costs, weights = np.zeros((9, 9)), np.zeros(9), [], 0.0
     rows, columns = photo.grey.shape
     down, across = np.gradient(shot.grey)
     for i in range(rows):

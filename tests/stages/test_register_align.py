@@ -72,7 +72,7 @@ def test_the_render_for_alignment_equals_the_twins(seed: int) -> None:
     np.testing.assert_allclose(got[1], want[1], rtol=1e-12)
     np.testing.assert_array_equal(got[2], want[2])
     K = np.array([[7.0, 0, 3], [0, 8, 2.5], [0, 0, 1]])
-    xi = rng.normal(size=6)
+    xi = rng.normal(size=7)
     if want[2].any():
         flow = _core.flow(got, (7.0, 8.0, 3.0, 2.5), xi.tolist())
         assert flow == pytest.approx(twin.flow(want[1], want[2], K, xi), rel=1e-9)
@@ -177,7 +177,9 @@ def test_its_slope_is_how_the_energy_changes() -> None:
     camera, renderer = around(5, (160, 120), 2.5)[1], Renderer(BALL)
     level = pyramid_of(camera, np.clip(0.9 * renderer.image(camera), 0, 1), CONFIG)[-1][1]
     start = off(camera.viewmat, 0.02, 0.4, 3)
-    prior = SimpleNamespace(viewmat=off(camera.viewmat, 0.01, 0.2, 4), information=50 * np.eye(6))
+    prior = SimpleNamespace(
+        viewmat=off(camera.viewmat, 0.01, 0.2, 4), information=50 * np.eye(7), focal_sigma=0.001
+    )
     energy = Energy(renderer, camera, level, prior, CONFIG)
     here = energy.at(start, 1.0, 0.0)
     along = here.slope / np.sqrt(np.diag(here.hessian))
@@ -197,7 +199,7 @@ def test_it_ends_at_the_pose(view: int) -> None:
     distance, angle = pose_error(found.viewmat, camera.viewmat)
     assert distance < 3e-3
     assert angle < 0.1
-    held = SimpleNamespace(viewmat=start.viewmat, information=1e9 * np.eye(6))
+    held = SimpleNamespace(viewmat=start.viewmat, information=1e9 * np.eye(7), focal_sigma=0.001)
     stays = polish(renderer, start, camera, level, held, CONFIG)
     assert pose_error(stays.viewmat, start.viewmat)[0] < 1e-4
 

@@ -3,11 +3,11 @@
 The photo P and the render R at camera_from_world T satisfy P(x) = g·R(x) + b. Moving the camera to exp(ξ)T
 moves the image of the point X (in the camera's axes) by ∂π/∂X · (v + ω × X), so to first order
 
-P − g·R − b = −∇I · ∂π/∂X · [I | −[X]ₓ] · ξ,
+P − g·R − b = −∇I · (∂π/∂X · [I | −[X]ₓ] · ξ + (f_x X/Z, f_y Y/Z) · φ),
 
 where ∇I is the mean of g·∇R and ∇P (efficient second-order minimisation: Malis 2004; Benhimane and Malis
-2004). ξ and the changes of g and b are solved together with Tukey's weights, then the scene is rendered
-again.
+2004), and φ changes the logarithm of the focal length, whose given value has a prior of `focal_sigma`. ξ, φ
+and the changes of g and b are solved together with Tukey's weights, then the scene is rendered again.
 """
 
 from dataclasses import dataclass, replace
@@ -25,9 +25,17 @@ from g2ard.stages.register.pose import Float, moved
 
 Mask = NDArray[np.bool_]
 
+TUKEY = 4.685
+"""Tukey's constant, as in the normal equations' weights."""
 _DAMPING = 1e-6
 """Relative damping added to the diagonal of the normal equations."""
 _STEP_HALVINGS = 3
+_CONTRADICTED = 3.0
+"""Deviations of the focal length from its prior, in joint σ, beyond which the prior is widened."""
+_WIDEST = 0.3
+"""Largest σ of that prior."""
+_REPEATED_LEVELS = 2
+"""Finest levels that are aligned again with a wider prior."""
 _COARSE_STILL_FACTOR = 10
 """Factor on `still` for all levels but the finest."""
 
@@ -57,11 +65,11 @@ class Shot(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Normal:
-    """Weighted normal equations H·δ = y of δ = (v, ω, Δg, Δb).
+    """Weighted normal equations H·δ = y of δ = (v, ω, φ, Δg, Δb).
 
     Args:
-        matrix: (8, 8).
-        right: (8,).
+        matrix: (9, 9).
+        right: (9,).
         scale: σ of the residuals, from their median absolute deviation.
         cost: mean of Tukey's ρ(r/σ) over valid pixels, in [0, 1].
         weights: Σ w.
@@ -80,11 +88,13 @@ class Aligned:
 
     Args:
         viewmat: (4, 4) camera_from_world.
-        covariance: (6, 6) of ξ = (v, ω) around the result, in the camera's axes: (JᵀWJ)⁻¹·σ²·`correlated`
-            with gain and bias marginalised; None if the photo does not determine the pose.
+        covariance: (7, 7) of (v, ω, φ) around the result, in the camera's axes: (JᵀWJ/(σ²·`correlated`) +
+            prior)⁻¹ with gain and bias marginalised; None if the photo does not determine the pose.
         overlap: share of valid pixels.
         steps: number of renders at all levels.
         depth: median depth of valid pixels, scene units.
+        zoom: estimated over given focal length.
+        alone: see `focal_alone`.
     """
 
     viewmat: Float
@@ -94,6 +104,8 @@ class Aligned:
     overlap: float
     steps: int
     depth: float
+    zoom: float = 1.0
+    alone: tuple[float, float] = (0.0, np.inf)
 
 
 def level_of(grey: Float, mask: Mask | None = None) -> Level:
@@ -119,8 +131,30 @@ def normal_equations(
 
 
 def moves(shot: Shot, K: Float, xi: Float) -> float:
-    """Return the root mean square motion, in pixels, of the valid pixels under ξ."""
+    """Return the root mean square motion, in pixels, of the valid pixels under (v, ω, φ)."""
     return _core.flow(shot, _lens(K), xi.tolist())
+
+
+def zoomed(camera: Camera, zoom: float, viewmat: Float) -> Camera:
+    """Return the camera at a pose with its focal lengths multiplied by `zoom`."""
+    return replace(camera, K=camera.K * np.array([[zoom, 1, 1], [1, zoom, 1], [1, 1, 1]]), viewmat=viewmat)
+
+
+def focal_alone(matrix: Float, right: Float, zoom: float) -> tuple[float, float]:
+    """Return φ = log of the focal length over the given one, and its σ, by the data without the prior.
+
+    `matrix` and `right` are information about changes of (v, ω, φ, …) where it is log `zoom`.
+    """
+    covariance = inverse(matrix)
+    if covariance is None:
+        return 0.0, float("inf")
+    return float(np.log(zoom) + covariance[6] @ right), float(np.sqrt(covariance[6, 6]))
+
+
+def focal_prior(alone: tuple[float, float], prior: float) -> float:
+    """Return σ of a prior of φ that `focal_alone` does not contradict: `prior`, or a wider one."""
+    off = abs(alone[0])
+    return min(off, _WIDEST) if off > _CONTRADICTED * np.hypot(alone[1], prior) else prior
 
 
 def _lens(K: Float) -> tuple[float, float, float, float]:
@@ -128,17 +162,43 @@ def _lens(K: Float) -> tuple[float, float, float, float]:
 
 
 def align(
-    renderer: Renderer, start: Float, pyramid: list[tuple[Camera, Level]], config: RegisterConfig
+    renderer: Renderer,
+    start: Float,
+    pyramid: list[tuple[Camera, Level]],
+    config: RegisterConfig,
+    zoom: float = 1.0,
+    focal_sigma: float | None = None,
 ) -> Aligned | None:
     """Align a photo, coarse to fine, from a pose; return None if too few pixels are valid there.
 
-    The pyramid's cameras state size and K of each level; their poses are ignored.
+    The pyramid's cameras state size and given K of each level; their poses are ignored. `focal_sigma` is that
+    of the config by default.
     """
-    state = Aligned(np.asarray(start, np.float64), 1.0, 0.0, None, 0.0, 0, 0.0)
+    state = Aligned(np.asarray(start, np.float64), 1.0, 0.0, None, 0.0, 0, 0.0, zoom)
+    if focal_sigma is not None:
+        return _align_levels(renderer, state, pyramid, config, focal_sigma)
+    prior = config.focal_sigma
+    aligned = _align_levels(renderer, state, pyramid, config, prior)
+    if aligned is None or aligned.covariance is None:
+        return aligned
+    wider = focal_prior(aligned.alone, prior)
+    if wider == prior:
+        return aligned
+    again = _align_levels(renderer, aligned, pyramid[-_REPEATED_LEVELS:], config, wider)
+    return aligned if again is None else again
+
+
+def _align_levels(
+    renderer: Renderer,
+    state: Aligned,
+    pyramid: list[tuple[Camera, Level]],
+    config: RegisterConfig,
+    prior: float,
+) -> Aligned | None:
     for number, (camera, photo) in enumerate(pyramid):
         last = number == len(pyramid) - 1
         still = config.still if last else _COARSE_STILL_FACTOR * config.still
-        aligned = _align_level(renderer, state, camera, photo, config, still, fresh=number == 0)
+        aligned = _align_level(renderer, state, camera, photo, config, prior, still, fresh=number == 0)
         if aligned is None:
             return None
         state = aligned
@@ -151,6 +211,7 @@ def _align_level(
     camera: Camera,
     photo: Level,
     config: RegisterConfig,
+    prior: float,
     enough: float,
     *,
     fresh: bool,
@@ -161,19 +222,26 @@ def _align_level(
     fewer pixels than `enough`.
     """
 
-    def shot_at(viewmat: Float) -> Shot:
-        return shot_of(renderer.render(replace(camera, viewmat=viewmat)), config)
+    def seen(viewmat: Float, zoom: float) -> tuple[Camera, Shot] | None:
+        there = zoomed(camera, zoom, viewmat)
+        shot = shot_of(renderer.render(there), config)
+        return (there, shot) if (photo.mask & shot.mask).mean() >= config.min_overlap else None
 
-    def overlaps(shot: Shot) -> bool:
-        return (photo.mask & shot.mask).mean() >= config.min_overlap
+    def equations(
+        view: tuple[Camera, Shot], light: tuple[float, float], scale: float | None = None
+    ) -> Normal:
+        there, shot = view
+        normal = normal_equations(photo, shot, there.K, *light, scale)
+        pixels = int((photo.mask & shot.mask).sum())
+        return with_prior(normal, pixels, float(np.log(there.K[0, 0] / camera.K[0, 0])), prior, config)
 
-    pose, gain, bias, taken = state.viewmat, state.gain, state.bias, state.steps + 1
-    shot = shot_at(pose)
-    if not overlaps(shot):
+    pose, zoom, light, taken = state.viewmat, state.zoom, (state.gain, state.bias), state.steps + 1
+    view = seen(pose, zoom)
+    if view is None:
         return None
     if fresh:
-        gain, bias = _light(photo, shot)
-    normal = normal_equations(photo, shot, camera.K, gain, bias)
+        light = _light(photo, view[1])
+    normal = equations(view, light)
     scale = normal.scale
     for _ in range(config.iterations):
         step = _solved(normal)
@@ -181,34 +249,47 @@ def _align_level(
         for _ in range(_STEP_HALVINGS + 1):
             if step is None:
                 break
-            trial = moved(pose, step[:6])
-            seen = shot_at(trial)
+            trial, focal = moved(pose, step[:6]), zoom * float(np.exp(step[6]))
+            there = seen(trial, focal)
             taken += 1
-            if overlaps(seen):
-                light = gain + step[6], bias + step[7]
-                after = normal_equations(photo, seen, camera.K, *light, scale)
-                if light[0] > 0 and after.cost < normal.cost:
+            if there is not None:
+                lit = light[0] + step[7], light[1] + step[8]
+                after = equations(there, lit, scale)
+                if lit[0] > 0 and after.cost < normal.cost:
                     better = True
                     break
             step = step / 2
-        if not better or step is None:
+        if not better or step is None or there is None:
             break
-        still = moves(shot, camera.K, step[:6]) < enough
-        pose, shot, normal, (gain, bias) = trial, seen, after, light
+        still = moves(view[1], view[0].K, step[:7]) < enough
+        pose, zoom, view, normal, light = trial, focal, there, after, lit
         if still:
             break
-    final = normal_equations(photo, shot, camera.K, gain, bias)
+    final = equations(view, light)
     covariance = inverse(final.matrix)
-    counted = photo.mask & shot.mask
+    plain = normal_equations(photo, view[1], view[0].K, *light)
+    variance = plain.scale**2 * config.correlated
+    counted = photo.mask & view[1].mask
     return Aligned(
         pose,
-        gain,
-        bias,
-        None if covariance is None else covariance[:6, :6] * (final.scale**2 * config.correlated),
+        *light,
+        None if covariance is None else covariance[:7, :7] * (final.scale**2 * config.correlated),
         float(counted.mean()),
         taken,
-        float(np.median(shot.depth[counted])),
+        float(np.median(view[1].depth[counted])),
+        zoom,
+        focal_alone(plain.matrix / variance, plain.right / variance, zoom),
     )
+
+
+def with_prior(normal: Normal, pixels: int, zoom: float, sigma: float, config: RegisterConfig) -> Normal:
+    """Add the prior of the logarithm of the focal length, `zoom` ~ N(0, `sigma`²), to equations and cost."""
+    weight = normal.scale**2 * config.correlated / sigma**2
+    matrix, right = normal.matrix.copy(), normal.right.copy()
+    matrix[6, 6] += weight
+    right[6] -= weight * zoom
+    penalty = 3 * config.correlated * (zoom / sigma / TUKEY) ** 2 / pixels
+    return replace(normal, matrix=matrix, right=right, cost=normal.cost + penalty)
 
 
 def _light(photo: Level, shot: Shot) -> tuple[float, float]:
@@ -225,7 +306,7 @@ def _solved(normal: Normal) -> Float | None:
     if (unit_scaled := _unit_scaled(normal.matrix)) is None:
         return None
     scaled, unit = unit_scaled
-    return unit * np.linalg.solve(scaled + _DAMPING * np.eye(8), unit * normal.right)
+    return unit * np.linalg.solve(scaled + _DAMPING * np.eye(len(unit)), unit * normal.right)
 
 
 def inverse(matrix: Float) -> Float | None:

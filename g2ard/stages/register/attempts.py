@@ -10,12 +10,13 @@ from g2ard.io.images import load_photo, resized
 from g2ard.progress import Progress, silent
 from g2ard.rendering.renderer import Renderer
 from g2ard.scene.cameras import Camera, Cameras
-from g2ard.stages.register.align import Aligned, Level, align, inverse, level_of
+from g2ard.stages.register.align import Aligned, Level, align, inverse, level_of, zoomed
 from g2ard.stages.register.config import RegisterConfig
 from g2ard.stages.register.grey import band_passed, grey_of, local_zncc, shift_between
-from g2ard.stages.register.matchers import Matcher
+from g2ard.stages.register.matchers import Matcher, Sift, sift_or_none
 from g2ard.stages.register.polish import polish
-from g2ard.stages.register.pose import Float, motion_between, moved, rotation_of
+from g2ard.stages.register.pose import Float, motion_between, moved, pose_error, rotation_of
+from g2ard.stages.register.repeats import decisive, look, preference, repeated_poses, softened
 from g2ard.stages.register.solve import Solved, solve
 
 
@@ -70,6 +71,14 @@ class PoolRenders:
         return [(at, similar[at][0]) for at in order], renders
 
 
+_REPEAT_ROUNDS = 3
+"""Most moves to a pose that explains a photo better than those that look alike."""
+_REPEATED_LEVELS = 3
+"""Finest levels of direct alignment that refine such poses."""
+_LIKENESS_LOSS = 0.15
+"""Loss of local ZNCC below which such poses count."""
+_APART = 0.02, 1.0
+"""Least distance, as a share of the depth, and least angle in degrees of two poses."""
 _REFINING_LEVELS = 2
 """Finest levels of direct alignment that refine a pose from features."""
 
@@ -154,6 +163,11 @@ def _grey(planes: NDArray[np.float32]) -> Float:
     return planes[..., 0].astype(np.float64)
 
 
+def _apart(a: Aligned, b: Aligned) -> bool:
+    distance, angle = pose_error(a.viewmat, b.viewmat)
+    return distance > _APART[0] * b.depth or angle > _APART[1]
+
+
 class Search:
     """Attempts on photos of one scene, with a count of renders.
 
@@ -164,13 +178,14 @@ class Search:
     def __init__(self, renderer: Renderer, config: RegisterConfig, match: Matcher | None) -> None:
         self.renderer, self.config, self.match = renderer, config, match
         self.renders = 0
+        self._sift = match if isinstance(match, Sift) else sift_or_none(config.ratio, config.features)
 
     def by_alignment(self, start: Start, photo: Photo) -> Candidate | None:
         """Align directly, coarse to fine; return None if the start does not see the scene."""
         aligned = self._aligned(start.begins, photo.pyramid)
         if aligned is not None and self.config.refine == "exact":
             aligned = self._polished(aligned, photo, None)
-        return None if aligned is None else Candidate(start, aligned, self._likeness(aligned.viewmat, photo))
+        return None if aligned is None else Candidate(start, aligned, self._likeness(aligned, photo))
 
     def by_features(self, start: Start, photo: Photo) -> Candidate | None:
         """Match, solve PnP and refine; return None without a matcher or with too few inliers."""
@@ -190,48 +205,126 @@ class Search:
         self.renders += passes if solved is None else solved.passes
         return solved if solved is not None and solved.inliers >= self.config.min_inliers else None
 
+    def against_repeats(self, best: Candidate, photo: Photo) -> tuple[Candidate, list[Float]]:
+        """Compare a pose with those at which the scene looks alike.
+
+        Returns the candidate that explains the photo best, and the poses that the photo does not exclude.
+        """
+        alike: list[Float] = []
+        for _ in range(_REPEAT_ROUNDS):
+            best, alike, moved_on = self._best_of_repeats(best, photo)
+            if not moved_on:
+                break
+        return best, alike
+
+    def _best_of_repeats(self, best: Candidate, photo: Photo) -> tuple[Candidate, list[Float], bool]:
+        config = self.config
+        if self._sift is None:
+            return best, [], False
+        camera, level = photo.pyramid[-1]
+        here = zoomed(camera, best.found.zoom, best.found.viewmat)
+        self.renders += 1
+        poses = repeated_poses(self.renderer, here, self._sift, config)
+        if not poses:
+            return best, [], False
+        focal_sigma = best.solved.focal_sigma if best.solved else config.focal_sigma
+        aligned: list[Candidate] = []
+        for pose in (best.found.viewmat, *poses):
+            found = self._aligned(pose, photo.pyramid[-_REPEATED_LEVELS:], best.found.zoom, focal_sigma)
+            if found is None:
+                continue
+            candidate = Candidate(best.start, found, self._likeness(found, photo))
+            fresh = all(_apart(found, other.found) for other in aligned)
+            if fresh and candidate.zncc >= best.zncc - _LIKENESS_LOSS:
+                aligned.append(candidate)
+        if len(aligned) < 2:
+            return best, [], False
+        image = softened(resized(photo.image, (camera.width, camera.height)))
+        looks = [look(self.renderer, zoomed(camera, c.found.zoom, c.found.viewmat), config) for c in aligned]
+        self.renders += len(looks)
+
+        def compared(a: int, b: int) -> float:
+            return preference(image, level.mask, looks[a], looks[b], config)
+
+        first = 0
+        for other in range(1, len(aligned)):
+            if compared(first, other) < 0:
+                first = other
+        alike = [
+            c.found.viewmat for k, c in enumerate(aligned) if k != first and not decisive(compared(first, k))
+        ]
+        chosen = aligned[first]
+        if not _apart(chosen.found, best.found):
+            return best, alike, False
+        refined = self.by_features(replace(best.start, begins=chosen.found.viewmat), photo)
+        if refined is not None and not _apart(refined.found, chosen.found):
+            chosen = refined
+        return chosen, alike, True
+
     def _refined(self, start: Start, solved: Solved, photo: Photo) -> Candidate:
         """Refine a pose from features as `refine` says.
 
         "none" keeps it. "photometric" aligns from it. "auto" takes the mean of both weighted by their
-        information: ξ = (Λ_f + Λ_p)⁻¹ Λ_p ξ_p, with ξ_p the motion from the first to the second. "exact"
-        polishes that mean.
+        information: ξ = (Λ_f + Λ_p)⁻¹ (Λ_p ξ_p − Λ_0 ξ_0), with ξ_p the motion from the first to the second,
+        Λ_0 and ξ_0 the prior of the focal length, which Λ_p has too. "exact" polishes that mean.
         """
-        refine = self.config.refine
-        near = self._aligned(solved.viewmat, photo.pyramid[-_REFINING_LEVELS:])
-        plain = Aligned(solved.viewmat, 1.0, 0.0, inverse(solved.information), 0.0, 0, solved.depth)
+        refine, focal_sigma = self.config.refine, solved.focal_sigma
+        near = self._aligned(solved.viewmat, photo.pyramid[-_REFINING_LEVELS:], solved.zoom, focal_sigma)
+        prior = np.zeros((7, 7))
+        prior[6, 6] = focal_sigma**-2
+        plain = Aligned(
+            solved.viewmat, 1.0, 0.0, inverse(solved.information + prior), 0.0, 0, solved.depth, solved.zoom
+        )
         if near is None:
-            return Candidate(start, plain, self._likeness(solved.viewmat, photo), solved)
+            return Candidate(start, plain, self._likeness(plain, photo), solved)
         refined = near
         if refine != "photometric":
-            refined = replace(near, viewmat=solved.viewmat, covariance=plain.covariance, depth=solved.depth)
+            refined = replace(
+                near,
+                viewmat=solved.viewmat,
+                covariance=plain.covariance,
+                depth=solved.depth,
+                zoom=solved.zoom,
+            )
         if refine in ("auto", "exact") and near.covariance is not None:
-            of_light = np.linalg.inv(near.covariance)
-            both = inverse(solved.information + of_light)
-            if both is not None:
-                xi = motion_between(solved.viewmat, near.viewmat)
+            of_light = inverse(near.covariance)
+            both = None if of_light is None else inverse(solved.information + of_light)
+            if of_light is not None and both is not None:
+                xi = [*motion_between(solved.viewmat, near.viewmat), np.log(near.zoom / solved.zoom)]
+                step = both @ (of_light @ xi + np.log(solved.zoom) * prior[6])
                 refined = replace(
-                    refined, viewmat=moved(solved.viewmat, both @ of_light @ xi), covariance=both
+                    refined,
+                    viewmat=moved(solved.viewmat, step[:6]),
+                    covariance=both,
+                    zoom=solved.zoom * float(np.exp(step[6])),
                 )
         if refine == "exact":
             refined = self._polished(refined, photo, solved)
-        return Candidate(start, refined, self._likeness(refined.viewmat, photo), solved)
+        return Candidate(start, refined, self._likeness(refined, photo), solved)
 
     def _polished(self, start: Aligned, photo: Photo, prior: Solved | None) -> Aligned:
         """Polish by the exact gradient at the finest level; return the start if that fails."""
-        polished = polish(self.renderer, start, *photo.pyramid[-1], prior, self.config)
+        camera, level = photo.pyramid[-1]
+        camera = zoomed(camera, start.zoom, camera.viewmat)
+        polished = polish(self.renderer, start, camera, level, prior, self.config)
         self.renders += 1 if polished is None else polished.steps
         return start if polished is None else polished
 
-    def _aligned(self, pose: Float, levels: list[tuple[Camera, Level]]) -> Aligned | None:
-        aligned = align(self.renderer, pose, levels, self.config)
+    def _aligned(
+        self,
+        pose: Float,
+        levels: list[tuple[Camera, Level]],
+        zoom: float = 1.0,
+        focal_sigma: float | None = None,
+    ) -> Aligned | None:
+        aligned = align(self.renderer, pose, levels, self.config, zoom, focal_sigma)
         self.renders += 1 if aligned is None else aligned.steps
         return aligned
 
-    def _likeness(self, viewmat: Float, photo: Photo) -> float:
+    def _likeness(self, found: Aligned, photo: Photo) -> float:
         """Return the median local ZNCC at the finest level, unblurred."""
         camera, level = photo.pyramid[-1]
-        out = self.renderer.render(replace(camera, viewmat=viewmat))
+        out = self.renderer.render(zoomed(camera, found.zoom, found.viewmat))
         self.renders += 1
         mask = level.mask & (out.alpha >= self.config.min_alpha)
         return local_zncc(grey_of(np.clip(out.image, 0, 1)), photo.whole, mask, self.config.window)

@@ -14,6 +14,13 @@ _Side = Annotated[int, Within("[32, inf)")]
 _SmallSide = Annotated[int, Within("[16, inf)")]
 _Part = Annotated[float, Within("(0, 1]")]
 
+STATED_FOCAL_SIGMA = 0.0002
+"""σ of the logarithm of focal lengths that come with views, as bundle adjustment knows them."""
+ROUGH_FOCAL_SIGMA = 0.015
+"""The same for those typed in or from EXIF."""
+TAIL = 2.0
+"""Factor on `focal_sigma` in covariances, because a minority of focal lengths is far off."""
+
 _FEATURE_FIELDS = ("passes", "features", "ratio", "max_reprojection", "min_inliers", "alike")
 
 
@@ -42,6 +49,7 @@ class RegisterConfig(Settings):
         max_edge: pixels next to a relative depth jump above this are ignored.
         min_overlap: smallest share of valid pixels.
         window: side of ZNCC's windows in pixels.
+        focal_sigma: σ of the given focal lengths' logarithm. Pose and focal length are estimated together.
         candidates: number of pool poses tried, ranked by renders of `pool_size` pixels.
         pool_size: longer side of those renders in pixels.
         correlated: factor on variances, because neighbouring residuals are correlated; calibrated at 500
@@ -68,11 +76,12 @@ class RegisterConfig(Settings):
     accept: _Part = 0.6
     doubt: Share = 0.35
     max_angle_sigma: AboveZero = 0.7
-    max_position_sigma: AboveZero = 0.03
+    max_position_sigma: AboveZero = 0.04
     min_alpha: _Part = 0.5
     max_edge: AboveZero = 0.1
     min_overlap: _Part = 0.1
     window: Annotated[int, Within("[3, inf)")] = 15
+    focal_sigma: AboveZero = STATED_FOCAL_SIGMA
     candidates: AtLeastOne = 5
     pool_size: _SmallSide = 64
     correlated: AboveZero = 2000.0

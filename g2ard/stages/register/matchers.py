@@ -162,12 +162,12 @@ class Sift:
 
     def __call__(self, photo: Image, render: Image) -> Pairs:
         if self._kept is None or self._kept[0] is not photo:
-            self._kept = photo, self._features(photo)
-        (a, of_a), (b, of_b) = self._kept[1], self._features(render)
+            self._kept = photo, self.features(photo)
+        (a, of_a), (b, of_b) = self._kept[1], self.features(render)
         i, j = mutual(of_a, of_b, self._ratio)
         return a[i], b[j]
 
-    def _features(self, image: Image) -> tuple[Float, NDArray[np.float32]]:
+    def features(self, image: Image) -> tuple[Float, NDArray[np.float32]]:
         """Return (M, 2) positions and (M, 128) integer-valued descriptors."""
         grey = np.clip(grey_of(image) * 255 + 0.5, 0, 255).astype(np.uint8)
         doubled, whole = self._extractors
@@ -175,6 +175,11 @@ class Sift:
         keypoints, descriptors = extractor.extract_from_uint8_array(np.ascontiguousarray(grey))
         places = np.array([(point.x, point.y) for point in keypoints], np.float64).reshape(-1, 2)
         return places, descriptors.data.astype(np.float32)
+
+
+def sift_or_none(ratio: float, most: int) -> Sift | None:
+    """Return SIFT if it is available."""
+    return None if _unusable() else Sift(ratio, most)
 
 
 def mutual(

@@ -26,10 +26,10 @@ from g2ard.stages.register.attempts import (
     small_render,
     turned,
 )
-from g2ard.stages.register.config import RegisterConfig
+from g2ard.stages.register.config import TAIL, RegisterConfig
 from g2ard.stages.register.grey import band_passed
 from g2ard.stages.register.matchers import matcher_named
-from g2ard.stages.register.pose import Float, pose_error
+from g2ard.stages.register.pose import Float, motion_between, pose_error
 from g2ard.stages.register.report import KEPT, PhotoReport, PoseError, Registered, RegisterReport, Status
 
 _FEATURES_BONUS = 0.05
@@ -73,7 +73,7 @@ def register(
     renderer = Renderer(scene, background=background)
     renders = None if pool is None else PoolRenders(renderer, pool, config, progress)
     search = Search(renderer, config, matcher_named(config.matcher, config.ratio, config.features))
-    rows, kept, poses, matches = [], [], [], {}
+    rows, kept, poses, zooms, matches = [], [], [], [], {}
     for i, name in enumerate(photos.names):
         progress("register", i, len(photos))
         began = time.perf_counter()
@@ -87,10 +87,13 @@ def register(
         if row.camera_from_world is not None and row.status in KEPT[keep]:
             kept.append(i)
             poses.append(np.array(row.camera_from_world))
+            zooms.append(1.0 if row.focal is None else row.focal / photos.Ks[i, 0, 0])
     progress("register", len(photos), len(photos))
     cameras = photos.take(np.array(kept, int))
     if kept:
-        cameras = replace(cameras, viewmats=np.stack(poses))
+        Ks = cameras.Ks.copy()
+        Ks[:, [0, 1], [0, 1]] *= np.array(zooms)[:, None]
+        cameras = replace(cameras, viewmats=np.stack(poses), Ks=Ks)
     return Registered(cameras, RegisterReport(tuple(rows)), matches)
 
 
@@ -134,15 +137,17 @@ def _register_photo(
     else:
         assert pool is not None
         candidates = _from_pool(search, pool, photo)
-    renders = search.renders
     if not candidates:
         least = f"{search.config.min_overlap:.0%} of the photo"
         why = f"away from edges, the scene covers less than {least} at the starting pose"
         if not search.config.fallback:
             why = f"fewer than {search.config.min_inliers} matches confirm a pose"
-        return replace(refused, reason=why, renders=renders), None
+        return replace(refused, reason=why, renders=search.renders), None
     best = max(candidates, key=lambda c: c.zncc + (_FEATURES_BONUS if c.solved else 0))
-    row = _reported(name, best, search.config, renders)
+    alike: list[Float] = []
+    if search.config.fallback and best.zncc >= min(search.config.doubt, search.config.accept):
+        best, alike = search.against_repeats(best, photo)
+    row = _reported(name, best, search.config, search.renders, photos[index].K[0, 0], alike)
     if true is not None:
         start_error = PoseError(*pose_error(best.start.pose, true))
         end_error = PoseError(*pose_error(best.found.viewmat, true))
@@ -199,14 +204,24 @@ def _featured(search: Search, aligned: list[Candidate], photo: Photo) -> list[Ca
     return [candidate] if candidate else []
 
 
-def _reported(name: str, best: Candidate, config: RegisterConfig, renders: int) -> PhotoReport:
+def _reported(
+    name: str, best: Candidate, config: RegisterConfig, renders: int, focal: float, alike: list[Float]
+) -> PhotoReport:
     estimate = best.found
-    sigma = None
+    sigma, covariance = None, None
+    prior = best.solved.focal_sigma if best.solved else config.focal_sigma
     if estimate.covariance is not None:
-        position = np.sqrt(np.trace(estimate.covariance[:3, :3]))
-        rotation = np.sqrt(np.trace(estimate.covariance[3:, 3:]))
+        motions = [motion_between(estimate.viewmat, other) for other in alike]
+        covariance = _with_tail(estimate.covariance, prior)[:6, :6] + sum(np.outer(m, m) for m in motions) / (
+            1 + len(motions)
+        )
+        position = np.sqrt(np.trace(covariance[:3, :3]))
+        rotation = np.sqrt(np.trace(covariance[3:6, 3:6]))
         sigma = PoseError(float(position), float(np.degrees(rotation)))
     status, reason = _acceptance(best.zncc, sigma, estimate.depth, config)
+    if alike and status != "refused":
+        away = min(pose_error(estimate.viewmat, other)[0] for other in alike)
+        status, reason = "uncertain", f"the scene repeats itself: a pose {away:.2g} units away fits as well"
     names = ("matches", "inliers", "spread", "reprojection", "passes") if best.solved else ()
     of_features: dict[str, Any] = {name: getattr(best.solved, name) for name in names}
     return PhotoReport(
@@ -220,11 +235,21 @@ def _reported(name: str, best: Candidate, config: RegisterConfig, renders: int) 
         gain=estimate.gain,
         bias=estimate.bias,
         overlap=estimate.overlap,
-        covariance=None if estimate.covariance is None else _rows(estimate.covariance),
+        covariance=None if covariance is None else _rows(covariance),
+        focal=float(focal * estimate.zoom),
+        focal_sigma=None if estimate.covariance is None else float(estimate.covariance[6, 6]) ** 0.5,
         sigma=sigma,
         renders=renders,
         camera_from_world=_rows(estimate.viewmat),
     )
+
+
+def _with_tail(covariance: Float, prior: float) -> Float:
+    """Return the covariance of an estimate with `prior` as σ of log f, which varies by `TAIL` times that.
+
+    C = (Λ + eeᵀ/s²)⁻¹ becomes C (Λ + eeᵀ TAIL²/s²) C, where e is the axis of φ.
+    """
+    return covariance + np.outer(covariance[6], covariance[6]) * (TAIL**2 - 1) / prior**2
 
 
 def _acceptance(

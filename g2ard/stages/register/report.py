@@ -54,6 +54,8 @@ class PhotoReport(Report):
         bias: see `gain`.
         overlap: share of the pixels compared.
         covariance: (6, 6) covariance of (v, ω) in the camera's axes: scene units, radians.
+        focal: estimated focal length f_x, pixels.
+        focal_sigma: σ of its logarithm.
         sigma: root of the covariance's trace for position, scene units, and rotation, degrees.
         camera_from_world: (4, 4) result; None if there is none.
         start_error: error of the starting pose; None without a reference or a starting pose.
@@ -75,6 +77,8 @@ class PhotoReport(Report):
     bias: float | None = None
     overlap: float | None = None
     covariance: tuple[tuple[float, ...], ...] | None = None
+    focal: float | None = None
+    focal_sigma: float | None = None
     sigma: PoseError | None = None
     renders: int = 0
     seconds: float = 0.0

@@ -6,16 +6,17 @@ Cauchy's ρ; both by pycolmap. A render at the new pose is more similar to the p
 the pose converges.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from g2ard.rendering.renderer import Rendered, Renderer
 from g2ard.scene.cameras import Camera
+from g2ard.stages.register.align import focal_alone, focal_prior, zoomed
 from g2ard.stages.register.config import RegisterConfig
 from g2ard.stages.register.matchers import Matcher
-from g2ard.stages.register.pose import Float
+from g2ard.stages.register.pose import Float, moved
 
 _LEAST_MATCHES = 6
 """Least matches and inliers for a pose; three determine it, the rest confirm it."""
@@ -23,6 +24,10 @@ _SIGMA_OF_MAD = 1.4826
 """Standard deviation of a normal distribution over its median absolute deviation."""
 _LEAST_MATCH_SIGMA = 0.1
 """Least σ of a match, pixels."""
+_FOCAL_STEPS = 20
+"""Most Gauss–Newton steps of pose and focal length."""
+_MOST_ZOOM = 0.1
+"""Largest change of the logarithm of the focal length in one step."""
 _STILL_PIXELS = 0.3
 """Root mean square motion in pixels below which passes stop; about a keypoint's error."""
 
@@ -36,10 +41,13 @@ class Solved:
         matches: number of matches with known depth.
         spread: share of the image's 4 × 4 cells with an inlier.
         reprojection: median reprojection error of the inliers, pixels.
-        information: (6, 6) inverse covariance of ξ = (v, ω), camera axes; see `information`.
+        information: (7, 7) inverse covariance of (v, ω, φ), camera axes, without a prior; see `information`.
         depth: median depth of the inliers, scene units.
         pixels: (inliers, 2) pixels of the photo.
         seen: (inliers, 2) pixels of the last render.
+        zoom: estimated over given focal length.
+        focal_sigma: σ of the prior of log `zoom`, wider than the config's if matches contradict that.
+        alone: the matches' `focal_alone`.
     """
 
     viewmat: Float
@@ -52,6 +60,9 @@ class Solved:
     passes: int
     pixels: Float
     seen: Float
+    zoom: float
+    focal_sigma: float
+    alone: tuple[float, float]
 
 
 def solve(
@@ -70,7 +81,9 @@ def solve(
     """
     solution = None
     for number in range(passes):
-        there = replace(camera, viewmat=start if solution is None else solution.viewmat)
+        there = zoomed(camera, 1.0, start)
+        if solution is not None:
+            there = zoomed(camera, solution.zoom, solution.viewmat)
         out = renderer.render(there, median=True)
         uv, seen = match(photo, np.clip(out.image, 0, 1))
         counts = _at(mask, uv)
@@ -81,20 +94,25 @@ def solve(
             break
         T, inlying = after
         of, at, X = uv[known][inlying], seen[known][inlying], points[known][inlying]
-        shift = _projected(T, there.K, X) - _projected(there.viewmat, there.K, X)
+        found, prior, data, alone = with_focal(zoomed(there, 1.0, T), camera.K[0, 0], of, X, config)
+        T, K = found.viewmat, found.K
+        shift = _projected(T, K, X) - _projected(there.viewmat, there.K, X)
         cells = np.floor(4 * of / [camera.width, camera.height]).clip(0, 3) @ [1, 4]
-        distance = np.linalg.norm(_projected(T, camera.K, X) - of, axis=1)
+        distance = np.linalg.norm(_projected(T, K, X) - of, axis=1)
         solution = Solved(
             viewmat=T,
             matches=int(known.sum()),
             inliers=len(of),
             spread=len(np.unique(cells)) / 16,
             reprojection=float(np.median(distance)),
-            information=information(T, camera.K, of, X) / config.alike,
+            information=data,
             depth=float(np.median(X @ T[2, :3] + T[2, 3])),
             passes=number + 1,
             pixels=of,
             seen=at,
+            zoom=float(K[0, 0] / camera.K[0, 0]),
+            focal_sigma=prior,
+            alone=alone,
         )
         if float(np.sqrt((shift**2).sum(1).mean())) < _STILL_PIXELS:
             break
@@ -164,22 +182,55 @@ def solve_pnp(
     return (T, np.asarray(answer["inlier_mask"], bool)) if np.isfinite(T).all() else None
 
 
-def information(T: Float, K: Float, uv: Float, points: Float) -> Float:
-    """Return the (6, 6) JᵀWJ/σ² of the reprojections π(exp(ξ) T X) − u, with J = ∂π/∂X·[I | −[X]ₓ].
+def with_focal(
+    camera: Camera, given: float, uv: Float, points: Float, config: RegisterConfig
+) -> tuple[Camera, float, Float, tuple[float, float]]:
+    """Refine pose and focal length on (M, 2) pixels of (M, 3) points, with a prior at `given` pixels.
 
-    W is Cauchy's weight 1/(1 + r²/σ²), with σ from the median absolute deviation of the residuals.
+    Returns the camera, σ of the prior, which is wider where the matches contradict `focal_sigma`, the
+    matches' information, and `focal_alone`.
+    """
+    prior = config.focal_sigma
+    for _ in range(2):
+        here = camera
+        for _ in range(_FOCAL_STEPS):
+            data, right = information(here.viewmat, here.K, uv, points)
+            data, right = data / config.alike, right / config.alike
+            alone = focal_alone(data, right, here.K[0, 0] / given)
+            both = data.copy()
+            both[6, 6] += 1 / prior**2
+            right[6] -= float(np.log(here.K[0, 0] / given)) / prior**2
+            unit = 1 / np.sqrt(np.maximum(np.diag(both), 1e-30))
+            covariance = np.linalg.pinv(both * unit[:, None] * unit) * unit[:, None] * unit
+            step = covariance @ right
+            zoom = float(np.exp(np.clip(step[6], -_MOST_ZOOM, _MOST_ZOOM)))
+            here = zoomed(here, zoom, moved(here.viewmat, step[:6]))
+            if (np.abs(step) < 1e-3 * np.sqrt(np.diag(covariance))).all():
+                break
+        wider = focal_prior(alone, prior)
+        if wider == prior:
+            break
+        prior = wider
+    return here, prior, data, alone
+
+
+def information(T: Float, K: Float, uv: Float, points: Float) -> tuple[Float, Float]:
+    """Return the (7, 7) JᵀWJ/σ² and the (7,) JᵀWr/σ² of r = u − π(exp(ξ) T X) with focal lengths f·exp(φ).
+
+    J = (∂π/∂X·[I | −[X]ₓ], (f_x X/Z, f_y Y/Z)). W is Cauchy's weight 1/(1 + r²/σ²), with σ from the median
+    absolute deviation of the residuals.
     """
     X = points @ T[:3, :3].T + T[:3, 3]
     x, y, depth = X[:, 0] / X[:, 2], X[:, 1] / X[:, 2], X[:, 2]
     none = np.zeros(len(X))
-    right = np.stack([1 / depth, none, -x / depth, -x * y, 1 + x * x, -y]) * K[0, 0]
-    down = np.stack([none, 1 / depth, -y / depth, -1 - y * y, x * y, x]) * K[1, 1]
-    residual = _projected(T, K, points) - uv
+    right = np.stack([1 / depth, none, -x / depth, -x * y, 1 + x * x, -y, x]) * K[0, 0]
+    down = np.stack([none, 1 / depth, -y / depth, -1 - y * y, x * y, x, y]) * K[1, 1]
+    residual = uv - _projected(T, K, points)
     sigma = max(_LEAST_MATCH_SIGMA, _SIGMA_OF_MAD * float(np.median(np.abs(residual))))
     weight = 1 / (1 + (residual**2).sum(1) / sigma**2)
     J = np.concatenate([right, down], 1)
     weights = np.concatenate([weight, weight]) / sigma**2
-    return np.einsum("in,jn->ij", J * weights, J, optimize=False)
+    return np.einsum("in,jn->ij", J * weights, J, optimize=False), (J * weights) @ residual.T.ravel()
 
 
 def _projected(T: Float, K: Float, points: Float) -> Float:

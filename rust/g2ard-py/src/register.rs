@@ -56,7 +56,7 @@ pub fn shot<'py>(
     ))
 }
 
-type Normal = ([[f64; 8]; 8], [f64; 8], f64, f64, f64);
+type Normal = ([[f64; 9]; 9], [f64; 9], f64, f64, f64);
 
 /// Return (matrix, right, scale, cost, weights) of one step. `photo` is (grey, right, down, mask), `shot` the result of
 /// `shot`, `lens` (fx, fy, cx, cy) and `light` (gain, bias).
@@ -97,13 +97,13 @@ fn render<'a>(shot: &'a (Grey<'_>, Grey<'_>, Mask<'_>)) -> PyResult<Render<'a>> 
     })
 }
 
-/// Return the root mean square, in pixels, by which ξ moves the unmasked pixels.
+/// Return the root mean square, in pixels, by which ξ and a zoom move the unmasked pixels.
 #[pyfunction]
 pub fn flow<'py>(
     py: Python<'py>,
     shot: (Grey<'py>, Grey<'py>, Mask<'py>),
     lens: [f64; 4],
-    xi: [f64; 6],
+    xi: [f64; 7],
 ) -> PyResult<f64> {
     let size = size(&shot.0);
     let shot = render(&shot)?;

@@ -11,9 +11,10 @@ const TUKEY: f64 = 4.685;
 const SIGMAS: f64 = 1.4826;
 /// Smallest scale of the residuals: a quarter of an 8-bit step.
 const LEAST_SCALE: f64 = 1e-3;
-/// v, ω, gain and bias.
-const UNKNOWNS: usize = 8;
-const MOTION: usize = 6;
+/// v, ω, zoom, gain and bias.
+const UNKNOWNS: usize = 9;
+/// v, ω and the logarithm of the focal length.
+const MOTION: usize = 7;
 
 /// A photo at one size: grey, blurred; its gradients; its mask.
 #[derive(Debug, Clone, Copy)]
@@ -48,7 +49,7 @@ pub struct Light {
     pub bias: f64,
 }
 
-/// H·δ = y of δ = (v, ω, Δgain, Δbias).
+/// H·δ = y of δ = (v, ω, Δlog f, Δgain, Δbias).
 #[derive(Debug, Clone, PartialEq)]
 pub struct Normal {
     pub matrix: [[f64; UNKNOWNS]; UNKNOWNS],
@@ -73,7 +74,7 @@ struct Sums {
 }
 
 /// ∇I·∂π/∂X·[I | −[X]ₓ], with x = X/Z, y = Y/Z and gradients times focal lengths p, q:
-/// (p/Z, q/Z, −(px + qy)/Z, −pxy − q(1 + y²), p(1 + x²) + qxy, −py + qx).
+/// (p/Z, q/Z, −(px + qy)/Z, −pxy − q(1 + y²), p(1 + x²) + qxy, −py + qx), and px + qy for the focal length.
 #[inline(always)]
 fn motion(x: f64, y: f64, depth: f64, p: f64, q: f64) -> [f64; MOTION] {
     let along = p * x + q * y;
@@ -84,6 +85,7 @@ fn motion(x: f64, y: f64, depth: f64, p: f64, q: f64) -> [f64; MOTION] {
         -along * y - q,
         along * x + p,
         q * x - p * y,
+        along,
     ]
 }
 
@@ -226,7 +228,7 @@ pub(super) fn median(values: &mut [f64]) -> f64 {
     lower.map_or(upper, |lower| (lower + upper) / 2.0)
 }
 
-/// Root mean square, in pixels, by which ξ moves the unmasked pixels; NaN without any.
+/// Root mean square, in pixels, by which ξ and a zoom move the unmasked pixels; NaN without any.
 pub fn flow(shot: &Render, size: Size, lens: &Lens, xi: &[f64; MOTION]) -> Result<f64> {
     size.check("shot's depth", shot.depth, 1)?;
     size.check("shot's mask", shot.mask, 1)?;
