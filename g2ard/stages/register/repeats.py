@@ -27,17 +27,17 @@ from g2ard.stages.register.matchers import Sift
 from g2ard.stages.register.pose import Float
 from g2ard.stages.register.solve import lifted, solve_pnp
 
-_MOST_REPEATS = 8
+_MOST_REPEATS = 12
 """Most repetitions that are looked for."""
 _LEAST_SHIFT = 0.04
 """Least distance of matched features, as a share of the longer side."""
-_LIKE = 0.12
+_LIKE = 0.3
 """Largest squared distance of matched descriptors of norm 1."""
 _MOST_FEATURES = 700
 """About the most features that are matched."""
 _MOST_MATCHES = 250
 """About the most matches that a repetition is solved from."""
-_CELL = 0.03
+_CELL = 0.05
 """Side of the cells of displacements, as a share of the longer side; 3 × 3 of them make a repetition."""
 _LEAST_SUPPORT = 12, 0.05
 """Least matches that support a repetition, and as a share of the features."""
