@@ -32,6 +32,8 @@ _DAMPING = 1e-6
 _STEP_HALVINGS = 3
 _CONTRADICTED = 3.0
 """Deviations of the focal length from its prior, in joint σ, beyond which the prior is widened."""
+_FARTHEST = 1e9
+"""Largest entry of a pose that is rendered."""
 _WIDEST = 0.3
 """Largest σ of that prior."""
 _REPEATED_LEVELS = 2
@@ -223,6 +225,8 @@ def _align_level(
     """
 
     def seen(viewmat: Float, zoom: float) -> tuple[Camera, Shot] | None:
+        if not (np.abs(viewmat) < _FARTHEST).all():
+            return None
         there = zoomed(camera, zoom, viewmat)
         shot = shot_of(renderer.render(there), config)
         return (there, shot) if (photo.mask & shot.mask).mean() >= config.min_overlap else None
@@ -249,7 +253,7 @@ def _align_level(
         for _ in range(_STEP_HALVINGS + 1):
             if step is None:
                 break
-            trial, focal = moved(pose, step[:6]), zoom * float(np.exp(step[6]))
+            trial, focal = moved(pose, step[:6]), zoom * float(np.exp(np.clip(step[6], -_WIDEST, _WIDEST)))
             there = seen(trial, focal)
             taken += 1
             if there is not None:

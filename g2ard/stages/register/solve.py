@@ -211,6 +211,14 @@ def with_focal(
         if wider == prior:
             break
         prior = wider
+    before, after = (np.median(np.abs(_projected(c.viewmat, c.K, points) - uv)) for c in (camera, here))
+    if not after < before + config.max_reprojection:  # diverged
+        return (
+            camera,
+            config.focal_sigma,
+            information(camera.viewmat, camera.K, uv, points)[0] / config.alike,
+            alone,
+        )
     return here, prior, data, alone
 
 
