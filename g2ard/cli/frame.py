@@ -34,7 +34,8 @@ from g2ard.errors import G2ardError, InputError
 from g2ard.io import check_scene_output, check_views_output, find_views, kind, read_view_set, write_views
 from g2ard.io.atomic import atomic_output, check_output
 from g2ard.io.detect import run_scene
-from g2ard.io.paths import is_photo, real_path
+from g2ard.io.finding import is_photo
+from g2ard.io.paths import real_path
 from g2ard.io.reports import plain
 from g2ard.io.scene_formats import axes_note, files_of, scene_format
 from g2ard.io.scenes import tell, write_scene

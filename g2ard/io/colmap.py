@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard.errors import InputError, damaged
-from g2ard.io.finding import Finder
+from g2ard.io.finding import Finder, files_in
 from g2ard.io.jsonfile import Place
 from g2ard.io.paths import read_text
-from g2ard.io.photos import Frame, Lens, Listed, photo_size, posed
+from g2ard.io.photos import Frame, Lens, Listed, posed
 from g2ard.io.transforms import intrinsics_of
 from g2ard.io.types import Note
 from g2ard.progress import plural
@@ -124,7 +124,7 @@ _POINT_FILES = ("points3d.bin", "points3d.txt")
 
 def _held(folder: Path) -> dict[str, Path]:
     """Return the files of a folder by name in small letters."""
-    return {p.name.lower(): p for p in sorted(folder.iterdir()) if p.is_file()} if folder.is_dir() else {}
+    return {path.name.lower(): path for path in files_in(folder)}
 
 
 def _tables(folder: Path) -> tuple[Path, Path] | None:
@@ -178,7 +178,7 @@ def read(path: Path, images: Path | None = None) -> Listed:
         return found
     largest = max(others, key=_count)
     text = f"read {found.path} of {len(others) + 1} models; {largest} has {plural(_count(largest), 'image')}"
-    return found._replace(notes=(Note("other_models", len(others), text),))
+    return found._replace(notes=(*found.notes, Note("other_models", len(others), text)))
 
 
 def listed(path: Path, images: Path | None = None) -> Listed:
@@ -196,10 +196,10 @@ def listed(path: Path, images: Path | None = None) -> Listed:
         images_read = _images(open_table(tables[1], "image"))
     if not images_read:
         raise InputError("has no images", path=tables[1])
-    finder = Finder(images) if images else Finder(*_photo_folders(path, folder))
+    names = [name for name, *_ in images_read]
+    finder = Finder(images) if images else Finder.among(names, *_photo_folders(path, folder))
     frames, faults = list[Frame](), list[tuple[str, InputError]]()
-    by_rig = None
-    sizes: dict[int, tuple[int, int]] = {}
+    by_rig, stale = _rig_poses(folder, tables[1].suffix.lower()), 0
     for name, key, number, own, fault in sorted(images_read, key=lambda image: image[0]):
         if number not in cameras:
             raise InputError(f"{name!r} has the unknown camera {number}", path=tables[1])
@@ -207,31 +207,34 @@ def listed(path: Path, images: Path | None = None) -> Listed:
         if isinstance(camera, InputError):
             faults.append((name, camera))
             continue
-        photo = finder.photo(name)
-        if images is not None and photo.is_file():
-            if number not in sizes:  # one lens, one size
-                sizes[number] = photo_size(photo, tables[1], camera.size)
-            camera = camera.at(sizes[number])
-        pose = None
-        if fault is None and any(own[:4]):
-            pose = posed(own[:4], own[4:])
-        else:
-            by_rig = _rig_poses(folder, tables[1].suffix.lower()) if by_rig is None else by_rig
-            pose = by_rig.get((key, number))
+        pose = posed(own[:4], own[4:]) if fault is None and any(own[:4]) else None
+        in_rig = by_rig.get((key, number))
+        if in_rig is not None and (pose is None or not np.allclose(in_rig, pose, rtol=_SAME, atol=_SAME)):
+            stale += pose is not None
+            pose = in_rig
         if pose is None:
             if fault is None:
                 raise InputError(f"{name!r}: its quaternion is zero", path=tables[1])
             faults.append((name, fault))
             continue
-        frames.append(Frame(name, pose, camera, photo, listed=name))
-    return Listed(folder, frames, faults)
+        frames.append(Frame(name, pose, camera, finder.photo(name), listed=name))
+    text = f"{plural(stale, 'pose')} of {tables[1].name} differ from rigs and frames, which count"
+    notes = (Note("stale_poses", stale, text),) if stale else ()
+    return Listed(folder, frames, faults, (*finder.notes, *notes))
 
 
-def _photo_folders(path: Path, model: Path) -> list[Path]:
-    """Return folders of photos: `images` beside `path`, the model or up to three folders above it."""
+_SAME = 1e-5  # difference of poses that rounding may cause
+
+
+def _photo_folders(path: Path, model: Path) -> tuple[list[Path], list[Path]]:
+    """Return folders of photos: `images` beside `path`, the model or up to three folders above it; and where
+    photos may be otherwise, up to the project's folder, which is above `sparse`."""
     roots = (path, model, model.parent, model.parent.parent, model.parent.parent.parent)
     found = [root / "images" for root in roots if (root / "images").is_dir()]
-    return found[:1] or [path / "images"]
+    project = model
+    while project.name.isdecimal() or project.name in ("sparse", "colmap"):
+        project = project.parent
+    return found[:1] or [path / "images"], [path, model, project]
 
 
 class Columns(NamedTuple):
@@ -297,10 +300,7 @@ class Table:
         if end < 0:
             raise self._cut_off("NAME")
         start, self._at = self._at, end + 1
-        try:
-            return self.data[start:end].decode()
-        except UnicodeDecodeError:
-            raise self.place("NAME").error("is not UTF-8") from None
+        return self.data[start:end].decode(errors="surrogateescape")
 
     def skip_points(self) -> None:
         self.skip(24 * self.take(_POINTS)[0], "POINTS2D")
@@ -387,10 +387,11 @@ def _is_points(line: str) -> bool:
     """Return whether a line of images.txt has triples x, y, POINT3D_ID, unlike the line of an image."""
     words = line.split()
     ids = words[2::3]
-    return len(words) % 3 == 0 and all(map(_WHOLE.fullmatch, ids)) and all(map(_NUMBER.fullmatch, words[:30]))
+    numbers = all(_NUMBER.fullmatch(word) or _NOT_FINITE.fullmatch(word) for word in words[:30])
+    return len(words) % 3 == 0 and all(map(_WHOLE.fullmatch, ids)) and numbers
 
 
-_WHOLE, _NUMBER = re.compile(r"-?\d+"), re.compile(r"[+-]?(nan|inf|[\d.]+(e[+-]?\d+)?)", re.IGNORECASE)
+_WHOLE, _NUMBER = re.compile(r"-?\d+"), re.compile(r"[+-]?[\d.]+(e[+-]?\d+)?", re.IGNORECASE)
 
 
 def _params(count: int) -> list[str]:

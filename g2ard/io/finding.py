@@ -1,12 +1,43 @@
-"""Finding the photos, masks and points that a file of views names, in one order for all formats."""
+"""Finding the photos, masks and points that views name, by one rule for all formats."""
 
 from __future__ import annotations
 
+import re
+import unicodedata
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
 from pathlib import Path, PureWindowsPath
+from typing import TYPE_CHECKING
 
-from g2ard.io.paths import is_photo, other_photo
+if TYPE_CHECKING:
+    from g2ard.io.types import Note
+
+_PHOTO_SUFFIXES = (".png", ".jpg", ".jpeg", ".jfif", ".webp", ".tif", ".tiff", ".bmp")
+
+_RAW = ".dng .cr2 .cr3 .nef .arw .raf .orf .rw2 .raw"
+_OTHER_PHOTOS = {
+    **dict.fromkeys((".heic", ".heif", ".hif"), "HEIC"),
+    ".exr": "OpenEXR",
+    ".hdr": "Radiance HDR",
+    ".jxl": "JPEG XL",
+    **{suffix: f"raw ({suffix[1:].upper()})" for suffix in _RAW.split()},
+}
+"""Suffixes of photos that cannot be read, and their formats."""
+
+_LEFT_BY_SYSTEMS = re.compile(r"\._.*|\.ds_store|thumbs\.db|desktop\.ini", re.IGNORECASE)
+
+_CODE_PAGES = ("cp949", "cp932", "gbk", "big5", "cp1252", "cp1251", "cp1250", "cp437")
+"""Character sets of names that are not UTF-8."""
+_MISREAD_AS = ("cp437", "cp1252", "latin-1")
+"""Character sets that programs take names for whose own is not stated, as in .zip files."""
 
 _MASK_FOLDERS = ("masks", "mask")
+_MASKS_BESIDE = ("{name}.mask", "{stem}.mask", "{name}_mask", "{stem}_mask", "{stem}-mask", "mask_{stem}")
+_MASKS = ("{name}", "{stem}", *_MASKS_BESIDE)
+"""Names of a photo's mask without its suffix: beside the photo, and in a folder of masks."""
+
+_MOST_FOLDERS = 64  # folders to look into for photos that are not where they are expected
+_ASKED = 64  # names, evenly spaced, that tell whether a folder holds the photos
 
 
 class Finder:
@@ -17,34 +48,55 @@ class Finder:
     1. the path as written, absolute or below a folder;
     2. with `\\` read as `/`, its end: without root and drive, then without one leading folder after the
        other, so that `C:\\capture\\images\\a\\1.png` is found as `images/a/1.png`, `a/1.png` or `1.png`;
-    3. in the same order, a photo of that name in other capitals;
-    4. in the same order, a photo of that name with another suffix.
+    3. in the same order, a file of that name in other capitals or another Unicode form;
+    4. in the same order, a photo of that name with another suffix;
+    5. in the same order, a photo whose name is the same in another character set.
+
+    Empty files, and those that systems leave in folders, are ignored.
 
     Args:
         folders: where to look; a missing folder is ignored.
+
+    Attributes:
+        notes: a note if `among` chose a folder where photos were not expected.
     """
 
-    def __init__(self, *folders: Path) -> None:
-        self._folders = tuple(dict.fromkeys(folders))
-        self._listings: dict[Path, tuple[set[str], dict[tuple[str, str], Path]]] = {}
+    def __init__(self, *folders: Path, notes: tuple[Note, ...] = ()) -> None:
+        self._folders, self.notes = tuple(dict.fromkeys(folders)), notes
+        self._listings: dict[Path, tuple[dict[str, Path], dict[str, Path]]] = {}
+
+    @classmethod
+    def among(cls, names: Sequence[str], folders: Sequence[Path], around: Iterable[Path]) -> Finder:
+        """Return the finder in `folders`, or if they hold none of the names, in the first folder that does:
+        one of `around`, or a folder in one of these."""
+        from g2ard.io.types import Note
+
+        asked, expected = names[:: max(1, len(names) // _ASKED)], cls(*folders)
+        if any(map(expected.find, asked)):
+            return expected
+        roots = [root for root in dict.fromkeys(around) if root.is_dir()]
+        inner = (sorted(filter(Path.is_dir, root.iterdir()))[:_MOST_FOLDERS] for root in roots)
+        for place in [*roots, *(folder for folders in inner for folder in folders)]:
+            found = cls(place)
+            if there := sum(found.find(name) is not None for name in asked):
+                text = f"photos are in {place}, not in {folders[0]}"
+                return cls(place, notes=(Note("photos_elsewhere", there, text),))
+        return expected
 
     def find(self, name: str) -> Path | None:
         """Return the file that `name` means, or None."""
         if not name or "\0" in name:
             return None
         for folder in self._folders:
-            if (folder / name).is_file():
+            if usable(folder / name):
                 return folder / name
         parts = plain_parts(name)
-        ends = [Path(*parts[k:]) for k in range(len(parts))]
-        for end in ends:
-            for folder in self._folders:
-                if end.name in self._listed((folder / end).parent)[0]:
-                    return folder / end
-        for key in (_name_key, _stem_key):
+        ends = [parts[k:] for k in range(len(parts))]
+        for keys in _keys(parts[-1] if parts else ""):
             for end in ends:
                 for folder in self._folders:
-                    if found := self._listed((folder / end).parent)[1].get(key(end)):
+                    files = self._within(folder, end[:-1])
+                    if found := next((files[key] for key in keys if key in files), None):
                         return found
         return None
 
@@ -52,22 +104,142 @@ class Finder:
         """Return the file that `name` means, or where it was expected first."""
         return self.find(name) or self._folders[0] / name
 
-    def _listed(self, folder: Path) -> tuple[set[str], dict[tuple[str, str], Path]]:
-        """Return the names of a folder's files, and its photos by name and by stem in small letters."""
+    def mask(self, photo: Path, depth: int) -> Path | None:
+        """Return the mask of a photo: in a folder of masks beside that of the photos, at most `depth` folders
+        above, with the same folders in it; otherwise beside the photo."""
+        spelled = [(place, path, _MASKS) for place, path in mask_folders(photo, depth)]
+        for folder, path, names in [*spelled, (photo.parent, Path(photo.name), _MASKS_BESIDE)]:
+            files = self._within(folder, path.parts[:-1])
+            wanted = (f"stem {_folded(n.format(name=path.name, stem=path.stem))}" for n in names)
+            exact = f"exact {path.name}" if names is _MASKS else ""
+            if found := next((files[key] for key in (exact, *wanted) if key in files), None):
+                return found
+        return None
+
+    def _within(self, folder: Path, parts: Sequence[str]) -> dict[str, Path]:
+        """Return the files by key of a folder below one."""
+        for part in parts:
+            inner = self._listed(folder)[1]
+            below = next((inner[key] for keys in _keys(part) for key in keys if key in inner), None)
+            if below is None:
+                return {}
+            folder = below
+        return self._listed(folder)[0]
+
+    def _listed(self, folder: Path) -> tuple[dict[str, Path], dict[str, Path]]:
+        """Return the files and the folders of a folder by key; only photos have keys without suffix."""
         if folder not in self._listings:
-            files = sorted(p for p in folder.iterdir() if p.is_file()) if folder.is_dir() else []
-            photos = [file for file in reversed(files) if is_photo(file)]
-            keys = {key(file): file for key in (_stem_key, _name_key) for file in photos}
-            self._listings[folder] = {file.name for file in files}, keys
+            held = sorted(folder.iterdir(), reverse=True) if folder.is_dir() else []
+            levels = [(path, _keys(path.name)) for path in held if path.is_dir() or usable(path)]
+            files: dict[str, Path] = {}
+            for depth in (3, 2, 1, 0):  # nearer spellings win
+                for path, keys in levels:
+                    if not path.is_dir() and (depth < 2 or is_photo(path)):
+                        files |= dict.fromkeys(keys[depth], path)
+            inner = {key: path for path, keys in levels if path.is_dir() for keys_ in keys for key in keys_}
+            self._listings[folder] = files, inner
         return self._listings[folder]
 
 
-def _name_key(path: Path) -> tuple[str, str]:
-    return "name", path.name.lower()
+def _keys(name: str) -> list[list[str]]:
+    """Return what a file may be found by, the strictest first."""
+    folded, others = _folded(name), [_folded(_stem(other)) for other in _respelled(name)]
+    stem = f"stem {_folded(_stem(name))}"
+    return [[f"exact {name}"], [f"name {folded}"], [stem], [f"other {other}" for other in others]]
 
 
-def _stem_key(path: Path) -> tuple[str, str]:
-    return "stem", (path.stem if is_a_photo(path) else path.name).lower()
+def _stem(name: str) -> str:
+    return Path(name).stem if is_a_photo(Path(name)) else name
+
+
+def _folded(name: str) -> str:
+    """Return a name in one Unicode form, without capitals.
+
+    >>> _folded("Ku\\u0308che") == _folded("K\\u00dcCHE")
+    True
+    """
+    return unicodedata.normalize("NFC", unicodedata.normalize("NFC", name).casefold())
+
+
+def _respelled(name: str) -> Iterator[str]:
+    """Yield a name as it is in other character sets, if it may have been written in one of them.
+
+    Bytes that are not UTF-8 are surrogates, as `os.fsdecode` returns them.
+    """
+    if name.isascii():
+        return
+    yield name
+    for wrong in ("utf-8", *_MISREAD_AS):
+        with suppress(UnicodeError):
+            data = name.encode(wrong, "surrogateescape" if wrong == "utf-8" else "strict")
+            for own in ("utf-8", *_CODE_PAGES):
+                with suppress(UnicodeError):
+                    yield data.decode(own)
+
+
+def readable(names: Sequence[str], photos: Sequence[Path | None]) -> list[str]:
+    """Return names without surrogates: in the character set that agrees with most of the photos' names, in
+    UTF-8 with `\\x..` if none does.
+
+    >>> readable(["caf\\udce9.png"], [Path("caf\\u00e9.png")]), readable(["caf\\udce9"], [None])
+    (['café.png'], ['caf\\\\xe9'])
+    """
+    if all(map(_printable, names)):
+        return list(names)
+    best, most = [_escaped(name) for name in names], 0
+    for own in _CODE_PAGES:
+        with suppress(UnicodeError):
+            spelled = [name.encode("utf-8", "surrogateescape").decode(own) for name in names]
+            own_names = zip(spelled, photos, strict=True)
+            agree = sum(p is not None and _folded(s).endswith(_folded(p.name)) for s, p in own_names)
+            if agree > most:
+                best, most = spelled, agree
+    return [name if _printable(name) else other for name, other in zip(names, best, strict=True)]
+
+
+def _printable(name: str) -> bool:
+    return not any("\ud800" <= letter <= "\udfff" for letter in name)
+
+
+def _escaped(name: str) -> str:
+    return name.encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
+
+
+def usable(path: Path) -> bool:
+    """Return whether a path is a file that is not empty, and not one that systems leave in folders."""
+    if _LEFT_BY_SYSTEMS.fullmatch(path.name):
+        return False
+    with suppress(OSError, ValueError):
+        return path.is_file() and path.stat().st_size > 0
+    return False
+
+
+def files_in(folder: Path, *suffixes: str) -> list[Path]:
+    """Return the usable files of a folder, sorted; none if it does not exist."""
+    held = sorted(folder.iterdir()) if folder.is_dir() else []
+    return [path for path in held if (not suffixes or path.suffix.lower() in suffixes) and usable(path)]
+
+
+def photos_in(folder: Path, *, below: bool = False) -> list[Path]:
+    """Return the photos in a folder that can be read, or also those below it, without masks beside them."""
+    files = sorted(filter(usable, folder.rglob("*"))) if below else files_in(folder)
+    photos = [file for file in files if is_photo(file)]
+    masks = {p.with_name(m.format(name=p.name, stem=p.stem)) for p in photos for m in _MASKS_BESIDE}
+    return [photo for photo in photos if photo.with_name(photo.stem) not in masks]
+
+
+def is_photo(path: Path) -> bool:
+    """Return whether a name has the suffix of a photo that can be read."""
+    return path.suffix.lower() in _PHOTO_SUFFIXES
+
+
+def other_photo(path: Path) -> str | None:
+    """Return the format of a photo that cannot be read, by its suffix, or None."""
+    return _OTHER_PHOTOS.get(path.suffix.lower())
+
+
+def is_a_photo(path: Path) -> bool:
+    return is_photo(path) or other_photo(path) is not None
 
 
 def plain_parts(name: str) -> list[str]:
@@ -81,18 +253,11 @@ def plain_parts(name: str) -> list[str]:
 
 
 def is_end(name: str, photo: Path) -> bool:
-    """Return whether a photo's path ends in all parts of `name`, whatever the suffix."""
+    """Return whether a photo's path ends in all parts of `name`, whatever the spelling and suffix."""
     parts = plain_parts(name)
-    return _stems(parts) == _stems(list(photo.parts[-len(parts) :]))
-
-
-def _stems(parts: list[str]) -> list[str]:
-    last = Path(parts[-1] if parts else "")
-    return [*parts[:-1], _stem_key(last)[1]]
-
-
-def is_a_photo(path: Path) -> bool:
-    return is_photo(path) or other_photo(path) is not None
+    pairs = zip(reversed(parts), reversed(photo.parts), strict=False)
+    alike = [any(not set(a).isdisjoint(b) for a, b in zip(*map(_keys, pair), strict=True)) for pair in pairs]
+    return len(alike) == len(parts) and all(alike)
 
 
 def mask_folders(photo: Path, depth: int) -> list[tuple[Path, Path]]:
@@ -104,15 +269,6 @@ def mask_folders(photo: Path, depth: int) -> list[tuple[Path, Path]]:
     for own in photo.parents[: max(1, depth)]:
         size = own.name.partition("_")[2]  # images_4 goes with masks_4
         names = [f"{name}_{size}" for name in _MASK_FOLDERS if size] + list(_MASK_FOLDERS)
+        names += [f"{own.name}_{name}" for name in _MASK_FOLDERS]
         found += [(own.parent / name, photo.relative_to(own)) for name in names]
     return [(folder, path) for folder, path in found if folder.is_dir()]
-
-
-def find_mask(photo: Path, depth: int) -> Path | None:
-    """Return the mask of a photo: of its path in a folder `masks` beside that of the photos, with its suffix,
-    with `.png` after it, or with `.png` instead."""
-    for folder, path in mask_folders(photo, depth):
-        names = (path, path.with_name(f"{path.name}.png"), path.with_suffix(".png"))
-        if found := next((folder / name for name in names if (folder / name).is_file()), None):
-            return found
-    return None

@@ -9,7 +9,7 @@ import numpy as np
 
 from g2ard.io.finding import Finder
 from g2ard.io.jsonfile import Matrix, Number, Place, Vector, Whole, checked, read_any_json
-from g2ard.io.photos import Frame, Lens, Listed, fits, inverse, photo_size, rigid
+from g2ard.io.photos import Frame, Lens, Listed, inverse, rigid
 from g2ard.io.transforms import json_rows
 from g2ard.io.types import Note
 from g2ard.progress import plural
@@ -34,13 +34,13 @@ def read(path: Path, images: Path | None = None) -> Listed:
 
     `rotation` holds the rows of world_from_camera, in OpenCV axes. The principal point is the image's centre,
     as in INRIA's trainer. The id is appended to repeated names, such as r_0 of each split of NeRF's synthetic
-    scenes. Without `images`, photos are in `images` beside the file. Cameras are scaled to resized photos.
+    scenes. Without `images`, photos are in `images` beside the file.
     """
     file = path / NAME if path.is_dir() else path
     listed = checked(read_any_json(file), list[_Camera], Place(file), entries="camera")
-    if images is None and (file.parent / "images").is_dir():
-        images = file.parent / "images"
-    finder = Finder(images) if images else None
+    beside, names = images or file.parent / "images", [camera.img_name for camera in listed]
+    among = Finder(beside) if images else Finder.among(names, [beside], [file.parent])
+    finder = among if beside.is_dir() or among.notes else None
     frames = [_frame(Place(file, i, "camera"), camera, finder) for i, camera in enumerate(listed)]
     times = Counter(frame.name for frame in frames)
     for i, frame in enumerate(frames):
@@ -48,25 +48,17 @@ def read(path: Path, images: Path | None = None) -> Listed:
             frames[i] = frame._replace(name=f"{frame.name}_{i if listed[i].id is None else listed[i].id}")
     repeated = sum(count for count in times.values() if count > 1)
     text = f"{plural(repeated, 'camera')} of {len(frames)} have repeated names; their ids are appended"
-    return Listed(file, frames, notes=(Note("repeated_names", repeated, text),) if repeated else ())
+    notes = (*among.notes, Note("repeated_names", repeated, text)) if repeated else among.notes
+    return Listed(file, frames, notes=notes)
 
 
 def _frame(place: Place, camera: _Camera, finder: Finder | None) -> Frame:
     world_from_camera = np.column_stack([camera.rotation, camera.position])
-    fx, fy = camera.fx, camera.fy
-    width, height = int(camera.width), int(camera.height)
-    photo = finder.photo(camera.img_name) if finder else None
-    # The file has the size of the full photos; the trainer may have used and kept smaller ones.
-    if photo is not None and photo.is_file() and width and height:
-        (shown_width, shown_height), full = photo_size(photo, place.path, (width, height)), (width, height)
-        if fits((shown_width, shown_height), full):
-            width, height = shown_width, shown_height
-            fx, fy = fx * width / full[0], fy * height / full[1]
     return Frame(
         name=camera.img_name,
         viewmat=inverse(rigid(world_from_camera, place.to("rotation"))),
-        lens=Lens.pinhole((width, height), (fx, fy)),
-        photo=photo,
+        lens=Lens.pinhole((int(camera.width), int(camera.height)), (camera.fx, camera.fy)),
+        photo=finder.photo(camera.img_name) if finder else None,
         listed=camera.img_name,
     )
 

@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 
 from g2ard.errors import InputError, damaged
+from g2ard.io.finding import photos_in
 from g2ard.io.jsonfile import Place
-from g2ard.io.paths import is_photo
-from g2ard.io.photos import Frame, Lens, Listed, inverse, photo_size, rigid
+from g2ard.io.photos import Frame, Lens, Listed, inverse, rigid
 from g2ard.progress import plural
 
 NAME = "poses_bounds.npy"
@@ -53,8 +53,6 @@ def _frame(place: Place, matrix: np.ndarray, photo: Path | None) -> Frame:
         raise place.error(f"has height {height}, width {width} and focal length {focal}")
     pose = rigid(np.hstack([matrix[:, :3] @ _LLFF_AXES, matrix[:, 3:4]]), place)
     lens = Lens.pinhole((round(width), round(height)), (focal, focal))
-    if photo is not None:
-        lens = lens.at(photo_size(photo, place.path, lens.size))
     name = f"{place.index:05d}" if photo is None else photo.name
     return Frame(name, inverse(pose), lens, photo)
 
@@ -63,6 +61,6 @@ def _photos(folder: Path, images: Path | None) -> list[Path]:
     """Return the photos that belong to the rows, sorted by name; none if there is no folder of photos."""
     named = sorted((p for p in folder.glob("images*") if p.is_dir()), key=lambda p: (len(p.name), p.name))
     for place in [images] if images else named:
-        if found := sorted(p for p in place.iterdir() if is_photo(p)):
+        if found := photos_in(place):
             return found
     return []

@@ -9,7 +9,7 @@ from g2ard.errors import InputError
 from g2ard.io import colmap, transforms
 from g2ard.io.finding import Finder
 from g2ard.io.jsonfile import Place, Pose, checked, read_any_json
-from g2ard.io.photos import Frame, Lens, Listed, photo_size, rigid
+from g2ard.io.photos import Frame, Lens, Listed, rigid
 from g2ard.io.settings import below
 
 LISTS = {"transforms_train.json": "train", "transforms_eval.json": "test"}
@@ -56,8 +56,6 @@ def _frame(
     ups = (below(path, up) for up in file_path.parents[:3] if up.parts)
     lens = _lens(place, file_path, there or next(filter(None, ups), None), lenses)
     photo = finder.photo(camera.file_path) if finder else there
-    if photo is not None and photo.is_file():
-        lens = lens.at(photo_size(photo, path, lens.size))
     return Frame(
         name=file_path.name,
         viewmat=transforms.opencv_view(world_from_camera),

@@ -13,18 +13,6 @@ from g2ard.errors import InputError
 _WHOLE_BYTES = 1 << 28  # largest file that is hashed as a whole, so any photo: 1 % of the time to decode it
 _HASHED_END_BYTES = 1 << 16  # bytes at each end of a larger file to hash
 _LONGEST_NAME = 200  # longest file name, bytes; systems allow 255, including suffixes and temporary names
-_PHOTO_SUFFIXES = (".png", ".jpg", ".jpeg", ".jfif", ".webp", ".tif", ".tiff", ".bmp")
-
-_RAW = ".dng .cr2 .cr3 .nef .arw .raf .orf .rw2 .raw"
-_OTHER_PHOTOS = {
-    **dict.fromkeys((".heic", ".heif", ".hif"), "HEIC"),
-    ".exr": "OpenEXR",
-    ".hdr": "Radiance HDR",
-    ".jxl": "JPEG XL",
-    **{suffix: f"raw ({suffix[1:].upper()})" for suffix in _RAW.split()},
-}
-"""Suffixes of photos that cannot be read, and their formats."""
-
 
 _LARGEST_RATIO = 100
 _ALWAYS_UNPACKED = 64 << 20  # bytes that any file may unpack to; larger ones are limited by `_LARGEST_RATIO`
@@ -66,12 +54,18 @@ def read_text(path: Path) -> str:
 
 
 def decoded(path: Path, data: bytes) -> str:
-    """Decode text in UTF-8, or in UTF-16 with a byte order mark, which is removed; `path` is for errors."""
+    """Decode text in UTF-8, or in UTF-16 with a byte order mark, which is removed; `path` is for errors.
+
+    Bytes of other character sets become surrogates, see `g2ard.io.finding.readable`.
+    """
     wide = data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
     try:
-        return data.decode("utf-16" if wide else "utf-8-sig")
+        text = data.decode("utf-16" if wide else "utf-8-sig", "strict" if wide else "surrogateescape")
     except UnicodeDecodeError as error:
         raise InputError("not a text file", path=path) from error
+    if "\0" in text:
+        raise InputError("not a text file", path=path)
+    return text
 
 
 def short_names(paths: Sequence[Path]) -> list[str]:
@@ -108,16 +102,6 @@ def _inside(path: str | Path, i: int, name: str) -> PurePosixPath:
         short = name if len(name) <= _LONGEST_NAME else f"{name[:_LONGEST_NAME]}…"
         raise InputError(f"has the invalid file name {short!r}", path=path, index=i, item="view")
     return PurePosixPath(*kept)
-
-
-def is_photo(path: Path) -> bool:
-    """Return whether a name has the suffix of a photo that can be read."""
-    return path.suffix.lower() in _PHOTO_SUFFIXES
-
-
-def other_photo(path: Path) -> str | None:
-    """Return the format of a photo that cannot be read, by its suffix, or None."""
-    return _OTHER_PHOTOS.get(path.suffix.lower())
 
 
 def file_identity(files: Iterable[Path]) -> list[Any]:

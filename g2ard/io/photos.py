@@ -14,9 +14,19 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from g2ard.errors import InputError, damaged
-from g2ard.io.finding import find_mask, is_a_photo, is_end, mask_folders, plain_parts
+from g2ard.io.finding import (
+    Finder,
+    is_a_photo,
+    is_end,
+    mask_folders,
+    other_photo,
+    photos_in,
+    plain_parts,
+    readable,
+    usable,
+)
 from g2ard.io.jsonfile import Place
-from g2ard.io.paths import check_regular, is_photo, other_photo
+from g2ard.io.paths import check_regular
 from g2ard.io.types import Note, ViewSet
 from g2ard.progress import plural
 from g2ard.scene.cameras import LARGEST_IMAGE, USUAL, Cameras, check_image
@@ -163,19 +173,19 @@ def fits(size: tuple[float, float], like: tuple[float, float]) -> bool:
     return abs(size[0] * like[1] - size[1] * like[0]) <= ASPECT_SLACK * size[1] * like[0]
 
 
-def _orientation(photo: Path) -> int:
-    with suppress(Exception):
-        with photo.open("rb") as file:
-            if file.read(4) not in _OFTEN_TURNED:
-                return 1
-        with opened_image(photo) as image:
-            return int(image.getexif().get(_ORIENTATION, 1))
-    return 1
+def _at_photo(lens: Lens, photo: Path) -> tuple[Lens, bool]:
+    """Return a lens for the size of its photo, if that has the same aspect, and whether EXIF turns the photo.
+
+    A photo that cannot be read changes nothing.
+    """
+    with suppress(Exception), opened_image(photo) as image:
+        size = turned(image.size) if turns(image, lens.size) else image.size
+        is_turned = int(image.getexif().get(_ORIENTATION, 1)) != 1
+        return (lens if lens.made or not fits(size, lens.size) else lens.at(size)), is_turned
+    return lens, False
 
 
 _ORIENTATION = 0x0112
-_OFTEN_TURNED = (b"\xff\xd8\xff\xe1", b"\xff\xd8\xff\xe0", b"RIFF", b"II*\0", b"MM\0*", b"\x89PNG")
-"""First bytes of formats that cameras write."""
 
 
 def exif_focal(path: Path) -> float | None:
@@ -232,6 +242,7 @@ def inverse(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _cameras(path: Path, frames: Sequence[Frame]) -> Cameras:
+    masks = Finder()
     try:
         return Cameras.from_lists(
             [f.viewmat for f in frames],
@@ -240,7 +251,7 @@ def _cameras(path: Path, frames: Sequence[Frame]) -> Cameras:
             [f.name for f in frames],
             [f.photo for f in frames],
             [f.lens.distortion for f in frames],
-            [_mask(f) for f in frames],
+            [_mask(f, masks) for f in frames],
             [f.kind for f in frames],
             [f.lens.photo for f in frames],
         )
@@ -250,11 +261,11 @@ def _cameras(path: Path, frames: Sequence[Frame]) -> Cameras:
         raise InputError("the size of a view is too large", path=path) from error
 
 
-def _mask(frame: Frame) -> Path | None:
-    """Return the frame's mask, or that of its photo in a folder of masks."""
+def _mask(frame: Frame, masks: Finder) -> Path | None:
+    """Return the frame's mask, or that found for its photo."""
     if frame.mask is not None or frame.photo is None:
         return frame.mask
-    return find_mask(frame.photo, len(plain_parts(frame.listed or frame.name)))
+    return masks.mask(frame.photo, len(plain_parts(frame.listed or frame.name)))
 
 
 def view_set(listed: Listed) -> ViewSet:
@@ -262,6 +273,8 @@ def view_set(listed: Listed) -> ViewSet:
     path, frames, left_out, further = listed
     if not frames and not listed.whole():
         raise InputError("no views found", path=path)
+    names = readable([frame.name for frame in frames], [frame.photo for frame in frames])
+    frames = [frame._replace(name=name) for frame, name in zip(frames, names, strict=True)]
     name, times = Counter(frame.name for frame in frames).most_common(1)[0]
     if times > 1:
         raise InputError(f"{times} views are named {name!r}; names must be unique", path=path)
@@ -281,7 +294,7 @@ def view_set(listed: Listed) -> ViewSet:
         text = f"{plural(len(bent), 'photo')} ({models}) resampled to {plural(made, 'pinhole view')}"
         notes.append(Note("resampled", made, text))
     pictured = [frame for frame in frames if frame.photo is not None]
-    present = [frame for frame in pictured if frame.photo and frame.photo.is_file()]
+    present = [frame for frame in pictured if frame.photo and usable(frame.photo)]
     if present and len(present) < len(frames):
         there = {frame.name for frame in present}
         frames = [f if f.name in there else f._replace(photo=None, mask=None) for f in frames]
@@ -325,7 +338,7 @@ def _idle_masks(present: Sequence[Frame]) -> list[Path]:
     """Return folders of masks for the first photo that hold images."""
     photo, name = present[0].photo, present[0].listed or present[0].name
     folders = mask_folders(photo, len(plain_parts(name))) if photo else []
-    return [folder for folder, _ in folders if any(is_photo(file) for file in folder.rglob("*"))]
+    return [folder for folder, _ in folders if photos_in(folder, below=True)]
 
 
 _PHOTO_NOTES = {
@@ -334,6 +347,8 @@ _PHOTO_NOTES = {
     "other_suffix": "found with another suffix: {first}",
     "exif_orientation": "with an EXIF orientation (the first is {first}): turned where only that fits the "
     "size of the view, otherwise read as stored",
+    "other_size": "of another size than the file says, which their views take ({first})",
+    "other_spelling": "found with another spelling, Unicode form or character set: {first}",
 }
 """Code of a note on photos → its text after their number."""
 
@@ -344,7 +359,7 @@ def _checked_photos(frames: Sequence[Frame]) -> tuple[list[Frame], list[Note]]:
     times = Counter(frame.photo for frame in frames)
     for i, frame in enumerate(frames):
         photo, wanted = frame.photo, Path(frame.listed)
-        if photo is None or not photo.is_file():
+        if photo is None or not usable(photo):
             continue
         if (what := unreadable(photo)) is not None:
             found["unreadable_photos"].append(f"{frame.name} is {what}")
@@ -354,9 +369,16 @@ def _checked_photos(frames: Sequence[Frame]) -> tuple[list[Frame], list[Note]]:
             out[i] = frame._replace(photo=None, mask=None)
         else:
             if is_a_photo(wanted) and photo.suffix.lower() != wanted.suffix.lower():
-                found["other_suffix"].append(f"{frame.listed} is {photo.name}")
-            if _orientation(photo) != 1:
+                found["other_suffix"].append(f"{frame.name} is {photo.name}")
+            elif is_a_photo(wanted) and plain_parts(frame.listed)[-1].lower() != photo.name.lower():
+                found["other_spelling"].append(f"{frame.name} is {photo.name}")
+            lens, is_turned = _at_photo(frame.lens, photo)
+            if is_turned:
                 found["exif_orientation"].append(photo.name)
+            if lens.size != frame.lens.size:
+                sizes = "{}×{} instead of {}×{}".format(*lens.size, *frame.lens.size)
+                found["other_size"].append(f"{frame.name} is {sizes}")
+                out[i] = frame._replace(lens=lens)
     notes = []
     for code, photos in found.items():
         if photos:

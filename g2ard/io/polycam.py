@@ -6,7 +6,7 @@ import msgspec
 import numpy as np
 
 from g2ard.errors import InputError
-from g2ard.io.finding import Finder
+from g2ard.io.finding import Finder, files_in
 from g2ard.io.jsonfile import Number, Place, Whole, checked, read_json
 from g2ard.io.photos import Frame, Lens, Listed, rigid
 from g2ard.io.transforms import opencv_view
@@ -31,7 +31,7 @@ def cameras_in(path: Path) -> tuple[Path, Path] | None:
     """Return the folders of cameras and of photos of a capture, optimised ones first, or None."""
     for cameras, photos in _FOLDERS:
         folder = path / "keyframes" / cameras
-        if folder.is_dir() and any(folder.glob("*.json")):
+        if files_in(folder, ".json"):
             return folder, path / "keyframes" / photos
     return None
 
@@ -44,7 +44,7 @@ def read(path: Path, images: Path | None = None) -> Listed:
     if folders is None:
         raise InputError("has no keyframes/cameras with .json files", path=path)
     cameras, photos = folders
-    files = sorted(cameras.glob("*.json"), key=lambda file: (len(file.stem), file.stem))
+    files = sorted(files_in(cameras, ".json"), key=lambda file: (len(file.stem), file.stem))
     finder = Finder(images or photos)
     found = Listed(path, [_frame(file, finder) for file in files])
     if cameras.name == "corrected_cameras":

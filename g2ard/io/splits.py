@@ -8,8 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard.errors import InputError
+from g2ard.io.colmap import model_folder
+from g2ard.io.finding import usable
 from g2ard.io.jsonfile import read_json
-from g2ard.io.paths import real_path
+from g2ard.io.paths import read_text, real_path
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.lenses import photo_of
 
@@ -23,8 +25,8 @@ def split_mask(
     """Return the mask of views in a split.
 
     Splits come from the views themselves, otherwise from a split.json beside them ({"train": [names], "test":
-    [names]}, and further keys), otherwise from the rule: sorted by name, every 8th starting with the first is
-    "test", the others "train".
+    [names]}, and further keys), otherwise from a test.txt or train.txt there, a name per line, otherwise from
+    the rule: sorted by name, every 8th starting with the first is "test", the others "train".
 
     Args:
         views: the file or folder of the views; None applies the rule.
@@ -54,7 +56,8 @@ def split_mask(
 
 def states_splits(views: str | Path | None, stated: Sequence[str | None] = ()) -> bool:
     """Return whether splits are stated by views or by a split.json beside them, see `split_mask`."""
-    return any(stated) or (views is not None and _read_split(Path(views)) is not None)
+    read = _read_split, _read_apart
+    return any(stated) or (views is not None and any(of(Path(views)) is not None for of in read))
 
 
 def splits_of(
@@ -105,6 +108,10 @@ def _masks(
     if any(stated):
         return {word: np.array([s == word for s in stated], bool) for word in {s for s in stated if s}}
     listed = None if views is None else _read_split(Path(views))
+    if listed is None and views is not None and (apart := _read_apart(Path(views))):
+        split, wanted = apart
+        if (mask := _listed(names, wanted)).any():
+            return {split: mask, "test" if split == "train" else "train": ~mask}
     if listed is None:
         test = np.zeros(len(names), bool)
         photos = [photo_of(name) for name in names]
@@ -123,10 +130,7 @@ def _masks(
 def _read_split(views: Path) -> dict[str, list[str]] | None:
     """Read split.json from the views' folder; for a COLMAP model in sparse/ or sparse/N also from the folders
     above it, up to that of sparse/."""
-    folder = views if views.is_dir() else views.parent
-    above = 2 if folder.name.isdecimal() and folder.parent.name == "sparse" else int(folder.name == "sparse")
-    places = [folder, *folder.parents[:above]]
-    path = next((p for place in places if (p := place / "split.json").is_file()), None)
+    path = next((p for place in _places(views) if (p := place / "split.json").is_file()), None)
     if path is None:
         return None
     content: dict[str, Any] = read_json(path)
@@ -134,6 +138,23 @@ def _read_split(views: Path) -> dict[str, list[str]] | None:
     if not lists or not all(isinstance(name, str) for value in lists.values() for name in value):
         raise InputError('expected lists of names, as in {"train": ["a.jpg"], "test": ["b.jpg"]}', path=path)
     return lists
+
+
+def _read_apart(views: Path) -> tuple[str, list[str]] | None:
+    """Return the split and the names of a test.txt or train.txt beside the tables of a COLMAP model, where
+    INRIA's trainer has it, or beside the views."""
+    model = model_folder(views)
+    for place in [*([model] if model else ()), *_places(views)]:
+        for split in ("test", "train"):
+            if usable(file := place / f"{split}.txt"):
+                return split, [word for line in read_text(file).splitlines() if (word := line.strip())]
+    return None
+
+
+def _places(views: Path) -> list[Path]:
+    folder = views if views.is_dir() else views.parent
+    above = 2 if folder.name.isdecimal() and folder.parent.name == "sparse" else int(folder.name == "sparse")
+    return [folder, *folder.parents[:above]]
 
 
 def _listed(names: Sequence[str], wanted: Sequence[str]) -> NDArray[np.bool_]:

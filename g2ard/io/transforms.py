@@ -87,9 +87,11 @@ def read(path: Path, images: Path | None = None) -> Listed:
         return listed(path, images)
     test, note = path.parent / _TEST, Note("test_beside", 1, f"{_TEST} beside it has the test views")
     if test.is_file():
-        return _listed(path, {path: "train", test: "test"}, images)._replace(notes=(note,))
+        found = _listed(path, {path: "train", test: "test"}, images)
+        return found._replace(notes=(*found.notes, note))
     note = Note("no_test_beside", 1, f"no {_TEST} beside it; every 8th of its views is held out")
-    return listed(path, images)._replace(notes=(note,))
+    found = listed(path, images)
+    return found._replace(notes=(*found.notes, note))
 
 
 def listed(path: Path, images: Path | None = None) -> Listed:
@@ -107,15 +109,16 @@ def files_of(folder: Path) -> dict[Path, str | None]:
 
 
 def _listed(path: Path, files: Mapping[Path, str | None], images: Path | None) -> Listed:
-    frames, left_out = list[Frame](), list[tuple[str, InputError]]()
+    frames, left_out, notes = list[Frame](), list[tuple[str, InputError]](), list[Note]()
     for file, split in files.items():
-        frames += _frames(file, images, left_out, split)
-    return Listed(path, frames, left_out)
+        own, further = _frames(file, images, left_out, split)
+        frames, notes = frames + own, [*notes, *further]
+    return Listed(path, frames, left_out, tuple(notes))
 
 
 def _frames(
     path: Path, images: Path | None, left_out: list[tuple[str, InputError]], split: str | None
-) -> list[Frame]:
+) -> tuple[list[Frame], tuple[Note, ...]]:
     """Read the frames of a transforms.json, and append views with numbers that are not finite to `left_out`.
 
     If it lists the names of its splits, these count (None for an unlisted frame), otherwise `split`. Frames
@@ -129,7 +132,9 @@ def _frames(
     if not lists["frames"]:
         raise InputError("no views found ('frames' is empty)", path=path)
     folder, above = path.parent, path.parent.parent
-    finder = Finder(images) if images else Finder(folder, folder / "images", above / "resized_images")
+    names = [str(entry.get("file_path")) for entry in lists["frames"] if isinstance(entry, dict)]
+    places = [folder, folder / "images", above / "resized_images"]
+    finder = Finder(images) if images else Finder.among(names, places, [folder])
     masks = Finder(folder, folder / "masks", above / "resized_anon_masks")
     apart = [(key, word) for key, word in _APART.items() if lists[key]]
     frames: list[Frame] = []
@@ -144,9 +149,9 @@ def _frames(
                     raise
                 left_out.append((str(entry.get("file_path")), error))
     split_of = _stated(path, lists)
-    if not split_of:
-        return frames
-    return [frame._replace(split=split_of.get(Path(frame.listed).as_posix())) for frame in frames]
+    if split_of:
+        frames = [frame._replace(split=split_of.get(Path(frame.listed).as_posix())) for frame in frames]
+    return frames, finder.notes
 
 
 def _finite(value: Any) -> bool:

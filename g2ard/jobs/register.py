@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import Any, Literal, TypeVar
@@ -18,8 +19,8 @@ from g2ard.errors import InputError, require
 from g2ard.io import read_view_set
 from g2ard.io.cambridge import read_ace
 from g2ard.io.detect import file_format
-from g2ard.io.paths import is_photo
-from g2ard.io.photos import exif_focal, has_alpha, photo_size
+from g2ard.io.finding import photos_in
+from g2ard.io.photos import exif_focal, fits, has_alpha, photo_size
 from g2ard.jobs.inputs import load_scene
 from g2ard.jobs.view_checks import propose_background
 from g2ard.pipeline.presets import GS_CPR
@@ -254,7 +255,7 @@ def _photos_in(path: Path) -> list[Path]:
     try:
         file_format(path)
     except InputError:
-        files = sorted(f for f in path.rglob("*") if is_photo(f) and f.is_file())
+        files = photos_in(path, below=True)
         if not files:
             raise InputError("neither photos nor views in this folder", path=path) from None
         return files
@@ -305,16 +306,21 @@ def _same_lens(a: Camera, b: Camera) -> bool:
 
 def _check_aspects(files: list[Path], sizes: list[tuple[int, int]], views: list[Camera]) -> None:
     """Reject intrinsics that fit none of the photos; single misfits are rejected later."""
-    off = [
-        abs(w * v.height - h * v.width) > 0.02 * h * v.width for (w, h), v in zip(sizes, views, strict=True)
-    ]
-    if all(off) and any(sizes[0]):
+    wanted = [(view.width, view.height) for view in views]
+    if any(sizes[0]) and not any(map(_suits, files, sizes, wanted)):
         (w, h), view = sizes[0], views[0]
         raise InputError(
             f"the photo is {w}×{h}, but its intrinsics are for {view.width}×{view.height}; "
             "pass intrinsics with the aspect ratio of these photos",
             path=files[0],
         )
+
+
+def _suits(file: Path, size: tuple[int, int], like: tuple[int, int]) -> bool:
+    """Return whether a photo, upright if EXIF says so, has the aspect of its view."""
+    with suppress(InputError):
+        size = photo_size(file, like=like)
+    return fits(size, like)
 
 
 def read_poses(path: Path) -> dict[str, NDArray[np.float64]]:

@@ -358,7 +358,7 @@ def test_named_points_that_cannot_be_used_are_a_warning(tmp_path: Path, name: st
 def test_points_named_on_another_machine(tmp_path: Path) -> None:
     path = captured(tmp_path, NAMES, ply_file_path="C:\\capture\\cloud\\p.ply")
     (tmp_path / "cloud").mkdir()
-    (tmp_path / "cloud" / "p.ply").touch()
+    (tmp_path / "cloud" / "p.ply").write_bytes(b"ply")
     assert sparse_file(path) == tmp_path / "cloud" / "p.ply"
 
 

@@ -52,7 +52,7 @@ def test_cameras_json_with_photos(tmp_path: Path) -> None:
     found = read_view_set(path, images=tmp_path / "photos")
     assert found.cameras.names == ("001", "002", "003")
     assert [p.name for p in found.cameras.image_paths if p] == ["001.jpg", "002.jpg", "003.jpg"]
-    assert [note.code for note in found.notes] == ["missing_photos"]
+    assert [note.code for note in found.notes] == ["other_size", "missing_photos"]
     assert (found.cameras.widths[0], found.cameras.heights[0]) == (80, 60)
     assert found.cameras.Ks[0].tolist() == [[35, 0, 40], [0, 35.5, 30], [0, 0, 1]]
 
