@@ -13,7 +13,9 @@ from typing import Any, Literal
 
 from g2ard.config.choices import BLACK, Colour
 from g2ard.errors import InputError
+from g2ard.io.finding import usable
 from g2ard.io.paths import check_regular
+from g2ard.io.signs import Sign, foreign, sign_of
 
 Kind = Literal["splats", "points", "views"]
 
@@ -34,6 +36,7 @@ READERS: dict[Kind, dict[str, tuple[str, ...]]] = {
         "las": (".las", ".laz"),
         "e57": (".e57",),
         "points3d": ("points3d.bin", "points3d.txt"),
+        "cloud_text": (".pcd", ".xyz", ".pts", ".asc"),
     },
     "views": {
         "views": (),
@@ -91,23 +94,11 @@ _OTHER_KINDS: dict[tuple[Kind, Kind], str] = {
 }
 """Hints by the expected and the found kind of a file."""
 
-_CONVERTERS = {
-    ".lcc": "`splat-transform scene.lcc scene.ply` (npm: @playcanvas/splat-transform) converts it",
-    **dict.fromkeys(
-        (".zip", ".7z", ".rar", ".tar", ".gz", ".tgz"), "unpack the archive and give the file or folder in it"
-    ),
-    **{
-        suffix: f"`pdal translate cloud{suffix} cloud.ply` (pdal.io) converts it"
-        for suffix in (".pcd", ".pts", ".ptx", ".xyz", ".asc")
-    },
-    ".rad": "convert the scene that it was built from; Spark builds .rad files from .ply, .spz or .sog",
-}
-"""Advice for scenes of other programs and for archives."""
-
 MANIFEST, POINTS = "tiles.json", ".points"
 """Files of finished and unfinished folders of tiles, and their folder of points to lift."""
 
 _MOST_INSPECTED_FILES = 64  # maximum files of a folder to inspect for suggestions
+_MOST_SEARCHED_FILES = 256  # maximum files of a folder and those below to look for signs of other programs
 
 
 def kind(path: str | Path) -> Kind:
@@ -156,36 +147,46 @@ def reader(path: str | Path, expected: Kind) -> tuple[Path, Any]:
 def _of_file(path: Path, modified: int, size: int) -> str:
     """Return the format of a file, looked into once until it is modified or has another size."""
     suffix = path.suffix.lower()
+    _check_content(path)
+    if path.name.lower() == "meta.json":
+        _by_gsplat(path.parent)
     if found := _BY_NAME.get(path.name.lower()) or _BY_NAME.get(suffix):
-        _check_content(path, suffix)
         return found
     if suffix == ".ply":
         return _ply_format(path)
     if suffix == ".json":
         return _json_format(path)
-    if suffix in _CONVERTERS:
-        raise InputError(f"{suffix[1:].upper()} files are not supported", path=path, hint=_CONVERTERS[suffix])
+    if suffix in (".txt", ".csv", ""):
+        from g2ard.io.cloud_text import holds_points
+
+        if holds_points(path):
+            return "cloud_text"
     raise InputError(
         f"unknown format {path.suffix!r} (scenes: .ply .sog .spz .glb .gltf .splat .ksplat .usda .usdc; "
-        "point clouds: .ply .las .laz .e57; views: a COLMAP folder, a .json, or a training run)",
+        "point clouds: .ply .las .laz .e57 .pcd .xyz; views: a COLMAP folder, a .json, or a training run)",
         path=path,
     )
 
 
-def _check_content(path: Path, suffix: str) -> None:
-    """Reject a file of another format than its name says, if its first bytes tell."""
-    if path.name.lower() == "meta.json":
-        _by_gsplat(path.parent)
-    with path.open("rb") as file:
-        held = _BY_CONTENT.get(file.read(4))
-    if held is not None and suffix in (".sog", ".spz", ".glb", ".splat", ".ksplat") and held != suffix:
-        raise InputError(
-            f"is a {held} file in spite of its name", path=path, hint=f"rename it to {path.stem}{held}"
-        )
+def _check_content(path: Path) -> None:
+    """Reject a file of another program, or of another format than its name says."""
+    sign, suffix = sign_of(path), path.suffix.lower()
+    if sign is None:
+        return
+    if not sign.reads:
+        raise sign.error(path)
+    if suffix in _OWN and sign.reads not in _OWN[suffix]:
+        hint = f"rename it to {path.stem}{sign.reads}"
+        raise InputError(f"is {sign.what} in spite of its name", path=path, hint=hint)
 
 
-_BY_CONTENT = {b"ply\n": ".ply", b"ply\r": ".ply", b"PK\x03\x04": ".sog", b"glTF": ".glb", b"NGSP": ".spz"}
-"""First bytes of formats → their suffix."""
+_OWN = {
+    **{suffix: (suffix,) for suffix in (".ply", ".sog", ".spz", ".glb", ".splat", ".ksplat", ".e57", ".pcd")},
+    **dict.fromkeys((".las", ".laz"), (".las",)),
+    **dict.fromkeys((".json", ".txt", ".csv", ".xyz", ".pts", ".asc", ".gltf"), ()),
+    **dict.fromkeys((".usd", ".usda", ".usdc", ".usdz"), (".usda", ".usdc", ".usdz")),
+}
+"""Suffixes of formats, and which of those that content tells they may have."""
 
 
 def run_scene(path: str | Path) -> Path:
@@ -223,7 +224,7 @@ def holds(name: str, folder: Path) -> bool:
     files = _FOLDERS[name]
     if files is None:
         return bool(import_module(f"g2ard.io.{name}").holds(folder))
-    return any((folder / file).is_file() for file in files)
+    return any(usable(folder / file) and foreign(folder / file) is None for file in files)
 
 
 def json_format(content: Any) -> str | None:
@@ -296,7 +297,7 @@ def _folder_format(path: Path) -> str:
 
     if (path / MANIFEST).is_file():
         return "tiles"
-    if (chunks := chunks_of(path)) and not _by_gsplat(chunks[0]):
+    if (chunks := chunks_of(path)) and not (chunks[0].is_dir() and _by_gsplat(chunks[0])):
         return "sog"
     if name := next((name for name in _FOLDERS if holds(name, path)), None):
         return name
@@ -353,9 +354,9 @@ def _instead(path: Path) -> str:
         return f"; give one of its runs: {', '.join(runs[:5])}"
     if models := models_below(path):
         return f"; give {models[0]}, which has a COLMAP model"
-    foreign = [file for file in sorted(path.iterdir()) if file.suffix.lower() in _CONVERTERS]
-    if foreign:
-        return f"; it has {foreign[0].name}: {_CONVERTERS[foreign[0].suffix.lower()]}"
+    if found := _foreign_in(path):
+        file, sign = found
+        return f"; {file.relative_to(path)} is {sign.what}: {sign.todo}"
     for place in (path / "images", path):
         photos = _photos_in(place)
         if not photos:
@@ -373,6 +374,17 @@ def _instead(path: Path) -> str:
         "cameras.json, LLFF's poses_bounds.npy, Polycam's keyframes, nerfstudio's and gsplat's runs, "
         "Cambridge's dataset_train.txt)"
     )
+
+
+def _foreign_in(path: Path) -> tuple[Path, Sign] | None:
+    """Return a file of another program in a folder or up to two levels below, poses first."""
+    from g2ard.io.finding import is_a_photo
+
+    levels = ("*", "*/*", "*/*/*")
+    files = (file for level in levels for file in sorted(path.glob(level)) if not is_a_photo(file))
+    signs = ((file, foreign(file)) for file in islice(filter(usable, files), _MOST_SEARCHED_FILES))
+    found = [(file, sign) for file, sign in signs if sign is not None]
+    return min(found, key=lambda pair: not pair[1].poses, default=None)
 
 
 def _photos_in(folder: Path) -> list[Path]:
@@ -399,12 +411,13 @@ def _poses_above(path: Path) -> Path | None:
 
 
 def _ply_format(path: Path) -> str:
-    from g2ard.io.plyfiles import read_header, scene_names
+    from g2ard.io.plyfiles import groups_of, read_header, scene_names
 
     header = read_header(path)
-    if "vertex" not in header.counts:
+    group = groups_of(header)[-1]
+    if group not in header.counts:
         raise InputError("has no 'vertex' element", path=path)
-    properties = scene_names(header.properties("vertex"))
+    properties = scene_names(header.properties(group))
     if "packed_position" in properties:
         return "compressed_ply"
     scene_words = ("f_dc_", "rot_", "scale_", "opacity")

@@ -29,7 +29,7 @@ from g2ard.io.paths import check_regular, decoded
 from g2ard.io.sanitize import Raw, cleaned
 from g2ard.io.types import Note, Scene
 from g2ard.progress import plural
-from g2ard.scene.splats import Splats
+from g2ard.scene.splats import SH_C0, Splats
 from g2ard.scene.transform import deformed, harmonic_signs, join, rotation_matrices
 
 EXTENSION = "KHR_gaussian_splatting"
@@ -389,18 +389,29 @@ def _attributes_of(place: Place, document: _Document, binary: bytes, names: dict
             place.to(name), document, binary, checked(names[name], Whole, place.to(name)), name, width
         )
 
+    own, draft = list(names), f"{EXTENSION}:SCALE" not in names and "_SCALE" in names
+    if draft:  # the extension's first draft
+        names = {
+            f"{EXTENSION}:{name[1:]}" if name.startswith("_") else name: at for name, at in names.items()
+        }
     degree = max(d for d in range(4) if d == 0 or f"{EXTENSION}:SH_DEGREE_{d}_COEF_0" in names)
     means = values("POSITION", 3)
     raw = Raw.empty(len(means), (degree + 1) ** 2 - 1)
     scales, notes = values(f"{EXTENSION}:SCALE", 3), []
-    raw.set_linear(scales, values(f"{EXTENSION}:OPACITY", 1)[:, 0])
+    color = values("COLOR_0", 4) if f"{EXTENSION}:SH_DEGREE_0_COEF_0" not in names and draft else None
+    raw.set_linear(scales, values(f"{EXTENSION}:OPACITY", 1)[:, 0] if color is None else color[:, 3])
+    if draft:
+        text = f"written by the first draft of {EXTENSION} ({', '.join(own)})"
+        notes.append(Note("first_draft", len(means), text))
     if (scales < 0).any():
         notes.append(Note("log_scales", len(scales), "scales are below 0, so all are taken as logarithms"))
         raw.log_scales[:] = scales
     with np.errstate(invalid="ignore"):  # a signalling NaN
         raw.means[:] = means * _GLTF_TURN
         raw.quats[:] = values(f"{EXTENSION}:ROTATION", 4)[:, [3, 0, 1, 2]] * (1, *_GLTF_TURN)
-        raw.sh0[:, 0] = values(f"{EXTENSION}:SH_DEGREE_0_COEF_0", 3)
+        raw.sh0[:, 0] = (
+            values(f"{EXTENSION}:SH_DEGREE_0_COEF_0", 3) if color is None else (color[:, :3] - 0.5) / SH_C0
+        )
         for name, k in _harmonics(degree):
             raw.shN[:, k] = values(name, 3) * _SH_FLIPS[k]
     return cleaned(place.path, raw, notes)

@@ -89,7 +89,14 @@ def read_any_json(path: Path) -> Any:
 
 
 def parse_json(path: Path, text: str) -> Any:
-    """Return the content of JSON text; `path` is for errors."""
+    """Return the content of JSON text; `path` is for errors.
+
+    Text in another character set than UTF-8 becomes Latin 1, in which names of files can be found.
+    """
+    try:
+        text.encode()
+    except UnicodeEncodeError:
+        text = text.encode("utf-8", "surrogateescape").decode("latin-1")
     try:
         return json.loads(text)
     except json.JSONDecodeError as error:

@@ -3,6 +3,7 @@
 import codecs
 import hashlib
 import os
+import re
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from pathlib import Path, PurePosixPath, PureWindowsPath
@@ -66,6 +67,28 @@ def decoded(path: Path, data: bytes) -> str:
     if "\0" in text:
         raise InputError("not a text file", path=path)
     return text
+
+
+def plain_numbers(text: str) -> str:
+    """Return text in columns with the numbers that Python reads, separated by blanks.
+
+    Decimal commas, further separators, and what Windows writes for numbers that are not finite are replaced.
+
+    >>> plain_numbers("1,5;2;-nan(ind)"), plain_numbers("1.5,2, 1.#QNAN"), plain_numbers("1,2,3")
+    ('1.5 2 nan', '1.5 2  nan', '1 2 3')
+    """
+    sample = text[:_SAMPLE]
+    decimal = (
+        re.search(r"\d,\d", sample) and not re.search(r"\d\.\d", sample) and re.search(r"\d[;\t ]", sample)
+    )
+    text = re.sub(r"(?<=\d),(?=\d)", ".", text) if decimal else text
+    text = text.replace(",", " ").replace(";", " ")
+    return NOT_FINITE.sub("nan", text) if re.search(r"nan\(|#", text, re.IGNORECASE) else text
+
+
+_SAMPLE = 1 << 14  # characters that tell whether commas are decimal
+NOT_FINITE = re.compile(r"[+-]?(nan\([^)\s]*\)|\d\.#\w+)", re.IGNORECASE)
+"""Numbers that are not finite, as C and C++ write them on Windows."""
 
 
 def short_names(paths: Sequence[Path]) -> list[str]:

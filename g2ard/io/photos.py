@@ -27,6 +27,7 @@ from g2ard.io.finding import (
 )
 from g2ard.io.jsonfile import Place
 from g2ard.io.paths import check_regular
+from g2ard.io.signs import PHOTOS, foreign
 from g2ard.io.types import Note, ViewSet
 from g2ard.progress import plural
 from g2ard.scene.cameras import LARGEST_IMAGE, USUAL, Cameras, check_image
@@ -392,19 +393,10 @@ def unreadable(photo: Path) -> str | None:
     if (by_suffix := other_photo(photo)) is not None:
         return by_suffix
     with suppress(OSError), photo.open("rb") as file:
-        head = file.read(40)
-        if head[4:8] == b"ftyp" and head[8:12] in _HEIF_BRANDS:
-            return "HEIC"
-        return next((what for start, what in _OTHER_STARTS.items() if head.startswith(start)), None)
-    return None
-
-
-_HEIF_BRANDS = (b"heic", b"heix", b"heim", b"heis", b"hevc", b"mif1", b"msf1")
-_OTHER_STARTS = {
-    b"v/1\x01": "OpenEXR",
-    b"\0\0\0\x0cJXL ": "JPEG XL",
-    b"version https://git-lfs": "a pointer of Git LFS (`git lfs pull` gets the photos)",
-}
+        if file.read(8).startswith(PHOTOS):
+            return None
+    sign = foreign(photo)
+    return None if sign is None else f"{sign.what} ({sign.todo})"
 
 
 def pictured(found: ViewSet) -> ViewSet:

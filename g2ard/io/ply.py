@@ -42,7 +42,8 @@ class Stream(RawStream):
 
     def __init__(self, path: Path) -> None:
         header = plyfiles.read_header(path)
-        names = plyfiles.scene_names(header.properties("vertex"))
+        groups = plyfiles.groups_of(header)
+        names = plyfiles.scene_names(header.properties(groups[-1]))
         mode = plyfiles.render_model_of(header.comments)
         rgb = next((names_ for names_ in plyfiles.COLOR_NAMES if set(names_) <= set(names)), None)
         self._rgb = rgb if rgb and not any(name in names for name in _DC) else None
@@ -57,7 +58,7 @@ class Stream(RawStream):
         plyfiles.require(path, list(names), needed, "a 3DGS scene")
         rest = sorted((p for p in names if re.fullmatch(r"f_rest_\d{1,3}", p)), key=lambda p: int(p[7:]))
         stored, kept = _bands(path, rest)
-        (rows,) = plyfiles.read_element(path, header, "vertex")
+        rows = _joined(plyfiles.read_element(path, header, *groups))
         self._names, self._path, self._rows = names, path, rows
         shift = np.zeros(3)
         if rows.dtype[names["x"]].itemsize == 8:
@@ -136,6 +137,22 @@ class Stream(RawStream):
                 raw.shN[:, :, channel] = bands[:, channel, : self._kept]
 
 
+def _joined(groups: list[NDArray[Any]]) -> NDArray[Any]:
+    """Return groups of rows as one, with zeros for harmonics past their degrees; the last has the most."""
+    if len(groups) == 1:
+        return groups[0]
+    rows, at = np.zeros(sum(map(len, groups)), groups[-1].dtype), 0
+    most = sum(name.startswith("f_rest_") for name in rows.dtype.names or ()) // 3
+    for group in groups:
+        names = group.dtype.names or ()
+        own = sum(name.startswith("f_rest_") for name in names) // 3
+        for name in names:  # harmonics are stored channel after channel
+            k = int(name[7:]) if name.startswith("f_rest_") else -1
+            rows[name if k < 0 else f"f_rest_{k // own * most + k % own}"][at : at + len(group)] = group[name]
+        at += len(group)
+    return rows
+
+
 def _widen(raw: Raw, size: NDArray[np.float64]) -> None:
     """Apply the 3D filter of Mip-Splatting of (n,) sizes f: σ² + f², and α·√(Πσ² / Π(σ² + f²))."""
     before = 2 * raw.log_scales.astype(np.float64)
@@ -186,8 +203,8 @@ def _range(seen: tuple[float, float], values: NDArray[Any]) -> tuple[float, floa
 
 def _frames(header: plyfiles.PlyHeader) -> list[Note]:
     """Return a note on elements with changes of the Gaussians over time."""
-    count = header.counts["vertex"]
-    moving = [name for name, rows in header.counts.items() if name != "vertex" and rows == count > 1]
+    count, groups = header.counts.get("vertex"), plyfiles.groups_of(header)
+    moving = [name for name, rows in header.counts.items() if name not in groups and rows == count != 1]
     if not moving:
         return []
     names = ", ".join(moving[:3]) + (", …" if len(moving) > 3 else "")

@@ -15,6 +15,7 @@ from plyfile import PlyData, PlyElement, PlyElementParseError, PlyListProperty, 
 from g2ard.config.choices import RenderModel
 from g2ard.errors import InputError, damaged
 from g2ard.io.atomic import atomic_output
+from g2ard.io.paths import plain_numbers
 
 _OFFSET_COMMENT = re.compile(r"g2ard offset (\S+) (\S+) (\S+)$")
 _VERTICAL_AXIS = re.compile(r"vertical (a)xis\s*[:=]?\s*(.+)", re.IGNORECASE)
@@ -112,6 +113,12 @@ def scene_names(properties: Sequence[str]) -> dict[str, str]:
     return found
 
 
+def groups_of(header: PlyHeader) -> list[str]:
+    """Return the element of vertices, or those of reduced-3dgs for the SH degrees, vertex_0 and on."""
+    groups = sorted(name for name in header.counts if re.fullmatch(r"vertex_\d", name))
+    return ["vertex"] if "vertex" in header.counts or not groups else groups
+
+
 def offset_of(path: Path, header: PlyHeader) -> NDArray[np.float64]:
     """Return the (3,) offset of a comment `g2ard offset X Y Z`; zeros without one."""
     for comment in header.comments:
@@ -182,7 +189,7 @@ def comments_of(
     return comments + (["SplatRenderMode: mip"] if render_model == "antialiased" else [])
 
 
-def read_element(path: Path, header: PlyHeader, *names: str) -> list[NDArray[Any]]:
+def read_element(path: Path, header: PlyHeader, *names: str, plain: bool = False) -> list[NDArray[Any]]:
     """Return an array of rows per element name, memory-mapped if the file is binary.
 
     Lists are first read as triangles, since lists of a known length can be mapped; if a polygon has another
@@ -198,12 +205,14 @@ def read_element(path: Path, header: PlyHeader, *names: str) -> list[NDArray[Any
     }
     try:
         try:
-            ply = _read(path, header, triangles)
+            ply = _read(path, header, triangles, plain)
         except PlyElementParseError:
             if not any(triangles.values()):
                 raise
-            ply = _read(path, header, {})
+            ply = _read(path, header, {}, plain)
     except PlyElementParseError as error:
+        if header.elements.text and not plain:  # numbers of other languages or of Windows
+            return read_element(path, header, *names, plain=True)
         name = error.element.name
         raise damaged(
             f"of {header.counts.get(name, 0)} cannot be read ({error.message})",
@@ -217,8 +226,13 @@ def read_element(path: Path, header: PlyHeader, *names: str) -> list[NDArray[Any
     return [ply[name].data for name in names]
 
 
-def _read(path: Path, header: PlyHeader, list_lengths: dict[str, dict[str, int]]) -> PlyData:
+def _read(
+    path: Path, header: PlyHeader, list_lengths: dict[str, dict[str, int]], plain: bool = False
+) -> PlyData:
     with _Plain(path, header.span) as file:
+        if plain:
+            head, body = file.read(len(header.span)), file.read().decode("latin-1")
+            return PlyData.read(io.BytesIO(head + plain_numbers(body).encode("latin-1")))
         return PlyData.read(file, mmap="r", known_list_len=list_lengths)
 
 

@@ -13,6 +13,7 @@ from g2ard.errors import InputError, OutputError
 from g2ard.io.atomic import atomic_output, check_output
 from g2ard.io.detect import file_format, reader
 from g2ard.io.scene_formats import Rounding, check_options, lost_in, scene_format
+from g2ard.io.signs import explained
 from g2ard.progress import Progress, Say, silent
 
 if TYPE_CHECKING:
@@ -48,6 +49,7 @@ def read_splats(path: str | Path, *, render_model: RenderModel | None = None) ->
     return read_scene(path, render_model=render_model).splats
 
 
+@explained
 def read_scene(path: str | Path, *, render_model: RenderModel | None = None) -> Scene:
     """Read a Gaussian scene with notes on dropped rows, clamped values and ignored properties."""
     path, module = reader(path, "splats")
@@ -57,6 +59,7 @@ def read_scene(path: str | Path, *, render_model: RenderModel | None = None) -> 
     return replace(scene, splats=replace(scene.splats, render_model=render_model))
 
 
+@explained
 def open_stream(
     path: str | Path | Sequence[str | Path], *, render_model: RenderModel | None = None
 ) -> SceneStream:
@@ -231,6 +234,7 @@ def read_cloud(path: str | Path) -> Cloud:
     return open_point_stream(path).whole()
 
 
+@explained
 def open_point_stream(path: str | Path | Sequence[str | Path]) -> PointStream:
     """Open a coloured point cloud, or several as one, for reading in blocks.
 

@@ -11,7 +11,7 @@ import struct
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -337,7 +337,7 @@ def _listed(index: Path) -> list[Path]:
     """Return the chunks that lod-meta.json's tree uses at level 0, in the order of its list, and the sky."""
     content = checked(read_json(index), _Levels, Place(index))
     names, sky = content.filenames, content.environment
-    files = [index.parent / Path(name).parent for name in names]
+    files = [_chunk_at(index.parent / name) for name in names]
     used: set[int] = set()
     nodes = [(content.tree, Place(index).to("tree"))]
     while nodes:
@@ -352,15 +352,20 @@ def _listed(index: Path) -> list[Path]:
     for i in sorted(used):
         place = Place(index).to("filenames", i)
         try:
-            there = (files[i] / "meta.json").is_file()
+            there = files[i].is_file() or (files[i] / "meta.json").is_file()
         except OSError as error:  # a name too long
             raise place.error(f"cannot be found ({error.strerror})") from error
         if not there:
             raise place.error(f"is {names[i]}, which does not exist")
     chunks = [files[i] for i in sorted(used)]
     if sky and (index.parent / sky).is_file():
-        chunks.append((index.parent / sky).parent)
+        chunks.append(_chunk_at(index.parent / sky))
     return chunks
+
+
+def _chunk_at(file: Path) -> Path:
+    """Return the place of a chunk: its archive, or the folder of its meta.json."""
+    return file if file.suffix.lower() == ".sog" else file.parent
 
 
 def _offset(chunks: list[_Chunk]) -> NDArray[np.float64]:
@@ -400,8 +405,8 @@ class Stream(RawStream):
     def identity(self) -> list[Any]:
         if self.path.suffix.lower() == ".sog":
             return file_identity([self.path])
-        files = (file for folder in chunks_of(self.path) for file in folder.iterdir() if file.is_file())
-        return file_identity(sorted(files))
+        places = (place.iterdir() if place.is_dir() else [place] for place in chunks_of(self.path))
+        return file_identity(sorted(file for files in places for file in files if file.is_file()))
 
     def positions(self, rows: int) -> Iterator[NDArray[np.float32]]:
         with _opened(self.path) as chunks:
@@ -421,15 +426,23 @@ class Stream(RawStream):
 
 @contextmanager
 def _opened(path: Path) -> Iterator[list[_Chunk]]:
-    if path.suffix.lower() != ".sog":
-        yield [_Chunk(folder, folder) for folder in chunks_of(path)]
+    places = [path] if path.suffix.lower() == ".sog" else chunks_of(path)
+    with ExitStack() as opened:
+        yield [opened.enter_context(_chunk(place)) for place in places]
+
+
+@contextmanager
+def _chunk(path: Path) -> Iterator[_Chunk]:
+    """Open a chunk: an archive, or a folder."""
+    if path.is_dir():
+        yield _Chunk(path, path)
         return
     try:
         with zipfile.ZipFile(path) as bundle:
             inside = [name for name in bundle.namelist() if name.rpartition("/")[2] == "meta.json"]
             if not inside:
                 raise InputError("has no meta.json", path=path)
-            yield [_Chunk(path, zipfile.Path(bundle, min(inside, key=len).removesuffix("meta.json")))]
+            yield _Chunk(path, zipfile.Path(bundle, min(inside, key=len).removesuffix("meta.json")))
     except InputError:
         raise
     except (zipfile.BadZipFile, EOFError, OSError, ValueError, struct.error, OverflowError) as error:

@@ -8,11 +8,16 @@ import numpy as np
 from g2ard.errors import InputError, damaged
 from g2ard.io.atomic import atomic_output
 from g2ard.io.packing import as_bytes, world_means, writable
+from g2ard.io.plyfiles import spread_rows
 from g2ard.io.sanitize import Raw
 from g2ard.io.stream import RawStream
 from g2ard.scene.splats import SH_C0, Splats, unit_quats
 
 _ROW = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
+
+
+_FAR, _POSSIBLE = 1e18, 0.75  # largest scale, and least share of rows with possible values
+_READ, _TEXT = 128, [*range(9, 14), *range(32, 127)]  # rows, and bytes that are all of a text
 
 
 class Stream(RawStream):
@@ -23,6 +28,14 @@ class Stream(RawStream):
         if not size or size % _ROW.itemsize:
             text = f"is not a complete .splat: {size:,} bytes are not a multiple of 32"
             raise damaged(text, path=path)
+        rows = spread_rows(np.memmap(path, _ROW, "r"))
+        with np.errstate(invalid="ignore"):
+            right = np.isfinite(rows["mean"]).all(1) & ((rows["scale"] >= 0) & (rows["scale"] < _FAR)).all(1)
+        words = bool(np.isin(np.frombuffer(rows[:_READ].tobytes(), "u1"), _TEXT).all())
+        if words or right.mean() < _POSSIBLE:
+            what = "text" if words else f"{1 - right.mean():.0%} of its rows are impossible"
+            hint = "rename it to the suffix of its format, or export it again"
+            raise InputError(f"is not a .splat: {what}", path=path, hint=hint)
         super().__init__(path, size // _ROW.itemsize)
 
     def raw(self, rows: int, start: int) -> Iterator[Raw]:

@@ -12,6 +12,7 @@ from g2ard.config.choices import ViewFormat
 from g2ard.errors import InputError, OutputError
 from g2ard.io.atomic import atomic_folder, atomic_output, check_output
 from g2ard.io.detect import reader, run_views
+from g2ard.io.signs import explained
 from g2ard.progress import plural
 
 if TYPE_CHECKING:
@@ -104,6 +105,7 @@ def read_views(path: str | Path, *, images: str | Path | None = None, split: str
     return read_view_set(path, images=images, split=split).cameras
 
 
+@explained
 def read_view_set(
     path: str | Path | ViewFiles,
     *,

@@ -21,7 +21,9 @@ from g2ard.io.cambridge import read_ace
 from g2ard.io.detect import file_format
 from g2ard.io.finding import photos_in
 from g2ard.io.photos import exif_focal, fits, has_alpha, photo_size
+from g2ard.io.signs import explained
 from g2ard.jobs.inputs import load_scene
+from g2ard.jobs.trajectory import is_trajectory, read_trajectory
 from g2ard.jobs.view_checks import propose_background
 from g2ard.pipeline.presets import GS_CPR
 from g2ard.poses import plan_pool
@@ -323,6 +325,7 @@ def _suits(file: Path, size: tuple[int, int], like: tuple[int, int]) -> bool:
     return fits(size, like)
 
 
+@explained
 def read_poses(path: Path) -> dict[str, NDArray[np.float64]]:
     """Read name → (4, 4) camera_from_world from views in any format, or from ACE's text (`read_ace`)."""
     if path.suffix.lower() == ".txt" and path.is_file():
@@ -332,7 +335,9 @@ def read_poses(path: Path) -> dict[str, NDArray[np.float64]]:
 
 
 def poses_for(path: Path, names: Sequence[str]) -> dict[str, NDArray[np.float64]]:
-    """Read the poses of the named photos, see `read_poses` and `matched`."""
+    """Read the poses of the named photos, see `read_poses` and `matched`, or those of a trajectory."""
+    if is_trajectory(path):
+        return read_trajectory(path, names)
     found = matched(read_poses(path), names)
     if not found:
         raise InputError(f"no pose has the name of a photo (the first photo is {names[0]})", path=path)

@@ -41,7 +41,7 @@ def test_errors_point_to_the_poses_of_photos(folder: Path) -> None:
     (folder / "scan" / "cameras.json").unlink()
     (folder / "scan" / "sparse" / "0").mkdir(parents=True)
     for name in ("cameras.bin", "images.bin"):
-        (folder / "scan" / "sparse" / "0" / name).touch()
+        (folder / "scan" / "sparse" / "0" / name).write_bytes(bytes(8))
     with pytest.raises(InputError, match=r"give .*scan, which has the poses of its photos$"):
         g2ard.load_views(shots)
 

@@ -1,13 +1,21 @@
 """Files and folders of other programs are named for what they are."""
 
+import gzip
+import io
 import json
+import re
+import zipfile
 from pathlib import Path
 
+import numpy as np
 import pytest
 from PIL import Image
 
 from g2ard.errors import InputError
-from g2ard.io import kind, read_cloud, read_scene
+from g2ard.io import kind, read_scene
+from g2ard.io.signs import SIGNS, Sign, sign_of
+from g2ard.io.view_sets import read_view_set
+from helpers.view_files import colmap, orbit
 
 TILESET = {"asset": {"version": "1.1"}, "geometricError": 9, "root": {"children": []}}
 
@@ -46,28 +54,90 @@ def test_pngs_of_gsplat(tmp_path: Path, given: str, name: str, names: list[str],
         read_scene(tmp_path / name / given)
 
 
-@pytest.mark.parametrize("suffix", [".lcc", ".LCC", ".zip", ".7z", ".rad", ".pcd"])
-@pytest.mark.parametrize("beside", [[], ["data.bin", "attrs.lcp"]])
-def test_folders_with_a_file_of_another_program(tmp_path: Path, suffix: str, beside: list[str]) -> None:
-    for name in [f"room{suffix}", *beside]:
-        (tmp_path / name).write_bytes(b"x")
-    for path in (tmp_path, tmp_path / f"room{suffix}"):
+def sample(sign: Sign) -> tuple[str, bytes]:
+    """Return the name and the content of a file of this kind, made from its row."""
+    name = sign.names.split()[0].replace("*", "a")
+    content = b"\0\7" if sign.names != "*" and not (sign.starts or sign.words) else b" ".join(sign.words)
+    if sign.words and sign.words[0].startswith(b"numbers:"):
+        times = [
+            f"{i} 2 3 4 0 0 0 1" if b"unit" in sign.words[0] else f"1 0 0 {i} 0 1 0 3 0 0 1 4"
+            for i in range(4)
+        ]
+        return name, "\n".join(times).encode()
+    if sign.starts[:1] == (b"PK\3\4",) and sign.words:
+        packed = io.BytesIO()
+        with zipfile.ZipFile(packed, "w") as bundle:
+            for word in sign.words:
+                bundle.writestr(word.decode(), b"")
+        return name, packed.getvalue()
+    if sign.starts == (b"\x1f\x8b",):
+        return name, gzip.compress(content)
+    return name, bytes(sign.at) + (sign.starts[0] if sign.starts else b"") + b" " * bool(content) + content
+
+
+@pytest.mark.parametrize("sign", SIGNS, ids=lambda sign: f"{sign.what} {sign.names}"[:60])
+def test_every_kind_is_told_from_its_row(tmp_path: Path, sign: Sign) -> None:
+    name, content = sample(sign)
+    file = tmp_path / (name if name != "*" and "." in name else "thing.dat")
+    file.write_bytes(content)
+    assert sign_of(file) == sign
+    if sign.reads:
+        return
+    for path in (file, tmp_path):  # itself, and in a folder
         with pytest.raises(InputError) as caught:
             kind(path)
-        assert suffix.strip(".").lower() in str(caught.value).lower()
-        assert "looked for" not in str(caught.value)
-        assert "unknown format" not in str(caught.value)
+        assert sign.what in str(caught.value)
+        assert sign.todo in str(caught.value)
+        assert "estimate them with" not in str(caught.value)
 
 
-CONVERTERS = {
-    **dict.fromkeys((".pcd", ".pts", ".ptx", ".xyz"), "pdal translate"),
-    **{".lcc": "splat-transform", ".rad": "Spark"},
-}
+@pytest.mark.parametrize("sign", [sign for sign in SIGNS if sign.poses], ids=lambda sign: sign.what[:60])
+def test_poses_beside_photos_are_named(tmp_path: Path, sign: Sign) -> None:
+    name, content = sample(sign)
+    (tmp_path / "images").mkdir()
+    Image.new("RGB", (8, 6)).save(tmp_path / "images" / "a.png")
+    (tmp_path / "deep" / "er").mkdir(parents=True)
+    (tmp_path / "deep" / "er" / (name if "." in name else "cameras.txt")).write_bytes(content)
+    with pytest.raises(InputError, match=re.escape(sign.what)) as caught:
+        kind(tmp_path)
+    assert "estimate them" not in str(caught.value)
 
 
-@pytest.mark.parametrize("suffix", CONVERTERS)
-def test_a_format_that_is_not_read_names_what_converts_it(suffix: str, tmp_path: Path) -> None:
-    (tmp_path / f"a{suffix}").write_text("1 2 3 255 0 0\n")
-    for read in (read_scene, read_cloud):
-        with pytest.raises(InputError, match=rf"a\{suffix}: .*{CONVERTERS[suffix]}"):
-            read(tmp_path / f"a{suffix}")
+POINTER = b"version https://git-lfs.github.com/spec/v1\noid sha256:0123\nsize 15600213\n"
+NAMES = "a.ply a.splat a.ksplat a.spz a.sog a.glb a.gltf a.usdc a.las a.laz a.e57 a.pcd a.xyz a.txt a.json"
+TABLES = (
+    "meta.json cameras.bin images.bin points3D.bin cameras.json transforms.json poses_bounds.npy config.yml"
+)
+
+
+@pytest.mark.parametrize("name", f"{NAMES} {TABLES}".split())
+@pytest.mark.parametrize("content", [POINTER, b"\n<!DOCTYPE html>\n<html>"], ids=["lfs", "html"])
+def test_pointers_and_pages_in_place_of_any_file(tmp_path: Path, name: str, content: bytes) -> None:
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(InputError, match=r"LFS|HTML"):
+        kind(tmp_path / name)
+
+
+def test_pointers_beside_the_given_file(tmp_path: Path) -> None:
+    colmap(tmp_path, orbit(4), text=False)
+    (tmp_path / "sparse" / "0" / "images.bin").write_bytes(POINTER)
+    with pytest.raises(InputError, match=r"images\.bin: is a pointer of Git LFS"):
+        read_view_set(tmp_path)
+
+
+@pytest.mark.parametrize("sign", [sign for sign in SIGNS if sign.reads], ids=lambda sign: sign.reads)
+def test_a_splat_of_another_format_is_named(tmp_path: Path, sign: Sign) -> None:
+    content = sample(sign)[1]
+    (tmp_path / "a.splat").write_bytes(content + bytes(-len(content) % 32))
+    with pytest.raises(InputError, match=re.escape(sign.what)):
+        read_scene(tmp_path / "a.splat")
+
+
+@pytest.mark.parametrize("what", ["text", "noise"])
+def test_a_splat_of_impossible_values_is_refused(tmp_path: Path, what: str) -> None:
+    noise = np.random.default_rng(0).integers(0, 256, 3200, dtype=np.uint8).tobytes()
+    (tmp_path / "a.splat").write_bytes(
+        noise if what == "noise" else b"a row of a table of words, and 1" * 100
+    )
+    with pytest.raises(InputError, match=r"is not a \.splat"):
+        read_scene(tmp_path / "a.splat")

@@ -77,7 +77,7 @@ DAMAGES: list[tuple[str, Callable[[bytes], bytes], str]] = [
         for keep in (0, 20, 300, -30)
     ),
     ("scene", lambda data: b"", "is empty"),
-    ("scene", lambda data: b"PK\x03\x04 a zip", "not a PLY"),
+    ("scene", lambda data: b"PK\x03\x04 a zip", "an archive"),
     ("scene", lambda data: b"plywood\n", "not a PLY"),
     ("scene", lambda data: PLY + b"element vertex 3\n", "end_header"),
     ("scene", lambda data: PLY + b"element vertex many\nend_header\n", "line 3"),

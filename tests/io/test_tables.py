@@ -1,0 +1,146 @@
+"""Point clouds in tables of text and in .pcd, and trajectories of SLAM programs."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from g2ard.errors import InputError
+from g2ard.io import kind, read_cloud
+from g2ard.jobs.register import poses_for
+from helpers.view_files import orbit
+
+RNG = np.random.default_rng(3)
+XYZ = RNG.uniform(-5, 5, (40, 3)).round(3)
+RGB = RNG.integers(1, 256, (40, 3))
+GREY = RNG.integers(-2000, 2000, (40, 1))
+
+
+def written(
+    path: Path, columns: list[np.ndarray], between: str = " ", point: str = ".", top: str = ""
+) -> Path:
+    rows = np.column_stack(columns)
+    lines = [between.join(f"{value:.10g}".replace(".", point) for value in row) for row in rows]
+    path.write_text(top + "\n".join(lines) + "\n")
+    return path
+
+
+def is_cloud(path: Path) -> None:
+    assert kind(path) == "points"
+    found = read_cloud(path).points
+    np.testing.assert_array_equal(found.positions, XYZ)
+    np.testing.assert_allclose(found.colors, RGB / 255, atol=1e-6)
+
+
+@pytest.mark.parametrize("suffix", [".xyz", ".txt", ".csv", ".asc", ".pts"])
+@pytest.mark.parametrize(
+    ("between", "point"),
+    [(" ", "."), ("\t", "."), (",", "."), (", ", "."), (";", "."), (" ", ","), (";", ",")],
+)
+@pytest.mark.parametrize(
+    "top", ["", "x{0}y{0}z{0}r{0}g{0}b\n", "//X{0}Y{0}Z{0}R{0}G{0}B\n", "# a comment\n", "40\n"]
+)
+def test_six_columns(tmp_path: Path, suffix: str, between: str, point: str, top: str) -> None:
+    is_cloud(written(tmp_path / f"a{suffix}", [XYZ, RGB], between, point, top.format(between)))
+
+
+@pytest.mark.parametrize(
+    ("columns", "top"),
+    [
+        ([XYZ, GREY, RGB], ""),
+        ([XYZ, RGB, GREY], ""),
+        ([XYZ, RGB, XYZ / 9], ""),
+        ([XYZ, XYZ / 9, RGB], ""),
+        ([RGB, XYZ], "red green blue x y z\n"),
+        ([XYZ, GREY, RGB, GREY, GREY], "X Y Z Classification Red Green Blue Intensity GpsTime\n"),
+    ],
+)
+def test_further_columns(tmp_path: Path, columns: list[np.ndarray], top: str) -> None:
+    is_cloud(written(tmp_path / "a.txt", columns, top=top))
+
+
+def test_intensities_are_grey(tmp_path: Path) -> None:
+    found = read_cloud(written(tmp_path / "a.pts", [XYZ, GREY], top="40\n"))
+    assert [note.code for note in found.notes] == ["grey"]
+    assert (np.argsort(found.points.colors[:, 0], kind="stable") == np.argsort(GREY[:, 0], kind="stable"))[
+        2:-2
+    ].all()
+
+
+@pytest.mark.parametrize(
+    ("columns", "says"), [([XYZ], "no colours"), ([XYZ, GREY, GREY], "columns"), ([XYZ, XYZ - 9], "columns")]
+)
+def test_columns_that_are_not_colours_are_named(tmp_path: Path, columns: list[np.ndarray], says: str) -> None:
+    with pytest.raises(InputError, match=says):
+        read_cloud(written(tmp_path / "a.xyz", columns))
+
+
+@pytest.mark.parametrize("how", ["ascii", "binary"])
+@pytest.mark.parametrize("rgb", ["F", "U", "apart"])
+def test_pcd(tmp_path: Path, how: str, rgb: str) -> None:
+    packed = (RGB[:, 0] << 16 | RGB[:, 1] << 8 | RGB[:, 2]).astype("<u4")
+    names = ["r", "g", "b"] if rgb == "apart" else ["rgb"]
+    kinds = {"F": "<f4", "U": "<u4", "apart": "u1"}[rgb]
+    rows = np.zeros(40, [(n, "<f8") for n in "xyz"] + [("normal", "<f4", 3)] + [(n, kinds) for n in names])
+    for i, axis in enumerate("xyz"):
+        rows[axis] = XYZ[:, i]
+    for i, name in enumerate(names):
+        rows[name] = RGB[:, i] if rgb == "apart" else packed.view(kinds)
+    size, letter = np.dtype(kinds).itemsize, "U" if rgb == "apart" else rgb
+    head = f"# .PCD v0.7\nVERSION 0.7\nFIELDS x y z normal {' '.join(names)}\n"
+    head += f"SIZE 8 8 8 4{f' {size}' * len(names)}\nTYPE F F F F{f' {letter}' * len(names)}\nCOUNT 1 1 1 3{' 1' * len(names)}\nWIDTH 40\nHEIGHT 1\n"
+    head += f"VIEWPOINT 0 0 0 1 0 0 0\nPOINTS 40\nDATA {how}\n"
+    text = "\n".join(" ".join(f"{v:.9g}" for v in np.hstack([*row.item()])) for row in rows)
+    (tmp_path / "a.pcd").write_bytes(head.encode() + (rows.tobytes() if how == "binary" else text.encode()))
+    is_cloud(tmp_path / "a.pcd")
+    (tmp_path / "a.pcd").write_bytes((head + "1 2").encode())
+    with pytest.raises(InputError, match=r"a\.pcd: "):
+        read_cloud(tmp_path / "a.pcd")
+
+
+def test_packed_pcd_says_what_unpacks_it(tmp_path: Path) -> None:
+    (tmp_path / "a.pcd").write_text(
+        "FIELDS x y z rgb\nSIZE 4 4 4 4\nTYPE F F F F\nPOINTS 1\nDATA binary_compressed\n"
+    )
+    with pytest.raises(InputError, match="pcl_convert_pcd_ascii_binary"):
+        read_cloud(tmp_path / "a.pcd")
+
+
+def trajectory(path: Path, times: list[str]) -> Path:
+    lines = ["# timestamp tx ty tz qx qy qz qw"]
+    for time, view in zip(times, orbit(len(times)), strict=True):
+        world = np.linalg.inv(view)
+        if path.name == "kitti.txt":
+            lines.append(" ".join(map(repr, world[:3].ravel().tolist())))
+            continue
+        w = np.sqrt(max(1e-12, 1 + np.trace(world[:3, :3]))) / 2
+        R = world[:3, :3]
+        xyz = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]]) / (4 * w)
+        lines.append(" ".join([time, *map(repr, [*world[:3, 3].tolist(), *xyz.tolist(), float(w)])]))
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+@pytest.mark.parametrize("file", ["CameraTrajectory.txt", "traj.tum", "kitti.txt"])
+@pytest.mark.parametrize(
+    ("times", "names"),
+    [
+        ("1403636579.{}00000", "1403636579{}00000000.png"),
+        ("1403636579{}00000000", "cam0/1403636579{}00000000.png"),
+        ("1403636579.{}01", "1403636579.{}.png"),
+        ("{}", "frame_{}.png"),
+        ("17.{}", "photo {}.jpg"),
+    ],
+)
+def test_trajectories(tmp_path: Path, file: str, times: str, names: str) -> None:
+    path = trajectory(tmp_path / file, [times.format(i) for i in range(1, 7)])
+    photos = [names.format(i) for i in range(1, 7)]
+    found = poses_for(path, photos)
+    for name, view in zip(photos, orbit(6), strict=True):
+        np.testing.assert_allclose(found[name], view, atol=1e-5)
+
+
+def test_trajectories_of_other_photos_are_refused(tmp_path: Path) -> None:
+    path = trajectory(tmp_path / "a.txt", [f"14{i}.5" for i in range(6)])
+    with pytest.raises(InputError, match="trajectory of 6 poses"):
+        poses_for(path, ["a.png", "b.png"])
