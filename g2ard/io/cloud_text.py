@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from g2ard.errors import InputError, damaged
 from g2ard.io.paths import plain_numbers, read_text
+from g2ard.io.signs import is_table
 from g2ard.io.stream import MarkedPoints, PointStream, full_scales
 from g2ard.io.types import Note
 
@@ -81,6 +82,8 @@ class Stream(PointStream):
 
 def holds_points(path: Path) -> bool:
     """Return whether the first lines of a text are those of a table of points."""
+    if is_table(path):
+        return True
     with suppress(InputError, OSError), path.open("rb") as file:
         head = file.read(_HEAD).decode("utf-8-sig", "replace")
         return {"x", "y", "z"} <= set(_text(path, head.rpartition("\n")[0] or head)[0])
@@ -99,6 +102,8 @@ def _text(path: Path, text: str) -> tuple[list[str], NDArray[np.float64]]:
             names = words
         elif len(words) > 1 and not line.lstrip().startswith(("#", "/", "%")):
             break
+    if not any(map(str.isdigit, text)):
+        raise InputError("has no points", path=path)
     try:
         table = np.loadtxt(io.StringIO(text), np.float64, comments=("#", "//", "%"), skiprows=first, ndmin=2)
     except ValueError as error:

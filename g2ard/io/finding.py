@@ -184,25 +184,21 @@ def readable(names: Sequence[str], photos: Sequence[Path | None]) -> list[str]:
     >>> readable(["caf\\udce9.png"], [Path("caf\\u00e9.png")]), readable(["caf\\udce9"], [None])
     (['café.png'], ['caf\\\\xe9'])
     """
-    if all(map(_printable, names)):
+    if all(map(str.isascii, names)):
         return list(names)
-    best, most = [_escaped(name) for name in names], 0
+
+    def agreeing(spelled: Sequence[str]) -> int:
+        own = zip(spelled, photos, strict=True)
+        return sum(p is not None and _folded(s).endswith(_folded(p.name)) for s, p in own)
+
+    data = [name.encode("utf-8", "surrogateescape") for name in names]
+    best = [raw.decode("utf-8", "backslashreplace") for raw in data]
     for own in _CODE_PAGES:
-        with suppress(UnicodeError):
-            spelled = [name.encode("utf-8", "surrogateescape").decode(own) for name in names]
-            own_names = zip(spelled, photos, strict=True)
-            agree = sum(p is not None and _folded(s).endswith(_folded(p.name)) for s, p in own_names)
-            if agree > most:
-                best, most = spelled, agree
-    return [name if _printable(name) else other for name, other in zip(names, best, strict=True)]
-
-
-def _printable(name: str) -> bool:
-    return not any("\ud800" <= letter <= "\udfff" for letter in name)
-
-
-def _escaped(name: str) -> str:
-    return name.encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
+        for wrong in ("utf-8", "latin-1"):  # text in another character set is read as one of these
+            with suppress(UnicodeError):
+                spelled = [name.encode(wrong, "surrogateescape").decode(own) for name in names]
+                best = spelled if agreeing(spelled) > agreeing(best) else best
+    return best
 
 
 def usable(path: Path) -> bool:
@@ -270,5 +266,6 @@ def mask_folders(photo: Path, depth: int) -> list[tuple[Path, Path]]:
         size = own.name.partition("_")[2]  # images_4 goes with masks_4
         names = [f"{name}_{size}" for name in _MASK_FOLDERS if size] + list(_MASK_FOLDERS)
         names += [f"{own.name}_{name}" for name in _MASK_FOLDERS]
-        found += [(own.parent / name, photo.relative_to(own)) for name in names]
-    return [(folder, path) for folder, path in found if folder.is_dir()]
+        beside = {_folded(p.name): p for p in own.parent.iterdir() if p.is_dir()} if own.is_dir() else {}
+        found += [(beside[key], photo.relative_to(own)) for name in names if (key := _folded(name)) in beside]
+    return found

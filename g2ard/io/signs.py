@@ -215,6 +215,12 @@ def _shape(head: bytes) -> bytes:
     return b"\nnumbers:%d" % count
 
 
+def is_table(path: Path) -> bool:
+    """Return whether a file is text in lines of three numbers or more."""
+    count = _head(path).rpartition(b"\nnumbers:")[2].split(b" ")[0]
+    return count.isdigit() and int(count) >= 3
+
+
 def explained(read: Callable[Given, Returned]) -> Callable[Given, Returned]:
     """Let errors of a function about a file of another program say what that file is."""
 

@@ -190,7 +190,7 @@ def test_missing_and_unknown_files(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="is a mesh"):
         kind(tmp_path / "a.obj")
     (tmp_path / "a.zip").write_bytes(b"PK\x03\x04")
-    for path, advice in ((tmp_path / "a.zip", "unpack the archive"), ("https://a.org/a.ply", "download it")):
+    for path, advice in ((tmp_path / "a.zip", "unpack it"), ("https://a.org/a.ply", "download it")):
         with pytest.raises(InputError, match=advice):
             kind(path)
 

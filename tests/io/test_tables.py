@@ -88,7 +88,8 @@ def test_pcd(tmp_path: Path, how: str, rgb: str) -> None:
         rows[name] = RGB[:, i] if rgb == "apart" else packed.view(kinds)
     size, letter = np.dtype(kinds).itemsize, "U" if rgb == "apart" else rgb
     head = f"# .PCD v0.7\nVERSION 0.7\nFIELDS x y z normal {' '.join(names)}\n"
-    head += f"SIZE 8 8 8 4{f' {size}' * len(names)}\nTYPE F F F F{f' {letter}' * len(names)}\nCOUNT 1 1 1 3{' 1' * len(names)}\nWIDTH 40\nHEIGHT 1\n"
+    head += f"SIZE 8 8 8 4{f' {size}' * len(names)}\nTYPE F F F F{f' {letter}' * len(names)}\n"
+    head += f"COUNT 1 1 1 3{' 1' * len(names)}\nWIDTH 40\nHEIGHT 1\n"
     head += f"VIEWPOINT 0 0 0 1 0 0 0\nPOINTS 40\nDATA {how}\n"
     text = "\n".join(" ".join(f"{v:.9g}" for v in np.hstack([*row.item()])) for row in rows)
     (tmp_path / "a.pcd").write_bytes(head.encode() + (rows.tobytes() if how == "binary" else text.encode()))
