@@ -93,9 +93,7 @@ def parse_json(path: Path, text: str) -> Any:
 
     Text in another character set than UTF-8 becomes Latin 1, in which names of files can be found.
     """
-    try:
-        text.encode()
-    except UnicodeEncodeError:
+    if not text.isascii() and any("\udc80" <= letter <= "\udcff" for letter in text):
         text = text.encode("utf-8", "surrogateescape").decode("latin-1")
     try:
         return json.loads(text)
