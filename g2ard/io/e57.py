@@ -6,7 +6,7 @@ import re
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard.errors import G2ardError, InputError, missing
+from g2ard.io import judge
 from g2ard.io.atomic import atomic_output
-from g2ard.io.paths import check_unpacked
+from g2ard.io.paths import check_unpacked, file_identity
 from g2ard.io.photos import Frame, Lens, Listed, inverse, posed
-from g2ard.io.stream import MarkedPoints, PointStream, from_row, full_scales
+from g2ard.io.stream import JoinedClouds, MarkedPoints, Names, PointStream, telling
 from g2ard.io.transforms import FLIP
 from g2ard.io.types import Note
 from g2ard.progress import plural
@@ -26,8 +27,9 @@ from g2ard.scene.transform import rotation_matrices
 
 _CARTESIAN = ("cartesianX", "cartesianY", "cartesianZ")
 _SPHERICAL = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
-_COLORS = ("colorRed", "colorGreen", "colorBlue")
-_SAMPLE_ROWS = 100_000  # points at the beginning of each scan that tell where it is
+_COLORS, _INTENSITY = ("colorRed", "colorGreen", "colorBlue"), ("intensity",)
+_UNSEEN = {_COLORS: ("isColorInvalid",), _INTENSITY: ("isIntensityInvalid",)}
+_SAMPLE_ROWS = 100_000  # points of each scan that tell where it is and how it is coloured
 
 _PANORAMA_AXES = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 """OpenCV's camera axes in those of a panorama, whose middle is along x, with z up."""
@@ -37,112 +39,135 @@ _SUFFIXES = {"jpegImage": ".jpg", "pngImage": ".png"}
 _NO_NAME = re.compile(r"[^\w.-]+")
 
 
-@dataclass(frozen=True)
-class _Scan:
-    """A scan's points: count, fields to read, and pose (world = rotation @ x + translation)."""
-
-    count: int
-    place: tuple[str, ...]
-    color: tuple[str, ...]
-    invalid: tuple[str, ...]
-    rotation: NDArray[np.float64]
-    translation: NDArray[np.float64]
-    dark: float
-    bright: float
-
-
-class Stream(PointStream):
+class Stream(JoinedClouds):
     """Points of all scans in the world of their poses, with colours, or grey from intensities.
 
-    Points that a scan marks as invalid are dropped.
+    Points that a scan marks as invalid are dropped; a scan without points counts for nothing.
     """
 
     def __init__(self, path: Path) -> None:
-        self.path = path
         with _opened(path) as file:
-            self._scans = [_scan(path, file, number) for number in range(file.scan_count)]
+            headers = [file.get_header(number) for number in range(file.scan_count)]
+            counts = [header.point_count for header in headers]
+            check_unpacked(path, path.stat().st_size, 24 * sum(counts))
             self._photos = sum(node.isDefined("pose") for node in _images(file))
-        count = sum(scan.count for scan in self._scans)
-        check_unpacked(path, path.stat().st_size, 24 * count)
-        sample = [np.zeros((0, 3))]
-        for number, scan in enumerate(self._scans):
-            for positions, _, noise in self._blocks(number, min(_SAMPLE_ROWS, scan.count), 0):
-                sample.append(positions[~noise])
-                break
-        super().__init__(path, count, np.concatenate(sample), full_scales(np.dtype(np.float64)))
+            scans = [_Scan(path, header, number) for number, header in enumerate(headers) if counts[number]]
+        if not scans:
+            raise InputError("has no points", path=path)
+        super().__init__(scans)
+
+    def identity(self) -> list[Any]:
+        return file_identity([self.path])
 
     def header_notes(self) -> tuple[Note, ...]:
-        notes = tuple(note for note in super().header_notes() if note.code != "eight_bit_colors")
-        if not self._photos:
-            return notes
-        text = f"{plural(self._photos, 'photo')} with poses inside; --views {self.path} uses them"
-        return (*notes, Note("photos", self._photos, text))
+        found: dict[str, list[Note]] = {}
+        for scan in self.streams:
+            for note in scan.header_notes():
+                found.setdefault(note.code, []).append(note)
+        notes = [
+            replace(same[0], count=sum(note.count for note in same), text=f"{same[0]}{_more(len(same))}")
+            for same in found.values()
+        ]
+        if self._photos:
+            text = f"{plural(self._photos, 'photo')} with poses inside; --views {self.path} uses them"
+            notes.append(Note("photos", self._photos, text))
+        return tuple(notes)
+
+
+def _more(count: int) -> str:
+    return f"; similar in {plural(count - 1, 'other scan')}" if count > 1 else ""
+
+
+class _Scan(PointStream):
+    """A scan's points, at world = rotation @ x + translation."""
+
+    def __init__(self, path: Path, header: Any, number: int) -> None:
+        self.path, self.count, self._number = path, header.point_count, number
+        self._names = names = set(header.point_fields)
+        place = next((fields for fields in (_CARTESIAN, _SPHERICAL) if names.issuperset(fields)), None)
+        if place is None:
+            what = "has no positions (cartesianX, cartesianY, cartesianZ)"
+            raise InputError(what, path=path, index=number, item="scan")
+        self._place = place
+        self._rotation = rotation_matrices(np.asarray(header.rotation, np.float64)[None])[0]
+        self._translation = np.asarray(header.translation, np.float64)
+        choices = [fields for fields in (_COLORS, _INTENSITY) if names.issuperset(fields)]
+        self._color, sample = telling(choices, self._sampled)
+        limits = _limits(header, "intensity") if self._color == _INTENSITY else None
+        scales = judge.full_scales(np.dtype(np.float64))
+        super().__init__(path, self.count, sample, scales, limits)
+        if self.channels == 3 and (stated := _limits(header, "colorRed")):
+            dark, full = self._range
+            white = next((scale for scale in scales if scale >= stated[1]), full)
+            self._range = dark, full if full == 255 or full > white else white
+
+    def header_notes(self) -> tuple[Note, ...]:
+        scaled = ("eight_bit_colors", "color_range")  # fields have no range of their own
+        return tuple(note for note in super().header_notes() if note.code not in scaled)
+
+    def _sampled(self, color: Names) -> MarkedPoints:
+        """Return points from all parts of the scan."""
+        self._color = color
+        step = max(1, self.count // _SAMPLE_ROWS)
+        parts = [[values[::step] for values in part] for part in self.raw(_SAMPLE_ROWS, 0)]
+        positions, colors, noise = (np.concatenate(values) for values in zip(*parts, strict=True))
+        return positions, colors, noise
+
+    def _marks(self) -> list[str]:
+        """Return the fields that mark points without positions or colours."""
+        places = ("cartesianInvalidState", "sphericalInvalidState")
+        present = [name for name in places if name in self._names][:1]
+        return present + [mark for mark in _UNSEEN.get(self._color, ()) if mark in self._names]
 
     def raw(self, rows: int, start: int) -> Iterator[MarkedPoints]:
-        for number, begin in from_row([scan.count for scan in self._scans], start):
-            yield from self._blocks(number, rows, begin)
-
-    def _blocks(self, number: int, rows: int, begin: int) -> Iterator[MarkedPoints]:
-        """Yield a scan's points from a row on; those before are read too, since files cannot be searched."""
-        scan = self._scans[number]
-        if not rows:
-            return
+        """Yield points from a row on; those before are read too, since files cannot be searched."""
         from pye57 import libe57
 
         with _opened(self.path) as file:
-            fields = {name: np.empty(rows) for name in (*scan.place, *scan.color, *scan.invalid)}
+            names = (*self._place, *self._color, *self._marks())
+            fields = {name: np.empty(rows) for name in names}
             buffers = libe57.VectorSourceDestBuffer()
             for name, values in fields.items():
                 buffers.append(libe57.SourceDestBuffer(file.image_file, name, values, rows, True, True))
-            reader = file.get_header(number)["points"].reader(buffers)
+            reader = file.get_header(self._number)["points"].reader(buffers)
             at = 0
             while got := reader.read():
-                skipped = min(got, max(0, begin - at))
+                skipped = min(got, max(0, start - at))
                 at += got
                 if skipped < got:
-                    yield _points(scan, {name: v[skipped:got] for name, v in fields.items()})
+                    yield self._points({name: v[skipped:got] for name, v in fields.items()})
             reader.close()
-        if at < scan.count:
-            raise InputError(f"scan {number} has {at:,} of {scan.count:,} points", path=self.path)
+        if at < self.count:
+            text = f"scan {self._number} has {at:,} of {self.count:,} points"
+            raise InputError(text, path=self.path)
+
+    def _points(self, fields: dict[str, NDArray[np.float64]]) -> MarkedPoints:
+        a, b, c = (fields[name] for name in self._place)
+        if self._place == _SPHERICAL:  # range, azimuth, elevation
+            a, b, c = a * np.cos(c) * np.cos(b), a * np.cos(c) * np.sin(b), a * np.sin(c)
+        positions = np.stack([a, b, c], axis=1) @ self._rotation.T + self._translation
+        colors = np.zeros((len(positions), len(self._color)), np.float32)
+        for channel, name in enumerate(self._color):
+            colors[:, channel] = fields[name]
+        noise = np.zeros(len(positions), bool)
+        for name in self._marks():
+            if name in _UNSEEN.get(self._color, ()):
+                colors[fields[name] != 0] = 0
+            else:
+                noise |= fields[name] != 0
+        return positions, colors, noise
 
 
-def _points(scan: _Scan, fields: dict[str, NDArray[np.float64]]) -> MarkedPoints:
-    a, b, c = (fields[name] for name in scan.place)
-    if scan.place == _SPHERICAL:  # range, azimuth, elevation
-        a, b, c = a * np.cos(c) * np.cos(b), a * np.cos(c) * np.sin(b), a * np.sin(c)
-    positions = np.stack([a, b, c], axis=1) @ scan.rotation.T + scan.translation
-    colors = np.stack([fields[name] for name in scan.color], axis=1)
-    if len(scan.color) == 1:
-        grey = (colors - scan.dark) / max(scan.bright - scan.dark, 1e-300)
-        colors = np.repeat(255 * np.clip(grey, 0, 1), 3, axis=1)
-    noise = np.zeros(len(positions), bool)
-    for name in scan.invalid:
-        noise |= fields[name] != 0
-    return positions, colors.astype(np.float32), noise
-
-
-def _scan(path: Path, file: Any, number: int) -> _Scan:
-    header = file.get_header(number)
-    names = set(header.point_fields)
-    place = next((fields for fields in (_CARTESIAN, _SPHERICAL) if names.issuperset(fields)), None)
-    if place is None:
-        what = "has no positions (cartesianX, cartesianY, cartesianZ)"
-        raise InputError(what, path=path, index=number, item="scan")
-    color = _COLORS if names.issuperset(_COLORS) else ("intensity",)
-    if not names.issuperset(color):
-        raise InputError("has neither colours nor intensities", path=path, index=number, item="scan")
-    invalid = tuple({"cartesianInvalidState", "sphericalInvalidState"} & names)[:1]
-    limits = _limits(header) if color == ("intensity",) else (0.0, 1.0)
-    rotation = rotation_matrices(np.asarray(header.rotation, np.float64)[None])[0]
-    translation = np.asarray(header.translation, np.float64)
-    return _Scan(header.point_count, place, color, invalid, rotation, translation, *limits)
-
-
-def _limits(header: Any) -> tuple[float, float]:
-    if "intensityLimits" not in header.scan_fields:
-        return 0.0, 1.0
-    found = header["intensityLimits"]
-    return float(found["intensityMinimum"].value()), float(found["intensityMaximum"].value())
+def _limits(header: Any, name: str) -> tuple[float, float] | None:
+    """Return the stated range of a scan's intensities or colours, or None."""
+    limits = f"{name.removesuffix('Red')}Limits"
+    if limits not in header.scan_fields:
+        return None
+    try:
+        found = [float(header[limits][f"{name}{end}"].value()) for end in ("Minimum", "Maximum")]
+    except Exception:  # libe57's own, for a structure without them
+        return None
+    return (found[0], found[1]) if found[0] < found[1] else None
 
 
 def _images(file: Any) -> list[Any]:

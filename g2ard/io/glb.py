@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard.errors import InputError, damaged, require
-from g2ard.io import spz
+from g2ard.io import judge, spz
 from g2ard.io.atomic import atomic_output
 from g2ard.io.jsonfile import Number, Place, Row, Vector, Whole, checked, parse_json
 from g2ard.io.packing import packing_order, rounding, unit_quats, writable
@@ -397,21 +397,16 @@ def _attributes_of(place: Place, document: _Document, binary: bytes, names: dict
     degree = max(d for d in range(4) if d == 0 or f"{EXTENSION}:SH_DEGREE_{d}_COEF_0" in names)
     means = values("POSITION", 3)
     raw = Raw.empty(len(means), (degree + 1) ** 2 - 1)
-    scales, notes = values(f"{EXTENSION}:SCALE", 3), []
     color = values("COLOR_0", 4) if f"{EXTENSION}:SH_DEGREE_0_COEF_0" not in names and draft else None
-    raw.set_linear(scales, values(f"{EXTENSION}:OPACITY", 1)[:, 0] if color is None else color[:, 3])
+    opacities = values(f"{EXTENSION}:OPACITY", 1)[:, 0] if color is None else color[:, 3]
+    sh0 = values(f"{EXTENSION}:SH_DEGREE_0_COEF_0", 3) if color is None else (color[:, :3] - 0.5) / SH_C0
+    notes = judge.fill(raw, values(f"{EXTENSION}:SCALE", 3), opacities, sh0)
     if draft:
         text = f"written by the first draft of {EXTENSION} ({', '.join(own)})"
         notes.append(Note("first_draft", len(means), text))
-    if (scales < 0).any():
-        notes.append(Note("log_scales", len(scales), "scales are below 0, so all are taken as logarithms"))
-        raw.log_scales[:] = scales
     with np.errstate(invalid="ignore"):  # a signalling NaN
         raw.means[:] = means * _GLTF_TURN
         raw.quats[:] = values(f"{EXTENSION}:ROTATION", 4)[:, [3, 0, 1, 2]] * (1, *_GLTF_TURN)
-        raw.sh0[:, 0] = (
-            values(f"{EXTENSION}:SH_DEGREE_0_COEF_0", 3) if color is None else (color[:, :3] - 0.5) / SH_C0
-        )
         for name, k in _harmonics(degree):
             raw.shN[:, k] = values(name, 3) * _SH_FLIPS[k]
     return cleaned(place.path, raw, notes)

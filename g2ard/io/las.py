@@ -1,5 +1,6 @@
 """Reader for LiDAR point clouds, .las and .laz, with laspy and lazrs."""
 
+import re
 import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -9,8 +10,10 @@ from typing import Any
 import numpy as np
 
 from g2ard.errors import InputError, damaged
+from g2ard.io import judge
 from g2ard.io.paths import check_unpacked
-from g2ard.io.stream import MarkedPoints, PointStream, full_scales
+from g2ard.io.stream import MarkedPoints, Names, PointStream, telling
+from g2ard.io.types import Note
 
 _LARGEST_CHUNK = 1 << 30
 """Largest chunk, in bytes of unpacked points, of a file with fewer points than a chunk holds."""
@@ -22,21 +25,42 @@ _SAMPLES, _SAMPLE_ROWS = 20, 5000
 _NOISE = (7, 18)  # classes of low and high noise
 
 
+_NOTHING = np.zeros((0, 3)), np.zeros((0, 0), np.float32), np.zeros(0, bool)
+_RGB = ("red", "green", "blue")
+
+
 class Stream(PointStream):
-    """Positions and colours, without points of the classes of noise and withheld ones.
+    """Positions and colours or intensities, without points of the classes of noise and withheld ones.
 
     One chunk of a .laz is unpacked at a time.
     """
 
     def __init__(self, path: Path) -> None:
         with _opened(path) as reader:
-            count, sample = reader.header.point_count, []
-            for first in sorted({count * part // _SAMPLES for part in range(_SAMPLES)}):
+            count, header = reader.header.point_count, reader.header
+            names = set(header.point_format.dimension_names)
+            choices = [fields for fields in (_RGB, ("intensity",)) if names.issuperset(fields)]
+            runs = []
+            for first in sorted({count * part // _SAMPLES for part in range(_SAMPLES)}) if count else []:
                 reader.seek(first)
-                positions, _, noise = _points(reader.read_points(min(_SAMPLE_ROWS, count - first)))
-                sample.append(positions[~noise])
-        at = np.concatenate(sample)
-        super().__init__(path, count, at, full_scales(np.dtype(np.uint16)))
+                runs.append(reader.read_points(min(_SAMPLE_ROWS, count - first)))
+            text = f"the header states 0 points; {count:,} follow, and are read"
+            notes = (Note("header_count", count, text),) if reader.recovered else ()
+            system = _system(header)
+
+        def sampled(color: Names) -> MarkedPoints:
+            parts = [_points(run, color) for run in runs] or [_NOTHING]
+            positions, values, noise = (np.concatenate(column) for column in zip(*parts, strict=True))
+            return positions, values, noise
+
+        self._color, sample = telling(choices, sampled)
+        super().__init__(path, count, sample, judge.full_scales(np.dtype(np.uint16)), notes=notes)
+        self.system = system
+        if choices[0] != _RGB:
+            number = header.point_format.id
+            self.lack = (
+                f"point format {number} has no colours ('red', 'green', 'blue'), and intensities are equal"
+            )
 
     def raw(self, rows: int, start: int) -> Iterator[MarkedPoints]:
         with _opened(self.path) as reader:
@@ -47,14 +71,31 @@ class Stream(PointStream):
                 las = reader.read_points(wanted)
                 if len(las) < wanted:
                     _check_count(self.path, first + len(las), self.count)
-                yield _points(las)
+                yield _points(las, self._color)
 
 
-def _points(las: Any) -> MarkedPoints:
+def _points(las: Any, color: Names) -> MarkedPoints:
     positions = np.stack([np.asarray(las[name], np.float64) for name in ("x", "y", "z")], axis=1)
-    rgb = np.stack([np.asarray(las[name], np.float32) for name in ("red", "green", "blue")], axis=1)
+    values = np.stack([np.asarray(las[name], np.float32) for name in color], axis=1)
     noise = np.isin(np.asarray(las["classification"]), _NOISE) | np.asarray(las["withheld"], bool)
-    return positions, rgb, noise
+    return positions, values, noise
+
+
+def _system(header: Any) -> str | None:
+    """Return the map system that a header states: its EPSG code, or otherwise its name."""
+    for record in header.vlrs:
+        if record.record_id == 34735 and hasattr(record, "geo_keys"):
+            codes = {key.id: key.value_offset for key in record.geo_keys}
+            code = next((codes[key] for key in (3072, 2048) if 0 < codes.get(key, 0) < 32767), None)
+            if code:
+                return f"EPSG:{code}"
+        if record.record_id == 2112 and hasattr(record, "string"):
+            found = re.search(r'PROJ(?:CS|CRS)\["([^"]+)"(.*)', record.string, re.DOTALL)
+            if found:
+                own = re.split(r"VERT_?C(?:S|RS)\[", found[2])[0]
+                code = re.search(r'(?:AUTHORITY|ID)\["EPSG",\s*"?(\d+)"?\][\]\s,\0]*$', own)
+                return f"EPSG:{code[1]}" if code else found[1]
+    return None
 
 
 @contextmanager
@@ -66,13 +107,10 @@ def _opened(path: Path) -> Iterator[Any]:
     try:
         with laspy.open(path) as reader:
             header = reader.header
-            names = set(header.point_format.dimension_names)
-            if not {"red", "green", "blue"} <= names:
-                raise InputError(
-                    f"point format {header.point_format.id} has no colours ('red', 'green', 'blue')",
-                    path=path,
-                    hint="add colours, for example with PDAL's filters.colorization",
-                )
+            reader.recovered = _recovered(path, header)
+            for name, values in (("scale", header.scales), ("offset", header.offsets)):
+                if not np.isfinite(values).all() or (name == "scale" and not values.all()):
+                    raise damaged(f"broken header: its {name}s are {values.tolist()}", path=path)
             if header.are_points_compressed:
                 _check_chunk_table(path, header.offset_to_point_data, header.point_count)
                 _check_chunks(path, header)
@@ -86,6 +124,26 @@ def _opened(path: Path) -> Iterator[Any]:
         if not isinstance(error, Exception) and type(error).__name__ != "PanicException":
             raise
         raise InputError(f"cannot be read as LAS: {str(error) or type(error).__name__}", path=path) from error
+
+
+def _recovered(path: Path, header: Any) -> bool:
+    """Set a count of points of 0 to the number that follow, and return whether there are any."""
+    if header.point_count:
+        return False
+    with path.open("rb") as file:
+        head = file.read(247).ljust(247, b"\0")
+    (legacy,), (extended,) = struct.unpack_from("<I", head, 107), struct.unpack_from("<Q", head, 235)
+    end = path.stat().st_size
+    if head[25] >= 4 and header.offset_to_point_data < extended < end:
+        end = extended
+    room = max(0, end - header.offset_to_point_data)
+    if header.are_points_compressed:
+        if not legacy and room > 64:  # bytes of an empty chunk table, and some
+            raise damaged("broken header: it states 0 points, and compressed ones follow", path=path)
+        header.point_count = legacy
+    else:
+        header.point_count = room // header.point_format.size
+    return bool(header.point_count)
 
 
 def _check_records(path: Path) -> None:

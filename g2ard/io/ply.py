@@ -2,7 +2,6 @@
 
 import re
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +11,7 @@ from numpy.typing import NDArray
 
 from g2ard.config.choices import PlyLayout, RenderModel
 from g2ard.errors import InputError, require
-from g2ard.io import plyfiles
+from g2ard.io import judge, plyfiles
 from g2ard.io.packing import rounding
 from g2ard.io.sanitize import BLOCK, LOG_SCALE_LIMIT, Raw
 from g2ard.io.stream import RawStream, SceneStream
@@ -27,7 +26,7 @@ _QUATS = ["rot_0", "rot_1", "rot_2", "rot_3"]
 _REQUIRED_PROPERTIES = [*_MEANS, *_DC, "opacity", *_SCALES, *_QUATS]
 _NORMALS = ["nx", "ny", "nz"]
 _FILTER = "filter_3d"
-_FEWEST_JUDGED = 3 * 16  # scales, three of a Gaussian, that suffice to tell whether they are logarithms
+_JUDGED = 4096  # rows that tell how values are stored
 _FLAT_LOG_RATIO = np.log(np.float32(1e-3))
 """Logarithm of the thickness of 2D Gaussians over their shorter scale."""
 
@@ -77,8 +76,8 @@ class Stream(RawStream):
         self.up = plyfiles.up_of(header.comments)
         self._shift, self._flat = shift, flat
         self._rest, self._stored, self._kept = rest, stored, kept
-        self._stated = _Stated()
-        self._white = 1.0 if self._rgb is None else self._brightest()
+        self._read, self._white = self._judged()
+        self.notes += self._read.notes
 
     def positions(self, rows: int) -> Iterator[NDArray[np.float32]]:
         for _, block in plyfiles.row_blocks(self.path, self._rows, rows):
@@ -95,9 +94,6 @@ class Stream(RawStream):
                     self._decode(block[part], raw.take(part))
             yield raw
 
-    def header_notes(self) -> tuple[Note, ...]:
-        return (*self.notes, *self._stated.notes())
-
     def _columns(self, block: NDArray[Any], names: list[str]) -> NDArray[Any]:
         return structured_to_unstructured(block[[self._names[name] for name in names]])
 
@@ -105,20 +101,20 @@ class Stream(RawStream):
         means = self._columns(block, _MEANS)
         return np.asarray(means - self._shift if self._shift.any() else means, np.float32)
 
-    def _brightest(self) -> float:
-        """Return the number that means white: 1, 255 or 65,535, by the values rather than their type."""
-        assert self._rgb is not None
-        top = 0.0
-        for _, block in plyfiles.row_blocks(self._path, self._rows, BLOCK):
-            values = self._columns(block, self._rgb)
-            top = max(top, float(np.max(values, where=np.isfinite(values), initial=0.0)))
-        whole = all(self._rows.dtype[self._names[name]].kind in "iu" for name in self._rgb)
-        return 1.0 if top <= 1 and not whole else 255.0 if top <= 255 else 65535.0
+    def _judged(self) -> tuple[judge.Reading, float]:
+        """Return how values are stored, and the number that means white in RGB."""
+        rows = plyfiles.spread_rows(self._rows, _JUDGED)
+        scales, base = self._columns(rows, self._scales), self._columns(rows, self._rgb or _DC)
+        opacities = rows[self._names["opacity"]]
+        if self._rgb is None:
+            return judge.judged(scales, opacities, base, logs=True), 1.0
+        full = judge.white(base, judge.full_scales(base.dtype))
+        return judge.judged(scales, opacities, np.zeros((0, 3)), logs=True), full
 
     def _decode(self, block: NDArray[Any], raw: Raw) -> None:
         raw.means[:] = self._means(block)
         if self._rgb is None:
-            raw.sh0[:, 0] = self._columns(block, _DC)
+            raw.sh0[:, 0] = self._read.sh0(self._columns(block, _DC))
         else:
             raw.sh0[:, 0] = (self._columns(block, self._rgb) / self._white - 0.5) / SH_C0
         raw.log_scales[:, : len(self._scales)] = self._columns(block, self._scales)
@@ -126,9 +122,9 @@ class Stream(RawStream):
             raw.log_scales[:, 2] = raw.log_scales[:, :2].min(axis=1) + _FLAT_LOG_RATIO
         elif len(self._scales) == 1:
             raw.log_scales[:, 1:] = raw.log_scales[:, :1]
-        raw.quats[:] = self._columns(block, self._quats) if self._quats else (1, 0, 0, 0)
-        raw.logit_opacities[:] = block[self._names["opacity"]]
-        self._stated.see(raw)
+        quats = self._columns(block, self._quats) if self._quats else np.array([[1.0, 0, 0, 0]])
+        raw.quats[:] = quats - (128.0 if quats.dtype == np.uint8 else 0.0)  # of bytes, 128 is 0
+        raw.logit_opacities[:] = self._read.opacity_logits(block[self._names["opacity"]])
         if _FILTER in self._names:
             _widen(raw, np.asarray(block[self._names[_FILTER]], np.float64))
         if self._rest:  # channel-major: all of red's coefficients, then green's, then blue's
@@ -164,41 +160,6 @@ def _widen(raw: Raw, size: NDArray[np.float64]) -> None:
     with np.errstate(divide="ignore"):
         faded = np.logaddexp(dark, lit + np.log(-np.expm1(fading)))
     raw.log_scales[:], raw.logit_opacities[:] = after / 2, lit + fading - faded
-
-
-@dataclass
-class _Stated:
-    """Ranges of the stored scales and opacities, which tell whether they are logarithms and logits."""
-
-    scales: tuple[float, float] = (np.inf, -np.inf)
-    opacities: tuple[float, float] = (np.inf, -np.inf)
-    total: float = 0.0
-    count: int = 0
-
-    def see(self, raw: Raw) -> None:
-        finite = raw.log_scales[np.isfinite(raw.log_scales)]
-        self.scales = _range(self.scales, finite)
-        self.opacities = _range(self.opacities, raw.logit_opacities[np.isfinite(raw.logit_opacities)])
-        self.total, self.count = self.total + float(finite.sum(dtype=np.float64)), self.count + finite.size
-
-    def notes(self) -> list[Note]:
-        """Return a note if all scales are positive and 1 at most on average, or all opacities in [0, 1]."""
-        (least, most), (faint, solid) = self.scales, self.opacities
-        enough = self.count >= _FEWEST_JUDGED
-        linear = enough and 0 < least < most and self.total < self.count
-        activated = enough and 0 <= faint < solid <= 1
-        if not (linear or activated):
-            return []
-        what = [f"scales ({least:.3g} to {most:.3g}) look linear, not logarithms"] * linear
-        what += [f"opacities ({faint:.3g} to {solid:.3g}) look activated, not logits"] * activated
-        return [Note("activated", 1, " and ".join(what) + "; they are read as a 3DGS .ply defines them")]
-
-
-def _range(seen: tuple[float, float], values: NDArray[Any]) -> tuple[float, float]:
-    return (
-        min(seen[0], float(values.min(initial=np.inf))),
-        max(seen[1], float(values.max(initial=-np.inf))),
-    )
 
 
 def _frames(header: plyfiles.PlyHeader) -> list[Note]:

@@ -276,12 +276,12 @@ def row_blocks(
         yield first, block
 
 
-def spread_rows(rows: NDArray[Any]) -> NDArray[Any]:
-    """Return evenly spaced rows: 100,000 to 200,000 of them, or all if there are fewer.
+def spread_rows(rows: NDArray[Any], count: int = 100_000) -> NDArray[Any]:
+    """Return evenly spaced rows: `count` to twice as many, or all if there are fewer.
 
     A memory map of a file is read row by row, so that the pages between are not loaded.
     """
-    step = max(1, len(rows) // 100_000)
+    step = max(1, len(rows) // count)
     if not isinstance(rows, np.memmap) or step == 1:
         return np.asarray(rows[::step])
     parts = []

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from g2ard.errors import InputError, damaged
 from g2ard.io.colmap import Columns, Table, TextTable, model_folder, parsing, points_file
 from g2ard.io.jsonfile import Place
-from g2ard.io.stream import MarkedPoints, PointStream, full_scales
+from g2ard.io.stream import MarkedPoints, PointStream
 
 _POINT = Columns.of("QdddBBBdQ", "POINT3D_ID", *"XYZRGB", "ERROR", "TRACK")
 _NUMBERS = Columns.of("ddddddd", "POINT3D_ID", *"XYZRGB")
@@ -27,7 +27,9 @@ class Stream(PointStream):
         with parsing(path):
             self._positions, rgb = (_binary if path.suffix.lower() == ".bin" else _text)(path)
         self._colors = rgb.astype(np.float32)
-        super().__init__(path, len(rgb), self._positions, full_scales(rgb.dtype))
+        whole = (self._colors == np.rint(self._colors)).all()
+        sample = self._positions, self._colors, np.zeros(len(rgb), bool)
+        super().__init__(path, len(rgb), sample, (255.0,) if whole else (1.0, 255.0))
 
     def raw(self, rows: int, start: int) -> Iterator[MarkedPoints]:
         for first in range(start, self.count, rows):
@@ -50,7 +52,7 @@ def _binary(path: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
     return positions, rgb
 
 
-def _text(path: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
+def _text(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     table = TextTable(path, "point")
     rows = [table.words[1:7] for _ in table]
     plain = all(word.isascii() and "_" not in word for words in rows for word in words)  # float() reads both
@@ -65,4 +67,4 @@ def _text(path: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
     if not inside.all():
         i, channel = (int(at) for at in np.argwhere(~inside)[0])
         raise Place(path, i, "point", "RGB"[channel]).error(f"is {rows[i][3 + channel]!r}, expected 0 to 255")
-    return values[:, :3], values[:, 3:].astype(np.uint8)
+    return values[:, :3], values[:, 3:]

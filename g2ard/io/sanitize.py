@@ -117,8 +117,14 @@ class Tally:
         self._count(good)
         self.noise += int(np.count_nonzero(good & noise))
         good &= ~noise
-        self.brightest = max(self.brightest, float(np.max(colors, where=good[:, None], initial=0.0)))
         return good
+
+    def join(self, other: Tally) -> None:
+        """Add the counts of another source of points, whose rows follow."""
+        if other.dropped and not self.dropped:
+            self.first = self.rows + other.first
+        for name in ("rows", "dropped", "noise"):
+            setattr(self, name, getattr(self, name) + getattr(other, name))
 
     def clean(self, raw: Raw) -> NDArray[np.bool_]:
         """Clamp and activate rows in place, making `log_scales` linear; return an (N,) mask to keep."""

@@ -229,17 +229,17 @@ def read_points(path: str | Path) -> Points:
     return read_cloud(path).points
 
 
-def read_cloud(path: str | Path) -> Cloud:
-    """Read a coloured point cloud with notes on the file."""
-    return open_point_stream(path).whole()
+def read_cloud(path: str | Path, *, bare: bool = False) -> Cloud:
+    """Read a coloured point cloud with notes on the file; a `bare` one may be black, without colours."""
+    return open_point_stream(path, bare=bare).whole()
 
 
 @explained
-def open_point_stream(path: str | Path | Sequence[str | Path]) -> PointStream:
+def open_point_stream(path: str | Path | Sequence[str | Path], *, bare: bool = False) -> PointStream:
     """Open a coloured point cloud, or several as one, for reading in blocks.
 
     Memory holds one block of a .ply, .las, .laz or .e57, or the whole file of other formats. Several clouds
-    get the offset of the first.
+    get one offset. Without colours, intensities become grey; without either, the cloud must be `bare`.
     """
     from g2ard.io.stream import JoinedClouds
 
@@ -250,7 +250,12 @@ def open_point_stream(path: str | Path | Sequence[str | Path]) -> PointStream:
         return streams[0] if len(streams) == 1 else JoinedClouds(streams)
     path, module = reader(path, "points")
     stream: PointStream = module.Stream(path)
+    if not stream.channels and len(stream.sample) and not bare:
+        raise InputError(stream.lack, path=path, hint=_UNCOLORED)
     return stream
+
+
+_UNCOLORED = "add colours, for example with PDAL's filters.colorization, or {views=} with photos to `distill`"
 
 
 def write_points(path: str | Path, points: Points, *, overwrite: bool = False) -> None:

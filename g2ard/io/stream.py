@@ -1,7 +1,7 @@
 """Scenes and coloured point clouds in blocks, for files larger than memory."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Generic, TypeVar
@@ -10,9 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard.config.choices import RenderModel
+from g2ard.io import judge
 from g2ard.io.paths import file_identity
 from g2ard.io.sanitize import BLOCK, Raw, Tally
 from g2ard.io.types import Cloud, Note, Points, Scene
+from g2ard.progress import plural
 from g2ard.scene.splats import ARRAYS, Splats
 from g2ard.scene.transform import one_model
 
@@ -20,14 +22,18 @@ _DEGREE_OF_REST = {0: 0, 3: 1, 8: 2, 15: 3}
 _POINTS_AT_ONCE = 1 << 20
 
 RawPoints = tuple[NDArray[np.float64], NDArray[np.float32]]
-"""(n, 3) positions, world units, and (n, 3) colours; colours / `divisor` are in [0, 1]."""
+"""(n, 3) positions, world units, and (n, 3) colours in [0, 1]."""
 
 MarkedPoints = tuple[NDArray[np.float64], NDArray[np.float32], NDArray[np.bool_]]
-"""Positions, colours, and an (n,) mask of points that the file marks as noise."""
+"""(n, 3) positions; (n, 3) colours, (n, 1) intensities or (n, 0); (n,) whether the file marks noise."""
 
-_FULL = (255.0, 65535.0)  # largest colours of 8 and 16 bits
+_BLACK = 1.5 / 255  # colours below are taken for none
+_BLACK_SHARE = 1e-3  # share of black points that is told
+_APART = 100.0  # distance between clouds, in extents, beyond which they may be in several map systems
 _FAR = 10.0  # distance from the origin, in extents, beyond which coordinates may be those of a map
 _STEEP = 20.0  # extent in z over that in x and y beyond which x and y may be degrees
+
+Names = tuple[str, ...]
 
 Block = TypeVar("Block", Splats, RawPoints)
 
@@ -159,57 +165,81 @@ class PartsStream(SceneStream):
         return self.notes
 
 
-def full_scales(kind: np.dtype[Any]) -> tuple[float, ...]:
-    """Return the values, ascending, that colours stored as a type may have at full brightness.
-
-    >>> full_scales(np.dtype("u1")), full_scales(np.dtype("i4")), full_scales(np.dtype("f8"))
-    ((255.0,), (255.0, 65535.0, 2147483647.0), (1.0, 255.0, 65535.0))
-    """
-    if kind.kind == "f":
-        return (1.0, *_FULL)
-    most = float(np.iinfo(kind).max)
-    return (*(full for full in _FULL if full < most), most)
-
-
 class PointStream(Stream[RawPoints]):
-    """Coloured point cloud in blocks.
+    """Point cloud in blocks, with colours, or grey from intensities, by the range that most of them have.
 
-    Colours are divided by the smallest of `full_scales` that holds the brightest, whatever their type.
+    Attributes:
+        sample: (n, 3) finite positions from all parts of the cloud, without noise.
+        channels: 3 for colours, 1 for intensities, 0 if there is nothing to colour points by.
+        lack: why there are no colours.
+        system: the map system that the file states.
     """
 
     def __init__(
-        self, path: Path, count: int, sample: NDArray[np.float64], scales: Sequence[float] = (1.0,)
+        self,
+        path: Path,
+        count: int,
+        sample: MarkedPoints,
+        scales: Sequence[float] = (1.0,),
+        limits: tuple[float, float] | None = None,
+        notes: tuple[Note, ...] = (),
     ) -> None:
         """Open a cloud, whose centre becomes the offset if it is far from the origin.
 
-        The (n, 3) sample is of all parts of the cloud, since files' own bounds may be wrong.
+        The sample is of all parts of the cloud, since files' own bounds may be wrong.
         """
-        finite = sample[np.isfinite(sample).all(axis=1)]
-        low, high = np.percentile(finite, (1, 99), axis=0) if len(finite) else np.zeros((2, 3))
+        positions, values, noise = sample
+        good = np.isfinite(positions).all(axis=1) & ~noise
+        self.sample = positions[good]
+        low, high = np.percentile(self.sample, (1, 99), axis=0) if good.any() else np.zeros((2, 3))
         middle, extent = (low + high) / 2, high - low
         far = np.isfinite(middle).all() and (np.abs(middle) > np.linalg.norm(extent)).any()
-        notes = (_DEGREES,) if _in_degrees(middle, extent) else ()
+        notes = (*notes, _DEGREES) if _in_degrees(middle, extent) else notes
         super().__init__(path, count, np.rint(middle) if far else None, notes, "point")
-        self.scales = scales
+        self.channels, self.scales = values.shape[1], scales
+        self.lack = "has neither colours nor intensities that vary"
+        self.system: str | None = None
+        self._range = 0.0, 1.0
+        if self.channels == 3:
+            self._range = 0.0, judge.white(values[good], scales)
+        elif self.channels == 1:
+            self._range = judge.shades(values[good], limits)
+            self.channels = int(self._range[0] < self._range[1])
+        self.black = self.bright = 0
+
+    def shown(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return stored values as (n, 3) colours in [0, 1]."""
+        if not self.channels:
+            return np.zeros((len(values), 3), np.float32)
+        dark, full = self._range
+        with np.errstate(invalid="ignore"):
+            shades = (values - np.float32(dark)) / np.float32(full - dark)
+        self.bright += int(np.count_nonzero((shades > judge.HDR).any(axis=1)))
+        return np.broadcast_to(np.clip(shades, 0, 1), (len(values), 3))
 
     @abstractmethod
     def raw(self, rows: int, start: int) -> Iterator[MarkedPoints]:
         """Yield the source's points from `start`, at most `rows` at a time."""
 
-    @property
-    def divisor(self) -> float:
-        """The divisor of colours, known once `blocks` has finished."""
-        brightest = self.tally.brightest
-        fits = (full for full in self.scales if brightest <= full * (1.5 if full == 1 else 1.001))
-        return next(fits, self.scales[-1])
-
     def header_notes(self) -> tuple[Note, ...]:
-        notes, rows = list(self.notes), self.tally.rows
-        if rows and self.tally.brightest <= 0:
+        notes, rows, (dark, full) = list(self.notes), self.tally.rows, self._range
+        if not rows:
+            return tuple(notes)
+        if self.channels == 1:
+            text = f"no colours; intensities of {dark:g} to {full:g} are shown as grey"
+            notes.append(Note("grey", rows, text))
+        elif self.black >= rows - self.tally.dropped:
             text = "all colours are 0; add colours, for example with PDAL's filters.colorization"
             notes.append(Note("black", rows, text))
-        elif rows and self.divisor == _FULL[0] < self.scales[-1]:
-            notes.append(Note("eight_bit_colors", rows, "colours up to 255 in fields of a larger range"))
+        elif self.black > _BLACK_SHARE * rows:
+            text = f"{plural(self.black, 'point')} are black, perhaps without colours"
+            notes.append(Note("black_points", self.black, text))
+        if self.channels == 3 and 1 < full < self.scales[-1]:
+            text = f"colours up to {full:,.0f} in fields of a larger range"
+            notes.append(Note("eight_bit_colors" if full == 255 else "color_range", rows, text))
+        if self.channels == 3 and self.bright:
+            text = f"{plural(self.bright, 'point')} brighter than the range of most colours taken as white"
+            notes.append(Note("bright_points", self.bright, text))
         return tuple(notes)
 
     def near(self, positions: NDArray[np.float64]) -> NDArray[np.float32]:
@@ -224,18 +254,23 @@ class PointStream(Stream[RawPoints]):
             yield near
 
     def blocks(self, rows: int, start: int = 0) -> Iterator[RawPoints]:
-        for positions, colors, noise in self.raw(rows, start):
-            good = self.tally.keep(positions, colors, noise)
-            yield (positions, colors) if good.all() else (positions[good], colors[good])
+        for positions, values, noise in self.raw(rows, start):
+            good = self.tally.keep(positions, values, noise)
+            positions, values = (positions, values) if good.all() else (positions[good], values[good])
+            colors = self.shown(values)
+            self.black += int(np.count_nonzero(colors.max(axis=1, initial=0) < _BLACK))
+            yield positions, colors
 
     def whole(self) -> Cloud:
-        """Read all points, with colours in [0, 1]."""
+        """Read all points."""
         positions, colors, kept = np.empty((self.count, 3)), np.empty((self.count, 3), np.float32), 0
         for block in self.blocks(_POINTS_AT_ONCE):
             rows = slice(kept, kept := kept + len(block[0]))
             positions[rows], colors[rows] = block
         notes = self.all_notes()
-        return Cloud(Points(positions[:kept], np.clip(colors[:kept] / np.float32(self.divisor), 0, 1)), notes)
+        colors = colors[:kept]
+        colored = (colors.max(axis=1, initial=0) >= _BLACK) & (self.channels == 3)
+        return Cloud(Points(positions[:kept], colors), notes, colored)
 
 
 _DEGREES = Note(
@@ -254,7 +289,7 @@ def _in_degrees(middle: NDArray[np.float64], extent: NDArray[np.float64]) -> boo
 
 
 class Joined(Stream[Block]):
-    """Several sources as one, with the offset of the first."""
+    """Several sources as one."""
 
     streams: Sequence[Stream[Block]]
 
@@ -266,7 +301,7 @@ class Joined(Stream[Block]):
 
 
 class JoinedScenes(Joined[Splats], SceneStream):
-    """Several scenes as one, with the highest of their SH degrees."""
+    """Several scenes as one, with the offset of the first and the highest of their SH degrees."""
 
     streams: Sequence[SceneStream]
 
@@ -296,33 +331,55 @@ class JoinedScenes(Joined[Splats], SceneStream):
 
 
 class JoinedClouds(Joined[RawPoints], PointStream):
-    """Several point clouds as one, with colours scaled to [0, 1]."""
+    """Several point clouds as one, with the offset of all."""
 
     streams: Sequence[PointStream]
 
     def __init__(self, streams: Sequence[PointStream]) -> None:
-        self.streams, self._divisors = streams, dict[int, float]()
-        Stream.__init__(self, streams[0].path, sum(s.count for s in streams), streams[0].offset, item="point")
+        self.streams = streams
+        at = np.concatenate([stream.sample for stream in streams])
+        sample = at, np.zeros((len(at), 0), np.float32), np.zeros(len(at), bool)
+        PointStream.__init__(self, streams[0].path, sum(s.count for s in streams), sample)
+        self.channels, self.lack = max(stream.channels for stream in streams), streams[0].lack
+        self.notes = tuple(_several_systems(streams))
+
+    def header_notes(self) -> tuple[Note, ...]:
+        return (*self.notes, *super().header_notes())
 
     def raw(self, rows: int, start: int) -> Iterator[MarkedPoints]:
         for number, begin in from_row([stream.count for stream in self.streams], start):
-            divisor = self._divisor(number, rows)
-            for positions, colors, noise in self.streams[number].raw(rows, begin):
-                yield positions, colors / np.float32(divisor), noise
+            yield from self.streams[number].raw(rows, begin)
 
-    def _divisor(self, number: int, rows: int) -> float:
-        """Return a file's divisor, which takes an additional pass over its points."""
-        if number not in self._divisors:
-            stream = self.streams[number]
-            stream.tally = Tally("point")
-            for points in stream.raw(rows, 0):
-                stream.tally.keep(*points)
-            self._divisors[number] = stream.divisor
-        return self._divisors[number]
+    def blocks(self, rows: int, start: int = 0) -> Iterator[RawPoints]:
+        for number, begin in from_row([stream.count for stream in self.streams], start):
+            stream, own = self.streams[number], Tally("point")
+            stream.tally = own
+            yield from stream.blocks(rows, begin)
+            self.tally.join(own)
 
-    @property
-    def divisor(self) -> float:
-        return 1.0
+
+def _several_systems(streams: Sequence[PointStream]) -> Iterator[Note]:
+    """Yield a note if clouds state several map systems, or lie far apart."""
+    stated = {stream.system: stream.path.name for stream in reversed(streams) if stream.system}
+    if len(stated) > 1:
+        words = ", ".join(f"{name} in {system}" for system, name in stated.items())
+        yield Note("map_systems", len(stated), f"several map systems: {words}; project all to one first")
+        return
+    boxes = [(s.path.name, *np.percentile(s.sample, (1, 99), axis=0)) for s in streams if len(s.sample)]
+    for number, (name, low, high) in enumerate(boxes):
+        others = [box for i, box in enumerate(boxes) if i != number]
+        gaps = [np.maximum(low - box[2], box[1] - high).max() for box in others]
+        size = max(float((box[2] - box[1]).max()) for box in boxes)
+        if gaps and min(gaps) > _APART * size > 0:
+            text = f"{name} lies {min(gaps):,.0f} units from the others, perhaps in another coordinate system"
+            yield Note("map_systems", 1, text)
+            return
+
+
+def telling(choices: Iterable[Names], read: Callable[[Names], MarkedPoints]) -> tuple[Names, MarkedPoints]:
+    """Return the first of several names of colours whose sample is not black, or constant, and the sample."""
+    found = [(names, read(names)) for names in choices] or [((), read(()))]
+    return next((each for each in found if judge.tells(each[1][1][~each[1][2]])), found[0])
 
 
 def from_row(counts: Sequence[int], start: int) -> Iterator[tuple[int, int]]:

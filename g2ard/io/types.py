@@ -73,10 +73,15 @@ class Scene:
 
 @dataclass(frozen=True, eq=False)
 class Cloud:
-    """Points of a file, with notes."""
+    """Points of a file, with notes.
+
+    Args:
+        colored: (N,) whether a point has a colour, neither grey from intensities nor black.
+    """
 
     points: Points
-    notes: tuple[Note, ...] = ()
+    notes: tuple[Note, ...]
+    colored: NDArray[np.bool_]
 
 
 @dataclass(frozen=True)

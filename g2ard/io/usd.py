@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard.errors import InputError, OutputError, missing
+from g2ard.io import judge
 from g2ard.io.atomic import atomic_output
 from g2ard.io.glb import LINEAR_NOTE, placed
 from g2ard.io.packing import rounding, unit_quats, writable
@@ -202,17 +203,17 @@ def _read_prim(path: Path, pxr: Any, prim: Any) -> Scene:
     raw.means[:] = means * _USD_TURN
     raw.quats[:] = _values(path, pxr, prim, "orientations", 4, count)[:, [3, 0, 1, 2]] * _QUAT_TURN
     alphas = _values(path, pxr, prim, "opacities", 1, count)[:, 0]
-    raw.set_linear(_values(path, pxr, prim, "scales", 3, count), alphas)
     if coefficients:
         bands = _values(path, pxr, prim, f"{_SH}Coefficients", 3, count * size).reshape(count, size, 3)
-        raw.sh0[:] = bands[:, :1]
+        base = bands[:, 0]
         raw.shN[:] = bands[:, 1:] * FLIPS[: size - 1, None]
     else:
         rgb = _values(path, pxr, prim, _COLOR, 3, None)
         if len(rgb) not in (1, count):
             raise InputError(f"has {len(rgb):,} values, expected {count:,}", path=path, property=_COLOR)
-        raw.sh0[:, 0] = (rgb - 0.5) / SH_C0
+        base = np.broadcast_to((rgb / judge.white(rgb, (1.0, 255.0)) - 0.5) / SH_C0, (count, 3))
         notes.append(Note("display_color", count, "colours are those of displayColor, taken as sRGB"))
+    notes += judge.fill(raw, _values(path, pxr, prim, "scales", 3, count), alphas, base)
     if _color_space(pxr, prim).lower().startswith("lin"):
         notes.append(LINEAR_NOTE)
     return cleaned(path, raw, notes)

@@ -267,8 +267,7 @@ def _lifted(points: TileWriter, index: int, cloud: PointStream, config: LiftConf
     if not len(core):
         return Splats.create(np.empty((0, 3)), scales=np.empty((0, 3)))
     both = np.concatenate([core, halo])
-    colors = np.clip(both["rgb"] / np.float32(cloud.divisor), 0, 1)
-    discs, rows = lift_rows(both["far"], colors, config)
+    discs, rows = lift_rows(both["far"], both["rgb"], config)
     rows = rows[rows < len(core)]
     means = np.ascontiguousarray(core["near"][rows])
     return replace(discs.take(slice(0, len(rows))), means=means, offset=cloud.offset)

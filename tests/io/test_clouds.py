@@ -5,6 +5,7 @@ from pathlib import Path
 
 import laspy
 import numpy as np
+import pye57
 import pytest
 
 from g2ard.errors import InputError, OutputError
@@ -203,6 +204,156 @@ def test_las(tmp_path: Path, suffix: str, top: int) -> None:
     np.testing.assert_allclose(found.points.colors, rgb / top, atol=1e-6)
     assert [n.code for n in found.notes] == (["eight_bit_colors"] if top == 255 else [])
     assert kind(tmp_path / f"a{suffix}") == "points"
+
+
+STORED = ["las", "laz", "ply", "e57"]
+
+
+def stored(path: Path, positions: np.ndarray, rgb: np.ndarray | None, intensity: np.ndarray) -> Path:
+    """Write 16-bit colours, if any, and intensities in the format of the name."""
+    if path.suffix in (".las", ".laz"):
+        return las(path, positions, rgb, 3, intensity=intensity)
+    if path.suffix == ".ply":
+        types = columns("f8", "u2") if rgb is not None else dict.fromkeys("xyz", "f8")
+        cells = [positions, *([] if rgb is None else [rgb]), intensity]
+        return ply(path, types | {"scalar_Intensity": "f4"}, np.column_stack(cells))
+    fields = {f"cartesian{axis}": values for axis, values in zip("XYZ", positions.T, strict=True)}
+    if rgb is not None:
+        names = ("colorRed", "colorGreen", "colorBlue")
+        fields |= {name: np.ascontiguousarray(v) for name, v in zip(names, rgb.T, strict=True)}
+    with pye57.E57(str(path), mode="w") as file:
+        file.write_scan_raw(fields | {"intensity": intensity.astype(float)})
+    return path
+
+
+@pytest.mark.parametrize("black", [False, True])
+@pytest.mark.parametrize("suffix", STORED)
+def test_intensities_are_grey_where_colors_are_missing_or_all_black(
+    tmp_path: Path, suffix: str, black: bool
+) -> None:
+    """A stray changes nothing; intensities of one value are refused, or black with a note."""
+    rng = np.random.default_rng(0)
+    positions, intensity = rng.normal(0, 9, (3000, 3)), rng.integers(100, 900, 3000)
+    intensity[5] = 60_000
+    rgb = np.zeros((3000, 3)) if black else None
+    found = read_cloud(stored(tmp_path / f"a.{suffix}", positions, rgb, intensity))
+    assert [note.code for note in found.notes] == ["grey"]
+    assert not found.colored.any()
+    ranks = np.argsort(np.argsort(intensity, kind="stable")) / 3000
+    np.testing.assert_allclose(found.points.colors[:, 1], ranks, atol=0.03)
+    path = stored(tmp_path / f"b.{suffix}", positions, rgb, np.full(3000, 7))
+    if black:
+        assert [note.code for note in read_cloud(path).notes] == ["black"]
+    else:
+        with pytest.raises(InputError, match=rf"b\.{suffix}: .*colour"):
+            read_cloud(path)
+    assert len(read_cloud(path, bare=True).points) == 3000
+
+
+@pytest.mark.parametrize("bits", [8, 10, 12, 16])
+@pytest.mark.parametrize("strays", [0, 20])
+@pytest.mark.parametrize("suffix", STORED[:3])
+def test_the_range_of_colors_is_that_of_most(tmp_path: Path, suffix: str, strays: int, bits: int) -> None:
+    """Black points count for nothing in it, and are told."""
+    rng = np.random.default_rng(1)
+    unit = rng.uniform(0.02, 1, (3000, 3))
+    unit[100:1600] = 0
+    rgb = np.rint(unit * (2**bits - 1))
+    rgb[:strays] = 65535
+    path = stored(tmp_path / f"a.{suffix}", rng.normal(0, 9, (3000, 3)), rgb, np.full(3000, 7))
+    found = read_cloud(path)
+    np.testing.assert_allclose(found.points.colors[strays:], unit[strays:], atol=1 / 255)
+    codes = {note.code for note in found.notes}
+    assert ("black_points" in codes, "bright_points" in codes) == (True, strays > 0 and bits < 16)
+    assert np.count_nonzero(~found.colored) == 1500
+
+
+@pytest.mark.parametrize("rest", ["empty", "noise", "strays"])
+@pytest.mark.parametrize("suffix", ["las", "laz"])
+def test_a_cloud_of_nothing_moves_no_other(tmp_path: Path, rest: str, suffix: str) -> None:
+    rng = np.random.default_rng(2)
+    positions, rgb = FAR + rng.normal(0, 20, (2000, 3)), rng.integers(1, 65535, (2000, 3))
+    las(tmp_path / "b.las", positions, rgb)
+    count = {"empty": 0, "noise": 300, "strays": 3}[rest]
+    places = np.zeros((count, 3)) if count else np.zeros((1, 3))
+    path = las(tmp_path / f"a.{suffix}", places, np.full(places.shape, 65535))
+    if rest == "noise":
+        las(path, places, np.full(places.shape, 65535), classification=np.full(count, 7))
+    if rest == "empty":
+        with laspy.open(path, mode="w", header=laspy.LasHeader(point_format=2, version="1.2")):
+            pass
+    stream = open_point_stream([path, tmp_path / "b.las"])
+    near = np.concatenate(list(stream.positions(500)))[-2000:]
+    np.testing.assert_allclose(near + stream.offset, positions, atol=0.005, rtol=0)
+    assert ("map_systems" in [note.code for note in stream.header_notes()]) == (rest == "strays")
+
+
+def systems(path: Path, code: int | None, wkt: str | None) -> Path:
+    header = laspy.LasHeader(point_format=7, version="1.4")
+    if code:
+        record = laspy.vlrs.known.GeoKeyDirectoryVlr()
+        record.parse_record_data(struct.pack("<8H", 1, 1, 0, 1, 3072, 0, 1, code))
+        header.vlrs.append(record)
+    if wkt:
+        header.vlrs.append(laspy.vlrs.known.WktCoordinateSystemVlr(wkt))
+    data = laspy.LasData(header)
+    data.x = data.y = data.z = np.arange(50.0)
+    data.red = data.green = data.blue = np.arange(50) * 999
+    data.write(str(path))
+    return path
+
+
+UTM = 'PROJCS["UTM {0}N",GEOGCS["W",AUTHORITY["EPSG","4326"]],UNIT["metre",1],AUTHORITY["EPSG","326{0}"]]'
+
+
+@pytest.mark.parametrize(
+    ("a", "b", "several"),
+    [
+        ((32632, None), (32633, None), True),
+        ((None, UTM.format(32)), (None, UTM.format(33)), True),
+        ((32632, None), (None, UTM.format(32)), False),
+        (
+            (32632, None),
+            (None, f'COMPD_CS["x",{UTM.format(32)},VERT_CS["h",AUTHORITY["EPSG","5773"]]]'),
+            False,
+        ),
+        ((None, 'PROJCRS["A",ID["EPSG",2056]]'), (None, 'PROJCRS["B"]'), True),
+        ((32632, None), (None, None), False),
+    ],
+)
+def test_several_map_systems_are_told(tmp_path: Path, a: tuple, b: tuple, several: bool) -> None:
+    paths = [systems(tmp_path / "a.las", *a), systems(tmp_path / "b.las", *b)]
+    notes = open_point_stream(paths).header_notes()
+    assert [note.code for note in notes] == ["map_systems"] * several
+
+
+@pytest.mark.parametrize("value", [0.0, np.nan, np.inf])
+@pytest.mark.parametrize("at", [131, 139, 147, 155])
+@pytest.mark.parametrize("suffix", ["las", "laz"])
+def test_a_broken_scale_or_offset_is_named(tmp_path: Path, suffix: str, at: int, value: float) -> None:
+    path = las(tmp_path / f"a.{suffix}", np.arange(30.0).reshape(10, 3), np.ones((10, 3), int))
+    data = bytearray(path.read_bytes())
+    struct.pack_into("<d", data, at, value)
+    path.write_bytes(data)
+    if at == 155 and value == 0:  # an offset of 0 is one
+        assert len(read_points(path)) == 10
+        return
+    with pytest.raises(InputError, match=rf"a\.{suffix}: .*{'offset' if at == 155 else 'scale'}"):
+        read_points(path)
+
+
+@pytest.mark.parametrize("point_format", [2, 7])
+def test_points_after_a_count_of_0(tmp_path: Path, point_format: int) -> None:
+    positions = np.arange(30.0).reshape(10, 3)
+    path = las(tmp_path / "a.las", positions, np.arange(30).reshape(10, 3), point_format)
+    data = bytearray(path.read_bytes())
+    data[107:111] = bytes(4)
+    if point_format == 7:
+        data[247:255] = bytes(8)
+    path.write_bytes(data)
+    found = read_cloud(path)
+    np.testing.assert_allclose(found.points.positions, positions)
+    assert "header_count" in [note.code for note in found.notes]
 
 
 def test_las_without_color(tmp_path: Path) -> None:

@@ -57,7 +57,7 @@ def test_blocks_begin_at_any_row(tmp_path: Path, rows: int, start: int) -> None:
     blocks = list(open_point_stream(path).blocks(rows, start))
     assert max(len(positions) for positions, _ in blocks) <= rows
     np.testing.assert_array_equal(np.concatenate([p for p, _ in blocks]), whole.positions[start:])
-    np.testing.assert_allclose(np.concatenate([c for _, c in blocks]) / 255, whole.colors[start:], atol=1e-6)
+    np.testing.assert_allclose(np.concatenate([c for _, c in blocks]), whole.colors[start:], atol=1e-6)
 
 
 def test_intensities_are_grey_between_their_limits(tmp_path: Path) -> None:
@@ -77,8 +77,30 @@ def test_invalid_points_are_dropped(tmp_path: Path) -> None:
     assert [(n.code, n.count) for n in found.notes] == [("noise", 250)]
 
 
+def raw_scans(path: Path, *scans: dict[str, np.ndarray]) -> Path:
+    """Write scans of float fields by the lower interface, which changes no values."""
+    with pye57.E57(str(path), mode="w") as file:
+        image = file.image_file
+        for fields in scans:
+            count = len(next(iter(fields.values())))
+            node, prototype = libe57.StructureNode(image), libe57.StructureNode(image)
+            for name in fields:
+                prototype.set(name, libe57.FloatNode(image, 0.0, libe57.E57_DOUBLE, -1e9, 1e9))
+            points = libe57.CompressedVectorNode(image, prototype, libe57.VectorNode(image, True))
+            node.set("points", points)
+            file.data3d.append(node)
+            buffers = libe57.VectorSourceDestBuffer()
+            kept = {name: np.ascontiguousarray(values, np.float64) for name, values in fields.items()}
+            for name, column in kept.items():
+                buffers.append(libe57.SourceDestBuffer(image, name, column, count, True, True))
+            writer = points.writer(buffers)
+            writer.write(count)
+            writer.close()
+    return path
+
+
 def spherical(path: Path, count: int = 200) -> np.ndarray:
-    """Write a scan of ranges and angles, which pye57 writes by its lower interface; return its positions."""
+    """Write a scan of ranges and angles; return its positions."""
     rng = np.random.default_rng(0)
     names = ("sphericalRange", "sphericalAzimuth", "sphericalElevation", "intensity")
     values = [
@@ -87,20 +109,7 @@ def spherical(path: Path, count: int = 200) -> np.ndarray:
         rng.uniform(-1, 1, count),
         rng.random(count),
     ]
-    with pye57.E57(str(path), mode="w") as file:
-        image = file.image_file
-        node, prototype = libe57.StructureNode(image), libe57.StructureNode(image)
-        for name in names:
-            prototype.set(name, libe57.FloatNode(image, 0.0, libe57.E57_DOUBLE, -1e3, 1e3))
-        points = libe57.CompressedVectorNode(image, prototype, libe57.VectorNode(image, True))
-        node.set("points", points)
-        file.data3d.append(node)
-        buffers = libe57.VectorSourceDestBuffer()
-        for name, column in zip(names, values, strict=True):
-            buffers.append(libe57.SourceDestBuffer(image, name, column, count, True, True))
-        writer = points.writer(buffers)
-        writer.write(count)
-        writer.close()
+    raw_scans(path, dict(zip(names, values, strict=True)))
     far, around, up, _ = values
     return np.stack(
         [far * np.cos(up) * np.cos(around), far * np.cos(up) * np.sin(around), far * np.sin(up)], 1
@@ -129,8 +138,27 @@ def test_damaged(tmp_path: Path, keep: int) -> None:
 
 def test_no_colors(tmp_path: Path) -> None:
     fields = {name: values for name, values in scan(0).items() if name.startswith("cartesian")}
-    with pytest.raises(InputError, match=r"a\.e57: scan 1 .*colours"):
-        read_cloud(written(tmp_path / "a.e57", scan(0), fields))
+    found = read_cloud(written(tmp_path / "a.e57", scan(0), fields))
+    assert [(note.code, note.count) for note in found.notes] == [("black", 500)]
+    assert found.colored[:500].mean() > 0.99 > 0.01 > found.colored[500:].mean()
+    with pytest.raises(InputError, match=r"b\.e57: .*colours"):
+        read_cloud(written(tmp_path / "b.e57", fields))
+
+
+def test_each_scan_has_its_own_range(tmp_path: Path) -> None:
+    """Also with strays, without stated limits, or with intensities instead of colours."""
+    byte, word, grey = scan(0, 2000), scan(1, 2000), scan(2, 2000)
+    deep = {name: 257 * values for name, values in word.items() if name.startswith("color")}
+    place = {name: values for name, values in grey.items() if name.startswith("cartesian")}
+    values = np.random.default_rng(3).uniform(50, 1000, 2000)
+    values[7] = 1e6
+    found = read_cloud(raw_scans(tmp_path / "a.e57", byte, word | deep, place | {"intensity": values}))
+    rgb = [np.stack([s[f"color{c}"] for c in ("Red", "Green", "Blue")], 1) for s in (byte, word)]
+    np.testing.assert_allclose(found.points.colors[:4000], np.concatenate(rgb) / 255, atol=1e-6)
+    shades = found.points.colors[4000:, 0]
+    assert shades.std() > 0.25
+    assert 0.4 < shades.mean() < 0.6
+    assert [note.code for note in found.notes] == ["grey"]
 
 
 def test_needs_pye57(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,0 +1,157 @@
+"""What stored numbers mean, judged by most of them: a few strays decide nothing."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from g2ard.io.sanitize import Raw, logits_of
+from g2ard.io.types import Note
+from g2ard.progress import plural
+from g2ard.scene.splats import SH_C0
+
+_BULK = 0.98
+"""Share of the values that decides, in samples of more than fifty."""
+
+_FULL = (255.0, 1023.0, 4095.0, 65535.0)  # white in 8, 10, 12 and 16 bits
+HDR = 1.5  # brightest value of float colours of which 1 is white
+_FILLED = 0.25  # part of stated limits that intensities fill
+_FEWEST = 16  # Gaussians that suffice to judge how they are stored
+_OUTSIDE, _ROUNDING = 0.1, 1e-3
+"""Amounts by which opacities leave [0, 1] that tell logits, and that are clamped without a note."""
+
+_LARGEST_LOGIT = 20.0  # whole numbers up to here may be logits
+
+Values = NDArray[Any]
+
+
+def full_scales(kind: np.dtype[Any]) -> tuple[float, ...]:
+    """Return the values, ascending, that colours stored as a type may have at full brightness.
+
+    >>> full_scales(np.dtype("u1")), full_scales(np.dtype("i2")), full_scales(np.dtype("f8"))
+    ((255.0,), (255.0, 1023.0, 4095.0, 32767.0), (1.0, 255.0, 1023.0, 4095.0, 65535.0))
+    """
+    if kind.kind == "f":
+        return (1.0, *_FULL)
+    most = float(np.iinfo(kind).max)
+    return (*(full for full in _FULL if full < most), most)
+
+
+def bulk(values: Values) -> tuple[float, float]:
+    """Return the range of most of the finite values; (0, 0) without any."""
+    finite = values[np.isfinite(values)]
+    if not finite.size:
+        return 0.0, 0.0
+    low, high = np.quantile(finite, 1 - _BULK, method="lower"), np.quantile(finite, _BULK, method="higher")
+    return float(low), float(high)
+
+
+def white(colors: Values, scales: Sequence[float]) -> float:
+    """Return the smallest of the scales that holds most of the (n, 3) colours that are not black.
+
+    >>> stray = np.array([[200.0, 9, 0]] * 500 + [[65535.0, 65535, 65535]])
+    >>> white(stray, full_scales(np.dtype("u2")))
+    255.0
+    """
+    brightest = colors.max(axis=1, initial=0)
+    top = bulk(brightest[brightest > 0])[1]
+    fits = (full for full in scales if 0 < top <= full * (HDR if full == 1 else 1.001))
+    return next(fits, scales[-1])
+
+
+def shades(values: Values, limits: tuple[float, float] | None = None) -> tuple[float, float]:
+    """Return the intensities that mean black and white: stated limits, if most values fill a part of them."""
+    low, high = bulk(values)
+    if limits and low >= limits[0] and high <= limits[1] and high - low >= _FILLED * (limits[1] - limits[0]):
+        return limits
+    return low, high
+
+
+def tells(values: Values) -> bool:
+    """Return whether colours (n, 3) are not all black, or intensities (n, 1) vary."""
+    finite = values[np.isfinite(values).all(axis=1)]
+    return bool(finite.any() if values.shape[1] == 3 else np.ptp(finite) > 0) if finite.size else False
+
+
+@dataclass(frozen=True)
+class Reading:
+    """How a scene's numbers are read.
+
+    Args:
+        log_scales: whether scales are logarithms.
+        opaque: the number that means opaque; None if opacities are logits.
+        white: the number that means white; None if base colours are coefficients of band 0.
+    """
+
+    log_scales: bool
+    opaque: float | None
+    white: float | None
+    notes: tuple[Note, ...]
+
+    def opacity_logits(self, values: Values) -> Values:
+        """Return logits; opacities past [0, 1] are clamped."""
+        wide = values.astype(np.float64)
+        return wide if self.opaque is None else logits_of(np.clip(wide / self.opaque, 0, 1))
+
+    def sh0(self, values: Values) -> Values:
+        """Return coefficients of band 0."""
+        return values if self.white is None else (values / self.white - 0.5) / SH_C0
+
+
+def judged(scales: Values, opacities: Values, base: Values, *, logs: bool) -> Reading:
+    """Judge how a scene's scales (n, k), opacities (n,) and base colours (n, 3) are stored.
+
+    Args:
+        logs: whether the format defines scales as logarithms and opacities as logits, otherwise as linear.
+            The definition holds, and doubts are noted, unless the numbers make no sense in it.
+    """
+    count, (small, large), (faint, solid) = len(opacities), bulk(scales), bulk(opacities)
+    enough = count >= _FEWEST
+    told: list[str] = []
+    opaque, notes = None if logs else 1.0, list[Note]()
+    if faint >= 0 and solid > 0 and _are_whole(opacities):
+        opaque = white(opacities[:, None], full_scales(opacities.dtype)) if solid > 1 else 1.0
+        if opaque > 1:
+            notes.append(Note("opacities", count, f"opacities are whole numbers, taken as 0 to {opaque:g}"))
+    elif not logs and (faint < -_OUTSIDE or solid > 1 + _OUTSIDE):
+        opaque = None
+        notes.append(Note("opacities", count, "opacities leave [0, 1], so all are taken as logits"))
+    elif logs and enough and 0 <= faint <= solid <= 1 and (faint < solid or solid == 1):
+        told.append(f"opacities ({faint:.3g} to {solid:.3g}) look activated, not logits")
+    elif not logs and (past := int(np.sum(np.abs(opacities - 0.5) > 0.5 + _ROUNDING))):
+        text = f"{plural(past, 'opacity', 'opacities')} past [0, 1] clamped"
+        notes.append(Note("opacities", past, text))
+    log_scales = logs
+    if not logs and small < 0:
+        log_scales = True
+        notes.append(Note("log_scales", count, "scales are below 0, so all are taken as logarithms"))
+    elif logs and enough and 0 < small < large and np.mean(scales, where=np.isfinite(scales)) < 1:
+        told.insert(0, f"scales ({small:.3g} to {large:.3g}) look linear, not logarithms")
+    dark, bright = bulk(base)
+    full = None
+    if dark >= 0 and bright > 1 and _are_whole(base):
+        full = white(base, full_scales(base.dtype))
+        notes.append(Note("base_colors", count, f"base colours are whole numbers, taken as 0 to {full:g}"))
+    elif enough and 0 <= dark < bright - 0.5 and bright <= 1:
+        told.append(f"base colours ({dark:.3g} to {bright:.3g}) look like RGB, not coefficients")
+    if told:
+        notes.append(Note("activated", 1, f"{' and '.join(told)}; they are read as the format defines them"))
+    return Reading(log_scales, opaque, full, tuple(notes))
+
+
+def fill(raw: Raw, scales: Values, opacities: Values, base: Values) -> list[Note]:
+    """Fill in a scene of a format of linear scales and opacities, as they are judged; return notes."""
+    read = judged(scales, opacities, base, logs=False)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        raw.log_scales[:] = scales if read.log_scales else np.log(scales.astype(np.float64))
+        raw.logit_opacities[:], raw.sh0[:, 0] = read.opacity_logits(opacities), read.sh0(base)
+    return list(read.notes)
+
+
+def _are_whole(values: Values) -> bool:
+    """Return whether values are whole numbers of a larger range than coefficients and logits have."""
+    if values.dtype.kind in "iu":
+        return True
+    return bulk(values)[1] > _LARGEST_LOGIT and bool((values == np.rint(values))[np.isfinite(values)].all())

@@ -1,0 +1,99 @@
+"""How scenes of .ply, .glb and USD store opacities, scales and colours is judged alike."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from plyfile import PlyData, PlyElement
+
+from g2ard.io import read_scene
+from g2ard.io.judge import judged
+from g2ard.scene.splats import SH_C0
+
+RNG = np.random.default_rng(5)
+COUNT = 400
+SCALES = np.exp(RNG.normal(-4, 1, (COUNT, 3)))
+ALPHAS = np.concatenate([[1.0], RNG.uniform(0.05, 0.98, COUNT - 1)])
+LOGITS = np.log(ALPHAS[1:] / (1 - ALPHAS[1:]))
+RGB = np.rint(RNG.uniform(0.1, 1, (COUNT, 3)) * 255) / 255
+BASE = (RGB - 0.5) / SH_C0
+
+
+def sigmoid(logits):
+    with np.errstate(over="ignore"):
+        return 1 / (1 + np.exp(-np.asarray(logits, np.float64)))
+
+
+@pytest.mark.parametrize("logs", [True, False])
+@pytest.mark.parametrize(
+    ("kind", "top"), [("u1", 255), ("u2", 65535), ("u2", 255), ("f4", 255), ("f4", 65535)]
+)
+def test_whole_numbers_are_parts_of_their_range(kind: str, top: int, logs: bool) -> None:
+    stored, colors = np.rint(ALPHAS * top).astype(kind), np.rint(RGB * top).astype(kind)
+    read = judged(np.log(SCALES) if logs else SCALES, stored, colors, logs=logs)
+    np.testing.assert_allclose(sigmoid(read.opacity_logits(stored)), ALPHAS, atol=0.5 / 255)
+    np.testing.assert_allclose(read.sh0(colors), BASE, atol=0.01)
+    assert [note.code for note in read.notes] == ["opacities", "base_colors"]
+
+
+def test_linear_opacities_a_little_past_1_stay_opaque() -> None:
+    stored = np.minimum(ALPHAS * 1.0001 + 1e-7, 1.0000001)
+    stored[3] = -1e-4
+    read = judged(SCALES, stored, BASE, logs=False)
+    np.testing.assert_allclose(sigmoid(read.opacity_logits(stored)), np.clip(stored, 0, 1))
+    assert read.notes == ()
+    stored[7] = 3
+    read = judged(SCALES, stored, BASE, logs=False)
+    assert sigmoid(read.opacity_logits(stored))[7] == 1
+    assert [(note.code, note.count) for note in read.notes] == [("opacities", 1)]
+
+
+@pytest.mark.parametrize("shift", [0.0, 8.0])  # also if all are positive
+def test_logits_and_logarithms_where_linear_ones_are_defined(shift: float) -> None:
+    logs = np.log(SCALES[1:])
+    read = judged(logs, LOGITS + shift, BASE[1:], logs=False)
+    assert (read.log_scales, read.opaque) == (True, None)
+    np.testing.assert_array_equal(read.opacity_logits(LOGITS), LOGITS)
+    assert {note.code for note in read.notes} == {"log_scales", "opacities"}
+
+
+@pytest.mark.parametrize(
+    ("scales", "opacities", "base", "words"),
+    [
+        (np.log(SCALES), np.ones(COUNT), BASE, ["opacities"]),
+        (np.log(SCALES), ALPHAS, BASE, ["opacities"]),
+        (np.log(SCALES), np.append(ALPHAS[1:], 1.7), BASE, ["opacities"]),
+        (SCALES, np.append(LOGITS, 2), BASE, ["scales"]),
+        (np.log(SCALES), np.append(LOGITS, 2), RGB, ["base colours"]),
+        (SCALES, ALPHAS, RGB, ["scales", "opacities", "base colours"]),
+        (np.log(SCALES), np.append(LOGITS, 2), BASE, []),
+        (np.log(SCALES), np.zeros(COUNT), BASE, []),  # opacity 0.5, as of lifted points
+    ],
+)
+def test_activated_values_in_a_ply_are_noted(
+    scales: np.ndarray, opacities: np.ndarray, base: np.ndarray, words: list[str]
+) -> None:
+    read = judged(scales, opacities, base, logs=True)
+    text = " ".join(note.text for note in read.notes)
+    assert [word for word in ("scales", "opacities", "base colours") if f"{word} (" in text] == words
+    assert (read.log_scales, read.opaque, read.white) == (True, None, None)
+
+
+def test_a_ply_of_bytes(tmp_path: Path) -> None:
+    """Quaternions of bytes are around 128."""
+    quats = RNG.normal(size=(COUNT, 4))
+    quats /= np.linalg.norm(quats, axis=1, keepdims=True)
+    names = [f"rot_{i}" for i in range(4)]
+    columns = dict(zip("xyz", RNG.normal(size=(3, COUNT)), strict=True))
+    columns |= {f"scale_{i}": np.log(SCALES[:, i]) for i in range(3)}
+    small = dict(zip(names, np.rint(quats.T * 127 + 128), strict=True)) | {"opacity": ALPHAS * 255}
+    small |= dict(zip(("red", "green", "blue"), RGB.T * 255, strict=True))
+    rows = np.empty(COUNT, [(name, "f4") for name in columns] + [(name, "u1") for name in small])
+    for name, values in (columns | small).items():
+        rows[name] = np.rint(values) if name in small else values
+    PlyData([PlyElement.describe(rows, "vertex")]).write(str(tmp_path / "a.ply"))
+    found = read_scene(tmp_path / "a.ply").splats
+    np.testing.assert_allclose(found.opacities, ALPHAS, atol=0.5 / 255)
+    np.testing.assert_allclose(found.colors, RGB, atol=1e-5)
+    own = found.quats / np.linalg.norm(found.quats, axis=1, keepdims=True)
+    assert np.abs((own * quats).sum(1)).min() > 0.999
