@@ -1,6 +1,7 @@
 """The program: its arguments, its streams and its exit status."""
 
 import gc
+import io
 import os
 import sys
 from typing import TextIO
@@ -51,7 +52,10 @@ def run_program(app: typer.Typer, name: str) -> None:
 
 
 def _open_streams() -> None:
-    """Send to nowhere what goes to a closed stream, as after `>&-`, and keep files off its number."""
+    """Send to nowhere what goes to a closed stream, as after `>&-`, and keep files off its number.
+
+    Characters that a stream's character set lacks are replaced.
+    """
     for number, name in enumerate(("stdin", "stdout", "stderr")):
         try:
             os.fstat(number)
@@ -61,6 +65,8 @@ def _open_streams() -> None:
         if getattr(sys, name) is None:
             stream = os.fdopen(number, "w" if number else "r", encoding="utf-8", closefd=False)
             setattr(sys, name, stream)
+        if number and isinstance(stream := getattr(sys, name), io.TextIOWrapper):
+            stream.reconfigure(errors="replace")
 
 
 def _name_shell(words: list[str]) -> None:
