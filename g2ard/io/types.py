@@ -83,6 +83,9 @@ class Cloud:
     notes: tuple[Note, ...]
     colored: NDArray[np.bool_]
 
+    def __len__(self) -> int:
+        return len(self.points)
+
 
 @dataclass(frozen=True)
 class ViewFiles:

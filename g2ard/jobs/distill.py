@@ -19,13 +19,15 @@ from g2ard.config.schema import listed
 from g2ard.errors import InputError
 from g2ard.io import kind, read_cloud, read_splats
 from g2ard.io.paths import real_path
-from g2ard.io.types import Points
+from g2ard.io.splits import for_training
+from g2ard.io.types import Cloud, Points
 from g2ard.jobs.budget import Budget
 from g2ard.jobs.clean import clean as remove_clutter
 from g2ard.jobs.distill_options import DistillOptions
 from g2ard.jobs.inputs import Views, load_scene, make_targets, scorable
 from g2ard.jobs.measured_budget import Reduction, ResolvedBudget
 from g2ard.jobs.memory import RECOVERY_TIMES
+from g2ard.jobs.photo_colors import colored
 from g2ard.jobs.photo_points import distinct, sparse_file, sparse_points, topped_up
 from g2ard.jobs.view_checks import check_photos, propose_background
 from g2ard.jobs.views import Use, views_of, within_pixels
@@ -610,13 +612,17 @@ def _read(scene: Scene, budget: Budget, options: DistillOptions, progress: Progr
     if views is None or is_made(views):
         if scene is None:
             raise InputError("missing; without a scene, pass photos with poses as views", parameter="scene")
-        points, name, _ = _points(scene, None, say)
-        assert points is not None
+        cloud, name, _ = _points(scene, None, say)
+        assert cloud is not None
         say("no photos: the lifted points render the training images; photos, given as views, show more")
-        lifted = lift(points.positions, points.colors, **vars(options.config.lift), progress=progress)
+        xyz, rgb = cloud.points.positions, cloud.points.colors
+        lifted = lift(xyz, rgb, **vars(options.config.lift), progress=progress)
         return _Read(lifted, False, options.beside, name, len(lifted))
-    points, name, of_photos = _points(scene, views, say)
-    points = points and distinct(points)
+    cloud, name, of_photos = _points(scene, views, say)
+    points: Points | None = None
+    if cloud is not None:
+        split = "train" if options.held_out is None else for_training
+        points = distinct(colored(cloud, views, split, name, progress=progress, say=say))
     given = 0 if points is None or scene is None else len(points)
     wanted = budget.count or 0
     if points is None and not wanted:
@@ -646,16 +652,18 @@ def _read(scene: Scene, budget: Budget, options: DistillOptions, progress: Progr
 
 def _points(
     scene: Points | str | Path | None, views: Views | None, say: Say
-) -> tuple[Points | None, str, bool]:
-    """Return the points of a cloud or stored with the views, their name in errors, and whether they were
-    found in photos."""
+) -> tuple[Cloud | None, str, bool]:
+    """Return a cloud, or that stored with the views, its name in errors, and whether it was found in photos.
+
+    With views, the cloud may be without colours.
+    """
     if isinstance(scene, Points):
-        return scene, "cloud", False
+        return Cloud(scene, (), np.any(scene.colors, axis=1)), "cloud", False
     sparse = None if views is None else sparse_file(views)
     if scene is None:
-        return sparse_points(sparse, say), "cloud", True
-    cloud = read_cloud(scene)
+        return sparse_points(sparse, say), "cloud" if sparse is None else str(sparse), True
+    cloud = read_cloud(scene, bare=views is not None)
     for note in cloud.notes:
         say(f"{scene}: {note}")
     given = (kind(scene) == "views" and sparse_file(scene)) or Path(scene)
-    return cloud.points, str(scene), sparse is not None and real_path(given) == real_path(sparse)
+    return cloud, str(scene), sparse is not None and real_path(given) == real_path(sparse)

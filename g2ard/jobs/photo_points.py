@@ -16,13 +16,13 @@ from numpy.typing import NDArray
 
 from g2ard.config.choices import BLACK, Colour
 from g2ard.errors import G2ardError, InputError
-from g2ard.io import read_points
+from g2ard.io import read_cloud
 from g2ard.io.detect import file_format
 from g2ard.io.finding import Finder
 from g2ard.io.images import composited, load_photo
 from g2ard.io.jsonfile import read_json
 from g2ard.io.splits import for_training
-from g2ard.io.types import Points, ViewFiles, ViewSet
+from g2ard.io.types import Cloud, Points, ViewFiles, ViewSet
 from g2ard.jobs.inputs import Split, Views, load_view_sets
 from g2ard.progress import Progress, Say, plural, silent, unsaid
 from g2ard.scene.cameras import Cameras
@@ -221,15 +221,15 @@ def distinct(points: Points) -> Points:
     return Points(points.positions[rows], np.ascontiguousarray(colors, np.float32))
 
 
-def sparse_points(file: Path | None, say: Say = unsaid) -> Points | None:
-    """Read the points of `sparse_file`; return None, and say why, if they cannot be used."""
+def sparse_points(file: Path | None, say: Say = unsaid) -> Cloud | None:
+    """Read the points of `sparse_file`; return None, and say why, if there are none that can be read."""
     try:
-        points = None if file is None else read_points(file)
+        cloud = None if file is None else read_cloud(file, bare=True)
     except G2ardError as error:
         say(f"warning: no starting points from photos: {error}")
         return None
-    if points is None or len(points):
-        return points
+    if cloud is None or len(cloud.points):
+        return cloud
     say(f"warning: no starting points from photos: {file}: has no points")
     return None
 

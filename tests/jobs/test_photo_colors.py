@@ -1,0 +1,42 @@
+"""Points without colours take those of the photos that see them."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from g2ard.jobs.photo_colors import median_colors
+from g2ard.scene.cameras import Camera, Cameras
+
+
+def view(folder: Path, number: int, colour: tuple[int, int, int], eye: list[float]) -> Camera:
+    path = folder / f"{number}.png"
+    Image.new("RGB", (64, 48), colour).save(path)
+    return replace(Camera.facing(eye, [0, 0, 0], width=64, height=48, name=path.name), image_path=path)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_each_side_has_the_median_colour_of_its_own_photos(tmp_path: Path, seed: int) -> None:
+    """A wall's two sides are seen by two groups of photos; one photo of each shows something else."""
+    rng = np.random.default_rng(seed)
+    wall = rng.uniform(-1, 1, (6000, 3)) * (1, 0, 1)
+    front, back = (wall + np.array([0, y, 0]) for y in (-0.3, 0.3))
+    colours = {-4.0: (200, 40, 10), 4.0: (20, 90, 220)}
+    cameras = []
+    for y, colour in colours.items():
+        for x in (-0.3, 0.0, 0.3):
+            shown = (0, 255, 0) if x == 0 else colour
+            cameras.append(view(tmp_path, len(cameras), shown, [x, y, 0.1]))
+    positions = np.concatenate([front, back, [[0, 50.0, 0]]])
+    wanted = np.ones(len(positions), bool)
+    wanted[1::5] = False
+    found, seen = median_colors(positions, wanted, Cameras.of(cameras))
+    assert len(found) == wanted.sum()
+    side = positions[wanted, 1]
+    for y, near in ((-4.0, side < 0), (4.0, (side > 0) & (side < 1))):
+        right = np.abs(255 * found[near] - colours[y]).max(1) < 1
+        assert seen[near].mean() > 0.9
+        assert right[seen[near]].mean() > 0.95
+    assert not seen[-1]
