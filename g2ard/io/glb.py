@@ -260,7 +260,13 @@ class _Compressed(msgspec.Struct, rename="camel"):
     buffer_view: Whole
 
 
+class _Shown(msgspec.Struct):
+    nodes: list[Whole] = []
+
+
 class _Document(msgspec.Struct, rename="camel"):
+    scene: Whole = Whole(0)
+    scenes: list[_Shown] = []
     meshes: list[_Mesh] = []
     nodes: list[_Node] = []
     accessors: list[_Accessor] = []
@@ -326,9 +332,10 @@ def _has_splats(primitive: _Primitive) -> bool:
 
 def _shown(path: Path, document: _Document, binary: bytes) -> Iterator[tuple[Scene, NDArray[np.float64]]]:
     """Yield each splat primitive with each of its placements."""
+    shown = _nodes_shown(path, document)
     for index, mesh in enumerate(document.meshes):
         held = [at for at, primitive in enumerate(mesh.primitives) if _has_splats(primitive)]
-        placements = _placements(path, document.nodes, index) if held else []
+        placements = _placements(path, document.nodes, index, shown) if held else []
         for at in held:
             within = Place(path).to("meshes", index, "primitives", at)
             scene = _primitive(within, document, binary, mesh.primitives[at])
@@ -366,7 +373,7 @@ def _primitive(within: Place, document: _Document, binary: bytes, primitive: _Pr
         raise InputError(f"unsupported extension {unknown[0]!r}", path=path)
     if splats.kernel != "ellipse":
         raise InputError("unsupported kernel; expected 'ellipse'", path=path)
-    notes = [LINEAR_NOTE] if splats.color_space == "lin_rec709_display" else []
+    notes = [LINEAR_NOTE] if "lin" in str(splats.color_space).lower() else []
     name = next((name for name in _SPZ_EXTENSIONS if name in inside), None)
     if name is None:
         scene = _attributes_of(within.to("attributes"), document, binary, primitive.attributes)
@@ -455,8 +462,23 @@ def _accessor(
     return np.maximum(rows.astype(np.float32) / np.float32(top), np.float32(-1))
 
 
-def _placements(path: Path, nodes: list[_Node], mesh: int) -> list[NDArray[np.float64]]:
-    """Return the (4, 4) placements by a mesh's nodes and their ancestors, in the axes of a .ply."""
+def _nodes_shown(path: Path, document: _Document) -> set[int]:
+    """Return the nodes of the shown scene and below; all, if there are no scenes, or it shows no splats."""
+    every = set(range(len(document.nodes)))
+    if not document.scenes:
+        return every
+    ahead = list(_entry(document.scenes, document.scene, Place(path).to("scene")).nodes)
+    found = set[int]()
+    while ahead:
+        if (at := ahead.pop()) not in found:
+            ahead += _entry(document.nodes, at, Place(path).to("scenes", document.scene, "nodes")).children
+            found.add(int(at))
+    splats = {i for i, mesh in enumerate(document.meshes) if any(map(_has_splats, mesh.primitives))}
+    return found if any(document.nodes[at].mesh in splats for at in found) else every
+
+
+def _placements(path: Path, nodes: list[_Node], mesh: int, seen: set[int]) -> list[NDArray[np.float64]]:
+    """Return the (4, 4) placements by a mesh's `seen` nodes and their ancestors, in the axes of a .ply."""
     parents: dict[int, int] = {}
     for i, node in enumerate(nodes):
         for k, child in enumerate(node.children):
@@ -464,20 +486,21 @@ def _placements(path: Path, nodes: list[_Node], mesh: int) -> list[NDArray[np.fl
             if parents.setdefault(child, i) != i:
                 raise InputError(f"node {child} has 2 parents", path=path)
     found = []
-    for shown in (i for i, node in enumerate(nodes) if node.mesh == mesh):
+    holders = [i for i, node in enumerate(nodes) if node.mesh == mesh]
+    for shown in (i for i in holders if i in seen):
         at: int | None = shown
-        total, seen = np.eye(4), set[int]()
+        total, above = np.eye(4), set[int]()
         while at is not None:
-            if at in seen:
+            if at in above:
                 raise InputError(f"node {at} is its own ancestor", path=path)
-            seen.add(at)
+            above.add(at)
             with np.errstate(over="ignore", invalid="ignore"):
                 total = _local(nodes[at]) @ total
             at = parents.get(at)
         if not np.isfinite(total[:3, 3]).all():
             raise InputError(f"invalid translation {tuple(total[:3, 3].tolist())}", path=path)
         found.append(total * np.outer((*_GLTF_TURN, 1), (*_GLTF_TURN, 1)))
-    return found or [np.eye(4)]
+    return found if holders else [np.eye(4)]
 
 
 def _local(node: _Node) -> NDArray[np.float64]:

@@ -48,6 +48,9 @@ FORMATS: dict[FormatName, SceneFormat] = {
 }
 """Formats by name, longer suffixes first."""
 
+LARGEST_SPZ = 10_485_760
+"""Gaussians that readers of SPZ from before May 2026 accept."""
+
 _VISIBLE_ROUNDING = 0.01
 """Rounding of positions that can be visible, as a share of a typical Gaussian's scale."""
 
@@ -86,18 +89,18 @@ def written_bytes(path: Path) -> int:
 
 def lost_in(path: str | Path, splats: Splats, **options: object) -> list[Note]:
     """Return notes on what the format of an output path cannot hold; `options` are the writer's."""
-    output_format = scene_format(path)
-    states_model = (
-        output_format.models or options.get("compress") == "spz"
-    )  # SPZ inside a .glb has a flag for it
-    if states_model or not splats.antialiased:
-        return []
     from g2ard.io.types import Note
 
-    text = (
-        f"{output_format.suffix} cannot say that the scene is antialiased; other programs draw it too opaque"
-    )
-    return [Note("lost_render_model", 1, text)]
+    output_format, notes = scene_format(path), list[Note]()
+    is_spz = output_format.module == "spz" or options.get("compress") == "spz"
+    if splats.antialiased and not (output_format.models or is_spz):  # SPZ inside a .glb has a flag for it
+        suffix = output_format.suffix
+        text = f"{suffix} cannot say that the scene is antialiased; other programs draw it too opaque"
+        notes.append(Note("lost_render_model", 1, text))
+    if is_spz and len(splats) > LARGEST_SPZ:
+        text = f"readers of SPZ from before May 2026 refuse more than {LARGEST_SPZ:,} Gaussians"
+        notes.append(Note("large_spz", len(splats), text))
+    return notes
 
 
 def check_positions(path: str | Path, splats: Splats, count: int | None = None) -> None:

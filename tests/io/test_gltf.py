@@ -63,7 +63,7 @@ def test_several_primitives_are_joined(tmp_path: Path, in_one_mesh: bool) -> Non
         document["meshes"] = [{"primitives": [primitive, plain, primitive]}]
     else:
         document["meshes"] = [{"primitives": [primitive]}, {"primitives": [plain, primitive]}]
-        document |= {"nodes": [{"mesh": 0}, {"mesh": 1}]}
+        document |= {"nodes": [{"mesh": 0}, {"mesh": 1}], "scenes": [{"nodes": [0, 1]}]}
     found = read_scene(write_glb(tmp_path / "a.glb", document, binary))
     np.testing.assert_allclose(found.splats.means, np.concatenate([truth.means] * 2), atol=1e-6)
     assert [note.code for note in found.notes] == ["ignored_meshes"]
@@ -132,3 +132,26 @@ def test_any_affine_placement(seed: int, kind: str) -> None:
 def test_a_placement_that_flattens_is_refused() -> None:
     with pytest.raises(InputError, match="flattens"):
         deformed(scene(), np.diag([1.0, 0, 1, 1]))
+
+
+@pytest.mark.parametrize("scene_index", [None, 0, 1])
+def test_only_the_shown_scene_is_read(tmp_path: Path, scene_index: int | None) -> None:
+    """Also where nodes below those of the scene show the mesh; without a `scene`, the first is shown."""
+    document, binary = parts_of(tmp_path, scene())
+    nodes = [{"mesh": 0}, {"mesh": 0, "translation": [-9.0, 0, 0]}, {"children": [1]}, {"mesh": 0}]
+    document |= {"nodes": nodes, "scenes": [{"nodes": [0]}, {"nodes": [2]}]}
+    document.pop("scene")
+    if scene_index is not None:
+        document["scene"] = scene_index
+    found = read_splats(write_glb(tmp_path / "a.glb", document, binary))
+    assert len(found) == len(scene())
+    shift = 9.0 if scene_index else 0.0
+    np.testing.assert_allclose((found.means + found.offset)[:, 0], scene().means[:, 0] + shift, atol=1e-5)
+
+
+@pytest.mark.parametrize("space", ["BT.709-linear", "lin_rec709_display", "srgb_rec709_display"])
+def test_linear_colours_are_noted(tmp_path: Path, space: str) -> None:
+    document, binary = parts_of(tmp_path, scene())
+    document["meshes"][0]["primitives"][0]["extensions"][EXTENSION]["colorSpace"] = space
+    notes = read_scene(write_glb(tmp_path / "a.glb", document, binary)).notes
+    assert [note.code for note in notes] == ["linear_colors"] * ("lin" in space)

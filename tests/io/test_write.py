@@ -14,6 +14,7 @@ from g2ard.errors import InputError, OutputError
 from g2ard.io import check_scene_output, read_splats, write_splats
 from g2ard.io.glb import EXTENSION, SPZ_EXTENSION
 from g2ard.io.packing import packing_order, unit_quats
+from g2ard.io.scene_formats import lost_in
 from g2ard.io.sog_write import nearest, palette_size, sog_files
 from g2ard.io.spz import fraction_bits
 from g2ard.jobs.convert import convert
@@ -540,3 +541,13 @@ def test_attributes_of_a_glb_may_be_normalised_integers(tmp_path: Path, name: st
     for attribute, field in STORED.items():
         step = 0.51 / np.iinfo(dtype).max if attribute == name else 1e-7
         np.testing.assert_allclose(getattr(found, field), getattr(plain, field), atol=step)
+
+
+@pytest.mark.parametrize(("name", "options"), [("a.spz", {}), ("a.glb", {"compress": "spz"}), ("a.glb", {})])
+def test_a_large_spz_is_noted(monkeypatch: pytest.MonkeyPatch, name: str, options: dict[str, str]) -> None:
+    monkeypatch.setattr("g2ard.io.scene_formats.LARGEST_SPZ", 19)
+    ball = checkered_ball(20)
+    codes = [note.code for note in lost_in(name, ball, **options)]
+    assert codes == ["large_spz"] * (name == "a.spz" or bool(options))
+    monkeypatch.setattr("g2ard.io.scene_formats.LARGEST_SPZ", 20)
+    assert lost_in(name, ball, **options) == []
