@@ -344,11 +344,9 @@ def test_points_that_cannot_be_used_are_a_warning(tmp_path: Path, damage: str, t
     assert points is not None or (len(said) == 1 and ("points3D" in said[0] or "sparse" in said[0]))
 
 
-@pytest.mark.parametrize("name", ["gone.ply", "/mnt/gone.ply", "grey.ply"])
+@pytest.mark.parametrize("name", ["gone.ply", "/mnt/gone.ply"])
 def test_named_points_that_cannot_be_used_are_a_warning(tmp_path: Path, name: str) -> None:
     path = captured(tmp_path, NAMES, ply_file_path=name)
-    head = "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\n"
-    (tmp_path / "grey.ply").write_text(f"{head}end_header\n0 0 0\n")
     said: list[str] = []
     assert sparse_points(sparse_file(path), said.append) is None
     assert len(said) == 1
@@ -365,3 +363,13 @@ def test_points_named_on_another_machine(tmp_path: Path) -> None:
 def _made(path: Path) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
     return path
+
+
+def test_named_points_without_colours_are_taken(tmp_path: Path) -> None:
+    """Photos colour them."""
+    path = captured(tmp_path, NAMES, ply_file_path="bare.ply")
+    head = "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\n"
+    (tmp_path / "bare.ply").write_text(f"{head}end_header\n0 0 0\n")
+    cloud = sparse_points(sparse_file(path))
+    assert cloud is not None
+    assert cloud.colored.tolist() == [False]

@@ -107,3 +107,19 @@ def test_near_coordinates_get_no_offset():
     near = lift(points, np.full((500, 3), 0.5))
     np.testing.assert_array_equal(near.offset, 0)
     np.testing.assert_array_equal(near.means, points.astype(np.float32))
+
+
+@pytest.mark.parametrize("count", [1, 14, 35])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_strays_do_not_become_large(count: int, seed: int) -> None:
+    """Far points take a size near that of the surface; those of the surface keep theirs, at any density."""
+    rng = np.random.default_rng(seed)
+    ground = np.column_stack([rng.uniform(-40, 40, (8000, 2)), rng.normal(0, 0.05, 8000)])
+    ground[:, :2] *= 0.3 + 0.7 * np.abs(ground[:, :2]) / 40  # ten times denser in the middle
+    strays = np.column_stack([rng.uniform(-40, 40, (count, 2)), rng.uniform(80, 400, count)])
+    alone = lift(ground, np.full(ground.shape, 0.5)).scales
+    found = lift(np.concatenate([ground, strays]), np.full((8000 + count, 3), 0.5)).scales
+    same = (found[:8000] == alone).all(1)
+    assert same.mean() > 0.98
+    edge = np.quantile(alone.max(1), 0.999)
+    assert found[8000:].max() < 5 * edge  # 20 to 70 without a limit

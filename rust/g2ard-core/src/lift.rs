@@ -75,6 +75,16 @@ impl Patch {
     }
 }
 
+/// Neighbours over `neighbors` whose sizes limit that of a disc. Strays must be fewer than a quarter of them.
+const AROUND: usize = 16;
+/// Patches in Morton order that share the window in which strays are first looked for.
+const WINDOW: usize = 64;
+/// Logarithm of the ratio of the quartiles of sizes among points of even density: the radius of the k nearest has a relative
+/// deviation of 1/(2√k), here of k = 10.
+const EVEN: f64 = 1.349 * 0.158;
+/// Radius of the nearest points in the corner of a surface, a quarter of a plane, over that inside.
+const CORNER: f64 = 2.0;
+
 /// Rows between two checks of the control.
 const CHUNK: usize = 4096;
 
@@ -104,6 +114,7 @@ pub fn lift(points: &[[f64; 3]], config: &LiftConfig, control: &Control) -> Resu
     let mut patches = patches.concat();
     let lines = lines::find(tree.rows(), &patches, &beside);
     lines::widen(points, lines, &mut patches, config, control)?;
+    shrink_strays(&tree, &mut patches, config);
     Ok(discs(&tree, &patches, config))
 }
 
@@ -126,6 +137,59 @@ fn extent(points: &[[f64; 3]], row: u32, near: &[Neighbor<f64>]) -> Eigen {
         }
     }
     symmetric_eigen(&cov)
+}
+
+/// Shrinks patches that are far larger than those around them, which span the void between stray points, to `fence`.
+fn shrink_strays(tree: &Tree, patches: &mut [Patch], config: &LiftConfig) {
+    let (count, around) = (patches.len(), AROUND * config.neighbors);
+    if count <= around {
+        return;
+    }
+    let sizes: Vec<f64> = patches
+        .iter()
+        .map(|p| p.sigmas[0].max(p.sigmas[1]))
+        .collect();
+    let candidates: Vec<usize> = (0..count.div_ceil(WINDOW))
+        .into_par_iter()
+        .flat_map_iter(|window| {
+            let here = window * WINDOW..((window + 1) * WINDOW).min(count);
+            let first = (here.start + WINDOW / 2).saturating_sub(around / 2);
+            let first = first.min(count - around);
+            let limit = fence(sizes[first..first + around].to_vec());
+            here.filter(|&at| sizes[at] > limit).collect::<Vec<_>>()
+        })
+        .collect();
+    let mut at_row = vec![0u32; if candidates.is_empty() { 0 } else { count }];
+    for at in 0..at_row.len() {
+        at_row[tree.rows()[at] as usize] = at as u32;
+    }
+    let limits: Vec<f64> = candidates
+        .par_iter()
+        .map(|&at| {
+            let mut limit = f64::INFINITY;
+            tree.nearest(at..at + 1, around, |_, near| {
+                let size = |n: &Neighbor<f64>| sizes[at_row[n.1 as usize] as usize];
+                limit = fence(near.iter().map(size).collect());
+            });
+            limit
+        })
+        .collect();
+    for (at, limit) in candidates.into_iter().zip(limits) {
+        let share = (limit / sizes[at]).min(1.0);
+        patches[at].sigmas = patches[at].sigmas.map(|s| share * s);
+    }
+}
+
+/// Tukey's fence of the logarithms of sizes, Q3 + 1.5 (Q3 − Q1), past which they are outliers: with at least the spread of
+/// even points, and room for corners. Infinity if most sizes are 0.
+fn fence(mut sizes: Vec<f64>) -> f64 {
+    sizes.sort_unstable_by(f64::total_cmp);
+    let quartile = |part: usize| sizes[part * sizes.len() / 4].ln();
+    let (first, third) = (quartile(1), quartile(3));
+    if !(first.is_finite() && third.is_finite()) {
+        return f64::INFINITY;
+    }
+    CORNER * (third + 1.5 * (third - first).max(EVEN)).exp()
 }
 
 /// Sizes in the order of the points. A patch without extent (all neighbours at one place) takes the median extent of
