@@ -61,9 +61,10 @@ class Stream(JoinedClouds):
 
     def header_notes(self) -> tuple[Note, ...]:
         found: dict[str, list[Note]] = {}
-        for scan in self.streams:
+        for number, scan in enumerate(self.streams):
+            part = f"scan {number}: " if len(self.streams) > 1 else ""
             for note in scan.header_notes():
-                found.setdefault(note.code, []).append(note)
+                found.setdefault(note.code, []).append(replace(note, text=f"{part}{note}"))
         notes = [
             replace(same[0], count=sum(note.count for note in same), text=f"{same[0]}{_more(len(same))}")
             for same in found.values()

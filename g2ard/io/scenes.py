@@ -255,7 +255,9 @@ def open_point_stream(path: str | Path | Sequence[str | Path], *, bare: bool = F
     return stream
 
 
-_UNCOLORED = "add colours, for example with PDAL's filters.colorization, or {views=} with photos to `distill`"
+_UNCOLORED = (
+    "add colours, for example with PDAL's filters.colorization, or run `distill` with photos ({views=DIR})"
+)
 
 
 def write_points(path: str | Path, points: Points, *, overwrite: bool = False) -> None:

@@ -222,15 +222,16 @@ class PointStream(Stream[RawPoints]):
         """Yield the source's points from `start`, at most `rows` at a time."""
 
     def header_notes(self) -> tuple[Note, ...]:
-        notes, rows, (dark, full) = list(self.notes), self.tally.rows, self._range
+        notes, (dark, full) = list(self.notes), self._range
+        rows = self.tally.rows - self.tally.dropped - self.tally.noise
         if not rows:
             return tuple(notes)
         if self.channels == 1:
             text = f"no colours; intensities of {dark:g} to {full:g} are shown as grey"
             notes.append(Note("grey", rows, text))
-        elif self.black >= rows - self.tally.dropped:
+        elif self.black == rows:
             text = "all colours are 0; add colours, for example with PDAL's filters.colorization"
-            notes.append(Note("black", rows, text))
+            notes.append(Note("black", rows, text if self.channels else "no colours"))
         elif self.black > _BLACK_SHARE * rows:
             text = f"{plural(self.black, 'point')} are black, perhaps without colours"
             notes.append(Note("black_points", self.black, text))
