@@ -92,14 +92,16 @@ class Reading:
 
     def opacity_logits(self, values: Values) -> Values:
         """Return logits; opacities past [0, 1] are clamped."""
-        wide = values.astype(np.float64)
-        return wide if self.opaque is None else logits_of(np.clip(wide / self.opaque, 0, 1))
+        if self.opaque is None:
+            return values
+        return logits_of(np.clip(values.astype(np.float64) / self.opaque, 0, 1))
 
     def sh0(self, values: Values) -> Values:
         """Return coefficients of band 0."""
         return values if self.white is None else (values / self.white - 0.5) / SH_C0
 
 
+@np.errstate(invalid="ignore")  # signalling NaNs
 def judged(scales: Values, opacities: Values, base: Values, *, logs: bool) -> Reading:
     """Judge how a scene's scales (n, k), opacities (n,) and base colours (n, 3) are stored.
 

@@ -28,7 +28,7 @@ MarkedPoints = tuple[NDArray[np.float64], NDArray[np.float32], NDArray[np.bool_]
 """(n, 3) positions; (n, 3) colours, (n, 1) intensities or (n, 0); (n,) whether the file marks noise."""
 
 _BLACK = 1.5 / 255  # colours below are taken for none
-_BLACK_SHARE = 1e-3  # share of black points that is told
+_FEW_BLACK, _BLACK_SHARE = 15, 1e-3  # number and share of black points that are not told
 _APART = 100.0  # distance between clouds, in extents, beyond which they may be in several map systems
 _FAR = 10.0  # distance from the origin, in extents, beyond which coordinates may be those of a map
 _STEEP = 20.0  # extent in z over that in x and y beyond which x and y may be degrees
@@ -232,7 +232,7 @@ class PointStream(Stream[RawPoints]):
         elif self.black == rows:
             text = "all colours are 0; add colours, for example with PDAL's filters.colorization"
             notes.append(Note("black", rows, text if self.channels else "no colours"))
-        elif self.black > _BLACK_SHARE * rows:
+        elif self.black > max(_FEW_BLACK, _BLACK_SHARE * rows):
             text = f"{plural(self.black, 'point')} are black, perhaps without colours"
             notes.append(Note("black_points", self.black, text))
         if self.channels == 3 and 1 < full < self.scales[-1]:
