@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard.errors import InputError, damaged
+from g2ard.io import judge
 from g2ard.io.paths import plain_numbers, read_text
 from g2ard.io.signs import is_table
-from g2ard.io.stream import MarkedPoints, PointStream, full_scales
-from g2ard.io.types import Note
+from g2ard.io.stream import MarkedPoints, PointStream
 
 _COLUMNS = {
     "x": ("x", "easting"),
@@ -25,6 +25,9 @@ _COLUMNS = {
     "intensity": ("intensity", "i", "reflectance", "scalar_intensity"),
 }
 """Columns and their names in headings, in small letters."""
+
+_SHADES = ("red", "green", "blue"), ("intensity",)
+"""Columns that colour points, the best first."""
 
 _TRIPLES = {6: (3,), 7: (4, 3), 8: (3, 4, 5), 9: (3, 6), 10: (3, 4, 6, 7)}
 """Number of columns without a heading → where colours may begin, the likeliest first."""
@@ -59,25 +62,19 @@ class Stream(PointStream):
         if missing := [name for name in "xyz" if name not in column]:
             raise InputError(f"has no column {missing[0]!r} (found {' '.join(names)})", path=path)
         self._positions = table[:, [column[name] for name in "xyz"]]
-        notes, white = list[Note](), full_scales(np.dtype(np.float64))
-        if {"red", "green", "blue"} <= set(column):
-            self._colors = table[:, [column[name] for name in ("red", "green", "blue")]].astype(np.float32)
-        elif "intensity" in column:
-            grey = table[:, [column["intensity"]] * 3]
-            low, high = np.nanpercentile(grey, (1, 99))
-            self._colors = np.clip((grey - low) / ((high - low) or 1), 0, 1).astype(np.float32)
-            notes.append(Note("grey", len(grey), "no colours: points are grey by their intensities"))
-        else:
-            text = f"has no colours (found columns {' '.join(names)})"
-            raise InputError(text, path=path, hint="export columns x y z red green blue, with a heading")
-        super().__init__(path, len(table), self._positions, white)
-        self.notes = (*self.notes, *notes)
+        shades: tuple[str, ...] = next((names for names in _SHADES if set(names) <= set(column)), ())
+        self._values = table[:, [column[name] for name in shades]].astype(np.float32)
+        unmarked = np.zeros(len(table), bool)
+        scales = judge.full_scales(np.dtype(np.float64))
+        super().__init__(path, len(table), (self._positions, self._values, unmarked), scales)
+        if not shades:
+            self.lack = f"has no colours (found columns {' '.join(names)})"
 
     def raw(self, rows: int, start: int) -> Iterator[MarkedPoints]:
         for first in range(start, self.count, rows):
             part = slice(first, first + rows)
-            colors = self._colors[part]
-            yield self._positions[part], colors, np.zeros(len(colors), bool)
+            values = self._values[part]
+            yield self._positions[part], values, np.zeros(len(values), bool)
 
 
 def holds_points(path: Path) -> bool:

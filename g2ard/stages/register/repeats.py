@@ -73,9 +73,8 @@ def repeated_poses(renderer: Renderer, camera: Camera, sift: Sift, config: Regis
     places, descriptors = sift.features(np.clip(out.image, 0, 1))
     points, known = lifted(out, camera, places, config)
     step = 1 + int(known.sum()) // _MOST_FEATURES
-    places, descriptors, points = (
-        each[known][::step] for each in (places, descriptors / np.float32(512), points)
-    )
+    places, points = places[known][::step], points[known][::step]
+    descriptors = descriptors[known][::step] / np.float32(512)
     least = max(_LEAST_SUPPORT[0], int(_LEAST_SUPPORT[1] * len(places)))
     if len(places) < least:
         return []
@@ -92,7 +91,7 @@ def repeated_poses(renderer: Renderer, camera: Camera, sift: Sift, config: Regis
     while left.any() and len(found) < _MOST_REPEATS:
         table = np.zeros(tuple(cells.max(0) + 2), int)
         np.add.at(table, tuple(cells[left].T), 1)
-        near = sum(np.roll(table, shift, (0, 1)) for shift in np.ndindex(3, 3))
+        near = np.sum([np.roll(table, shift, (0, 1)) for shift in np.ndindex(3, 3)], axis=0)
         centre = np.array(np.unravel_index(int(np.argmax(near)), near.shape)) - 1
         if near.max() < least:
             break
