@@ -193,14 +193,15 @@ class RunFolder:
             return report, ""
         scenes = [("simplified", done.simplified), ("recovered", done.splats)]
         targets = list(filter(None, (done.held_out, job.targets.apart)))
-        recover, page = job.config.recover, self.path / "report.html"
+        recover, page, best = job.config.recover, self.path / "report.html", job.best(done)
         with self._run.finishing("report.html"):
-            distill_report(page, title, scenes, targets, report, recover.background, told)
+            distill_report(page, title, scenes, targets, report, recover.background, told, best=best)
         with self._run.finishing(_PICTURE):
-            preview(self.path / _PICTURE, targets[0], scenes, recover.background)
+            preview(self.path / _PICTURE, best, scenes, recover.background)
         if not self._run.config["page"]:
             return report, ""
-        dense, seen = None if recover.from_points else job.prior, job.views.train.cameras
+        dense = None if recover.from_points else job.prior
+        seen = job.views.train.cameras if job.views.pool is None else best.cameras
         with self._run.finishing("view.html"):
             size, line = self.write_view(done.splats, dense, seen, recover.background)
         return replace(report, bytes={**report.bytes, "view": size}), line

@@ -30,12 +30,14 @@ from g2ard.jobs.memory import RECOVERY_TIMES
 from g2ard.jobs.photo_colors import colored
 from g2ard.jobs.photo_points import distinct, sparse_file, sparse_points, topped_up
 from g2ard.jobs.view_checks import check_photos, propose_background
+from g2ard.jobs.viewer_frame import level_up
 from g2ard.jobs.views import Use, views_of, within_pixels
 from g2ard.pipeline.config import DistillConfig
 from g2ard.pipeline.distill import Distilled, RunViews
 from g2ard.pipeline.distill import distill as pipeline
+from g2ard.poses import best_views
 from g2ard.progress import Progress, Say, plural, silent, unsaid
-from g2ard.rendering.targets import Targets, fill, kinds_of, kinds_told
+from g2ard.rendering.targets import Subset, Targets, TeacherRenders, fill, kinds_of, kinds_told
 from g2ard.rendering.visibility import overdraw, visibility_source
 from g2ard.report.run import Packed, RunReport, by_kind
 from g2ard.scene.cameras import USUAL, Cameras
@@ -169,6 +171,17 @@ class DistillJob:
         full = None if views.full is None else scorable(made(within_pixels(views.full)))
         return RunTargets(train, held_out, validation, apart, full)
 
+    def best(self, done: Distilled) -> Targets:
+        """Return targets of the views that show the result best: placed ones, or some of the scored ones."""
+        held_out = self.targets.held_out
+        cameras, pool = held_out.cameras, self.views.pool
+        if self.teacher is None or pool is None:
+            names = best_views(done.splats, _SHOWN, cameras).names
+            return done.scored_on(Subset(held_out, [cameras.names.index(name) for name in names]))
+        found = best_views(self.prior, _SHOWN, up=level_up(pool.cameras))
+        longest = int(np.maximum(cameras.widths, cameras.heights).max())
+        return TeacherRenders(self.teacher, found.resized(longest), background=self.config.recover.background)
+
     def run(self, work: Path | None = None) -> Distilled:
         """Distil the scene; `work` is the folder for resuming, see `g2ard.pipeline.distill`."""
         for scored in filter(None, (self.targets.held_out, self.targets.apart)):
@@ -286,6 +299,9 @@ class DistillJob:
 
 
 Scene = Splats | Points | str | Path | None
+
+_SHOWN = 3
+"""Views in pictures of a run."""
 
 _USUAL_RATIO = 10
 """Reduction for which views are chosen if the count is measured later, in these views."""

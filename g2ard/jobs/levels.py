@@ -393,8 +393,6 @@ def write_level_page(
     beside: str | Path | None = None,
     up: Sequence[float] | None = None,
     background: Colour = BLACK,
-    seed: int = 0,
-    progress: Progress = silent,
 ) -> int:
     """Write the page that shows the levels in a folder, and return its bytes.
 
@@ -406,7 +404,7 @@ def write_level_page(
     """
     coarse = levels[-1]
     few = coarse.take(np.array(evenly_spaced(len(coarse), _ROWS, floor=True)))
-    frame = frame_of(few, views, beside=beside, up=up, seed=seed, progress=progress)
+    frame = frame_of(few, views, beside=beside, up=up)
     page, title, offset = folder / "index.html", Path(beside or folder).resolve().name, np.asarray(few.offset)
     if kind == "sog":
         rotation, position = frame.placed(offset)

@@ -10,21 +10,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard.config.checks import checks_arguments
-from g2ard.config.choices import is_made
 from g2ard.errors import InputError
 from g2ard.jobs.inputs import Views, load_views
-from g2ard.jobs.view_checks import opaque_points
-from g2ard.jobs.views import views_or_pool
+from g2ard.jobs.view_checks import given_or_found, opaque_points
+from g2ard.poses import best_views
 from g2ard.poses.site import Site
-from g2ard.progress import Progress, Say, silent, unsaid
-from g2ard.rendering.renderer import Renderer
+from g2ard.progress import Say, unsaid
 from g2ard.scene.cameras import Camera, Cameras
 from g2ard.scene.splats import Splats
 from g2ard.scene.transform import quaternion_of, transform, unit_up
 from g2ard.viewer.page import Start
-
-_START_POOL = 32
-"""Number of generated poses from which the initial camera is chosen."""
 
 _UP_SAMPLE = 100_000
 """Gaussians used to estimate the up direction."""
@@ -40,14 +35,6 @@ _ONE_WAY_SPREAD = 1e-3
 
 _UPRIGHT_MEAN = 0.8
 """Length of the mean of the photos' up directions, above which it is up."""
-
-_START_VIEWS, _START_SIDE = 12, 160
-"""Number of typical views that are rendered to choose the opening one, and their longer side in pixels."""
-
-_SUBJECT_SHARE, _WHOLE_SUBJECT = 0.7, 0.995
-"""Share of the points in sight from which a view shows one subject, and at which it shows all of it."""
-_FARTHEST_STEP = 1.5
-"""Largest step back from the subject, in its distances."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,48 +101,44 @@ def frame_of(
     start: str | None = None,
     beside: str | Path | None = None,
     up: Sequence[float] | None = None,
-    seed: int = 0,
-    progress: Progress = silent,
     say: Say = unsaid,
 ) -> ViewerFrame:
-    """Choose a frame and an initial camera from given views, found views, or a generated pool.
+    """Choose a frame and an initial camera, from views that are given or found beside the scene, if any.
 
     Args:
         scene: the scene, or the left one of two.
-        views: cameras, or their path; "made" generates a pool.
-        start: name of the initial view; None takes a typical one with much detail.
+        views: cameras, or their path; "made" ignores those beside the scene.
+        start: name of the initial view; None takes the one that shows most.
         up: (3,) direction away from the ground; None takes it from the views, or estimates it.
     """
+    found, _ = given_or_found(views, beside, scene, [], say, up=up)
+    cameras = None if found is None else load_views(found, "all", None, say)
     try:
-        found = views_or_pool(
-            scene, views, beside=beside, count=_START_POOL, up=up, seed=seed, progress=progress, say=say
-        )
+        return frame_with(scene, cameras, start=start, up=up)
     except InputError as error:
-        if start is not None or not (views is None or is_made(views)):
+        if start is not None or cameras is not None:
             raise
         say(f"no pose to start at: {error}")
         return ViewerFrame(_turn(up_of(scene, up)), _middle(scene))
-    cameras = load_views(found, "all", None, say)
-    return frame_with(scene, cameras, start=start, up=up)
 
 
 def frame_with(
-    scene: Splats, cameras: Cameras, *, start: str | None = None, up: Sequence[float] | None = None
+    scene: Splats, cameras: Cameras | None, *, start: str | None = None, up: Sequence[float] | None = None
 ) -> ViewerFrame:
-    """Choose a frame and an initial camera from given cameras, like `frame_of`."""
+    """Choose a frame and an initial camera, from given cameras if there are any, like `frame_of`."""
     up = scene.up if up is None else up
-    axis = _level(cameras) if up is None else None
-    stand = ViewerFrame(_turn(up_of(scene, up) if axis is None else axis), _middle(scene))
-    points = opaque_points(scene)
+    axis = level_up(cameras) if up is None and cameras is not None else None
+    axis = up_of(scene, up) if axis is None else axis
+    if cameras is None or start is None:
+        cameras = best_views(scene, cameras=cameras, up=axis)
     if start and start not in cameras.names:
         raise InputError(f"no view {start!r} among {', '.join(cameras.names[:4])}, …", parameter="start")
-    view = cameras[cameras.names.index(start)] if start else _typical(scene, cameras, stand.up, points)
-    if not start and len(cameras) > 1:
-        view = _with_subject(view, points)
-    return replace(stand, start=stand.start_at(view, points), name=view.name)
+    view = cameras[cameras.names.index(start) if start else 0]
+    stand = ViewerFrame(_turn(axis), _middle(scene))
+    return replace(stand, start=stand.start_at(view, opaque_points(scene)), name=view.name)
 
 
-def _level(cameras: Cameras) -> NDArray[np.float64] | None:
+def level_up(cameras: Cameras) -> NDArray[np.float64] | None:
     """Return the up direction that views share, or that of photos which all face one way; otherwise None."""
     across, up = cameras.viewmats[:, 0, :3], -cameras.viewmats[:, 1, :3].mean(axis=0)
     values, vectors = np.linalg.eigh(across.T @ across / len(cameras))
@@ -210,45 +193,3 @@ def _turn(up: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _middle(scene: Splats) -> NDArray[np.float64]:
     return np.median(opaque_points(scene), axis=0)
-
-
-def _typical(scene: Splats, cameras: Cameras, up: NDArray[np.float64], points: NDArray[np.float64]) -> Camera:
-    """Return the usual view whose render has most detail among those nearest to the median view.
-
-    Views are compared by pitch, depth and share of the points in view, in median deviations: the median view
-    frames the subject, and detail tells its front from its back.
-    """
-    cameras = cameras.usual()
-    traits = np.array([_traits(view, up, points) for view in cameras])
-    away = np.abs(traits - np.median(traits, axis=0))
-    spread = np.median(away, axis=0)
-    order = np.argsort((away / np.where(spread > 0, spread, 1)).sum(axis=1), kind="stable")
-    tried, renderer = cameras.take(order[:_START_VIEWS]), Renderer(scene)
-    return tried[int(np.argmax([_detail(renderer.clipped(view)) for view in tried.resized(_START_SIDE)]))]
-
-
-def _with_subject(view: Camera, points: NDArray[np.float64]) -> Camera:
-    """Move a view back until the whole subject is in sight, if most of it is."""
-    if view.holds(points).mean() < _SUBJECT_SHARE:
-        return view  # inside, or before something larger
-    ahead = view.viewmat[2, :3]
-    depth = float(np.median((points[view.holds(points)] - view.position) @ ahead))
-    for step in np.arange(0.0, _FARTHEST_STEP, 0.05) * depth:
-        viewmat = view.viewmat.copy()
-        viewmat[2, 3] += step
-        moved = replace(view, viewmat=viewmat)
-        if moved.holds(points).mean() >= _WHOLE_SUBJECT:
-            return moved
-    return view
-
-
-def _traits(view: Camera, up: NDArray[np.float64], points: NDArray[np.float64]) -> tuple[float, float, float]:
-    """Return a view's pitch in radians, logarithm of the median depth, and share of the points in view."""
-    held, ahead = view.holds(points), view.viewmat[2, :3]
-    depth = np.median((points[held] - view.position) @ ahead) if held.any() else 1e-30
-    return float(np.arcsin(np.clip(ahead @ up, -1, 1))), float(np.log(depth)), float(held.mean())
-
-
-def _detail(image: NDArray[np.float32]) -> float:
-    """Return the mean absolute difference of neighbouring pixels."""
-    return float(sum(np.abs(np.diff(image, axis=axis)).mean(dtype=np.float64) for axis in (0, 1)))

@@ -18,7 +18,7 @@ from g2ard.jobs.inputs import Views, drop_held_out, load_view_sets, load_views
 from g2ard.jobs.view_checks import as_pool, check_sight, given_or_found, opaque_points, warn_of_sight
 from g2ard.pipeline.config import SelectConfig
 from g2ard.pipeline.distill import RunViews
-from g2ard.poses import Pool, plan_pool
+from g2ard.poses import Pool, best_views, plan_pool
 from g2ard.progress import Progress, Say, direction, silent, unsaid
 from g2ard.scene.cameras import USUAL, Camera, Cameras, look_at, rows_by_kind
 from g2ard.scene.samples import evenly_spaced
@@ -306,6 +306,18 @@ def views_or_pool(
         return ViewSet(Cameras.of([*made.pool.cameras, *apart]), splits=made.pool.splits + splits)
     say(f"views: {len(planned.cameras)} generated; {_of(planned, planned.cameras)}")
     return ViewSet(planned.cameras, splits=splits_of(None, planned.cameras.names))
+
+
+def looks_at(
+    scene: Splats, count: int, *, up: Up = None, seed: int = 0, progress: Progress = silent, say: Say = unsaid
+) -> Cameras:
+    """Return the views that show a scene best, and those of a pool if `count` asks for more."""
+    best = best_views(scene, count, up=up)
+    say(f"views: {count} generated")
+    if len(best) == count:
+        return best
+    pool = _planned(scene, count - len(best), up=up, seed=seed, progress=progress)
+    return Cameras.of([*best, *pool.cameras])
 
 
 def _of(pool: Pool, cameras: Cameras) -> str:

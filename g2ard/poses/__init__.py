@@ -2,9 +2,10 @@
 
 A scene is turned upright (`up`), freed of floaters and sky (`matter`), and its free space mapped (`site`).
 Planners (`outside`, `within`) propose poses from endless even sequences, and keep those that stand in free
-space and see enough (`sight`). `pool` combines them.
+space and see enough (`sight`). `pool` combines them; `showing` chooses the views that show a scene best.
 """
 
 from g2ard.poses.pool import Pool, make_pool, plan_pool
+from g2ard.poses.showing import best_views
 
-__all__ = ["Pool", "make_pool", "plan_pool"]
+__all__ = ["Pool", "best_views", "make_pool", "plan_pool"]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from g2ard.poses.numbers import Floats, between, directions, halton, quantile, turned
@@ -14,6 +16,10 @@ which it just fits."""
 
 _FITTING, _OUTLINE = 0.97, 8_000
 """Share of the matter in frame when the object just fits, and the points that represent its outline."""
+
+_FILLED, _WHOLE, _ROUNDS = 0.94, 0.998, 6
+"""Share of the frame that a view of the whole fills, the share of the matter that is the whole, and steps in
+which such a view finds its place."""
 
 _OUTSIDE = 1.2
 """Least distance from the centre: everything lies within about 1 of it."""
@@ -70,6 +76,30 @@ def _fitting(site: Site, target: Floats, outward: Floats, lens: Lens) -> Floats:
         x, y, z = turned(points, frame).T
         distances[i] = quantile(np.maximum(np.abs(x) / wide, np.abs(y) / tall) - z, weights, _FITTING)
     return np.maximum(distances, _OUTSIDE)
+
+
+def ring(survey: Survey, rises: Sequence[float], turns: int) -> Poses:
+    """Return poses all around a scene at some degrees above its horizon, with all of it just in frame.
+
+    Poses in matter are dropped.
+    """
+    site = survey.site
+    points, (wide, tall) = site.points[:_OUTLINE], np.array(survey.lens.tangents) * _FILLED
+    rise, turn = (part.ravel() for part in np.meshgrid(np.radians(rises), np.arange(turns) / turns))
+    gazes = -directions(turn, np.cos(rise), np.sin(rise))
+    eyes = np.empty_like(gazes)
+    for i, frame in enumerate(Poses(gazes, gazes).frames()):
+        x, y, z = turned(points, frame).T
+        eye = np.zeros(3)
+        for _ in range(_ROUNDS):  # aim at the middle of what the frame shows, as near as it fits
+            away = np.maximum(np.abs(x - eye[0]) / wide, np.abs(y - eye[1]) / tall) - z
+            eye[2] = -float(quantile(away, site.weights[:_OUTLINE], _WHOLE))
+            ahead = np.flatnonzero(away <= -eye[2])
+            for axis, across in ((0, x), (1, y)):
+                slopes = (across[ahead] - eye[axis]) / (z[ahead] - eye[2])
+                eye[axis] -= eye[2] * (slopes.max() + slopes.min()) / 2
+        eyes[i] = eye @ frame
+    return Poses(eyes, gazes).take(site.is_free(eyes, 2, _LOWEST))
 
 
 def plan_aerial(survey: Survey, count: int, shift: int = 0, first: int | None = None) -> Poses:

@@ -14,9 +14,11 @@ from g2ard.errors import InputError, require
 from g2ard.io.splits import HOLD_OUT
 from g2ard.poses.numbers import middle, norms, strata
 from g2ard.poses.outside import plan_aerial, plan_orbit
+from g2ard.poses.showing import is_hidden
 from g2ard.poses.sight import Lens, Poses, Survey
 from g2ard.poses.site import Site
 from g2ard.poses.within import (
+    WIDE,
     Reach,
     is_room,
     plan_anywhere,
@@ -46,8 +48,8 @@ _COARSE = (0.2, 0.4)
 """Shares of the matter seen only below a pixel between which more and more poses step nearer. Measured:
 objects .06–.17, whole scenes .01–.06, two chunks cut from a room, seen from outside, .44 and .55."""
 
-_FOV, _FOV_WIDE = 50.0, 70.0
-"""Horizontal fields of view in degrees: within a scene people use wider lenses."""
+_FOV = 50.0
+"""Horizontal field of view in degrees of poses around or above a scene."""
 
 _STREET = 0.25
 """Share of a landscape's poses that stand on its ground, where there is room."""
@@ -171,7 +173,7 @@ def plan_pool(
     progress("scene", 1, 1)
     survey = Survey(splats, represents, site, lens, seed, counter(progress, "poses"))
     if kind == "auto" and fov is None and is_room(survey):
-        survey = replace(survey, lens=Lens(size, _FOV_WIDE))
+        survey = replace(survey, lens=Lens(size, WIDE))
     poses, used, why = _planned(survey, kind, count)
     held = _held(survey, poses)
     wanted = round(count * max(1.0, min(grow, 1 / np.sqrt(held))))
@@ -219,7 +221,7 @@ def _more(survey: Survey, poses: Poses, reach: Reach, kind: str, count: int) -> 
     if kind == "near":
         views = survey.cameras(plan_near(survey, poses, reach, count))
     else:
-        wide = replace(survey, lens=Lens(survey.lens.size, _FOV_WIDE))
+        wide = replace(survey, lens=Lens(survey.lens.size, WIDE))
         found = plan_walk(wide, count, 3) if kind == "standing" else plan_anywhere(wide, count)
         views = wide.cameras(found)
     return [replace(view, name=view.name.replace("pose", kind), kind=kind) for view in views]
@@ -244,7 +246,12 @@ def _auto(survey: Survey, count: int) -> tuple[dict[str, Poses], str]:
             parts[kind] = Poses.joined([parts[kind], poses] if kind in parts else [poses])
 
     add("inside", plan_inside(survey, round(inside.weight * count)))
-    if missing():
+    hidden = missing() > 0 and is_hidden(survey)
+    if hidden:
+        why.append("a ceiling hides it from around and above")
+        add("walk", plan_walk(survey, missing()))
+        add("sharp", plan_sharp(survey, missing()))
+    if missing() and not hidden:
         kind = "aerial" if landscape else "orbit"
         why.append("a landscape" if landscape else "an object")
         sharp = _sharp(survey, _PLANNERS[kind](survey, missing(), first=_SAMPLED))
@@ -262,7 +269,7 @@ def _auto(survey: Survey, count: int) -> tuple[dict[str, Poses], str]:
         if missing() and share < _FEW:
             add("walk", plan_walk(survey, missing(), 2))
     for kind in sorted(("aerial", "orbit"), key=lambda kind: kind not in parts):
-        if missing():  # rather foggy views than too few
+        if missing():  # rather hidden or foggy views than too few
             add(kind, _PLANNERS[kind](survey, missing(), 1))
     return parts, "; ".join(why)
 

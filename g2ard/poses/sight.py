@@ -10,9 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard import _core
+from g2ard.config.choices import BLACK
 from g2ard.errors import require
 from g2ard.poses.numbers import Floats, canonical_order, norms, quantile
 from g2ard.poses.site import Inside, Site
+from g2ard.rendering.renderer import RasterSettings, View, view_of
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
 from g2ard.system.cached import cached_property
@@ -28,9 +30,9 @@ _PATIENCE, _TOLERABLE = 12, 0.5
 _BLOCK = 256
 """Candidates judged between two reports of progress, about a second; results do not depend on it."""
 
-_ROWS, SIGHT_ROWS, _LONGEST, _BATCH = 12_000, 24_000, 96, 32
-"""Gaussians rendered per glance, and where lines of sight matter; pixels along the longer side; and renders
-made together."""
+_ROWS, SIGHT_ROWS, _OUTLOOK_ROWS, _LONGEST, _BATCH = 12_000, 24_000, 80_000, 96, 32
+"""Gaussians rendered per glance, where lines of sight matter, and to judge whole pictures; pixels along the
+longer side; and renders made together."""
 
 _MOST_WIDENED = 4.0
 """Largest factor by which a sample of 12,000 Gaussians grows along the two longer axes, to cover for the
@@ -38,9 +40,6 @@ rest; a larger sample may grow more."""
 
 _CROP = 32
 """Side in pixels of the part around an aim that tells whether the line of sight is clear."""
-
-_SOLID = 0.3
-"""Least opacity of Gaussians that a view may aim at."""
 
 _FINE, _COARSEST = 0.03, 0.9
 """Radians: Gaussians with a smaller angular standard deviation are detail; the rest is fog and sky. And the
@@ -128,13 +127,13 @@ class Glance:
         shortest = np.arange(3) == np.argmin(sample.scales, axis=1)[:, None]
         logs = np.log(np.maximum(sample.scales, np.finfo(np.float32).tiny))
         self._means, self._antialiased = means, sample.antialiased
-        self.points, self.solid = means + self._middle, sample.opacities > _SOLID
+        self.points, self.opacities = means + self._middle, sample.opacities
         self._arrays: tuple[NDArray[np.float32], ...] = (
             np.ascontiguousarray(means, np.float32),
             np.ascontiguousarray(sample.quats, np.float32),
             np.ascontiguousarray(np.where(shortest, logs, logs + np.log(widen)), np.float32),
             np.ascontiguousarray(np.clip(sample.logit_opacities, -80, 80), np.float32),
-            np.zeros((len(means), 1, 3), np.float32),
+            np.ascontiguousarray(sample.sh0, np.float32),
             np.zeros((len(means), 0, 3), np.float32),
         )
 
@@ -147,17 +146,38 @@ class Glance:
             too close to the camera have large ones. Matter beyond `reach`, (C,), counts only for the first.
         """
         figures = np.zeros((3, len(cameras)))
-        away = norms(cameras.positions - self._middle)
-        near = 1e-3 * float(np.median(away)) if len(cameras) else None
-        for i, (sums, depth, pixels) in enumerate(self._renders(cameras, near or None)):
-            weight = sums["weight"]
+        for i, (sums, depth, view) in enumerate(self._renders(cameras, self._near_of(cameras))):
+            weight = sums["weight"] / np.prod(view[2])
             seen = (weight > 0) & (depth <= (np.inf if reach is None else reach[i]))
-            figures[:, i] = weight.sum() / pixels, 0.0, np.inf
+            figures[:, i] = weight.sum(), 0.0, np.inf
             if seen.any():
                 angle = self._sigma[seen] / np.maximum(depth[seen], np.finfo(float).tiny)
-                fine = weight[seen][angle < _FINE].sum() / pixels
+                fine = weight[seen][angle < _FINE].sum()
                 figures[1:, i] = fine, quantile(angle, weight[seen], _COARSEST)
         return figures
+
+    def _near_of(self, cameras: Cameras) -> float | None:
+        away = norms(cameras.positions - self._middle)
+        return 1e-3 * float(np.median(away)) or None if len(cameras) else None
+
+    def sights(self, cameras: Cameras) -> tuple[Floats, Floats, Floats, NDArray[np.float32]]:
+        """Look through C cameras, and tell what each sees of every Gaussian.
+
+        Returns:
+            (C,) mean α; (C,) the part of it from Gaussians under 0.03 rad; (C,) mean difference of
+            neighbouring pixels; and (C, N) mean transmittances in front of the Gaussians, 0 out of frame.
+        """
+        covered, fine, detail = np.zeros((3, len(cameras)))
+        seen = np.zeros((len(cameras), len(self.points)), np.float32)
+        near, rasterizer = self._near_of(cameras), _core.Rasterizer()
+        settings = RasterSettings(antialiased=self._antialiased, near=near)
+        for i, (sums, depth, view) in enumerate(self._renders(cameras, near)):
+            image = np.clip(rasterizer.image(self._arrays, view, settings, list(BLACK)), 0, 1)
+            weight = sums["weight"] / image[..., 0].size
+            covered[i], fine[i] = weight.sum(), weight[self._sigma < _FINE * depth].sum()
+            seen[i] = sums["transmittance"] / np.maximum(1, sums["hits"])
+            detail[i] = sum(np.abs(np.diff(image, axis=axis)).mean(dtype=np.float64) for axis in (0, 1))
+        return covered, fine, detail, seen
 
     def clear(self, cameras: Cameras, aims: NDArray[np.int64], close: float) -> Floats:
         """Return the (C,) mean transmittances in front of what C views have in the middle, over its pixels.
@@ -176,14 +196,12 @@ class Glance:
     def murk(self, cameras: Cameras, close: float) -> Floats:
         """Return the (C,) shares of the images that show matter nearer than `close`, scene units."""
         renders = self._renders(cameras, _NEAR * close)
-        return np.array([sums["weight"][depth < close].sum() / pixels for sums, depth, pixels in renders])
+        return np.array([sums["weight"][depth < close].sum() / np.prod(v[2]) for sums, depth, v in renders])
 
     def _renders(
         self, cameras: Cameras, near: float | None, crop: bool = False
-    ) -> Iterator[tuple[dict[str, Any], Floats, int]]:
-        """Yield each camera's sums, the distances to the Gaussians, and the number of pixels."""
-        from g2ard.rendering.renderer import RasterSettings, view_of
-
+    ) -> Iterator[tuple[dict[str, Any], Floats, View]]:
+        """Yield each camera's sums, the distances to the Gaussians, and the view as kernels take it."""
         if not len(cameras):
             return
         here = cameras.resized(_LONGEST).recentred(self._middle)
@@ -195,7 +213,7 @@ class Glance:
             batch = range(first, min(first + _BATCH, len(here)))
             views = [view_of(here, i, settings) for i in batch]
             for i, sums in zip(batch, _core.accumulate_each(self._arrays, views, settings), strict=True):
-                yield sums, norms(self._means - here.positions[i]), int(here.widths[i] * here.heights[i])
+                yield sums, norms(self._means - here.positions[i]), views[i - first]
 
 
 @dataclass(frozen=True, eq=False)
@@ -227,6 +245,11 @@ class Survey:
     def glance(self) -> Glance:
         """Small renders of the scene."""
         return Glance(self.splats, self.represents)
+
+    @cached_property
+    def outlook(self) -> Glance:
+        """Small renders that show what hides what."""
+        return Glance(self.splats, self.represents, _OUTLOOK_ROWS)
 
     def cameras(self, poses: Poses) -> Cameras:
         """Return cameras in world coordinates, named in order."""

@@ -17,6 +17,9 @@ _ROOM_PITCHES, _WALK_PITCHES, _SHARP_PITCHES = (-0.3, 0.2), (-25.0, 10.0), (-35.
 _EYES = {True: (0.35, 0.75), False: (0.2, 0.6)}
 """Range of eye heights above the ground: indoors in heights of the room, outdoors in `Site.tallness`."""
 
+WIDE = 70.0
+"""Horizontal field of view in degrees: within a scene people use wider lenses."""
+
 _MOSTLY_INSIDE = 0.5
 """Share of a pool within rooms above which the scene is a room."""
 
@@ -55,6 +58,9 @@ _CLOSE = 0.5 * _DISTANCES[0]
 
 _MURK, _CLEAR = 0.08, 0.35
 """Largest share of the image that shows close matter, and least transmittance in front of the aim."""
+
+_SOLID = 0.3
+"""Least opacity of Gaussians that a view may aim at."""
 
 _SAMPLE = 512
 """Points that represent the scene's matter."""
@@ -114,10 +120,10 @@ def plan_walk(survey: Survey, count: int, shift: int = 0) -> Poses:
     places[:, 2] = site.ground(places) + tall * between(_EYES[indoors], at[:, 2])
     places = places[site.is_free(places, room / site.grid.cell)]
     if indoors:
-        places = places[_closed(site, places, 64, -1.0, 0.5) > _WALLS]
+        places = places[closed(site, places, 64, -1.0, 0.5) > _WALLS]
     else:
-        places = places[_closed(site, places, 32, 0.5, 1.0) < 1 - _SKY]
-        places = places[_closed(site, places, 16, -1.0, -0.8) > _FLOOR]
+        places = places[closed(site, places, 32, 0.5, 1.0) < 1 - _SKY]
+        places = places[closed(site, places, 16, -1.0, -0.8) > _FLOOR]
     places = places[_together(site, places)]
 
     def tried(start: int, stop: int) -> tuple[Poses, Floats]:
@@ -131,7 +137,7 @@ def plan_walk(survey: Survey, count: int, shift: int = 0) -> Poses:
     return gather(survey, count if len(places) else 0, tried)
 
 
-def _closed(site: Site, points: Floats, rays: int, low: float, high: float) -> Floats:
+def closed(site: Site, points: Floats, rays: int, low: float, high: float) -> Floats:
     """Return (M,) shares of the directions between two heights on the sphere that meet matter."""
     return np.isfinite(site.met(points, fibonacci(rays, low, high))).mean(axis=1)
 
@@ -180,7 +186,7 @@ def plan_anywhere(survey: Survey, count: int) -> Poses:
     diagonal = float(norms(site.box[1:] - site.box[:1])[0])
     points = (glance.points - site.origin) @ site.axes.T / site.size
     within = ((points > site.box[0]) & (points < site.box[1])).all(axis=1)
-    rows = np.flatnonzero(within & glance.solid)
+    rows = np.flatnonzero(within & (glance.opacities > _SOLID))
 
     def tried(start: int, stop: int) -> tuple[Poses, Floats]:
         which, far, turn, rise = halton(start, stop, 4, survey.seed + 5).T

@@ -6,23 +6,22 @@ from pathlib import Path
 from statistics import fmean
 
 import numpy as np
+from numpy.typing import NDArray
 
 from g2ard.config.choices import BLACK, Colour
 from g2ard.io.images import contact_sheet, to_bytes, write_png
 from g2ard.progress import plural
 from g2ard.rendering.exposure import rendered
-from g2ard.rendering.metrics import psnr
 from g2ard.rendering.renderer import Renderer
-from g2ard.rendering.targets import Targets
+from g2ard.rendering.targets import Targets, mask_of
 from g2ard.report.page import Page, Shown
 from g2ard.report.run import COLUMNS, LOST, KindScore, RunReport, TiledReport, cells
 from g2ard.scene.cameras import rows_by_kind
-from g2ard.scene.samples import evenly_spaced
 from g2ard.scene.splats import Splats
-from g2ard.stages.evaluate import ViewScore
+from g2ard.stages.evaluate import ViewScore, evaluate
 
-_SHOWN = 3  # pictures of the page, and rows of the preview picture
-_POINTS = 4096  # Gaussians that tell how much of the scene a view has in frame
+_SHOWN = 3  # worst views of the page, at most
+_UNSCORED = np.float32(0.5)
 
 
 def distill_report(
@@ -33,14 +32,17 @@ def distill_report(
     report: RunReport,
     background: Colour = BLACK,
     told: Sequence[str] = (),
+    *,
+    best: Targets,
 ) -> None:
-    """Write the HTML page of one run: a verdict, scores by kind of view, and pictures of a typical
-    view and of the worst ones.
+    """Write the HTML page of one run: a verdict, scores by kind of view, and pictures of the view that shows
+    most and of the worst ones.
 
     Args:
         scenes: (name, scene) of `simplified` and `recovered`, as `report.scores` names them.
         targets: photos or teacher renders of the held-out views, and of the views of other kinds, if any.
         told: summary lines that the command prints.
+        best: targets whose first view shows most of the scene.
     """
     page = Page(title, verdict(report))
     views = [(part, row) for part in targets for row in range(len(part.cameras))]
@@ -49,23 +51,22 @@ def distill_report(
     before, after = scores[scenes[0][0]], scores[scenes[-1][0]]
     renderers = [(name, Renderer(splats, background=background)) for name, splats in reversed(scenes)]
 
-    def show(view: int) -> None:
-        part, row = views[view]
+    def show(part: Targets, row: int, psnrs: Sequence[float]) -> None:
         camera = part.cameras[row]
         shown = [
-            Shown(stage, to_bytes(rendered(renderer, part, row)), f"{scores[stage][view].psnr:.2f} dB")
-            for stage, renderer in renderers
+            Shown(stage, to_bytes(scored(rendered(renderer, part, row), part, row)), f"{psnr:.2f} dB")
+            for (stage, renderer), psnr in zip(renderers, psnrs, strict=True)
         ]
         title = f"{part.cameras.names[row]}, {camera.width}×{camera.height} px"
-        page.comparison(title, to_bytes(part[row]), shown)
+        page.comparison(title, to_bytes(scored(part[row], part, row)), shown)
 
-    typical = sorted(range(len(after)), key=lambda row: after[row].psnr)[len(after) // 2]
     page.heading("A typical view")
     page.paragraph(
         f"Left of the divider: the {'photo' if 'photo' in report.against else 'dense scene'}. "
         "Right: the result. Below: its worst regions, magnified."
     )
-    show(typical)
+    whole = [evaluate(splats, best, background=background).views[0].psnr for _, splats in reversed(scenes)]
+    show(best, 0, whole)
     page.heading("Scores")
     page.table(COLUMNS, cells(report.kinds))
     page.paragraph(f"PSNR and SSIM: simplified → recovered, in views of {report.size}.")
@@ -77,11 +78,11 @@ def distill_report(
     if lost:
         page.paragraph(f"Views that ended below their start: {', '.join(text for _, text in lost)}.")
     shown = list(dict.fromkeys([*(row for row, _ in lost[:1]), *_worst(after)]))[:_SHOWN]
-    worst = [view for view in shown if view != typical]
+    worst = [view for view in shown if after[view].name != best.cameras.names[0]]
     if worst:
         page.heading("Worst views")
     for view in worst:
-        show(view)
+        show(*views[view], [scores[stage][view].psnr for stage, _ in renderers])
     before_mb, after_mb = ((report.bytes[name] or 0) / 1e6 for name in ("input", "output"))
     page.paragraph(
         f"{before_mb:.2f} → {after_mb:.2f} MB as .ply, in {report.seconds['total']:,.0f} s. "
@@ -182,24 +183,31 @@ def tiled_report(path: Path, title: str, report: TiledReport) -> None:
 def preview(
     path: Path, targets: Targets, scenes: list[tuple[str, Splats]], background: Colour = BLACK
 ) -> None:
-    """Write a PNG with a row for each of three views: target, then each scene with its PSNR.
+    """Write a PNG with a row for each view: target, then each scene with its PSNR.
 
-    The views are those of each third that have most of the scene in frame.
+    Pixels that are not scored are grey in all of them.
     """
-    cameras, shown = targets.cameras, scenes[-1][1]
-    some = shown.take(evenly_spaced(len(shown), _POINTS))
-    points = some.means.astype(np.float64) + some.offset
-    share = [(camera.holds(points) * some.opacities).sum() for camera in cameras]
-    thirds = np.array_split(np.arange(len(cameras)), min(_SHOWN, len(cameras)))
-    rows, captions = [], []
+    cameras = targets.cameras
     renderers = [Renderer(splats, background=background) for _, splats in scenes]
-    for view in (max(map(int, third), key=share.__getitem__) for third in thirds):
-        target = targets[view]
-        rows.append([target, *(rendered(renderer, targets, view) for renderer in renderers)])
-        scores = [
-            f"{name} {psnr(image, target):.2f} dB"
-            for (name, _), image in zip(scenes, rows[-1][1:], strict=True)
+    scores = [evaluate(splats, targets, background=background).views for _, splats in scenes]
+    rows = [
+        [
+            scored(image, targets, view)
+            for image in (targets[view], *(rendered(r, targets, view) for r in renderers))
         ]
-        captions.append(", ".join([cameras.names[view], *scores]))
+        for view in range(len(cameras))
+    ]
+    captions = [
+        ", ".join(
+            [view[0].name, *(f"{name} {v.psnr:.2f} dB" for (name, _), v in zip(scenes, view, strict=True))]
+        )
+        for view in zip(*scores, strict=True)
+    ]
     labels = ["target", *(f"{name}: {plural(len(splats), 'Gaussian')}" for name, splats in scenes)]
     write_png(path, contact_sheet(rows, labels, row_labels=captions), overwrite=True)
+
+
+def scored(image: NDArray[np.float32], targets: Targets, view: int) -> NDArray[np.float32]:
+    """Return an image of a view with the pixels that are not scored in grey."""
+    mask = mask_of(targets, view)
+    return image if mask is None else np.where(mask[..., None], image, _UNSCORED)

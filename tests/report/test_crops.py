@@ -3,9 +3,9 @@
 import base64
 import json
 import re
-from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ from PIL import Image
 from g2ard.rendering.targets import TeacherRenders
 from g2ard.report import distilled
 from g2ard.report.page import Page, Shown, pixels, worst_windows
-from g2ard.scene.cameras import Cameras
+from g2ard.stages.evaluate import evaluate
 from helpers.scenes import around, checkered_ball
 from helpers.studies import check_page
 
@@ -73,19 +73,23 @@ def test_the_caption_of_a_crop_names_its_image() -> None:
     assert set(captions) == {"target", "small<br>whole view <b>23.40 dB</b>"}
 
 
-def test_the_preview_shows_views_with_most_of_the_scene_in_frame(
+def test_the_preview_has_the_scores_of_the_table_and_greys_what_is_not_scored(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    ball = checkered_ball(200)
-    near, far = (around(3, (32, 24), distance) for distance in (1.2, 4.0))
-    cameras = Cameras.of(
-        replace(camera, name=f"{name}_{i}")
-        for i, pair in enumerate(zip(near, far, strict=True))
-        for name, camera in zip(("near", "far"), pair, strict=True)
-    )
-    labels: list[str] = []
+    ball, cameras = checkered_ball(200), around(2, (32, 24))
+    shown: list[Any] = []
     monkeypatch.setattr(
-        distilled, "contact_sheet", lambda rows, _, row_labels: labels.extend(row_labels) or rows[0][0]
+        distilled, "contact_sheet", lambda rows, _, row_labels: shown.extend([rows, row_labels]) or rows[0][0]
     )
-    distilled.preview(tmp_path / "preview.png", TeacherRenders(ball, cameras), [("ball", ball)])
-    assert [label.split(",")[0] for label in labels] == ["far_0", "far_1", "far_2"]
+    mask = np.zeros((24, 32), bool)
+    mask[6:18, 8:24] = True
+    targets = TeacherRenders(ball, cameras)
+    monkeypatch.setattr(targets, "mask", lambda view: mask, raising=False)
+    half = ball.take(range(100))
+    distilled.preview(tmp_path / "preview.png", targets, [("half", half)])
+    rows, captions = shown
+    table = evaluate(half, targets)
+    assert captions == [f"{view.name}, half {view.psnr:.2f} dB" for view in table.views]
+    for image in (image for row in rows for image in row):
+        assert (image[~mask] == 0.5).all()
+    np.testing.assert_array_equal(rows[1][0][mask], targets[1][mask])

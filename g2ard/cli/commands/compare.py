@@ -44,11 +44,14 @@ def compare(
     background: opt.BackgroundOption = None,
 ) -> None:
     """Compare renders of two scenes: PSNR, SSIM, the worst views, and a page to look at."""
+    from g2ard.io.types import ViewSet
     from g2ard.jobs.inputs import load_views
     from g2ard.jobs.view_checks import check_sight, opaque_points
-    from g2ard.jobs.viewer_frame import frame_with
+    from g2ard.jobs.viewer_frame import frame_with, level_up
     from g2ard.jobs.views import views_or_pool
+    from g2ard.poses import best_views
     from g2ard.rendering.targets import TeacherRenders
+    from g2ard.scene.cameras import Cameras
     from g2ard.stages.evaluate import evaluate
     from g2ard.viewer.page import write_page
 
@@ -61,9 +64,10 @@ def compare(
     run.console.expect([("poses", 1.0), ("targets", 2.0), ("evaluate", 3.0), *page])
     reference, other = (run.load(path) for path in paths)
     colour = opt.background_of(run, background, first, second) or BLACK
+    given = opt.with_images(views, images)
     found = views_or_pool(
         reference,
-        opt.with_images(views, images),
+        given,
         beside=paths[0],
         count=looks,
         seed=run.seed,
@@ -86,9 +90,16 @@ def compare(
     )
     if output is not None:
         run.begin("page")
-        names = sorted(cameras.names, key=lambda name: psnr[name])
-        middle = [cameras.names.index(name) for name in names[len(names) // 4 : -(-3 * len(names) // 4)]]
-        stand, points = frame_with(reference, cameras.take(middle)), opaque_points(reference)
+        points = opaque_points(reference)
+        if found is not given and isinstance(found, ViewSet):  # generated views may show only parts
+            up = level_up(cameras)
+            best = best_views(reference, up=up).resized(int(cameras.widths.max()))
+            renders = TeacherRenders(reference, best, background=colour)
+            psnr[best.names[0]] = evaluate(other, renders, background=colour).psnr
+            stand = frame_with(reference, best, up=None if up is None else up.tolist())
+            cameras = Cameras.of([*cameras, *best])
+        else:
+            stand = frame_with(reference, cameras)
         shown = {"typical": str(stand.name)} | {f"worst {i}": v.name for i, v in enumerate(worst, 1)}
         stops = [
             (

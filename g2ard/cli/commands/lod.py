@@ -212,11 +212,9 @@ def lod(
             axis = tileset_up(levels.splats, up, run.say).tolist()
             written = save_tileset(output, levels.splats, up=axis, place=spot, **common)
         run.kept.append(f"{output} is written")
-        frame: dict[str, Any] = {"views": views, "beside": scene, "up": axis, "seed": run.seed}
+        frame: dict[str, Any] = {"views": views, "beside": scene, "up": axis}
         with run.finishing("the page"):
-            written += write_level_page(
-                output, levels.splats, kind, background=colour, progress=run.progress, **frame
-            )
+            written += write_level_page(output, levels.splats, kind, background=colour, **frame)
             query = "" if kind == "sog" else "/?cesium=URL (a folder of CesiumJS)"
             run.say(f"page: python -m http.server --directory {output}, then http://localhost:8000{query}")
         peak = {"peak_rss_bytes": peak_rss_of_all()} if tiled else {}

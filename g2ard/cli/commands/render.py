@@ -84,7 +84,7 @@ def render(
     from g2ard.io.images import to_bytes, write_animation
     from g2ard.jobs.inputs import load_views
     from g2ard.jobs.view_checks import warn_of_sight
-    from g2ard.jobs.views import orbit, views_or_pool
+    from g2ard.jobs.views import looks_at, orbit, views_or_pool
     from g2ard.rendering.renderer import RasterSettings, Renderer, stations
 
     if output is None and sheet is None:
@@ -105,17 +105,10 @@ def render(
     found: Any
     if turn is not None:
         found = orbit(splats, turn, up=up, seed=run.seed, progress=run.progress, say=run.say)
+    elif looks is not None:
+        found = looks_at(splats, looks, up=up, seed=run.seed, **run.callbacks)
     else:
-        found = views_or_pool(
-            splats,
-            "made" if looks is not None else views,
-            beside=scene,
-            count=looks,
-            up=up,
-            seed=run.seed,
-            progress=run.progress,
-            say=run.say,
-        )
+        found = views_or_pool(splats, views, beside=scene, up=up, seed=run.seed, **run.callbacks)
     cameras = load_views(found, split, None if around else size, run.say)
     if around:
         cameras = stations(cameras)

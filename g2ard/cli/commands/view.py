@@ -44,7 +44,7 @@ def view(
     images: opt.ImagesOption = None,
     start: Annotated[
         str | None,
-        typer.Option(metavar="NAME", help="View to open with; by default a typical one with much detail."),
+        typer.Option(metavar="NAME", help="View to open with; by default the one that shows most."),
     ] = None,
     background: opt.BackgroundOption = None,
     up: opt.UpOption = None,
@@ -97,6 +97,7 @@ def _write(
     up: opt.Triple | None,
 ) -> None:
     """Write the page of one scene or two."""
+    from g2ard.io import read_views
     from g2ard.jobs.viewer_frame import frame_of
     from g2ard.viewer.page import write_page
 
@@ -104,9 +105,9 @@ def _write(
     run.claim_file("--output", output, page=True)
     paths = [run_scene(path) for path in (scene, other) if path is not None]
     loaded = [run.load(path) for path in paths]
-    if views is None and scene.is_dir() and (scene / "views.json").is_file():
-        views = scene / "views.json"
-    stand = frame_of(loaded[0], views, start=start, beside=paths[0], up=up, seed=run.seed, **run.callbacks)
+    if views is None and scene.is_dir() and (own := scene / "views.json").is_file():
+        views = own if any(read_views(own).image_paths) else "made"  # generated ones show what trains
+    stand = frame_of(loaded[0], views, start=start, beside=paths[0], up=up, say=run.say)
     named = zip(short_names(paths), loaded, strict=True)
     labels = [f"{name}: {plural(len(splats), 'Gaussian')}" for name, splats in named]
     run.begin("page")

@@ -1,0 +1,175 @@
+"""Representative views of a scene: where a person would stand to show it to others."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from g2ard.errors import InputError
+from g2ard.poses.numbers import Floats, between, canonical_order, halton
+from g2ard.poses.outside import ring
+from g2ard.poses.sight import Lens, Poses, Survey
+from g2ard.poses.site import Site
+from g2ard.poses.within import WIDE, closed, is_room, plan_inside, plan_sharp, plan_walk
+from g2ard.scene.cameras import Cameras
+from g2ard.scene.samples import evenly_spaced
+from g2ard.scene.splats import Splats
+
+_ROWS = 150_000
+"""Gaussians that places are planned on, and that small pictures show."""
+
+_RISES, _TURNS = (12.0, 26.0, 40.0), 12
+"""Degrees above the horizon of views from around, and their number at each."""
+
+_STANDING, _GAZES = 32, (-0.35, 0.15)
+"""Views within the scene that each planner proposes, and heights of their unit gazes: people look ahead."""
+
+_PLACES, _ROOFED = 256, 0.25
+"""Places, and the share of the free ones with matter above in most directions that a ceiling needs."""
+
+_PHOTOS = 64
+"""Photos that are judged, at most."""
+
+_OPEN, _CRISP, _GOOD = 0.8, 0.6, 0.4
+"""Share of what all see that views from around see together, and mean share of what they show that is sharp,
+above which a scene is shown from around; and clearness of a view within that counts. Measured: objects and
+maps above .96 and .99, rooms and a hall .60 to .66, an open scene under its own sky .97 and .47."""
+
+_LEAST = 1e-6
+"""Clearness that all views have, so that a coarse scene has some."""
+
+_AGAIN, _APART = 0.1, 60.0
+"""Worth of seeing again what an earlier view shows, and degrees between views that are different."""
+
+_FULL, _CLEAR = 4.0, 0.5
+"""Power of the covered share of the frame that counts in views within a scene, and the least clearness of a
+view, relative to the clearest."""
+
+
+@dataclass(frozen=True, eq=False)
+class Outlook:
+    """What V views see of a scene's subject: its Gaussians within the site's box.
+
+    Args:
+        cameras: the views.
+        seen: (V, N) share of the subject's opacity that each view sees at each of N Gaussians.
+        clear: (V,) share of the image that shows Gaussians under 0.03 rad, times a power of the share that is
+            not empty.
+        detail: (V,) mean difference of neighbouring pixels.
+    """
+
+    cameras: Cameras
+    seen: NDArray[np.float32]
+    clear: Floats
+    detail: Floats
+
+    @classmethod
+    def of(cls, survey: Survey, cameras: Cameras, full: float = -1.0) -> Outlook:
+        """Look through the views, whose covered share to the power of `full` counts."""
+        site, glance = survey.site, survey.outlook
+        points = (glance.points - site.origin) @ site.axes.T / site.size
+        mass = glance.opacities * ((points > site.box[0]) & (points < site.box[1])).all(axis=1)
+        covered, sharp, detail, seen = glance.sights(cameras)
+        seen *= (mass / max(float(mass.sum()), 1e-9)).astype(np.float32)
+        return cls(cameras, seen, sharp * np.maximum(covered, 1e-9) ** full, detail)
+
+
+def outlooks(survey: Survey, every: int = 1) -> tuple[Outlook, Outlook]:
+    """Return views from around a scene, which show it whole, and views at eye level within it.
+
+    There are fewer of both if `every` is more than 1.
+    """
+    wide = replace(survey, lens=Lens(survey.lens.size, WIDE))
+    poses = Poses.joined([plan(wide, _STANDING // every) for plan in (plan_inside, plan_walk, plan_sharp)])
+    level = poses.take((poses.gazes[:, 2] > _GAZES[0]) & (poses.gazes[:, 2] < _GAZES[1]))
+    around = survey.cameras(ring(survey, _RISES, _TURNS // every))
+    return Outlook.of(survey, around), Outlook.of(survey, wide.cameras(level), _FULL)
+
+
+def is_hidden(survey: Survey, looks: tuple[Outlook, Outlook] | None = None) -> bool:
+    """Return whether views from around see little of what clear views within do, as above a ceiling.
+
+    Without a ground there is no ceiling: a closed shell is an object.
+    """
+    site = survey.site
+    if site.terrain is None:
+        return False
+    if looks is None:
+        places = between(site.box, halton(0, _PLACES, 3, 0))
+        above = closed(site, places[site.is_free(places, 2)], 16, 0.5, 1.0)
+        if (above > 0.5).sum() <= _ROOFED * len(above):
+            return False
+    around, within = looks or outlooks(survey, 2)
+    seen = around.seen.max(axis=0, initial=0.0)
+    both = within.seen[within.clear > _GOOD].max(axis=0, initial=0.0)
+    return bool(seen.sum(dtype=np.float64) < _OPEN * np.maximum(seen, both).sum(dtype=np.float64))
+
+
+def is_within(survey: Survey, around: Outlook, within: Outlook) -> bool:
+    """Return whether a scene is shown from within."""
+    blurred = around.clear.sum() <= _CRISP * len(around.cameras)
+    good = within.clear.max(initial=0.0) > _GOOD
+    return is_room(survey) or bool(good and (blurred or is_hidden(survey, (around, within))))
+
+
+def best_views(
+    splats: Splats,
+    count: int = 1,
+    cameras: Cameras | None = None,
+    *,
+    size: tuple[int, int] = (800, 600),
+    up: ArrayLike | None = None,
+) -> Cameras:
+    """Return at most `count` views that show a scene best, the best first, each different from those before.
+
+    Objects and maps are shown whole, from around and somewhat above. What a ceiling hides, or a sky blurs, is
+    shown from within, at eye level.
+
+    Args:
+        splats: the scene.
+        cameras: views to choose from, such as photos'; None places views.
+        size: width and height of placed views, pixels.
+        up: (3,) direction away from the ground; None estimates it.
+
+    Raises:
+        InputError: nothing in the scene is visible, or no free place sees it.
+    """
+    cameras = cameras and cameras.usual()
+    if cameras is not None and len(cameras) == 1:
+        return cameras
+    rows = np.flatnonzero(splats.opacities > 1 / 255)
+    some = splats.take(rows[canonical_order(splats, rows)[:_ROWS]])
+    represents = len(rows) / max(1, len(some))
+    some = some.take(some.finite_rows()) if len(some) else some
+    survey = Survey(some, represents, Site.of(some, up, None, represents), Lens(size))
+    if cameras is not None:
+        look = Outlook.of(survey, cameras.take(evenly_spaced(len(cameras), _PHOTOS)))
+        worth = look.detail * look.seen.sum(axis=1, dtype=np.float64)
+        return look.cameras.take(_chosen(look, worth, count))
+    around, within = outlooks(survey)
+    look = within if len(within.cameras) and is_within(survey, around, within) else around
+    found = look.cameras.take(_chosen(look, look.detail, count))
+    if not len(found):
+        raise InputError("no free place has a view of the scene; give views")
+    return replace(found, names=tuple(f"view_{i:04d}" for i in range(len(found))))
+
+
+def _chosen(look: Outlook, worth: Floats, count: int) -> list[int]:
+    """Return clear views in order of what they add, times their worth."""
+    worth = np.where(look.clear >= _CLEAR * look.clear.max(initial=0), worth * (look.clear + _LEAST), 0.0)
+    total = look.seen.sum(axis=1, dtype=np.float64)
+    forwards, least = look.cameras.forwards, np.full(len(total), np.inf)
+    union, chosen = np.zeros_like(look.seen[:1]), list[int]()
+    while len(chosen) < min(count, len(total)):
+        new = np.maximum(look.seen - union, 0).sum(axis=1, dtype=np.float64)
+        value = worth * (new + _AGAIN * total) * np.minimum(1, least / _APART)
+        best = int(np.argmax(value))
+        if not value[best] > 0:
+            break
+        chosen.append(best)
+        union = np.maximum(union, look.seen[best])
+        least = np.minimum(least, np.degrees(np.arccos(np.clip(forwards @ forwards[best], -1, 1))))
+        worth[best] = 0
+    return chosen or [0][: len(total)]

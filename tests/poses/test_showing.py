@@ -1,0 +1,139 @@
+"""Representative views of twelve scenes: whole and sharp, from around or from within, and far apart."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from g2ard import _core
+from g2ard.io import read_cloud, read_splats
+from g2ard.poses import best_views, plan_pool
+from g2ard.rendering.renderer import arrays_of, settings_for, view_of
+from g2ard.scene.cameras import Camera, Cameras
+from g2ard.scene.splats import Splats
+from g2ard.stages.lift import lift
+from helpers.halls import SIZE, hall
+from helpers.realdata import real
+from reference import poses as naive
+
+_DRAWN = 120_000
+
+
+def chunks(name: str) -> Splats:
+    folder = real(name)
+    parts = [read_splats(part).narrowed() for part in sorted(folder.glob("0_*"))]
+    return naive.joined(*(part.recentred(parts[0].offset) for part in parts))
+
+
+def autzen() -> Splats:
+    points = read_cloud(real("autzen_lidar/autzen_stadium.laz")).points
+    assert points.colors is not None
+    return lift(points.positions[::20], points.colors[::20])
+
+
+SCENES: dict[str, tuple[Callable[[], Splats], str]] = {
+    "statue": (naive.statue, "around"),
+    "town": (naive.town, "around"),
+    "ball": (lambda: naive.sphere((0, 0, 0), 1.0, 0.03), "around"),
+    "coarse": (lambda: naive.sphere((0, 0, 0), 1.0, 0.16), "around"),
+    "room": (naive.room, "within"),
+    "hall": (hall, "within"),
+    "hall under plates": (lambda: hall(plate=0.2), "within"),
+    "playbot": (lambda: read_splats(real("playbot/0_0")), "around"),
+    "guitar": (lambda: read_splats(real("format_samples/guitar.compressed.ply")), "around"),
+    "autzen": (autzen, "around"),
+    "taebak_park": (lambda: chunks("taebak_park"), "around"),
+    "showroom": (lambda: chunks("showroom"), "within"),
+    "paljassaare": (lambda: read_splats(real("paljassaare/0_0")), "within"),
+}
+
+
+def seen(splats: Splats, cameras: Cameras) -> np.ndarray:
+    """Return per view the share of the image that is not empty, and the share that is resolved."""
+    some = splats.take(slice(None, None, -(-len(splats) // _DRAWN))).narrowed()
+    grown = some.scales * np.float32(np.sqrt(len(splats) / len(some)))  # to cover for the others
+    settings = settings_for(some.means, antialiased=some.antialiased)
+    small = cameras.resized(120).recentred(some.offset)
+    views = [view_of(small, i, settings) for i in range(len(small))]
+    sigma = np.sort(some.scales.astype(np.float64), axis=1)[:, 1:].prod(axis=1) ** 0.5
+    found = []
+    for view, sums in enumerate(
+        _core.accumulate_each(arrays_of(replace(some, scales=grown)), views, settings)
+    ):
+        weight = sums["weight"] / (small.widths[view] * small.heights[view])
+        away = np.linalg.norm(some.means - small.positions[view], axis=1)
+        found.append((weight.sum(), weight[sigma < 0.03 * away].sum()))
+    return np.array(found)
+
+
+def subject(splats: Splats) -> np.ndarray:
+    """Return the means that are opaque, without the outermost hundredth along each axis."""
+    means = splats.means[splats.opacities > 0.3].astype(np.float64) + splats.offset
+    low, high = np.quantile(means, [0.01, 0.99], axis=0)
+    return means[((means >= low) & (means <= high)).all(axis=1)]
+
+
+def least_angle(cameras: Cameras) -> float:
+    cosines = cameras.forwards @ cameras.forwards.T
+    return float(np.degrees(np.arccos(np.clip(cosines[~np.eye(len(cameras), dtype=bool)].max(), -1, 1))))
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_the_best_views_are_whole_or_within_sharp_and_apart(name: str) -> None:
+    make, where = SCENES[name]
+    splats = make()
+    views = best_views(splats, 4)
+    assert views.names == ("view_0000", "view_0001", "view_0002", "view_0003")
+    matter, (covered, resolved) = subject(splats), seen(splats, views).T
+    frames = np.array([view.holds(matter).mean() for view in views])
+    low, high = matter.min(axis=0), matter.max(axis=0)
+    outside = ((views.positions < low) | (views.positions > high)).any(axis=1)
+    print(name, frames.round(3), covered.round(2), resolved.round(2), least_angle(views), outside)
+    if where == "around":
+        assert outside.all()
+        assert frames[0] >= 0.995
+        assert (frames >= 0.98).all()
+        if name != "coarse":
+            assert (resolved >= 0.9 * covered).all()
+        assert least_angle(views) >= 35
+    else:
+        assert not outside.any()
+        assert (covered > 0.8).all()
+        assert (resolved > 0.4).all()
+        assert frames[0] > 0.15
+        assert least_angle(views) >= 20
+
+
+def test_a_hall_that_is_no_room_still_trains_from_within(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("g2ard.poses.site._ENCLOSED", 1.1)  # more than all directions
+    pool = plan_pool(hall(plate=0.2), 16, rows=60_000)  # a ceiling that looks sharp from above
+    eyes = pool.cameras.positions
+    assert ((eyes > 0) & (eyes < SIZE)).all()
+    assert "ceiling" in pool.why
+
+
+def test_photos_are_chosen_by_what_they_see() -> None:
+    statue = naive.statue()
+    views = Cameras.of(
+        Camera.facing(eye, target, fov=60, name=name)
+        for name, eye, target in (
+            ("away", (5, 0, 3), (9, 0, 3)),
+            ("close", (0, -1.6, 1.3), (0, 0, 1.3)),
+            ("front", (0, -6, 3), (0, 0, 0.8)),
+            ("back", (0, 6, 3), (0, 0, 0.8)),
+            ("beside", (0.4, -6, 3), (0, 0, 0.8)),
+        )
+    )
+    chosen = best_views(statue, 3, views).names
+    assert set(chosen[:2]) in ({"front", "back"}, {"beside", "back"})
+    assert "away" not in chosen
+
+
+def test_the_best_views_do_not_depend_on_the_order_of_rows() -> None:
+    statue = naive.statue()
+    order = np.random.default_rng(0).permutation(len(statue))
+    first, second = best_views(statue, 3), best_views(statue.take(order), 3)
+    np.testing.assert_allclose(first.viewmats, second.viewmats, atol=1e-6)
