@@ -146,7 +146,8 @@ def best_views(
     survey = Survey(some, represents, Site.of(some, up, None, represents), Lens(size))
     if cameras is not None:
         look = Outlook.of(survey, cameras.take(evenly_spaced(len(cameras), _PHOTOS)))
-        worth = look.detail * look.seen.sum(axis=1, dtype=np.float64)
+        shared = look.seen * look.seen.mean(axis=0)  # photos turn to their subject
+        worth = look.detail * (shared.sum(axis=1, dtype=np.float64) / max(float(shared.sum()), 1e-30)) ** 2
         return look.cameras.take(_chosen(look, worth, count))
     around, within = outlooks(survey)
     look = within if len(within.cameras) and is_within(survey, around, within) else around
