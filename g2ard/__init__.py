@@ -54,6 +54,7 @@ if TYPE_CHECKING:
     from g2ard.jobs.distill import distill
     from g2ard.jobs.distill_options import DistillOptions
     from g2ard.jobs.levels import lod, save_tileset
+    from g2ard.jobs.notebook import view
     from g2ard.jobs.recover import recover
     from g2ard.jobs.register import register
     from g2ard.jobs.simplify import simplify
@@ -145,6 +146,7 @@ __all__ = [
     "show_progress",
     "simplify",
     "up_of",
+    "view",
 ]
 
 _HOMES = {
@@ -161,6 +163,7 @@ _HOMES = {
     "jobs.distill": ("distill",),
     "jobs.distill_options": ("DistillOptions",),
     "jobs.levels": ("lod", "save_tileset"),
+    "jobs.notebook": ("view",),
     "jobs.recover": ("recover",),
     "jobs.register": ("register",),
     "jobs.simplify": ("simplify",),

@@ -91,6 +91,7 @@ VALID: dict[str, dict[str, Any]] = {
     "show_progress": {"stage": "read", "done": 1, "total": 2},
     "simplify": {"scene": BALL, "ratio": 4},
     "up_of": {"scene": BALL},
+    "view": {"scene": BALL},
     "Camera": {"viewmat": np.eye(4), "K": np.eye(3), "width": 8, "height": 6},
     "Georeference": {"longitude": 25, "latitude": 59, "height": 30},
     "Photos": {"cameras": VIEWS, "images": IMAGES},
@@ -172,8 +173,32 @@ def test_recover_takes_settings_by_name() -> None:
     by_name = g2ard.recover(SMALL, **decided, steps=3, schedule="fast")
     by_path = g2ard.recover(SMALL, **decided, settings={"recover.steps": 3, "schedule": "fast"})
     assert by_name.splats.fingerprint() == by_path.splats.fingerprint()
-    with pytest.raises(g2ard.InputError, match="unknown setting 'step'; did you mean"):
-        g2ard.recover(SMALL, TARGETS, step=3)
+
+
+def test_every_public_function_answers_an_unknown_keyword_by_the_nearest() -> None:
+    asked = 0
+    for name in g2ard.__all__:
+        function = getattr(g2ard, name)
+        if not inspect.isfunction(function):
+            continue
+        for keyword, parameter in inspect.signature(function).parameters.items():
+            if parameter.kind is parameter.VAR_KEYWORD or len(keyword) < 4:
+                continue
+            first = {"scene": SMALL, "ratio": 2.0} if name == "distill" else {}
+            if name == "recover":
+                first = {"student": SMALL, "targets": TARGETS}
+            if name in ("save", "save_views", "convert", "save_levels", "save_tileset"):
+                continue  # options of formats are answered by their formats
+            wrong = f"{keyword[:-1]}x{keyword[-1]}"
+            with pytest.raises((TypeError, g2ard.InputError), match=rf"'{wrong}'; did you mean {keyword}\?"):
+                function(**first, **{wrong: 1})
+            asked += 1
+    assert asked > 100
+
+
+def test_editors_complete_what_people_set() -> None:
+    for function in (g2ard.distill, g2ard.recover):
+        assert {"steps", "background", "schedule", "seed"} <= {*inspect.signature(function).parameters}
 
 
 BYTES = np.rint(IMAGES * 255).astype(np.uint8)

@@ -5,8 +5,9 @@ from __future__ import annotations
 import inspect
 import math
 import types
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
+from difflib import get_close_matches
 from functools import cache, wraps
 from numbers import Integral, Real
 from typing import Annotated, Any, Literal, ParamSpec, TypeVar, Union, get_args, get_origin, get_type_hints
@@ -146,12 +147,27 @@ def checks_arguments(function: Callable[P, Result]) -> Callable[P, Result]:
     @wraps(function)
     def checked(*args: P.args, **kwargs: P.kwargs) -> Result:
         kinds = _hints(function)
+        unknown = [] if loose else [name for name in kwargs if name not in signature.parameters]
+        if unknown:
+            near = nearest(unknown[0], [name for name in signature.parameters if name != "self"])
+            raise TypeError(f"{function.__name__}() has no keyword {unknown[0]!r}; {near}")
         for name, value in signature.bind(*args, **kwargs).arguments.items():
             if name in kinds and name not in loose:
                 _check(name, value, kinds[name])
         return function(*args, **kwargs)
 
     return checked
+
+
+def nearest(name: str, listed: Iterable[str], known: Iterable[str] | None = None) -> str:
+    """Return a question for the names most like an unknown one, or else the list.
+
+    >>> nearest("ratoi", ["count", "ratio"]), nearest("x", ["count", "ratio"])
+    ('did you mean ratio?', 'expected one of count, ratio')
+    """
+    listed = list(listed)
+    close = get_close_matches(name, sorted(listed if known is None else known), 1)
+    return f"did you mean {close[0]}?" if close else f"expected one of {', '.join(listed)}"
 
 
 def signature_of(other: Callable[P, Any]) -> Callable[[Callable[..., Result]], Callable[P, Result]]:

@@ -16,13 +16,14 @@ Settings with a classmethod `named` can be set as a whole by name: `recover.sche
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
 from difflib import get_close_matches
 from functools import cache
+from inspect import signature
 from typing import Any, ClassVar, Literal, Self, TypeVar, get_args, get_origin, get_type_hints
 
-from g2ard.config.checks import bare, check_fields, check_type, described, options_of
+from g2ard.config.checks import bare, check_fields, check_type, described, nearest, options_of
 from g2ard.errors import InputError
 
 Config = TypeVar("Config")
@@ -126,6 +127,20 @@ def full_paths(values: Mapping[str, Any], config: Any) -> dict[str, Any]:
             check_type(name, value, known[path].kind)
         found[path] = value
     return found
+
+
+def keywords(function: Callable[..., Any], config: Any, given: Mapping[str, Any]) -> dict[str, Any]:
+    """Return settings given as keywords of a function that are not None.
+
+    A name that is neither an argument nor the end of a path of `config` is answered by the nearest of these.
+    """
+    arguments = [name for name, p in signature(function).parameters.items() if p.kind is not p.VAR_KEYWORD]
+    paths = {leaf.path for leaf in _leaves(config, every=True)}
+    known = {*arguments, *(path.rpartition(".")[2] for path in paths)}
+    for name in given:
+        if name not in known and name not in paths and "." not in name:
+            raise InputError(f"unknown keyword {name!r}; {nearest(name, arguments, known)}")
+    return {name: value for name, value in given.items() if value is not None}
 
 
 def changed(config: Config, values: Mapping[str, Any]) -> Config:

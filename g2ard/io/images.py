@@ -10,6 +10,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -392,7 +393,14 @@ def write_png(path: str | Path, image: ArrayLike, *, overwrite: bool = False) ->
     if not values.size or not (values.ndim == 2 or (values.ndim == 3 and values.shape[2] in (3, 4))):
         raise InputError(f"expected an image, got an array of shape {values.shape}", path=path)
     with atomic_output(path, overwrite) as temporary:
-        Image.fromarray(np.ascontiguousarray(values)).save(temporary, format="PNG")
+        temporary.write_bytes(png_bytes(values))
+
+
+def png_bytes(image: ArrayLike) -> bytes:
+    """Return an image, as `write_png` takes it, as the content of a PNG file."""
+    content = BytesIO()
+    Image.fromarray(np.ascontiguousarray(to_bytes(image))).save(content, format="PNG")
+    return content.getvalue()
 
 
 def contact_sheet(

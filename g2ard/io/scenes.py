@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from g2ard.config.choices import RenderModel
     from g2ard.io.stream import PointStream, SceneStream
     from g2ard.io.types import Cloud, Note, Points, Scene
-    from g2ard.scene.splats import Splats
+    from g2ard.scene.splats import HasSplats, Splats
 
 
 @checks_arguments
@@ -107,7 +107,7 @@ def check_scene_output(path: str | Path, overwrite: bool = False) -> Path:
 @checks_arguments
 def write_splats(
     path: str | Path,
-    splats: Splats,
+    splats: Splats | HasSplats,
     *,
     overwrite: bool = False,
     progress: Progress = silent,
@@ -118,7 +118,7 @@ def write_splats(
     Args:
         path: .ply (3DGS), .compressed.ply, .sog, .spz, .glb (KHR_gaussian_splatting), .splat, .usda,
             .usdc; NAME/meta.json for a SOG folder.
-        splats: the scene.
+        splats: the scene, or a result that holds one.
         overwrite: whether to replace an existing file.
         progress: called while a format that takes long is packed.
         **options: format options: `normals=True` adds nx ny nz to a .ply, and `layout="inria"` also pads it
@@ -143,7 +143,9 @@ def write_splats(
     >>> len(g2ard.load(path))
     1
     """
-    tell(path, write_scene(path, splats, overwrite=overwrite, progress=progress, **options))
+    from g2ard.scene.splats import scene_of
+
+    tell(path, write_scene(path, scene_of(splats), overwrite=overwrite, progress=progress, **options))
 
 
 def write_scene(

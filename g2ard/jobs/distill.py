@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard.config.checks import AtLeastOne, checks_arguments
-from g2ard.config.choices import FormatName, RenderModel, is_made
-from g2ard.config.schema import listed
+from g2ard.config.choices import Colour, FormatName, RenderModel, is_made
+from g2ard.config.schema import keywords, listed
 from g2ard.errors import InputError
 from g2ard.io import kind, read_cloud, read_splats
 from g2ard.io.paths import real_path
@@ -326,6 +326,10 @@ def distill(
     render_model: RenderModel | None = None,
     format: FormatName = "ply",
     preset: str = "auto",
+    steps: AtLeastOne | None = None,
+    schedule: str | Schedule | None = None,
+    background: Colour | None = None,
+    seed: int | None = None,
     settings: Mapping[str, Any] | None = None,
     work: Path | None = None,
     progress: Progress = silent,
@@ -363,13 +367,18 @@ def distill(
         clean: remove invisible and stray Gaussians first, like `g2ard clean`.
         render_model: "classic" or "antialiased": overrides what the scene's file says.
         beside: a path to look for cameras beside, if `scene` is not a path.
+        steps: steps of the final recovery; None takes the schedule's, and more where views or points need
+            them.
+        schedule: fast, default, best or paper.
+        background: RGB in [0, 1] behind the scene.
+        seed: seed of generated views, and of the order of views in recovery.
         settings: values of `g2ard.DistillConfig` by path, such as {"recover.schedule.rates.means": 1e-3};
             they override the preset.
         work: folder for finished rounds and checkpoints; the same call resumes from it after Ctrl-C.
         progress: called by all stages.
         say: called with log messages.
-        fields: settings by field name, like the command's flags: `steps=100`, `background=(1, 1, 1)`,
-            `method="fast"`, `seed=1`. None keeps the preset's value.
+        fields: other settings by field name, like the command's flags: `method="fast"`, `sh_degree=0`. None
+            keeps the preset's value.
 
     Returns:
         The compact scene, its unrecovered version, a report, and the held-out targets.
@@ -405,6 +414,7 @@ def distill(
     >>> small = distill("cloud.ply", count=100_000, views="photos/", size=1600)  # doctest: +SKIP
     """
     budget = Budget(count, ratio, fit=fit, min_psnr=min_psnr, min_ssim=min_ssim)
+    named = {"steps": steps, "schedule": schedule, "background": background, "seed": seed}
     options = DistillOptions(
         views=views,
         photos=photos,
@@ -416,7 +426,7 @@ def distill(
         render_model=render_model,
         format=format,
         preset=preset,
-        settings={name: value for name, value in fields.items() if value is not None} | dict(settings or {}),
+        settings=keywords(distill, DistillConfig(), fields | named) | dict(settings or {}),
     )
     job = prepare(scene, budget, options, progress=progress, say=say)
     done = job.run(work)

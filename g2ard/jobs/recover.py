@@ -9,9 +9,9 @@ from typing import Any
 
 from numpy.typing import ArrayLike, NDArray
 
-from g2ard.config.checks import checks_arguments
+from g2ard.config.checks import AtLeastOne, checks_arguments
 from g2ard.config.choices import Colour, RenderModel, is_made
-from g2ard.config.schema import changed, full_paths
+from g2ard.config.schema import changed, full_paths, keywords
 from g2ard.errors import InputError, require
 from g2ard.io.types import ViewSet
 from g2ard.jobs.cost import Cost, cost_of_recovery
@@ -28,6 +28,7 @@ from g2ard.stages.evaluate import evaluate
 from g2ard.stages.recover import RecoverConfig, Recovered
 from g2ard.stages.recover import recover as optimize
 from g2ard.stages.recover.anchors import Anchors, PriorMeasures, regularizers_for
+from g2ard.stages.recover.config import Schedule
 from g2ard.stages.recover.optimize import Watch
 from g2ard.system.cached import cached_property
 
@@ -240,6 +241,10 @@ def recover(
     teacher: Splats | str | Path | None = None,
     photos: bool = False,
     preset: str = "auto",
+    steps: AtLeastOne | None = None,
+    schedule: str | Schedule | None = None,
+    background: Colour | None = None,
+    seed: int | None = None,
     settings: Mapping[str, Any] | None = None,
     split: str = "train",
     size: int | None = None,
@@ -272,6 +277,10 @@ def recover(
         photos: with a teacher, use photos where views have them; also accept photos that show nothing of the
             student.
         preset: settings by name, without `targets`; see `g2ard.preset`.
+        steps: steps to take; None takes the schedule's, and more where views or points need them.
+        schedule: fast, default, best or paper. It, `steps`, `background` and `seed` override everything else.
+        background: RGB in [0, 1] behind the scene.
+        seed: seed of generated views, and of the order of views.
         settings: values of `RecoverConfig` by path, without `targets`, such as
             {"recover.schedule.rates.means": 1e-3}; they override the preset.
         split: split of the views to train on.
@@ -289,8 +298,8 @@ def recover(
         progress: called after every step with loss, PSNR of a few training views and steps/s.
         say: called with log messages.
         watch: called after every step; its time does not count.
-        fields: settings by field name, like the command's flags: `steps=100`, `background=(1, 1, 1)`,
-            `schedule="fast"`. They override everything else; None keeps the other value.
+        fields: other settings by field name, like the command's flags: `tolerance=0.1`, `sh_degree=0`. They
+            override everything else; None keeps the other value.
 
     Returns:
         The recovered scene, its Gaussians in the student's order, and a report.
@@ -311,7 +320,8 @@ def recover(
     >>> len(better.splats), better.report.psnr.after > better.report.psnr.before
     (100, True)
     """
-    named = {name: value for name, value in fields.items() if value is not None}
+    given = {"steps": steps, "schedule": schedule, "background": background, "seed": seed}
+    named = keywords(recover, RecoverConfig(), fields | given)
     if targets is None:
         _refuse("targets", config=config, weights=weights, validation=validation, frozen=frozen)
         if isinstance(anchors, Anchors):

@@ -27,6 +27,7 @@ from g2ard.stages.recover.anchors import FREE
 from g2ard.stages.recover.config import PAPER, TUNED, FitConfig, Schedule
 from g2ard.stages.recover.probe import Probe
 from g2ard.stages.recover.report import Gain, RecoverReport
+from g2ard.system.shown import Shown
 
 _FITTED_VIEWS = 16
 """Number of evenly spaced targets used to fit the change of colours."""
@@ -235,7 +236,7 @@ class AdaptReport(Report):
 
 
 @dataclass(frozen=True, eq=False)
-class Adapted:
+class Adapted(Shown):
     """A scene with new appearance.
 
     Args:

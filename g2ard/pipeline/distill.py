@@ -27,6 +27,7 @@ from g2ard.stages.recover.optimize import Watch
 from g2ard.stages.select import SurfaceOptions, select
 from g2ard.stages.simplify import simplify
 from g2ard.stages.simplify.reduce import SimplifyReport
+from g2ard.system.shown import Shown
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +63,7 @@ _FINAL = "final"
 
 
 @dataclass(frozen=True, eq=False)
-class Distilled:
+class Distilled(Shown):
     """A compact scene and a report.
 
     Args:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
@@ -14,11 +15,12 @@ from g2ard.config.checks import AboveZero, Within, checks_arguments
 from g2ard.config.choices import BLACK, Convention
 from g2ard.config.schema import Settings
 from g2ard.errors import InputError, require
-from g2ard.io.images import resized
+from g2ard.io import read_splats
+from g2ard.io.images import png_bytes, resized, to_bytes
 from g2ard.scene.cameras import Camera, Cameras
 from g2ard.scene.lenses import FACES, panorama_rays, photo_of
 from g2ard.scene.prepared import DRAWN_LOG_SCALES, DRAWN_LOGITS, MAX_OPACITY
-from g2ard.scene.splats import Splats, unit_quats
+from g2ard.scene.splats import HasSplats, Splats, scene_of, unit_quats
 
 _Floats = NDArray[np.float32]
 View = tuple[list[list[float]], list[float], tuple[int, int], float]
@@ -138,6 +140,13 @@ class Rendered:
     def __repr__(self) -> str:
         height, width = self.alpha.shape
         return f"Rendered({width} × {height})"
+
+    def image_8bit(self) -> NDArray[np.uint8]:
+        """Return the image as bytes, (H, W, 3) uint8, clipped and rounded like `g2ard render` does."""
+        return to_bytes(self.image)
+
+    def _repr_png_(self) -> bytes:
+        return png_bytes(self.image)
 
 
 class Renderer:
@@ -259,7 +268,7 @@ class Renderer:
 
 @checks_arguments
 def render(
-    splats: Splats,
+    splats: Splats | HasSplats | str | Path,
     camera: Camera,
     *,
     background: Sequence[float] = BLACK,
@@ -272,7 +281,7 @@ def render(
     the splats in front; Σ₂ is the projected covariance with a dilation of 0.3 px² (3DGS, Kerbl et al. 2023).
 
     Args:
-        splats: the scene, SH degree 0–3.
+        splats: the scene, SH degree 0–3, a result, or the path of either.
         camera: the view, world coordinates.
         background: RGB in [0, 1] behind the scene.
         settings: conventions; None means gsplat's.
@@ -282,7 +291,8 @@ def render(
         A `Rendered`: image (H, W, 3), alpha (H, W) and depth (H, W), all float32; depth in scene units.
 
     Raises:
-        InputError: an invalid camera, or a background that is not three numbers from 0 to 1.
+        InputError: an unreadable scene, an invalid camera, or a background that is not three numbers from 0
+            to 1.
 
     >>> from g2ard.scene.cameras import Camera
     >>> dot = Splats.create([[0, 0, 0]], scales=[[0.1] * 3], logit_opacities=[9])
@@ -290,7 +300,8 @@ def render(
     >>> out.image.shape, bool(out.alpha[12, 16] > 0.9), out.image[0, 0].tolist()
     ((24, 32, 3), True, [1.0, 1.0, 1.0])
     """
-    return Renderer(splats, background=background, settings=settings).render(camera, median=median)
+    scene = read_splats(splats) if isinstance(splats, str | Path) else scene_of(splats)
+    return Renderer(scene, background=background, settings=settings).render(camera, median=median)
 
 
 _NEAR_SAMPLE = 65_536

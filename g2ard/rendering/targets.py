@@ -24,6 +24,7 @@ from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
 from g2ard.system.cached import cached_property
 from g2ard.system.keys import key_of
+from g2ard.system.shown import Shown
 from g2ard.system.threads import in_threads
 
 CACHE_BYTES = 2_000_000_000
@@ -299,7 +300,7 @@ _KEEPING = threading.Lock()
 """Held while targets change what they keep; one for all, so that targets can be pickled."""
 
 
-class _Cached(_Sourced, ABC):
+class _Cached(_Sourced, Shown, ABC):
     """Cache of what `_make` returns, up to `limit` bytes, first come first kept."""
 
     _UNKEYED = ("_limit", "_kept", "_bytes", "_masks", "_renderer")
@@ -310,6 +311,9 @@ class _Cached(_Sourced, ABC):
         self._limit = limit
         self._kept: dict[int, NDArray[Any] | None] = {}
         self._bytes = 0
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({plural(len(self.cameras), 'view')})"
 
     @abstractmethod
     def _make(self, view: int) -> NDArray[Any]:

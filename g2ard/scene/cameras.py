@@ -16,6 +16,7 @@ from g2ard.progress import plural
 from g2ard.scene.lenses import PhotoLens
 from g2ard.scene.samples import evenly_spaced
 from g2ard.system.keys import UNKEYED, key_of, keyed
+from g2ard.system.shown import Shown
 
 USUAL = "usual"
 """Kind of views that state none: given views, and the poses that suit the scene."""
@@ -42,7 +43,7 @@ def check_image(width: int, height: int, **fields: Any) -> None:
 
 
 @dataclass(frozen=True, eq=False)
-class Camera:
+class Camera(Shown):
     """One view.
 
     Args:
@@ -77,6 +78,10 @@ class Camera:
 
     def __post_init__(self) -> None:
         check_fields(self)
+
+    def __repr__(self) -> str:
+        x, y, z = self.position
+        return f"Camera({self.name!r}, {self.width} × {self.height}, at {x:.4g}, {y:.4g}, {z:.4g})"
 
     @classmethod
     def facing(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,6 +13,7 @@ from g2ard.errors import InputError, require
 from g2ard.progress import plural
 from g2ard.system.cached import cached_property
 from g2ard.system.keys import UNKEYED, key_of, keyed
+from g2ard.system.shown import Shown
 
 SH_C0 = 0.28209479177387814
 """Band-0 spherical harmonic: colour = 0.5 + SH_C0 · sh0."""
@@ -34,7 +35,7 @@ _DEGREE_OF_REST = {0: 0, 3: 1, 8: 2, 15: 3}
 
 
 @dataclass(frozen=True, eq=False)
-class Splats:
+class Splats(Shown):
     """N Gaussians as a structure of arrays.
 
     Args:
@@ -237,6 +238,27 @@ class Splats:
         for name in ("quats", "scales", "sh0", "shN"):
             ok &= np.isfinite(getattr(self, name)).reshape(len(self), -1).all(1)
         return ok
+
+
+class HasSplats(Protocol):
+    """A result with a scene, such as `Simplified` or `Distilled`."""
+
+    @property
+    def splats(self) -> Splats: ...
+
+
+def scene_of(scene: Splats | HasSplats, parameter: str = "splats") -> Splats:
+    """Return a scene, or that of a result; errors name it `parameter`.
+
+    >>> scene_of(Splats.create([[0, 0, 0]], scales=[[1, 1, 1]]))
+    Splats(1 Gaussian, SH degree 0)
+    """
+    found = scene if isinstance(scene, Splats) else getattr(scene, "splats", None)
+    if not isinstance(found, Splats):
+        raise InputError(
+            f"expected Splats or a result with splats, got {type(scene).__name__}", parameter=parameter
+        )
+    return found
 
 
 def _as_floats(name: str, values: Any, kind: type[Any] | None = None) -> NDArray[Any]:

@@ -22,6 +22,7 @@ from g2ard.stages.recover.guard import Guard
 from g2ard.stages.recover.loop import Loop, Watch, checked_weights, finite
 from g2ard.stages.recover.probe import Probe, harmful_changes, score_by_kind
 from g2ard.stages.recover.report import Gain, Geometry, Look, RecoverReport, Trial, Validation
+from g2ard.system.shown import Shown
 
 __all__ = ["Recovered", "Watch", "recover"]
 
@@ -30,7 +31,7 @@ _SAME_PSNR = 10 * math.log10(12 * 255**2)
 
 
 @dataclass(frozen=True, eq=False)
-class Recovered:
+class Recovered(Shown):
     """A recovered scene and a report.
 
     Args:

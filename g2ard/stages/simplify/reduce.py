@@ -25,6 +25,7 @@ from g2ard.stages.simplify.pairs import (
     rows_of,
     splats_of,
 )
+from g2ard.system.shown import Shown
 
 
 @dataclass(frozen=True)
@@ -93,7 +94,7 @@ _DEFAULTS = SimplifyConfig()
 
 
 @dataclass(frozen=True, eq=False)
-class Simplified:
+class Simplified(Shown):
     """Result of simplification.
 
     Args:

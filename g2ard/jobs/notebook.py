@@ -1,0 +1,165 @@
+"""Scenes, views and results in a notebook: `g2ard.view`, and what cells show of them."""
+
+from __future__ import annotations
+
+import base64
+import sys
+from collections.abc import Sequence
+from html import escape
+from pathlib import Path
+from tempfile import mkdtemp
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from g2ard.config.checks import checks_arguments
+from g2ard.config.choices import BLACK
+from g2ard.errors import InputError
+from g2ard.io.detect import run_scene
+from g2ard.io.images import contact_sheet, load_photo, png_bytes, resized
+from g2ard.io.paths import short_names
+from g2ard.jobs.inputs import Views, load_scene
+from g2ard.jobs.viewer_frame import frame_of
+from g2ard.poses import best_views
+from g2ard.progress import Progress, Say, plural, silent, unsaid
+from g2ard.rendering.renderer import Renderer
+from g2ard.rendering.targets import Targets
+from g2ard.scene.cameras import Camera, Cameras
+from g2ard.scene.samples import evenly_spaced
+from g2ard.scene.splats import HasSplats, Splats, scene_of
+from g2ard.viewer.page import write_page
+
+_SIZE = (480, 360)
+"""Width and height in pixels of a scene's picture."""
+_TARGETS, _TARGET = 4, 240
+"""Targets in a picture, and the longer side of each in pixels."""
+_FRAME = 640
+"""Height of a page in a cell, pixels."""
+
+
+@checks_arguments
+def view(
+    scene: Splats | HasSplats | str | Path,
+    other: Splats | HasSplats | str | Path | None = None,
+    *,
+    output: str | Path | None = None,
+    views: Views | None = None,
+    start: str | None = None,
+    up: Sequence[float] | None = None,
+    background: Sequence[float] = BLACK,
+    overwrite: bool = False,
+    progress: Progress = silent,
+    say: Say = unsaid,
+) -> Any:
+    """Show one scene, or two with a divider, on a page with a viewer, like the command `g2ard view`.
+
+    Args:
+        scene: the scene, a result, or the path of either.
+        other: a second scene to compare with, right of the divider.
+        output: the page's file, .html; None writes a temporary one.
+        views: cameras to start from, or their path; None looks for some beside a path, or places the start.
+        start: name of the view to open with; None takes the one that shows most.
+        up: (3,) direction away from the ground; None estimates it.
+        background: RGB in [0, 1] behind the scene.
+        overwrite: whether to replace an existing file.
+        progress: called while scenes are packed.
+        say: called with log messages.
+
+    Returns:
+        In a notebook, an `IFrame` of the whole page, for the cell to show. Elsewhere, the page's path.
+
+    Raises:
+        InputError: an unreadable scene or views, or a scene too large for a page.
+        OutputError: the file exists, cannot be written, or does not end in .html.
+
+    >>> dots = Splats.create([[0, 0, 0], [1, 0, 0]], scales=[[0.1] * 3] * 2)
+    >>> view(dots).name
+    'view.html'
+    """
+    given = [scene] if other is None else [scene, other]
+    sources = [run_scene(Path(one)) if isinstance(one, str | Path) else None for one in given]
+    loaded = [
+        load_scene(path or scene_of(one, name), say)  # type: ignore[arg-type] # paths have sources
+        for one, path, name in zip(given, sources, ("scene", "other"), strict=False)
+    ]
+    paths = [path for path in sources if path is not None]
+    names = iter(short_names(paths) if paths else ())
+    labels = [
+        f"{type(one).__name__.lower() if path is None else next(names)}: {plural(len(splats), 'Gaussian')}"
+        for one, path, splats in zip(given, sources, loaded, strict=True)
+    ]
+    stand = frame_of(loaded[0], views, start=start, beside=sources[0], up=up, say=say)
+    page = Path(mkdtemp(prefix="g2ard-")) / "view.html" if output is None else Path(output)
+    write_page(
+        page,
+        [(label, stand.of(splats)) for label, splats in zip(labels, loaded, strict=True)],
+        start=stand.start,
+        background=background,
+        overwrite=overwrite,
+        progress=progress,
+    )
+    return _inline(page) if _in_notebook() else page
+
+
+def html_of(shown: Any) -> str:
+    """Return what a notebook shows of a scene, a view, targets or a result: its line and a picture."""
+    try:
+        picture = _picture(shown)
+    except InputError as error:  # nothing visible, or a photo that moved
+        return f"<div>{escape(repr(shown))}<br><small>{escape(str(error))}</small></div>"
+    return f"<div>{escape(repr(shown))}<br>{picture}</div>"
+
+
+def _picture(shown: Any) -> str:
+    if isinstance(shown, Camera):
+        if shown.image_path is None:
+            return _wedge(shown)
+        return _embedded(_small(load_photo(Cameras.of([shown]), 0)[0]))
+    if hasattr(shown, "cameras"):
+        return _embedded(_row(shown))
+    scene = scene_of(shown)
+    view = best_views(scene, size=_SIZE)[0]
+    return _embedded(Renderer(scene).clipped(view))
+
+
+def _row(targets: Targets) -> NDArray[np.uint8]:
+    """Return a few targets in a row, evenly spaced."""
+    some = evenly_spaced(len(targets.cameras), _TARGETS)
+    names = [targets.cameras.names[view] for view in some]
+    return contact_sheet([[_small(targets[int(view)]) for view in some]], names)
+
+
+def _small(image: NDArray[Any]) -> NDArray[Any]:
+    height, width = image.shape[:2]
+    share = min(1.0, _TARGET / max(height, width))
+    return resized(image, (max(1, round(width * share)), max(1, round(height * share))))
+
+
+def _embedded(image: NDArray[Any]) -> str:
+    return f'<img alt="" src="data:image/png;base64,{base64.b64encode(png_bytes(image)).decode()}">'
+
+
+def _wedge(camera: Camera) -> str:
+    """Draw the image's frame and its principal point, in proportion."""
+    width, height = camera.width, camera.height
+    x, y, line = camera.K[0, 2], camera.K[1, 2], max(width, height) / 100
+    return (
+        f'<svg viewBox="0 0 {width} {height}" width="{_TARGET}" fill="none" stroke="currentColor"'
+        f' stroke-width="{line:g}"><rect width="{width}" height="{height}"/>'
+        f'<path d="M0 0L{x:g} {y:g}L{width} 0M0 {height}L{x:g} {y:g}L{width} {height}"/></svg>'
+    )
+
+
+def _in_notebook() -> bool:
+    """Return whether this runs in a kernel, whose cells show HTML."""
+    ipython = sys.modules.get("IPython")
+    shell = None if ipython is None else ipython.get_ipython()
+    return getattr(shell, "kernel", None) is not None
+
+
+def _inline(page: Path) -> Any:
+    from IPython.display import IFrame
+
+    content = escape(page.read_text(encoding="utf-8"))
+    return IFrame("about:blank", "100%", _FRAME, extras=[f'srcdoc="{content}"'])

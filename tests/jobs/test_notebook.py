@@ -1,0 +1,122 @@
+"""What notebooks show: pages inline, and a line with a picture of scenes, views, targets and results."""
+
+import base64
+import re
+import sys
+from dataclasses import replace
+from html import unescape
+from io import BytesIO
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import g2ard
+from helpers.scenes import around, checkered_ball
+
+BALL = checkered_ball(600)
+VIEWS = around(3)
+
+
+@pytest.fixture(scope="module")
+def results() -> dict[str, Any]:
+    done = g2ard.distill(BALL, count=60, views=VIEWS, steps=2, size=64)
+    return {
+        "Splats": BALL,
+        "Simplified": g2ard.simplify(BALL, ratio=4, blind=True),
+        "Distilled": done,
+        "TeacherRenders": g2ard.TeacherRenders(BALL, VIEWS),
+        "Camera": VIEWS[0],
+        "Recovered": g2ard.recover(BALL, done.held_out, steps=2),
+    }
+
+
+def embedded(html: str) -> np.ndarray:
+    (data,) = re.findall(r'src="data:image/png;base64,([^"]+)"', html)
+    return np.asarray(Image.open(BytesIO(base64.b64decode(data))))
+
+
+def test_results_show_a_line_and_a_picture(results: dict[str, Any]) -> None:
+    for name, shown in results.items():
+        line, html = repr(shown), shown._repr_html_()
+        assert line.startswith(f"{name}("), line
+        assert "\n" not in line
+        assert len(line) < 120
+        assert line in unescape(html)
+        if name != "Camera":
+            assert embedded(html).std() > 5, name  # the ball, not an empty picture
+
+
+def test_a_camera_shows_its_photo_or_its_frame(tmp_path: Path) -> None:
+    view = VIEWS[0]
+    assert f'viewBox="0 0 {view.width} {view.height}"' in view._repr_html_()
+    photo = np.zeros((view.height, view.width, 3), np.uint8)
+    photo[:, : view.width // 2] = (255, 0, 0)
+    Image.fromarray(photo).save(tmp_path / "half.png")
+    shown = embedded(replace(view, image_path=tmp_path / "half.png")._repr_html_())
+    assert shown[0, 0].tolist() == [255, 0, 0]
+    assert shown[0, -1].tolist() == [0, 0, 0]
+    gone = replace(view, image_path=tmp_path / "gone.png")
+    assert "gone.png" in gone._repr_html_()
+    assert "<img" not in gone._repr_html_()
+
+
+def test_a_scene_without_anything_to_see_is_a_line() -> None:
+    clear = replace(BALL, logit_opacities=np.full(len(BALL), -20, np.float32))
+    assert "<img" not in clear._repr_html_()
+    assert repr(clear) in clear._repr_html_()
+
+
+def test_rendered_images_show_as_they_are_written(tmp_path: Path) -> None:
+    g2ard.save(tmp_path / "ball.ply", BALL)
+    rendered = g2ard.render(BALL, VIEWS[0], background=(1, 1, 1))
+    bright = replace(rendered, image=rendered.image * 2)
+    assert bright.image_8bit().dtype == np.uint8
+    assert bright.image_8bit()[0, 0].tolist() == [255] * 3
+    shown = np.asarray(Image.open(BytesIO(rendered._repr_png_())))
+    np.testing.assert_array_equal(shown, rendered.image_8bit())
+
+
+def test_paths_and_results_are_taken_for_scenes(tmp_path: Path, results: dict[str, Any]) -> None:
+    small = results["Simplified"]
+    g2ard.save(tmp_path / "small.ply", small)
+    assert len(g2ard.load(tmp_path / "small.ply")) == len(small.splats)
+    expected = g2ard.render(small.splats, VIEWS[0]).image
+    np.testing.assert_array_equal(g2ard.render(small, VIEWS[0]).image, expected)
+    from_file = g2ard.render(tmp_path / "small.ply", VIEWS[0]).image
+    np.testing.assert_allclose(from_file, expected, atol=1e-4)
+    for wrong in (3, VIEWS, None):
+        with pytest.raises(g2ard.InputError, match="splats: expected Splats or a result with splats"):
+            g2ard.save(tmp_path / "wrong.ply", wrong)  # type: ignore[arg-type]
+
+
+def test_view_returns_its_page(tmp_path: Path, results: dict[str, Any]) -> None:
+    page = g2ard.view(BALL)
+    assert page.name == "view.html"
+    assert "splats: 600 Gaussians" in page.read_text(encoding="utf-8")
+    two = g2ard.view(BALL, results["Distilled"], output=tmp_path / "two.html")
+    assert two == tmp_path / "two.html"
+    text = two.read_text(encoding="utf-8")
+    assert "splats: 600 Gaussians" in text
+    assert "distilled: 60 Gaussians" in text
+    with pytest.raises(g2ard.OutputError, match="exists"):
+        g2ard.view(BALL, output=two)
+
+
+def test_view_shows_the_whole_page_in_a_notebook(monkeypatch: pytest.MonkeyPatch) -> None:
+    """IPython's `IFrame(src, width, height, extras)` writes the extras as attributes of its frame."""
+    shell = SimpleNamespace(kernel=object())
+    frames = SimpleNamespace(IFrame=lambda src, width, height, extras: SimpleNamespace(extras=extras))
+    monkeypatch.setitem(sys.modules, "IPython", SimpleNamespace(get_ipython=lambda: shell))
+    monkeypatch.setitem(sys.modules, "IPython.display", frames)
+    (attribute,) = g2ard.view(BALL).extras
+    name, _, content = attribute.partition("=")
+    assert name == "srcdoc"
+    assert content[0] == content[-1] == '"'
+    assert '"' not in content[1:-1]
+    assert unescape(content[1:-1]).startswith("<!doctype html>")
+    shell.kernel = None  # IPython in a terminal
+    assert isinstance(g2ard.view(BALL), Path)
