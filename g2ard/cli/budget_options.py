@@ -121,7 +121,7 @@ BUDGETS: dict[str, tuple[Any, ...]] = {
             "--count",
             parser=Counts.parse,
             metavar="COUNT",
-            help="Gaussians to keep: 250000, 250k, 1.5M or 25%. Several (10k,20k) need {count} in --output.",
+            help="Gaussians to keep: 250000, 250k, 1.5M or 25%.",
         ),
     ),
     "ratio": (
@@ -131,7 +131,7 @@ BUDGETS: dict[str, tuple[Any, ...]] = {
             "--ratio",
             parser=Ratios.parse,
             metavar="RATIO",
-            help="Reduction ratio: 10 keeps a tenth. Several (5,10,20) need {ratio} in --output.",
+            help="Reduction ratio: 10 keeps a tenth.",
         ),
     ),
     "fit": (
@@ -152,6 +152,12 @@ BUDGETS: dict[str, tuple[Any, ...]] = {
     ),
 }
 """Options of commands with budgets, see `g2ard.cli.frame.command`: name → type and option."""
+
+SEVERAL = {
+    "count": " Several (10k,20k) need {count} in --output.",
+    "ratio": " Several (5,10,20) need {ratio} in --output.",
+}
+"""Ends of the help texts of commands that take several budgets."""
 
 TILES: dict[str, tuple[Any, ...]] = {
     "tile_rows": (

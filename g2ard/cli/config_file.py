@@ -156,4 +156,4 @@ def _plain(value: Any) -> Any:
     if isinstance(value, bool | int | float) and math.isfinite(value):
         return value
     text = str(value)
-    return int(text) if isinstance(value, Count) and text.isdecimal() else text
+    return int(text) if isinstance(value, Count | tuple) and text.isdecimal() else text

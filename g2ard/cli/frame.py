@@ -13,6 +13,7 @@ import re
 import traceback
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from copy import copy
 from itertools import combinations
 from pathlib import Path
 from pkgutil import resolve_name
@@ -22,7 +23,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 import typer
 
 from g2ard.cli.app import app
-from g2ard.cli.budget_options import BUDGETS, TILES, Counts, Ratios
+from g2ard.cli.budget_options import BUDGETS, SEVERAL, TILES, Counts, Ratios
 from g2ard.cli.config_file import load_config, printed
 from g2ard.cli.console import Console
 from g2ard.cli.fields import FIELDS
@@ -448,6 +449,7 @@ def command(
     fields: Sequence[str] = (),
     scenes: bool = False,
     budgets: bool = False,
+    several: bool = False,
     tiles: bool = False,
     outputs: Collection[str] = ("output",),
     without: Collection[str] = (),
@@ -461,7 +463,8 @@ def command(
             takes no --set.
         fields: paths of its settings that flags set: those of `FIELDS`, or options named like them.
         scenes: whether it reads scenes and takes --render-model, see `Run.load`.
-        budgets: whether it takes budgets, see `g2ard.cli.outputs.budgets_of`.
+        budgets: whether it takes a budget, see `g2ard.cli.outputs.budget_of`.
+        several: whether it takes several, see `g2ard.cli.outputs.budgets_of`.
         tiles: whether it works on scenes in tiles, see `g2ard.cli.tiling.tiling_of`.
         outputs: parameters that are paths to write, all of which it passes to `Run.claim`.
         without: common options that have no effect on it.
@@ -470,6 +473,11 @@ def command(
     def register(fn: Callable[..., None]) -> Callable[..., None]:
         own = list(inspect.signature(fn, eval_str=True).parameters.values())[1:]
         shared_options = {**(BUDGETS if budgets else {}), **(TILES if tiles else {})}
+        for key, end in SEVERAL.items() if several else ():
+            kind, option = shared_options[key]
+            option = copy(option)
+            option.help += end
+            shared_options[key] = (kind, option)
         shared_options |= {
             path.rpartition(".")[2]: (kind | None, option)
             for path, (kind, option) in FIELDS.items()

@@ -183,6 +183,37 @@ ResumeOption = Annotated[bool, typer.Option("--resume", help="Continue an interr
 SizeOption = Annotated[
     int | None, typer.Option(min=16, metavar="PIXELS", help="Shrink images to this longer side.")
 ]
+
+
+class Shape(tuple[int, ...]):
+    """A longer side, or a width and height, in one argument."""
+
+    def __str__(self) -> str:
+        return "x".join(map(str, self))
+
+
+def _shape(text: str) -> Shape:
+    """Read 1920 or 1920x1080.
+
+    >>> _shape("1920"), _shape("1920x1080")
+    ((1920,), (1920, 1080))
+    """
+    parts = text.lower().replace("×", "x").split("x")
+    if len(parts) > 2 or not all(part.strip().isdecimal() and int(part) >= 16 for part in parts):
+        raise typer.BadParameter(
+            f"expected pixels, at least 16, such as 1920 or 1920x1080 (width, height), got {text!r}"
+        )
+    return Shape(map(int, parts))
+
+
+ShapeOption = Annotated[
+    Shape | None,
+    typer.Option(
+        parser=_shape,
+        metavar="PIXELS|WxH",
+        help="Longer side, or width and height, of generated views; given views shrink to a longer side.",
+    ),
+]
 BackgroundOption = Annotated[
     Triple | None,
     typer.Option(

@@ -9,12 +9,12 @@ from typer.core import TyperCommand
 USED: dict[str, tuple[str, ...]] = {
     "distill": (
         *("output", "count", "ratio", "fit", "views"),
-        *("images", "photos", "size", "format", "resume"),
+        *("images", "photos", "size", "schedule", "recovery_time", "format", "resume"),
     ),
     "simplify": ("output", "count", "ratio", "fit", "views", "method", "no_views", "overwrite"),
     "recover": (
         *("output", "views", "teacher", "photos", "images"),
-        *("size", "schedule", "steps", "background", "resume"),
+        *("size", "schedule", "steps", "recovery_time", "background", "resume"),
     ),
     "adapt": ("output", "views", "teacher", "images", "size", "steps", "background", "resume"),
     "register": ("output", "photos", "poses", "pool", "focal", "intrinsics", "size", "matcher", "report"),
@@ -37,7 +37,7 @@ USED: dict[str, tuple[str, ...]] = {
     "compare": ("output", "views", "looks", "size", "background", "overwrite"),
     "info": ("devices", "images", "json"),
 }
-"""Command → at most ten options that people use, in order of use; `--help` shows these."""
+"""Command → at most twelve options that people use, in order of use; `--help` shows these."""
 
 _PANELS = {
     "Budget": ("count", "ratio", "ratios", "fit", "min_psnr", "min_ssim"),

@@ -22,6 +22,9 @@ if TYPE_CHECKING:
 _REPORTED_PSNR_LOSS, _REPORTED_SSIM_LOSS = 0.05, 0.001
 """Losses against the simplified scene that are reported, in dB and SSIM."""
 
+_HARMFUL_SIZE = 3.0
+"""Loss in dB at the views' own size, against that of training, above which --size is warned of."""
+
 _LEAST_REPORTED_SHARE = 0.005
 """Share of the scene too small to report."""
 
@@ -118,6 +121,11 @@ def told(report: RunReport | TiledReport, *, verbose: bool = False) -> list[str]
             f"at the views' own size ({after.scored_in}): {before.psnr:.2f} → {after.psnr:.2f} dB, "
             f"SSIM {before.ssim:.4f} → {after.ssim:.4f}"
         )
+        if (lost := report.scores["recovered"].psnr - after.psnr) > _HARMFUL_SIZE:
+            lines.append(
+                f"warning: the result is {lost:.1f} dB worse at the views' own size than at --size; "
+                "leave --size out, or give a larger one"
+            )
     return [line for line in lines if line is not None]
 
 

@@ -9,14 +9,15 @@ from typing import TYPE_CHECKING, Any
 
 from g2ard.config.checks import checks_arguments
 from g2ard.config.choices import FormatName, RenderModel
-from g2ard.io import read_scene
+from g2ard.io import kind, read_cloud, read_scene
 from g2ard.io.types import Note
 from g2ard.jobs.budget import Budget
 from g2ard.jobs.inputs import Views, say_notes
 from g2ard.jobs.measured_budget import Reduction
 from g2ard.pipeline.presets import configured
-from g2ard.progress import Progress, Say, silent, unsaid
+from g2ard.progress import Progress, Say, plural, silent, unsaid
 from g2ard.scene.splats import Splats
+from g2ard.stages.lift import lift
 from g2ard.stages.simplify import Simplified, SimplifyConfig
 from g2ard.stages.simplify.gaps import say_gaps
 
@@ -59,11 +60,26 @@ def reducing(
     notes: Sequence[Note] = ()
     if not isinstance(scene, Splats):
         progress("read", 0, 0)
+        if kind(scene) == "points":
+            scene, notes = _lifted(scene, progress, say)
+    if not isinstance(scene, Splats):
         found = read_scene(scene, render_model=render_model)
         say_notes(scene, found.notes, say)
         scene, notes = found.splats, found.notes
     counted(len(scene))
     yield Reduction(scene, beside=beside, notes=notes, **options, **callbacks)
+
+
+def _lifted(cloud: str | Path, progress: Progress, say: Say) -> tuple[Splats, Sequence[Note]]:
+    """Read a point cloud and lift it, like `g2ard lift`."""
+    found = read_cloud(cloud)
+    for note in found.notes:
+        say(f"{cloud}: {note}")
+    points = found.points
+    lifted = lift(points.positions, points.colors, progress=progress)
+    discs = plural(len(lifted), "disc")
+    say(f"{cloud}: {plural(len(points), 'point')} lifted to {discs}, as `g2ard lift` does")
+    return lifted, found.notes
 
 
 @checks_arguments
@@ -95,7 +111,7 @@ def simplify(
     the scene, or in generated views. `fast` uses only given views, `paper` none.
 
     Args:
-        scene: the dense scene, or its path.
+        scene: the dense scene, or its path; a coloured point cloud is lifted first.
         count: Gaussians to keep, at most those of the scene.
         ratio: reduction factor, at least 1; the result has round(N/ratio).
         fit: largest file, such as "5MB", or a device (see `Budget`).

@@ -32,6 +32,9 @@ Up = Sequence[float] | None
 Use = Literal["distil", "levels", "tiles", "merging"]
 """Use of generated views. Levels and tiles are scored in usual views alone; merging has no recovery."""
 
+_SHAPE = (800, 600)
+"""Width and height of generated views in pixels, unless another size is requested."""
+
 FULL_PIXELS = 8_000_000
 """Pixels of the views that are scored at their own size after a requested one."""
 
@@ -268,6 +271,7 @@ def views_or_pool(
     beside: str | Path | None = None,
     count: int | None = None,
     student: Splats | None = None,
+    size: tuple[int, int] = _SHAPE,
     up: Up = None,
     seed: int = 0,
     progress: Progress = silent,
@@ -279,6 +283,7 @@ def views_or_pool(
         count: size of a generated pool; None chooses like `distill`.
         student: a compact scene that will be recovered in a generated pool. Views of other kinds complete it
             as in `distill`, and further ones are in the splits `test` and, for validation, `val`.
+        size: width and height of generated views, pixels.
 
     Other arguments are those of `views_of`.
     """
@@ -286,8 +291,8 @@ def views_or_pool(
     if given is not None:
         return given
     grow = _POOL_GROWTH if count is None else 1.0
-    size = _POOL_VIEWS if count is None else count
-    planned = _planned(scene, size, up=up, seed=seed, progress=progress, grow=grow)
+    count = _POOL_VIEWS if count is None else count
+    planned = _planned(scene, count, size=size, up=up, seed=seed, progress=progress, grow=grow)
     if student is not None:
         mix = partial(
             _mixed,
@@ -308,15 +313,52 @@ def views_or_pool(
     return ViewSet(planned.cameras, splits=splits_of(None, planned.cameras.names))
 
 
+def planned_at(size: Sequence[int] | None) -> tuple[int, int]:
+    """Return the size to plan views at for a requested one, a longer side or width and height.
+
+    It has the requested shape, but not its pixels, so that the same views are planned at any size.
+
+    >>> planned_at(None), planned_at([1920]), planned_at([1920, 1080]), planned_at([600, 1200])
+    ((800, 600), (800, 600), (800, 450), (400, 800))
+    """
+    if size is None or len(size) == 1:
+        return _SHAPE
+    width, height = (max(1, round(_SHAPE[0] * side / max(size))) for side in size)
+    return width, height
+
+
+def at_size(cameras: Cameras, size: Sequence[int] | None, *, made: bool) -> Cameras:
+    """Return views at a requested size, see `planned_at`; those that were not `made` only shrink."""
+    if size is None:
+        return cameras
+    if made:
+        return cameras.scaled(size[0]) if len(size) == 1 else cameras.sized(size[0], size[1])
+    if len(size) > 1:
+        raise InputError("given and found views keep their shape; give one number", parameter="size")
+    return cameras.resized(size[0])
+
+
+def is_planned(views: Views) -> bool:
+    """Return whether the views of `views_or_pool`, given as a path or none, were generated."""
+    return isinstance(views, Cameras | ViewSet)
+
+
 def looks_at(
-    scene: Splats, count: int, *, up: Up = None, seed: int = 0, progress: Progress = silent, say: Say = unsaid
+    scene: Splats,
+    count: int,
+    *,
+    size: tuple[int, int] = _SHAPE,
+    up: Up = None,
+    seed: int = 0,
+    progress: Progress = silent,
+    say: Say = unsaid,
 ) -> Cameras:
     """Return the views that show a scene best, and those of a pool if `count` asks for more."""
-    best = best_views(scene, count, up=up)
+    best = best_views(scene, count, size=size, up=up)
     say(f"views: {count} generated")
     if len(best) == count:
         return best
-    pool = _planned(scene, count - len(best), up=up, seed=seed, progress=progress)
+    pool = _planned(scene, count - len(best), size=size, up=up, seed=seed, progress=progress)
     return Cameras.of([*best, *pool.cameras])
 
 

@@ -311,6 +311,16 @@ class Cameras:
         """Return the views with a longer side of `longest` pixels, also if they are smaller."""
         return self._by(longest / np.maximum(self.widths, self.heights))
 
+    def sized(self, width: int, height: int) -> Cameras:
+        """Return the views at exactly this size, with their horizontal field of view."""
+        check_image(width, height, parameter="size")
+        Ks = self.Ks.copy()
+        Ks[:, 0] *= (width / self.widths)[:, None]
+        Ks[:, 1, 1] *= width / self.widths
+        Ks[:, 1, 2] *= height / self.heights
+        n = len(self)
+        return replace(self, Ks=Ks, widths=np.full(n, width), heights=np.full(n, height))
+
     def _by(self, factor: NDArray[np.float64]) -> Cameras:
         """Return the views with a factor on the size of each."""
         widths = np.maximum(1, np.rint(self.widths * factor)).astype(np.int64)

@@ -1,5 +1,6 @@
 """Errors for inputs that are missing, damaged or of the wrong kind."""
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -21,9 +22,25 @@ def test_a_wrong_kind_of_input_names_the_command_that_takes_it(
     photos_of(folder / "photos", points=True)
     for ask, status, words in (
         (("distill", "photos", "-n", 100, "-o", "x"), 2, "photos holds views, not a scene"),
-        (("simplify", "photos/sparse.ply", "-r", 2, "-o", "x.ply"), 1, "`g2ard lift` turns it into a scene"),
+        (("clean", "photos/sparse.ply", "-o", "x.ply"), 1, "`g2ard lift` turns it into a scene"),
     ):
         assert words in refused(command_line, folder, *ask, status=status)
+
+
+def test_simplify_lifts_a_point_cloud_as_lift_does(command_line: CommandLine, folder: Path) -> None:
+    photos_of(folder / "photos", points=True)
+    cloud = "photos/sparse.ply"
+    succeeds(command_line, folder, "lift", cloud, "-o", "lifted.ply")
+    succeeds(command_line, folder, "simplify", "lifted.ply", "-r", 4, "--method", "fast", "-o", "two.ply")
+    ask = ("simplify", cloud, "-r", 4, "--method", "fast", "-o", "one.ply", "--memory", "8GB")
+    told = succeeds(command_line, folder, *ask).err
+    points = len(g2ard.load_points(folder / cloud))
+    assert re.search(rf"{cloud}: {points:,} points lifted to [\d,]+ discs", told)
+    one, two = (g2ard.load(folder / name) for name in ("one.ply", "two.ply"))
+    assert len(one) == len(two)
+    np.testing.assert_allclose(np.sort(one.means, axis=0), np.sort(two.means, axis=0), atol=1e-3)
+    ours = g2ard.simplify(folder / cloud, ratio=4, method="fast").splats
+    np.testing.assert_allclose(ours.means, one.means, atol=1e-6)
 
 
 def test_errors_point_to_the_poses_of_photos(folder: Path) -> None:

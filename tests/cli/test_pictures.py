@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from g2ard.io import write_splats
+from g2ard.io import write_splats, write_views
 from g2ard.jobs.views import orbit
 from helpers.commands import CommandLine, refused, succeeds
-from helpers.scenes import checkered_ball
+from helpers.scenes import around, checkered_ball
 
 
 def test_an_orbit_keeps_its_distance_and_turns_by_equal_angles() -> None:
@@ -39,6 +39,38 @@ def test_render_writes_an_animation(tmp_path: Path, command_line: CommandLine, n
         found.load()
         assert found.info["duration"] == 100
     assert "exists" in refused(command_line, tmp_path, *ask, status=1)
+
+
+@pytest.mark.parametrize(
+    ("given", "size"), [("96", (96, 72)), ("1000", (1000, 750)), ("96x54", (96, 54)), ("30x50", (30, 50))]
+)
+@pytest.mark.parametrize("views", [("--orbit", 1), ("-k", 1), ("--views", "made")])
+def test_generated_views_have_the_size_that_is_asked_for(
+    tmp_path: Path, command_line: CommandLine, views: tuple[object, ...], given: str, size: tuple[int, int]
+) -> None:
+    write_splats(tmp_path / "ball.ply", checkered_ball(300))
+    few = ("--split", "test") if "made" in views else ()
+    succeeds(command_line, tmp_path, "render", "ball.ply", *views, *few, "--size", given, "-o", "out")
+    for path in (tmp_path / "out").iterdir():
+        with Image.open(path) as found:
+            assert found.size == size
+
+
+def test_a_shape_is_for_generated_views(tmp_path: Path, command_line: CommandLine) -> None:
+    write_splats(tmp_path / "ball.ply", checkered_ball(300))
+    write_views(tmp_path / "views.json", around(2))
+    ask = ("render", "ball.ply", "--views", "views.json", "-o", "out", "--size")
+    assert "given views keep their shape" in refused(command_line, tmp_path, *ask, "96x54")
+    assert "1920x1080" in refused(command_line, tmp_path, *ask, "12")
+    assert "wide as high" in refused(command_line, tmp_path, *ask[:2], "--panorama", *ask[4:], "96x54")
+
+
+def test_a_shape_keeps_pixels_square_and_the_field_of_view() -> None:
+    view = around(1)
+    sized = view.sized(192, 54)
+    assert sized.Ks[0, 0, 0] == pytest.approx(sized.Ks[0, 1, 1])
+    assert sized.Ks[0, 0, 0] / 192 == pytest.approx(view.Ks[0, 0, 0] / view.widths[0])
+    assert sized.Ks[0, :2, 2].tolist() == pytest.approx([96, 27])
 
 
 def test_an_mp4_without_ffmpeg_says_so(

@@ -4,6 +4,7 @@ import json
 import re
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -170,6 +171,25 @@ def test_every_score_has_its_size(runs: Path, command_line: CommandLine) -> None
         told = succeeds(command_line, runs, command, "ball.ply", *ask, "-o", f"{command}.ply").err
         (line,) = [line for line in told.splitlines() if line.startswith(f"{command}.ply")]
         assert "32×24 px" in line
+
+
+def test_a_size_that_harms_is_a_warning_with_the_way_out() -> None:
+    """A loss above 3 dB at the views' own size is told as one; a smaller one is not."""
+    from g2ard.cli.run_result import told
+
+    means = [
+        SimpleNamespace(psnr=psnr, ssim=0.9, scored_in="8 photos, 800×600 px")
+        for psnr in (20.0, 34.8, 27.3, 32)
+    ]
+    before, at_size, harmed, usual = means
+    fields = dict.fromkeys(("unseen", "packed", "opacity_lost"))
+    for own, warned in ((harmed, True), (usual, False)):
+        own_size = {"simplified": before, "recovered": own}
+        scores = {"recovered": at_size}
+        report: Any = SimpleNamespace(rounds=[], kinds=[], own_size=own_size, scores=scores, **fields)
+        warnings = [line for line in told(report) if line.startswith("warning: ")]
+        assert bool(warnings) == warned
+        assert all("7.5 dB" in line and "leave --size out" in line for line in warnings)
 
 
 def test_no_second_score_without_a_size(runs: Path, command_line: CommandLine) -> None:

@@ -40,15 +40,14 @@ def compare(
     views: opt.ViewsOrMadeOption = None,
     images: opt.ImagesOption = None,
     looks: Annotated[int, typer.Option("-k", min=1, metavar="K", help="Views to generate.")] = 24,
-    size: opt.SizeOption = None,
+    size: opt.ShapeOption = None,
     background: opt.BackgroundOption = None,
 ) -> None:
     """Compare renders of two scenes: PSNR, SSIM, the worst views, and a page to look at."""
-    from g2ard.io.types import ViewSet
     from g2ard.jobs.inputs import load_views
     from g2ard.jobs.view_checks import check_sight, opaque_points
     from g2ard.jobs.viewer_frame import frame_with, level_up
-    from g2ard.jobs.views import views_or_pool
+    from g2ard.jobs.views import at_size, is_planned, planned_at, views_or_pool
     from g2ard.poses import best_views
     from g2ard.rendering.targets import TeacherRenders
     from g2ard.scene.cameras import Cameras
@@ -70,10 +69,11 @@ def compare(
         given,
         beside=paths[0],
         count=looks,
+        size=planned_at(size),
         seed=run.seed,
         **run.callbacks,
     )
-    cameras = load_views(found, "all", size, run.say)
+    cameras = at_size(load_views(found, "all", None, run.say), size, made=is_planned(found))
     check_sight(reference, cameras, run.say)
     targets = TeacherRenders(reference, cameras, background=colour, progress=run.progress)
     scores = evaluate(other, targets, background=colour, progress=run.progress)
@@ -91,9 +91,9 @@ def compare(
     if output is not None:
         run.begin("page")
         points = opaque_points(reference)
-        if found is not given and isinstance(found, ViewSet):  # generated views may show only parts
+        if is_planned(found):  # generated views may show only parts
             up = level_up(cameras)
-            best = best_views(reference, up=up).resized(int(cameras.widths.max()))
+            best = at_size(best_views(reference, size=planned_at(size), up=up), size, made=True)
             renders = TeacherRenders(reference, best, background=colour)
             psnr[best.names[0]] = evaluate(other, renders, background=colour).psnr
             stand = frame_with(reference, best, up=None if up is None else up.tolist())

@@ -76,7 +76,7 @@ def render(
     ] = None,
     convention: opt.ConventionOption = "gsplat",
     split: opt.SplitOption = "all",
-    size: opt.SizeOption = None,
+    size: opt.ShapeOption = None,
     background: opt.BackgroundOption = None,
     up: opt.UpOption = None,
 ) -> None:
@@ -84,7 +84,7 @@ def render(
     from g2ard.io.images import to_bytes, write_animation
     from g2ard.jobs.inputs import load_views
     from g2ard.jobs.view_checks import warn_of_sight
-    from g2ard.jobs.views import looks_at, orbit, views_or_pool
+    from g2ard.jobs.views import at_size, is_planned, looks_at, orbit, planned_at, views_or_pool
     from g2ard.rendering.renderer import RasterSettings, Renderer, stations
 
     if output is None and sheet is None:
@@ -98,21 +98,26 @@ def render(
         run.refuse_typed("without generated views", "up")
     if animation is None:
         run.refuse_typed("without an animation", "fps")
+    if size is not None and len(size) > 1 and (around or (views is not None and not is_made(views))):
+        what = "panoramas are twice as wide as high" if around else "given views keep their shape"
+        raise typer.BadParameter(f"--size: {what}; give one number, not {size}")
     views = opt.with_images(views, images)
     if sheet is not None:
         run.claim_file("--sheet", sheet)
     splats = run.load(scene)
     found: Any
     if turn is not None:
-        found = orbit(splats, turn, up=up, seed=run.seed, progress=run.progress, say=run.say)
+        found = orbit(splats, turn, size=planned_at(size), up=up, seed=run.seed, **run.callbacks)
     elif looks is not None:
-        found = looks_at(splats, looks, up=up, seed=run.seed, **run.callbacks)
+        found = looks_at(splats, looks, size=planned_at(size), up=up, seed=run.seed, **run.callbacks)
     else:
-        found = views_or_pool(splats, views, beside=scene, up=up, seed=run.seed, **run.callbacks)
-    cameras = load_views(found, split, None if around else size, run.say)
+        how: dict[str, Any] = {"up": up, "seed": run.seed, **run.callbacks}
+        found = views_or_pool(splats, views, beside=scene, size=planned_at(size), **how)
+    cameras = load_views(found, split, None, run.say)
     if around:
         cameras = stations(cameras)
     else:
+        cameras = at_size(cameras, size, made=is_planned(found))
         warn_of_sight(splats, cameras, run.say)
     places = output_names(cameras.source or str(views), cameras.names) if output is not None else []
     if output is not None:
@@ -126,7 +131,7 @@ def render(
             camera = cameras[view]
             rendered: Rendered | None = None
             if around:
-                rendered = renderer.panorama(camera, width=2 * max(2, (size or _PANORAMA) // 2))
+                rendered = renderer.panorama(camera, width=2 * max(2, (size[0] if size else _PANORAMA) // 2))
             elif depth:
                 rendered = renderer.render(camera)
             image = renderer.image(camera) if rendered is None else rendered.image

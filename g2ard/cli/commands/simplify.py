@@ -16,6 +16,7 @@ from g2ard.cli.run_result import say_fit, say_weight, tell_quality, tiles_of
 from g2ard.cli.tiling import tiling_of, work_folder
 from g2ard.config.choices import is_made
 from g2ard.config.schema import listed
+from g2ard.io import kind
 from g2ard.io.atomic import atomic_output
 from g2ard.io.scene_formats import written_bytes
 from g2ard.progress import plural
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
     fields=("simplify.method", "simplify.keep_region"),
     scenes=True,
     budgets=True,
+    several=True,
     tiles=True,
     outputs=("output", "parents"),
 )
@@ -58,6 +60,7 @@ def simplify(
 
     The default method weighs errors by visibility. It uses --views, or cameras found beside the scene, or
     generated views. The fast method uses views only if --views is given; the paper's method uses none.
+    A coloured point cloud is lifted first, as by `g2ard lift`.
     Scenes larger than memory and folders of tiles are simplified tile by tile to the same exact budget.
     """
     import numpy as np
@@ -90,7 +93,8 @@ def simplify(
         refuse_whole(scene, needs_whole(config, preset, budgets, name, parents=parents))
     else:
         say_fit(run, scene, budgets[0], name)
-        check_whole_memory(scene, tiling, WHOLE_TIMES)
+        if kind(scene) != "points":
+            check_whole_memory(scene, tiling, WHOLE_TIMES)
         if parents is not None and not dry_run:
             maps = Outputs(parents, budgets, run.claim_file, name="--parents")
         seen = [("read", 0.2), ("poses", 1.0), ("visibility", 2.0)]  # seconds for playbot
