@@ -20,7 +20,7 @@ _LARGEST_DENSE = 2_000_000
 """Largest dense scene that is shown beside a run's result."""
 
 
-@command("view", example="g2ard view run/ dense.ply -o compare.html", scenes=True)
+@command("view", example="g2ard view run/ dense.ply -o compare.html", scenes=True, without=("seed",))
 def view(
     run: Run,
     scene: Annotated[
