@@ -61,6 +61,10 @@ Say = Callable[[str], None]
 """Callback with a line of status, such as a warning or a decision and its reason."""
 
 
+class Detail(str):
+    """A message that commands print with -v only."""
+
+
 def unsaid(text: str) -> None:
     """Say nothing."""
 

@@ -22,6 +22,8 @@ _LIVE_LINE_DELAY, _LIVE_LINE_PERIOD = 0.4, 0.125
 """Seconds before the live line appears, and between its updates; short commands never import rich."""
 _SILENT_SECONDS = 1.0
 """Seconds after the end of a stage until the live line says that the command is still working."""
+_STEADY = 1.5
+"""Largest ratio of two estimates of a stage's duration, the second after twice the time, that are alike."""
 _ETA_KNOWN_SHARE = 0.1
 """Share of the expected work after which the time that the whole command still needs is shown."""
 _ECHO = 5
@@ -92,6 +94,18 @@ class _Stage:
     figures: list[str] = field(default_factory=list)
     ended: float | None = None
     printed: float = 0.0
+    settled: bool = False
+    noted: tuple[float, float] | None = None
+
+    def note(self, now: float) -> None:
+        """Compare the estimated duration with that at half of the time so far; alike, they are settled."""
+        elapsed, share = now - self.began, self.share
+        if share <= 0 or elapsed < 1 or (self.noted is not None and elapsed < 2 * self.noted[0]):
+            return
+        whole = elapsed / share
+        if self.noted is not None and self.noted[1] / _STEADY <= whole <= self.noted[1] * _STEADY:
+            self.settled = True
+        self.noted = elapsed, whole
 
     @property
     def share(self) -> float:
@@ -99,9 +113,9 @@ class _Stage:
         return (self.done - self.first) / (self.total - self.first) if self.total > self.first else 0.0
 
     def left(self, now: float) -> float | None:
-        """Return the estimated seconds to the end, or None if they are unknown."""
+        """Return the estimated seconds to the end, or None if they are unknown, or not yet settled."""
         elapsed, share = now - self.began, self.share
-        return elapsed / share * (1 - share) if share > 0 and elapsed >= 1 else None
+        return elapsed / share * (1 - share) if self.settled and share > 0 else None
 
 
 class _Plan:
@@ -164,6 +178,10 @@ class Console:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, where: TracebackType | None
     ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Stop the live line: the work is done, and what follows waits."""
         self._ended.set()
         self._clear()
 
@@ -237,6 +255,7 @@ class Console:
                 if self._plan is not None:
                     self._plan.reach(stage)
             current.done, current.total = done, total
+            current.note(now)
             current.figures = [f"{name} {value}" for name, value in (info or {}).items()]
             if total and done >= total:
                 self._end_stage()

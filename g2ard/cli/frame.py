@@ -41,7 +41,7 @@ from g2ard.io.reports import plain
 from g2ard.io.scene_formats import axes_note, files_of, scene_format
 from g2ard.io.scenes import tell, write_scene
 from g2ard.pipeline.presets import configured
-from g2ard.progress import plural
+from g2ard.progress import Detail, plural
 from g2ard.system import devices, interrupt
 from g2ard.system.cached import cached_property
 
@@ -228,9 +228,10 @@ class Run:
             self._adapter = adapter
 
     def say(self, text: str) -> None:
-        """Print a line of status to stderr, unless --quiet."""
+        """Print a line of status to stderr, unless --quiet; a `Detail` only with --verbose."""
         self.tell_notes()
-        self.console.say(text)
+        if self.verbose or not isinstance(text, Detail):
+            self.console.say(text)
 
     def answer(self, text: str) -> None:
         """Print to stderr what the command was run for, such as an estimate, even with --quiet."""

@@ -15,8 +15,11 @@ def budgets_of(run: Run) -> list[Budget]:
     """Return the budgets of the options, and check that exactly one kind is given."""
     counts, ratios, fit, min_psnr, min_ssim = (run.shared[name] for name in BUDGETS)
     quality = min_psnr is not None or min_ssim is not None
-    if [bool(counts), bool(ratios), fit is not None, quality].count(True) != 1:
-        raise typer.BadParameter(f"give the budget as one of {BUDGET_FLAGS}")
+    kinds = [bool(counts), bool(ratios), fit is not None, quality].count(True)
+    if not kinds:
+        raise typer.BadParameter(f"say how small the result is to be, as -r 10 does: {BUDGET_FLAGS}")
+    if kinds > 1:
+        raise typer.BadParameter(f"the result can have one size alone; keep one of {BUDGET_FLAGS}")
     if fit is not None or quality:
         with run.usage():
             return [Budget(fit=fit, min_psnr=min_psnr, min_ssim=min_ssim)]

@@ -307,7 +307,7 @@ def _folder_format(path: Path) -> str:
         raise InputError("has unfinished tiles", path=path, hint="run the same `g2ard ingest` again")
     if error := incomplete(path):
         raise error
-    raise InputError(f"is not a supported folder{_instead(path)}", path=path)
+    raise InputError(_unsupported(path), path=path)
 
 
 def _by_gsplat(folder: Path) -> bool:
@@ -333,7 +333,11 @@ def _near(path: Path) -> str:
     return f"; did you mean {' or '.join(str(path.with_name(name)) for name in close)}?" if close else ""
 
 
-def _instead(path: Path) -> str:
+_NO_FOLDER = "is not a supported folder"
+
+
+def _unsupported(path: Path) -> str:
+    """Say what a folder holds instead of one thing that can be read, and what to give."""
     from g2ard.io.colmap import models_below
     from g2ard.io.photos import unreadable
 
@@ -349,30 +353,30 @@ def _instead(path: Path) -> str:
     words = {"splats": "a scene", "points": "a point cloud", "views": "views"}
     held_kinds = [f"{', '.join(names[:5])} ({words[what]})" for what, names in held.items() if names]
     if held_kinds:
-        return f"; give one of its files: {', '.join(held_kinds)}"
+        return f"{_NO_FOLDER}; give one of its files: {', '.join(held_kinds)}"
     if runs := [folder.name for folder in sorted(path.iterdir()) if run_scene(folder) != folder]:
-        return f"; give one of its runs: {', '.join(runs[:5])}"
+        return f"{_NO_FOLDER}; give one of its runs: {', '.join(runs[:5])}"
     if models := models_below(path):
-        return f"; give {models[0]}, which has a COLMAP model"
+        return f"{_NO_FOLDER}; give {models[0]}, which has a COLMAP model"
     if found := _foreign_in(path):
         file, sign = found
-        return f"; {file.relative_to(path)} is {sign.what}: {sign.todo}"
+        return f"{_NO_FOLDER}; {file.relative_to(path)} is {sign.what}: {sign.todo}"
     for place in (path / "images", path):
         photos = _photos_in(place)
         if not photos:
             continue
         if (poses := _poses_above(path)) is not None:
-            return f"; give {poses}, which has the poses of its photos"
+            return f"holds photos alone; give {poses}, which has their poses"
         unread = [what for file in photos[:_MOST_INSPECTED_FILES] if (what := unreadable(file))]
         first = f"convert its {unread[0]} photos to JPEG, then " if unread else ""
         return (
-            f"; it has photos without poses: {first}estimate them with `colmap automatic_reconstructor "
+            f"holds photos without poses: {first}estimate them with `colmap automatic_reconstructor "
             f"--workspace_path project --image_path {place}` and give project"
         )
     return (
-        " (looked for SOG's meta.json, `ingest`'s tiles.json, a COLMAP sparse/0, transforms.json, "
-        "cameras.json, LLFF's poses_bounds.npy, Polycam's keyframes, nerfstudio's and gsplat's runs, "
-        "Cambridge's dataset_train.txt)"
+        f"{_NO_FOLDER} (looked for SOG's meta.json, `ingest`'s tiles.json, a COLMAP sparse/0, "
+        "transforms.json, cameras.json, LLFF's poses_bounds.npy, Polycam's keyframes, nerfstudio's and "
+        "gsplat's runs, Cambridge's dataset_train.txt)"
     )
 
 

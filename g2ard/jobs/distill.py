@@ -36,7 +36,7 @@ from g2ard.pipeline.config import DistillConfig
 from g2ard.pipeline.distill import Distilled, RunViews
 from g2ard.pipeline.distill import distill as pipeline
 from g2ard.poses import best_views
-from g2ard.progress import Progress, Say, plural, silent, unsaid
+from g2ard.progress import Detail, Progress, Say, plural, silent, unsaid
 from g2ard.rendering.targets import Subset, Targets, TeacherRenders, fill, kinds_of, kinds_told
 from g2ard.rendering.visibility import overdraw, visibility_source
 from g2ard.report.run import Packed, RunReport, by_kind
@@ -528,7 +528,7 @@ def prepare(
     if not read.from_photos and wanted.count == len(prior):
         say(f"nothing to simplify: the scene has {plural(len(prior), 'Gaussian')}")
     if recovers:
-        say(f"regularisers: {preset_label}")
+        say(Detail(f"regularisers: {preset_label}"))
     config = options.configured(regularizers, default_degree)
     if read.from_photos:
         schedule = config.recover.schedule

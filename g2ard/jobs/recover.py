@@ -19,7 +19,7 @@ from g2ard.jobs.inputs import Views, load_scene, load_split_views, make_targets,
 from g2ard.jobs.view_checks import check_photos, propose_background, warn_of_sight
 from g2ard.jobs.views import shrunk, views_or_pool, within_pixels
 from g2ard.pipeline.presets import PRESETS, configured
-from g2ard.progress import Progress, Say, plural, silent, unsaid
+from g2ard.progress import Detail, Progress, Say, plural, silent, unsaid
 from g2ard.rendering.targets import Exposed, Targets, checked_targets, fill, kinds_of, kinds_told
 from g2ard.report.run import KindScore, by_kind
 from g2ard.scene.cameras import USUAL, Cameras
@@ -426,7 +426,7 @@ def prepare(
         of_photos = kinds_of(targets) != kinds_told(0, 1)
         config = replace(config, steps=config.final_steps(start, chosen.cameras, photos=of_photos))
     of_student = "" if teaching.dense else "; measured on the student, as there is no teacher"
-    say(f"regularisers: {why}{of_student}")
+    say(Detail(f"regularisers: {why}{of_student}"))
     return RecoverJob(
         start,
         chosen,

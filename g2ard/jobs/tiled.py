@@ -26,7 +26,7 @@ from g2ard.jobs.tiling import Tiling
 from g2ard.jobs.views import pool_times, views_of
 from g2ard.pipeline.config import DistillConfig
 from g2ard.pipeline.distill import RunViews, selected
-from g2ard.progress import Progress, Say, silent, unsaid
+from g2ard.progress import Detail, Progress, Say, silent, unsaid
 from g2ard.report.run import TiledReport, TiledScores
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
@@ -296,7 +296,7 @@ def prepare_tiles(
     regularizers, why, _ = regularizers_for(options.named("recover.regularizers"), sample)
     config = options.configured(regularizers)
     if recovers:
-        say(f"regularisers: {why}")
+        say(Detail(f"regularisers: {why}"))
         views = _weighted(views, sample, config, progress)
     return TiledJob(tiles, wanted, sample, views, config, recovers, began, say)
 

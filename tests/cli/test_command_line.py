@@ -1,15 +1,19 @@
 """The command line's contract: exit statuses, one-line errors, lazy imports."""
 
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
+import g2ard
 from g2ard.cli.app import COMMANDS
 from g2ard.cli.console import Console
+from g2ard.cli.frame import Run
 from helpers.commands import CommandLine, refused, succeeds
+from helpers.scenes import around, checkered_ball
 
 
 def imported_by(statement: str, *heavy: str) -> list[str]:
@@ -62,6 +66,65 @@ def test_progress_lines(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.
     assert "ETA" in lines[0]
     assert "loss 0.5" in lines[0]
     assert lines[-1].startswith("recover: 40/40")
+
+
+def test_remaining_time_is_hidden_until_it_settles(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A first unit that takes long, such as a compilation, promises days."""
+    now = 0.0
+    monkeypatch.setattr("g2ard.cli.console.time.monotonic", lambda: now)
+    console = Console()
+    console("targets", 0, 100_000)
+    for done in range(1, 4000):
+        now += 10 if done == 1 else 0.01
+        console("targets", done, 100_000)
+        console.tick()
+    lines = capsys.readouterr().err.splitlines()
+    assert "ETA" not in lines[0]
+    assert all(int(hours) < 1 for hours in re.findall(r"ETA (\d+) h", "\n".join(lines)))
+    for done in range(4000, 50_000):
+        now += 0.01
+        console("targets", done, 100_000)
+        console.tick()
+    assert "ETA 8 min" in capsys.readouterr().err.splitlines()[-1]
+
+
+def test_a_machine_without_a_gpu_says_one_thing(tmp_path: Path) -> None:
+    """`info --devices` gives the reason that a fallback to the CPU gives; auto says nothing."""
+    g2ard.save(tmp_path / "ball.ply", checkered_ball(300))
+    g2ard.save_views(tmp_path / "views.json", around(2, (48, 36)))
+
+    def told(*words: object) -> str:
+        without = dict.fromkeys(("VK_ICD_FILENAMES", "VK_DRIVER_FILES"), "/dev/null")
+        ask = [sys.executable, "-m", "g2ard", *map(str, words)]
+        done = subprocess.run(
+            ask, cwd=tmp_path, env={**os.environ, **without}, capture_output=True, text=True, check=True
+        )
+        return done.stdout + done.stderr
+
+    listed = told("info", "--devices")
+    reasons = re.findall(r"│ none +│ (.*?) +│", listed)
+    if not reasons:
+        pytest.skip("a driver that needs no list of drivers")
+    assert re.search(r"--device auto +│ the CPU", listed)
+    ask = ("evaluate", "ball.ply", "--teacher", "ball.ply", "--views", "views.json", "--split", "all")
+    assert reasons[0] in told(*ask, "--device", "gpu")
+    assert "GPU" not in told(*ask, "--device", "auto")
+
+
+def test_a_page_that_is_served_leaves_no_live_line(
+    command_line: CommandLine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    g2ard.save(tmp_path / "ball.ply", checkered_ball(300))
+    done: list[str] = []
+    close = Console.close
+    monkeypatch.setattr(Console, "close", lambda console: [done.append("closed"), close(console)][1])
+
+    monkeypatch.setattr(Run, "answer", lambda run, text: done.append(text))
+    assert "stopped" in succeeds(command_line, tmp_path, "view", "ball.ply").err
+    assert done[0] == "closed"
+    assert "127.0.0.1" in done[1]
 
 
 def test_quiet_prints_errors_only(capsys: pytest.CaptureFixture[str]) -> None:

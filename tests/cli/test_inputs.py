@@ -50,16 +50,16 @@ def test_errors_point_to_the_poses_of_photos(folder: Path) -> None:
     with pytest.raises(InputError, match="estimate them with `colmap"):
         g2ard.load_views(shots)
     (folder / "scan" / "transforms.json").write_text("{}")
-    with pytest.raises(InputError, match=r"give .*scan/transforms\.json, which has the poses of its photos$"):
+    with pytest.raises(InputError, match=r"give .*scan/transforms\.json, which has their poses$"):
         g2ard.load_views(shots)
     (folder / "scan" / "transforms.json").rename(folder / "scan" / "cameras.json")
-    with pytest.raises(InputError, match=r"give .*scan, which has the poses of its photos$"):
+    with pytest.raises(InputError, match=r"give .*scan, which has their poses$"):
         g2ard.load_views(shots)
     (folder / "scan" / "cameras.json").unlink()
     (folder / "scan" / "sparse" / "0").mkdir(parents=True)
     for name in ("cameras.bin", "images.bin"):
         (folder / "scan" / "sparse" / "0" / name).write_bytes(bytes(8))
-    with pytest.raises(InputError, match=r"give .*scan, which has the poses of its photos$"):
+    with pytest.raises(InputError, match=r"give .*scan, which has their poses$"):
         g2ard.load_views(shots)
 
 

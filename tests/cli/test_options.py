@@ -55,7 +55,7 @@ def test_a_flag_wins_over_what_it_excludes_in_the_config(folder: Path, command_l
         succeeds(command_line, folder, *ask)
         assert len(read_splats(folder / "small.ply")) == count
     ask = ("simplify", "a.ply", "-r", 10, "-n", 5, "-o", "o.ply", "--config", "c.toml")
-    assert "one of -n COUNT, -r RATIO" in refused(command_line, folder, *ask)
+    assert "keep one of -n COUNT, -r RATIO" in refused(command_line, folder, *ask)
     ask = ("recover", "small.ply", "--views", "views.json", "--teacher", "a.ply", "-o", "o.ply")
     succeeds(command_line, folder, *ask, "--config", "c.toml", "--recovery-time", "1s")
 

@@ -141,10 +141,10 @@ def test_photos_of_two_worlds_are_refused(tmp_path: Path, command_line: CommandL
 def test_compare_says_which_run_is_closer_to_their_scene(runs: Path, command_line: CommandLine) -> None:
     ask = ("compare", "-k", 2, "--size", 32)
     for order in (("worse", "better"), ("better", "worse")):
-        assert "to ball.ply: better is better: +" in succeeds(command_line, runs, *ask, *order).err
+        assert "against ball.ply, better is better: +" in succeeds(command_line, runs, *ask, *order).err
     g2ard.save("plain.ply", BALL.take(range(100)))
     for order in (("plain.ply", "better"), ("better", "plain.ply")):
-        assert "only known of two runs" in succeeds(command_line, runs, *ask, *order).err
+        assert "g2ard evaluate" in succeeds(command_line, runs, *ask, *order).err
     told = succeeds(command_line, runs, *ask, "ball.ply", "better", "--json", "-")
     assert json.loads(told.out)["closer"] is None
 

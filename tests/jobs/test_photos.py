@@ -26,7 +26,7 @@ from helpers.photos import photos_of, rgba_photos_of
 def test_photos_alone_are_enough(points: bool, command_line: CommandLine, tmp_path: Path) -> None:
     photos_of(tmp_path / "photos", points)
     ask = ("distill", "--views", "photos", "-o", "run", "--json", "-")
-    out, error = succeeds(command_line, tmp_path, *ask, "-n", 500, "--steps", 150)
+    out, error = succeeds(command_line, tmp_path, *ask, "-n", 500, "--steps", 150, "-v")
     found = json.loads(out)
     assert (found["output_count"], found["against"]) == (500, "photos")
     assert found["scores"]["recovered"]["psnr"] > max(17, found["scores"]["simplified"]["psnr"] + 1)
@@ -48,11 +48,11 @@ def test_sparse_points_given_as_a_cloud_are_known_and_other_clouds_are_surfaces(
     photos_of(tmp_path / "photos", points=True)
     (tmp_path / "scan.ply").write_bytes((tmp_path / "photos" / "sparse.ply").read_bytes())
     ask = ("--views", "photos", "-n", 900, "--steps", 3)
-    sparse = succeeds(command_line, tmp_path, "distill", "photos/sparse.ply", *ask, "-o", "run").err
+    sparse = succeeds(command_line, tmp_path, "distill", "photos/sparse.ply", *ask, "-o", "run", "-v").err
     assert "regularisers: none;" in sparse
     assert "sparse.ply has" not in sparse, sparse
-    scan = succeeds(command_line, tmp_path, "distill", "scan.ply", *ask, "-o", "scan").err
-    assert "regularisers: none;" not in scan
+    scan = succeeds(command_line, tmp_path, "distill", "scan.ply", *ask, "-o", "scan", "-v").err
+    assert "regularisers: lift" in scan
     assert "MB, scan.ply has 0." in scan, scan
 
 

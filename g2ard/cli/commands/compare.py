@@ -146,11 +146,12 @@ def _closer(
     if real_path(first) == source_of(second) or real_path(second) == source_of(first):
         return None
     if not (is_run(first) and is_run(second)):
-        return "which of the two is closer to the scene that they show is only known of two runs of `distill`"
+        both = f"{first} {second}"
+        return f"to see which is closer to the original: g2ard evaluate {both} --teacher ORIGINAL"
     try:
         common = common_of([first, second], background=True)
     except InputError as error:
-        return f"which of the two is closer to the scene is unknown: {error}"
+        return f"cannot say which is closer to the original: {error}"
     assert common is not None
     teaching = Teaching(common.teacher, colour, chosen=True, photos=common.photos, **run.callbacks)
     cameras = load_views(common.views, "test", common.size, unpictured=teaching.dense is not None)
@@ -160,4 +161,4 @@ def _closer(
     ]
     line = better_line(short_names([first, second]), scores, targets, "test")
     original = "the photos" if common.teacher is None else str(common.teacher)
-    return f"to {original}: {line}"
+    return f"against {original}, {line}"

@@ -18,6 +18,8 @@ from g2ard.progress import plural
 if TYPE_CHECKING:
     from g2ard.scene.splats import Splats
 
+_NO_DRIVER = "no graphics driver that speaks Vulkan, Metal or DirectX 12 was found"
+
 
 @command("info", example="g2ard info scene.ply --json -", without=("seed", "threads", "device"))
 def info(
@@ -138,9 +140,7 @@ def _devices(run: Run) -> None:
             ["", f"buffers to {_size(a.max_buffer)}, bound {_size(a.max_binding)} at a time"],
         ]
     if not found:
-        why = (
-            "this build has no GPU kernels" if found is None else "no driver for Vulkan, Metal or DirectX 12"
-        )
+        why = "this build has no GPU kernels" if found is None else _NO_DRIVER
         rows.append(["none", why])
     rows.append(["--device cpu", "always available"])
     rows.append(["--device gpu", used["gpu"] or "the CPU"])

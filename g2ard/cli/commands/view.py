@@ -149,6 +149,7 @@ def _show(run: Run, folder: Path, page: str) -> None:
     with ThreadingHTTPServer(("127.0.0.1", 0), partial(Quiet, directory=str(folder))) as server:
         Thread(target=server.serve_forever, daemon=True).start()
         address = f"http://127.0.0.1:{server.server_address[1]}/{page}"
+        run.console.close()
         run.answer(f"{address} (Ctrl-C ends)")
         try:
             webbrowser.open(address)
