@@ -7,8 +7,8 @@ from collections.abc import Callable
 MULTIPLIERS = (1 / 3, 3**-0.5, 1.0, 3**0.5)
 """Multipliers of all rates; trained scenes need 1 or less, lifts more."""
 
-_EQUAL_GAIN_SHARE, _EQUAL_GAIN = 0.05, 0.15
-"""Share of the best gain, and dB, within which other gains count as equal to it."""
+_EQUAL_GAIN_SHARE = 0.05
+"""Share of the best gain within which other gains count as equal to it."""
 _LEAST_MULTIPLIER = 0.01
 """Multiplier below which no smaller one is tried: they change nothing visible in 8 bits."""
 _TRIAL_STEPS, _LIMITED_STEPS, _SHORTEST_HORIZON = (10, 60), 20, 100
@@ -39,12 +39,12 @@ class Trials:
         """Search `MULTIPLIERS` downwards from the one nearest to `guess`, then upwards.
 
         Nothing larger is tried once a smaller one has clearly beaten the guess. Earlier trials are forgotten.
-        The largest multiplier whose gain is within 5 % or 0.15 dB of the best is chosen. Trials are too short
-        to show the benefit of larger rates, and a long run decays its rates towards the end.
+        The largest multiplier whose gain is within 5 % of the best is chosen. Trials are too short to show
+        the benefit of larger rates, and a long run decays its rates towards the end.
 
         >>> Trials(lambda m, end: -abs(m - 1), 0, None).search(0.2)
         1.0
-        >>> near = {1 / 3: 32.0, 3**-0.5: 31.9}
+        >>> near = {1 / 3: 32.0, 3**-0.5: 31.95}
         >>> round(Trials(lambda m, end: near.get(m, 30.0), 30, None).search(1 / 3), 3)
         0.577
 
@@ -59,7 +59,7 @@ class Trials:
 
         def good(i: int) -> bool:
             best = max(seen.values())
-            return seen[i] >= best - max(_EQUAL_GAIN_SHARE * (best - self.start), _EQUAL_GAIN)
+            return seen[i] >= best - _EQUAL_GAIN_SHARE * max(best - self.start, 0.0)
 
         at = min(range(len(MULTIPLIERS)), key=lambda i: abs(math.log(MULTIPLIERS[i] / guess)))
         for neighbours in (range(at, -1, -1), range(at + 1, len(MULTIPLIERS))):
