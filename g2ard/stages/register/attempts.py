@@ -73,14 +73,14 @@ class PoolRenders:
 
 _REPEAT_ROUNDS = 3
 """Most moves to a pose that explains a photo better than those that look alike."""
-_REPEATED_LEVELS = 3
-"""Finest levels of direct alignment that refine such poses."""
+_REPEATED_ITERATIONS = 4
+"""Most iterations per level of their alignment."""
 _LIKENESS_LOSS = 0.15
 """Loss of local ZNCC below which such poses count."""
 _APART = 0.02, 1.0
 """Least distance, as a share of the depth, and least angle in degrees of two poses."""
 _REFINING_LEVELS = 2
-"""Finest levels of direct alignment that refine a pose from features."""
+"""Finest levels of direct alignment that refine a pose from features, or of a repetition."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -228,9 +228,12 @@ class Search:
         if not poses:
             return best, [], False
         focal_sigma = best.solved.focal_sigma if best.solved else config.focal_sigma
-        aligned: list[Candidate] = []
-        for pose in (best.found.viewmat, *poses):
-            found = self._aligned(pose, photo.pyramid[-_REPEATED_LEVELS:], best.found.zoom, focal_sigma)
+        quick = replace(config, iterations=min(config.iterations, _REPEATED_ITERATIONS))
+        aligned = [best]
+        for pose in poses:
+            found = self._aligned(
+                pose, photo.pyramid[-_REFINING_LEVELS:], best.found.zoom, focal_sigma, quick
+            )
             if found is None:
                 continue
             candidate = Candidate(best.start, found, self._likeness(found, photo))
@@ -253,9 +256,9 @@ class Search:
         alike = [
             c.found.viewmat for k, c in enumerate(aligned) if k != first and not decisive(compared(first, k))
         ]
-        chosen = aligned[first]
-        if not _apart(chosen.found, best.found):
+        if first == 0:
             return best, alike, False
+        chosen = aligned[first]
         refined = self.by_features(replace(best.start, begins=chosen.found.viewmat), photo)
         if refined is not None and not _apart(refined.found, chosen.found):
             chosen = refined
@@ -316,8 +319,9 @@ class Search:
         levels: list[tuple[Camera, Level]],
         zoom: float = 1.0,
         focal_sigma: float | None = None,
+        config: RegisterConfig | None = None,
     ) -> Aligned | None:
-        aligned = align(self.renderer, pose, levels, self.config, zoom, focal_sigma)
+        aligned = align(self.renderer, pose, levels, config or self.config, zoom, focal_sigma)
         self.renders += 1 if aligned is None else aligned.steps
         return aligned
 

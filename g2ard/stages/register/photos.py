@@ -221,7 +221,7 @@ def _reported(
     status, reason = _acceptance(best.zncc, sigma, estimate.depth, config)
     if alike and status != "refused":
         away = min(pose_error(estimate.viewmat, other)[0] for other in alike)
-        status, reason = "uncertain", f"the scene repeats itself: a pose {away:.2g} units away fits as well"
+        status, reason = "uncertain", f"places look alike: a pose {away:.2g} units away fits as well"
     names = ("matches", "inliers", "spread", "reprojection", "passes") if best.solved else ()
     of_features: dict[str, Any] = {name: getattr(best.solved, name) for name in names}
     return PhotoReport(

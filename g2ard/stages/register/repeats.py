@@ -1,34 +1,43 @@
 """Poses that a repeating scene makes look alike, and the photo's choice between them.
 
 Features of a render at the found pose T are matched with other features of the same render. A match (u, u')
-assigns to u the point X' that the render shows at u'. Where the scene repeats itself, many matches have about
-the same displacement, and agree on one pose T', by PnP: the render at T' looks like the one at T. Windows of
-a façade, columns, tiles and the sides of a round tower all give such poses.
+says that the places X and X', which the render shows there, look alike. Common displacements X' − X give
+poses T' = T·(I, X − X') moved along a façade, columns or tiles; matches with common displacements u' − u
+give others by PnP, such as those around a round tower. T' counts if the render resembles itself where T'
+shows X at u': the grey at u and u' is alike over much of the image. That needs no further render.
 
 Photo P and renders A, B at two such poses differ in few pixels, such as those of a door. There
 
 λ = ½ + Σ D·(P − (A + B)/2) / Σ D²,  D = A − B,
 
-is 1 if A explains the photo and 0 if B does. Its σ comes from the residuals where A and B agree.
+is 1 if A explains the photo and 0 if B does. Its variance is that of a model's inaccuracy, of the residuals
+where A and B agree, and of the largest thing there that neither explains, since such a thing may also hide
+or feign a difference: with energy U, a share of λ between 0 and √(U/ΣD²), of variance U/(12 ΣD²).
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from g2ard.rendering.renderer import Renderer
+from g2ard.io.images import resized
+from g2ard.rendering.renderer import Rendered, Renderer
 from g2ard.scene.cameras import Camera
 from g2ard.stages.register.config import RegisterConfig
-from g2ard.stages.register.grey import blurred
+from g2ard.stages.register.grey import band_passed, blurred, box_mean, grey_of, zncc
 from g2ard.stages.register.matchers import Sift
-from g2ard.stages.register.pose import Float
+from g2ard.stages.register.pose import Float, pose_error
 from g2ard.stages.register.solve import lifted, solve_pnp
 
-_MOST_REPEATS = 12
-"""Most repetitions that are looked for."""
+_MOST_PAIRS = 50_000
+"""About the most pairs of like features that are counted."""
+_MOST_PEAKS = 96, 8
+"""Most common displacements that are tried, of points and of pixels."""
+_MOST_REPEATS = 6
+"""Most poses that are returned."""
 _LEAST_SHIFT = 0.04
 """Least distance of matched features, as a share of the longer side."""
 _LIKE = 0.3
@@ -36,17 +45,28 @@ _LIKE = 0.3
 _MOST_FEATURES = 700
 """About the most features that are matched."""
 _MOST_MATCHES = 250
-"""About the most matches that a repetition is solved from."""
-_CELL = 0.05
-"""Side of the cells of displacements, as a share of the longer side; 3 × 3 of them make a repetition."""
+"""About the most matches that a pose is solved from."""
+_CELL = 0.05, 0.02
+"""Side of the cells of displacements, as a share of the longer side and of the depth; they and their
+neighbours make a repetition."""
 _LEAST_SUPPORT = 12, 0.05
 """Least matches that support a repetition, and as a share of the features."""
+_SELF_SIDE = 125
+"""Longer side in pixels at which a render is compared with itself."""
+_SELF_LIKE = 0.5, 0.15
+"""Least ZNCC of a render with itself as moved by a repetition, and least share of its pixels compared."""
 _AGREEING = 0.04
-"""Largest difference in any channel at pixels where two renders agree."""
+"""Largest difference in any channel at pixels where two renders agree, besides that by alignment."""
+_MISALIGNED = 0.7
+"""Largest error of their alignment, pixels."""
+_LEAST_NOISE = 0.02
+"""Least σ of a photo's colours."""
 _DECISIVE = 3.0
 """σ of λ between two poses beyond which one is excluded."""
 _MODEL_SIGMA = 0.08
 """σ of λ because a scene never renders as a photo looks."""
+_THING = 8
+"""Longer side of an image over that of the windows in which something unexplained is looked for."""
 
 
 class Look(NamedTuple):
@@ -68,7 +88,7 @@ def softened(image: NDArray[np.float32]) -> Float:
 
 
 def repeated_poses(renderer: Renderer, camera: Camera, sift: Sift, config: RegisterConfig) -> list[Float]:
-    """Return the poses whose renders look like the one of `camera`, most supported first."""
+    """Return at most `_MOST_REPEATS` poses whose renders look like the one of `camera`, most alike first."""
     out = renderer.render(camera, median=True)
     places, descriptors = sift.features(np.clip(out.image, 0, 1))
     points, known = lifted(out, camera, places, config)
@@ -82,26 +102,84 @@ def repeated_poses(renderer: Renderer, camera: Camera, sift: Sift, config: Regis
     squares = 2 - 2 * descriptors @ descriptors.T
     apart = np.hypot(*(np.subtract.outer(axis, axis) for axis in places.T))
     i, j = np.nonzero((squares < _LIKE) & (apart > _LEAST_SHIFT * side))
-    cells = np.floor((places[j] - places[i]) / (_CELL * side)).astype(int)
-    if not len(cells):
-        return []
-    cells -= cells.min(0) - 2
-    found: list[Float] = []
-    left = np.ones(len(i), bool)
-    while left.any() and len(found) < _MOST_REPEATS:
-        table = np.zeros(tuple(cells.max(0) + 2), int)
-        np.add.at(table, tuple(cells[left].T), 1)
-        near = np.sum([np.roll(table, shift, (0, 1)) for shift in np.ndindex(3, 3)], axis=0)
-        centre = np.array(np.unravel_index(int(np.argmax(near)), near.shape)) - 1
-        if near.max() < least:
-            break
-        one = np.flatnonzero(left & (np.abs(cells - centre).max(1) <= 1))
-        left[one] = False
-        one = one[:: 1 + len(one) // _MOST_MATCHES]
-        answer = solve_pnp(camera, places[i[one]], points[j[one]], config)
+    fewer = slice(None, None, 1 + len(i) // _MOST_PAIRS)
+    i, j = i[fewer], j[fewer]
+    poses = []
+    depth = float(np.median(points @ camera.viewmat[2, :3] + camera.viewmat[2, 3]))
+    offsets = points[j] - points[i]
+    for one in _common(offsets / (_CELL[1] * depth), least, _MOST_PEAKS[0]):
+        back = np.eye(4)
+        back[:3, 3] = -np.median(offsets[one], 0)
+        poses.append(camera.viewmat @ back)
+    for one in _common((places[j] - places[i]) / (_CELL[0] * side), least, _MOST_PEAKS[1]):
+        few = one[:: 1 + len(one) // _MOST_MATCHES]
+        answer = solve_pnp(camera, places[i[few]], points[j[few]], config)
         if answer is not None and answer[1].sum() >= _LEAST_SUPPORT[0]:
-            found.append(answer[0])
-    return found
+            poses.append(answer[0])
+    resemblance = _Resemblance(out, camera, config)
+    scored = sorted(((resemblance.of(pose), n) for n, pose in enumerate(poses)), reverse=True)
+    found: list[Float] = []
+    for likeness, n in scored:
+        known_already = (pose_error(poses[n], other) for other in found)
+        if likeness > 0 and all(a > _CELL[1] * depth or turn > 1 for a, turn in known_already):
+            found.append(poses[n])
+    return found[:_MOST_REPEATS]
+
+
+def _common(steps: Float, least: int, most: int) -> Iterator[NDArray[np.intp]]:
+    """Yield indices of the (M, D) displacements, in cells, around each of the `most` most common ones."""
+    if len(steps) < least:
+        return
+    cells = np.floor(steps).astype(np.int64)
+    cells -= cells.min(0)
+    kind = np.unique(np.ravel_multi_index(tuple(cells.T), tuple(cells.max(0) + 1)), return_inverse=True)[1]
+    left = np.ones(len(steps), bool)
+    for _ in range(most):
+        commonest = int(np.argmax(np.bincount(kind[left])))
+        centre = np.median(steps[left & (kind == commonest)], 0)
+        near = left & (np.abs(steps - centre) <= 1).all(1)
+        if near.sum() >= least:
+            yield np.flatnonzero(near)
+        left &= ~near & (kind != commonest)
+        if left.sum() < least:
+            return
+
+
+class _Resemblance:
+    """How far a render looks as if seen from another pose, by moving its own pixels; occlusion is ignored."""
+
+    def __init__(self, out: Rendered, camera: Camera, config: RegisterConfig) -> None:
+        share = min(1.0, _SELF_SIDE / max(camera.width, camera.height))
+        self._size = width, height = round(camera.width * share), round(camera.height * share)
+        planes = np.dstack([grey_of(np.clip(out.image, 0, 1)), out.alpha >= config.min_alpha])
+        small = resized(planes.astype(np.float32), (width, height)).astype(np.float64)
+        self._grey, self._mask = band_passed(small[..., 0]), small[..., 1] > 0.999
+        self._scale = np.array([width / camera.width, height / camera.height])
+        self._camera = camera
+        v, u = np.nonzero(self._mask)
+        at = (np.stack([u, v], 1) + 0.5) / self._scale
+        column, row = at.astype(int).T
+        z = out.depth[row, column].astype(np.float64)
+        K = camera.K
+        rays = np.stack([(at[:, 0] - K[0, 2]) / K[0, 0], (at[:, 1] - K[1, 2]) / K[1, 1], np.ones(len(at))], 1)
+        self._seen, self._here = rays * z[:, None], self._grey[v, u]
+
+    def of(self, pose: Float) -> float:
+        """Return the ZNCC times the square root of the share of pixels compared; 0 where it is too low."""
+        motion = pose @ np.linalg.inv(self._camera.viewmat)
+        X = self._seen @ motion[:3, :3].T + motion[:3, 3]
+        ahead = X[:, 2] > 1e-3 * np.abs(self._seen[:, 2])
+        K, depth = self._camera.K, np.where(ahead, X[:, 2], 1)
+        uv = X[:, :2] / depth[:, None] * [K[0, 0], K[1, 1]] + K[:2, 2]
+        column, row = np.floor(np.clip(uv * self._scale, -1, 1e6)).astype(int).T
+        inside = ahead & (column >= 0) & (row >= 0) & (column < self._size[0]) & (row < self._size[1])
+        inside[inside] = self._mask[row[inside], column[inside]]
+        share = float(inside.sum()) / max(1, len(inside))
+        if share < _SELF_LIKE[1]:
+            return 0.0
+        there = self._grey[row[inside], column[inside]]
+        likeness = zncc(self._here[inside], there, np.ones(len(there), bool))
+        return likeness * float(np.sqrt(share)) if likeness >= _SELF_LIKE[0] else 0.0
 
 
 def preference(photo: Float, mask: NDArray[np.bool_], a: Look, b: Look, config: RegisterConfig) -> float:
@@ -112,7 +190,9 @@ def preference(photo: Float, mask: NDArray[np.bool_], a: Look, b: Look, config: 
     """
     usual = photo[mask].mean(0)
     both = mask & a.mask & b.mask
-    agree = both & (np.abs(a.image - b.image).max(2) < _AGREEING)
+    slope = np.max([np.hypot(*np.gradient(a.image[..., c])) for c in range(3)], axis=0)
+    differ = np.abs(a.image - b.image).max(2) > _AGREEING + _MISALIGNED * slope
+    agree = both & ~differ
     if agree.sum() < 0.02 * mask.sum():
         agree = both
     if not agree.any():
@@ -121,15 +201,20 @@ def preference(photo: Float, mask: NDArray[np.bool_], a: Look, b: Look, config: 
     spread = np.maximum(((mean - mean.mean(0)) ** 2).mean(0), 1e-6)
     gain = np.clip(((mean - mean.mean(0)) * (seen - seen.mean(0))).mean(0) / spread, 0.1, 10)
     bias = seen.mean(0) - gain * mean.mean(0)
-    noise = float(((seen - gain * mean - bias) ** 2).mean())
+    residual = np.zeros(mask.shape)
+    residual[agree] = ((seen - gain * mean - bias) ** 2).sum(1)
+    noise = max(float(residual[agree].mean()) / 3, _LEAST_NOISE**2)
+    side = max(1, max(mask.shape) // _THING)
+    sums = side * side * box_mean(residual, min(side, *mask.shape))
+    thing = float(sums.max() - np.median(sums))
     first, second = (np.where(each.mask[..., None], gain * each.image + bias, usual) for each in (a, b))
-    counts = mask & (a.mask | b.mask)
+    counts = mask & np.where(a.mask & b.mask, differ, a.mask | b.mask)
     D = (first - second)[counts]
     energy = float((D * D).sum())
     if energy < 1e-9:
         return 0.0
     share = float((D * (photo[counts] - (first + second)[counts] / 2)).sum()) / energy
-    sigma = np.hypot(_MODEL_SIGMA, np.sqrt(3 * config.window**2 * noise / energy))
+    sigma = np.sqrt(_MODEL_SIGMA**2 + (3 * config.window**2 * noise + thing / 12) / energy)
     return float(share / sigma)
 
 

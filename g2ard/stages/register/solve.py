@@ -22,7 +22,7 @@ _LEAST_MATCHES = 6
 """Least matches and inliers for a pose; three determine it, the rest confirm it."""
 _SIGMA_OF_MAD = 1.4826
 """Standard deviation of a normal distribution over its median absolute deviation."""
-_LEAST_MATCH_SIGMA = 0.1
+_LEAST_MATCH_SIGMA = 0.02
 """Least σ of a match, pixels."""
 _FOCAL_STEPS = 20
 """Most Gauss–Newton steps of pose and focal length."""
