@@ -84,7 +84,7 @@ class RegisterConfig(Settings):
     focal_sigma: AboveZero = STATED_FOCAL_SIGMA
     candidates: AtLeastOne = 5
     pool_size: _SmallSide = 64
-    correlated: AboveZero = 2000.0
+    correlated: AboveZero = 1200.0
     features: AtLeastOne = 4096
     ratio: _Part = 0.85
     max_reprojection: AboveZero = 3.0
