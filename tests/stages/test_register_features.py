@@ -146,18 +146,20 @@ def test_features_find_the_pose(tmp_path: Path) -> None:
     assert all(row.inliers == 0 and row.reprojection is None for row in direct.report.photos)
 
 
-def test_features_and_alignment_are_no_worse_than_alignment(tmp_path: Path) -> None:
+def test_features_and_alignment_are_no_worse_than_either(tmp_path: Path) -> None:
+    """At the photo's size: a smaller render of a ball on black is a little wider than the shrunk photo."""
     pytest.importorskip("pycolmap")
     views = _photographed(tmp_path)
     truth = dict(zip(views.names, views.viewmats, strict=True))
     starts = {name: off(pose, 0.2, 6, i) for i, (name, pose) in enumerate(truth.items())}
     errors = {}
     for refine in ("auto", "none", "photometric"):
-        config = replace(CONFIG, refine=refine)  # type: ignore[arg-type]
+        config = replace(CONFIG, refine=refine, align_size=CONFIG.size)  # type: ignore[arg-type]
         rows = register(BALL, views, starts=starts, truth=truth, config=config).report.photos
+        assert all(row.inliers for row in rows)
         errors[refine] = np.median([r.error.position for r in rows if r.error])
     assert errors["none"] < 0.001
-    assert errors["auto"] <= 1.1 * errors["photometric"]
+    assert errors["auto"] <= 1.1 * min(errors["none"], errors["photometric"]) + 2e-4
 
 
 def test_results_do_not_depend_on_threads(tmp_path: Path) -> None:
