@@ -13,10 +13,11 @@ import numpy as np
 import pytest
 
 from g2ard.errors import InputError
-from g2ard.io import read_splats, write_splats
+from g2ard.io import read_splats, write_splats, write_views
 from g2ard.jobs.memory import plan_tiles
 from g2ard.jobs.tiling import Tiling, is_tiled
 from g2ard.rendering.targets import TeacherRenders
+from g2ard.scene.cameras import look_at
 from g2ard.stages.evaluate import evaluate
 from g2ard.stages.recover import RecoverConfig, recover
 from g2ard.stages.recover.config import Schedule
@@ -25,6 +26,7 @@ from g2ard.tiles.ingest import ingest
 from helpers.cloud_files import columns, ply
 from helpers.commands import CommandLine, succeeds
 from helpers.project import environment
+from helpers.scenes import views_at
 from helpers.systems import is_worker, needs_proc, workers_of
 from helpers.tiled_scenes import ring, town, town_in
 
@@ -210,6 +212,20 @@ def test_distill_in_tiles_recovers(command_line: CommandLine, folder: Path, tmp_
     assert f"{sum(tile['steps'] for tile in tiles):,} recovery steps of all tiles together" in page
     assert all(f"{tile['recovered']:.2f}" in page for tile in tiles)
     assert not list(tmp_path.glob("run/.*"))
+
+
+def test_a_tile_takes_steps_for_the_views_that_see_it(command_line: CommandLine, tmp_path: Path) -> None:
+    write_splats(tmp_path / "town.ply", town(4000))
+    ends = [-6.0, 6.0] * 5  # no view shows both ends, which are two tiles
+    eyes = [([x, 0.1 * i - 0.4, 5], [x, 0, 0]) for i, x in enumerate(ends)]
+    poses = [look_at(eye, target) for eye, target in eyes]
+    write_views(tmp_path / "ends.json", views_at(poses, (64, 48), 300), splits=["train"] * 8 + ["test"] * 2)
+    ask = ("distill", "town.ply", "-r", 10, "--views", "ends.json", "--focus", "far", "-o", "run")
+    ask += ("--tile-rows", 2500, "--workers", 1, "--steps", 40, "--json", "-")
+    told = json.loads(succeeds(command_line, tmp_path, *ask).out)
+    steps = [tile["steps"] for tile in told["scores"]["tiles"]]
+    assert sum(steps) == 40
+    assert max(steps) < 25
 
 
 def test_tiles_make_a_folder_of_sog(command_line: CommandLine, folder: Path, tmp_path: Path) -> None:

@@ -30,7 +30,7 @@ from g2ard.tiles.executor import Workers, executor
 from g2ard.tiles.ingest import ingest
 from g2ard.tiles.merging import TiledScene, cheapest, plan_ends, simplify_tiles
 from g2ard.tiles.simplify import GONE, TiledRun, _add_until_converged
-from g2ard.tiles.tasks import Task
+from g2ard.tiles.tasks import Task, far_around, scene_of
 from helpers.systems import needs_proc, workers_of
 from helpers.tiled_scenes import reduced, ring, town
 
@@ -326,6 +326,21 @@ def test_progress_moves_within_a_task(tmp_path: Path, workers: int) -> None:
     assert seen == sorted(seen)
     assert seen[-1] == 200
     assert sorted(tmp_path.iterdir()) == sorted(task.output for task in tasks)
+
+
+def test_coarse_surroundings_begin_where_the_halo_ends(store: TileStore, tmp_path: Path) -> None:
+    with executor(threads=1) as runs:
+        coarse = TiledRun(store, Workers(runs, tmp_path), SimplifyConfig()).coarse
+    everything = [scene_of(path, "near").means for path in coarse]
+    for tile in store.tiles:
+        levels = [None if other is tile else "near" for other in store.tiles]
+        far = far_around(store, {"tile": tile.index, "levels": levels}, {"coarse": coarse})
+        found = np.concatenate([part.means for part in far])
+        others = np.concatenate([part for part, level in zip(everything, levels, strict=True) if level])
+        # How far each lies outside the tile, along the axis where it is farthest.
+        away = np.maximum(np.array(tile.low) - others, others - np.array(tile.high)).max(axis=1)
+        assert ((away > 0) & (away <= store.margin)).any()
+        np.testing.assert_array_equal(found, others[away > store.margin])
 
 
 def test_a_sample_for_views_has_enough_rows(store: TileStore, tmp_path: Path) -> None:
