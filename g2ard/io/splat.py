@@ -30,7 +30,8 @@ class Stream(RawStream):
             raise damaged(text, path=path)
         rows = spread_rows(np.memmap(path, _ROW, "r"))
         with np.errstate(invalid="ignore"):
-            right = np.isfinite(rows["mean"]).all(1) & ((rows["scale"] > 0) & (rows["scale"] < _FAR)).all(1)
+            right = np.isfinite(rows["mean"]).all(1) & ((rows["scale"] >= 0) & (rows["scale"] < _FAR)).all(1)
+        right &= rows.view("u1").reshape(len(rows), -1).any(1)
         words = bool(np.isin(np.frombuffer(rows[:_READ].tobytes(), "u1"), _TEXT).all())
         if words or right.mean() < _POSSIBLE:
             what = "text" if words else f"{1 - right.mean():.0%} of its rows are impossible"

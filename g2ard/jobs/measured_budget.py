@@ -62,7 +62,7 @@ _MOST_COMPARED_GAUSSIANS = 2_000_000
 """Gaussians above which scenes are not compared."""
 _FEWEST_GAUSSIANS = 64
 """Smallest count that a search tries."""
-_LAYER_TRIALS = 6
+_LAYER_TRIALS = 8
 """Most counts at which overdraw is measured."""
 
 

@@ -35,7 +35,7 @@ def _lifted(scene: g2ard.Splats) -> g2ard.Splats:
 KINDS = {
     "trained": lambda scene: scene,
     "lifted": _lifted,
-    "small": lambda scene: g2ard.simplify(scene, ratio=8).splats,
+    "small": lambda scene: g2ard.simplify(scene, ratio=4).splats,
 }
 
 

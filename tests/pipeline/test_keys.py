@@ -63,11 +63,11 @@ KEYED: dict[type, tuple[Any, str]] = {
             np.zeros(40, bool),
         ),
         "probe guard multiplier reach trials done seconds resumed losses geometry skipped_before tally "
-        "_epoch",
+        "exposures _epoch",
     ),
     Photos: (
         Photos(VIEWS, IMAGES, exposures=EXPOSURES),
-        "cameras _limit _kept _bytes _masks",
+        "cameras _limit _kept _bytes _masks _alphas",
     ),
     TeacherRenders: (
         TeacherRenders(BALL, VIEWS, settings=RasterSettings(), lazy=True),
@@ -78,7 +78,15 @@ KEYED: dict[type, tuple[Any, str]] = {
 """An object of each class that has a key, and its attributes that do not count: what only messages and
 progress show, what other keys hold, and what a computation changes on its way."""
 
-PARTS = {targets._Sourced, targets._Chosen, targets._Converted, PhotosOrRenders, PreparedScene, TileTargets}
+PARTS = {
+    targets._Sourced,
+    targets._Chosen,
+    targets._Converted,
+    targets.Exposed,
+    PhotosOrRenders,
+    PreparedScene,
+    TileTargets,
+}
 """Classes between those, or whose images are hashed."""
 
 

@@ -29,7 +29,7 @@ from g2ard.stages.recover.config import TUNED
 from g2ard.stages.recover.engine import FusedEngine
 from g2ard.stages.recover.guard import Guard, blended
 from g2ard.stages.recover.report import outcome
-from g2ard.stages.simplify import simplify
+from g2ard.stages.simplify import SimplifyConfig, simplify
 from g2ard.system import devices
 from helpers.gpus import skip_without_gpu
 from helpers.interruptions import press_ctrl_c_at
@@ -38,6 +38,8 @@ from helpers.threads import on_threads
 
 VIEWS = around()
 TEACHER = checkered_ball()
+NARROW = SimplifyConfig(surface_depth=math.inf, max_growth=1.25)
+"""Settings of starts whose gaps recovery has to close."""
 UNEVEN = np.linspace(0, 3, len(VIEWS)) ** 2
 """Weights of views."""
 
@@ -260,7 +262,7 @@ def test_trials_choose_rates_that_suit_the_scene(student: Splats, targets: Teach
 
 def test_layers_as_wide_as_the_sky_do_not_shake_the_image() -> None:
     targets = TeacherRenders(under_a_sky(TEACHER), around(12, (160, 120)))
-    start = under_a_sky(simplify(TEACHER, 1500).splats)
+    start = under_a_sky(simplify(TEACHER, 1500, config=NARROW).splats)
     held, free = (
         recover(
             start, targets, RecoverConfig(schedule=replace(TUNED, multiplier=1.0, reach=reach), steps=150)
@@ -448,7 +450,7 @@ def test_validation_views_scale_back_harmful_changes() -> None:
 
 def test_training_views_vote_on_which_changes_were_harmful() -> None:
     """The sums of light times change equal those of renders in which one Gaussian alone is white."""
-    start = simplify(TEACHER, 50).splats
+    start = simplify(TEACHER, 50, config=NARROW).splats
     colours = np.random.default_rng(0).normal(0, 0.5, start.sh0.shape).astype(np.float32)
     end = replace(start, sh0=start.sh0 + colours)
     black = replace(end, sh0=np.full_like(end.sh0, -0.5 / 0.28209479177387814))
@@ -483,7 +485,7 @@ def test_training_views_vote_on_which_changes_were_harmful() -> None:
 
 def test_a_recovery_that_only_harms_validation_views_stops_at_half(targets: TeacherRenders) -> None:
     """The validation views show another scene."""
-    start = simplify(TEACHER, 1500).splats
+    start = simplify(TEACHER, 1500, config=NARROW).splats
     elsewhere = TeacherRenders(checkered_ball(500), around(5, (64, 48), 2.0))
     done = recover(start, targets, RecoverConfig(steps=100), validation=elsewhere)
     assert done.report.stopped == done.report.steps == 50

@@ -107,13 +107,11 @@ def test_a_surface_of_one_layer_stays_closed(ratio: float, most: float, method: 
 
 @pytest.mark.parametrize("seen", [True, False])
 @pytest.mark.parametrize("kind", [plane, stack, ball])
-def test_no_scene_gets_worse_than_by_a_fixed_growth(kind: Callable[[int], Splats], seen: bool) -> None:
+def test_every_scene_is_better_than_without_growth(kind: Callable[[int], Splats], seen: bool) -> None:
     scene = kind(1)
-    chosen = likeness(scene, reduced(scene, 12, seen=seen).splats)
-    for growth in (1.0, 1.25, 2.0):
-        fixed = reduced(scene, 12, seen=seen, config=SimplifyConfig(max_growth=growth, **ALL_MASS))
-        assert chosen > likeness(scene, fixed.splats) - 0.3
+    fixed = reduced(scene, 12, seen=seen, config=SimplifyConfig(max_growth=1))
     assert fixed.report.clamped_opacities > 0.3 * len(fixed.splats)
+    assert likeness(scene, reduced(scene, 12, seen=seen).splats) > likeness(scene, fixed.splats) + 0.5
 
 
 @pytest.mark.parametrize("kind", [plane, stack, ball])
@@ -153,7 +151,7 @@ def test_gaps_are_measured_in_the_views_that_weigh_rows() -> None:
 
 
 def test_only_pixels_where_the_dense_scene_is_opaque_count_as_gaps() -> None:
-    faint = replace(plane(5), logit_opacities=np.full(6000, -1.0, np.float32))
+    faint = replace(plane(5), logit_opacities=np.full(6000, -4.0, np.float32))
     assert opacity_lost(faint, faint.take(np.arange(0, 6000, 9)), around(faint)) == 0
 
 
