@@ -5,17 +5,21 @@ They serve remaining times, `--dry-run` and `--memory`.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from g2ard.errors import InputError
+from g2ard.io.sog_write import palette_size
 from g2ard.io.tiles import row_width
-from g2ard.jobs.memory import RECOVERY_TIMES, WHOLE_TIMES, TileMemory, amount
-from g2ard.jobs.views import FULL_PIXELS
+from g2ard.jobs.memory import RECOVERY_TIMES, TileMemory, amount
+from g2ard.jobs.views import within_pixels
 from g2ard.progress import plural
 from g2ard.rendering.targets import CACHE_BYTES
+from g2ard.system.threads import threads_used
 
 if TYPE_CHECKING:
     from g2ard.jobs.distill import DistillJob
@@ -45,14 +49,24 @@ _LIGHT, _TILED_TIMES, _SEEN_TILES = 0.0025, 1.2, 4
 drawn too (0.6 on guitar and 2.1 on playbot, in four tiles by two workers); and the most tiles that a view is
 expected to see, each of which takes steps."""
 
-_PAGE_BYTES, _PAGE_FULL = 170, 130_000
-"""Memory of packing the viewer page: bytes per Gaussian and SH coefficient above degree 0, and the count from
-which it stops growing. Measured on playbot: 113 MB for 25,000 Gaussians, 511 for 125,000, 538 for 250,000.
-"""
 LARGEST_DENSE = 250_000
 """Largest dense scene that view.html shows beside the result: it adds at most 8 MB of SOG at SH degree 2."""
-_PROGRAM_BYTES = 90_000_000
+_PROGRAM_BYTES = 65_000_000
 """Bytes of the interpreter and loaded libraries."""
+_SCENE_TIMES, _KEPT_TIMES = 2.7, 2.0
+"""Memory of simplification as a multiple of the scene's arrays, and of the scene and its prepared copy, which
+stay until the end. Measured on 60,000 to 5,000,000 Gaussians of SH degree 0 and 3."""
+_SURVEY, _LOOKS = (35_000_000, 500), (35_000_000, 800)
+"""Bytes, and bytes per Gaussian of a sample, that planning views or measuring visibility leaves, and that the
+choice of views to show takes."""
+_SAMPLE = 150_000
+"""Largest sample on which views are planned and chosen."""
+_IMAGE_BYTES = 60
+"""Bytes per pixel of a view that is rendered and scored, of which every thread of `in_threads` has one."""
+_PACKED_BYTES, _PALETTE_BYTES = 200, 6_000
+"""Bytes of packing the viewer page: per Gaussian, and per entry of the palette of harmonics, of which there
+are at most 65,536. Measured: 7 MB for 25,000 Gaussians of SH degree 0 and 31 for 150,000; 3,500 to 8,500 per
+entry for degrees 1 to 3."""
 _TRAINER_BYTES = 983
 """Bytes per Gaussian in recovery: parameters, Adam's moments, buffers (`docs/benchmarks.md`)."""
 
@@ -110,16 +124,16 @@ def cost_of(job: DistillJob | TiledJob, count: int, *, page: bool = True) -> Cos
         stages += [("recover", recovery)] if job.recovers else []
     stages.append(("scoring", _each(_SCORE, size, len(job.prior)) * len(test)))
     stages += [("report.html", _REPORT), ("view.html", _PAGE)] if page else []
-    return Cost(views, pixels, steps, tuple(stages), _peak_bytes(job, count, views * pixels, page))
+    return Cost(views, pixels, steps, tuple(stages), _peak_bytes(job, count, steps, page))
 
 
 def cost_of_recovery(
     scene: Splats,
     training: Cameras,
-    others: int,
     steps: int,
     *,
-    scored: int = 0,
+    scored: Cameras | None = None,
+    validation: Cameras | None = None,
     seconds: float | None = None,
     teacher: Splats | None = None,
     stage: str = "recover",
@@ -127,19 +141,24 @@ def cost_of_recovery(
     """Return the cost of fitting a scene as it is, by `g2ard recover` or `g2ard adapt`.
 
     Args:
-        others: number of further views that need a target, of which `scored` are scored before and after.
+        scored: views scored before and after.
+        validation: further views that need a target.
         seconds: time limit of the fit instead of the steps' time.
         teacher: scene that renders the targets; None if they are photos.
         stage: name of the fit in progress messages.
     """
-    pixels, views = _mean_pixels(training), len(training) + others
+    used = [part for part in (training, scored, validation) if part is not None]
+    pixels, views = _mean_pixels(training), sum(map(len, used))
     size = pixels / _USUAL_PIXELS
     stages = [] if teacher is None else [("targets", _each(_RENDER, size, len(teacher)) * views)]
     stages.append((stage, seconds or _each(_STEP, size, len(scene)) * steps))
-    stages += [("scoring", _each(_SCORE, size, len(scene)) * scored)] if scored else []
-    dense = 0 if teacher is None else teacher.nbytes
-    targets = min(CACHE_BYTES, views * pixels * (3 if teacher is None else 12))
-    memory = _PROGRAM_BYTES + targets + dense + 3 * scene.nbytes + _TRAINER_BYTES * len(scene)
+    if scored is not None:
+        stages.append(
+            ("scoring", _each(_SCORE, _mean_pixels(scored) / _USUAL_PIXELS, len(scene)) * len(scored))
+        )
+    dense = 0 if teacher is None else int(_KEPT_TIMES * teacher.nbytes)
+    memory = _PROGRAM_BYTES + _target_bytes(used, renders=teacher is not None) + _image_bytes(used)
+    memory += dense + int(_KEPT_TIMES * scene.nbytes) + _TRAINER_BYTES * len(scene)
     return Cost(views, pixels, steps, tuple(stages), memory)
 
 
@@ -150,7 +169,11 @@ def _each(seconds: tuple[float, float], size: float, count: float) -> float:
 
 
 def _mean_pixels(cameras: Cameras) -> int:
-    return int(np.mean(cameras.widths.astype(np.int64) * cameras.heights))
+    return int(np.mean(_pixels(cameras)))
+
+
+def _pixels(cameras: Cameras) -> NDArray[np.int64]:
+    return cameras.widths.astype(np.int64) * cameras.heights
 
 
 def cost_of_reduction(reduce: Reduction, count: int) -> Cost:
@@ -161,7 +184,9 @@ def cost_of_reduction(reduce: Reduction, count: int) -> Cost:
         stages = _tiled_stages(reduce.tiles, views, gaps=True)
         return Cost(views, pixels, 0, tuple(stages), reduce.tiles.plan.bytes)
     stages = [("visibility", _VISIBILITY * views), ("simplify", _SIMPLIFY * reduce.total)]
-    return Cost(views, pixels, 0, tuple(stages), _PROGRAM_BYTES + int(WHOLE_TIMES * reduce.splats.nbytes))
+    memory = _PROGRAM_BYTES + int(_SCENE_TIMES * reduce.splats.nbytes)
+    memory += _sampled(_SURVEY, reduce.total) if views else 0
+    return Cost(views, pixels, 0, tuple(stages), memory)
 
 
 def _tiled_stages(tiles: Tiles, views: int, *, gaps: bool) -> list[tuple[str, float]]:
@@ -181,25 +206,44 @@ def _tiled_stages(tiles: Tiles, views: int, *, gaps: bool) -> list[tuple[str, fl
     ]
 
 
-def _peak_bytes(job: DistillJob, count: int, pixels: int, page: bool) -> int:
-    """Return the peak memory: of simplification, of recovery, or of packing the page."""
-    given = job.config.recover.sh_degree
+def _peak_bytes(job: DistillJob, count: int, steps: int, page: bool) -> int:
+    """Return the peak memory: of simplification, of recovery, or of what is written at the end."""
+    given, views, train = job.config.recover.sh_degree, job.views, job.views.train.cameras
     degree = job.prior.sh_degree if given is None else given
-    scene, small = job.prior.nbytes, 4 * row_width(degree) * count
-    packed, deepest = count, degree
-    if len(job.prior) <= LARGEST_DENSE:  # shown beside the result
-        packed, deepest = max(count, len(job.prior)), max(degree, job.prior.sh_degree)
-    packing = _PAGE_BYTES * 3 * ((deepest + 1) ** 2 - 1) * min(packed, _PAGE_FULL)
-    targets = min(CACHE_BYTES, pixels * (12 if job.teacher is not None else 3))
-    trained = targets + scene + _TRAINER_BYTES * count
-    full = (
-        0
-        if job.views.full is None
-        else 12 * min(FULL_PIXELS, int((job.views.full.widths * job.views.full.heights).sum()))
-    )
-    written = targets + full + 2 * scene + (packing if page else 0)
-    # The recovered scene and its rows come on top.
-    return _PROGRAM_BYTES + int(max(targets + WHOLE_TIMES * scene, trained, written)) + 2 * small
+    dense, scene, small = len(job.prior), job.prior.nbytes, 4 * row_width(degree) * count
+    chosen = job.config.select.count_of(len(train))
+    used = [train if chosen == "auto" else train.take(range(min(chosen, len(train))))] if steps else []
+    used += [part for part in (views.test, views.apart) if part is not None]
+    full = [] if views.full is None else [within_pixels(views.full)]
+    targets = _target_bytes(used, renders=job.teacher is not None)
+    targets += _target_bytes(full, renders=job.teacher is not None)
+    kept = _PROGRAM_BYTES + _sampled(_SURVEY, dense) + targets + _image_bytes([*used, *full]) + 2 * small
+    packing = _packing_bytes(count, degree)
+    if count < dense <= LARGEST_DENSE:  # shown beside the result
+        packing = max(packing, _packing_bytes(dense, job.prior.sh_degree))
+    written = _KEPT_TIMES * scene + max(_sampled(_LOOKS, dense), packing if page else 0)
+    return kept + int(max(_SCENE_TIMES * scene, scene + _TRAINER_BYTES * count, written))
+
+
+def _target_bytes(views: Sequence[Cameras], *, renders: bool) -> int:
+    """Return the bytes of cached targets: float32 renders, or photos of 8 bits."""
+    return min(CACHE_BYTES, (12 if renders else 3) * sum(int(_pixels(part).sum()) for part in views))
+
+
+def _sampled(cost: tuple[int, int], count: int) -> int:
+    """Return the bytes of work on at most `_SAMPLE` of a scene's Gaussians."""
+    fixed, per_gaussian = cost
+    return fixed + per_gaussian * min(count, _SAMPLE)
+
+
+def _image_bytes(views: Sequence[Cameras]) -> int:
+    """Return the bytes of rendering and scoring as many of the largest views as there are threads."""
+    largest = max((int(_pixels(part).max()) for part in views if len(part)), default=0)
+    return _IMAGE_BYTES * largest * threads_used()
+
+
+def _packing_bytes(count: int, degree: int) -> int:
+    return _PACKED_BYTES * count + (_PALETTE_BYTES * palette_size(count) if degree else 0)
 
 
 def check_job_memory(job: DistillJob | TiledJob, most: int | None, need: int) -> None:

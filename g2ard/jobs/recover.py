@@ -195,14 +195,12 @@ class RecoverJob:
     @property
     def cost(self) -> Cost:
         """Rough time and memory."""
-        scored = 0 if self.held_out is None else len(self.held_out.cameras)
-        others = scored + (0 if self.validation is None else len(self.validation.cameras))
         return cost_of_recovery(
             self.student,
             self.views.cameras,
-            others,
             0 if self._same else self.config.horizon,
-            scored=scored,
+            scored=None if self.held_out is None else self.held_out.cameras,
+            validation=None if self.validation is None else self.validation.cameras,
             seconds=self.config.recovery_time,
             teacher=self.teaching.dense,
         )

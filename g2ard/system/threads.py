@@ -13,6 +13,13 @@ _MOST = 4
 """Most items at a time: each may hold a few images."""
 
 
+def threads_used() -> int:
+    """Return the number of threads of `in_threads`."""
+    from g2ard import _core
+
+    return min(_core.num_threads(), _MOST)
+
+
 def in_threads(function: Callable[[_Item], _Result], items: Iterable[_Item]) -> Iterator[_Result]:
     """Call a function for every item, on at most four threads, and yield the results in order.
 
@@ -22,9 +29,7 @@ def in_threads(function: Callable[[_Item], _Result], items: Iterable[_Item]) -> 
     >>> list(in_threads(str, range(3)))
     ['0', '1', '2']
     """
-    from g2ard import _core
-
-    threads = min(_core.num_threads(), _MOST)
+    threads = threads_used()
     if threads == 1:
         yield from map(function, items)
         return

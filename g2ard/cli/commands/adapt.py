@@ -69,7 +69,7 @@ def adapt(
         **run.callbacks,
     )
     _, targets = teaching.training(splats, opt.with_images(views, images, alpha), split, size)
-    cost = cost_of_recovery(splats, targets.cameras, 0, config.steps, teacher=teaching.dense, stage="adapt")
+    cost = cost_of_recovery(splats, targets.cameras, config.steps, teacher=teaching.dense, stage="adapt")
     if dry_run:
         tell_plan(run, len(splats), cost)
         return
