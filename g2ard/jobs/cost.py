@@ -30,20 +30,23 @@ if TYPE_CHECKING:
 
 _USUAL_PIXELS = 480_000
 """Pixels of a generated view."""
-_RENDER, _STEP, _SCORE = (0.009, 8e-8), (0.016, 3e-7), (0.05, 3.5e-7)
+_RENDER, _STEP, _SCORE = (0.009, 6e-8), (0.016, 3e-7), (0.02, 7.5e-7)
 """Seconds per view of these pixels, and per Gaussian: of a target, of a step of recovery, and of scoring a
-scene before and after. Measured, like the next, on two cores of a virtual machine: estimates are 0.68 to 1.09
-times what guitar 90,854 → 5,000, biker 152,746 → 10,000, playbot 500,000 → 50,000, showroom/0_7 542,681 →
-20,000 and taebak_park/0_0 532,101 → 20,000 take.
+scene before and after. Like the next, for two quiet cores, which take about 1 / 1.6 of the CPU time.
+A target of playbot (500,000) takes 52 ms. In CPU time it is 17 ms on guitar (90,854), 27 on 150,000 rows of
+playbot and 38 on taebak_park/0_0 (532,101); scoring a view takes 33 ms on 5,000 Gaussians and 57 on 20,000.
 """
-_SIMPLIFY, _VISIBILITY, _REPORT, _PAGE = 7e-6, 0.006, 1.5, 1.0
-"""Seconds per Gaussian of simplification, per view for visibility, of the report and of the page."""
+_SIMPLIFY, _VISIBILITY, _REPORT, _PAGE = 3e-6, 0.006, 1.5, 1.0
+"""Seconds per Gaussian of simplification, per view for visibility, of the report and of the page. The first
+two take 3.3 s on playbot, and 1.2 and 2.7 s of CPU time on guitar and taebak_park/0_0."""
 
 _TILED = {
-    **{"tiles": 2, "coarse": 3, "light": 0, "visibility": 11, "costs": 1},
-    **{"plans": 2, "merge": 1, "gaps": 3, "merged visibility": 4},
+    **{"tiles": 1.5, "coarse": 0.5, "light": 0, "visibility": 3, "costs": 0.2},
+    **{"plans": 0.6, "merge": 0.4, "gaps": 1.3, "merged visibility": 0.8},
 }
-"""Microseconds per Gaussian of stages in tiles, in order, measured on 150,000 Gaussians in three tiles."""
+"""Microseconds per Gaussian of stages in tiles, in order: half to two thirds of the CPU time of guitar and
+150,000 Gaussians of playbot in tiles of 30,000 and 50,000. In larger tiles, 1 to 100 million Gaussians take
+5 to 7 in all (`docs/benchmarks.md`)."""
 _LIGHT, _TILED_TIMES, _SEEN_TILES = 0.0025, 1.2, 4
 """Seconds per view of `light`; time of a step in a tile relative to one in one piece, as surroundings are
 drawn too (0.6 on guitar and 2.1 on playbot, in four tiles by two workers); and the most tiles that a view is
@@ -55,7 +58,7 @@ _PROGRAM_BYTES = 65_000_000
 """Bytes of the interpreter and loaded libraries."""
 _SCENE_TIMES, _KEPT_TIMES = 2.7, 2.0
 """Memory of simplification as a multiple of the scene's arrays, and of the scene and its prepared copy, which
-stay until the end. Measured on 60,000 to 5,000,000 Gaussians of SH degree 0 and 3."""
+stay until the end. Measured on 60,000 and 200,000 Gaussians of SH degree 0 and 3."""
 _SURVEY, _LOOKS = (35_000_000, 500), (35_000_000, 800)
 """Bytes, and bytes per Gaussian of a sample, that planning views or measuring visibility leaves, and that the
 choice of views to show takes."""
@@ -122,7 +125,8 @@ def cost_of(job: DistillJob | TiledJob, count: int, *, page: bool = True) -> Cos
     if not kept:
         stages += [("visibility", _VISIBILITY * len(train)), ("simplify", _SIMPLIFY * len(job.prior))]
         stages += [("recover", recovery)] if job.recovers else []
-    stages.append(("scoring", _each(_SCORE, size, len(job.prior)) * len(test)))
+    scored = len(test) + apart // 2  # the others validate
+    stages.append(("scoring", _each(_SCORE, size, count) * scored))
     stages += [("report.html", _REPORT), ("view.html", _PAGE)] if page else []
     return Cost(views, pixels, steps, tuple(stages), _peak_bytes(job, count, steps, page))
 
