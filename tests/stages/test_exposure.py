@@ -142,3 +142,13 @@ def test_commands_say_what_was_undone(tmp_path: Path, command_line: CommandLine)
     report = (tmp_path / "distill-unequal/report.json").read_text()
     assert '"exposure"' in report
     assert "differ in exposure" in (tmp_path / "distill-unequal/report.html").read_text()
+
+
+@pytest.mark.parametrize(("gain", "differ"), [(0.97, False), (0.75, True)])
+def test_gains_that_hardly_differ_are_not_fitted(gain: float, differ: bool) -> None:
+    """However much of a small error they explain."""
+    scene, views = checkered_ball(600).with_sh_degree(0), around(8, (48, 36))
+    renderer = g2ard.Renderer(scene)
+    images = [renderer.clipped(camera) * gain ** (row % 2) for row, camera in enumerate(views)]
+    found = exposures_of(scene, Photos(views, images), (0.0, 0.0, 0.0))
+    assert (found is not None) == differ
