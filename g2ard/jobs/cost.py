@@ -42,7 +42,7 @@ two take 3.3 s on playbot, and 1.2 and 2.7 s of CPU time on guitar and taebak_pa
 
 _TILED = {
     **{"tiles": 1.5, "coarse": 0.5, "light": 0, "visibility": 3, "costs": 0.2},
-    **{"plans": 0.6, "merge": 0.4, "gaps": 1.3, "merged visibility": 0.8},
+    **{"plans": 0.6, "merge": 0.4, "merged visibility": 0.8, "gaps": 1.3},
 }
 """Microseconds per Gaussian of stages in tiles, in order: half to two thirds of the CPU time of guitar and
 150,000 Gaussians of playbot in tiles of 30,000 and 50,000. In larger tiles, 1 to 100 million Gaussians take

@@ -39,9 +39,7 @@ def test_a_short_run_has_no_needless_notes(command_line: CommandLine, folder: Pa
     assert "views: 113 train, 40 score, 24 validate; orbit + anywhere; the up direction is a guess\n" in error
     for needless in ("never acted", "of its box", "times as high", "regularisers"):
         assert needless not in error
-    verbose = command_line(*SHORT, "-r", 10, "-o", "run", "-wv", cwd=folder)[2]
-    assert "never acted" in verbose
-    assert "regularisers: " in verbose
+    assert "regularisers: " in command_line(*SHORT, "-r", 10, "-o", "run", "-wv", cwd=folder)[2]
 
 
 def test_one_is_one(command_line: CommandLine, folder: Path) -> None:

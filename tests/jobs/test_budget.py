@@ -109,11 +109,11 @@ def test_quest3_bounds_overdraw(recovered: bool, monkeypatch: pytest.MonkeyPatch
     assert plain.count == reduce.resolved(Budget(fit="web"), "a", "a.ply").count == 6000
     dense = close_up(scene)
     assert dense is not None
-    monkeypatch.setitem(LAYERS, "quest3", dense["mean"] / 2)
+    monkeypatch.setitem(LAYERS, "quest3", dense["mean"] / 1.3)
     found = reduce.resolved(Budget(fit="Quest3"), "a", "a.ply").count
     near = close_up(fast(scene, found) if recovered else reduce(found).splats)
     assert near is not None
-    assert dense["mean"] / 4 < near["mean"] <= dense["mean"] / 2
+    assert dense["mean"] / 4 < near["mean"] <= dense["mean"] / 1.3
     assert f"at {found:,}" in " ".join(said)
     monkeypatch.setitem(LAYERS, "quest3", 1e-3)  # out of reach: the search ends, and says what it has
     assert reduce.resolved(Budget(fit="quest3"), "a", "a.ply").count < found

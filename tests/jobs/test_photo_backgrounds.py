@@ -184,7 +184,8 @@ def test_a_cloud_is_topped_up_from_photos_elsewhere(command_line: CommandLine, t
     model(tmp_path / "toy", images="elsewhere")
     cloud_of(tmp_path / "toy" / "input.ply", BALL.take(np.arange(300)))
     ask = ("distill", "toy/input.ply", "--views", "toy", "-n", 500, "--steps", 2, "--no-page", "--json", "-")
-    assert "has no photo" in refused(command_line, tmp_path, *ask, "-o", "run", status=1)
+    found = succeeds(command_line, tmp_path, *ask, "-o", "found").err
+    assert "photos are in toy/elsewhere, not in toy/images" in found
     out, error = succeeds(command_line, tmp_path, *ask, "--images", "toy/elsewhere", "-o", "run")
     assert json.loads(out)["output_count"] == 500
     assert "starting from 300 sparse points and 200 points along camera rays" in error

@@ -176,7 +176,7 @@ def test_a_scanned_cloud_and_photos_are_distilled(command_line: CommandLine, tmp
     np.testing.assert_allclose(g2ard.load(tmp_path / "run" / "scene.ply").offset, place, rtol=1e-4)
     las(tmp_path / "plain.las", PRIOR.means, None)
     error = refused(command_line, tmp_path, "lift", "plain.las", "-o", "p.ply", status=1)
-    assert "has no colours ('red', 'green', 'blue'); add colours" in error
+    assert "has no colours ('red', 'green', 'blue'), and intensities are equal; add colours" in error
 
 
 def test_a_scene_that_fits_is_written_as_it_is(command_line: CommandLine, tmp_path: Path) -> None:
