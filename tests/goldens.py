@@ -97,6 +97,8 @@ def keys(text: bytes | str, before: str = "") -> Iterator[str]:
 
 def _keys(value: Any, before: str) -> Iterator[str]:
     for name in sorted(value) if isinstance(value, dict) else ():
+        if "/" in name:  # a path
+            continue
         yield f"{before}.{name}"
         yield from _keys(value[name], f"{before}.{name}")
 
@@ -105,7 +107,8 @@ def canonical(value: Any, root: Path) -> Any:
     """Return parsed JSON with its varying values masked."""
     if isinstance(value, dict):
         masks = {key: "<masked>" for key in value if _MASKED_KEYS.search(key)}
-        return {key: canonical(item, root) for key, item in value.items() if key not in masks} | masks
+        kept = {key: item for key, item in value.items() if key not in masks}
+        return {masked(key, root): canonical(item, root) for key, item in kept.items()} | masks
     if isinstance(value, list):
         return [canonical(item, root) for item in value]
     return masked(value, root) if isinstance(value, str) else value
@@ -121,7 +124,9 @@ def printed_text(data: bytes, root: Path) -> str:
 
 
 def content(path: Path, root: Path) -> bytes:
-    """Return what is hashed of a file."""
+    """Return what is hashed of a file; records of finished runs hold times."""
+    if path.suffix == ".finished":
+        return b""
     data = path.read_bytes()
     if path.suffix == ".json":
         return printed_text(data, root).encode()
