@@ -67,8 +67,8 @@ class Finder:
 
     @classmethod
     def among(cls, names: Sequence[str], folders: Sequence[Path], around: Iterable[Path]) -> Finder:
-        """Return the finder in `folders`, or if they hold none of the names, in the first folder that does:
-        one of `around`, or a folder in one of these."""
+        """Return the finder in `folders`, or if they hold none of the names, in the first folder that holds
+        half of them: one of `around`, or a folder in these. A few like names may be of other photos."""
         from g2ard.io.types import Note
 
         asked, expected = names[:: max(1, len(names) // _ASKED)], cls(*folders)
@@ -78,7 +78,8 @@ class Finder:
         inner = (sorted(filter(Path.is_dir, root.iterdir()))[:_MOST_FOLDERS] for root in roots)
         for place in [*roots, *(folder for folders in inner for folder in folders)]:
             found = cls(place)
-            if there := sum(found.find(name) is not None for name in asked):
+            there = sum(found.find(name) is not None for name in asked)
+            if 2 * there >= max(1, len(asked)):
                 text = f"photos are in {place}, not in {folders[0]}"
                 return cls(place, notes=(Note("photos_elsewhere", there, text),))
         return expected

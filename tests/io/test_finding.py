@@ -169,3 +169,12 @@ def test_doubles_of_polycam(tmp_path: Path) -> None:
         (cameras / f"._{i}.json").write_bytes(struct.pack(">II", 0x00051607, 0x00020000))
         photo(tmp_path / "keyframes" / "images" / f"{i}.jpg")
     assert len(read_view_set(tmp_path).cameras) == 3
+
+
+def test_a_folder_with_a_few_of_the_names_holds_other_photos(tmp_path: Path) -> None:
+    (tmp_path / "new").mkdir()
+    names = [f"{k}.png" for k in range(8)]
+    for held in range(1, 9):
+        (tmp_path / "new" / names[held - 1]).write_bytes(b"photo")
+        found = Finder.among(names, [tmp_path / "images"], [tmp_path])
+        assert (found.find(names[0]) is not None) == (held >= 4)
