@@ -87,7 +87,7 @@ def identities(files: Iterable[Path]) -> dict[str, Any]:
 
 
 def _record_of(place: Path, output: Path) -> dict[str, Any] | None:
-    """Return the record of a finished output, or None if there is none or the output is another file."""
+    """Return the record of a finished output, or None if it is missing or the output is another file."""
     file = record_file(place, output)
     if not (file.is_file() and is_taken(output)):
         return None

@@ -1,4 +1,4 @@
-"""What stored numbers mean, judged by most of them: a few strays decide nothing."""
+"""Meaning of stored numbers, judged by most of them: a few strays decide nothing."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -77,7 +77,7 @@ def tells(values: Values) -> bool:
 
 @dataclass(frozen=True)
 class Reading:
-    """How a scene's numbers are read.
+    """Interpretation of a scene's numbers.
 
     Args:
         log_scales: whether scales are logarithms.

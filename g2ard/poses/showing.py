@@ -50,7 +50,7 @@ view, relative to the clearest."""
 
 @dataclass(frozen=True, eq=False)
 class Outlook:
-    """What V views see of a scene's subject: its Gaussians within the site's box.
+    """Figures of V views of a scene's subject: its Gaussians within the site's box.
 
     Args:
         cameras: the views.

@@ -1,4 +1,4 @@
-"""What notebooks show of scenes, views and results: one line and a picture."""
+"""One line and a picture of scenes, views and results, for notebooks."""
 
 from __future__ import annotations
 

@@ -146,7 +146,7 @@ def _common(steps: Float, least: int, most: int) -> Iterator[NDArray[np.intp]]:
 
 
 class _Resemblance:
-    """How far a render looks as if seen from another pose, by moving its own pixels; occlusion is ignored."""
+    """Likeness of a render to itself seen from other poses, by moving its own pixels; ignores occlusion."""
 
     def __init__(self, out: Rendered, camera: Camera, config: RegisterConfig) -> None:
         share = min(1.0, _SELF_SIDE / max(camera.width, camera.height))
