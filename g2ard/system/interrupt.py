@@ -6,13 +6,16 @@ at once; otherwise libraries that are still loading would print long tracebacks.
 
 from __future__ import annotations
 
+import _thread
 import os
 import signal
+import sys
+import time
 
 TYPE_CHECKING = False  # this is the program's first import, and importing typing is slow enough to interrupt
 if TYPE_CHECKING:
     from types import FrameType
-    from typing import NoReturn
+    from typing import Any, NoReturn
 
 STATUSES = (130, 143)
 """Exit statuses after Ctrl-C and after SIGTERM."""
@@ -54,16 +57,38 @@ class RaisesInterrupt:
 
     It changes only handlers that `ends_the_program` installed, and restores them at its end. In other
     programs, which call commands as functions, signals stay as they are.
+
+    Python only reports an exception that arrives in a finaliser or in a weak reference's callback, and goes
+    on. There the signal is sent again.
     """
 
     def __enter__(self) -> None:
         self._replaced = [n for n in (signal.SIGINT, signal.SIGTERM) if signal.getsignal(n) is _end]
         for number in self._replaced:
             signal.signal(number, signal.default_int_handler if number == signal.SIGINT else terminate)
+        self._report = sys.unraisablehook
+        self._again = False
+        if self._replaced:
+            sys.unraisablehook = self._lost
 
     def __exit__(self, *_: object) -> None:
+        self._again = False
+        sys.unraisablehook = self._report
         for number in self._replaced:
             signal.signal(number, _end)
+
+    def _lost(self, lost: Any) -> None:
+        if not issubclass(lost.exc_type, KeyboardInterrupt):
+            self._report(lost)
+        elif not self._again:
+            self._again = True
+            _thread.start_new_thread(self._send_again, (_last,))
+
+    def _send_again(self, number: int) -> None:
+        time.sleep(0.01)  # the finaliser ends first
+        if self._again:
+            self._again = False
+            _thread.interrupt_main(signal.Signals(number))
 
 
 def leave() -> NoReturn:
@@ -72,8 +97,6 @@ def leave() -> NoReturn:
     Python records a signal that arrives during `exec` (as in creating a dataclass) as unhandled, and would
     end even a program that has handled it by the signal; `os._exit` avoids that.
     """
-    import sys
-
     if (shared := sys.modules.get("multiprocessing.util")) is not None:
         shared._run_finalizers(0)  # release semaphores, or the resource tracker reports them as leaked
     sys.stdout.flush()
