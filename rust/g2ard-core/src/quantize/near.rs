@@ -53,5 +53,6 @@ fn nearest(
         found.truncate(most);
     }
     found.sort_unstable_by(order);
-    found.into_iter().map(|(_, row)| row).collect()
+    // By reference: collecting in place would keep the allocation of all distances.
+    found.iter().map(|&(_, row)| row).collect()
 }
