@@ -121,12 +121,13 @@ def cost_of(job: DistillJob | TiledJob, count: int, *, page: bool = True) -> Cos
         stages.append(("recover", times * recovery + drawn) if job.recovers else ("score", drawn))
         return Cost(views, pixels, steps, tuple(stages), job.tiles.plan.bytes)
     target = _each(_RENDER, size, 0 if job.teacher is None else len(job.prior))
+    twice = 4 * len(job.views.twice or ())
     stages = [("targets", target * (views if steps else len(test) + apart))]
     if not kept:
         stages += [("visibility", _VISIBILITY * len(train)), ("simplify", _SIMPLIFY * len(job.prior))]
         stages += [("recover", recovery)] if job.recovers else []
-    scored = len(test) + apart // 2  # the others validate
-    stages.append(("scoring", _each(_SCORE, size, count) * scored))
+    scored = len(test) + apart // 2 + twice  # the others validate
+    stages.append(("scoring", _each(_SCORE, size, count) * scored + target * twice))
     stages += [("report.html", _REPORT), ("view.html", _PAGE)] if page else []
     return Cost(views, pixels, steps, tuple(stages), _peak_bytes(job, count, steps, page))
 

@@ -66,6 +66,7 @@ class RunTargets:
         apart: the others of these views, for scoring.
         full: held-out targets at the views' own size, of large views only some (`within_pixels`); None if no
             size shrank them.
+        twice: some of the held-out targets at twice their size, see `RunViews`.
     """
 
     train: Targets
@@ -73,6 +74,7 @@ class RunTargets:
     validation: Targets | None
     apart: Targets | None
     full: Targets | None
+    twice: Targets | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,7 +171,8 @@ class DistillJob:
         if self.teacher is not None and views.apart is not None and len(views.apart) > 1:
             validation, apart = (made(views.apart.take(range(i, len(views.apart), 2))) for i in (0, 1))
         full = None if views.full is None else scorable(made(within_pixels(views.full)))
-        return RunTargets(train, held_out, validation, apart, full)
+        twice = None if views.twice is None or self.teacher is None else made(views.twice)
+        return RunTargets(train, held_out, validation, apart, full, twice)
 
     def best(self, done: Distilled) -> Targets:
         """Return targets of the views that show the result best: placed ones, or some of the scored ones."""
@@ -242,8 +245,9 @@ class DistillJob:
         held_out, targets = done.scored_on(self.targets.held_out), self.targets
         cameras = held_out.cameras
         scores, apart = scored(held_out), None if targets.apart is None else scored(targets.apart)
+        twice = None if targets.twice is None else scored(targets.twice)
         before, after = (
-            [view for part in (scores, apart) if part for view in part[name].views] for name in scenes
+            [view for part in (scores, apart, twice) if part for view in part[name].views] for name in scenes
         )
         full = None if targets.full is None else scored(done.scored_on(targets.full))
         made = self.views.pool is not None and "test" in self.views.pool.splits

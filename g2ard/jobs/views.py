@@ -19,10 +19,12 @@ from g2ard.jobs.view_checks import as_pool, check_sight, given_or_found, opaque_
 from g2ard.pipeline.config import SelectConfig
 from g2ard.pipeline.distill import RunViews
 from g2ard.poses import Pool, best_views, plan_pool
+from g2ard.poses.zooms import zoomed
 from g2ard.progress import Progress, Say, direction, silent, unsaid
 from g2ard.scene.cameras import USUAL, Camera, Cameras, look_at, rows_by_kind
 from g2ard.scene.samples import evenly_spaced
 from g2ard.scene.splats import Splats
+from g2ard.stages.recover.config import STEPS_FOR_RENDERS, VIEWS_PER_SCHEDULE, RecoverConfig
 from g2ard.stages.select.light import complete
 from g2ard.stages.simplify import simplify
 
@@ -44,6 +46,13 @@ if a view shows little of the scene."""
 _OFFERED_VIEWS, _VIEWS_APART = 64, 16
 """Views of each other kind from which training views are chosen, and further ones: one half validates
 recovery, the other is scored."""
+_USES, _LEAST_SHARE = 5.0, 0.15
+"""Steps per training view, and least share of the pool that is used: runs of few steps plan, render and score
+few views."""
+_LEAST_SCORED, _LEAST_APART = 6, 4
+"""Least usual views that are scored, and least views of each other kind that validate and are scored."""
+_TWICE, _TWICE_VIEWS, _TWICE_LONGEST = "usual at 2×", 4, 2400
+"""Kind of views that are scored at twice their size, their number in a whole pool, and their longest side."""
 _OTHER_KINDS = ("near", "standing", "anywhere")
 _COMPACT_ROWS = 100_000
 """Most Gaussians of the compact scene that the choice is measured on."""
@@ -107,13 +116,15 @@ def views_of(
                 "generated views have no photos", parameter="photos", hint="give {views} that have them"
             )
         held_out = None if options.held_out is None else load(options.held_out, [for_scores])[0].cameras
+        share = 1.0 if use in ("merging", "tiles") else pool_share(options.config.recover)
         return _generated(
             plan(_POOL_VIEWS, grow=_POOL_GROWTH),
             held_out,
             options.size,
-            partial(mix, select=select),
+            partial(mix, select=select, share=share),
             use,
             say,
+            share=share,
         )
     if options.held_out is None:
         train, test = load(given, ["train", "test"])
@@ -140,6 +151,19 @@ def views_of(
     return RunViews(train, test.cameras, apart, full=full)
 
 
+def pool_share(recover: RecoverConfig) -> float:
+    """Return the share of a generated pool that a recovery uses.
+
+    >>> from g2ard.stages.recover.config import Schedule
+    >>> pool_share(RecoverConfig()), round(pool_share(RecoverConfig(schedule=Schedule.named("fast"))), 2)
+    (1.0, 0.34)
+    """
+    if recover.recovery_time is not None or not recover.schedule.means_in_scales:
+        return 1.0
+    steps = STEPS_FOR_RENDERS * recover.schedule.steps if recover.steps is None else recover.steps
+    return min(1.0, max(_LEAST_SHARE, steps / (_USES * VIEWS_PER_SCHEDULE)))
+
+
 def shrunk(cameras: Cameras, size: int | None) -> Cameras | None:
     """Return the views if `size` shrinks any of them, otherwise None."""
     larger = size is not None and bool((np.maximum(cameras.widths, cameras.heights) > size).any())
@@ -153,14 +177,30 @@ def within_pixels(cameras: Cameras) -> Cameras:
 
 
 def _generated(
-    planned: Pool, held_out: Cameras | None, size: int | None, mix: Callable[..., _Mixed], use: Use, say: Say
+    planned: Pool,
+    held_out: Cameras | None,
+    size: int | None,
+    mix: Callable[..., _Mixed],
+    use: Use,
+    say: Say,
+    *,
+    share: float = 1.0,
 ) -> RunViews:
-    """Split a pool into views for training and for scoring; all train if `held_out` are scored."""
+    """Split a pool into views for training and for scoring; all train if `held_out` are scored.
+
+    Args:
+        share: share of the pool that is used.
+    """
     names = planned.cameras.names
     held_back = split_mask(None, names, "test") if held_out is None else np.zeros(len(names), bool)
     usual = ViewSet(planned.cameras, splits=tuple(np.where(held_back, "test", "train").tolist()))
-    train, apart, unseen = mix(usual.take(~held_back), planned)
+    usual = usual.take(~held_back)
     test = planned.cameras.take(held_back)
+    if share < 1:
+        chosen = _first(usual.cameras, share)
+        usual = ViewSet(chosen, splits=("train",) * len(chosen))
+        test = _first(test, share, _LEAST_SCORED)
+    train, apart, unseen = mix(usual, planned)
     pool = ViewSet(
         Cameras.of([*train.cameras, *test]),
         splits=("train",) * len(train.cameras) + ("test",) * len(test),
@@ -170,8 +210,32 @@ def _generated(
     train, scored = train.resized(size), test
     if held_out is not None:
         train, scored = drop_held_out(train, held_out, say), held_out
-    full = shrunk(scored, size)
-    return RunViews(train, scored.resized(size), apart and apart.resized(size), pool, unseen, full)
+    full, scored = shrunk(scored, size), scored.resized(size)
+    twice = None
+    if use == "distil" and held_out is None:
+        twice = _twice(scored, max(2, round(share * _TWICE_VIEWS)))
+    return RunViews(train, scored, apart and apart.resized(size), pool, unseen, full, twice)
+
+
+def _twice(cameras: Cameras, count: int) -> Cameras | None:
+    """Return some views at twice their size, None if that is very large."""
+    longest = 2 * int(np.maximum(cameras.widths, cameras.heights).max())
+    some = cameras.take(evenly_spaced(len(cameras), count)).scaled(longest)
+    return replace(some, kinds=(_TWICE,) * len(some)) if longest <= _TWICE_LONGEST else None
+
+
+def _first(cameras: Cameras, share: float, least: int = 1) -> Cameras:
+    """Return a share of the views, each next one farthest from those before; fewer are a prefix of more."""
+    wanted = max(least, round(share * len(cameras)))
+    if wanted >= len(cameras):
+        return cameras
+    spread = max(float(np.ptp(cameras.positions, axis=0).max()), np.finfo(float).tiny)
+    places = np.concatenate([cameras.positions / spread, cameras.forwards / 4], axis=1)
+    apart, order = np.full(len(places), np.inf), [0]
+    while len(order) < wanted:
+        apart = np.minimum(apart, np.square(places - places[order[-1]]).sum(axis=1))
+        order.append(int(np.argmax(apart)))
+    return cameras.take(sorted(order))
 
 
 def _uses(use: Use, train: int, test: int, apart: int) -> str:
@@ -206,15 +270,20 @@ def _mixed(
     size: int | None,
     progress: Progress,
     say: Say,
+    share: float = 1.0,
 ) -> _Mixed:
     """Add views of other kinds to training views: those that `complete` chooses, or of one kind with a focus.
 
     Some further views of each kind are set apart.
+
+    Args:
+        share: share of the pool that is used.
     """
     usual, times = len(train.cameras), _times(prior, represents)
-    spare, focus = round(_VIEWS_APART * times), select.focus
-    grown = max(1.0, min(usual / _TRAINING_VIEWS, _POOL_GROWTH * times))
-    wanted = dict.fromkeys(_OTHER_KINDS, round(_OFFERED_VIEWS * grown))
+    spare, focus = max(_LEAST_APART, round(_VIEWS_APART * times * share)), select.focus
+    least = round(_TRAINING_VIEWS * times * share)
+    grown = max(1.0, min(usual / (_TRAINING_VIEWS * share), _POOL_GROWTH * times))
+    wanted = dict.fromkeys(_OTHER_KINDS, round(_OFFERED_VIEWS * grown * share))
     if focus == "far":
         wanted = {"near": 0}
     elif focus is not None:
@@ -232,7 +301,6 @@ def _mixed(
     more, unseen = Cameras.of(offered) if offered else None, None
     if focus is None and more is not None:
         compact, per_row = _compact(prior, count, represents, progress)
-        least = round(_TRAINING_VIEWS * times)
         order, _, unseen = complete(
             compact,
             train.cameras,
@@ -252,6 +320,8 @@ def _mixed(
         train.splits and train.splits + ("train",) * len(more),
         np.append(weights, np.ones(len(more))),  # drawn equally often
     )
+    if focus is None:
+        mixed = replace(mixed, cameras=zoomed(compact, mixed.cameras, represents=per_row, share=share))
     return mixed, others, unseen
 
 

@@ -41,6 +41,7 @@ class RunViews:
         pool: the whole generated pool, written beside the result.
         full: the usual views for scoring at their own size, if a requested size shrank them.
         unseen: share of the sampled matter that no view of the pool sees.
+        twice: a few of the usual views for scoring at twice their size, if they were generated.
     """
 
     train: ViewSet
@@ -49,6 +50,7 @@ class RunViews:
     pool: ViewSet | None = None
     unseen: float | None = None
     full: Cameras | None = None
+    twice: Cameras | None = None
 
     def resized(self, longest: int) -> RunViews:
         """Shrink all views for training and scoring."""

@@ -27,6 +27,8 @@ from g2ard.system.keys import key_of
 from g2ard.system.shown import Shown
 from g2ard.system.threads import in_threads
 
+RENDERS = "teacher renders"
+"""What targets without photos are called."""
 CACHE_BYTES = 2_000_000_000
 """Bytes of targets cached in memory; further ones are loaded or rendered again on each access."""
 
@@ -70,7 +72,7 @@ def kinds_told(photos: int, renders: int) -> str:
     """
     if photos and renders:
         return f"{plural(photos, 'photo')} and {plural(renders, 'teacher render')}"
-    return "photos" if photos else "teacher renders"
+    return "photos" if photos else RENDERS
 
 
 def scored_in(targets: Targets, split: str = "") -> str:

@@ -19,6 +19,19 @@ def evenly_spaced(count: int, most: int, *, floor: bool = False) -> list[int]:
     return indices
 
 
+def spread(count: int) -> NDArray[np.int64]:
+    """Return the indices below `count` in an order of which every prefix is spread evenly (van der Corput's).
+
+    >>> spread(6).tolist(), spread(0).tolist()
+    ([0, 4, 2, 1, 5, 3], [])
+    """
+    bits = max(count - 1, 0).bit_length()
+    order = np.zeros(1, np.int64)
+    for bit in reversed(range(bits)):
+        order = np.concatenate([order, order + (1 << bit)])
+    return order[order < count]
+
+
 def weighted_quantile(values: NDArray[Any], weights: NDArray[Any], share: float) -> float:
     """Return the value below which the share of the weight lies.
 

@@ -68,7 +68,7 @@ def test_distill_trains_and_scores_on_them(command_line: CommandLine, folder: Pa
     assert set(g2ard.load_views(folder / "run", split="test").names) == held_out
     error = succeeds(command_line, folder, *DISTILL, "-o", "pool", "--size", 64, "--views", "made").err
     assert SAID not in error
-    assert len(read_view_set(folder / "pool" / "views.json").cameras) >= 128
+    assert len(read_view_set(folder / "pool" / "views.json").cameras) >= 20
 
 
 def test_large_cameras_without_photos_are_shrunk(command_line: CommandLine, folder: Path) -> None:

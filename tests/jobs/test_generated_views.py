@@ -10,6 +10,7 @@ from PIL import Image
 from g2ard.io import write_views
 from g2ard.jobs.distill_options import DistillOptions
 from g2ard.jobs.views import views_of
+from g2ard.pipeline.distill import RunViews
 from g2ard.poses import plan_pool
 from g2ard.rendering.visibility import visibility_source
 from g2ard.scene.cameras import Cameras, rows_by_kind
@@ -102,3 +103,29 @@ def test_given_views_stay_first(tmp_path: Path) -> None:
     assert mixed.names[: len(plain)] == plain.names
     assert set(mixed.kinds[len(plain) :]) == {"anywhere"}
     assert len(mixed) - len(plain) == round(len(plain) / 3)
+
+
+def test_runs_of_few_steps_use_few_views() -> None:
+    """Fewer views are a subset of more, those that are scored too."""
+    scene = naive.statue()
+
+    def made(**recover: object) -> RunViews:
+        return views_of(scene, DistillOptions(views="made", settings=recover), len(scene) // 10)
+
+    whole, fast, few = made(), made(schedule="fast"), made(steps=20)
+    counts = [len(views.train.cameras) for views in (whole, fast, few)]
+    assert counts[0] > 2 * counts[1] > 2 * counts[2] > 20
+    usual = [
+        {tuple(place) for place in views.train.cameras.usual().positions.round(9)}
+        for views in (whole, fast, few)
+    ]
+    assert len(usual[2] & usual[1]) > 0.6 * len(usual[2])  # a zoom stands where its view stood
+    assert [len(views.test) for views in (whole, fast, few)] == [16, 6, 6]
+    assert [len(views.apart or ()) for views in (whole, fast, few)] == [48, 15, 12]
+
+
+def test_a_few_views_are_scored_at_twice_their_size(command_line: CommandLine, folder: Path) -> None:
+    ask = ("distill", "ball.ply", "-r", 4, "--steps", 20, "--size", 64, "-o", "run", "--no-page")
+    told = json.loads(succeeds(command_line, folder, *ask, "--json", "-").out)
+    kinds = {row["kind"]: row["views"] for row in told["kinds"]}
+    assert kinds["usual at 2×"] == 2

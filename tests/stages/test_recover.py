@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from g2ard.errors import DeviceError, InputError
 from g2ard.rendering.renderer import Renderer
-from g2ard.rendering.targets import Subset, TeacherRenders
+from g2ard.rendering.targets import Photos, Subset, TeacherRenders
 from g2ard.rendering.visibility import visibility
 from g2ard.scene.splats import Splats, unit_quats
 from g2ard.stages.evaluate import evaluate
@@ -47,6 +47,12 @@ UNEVEN = np.linspace(0, 3, len(VIEWS)) ** 2
 @pytest.fixture(scope="module")
 def targets() -> TeacherRenders:
     return TeacherRenders(TEACHER, VIEWS)
+
+
+@pytest.fixture(scope="module")
+def photos(targets: TeacherRenders) -> Photos:
+    """The same images as photos, for which rates are tried."""
+    return Photos(targets.cameras, [targets[view] for view in range(len(targets.cameras))])
 
 
 @pytest.fixture(scope="module")
@@ -121,7 +127,7 @@ def test_the_gpu_recovers_like_the_cpu(student: Splats, targets: TeacherRenders,
 @pytest.mark.parametrize("saved", [False, True])
 def test_if_a_device_fails_the_steps_since_the_last_checkpoint_are_repeated(
     student: Splats,
-    targets: TeacherRenders,
+    photos: Photos,
     saved: bool,
     call: int,
     tmp_path: Path,
@@ -139,9 +145,9 @@ def test_if_a_device_fails_the_steps_since_the_last_checkpoint_are_repeated(
     monkeypatch.setattr(FusedEngine, "step", counted)
     monkeypatch.setattr(checkpoint_module, "PERIOD", 0.0)
     checkpoint = tmp_path / "c.npz" if saved else None
-    found = recover(student, targets, config, checkpoint=checkpoint)
+    found = recover(student, photos, config, checkpoint=checkpoint)
     failed, call, calls[0] = calls[0], 0, 0
-    whole = recover(student, targets, config)
+    whole = recover(student, photos, config)
     assert_same_bits(whole.splats, found.splats)
     assert whole.report.loss == found.report.loss
     assert found.report.resumed is None
@@ -184,10 +190,10 @@ def test_same_bits_from_run_to_run_and_for_any_threads(student: Splats, targets:
     indirect=["engine"],
 )
 def test_an_interrupted_run_resumes_to_the_same_bits(
-    student: Splats, targets: TeacherRenders, engine: Any, steps: int, weights: Any, tmp_path: Path
+    student: Splats, photos: Photos, engine: Any, steps: int, weights: Any, tmp_path: Path
 ) -> None:
     config = RecoverConfig(steps=steps, engine=engine, regularizers=replace(REGULARIZERS["lift"], period=10))
-    run = partial(recover, student, targets, config, weights=weights)
+    run = partial(recover, student, photos, config, weights=weights)
     whole = run()
     checkpoint = tmp_path / "c.npz"
     with pytest.raises(KeyboardInterrupt):
@@ -206,7 +212,7 @@ def test_an_interrupted_run_resumes_to_the_same_bits(
 
 
 def test_an_interrupt_during_trials_is_kept(
-    targets: TeacherRenders, student: Splats, monkeypatch: pytest.MonkeyPatch
+    photos: Photos, student: Splats, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Even if what runs at that moment hides it."""
     learn = loop.Loop._learn
@@ -219,7 +225,7 @@ def test_an_interrupt_during_trials_is_kept(
     monkeypatch.setattr(loop.Loop, "_learn", interrupted)
     told, config = [], RecoverConfig(steps=150)
     with pytest.raises(KeyboardInterrupt):
-        recover(student, targets, config, progress=lambda stage, done, *_: told.append(done))
+        recover(student, photos, config, progress=lambda stage, done, *_: told.append(done))
     assert told == [0]
 
 
@@ -247,14 +253,20 @@ def test_resume_refuses_other_options(student: Splats, targets: TeacherRenders, 
         recover(**ask)
 
 
-def test_trials_choose_rates_that_suit_the_scene(student: Splats, targets: TeacherRenders) -> None:
-    report = recover(student, targets, RecoverConfig(steps=100)).report
+def test_trials_choose_rates_that_suit_the_scene(
+    student: Splats, targets: TeacherRenders, photos: Photos
+) -> None:
+    report = recover(student, photos, RecoverConfig(steps=100)).report
     most = max(trial.psnr for trial in report.trials) - report.psnr.before
     good = [t for t in report.trials if t.psnr - report.psnr.before >= 0.96 * most]
     assert report.multiplier == max(trial.multiplier for trial in good)
     assert len(report.trials) >= 2
     nearly = recover(TEACHER, targets, RecoverConfig(steps=100)).report  # nothing to gain: small steps
     assert nearly.multiplier == pytest.approx(1 / 3)
+    rough = recover(student, targets, RecoverConfig(steps=100)).report  # of renders the error says enough
+    assert 1 / 3 < rough.multiplier == loop.multiplier_for(10 ** (-rough.psnr.before / 20))
+    assert not rough.trials
+    assert nearly.trials
     fixed = RecoverConfig(schedule=replace(TUNED, multiplier=0.7), steps=100)
     report = recover(student, targets, fixed).report
     assert (report.multiplier, report.trials) == (0.7, ())

@@ -12,7 +12,7 @@ from g2ard.config.checks import AboveZero, AtLeastOne, Degree, NotNegative, Posi
 from g2ard.config.choices import BLACK, Colour, Engine
 from g2ard.config.schema import Settings
 from g2ard.errors import InputError, require
-from g2ard.scene.cameras import Cameras
+from g2ard.scene.cameras import ZOOM, Cameras
 from g2ard.scene.samples import evenly_spaced
 from g2ard.scene.splats import Splats
 from g2ard.stages.recover.anchors import REGULARIZERS, Regularizers
@@ -32,9 +32,12 @@ _UNTRAINED_RMSE = 0.1
 _SIGHT_SAMPLE = 4096
 """Gaussians that `steps_for` measures views with."""
 
-_USUAL_VIEWS, _MOST_GROWTH, _VIEWS_PER_SCHEDULE = 112, 2.25, 140
+_USUAL_VIEWS, _MOST_GROWTH, VIEWS_PER_SCHEDULE = 112, 2.25, 140
 """Usual views that train if each holds the whole scene, the largest factor if it holds less, and the views
 that the schedule's steps are for."""
+
+STEPS_FOR_RENDERS = 0.8
+"""Share of the schedule's steps that renders need: they agree with each other, photos do not."""
 
 _FEW_POINTS = 1250
 """Points of photos up to which the schedule's steps suffice."""
@@ -234,25 +237,27 @@ def steps_from_points(count: int, steps: int) -> int:
 
 
 def steps_for(scene: Splats, cameras: Cameras, steps: int) -> int:
-    """Return the steps for views against renders, 1 to 3 times `steps`.
+    """Return the steps for views against renders, 0.8 to 2.4 times `steps`.
 
-    `steps` are for 140 views, each used about seven times. However many usual views there are, they count as
+    The least are for 140 views, each used about six times. However many usual views there are, they count as
     112/√h, at most 252, if one holds a share h of the scene: a view of an orbit shows the whole object, but a
-    view in a room a tenth of it. Views of other kinds count in proportion.
+    view in a room a tenth of it. Views of other kinds count in proportion, zooms not at all.
 
     >>> from g2ard.scene.cameras import look_at
     >>> line = Splats.create([[0, 0, 0], [9, 0, 0], [0, 0, 9], [-9, 0, 0]], scales=np.ones((4, 3)))
     >>> K = [[50, 0, 32], [0, 50, 32], [0, 0, 1]]
     >>> view = Cameras.from_lists([look_at([0, -3, 0], [0, 0, 0])], [K], [(64, 64)], ["a"])
     >>> steps_for(line, view, 1000)
-    1600
+    1280
     """
     usual = cameras.usual()
+    plain = sum(kind != ZOOM for kind in cameras.kinds)
     some = evenly_spaced(len(scene), _SIGHT_SAMPLE)
     points = scene.means[some].astype(np.float64) + scene.offset
     share = max(usual.usual_share(points), 1 / _MOST_GROWTH**2)
-    views = _USUAL_VIEWS / math.sqrt(share) * (len(cameras) / len(usual))
-    return round(steps * min(max(1.0, views / _VIEWS_PER_SCHEDULE), _MOST_STEPS_FACTOR))
+    views = _USUAL_VIEWS / math.sqrt(share) * (plain / len(usual))
+    factor = min(max(1.0, views / VIEWS_PER_SCHEDULE), _MOST_STEPS_FACTOR)
+    return round(steps * STEPS_FOR_RENDERS * factor)
 
 
 @dataclass(frozen=True)

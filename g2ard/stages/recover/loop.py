@@ -21,7 +21,7 @@ from g2ard.errors import DeviceError, InputError, require, require_torch
 from g2ard.progress import Progress, silent
 from g2ard.rendering.exposure import exposures_of, unexposed
 from g2ard.rendering.renderer import settings_for
-from g2ard.rendering.targets import Targets, fingerprint_of, mask_of
+from g2ard.rendering.targets import RENDERS, Targets, fingerprint_of, kinds_of, mask_of
 from g2ard.scene.shape import needle_share
 from g2ard.scene.splats import Splats
 from g2ard.stages.recover.anchors import Anchors, drift95
@@ -142,8 +142,8 @@ class Loop:
     def choose_rates(self, start: float) -> None:
         """Choose reach and multiplier: the schedule's, or from the initial error and short trials.
 
-        The time of the trials counts. `start` is the PSNR before recovery; for short horizons it alone
-        decides.
+        The time of the trials counts. `start` is the PSNR before recovery. It alone decides for short
+        horizons, and for renders that are not nearly fitted.
         """
         schedule, limit = self.config.schedule, self.config.recovery_time
         rmse = 10 ** (-start / 20)
@@ -153,6 +153,8 @@ class Loop:
             self.multiplier = schedule.multiplier
             return
         self.multiplier = multiplier_for(rmse)
+        if kinds_of(self.targets) == RENDERS and limit is None and self.multiplier > min(MULTIPLIERS):
+            return
         if steps := trial_steps(self.config.horizon, limit):
             tight = reach_for(0.0, typical) if schedule.reach is None else self.reach
             with checkpoints.deferred_interrupt() as interrupted:
