@@ -66,10 +66,10 @@ _SAMPLE = 150_000
 """Largest sample on which views are planned and chosen."""
 _IMAGE_BYTES = 60
 """Bytes per pixel of a view that is rendered and scored, of which every thread of `in_threads` has one."""
-_PACKED_BYTES, _PALETTE_BYTES = 200, 6_000
+_PACKED_BYTES, _PALETTE_BYTES = 200, 1_300
 """Bytes of packing the viewer page: per Gaussian, and per entry of the palette of harmonics, of which there
-are at most 65,536. Measured: 7 MB for 25,000 Gaussians of SH degree 0 and 31 for 150,000; 3,500 to 8,500 per
-entry for degrees 1 to 3."""
+are at most 65,536. Measured: 22 and 39 MB for 20,000 Gaussians of SH degree 1 and 3, 97 for 150,000 of degree
+2, 118 for 250,000 of degree 3."""
 _TRAINER_BYTES = 983
 """Bytes per Gaussian in recovery: parameters, Adam's moments, buffers (`docs/benchmarks.md`)."""
 
