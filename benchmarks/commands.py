@@ -36,7 +36,6 @@ def _root() -> None:
 @command(
     "run",
     parent=app,
-    cuda=True,
     settings="",
     example="python -m benchmarks run simplify scene.ply --ratios 10",
 )
@@ -72,9 +71,9 @@ def run_(
 ) -> None:
     """Run studies: DIR/rows.csv holds a row per measurement, DIR/report.html shows them.
 
-    --set KEY=VALUE sets any other key of the studies, --set scene.KEY=VALUE of their scenes. --device cuda
-    recovers, adapts and scores with gsplat on an NVIDIA GPU, as --set engine=gsplat does. A stopped run
-    continues where it was, -w measures anew. A cell that fails is a row with its error, and is tried again.
+    --set KEY=VALUE sets any other key of the studies, --set scene.KEY=VALUE of their scenes. A stopped
+    run continues where it was, -w measures anew. A cell that fails is a row with its error, and is tried
+    again.
     """
     from benchmarks.report import write_report
     from benchmarks.rows import shown
@@ -105,8 +104,6 @@ def run_(
     flags["seeds"] = str(run.seed) if run.seed and seeds is None else seeds
     given = {name: value for name, value in flags.items() if value is not None}
     forced = dict(_setting(text) for text in run.config.get("set") or [])
-    if run.device == "cuda":
-        forced.setdefault("engine", "gsplat")
     studies = []
     for path in files:
         one = read_study(path)
@@ -115,10 +112,7 @@ def run_(
         for name in sorted(unfit & given.keys()):
             run.say(f"{path}: has no {name}, and --{name.replace('_', '-')} is ignored there")
         unfit |= set() if hasattr(one, "lpips") else {"lpips"}
-        fit = {name: value for name, value in forced.items() if name != "engine" or hasattr(one, name)}
-        if fit != forced:
-            run.say(f"{path}: recovers nothing, so it has no engine; it runs on the CPU")
-        one = one.narrowed({name: given[name] for name in given if name not in unfit} | fit)
+        one = one.narrowed({name: given[name] for name in given if name not in unfit} | forced)
         wanted = one.scenes if only is None else tuple(s for s in one.scenes if s.name in only.split(","))
         if not wanted:
             there = f"no scene {only!r} (it has {', '.join(s.name for s in one.scenes)})"

@@ -12,9 +12,8 @@ from PIL import Image
 from benchmarks.rows import Row
 from g2ard.config.choices import BLACK, Colour
 from g2ard.io.images import as_saved, to_bytes
-from g2ard.rendering.cuda import renderer_on
 from g2ard.rendering.metrics import Lpips, edge_psnr, psnr, ssim
-from g2ard.rendering.renderer import RasterSettings
+from g2ard.rendering.renderer import RasterSettings, Renderer
 from g2ard.rendering.targets import Targets, mask_of
 from g2ard.scene.samples import evenly_spaced
 from g2ard.scene.splats import Splats
@@ -51,7 +50,6 @@ def score(
     lpips: dict[str, Lpips] | None = None,
     settings: RasterSettings | None = None,
     eight_bit: bool = False,
-    device: str = "cpu",
     pictures: Path | None = None,
 ) -> list[View]:
     """Render and score every view.
@@ -63,10 +61,9 @@ def score(
         lpips: LPIPS networks, if any.
         settings: conventions of the renderer; None means gsplat's.
         eight_bit: as in `g2ard.stages.evaluate.evaluate`.
-        device: as in `g2ard.stages.evaluate.evaluate`.
         pictures: folder for JPEGs of the `pictured` views, named by index.
     """
-    renderer = renderer_on(device, splats, background, settings)
+    renderer = Renderer(splats, background=background, settings=settings)
     views = []
     for number, name in enumerate(targets.cameras.names):
         image, target = renderer.clipped(targets.cameras[number]), targets[number]

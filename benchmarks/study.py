@@ -170,13 +170,8 @@ class Study(ABC):
             missing = next(filter(None, (_VARIABLE.search(path) for path in paths if path)), None)
             if missing is not None:
                 raise InputError(f"{self.name}: scene {scene.name}: ${missing[1]} is not set")
-        engine = getattr(self, "engine", "fused")
-        if engine != "fused":
-            require_torch(f"engine '{engine}'", "cuda" if engine == "gsplat" else "torch")
-        if engine == "gsplat":
-            from g2ard.rendering.cuda import check_cuda
-
-            check_cuda()
+        if getattr(self, "engine", "fused") == "torch":
+            require_torch("engine 'torch'")
 
     def narrowed(self, options: Mapping[str, Any]) -> Self:
         """Return the study with changed keys; `scene.KEY` sets a key of all scenes."""

@@ -127,10 +127,10 @@ def missing(what: str, package: str, **fields: Any) -> MissingDependencyError:
     )
 
 
-def require_torch(feature: str, packages: str = "torch") -> None:
-    """Check that torch can be imported, without importing it; `packages` are those to install."""
+def require_torch(feature: str) -> None:
+    """Check that torch can be imported, without importing it."""
     if find_spec("torch") is None:
-        raise MissingDependencyError(f"{feature} needs torch", hint=f"pip install {packages}")
+        raise MissingDependencyError(f"{feature} needs torch", hint="pip install torch")
 
 
 def require(name: str, value: object, fits: bool, expected: str) -> None:

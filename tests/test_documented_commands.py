@@ -29,7 +29,6 @@ NOT_RUN = {
     r"python -m http\.server .*": "a server that does not end",
     r"dask (scheduler|worker)\b.*": "a server that does not end; tests/tiles starts one",
     r"python -m benchmarks synth .*": "takes a minute; tests/benchmarks/test_synth.py makes a small one",
-    r"g2ard .* --device cuda .*": "needs an NVIDIA GPU",
     r"g2ard register .* --pool train.json .*": "takes a minute; tests/stages/test_register.py tries a pool",
 }
 """Pattern of a command → why it does not run here."""

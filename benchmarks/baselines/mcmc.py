@@ -1,6 +1,6 @@
 """Training anew by MCMC at an exact count (Kheradmand et al., 3D Gaussian Splatting as MCMC, 2024).
 
-With the engine `gsplat`, gsplat's rasteriser and strategy train on an NVIDIA GPU; otherwise `g2ard.rasterize`
+With `gsplat`, gsplat's rasteriser and strategy train on an NVIDIA GPU; otherwise `g2ard.rasterize`
 and the strategy of this module on the CPU. Rates and weights are those of gsplat's trainer for this strategy.
 They hold for cameras within a unit sphere, so training is in such coordinates.
 """
@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 import time
 from dataclasses import replace
+from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -17,7 +18,6 @@ from numpy.typing import NDArray
 
 from g2ard.config.choices import BLACK, Colour
 from g2ard.errors import InputError, require_torch
-from g2ard.rendering import cuda
 from g2ard.rendering.renderer import RasterSettings
 from g2ard.rendering.targets import Targets, mask_of
 from g2ard.scene.cameras import Cameras
@@ -57,6 +57,21 @@ _DEAD, _NOISE, _GATE = 0.005, 5e5, 100.0
 """Opacity from which a Gaussian lives, and strength and steepness of the noise."""
 _MOST_COPIES = 51
 
+_SSIM_WINDOW, _SSIM_SIGMA = 11, 1.5
+_SSIM_C1, _SSIM_C2 = 0.01**2, 0.03**2
+
+DEVICE = "cuda"
+"""torch's name of the device that gsplat uses."""
+
+
+def has_gsplat() -> bool:
+    """Return whether gsplat is installed and there is a GPU for it."""
+    if find_spec("gsplat") is None or find_spec("torch") is None:
+        return False
+    import torch
+
+    return torch.cuda.is_available()
+
 
 def train(
     prior: Splats,
@@ -64,7 +79,7 @@ def train(
     targets: Targets,
     steps: int,
     *,
-    engine: str = "fused",
+    gsplat: bool = False,
     background: Colour = BLACK,
     seed: int = 0,
     watch: Watch | None = None,
@@ -76,27 +91,27 @@ def train(
         count: Gaussians of the start and of the result, at most the prior's.
         targets: photos or renders, with cameras in world coordinates.
         steps: steps of one view each, for which the rates are scheduled.
-        engine: gsplat trains on a GPU, any other on the CPU.
+        gsplat: whether to train on an NVIDIA GPU with gsplat, otherwise on the CPU.
         watch: called after every 25th step, as by `g2ard.recover`; its time does not count.
 
     Raises:
-        InputError: more Gaussians than the prior has, or no CUDA device for gsplat.
-        MissingDependencyError: torch or gsplat is not installed.
+        InputError: more Gaussians than the prior has, or `gsplat` without gsplat or a CUDA device.
+        MissingDependencyError: torch is not installed.
     """
     require_torch("training anew")
     import torch
 
-    if engine == "gsplat":
-        cuda.check_cuda()
-    gpu = engine == "gsplat"
-
+    if gsplat and not has_gsplat():
+        raise InputError("gsplat needs an NVIDIA GPU, torch for CUDA, and the package gsplat")
     if not 1 <= count <= len(prior):
         raise InputError(f"count: expected 1 to {len(prior)}, got {count}")
     torch.manual_seed(seed)
     middle, extent = _frame(targets.cameras)
-    views = [_tensors(targets, view, gpu) for view in range(len(targets.cameras))]
+    views = [_tensors(targets, view, gsplat) for view in range(len(targets.cameras))]
     spent, now = 0.0, time.monotonic()
-    training = _Training(prior, count, _within(targets.cameras, middle, extent), middle, extent, steps, gpu)
+    training = _Training(
+        prior, count, _within(targets.cameras, middle, extent), middle, extent, steps, gsplat
+    )
     for step in range(steps):
         epoch, turn = divmod(step, len(views))
         if turn == 0:
@@ -159,8 +174,6 @@ class _Training:
 
     def step(self, step: int, view: int, target: Tensor, mask: Tensor | None, background: Colour) -> None:
         """Take one step on a view, then let the strategy relocate and perturb Gaussians."""
-        from g2ard.stages.recover.losses import l1_ssim_anywhere
-
         values = self._values
         known = (min(step // _STEPS_PER_DEGREE, _SH_DEGREE) + 1) ** 2 - 1
         parameters = {
@@ -174,7 +187,7 @@ class _Training:
         image = self._rendered(parameters, view, background)
         if mask is not None:
             image, target = image * mask, target * mask
-        loss = l1_ssim_anywhere(image, target, _SSIM_WEIGHT)
+        loss = l1_ssim(image, target, _SSIM_WEIGHT)
         loss = loss + _OPACITY_WEIGHT * values["opacities"].sigmoid().mean()
         loss = loss + _SCALE_WEIGHT * values["scales"].exp().mean()
         loss.backward()
@@ -187,7 +200,7 @@ class _Training:
 
     def _rendered(self, parameters: dict[str, Tensor], view: int, background: Colour) -> Tensor:
         if self._gpu:
-            return cuda.rasterized(parameters, self._cameras, view, background, self._settings)
+            return _rasterized(parameters, self._cameras, view, background, self._settings)
         from g2ard.stages.recover.rasterize import rasterize
 
         image, _, _ = rasterize(
@@ -256,7 +269,7 @@ class _Strategy:
 
 
 def _device(gpu: bool) -> str:
-    return cuda.DEVICE if gpu else "cpu"
+    return DEVICE if gpu else "cpu"
 
 
 def _strategy(gpu: bool, count: int, last_move: int) -> Any:
@@ -273,6 +286,62 @@ def _strategy(gpu: bool, count: int, last_move: int) -> Any:
         refine_every=_MOVES,
         min_opacity=_DEAD,
     )
+
+
+def _rasterized(
+    parameters: dict[str, Tensor], cameras: Cameras, view: int, background: Any, settings: RasterSettings
+) -> Tensor:
+    """Render one view (H, W, 3) with gsplat on an NVIDIA GPU, differentiably.
+
+    Args:
+        parameters: means, quats, log_scales, logit_opacities, sh0 and shN, on the device.
+        settings: only the near plane and antialiasing; gsplat has its own conventions.
+    """
+    import torch
+    from gsplat import rasterization
+
+    device = parameters["means"].device
+    coefficients = torch.cat([parameters["sh0"], parameters["shN"]], 1)
+    image, _, _ = rasterization(
+        means=parameters["means"],
+        quats=parameters["quats"],
+        scales=parameters["log_scales"].exp(),
+        opacities=parameters["logit_opacities"].sigmoid(),
+        colors=coefficients,
+        viewmats=torch.from_numpy(cameras.viewmats[view]).float().to(device)[None],
+        Ks=torch.from_numpy(cameras.Ks[view]).float().to(device)[None],
+        width=int(cameras.widths[view]),
+        height=int(cameras.heights[view]),
+        sh_degree=round(coefficients.shape[1] ** 0.5) - 1,
+        backgrounds=torch.tensor([background], dtype=torch.float32, device=device),
+        near_plane=settings.near_of(view),
+        rasterize_mode="antialiased" if settings.antialiased else "classic",
+        packed=False,
+    )
+    return image[0]
+
+
+def l1_ssim(image: Tensor, target: Tensor, ssim_weight: float) -> Tensor:
+    """Compute `g2ard.stages.recover.losses.l1_ssim` with torch operations, on any device."""
+    import torch
+    from torch.nn.functional import conv2d
+
+    x, y = (t.permute(2, 0, 1)[:, None] for t in (image, target))
+    offsets = torch.arange(_SSIM_WINDOW, device=image.device, dtype=image.dtype) - _SSIM_WINDOW // 2
+    weights = torch.exp(-(offsets**2) / (2 * _SSIM_SIGMA**2))
+    weights = weights / weights.sum()
+
+    def blurred(t: Tensor) -> Tensor:
+        t = conv2d(t, weights.view(1, 1, 1, -1), padding=(0, _SSIM_WINDOW // 2))
+        return conv2d(t, weights.view(1, 1, -1, 1), padding=(_SSIM_WINDOW // 2, 0))
+
+    mean_x, mean_y = blurred(x), blurred(y)
+    var_x = (blurred(x * x) - mean_x**2).clamp_min(0)
+    var_y = (blurred(y * y) - mean_y**2).clamp_min(0)
+    both = blurred(x * y) - mean_x * mean_y
+    above = (2 * mean_x * mean_y + _SSIM_C1) * (2 * both + _SSIM_C2)
+    ssim = above / ((mean_x**2 + mean_y**2 + _SSIM_C1) * (var_x + var_y + _SSIM_C2))
+    return ((1 - ssim_weight) * (x - y).abs() + ssim_weight * (1 - ssim)).mean()
 
 
 def _relocate(values: Any, optimizers: Any, coefficients: Tensor) -> None:

@@ -11,6 +11,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
 
+from benchmarks.baselines import mcmc
 from benchmarks.kinds.raster import GPU, built_in_view, drawn, timed_step
 from benchmarks.process import measured
 from benchmarks.rows import Row
@@ -23,8 +24,6 @@ from g2ard.errors import InputError
 from g2ard.system import devices
 
 __all__ = ["Devices"]
-
-_CUDA = ("cuda", "gsplat")
 
 _STAGES = {
     "project": ("splat",),
@@ -42,15 +41,14 @@ class Devices(Study):
     """A study of a recovery step and of a short `g2ard distill`, in a process of its own, by device.
 
     Args:
-        methods: "cpu"; "gpu", the best adapter, even a software one; "cuda", gsplat's engine; "gsplat", a
-            plain loop around gsplat's rasteriser that trains as many Gaussians anew. The last two are
-            skipped without CUDA.
+        methods: "cpu"; "gpu", the best adapter, even a software one; "gsplat", a plain loop around gsplat's
+            rasteriser that trains as many Gaussians anew, skipped if gsplat or CUDA is missing.
         steps: of the distillation and of the loop.
         image: width and height of the view of the timed step, for scenes without views.
         repeats: timed steps; the fastest is recorded.
     """
 
-    METHODS: ClassVar[Mapping[str, Any]] = {name: name for name in ("cpu", "gpu", *_CUDA)}
+    METHODS: ClassVar[Mapping[str, Any]] = {name: name for name in ("cpu", "gpu", "gsplat")}
 
     steps: int = key(200, least=1)
     image: tuple[int, int] = key((640, 480), least=1)
@@ -59,7 +57,7 @@ class Devices(Study):
     def cells(self, scene: SceneSpec, work: Path) -> Iterator[Cell]:
         """Yield a cell per ratio and device."""
         place = Workspace(work, self, scene)
-        names = {"cpu": _core.instruction_sets()[0], **{name: name for name in _CUDA}}
+        names = {"cpu": _core.instruction_sets()[0], "gsplat": "gsplat"}
         if "gpu" in self.methods:
             adapters = devices.adapters()
             if not adapters:
@@ -67,7 +65,7 @@ class Devices(Study):
             names["gpu"] = GPU + adapters[0].name
         for ratio in self.ratios:
             for device in self.methods:
-                if device not in _CUDA or _cuda():
+                if device != "gsplat" or mcmc.has_gsplat():
                     cell = {"ratio": ratio, "isa": names[device], "threads": _core.num_threads()}
                     yield Cell(cell, partial(self._measured, place, ratio, device))
 
@@ -75,8 +73,7 @@ class Devices(Study):
         budget = budget_of(len(place.splats), ratio)
         if device == "gsplat":
             return [self._loop(place, budget)]
-        step = {} if device == "cuda" else self._step(place, budget, device)
-        return [{**step, **self._distilled(place, budget, device)}]
+        return [{**self._step(place, budget, device), **self._distilled(place, budget, device)}]
 
     def _step(self, place: Workspace, budget: int, device: str) -> Row:
         """Time steps on a random subset of the scene, on a GPU each kernel too."""
@@ -138,12 +135,10 @@ class Devices(Study):
 
     def _loop(self, place: Workspace, budget: int) -> Row:
         """Train anew with gsplat's rasteriser, without anything of g2ard in the steps."""
-        from benchmarks.baselines import mcmc
-
         background = place.scene.background
         targets = place.targets(place.train_cameras)
         made, seconds = mcmc.train(
-            place.splats, budget, targets, self.steps, engine="gsplat", background=background
+            place.splats, budget, targets, self.steps, gsplat=True, background=background
         )
         scored = figures(score(made, place.targets(next(iter(place.scored.values()))), background))
         return {
@@ -153,16 +148,6 @@ class Devices(Study):
             "psnr": scored["psnr"],
             "ssim": scored["ssim"],
         }
-
-
-def _cuda() -> bool:
-    from g2ard.rendering.cuda import check_cuda
-
-    try:
-        check_cuda()
-    except (InputError, ImportError):
-        return False
-    return True
 
 
 def _by_stage(seconds: Mapping[str, float], steps: int) -> Row:

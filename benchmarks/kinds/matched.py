@@ -60,7 +60,7 @@ class Matched(Study):
         adapt_on: "train", or "all" views of `adapt` that are not of another split.
         convention: conventions of the renderer for scores.
         eight_bit: whether to round renders and targets to 8 bits before scoring, as in saved PNGs.
-        engine: engine of recovery and adaptation; gsplat also scores on the GPU: renders and LPIPS.
+        engine: engine of recovery and adaptation.
         fold: the paper's rounds end with the one before if the last removes less than this share; the
             text has 0.
         lpips: folder of LPIPS weights.
@@ -152,12 +152,7 @@ class Matched(Study):
         if self.lpips is None:
             return {}
         scaled = self.lpips_input == "scaled"
-        return load_lpips(self.folder / self.lpips, scaled=scaled, device=self.device)
-
-    @property
-    def device(self) -> str:
-        """torch's device for scores."""
-        return "cuda" if self.engine == "gsplat" else "cpu"
+        return load_lpips(self.folder / self.lpips, scaled=scaled)
 
     def _measured(
         self, place: MatchedWorkspace, ratio: float, method: MethodSpec, budget: Budget, seed: int
@@ -186,7 +181,6 @@ class Matched(Study):
                 lpips=self.networks,
                 settings=place.settings,
                 eight_bit=self.eight_bit,
-                device=self.device,
                 pictures=folder / pictures,
             )
             for view in pictured(len(scored)):

@@ -47,7 +47,7 @@ class Variant:
         preset: preset of a whole distillation, from selection on; None only recovers, from a simplification
             that all such variants share.
         settings: settings of the distillation by full path. Without `recover.steps`, the study's are taken.
-        retrains: whether to train anew by gsplat's MCMC instead, from points of the prior.
+        retrains: whether to train anew by MCMC instead, from points of the prior.
     """
 
     name: str
@@ -67,6 +67,7 @@ class Recover(Study):
         methods: tables of `Variant`.
         steps: steps of variants that set none, over all rounds; only the last unless a variant runs each.
         engine: engine of recovery.
+        gsplat: whether variants that retrain do so on an NVIDIA GPU, with gsplat's rasteriser and strategy.
         protocol: kinds of views to score: "pool", "standing" (near and standing views), "anywhere", or "all".
     """
 
@@ -74,6 +75,7 @@ class Recover(Study):
 
     steps: tuple[int, ...] = key((1000,), least=1, axis=True)
     engine: str = key("fused", choices=ENGINES)
+    gsplat: bool = key(False)
     protocol: str = key("all", choices=tuple(PROTOCOLS), axis=True)
 
     def cells(self, scene: SceneSpec, work: Path) -> Iterator[Cell]:
@@ -224,7 +226,7 @@ class _Run:
             self.budget,
             targets,
             self.steps,
-            engine=place.study.engine,
+            gsplat=place.study.gsplat,
             background=colour,
             seed=self.seed,
             watch=self._watch,

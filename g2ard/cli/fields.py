@@ -38,8 +38,7 @@ _SH_DEGREE = typer.Option(min=0, max=3, help="SH degree of the result; by defaul
 ShDegreeOption = Annotated[int | None, _SH_DEGREE]
 _ENGINE = typer.Option(
     help="Engine of the steps, with equal results up to rounding: fused (Rust or --device gpu, the "
-    "default), torch (autograd; needs the extra `torch`) or gsplat (NVIDIA GPU, as --device cuda; extra "
-    "`cuda`)."
+    "default) or torch (autograd; needs the extra `torch`)."
 )
 FIELDS: dict[str, tuple[Any, Any]] = {
     "simplify.method": (Method, typer.Option(help="Simplification method.")),

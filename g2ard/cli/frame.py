@@ -77,7 +77,7 @@ _COMMON_OPTIONS: dict[str, tuple[Any, ...]] = {
     "json": (str | None, typer.Option(metavar="FILE|-", help="Write the result as JSON; - is stdout.")),
     "seed": (int, typer.Option(min=0, help="Random seed."), 0),
     "threads": (int, typer.Option(min=0, max=256, help="CPU threads; 0 uses all cores."), 0),
-    "device": (str, typer.Option(metavar="auto|cpu|gpu|cuda", help="Where to compute."), "auto"),
+    "device": (str, typer.Option(metavar="auto|cpu|gpu", help="Where to compute."), "auto"),
     "print_config": (
         bool,
         typer.Option("--print-config", help="Print the options as a --config file, then exit."),
@@ -445,7 +445,6 @@ def command(
     *,
     example: str,
     parent: typer.Typer = app,
-    cuda: bool = False,
     settings: str | None = None,
     fields: Sequence[str] = (),
     scenes: bool = False,
@@ -459,7 +458,6 @@ def command(
 
     Args:
         parent: group it belongs to.
-        cuda: whether it supports --device cuda.
         settings: config of --set as MODULE:CLASS, see `Run.settled`, or "" if the command checks it; None
             takes no --set.
         fields: paths of its settings that flags set: those of `FIELDS`, or options named like them.
@@ -507,7 +505,7 @@ def command(
                 typer.echo(printed(ctx, {**values, **shared_values, **run.config}), nl=False)
                 return
             with interrupt.RaisesInterrupt():
-                _execute(run, fn, values, cuda)
+                _execute(run, fn, values)
 
         # Typer reads options from the signature: the context, the command's own, and the shared ones.
         context = inspect.Parameter("ctx", inspect.Parameter.KEYWORD_ONLY, annotation=typer.Context)
@@ -526,11 +524,9 @@ def _parameter(name: str, kind: Any, option: Any, default: Any = None) -> inspec
     return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
 
 
-def _execute(run: Run, fn: Callable[..., None], options: dict[str, Any], cuda: bool) -> None:
-    if run.device not in ("auto", "cpu", "gpu", "cuda"):
-        raise typer.BadParameter(f"--device: expected auto, cpu, gpu or cuda, got {run.device!r}")
-    if run.device == "cuda" and not cuda:
-        run.say("--device cuda: this command does not use CUDA; it runs on the CPU")
+def _execute(run: Run, fn: Callable[..., None], options: dict[str, Any]) -> None:
+    if run.device not in ("auto", "cpu", "gpu"):
+        raise typer.BadParameter(f"--device: expected auto, cpu or gpu, got {run.device!r}")
     try:
         if run.json not in (None, "-"):
             run.claim_file("--json", Path(str(run.json)))

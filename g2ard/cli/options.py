@@ -279,26 +279,10 @@ def views_count(text: str) -> Count | str:
     return "auto" if text.strip() == "auto" else Count.parse(text)
 
 
-def choose_engine(run: Run, settings: dict[str, Any], path: str) -> None:
-    """Set the engine at `path` to gsplat for --device cuda, and check early that the engine can run."""
-    asked = "engine"
-    if run.device == "cuda" and path not in settings:
-        settings[path], asked = "gsplat", "device"
-    if settings.get(path) == "gsplat":
-        use_cuda(run, asked)
-    elif settings.get(path) == "torch":
+def check_engine(engine: str | None) -> None:
+    """Check early that an engine can run."""
+    if engine == "torch":
         require_torch("--engine torch")
-
-
-def use_cuda(run: Run, asked: str = "device") -> None:
-    """Check that CUDA, requested by the option `asked`, is available; warn that it is usually slower."""
-    flag = "--device cuda" if asked == "device" else "--engine gsplat"
-    require_torch(flag, "torch gsplat")
-    from g2ard.rendering.cuda import check_cuda
-
-    check_cuda(asked)
-    speeds = "recovery: 58 steps/s on an H200, 184 on 16 CPU cores"
-    run.say(f"warning: {flag}: the CPU is usually faster ({speeds})")
 
 
 def trained_on(split: str) -> str:

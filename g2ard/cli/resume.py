@@ -33,7 +33,7 @@ CALL_OPTIONS = (
     *("output", "resume", "keep", "page", "dry_run", "threads", "device"),
     *("memory", "workers", "scheduler", "work", "views_format", "count", "ratio"),
 )
-"""Options that may differ from a finished run's: `device` except CUDA, and budgets of the same count."""
+"""Options that may differ from a finished run's: also budgets of the same count."""
 
 
 def record_file(place: Path, output: Path) -> Path:
@@ -61,8 +61,6 @@ def check_same(run: Run, record: Mapping[str, Any], output: Path, *others: str) 
     then, now = record.get("config", {}), json.loads(json.dumps(run.config, default=str))
     names = [name for name in now if name in then and name not in CALL_OPTIONS]
     found = [*others, *(name.replace("_", "-") for name in names if now[name] != then[name])]
-    if "cuda" in (now["device"], then.get("device")) and now["device"] != then.get("device"):
-        found.append("device")
     if found:
         raise OutputError(
             f"finished with other options ({', '.join(found)})",

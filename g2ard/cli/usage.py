@@ -3,11 +3,12 @@
 import re
 import sys
 from collections.abc import Iterable, Mapping
-from typing import Any
+from typing import Any, Literal
 
 import typer
 
 from g2ard.cli.budget_options import BUDGET_FLAGS, BUDGETS
+from g2ard.config.checks import described
 from g2ard.errors import G2ardError
 
 _FLAGS = {"overwrite=True": "-w (--overwrite)"}
@@ -141,7 +142,7 @@ def _allowed(parameter: Any) -> str:
     """Describe the values an option accepts: choices, true or false, or a number within bounds."""
     descriptor = parameter.type_descriptor
     if descriptor.choices is not None:
-        return f"one of {', '.join(map(str, descriptor.choices))}"
+        return described(Literal[tuple(descriptor.choices)])
     kinds = {bool: "true or false", int: "a whole number", float: "a number"}
     low, high = descriptor.parameter_info.min, descriptor.parameter_info.max
     bounds = {

@@ -12,6 +12,7 @@ from functools import cache, wraps
 from numbers import Integral, Real
 from typing import Annotated, Any, Literal, ParamSpec, TypeVar, Union, get_args, get_origin, get_type_hints
 
+from g2ard.config.choices import Engine
 from g2ard.errors import InputError, require
 
 P = ParamSpec("P")
@@ -193,7 +194,7 @@ def described(kind: Any) -> str:
         finite = bare(kind) is float and limits.interval.endswith("inf)")
         return f"{'a finite number' if finite else described(bare(kind))} {limits}".rstrip()
     if get_origin(kind) is Literal:
-        return f"one of {', '.join(map(str, get_args(kind)))}"
+        return f"one of {', '.join(map(str, get_args(kind)))}{_REMARKS.get(kind, '')}"
     if get_origin(kind) is tuple:
         kinds = get_args(kind)
         return "comma-separated numbers" if kinds[-1] is Ellipsis else f"{len(kinds)} comma-separated numbers"
@@ -219,6 +220,9 @@ def options_of(kind: Any) -> tuple[Any, ...]:
 def bare(kind: Any) -> Any:
     """Return a type without its limits."""
     return get_args(kind)[0] if get_origin(kind) is Annotated else kind
+
+
+_REMARKS: dict[Any, str] = {Engine: " (the device gpu runs fused on a GPU)"}
 
 
 class _Array:

@@ -37,7 +37,7 @@ PaperPresetName = Literal["paper", "paper-trained", "paper-lift", "paper-noisy"]
 PresetName = Literal["auto", "trained", "lift", "noisy", PaperPresetName]
 """Regularisers for each kind of prior (`g2ard.stages.recover.anchors`)."""
 
-Engine = Literal["fused", "torch", "gsplat"]
+Engine = Literal["fused", "torch"]
 """Engines that run recovery's steps (`g2ard.stages.recover.engine`)."""
 ENGINES: tuple[Engine, ...] = get_args(Engine)
 

@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard.io.reports import Report
-from g2ard.rendering.cuda import CudaRenderer
 from g2ard.rendering.renderer import Renderer
 from g2ard.rendering.targets import Exposed, Targets, against_of, alpha_of, mask_of
 from g2ard.scene.samples import evenly_spaced
@@ -117,7 +116,7 @@ def _moments(image: NDArray[np.float32], targets: Targets, view: int, background
     return Moments(normal, right, total(missing**2), int(counts.sum(dtype=np.int64)) // 3)
 
 
-def rendered(renderer: Renderer | CudaRenderer, targets: Targets, view: int) -> NDArray[np.float32]:
+def rendered(renderer: Renderer, targets: Targets, view: int) -> NDArray[np.float32]:
     """Render a view of targets, clipped to [0, 1]; with `Exposed` targets, after the gain and offset of each
     channel that fit it best to its photo."""
     if not isinstance(targets, Exposed) or against_of(targets, view) != "photo":

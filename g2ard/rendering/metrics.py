@@ -107,7 +107,6 @@ class Lpips:
         scaled: map images from [0, 1] to [−1, 1], the range the networks were fitted for. False passes them
             unscaled, as 3DGS's evaluation does (graphdeco-inria/gaussian-splatting#1239). Scores of the two
             are not comparable.
-        device: torch's device to compute on.
 
     Raises:
         InputError: missing weights.
@@ -120,17 +119,13 @@ class Lpips:
         linear: dict[str, Any],
         *,
         scaled: bool = True,
-        device: str = "cpu",
     ) -> None:
-        self.net, self.scaled, self.device = net, scaled, device
+        self.net, self.scaled = net, scaled
         try:
             self._layers = {
-                i: [backbone[f"features.{i}.{name}"].to(device) for name in ("weight", "bias")]
-                for i in _CONV[net]
+                i: [backbone[f"features.{i}.{name}"] for name in ("weight", "bias")] for i in _CONV[net]
             }
-            self._linear = [
-                linear[f"lin{i}.model.1.weight"].reshape(1, -1, 1, 1).to(device) for i in range(5)
-            ]
+            self._linear = [linear[f"lin{i}.model.1.weight"].reshape(1, -1, 1, 1) for i in range(5)]
         except KeyError as error:
             raise InputError(f"LPIPS {net}: the weights lack {error}") from None
 
@@ -149,9 +144,9 @@ class Lpips:
         import torch
         from torch.nn import functional
 
-        x = torch.from_numpy(np.ascontiguousarray(image.transpose(2, 0, 1)))[None].to(self.device)
+        x = torch.from_numpy(np.ascontiguousarray(image.transpose(2, 0, 1)))[None]
         x = 2 * x - 1 if self.scaled else x
-        mean, std = (torch.tensor(v, device=self.device).reshape(1, 3, 1, 1) for v in (_MEAN, _STD))
+        mean, std = (torch.tensor(v).reshape(1, 3, 1, 1) for v in (_MEAN, _STD))
         x = (x - mean) / std
         taps = []
         for i in range(_TAPS[self.net][-1] + 1):
@@ -168,7 +163,7 @@ class Lpips:
         return taps
 
 
-def load_lpips(folder: Path, *, scaled: bool = True, device: str = "cpu") -> dict[str, Lpips]:
+def load_lpips(folder: Path, *, scaled: bool = True) -> dict[str, Lpips]:
     """Load the networks whose weights are in a folder: alexnet*.pth with alex.pth, vgg16*.pth with vgg.pth.
 
     The first of each pair holds torchvision's ImageNet weights, the second LPIPS's linear layers (v0.1).
@@ -191,7 +186,7 @@ def load_lpips(folder: Path, *, scaled: bool = True, device: str = "cpu") -> dic
                 files.append(torch.load(path, map_location="cpu", weights_only=True))
             except Exception as error:  # torch raises any exception from unpickling
                 raise InputError(f"not a torch state dict ({type(error).__name__})", path=path) from None
-        out[net] = Lpips(net, files[0], files[1], scaled=scaled, device=device)
+        out[net] = Lpips(net, files[0], files[1], scaled=scaled)
     if not out:
         raise InputError(
             "no LPIPS weights (alexnet*.pth and alex.pth, or vgg16*.pth and vgg.pth)", path=folder

@@ -15,10 +15,9 @@ from g2ard.errors import InputError
 from g2ard.io.images import as_saved
 from g2ard.io.reports import Report
 from g2ard.progress import Progress, plural, silent
-from g2ard.rendering.cuda import renderer_on
 from g2ard.rendering.exposure import rendered
 from g2ard.rendering.metrics import Lpips, edge_psnr, psnr, ssim
-from g2ard.rendering.renderer import RasterSettings
+from g2ard.rendering.renderer import RasterSettings, Renderer
 from g2ard.rendering.targets import Targets, against_of, checked_targets, fill, mask_of, scored_in
 from g2ard.scene.cameras import USUAL
 from g2ard.scene.splats import Splats
@@ -133,7 +132,6 @@ def evaluate(
     lpips: Mapping[str, Lpips] | None = None,
     settings: RasterSettings | None = None,
     eight_bit: bool = False,
-    device: str = "cpu",
     progress: Progress = silent,
     stage: str = "evaluate",
 ) -> Evaluation:
@@ -153,7 +151,6 @@ def evaluate(
         settings: the renderer's conventions; None means gsplat's. Teacher renders have their own, see
             `g2ard.rendering.targets.TeacherRenders`.
         eight_bit: round renders and targets to multiples of 1/255, as in evaluations from saved PNGs.
-        device: "cuda" renders with gsplat on an NVIDIA GPU, unless `settings` ask for INRIA's conventions.
         progress: called after each view.
         stage: stage name for progress.
 
@@ -175,7 +172,7 @@ def evaluate(
     targets = checked_targets(targets)
     cameras = targets.cameras
     fill(targets, progress)
-    renderer = renderer_on(device, splats, background, settings)
+    renderer = Renderer(splats, background=background, settings=settings)
 
     def score(view: int) -> ViewScore:
         name = cameras.names[view]

@@ -12,10 +12,10 @@ import torch
 
 from benchmarks.baselines import mcmc
 from g2ard.errors import InputError
-from g2ard.rendering import cuda
 from g2ard.rendering.targets import TeacherRenders
 from g2ard.scene.transform import transform
 from g2ard.stages.evaluate import evaluate
+from g2ard.stages.recover import losses
 from helpers.raster_cases import gsplat_rasterization
 from helpers.scenes import around, checkered_ball
 from helpers.studies import ball_of, measured
@@ -61,8 +61,8 @@ class Strategy:
 def gsplat(monkeypatch: pytest.MonkeyPatch) -> list[Strategy]:
     stand_in = SimpleNamespace(rasterization=gsplat_rasterization, MCMCStrategy=Strategy)
     monkeypatch.setitem(sys.modules, "gsplat", stand_in)
-    monkeypatch.setattr(cuda, "check_cuda", lambda: None)
-    monkeypatch.setattr(cuda, "DEVICE", "cpu")
+    monkeypatch.setattr(mcmc, "has_gsplat", lambda: True)
+    monkeypatch.setattr(mcmc, "DEVICE", "cpu")
     monkeypatch.setattr(Strategy, "made", [])
     return Strategy.made
 
@@ -78,8 +78,8 @@ def test_the_study_scores_training_like_recovery(tmp_path: Path) -> None:
 
 def test_gsplat_is_called_as_documented(gsplat: list[Strategy]) -> None:
     """Only the rasteriser differs, given the same noise and no relocation."""
-    first, _ = mcmc.train(BALL, 30, TARGETS, 1, engine="gsplat")
-    done, seconds = mcmc.train(BALL, 30, TARGETS, 18, engine="gsplat")
+    first, _ = mcmc.train(BALL, 30, TARGETS, 1, gsplat=True)
+    done, seconds = mcmc.train(BALL, 30, TARGETS, 18, gsplat=True)
     assert (gsplat[-1].cap_max, gsplat[-1].refine_stop_iter) == (30, 15)
     assert (len(done), done.sh_degree) == (30, 3)
     assert seconds > 0
@@ -87,6 +87,26 @@ def test_gsplat_is_called_as_documented(gsplat: list[Strategy]) -> None:
     rates = gsplat[-1].rates
     assert rates[-1] == pytest.approx(0.01 * 1.76e-4)
     assert np.allclose(np.diff(np.log(rates)), np.log(0.01) / 18)
+
+
+def test_the_loss_in_plain_torch_is_the_fused_one() -> None:
+    torch.manual_seed(0)
+    target = torch.rand(37, 53, 3)
+    mixed = 0.7 * target + 0.3 * torch.rand(37, 53, 3)
+    found = []
+    for loss in (losses.l1_ssim, mcmc.l1_ssim):
+        image = mixed.clone().requires_grad_()
+        value = loss(image, target, 0.3)
+        value.backward()
+        found.append((value.detach(), image.grad))
+    torch.testing.assert_close(found[0][0], found[1][0], rtol=0, atol=1e-6)
+    torch.testing.assert_close(found[0][1], found[1][1], rtol=1e-3, atol=1e-8)
+
+
+def test_gsplat_without_a_gpu_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(mcmc, "find_spec", lambda name: None)
+    with pytest.raises(InputError, match="gsplat needs an NVIDIA GPU"):
+        mcmc.train(BALL, 30, TARGETS, 1, gsplat=True)
 
 
 @pytest.mark.parametrize("copies", [1, 2, 3, 7, 51])

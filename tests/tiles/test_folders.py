@@ -218,7 +218,7 @@ def test_several_whole_options_are_named_together(command_line: CommandLine, pla
     assert "tiles: --clean and --photos need the whole scene in memory" in told
     assert "use `g2ard ingest tiles -o DIR --tile-rows 1,600` for one piece" in told
     assert needs_whole(DistillOptions().config) == []
-    assert needs_whole(DistillOptions(settings={"engine": "gsplat"}).config) == ["--engine"]
+    assert needs_whole(DistillOptions(settings={"engine": "torch"}).config) == ["--engine"]
 
 
 def test_rows_of_tiles_that_lie_in_a_folder_are_theirs(command_line: CommandLine, place: Path) -> None:

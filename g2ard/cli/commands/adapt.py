@@ -20,7 +20,6 @@ _FIELDS = "steps tolerance schedule prior_views sh_degree engine background seed
 @command(
     "adapt",
     example="g2ard adapt small.ply --views winter/ -o winter.ply",
-    cuda=True,
     settings="g2ard.pipeline.adapt:AdaptConfig",
     fields=tuple(f"adapt.{name}" for name in _FIELDS.split()),
     scenes=True,
@@ -51,7 +50,7 @@ def adapt(
         run.refuse_typed("with --teacher, unless --photos is given", "images", "alpha")
     background = opt.background_of(run, background, compact)
     settings, _ = run.settled(AdaptConfig(), preset)
-    opt.choose_engine(run, settings, "adapt.engine")
+    opt.check_engine(settings.get("adapt.engine"))
     config = configured(AdaptConfig(), preset or "auto", settings)
     work = checkpoint_beside(output, ".work")
     if not dry_run:

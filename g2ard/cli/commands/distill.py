@@ -19,7 +19,6 @@ from g2ard.io import kind
 @command(
     "distill",
     example="g2ard distill scene.ply -r 10 -o run/",
-    cuda=True,
     settings="g2ard.pipeline.config:DistillConfig",
     fields=(
         *("simplify.method", "simplify.keep_region", "select.focus"),
@@ -99,7 +98,7 @@ def distill(
         run.refuse_typed("on given views", "views_format")
     if scene is None or photos:
         run.refuse_typed("without generated views", "up")
-    opt.choose_engine(run, settings, "recover.engine")
+    opt.check_engine(settings.get("recover.engine"))
     refuse_file(output, f"the scene in it is scene.{format}")
     run.claim("--output", output, folder=True)
     folder = RunFolder(run, output, f"scene.{format}", resume)

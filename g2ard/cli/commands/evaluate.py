@@ -23,7 +23,6 @@ if TYPE_CHECKING:
 @command(
     "evaluate",
     example="g2ard evaluate small.ply --views poses.json --teacher scene.ply --json -",
-    cuda=True,
     scenes=True,
 )
 def evaluate(
@@ -89,9 +88,6 @@ def evaluate(
     else:
         with run.usage():
             check_teacher(views, teacher)
-    device = "cuda" if run.device == "cuda" else "cpu"
-    if device == "cuda":
-        opt.use_cuda(run)
     given = opt.with_images(views, images, alpha) if own is None else own.views
     for path in scenes:
         check_scene(path)
@@ -118,7 +114,7 @@ def evaluate(
     targets = scorable(teaching.targets(full.resized(size), settings=settings), run.say)
     unshrunk = teaching.full_size(full, size, settings=settings)
     cameras = targets.cameras
-    networks = load_lpips(lpips, scaled=lpips_input == "scaled", device=device) if lpips else None
+    networks = load_lpips(lpips, scaled=lpips_input == "scaled") if lpips else None
     rows: list[dict[str, Any]] = []
     found = []
     for path in scenes:
@@ -133,7 +129,6 @@ def evaluate(
             lpips=networks,
             settings=settings,
             eight_bit=eight_bit,
-            device=device,
             progress=run.progress,
         )
         scored = alike(targets, stage=path.name)

@@ -146,24 +146,8 @@ def _devices(run: Run) -> None:
     rows.append(["--device gpu", used["gpu"] or "the CPU"])
     probed = f"{real} for scenes of at least 200,000 rows, if a test run is correct and faster than the CPU"
     rows.append(["--device auto", probed if real else "the CPU"])
-    cuda = _cuda()
-    rows.append(["--device cuda", cuda or "not available: needs an NVIDIA GPU, torch with CUDA and gsplat"])
     _show(run, "What --device takes", rows)
-    run.result({"adapters": [asdict(a) for a in found or ()], "used": {**used, "cpu": "CPU", "cuda": cuda}})
-
-
-def _cuda() -> str | None:
-    """Return the name of the GPU that --device cuda uses, None without one."""
-    from g2ard.errors import G2ardError
-
-    try:
-        from g2ard.rendering.cuda import check_cuda
-
-        check_cuda("device")
-        import torch
-    except (G2ardError, ImportError):
-        return None
-    return str(torch.cuda.get_device_name())
+    run.result({"adapters": [asdict(a) for a in found or ()], "used": {**used, "cpu": "CPU"}})
 
 
 def _show(run: Run, title: str, rows: list[list[str]]) -> None:

@@ -19,7 +19,6 @@ _FIELDS = "schedule steps recovery_time sh_degree engine background seed"
 @command(
     "recover",
     example="g2ard recover small.ply --views poses.json --teacher scene.ply -o better.ply",
-    cuda=True,
     settings="g2ard.stages.recover:RecoverConfig",
     fields=tuple(f"recover.{name}" for name in _FIELDS.split()),
     scenes=True,
@@ -64,7 +63,7 @@ def recover(
     checkpoint = checkpoint_beside(output, ".checkpoint.npz")
     if not dry_run:
         check_scene_run(run, checkpoint, resume, output)
-    opt.choose_engine(run, settings, "recover.engine")
+    opt.check_engine(settings.get("recover.engine"))
     job = prepare(
         student,
         views=opt.with_images(views, images, alpha),

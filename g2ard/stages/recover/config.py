@@ -270,8 +270,7 @@ class FitConfig(Settings):
         background: RGB behind the scene.
         seed: seed of the order of views.
         engine: "fused" runs whole steps in Rust, or on the GPU in use; "torch" uses autograd over the Rust
-            rasteriser and `SelectiveAdam`, with equal results up to rounding; "gsplat" is the same on an
-            NVIDIA GPU.
+            rasteriser and `SelectiveAdam`, with equal results up to rounding.
 
     Raises:
         InputError: a value out of range.

@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 import g2ard.stages.recover.checkpoint as checkpoints
-from g2ard.config.choices import ENGINES
 from g2ard.errors import DeviceError, InputError, require, require_torch
 from g2ard.progress import Progress, silent
 from g2ard.rendering.exposure import exposures_of, unexposed
@@ -385,17 +384,10 @@ def _engine_class(name: str) -> type[Engine]:
     """Return the engine class of a name in `RecoverConfig.engine`, importing its packages on demand."""
     if name == "fused":
         return FusedEngine
-    if name == "torch":
-        require_torch("engine 'torch'")
-        from g2ard.stages.recover.torch_engine import TorchEngine
+    require_torch("engine 'torch'")
+    from g2ard.stages.recover.torch_engine import TorchEngine
 
-        return TorchEngine
-    if name == "gsplat":
-        require_torch("engine 'gsplat'", "torch gsplat")
-        from g2ard.stages.recover.torch_engine import GsplatEngine
-
-        return GsplatEngine
-    raise InputError(f"expected {', '.join(ENGINES)}, got {name!r}", parameter="engine")
+    return TorchEngine
 
 
 def checked_weights(weights: ArrayLike | None, count: int) -> NDArray[np.float64] | None:

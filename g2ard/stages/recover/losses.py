@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn.functional import conv2d, normalize
+from torch.nn.functional import normalize
 
 from g2ard import _core
 from g2ard.errors import require
@@ -64,10 +64,6 @@ def rotations(quats: Tensor) -> Tensor:
     return torch.stack([torch.stack(row, 1) for row in rows], 1)
 
 
-_SSIM_WINDOW, _SSIM_SIGMA = 11, 1.5
-_SSIM_C1, _SSIM_C2 = 0.01**2, 0.03**2
-
-
 class _L1Ssim(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, image: Tensor, target: Tensor, ssim_weight: float, mask: Tensor | None) -> Tensor:
@@ -102,36 +98,6 @@ def l1_ssim(image: Tensor, target: Tensor, ssim_weight: float = 0.2, mask: Tenso
         require(name, given, fits, "(H, W, C) float32 on the CPU")
     loss: Tensor = _L1Ssim.apply(image, target, ssim_weight, mask)
     return loss
-
-
-def l1_ssim_anywhere(
-    image: Tensor, target: Tensor, ssim_weight: float = 0.2, mask: Tensor | None = None
-) -> Tensor:
-    """Compute `l1_ssim` with torch operations, on any device."""
-    counts = torch.ones_like(image[..., 0], dtype=torch.bool) if mask is None else mask
-    x, y = (torch.where(counts, t.permute(2, 0, 1), 0.0)[:, None] for t in (image, target))
-    offsets = torch.arange(_SSIM_WINDOW, device=image.device, dtype=image.dtype) - _SSIM_WINDOW // 2
-    weights = torch.exp(-(offsets**2) / (2 * _SSIM_SIGMA**2))
-    weights = weights / weights.sum()
-
-    def summed(t: Tensor) -> Tensor:
-        t = conv2d(t, weights.view(1, 1, 1, -1), padding=(0, _SSIM_WINDOW // 2))
-        return conv2d(t, weights.view(1, 1, -1, 1), padding=(_SSIM_WINDOW // 2, 0))
-
-    # Without a mask, pixels beyond the edge are black and count; with one they have no part.
-    inside = None if mask is None else summed(counts.to(image.dtype)[None, None]).where(counts, 1.0)
-
-    def blurred(t: Tensor) -> Tensor:
-        return summed(t) if inside is None else summed(t) / inside
-
-    mean_x, mean_y = blurred(x), blurred(y)
-    var_x = (blurred(x * x) - mean_x**2).clamp_min(0)
-    var_y = (blurred(y * y) - mean_y**2).clamp_min(0)
-    both = blurred(x * y) - mean_x * mean_y
-    above = (2 * mean_x * mean_y + _SSIM_C1) * (2 * both + _SSIM_C2)
-    ssim = above / ((mean_x**2 + mean_y**2 + _SSIM_C1) * (var_x + var_y + _SSIM_C2))
-    loss = (1 - ssim_weight) * (x - y).abs() + ssim_weight * (1 - ssim)
-    return torch.where(counts, loss, 0.0).sum() / (counts.sum().clamp_min(1) * len(x))
 
 
 def anchor_loss(means: Tensor, anchors: Anchors) -> Tensor:

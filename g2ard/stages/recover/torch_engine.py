@@ -1,4 +1,4 @@
-"""Engine in torch: autograd over the Rust rasteriser, or gsplat's on an NVIDIA GPU; Adam by rows."""
+"""Engine in torch: autograd over the Rust rasteriser; Adam by rows."""
 
 import math
 from collections.abc import Iterator, Mapping
@@ -12,16 +12,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from g2ard import _core
-from g2ard.rendering.cuda import DEVICE, check_cuda, rasterized
 from g2ard.scene.splats import Splats
 from g2ard.stages.recover.config import Rates
 from g2ard.stages.recover.engine import LEAST_LOSS, TYPICAL_LOSS, Objective, radii
-from g2ard.stages.recover.losses import extents, l1_ssim, l1_ssim_anywhere, regularization, share_of_rate
+from g2ard.stages.recover.losses import extents, l1_ssim, regularization, share_of_rate
 from g2ard.stages.recover.rasterize import rasterize
-
-_BETAS, _EPS = (0.9, 0.999), 1e-15
-_LARGEST_GRADIENT = 1e18
-"""Largest gradient whose square fits float32."""
 
 
 class SelectiveAdam:
@@ -29,8 +24,8 @@ class SelectiveAdam:
 
     A row whose gradients are all zero keeps its values and moments, and each row has its own step count t: p
     ← p − lr · m/(1 − β₁ᵗ) / (√(v/(1 − β₂ᵗ)) + ε), with the bias terms in float64. A row with a gradient that
-    is not finite, or over 1e18, is skipped too, and counted. On the CPU a step is one pass in Rust, with the
-    bits of any number of threads.
+    is not finite, or over 1e18, is skipped too, and counted. A step is one pass in Rust, with the bits of any
+    number of threads.
 
     Args:
         parameters: (N, …) tensors by name.
@@ -48,7 +43,7 @@ class SelectiveAdam:
             f"{key}.{name}": torch.zeros_like(p) for name, p in parameters.items() for key in "mv"
         }
         first = next(iter(parameters.values()))
-        self.counts = torch.zeros(len(first), dtype=torch.int64, device=first.device)
+        self.counts = torch.zeros(len(first), dtype=torch.int64)
 
     @torch.no_grad()
     def step(self, rates: Mapping[str, float], shares: Mapping[str, Tensor]) -> None:
@@ -58,9 +53,6 @@ class SelectiveAdam:
             rates: learning rate of each parameter.
             shares: factors on the rates of some parameters, per row or value.
         """
-        if self.counts.device.type != "cpu":
-            self._step_in_torch(rates, shares)
-            return
         rows = [self._arrays(name, rates[name], shares.get(name)) for name in self._parameters]
         self.skipped += _core.adam_rows(rows, self.counts.numpy())
 
@@ -70,27 +62,6 @@ class SelectiveAdam:
         assert p.grad is not None
         held = (t.numpy() for t in (p.detach(), m, v, p.grad.contiguous()))
         return *held, rate, None if share is None else share.contiguous().numpy()
-
-    def _step_in_torch(self, rates: Mapping[str, float], shares: Mapping[str, Tensor]) -> None:
-        """Take the kernel's step with torch's operations, for GPUs."""
-        grads = {name: p.grad for name, p in self._parameters.items() if p.grad is not None}
-        flat = [grad.flatten().view(len(grad), -1) for grad in grads.values()]
-        touched = torch.stack([(grad != 0).any(1) for grad in flat]).any(0)
-        sound = torch.stack([(grad.abs() <= _LARGEST_GRADIENT).all(1) for grad in flat]).all(0)
-        self.skipped += int((touched & ~sound).sum())
-        rows = (touched & sound).nonzero()[:, 0]
-        self.counts[rows] += 1
-        (beta1, beta2), p = _BETAS, self._parameters
-        for name in grads:
-            grad, m, v = grads[name][rows], self.moments[f"m.{name}"], self.moments[f"v.{name}"]
-            steps = self.counts[rows].double().reshape(-1, *[1] * (grad.ndim - 1))
-            bias1, bias2 = ((1 / (1 - beta**steps)).to(grad.dtype) for beta in (beta1, beta2))
-            m[rows] = m[rows].lerp_(grad, 1 - beta1)
-            v[rows] = v[rows].mul_(beta2).addcmul_(grad, grad, value=1 - beta2)
-            step = (m[rows] * bias1) / ((v[rows] * bias2).sqrt_() + _EPS)
-            if name in shares:
-                step *= shares[name][rows]
-            p[name][rows] -= rates[name] * step
 
 
 @contextmanager
@@ -112,19 +83,16 @@ class TorchEngine:
     """`FusedEngine` in torch, with the moments of `SelectiveAdam`.
 
     With `means_in_scales` the means are optimised as multiples of each Gaussian's initial radius (`radii`):
-    Adam ignores the scale of gradients, so a rate of 0.05 moves a Gaussian by 5 % of its size. Subclasses
-    replace rendering, loss and device.
+    Adam ignores the scale of gradients, so a rate of 0.05 moves a Gaussian by 5 % of its size.
     """
-
-    device = torch.device("cpu")
 
     def __init__(self, objective: Objective) -> None:
         self._objective = objective
         splats = objective.start
         self._settings = objective.settings
-        self._base = torch.from_numpy(splats.means.astype(np.float32)).to(self.device)
+        self._base = torch.from_numpy(splats.means.astype(np.float32))
         unit = radii(splats) if objective.means_in_scales else np.ones(len(splats), np.float32)
-        self._unit = torch.from_numpy(unit[:, None]).to(self.device)
+        self._unit = torch.from_numpy(unit[:, None])
         start = {
             "means": np.zeros((len(splats), 3), np.float32),
             "log_scales": splats.log_scales,
@@ -134,8 +102,7 @@ class TorchEngine:
             "shN": splats.shN,
         }
         self._parameters = {
-            name: torch.from_numpy(array.copy()).to(self.device).requires_grad_()
-            for name, array in start.items()
+            name: torch.from_numpy(array.copy()).requires_grad_() for name, array in start.items()
         }
         self._adam = SelectiveAdam({name: p for name, p in self._parameters.items() if p.numel()})
 
@@ -153,8 +120,8 @@ class TorchEngine:
         p = self._parameters
         means = self._base + self._unit * p["means"]
         image = self._render(means, view)
-        counts = None if mask is None else torch.from_numpy(mask).to(self.device)
-        loss = self._loss(image, torch.from_numpy(target).to(self.device), counts)
+        counts = None if mask is None else torch.from_numpy(mask)
+        loss = l1_ssim(image, torch.from_numpy(target), self._objective.ssim_weight, counts)
         total = loss
         if self._objective.relative:
             total = total * (TYPICAL_LOSS / max(float(loss.detach()), LEAST_LOSS))
@@ -188,14 +155,11 @@ class TorchEngine:
             settings=self._settings,
         )[0]
 
-    def _loss(self, image: Tensor, target: Tensor, mask: Tensor | None) -> Tensor:
-        return l1_ssim(image, target, self._objective.ssim_weight, mask)
-
     def splats(self) -> Splats:
-        p = {name: value.detach().cpu() for name, value in self._parameters.items()}
+        p = {name: value.detach() for name, value in self._parameters.items()}
         return replace(
             self._objective.start,
-            means=(self._base.cpu() + self._unit.cpu() * p["means"]).numpy().copy(),
+            means=(self._base + self._unit * p["means"]).numpy().copy(),
             quats=torch.nn.functional.normalize(p["quats"], dim=1).numpy().copy(),
             scales=p["log_scales"].double().exp().float().numpy(),
             logit_opacities=p["logit_opacities"].numpy().copy(),
@@ -204,17 +168,17 @@ class TorchEngine:
         )
 
     def state(self) -> dict[str, NDArray[Any]]:
-        arrays = {f"p.{name}": value.detach().cpu().numpy() for name, value in self._parameters.items()}
-        arrays["base"], arrays["unit"] = self._base.cpu().numpy(), self._unit.cpu().numpy()
+        arrays = {f"p.{name}": value.detach().numpy() for name, value in self._parameters.items()}
+        arrays["base"], arrays["unit"] = self._base.numpy(), self._unit.numpy()
         arrays["skipped"], arrays["counts"] = np.array(self._adam.skipped), self.counts
-        return arrays | {name: moment.cpu().numpy() for name, moment in self._adam.moments.items()}
+        return arrays | {name: moment.numpy() for name, moment in self._adam.moments.items()}
 
     def load(self, state: dict[str, NDArray[Any]]) -> None:
         with torch.no_grad():
             for name, parameter in self._parameters.items():
                 parameter.copy_(torch.from_numpy(state[f"p.{name}"]))
-        self._base = torch.from_numpy(state["base"]).to(self.device)
-        self._unit = torch.from_numpy(state["unit"]).to(self.device)
+        self._base = torch.from_numpy(state["base"])
+        self._unit = torch.from_numpy(state["unit"])
         self._adam.skipped = int(state["skipped"])
         self._adam.counts.copy_(torch.from_numpy(state["counts"]))
         for name, moment in self._adam.moments.items():
@@ -222,25 +186,8 @@ class TorchEngine:
 
     @property
     def counts(self) -> NDArray[Any]:
-        return self._adam.counts.cpu().numpy()
+        return self._adam.counts.numpy()
 
     @property
     def skipped(self) -> int:
         return self._adam.skipped
-
-
-class GsplatEngine(TorchEngine):
-    """`TorchEngine` on the GPU; gsplat adds gradients atomically, so runs differ in the last bits."""
-
-    device = torch.device(DEVICE)
-
-    def __init__(self, objective: Objective) -> None:
-        check_cuda()
-        super().__init__(objective)
-
-    def _render(self, means: Tensor, view: int) -> Tensor:
-        objective, parameters = self._objective, {**self._parameters, "means": means}
-        return rasterized(parameters, objective.cameras, view, objective.background, self._settings)
-
-    def _loss(self, image: Tensor, target: Tensor, mask: Tensor | None) -> Tensor:
-        return l1_ssim_anywhere(image, target, self._objective.ssim_weight, mask)
