@@ -25,7 +25,7 @@ USED: dict[str, tuple[str, ...]] = {
         *("scale", "rotate", "translate", "from_axes", "to_axes"),
     ),
     "clean": ("output", "only", "strength", "split_sky", "preview", "dry_run", "overwrite"),
-    "poses": ("output", "looks", "kind", "resolution", "fov", "up", "format", "overwrite"),
+    "poses": ("output", "looks", "kind", "size", "fov", "up", "format", "overwrite"),
     "select": ("output", "k", "views", "images", "split", "preset", "format", "overwrite"),
     "render": (
         *("output", "sheet", "looks", "views", "turn"),
@@ -98,18 +98,13 @@ def in_panel(command: str, parameter: Parameter) -> Parameter:
     return parameter.replace(annotation=Annotated[kind, option])
 
 
-_FORMER = {("distill", "--view"): "--page", ("distill", "--no-view"): "--no-page"}
-"""Command and a flag's former spelling → its spelling."""
-
-
 class Command(TyperCommand):
     """A command whose `--help` shows the options people use, and `--help-all` all of them."""
 
     _all = False
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Show all options for `--help-all`; take a flag by its former spelling."""
-        args = [_FORMER.get((str(self.name), word), word) for word in args]
+        """Show all options for `--help-all`."""
         self._all = "--help-all" in args
         if self._all:
             args = ["--help"]

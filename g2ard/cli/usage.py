@@ -58,37 +58,12 @@ def meant(words: Iterable[str], known: Iterable[str]) -> str:
     return ", ".join(told)
 
 
-RENAMED = {
-    ("register", "--photos"): "--images",
-    ("poses", "-n"): "-k",
-    ("poses", "--count"): "-k",
-    ("poses", "--size"): "--resolution",
-    ("compare", "-n"): "-k",
-    ("compare", "--count"): "-k",
-    ("render", "-n"): "-k",
-    ("render", "--count"): "-k",
-}
-"""Command and an option's former spelling → its spelling."""
-
-
-def _renamed(error: Any) -> str | None:
-    """Return the message for an option that has another name now, if it is one."""
-    option, command = (
-        getattr(error, "option_name", None),
-        getattr(getattr(error, "ctx", None), "info_name", None),
-    )
-    found = RENAMED.get((str(command), str(option)))
-    return found and f"{option} is now {found}"
-
-
 def usage_line(error: typer.TyperException) -> str:
     """Return the line for a usage error: typer's message, or a shorter one for an invalid value."""
     refused = getattr(error.__cause__, "errors", None)
     parameter: Any = getattr(error, "param", None)
     if type(error).__name__ == "MissingParameter" and (missing := _missing(error)):
         return f"missing {' and '.join(missing)}"
-    if (renamed := _renamed(error)) is not None:
-        return renamed
     if (long := _of_one_dash(error)) is not None:
         return f"{long[1:]}: long options need two dashes; write {long}"
     if isinstance(error, typer.BadParameter) and parameter is None:  # a check of several options at once

@@ -56,8 +56,8 @@ def test_keys_above_tables_apply_to_every_command(command_line: CommandLine, fol
         ("distill ball.ply -r 9 -o run --recovery-time 2m", {"recovery-time": 120}),
         ("info ball.ply views.json", {"paths": ["ball.ply", "views.json"]}),
         (
-            "poses ball.ply -o p.json --resolution 320x240 --up 0,0,1",
-            {"resolution": "320x240", "up": [0, 0, 1]},
+            "poses ball.ply -o p.json --size 320x240 --up 0,0,1",
+            {"size": "320x240", "up": [0, 0, 1]},
         ),
         (
             "distill ball.ply -o run -n 50 --keep-region 0,0,.5,1 --keep-region 1,2,3,4",

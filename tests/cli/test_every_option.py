@@ -164,7 +164,7 @@ OPTIONS: dict[str, dict[str, str]] = {
     "poses": {
         **_common("format looks up"),
         "kind": "--kind aerial",
-        "resolution": "--resolution 64x48",
+        "size": "--size 64x48",
         "fov": "--fov 30",
     },
     "select": {

@@ -10,7 +10,6 @@ import pytest
 import g2ard
 from g2ard.cli.app import COMMANDS
 from g2ard.cli.panels import USED
-from g2ard.cli.usage import RENAMED
 from helpers.commands import CommandLine, refused, succeeds
 from helpers.project import ROOT
 from helpers.scenes import checkered_ball
@@ -91,19 +90,6 @@ def test_options_without_effect_are_left_out() -> None:
     for command in COMMANDS:  # whatever takes a seed uses it
         text = (ROOT / "g2ard" / "cli" / "commands" / f"{command}.py").read_text(encoding="utf-8")
         assert ("seed" in options_of(command)) == ("seed" in text.replace('without=("seed"', "")), command
-
-
-def test_a_flag_is_taken_by_its_former_spelling(command_line: CommandLine, tmp_path: Path) -> None:
-    for flag, page in (("--no-view", False), ("--view", True)):
-        ask = ("distill", "x.ply", "-r", 2, "-o", "run", flag, "--print-config")
-        assert f"page = {str(page).lower()}" in succeeds(command_line, tmp_path, *ask).out
-
-
-@pytest.mark.parametrize(("command", "old"), RENAMED)
-def test_a_renamed_option_is_named(command: str, old: str, command_line: CommandLine, tmp_path: Path) -> None:
-    new = RENAMED[command, old]
-    assert any(new in (*p.opts, *p.secondary_opts) for p in options_of(command).values())
-    assert f"{old} is now {new}" in refused(command_line, tmp_path, command, "a.ply", old, "5")
 
 
 def test_lines_of_the_list_are_those_of_the_commands() -> None:

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from g2ard.errors import InputError
-from g2ard.io import read_splats, write_splats
+from g2ard.io import read_splats, read_views, write_splats
 from g2ard.poses import make_pool, plan_pool
 from g2ard.poses.numbers import fibonacci
 from g2ard.poses.sight import Poses, Survey
@@ -264,7 +264,7 @@ def test_invisible_scenes_are_refused(splats) -> None:
 
 
 @pytest.mark.parametrize(
-    "wrong", [("-k", "0"), ("--kind", "spiral"), ("--resolution", "800"), ("--up", "0,0"), ("--up", "0,0,0")]
+    "wrong", [("-k", "0"), ("--kind", "spiral"), ("--size", "800x"), ("--up", "0,0"), ("--up", "0,0,0")]
 )
 def test_command_usage(wrong, command_line: CommandLine, tmp_path: Path) -> None:
     status, _, error = command_line("poses", "scene.ply", "-o", "p.json", *wrong, cwd=tmp_path)
@@ -272,6 +272,17 @@ def test_command_usage(wrong, command_line: CommandLine, tmp_path: Path) -> None
     assert len(error.strip().splitlines()) == 1
     assert wrong[0] in error
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(("size", "pixels"), [(None, (800, 600)), ("64", (64, 48)), ("48x64", (48, 64))])
+def test_size_is_a_longer_side_or_both(
+    size: str | None, pixels: tuple[int, int], command_line: CommandLine, tmp_path: Path
+) -> None:
+    write_splats(tmp_path / "scene.ply", one())
+    given = () if size is None else ("--size", size)
+    assert command_line("poses", "scene.ply", "-k", "2", *given, "-o", "p.json", cwd=tmp_path)[0] == 0
+    views = read_views(tmp_path / "p.json")
+    assert {*zip(views.widths.tolist(), views.heights.tolist(), strict=True)} == {pixels}
 
 
 def test_threads_do_not_matter(scenes, tmp_path: Path) -> None:

@@ -1,33 +1,16 @@
 """`g2ard poses`: scene → generated views."""
 
-import re
 from typing import Annotated
 
 import typer
 
 from g2ard.cli.frame import Run, command
-from g2ard.cli.options import OutputOption, SceneArgument, UpOption, ViewFormatOption
+from g2ard.cli.options import OutputOption, SceneArgument, ShapeOption, UpOption, ViewFormatOption
 from g2ard.config.choices import PoolKind
 from g2ard.progress import direction, plural
 
 _LEAST_REPORTED_SHARE = 0.005
 """Share of the scene too small to report."""
-
-
-class _Size(tuple[int, int]):
-    """Width and height in one argument (see `g2ard.cli.options.Triple`)."""
-
-    def __str__(self) -> str:
-        return f"{self[0]}x{self[1]}"
-
-
-def _size(text: str) -> _Size:
-    match = re.fullmatch(r"(\d+)[x×](\d+)", text.strip())
-    if match is None or not all(16 <= int(side) <= 16384 for side in match.groups()):
-        raise typer.BadParameter(
-            f"expected WIDTHxHEIGHT from 16 to 16384 pixels, such as 800x600, got {text!r}"
-        )
-    return _Size((int(match[1]), int(match[2])))
 
 
 @command("poses", example="g2ard poses scene.ply -k 128 -o poses.json", scenes=True)
@@ -43,10 +26,7 @@ def poses(
         ),
     ] = "auto",
     looks: Annotated[int, typer.Option("-k", min=1, metavar="K", help="Views to generate.")] = 128,
-    resolution: Annotated[
-        _Size | None,
-        typer.Option(parser=_size, metavar="WxH", help="Image size, pixels; 800x600 by default."),
-    ] = None,
+    size: ShapeOption = None,
     fov: Annotated[
         float | None,
         typer.Option(
@@ -60,12 +40,13 @@ def poses(
     from g2ard.poses import plan_pool
 
     run.claim_views(output, format)
+    width, height = (800, 600) if size is None else (*size, max(1, round(0.75 * size[0])))[:2]
     splats = run.load(scene)
     pool = plan_pool(
         splats,
         looks,
         kind=kind,
-        size=resolution or (800, 600),
+        size=(width, height),
         fov=fov,
         up=up,
         seed=run.seed,
