@@ -14,12 +14,9 @@ Method = Literal["default", "fast", "paper"]
 """Methods of simplification."""
 METHODS: tuple[Method, ...] = get_args(Method)
 
-Policy = Literal["auto", "directional", "coverage", "pose-diverse", "random", "uniform"]
+Policy = Literal["auto", "directional", "coverage", "pose-diverse", "random"]
 """Policies of view selection."""
 POLICIES: tuple[Policy, ...] = get_args(Policy)
-
-UNMEASURED: tuple[Policy, ...] = ("random", "uniform")
-"""Policies that measure nothing and so cannot tell how many views are enough."""
 
 PoolKind = Literal["auto", "orbit", "walk", "aerial", "inside", "sharp"]
 """Kinds of generated view pools (`g2ard.poses.make_pool`)."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from g2ard.config.checks import AtLeastOne, Within
-from g2ard.config.choices import UNMEASURED, Focus, Policy
+from g2ard.config.choices import Focus, Policy
 from g2ard.config.schema import Settings
 from g2ard.errors import InputError
 from g2ard.stages.lift import LiftConfig
@@ -46,7 +46,7 @@ class SelectConfig(Settings, tag="policy"):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.views_count == "auto" and self.policy in UNMEASURED:
+        if self.views_count == "auto" and self.policy == "random":
             raise InputError(
                 f"policy {self.policy} does not measure gains; pass a count instead of auto",
                 parameter="views_count",
@@ -65,7 +65,7 @@ class SelectConfig(Settings, tag="policy"):
 
 
 @dataclass(frozen=True)
-class Poses(SelectConfig, variants=("auto", "pose-diverse", "random", "uniform")):
+class Poses(SelectConfig, variants=("auto", "pose-diverse", "random")):
     """Settings of policies that need no surface: those of `SelectConfig`."""
 
 

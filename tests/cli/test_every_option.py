@@ -170,7 +170,7 @@ OPTIONS: dict[str, dict[str, str]] = {
     "select": {
         **_common("format views images preset"),
         "k": "-k 5",
-        "policy": "--policy uniform",
+        "policy": "--policy coverage",
         "split": "--split all",
     },
     "render": {

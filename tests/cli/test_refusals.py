@@ -45,7 +45,6 @@ USAGE = [
     ("recover ball.ply -o o.ply --engine gsplat", "expected one of fused, torch (the device gpu runs fused"),
     ("recover ball.ply -o o.ply --device cuda", "--device: expected auto, cpu or gpu, got 'cuda'"),
     ("select absent.ply --views v -k auto -o out --policy random", "policy random does not measure"),
-    ("select absent.ply --views v -k auto -o out --policy uniform", "policy uniform does not measure"),
     ("distill absent.ply -r 2 -o run --set views_count=auto --set policy=random", "does not measure"),
     ("distill --views views.json --renders -n 9 -o run", "--renders needs a SCENE to render"),
     ("distill ball.ply -n 5 -o run --held-out made", "--held-out must be a file of views"),

@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 
 from g2ard.config.checks import checks_arguments
-from g2ard.config.choices import POLICIES, UNMEASURED
+from g2ard.config.choices import POLICIES
 from g2ard.errors import InputError, require
 from g2ard.progress import Progress, plural, silent
 from g2ard.scene.cameras import Cameras, unseeing
@@ -77,7 +77,7 @@ def select(
         policy: one of `POLICIES`. "auto" uses poses only: farthest pose first until all are within reach,
             then facility location Σ_u w_u max_{v∈S} exp(−(d_uv/0.35)²) with crowded poses weighted less.
             "directional" is the paper's. "coverage" counts visible cells. "pose-diverse" takes the farthest
-            pose next. "random" and "uniform" (evenly along the candidates' order) measure nothing.
+            pose next. "random" measures nothing.
         seed: seed of "random".
         options: options of "directional" and "coverage".
         progress: called with the number of views rasterised.
@@ -120,7 +120,7 @@ def select(
         order = poses.facility_location(alike, of_usable, usable, shares)
         gains = poses.gains_of(order, alike, of_usable)
     else:
-        order = _blind(policy, np.flatnonzero(usable), k, seed)
+        order = np.random.default_rng([seed, 7]).permutation(np.flatnonzero(usable))
         gains = poses.gains_of(order, alike, pose_weights)
     if not len(order):
         raise InputError(unseeing(cameras, "a cell of the surface"))
@@ -143,7 +143,7 @@ def select(
 def _check(cameras: Cameras, k: int | Literal["auto"], policy: str, seed: int) -> None:
     """Reject an invalid number or seed, an unknown policy, and candidates that are missing or too large."""
     require("policy", repr(policy), policy in POLICIES, ", ".join(POLICIES))
-    if k == "auto" and policy in UNMEASURED:
+    if k == "auto" and policy == "random":
         raise InputError(f"'auto' needs a policy that measures gains, got {policy!r}", parameter="k")
     require("seed", seed, seed >= 0, "a whole number of at least 0")
     require("k", k, k == "auto" or k >= 1, "at least 1 view")
@@ -156,14 +156,6 @@ def _check(cameras: Cameras, k: int | Literal["auto"], policy: str, seed: int) -
         raise InputError(
             f"view {cameras.names[i]}: expected at most {_LARGEST_VIEW_SIDE} pixels per side, got {size}"
         )
-
-
-def _blind(policy: str, rows: Order, k: int | Literal["auto"], seed: int) -> Order:
-    if policy == "random":
-        return np.random.default_rng([seed, 7]).permutation(rows)
-    count = len(rows) if k == "auto" else min(k, len(rows))
-    chosen = np.floor((np.arange(count) + 0.5) * len(rows) / max(count, 1)).astype(np.int64)
-    return np.concatenate([rows[chosen], np.delete(rows, chosen)])
 
 
 def _knee(gains: Float) -> int:
