@@ -87,7 +87,7 @@ def test_results_print_as_one_short_line() -> None:
         (recovered, "Recovered(1,500 Gaussians, PSNR "),
         (
             g2ard.evaluate(BALL, done.held_out),
-            "Evaluation(1,500 Gaussians, 1 view against teacher renders, 64×48 px: PSNR ",
+            "Evaluation(1,500 Gaussians, 1 view against the dense scene, 64×48 px: PSNR ",
         ),
         (g2ard.render(BALL, views[0]), "Rendered(64 × 48)"),
     ):
@@ -145,7 +145,7 @@ def test_errors_speak_of_parameters(folder: Path) -> None:
     for wrong, words in (
         ({}, "expected exactly one kind of budget"),
         ({"count": 5, "ratio": 2}, "expected exactly one kind of budget"),
-        ({"count": 1501}, "at most its 1,500 Gaussians, got 1,501"),
+        ({"count": 1501}, "at most 1,500, got 1,501"),
         ({"ratio": 0.5}, "ratio: expected a finite number of at least 1"),
         ({"ratio": 2, "method": "magic"}, "method: expected one of default, fast, paper"),
     ):
@@ -153,7 +153,7 @@ def test_errors_speak_of_parameters(folder: Path) -> None:
             with pytest.raises(g2ard.InputError, match=words) as caught:
                 function(BALL, **wrong)
             assert "--" not in str(caught.value)
-    with pytest.raises(g2ard.InputError, match="at most its 1 Gaussian, got 5"):
+    with pytest.raises(g2ard.InputError, match="at most 1, got 5"):
         g2ard.distill(Points(np.zeros((9, 3)), np.zeros((9, 3), "f4")), count=5)
 
 

@@ -20,20 +20,20 @@ from g2ard.cli.resume import (
     kept,
     left_at,
 )
-from g2ard.config.choices import Colour, ViewFormat
+from g2ard.config.choices import BLACK, Colour, ViewFormat
 from g2ard.errors import InputError, OutputError
 from g2ard.io import write_views
 from g2ard.io.atomic import atomic_output, check_output, drop_empty, drop_temporaries
 from g2ard.io.jsonfile import read_json
+from g2ard.io.labels import DENSE, RESULT, labels_of, names_of
 from g2ard.io.lock import check_unlocked, locked
 from g2ard.io.reports import Report, plain
 from g2ard.io.scene_formats import FORMATS
 from g2ard.io.types import ViewSet
 from g2ard.jobs.budget import DEVICES, Budget
 from g2ard.jobs.cost import LARGEST_DENSE
-from g2ard.jobs.viewer_frame import frame_with
+from g2ard.jobs.viewer_frame import backdrop, frame_with
 from g2ard.pipeline.distill import RunViews
-from g2ard.progress import plural
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
 from g2ard.viewer.page import write_page
@@ -176,22 +176,25 @@ class RunFolder:
         write_views(self._scored, scored, splits=["test"] * len(scored), overwrite=True)
 
     def write_pages(
-        self, title: str, job: Any, done: Any, report: RunReport | TiledReport, told: Sequence[str]
+        self, source: Path, job: Any, done: Any, report: RunReport | TiledReport, told: Sequence[str]
     ) -> tuple[RunReport | TiledReport, str]:
         """Write report.html and, in one piece, preview.png and with --page view.html; return the report with
         the size of that page, and a line about it.
 
         Args:
+            source: what was distilled.
             told: the summary that the command prints.
         """
         from g2ard.report.distilled import distill_report, preview, tiled_report
         from g2ard.report.run import TiledReport
 
+        title = f"{names_of([source])[0]}: {report.title}"
         if isinstance(report, TiledReport):
             with self._run.finishing("report.html"):
                 tiled_report(self.path / "report.html", title, report)
             return report, ""
-        scenes = [("simplified", done.simplified), ("recovered", done.splats)]
+        scenes = [] if report.photos else [("simplified", done.simplified)]  # a start of photos is a blur
+        scenes.append((RESULT, done.splats))
         targets = list(filter(None, (done.held_out, job.targets.apart)))
         recover, page, best = job.config.recover, self.path / "report.html", job.best(done)
         with self._run.finishing("report.html"):
@@ -200,7 +203,7 @@ class RunFolder:
             preview(self.path / _PICTURE, best, scenes, recover.background)
         if not self._run.config["page"]:
             return report, ""
-        dense = None if recover.from_points else job.prior
+        dense = None if recover.from_points else (source, job.prior)
         seen = job.views.train.cameras if job.views.pool is None else best.cameras
         with self._run.finishing("view.html"):
             size, line = self.write_view(done.splats, dense, seen, recover.background)
@@ -213,23 +216,28 @@ class RunFolder:
             temporary.write_text(text + "\n", encoding="utf-8", newline="\n")
 
     def write_view(
-        self, splats: Splats, dense: Splats | None, cameras: Cameras, background: Colour
+        self, splats: Splats, dense: tuple[Path, Splats] | None, cameras: Cameras, background: Colour
     ) -> tuple[int | None, str]:
         """Write view.html unless browsers would not draw the scene smoothly; return its bytes, None if it was
         not written, and a line to print.
 
         Args:
-            dense: the dense scene, shown beside the result unless it would make the page large.
+            dense: path of the dense scene and the scene, shown left of the result unless it would make the
+                page large.
         """
         count, most = len(splats), DEVICES["web"]
         if count > most:
             return None, f"{self._view} skipped: over {most:,} Gaussians (`g2ard view` writes it anyway)"
         stand = frame_with(splats, cameras)
-        named = [(self.scene.name, splats)]
-        if dense is not None and count < len(dense) <= LARGEST_DENSE:
-            named.append(("dense", dense))
-        shown = [(f"{name}: {plural(len(scene), 'Gaussian')}", stand.of(scene)) for name, scene in named]
-        written, _ = write_page(self._view, shown, start=stand.start, background=background, overwrite=True)
+        known = None if background == BLACK else background
+        behind = backdrop(known, [splats if dense is None else dense[1]])
+        shown: list[Path | str] = [names_of([self.path])[0]]
+        scenes, roles = [splats], [RESULT]
+        if dense is not None and count < len(dense[1]) <= LARGEST_DENSE:
+            shown, scenes, roles = [dense[0], *shown], [dense[1], splats], [DENSE, RESULT]
+        labels = labels_of(shown, [len(scene) for scene in scenes], roles)
+        turned = [(label, stand.of(scene)) for label, scene in zip(labels, scenes, strict=True)]
+        written, _ = write_page(self._view, turned, start=stand.start, background=behind, overwrite=True)
         return written, f"view: {self._view} ({written / 1e6:.2f} MB)"
 
     def say_files(self, page: str = "") -> None:

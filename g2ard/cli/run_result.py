@@ -42,7 +42,7 @@ def tell_run(
 
     if isinstance(report, RunReport):
         run.say(counts_line(report))
-    title = f"held-out views against {report.against}, {report.size}, simplified → recovered:"
+    title = f"held-out views against {report.against}, {report.size}, {report.stages}:"
     run.console.table(title, list(COLUMNS), cells(report.kinds))
     for line in told(report, verbose=run.verbose):
         run.say(line)
@@ -80,17 +80,9 @@ def tiles_of(tiles: Tiles | None) -> dict[str, int]:
 
 def counts_line(report: RunReport) -> str:
     """Return counts, sizes and times."""
-    size, packed = report.bytes, report.packed
     seconds = {name: value for name, value in report.seconds.items() if name != "resumed"}
     times = ", ".join(f"{name} {value:.1f} s" for name, value in seconds.items())
-    sizes = _megabytes(size["output"], ".ply") if packed is None else _megabytes(size["file"], packed.file)
-    if not report.photos:
-        sizes = f"{_megabytes(size['input'], '.ply')} → {sizes}"
-    return f"{report.source} → {plural(report.output_count, 'Gaussian')}, {sizes}; {times}"
-
-
-def _megabytes(size: int | None, file: str) -> str:
-    return f"{(size or 0) / 1e6:.2f} MB as .{file.partition('.')[2]}"
+    return f"{report.title}, {report.sizes}; {times}"
 
 
 def told(report: RunReport | TiledReport, *, verbose: bool = False) -> list[str]:
@@ -108,7 +100,8 @@ def told(report: RunReport | TiledReport, *, verbose: bool = False) -> list[str]
     lines = [outcome(one) for entry in rounds for one in entry]
     lines += [str(one.exposure) for entry in rounds for one in entry[-1:] if one.exposure]
     lines += [unregularized(rounds)] if verbose else []
-    lines += list(map(loss, report.kinds))
+    start = "start" if report.photos else "simplified scene"
+    lines += [loss(kind, f"the {start} is better there (--keep writes it too)") for kind in report.kinds]
     lines.append(gaps_line(report.opacity_lost, RECOVERED_GAPS))
     if report.unseen and report.unseen > _LEAST_REPORTED_SHARE:
         lines.append(f"{report.unseen:.0%} of the scene is in no view: simplified but not recovered")

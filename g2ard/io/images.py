@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 import shutil
 import subprocess
 from collections import Counter
@@ -421,6 +422,10 @@ def contact_sheet(
     heights = [max((cell.height for cell in row), default=0) for row in grid]
     text = max(11, min(28, max(widths) // 20))
     font, line = ImageFont.load_default(text), round(1.6 * text)
+    for c, label in enumerate(labels[:columns]):
+        widths[c] = max(widths[c], math.ceil(font.getlength(label)))
+    longest = max((math.ceil(font.getlength(caption)) for caption in row_labels), default=0)
+    widths[-1] += max(0, longest - sum(widths) - _SHEET_GAP * (columns - 1))
     foot = line if row_labels else 0
     lefts = [_SHEET_GAP + sum(widths[:c]) + _SHEET_GAP * c for c in range(columns)]
     size = (

@@ -91,14 +91,6 @@ NOT_FINITE = re.compile(r"[+-]?(nan\([^)\s]*\)|\d\.#\w+)", re.IGNORECASE)
 """Numbers that are not finite, as C and C++ write them on Windows."""
 
 
-def short_names(paths: Sequence[Path]) -> list[str]:
-    """Return file names, with their folders if names repeat."""
-    names = [path.name for path in paths]
-    if len(set(names)) < len(names):
-        return ["/".join(path.absolute().parts[-2:]) for path in paths]
-    return names
-
-
 def output_names(path: str | Path, names: Sequence[str]) -> list[str]:
     """Return file names for views, without suffix, that stay inside one folder.
 

@@ -8,7 +8,6 @@ from typing import Annotated
 from g2ard.config.checks import AtLeastOne, Positive, Within
 from g2ard.config.schema import Settings
 from g2ard.errors import InputError
-from g2ard.progress import plural
 
 DEVICES = {
     "quest3": 400_000,
@@ -108,7 +107,5 @@ class Budget(Settings):
             return min(DEVICES[self.fit.lower()], total)
         assert self.count is not None
         if self.count > total:
-            raise InputError(
-                f"expected a budget of at most its {plural(total, 'Gaussian')}, got {self.count:,}", path=name
-            )
+            raise InputError(f"expected a budget of at most {total:,}, got {self.count:,}", path=name)
         return self.count

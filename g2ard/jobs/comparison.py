@@ -12,10 +12,11 @@ import numpy as np
 from g2ard.errors import InputError
 from g2ard.io.detect import run_background, run_scene, run_views
 from g2ard.io.jsonfile import read_json
+from g2ard.io.labels import DENSE, RESULT
 from g2ard.io.paths import real_path
 from g2ard.io.types import ViewSet
 from g2ard.jobs.inputs import Views, load_split_views
-from g2ard.rendering.targets import Targets, scored_in
+from g2ard.rendering.targets import Targets, kinds_told, scored_in
 from g2ard.scene.cameras import Camera, Cameras
 from g2ard.stages.evaluate import Evaluation
 
@@ -47,7 +48,7 @@ class Common:
     def of(cls, path: Path) -> Common:
         """Read the source of a run's own scores."""
         report = read_json(path / "report.json")
-        against, config = report.get("against", "teacher renders"), report["config"]
+        against, config = report.get("against", kinds_told(0, 1)), report["config"]
         teacher = None if against == "photos" else Path(config["scene"])
         return cls(path, path, teacher, teacher is not None and "photo" in against, config["size"])
 
@@ -83,9 +84,18 @@ def is_run(path: Path) -> bool:
 
 
 def source_of(path: Path) -> Path | None:
-    """Return the real path of the scene that a run renders its targets from, or None."""
-    teacher = Common.of(path).teacher if is_run(path) else None
-    return teacher and real_path(teacher)
+    """Return the real path of the dense scene of a run, or None."""
+    config = read_json(path / "report.json").get("config", {}) if is_run(path) else {}
+    scene = config.get("scene")
+    return None if scene is None else real_path(Path(scene))
+
+
+def dense_first(first: Path, second: Path) -> tuple[list[Path], tuple[str, ...]]:
+    """Return two scenes, the dense one before a run's result, with their roles; others as given, without."""
+    for dense, result in ((first, second), (second, first)):
+        if source_of(result) == real_path(dense):
+            return [dense, result], (DENSE, RESULT)
+    return [first, second], ()
 
 
 def common_of(paths: Sequence[Path], *, background: bool = False) -> Common | None:

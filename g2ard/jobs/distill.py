@@ -493,7 +493,7 @@ def prepare(
     if options.clean:
         done = remove_clutter(prior, seed=recover.seed, progress=progress, say=say)
         prior, cleaned = done.splats, done.clutter.counts
-    default_degree = 3 if read.lifted else None  # points have one colour each, photos show more
+    default_degree = 3 if read.needs_photos else None  # points have one colour each, photos show more
     degree = options.configured(sh_degree=default_degree).recover.sh_degree
     usual = max(1, len(prior) // _USUAL_RATIO)
     views = views_of(
@@ -501,7 +501,7 @@ def prepare(
         options,
         usual if budget.is_measured else budget.of(len(prior), read.name),
         beside=read.beside,
-        teach=not read.lifted and options.photos is not True,
+        teach=not read.needs_photos and options.photos is not True,
         use=use,
         progress=progress,
         say=say,
@@ -518,19 +518,21 @@ def prepare(
         say=say,
     )
     wanted = reduce.resolved(budget, read.name, f"scene.{options.format}", degree)
-    photos, renders = _sources(views, options.photos, read.lifted)
+    photos, renders = _sources(views, options.photos, read.needs_photos)
     choice = _regularizers(options, read, prior, cameras if photos else None)
     regularizers, preset_label, measured = choice
     if photos:
         given = options.named("recover.background") is not None
         propose_background(cameras, recover.background, given, say)
         if read.given:
-            shown = read.prior.take(np.arange(read.given)) if read.lifted else prior
-            insisted, renders_too = options.photos is True, not read.lifted
+            shown = read.prior.take(np.arange(read.given)) if read.needs_photos else prior
+            insisted, renders_too = options.photos is True, not read.needs_photos
             check_photos(shown, cameras, recover.background, say, insisted=insisted, renders=renders_too)
-    say(_task(prior, wanted.count, cameras if recovers else None, photos, alone=read.from_photos))
+    source = plural(len(prior), "point") if read.cloud else f"{len(prior):,}"
+    say(_task(source, wanted.count, cameras if recovers else None, photos, alone=read.from_photos))
     if not read.from_photos and wanted.count == len(prior):
-        say(f"nothing to simplify: the scene has {plural(len(prior), 'Gaussian')}")
+        one = "point" if read.cloud else "Gaussian"
+        say(f"nothing to simplify: the scene has {plural(len(prior), one)}")
     if recovers:
         say(Detail(f"regularisers: {preset_label}"))
     config = options.configured(regularizers, default_degree)
@@ -547,7 +549,7 @@ def prepare(
         teacher=prior if renders else None,
         photos_over_renders=photos and renders,
         config=config,
-        lifted=read.lifted,
+        lifted=read.cloud,
         preset=preset_label,
         measured=measured,
         recovers=recovers,
@@ -594,14 +596,14 @@ def _regularizers(
             "none; points from photos are rough, and move freely",
             measure_prior(prior),
         )
-    if read.lifted and kind == "paper":
+    if read.needs_photos and kind == "paper":
         kind = "paper-lift"
     return regularizers_for(kind, prior, photos, paper=paper)
 
 
-def _task(prior: Splats, count: int, train: Cameras | None, photos: bool, *, alone: bool) -> str:
+def _task(source: str, count: int, train: Cameras | None, photos: bool, *, alone: bool) -> str:
     """Describe the task in one line; `train` are the views of recovery, `alone` starts from photos."""
-    counts = f"{len(prior):,} → {plural(count, 'Gaussian')}"
+    counts = f"{source} → {plural(count, 'Gaussian')}"
     if train is None:
         return counts
     pictured = sum(path is not None for path in train.image_paths) if photos else 0
@@ -616,13 +618,15 @@ class _Read:
     """The dense scene as read or lifted.
 
     Args:
-        lifted: whether it was lifted from a point cloud.
+        cloud: whether it was lifted from a point cloud.
+        needs_photos: whether only photos can be its targets, as for points that go with photos.
         given: number of Gaussians, the first ones, from points that were not found in the photos.
         from_photos: whether the points, or some of them, were found in the photos, by COLMAP or here.
     """
 
     prior: Splats
-    lifted: bool
+    cloud: bool
+    needs_photos: bool
     beside: str | Path | None
     name: str
     given: int
@@ -633,11 +637,11 @@ def _read(scene: Scene, budget: Budget, options: DistillOptions, progress: Progr
     """Read the dense scene, or lift points; with photos they are topped up to the budget."""
     if isinstance(scene, Splats):
         options.check_trained()
-        return _Read(scene.narrowed(), False, options.beside, "scene", len(scene))
+        return _Read(scene.narrowed(), False, False, options.beside, "scene", len(scene))
     if isinstance(scene, str | Path) and kind(scene) == "splats":
         options.check_trained()
         splats = load_scene(scene, say, options.render_model)
-        return _Read(splats, False, options.beside or scene, str(scene), len(splats))
+        return _Read(splats, False, False, options.beside or scene, str(scene), len(splats))
     views, recover = options.views, options.config.recover
     if views is None or is_made(views):
         if scene is None:
@@ -647,7 +651,7 @@ def _read(scene: Scene, budget: Budget, options: DistillOptions, progress: Progr
         say("no photos: the lifted points render the training images; photos, given as views, show more")
         xyz, rgb = cloud.points.positions, cloud.points.colors
         lifted = lift(xyz, rgb, **vars(options.config.lift), progress=progress)
-        return _Read(lifted, False, options.beside, name, len(lifted))
+        return _Read(lifted, True, False, options.beside, name, len(lifted))
     cloud, name, of_photos = _points(scene, views, say)
     points: Points | None = None
     if cloud is not None:
@@ -677,7 +681,7 @@ def _read(scene: Scene, budget: Budget, options: DistillOptions, progress: Progr
     # Each point has its disc, for as many are needed, also where positions are equal about another middle.
     config = options.config.lift
     lifted, _ = lift_rows(points.positions, points.colors, config, progress, merge=False)
-    return _Read(lifted, True, options.beside, name, given, of_photos)
+    return _Read(lifted, True, True, options.beside, name, given, of_photos)
 
 
 def _points(

@@ -18,6 +18,7 @@ from g2ard.config.checks import AtLeastOne, checks_arguments
 from g2ard.config.choices import BLACK, Colour, RenderModel
 from g2ard.errors import InputError
 from g2ard.io.detect import kind
+from g2ard.io.labels import names_of
 from g2ard.io.reports import Report
 from g2ard.io.scenes import tell
 from g2ard.io.tiles import StoredScene
@@ -26,7 +27,7 @@ from g2ard.jobs.cost import Cost, cost_of
 from g2ard.jobs.distill import DistillJob, preparing
 from g2ard.jobs.distill_options import DistillOptions
 from g2ard.jobs.inputs import Views, load_scene
-from g2ard.jobs.viewer_frame import frame_of, up_of
+from g2ard.jobs.viewer_frame import backdrop, frame_of, up_of
 from g2ard.levels.tileset import TILE_OF_SCENE, Georeference, map_system
 from g2ard.levels.tileset import save_tileset as write_tileset
 from g2ard.levels.tree import Cut, Level, aligned
@@ -392,7 +393,7 @@ def write_level_page(
     views: Views | None = None,
     beside: str | Path | None = None,
     up: Sequence[float] | None = None,
-    background: Colour = BLACK,
+    background: Colour | None = None,
 ) -> int:
     """Write the page that shows the levels in a folder, and return its bytes.
 
@@ -401,21 +402,24 @@ def write_level_page(
         kind: streamed SOG, or 3D Tiles with z up.
         views, beside, up: see `g2ard.jobs.viewer_frame.frame_of`. The page's title names
             `beside`, or else the folder.
+        background: see `g2ard.jobs.viewer_frame.backdrop`.
     """
     coarse = levels[-1]
     few = coarse.take(np.array(evenly_spaced(len(coarse), _ROWS, floor=True)))
     frame = frame_of(few, views, beside=beside, up=up)
-    page, title, offset = folder / "index.html", Path(beside or folder).resolve().name, np.asarray(few.offset)
+    behind = backdrop(background, [few])
+    page, offset = folder / "index.html", np.asarray(few.offset)
+    title = names_of([Path(beside or folder)])[0]
     if kind == "sog":
         rotation, position = frame.placed(offset)
         placed: dict[str, Any] = {"rotation": rotation, "position": position}
         antialiased = few.antialiased
         return write_stream_page(
-            page, title, start=frame.start, antialiased=antialiased, background=background, **placed
+            page, title, start=frame.start, antialiased=antialiased, background=behind, **placed
         )
     reach = float(np.linalg.norm(np.ptp(few.means, axis=0)))
     start = frame.start or Start((0.0, reach / 4, -reach), (0.0, 0.0, 0.0), (60.0, 45.0))
     eye, target = (
         (TILE_OF_SCENE @ (frame.world(point) - offset)).tolist() for point in (start.position, start.target)
     )
-    return write_globe_page(page, title, eye=eye, target=target, fov=max(start.fov))
+    return write_globe_page(page, title, eye=eye, target=target, fov=max(start.fov), background=behind)

@@ -14,15 +14,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard.config.checks import checks_arguments
-from g2ard.config.choices import BLACK
+from g2ard.config.choices import Colour
 from g2ard.errors import InputError
 from g2ard.io.detect import run_scene
 from g2ard.io.images import contact_sheet, load_photo, png_bytes, resized
-from g2ard.io.paths import short_names
+from g2ard.io.labels import RESULT, labels_of
 from g2ard.jobs.inputs import Views, load_scene
-from g2ard.jobs.viewer_frame import frame_of
+from g2ard.jobs.viewer_frame import backdrop, frame_of
 from g2ard.poses import best_views
-from g2ard.progress import Progress, Say, plural, silent, unsaid
+from g2ard.progress import Progress, Say, silent, unsaid
 from g2ard.rendering.renderer import Renderer
 from g2ard.rendering.targets import Targets
 from g2ard.scene.cameras import Camera, Cameras
@@ -47,7 +47,7 @@ def view(
     views: Views | None = None,
     start: str | None = None,
     up: Sequence[float] | None = None,
-    background: Sequence[float] = BLACK,
+    background: Colour | None = None,
     overwrite: bool = False,
     progress: Progress = silent,
     say: Say = unsaid,
@@ -61,7 +61,7 @@ def view(
         views: cameras to start from, or their path; None looks for some beside a path, or places the start.
         start: name of the view to open with; None takes the one that shows most.
         up: (3,) direction away from the ground; None estimates it.
-        background: RGB in [0, 1] behind the scene.
+        background: RGB in [0, 1] behind the scene; None means black, or a soft gradient for a lift.
         overwrite: whether to replace an existing file.
         progress: called while scenes are packed.
         say: called with log messages.
@@ -78,24 +78,23 @@ def view(
     'view.html'
     """
     given = [scene] if other is None else [scene, other]
-    sources = [run_scene(Path(one)) if isinstance(one, str | Path) else None for one in given]
+    shown = [Path(one) if isinstance(one, str | Path) else one for one in given]
+    sources = [run_scene(one) if isinstance(one, Path) else None for one in shown]
     loaded = [
         load_scene(path or scene_of(one, name), say)  # type: ignore[arg-type] # paths have sources
         for one, path, name in zip(given, sources, ("scene", "other"), strict=False)
     ]
-    paths = [path for path in sources if path is not None]
-    names = iter(short_names(paths) if paths else ())
-    labels = [
-        f"{type(one).__name__.lower() if path is None else next(names)}: {plural(len(splats), 'Gaussian')}"
-        for one, path, splats in zip(given, sources, loaded, strict=True)
+    named = [
+        one if isinstance(one, Path) else "scene" if isinstance(one, Splats) else RESULT for one in shown
     ]
+    labels = labels_of(named, [len(splats) for splats in loaded])
     stand = frame_of(loaded[0], views, start=start, beside=sources[0], up=up, say=say)
     page = Path(mkdtemp(prefix="g2ard-")) / "view.html" if output is None else Path(output)
     write_page(
         page,
         [(label, stand.of(splats)) for label, splats in zip(labels, loaded, strict=True)],
         start=stand.start,
-        background=background,
+        background=backdrop(background, loaded),
         overwrite=overwrite,
         progress=progress,
     )

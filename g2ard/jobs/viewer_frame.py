@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard.config.checks import checks_arguments
+from g2ard.config.choices import BLACK, Colour
 from g2ard.errors import InputError
 from g2ard.jobs.inputs import Views, load_views
 from g2ard.jobs.view_checks import given_or_found, opaque_points
@@ -17,12 +18,14 @@ from g2ard.poses import best_views
 from g2ard.poses.site import Site
 from g2ard.progress import Say, unsaid
 from g2ard.scene.cameras import Camera, Cameras
+from g2ard.scene.samples import evenly_spaced
 from g2ard.scene.splats import Splats
 from g2ard.scene.transform import quaternion_of, transform, unit_up
+from g2ard.stages.recover.anchors import measure_prior
 from g2ard.viewer.page import Start
 
-_UP_SAMPLE = 100_000
-"""Gaussians used to estimate the up direction."""
+_SAMPLE = 100_000
+"""Gaussians used to estimate the up direction, or to recognise a lift."""
 
 _TO_VIEWER = np.diag([-1.0, -1.0, 1.0])
 """Rotation that the viewer applies to scenes: by 180° about z."""
@@ -138,6 +141,17 @@ def frame_with(
     return replace(stand, start=stand.start_at(view, opaque_points(scene)), name=view.name)
 
 
+def backdrop(given: Colour | None, scenes: Sequence[Splats]) -> Colour | None:
+    """Return the colour behind scenes on a page: the given one, or black, on which scenes are trained.
+
+    None, a soft gradient, is behind lifts of point clouds: they were trained on nothing, and have gaps.
+    """
+    if given is not None:
+        return given
+    samples = (scene.take(np.array(evenly_spaced(len(scene), _SAMPLE, floor=True))) for scene in scenes)
+    return None if any(measure_prior(sample).is_lift for sample in samples) else BLACK
+
+
 def level_up(cameras: Cameras) -> NDArray[np.float64] | None:
     """Return the up direction that views share, or that of photos which all face one way; otherwise None."""
     across, up = cameras.viewmats[:, 0, :3], -cameras.viewmats[:, 1, :3].mean(axis=0)
@@ -173,7 +187,7 @@ def up_of(scene: Splats, up: Sequence[float] | None = None) -> NDArray[np.float6
     if up is not None:
         return unit_up(up)
     try:
-        return Site.of(scene, None, _UP_SAMPLE).up.axis
+        return Site.of(scene, None, _SAMPLE).up.axis
     except InputError:  # nothing visible
         return np.array([0.0, -1.0, 0.0])
 

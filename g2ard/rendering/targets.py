@@ -27,7 +27,7 @@ from g2ard.system.keys import key_of
 from g2ard.system.shown import Shown
 from g2ard.system.threads import in_threads
 
-RENDERS = "teacher renders"
+RENDERS = "the dense scene"
 """What targets without photos are called."""
 CACHE_BYTES = 2_000_000_000
 """Bytes of targets cached in memory; further ones are loaded or rendered again on each access."""
@@ -68,10 +68,10 @@ def kinds_told(photos: int, renders: int) -> str:
     """Describe the kinds of targets, with counts if there are both.
 
     >>> kinds_told(7, 9), kinds_told(7, 0)
-    ('7 photos and 9 teacher renders', 'photos')
+    ('7 photos and 9 renders of the dense scene', 'photos')
     """
     if photos and renders:
-        return f"{plural(photos, 'photo')} and {plural(renders, 'teacher render')}"
+        return f"{plural(photos, 'photo')} and {plural(renders, 'render')} of the dense scene"
     return "photos" if photos else RENDERS
 
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from g2ard.config.choices import BLACK, Colour
 from g2ard.io.images import contact_sheet, to_bytes, write_png
+from g2ard.io.labels import DENSE, RESULT, TARGET, labels_of
 from g2ard.progress import plural
 from g2ard.rendering.exposure import rendered
 from g2ard.rendering.renderer import Renderer
@@ -39,7 +40,7 @@ def distill_report(
     most and of the worst ones.
 
     Args:
-        scenes: (name, scene) of `simplified` and `recovered`, as `report.scores` names them.
+        scenes: (name, scene) of those in pictures, the result last.
         targets: photos or teacher renders of the held-out views, and of the views of other kinds, if any.
         told: summary lines that the command prints.
         best: targets whose first view shows most of the scene.
@@ -47,8 +48,9 @@ def distill_report(
     page = Page(title, verdict(report))
     views = [(part, row) for part in targets for row in range(len(part.cameras))]
     parts = [part for part in (report.scores, report.apart) if part]
-    scores = {name: [view for part in parts for view in part[name].views] for name, _ in scenes}
-    before, after = scores[scenes[0][0]], scores[scenes[-1][0]]
+    scores = {name: [view for part in parts for view in part[name].views] for name in report.scores}
+    before, after = scores["simplified"], scores["recovered"]
+    scores[RESULT] = after
     renderers = [(name, Renderer(splats, background=background)) for name, splats in reversed(scenes)]
 
     def show(part: Targets, row: int, psnrs: Sequence[float]) -> None:
@@ -60,16 +62,18 @@ def distill_report(
         title = f"{part.cameras.names[row]}, {camera.width}×{camera.height} px"
         page.comparison(title, to_bytes(scored(part[row], part, row)), shown)
 
+    source = "a photo" if report.photos else f"a photo or a render of the {DENSE}"
+    if "photo" not in report.against:
+        source = f"a render of the {DENSE}"
     page.heading("A typical view")
     page.paragraph(
-        f"Left of the divider: the {'photo' if 'photo' in report.against else 'dense scene'}. "
-        "Right: the result. Below: its worst regions, magnified."
+        f"Left of the divider: the {TARGET}, {source}. Right: the {RESULT}. Its worst regions are magnified."
     )
     whole = [evaluate(splats, best, background=background).views[0].psnr for _, splats in reversed(scenes)]
     show(best, 0, whole)
     page.heading("Scores")
     page.table(COLUMNS, cells(report.kinds))
-    page.paragraph(f"PSNR and SSIM: simplified → recovered, in views of {report.size}.")
+    page.paragraph(f"PSNR and SSIM: {report.stages}, in views of {report.size}.")
     if edges := edges_line(report.kinds):
         page.paragraph(edges)
     for line in told:
@@ -83,9 +87,8 @@ def distill_report(
         page.heading("Worst views")
     for view in worst:
         show(*views[view], [scores[stage][view].psnr for stage, _ in renderers])
-    before_mb, after_mb = ((report.bytes[name] or 0) / 1e6 for name in ("input", "output"))
     page.paragraph(
-        f"{before_mb:.2f} → {after_mb:.2f} MB as .ply, in {report.seconds['total']:,.0f} s. "
+        f"{report.sizes}, in {report.seconds['total']:,.0f} s. "
         f"Scored against {report.against} in views that were not trained on, "
         f"which blend {report.overdraw:.1f} Gaussians per pixel."
     )
@@ -120,7 +123,7 @@ def verdict(report: RunReport | TiledReport) -> str:
     last = f"the worst view is {weakest.worst} ({weakest.worst_psnr.after:.1f} dB)"
     if len(kinds) > 1:
         last = f"{weakest.kind} views are weakest ({weakest.psnr.after:.1f} dB)"
-    what = "photos" if "photo" in report.against else "scene"
+    what = "photos" if "photo" in report.against else DENSE
     views = sum(kind.views for kind in kinds)
     mean = sum(kind.views * kind.psnr.after for kind in kinds) / views
     over = f"the mean of {views} held-out views" if views > 1 else "in one held-out view"
@@ -155,14 +158,14 @@ def tiled_report(path: Path, title: str, report: TiledReport) -> None:
     page = Page(title, verdict(report))
     page.table(COLUMNS, cells(scores.kinds))
     page.paragraph(
-        f"Simplified {scores.simplified:.2f} dB, recovered {scores.recovered:.2f} dB over the "
+        f"Simplified {scores.simplified:.2f} dB, {RESULT} {scores.recovered:.2f} dB over the "
         f"{scores.pixels:,} pixels that tiles own in {plural(views['test'], 'held-out view')}; "
         f"{plural(views['train'], 'training view')}, {scores.steps:,} recovery steps of all tiles "
         f"together, {report.seconds['total']:,.0f} s."
     )
     page.heading("Tiles, worst first")
     page.table(
-        ["tile", "Gaussians", "simplified, dB", "recovered, dB", "steps", "pixels"],
+        ["tile", "Gaussians", "simplified, dB", f"{RESULT}, dB", "steps", "pixels"],
         [
             [
                 str(tile.tile),
@@ -203,7 +206,7 @@ def preview(
         )
         for view in zip(*scores, strict=True)
     ]
-    labels = ["target", *(f"{name}: {plural(len(splats), 'Gaussian')}" for name, splats in scenes)]
+    labels = [TARGET, *labels_of([name for name, _ in scenes], [len(splats) for _, splats in scenes])]
     write_png(path, contact_sheet(rows, labels, row_labels=captions), overwrite=True)
 
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from g2ard.io.atomic import atomic_output
 from g2ard.io.images import to_bytes
+from g2ard.io.labels import TARGET
 
 _WINDOW, _CROPS = 0.28, 2  # side of an automatic crop as a share of the image's, and number of crops
 _LONGEST = 1280
@@ -127,29 +128,28 @@ class Page:
             f'height:{down:.2%}"></i>'
             for k, (left, top, across, down) in enumerate(windows)
         )
-        named = [Shown("target", target), *shown]
+        named = [Shown(TARGET, target), *shown]
         crops = [
             f'<div class="crops r{k % 2}">{"".join(self._crop(one, w) for one in named)}</div>'
             for k, w in enumerate(windows)
         ]
         self._parts.append(
-            f'<section class="view"><h4>{escape(title)}</h4><div class="pair">'
-            f'<div class="slider" style="aspect-ratio:{width}/{height};'
-            f'max-width:calc(85vh*{width / height:.4f})">'
-            f'<img data-i="{number}" alt="target"><img class="over" data-i="{numbers[0]}" alt="rendering">'
-            f'{marks}<span class="tag left">target</span><span class="tag right"></span>'
-            f'<input type="range" min="0" max="100" value="50" aria-label="target or rendering"></div>'
+            f'<section class="view"><h4>{escape(title)}</h4>'
+            f'<div class="pair" style="width:calc(85vh*{width / height:.4f})">'
+            f'<div class="slider" style="aspect-ratio:{width}/{height}">'
+            f'<img data-i="{number}" alt="{TARGET}"><img class="over" data-i="{numbers[0]}" alt="rendering">'
+            f'{marks}<span class="tag left">{TARGET}</span><span class="tag right"></span>'
+            f'<input type="range" min="0" max="100" value="50" aria-label="{TARGET} or rendering"></div>'
             f'<label class="pick">right: <select>{options}</select></label></div>'
-            f"{''.join(crops)}</section>"
+            f'<div class="parts">{"".join(crops)}</div></section>'
         )
 
     def _crop(self, shown: Shown, window: Window) -> str:
         rows, columns = pixels(window, *shown.image.shape[:2])
         number = self._image(shown.image[rows, columns])
-        whole = f"<br>whole view <b>{escape(shown.caption)}</b>" if shown.caption else ""
         return (
             f'<figure class="crop"><img data-i="{number}" alt="{escape(shown.name)}">'
-            f"<figcaption>{escape(shown.name)}{whole}</figcaption></figure>"
+            f"<figcaption>{escape(shown.name)}</figcaption></figure>"
         )
 
     def _image(self, image: NDArray[np.uint8]) -> int:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from g2ard.config.choices import Colour
 from g2ard.errors import InputError
 from g2ard.io.images import load_photo, to_bytes
+from g2ard.io.labels import RESULT
 from g2ard.progress import plural
 from g2ard.rendering.renderer import Renderer
 from g2ard.report.page import Page, Shown
@@ -61,7 +62,7 @@ def registration_report(
             continue  # deleted since it was registered
         render = to_bytes(renderer.image(replace(one[0], viewmat=np.array(row.camera_from_world))))
         alike = "kept at its start" if row.zncc is None else f"ZNCC {row.zncc:.2f}"
-        shown = [Shown("found", render, alike)]
+        shown = [Shown(RESULT, render, alike)]
         if row.name in starts:
             shown.append(Shown("start", to_bytes(renderer.image(replace(one[0], viewmat=starts[row.name])))))
         page.comparison(f"{row.name}: {row.status}", photo, shown)

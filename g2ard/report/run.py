@@ -8,8 +8,10 @@ from dataclasses import dataclass, field
 from statistics import fmean
 from typing import Any
 
+from g2ard.io.labels import RESULT
 from g2ard.io.reports import LEFT_OUT, Report
 from g2ard.progress import plural
+from g2ard.rendering.targets import kinds_told
 from g2ard.scene.cameras import USUAL, rows_by_kind
 from g2ard.stages.evaluate import Evaluation, Means, ViewScore
 from g2ard.stages.recover.anchors import PriorMeasures
@@ -222,10 +224,24 @@ class RunReport(Report):
     packed: Packed | None = field(default=None, metadata=LEFT_OUT)
 
     @property
+    def sizes(self) -> str:
+        """Sizes of the dense scene, except points found in photos, and of the result."""
+        before, after, file = ((self.bytes[name] or 0) / 1e6 for name in ("input", "output", "file"))
+        start = "" if self.photos else f"{before:.2f} → "
+        if self.packed is None:
+            return f"{start}{after:.2f} MB as .ply"
+        start = start.replace(" → ", " MB as .ply → ")
+        return f"{start}{file:.2f} MB as .{self.packed.file.partition('.')[2]}"
+
+    @property
+    def stages(self) -> str:
+        """What a score before and after stands for."""
+        return f"{'start' if self.photos else 'simplified'} → {RESULT}"
+
+    @property
     def title(self) -> str:
         """Numbers before and after."""
-        before = plural(self.photos, "photo") if self.photos else f"{self.input_count:,}"
-        return f"{before} → {plural(self.output_count, 'Gaussian')}"
+        return f"{self.source} → {plural(self.output_count, 'Gaussian')}"
 
     @property
     def source(self) -> str:
@@ -287,7 +303,8 @@ class TiledReport(Report):
     scores: TiledScores
     size: str
     views: dict[str, int]
-    against = "teacher renders"
+    against = kinds_told(0, 1)
+    stages = f"simplified → {RESULT}"
 
     @property
     def title(self) -> str:

@@ -26,11 +26,13 @@ function fitted({ position, target, fov }) {
   return { position, target, fov: Math.min(120, Math.max(10, Math.atan(half) * 360 / Math.PI)) };
 }
 
+document.body.classList.toggle('soft', background === null);
+
 const settings = {
   version: 2,
   tonemapping: 'none',
   highPrecisionRendering: false,
-  background: { color: background },
+  background: { color: background ?? [0, 0, 0, 0] }, // clear to see the page's gradient
   postEffectSettings: {
     sharpness: { enabled: false, amount: 0 },
     bloom: { enabled: false, intensity: 1, blurLevel: 2 },

@@ -54,7 +54,7 @@ def write_page(
     *,
     start: Start | None = None,
     stops: Sequence[tuple[str, Start]] = (),
-    background: Sequence[float] = BLACK,
+    background: Sequence[float] | None = BLACK,
     overwrite: bool = False,
     progress: Progress = silent,
 ) -> tuple[int, tuple[int, ...]]:
@@ -66,6 +66,7 @@ def write_page(
         scenes: (label, scene), one or two, left to right, in the same frame: x right, y down, z ahead.
         start: initial camera; None lets the viewer frame the whole scene.
         stops: (title, camera) of views to step through, by arrows below the scene.
+        background: RGB in [0, 1] behind the scenes; None means a soft gradient.
 
     Returns:
         Bytes of the page, and of each scene as .sog.
@@ -75,7 +76,7 @@ def write_page(
     shown = {
         "start": None if start is None else asdict(start),
         "stops": [{"title": title, **asdict(stop)} for title, stop in stops],
-        "background": [float(channel) for channel in background],
+        "background": _colour(background),
         "files": [f"scene{index}.sog" for index in range(len(scenes))],
         "antialiased": [splats.antialiased for _, splats in scenes],
         "placed": None,
@@ -92,7 +93,7 @@ def write_stream_page(
     rotation: Sequence[float],
     position: Sequence[float],
     antialiased: bool,
-    background: Sequence[float] = BLACK,
+    background: Sequence[float] | None = BLACK,
 ) -> int:
     """Write a page that streams lod-meta.json from its own folder, and return its bytes.
 
@@ -101,7 +102,7 @@ def write_stream_page(
     shown = {
         "start": None if start is None else asdict(start),
         "stops": [],
-        "background": [float(channel) for channel in background],
+        "background": _colour(background),
         "files": ["lod-meta.json"],
         "antialiased": [antialiased],
         "placed": {"rotation": [float(q) for q in rotation], "position": [float(x) for x in position]},
@@ -110,13 +111,20 @@ def write_stream_page(
 
 
 def write_globe_page(
-    path: str | Path, title: str, *, eye: Sequence[float], target: Sequence[float], fov: float
+    path: str | Path,
+    title: str,
+    *,
+    eye: Sequence[float],
+    target: Sequence[float],
+    fov: float,
+    background: Sequence[float] | None = BLACK,
 ) -> int:
     """Write a page that shows the tileset.json of its own folder with a CesiumJS named in its address.
 
     The initial camera is in the axes of the tiles, its field of view along the window's longer side.
     """
     view = {"eye": [float(x) for x in eye], "target": [float(x) for x in target], "fov": float(fov)}
+    view["background"] = _colour(background)
     text = (_HERE / "globe.html").read_text(encoding="utf-8")
     text = text.replace("{generator}", f"g2ard {__version__}").replace("{title}", escape(title))
     return _write(Path(path), text.replace("{view}", json.dumps(view)), overwrite=True)
@@ -126,6 +134,10 @@ def _write(path: Path, text: str, overwrite: bool) -> int:
     with atomic_output(path, overwrite) as temporary:
         temporary.write_text(text, encoding="utf-8", newline="\n")
         return temporary.stat().st_size
+
+
+def _colour(background: Sequence[float] | None) -> list[float] | None:
+    return None if background is None else [float(channel) for channel in background]
 
 
 def _sog(path: Path, label: str, splats: Splats, progress: Progress) -> bytes:

@@ -99,6 +99,6 @@ def test_recover_reports_losing_steps(tmp_path: Path, command_line: CommandLine)
     write_splats(tmp_path / "start.ply", replace(ball, sh0=ball.sh0 + grain))
     write_views(tmp_path / "v.json", around(6))
     asked = ("recover", "start.ply", "--views", "v.json", "--teacher", "ball.ply", "-o", "o.ply", "-w")
-    for steps, words in ((4, "kept the simplified scene: every step made"), (24, "recovery fell to ")):
+    for steps, words in ((4, "kept the start: every step made"), (24, "recovery fell to ")):
         told = succeeds(command_line, tmp_path, *asked, "--steps", steps).err
         assert sum(words in line for line in told.splitlines()) == 1

@@ -24,7 +24,7 @@ def run_folder(
     views: g2ard.Cameras,
     *,
     scene: g2ard.Splats = BALL,
-    against: str = "teacher renders",
+    against: str = "the dense scene",
     teacher: str = "ball.ply",
     held_out: int = 4,
     background: tuple[float, float, float] = (0, 0, 0),
@@ -48,7 +48,7 @@ def runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, request: pytest.Fixtur
     g2ard.save("ball.ply", BALL)
     photos = getattr(request, "param", "renders") == "photos"
     large = around(8, (64, 48))
-    against = "teacher renders"
+    against = "the dense scene"
     if photos:
         large, against = photographed(tmp_path, BALL, large), "photos"
     run_folder(tmp_path / "worse", large.resized(32), scene=BALL.take(range(60)), against=against)
@@ -182,7 +182,7 @@ def test_a_size_that_harms_is_a_warning_with_the_way_out() -> None:
         for psnr in (20.0, 34.8, 27.3, 32)
     ]
     before, at_size, harmed, usual = means
-    fields = dict.fromkeys(("unseen", "packed", "opacity_lost"))
+    fields = dict.fromkeys(("unseen", "packed", "opacity_lost", "photos"))
     for own, warned in ((harmed, True), (usual, False)):
         own_size = {"simplified": before, "recovered": own}
         scores = {"recovered": at_size}

@@ -61,7 +61,7 @@ def test_distill_trains_and_scores_on_them(command_line: CommandLine, folder: Pa
     out, error = succeeds(command_line, folder, *DISTILL, "-o", "run", "--set", "views_count=14")
     assert SAID in error
     report = json.loads(out)
-    assert report["against"] == "teacher renders"
+    assert report["against"] == "the dense scene"
     held_out = {view["name"] for view in report["scores"]["recovered"]["views"]}
     assert held_out == {"000", "008"}  # every 8th by name
     assert set(report["views"]["chosen"]) == {f"{i:03d}" for i in range(16)} - held_out

@@ -96,12 +96,12 @@ def test_paths_and_results_are_taken_for_scenes(tmp_path: Path, results: dict[st
 def test_view_returns_its_page(tmp_path: Path, results: dict[str, Any]) -> None:
     page = g2ard.view(BALL)
     assert page.name == "view.html"
-    assert "splats: 600 Gaussians" in page.read_text(encoding="utf-8")
+    assert "scene: 600 Gaussians" in page.read_text(encoding="utf-8")
     two = g2ard.view(BALL, results["Distilled"], output=tmp_path / "two.html")
     assert two == tmp_path / "two.html"
     text = two.read_text(encoding="utf-8")
-    assert "splats: 600 Gaussians" in text
-    assert "distilled: 60 Gaussians" in text
+    assert "scene: 600 Gaussians" in text
+    assert "result: 60 Gaussians" in text
     with pytest.raises(g2ard.OutputError, match="exists"):
         g2ard.view(BALL, output=two)
 

@@ -70,7 +70,7 @@ def test_command_on_a_trained_scene(command_line: CommandLine, tmp_path: Path) -
     report = json.loads(out)
     assert report["output_count"] == len(read_splats(tmp_path / "run" / "scene.ply")) == 300
     assert report["scores"]["recovered"]["psnr"] > report["scores"]["simplified"]["psnr"]
-    assert report["against"] == "teacher renders"
+    assert report["against"] == "the dense scene"
     apart = report["apart"]
     assert "near" in {view["kind"] for view in apart["recovered"]["views"]}
     assert not {view["name"] for view in report["scores"]["recovered"]["views"]} & {

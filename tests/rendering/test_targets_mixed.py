@@ -39,13 +39,13 @@ def run(command_line: CommandLine, folder: Path, *arguments: object) -> tuple[di
 def test_distill_learns_from_photos_and_renders(folder: Path, command_line: CommandLine) -> None:
     ask = ("distill", "ball.ply", "-r", 3, "--views", "v.json", "-o", "run", "--steps", 4, "--size", 48)
     report, told = run(command_line, folder, *ask)
-    assert "8 training views against 4 photos and 4 teacher renders" in told
+    assert "8 training views against 4 photos and 4 renders of the dense scene" in told
     assert "skipped" not in told
-    assert report["against"] == "2 photos and 2 teacher renders"
+    assert report["against"] == "2 photos and 2 renders of the dense scene"
     assert report["apart"] is None
     assert report["scores"]["recovered"]["views"][0]["against"] == "photo"
     report, told = run(command_line, folder, *ask, "--renders")
-    assert "8 training views against teacher renders" in told
+    assert "8 training views against the dense scene" in told
     report, told = run(command_line, folder, *ask, "--photos")
     assert "4 training views against photos" in told
     assert report["against"] == "photos"
@@ -62,9 +62,9 @@ def test_a_distillation_in_python_has_both_targets(folder: Path) -> None:
 def test_recover_takes_photos_beside_its_teacher(folder: Path, command_line: CommandLine) -> None:
     ask = ("recover", "ball.ply", "--views", "v.json", "-o", "o.ply", "--steps", 20)
     _, told = run(command_line, folder, *ask, "--teacher", "ball.ply")
-    assert "8 training views against teacher renders" in told
+    assert "8 training views against the dense scene" in told
     _, told = run(command_line, folder, *ask, "--teacher", "ball.ply", "--photos")
-    assert "8 training views against 4 photos and 4 teacher renders" in told
+    assert "8 training views against 4 photos and 4 renders of the dense scene" in told
     _, told = run(command_line, folder, *ask)
     assert "4 training views against photos" in told
 

@@ -18,7 +18,7 @@ def test_distill_writes_a_report(command_line: CommandLine, tmp_path: Path) -> N
     succeeds(command_line, tmp_path, "distill", "ball.ply", *options)
     html = (tmp_path / "run" / "report.html").read_text()
     check_page(html)
-    assert re.search(r'<p class="lead">300 of 1,200 Gaussians reproduce the scene at \d+\.\d dB', html)
+    assert re.search(r'<p class="lead">300 of 1,200 Gaussians reproduce the dense scene at \d+\.\d dB', html)
     assert html.index("<table>") < html.index("Worst views")
     assert "ball.ply" in html
 
@@ -43,7 +43,7 @@ def _report(**known: Any) -> RunReport:
 def test_the_verdict_names_the_weakest_kind_of_view() -> None:
     counts = {"input_count": 90, "output_count": 9, "size": "48×36 px"}
     report = _report(**counts, against="renders", kinds=by_kind(VIEWS, VIEWS))
-    told = "9 of 90 Gaussians reproduce the scene at 29.8 dB, the mean of 5 held-out views of 48×36 px"
+    told = "9 of 90 Gaussians reproduce the dense scene at 29.8 dB, the mean of 5 held-out views of 48×36 px"
     assert verdict(report) == f"{told}; near views are weakest (27.0 dB)."
     assert verdict(replace(report, kinds=())) == "9 Gaussians; no held-out view shows the scene."
     of_photos = verdict(replace(report, lifted=True, against="photos"))

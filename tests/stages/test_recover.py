@@ -402,7 +402,7 @@ def test_a_hopeless_recovery_stops_early_and_says_so(targets: TeacherRenders) ->
     assert done.report.steps == done.report.stopped == 75
     assert_same_bits(done.splats, replace(start, quats=unit_quats(start.quats)))
     told = outcome(done.report)
-    assert told.startswith("kept the simplified scene: recovery fell to ")
+    assert told.startswith("kept the start: recovery fell to ")
     assert told.endswith("given up at step 75")
 
 
@@ -506,7 +506,7 @@ def test_a_recovery_that_only_harms_validation_views_stops_at_half(targets: Teac
     looks = done.report.validation.looks
     assert [found.step for found in looks] == [0, 50, 50, 50]
     told = outcome(done.report)
-    assert told.startswith("kept the simplified scene: every step made validation views worse (")
+    assert told.startswith("kept the start: every step made validation views worse (")
 
 
 def test_other_views_gain_where_training_views_can_spare_it(student: Splats, tmp_path: Path) -> None:

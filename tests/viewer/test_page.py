@@ -240,22 +240,24 @@ def test_a_scene_without_views_is_looked_at_from_around_and_one_without_room_as_
 
 
 def test_a_run_has_a_page_unless_too_large(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    ball, path = checkered_ball(300), tmp_path / "view.html"
-    folder = RunFolder(None, tmp_path, "scene.sog", resume=False)
+    ball, path = checkered_ball(300), tmp_path / "run" / "view.html"
+    folder = RunFolder(None, tmp_path / "run", "scene.sog", resume=False)
     size, line = folder.write_view(ball, None, around(6), (1.0, 1.0, 1.0))
     assert size == path.stat().st_size
     assert "view.html" in line
-    assert Parts(path).labels == ["scene.sog: 300 Gaussians"]
-    folder.write_view(ball.take(range(30)), ball, around(6), (1.0, 1.0, 1.0))
-    assert Parts(path).labels == ["scene.sog: 30 Gaussians", "dense: 300 Gaussians"]
+    assert Parts(path).labels == ["result: run, 300 Gaussians"]
+    write_splats(tmp_path / "ball.ply", ball)
+    whole = tmp_path / "ball.ply", ball
+    folder.write_view(ball.take(range(30)), whole, around(6), (1.0, 1.0, 1.0))
+    assert Parts(path).labels == ["dense scene: ball.ply, 300 Gaussians", "result: run, 30 Gaussians"]
     for dense, largest in ((ball, 299), (ball.take(range(30)), 300)):  # too large, or the same
         monkeypatch.setattr("g2ard.cli.run_folder.LARGEST_DENSE", largest)
-        folder.write_view(ball.take(range(30)), dense, around(6), (1.0, 1.0, 1.0))
-        assert Parts(path).labels == ["scene.sog: 30 Gaussians"]
+        folder.write_view(ball.take(range(30)), (whole[0], dense), around(6), (1.0, 1.0, 1.0))
+        assert Parts(path).labels == ["result: run, 30 Gaussians"]
     config = {"keep": False, "views_format": "g2ard"}
     run = SimpleNamespace(write=lambda scene, splats, **_: write_splats(scene, splats), config=config)
     views = RunViews(ViewSet(around(4)), around(2))
-    RunFolder(run, tmp_path, "scene.sog", resume=False).write(SimpleNamespace(splats=ball), views)
+    RunFolder(run, tmp_path / "run", "scene.sog", resume=False).write(SimpleNamespace(splats=ball), views)
     assert not path.exists()  # a page of an earlier run
     monkeypatch.setitem(budget.DEVICES, "web", 299)
     size, line = folder.write_view(ball, None, around(6), (1.0, 1.0, 1.0))

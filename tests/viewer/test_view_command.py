@@ -23,7 +23,11 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     run.mkdir()
     g2ard.save(run / "scene.ply", BALL.take(range(90)))
     g2ard.save_views(run / "views.json", around(4, (48, 36)))
-    report = {"against": "teacher renders", "config": {"scene": "ball.ply", "size": None}, "settings": {}}
+    report = {
+        "against": "the dense scene",
+        "config": {"scene": "ball.ply", "size": None},
+        "settings": {},
+    }
     (run / "report.json").write_text(json.dumps(report))
     levels = tmp_path / "levels"
     levels.mkdir()
@@ -36,7 +40,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     ("path", "words"),
     [
         ("levels", ["levels here"]),
-        ("run", ["scene.ply: 90 Gaussians", "ball.ply: 200 Gaussians"]),
+        ("run", ["dense scene: ball.ply, 200 Gaussians | result: run, 90 Gaussians"]),
     ],
 )
 def test_a_page_is_served_until_ctrl_c(folder: Path, path: str, words: list[str]) -> None:

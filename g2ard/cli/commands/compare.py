@@ -11,7 +11,8 @@ from g2ard.cli import options as opt
 from g2ard.cli.frame import Run, command
 from g2ard.config.choices import BLACK, Colour, is_made
 from g2ard.io.detect import run_scene
-from g2ard.io.paths import real_path, short_names
+from g2ard.io.labels import labels_of, names_of
+from g2ard.io.paths import real_path
 from g2ard.progress import plural
 
 if TYPE_CHECKING:
@@ -24,9 +25,7 @@ _WORST_VIEWS = 3
 @command("compare", example="g2ard compare dense.ply small.ply -o compare.html", scenes=True)
 def compare(
     run: Run,
-    first: Annotated[
-        Path, typer.Argument(metavar="SCENE|RUN", help="The reference, such as the dense scene.")
-    ],
+    first: Annotated[Path, typer.Argument(metavar="SCENE|RUN", help="The dense scene, or another one.")],
     second: Annotated[Path, typer.Argument(metavar="SCENE|RUN", help="The scene to compare with it.")],
     output: Annotated[
         Path | None,
@@ -44,9 +43,10 @@ def compare(
     background: opt.BackgroundOption = None,
 ) -> None:
     """Compare renders of two scenes: PSNR, SSIM, the worst views, and a page to look at."""
+    from g2ard.jobs.comparison import dense_first
     from g2ard.jobs.inputs import load_views
     from g2ard.jobs.view_checks import check_sight, opaque_points
-    from g2ard.jobs.viewer_frame import frame_with, level_up
+    from g2ard.jobs.viewer_frame import backdrop, frame_with, level_up
     from g2ard.jobs.views import at_size, is_planned, planned_at, views_or_pool
     from g2ard.poses import best_views
     from g2ard.rendering.targets import TeacherRenders
@@ -56,16 +56,18 @@ def compare(
 
     if views is not None and not is_made(views):
         run.refuse_typed("on given views", "looks")
+    (first, second), roles = dense_first(first, second)
     paths = run_scene(first), run_scene(second)
     if output is not None:
         run.claim_file("--output", output, page=True)
     page = [] if output is None else [("page", 1.0), ("sog", 2.0), ("sog", 0.5)]
     run.console.expect([("poses", 1.0), ("targets", 2.0), ("evaluate", 3.0), *page])
-    reference, other = (run.load(path) for path in paths)
-    colour = opt.background_of(run, background, first, second) or BLACK
+    dense, other = (run.load(path) for path in paths)
+    known = opt.background_of(run, background, first, second)
+    colour = known or BLACK
     given = opt.with_images(views, images)
     found = views_or_pool(
-        reference,
+        dense,
         given,
         beside=paths[0],
         count=looks,
@@ -74,8 +76,8 @@ def compare(
         **run.callbacks,
     )
     cameras = at_size(load_views(found, "all", None, run.say), size, made=is_planned(found))
-    check_sight(reference, cameras, run.say)
-    targets = TeacherRenders(reference, cameras, background=colour, progress=run.progress)
+    check_sight(dense, cameras, run.say)
+    targets = TeacherRenders(dense, cameras, background=colour, progress=run.progress)
     scores = evaluate(other, targets, background=colour, progress=run.progress)
     worst = sorted(scores.views, key=lambda view: view.psnr)[:_WORST_VIEWS]
     psnr = {view.name: view.psnr for view in scores.views}
@@ -83,23 +85,28 @@ def compare(
         f"{second} against {first}: {plural(len(cameras), 'view')}, {cameras.size_text}",
         ["", "Gaussians", "PSNR, dB", "SSIM"],
         [
-            ["mean", f"{len(other):,} of {len(reference):,}", f"{scores.psnr:.2f}", f"{scores.ssim:.4f}"],
+            [
+                "mean",
+                f"{len(other):,} of {len(dense):,}",
+                f"{scores.psnr:.2f}",
+                f"{scores.ssim:.4f}",
+            ],
             *([f"worst: {v.name}", "", f"{v.psnr:.2f}", f"{v.ssim:.4f}"] for v in worst),
         ],
         stdout=run.json != "-",
     )
     if output is not None:
         run.begin("page")
-        points = opaque_points(reference)
+        points = opaque_points(dense)
         if is_planned(found):  # generated views may show only parts
             up = level_up(cameras)
-            best = at_size(best_views(reference, size=planned_at(size), up=up), size, made=True)
-            renders = TeacherRenders(reference, best, background=colour)
+            best = at_size(best_views(dense, size=planned_at(size), up=up), size, made=True)
+            renders = TeacherRenders(dense, best, background=colour)
             psnr[best.names[0]] = evaluate(other, renders, background=colour).psnr
-            stand = frame_with(reference, best, up=None if up is None else up.tolist())
+            stand = frame_with(dense, best, up=None if up is None else up.tolist())
             cameras = Cameras.of([*cameras, *best])
         else:
-            stand = frame_with(reference, cameras)
+            stand = frame_with(dense, cameras)
         shown = {"typical": str(stand.name)} | {f"worst {i}": v.name for i, v in enumerate(worst, 1)}
         stops = [
             (
@@ -108,31 +115,27 @@ def compare(
             )
             for what, name in shown.items()
         ]
-        scenes = [
-            (name, stand.of(splats))
-            for name, splats in zip(short_names(paths), (reference, other), strict=True)
-        ]
+        labels = labels_of([first, second], [len(dense), len(other)], roles)
+        scenes = [(label, stand.of(splats)) for label, splats in zip(labels, (dense, other), strict=True)]
         with run.finishing("--output"):
             write_page(
                 output,
                 scenes,
                 start=stand.start,
                 stops=stops,
-                background=colour,
+                background=backdrop(known, [dense, other]),
                 overwrite=run.overwrite,
                 progress=run.progress,
             )
         run.kept.append(f"{output} is written")
         run.say(f"{output}: opens at {stand.name}; the arrows below lead to the worst views")
-    closer = _closer(run, first, second, reference, other, colour)
+    closer = _closer(run, first, second, dense, other, colour)
     if closer is not None:
         run.say(closer)
     run.result({**scores.as_dict(), "closer": closer, "output": None if output is None else str(output)})
 
 
-def _closer(
-    run: Run, first: Path, second: Path, reference: Splats, other: Splats, colour: Colour
-) -> str | None:
+def _closer(run: Run, first: Path, second: Path, dense: Splats, other: Splats, colour: Colour) -> str | None:
     """Say which of two results is closer to the scene that both show; None if one is that scene.
 
     Only runs know what they were made of.
@@ -147,18 +150,18 @@ def _closer(
         return None
     if not (is_run(first) and is_run(second)):
         both = f"{first} {second}"
-        return f"to see which is closer to the original: g2ard evaluate {both} --teacher ORIGINAL"
+        return f"to see which is closer to their dense scene: g2ard evaluate {both} --teacher DENSE"
     try:
         common = common_of([first, second], background=True)
     except InputError as error:
-        return f"cannot say which is closer to the original: {error}"
+        return f"cannot say which is closer to their dense scene: {error}"
     assert common is not None
     teaching = Teaching(common.teacher, colour, chosen=True, photos=common.photos, **run.callbacks)
     cameras = load_views(common.views, "test", common.size, unpictured=teaching.dense is not None)
     targets = scorable(teaching.targets(cameras))
     scores = [
-        evaluate(splats, targets, background=colour, progress=run.progress) for splats in (reference, other)
+        evaluate(splats, targets, background=colour, progress=run.progress) for splats in (dense, other)
     ]
-    line = better_line(short_names([first, second]), scores, targets, "test")
-    original = "the photos" if common.teacher is None else str(common.teacher)
-    return f"against {original}, {line}"
+    line = better_line(names_of([first, second]), scores, targets, "test")
+    targets_of = "the photos" if common.teacher is None else str(common.teacher)
+    return f"against {targets_of}, {line}"

@@ -144,8 +144,7 @@ def distill(
             folder.write(done, job.views, job.targets)
             with run.finishing("scoring"):
                 report: Any = job.report(done, folder.scene)
-            title = f"{source.name}: {report.title}"
-            report, line = folder.write_pages(title, job, done, report, told(report))
+            report, line = folder.write_pages(source, job, done, report, told(report))
             folder.write_report(report)
     tell_run(run, source, job, done, report, folder, line)
 

@@ -14,7 +14,7 @@ from g2ard.cli.frame import Run, command
 from g2ard.config.choices import BLACK, LpipsInput
 from g2ard.errors import InputError
 from g2ard.io import check_scene
-from g2ard.io.paths import short_names
+from g2ard.io.labels import names_of
 
 if TYPE_CHECKING:
     from g2ard.scene.splats import Splats
@@ -148,7 +148,7 @@ def evaluate(
     protocol = f"{convention}'s conventions, {'8-bit' if eight_bit else 'float'} renders"
     name = "" if split == "all" else split
     _table(run, f"{scored_in(targets, name)}; {protocol}", rows)
-    names = short_names(scenes)
+    names = names_of(scenes)
     if unshrunk is not None:
         run.say(_own_size_line(names, rows))
     better = better_line(names, found, targets, name)
@@ -190,7 +190,7 @@ def _own_size_line(names: list[str], rows: list[dict[str, Any]]) -> str:
 
 def _table(run: Run, title: str, rows: list[dict[str, Any]]) -> None:
     columns = {
-        "scene": short_names([Path(r["scene"]) for r in rows]),
+        "scene": names_of([Path(r["scene"]) for r in rows]),
         "Gaussians": [f"{r['count']:,}" for r in rows],
         "MB": [f"{r['file_bytes'] / 1e6:.2f}" for r in rows],
         "PSNR": [f"{r['psnr']:.2f}" for r in rows],

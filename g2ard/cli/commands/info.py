@@ -70,6 +70,7 @@ def _described(path: Path, images: Path | None) -> tuple[dict[str, Any], list[li
     from g2ard.cli.run_folder import stopped_run
     from g2ard.io.describe import describe
     from g2ard.io.jsonfile import read_json
+    from g2ard.io.labels import RESULT
 
     if (stopped := stopped_run(path)) is not None:
         return stopped, _rows_of_stopped(path, stopped)
@@ -85,14 +86,16 @@ def _described(path: Path, images: Path | None) -> tuple[dict[str, Any], list[li
     figures, report = describe(scene, _overdraw), read_json(path / "report.json")
     against, scores = _scores(report)
     figures["run"] = {"input_count": report["input_count"], "against": against, "scores": scores}
-    rows = [["made from", plural(report["input_count"], "Gaussian")]]
+    photos, one = report.get("photos"), "point" if report.get("lifted") else "Gaussian"
+    rows = [["made from", plural(photos, "photo") if photos else plural(report["input_count"], one)]]
     if "overdraw" in report:  # not of runs in tiles
         figures["run"]["overdraw"] = report["overdraw"]
         rows.append(["Gaussians per pixel, held-out", f"{report['overdraw']:.1f}"])
+    words = {"simplified": "start" if photos else "simplified", "recovered": RESULT}
     for name, found in scores.items():
         ssim = f", SSIM {found['ssim']:.4f}" if "ssim" in found else ""
         size = f", {report['size']}" if "size" in report else ""
-        rows.append([name, f"{found['psnr']:.2f} dB{ssim} against {against}{size}"])
+        rows.append([words[name], f"{found['psnr']:.2f} dB{ssim} against {against}{size}"])
     return figures, [*_rows(figures), *rows]
 
 
@@ -109,9 +112,11 @@ def _overdraw(splats: Splats) -> dict[str, Any]:
 
 def _scores(report: dict[str, Any]) -> tuple[str, dict[str, dict[str, float]]]:
     """Return the name of a run's targets and its scores; tiled runs have only PSNR."""
+    from g2ard.rendering.targets import kinds_told
+
     scores = report["scores"]
     if "tiles" in report:
-        return "the scene's renders", {name: {"psnr": scores[name]} for name in ("simplified", "recovered")}
+        return kinds_told(0, 1), {name: {"psnr": scores[name]} for name in ("simplified", "recovered")}
     return report["against"], {
         name: {k: found[k] for k in ("psnr", "ssim")} for name, found in scores.items()
     }

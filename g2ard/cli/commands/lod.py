@@ -214,7 +214,7 @@ def lod(
         run.kept.append(f"{output} is written")
         frame: dict[str, Any] = {"views": views, "beside": scene, "up": axis}
         with run.finishing("the page"):
-            written += write_level_page(output, levels.splats, kind, background=colour, **frame)
+            written += write_level_page(output, levels.splats, kind, background=background, **frame)
             query = "" if kind == "sog" else "/?cesium=URL (a folder of CesiumJS)"
             run.say(f"page: python -m http.server --directory {output}, then http://localhost:8000{query}")
         peak = {"peak_rss_bytes": peak_rss_of_all()} if tiled else {}

@@ -96,7 +96,7 @@ def recover(
         kinds = job.score(result)
         if job.held_out is not None:
             pixels = job.held_out.cameras.size_text
-            title = f"held-out views against {kinds_of(job.held_out)}, {pixels}, before → after:"
+            title = f"held-out views against {kinds_of(job.held_out)}, {pixels}, start → result:"
             run.console.table(title, list(COLUMNS), cells(kinds))
         for line in filter(None, (loss(kind, "the student is better there") for kind in kinds)):
             run.say(line)

@@ -157,7 +157,9 @@ def register(
     if len(found.cameras):
         run.write_views(output, found.cameras, format)
     if report is not None:
-        title = f"Photos in {scene.name}"
+        from g2ard.io.labels import names_of
+
+        title = f"Photos in {names_of([scene])[0]}"
         with run.finishing("--report"):
             registration_report(
                 report, title, job.scene, job.photos, found, job.starts, config.size, lines, job.background

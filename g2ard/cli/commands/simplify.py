@@ -18,6 +18,7 @@ from g2ard.config.choices import is_made
 from g2ard.config.schema import listed
 from g2ard.io import kind
 from g2ard.io.atomic import atomic_output
+from g2ard.io.labels import counted
 from g2ard.io.scene_formats import written_bytes
 from g2ard.progress import plural
 from g2ard.system.peak_memory import peak_rss_of_all
@@ -182,7 +183,7 @@ def _tell(run: Run, scene: Path, reduce: Reduction, small: Simplified, output: P
         run.say(f"note: no view sees {share:.0%} of the Gaussians; they are weighted by size only")
     say_gaps(small.report.opacity_lost, run.say)
     say_weight(run, scene, output, reduce.splats)  # a sample has as much SH
-    run.say(f"{output}: {len(small.splats):,} of {plural(reduce.total, 'Gaussian')} in {seconds:.1f} s")
+    run.say(f"{output}: {len(small.splats):,} of {counted(reduce.total, scene)} in {seconds:.1f} s")
 
 
 def _table(run: Run, small: Simplified) -> None:

@@ -11,28 +11,29 @@ import typer
 
 from g2ard.cli import options as opt
 from g2ard.cli.frame import Run, command
-from g2ard.config.choices import BLACK
 from g2ard.io.detect import run_scene
-from g2ard.io.paths import short_names
-from g2ard.progress import plural
+from g2ard.io.labels import labels_of
 
 _LARGEST_DENSE = 2_000_000
 """Largest dense scene that is shown beside a run's result."""
 
 
-@command("view", example="g2ard view run/ dense.ply -o compare.html", scenes=True, without=("seed",))
+@command("view", example="g2ard view dense.ply run/ -o compare.html", scenes=True, without=("seed",))
 def view(
     run: Run,
     scene: Annotated[
         Path,
         typer.Argument(
             metavar="SCENE|RUN|LEVELS",
-            help="A scene, the folder of a `distill` run (beside its dense scene), or levels of `lod`.",
+            help="A scene, the folder of a `distill` run (right of its dense scene), or levels of `lod`.",
         ),
     ],
     other: Annotated[
         Path | None,
-        typer.Argument(metavar="[SCENE|RUN]", help="Second scene to compare with, right of a divider."),
+        typer.Argument(
+            metavar="[SCENE|RUN]",
+            help="Second scene, right of a divider; dense scenes stay left.",
+        ),
     ] = None,
     output: Annotated[
         Path | None,
@@ -98,24 +99,25 @@ def _write(
 ) -> None:
     """Write the page of one scene or two."""
     from g2ard.io import read_views
-    from g2ard.jobs.viewer_frame import frame_of
+    from g2ard.jobs.comparison import dense_first
+    from g2ard.jobs.viewer_frame import backdrop, frame_of
     from g2ard.viewer.page import write_page
 
     views = opt.with_images(given, images)
     run.claim_file("--output", output, page=True)
-    paths = [run_scene(path) for path in (scene, other) if path is not None]
+    shown, roles = ([scene], ()) if other is None else dense_first(scene, other)
+    paths = [run_scene(path) for path in shown]
     loaded = [run.load(path) for path in paths]
     if views is None and scene.is_dir() and (own := scene / "views.json").is_file():
         views = own if any(read_views(own).image_paths) else "made"  # generated ones show what trains
     stand = frame_of(loaded[0], views, start=start, beside=paths[0], up=up, say=run.say)
-    named = zip(short_names(paths), loaded, strict=True)
-    labels = [f"{name}: {plural(len(splats), 'Gaussian')}" for name, splats in named]
+    labels = labels_of(shown, [len(splats) for splats in loaded], roles)
     run.begin("page")
     written, scene_sizes = write_page(
         output,
         [(label, stand.of(splats)) for label, splats in zip(labels, loaded, strict=True)],
         start=stand.start,
-        background=opt.background_of(run, background, scene, other) or BLACK,
+        background=backdrop(opt.background_of(run, background, scene, other), loaded),
         overwrite=run.overwrite,
         progress=run.progress,
     )

@@ -183,6 +183,16 @@ class PriorMeasures(Report):
     view_dependent: bool
     consistency: float | None
 
+    @property
+    def is_lift(self) -> bool:
+        """Return whether the Gaussians are thin discs of equal proportions, their colours without view
+        dependence: an untrained lift."""
+        return (
+            not self.view_dependent
+            and self.thickness <= _LIFT_THICKNESS
+            and self.thickness_spread <= _LIFT_SPREAD
+        )
+
 
 def measure_prior(prior: Splats, cameras: Cameras | None = None) -> PriorMeasures:
     """Measure a scene, including its view consistency if there are views.
@@ -281,7 +291,7 @@ def regularizers_for(
 
 def _judged(m: PriorMeasures) -> tuple[str, str]:
     needles = f"{m.needle:.1%} of the Gaussians are needles"
-    if not m.view_dependent and m.thickness <= _LIFT_THICKNESS and m.thickness_spread <= _LIFT_SPREAD:
+    if m.is_lift:
         return "lift", "thin discs of equal proportions and colours without view dependence: not trained yet"
     if m.needle > _MANY_NEEDLES:
         return "noisy", needles

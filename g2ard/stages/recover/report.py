@@ -151,7 +151,7 @@ def outcome(report: RecoverReport) -> str | None:
         if lines:
             why = f"recovery fell to {', '.join(lines)}, and slower rates gained nothing"
         given_up = "" if report.stopped is None else f"; given up at step {report.stopped}"
-        return f"kept the simplified scene: {why}{given_up}"
+        return f"kept the start: {why}{given_up}"
     if lines:
         thirds = "a third" if len(lines) == 1 else f"1/{3 ** len(lines)}"
         return (
@@ -160,7 +160,7 @@ def outcome(report: RecoverReport) -> str | None:
     if report.blend < 1:
         return (
             f"recovery lost PSNR in the training views; the result mixes {report.blend:.0%} of it with "
-            f"{1 - report.blend:.0%} of the simplified scene, which scores more than either"
+            f"{1 - report.blend:.0%} of the start, which scores more than either"
         )
     return None
 

@@ -1,0 +1,71 @@
+"""Names and sizes of scenes, as pages, tables and messages show them."""
+
+import os
+import re
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+
+from g2ard.io.detect import kind
+from g2ard.progress import plural
+
+TARGET, DENSE, RESULT = "target", "dense scene", "result"
+"""Words for what renders are compared with, what is distilled, and what comes of it."""
+
+_GENERIC = re.compile(
+    r"(scene|points?(_?cloud|3d)?|cloud|splats?|gaussians?|model|output|result|simplified|(lod-)?meta|tileset|"
+    r"iteration_\d+|[\d_.-]+)",
+    re.IGNORECASE,
+)
+"""File and folder names that do not say which scene it is."""
+
+
+def names_of(paths: Sequence[Path]) -> list[str]:
+    """Return names of files or folders, with as many of their folders as tell which scene each one is.
+
+    >>> names_of([Path("garden.ply")]), names_of([Path("park/0_0")]), names_of([Path("run/scene.sog")])
+    (['garden.ply'], ['park/0_0'], ['run/scene.sog'])
+    >>> names_of([Path("a/small.ply"), Path("b/small.ply")])
+    ['a/small.ply', 'b/small.ply']
+    """
+    rows = [Path(os.path.abspath(path)).parts for path in paths]
+    depths = {row: _depth(row) for row in rows}
+    while True:
+        names = {row: "/".join(row[-depth:]) for row, depth in depths.items()}
+        times = Counter(names.values())
+        alike = [row for row in depths if times[names[row]] > 1 and depths[row] < len(row)]
+        if not alike:
+            return [names[row] for row in rows]
+        for row in alike:
+            depths[row] += 1
+
+
+def _depth(parts: tuple[str, ...]) -> int:
+    """Return how many parts of a path, from the last one, hold a name that is not generic."""
+    last = max(1, len(parts) - 1)
+    told = (depth for depth in range(1, last) if not _GENERIC.fullmatch(parts[-depth].split(".")[0]))
+    return next(told, last)
+
+
+def counted(count: int, scene: Path | str) -> str:
+    """Return a number of points, if the scene is the path of a point cloud, otherwise of Gaussians."""
+    return plural(count, "point" if isinstance(scene, Path) and kind(scene) == "points" else "Gaussian")
+
+
+def labels_of(scenes: Sequence[Path | str], counts: Sequence[int], roles: Sequence[str] = ()) -> list[str]:
+    """Return a label for each scene: its role if there are roles, its name and its size.
+
+    Args:
+        scenes: paths, or names of scenes without one.
+
+    >>> labels_of(["small", "dense"], [1, 2000])
+    ['small: 1 Gaussian', 'dense: 2,000 Gaussians']
+    >>> labels_of(["garden.ply"], [2000], [DENSE])
+    ['dense scene: garden.ply, 2,000 Gaussians']
+    """
+    names = iter(names_of([scene for scene in scenes if isinstance(scene, Path)]))
+    named = [next(names) if isinstance(scene, Path) else scene for scene in scenes]
+    sizes = [counted(count, scene) for count, scene in zip(counts, scenes, strict=True)]
+    if not roles:
+        return [f"{name}: {size}" for name, size in zip(named, sizes, strict=True)]
+    return [f"{role}: {name}, {size}" for role, name, size in zip(roles, named, sizes, strict=True)]

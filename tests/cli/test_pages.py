@@ -1,0 +1,199 @@
+"""Pages of all commands: which scene is on which side, what things are called, and what is behind them."""
+
+import json
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import pytest
+from PIL import Image
+
+from g2ard.config.choices import BLACK
+from helpers.commands import CommandLine, succeeds
+from helpers.photos import photos_of
+from helpers.writing_commands import write_inputs
+
+OTHER_WORDS = re.compile(r"\b(teacher|student|reference|original|recovered|distilled|prior)\b", re.I)
+"""Words that nobody reads for the dense scene, the target or the result."""
+
+
+class Text(HTMLParser):
+    """Text of a page with alternative texts and titles, the labels of its scenes, and its settings."""
+
+    def __init__(self, page: Path) -> None:
+        super().__init__()
+        self.text = ""
+        self.labels: list[str] = []
+        self.view: dict[str, Any] = {}
+        self._inside: tuple[str, dict[str, str | None]] = ("", {})
+        self.feed(page.read_text(encoding="utf-8"))
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self._inside = tag, dict(attrs)
+        self.text += "".join(f"\n{value}" for key, value in attrs if key in ("alt", "title", "aria-label"))
+
+    def handle_endtag(self, tag: str) -> None:
+        self._inside = "", {}
+
+    def handle_data(self, data: str) -> None:
+        tag, given = self._inside
+        if given.get("id") == "view":
+            self.view = json.loads(data)
+        if tag not in ("script", "style"):
+            self.text += f"\n{data}"
+        if given.get("class") == "label":
+            self.labels.append(data)
+
+
+BOTH = ["dense scene: ball.ply, 400 Gaussians", "result: run, 50 Gaussians"]
+PAGES: dict[str, tuple[str | None, list[str]]] = {
+    "run/view.html": ("distill ball.ply -r 8 --views views.json --steps 2 --size 24 --page -o run", BOTH),
+    "run/report.html": (None, []),
+    "given.html": ("view ball.ply run -o given.html", BOTH),
+    "turned.html": ("view run ball.ply -o turned.html", BOTH),
+    "compared.html": ("compare ball.ply run --views views.json -o compared.html", BOTH),
+    "back.html": ("compare run ball.ply --views views.json -o back.html", BOTH),
+    "two.html": (
+        "compare ball.ply other.ply --views views.json -o two.html",
+        ["ball.ply: 400 Gaussians", "other.ply: 200 Gaussians"],
+    ),
+    "levels/index.html": (
+        "lod ball.ply -r 4,8 --merge-only --views views.json -o levels",
+        ["ball.ply"],
+    ),
+    "found.html": (
+        "register ball.ply --images photos.json --matcher direct --report found.html -o poses.json",
+        [],
+    ),
+}
+"""Page → the command that writes it, unless an earlier one did, and its labels from left to right."""
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory, command_line: CommandLine) -> Path:
+    """Return a folder with all pages."""
+    folder = tmp_path_factory.mktemp("pages")
+    write_inputs(folder)
+    for command, _ in PAGES.values():
+        if command is not None:
+            succeeds(command_line, folder, *command.split())
+    return folder
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_the_dense_scene_is_left_and_the_result_right(page: str, made: Path) -> None:
+    assert Text(made / page).labels == PAGES[page][1]
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_pages_have_one_word_for_a_thing(page: str, made: Path) -> None:
+    text = Text(made / page).text
+    assert len(text) > 50
+    assert OTHER_WORDS.findall(text) == []
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        "distill ball.ply -r 8 --views views.json --steps 2 --size 24 -o said",
+        "compare ball.ply run --views views.json -w -o compared.html",
+        "compare other.ply run --views views.json",
+        "info run",
+        "evaluate run",
+        "view run ball.ply -w -o turned.html",
+    ],
+)
+def test_messages_have_the_words_of_pages(command: str, made: Path, command_line: CommandLine) -> None:
+    told = "".join(succeeds(command_line, made, *command.split(), "-v"))
+    told = re.sub(r"--teacher|simplified but not recovered", "", told)
+    assert OTHER_WORDS.findall(told) == []
+
+
+@pytest.fixture(scope="module")
+def of_photos(tmp_path_factory: pytest.TempPathFactory, command_line: CommandLine) -> tuple[Path, str]:
+    """Return the folder of a run from photos alone, and what it printed."""
+    folder = tmp_path_factory.mktemp("photos")
+    photos_of(folder / "bust", points=True, count=16)
+    ask = "distill --views bust -n 200 --steps 4 --page -o run"
+    return folder / "run", succeeds(command_line, folder, *ask.split()).err
+
+
+def test_photos_alone_show_the_photo_beside_the_result(of_photos: tuple[Path, str]) -> None:
+    run, told = of_photos
+    page = (run / "report.html").read_text(encoding="utf-8")
+    text = Text(run / "report.html").text
+    assert set(re.findall(r"<option[^>]*>(\w+) ", page)) == {"result"}
+    assert "start → result" in text
+    assert "start → result" in told
+    assert "simplified" not in text + told
+    size = f"{(run / 'scene.ply').stat().st_size / 1e6:.2f} MB"
+    for line in (text, told):
+        assert f"{size} as .ply" in line
+        assert f"→ {size}" not in line  # the first points are no larger scene
+    assert Text(run / "view.html").labels == ["result: run, 200 Gaussians"]
+    with Image.open(run / "preview.png") as found:
+        assert found.width < 3 * 64  # two photos of 64 pixels beside each other
+
+
+CLOUD_COMMANDS = [
+    "simplify autumn.ply -r 8 --no-views -o small.ply",
+    "distill autumn.ply -r 8 --views made --steps 2 --size 24 --page -o run",
+    "distill autumn.ply -r 8 --views photos.json --steps 2 -o run",
+    "distill autumn.ply -r 1 --views made --steps 2 --size 24 -o run",
+    "distill autumn.ply -n 401 --views made -o run",
+]
+
+
+@pytest.mark.parametrize("command", CLOUD_COMMANDS)
+def test_points_are_points(command: str, tmp_path: Path, command_line: CommandLine) -> None:
+    write_inputs(tmp_path)
+    (tmp_path / "cloud.ply").rename(tmp_path / "autumn.ply")
+    _, _, told = command_line(*command.split(), cwd=tmp_path)
+    for run in tmp_path.glob("run"):
+        told += succeeds(command_line, tmp_path, "info", run).out
+        told += "".join(Text(page).text for page in run.glob("*.html"))
+    as_many = "→ 400 Gaussians|400 Gaussians from 400 points|result: run, 400 Gaussians"
+    told = re.sub(as_many, "", told)
+    assert re.search("400 points|at most 400,", told)
+    assert not re.search(r"\b400 (Gaussian|→)", told), told
+
+
+LIFT_PAGES = {
+    "view.html": "view lifted.ply -o view.html",
+    "two.html": "compare lifted.ply other.ply --views views.json -o two.html",
+    "levels/index.html": "lod lifted.ply -r 1,4 --merge-only --views views.json -o levels",
+    "run/view.html": "distill cloud.ply -r 8 --views made --steps 2 --size 24 --page -o run",
+    "tileset/index.html": "lod lifted.ply -r 1,4 --merge-only --format 3dtiles --views views.json -o tileset",
+}
+
+
+@pytest.fixture(scope="module")
+def lifted(tmp_path_factory: pytest.TempPathFactory, command_line: CommandLine) -> Path:
+    folder = tmp_path_factory.mktemp("lifted")
+    write_inputs(folder)
+    succeeds(command_line, folder, "lift", "cloud.ply", "-o", "lifted.ply")
+    return folder
+
+
+@pytest.mark.parametrize("page", LIFT_PAGES)
+@pytest.mark.parametrize("given", [None, (0.25, 0.5, 1.0)])
+def test_lifts_are_before_a_soft_gradient_unless_a_background_is_given(
+    page: str, given: tuple[float, ...] | None, lifted: Path, command_line: CommandLine
+) -> None:
+    colour = () if given is None else ("--background", ",".join(map(str, given)))
+    succeeds(command_line, lifted, *LIFT_PAGES[page].split(), "-w", *colour)
+    assert background_of(lifted / page) == (given and list(given))
+    trained = LIFT_PAGES[page].replace("lifted.ply", "ball.ply").replace("cloud.ply", "ball.ply")
+    succeeds(command_line, lifted, *trained.split(), "-w", *colour)
+    assert background_of(lifted / page) == list(given or BLACK)
+    if page.startswith("run/"):
+        report = lifted / "run" / "report.json"
+        settings = json.loads(report.read_text(encoding="utf-8"))["settings"]
+        assert settings["recover.background"] == list(given or BLACK)
+
+
+def background_of(page: Path) -> Any:
+    found = re.search(r'"background": (null|\[[^]]*\])', page.read_text(encoding="utf-8"))
+    assert found is not None
+    return json.loads(found[1])
