@@ -146,9 +146,10 @@ class Page:
 
     def _crop(self, shown: Shown, window: Window) -> str:
         rows, columns = pixels(window, *shown.image.shape[:2])
-        number = self._image(shown.image[rows, columns])
+        crop = shown.image[rows, columns]
+        number, ratio = self._image(crop), crop.shape[1] / crop.shape[0]
         return (
-            f'<figure class="crop"><img data-i="{number}" alt="{escape(shown.name)}">'
+            f'<figure class="crop" style="max-width:min(300px,38vh*{ratio:.4f})"><img data-i="{number}" alt="{escape(shown.name)}">'
             f"<figcaption>{escape(shown.name)}</figcaption></figure>"
         )
 

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from g2ard.io.images import contact_sheet
 from g2ard.rendering.targets import TeacherRenders
 from g2ard.report import distilled
 from g2ard.report.page import Page, Shown, pixels, worst_windows
@@ -69,7 +70,7 @@ def test_the_caption_of_a_crop_names_its_image() -> None:
     grey = np.full((60, 80, 3), 128, np.uint8)
     page.comparison("view", grey, [Shown("small", grey // 2, "23.40 dB")])
     text = page.text()
-    captions = re.findall(r'class="crop">.*?<figcaption>(.*?)</figcaption>', text)
+    captions = re.findall(r'class="crop"[^>]*>.*?<figcaption>(.*?)</figcaption>', text)
     assert set(captions) == {"target", "small"}
 
 
@@ -93,3 +94,20 @@ def test_the_preview_has_the_scores_of_the_table_and_greys_what_is_not_scored(
     for image in (image for row in rows for image in row):
         assert (image[~mask] == 0.5).all()
     np.testing.assert_array_equal(rows[1][0][mask], targets[1][mask])
+
+
+@pytest.mark.parametrize("width", [20, 60, 400])
+def test_words_of_a_sheet_have_room(width: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    written: list[tuple[float, float]] = []
+
+    def text(self: Any, place: tuple[float, float], words: str, *, font: Any, **_: Any) -> None:
+        written.append((place[0], place[0] + font.getlength(words)))
+
+    monkeypatch.setattr("PIL.ImageDraw.ImageDraw.text", text)
+    rows = [[np.zeros((30, width, 3), np.uint8)] * 3] * 2
+    labels = ["target", "simplified: 50,000 Gaussians", "result: 50,000 Gaussians"]
+    sheet = contact_sheet(rows, labels, row_labels=["0027.jpg, simplified 24.32 dB, result 34.61 dB"] * 2)
+    assert len(written) == 5
+    assert all(end <= sheet.shape[1] for _, end in written)
+    ends = [0.0, *(end for _, end in written[:3])]
+    assert all(end <= start for end, (start, _) in zip(ends, written[:3], strict=False))

@@ -54,3 +54,22 @@ def test_pictures_are_no_taller_than_the_screen(
     assert browser.run("document.querySelector('.tag.right').textContent") == "one 9 dB"  # by the script
     pictures = browser.run("document.querySelectorAll('img[src^=\"data:image/jpeg;base64,\"]').length")
     assert pictures == 8  # a pair and two crops of three
+
+
+@pytest.mark.parametrize("shape", [(120, 67), (100, 100), (75, 100), (67, 120)])
+@pytest.mark.parametrize("count", [1, 2])
+def test_pictures_fill_their_card(
+    browser: Browser, shape: tuple[int, int], count: int, tmp_path: Path
+) -> None:
+    image = np.zeros((*shape, 3), np.uint8)
+    page = Page("a page")
+    shown = [Shown(name, image + np.uint8(9), "9 dB") for name in ("result", "simplified")[:count]]
+    page.comparison("view", image, shown)
+    opened(browser, page, tmp_path / "report.html", 1300)
+    browser.resize(1300, 900)
+    areas = browser.run(
+        "['.view', '.slider', '.crop img'].map(name => [...document.querySelectorAll(name)].map(e => {"
+        "const box = e.getBoundingClientRect(); return box.width * box.height}).reduce((a, b) => a + b))"
+    )
+    card, *pictures = areas
+    assert sum(pictures) > 0.5 * card
