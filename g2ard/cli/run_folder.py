@@ -196,8 +196,9 @@ class RunFolder:
         scenes = [] if report.photos else [("simplified", done.simplified)]  # a start of photos is a blur
         scenes.append((RESULT, done.splats))
         targets = list(filter(None, (done.held_out, job.targets.apart)))
-        recover, page, best = job.config.recover, self.path / "report.html", job.best(done)
+        recover, page = job.config.recover, self.path / "report.html"
         with self._run.finishing("report.html"):
+            best = job.best(done)
             distill_report(page, title, scenes, targets, report, recover.background, told, best=best)
         with self._run.finishing(_PICTURE):
             preview(self.path / _PICTURE, best, scenes, recover.background)

@@ -187,6 +187,7 @@ def say_weight(run: Run, source: Path, output: Path, splats: Splats, *, lifted: 
 
 def tell_quality(run: Run, budget: ResolvedBudget, splats: Splats) -> None:
     """Print the quality of a result with a quality budget; exit with status 3 if it is too low."""
+    run.begin("quality")
     judgement = budget.judge(splats)
     if judgement is None:
         return

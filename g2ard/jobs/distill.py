@@ -258,6 +258,7 @@ class DistillJob:
         if file.name != "scene.ply":
             found = score(read_splats(file), held_out, stage="score file")
             packed = Packed(file.name, found.psnr, found.ssim)
+        self.progress("gaps", 0, 0)
         return RunReport(
             input_count=len(self.prior),
             output_count=len(done.splats),
@@ -272,7 +273,7 @@ class DistillJob:
             kinds=by_kind(before, after, USUAL if made else "given"),
             unseen=self._unseen(done),
             opacity_lost=None if from_points else opacity_lost(self.prior, done.splats, cameras),
-            overdraw=overdraw(done.splats, cameras),
+            overdraw=overdraw(done.splats, cameras, self.progress),
             against=kinds_of(targets.held_out),
             preset=self.preset,
             prior=self.measured,

@@ -205,9 +205,13 @@ class Reduction:
         splats = self.splats
         pool = plan_pool(splats, _QUALITY_VIEWS, seed=self.seed, rows=_POOL_SAMPLE, progress=self.progress)
         cameras = pool.cameras.resized(_QUALITY_SIDE)
-        found, near = count_for_quality(
-            splats, wanted, cameras, lambda count: as_file(self(count).splats, file)
-        )
+
+        def reduce(count: int) -> Splats:
+            small = as_file(self(count).splats, file)
+            self.progress("quality", 0, 0)
+            return small
+
+        found, near = count_for_quality(splats, wanted, cameras, reduce)
         if found == len(splats):
             self.say(f"no smaller count was found that keeps the quality; keeping all {found:,} Gaussians")
         else:

@@ -327,12 +327,14 @@ def adapt(
     config, targets = config or AdaptConfig(), checked_targets(targets)
     given = compact if config.sh_degree is None else compact.with_sh_degree(config.sh_degree)
     probe = Probe(targets, config.background)
+    progress("adapt", 0, 0)
     change, start, share = None, given, np.ones(len(given))
     if isinstance(config, Stretched) and len(given) and len(targets.cameras):
         change = colour_change(given, targets, config.background)
         change = change if change.gain >= config.colour_worth else None
         start = given if change is None else recoloured(given, change)
     fitted, fits = _fit(start, targets, config, Steps(work, progress), progress)
+    progress("adapt", 0, 0)
     if config.prior_views:
         seen = views_seeing(start, targets.cameras)
         share = seen / (seen + config.prior_views)

@@ -28,7 +28,7 @@ from g2ard.poses.within import (
     plan_walk,
     reach_of,
 )
-from g2ard.progress import Progress, counter, silent
+from g2ard.progress import Progress, silent
 from g2ard.scene.cameras import Camera, Cameras
 from g2ard.scene.splats import Splats
 
@@ -171,7 +171,14 @@ def plan_pool(
     progress("scene", 0, 1)
     site = Site.of(splats, up, rows, represents)
     progress("scene", 1, 1)
-    survey = Survey(splats, represents, site, lens, seed, counter(progress, "poses"))
+
+    def tell(done: int, total: int) -> None:
+        progress("poses", done, total)
+        if done >= total:
+            progress("poses", 0, 0)  # until the next kind of poses
+
+    tell(0, 0)
+    survey = Survey(splats, represents, site, lens, seed, tell)
     if kind == "auto" and fov is None and is_room(survey):
         survey = replace(survey, lens=Lens(size, WIDE))
     poses, used, why = _planned(survey, kind, count)
@@ -196,6 +203,7 @@ def plan_pool(
     spread = max(float(np.ptp(poses.eyes, axis=0).max()), np.finfo(float).tiny)
     features = np.concatenate([poses.eyes / spread, poses.gazes / 4], axis=1)  # close for similar poses
     order = strata(features, HOLD_OUT, seed)
+    progress("poses", 1, 1)
     return Pool(
         survey.cameras(poses.take(order)),
         " + ".join(used),
@@ -218,6 +226,7 @@ def _planned(survey: Survey, kind: str, count: int) -> tuple[Poses, list[str], s
 
 def _more(survey: Survey, poses: Poses, reach: Reach, kind: str, count: int) -> list[Camera]:
     """Plan `Pool.more` views; near ones step from `poses`, with another seed than the pool's own."""
+    survey.tell(0, 0)
     if kind == "near":
         views = survey.cameras(plan_near(survey, poses, reach, count))
     else:

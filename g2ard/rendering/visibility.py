@@ -86,6 +86,7 @@ def visibility(
     splats, cameras = centred(splats, cameras)
     settings = settings_for(splats.means, settings, antialiased=splats.antialiased)
     views = [view_of(cameras, i, settings) for i in range(len(cameras))]
+    progress("visibility", 0, len(views))
     sums: dict[str, Any] = _core.accumulate(
         arrays_of(splats), views, settings, counter(progress, "visibility")
     )

@@ -194,7 +194,8 @@ def evaluate(
             (int(cameras.widths[view]), int(cameras.heights[view])),
         )
 
-    scores = []
+    scores: list[ViewScore] = []
+    progress(stage, 0, len(cameras))
     for done in in_threads(score, range(len(cameras))):
         scores.append(done)
         progress(stage, len(scores), len(cameras))

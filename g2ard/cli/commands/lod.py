@@ -204,6 +204,7 @@ def lod(
             content = [[one.store.key for one in levels.splats], asdict(rule)]
             begun = tiling.folder / f"written-{key_of(content)}"
             begun.mkdir(exist_ok=True)
+        run.begin("write")
         common: dict[str, Any] = {"cut": rule, "overwrite": run.overwrite, "work": begun, **run.callbacks}
         axis: Sequence[float] | None = up
         if kind == "sog":

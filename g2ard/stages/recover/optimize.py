@@ -96,6 +96,7 @@ def recover(
     anchors = anchors or Anchors.of(student, config.regularizers.in_plane)
     validation = validation if config.schedule.guarded else None
     probe = Probe(targets, config.background)
+    progress(stage, 0, 0)
     before = probe.all_of(student)
     view_weights = checked_weights(weights, len(targets.cameras))
     exact = skip_same and before >= _SAME_PSNR and config.schedule.guarded
@@ -114,9 +115,9 @@ def recover(
     loop = Loop(student, targets, config, view_weights, anchors, probe, guard, validation_key, frozen)
     if not exact:
         if checkpoint is None or not checkpoint.exists():
-            progress(stage, 0, 0, {})
             loop.choose_rates(before)
         end, seen = loop.run(checkpoint, progress, stage, watch)
+        progress(stage, 0, 0)
         result, after, blend = guard.choose_by_training(end)
     prior_views: float | None = 0.0
     if result is end and seen is not None:

@@ -99,6 +99,7 @@ def select(
     _check(cameras, k, policy, seed)
     began = time.perf_counter()
     seconds: dict[str, float] = {}
+    progress("select", 0, 0)
     coarse = surface(splats, min(_COARSE_CELLS, max(1, len(splats))))
     depths, shares = poses.outlooks(coarse, cameras)
     alike = poses.pose_kernel(cameras, depths)

@@ -66,8 +66,10 @@ def complete(
             scene, cameras, some, 1 / represents, lambda i: progress("coverage", first + i, renders)
         )
 
+    progress("coverage", 0, renders)
     before = light(measured, 0).sum(axis=0, dtype=np.float64) * (len(given) / max(1, len(measured)))
     received = light(offered, len(measured))
+    progress("select", 0, 0)
     order, gains = _core.select_light(received, before, most)
     again = float((before / (1 + before)).sum()) / max(len(given), least_views)
     count = int(np.searchsorted(-gains, -again))  # gains fall

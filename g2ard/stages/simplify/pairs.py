@@ -69,6 +69,7 @@ def merge(
 ) -> dict[str, Any]:
     """Merge by `default` or `fast`; `visibility` has one row per Gaussian of the scene."""
     config = config.resolved(antialiased=scene.antialiased)
+    progress("simplify", 0, 0)
     return _core.simplify_pairwise(
         scene.core,
         config.rounds(len(scene), budget),
@@ -97,7 +98,9 @@ def merge_and_fit(
     kept = row >= 0
     members = np.bincount(row[kept], minlength=len(merged))
     wanted = np.bincount(row[kept], weight[kept], len(merged))
-    fitted = fit_opacities(merged, members, wanted, source(merged).weight, wanted.mean())
+    weight = source(merged).weight
+    progress("opacities", 0, 0)
+    fitted = fit_opacities(merged, members, wanted, weight, wanted.mean())
     changed = fitted.logit_opacities != merged.logit_opacities
     changed |= (fitted.scales != merged.scales).any(axis=1)
     return {
