@@ -149,7 +149,8 @@ class Page:
         crop = shown.image[rows, columns]
         number, ratio = self._image(crop), crop.shape[1] / crop.shape[0]
         return (
-            f'<figure class="crop" style="max-width:min(300px,38vh*{ratio:.4f})"><img data-i="{number}" alt="{escape(shown.name)}">'
+            f'<figure class="crop" style="max-width:min(300px,38vh*{ratio:.4f})">'
+            f'<img data-i="{number}" alt="{escape(shown.name)}">'
             f"<figcaption>{escape(shown.name)}</figcaption></figure>"
         )
 

@@ -13,11 +13,12 @@ from g2ard.io import write_splats
 from g2ard.jobs.view_checks import opaque_points
 from g2ard.jobs.viewer_frame import frame_with
 from g2ard.rendering.metrics import psnr
+from g2ard.rendering.renderer import Renderer
 from g2ard.scene.cameras import Camera, Cameras
 from g2ard.scene.splats import Splats
 from g2ard.viewer.page import write_page
 from helpers.browser import Browser
-from helpers.pages import FRONT, GREY, HEIGHT, WIDTH, assert_shows, drawn, rendered, show
+from helpers.pages import FRONT, GREY, HEIGHT, WIDTH, assert_shows, drawn, like, rendered, show
 
 
 @pytest.fixture(scope="module")
@@ -186,3 +187,29 @@ def test_a_narrow_page_opens_readable_and_shows_each_scene_alone(tmp_path: Path)
         assert page.run(press.format(1)) == "inset(0px 0px 0px 0%)"
         assert page.run("document.getElementById('divider').hidden")
         assert page.run(press.format(1)) == "inset(0px 0px 0px 50%)"
+
+
+def test_without_a_background_scenes_are_before_a_soft_gradient(browser: Browser, tmp_path: Path) -> None:
+    scene = scattered()
+    stand = frame_with(scene, Cameras.of([FRONT]), up=(0, 0, 1))
+    shown = [(name, stand.of(scene)) for name in ("left", "right")]
+    image, alpha = layers(scene)
+    for count in (1, 2):
+        page = tmp_path / f"soft{count}.html"
+        write_page(page, shown[:count], start=stand.start, background=None)
+        show(browser, page)
+        drawn(browser, like(image, 30), count - 1)
+        browser.run("document.querySelector('.sse-ui').style.display = 'none'")
+        browser.run("document.getElementById('divider').hidden = true")
+        picture = browser.picture() / np.float32(255)
+        gradient = picture[60:, [0, -1]].mean(axis=1)  # seen on both sides, below the labels
+        assert (np.diff(gradient, axis=0) > -0.01).all()  # dithered
+        assert (gradient[-1] - gradient[0] > 0.1).all()
+        behind = image[60:] + (1 - alpha[60:, :, None]) * gradient[:, None]
+        assert psnr(picture[60:], np.clip(behind, 0, 1)) > 33
+
+
+def layers(scene: Splats) -> tuple[np.ndarray, np.ndarray]:
+    """Return the picture before black, (H, W, 3), and what it covers, (H, W)."""
+    found = Renderer(scene).render(FRONT)
+    return found.image, found.alpha
