@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from benchmarks.charts import COLORS, STYLE, Point, chart, legend, pareto, side_by_side
 from benchmarks.process import machine
 from benchmarks.rows import Row, shown
 from benchmarks.study import Study
 from g2ard import __version__
+from g2ard.report.charts import COLORS, STYLE, Point, chart, legend, pareto, side_by_side
 from g2ard.report.page import Page, Shown
 
 __all__ = ["write_report"]

@@ -33,7 +33,10 @@ USED: dict[str, tuple[str, ...]] = {
     ),
     "view": ("output", "views", "start", "background", "up", "overwrite"),
     "lod": ("output", "kind", "ratios", "recover", "views", "size", "place", "environment", "resume"),
-    "evaluate": ("views", "teacher", "photos", "images", "split", "size", "background", "lpips", "json"),
+    "evaluate": (
+        *("output", "views", "teacher", "photos", "images"),
+        *("split", "size", "background", "lpips", "json"),
+    ),
     "compare": ("output", "views", "looks", "size", "background", "overwrite"),
     "info": ("devices", "images", "json"),
 }

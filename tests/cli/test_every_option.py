@@ -201,6 +201,7 @@ OPTIONS: dict[str, dict[str, str]] = {
         "images": "--images other",
         "teacher": "--teacher ball.ply",
         "anchors": "--anchors fewer.ply",
+        "output": "-o page.html ball.ply --teacher ball.ply",
         "eight_bit": "--8bit",
         "split": "--split all",
     },

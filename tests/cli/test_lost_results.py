@@ -67,7 +67,7 @@ def test_a_failure_after_the_result_loses_nothing(
 def test_the_table_holds_every_command_that_writes_a_file() -> None:
     from g2ard.cli.app import COMMANDS as NAMES
 
-    assert set(NAMES) - {words.split()[0] for words in COMMANDS.values()} == {"evaluate", "info"}
+    assert set(NAMES) - {words.split()[0] for words in COMMANDS.values()} == {"info"}
 
 
 def test_a_run_whose_scores_failed_is_resumed(

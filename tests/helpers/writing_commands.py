@@ -29,6 +29,7 @@ COMMANDS = {
     "pool.json": "poses ball.ply -k 4 -o pool.json",
     "page.html": "view ball.ply --views views.json -o page.html",
     "two.html": "compare ball.ply other.ply --views views.json -o two.html",
+    "sizes.html": "evaluate ball.ply other.ply --teacher ball.ply --views views.json -o sizes.html",
     "tiles/tiles.json": "ingest ball.ply --tile-rows 150 -o tiles",
     "poses.json": "register ball.ply --images photos.json --matcher direct --report page.html -o poses.json",
 }

@@ -17,7 +17,12 @@ from g2ard.io import check_scene
 from g2ard.io.labels import names_of
 
 if TYPE_CHECKING:
+    from g2ard.jobs.inputs import Views
+    from g2ard.jobs.recover import Teaching
+    from g2ard.rendering.renderer import RasterSettings
+    from g2ard.rendering.targets import Targets
     from g2ard.scene.splats import Splats
+    from g2ard.stages.evaluate import Evaluation
 
 
 @command(
@@ -56,6 +61,16 @@ def evaluate(
     split: opt.SplitOption = "test",
     size: opt.SizeOption = None,
     background: opt.BackgroundOption = None,
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            "-o",
+            "--output",
+            metavar="FILE.html",
+            help="Write a page on results of several sizes: quality against size, pictures, and which "
+            "size suffices.",
+        ),
+    ] = None,
 ) -> None:
     """Score scenes against photos or a teacher's renders: PSNR, SSIM, edges, needles, overdraw.
 
@@ -79,6 +94,10 @@ def evaluate(
 
     if lpips_input != "scaled" and lpips is None:
         raise typer.BadParameter("--lpips-input goes with --lpips; give --lpips DIR")
+    if output is not None:
+        if len(scenes) < 2:
+            raise typer.BadParameter("--output compares sizes; give several scenes")
+        run.claim_file("--output", output, page=True)
     own = None
     if views is None and teacher is None:
         own = common_of(scenes, background=background is not None)
@@ -110,13 +129,15 @@ def evaluate(
     ]
     run.console.expect([*of_targets, *of_scenes])
     frozen = run.load(anchors) if anchors else None
-    full = load_views(teaching.views(given), split, None, run.say, unpictured=teaching.dense is not None)
+    found_views = teaching.views(given)
+    full = load_views(found_views, split, None, run.say, unpictured=teaching.dense is not None)
     targets = scorable(teaching.targets(full.resized(size), settings=settings), run.say)
     unshrunk = teaching.full_size(full, size, settings=settings)
     cameras = targets.cameras
     networks = load_lpips(lpips, scaled=lpips_input == "scaled") if lpips else None
     rows: list[dict[str, Any]] = []
     found = []
+    loaded: list[Splats] = []
     for path in scenes:
         splats = run.load(path)
         check_sight(splats, cameras, run.say)
@@ -133,6 +154,8 @@ def evaluate(
         )
         scored = alike(targets, stage=path.name)
         found.append(scored)
+        if output is not None:
+            loaded.append(splats)
         drift = None if frozen is None else _drift(frozen, splats, path)
         rows.append(
             {
@@ -154,12 +177,65 @@ def evaluate(
     better = better_line(names, found, targets, name)
     if better:
         run.say(better)
+    advice = None
+    if output is not None:
+        results = zip(scenes, loaded, found, strict=True)
+        advice = _write_ladder(run, output, list(results), targets, teaching, found_views, settings)
     counts = Counter(view["against"] for view in rows[0]["views"])
     single = {"photo": "photos", "teacher": "teacher"}
     against = counts if len(counts) > 1 else single[next(iter(counts))]
     followed = {"convention": convention, "8bit": eight_bit, "lpips_input": lpips_input if lpips else None}
-    told = {"against": against, "scored_in": scored_in(targets, name), "better": better}
+    told = {"against": against, "scored_in": scored_in(targets, name), "better": better, "advice": advice}
     run.result({**told, "protocol": followed, "scenes": rows})
+
+
+def _write_ladder(
+    run: Run,
+    output: Path,
+    results: list[tuple[Path, Splats, Evaluation]],
+    targets: Targets,
+    teaching: Teaching,
+    views: Views,
+    settings: RasterSettings,
+) -> str:
+    """Write the page on results of several sizes; print and return which one suffices."""
+    from g2ard.io.describe import bytes_of
+    from g2ard.jobs.viewer_frame import level_up
+    from g2ard.jobs.views import is_planned
+    from g2ard.poses import best_views
+    from g2ard.rendering.targets import Subset, TeacherRenders
+    from g2ard.report.ladder import Dense, Rung, labels, ladder, recommendation
+
+    run.begin("page")
+    dense, cameras = teaching.dense, targets.cameras
+    top = None
+    if dense is not None and teaching.teacher is not None:
+        teacher = Path(str(teaching.teacher))
+        top = Dense(teacher.name, len(dense), bytes_of(teacher))
+    names = short_names([path for path, _, _ in results])
+    words = labels(names, [len(splats) for _, splats, _ in results], None if top is None else top.count)
+    rungs = sorted(
+        (
+            Rung(name, word, bytes_of(path), splats, scores)
+            for (path, splats, scores), name, word in zip(results, names, words, strict=True)
+        ),
+        key=lambda rung: (rung.bytes, rung.name),
+    )
+    if dense is not None and not teaching.photos and is_planned(views):
+        best = best_views(dense, up=level_up(cameras)).resized(max(cameras[0].width, cameras[0].height))
+        shown: Targets = TeacherRenders(dense, best, background=teaching.background)
+    else:
+        name = best_views(rungs[-1].splats if dense is None else dense, 1, cameras).names[0]
+        shown = Subset(targets, [cameras.names.index(name)])
+    title = f"{'photos' if top is None else top.name}: {len(rungs)} sizes"
+    with run.finishing("--output"):
+        ladder(
+            output, title, rungs, targets, shown, dense=top, background=teaching.background, settings=settings
+        )
+    run.kept.append(f"{output} is written")
+    advice = recommendation(rungs)
+    run.say(f"{output}: {advice}")
+    return advice
 
 
 def _drift(frozen: Splats, splats: Splats, path: Path) -> float:

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from benchmarks.charts import Point, chart, pareto
+from g2ard.report.charts import Point, chart, pareto
 
 
 def test_pareto_points_are_beaten_by_none() -> None:

@@ -1,0 +1,176 @@
+"""Page of one scene's results at several sizes: quality against size, pictures, and which size suffices."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+from g2ard.config.choices import BLACK, Colour
+from g2ard.io.images import to_bytes
+from g2ard.progress import plural
+from g2ard.rendering.exposure import rendered
+from g2ard.rendering.renderer import RasterSettings, Renderer
+from g2ard.rendering.targets import Targets
+from g2ard.report.charts import STYLE, Point, chart, legend
+from g2ard.report.distilled import scored
+from g2ard.report.page import Page, Shown
+from g2ard.scene.splats import Splats
+from g2ard.stages.evaluate import Evaluation, ViewScore, evaluate
+
+_SOFT_PSNR = 32.0
+"""PSNR against the dense scene, dB, below which surfaces look soft."""
+_EQUAL_LOSS = 1.0
+"""Loss in dB against the best result that is tolerated where targets are photos, which no scene reaches."""
+
+
+@dataclass(frozen=True, eq=False)
+class Rung:
+    """A result of one size.
+
+    Args:
+        name: its file.
+        label: its size in one word, such as 10×.
+        bytes: size of the file.
+    """
+
+    name: str
+    label: str
+    bytes: int
+    splats: Splats
+    scores: Evaluation
+
+    @property
+    def worst(self) -> ViewScore:
+        """Score of its worst view."""
+        return min(self.scores.views, key=lambda view: view.psnr)
+
+
+@dataclass(frozen=True)
+class Dense:
+    """The scene that the results were made from: its name, Gaussians, and bytes of its file."""
+
+    name: str
+    count: int
+    bytes: int
+
+
+def labels(names: Sequence[str], counts: Sequence[int], dense: int | None) -> list[str]:
+    """Return a short name for each size: the ratio to the dense scene, the count, or the file's name.
+
+    >>> labels(["a", "b"], [100_000, 33_333], 1_000_000), labels(["a", "b"], [9, 20_000], None)
+    (['10×', '30×'], ['9 Gaussians', '20,000 Gaussians'])
+    >>> labels(["a.ply", "a.sog"], [100, 100], 1000)
+    ['a.ply', 'a.sog']
+    """
+    found = [plural(n, "Gaussian") if dense is None else f"{dense / n:.3g}×" for n in counts]
+    return list(names) if len(set(found)) < len(found) else found
+
+
+def recommendation(rungs: Sequence[Rung]) -> str:
+    """Return one sentence on the smallest result that suffices; `rungs` are sorted by size, smallest first.
+
+    Against renders of the dense scene no view may fall below 32 dB. Against photos the mean may be 1 dB below
+    the best.
+    """
+    by_photos = any(view.against == "photo" for view in rungs[0].scores.views)
+    best = max(rung.scores.psnr for rung in rungs)
+    enough = [
+        rung
+        for rung in rungs
+        if (rung.scores.psnr >= best - _EQUAL_LOSS if by_photos else rung.worst.psnr >= _SOFT_PSNR)
+    ]
+    if not enough:
+        largest = rungs[-1]
+        return (
+            f"every size loses visibly: {largest.label} has {largest.worst.psnr:.1f} dB in its worst view, "
+            f"and below {_SOFT_PSNR:.0f} dB surfaces look soft; keep more Gaussians"
+        )
+    found = enough[0]
+    if by_photos:
+        text = f"{found.label} is the smallest within {_EQUAL_LOSS:.0f} dB of the best: "
+        text += f"{found.scores.psnr:.1f} dB against the photos"
+    else:
+        text = f"{found.label} is the smallest without a visible loss: "
+        text += f"worst view {found.worst.psnr:.1f} dB"
+    return text + ("; fewer Gaussians may do" if found is rungs[0] else "")
+
+
+def ladder(
+    path: Path,
+    title: str,
+    rungs: Sequence[Rung],
+    targets: Targets,
+    best: Targets,
+    *,
+    dense: Dense | None,
+    background: Colour = BLACK,
+    settings: RasterSettings | None = None,
+) -> None:
+    """Write the HTML page.
+
+    Args:
+        rungs: the results, smallest first.
+        targets: photos or teacher renders that they are scored against.
+        best: targets whose first view shows most of the scene.
+        dense: the scene that they were made from; None without one.
+    """
+    advice = recommendation(rungs)
+    page = Page(title, f"{advice[0].upper()}{advice[1:]}.")
+    page.html(STYLE)
+    page.html(f'<div class="row"><figure>{_plot(rungs)}</figure></div>')
+    page.html(legend(["mean", "worst view"]))
+    page.table(_COLUMNS, _rows(rungs, dense))
+    page.paragraph(f"Scored in {rungs[0].scores.scored_in}.")
+    renderers = [Renderer(rung.splats, background=background, settings=settings) for rung in rungs]
+    score = partial(evaluate, targets=best, background=background, settings=settings)
+
+    def show(title: str, part: Targets, row: int, psnrs: Sequence[float]) -> None:
+        shown = [
+            Shown(rung.label, to_bytes(scored(rendered(renderer, part, row), part, row)), f"{psnr:.2f} dB")
+            for rung, renderer, psnr in zip(rungs, renderers, psnrs, strict=True)
+        ]
+        page.comparison(title, to_bytes(scored(part[row], part, row)), shown)
+
+    page.heading("The same view")
+    show(best.cameras.names[0], best, 0, [score(rung.splats).views[0].psnr for rung in rungs])
+    page.heading("The worst view of each size")
+    for name in dict.fromkeys(rung.worst.name for rung in rungs):
+        row = targets.cameras.names.index(name)
+        of = ", ".join(rung.label for rung in rungs if rung.worst.name == name)
+        show(f"{name}, worst of {of}", targets, row, [rung.scores.views[row].psnr for rung in rungs])
+    page.write(path)
+
+
+_COLUMNS = ("scene", "size", "Gaussians", "MB", "PSNR, dB", "worst view", "SSIM")
+
+
+def _rows(rungs: Sequence[Rung], dense: Dense | None) -> list[list[str]]:
+    top = [] if dense is None else [[dense.name, "1×", f"{dense.count:,}", _mb(dense.bytes), "", "", ""]]
+    return top + [
+        [
+            rung.name,
+            rung.label,
+            f"{rung.scores.count:,}",
+            _mb(rung.bytes),
+            f"{rung.scores.psnr:.2f}",
+            f"{rung.worst.name} {rung.worst.psnr:.2f}",
+            f"{rung.scores.ssim:.4f}",
+        ]
+        for rung in reversed(rungs)
+    ]
+
+
+def _mb(size: int) -> str:
+    return f"{size / 1e6:.2f}"
+
+
+def _plot(rungs: Sequence[Rung]) -> str:
+    """Draw mean and worst PSNR against size."""
+    points = []
+    for rung in rungs:
+        for series, psnr in enumerate((rung.scores.psnr, rung.worst.psnr)):
+            text = f"{rung.name}: {psnr:.2f} dB, {_mb(rung.bytes)} MB"
+            points.append(Point(rung.bytes / 1e6, psnr, series, text=text, label=rung.label))
+    return chart(points, x_label="MB", y_label="PSNR, dB", log=True, joined=True)
