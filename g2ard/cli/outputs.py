@@ -11,11 +11,13 @@ from g2ard.cli.frame import Run
 from g2ard.jobs.budget import Budget
 
 
-def budgets_of(run: Run) -> list[Budget]:
-    """Return the budgets of the options, and check that exactly one kind is given."""
+def budgets_of(run: Run, *, optional: bool = False) -> list[Budget]:
+    """Return the budgets of the options, and check that exactly one kind is given, or none if `optional`."""
     counts, ratios, fit, min_psnr, min_ssim = (run.shared[name] for name in BUDGETS)
     quality = min_psnr is not None or min_ssim is not None
     kinds = [bool(counts), bool(ratios), fit is not None, quality].count(True)
+    if not kinds and optional:
+        return []
     if not kinds:
         raise typer.BadParameter(f"say how small the result is to be, as -r 10 does: {BUDGET_FLAGS}")
     if kinds > 1:
@@ -28,15 +30,15 @@ def budgets_of(run: Run) -> list[Budget]:
     return [Budget(ratio=ratio) for several in ratios or [] for ratio in several]
 
 
-def budget_of(run: Run) -> Budget:
-    """Return the budget of the options, and check that it is the only one."""
-    first, *others = budgets_of(run)
-    if others:
+def budget_of(run: Run, *, optional: bool = False) -> Budget | None:
+    """Return the budget of the options, and check that it is the only one; None if `optional` and missing."""
+    budgets = budgets_of(run, optional=optional)
+    if len(budgets) > 1:
         raise typer.BadParameter(
             "give one budget, and run the command once for each; commas separate counts, so write a single "
             "one as 10_000"
         )
-    return first
+    return next(iter(budgets), None)
 
 
 def refuse_file(path: Path, what: str) -> None:

@@ -74,7 +74,7 @@ class RunFolder:
         self._scored = path / "scored.json"  # if some scored views are not in views.json
         self._inputs: dict[str, Any] = {}  # identity of each file that this run reads
 
-    def check(self, budget: Budget) -> dict[str, Any] | None:
+    def check(self, budget: Budget | None) -> dict[str, Any] | None:
         """Return the report of a finished run if --resume finds one; raise an `OutputError` unless the run
         may write here."""
         self._run.spare_inputs(self.scene, *self._other_scenes(), self._simplified, self._views, self._scored)
@@ -89,7 +89,7 @@ class RunFolder:
             check_stopped(self._run, self.unfinished, self._resume, self.scene)
         return self._finished(budget) if done else None
 
-    def _finished(self, budget: Budget) -> dict[str, Any]:
+    def _finished(self, budget: Budget | None) -> dict[str, Any]:
         """Return the finished run's report; raise an `OutputError` if its budget, options or input files were
         others."""
         record = read_json(self._report)
@@ -274,9 +274,9 @@ def stopped_run(folder: Path) -> dict[str, Any] | None:
     return {"path": str(folder), "kind": "stopped run", "kept": finished_steps(work), **told}
 
 
-def _other_budget(before: Mapping[str, Any], budget: Budget) -> list[str]:
+def _other_budget(before: Mapping[str, Any], budget: Budget | None) -> list[str]:
     """Return the name of the budget if an earlier run's was another one."""
-    if budget.is_measured or "output_count" not in before:  # measured ones are compared by their options
+    if budget is None or budget.is_measured or "output_count" not in before:  # options are compared
         return []
     with suppress(InputError):
         if budget.of(before["input_count"]) == before["output_count"]:

@@ -28,7 +28,7 @@ from g2ard.jobs.inputs import Views, load_scene, make_targets, scorable
 from g2ard.jobs.measured_budget import Reduction, ResolvedBudget
 from g2ard.jobs.memory import RECOVERY_TIMES
 from g2ard.jobs.photo_colors import colored
-from g2ard.jobs.photo_points import distinct, sparse_file, sparse_points, topped_up
+from g2ard.jobs.photo_points import distinct, sparse_file, sparse_points, topped_up, usual_count
 from g2ard.jobs.view_checks import check_photos, propose_background
 from g2ard.jobs.viewer_frame import level_up
 from g2ard.jobs.views import Use, views_of, within_pixels
@@ -351,7 +351,8 @@ def distill(
         scene: the dense scene, a coloured point cloud, or the path of either. None starts from photos alone:
             from COLMAP's sparse points, or as a fallback from points along camera rays
             (`g2ard.jobs.photo_points`).
-        count: Gaussians of the result, at most those of the scene.
+        count: Gaussians of the result, at most those of the scene. Photos alone need no budget: see
+            `g2ard.jobs.photo_points.usual_count`.
         ratio: reduction factor, at least 1.
         fit: largest file, such as "5MB", or a device (see `Budget`).
         min_psnr: PSNR (dB) that simplification alone must keep against the scene, in generated views.
@@ -418,7 +419,9 @@ def distill(
     >>> small = distill("cloud.laz", ratio=10)  # doctest: +SKIP
     >>> small = distill("cloud.ply", count=100_000, views="photos/", size=1600)  # doctest: +SKIP
     """
-    budget = Budget(count, ratio, fit=fit, min_psnr=min_psnr, min_ssim=min_ssim)
+    budget = None
+    if scene is not None or {count, ratio, fit, min_psnr, min_ssim} != {None}:
+        budget = Budget(count, ratio, fit=fit, min_psnr=min_psnr, min_ssim=min_ssim)
     named = {"steps": steps, "schedule": schedule, "background": background, "seed": seed}
     options = DistillOptions(
         views=views,
@@ -443,7 +446,7 @@ def distill(
 @contextmanager
 def preparing(
     scene: Scene,
-    budget: Budget,
+    budget: Budget | None,
     options: DistillOptions,
     tiling: Tiling | None = None,
     *,
@@ -459,7 +462,7 @@ def preparing(
         planned: whether tiles are only planned: the job has a cost, but cannot run.
     """
     callbacks: dict[str, Any] = {"progress": progress, "say": say}
-    if tiling is None:
+    if tiling is None or budget is None:
         yield prepare(scene, budget, options, use=use, **callbacks)
         return
     from g2ard.jobs.tiled import opened, prepare_tiles
@@ -473,7 +476,7 @@ def preparing(
 
 def prepare(
     scene: Scene,
-    budget: Budget,
+    budget: Budget | None,
     options: DistillOptions,
     *,
     use: Use = "distil",
@@ -484,12 +487,16 @@ def prepare(
 
     With the use `merging`, messages leave out what only recovery uses. Other arguments and errors are those
     of `distill`.
+
+    Args:
+        budget: None chooses a count for photos alone.
     """
     began, recovers = time.monotonic(), use != "merging"
     recover = options.config.recover  # rejects invalid settings before anything is read
     if not isinstance(scene, Splats):
         progress("read", 0, 0)
     read = _read(scene, budget, options, progress, say)
+    budget = budget or Budget(count=read.usual)
     prior, cleaned = read.prior, None
     if options.clean:
         done = remove_clutter(prior, seed=recover.seed, progress=progress, say=say)
@@ -623,6 +630,7 @@ class _Read:
         needs_photos: whether only photos can be its targets, as for points that go with photos.
         given: number of Gaussians, the first ones, from points that were not found in the photos.
         from_photos: whether the points, or some of them, were found in the photos, by COLMAP or here.
+        usual: count of the result, if no budget is given.
     """
 
     prior: Splats
@@ -632,9 +640,12 @@ class _Read:
     name: str
     given: int
     from_photos: bool = False
+    usual: int | None = None
 
 
-def _read(scene: Scene, budget: Budget, options: DistillOptions, progress: Progress, say: Say) -> _Read:
+def _read(
+    scene: Scene, budget: Budget | None, options: DistillOptions, progress: Progress, say: Say
+) -> _Read:
     """Read the dense scene, or lift points; with photos they are topped up to the budget."""
     if isinstance(scene, Splats):
         options.check_trained()
@@ -659,8 +670,12 @@ def _read(scene: Scene, budget: Budget, options: DistillOptions, progress: Progr
         split = "train" if options.held_out is None else for_training
         points = distinct(colored(cloud, views, split, name, progress=progress, say=say))
     given = 0 if points is None or scene is None else len(points)
-    wanted = budget.count or 0
-    if points is None and not wanted:
+    usual = None
+    if budget is None:
+        sparse = 0 if points is None else len(points)
+        usual = usual_count(views, options.held_out, options.size, sparse, say)
+    wanted = usual or (budget and budget.count) or 0
+    if points is None and budget is not None and not wanted:
         raise InputError(
             "needs sparse points, and there are none",
             parameter=budget.kind,
@@ -682,7 +697,7 @@ def _read(scene: Scene, budget: Budget, options: DistillOptions, progress: Progr
     # Each point has its disc, for as many are needed, also where positions are equal about another middle.
     config = options.config.lift
     lifted, _ = lift_rows(points.positions, points.colors, config, progress, merge=False)
-    return _Read(lifted, True, True, options.beside, name, given, of_photos)
+    return _Read(lifted, True, True, options.beside, name, given, of_photos, usual)
 
 
 def _points(

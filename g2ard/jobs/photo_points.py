@@ -26,6 +26,7 @@ from g2ard.io.types import Cloud, Points, ViewFiles, ViewSet
 from g2ard.jobs.inputs import Split, Views, load_view_sets
 from g2ard.progress import Progress, Say, plural, silent, unsaid
 from g2ard.scene.cameras import Cameras
+from g2ard.scene.samples import evenly_spaced
 from g2ard.stages.lift import merged
 
 _COARSE_VOXELS, _FINE_VOXELS = 64, 128
@@ -146,6 +147,8 @@ def grown(mask: Mask, radius: int) -> Mask:
     return mask
 
 
+_PIXELS_PER_GAUSSIAN, _MOST_USUAL_COUNT, _SAMPLED_PHOTOS = 100, 100_000, 16
+"""Pixels per Gaussian, most Gaussians, and photos that are looked at, if no count is given."""
 _PHOTO_SIDE = 240
 """Longer side in pixels of the photos used to place points."""
 _TRIAL_DEPTHS = 48
@@ -209,6 +212,37 @@ def topped_up(
     return Points(
         np.concatenate([part.positions for part in parts]), np.concatenate([part.colors for part in parts])
     )
+
+
+def usual_count(views: Views, held_out: Views | None, size: int | None, sparse: int, say: Say) -> int:
+    """Return the Gaussians of a scene that starts from photos alone, to two digits, and say so.
+
+    A Gaussian of SH degree 3 has 59 numbers, as many as 20 pixels. One per 100 pixels of the training photos
+    has five times as many equations as unknowns. There are at most 100,000, which take about ten minutes on
+    two cores, or as many as sparse points.
+
+    Args:
+        held_out: separate views for scoring; all of `views` are then for training.
+        size: longer side of the photos in pixels, if they are larger.
+    """
+    train = load_view_sets(views, ["train" if held_out is None else for_training], None)[0].cameras
+    cameras, small = train.resized(size), train.resized(_PHOTO_SIDE)
+    shares = [_shown_share(small, view) for view in evenly_spaced(len(small), _SAMPLED_PHOTOS)]
+    pixels = float((cameras.widths.astype(np.int64) * cameras.heights).sum()) * float(np.mean(shares))
+    most = max(_MOST_USUAL_COUNT, sparse)
+    found = max(1, int(float(f"{min(pixels / _PIXELS_PER_GAUSSIAN, most):.2g}")))
+    photos = plural(len(cameras), "photo")
+    say(f"{plural(found, 'Gaussian')}, one per {pixels / found:.0f} pixels of {photos}; a count changes it")
+    return found
+
+
+def _shown_share(cameras: Cameras, view: int) -> float:
+    """Return the share of a view's pixels that show something; 1 without a photo."""
+    if cameras.image_paths[view] is None:
+        return 1.0
+    image, mask = load_photo(cameras, view, None)
+    shown = image[..., 3] > 0.5 if image.shape[2] == 4 else np.ones(image.shape[:2], bool)
+    return float((shown if mask is None else shown & mask).mean())
 
 
 def distinct(points: Points) -> Points:

@@ -15,7 +15,7 @@ from g2ard.io.types import Points
 from g2ard.jobs.budget import Budget
 from g2ard.jobs.distill import prepare
 from g2ard.jobs.distill_options import DistillOptions
-from g2ard.jobs.photo_points import distinct, points_along_rays, topped_up, visual_hull
+from g2ard.jobs.photo_points import distinct, points_along_rays, topped_up, usual_count, visual_hull
 from g2ard.progress import silent, unsaid
 from g2ard.stages.recover.config import TUNED
 from helpers.commands import CommandLine, refused, succeeds
@@ -166,3 +166,47 @@ def test_rays_may_give_no_point(tmp_path: Path) -> None:
     write_png(tmp_path / "mask.png", np.zeros((48, 64)))
     with pytest.raises(InputError, match="found 0 points that three views see"):
         points_along_rays(replace(cameras, mask_paths=(tmp_path / "mask.png",) * 3), 70)
+
+
+def _of_photos(folder: Path, *ask: object, command_line: CommandLine) -> tuple[int, str]:
+    words = ("distill", "--views", "photos", "--steps", 2, "--no-page", "-o", "run", "-w", "--json", "-")
+    out, error = succeeds(command_line, folder, *words, *ask)
+    return json.loads(out)["output_count"], error
+
+
+def test_photos_alone_need_no_count(command_line: CommandLine, tmp_path: Path) -> None:
+    """It is one Gaussian per 100 pixels of the photos trained on, to two digits."""
+    photos_of(tmp_path / "photos")
+    train = g2ard.load_views(tmp_path / "photos", split="train")
+    for size in (None, 24):
+        given = () if size is None else ("--size", size)
+        count, error = _of_photos(tmp_path, *given, command_line=command_line)
+        cameras = train.resized(size)
+        pixels = int((cameras.widths * cameras.heights).sum())
+        assert count == int(float(f"{pixels / 100:.2g}"))
+        assert f"{count:,} Gaussians, one per " in error
+        assert f" pixels of {len(train)} photos; a count changes it\n" in error
+        assert (
+            g2ard.distill(None, views=tmp_path / "photos", steps=2, size=size).report.rounds[-1].count
+            == count
+        )
+    assert "has no budget" not in refused(command_line, tmp_path, "distill", "photos", "-o", "other")
+
+
+def test_transparent_pixels_need_no_gaussians(command_line: CommandLine, tmp_path: Path) -> None:
+    rgba_photos_of(tmp_path / "photos")
+    train = g2ard.load_views(tmp_path / "photos", split="train")
+    shares = [(load_photo(train, view, None)[0][..., 3] > 0.5).mean() for view in range(len(train))]
+    count, _ = _of_photos(tmp_path, command_line=command_line)
+    pixels = int((train.widths * train.heights).sum())
+    assert count == pytest.approx(np.mean(shares) * pixels / 100, rel=0.06)
+    assert np.mean(shares) < 0.7
+
+
+def test_no_count_is_above_its_limit_but_for_sparse_points(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    photos_of(tmp_path / "photos")
+    monkeypatch.setattr("g2ard.jobs.photo_points._MOST_USUAL_COUNT", 50)
+    for sparse, expected in ((0, 50), (70, 70)):
+        assert usual_count(tmp_path / "photos", None, None, sparse, unsaid) == expected

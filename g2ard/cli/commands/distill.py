@@ -81,6 +81,7 @@ def distill(
     The result has an exact number of Gaussians and standard 3DGS properties.
     Views come from --views, or from cameras found beside the scene, or are generated.
     A point cloud needs no photos; with posed ones (--views), the result is as sharp as they are.
+    Photos alone need no -n: it is one Gaussian per 100 of their pixels, at most 100,000.
     Scenes larger than memory and folders of tiles are distilled tile by tile.
     """
     from g2ard.cli.run_folder import RunFolder
@@ -91,7 +92,7 @@ def distill(
     from g2ard.pipeline.config import DistillConfig
 
     settings, _ = run.settled(DistillConfig(), preset)
-    budget = budget_of(run)
+    budget = budget_of(run, optional=scene is None)
     given = views is not None and not is_made(views)
     _check_options(scene, views, held_out, photos)
     if given:
@@ -124,10 +125,10 @@ def distill(
     )
     tiling = tiling_of(run, scene, output)
     how = tiling if scene is not None and is_tiled(scene, tiling) else None
-    if scene is not None and how is not None:
+    if scene is not None and budget is not None and how is not None:
         whole = needs_whole(options.config, preset, [budget], f"scene.{format}", clean=clean, photos=photos)
         refuse_whole(scene, whole)
-    elif scene is not None:
+    elif scene is not None and budget is not None:
         say_fit(run, scene, budget, f"scene.{format}")
     written = None if dry_run else how
     held = work_folder(run, written, options.views, options.held_out, again=" with --resume")
