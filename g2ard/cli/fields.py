@@ -73,7 +73,10 @@ FIELDS: dict[str, tuple[Any, Any]] = {
     ),
     **{f"{stage}.sh_degree": (int, _SH_DEGREE) for stage in ("recover", "adapt")},
     **{f"{stage}.engine": (Engine, _ENGINE) for stage in ("recover", "adapt")},
-    "adapt.steps": (int, typer.Option(min=1, help="Maximum steps; 7,000 by default.")),
+    "adapt.steps": (
+        int,
+        typer.Option(min=1, help="Maximum steps; by default 50 per image, at least 250 and at most 7,000."),
+    ),
     "adapt.tolerance": (
         float,
         typer.Option(

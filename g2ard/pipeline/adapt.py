@@ -39,6 +39,9 @@ _VISIBILITY_SIDE = 300
 """Longer side in pixels of the renders that measure visibility."""
 _HALF_SEEN_WEIGHT = 10.0
 """Σ αT over these renders at which a view counts as half."""
+_STEPS_PER_IMAGE, _FEWEST_STEPS, _MOST_STEPS = 50, 250, 7000
+"""Default steps: per image, at least, and at most as in the paper. A base colour moves by at most 0.28 × 0.03
+in a step and by half of that over a cosine, so that 250 steps span all of its range."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,7 +140,8 @@ class AdaptConfig(FitConfig, tag="schedule"):
     Args:
         schedule: "default" takes stretches of 500, 1,000, 2,000 … steps with cosine decay; "paper" takes all
             steps at once, with rates that decay to a tenth, without colour change or blending.
-        steps: maximum number of steps; 7,000 as in the paper.
+        steps: maximum number of steps. None takes 50 per image, at least 250 and at most the paper's 7,000,
+            which "paper" always takes.
         recovery: rates and decay of a stretch with frozen geometry, see `appearance_only`.
 
     Raises:
@@ -145,7 +149,7 @@ class AdaptConfig(FitConfig, tag="schedule"):
     """
 
     schedule: AdaptSchedule = "default"
-    steps: AtLeastOne = 7000
+    steps: AtLeastOne | None = None
     recovery: Schedule = field(default=_TUNED, metadata={"whole": True})
 
     if TYPE_CHECKING:  # the settings of a schedule are those of its class
@@ -162,15 +166,27 @@ class AdaptConfig(FitConfig, tag="schedule"):
                 parameter="recovery",
             )
 
-    def stretches(self) -> list[int]:
+    def most_steps(self, images: int) -> int:
+        """Return the maximum number of steps for some images.
+
+        >>> [AdaptConfig().most_steps(images) for images in (4, 43, 500)], AdaptConfig(steps=9).most_steps(4)
+        ([250, 2150, 7000], 9)
+        """
+        if self.steps is not None:
+            return self.steps
+        least = _FEWEST_STEPS if isinstance(self, Stretched) else _MOST_STEPS
+        return min(_MOST_STEPS, max(least, _STEPS_PER_IMAGE * images))
+
+    def stretches(self, images: int) -> list[int]:
         """Return the steps of each stretch, doubling; the remainder joins the last one.
 
-        >>> AdaptConfig().stretches(), AdaptConfig(steps=600).stretches()
+        >>> AdaptConfig().stretches(140), AdaptConfig(steps=600).stretches(140)
         ([500, 1000, 2000, 3500], [600])
         """
+        most = self.most_steps(images)
         if not isinstance(self, Stretched):
-            return [self.steps]
-        out, length, left = [], self.first_stretch, self.steps
+            return [most]
+        out, length, left = [], self.first_stretch, most
         while left >= 2 * length:
             out.append(length)
             left -= length
@@ -255,13 +271,14 @@ def _fit(
     start: Splats, targets: Targets, config: AdaptConfig, steps: Steps, progress: Progress
 ) -> tuple[Splats, list[RecoverReport]]:
     """Recover with frozen geometry in stretches, until one gains less than the tolerance."""
-    scene, before = start, 0
+    scene, before, images = start, 0, len(targets.cameras)
+    most = config.most_steps(images)
     reports: list[RecoverReport] = []
 
     def told(stage: str, done: int, total: int, info: Mapping[str, Any] | None = None) -> None:
-        progress(stage, before + done, config.steps, info or {})
+        progress(stage, before + done, most, info or {})
 
-    for length in config.stretches():
+    for length in config.stretches(images):
         how = RecoverConfig(
             schedule=config.recovery,
             steps=length,
@@ -340,7 +357,7 @@ def adapt(
         share = seen / (seen + config.prior_views)
     result = blended_appearance(start, fitted, share)
     changed = None if change is None else {k: np.asarray(v).tolist() for k, v in vars(change).items()}
-    taken = zip(config.stretches(), fits, strict=False)
+    taken = zip(config.stretches(len(targets.cameras)), fits, strict=False)
     stretches = tuple(Stretch(steps, fit.psnr.after) for steps, fit in taken)
     report = AdaptReport(
         steps=sum(stretch.steps for stretch in stretches),

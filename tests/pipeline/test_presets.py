@@ -132,7 +132,7 @@ def test_the_other_commands_know_it(folder: Path, command_line: CommandLine) -> 
 def test_in_python() -> None:
     noisy = g2ard.preset("paper-noisy")
     assert noisy.recover.regularizers == PAPER_REGULARIZERS["noisy"]
-    assert g2ard.preset("paper", g2ard.AdaptConfig()).stretches() == [7000]
+    assert g2ard.preset("paper", g2ard.AdaptConfig()).stretches(4) == [7000]
     with pytest.raises(InputError, match="expected"):
         preset("peer")
     with pytest.raises(InputError, match=r"views_count: .* in \(0, 1\]"):

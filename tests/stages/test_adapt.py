@@ -1,11 +1,13 @@
 """Appearance refitted on frozen geometry: colours changed at once, and Gaussians that few views have seen."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+import g2ard
 from g2ard.errors import InputError
 from g2ard.pipeline.adapt import (
     AdaptConfig,
@@ -19,6 +21,7 @@ from g2ard.rendering.renderer import render
 from g2ard.rendering.targets import Subset, TeacherRenders
 from g2ard.stages.evaluate import evaluate
 from g2ard.stages.simplify import simplify
+from helpers.commands import CommandLine, succeeds
 from helpers.scenes import around, checkered_ball
 
 VIEWS = around(24)
@@ -55,6 +58,43 @@ def test_stops_once_it_has_converged_and_not_before() -> None:
     every = adapt(pale(ball), targets, AdaptConfig(steps=1500, tolerance=0))
     assert every.report.steps == 1500
     assert [s.steps for s in every.report.stretches] == [500, 1000]
+
+
+@pytest.mark.parametrize(
+    ("count", "given", "said", "taken"),
+    [
+        (2, {}, "2 images: 250 steps", 250),
+        (20, {}, "20 images: 500 to 1,000 steps, as long as they gain", 500),
+        (20, {"tolerance": 0.0}, "20 images: 1,000 steps", 1000),
+        (2, {"steps": 3}, "2 images: 3 steps", 3),
+    ],
+)
+def test_steps_follow_the_number_of_images(
+    count: int, given: dict[str, float], said: str, taken: int, command_line: CommandLine, tmp_path: Path
+) -> None:
+    """The ball is there already, so that it stops as soon as it may."""
+    ball = checkered_ball(60)
+    g2ard.save(tmp_path / "ball.ply", ball)
+    g2ard.save_views(tmp_path / "views.json", VIEWS.take(range(count)).resized(16))
+    ask = ("adapt", "ball.ply", "--teacher", "ball.ply", "--views", "views.json", "--split", "all")
+    words = [word for name, value in given.items() for word in (f"--{name}", value)]
+    told = succeeds(command_line, tmp_path, *ask, *words, "-o", "out.ply", "--json", "told.json").err
+    assert f"{said}\n" in told
+    assert json.loads((tmp_path / "told.json").read_text())["steps"] == taken
+    planned = succeeds(command_line, tmp_path, *ask, *words, "--dry-run", "--json", "plan.json")
+    assert json.loads((tmp_path / "plan.json").read_text())["steps"] >= taken, planned
+
+
+def test_few_images_are_not_learnt_by_heart() -> None:
+    """More steps than the default for two images harm all other views, which gain by the default."""
+    ball, _ = evening()
+    compact = simplify(ball, 200).splats
+    targets = TeacherRenders(replace(ball, sh0=np.abs(ball.sh0)), VIEWS.resized(32))
+    some, others = Subset(targets, [0, 3]), Subset(targets, [1, 2, 4, 23])
+    few, many = (adapt(compact, some, AdaptConfig(**how)) for how in ({}, {"steps": 2000, "tolerance": 0.0}))
+    assert few.report.steps == 250
+    assert evaluate(few.splats, others).psnr > evaluate(many.splats, others).psnr
+    assert evaluate(few.splats, others).psnr > evaluate(compact, others).psnr
 
 
 def test_gives_a_flat_scene_bands_of_its_own() -> None:

@@ -68,10 +68,15 @@ def adapt(
         **run.callbacks,
     )
     _, targets = teaching.training(splats, opt.with_images(views, images, alpha), split, size)
-    cost = cost_of_recovery(splats, targets.cameras, config.steps, teacher=teaching.dense, stage="adapt")
+    count = len(targets.cameras)
+    most, first = config.most_steps(count), config.stretches(count)[0]
+    cost = cost_of_recovery(splats, targets.cameras, most, teacher=teaching.dense, stage="adapt")
     if dry_run:
         tell_plan(run, len(splats), cost)
         return
+    stops = first < most and config.tolerance > 0
+    least = f"{first:,} to " if stops else ""
+    run.say(f"{plural(count, 'image')}: {least}{plural(most, 'step')}{', as long as they gain' * stops}")
     run.console.expect(cost.stages)
     with stoppable(run, work, resume, output):
         work.mkdir(parents=True, exist_ok=True)
