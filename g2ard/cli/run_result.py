@@ -93,11 +93,12 @@ def told(report: RunReport | TiledReport, *, verbose: bool = False) -> list[str]
     if isinstance(report, TiledReport):
         return [line for line in map(loss, report.kinds) if line]
     from g2ard.jobs.measured_budget import score_lines
-    from g2ard.stages.recover.report import outcome, unregularized
+    from g2ard.stages.recover.report import cut_short, outcome, unregularized
     from g2ard.stages.simplify.gaps import RECOVERED_GAPS, gaps_line
 
     rounds = [entry.recover for entry in report.rounds]
     lines = [outcome(one) for entry in rounds for one in entry]
+    lines += [cut_short(one) for entry in rounds[-1:] for one in entry[-1:]]
     lines += [str(one.exposure) for entry in rounds for one in entry[-1:] if one.exposure]
     lines += [unregularized(rounds)] if verbose else []
     start = "start" if report.photos else "simplified scene"

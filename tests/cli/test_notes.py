@@ -42,6 +42,19 @@ def test_a_short_run_has_no_needless_notes(command_line: CommandLine, folder: Pa
     assert "regularisers: " in command_line(*SHORT, "-r", 10, "-o", "run", "-wv", cwd=folder)[2]
 
 
+def test_a_run_that_time_ends_says_so(command_line: CommandLine, tmp_path: Path) -> None:
+    """No machine takes a million steps in 0.2 s."""
+    photos_of(tmp_path / "photos", points=True)
+    ask = ("--views", "photos", "--set", "schedule.steps=1000000", "--recovery-time", "0.2s")
+    told = succeeds(
+        command_line, tmp_path, "distill", *ask, "-n", 300, "--keep", "--no-page", "-o", "run"
+    ).err
+    told += succeeds(
+        command_line, tmp_path, "recover", "run/simplified/scene.ply", *ask, "-o", "better.ply"
+    ).err
+    assert len(re.findall(r"(?m)^time ended recovery at step \d+ of 1,000,000\b", told)) == 2
+
+
 def test_one_is_one(command_line: CommandLine, folder: Path) -> None:
     ask = ("distill", "ball.ply", "-n", 1, "-o", "run", "--steps", 2, "--size", 32, "--format", "splat")
     error = succeeds(command_line, folder, *ask).err

@@ -28,7 +28,7 @@ from g2ard.stages.recover.anchors import REGULARIZERS, Anchors
 from g2ard.stages.recover.config import TUNED
 from g2ard.stages.recover.engine import FusedEngine
 from g2ard.stages.recover.guard import Guard, blended
-from g2ard.stages.recover.report import outcome
+from g2ard.stages.recover.report import cut_short, outcome
 from g2ard.stages.simplify import SimplifyConfig, simplify
 from g2ard.system import devices
 from helpers.gpus import skip_without_gpu
@@ -326,6 +326,31 @@ def test_a_recovery_time_sets_the_horizon(student: Splats, targets: TeacherRende
     assert 50 < report.steps < 600
     assert 6.0 <= report.seconds < 6.1
     assert report.psnr.after > report.psnr.before + 1
+
+
+@pytest.mark.usefixtures("clock")
+def test_a_recovery_that_time_ends_says_what_it_missed(student: Splats, targets: TeacherRenders) -> None:
+    seen: dict[int, tuple[float, Splats]] = {}
+    config = RecoverConfig(recovery_time=6.0)
+
+    def watch(step: int, seconds: float, scene: Callable[[], Splats]) -> None:
+        seen[step] = seconds, scene()
+
+    done = recover(student, targets, config, watch=watch).report
+    planned = config.final_steps(student, targets.cameras, photos=False)
+    assert done.steps < planned == done.planned
+    looked = 1 + min(step for step, (seconds, _) in seen.items() if seconds >= 0.75 * 6.0)
+    before, after = (
+        probe.Probe(targets, config.background).all_of(seen[step][1]) for step in (looked, done.steps)
+    )
+    assert done.pace == pytest.approx(100 * (after - before) / (done.steps - looked))
+    gaining = f"it was still gaining {done.pace:.1f} dB" if done.pace >= 0.05 else "it gained under 0.05 dB"
+    told = f"time ended recovery at step {done.steps} of {planned:,}; {gaining} per 100 steps"
+    assert cut_short(done) == told
+    long_enough = replace(config, schedule=replace(TUNED, steps=20))
+    assert cut_short(recover(student, targets, long_enough).report) is None
+    unlimited = recover(student, targets, RecoverConfig(steps=20)).report
+    assert (unlimited.planned, unlimited.pace) == (None, None)
 
 
 def test_progress_figures(student: Splats, targets: TeacherRenders, monkeypatch: pytest.MonkeyPatch) -> None:

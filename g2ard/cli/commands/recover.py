@@ -52,7 +52,7 @@ def recover(
     from g2ard.rendering.targets import kinds_of
     from g2ard.report.run import COLUMNS, cells
     from g2ard.stages.recover import RecoverConfig
-    from g2ard.stages.recover.report import outcome, unregularized
+    from g2ard.stages.recover.report import cut_short, outcome, unregularized
 
     if teacher is not None and not photos:
         run.refuse_typed("with --teacher, unless --photos is given", "alpha")
@@ -89,7 +89,8 @@ def recover(
         result = job.run(checkpoint)
         run.write(output, result.splats)
     exposure = str(result.report.exposure or "")
-    lines = [outcome(result.report), exposure, unregularized([[result.report]]) if run.verbose else None]
+    lines = [outcome(result.report), cut_short(result.report), exposure]
+    lines += [unregularized([[result.report]]) if run.verbose else None]
     for line in filter(None, lines):
         run.say(line)
     with run.finishing("scoring"):

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from g2ard.errors import InputError
 from g2ard.progress import Progress, plural, silent
 from g2ard.rendering.exposure import Exposure
-from g2ard.rendering.targets import Targets, fingerprint_of
+from g2ard.rendering.targets import Targets, fingerprint_of, kinds_of, kinds_told
 from g2ard.scene.cameras import unseeing
 from g2ard.scene.shape import needle_share
 from g2ard.scene.splats import Splats, unit_quats
@@ -119,6 +119,8 @@ def recover(
         end, seen = loop.run(checkpoint, progress, stage, watch)
         progress(stage, 0, 0)
         result, after, blend = guard.choose_by_training(end)
+    limited = config.recovery_time is not None and not exact
+    pace = guard.pace(loop.done, after) if limited and result is end else None
     prior_views: float | None = 0.0
     if result is end and seen is not None:
         result, prior_views = guard.choose_by_validation(end, seen, loop.done)
@@ -151,5 +153,14 @@ def recover(
             skipped={"non_finite": loop.skipped},
             exposure=None if loop.exposures is None else Exposure.over(loop.exposures, targets),
             resumed=loop.resumed,
+            planned=_planned(config, student, targets) if limited else None,
+            pace=pace,
         ),
     )
+
+
+def _planned(config: RecoverConfig, student: Splats, targets: Targets) -> int:
+    """Return the steps that a recovery takes without a time limit."""
+    if not config.final:
+        return config.horizon
+    return config.final_steps(student, targets.cameras, photos=kinds_of(targets) != kinds_told(0, 1))

@@ -9,6 +9,9 @@ from g2ard.progress import plural
 from g2ard.rendering.exposure import Exposure
 from g2ard.scene.cameras import USUAL
 
+_LEAST_PACE = 0.05
+"""Gain in dB per 100 steps that is worth more time."""
+
 
 @dataclass(frozen=True)
 class Gain(Report):
@@ -96,6 +99,8 @@ class RecoverReport(Report):
         skipped: `non_finite`: single-Gaussian steps whose gradient was not finite.
         exposure: what was estimated of the photos' exposures; None if they agree.
         resumed: part of `seconds` before this call resumed; None if it did not resume.
+        planned: steps that the schedule takes without a time limit; None without a limit.
+        pace: gain at the end of a limited recovery, dB per 100 steps.
     """
 
     steps: int
@@ -118,6 +123,8 @@ class RecoverReport(Report):
     skipped: dict[str, int]
     exposure: Exposure | None = field(default=None, metadata=LEFT_OUT)
     resumed: float | None = field(default=None, metadata=LEFT_OUT)
+    planned: int | None = field(default=None, metadata=LEFT_OUT)
+    pace: float | None = field(default=None, metadata=LEFT_OUT)
 
     def __repr__(self) -> str:
         return f"RecoverReport({plural(self.steps, 'step')} in {self.seconds:.1f} s, {self.psnr})"
@@ -163,6 +170,27 @@ def outcome(report: RecoverReport) -> str | None:
             f"{1 - report.blend:.0%} of the start, which scores more than either"
         )
     return None
+
+
+def cut_short(report: RecoverReport) -> str | None:
+    """Return a message if time ended a recovery before its usual steps, and whether it still gained.
+
+    >>> from dataclasses import replace
+    >>> rest = [(), Regularized(1, 0.0, 100), (), None, 1.0, False, None, {}]
+    >>> full = RecoverReport(827, 1.0, [], Gain(20, 28), 1.0, None, 0.0, (), 0.0, 0.0, *rest)
+    >>> cut_short(replace(full, planned=2100, pace=0.41))
+    'time ended recovery at step 827 of 2,100; it was still gaining 0.4 dB per 100 steps'
+    >>> cut_short(full) is cut_short(replace(full, planned=800)) is None
+    True
+    """
+    if report.planned is None or report.steps >= report.planned or report.kept_start or report.stopped:
+        return None
+    text = f"time ended recovery at step {report.steps:,} of {report.planned:,}"
+    if report.pace is None:
+        return text
+    if report.pace < _LEAST_PACE:
+        return f"{text}; it gained under {_LEAST_PACE:g} dB per 100 steps"
+    return f"{text}; it was still gaining {report.pace:.1f} dB per 100 steps"
 
 
 def unregularized(rounds: Sequence[Sequence[RecoverReport]]) -> str | None:
