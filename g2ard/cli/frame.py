@@ -95,7 +95,7 @@ _SETTINGS: dict[str, tuple[Any, ...]] = {
         list[str] | None,
         typer.Option(
             metavar="PATH=VALUE",
-            help="Change a setting, such as recover.schedule.steps=300; repeatable. See docs/options.md.",
+            help="Change any setting by its path; repeatable. See docs/options.md.",
         ),
     )
 }

@@ -7,12 +7,10 @@ from typing import Any
 
 import pytest
 
-import g2ard
 from g2ard.cli.app import COMMANDS
 from g2ard.cli.panels import USED
 from helpers.commands import CommandLine, refused, succeeds
 from helpers.project import ROOT
-from helpers.scenes import checkered_ball
 
 
 def options_of(command: str) -> dict[str, Any]:
@@ -46,31 +44,6 @@ def test_help_shows_twelve_options_at_most_in_order_of_use(
     assert [flag for flag in shown if flag in flags or flag.startswith("-")] == flags
     assert f"g2ard {command} --help-all" in text
     assert f"Example: g2ard {command}" in text
-
-
-@pytest.mark.parametrize("command", [c for c in COMMANDS if {"count", "ratio"} & set(options_of(c))])
-@pytest.mark.parametrize("option", ["count", "ratio"])
-def test_values_that_help_names_are_taken(
-    command: str, option: str, command_line: CommandLine, tmp_path: Path
-) -> None:
-    """Every example of a budget in a command's help is taken; several that it does not name are refused."""
-    known = options_of(command)[option]
-    flag, ball = known.opts[0], checkered_ball(40)
-    g2ard.save(tmp_path / "ball.ply", ball)
-    several = re.search(r"Several \((.*?)\) need (\{\w+\}) in (--\w+)", known.help)
-    if several:
-        values, pattern, output = several.groups()
-        small = {"10k,20k": "10,20", "5,10,20": "5,10,20"}[values]  # the ball has no 10,000
-        succeeds(command_line, tmp_path, command, "ball.ply", flag, small, output, f"out_{pattern}.ply")
-        assert len([*tmp_path.glob("out_*.ply")]) == small.count(",") + 1
-    else:
-        told = refused(command_line, tmp_path, command, "ball.ply", flag, "5,10", "-o", "out")
-        assert "one budget" in told
-    examples = {"count": r"250000, 250k, 1.5M or 25%", "ratio": "10 keeps a tenth"}[option]
-    assert examples in known.help
-    for value in re.findall(r"[\d.]+[kM%]?", examples):
-        told = command_line(command, "ball.ply", flag, value, "--dry-run", cwd=tmp_path)[2]
-        assert "--help" not in told, told  # no usage error, though the ball may have fewer Gaussians
 
 
 @pytest.mark.parametrize("command", COMMANDS)

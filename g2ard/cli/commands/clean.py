@@ -44,7 +44,8 @@ def clean(
         str | None,
         typer.Option(
             metavar="KIND,…",
-            help="Kinds to remove: invisible, giant, needle, floater, haze, streak; all by default; or none.",
+            help="Kinds to remove: invisible, giant, needle, floater, and with --strength haze, streak; all "
+            "by default; or none.",
         ),
     ] = None,
     split_sky: Annotated[
