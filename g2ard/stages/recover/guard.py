@@ -33,7 +33,7 @@ _LEAST_GAIN = 0.05
 _VALIDATION_FROM, _VALIDATION_LOSS = 0.5, 0.5
 """Share of the horizon from which validation views can stop a run, and the loss in dB above which they do."""
 
-_STATE = ("looked", "backed_off", "stopped", "best_score", "validation", "latest")
+_STATE = ("looked", "backed_off", "stopped", "best_score", "validation", "scores")
 _BEST = "best."
 
 
@@ -62,7 +62,7 @@ class Guard:
     backed_off: list[dict[str, float]] = field(default_factory=list)
     stopped: int | None = None
     validation: list[dict[str, Any]] = field(default_factory=list)
-    latest: tuple[int, float] | None = None
+    scores: list[tuple[int, float]] = field(default_factory=list)
     best_score: float = field(init=False)
 
     def __post_init__(self) -> None:
@@ -83,7 +83,7 @@ class Guard:
         while self.due(share):
             self.looked += 1
         value = self.score(scene)
-        self.latest = step, value
+        self.scores.append((step, value))
         if value > self.best_score:
             self.best, self.best_score = scene, value
         if not value < self.before - _HOPELESS_LOSSES[self.looked - 1] and math.isfinite(value):
@@ -100,10 +100,9 @@ class Guard:
         return "back"
 
     def pace(self, step: int, value: float) -> float | None:
-        """Return the gain in dB per 100 steps since the latest look; None without one."""
-        if self.latest is None or step <= self.latest[0]:
-            return None
-        return 100 * (value - self.latest[1]) / (step - self.latest[0])
+        """Return the gain in dB per 100 steps since the latest earlier look; None without one."""
+        earlier = [look for look in self.scores if look[0] < step]
+        return 100 * (value - earlier[-1][1]) / (step - earlier[-1][0]) if earlier else None
 
     @property
     def lost(self) -> float:
