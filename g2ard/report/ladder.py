@@ -9,7 +9,6 @@ from pathlib import Path
 
 from g2ard.config.choices import BLACK, Colour
 from g2ard.io.images import to_bytes
-from g2ard.progress import plural
 from g2ard.rendering.exposure import rendered
 from g2ard.rendering.renderer import RasterSettings, Renderer
 from g2ard.rendering.targets import Targets
@@ -59,13 +58,20 @@ class Dense:
 def labels(names: Sequence[str], counts: Sequence[int], dense: int | None) -> list[str]:
     """Return a short name for each size: the ratio to the dense scene, the count, or the file's name.
 
-    >>> labels(["a", "b"], [100_000, 33_333], 1_000_000), labels(["a", "b"], [9, 20_000], None)
-    (['10×', '30×'], ['9 Gaussians', '20,000 Gaussians'])
+    >>> labels(["a", "b"], [100_000, 33_333], 1_000_000), labels("abc", [9, 20_000, 1_234_567], None)
+    (['10×', '30×'], ['9', '20k', '1.23M'])
     >>> labels(["a.ply", "a.sog"], [100, 100], 1000)
     ['a.ply', 'a.sog']
     """
-    found = [plural(n, "Gaussian") if dense is None else f"{dense / n:.3g}×" for n in counts]
+    found = [_short(n) if dense is None else f"{dense / n:.3g}×" for n in counts]
     return list(names) if len(set(found)) < len(found) else found
+
+
+def _short(count: int) -> str:
+    for size, unit in ((1e6, "M"), (1e3, "k")):
+        if count >= size:
+            return f"{count / size:.3g}{unit}"
+    return str(count)
 
 
 def recommendation(rungs: Sequence[Rung]) -> str:
