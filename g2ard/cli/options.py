@@ -181,7 +181,8 @@ DryRunOption = Annotated[
 ]
 ResumeOption = Annotated[bool, typer.Option("--resume", help="Continue an interrupted run.")]
 SizeOption = Annotated[
-    int | None, typer.Option(min=16, metavar="PIXELS", help="Shrink images to this longer side.")
+    int | None,
+    typer.Option(min=16, metavar="PIXELS", help="Longer side of the images; photos only shrink to it."),
 ]
 
 
@@ -211,7 +212,7 @@ ShapeOption = Annotated[
     typer.Option(
         parser=_shape,
         metavar="PIXELS|WxH",
-        help="Longer side, or width and height, of generated views; given views shrink to a longer side.",
+        help="Longer side of the images, or width and height of generated views; photos only shrink.",
     ),
 ]
 BackgroundOption = Annotated[

@@ -453,7 +453,7 @@ def check_animation(path: Path) -> None:
     """Check that an animation of this suffix can be written."""
     if path.suffix.lower() == ".mp4" and shutil.which("ffmpeg") is None:
         raise MissingDependencyError(
-            "an .mp4 needs the program ffmpeg", path=path, hint="install it, or write .webp or .gif"
+            "an .mp4 needs the program ffmpeg on PATH", path=path, hint="install it, or write .webp or .gif"
         )
 
 

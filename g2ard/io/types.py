@@ -129,6 +129,10 @@ class ViewSet:
     def noted(self, code: str, count: int, text: str) -> ViewSet:
         return replace(self, notes=(*self.notes, Note(code, count, text)))
 
+    def fitted(self, longest: int | None) -> ViewSet:
+        """Return the views at a requested longer side; photos only shrink, and None keeps all."""
+        return replace(self, cameras=self.cameras.fitted(longest))
+
     def resized(self, longest: int | None) -> ViewSet:
         """Shrink views to a longer side of at most `longest` pixels; None keeps them."""
         return replace(self, cameras=self.cameras.resized(longest))

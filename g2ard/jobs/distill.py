@@ -183,7 +183,7 @@ class DistillJob:
             return done.scored_on(Subset(held_out, [cameras.names.index(name) for name in names]))
         found = best_views(self.prior, _SHOWN, up=level_up(pool.cameras))
         longest = int(np.maximum(cameras.widths, cameras.heights).max())
-        return TeacherRenders(self.teacher, found.resized(longest), background=self.config.recover.background)
+        return TeacherRenders(self.teacher, found.scaled(longest), background=self.config.recover.background)
 
     def run(self, work: Path | None = None) -> Distilled:
         """Distil the scene; `work` is the folder for resuming, see `g2ard.pipeline.distill`."""
@@ -363,7 +363,7 @@ def distill(
         photos: training images. True takes photos and skips views without one, False renders the scene, None
             takes the photo of each view and a render if it has none. A point cloud given with views needs
             photos; without views it is lifted, and the lift renders the training images.
-        size: longer side of the views in pixels, if they are larger.
+        size: longer side of the views in pixels; photos only shrink to it.
         preset: settings by name: "auto" measures the scene; "trained", "lift" or "noisy" names its kind;
             "paper" is the method of the paper, see `g2ard.preset`.
         format: file format that `fit`, `min_psnr` and `min_ssim` are meant for: ply, compressed.ply, sog,

@@ -71,19 +71,19 @@ _UNREPORTED_NOTES = ("clamped_logits",)
 def load_views(
     views: Views, split: str, size: int | None, say: Say = unsaid, *, unpictured: bool = False
 ) -> Cameras:
-    """Read the views of a split, shrunk to `size`; `unpictured` keeps views without a photo among others."""
+    """Read the views of a split at a longer side; `unpictured` keeps views without a photo among others."""
     return load_view_sets(views, [split], size, say, unpictured=unpictured)[0].cameras
 
 
 def load_view_sets(
     views: Views, splits: Sequence[Split], size: int | None, say: Say = unsaid, *, unpictured: bool = False
 ) -> list[ViewSet]:
-    """Read views once and return several splits, shrunk to `size`, with their weights."""
+    """Read views once and return several splits at a longer side, with their weights."""
     found, path = _read(views, say, unpictured=unpictured)
     parts = []
     for split in splits:
         chosen = partial(split_mask, which=split) if isinstance(split, str) else split
-        parts.append(found.take(chosen(path, found.cameras.names, stated=found.splits)).resized(size))
+        parts.append(found.take(chosen(path, found.cameras.names, stated=found.splits)).fitted(size))
     return parts
 
 

@@ -238,7 +238,7 @@ def lod(
         photos: training images. False renders the scene, True takes photos, None takes the photo of each view
             and a render if it has none.
         steps: steps of each recovery; None chooses like `g2ard.distill`.
-        size: longer side in pixels of the finest level's views, if they are larger.
+        size: longer side in pixels of the finest level's views; photos only shrink to it.
         background: RGB in [0, 1] behind the scene.
         beside: where to look for cameras, if `scene` is not a path.
         up: (3,) direction away from the ground for generated views; None estimates it.

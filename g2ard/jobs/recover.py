@@ -89,7 +89,7 @@ class Teaching:
     def training(self, scene: Splats, views: Views, split: str, size: int | None) -> tuple[ViewSet, Targets]:
         """Read a split of the views and return it with its targets; reject photos of another scene."""
         pool, mask = load_split_views(views, split, self.say, unpictured=self.dense is not None)
-        chosen = pool.take(mask).resized(size)
+        chosen = pool.take(mask).fitted(size)
         if held_out := chosen.splits.count("test"):
             count = len(chosen.cameras)
             self.say(f"split {split}: {held_out} of the {count} views trained on are test views")
@@ -123,14 +123,14 @@ class Teaching:
         cameras = self._split(views, "test")
         if cameras is None:
             return None
-        return scorable(self._made(cameras.resized(size)), self.say)
+        return scorable(self._made(cameras.fitted(size)), self.say)
 
     def validation(self, views: Views, size: int | None) -> Targets | None:
         """Return the renders of the views of other kinds in split `val`, or None."""
         cameras = None if self.dense is None or self.photos else self._split(views, "val")
         if cameras is None or USUAL in cameras.kinds:
             return None
-        return self._made(cameras.resized(size), say=self.say)
+        return self._made(cameras.fitted(size), say=self.say)
 
     def _split(self, views: Views, name: str) -> Cameras | None:
         """Return the views of a split, or None if it is empty."""
@@ -282,7 +282,7 @@ def recover(
         settings: values of `RecoverConfig` by path, without `targets`, such as
             {"recover.schedule.rates.means": 1e-3}; they override the preset.
         split: split of the views to train on.
-        size: longer side of the views in pixels, if they are larger.
+        size: longer side of the views in pixels; photos only shrink to it.
         weighted: draw views by the weights that they state; None asks the preset.
         render_model: overrides what the scenes' files say.
         weights: (C,) sampling weight of each view of `targets`; None draws all equally often.

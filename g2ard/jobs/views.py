@@ -12,16 +12,18 @@ import numpy as np
 
 from g2ard.config.checks import AtLeastOne, checks_arguments
 from g2ard.errors import InputError
+from g2ard.io.detect import run_views
 from g2ard.io.splits import for_scores, for_training, split_mask, splits_of
 from g2ard.io.types import ViewSet
 from g2ard.jobs.inputs import Views, drop_held_out, load_view_sets, load_views
-from g2ard.jobs.view_checks import as_pool, check_sight, given_or_found, opaque_points, warn_of_sight
+from g2ard.jobs.view_checks import as_pool, check_sight, given_or_found, warn_of_sight
+from g2ard.jobs.viewer_frame import level_up
 from g2ard.pipeline.config import SelectConfig
 from g2ard.pipeline.distill import RunViews
-from g2ard.poses import Pool, best_views, plan_pool
+from g2ard.poses import Pool, best_views, plan_pool, turntable
 from g2ard.poses.zooms import zoomed
-from g2ard.progress import Progress, Say, direction, silent, unsaid
-from g2ard.scene.cameras import USUAL, Camera, Cameras, look_at, rows_by_kind
+from g2ard.progress import Progress, Say, direction, plural, silent, unsaid
+from g2ard.scene.cameras import USUAL, Camera, Cameras, rows_by_kind
 from g2ard.scene.samples import evenly_spaced
 from g2ard.scene.splats import Splats
 from g2ard.stages.recover.config import STEPS_FOR_RENDERS, VIEWS_PER_SCHEDULE, RecoverConfig
@@ -136,7 +138,7 @@ def views_of(
     else:
         train, test = (replace(part, cameras=as_pool(part.cameras)) for part in (train, test))
     full = shrunk(test.cameras, options.size)
-    train, test = train.resized(options.size), test.resized(options.size)
+    train, test = train.fitted(options.size), test.fitted(options.size)
     if not teach or any(train.cameras.image_paths):
         if options.config.select.focus:
             say("warning: --focus has no effect on views with photos")
@@ -207,14 +209,14 @@ def _generated(
     )
     counts = _uses(use, len(train.cameras), len(test if held_out is None else held_out), len(apart or ()))
     say(f"views: {counts}; {_of(planned, pool.cameras)}")
-    train, scored = train.resized(size), test
+    train, scored = train.fitted(size), test
     if held_out is not None:
         train, scored = drop_held_out(train, held_out, say), held_out
-    full, scored = shrunk(scored, size), scored.resized(size)
+    full, scored = shrunk(scored, size), scored.fitted(size)
     twice = None
     if use == "distil" and held_out is None:
         twice = _twice(scored, max(2, round(share * _TWICE_VIEWS)))
-    return RunViews(train, scored, apart and apart.resized(size), pool, unseen, full, twice)
+    return RunViews(train, scored, apart and apart.fitted(size), pool, unseen, full, twice)
 
 
 def _twice(cameras: Cameras, count: int) -> Cameras | None:
@@ -297,7 +299,7 @@ def _mixed(
             say(f"warning: --focus {kind}: the scene has room for {taken} such views, {most} are wanted")
         offered += cameras[:taken]
         apart += cameras[taken:]
-    others = Cameras.of(apart).resized(size) if apart else None
+    others = Cameras.of(apart).fitted(size) if apart else None
     more, unseen = Cameras.of(offered) if offered else None, None
     if focus is None and more is not None:
         compact, per_row = _compact(prior, count, represents, progress)
@@ -315,7 +317,7 @@ def _mixed(
         return train, others, unseen
     weights = np.ones(usual) if train.weights is None else train.weights / train.weights.mean()
     mixed = ViewSet(
-        Cameras.of([*train.cameras, *more]).resized(size),
+        Cameras.of([*train.cameras, *more]).fitted(size),
         train.notes,
         train.splits and train.splits + ("train",) * len(more),
         np.append(weights, np.ones(len(more))),  # drawn equally often
@@ -398,14 +400,12 @@ def planned_at(size: Sequence[int] | None) -> tuple[int, int]:
 
 
 def at_size(cameras: Cameras, size: Sequence[int] | None, *, made: bool) -> Cameras:
-    """Return views at a requested size, see `planned_at`; those that were not `made` only shrink."""
-    if size is None:
-        return cameras
-    if made:
-        return cameras.scaled(size[0]) if len(size) == 1 else cameras.sized(size[0], size[1])
-    if len(size) > 1:
+    """Return views at a requested size, see `planned_at`; those that were not `made` keep their shape."""
+    if size is None or len(size) == 1:
+        return cameras.fitted(None if size is None else size[0])
+    if not made:
         raise InputError("given and found views keep their shape; give one number", parameter="size")
-    return cameras.resized(size[0])
+    return cameras.sized(size[0], size[1])
 
 
 def is_planned(views: Views) -> bool:
@@ -417,15 +417,21 @@ def looks_at(
     scene: Splats,
     count: int,
     *,
+    beside: str | Path | None = None,
     size: tuple[int, int] = _SHAPE,
     up: Up = None,
     seed: int = 0,
     progress: Progress = silent,
     say: Say = unsaid,
 ) -> Cameras:
-    """Return the views that show a scene best, and those of a pool if `count` asks for more."""
-    best = best_views(scene, count, size=size, up=up)
-    say(f"views: {count} generated")
+    """Return the views that show a scene best, and those of a pool if `count` asks for more.
+
+    They are chosen from the cameras of photos found `beside` the scene, if there are any.
+    """
+    photos = _photos_beside(scene, beside, size, up, say)
+    best = best_views(scene, count, photos, size=size, up=up)
+    if photos is None:
+        say(f"views: {count} generated")
     if len(best) == count:
         return best
     pool = _planned(scene, count - len(best), size=size, up=up, seed=seed, progress=progress)
@@ -506,10 +512,6 @@ def pool_times(count: float) -> float:
     return max(1.0, count / _POOL_GAUSSIANS)
 
 
-_TURN_POOL = 32
-"""Generated poses, of which the one that shows most of the scene begins the turn."""
-
-
 @checks_arguments
 def orbit(
     scene: Splats,
@@ -517,29 +519,27 @@ def orbit(
     *,
     size: tuple[int, int] = (800, 600),
     up: Sequence[float] | None = None,
-    seed: int = 0,
-    progress: Progress = silent,
+    beside: str | Path | None = None,
     say: Say = unsaid,
 ) -> Cameras:
-    """Return views at equal angles on a level circle around a scene, like `g2ard render --orbit`.
+    """Return views at equal angles that begin with the best one, like `g2ard render --orbit`.
 
-    All look at the circle's middle. The first view is the generated one that shows most of the scene; the
-    circle's middle is what lies at the median depth in its direction.
+    An object or a map is circled, with all of it in each frame. In a room the camera turns in place. A scene
+    of photos is circled around what the best photo has in the middle, to and fro if one side has no photos.
 
     Args:
         scene: the scene.
         count: number of views; the one after the last would be the first again.
         size: width and height, pixels.
         up: (3,) direction away from the ground; None estimates it.
-        seed: seed of the generated poses.
-        progress: called while poses are planned.
+        beside: path beside which to look for photos; None looks for none.
         say: called with the estimated up direction.
 
     Returns:
         The views, in order.
 
     Raises:
-        InputError: the scene is not visible, or has no room for poses around it.
+        InputError: the scene is not visible, or no free place sees it.
 
     >>> ball = np.random.default_rng(0).normal(size=(900, 3))
     >>> ball /= np.linalg.norm(ball, axis=1, keepdims=True)
@@ -547,20 +547,24 @@ def orbit(
     >>> len(orbit(scene, 4, size=(64, 48)))
     4
     """
-    pool = plan_pool(scene, _TURN_POOL, size=size, up=up, seed=seed, progress=progress)
-    points, axis = opaque_points(scene), np.asarray(pool.up, np.float64)
+    photos = _photos_beside(scene, beside, size, up, say)
+    level = level_up(photos) if up is None and photos is not None else None
+    views, axis = turntable(scene, count, photos, size=size, up=up if level is None else level)
     if up is None:
         say(f"up: {direction(axis)}, estimated; --up X,Y,Z sets it")
-    first = max(pool.cameras, key=lambda view: float(view.holds(points).mean()))
-    eye, ahead = first.position, first.viewmat[2, :3]
-    held = points[first.holds(points)]
-    target = eye + float(np.median((held - eye) @ ahead)) * ahead
-    height = ((eye - target) @ axis) * axis
-    level = eye - target - height
-    across = np.cross(axis, level)
-    views = []
-    for k in range(count):
-        angle = 2 * np.pi * k / count
-        position = target + height + np.cos(angle) * level + np.sin(angle) * across
-        views.append(replace(first, viewmat=look_at(position, target, axis), name=f"{k:04d}"))
-    return Cameras.of(views)
+    return views
+
+
+def _photos_beside(
+    scene: Splats, beside: str | Path | None, size: tuple[int, int], up: Sequence[float] | None, say: Say
+) -> Cameras | None:
+    """Return cameras at the poses of the photos of a run, or of those beside a scene, if there are any."""
+    found: Views | None = None if beside is None else run_views(beside)
+    if found is None or found == Path(str(beside)):
+        found, _ = given_or_found(None, beside, scene, [], say, up=up)
+    cameras = None if found is None else load_views(found, "all", None)
+    if cameras is None or not any(cameras.image_paths):
+        return None
+    say(f"views: from {plural(len(cameras), 'photo')} of {found}")
+    bare = replace(cameras, image_paths=(), mask_paths=(), lenses=(), distortions=np.zeros((0, 5)))
+    return bare.scaled(max(size))

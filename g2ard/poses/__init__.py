@@ -6,6 +6,6 @@ space and see enough (`sight`). `pool` combines them; `showing` chooses the view
 """
 
 from g2ard.poses.pool import Pool, make_pool, plan_pool
-from g2ard.poses.showing import best_views
+from g2ard.poses.showing import best_views, turntable
 
-__all__ = ["Pool", "best_views", "make_pool", "plan_pool"]
+__all__ = ["Pool", "best_views", "make_pool", "plan_pool", "turntable"]

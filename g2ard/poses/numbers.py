@@ -85,6 +85,17 @@ def directions(turn: Floats, level: Floats, height: ArrayLike) -> Floats:
     return np.stack([level * np.cos(around), level * np.sin(around), height], axis=1)
 
 
+def around(vector: Floats, angles: Floats) -> Floats:
+    """Return (K, 3): a vector turned around z by K angles, radians.
+
+    >>> around(np.array([1.0, 0.0, 5.0]), np.array([0.0, np.pi / 2, np.pi])).round(9).tolist()
+    [[1.0, 0.0, 5.0], [0.0, 1.0, 5.0], [-1.0, 0.0, 5.0]]
+    """
+    x, y, z = vector
+    cosine, sine = np.cos(angles), np.sin(angles)
+    return np.stack([x * cosine - y * sine, x * sine + y * cosine, np.full(len(angles), z)], axis=1)
+
+
 def fibonacci(count: int, low: float = -1.0, high: float = 1.0) -> Floats:
     """Return (count, 3) unit vectors, each representing the same area of the sphere.
 

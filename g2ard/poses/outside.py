@@ -9,6 +9,7 @@ import numpy as np
 from g2ard.poses.numbers import Floats, between, directions, halton, quantile, turned
 from g2ard.poses.sight import Lens, Poses, Rays, Survey, gather
 from g2ard.poses.site import Site
+from g2ard.scene.samples import evenly_spaced
 
 _ELEVATIONS, _DISTANCES = (-5.0, 50.0), (0.9, 1.25)
 """Ranges around an object: degrees above the horizon of its centre, and distances as multiples of that at
@@ -17,9 +18,12 @@ which it just fits."""
 _FITTING, _OUTLINE = 0.97, 8_000
 """Share of the matter in frame when the object just fits, and the points that represent its outline."""
 
-_FILLED, _WHOLE, _ROUNDS = 0.94, 0.998, 6
+_FILLED, _WHOLE, _ROUNDS = 0.9, 0.998, 6
 """Share of the frame that a view of the whole fills, the share of the matter that is the whole, and steps in
 which such a view finds its place."""
+
+_FITTED = 24
+"""Poses of a circle that are fitted, at most."""
 
 _OUTSIDE = 1.2
 """Least distance from the centre: everything lies within about 1 of it."""
@@ -100,6 +104,24 @@ def ring(survey: Survey, rises: Sequence[float], turns: int) -> Poses:
                 eye[axis] -= eye[2] * (slopes.max() + slopes.min()) / 2
         eyes[i] = eye @ frame
     return Poses(eyes, gazes).take(site.is_free(eyes, 2, _LOWEST))
+
+
+def circle(survey: Survey, gazes: Floats) -> Poses:
+    """Return poses on a level circle around a scene, with all of it just in frame."""
+    target = survey.site.box.mean(axis=0)
+    points, weights = survey.site.points[:_OUTLINE] - target, survey.site.weights[:_OUTLINE]
+    wide, tall = np.array(survey.lens.tangents) * _FILLED
+    frames = Poses(gazes, gazes).frames()
+    seen = [turned(points, frames[i]).T for i in evenly_spaced(len(gazes), _FITTED)]
+    away = down = 0.0
+    for _ in range(_ROUNDS):  # aim at the middle of what the frames show, as near as it fits all of them
+        needed = [np.maximum(np.abs(x) / wide, np.abs(y - down) / tall) - z for x, y, z in seen]
+        away = max(float(quantile(one, weights, _WHOLE)) for one in needed)
+        slopes = np.concatenate(
+            [((y - down) / (z + away))[one <= away] for (_, y, z), one in zip(seen, needed, strict=True)]
+        )
+        down += away * float(slopes.max() + slopes.min()) / 2
+    return Poses(target + down * frames[:, 1] - away * gazes, gazes)
 
 
 def plan_aerial(survey: Survey, count: int, shift: int = 0, first: int | None = None) -> Poses:

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from g2ard.errors import InputError
-from g2ard.poses.numbers import Floats, between, canonical_order, halton
-from g2ard.poses.outside import ring
+from g2ard.poses.numbers import Floats, around, between, canonical_order, halton, turned
+from g2ard.poses.outside import circle, ring
 from g2ard.poses.sight import Lens, Poses, Survey
 from g2ard.poses.site import Site
 from g2ard.poses.within import WIDE, closed, is_room, plan_inside, plan_sharp, plan_walk
@@ -37,11 +37,18 @@ _OPEN, _CRISP, _GOOD = 0.8, 0.6, 0.4
 above which a scene is shown from around; and clearness of a view within that counts. Measured: objects and
 maps above .96 and .99, rooms and a hall .60 to .66, an open scene under its own sky .97 and .47."""
 
-_LEAST = 1e-6
+_LEAST = 0.05
 """Clearness that all views have, so that a coarse scene has some."""
 
 _AGAIN, _APART = 0.1, 60.0
 """Worth of seeing again what an earlier view shows, and degrees between views that are different."""
+
+_MIDDLE, _EDGE, _UNCUT = 0.35, 0.15, 8.0
+"""Width of the middle of photos and of their margin, in halves of the image, and the power of the share of
+the subject that is within the margin."""
+
+_GAP = np.pi / 2
+"""Angle without photos, radians, that a turn does not enter."""
 
 _FULL, _CLEAR = 4.0, 0.5
 """Power of the covered share of the frame that counts in views within a scene, and the least clearness of a
@@ -58,12 +65,14 @@ class Outlook:
         clear: (V,) share of the image that shows Gaussians under 0.03 rad, times a power of the share that is
             not empty.
         detail: (V,) mean difference of neighbouring pixels.
+        spread: (V,) standard deviation of the colours: fronts are more colourful than backs.
     """
 
     cameras: Cameras
     seen: NDArray[np.float32]
     clear: Floats
     detail: Floats
+    spread: Floats
 
     @classmethod
     def of(cls, survey: Survey, cameras: Cameras, full: float = -1.0) -> Outlook:
@@ -71,9 +80,9 @@ class Outlook:
         site, glance = survey.site, survey.outlook
         points = (glance.points - site.origin) @ site.axes.T / site.size
         mass = glance.opacities * ((points > site.box[0]) & (points < site.box[1])).all(axis=1)
-        covered, sharp, detail, seen = glance.sights(cameras)
+        covered, sharp, detail, spread, seen = glance.sights(cameras)
         seen *= (mass / max(float(mass.sum()), 1e-9)).astype(np.float32)
-        return cls(cameras, seen, sharp * np.maximum(covered, 1e-9) ** full, detail)
+        return cls(cameras, seen, sharp * np.maximum(covered, 1e-9) ** full, detail, spread)
 
 
 def outlooks(survey: Survey, every: int = 1) -> tuple[Outlook, Outlook]:
@@ -139,27 +148,98 @@ def best_views(
     cameras = cameras and cameras.usual()
     if cameras is not None and len(cameras) == 1:
         return cameras
+    return _best(_survey(splats, size, up), count, cameras)[0]
+
+
+def turntable(
+    splats: Splats,
+    count: int,
+    cameras: Cameras | None = None,
+    *,
+    size: tuple[int, int] = (800, 600),
+    up: ArrayLike | None = None,
+) -> tuple[Cameras, Floats]:
+    """Return views at equal angles that begin with the best one, and the up direction.
+
+    Scenes that are shown from around turn as a whole. Within a scene, the camera turns in place. Photos turn
+    around what the best one has in the middle, to and fro if none are on one side.
+
+    Args and Raises: as `best_views`.
+    """
+    survey = _survey(splats, size, up)
+    best, kind = _best(survey, 1, cameras and cameras.usual())
+    site, first, angles = survey.site, best[0], 2 * np.pi * np.arange(count) / count
+    eye, gaze = (first.position - site.origin) @ site.axes.T / site.size, best.forwards[0] @ site.axes.T
+    away = 0.0
+    if kind == "photos":
+        assert cameras is not None
+        points = survey.outlook.points
+        middle = points[first.outward(points) < _MIDDLE]
+        away = (
+            float(np.median((middle - first.position) @ best.forwards[0])) / site.size if len(middle) else 0.0
+        )
+        eyes = turned((cameras.positions - site.origin) / site.size, site.axes) - (eye + away * gaze)
+        angles = _within_arc(angles, np.arctan2(eyes[:, 1], eyes[:, 0]) - np.arctan2(-gaze[1], -gaze[0]))
+    gazes = around(gaze, angles)
+    poses = circle(survey, gazes) if kind == "around" else Poses(eye + away * (gaze - gazes), gazes)
+    half = max(first.width / first.K[0, 0], first.height / first.K[1, 1] * size[0] / size[1]) / 2
+    views = replace(survey, lens=Lens(size, 2 * float(np.degrees(np.arctan(half))))).cameras(poses)
+    return replace(views, names=tuple(f"{i:04d}" for i in range(count))), site.axes[2]
+
+
+def _within_arc(angles: Floats, seen: Floats) -> Floats:
+    """Turn full circles into swings that begin at 0 and keep to the `seen` angles, if these leave a gap.
+
+    >>> _within_arc(np.radians([0, 90, 180, 270]), np.radians([0, 60, -30])).round(3).tolist()
+    [0.0, 1.047, 0.0, -0.524]
+    """
+    order = np.sort(np.append(seen % (2 * np.pi), 0.0))
+    gaps = np.diff(order, append=2 * np.pi)
+    widest = int(np.argmax(gaps))
+    if gaps[widest] < _GAP:
+        return angles
+    low, high = order[widest] + gaps[widest] - 2 * np.pi, order[widest]
+    return np.where(np.sin(angles) > 0, high, -low) * np.sin(angles)
+
+
+def _survey(splats: Splats, size: tuple[int, int], up: ArrayLike | None) -> Survey:
     rows = np.flatnonzero(splats.opacities > 1 / 255)
     some = splats.take(rows[canonical_order(splats, rows)[:_ROWS]])
     represents = len(rows) / max(1, len(some))
     some = some.take(some.finite_rows()) if len(some) else some
-    survey = Survey(some, represents, Site.of(some, up, None, represents), Lens(size))
+    return Survey(some, represents, Site.of(some, up, None, represents), Lens(size))
+
+
+def _best(survey: Survey, count: int, cameras: Cameras | None) -> tuple[Cameras, str]:
+    """Return the best views, and where they are: "photos", "within" or "around"."""
     if cameras is not None:
         look = Outlook.of(survey, cameras.take(evenly_spaced(len(cameras), _PHOTOS)))
-        shared = look.seen * look.seen.mean(axis=0)  # photos turn to their subject
-        worth = look.detail * (shared.sum(axis=1, dtype=np.float64) / max(float(shared.sum()), 1e-30)) ** 2
-        return look.cameras.take(_chosen(look, worth, count))
-    around, within = outlooks(survey)
-    look = within if len(within.cameras) and is_within(survey, around, within) else around
-    found = look.cameras.take(_chosen(look, look.detail, count))
+        return look.cameras.take(_chosen(look, look.detail * _wholeness(survey, look), count)), "photos"
+    outside, within = outlooks(survey)
+    kind = "within" if len(within.cameras) and is_within(survey, outside, within) else "around"
+    look = within if kind == "within" else outside
+    worth = look.detail if kind == "within" else look.detail * look.spread
+    found = look.cameras.take(_chosen(look, worth, count))
     if not len(found):
         raise InputError("no free place has a view of the scene; give views")
-    return replace(found, names=tuple(f"view_{i:04d}" for i in range(len(found))))
+    return replace(found, names=tuple(f"view_{i:04d}" for i in range(len(found)))), kind
+
+
+def _wholeness(survey: Survey, look: Outlook) -> Floats:
+    """Return (V,) how much photos show of their subject, which most have in the middle, and how whole."""
+    outward = np.stack([camera.outward(survey.outlook.points) for camera in look.cameras])
+    middle = (look.seen * np.exp(-np.square(outward / _MIDDLE) / 2)).mean(axis=0)
+    share = np.sqrt(middle / np.maximum(look.seen.max(axis=0), 1e-30))
+    shown = (look.seen * share).sum(axis=1)
+    within = (np.clip((1 - outward) / _EDGE, 0, 1) * middle * share).sum(axis=1)
+    within /= max(float((middle * share).sum()), 1e-30)
+    return shown / max(float(shown.max()), 1e-30) * within**_UNCUT
 
 
 def _chosen(look: Outlook, worth: Floats, count: int) -> list[int]:
     """Return clear views in order of what they add, times their worth."""
-    worth = np.where(look.clear >= _CLEAR * look.clear.max(initial=0), worth * (look.clear + _LEAST), 0.0)
+    clear = look.clear + _LEAST
+    worth = np.where(clear >= _CLEAR * clear.max(initial=0), worth * clear, 0.0)
     total = look.seen.sum(axis=1, dtype=np.float64)
     forwards, least = look.cameras.forwards, np.full(len(total), np.inf)
     union, chosen = np.zeros_like(look.seen[:1]), list[int]()

@@ -127,6 +127,7 @@ class Glance:
         shortest = np.arange(3) == np.argmin(sample.scales, axis=1)[:, None]
         logs = np.log(np.maximum(sample.scales, np.finfo(np.float32).tiny))
         self._means, self._antialiased = means, sample.antialiased
+        self._colors = np.clip(sample.colors.astype(np.float64), 0, 1)
         self.points, self.opacities = means + self._middle, sample.opacities
         self._arrays: tuple[NDArray[np.float32], ...] = (
             np.ascontiguousarray(means, np.float32),
@@ -160,14 +161,15 @@ class Glance:
         away = norms(cameras.positions - self._middle)
         return 1e-3 * float(np.median(away)) or None if len(cameras) else None
 
-    def sights(self, cameras: Cameras) -> tuple[Floats, Floats, Floats, NDArray[np.float32]]:
+    def sights(self, cameras: Cameras) -> tuple[Floats, Floats, Floats, Floats, NDArray[np.float32]]:
         """Look through C cameras, and tell what each sees of every Gaussian.
 
         Returns:
             (C,) mean α; (C,) the part of it from Gaussians under 0.03 rad; (C,) mean difference of
-            neighbouring pixels; and (C, N) mean transmittances in front of the Gaussians, 0 out of frame.
+            neighbouring pixels; (C,) standard deviation of the Gaussians' colours; and (C, N) mean
+            transmittances in front of the Gaussians, 0 out of frame.
         """
-        covered, fine, detail = np.zeros((3, len(cameras)))
+        covered, fine, detail, spread = np.zeros((4, len(cameras)))
         seen = np.zeros((len(cameras), len(self.points)), np.float32)
         near, rasterizer = self._near_of(cameras), _core.Rasterizer()
         settings = RasterSettings(antialiased=self._antialiased, near=near)
@@ -177,7 +179,9 @@ class Glance:
             covered[i], fine[i] = weight.sum(), weight[self._sigma < _FINE * depth].sum()
             seen[i] = sums["transmittance"] / np.maximum(1, sums["hits"])
             detail[i] = sum(np.abs(np.diff(image, axis=axis)).mean(dtype=np.float64) for axis in (0, 1))
-        return covered, fine, detail, seen
+            shown = sums["weight"].astype(np.float64)
+            spread[i] = np.sqrt(sum(_variance(channel, shown) for channel in self._colors.T))
+        return covered, fine, detail, spread, seen
 
     def clear(self, cameras: Cameras, aims: NDArray[np.int64], close: float) -> Floats:
         """Return the (C,) mean transmittances in front of what C views have in the middle, over its pixels.
@@ -214,6 +218,12 @@ class Glance:
             views = [view_of(here, i, settings) for i in batch]
             for i, sums in zip(batch, _core.accumulate_each(self._arrays, views, settings), strict=True):
                 yield sums, norms(self._means - here.positions[i]), views[i - first]
+
+
+def _variance(values: Floats, weights: Floats) -> float:
+    total = max(float(weights.sum()), 1e-30)
+    mean = float((weights * values).sum()) / total
+    return float((weights * (values - mean) ** 2).sum()) / total
 
 
 @dataclass(frozen=True, eq=False)

@@ -126,11 +126,16 @@ class Camera(Shown):
 
     def holds(self, points: ArrayLike) -> NDArray[np.bool_]:
         """Return which of the (N, 3) world points lie within the image, as (N,) bool, ignoring occlusion."""
+        return self.outward(points) <= 1
+
+    def outward(self, points: ArrayLike) -> NDArray[np.float64]:
+        """Return how far from the middle of the image (N, 3) world points lie: 1 at its edge, inf behind."""
         x, y, z = self.viewmat[:3, :3] @ (np.asarray(points, np.float64) - self.position).T
         K, front = self.K, z > 0
         ahead = np.where(front, z, 1.0)
         u, v = K[0, 0] * x / ahead + K[0, 2], K[1, 1] * y / ahead + K[1, 2]
-        return front & (u >= 0) & (u <= self.width) & (v >= 0) & (v <= self.height)
+        away = np.maximum(np.abs(2 * u / self.width - 1), np.abs(2 * v / self.height - 1))
+        return np.where(front, away, np.inf)
 
 
 @dataclass(frozen=True, eq=False)
@@ -307,17 +312,25 @@ class Cameras:
             return self
         return self._by(np.minimum(1.0, longest / np.maximum(self.widths, self.heights)))
 
+    def fitted(self, longest: int | None) -> Cameras:
+        """Return the views at a requested longer side; photos only shrink, and None keeps all."""
+        if longest is None:
+            return self
+        factor = longest / np.maximum(self.widths, self.heights)
+        pictured = [path is not None for path in self.image_paths]
+        return self._by(np.where(pictured, np.minimum(1.0, factor), factor))
+
     def scaled(self, longest: int) -> Cameras:
         """Return the views with a longer side of `longest` pixels, also if they are smaller."""
         return self._by(longest / np.maximum(self.widths, self.heights))
 
     def sized(self, width: int, height: int) -> Cameras:
-        """Return the views at exactly this size, with their horizontal field of view."""
+        """Return the views at exactly this size, each with all that it shows."""
         check_image(width, height, parameter="size")
         Ks = self.Ks.copy()
-        Ks[:, 0] *= (width / self.widths)[:, None]
-        Ks[:, 1, 1] *= width / self.widths
+        Ks[:, 0, 2] *= width / self.widths
         Ks[:, 1, 2] *= height / self.heights
+        Ks[:, (0, 1), (0, 1)] *= np.minimum(width / self.widths, height / self.heights)[:, None]
         n = len(self)
         return replace(self, Ks=Ks, widths=np.full(n, width), heights=np.full(n, height))
 

@@ -65,11 +65,11 @@ def test_a_shape_is_for_generated_views(tmp_path: Path, command_line: CommandLin
     assert "wide as high" in refused(command_line, tmp_path, *ask[:2], "--panorama", *ask[4:], "96x54")
 
 
-def test_a_shape_keeps_pixels_square_and_the_field_of_view() -> None:
+def test_a_shape_keeps_pixels_square_and_all_in_frame() -> None:
     view = around(1)
     sized = view.sized(192, 54)
     assert sized.Ks[0, 0, 0] == pytest.approx(sized.Ks[0, 1, 1])
-    assert sized.Ks[0, 0, 0] / 192 == pytest.approx(view.Ks[0, 0, 0] / view.widths[0])
+    assert sized.Ks[0, 1, 1] / 54 == pytest.approx(view.Ks[0, 1, 1] / view.heights[0])
     assert sized.Ks[0, :2, 2].tolist() == pytest.approx([96, 27])
 
 

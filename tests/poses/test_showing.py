@@ -10,7 +10,7 @@ import pytest
 
 from g2ard import _core
 from g2ard.io import read_cloud, read_splats
-from g2ard.poses import best_views, plan_pool
+from g2ard.poses import best_views, plan_pool, turntable
 from g2ard.rendering.renderer import arrays_of, settings_for, view_of
 from g2ard.scene.cameras import Camera, Cameras
 from g2ard.scene.splats import Splats
@@ -43,6 +43,7 @@ SCENES: dict[str, tuple[Callable[[], Splats], str]] = {
     "hall": (hall, "within"),
     "hall under plates": (lambda: hall(plate=0.2), "within"),
     "playbot": (lambda: read_splats(real("playbot/0_0")), "around"),
+    "biker": (lambda: read_splats(real("format_samples/biker.compressed.ply")), "around"),
     "guitar": (lambda: read_splats(real("format_samples/guitar.compressed.ply")), "around"),
     "autzen": (autzen, "around"),
     "taebak_park": (lambda: chunks("taebak_park"), "around"),
@@ -130,6 +131,64 @@ def test_photos_are_chosen_by_what_they_see() -> None:
     chosen = best_views(statue, 3, views).names
     assert set(chosen[:2]) in ({"front", "back"}, {"beside", "back"})
     assert "away" not in chosen
+
+
+def test_the_colourful_side_comes_first() -> None:
+    ball = naive.sphere((0, 0, 0), 1.0, 0.03)
+    front = np.array([0.6, -0.8, 0.0])
+    faint = np.where((ball.means @ front > 0.5)[:, None, None], 1.0, 0.3).astype(np.float32)
+    view = best_views(replace(ball, sh0=ball.sh0 * faint), up=(0, 0, 1))[0]
+    assert view.position @ front > 0.7 * np.linalg.norm(view.position)
+
+
+def test_a_biker_opens_with_the_face() -> None:
+    biker = SCENES["biker"][0]()
+    assert best_views(biker).forwards[0] @ (1, 0, 0) > 0.7  # the biker faces −x
+
+
+def test_photos_that_cut_their_subject_come_last() -> None:
+    statue = naive.statue()
+    views = [
+        Camera.facing((5 * np.cos(a), 5 * np.sin(a), 2), (0, 0, 1.2), fov=45, name=f"whole {i}")
+        for i, a in enumerate(np.linspace(0, 5, 6))
+    ]
+    cut = [
+        replace(view, viewmat=Camera.facing(0.6 * view.position, (0, 0, 0.3)).viewmat, name=f"cut {i}")
+        for i, view in enumerate(views[:2])
+    ]
+    assert all("whole" in name for name in best_views(statue, 4, Cameras.of([*cut, *views])).names)
+
+
+def test_a_turntable_keeps_all_of_an_object_in_frame() -> None:
+    statue = naive.statue()
+    first = best_views(statue, size=(320, 180))[0]
+    views, up = turntable(statue, 7, size=(320, 180))
+    seen = np.stack([view.outward(subject(statue)) for view in views])
+    assert seen.max() < 0.97
+    assert seen.max() > 0.75  # it fills the frame
+    np.testing.assert_allclose(views.forwards[0], first.viewmat[2, :3], atol=1e-6)
+    np.testing.assert_allclose(views.forwards @ up, views.forwards[0] @ up, atol=1e-6)
+    steps = np.diff(np.unwrap(np.arctan2(views.forwards[:, 1], views.forwards[:, 0])))
+    np.testing.assert_allclose(np.abs(steps), 2 * np.pi / 7, atol=1e-3)
+
+
+def test_in_a_room_the_camera_turns_in_place() -> None:
+    views, _ = turntable(naive.room(), 4, size=(320, 180))
+    np.testing.assert_allclose(views.positions, np.tile(views.positions[0], (4, 1)), atol=1e-6)
+    assert least_angle(views) > 60
+
+
+def test_a_turn_keeps_to_the_side_that_photos_show() -> None:
+    statue = naive.statue()
+    photos = Cameras.of(
+        Camera.facing((5 * np.cos(a), 5 * np.sin(a), 2), (0, 0, 1.2), fov=45, name=f"{i}")
+        for i, a in enumerate(np.radians([-40, -15, 10, 35]))
+    )
+    views, _ = turntable(statue, 12, photos, size=(320, 180), up=(0, 0, 1))
+    angles = np.degrees(np.arctan2(views.positions[:, 1], views.positions[:, 0]))
+    assert angles.min() == pytest.approx(-40, abs=3)
+    assert angles.max() == pytest.approx(35, abs=3)
+    np.testing.assert_allclose(np.linalg.norm(views.positions[:, :2], axis=1), 5, rtol=0.1)
 
 
 def test_the_best_views_do_not_depend_on_the_order_of_rows() -> None:

@@ -131,7 +131,7 @@ def evaluate(
     frozen = run.load(anchors) if anchors else None
     found_views = teaching.views(given)
     full = load_views(found_views, split, None, run.say, unpictured=teaching.dense is not None)
-    targets = scorable(teaching.targets(full.resized(size), settings=settings), run.say)
+    targets = scorable(teaching.targets(full.fitted(size), settings=settings), run.say)
     unshrunk = teaching.full_size(full, size, settings=settings)
     cameras = targets.cameras
     networks = load_lpips(lpips, scaled=lpips_input == "scaled") if lpips else None

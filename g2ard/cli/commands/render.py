@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections import deque
+from collections.abc import Iterator
 from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -106,12 +108,14 @@ def render(
         run.claim_file("--sheet", sheet)
     splats = run.load(scene)
     found: Any
+    how: dict[str, Any]
     if turn is not None:
-        found = orbit(splats, turn, size=planned_at(size), up=up, seed=run.seed, **run.callbacks)
+        found = orbit(splats, turn, size=planned_at(size), up=up, beside=scene, say=run.say)
     elif looks is not None:
-        found = looks_at(splats, looks, size=planned_at(size), up=up, seed=run.seed, **run.callbacks)
+        how = {"up": up, "seed": run.seed, "beside": None if is_made(views) else scene, **run.callbacks}
+        found = looks_at(splats, looks, size=planned_at(size), **how)
     else:
-        how: dict[str, Any] = {"up": up, "seed": run.seed, **run.callbacks}
+        how = {"up": up, "seed": run.seed, **run.callbacks}
         found = views_or_pool(splats, views, beside=scene, size=planned_at(size), **how)
     cameras = load_views(found, split, None, run.say)
     if around:
@@ -123,10 +127,10 @@ def render(
     if output is not None:
         run.claim("--output", *(file for place in places for file in _files(output / place, depth)))
     shown: list[NDArray[np.uint8]] = []
-    wanted = sheet is not None or animation is not None
     colour = opt.background_of(run, background, scene) or BLACK
     renderer = Renderer(splats, background=colour, settings=RasterSettings(convention=convention))
-    with nullcontext() if output is None else atomic_folder(output, run.overwrite) as folder:
+
+    def draw(folder: Path | None) -> Iterator[NDArray[np.uint8]]:
         for view in range(len(cameras)):
             camera = cameras[view]
             rendered: Rendered | None = None
@@ -135,15 +139,21 @@ def render(
             elif depth:
                 rendered = renderer.render(camera)
             image = renderer.image(camera) if rendered is None else rendered.image
-            if wanted:
-                shown.append(to_bytes(image))
             if folder is not None:
                 _write_view(folder / places[view], image, rendered.depth if rendered and depth else None)
+            pixels = to_bytes(image)
+            if sheet is not None:
+                shown.append(pixels)
             run.progress("render", view + 1, len(cameras))
-    run.kept += [f"{output} is written"] if output is not None else []
+            yield pixels
+
     if animation is not None:
-        write_animation(animation, shown, fps=fps, overwrite=run.overwrite)
+        write_animation(animation, draw(None), fps=fps, overwrite=run.overwrite)
         run.kept.append(f"{animation} is written")
+    else:
+        with nullcontext() if output is None else atomic_folder(output, run.overwrite) as folder:
+            deque(draw(folder), maxlen=0)
+    run.kept += [f"{output} is written"] if output is not None else []
     if sheet is not None:
         with run.finishing("--sheet"):
             _write_sheet(sheet, shown, cameras.names, run.overwrite)
