@@ -8,7 +8,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK = 1
 
 RUST := $(shell find rust -name '*.rs' -o -name '*.wgsl' -o -name Cargo.toml) Cargo.toml Cargo.lock
 
-.PHONY: demo test test-fresh lint docs stress fuzz fuzz-guided miri bench wheel wheel-linux ends release-check setup clean
+.PHONY: demo test test-fresh lint docs printed stress fuzz fuzz-guided miri bench wheel wheel-linux ends release-check setup clean
 
 setup: $(VENV)/.built
 
@@ -42,6 +42,10 @@ test: setup
 test-fresh: setup
 	cargo test --quiet --profile bench --workspace --exclude g2ard-core
 	$(BIN)/python -m pytest $$(grep -lE '^from helpers.(browser|peers) import|adapters\(\)' -r tests --include='test_*.py')
+
+# What the documentation prints, against what the program prints; `tests/printed.py record` writes it anew.
+printed: setup
+	$(BIN)/python tests/printed.py compare
 
 # Over 10,000 random gradient cases; a slice of them is in `make test`.
 stress: setup
