@@ -82,10 +82,9 @@ def printed_by(commands: str) -> str:
     with tempfile.TemporaryDirectory() as folder:
         for command in commands.split(" && "):
             words = command.replace("$DATA", str(realdata.ROOT)).split()
-            program = ["-m", *(["g2ard"] if words[0] == "g2ard" else words[1:3])]
-            rest = words[1:] if words[0] == "g2ard" else words[3:]
+            rest = ["-m", *words] if words[0] == "g2ard" else words[1:]
             done = subprocess.run(
-                [sys.executable, *program, *rest],
+                [sys.executable, *rest],
                 cwd=folder,
                 env=environment(COLUMNS="80"),
                 stdout=subprocess.PIPE,
