@@ -50,6 +50,11 @@ def test_relative_links_lead_somewhere(name: str) -> None:
             assert fragment in anchors(there), f"{name}: {target}"
 
 
+def test_the_documentation_stays_short() -> None:
+    pages = [ROOT / name for name in NAMES if not name.startswith(("benchmarks/", "CHANGELOG", "SECURITY"))]
+    assert sum(len(page.read_text(encoding="utf-8").split()) for page in pages) <= 36_000
+
+
 CURRENT = [n for n in NAMES if not n.startswith(("benchmarks/record", "docs/decisions/", "CHANGELOG"))]
 
 
