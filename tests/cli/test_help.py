@@ -9,7 +9,7 @@ import pytest
 
 from g2ard.cli.app import COMMANDS
 from g2ard.cli.panels import USED
-from helpers.commands import CommandLine, refused, succeeds
+from helpers.commands import CommandLine
 from helpers.project import ROOT
 
 

@@ -212,7 +212,7 @@ def _write_ladder(
     if dense is not None and teaching.teacher is not None:
         teacher = Path(str(teaching.teacher))
         top = Dense(teacher.name, len(dense), bytes_of(teacher))
-    names = short_names([path for path, _, _ in results])
+    names = names_of([path for path, _, _ in results])
     words = labels(names, [len(splats) for _, splats, _ in results], None if top is None else top.count)
     rungs = sorted(
         (
