@@ -85,42 +85,50 @@ class Outlook:
         return cls(cameras, seen, sharp * np.maximum(covered, 1e-9) ** full, detail, spread)
 
 
-def outlooks(survey: Survey, every: int = 1) -> tuple[Outlook, Outlook]:
-    """Return views from around a scene, which show it whole, and views at eye level within it.
+def _outside(survey: Survey, every: int = 1) -> Outlook:
+    """Return views from around a scene, which show it whole; there are fewer if `every` is more than 1."""
+    return Outlook.of(survey, survey.cameras(ring(survey, _RISES, _TURNS // every)))
 
-    There are fewer of both if `every` is more than 1.
-    """
+
+def _within(survey: Survey, every: int = 1) -> Outlook:
+    """Return views at eye level within a scene; there are fewer if `every` is more than 1."""
     wide = replace(survey, lens=Lens(survey.lens.size, WIDE))
     poses = Poses.joined([plan(wide, _STANDING // every) for plan in (plan_inside, plan_walk, plan_sharp)])
     level = poses.take((poses.gazes[:, 2] > _GAZES[0]) & (poses.gazes[:, 2] < _GAZES[1]))
-    around = survey.cameras(ring(survey, _RISES, _TURNS // every))
-    return Outlook.of(survey, around), Outlook.of(survey, wide.cameras(level), _FULL)
+    return Outlook.of(survey, wide.cameras(level), _FULL)
 
 
-def is_hidden(survey: Survey, looks: tuple[Outlook, Outlook] | None = None) -> bool:
-    """Return whether views from around see little of what clear views within do, as above a ceiling.
+def is_hidden(survey: Survey) -> bool:
+    """Return whether views from around see little of what clear views within do, as above a ceiling."""
+    return _is_roofed(survey) and _sees_less(_outside(survey, 2), _within(survey, 2))
 
-    Without a ground there is no ceiling: a closed shell is an object.
-    """
+
+def _is_roofed(survey: Survey) -> bool:
+    """Return whether many free places have matter above. Without a ground, a closed shell is an object."""
     site = survey.site
     if site.terrain is None:
         return False
-    if looks is None:
-        places = between(site.box, halton(0, _PLACES, 3, 0))
-        above = closed(site, places[site.is_free(places, 2)], 16, 0.5, 1.0)
-        if (above > 0.5).sum() <= _ROOFED * len(above):
-            return False
-    around, within = looks or outlooks(survey, 2)
+    places = between(site.box, halton(0, _PLACES, 3, 0))
+    above = closed(site, places[site.is_free(places, 2)], 16, 0.5, 1.0)
+    return bool((above > 0.5).sum() > _ROOFED * len(above))
+
+
+def _sees_less(around: Outlook, within: Outlook) -> bool:
     seen = around.seen.max(axis=0, initial=0.0)
     both = within.seen[within.clear > _GOOD].max(axis=0, initial=0.0)
     return bool(seen.sum(dtype=np.float64) < _OPEN * np.maximum(seen, both).sum(dtype=np.float64))
 
 
-def is_within(survey: Survey, around: Outlook, within: Outlook) -> bool:
-    """Return whether a scene is shown from within."""
+def _looks(survey: Survey) -> tuple[Outlook, str]:
+    """Return views that show a scene "within" it, planned only if it may be shown so, or from "around"."""
+    around, room = _outside(survey), is_room(survey)
     blurred = around.clear.sum() <= _CRISP * len(around.cameras)
-    good = within.clear.max(initial=0.0) > _GOOD
-    return is_room(survey) or bool(good and (blurred or is_hidden(survey, (around, within))))
+    if room or blurred or _is_roofed(survey):
+        within = _within(survey)
+        good = within.clear.max(initial=0.0) > _GOOD
+        if len(within.cameras) and (room or (good and (blurred or _sees_less(around, within)))):
+            return within, "within"
+    return around, "around"
 
 
 def best_views(
@@ -215,9 +223,7 @@ def _best(survey: Survey, count: int, cameras: Cameras | None) -> tuple[Cameras,
     if cameras is not None:
         look = Outlook.of(survey, cameras.take(evenly_spaced(len(cameras), _PHOTOS)))
         return look.cameras.take(_chosen(look, look.detail * _wholeness(survey, look), count)), "photos"
-    outside, within = outlooks(survey)
-    kind = "within" if len(within.cameras) and is_within(survey, outside, within) else "around"
-    look = within if kind == "within" else outside
+    look, kind = _looks(survey)
     worth = look.detail if kind == "within" else look.detail * look.spread
     found = look.cameras.take(_chosen(look, worth, count))
     if not len(found):
