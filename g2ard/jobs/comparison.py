@@ -16,7 +16,7 @@ from g2ard.io.labels import DENSE, RESULT
 from g2ard.io.paths import real_path
 from g2ard.io.types import ViewSet
 from g2ard.jobs.inputs import Views, load_split_views
-from g2ard.rendering.targets import Targets, kinds_told, scored_in
+from g2ard.rendering.targets import RENDERS, Targets, scored_in
 from g2ard.scene.cameras import Camera, Cameras
 from g2ard.stages.evaluate import Evaluation
 
@@ -48,7 +48,7 @@ class Common:
     def of(cls, path: Path) -> Common:
         """Read the source of a run's own scores."""
         report = read_json(path / "report.json")
-        against, config = report.get("against", kinds_told(0, 1)), report["config"]
+        against, config = report.get("against", RENDERS), report["config"]
         teacher = None if against == "photos" else Path(config["scene"])
         return cls(path, path, teacher, teacher is not None and "photo" in against, config["size"])
 

@@ -11,7 +11,7 @@ from typing import Any
 from g2ard.io.labels import RESULT
 from g2ard.io.reports import LEFT_OUT, Report
 from g2ard.progress import plural
-from g2ard.rendering.targets import kinds_told
+from g2ard.rendering.targets import RENDERS
 from g2ard.scene.cameras import USUAL, rows_by_kind
 from g2ard.stages.evaluate import Evaluation, Means, ViewScore
 from g2ard.stages.recover.anchors import PriorMeasures
@@ -303,7 +303,7 @@ class TiledReport(Report):
     scores: TiledScores
     size: str
     views: dict[str, int]
-    against = kinds_told(0, 1)
+    against = RENDERS
     stages = f"simplified → {RESULT}"
 
     @property

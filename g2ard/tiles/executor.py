@@ -81,7 +81,8 @@ class Workers:
         def told(task: Task, share: float) -> None:
             if share * task.cost > done.get(task.label, 0.0):
                 done[task.label] = share * task.cost
-                self.progress(stage, before + int(sum(done.values())), total)
+                now = before + int(sum(done.values()))
+                self.progress(stage, min(now, total - 1), total)  # the last task is not written yet
 
         self.progress(stage, before, total)
         self.executor(todo, told)

@@ -112,11 +112,11 @@ def _overdraw(splats: Splats) -> dict[str, Any]:
 
 def _scores(report: dict[str, Any]) -> tuple[str, dict[str, dict[str, float]]]:
     """Return the name of a run's targets and its scores; tiled runs have only PSNR."""
-    from g2ard.rendering.targets import kinds_told
+    from g2ard.rendering.targets import RENDERS
 
     scores = report["scores"]
     if "tiles" in report:
-        return kinds_told(0, 1), {name: {"psnr": scores[name]} for name in ("simplified", "recovered")}
+        return RENDERS, {name: {"psnr": scores[name]} for name in ("simplified", "recovered")}
     return report["against"], {
         name: {k: found[k] for k in ("psnr", "ssim")} for name, found in scores.items()
     }
