@@ -38,7 +38,7 @@ MARK = re.compile(
 TIMES = re.compile(r"[\d.,]+ (?:s|min|minutes|seconds|steps/s)\b")
 NAMES = re.compile(r"(?=[\w/-]*\d)(?=[\w/-]*[A-Za-z_])[\w/-]+(?:\.\w+)?|\d+\.(?:jpg|png)")
 NUMBERS = re.compile(r"\d[\d,]*(?:\.\d+)?")
-FIGURES = re.compile(r"\d[\d,]*\.\d+|\d{1,3}(?:,\d{3})+")
+_FIGURE = r"(?:\d[\d,]*\.\d+|\d{1,3}(?:,\d{3})+)"
 """Numbers of a paragraph that are checked: with decimals, or with thousands."""
 
 
@@ -119,11 +119,10 @@ def _alike(first: str, second: str) -> bool:
     >>> _alike("20,000", "20,001"), _alike("32.97", "33.02"), _alike("0.9045", "0.8045")
     (False, True, False)
     """
-    a, b = (float(text.replace(",", "")) for text in (first, second))
+    a, b = _number(first), _number(second)
     if "." not in first + second:
         return a == b
-    decimals = len(first.partition(".")[2])
-    return abs(a - b) <= (0.01 if decimals > 2 else max(0.2, 0.01 * abs(a)))
+    return abs(a - b) <= (0.01 if _decimals(first) > 2 else max(0.2, 0.01 * abs(a)))
 
 
 def _renewed_lines(block: str, printed: list[str]) -> tuple[str, list[str]]:
@@ -147,18 +146,36 @@ def _renewed_lines(block: str, printed: list[str]) -> tuple[str, list[str]]:
 
 
 def _renewed_figures(text: str, printed: str) -> tuple[str, list[str]]:
-    wrong, known = [], FIGURES.findall(printed)
+    """Renew the figures of a paragraph by the nearest printed ones; `A to B` is printed as `A → B`."""
+    wrong = []
+    pairs = [" to ".join(pair) for pair in re.findall(rf"({_FIGURE}) → ({_FIGURE})", printed)]
 
     def renewed(found: re.Match[str]) -> str:
-        old = found[0]
-        value, decimals = float(old.replace(",", "")), len(old.partition(".")[2])
-        same = [one for one in known if len(one.partition(".")[2]) == decimals]
-        new = min(same, key=lambda one: abs(float(one.replace(",", "")) - value), default=old)
-        if not same or not _alike(old, new):
-            wrong.append(f"{old} is not printed; the nearest is {new}")
+        old = _values(found[0])
+        known = pairs if len(old) > 1 else re.findall(_FIGURE, printed)
+        like = [one for one in known if list(map(_decimals, _values(one))) == list(map(_decimals, old))]
+
+        def distance(one: str) -> float:
+            return sum(abs(_number(a) - _number(b)) for a, b in zip(_values(one), old, strict=True))
+
+        new = min(like, key=distance, default=found[0])
+        if not like or not all(map(_alike, old, _values(new))):
+            wrong.append(f"{found[0]} is not printed; the nearest is {new}")
         return new
 
-    return FIGURES.sub(renewed, text), wrong
+    return re.sub(rf"{_FIGURE}(?: to {_FIGURE})?", renewed, text), wrong
+
+
+def _values(figures: str) -> list[str]:
+    return figures.split(" to ")
+
+
+def _number(text: str) -> float:
+    return float(text.replace(",", ""))
+
+
+def _decimals(text: str) -> int:
+    return len(text.partition(".")[2])
 
 
 def renewed_notebook() -> tuple[str, list[str]]:

@@ -49,7 +49,7 @@ def test_lines_and_figures_that_differ_are_found(told: str, differences: int) ->
 
 def test_figures_of_a_sentence_are_found_and_renewed() -> None:
     sentence = printed.Passage("a.md", "", False, "*fox* rises from 15.37 to 31.29 dB with 20,000 in 24 s.\n")
-    assert sentence.renewed("43 photos → 20,000\n15.41 → 31.20 dB") == (
+    assert sentence.renewed("43 photos → 20,000\n15.37 → 27.54 dB\n15.41 → 31.20 dB") == (
         "*fox* rises from 15.41 to 31.20 dB with 20,000 in 24 s.\n",
         [],
     )
