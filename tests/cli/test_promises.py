@@ -45,7 +45,6 @@ DEFAULTS: dict[str, str] = {
     "register passes": f"{REGISTER.passes} by default",
     "register accept": f"{REGISTER.accept} by default",
     "convert spz_version": f"{signature(spz.write).parameters['spz_version'].default} by default",
-    "poses resolution": "{}x{} by default".format(*signature(g2ard.make_pool).parameters["size"].default),
     "poses fov": f"by default {pool._FOV:g}, and {within.WIDE:g} in rooms",
     "render looks": f"by default {views._POOL_VIEWS}",
     "render around": f"{render._PANORAMA:,} pixels wide",
