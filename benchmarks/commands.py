@@ -11,7 +11,8 @@ from typing import Annotated
 import typer
 
 from benchmarks.synth.command import synth
-from g2ard.cli.frame import Run, command
+from g2ard.cli.command import command
+from g2ard.cli.run import Run
 from g2ard.errors import InputError
 from g2ard.progress import plural
 

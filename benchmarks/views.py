@@ -13,13 +13,13 @@ from g2ard.config.choices import Colour
 from g2ard.errors import InputError
 from g2ard.io.splits import for_scores
 from g2ard.poses import plan_pool
-from g2ard.poses.numbers import halton
 from g2ard.poses.outside import plan_orbit
 from g2ard.poses.sight import Lens, Poses, Rays, Survey
 from g2ard.poses.site import Site
 from g2ard.rendering.renderer import RasterSettings, arrays_of, view_of
 from g2ard.rendering.targets import TeacherRenders
 from g2ard.scene.cameras import Cameras, look_at
+from g2ard.scene.reproducible import halton
 from g2ard.scene.splats import Splats
 
 __all__ = ["anywhere_views", "given_views", "hidden_targets", "standing_views"]

@@ -47,7 +47,7 @@ if TYPE_CHECKING:
     from g2ard.io import read_views as load_views
     from g2ard.io import write_splats as save
     from g2ard.io import write_views as save_views
-    from g2ard.io.tiles import TileStore
+    from g2ard.io.tile_store import TileStore
     from g2ard.io.types import Points
     from g2ard.jobs.clean import Cleaned, clean
     from g2ard.jobs.convert import convert
@@ -57,9 +57,9 @@ if TYPE_CHECKING:
     from g2ard.jobs.notebook import view
     from g2ard.jobs.recover import recover
     from g2ard.jobs.register import register
+    from g2ard.jobs.run_views import orbit
     from g2ard.jobs.simplify import simplify
     from g2ard.jobs.viewer_frame import up_of
-    from g2ard.jobs.views import orbit
     from g2ard.levels import Georeference, save_levels
     from g2ard.pipeline.adapt import AdaptConfig, Adapted, adapt
     from g2ard.pipeline.config import DistillConfig, SelectConfig
@@ -167,7 +167,7 @@ _HOMES = {
     "jobs.recover": ("recover",),
     "jobs.register": ("register",),
     "jobs.simplify": ("simplify",),
-    "jobs.views": ("orbit",),
+    "jobs.run_views": ("orbit",),
     "jobs.viewer_frame": ("up_of",),
     "poses": ("make_pool",),
     "progress": ("show_progress",),
@@ -185,7 +185,7 @@ _HOMES = {
     "stages.simplify": ("Simplified", "SimplifyConfig"),
     "rendering.targets": ("Photos", "TeacherRenders"),
     "tiles.ingest": ("ingest",),
-    "io.tiles": ("TileStore",),
+    "io.tile_store": ("TileStore",),
 }
 """Module → its public names."""
 

@@ -9,7 +9,8 @@ from typing import Annotated, Any
 import typer
 
 from g2ard.cli.budget_options import Count
-from g2ard.cli.frame import Run, command
+from g2ard.cli.command import command
+from g2ard.cli.run import Run
 from g2ard.errors import InputError
 from g2ard.progress import plural
 

@@ -151,7 +151,7 @@ BUDGETS: dict[str, tuple[Any, ...]] = {
         typer.Option(min=0.01, max=0.9999, help="Smallest scene with at least this SSIM."),
     ),
 }
-"""Options of commands with budgets, see `g2ard.cli.frame.command`: name → type and option."""
+"""Options of commands with budgets, see `g2ard.cli.command.command`: name → type and option."""
 
 SEVERAL = {
     "count": " Several (10k,20k) need {count} in --output.",
@@ -192,4 +192,4 @@ TILES: dict[str, tuple[Any, ...]] = {
         ),
     ),
 }
-"""Options of commands that work in tiles, see `g2ard.cli.frame.command`: name → type and option."""
+"""Options of commands that work in tiles, see `g2ard.cli.command.command`: name → type and option."""

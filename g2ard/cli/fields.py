@@ -1,4 +1,4 @@
-"""Flags of settings, by the paths of the settings; `g2ard.cli.frame.command` adds them to commands."""
+"""Flags of settings, by the paths of the settings; `g2ard.cli.command.command` adds them to commands."""
 
 import re
 from typing import Annotated, Any

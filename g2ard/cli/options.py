@@ -22,7 +22,7 @@ from g2ard.config.choices import (
 from g2ard.errors import require_torch
 
 if TYPE_CHECKING:
-    from g2ard.cli.frame import Run
+    from g2ard.cli.run import Run
 
 SceneArgument = Annotated[
     Path,

@@ -7,7 +7,7 @@ from pathlib import Path
 import typer
 
 from g2ard.cli.budget_options import BUDGET_FLAGS, BUDGETS
-from g2ard.cli.frame import Run
+from g2ard.cli.run import Run
 from g2ard.jobs.budget import Budget
 
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import typer
 
-from g2ard.cli.frame import Run
+from g2ard.cli.run import Run
 from g2ard.errors import InputError, OutputError
 from g2ard.io import check_scene_output
 from g2ard.io.atomic import (

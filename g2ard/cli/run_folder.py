@@ -10,7 +10,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from g2ard.cli.frame import Run
 from g2ard.cli.resume import (
     OPTIONS,
     check_same,
@@ -20,6 +19,7 @@ from g2ard.cli.resume import (
     kept,
     left_at,
 )
+from g2ard.cli.run import Run
 from g2ard.config.choices import BLACK, Colour, ViewFormat
 from g2ard.errors import InputError, OutputError
 from g2ard.io import write_views
@@ -40,7 +40,7 @@ from g2ard.viewer.page import write_page
 
 if TYPE_CHECKING:
     from g2ard.jobs.distill import DistillJob, RunTargets
-    from g2ard.jobs.tiled import TiledDistilled, TiledJob
+    from g2ard.jobs.in_tiles import TiledDistilled, TiledJob
     from g2ard.pipeline.distill import Distilled
     from g2ard.report.run import RunReport, TiledReport
 

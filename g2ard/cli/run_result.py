@@ -6,16 +6,16 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from g2ard.cli.frame import Run
+from g2ard.cli.run import Run
 from g2ard.io.scene_formats import FORMATS, scene_format, written_bytes
 from g2ard.progress import plural
 
 if TYPE_CHECKING:
     from g2ard.cli.run_folder import RunFolder
     from g2ard.jobs.budget import Budget
+    from g2ard.jobs.budget_search import ResolvedBudget
     from g2ard.jobs.cost import Cost
-    from g2ard.jobs.measured_budget import ResolvedBudget
-    from g2ard.jobs.tiled import Tiles
+    from g2ard.jobs.in_tiles import Tiles
     from g2ard.report.run import KindScore, RunReport, TiledReport, ViewsReport
     from g2ard.scene.splats import Splats
 
@@ -92,7 +92,7 @@ def told(report: RunReport | TiledReport, *, verbose: bool = False) -> list[str]
 
     if isinstance(report, TiledReport):
         return [line for line in map(loss, report.kinds) if line]
-    from g2ard.jobs.measured_budget import score_lines
+    from g2ard.jobs.format_loss import score_lines
     from g2ard.stages.recover.report import cut_short, outcome, unregularized
     from g2ard.stages.simplify.gaps import RECOVERED_GAPS, gaps_line
 

@@ -76,7 +76,7 @@ LpipsInput = Literal["scaled", "unscaled"]
 LPIPS_INPUTS: tuple[LpipsInput, ...] = get_args(LpipsInput)
 
 ViewFormat = Literal["g2ard", "inria", "nerfstudio", "colmap"]
-"""Formats that views can be written to (`g2ard.io.view_sets`)."""
+"""Formats that views can be written to (`g2ard.io.views`)."""
 
 FormatName = Literal["ply", "sog", "spz", "glb", "compressed.ply", "splat", "usda", "usdc"]
 """Formats that scenes can be written to (`g2ard.io.scene_formats`)."""

@@ -24,7 +24,7 @@ from g2ard.io.scenes import (
     write_points,
     write_splats,
 )
-from g2ard.io.view_sets import check_views_output, read_view_set, read_views, write_views
+from g2ard.io.views import check_views_output, read_view_set, read_views, write_views
 
 __all__ = [
     "atomic_folder",

@@ -51,7 +51,10 @@ READERS: dict[Kind, dict[str, tuple[str, ...]]] = {
         "gsplat_run": ("cfg.yml",),
     },
 }
-"""Formats of each kind: the module that reads it, and suffixes or names of its files."""
+"""Formats of each kind, which are names of modules, and suffixes or names of their files."""
+
+MODULES = {"tiles": "tile_store", "views": "g2ard_views"}
+"""Modules that have another name than the format they read."""
 
 _FOLDERS: dict[str, tuple[str, ...] | None] = {
     "nerfstudio": ("dataparser_transforms.json",),  # before its data, which are in another world
@@ -140,7 +143,7 @@ def reader(path: str | Path, expected: Kind) -> tuple[Path, Any]:
         what = _NAMES[found] if found != "views" else name
         hint = _OTHER_KINDS.get((expected, found))
         raise InputError(f"expected {_NAMES[expected]}, found {what}", path=path, hint=hint)
-    return path, import_module(f"g2ard.io.{name}")
+    return path, import_module(f"g2ard.io.{MODULES.get(name, name)}")
 
 
 @lru_cache(maxsize=64)

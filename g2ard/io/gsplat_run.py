@@ -5,7 +5,7 @@ from pathlib import Path
 from g2ard.errors import InputError
 from g2ard.io import colmap
 from g2ard.io.photos import Listed
-from g2ard.io.settings import below, read_settings
+from g2ard.io.trainer_yaml import below, read_settings
 from g2ard.io.types import Note
 
 NAME = "cfg.yml"

@@ -12,7 +12,7 @@ from g2ard.errors import InputError
 from g2ard.io import colmap, transforms
 from g2ard.io.jsonfile import Place, Pose, Positive, checked, read_json
 from g2ard.io.photos import Frame, Listed, inverse, rigid
-from g2ard.io.settings import Settings, below, read_settings
+from g2ard.io.trainer_yaml import Settings, below, read_settings
 from g2ard.io.types import Note
 from g2ard.scene.samples import evenly_spaced
 

@@ -10,7 +10,7 @@ from g2ard.io import colmap, transforms
 from g2ard.io.finding import Finder
 from g2ard.io.jsonfile import Place, Pose, checked, read_any_json
 from g2ard.io.photos import Frame, Lens, Listed, rigid
-from g2ard.io.settings import below
+from g2ard.io.trainer_yaml import below
 
 LISTS = {"transforms_train.json": "train", "transforms_eval.json": "test"}
 """File → its split."""

@@ -1,130 +1,199 @@
-"""Reader and writer for g2ard's views .json, described in docs/formats.md."""
+"""Reading and writing views of any format."""
 
 from __future__ import annotations
 
-import json
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
-import msgspec
-import numpy as np
-from numpy.typing import ArrayLike, NDArray
-
-from g2ard.errors import InputError
-from g2ard.io.finding import Finder
-from g2ard.io.jsonfile import Matrix, Number, Place, Pose, Weight, Whole, checked, read_own
-from g2ard.io.paths import beside
-from g2ard.io.photos import Frame, Lens, Listed, rigid
+from g2ard.config.checks import check_type, checks_arguments
+from g2ard.config.choices import ViewFormat
+from g2ard.errors import InputError, OutputError
+from g2ard.io.atomic import atomic_folder, atomic_output, check_output
+from g2ard.io.detect import reader, run_views
+from g2ard.io.signs import explained
 from g2ard.progress import plural
-from g2ard.scene.cameras import USUAL, Cameras
-from g2ard.scene.lenses import PARAMETERS, PhotoLens
 
-_FORMAT = "g2ard-views"
-_VERSION = 1
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
 
-
-class _PhotoLens(msgspec.Struct):
-    model: str
-    size: tuple[Whole, Whole]
-    params: list[Number]
-    turn: Matrix
+    from g2ard.config.choices import Alpha
+    from g2ard.io.types import ViewFiles, ViewSet
+    from g2ard.scene.cameras import Cameras
 
 
-class _View(msgspec.Struct):
-    name: str
-    width: Whole
-    height: Whole
-    K: Matrix
-    camera_from_world: Pose
-    distortion: list[Number] = []
-    image: str | None = None
-    mask: str | None = None
-    split: str | None = None
-    weight: Weight | None = None
-    kind: str | None = None
-    lens: _PhotoLens | None = None
+_OFF_CENTRE = 0.5  # distance in pixels of a principal point from the middle that is worth a note
 
 
-def read(path: Path, images: Path | None = None) -> Listed:
-    """Read views; photo paths are relative to the file unless `images`, a folder of photos, is given."""
-    content = read_own(path, _FORMAT, _VERSION).get("views", [])
-    views = checked(content, list[_View], Place(path).to("views"), entries="view")
-    if not views:
-        raise InputError("no views found ('views' is empty)", path=path)
-    finder, masks = Finder(images or path.parent), Finder(path.parent)
-    return Listed(path, [_frame(Place(path, i, "view"), view, finder, masks) for i, view in enumerate(views)])
+def view_format(path: Path, given: ViewFormat | None = None) -> ViewFormat:
+    """Return the format of an output path: the given one, or that of its name.
+
+    >>> [view_format(Path(name)) for name in ("poses.json", "a/cameras.json", "transforms_1.json", "model")]
+    ['g2ard', 'inria', 'nerfstudio', 'colmap']
+    """
+    suffix, name = path.suffix.lower(), path.name.lower()
+    if given is None and suffix == "":
+        return "colmap"
+    expected = "" if given == "colmap" else ".json"
+    if suffix != expected:
+        where = "a folder" if given == "colmap" else ".json, or as a folder for COLMAP"
+        raise OutputError(f"views are written as {where}", path=path)
+    if given is not None:
+        return given
+    if name == "cameras.json":
+        return "inria"
+    return "nerfstudio" if name.startswith("transforms") else "g2ard"
 
 
-def _frame(place: Place, view: _View, finder: Finder, masks: Finder) -> Frame:
-    distortion = *view.distortion, *[0.0] * 5
-    return Frame(
-        name=view.name,
-        viewmat=_exact(np.array(view.camera_from_world), place.to("camera_from_world")),
-        lens=Lens(
-            (view.width, view.height),
-            np.array(view.K),
-            distortion[:5],
-            _photo_lens(view.lens, place),
-            made=True,
-        ),
-        photo=None if view.image is None else finder.photo(view.image),
-        mask=None if view.mask is None else masks.photo(view.mask),
-        split=view.split,
-        weight=view.weight,
-        kind=view.kind or USUAL,
-        listed=view.image or "",
-    )
+def lost_views(
+    cameras: Cameras, format: ViewFormat, splits: Sequence[str | None], weighted: bool
+) -> list[str]:
+    """Describe what a format cannot hold of views."""
+    from g2ard.scene.cameras import USUAL
+
+    if format == "g2ard":
+        return []
+    lost = []
+    middle = [[w / 2, h / 2] for w, h in zip(cameras.widths, cameras.heights, strict=True)]
+    off = int((abs(cameras.Ks[:, :2, 2] - middle).max(axis=1) > _OFF_CENTRE).sum())
+    if format == "inria" and off:
+        lost.append(f"{plural(off, 'principal point')} beside the image's middle")
+    bent = cameras.distortions[:, slice(None) if format == "inria" else slice(4, None)].any(axis=1)
+    if format != "nerfstudio" and bent.any():
+        what = "lens distortion" if format == "inria" else "k3 of the lens distortion"
+        lost.append(f"{what} of {plural(int(bent.sum()), 'view')}")
+    if format != "nerfstudio" and any(word not in (None, "train") for word in splits):
+        lost.append("splits")
+    photos = sum(lens is not None for lens in cameras.lenses)
+    lost += [f"photos of {plural(photos, 'view')} that other lenses took"] if photos else []
+    kinds = sum(kind != USUAL for kind in cameras.kinds)
+    lost += [f"the kinds of {plural(kinds, 'view')}"] if kinds else []
+    return lost + (["sampling weights"] if weighted else [])
 
 
-def _photo_lens(lens: _PhotoLens | None, place: Place) -> PhotoLens | None:
-    if lens is None:
-        return None
-    if PARAMETERS.get(lens.model) != len(lens.params) or min(lens.size) < 1:
-        raise place.to("lens").error(f"is not a lens of the model {lens.model!r}")
-    turn = tuple(np.array(lens.turn).ravel().tolist())
-    return PhotoLens(lens.model, (lens.size[0], lens.size[1]), tuple(lens.params), turn)
+def check_views_output(path: str | Path, overwrite: bool = False, format: ViewFormat | None = None) -> Path:
+    """Raise the `OutputError` that `write_views` would raise, before any work."""
+    return check_output(path, overwrite, folder=view_format(Path(path), format) == "colmap")
 
 
-def _exact(stored: NDArray[np.float64], place: Place) -> NDArray[np.float64]:
-    """Return the pose as stored if it is rigid to rounding, so that writing and reading change no bit."""
-    nearest = rigid(stored, place)
-    return stored if len(stored) == 4 and np.allclose(nearest, stored, rtol=0, atol=1e-9) else nearest
+@checks_arguments
+def read_views(path: str | Path, *, images: str | Path | None = None, split: str = "all") -> Cameras:
+    """Read views.
+
+    Args:
+        path: a COLMAP folder (or its images_4), a transforms.json or its folder, a nerfstudio, gsplat or
+            INRIA run, LLFF's poses_bounds.npy, a Polycam capture, a Cambridge Landmarks scene, a laser scan
+            with photos (.e57), or a .json written by g2ard.
+        images: folder of the photos, if they have moved.
+        split: "train", "test", or "all"; see `g2ard.io.splits.split_mask`.
+
+    Returns:
+        The views in OpenCV axes, sorted by name for COLMAP, otherwise in file order. Views whose photo is
+        missing are skipped, unless all photos are missing.
+
+    Raises:
+        InputError: the file is missing or damaged, or has no views in the split.
+
+    >>> import tempfile, g2ard
+    >>> path = Path(tempfile.mkdtemp()) / "views.json"
+    >>> around = [g2ard.Camera.facing([4, y, 0], [0, 0, 0], name=f"view_{y}") for y in range(8)]
+    >>> g2ard.save_views(path, g2ard.Cameras.of(around))
+    >>> g2ard.load_views(path), g2ard.load_views(path, split="test").names
+    (Cameras(8 views), ('view_0',))
+    """
+    return read_view_set(path, images=images, split=split).cameras
 
 
-def _written(lens: PhotoLens | None) -> dict[str, Any] | None:
-    if lens is None:
-        return None
-    turn = np.array(lens.turn).reshape(3, 3).tolist()
-    return {"model": lens.model, "size": lens.size, "params": lens.params, "turn": turn}
+@explained
+def read_view_set(
+    path: str | Path | ViewFiles,
+    *,
+    images: str | Path | None = None,
+    split: str = "all",
+    unpictured: bool = False,
+    alpha: Alpha = "composite",
+) -> ViewSet:
+    """Read views with their splits, weights and notes.
+
+    Args:
+        path: as for `read_views`, or `ViewFiles`, whose `images` and `alpha` then count.
+        unpictured: whether to keep views without photos among others.
+        alpha: "mask" makes a photo with alpha and without a mask its own mask.
+    """
+    from g2ard.io.photos import alpha_as_masks, pictured, view_set
+    from g2ard.io.splits import split_mask
+    from g2ard.io.types import ViewFiles
+
+    if not isinstance(path, ViewFiles):
+        path = ViewFiles(Path(path), Path(images) if images else None, alpha)
+    images, alpha = path.images, path.alpha
+    path, module = reader(run_views(path.path), "views")
+    if images is not None and not images.is_dir():
+        raise InputError("no such folder of photos", path=images)
+    try:
+        views = view_set(module.read(path, images))
+    except OSError as error:  # invalid photo name, unreadable folder
+        raise InputError(error.strerror or str(error), path=path) from error
+    views = views if unpictured else pictured(views)
+    views = alpha_as_masks(views) if alpha == "mask" else views
+    return views.take(split_mask(path, views.cameras.names, split, stated=views.splits))
 
 
-def text_of(path: Path, cameras: Cameras, splits: Sequence[str | None], weights: ArrayLike | None) -> str:
-    """Return views, one per line, with exact floats; see `g2ard.io.write_views`."""
-    count = len(cameras)
-    given = np.full(count, np.nan) if weights is None else np.asarray(weights, np.float64)
-    drawn = [None if np.isnan(weight) else weight for weight in given.tolist()]
-    parts = list(splits) or [None] * count
-    if len(parts) != count or len(drawn) != count:
-        raise InputError(
-            f"{plural(count, 'view')}, {len(parts)} splits and {len(drawn)} weights do not match", path=path
-        )
-    lines = []
-    for i in range(count):
-        view: dict[str, Any] = {
-            "name": cameras.names[i],
-            "width": int(cameras.widths[i]),
-            "height": int(cameras.heights[i]),
-            "K": cameras.Ks[i].tolist(),
-            "camera_from_world": cameras.viewmats[i].tolist(),
-            "distortion": cameras.distortions[i].tolist() if cameras.distortions[i].any() else None,
-            "lens": _written(cameras.lenses[i]),
-            "image": beside(cameras.image_paths[i], path),
-            "mask": beside(cameras.mask_paths[i], path),
-            "split": parts[i],
-            "weight": drawn[i],
-            "kind": None if cameras.kinds[i] == USUAL else cameras.kinds[i],
-        }
-        lines.append(json.dumps({key: value for key, value in view.items() if value is not None}))
-    head = f'{{"format": "{_FORMAT}", "version": {_VERSION}, "views": [\n'
-    return head + ",\n".join(lines) + "\n]}\n"
+@checks_arguments
+def write_views(
+    path: str | Path,
+    cameras: Cameras,
+    *,
+    splits: Sequence[str | None] = (),
+    weights: ArrayLike | None = None,
+    format: ViewFormat | None = None,
+    overwrite: bool = False,
+) -> None:
+    """Write views as g2ard's .json, which `read_views` restores to the same bits, or for other programs.
+
+    Args:
+        path: the .json to write, or a folder for COLMAP; photo paths are stored relative to it.
+        cameras: C views.
+        splits: "train", "test" or None per view, or ().
+        weights: (C,) sampling weights, NaN for views without one, or None.
+        format: "g2ard", "inria", "nerfstudio" or "colmap" (text). None decides by name: cameras.json is
+            INRIA's, transforms*.json nerfstudio's, a name without suffix a COLMAP project.
+        overwrite: whether to replace an existing file.
+
+    Warns:
+        UserWarning: the format cannot hold something of the views.
+
+    Raises:
+        OutputError: the file exists, cannot be written, or is not a .json.
+        InputError: there are no views, or `splits` or `weights` have another length.
+
+    >>> import tempfile, g2ard
+    >>> folder = Path(tempfile.mkdtemp())
+    >>> views = g2ard.Cameras.of([g2ard.Camera.facing([0, -3, 0], [0, 0, 0], name="front")])
+    >>> g2ard.save_views(folder / "views.json", views, splits=["train"])
+    >>> g2ard.save_views(folder / "transforms.json", views, splits=["train"])  # for nerfstudio
+    """
+    from g2ard.io import colmap, inria, transforms
+    from g2ard.io import g2ard_views as views
+    from g2ard.scene.cameras import Cameras
+
+    check_type("cameras", cameras, Cameras)
+    path = Path(path)
+    kind = view_format(path, format)
+    if not len(cameras):
+        raise InputError("not written: there are no views", path=path)
+    if kind == "colmap":
+        texts = colmap.texts_of(cameras)
+    elif kind == "inria":
+        texts = {"": inria.text_of(cameras)}
+    elif kind == "nerfstudio":
+        texts = {"": transforms.text_of(path, cameras, splits)}
+    else:
+        texts = {"": views.text_of(path, cameras, splits, weights)}
+    with (atomic_folder if kind == "colmap" else atomic_output)(path, overwrite) as temporary:
+        for name, text in texts.items():
+            (temporary / name).parent.mkdir(parents=True, exist_ok=True)
+            (temporary / name).write_text(text, encoding="utf-8")
+    if lost := lost_views(cameras, kind, splits, weights is not None):
+        warnings.warn(f"{path}: without {', '.join(lost)}", stacklevel=3)  # past `checks_arguments`

@@ -80,7 +80,7 @@ class Budget(Settings):
 
     @property
     def is_measured(self) -> bool:
-        """Return whether the count depends on the scene, not only on its size: `measured_budget`."""
+        """Return whether the count depends on the scene, not only on its size: `budget_search`."""
         return self.layers is not None or self._is_searched
 
     @property

@@ -14,17 +14,17 @@ from numpy.typing import NDArray
 
 from g2ard.errors import InputError
 from g2ard.io.sog_write import palette_size
-from g2ard.io.tiles import row_width
+from g2ard.io.tile_store import row_width
 from g2ard.jobs.memory import RECOVERY_TIMES, TileMemory, amount
-from g2ard.jobs.views import within_pixels
+from g2ard.jobs.run_views import within_pixels
 from g2ard.progress import plural
 from g2ard.rendering.targets import CACHE_BYTES
 from g2ard.system.threads import threads_used
 
 if TYPE_CHECKING:
     from g2ard.jobs.distill import DistillJob
-    from g2ard.jobs.measured_budget import Reduction
-    from g2ard.jobs.tiled import TiledJob, Tiles
+    from g2ard.jobs.in_tiles import TiledJob, Tiles
+    from g2ard.jobs.simplify import Reduction
     from g2ard.scene.cameras import Cameras
     from g2ard.scene.splats import Splats
 

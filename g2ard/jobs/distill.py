@@ -22,16 +22,17 @@ from g2ard.io.paths import real_path
 from g2ard.io.splits import for_training
 from g2ard.io.types import Cloud, Points
 from g2ard.jobs.budget import Budget
+from g2ard.jobs.budget_search import ResolvedBudget
 from g2ard.jobs.clean import clean as remove_clutter
 from g2ard.jobs.distill_options import DistillOptions
 from g2ard.jobs.inputs import Views, load_scene, make_targets, scorable
-from g2ard.jobs.measured_budget import Reduction, ResolvedBudget
 from g2ard.jobs.memory import RECOVERY_TIMES
 from g2ard.jobs.photo_colors import colored
 from g2ard.jobs.photo_points import distinct, sparse_file, sparse_points, topped_up, usual_count
+from g2ard.jobs.run_views import Use, views_of, within_pixels
+from g2ard.jobs.simplify import Reduction
 from g2ard.jobs.view_checks import check_photos, propose_background
 from g2ard.jobs.viewer_frame import level_up
-from g2ard.jobs.views import Use, views_of, within_pixels
 from g2ard.pipeline.config import DistillConfig
 from g2ard.pipeline.distill import Distilled, RunViews
 from g2ard.pipeline.distill import distill as pipeline
@@ -52,8 +53,8 @@ from g2ard.stages.simplify.gaps import opacity_lost, say_gaps
 from g2ard.system.cached import cached_property
 
 if TYPE_CHECKING:
-    from g2ard.jobs.tiled import TiledJob
-    from g2ard.jobs.tiling import Tiling
+    from g2ard.jobs.in_tiles import TiledJob
+    from g2ard.jobs.tile_options import Tiling
 
 
 @dataclass(frozen=True, eq=False)
@@ -465,7 +466,7 @@ def preparing(
     if tiling is None or budget is None:
         yield prepare(scene, budget, options, use=use, **callbacks)
         return
-    from g2ard.jobs.tiled import opened, prepare_tiles
+    from g2ard.jobs.in_tiles import opened, prepare_tiles
 
     assert isinstance(scene, Path)
     began, model = time.monotonic(), options.render_model

@@ -21,7 +21,7 @@ from g2ard.io.detect import kind
 from g2ard.io.labels import names_of
 from g2ard.io.reports import Report
 from g2ard.io.scenes import tell
-from g2ard.io.tiles import StoredScene
+from g2ard.io.tile_store import StoredScene
 from g2ard.jobs.budget import Budget
 from g2ard.jobs.cost import Cost, cost_of
 from g2ard.jobs.distill import DistillJob, preparing
@@ -38,8 +38,8 @@ from g2ard.scene.splats import Splats
 from g2ard.viewer.page import Start, write_globe_page, write_stream_page
 
 if TYPE_CHECKING:
-    from g2ard.jobs.tiled import TiledJob
-    from g2ard.jobs.tiling import Tiling
+    from g2ard.jobs.in_tiles import TiledJob
+    from g2ard.jobs.tile_options import Tiling
 
 RATIOS = (1.0, 2.0, 4.0, 8.0, 16.0)
 """Reduction factors; each level has half the Gaussians of the previous one, as in viewers' own tools."""

@@ -10,8 +10,8 @@ from pathlib import Path
 from g2ard.errors import InputError, require
 from g2ard.io import open_stream
 from g2ard.io.stream import SceneStream
-from g2ard.io.tiles import TileStore, row_width
-from g2ard.jobs.tiling import Tiling, cut_into, folder_of_tiles
+from g2ard.io.tile_store import TileStore, row_width
+from g2ard.jobs.tile_options import Tiling, cut_into, folder_of_tiles
 
 WHOLE_TIMES, LEVELS_TIMES = 3.6, 7.0
 """Memory in one piece as a multiple of the scene's arrays: simplification, and levels without recovery."""

@@ -10,19 +10,18 @@ from typing import Any
 from numpy.typing import ArrayLike, NDArray
 
 from g2ard.config.checks import AtLeastOne, checks_arguments
-from g2ard.config.choices import Colour, RenderModel, is_made
+from g2ard.config.choices import Colour, RenderModel
 from g2ard.config.schema import changed, full_paths, keywords
 from g2ard.errors import InputError, require
 from g2ard.io.types import ViewSet
 from g2ard.jobs.cost import Cost, cost_of_recovery
-from g2ard.jobs.inputs import Views, load_scene, load_split_views, make_targets, scorable
-from g2ard.jobs.view_checks import check_photos, propose_background, warn_of_sight
-from g2ard.jobs.views import shrunk, views_or_pool, within_pixels
+from g2ard.jobs.inputs import Views, load_scene
+from g2ard.jobs.teaching import Teaching, check_teacher
 from g2ard.pipeline.presets import PRESETS, configured
 from g2ard.progress import Detail, Progress, Say, plural, silent, unsaid
 from g2ard.rendering.targets import Exposed, Targets, checked_targets, fill, kinds_of, kinds_told
 from g2ard.report.run import KindScore, by_kind
-from g2ard.scene.cameras import USUAL, Cameras
+from g2ard.scene.cameras import USUAL
 from g2ard.scene.splats import Splats
 from g2ard.stages.evaluate import evaluate
 from g2ard.stages.recover import RecoverConfig, Recovered
@@ -31,115 +30,6 @@ from g2ard.stages.recover.anchors import Anchors, PriorMeasures, regularizers_fo
 from g2ard.stages.recover.config import Schedule
 from g2ard.stages.recover.optimize import Watch
 from g2ard.system.cached import cached_property
-
-
-def check_teacher(views: Views | None, teacher: Splats | str | Path | None) -> None:
-    """Check that there is something to train on or score against: photos of views, or a teacher."""
-    if teacher is None and is_made(views):
-        raise InputError("generated views have no photos", parameter="views", hint="give {teacher=SCENE}")
-    if teacher is None and views is None:
-        raise InputError("there are no targets", hint="give {views}, or a {teacher} to generate views of")
-
-
-@dataclass(frozen=True, eq=False)
-class Teaching:
-    """Source of targets: photos, or renders of a teacher.
-
-    Args:
-        teacher: the dense scene, or its path; None if all targets are photos.
-        chosen: whether the user chose the background.
-        photos: use photos where views have them, and renders of the teacher otherwise. Photos that show
-            nothing of the scene are accepted then.
-        render_model: overrides what the teacher's file says.
-        seed: seed of generated views.
-    """
-
-    teacher: Splats | str | Path | None
-    background: Colour
-    chosen: bool
-    photos: bool = False
-    render_model: RenderModel | None = None
-    seed: int = 0
-    progress: Progress = silent
-    say: Say = unsaid
-
-    @cached_property
-    def dense(self) -> Splats | None:
-        """The teacher, if there is one."""
-        return None if self.teacher is None else load_scene(self.teacher, self.say, self.render_model)
-
-    def views(self, given: Views | None, student: Splats | None = None) -> Views:
-        """Return the given views, or those found beside the teacher, or generated ones.
-
-        With a student, generated views are those that recover it, see `views_or_pool`.
-        """
-        if self.dense is None:
-            assert given is not None  # `check_teacher`
-            return given
-        return views_or_pool(
-            self.dense,
-            given,
-            beside=None if isinstance(self.teacher, Splats) else self.teacher,
-            student=student,
-            seed=self.seed,
-            progress=self.progress,
-            say=self.say,
-        )
-
-    def training(self, scene: Splats, views: Views, split: str, size: int | None) -> tuple[ViewSet, Targets]:
-        """Read a split of the views and return it with its targets; reject photos of another scene."""
-        pool, mask = load_split_views(views, split, self.say, unpictured=self.dense is not None)
-        chosen = pool.take(mask).fitted(size)
-        if held_out := chosen.splits.count("test"):
-            count = len(chosen.cameras)
-            self.say(f"split {split}: {held_out} of the {count} views trained on are test views")
-        warn_of_sight(scene, chosen.cameras, self.say)
-        targets = self.targets(chosen.cameras)
-        self.check_photos(scene, chosen.cameras)
-        return chosen, targets
-
-    def check_photos(self, scene: Splats, cameras: Cameras) -> None:
-        """Reject photos that do not show the scene, unless they are insisted on."""
-        if self.dense is None or self.photos:
-            check_photos(scene, cameras, self.background, self.say, insisted=self.photos)
-
-    def targets(self, cameras: Cameras, **options: Any) -> Targets:
-        """Return the targets of the views; note if another background fits their photos."""
-        if self.dense is None or self.photos:
-            propose_background(cameras, self.background, self.chosen, self.say)
-        return self._made(cameras, say=self.say, **options)
-
-    def full_size(self, cameras: Cameras, size: int | None, **options: Any) -> Targets | None:
-        """Return the targets of unshrunk views; None if `size` shrinks none of them.
-
-        Of large views there are only some, see `within_pixels`.
-        """
-        if shrunk(cameras, size) is None:
-            return None
-        return scorable(self._made(within_pixels(cameras), **options))
-
-    def held_out(self, views: Views, size: int | None) -> Targets | None:
-        """Return the targets of the test views; None if there are no such views."""
-        cameras = self._split(views, "test")
-        if cameras is None:
-            return None
-        return scorable(self._made(cameras.fitted(size)), self.say)
-
-    def validation(self, views: Views, size: int | None) -> Targets | None:
-        """Return the renders of the views of other kinds in split `val`, or None."""
-        cameras = None if self.dense is None or self.photos else self._split(views, "val")
-        if cameras is None or USUAL in cameras.kinds:
-            return None
-        return self._made(cameras.fitted(size), say=self.say)
-
-    def _split(self, views: Views, name: str) -> Cameras | None:
-        """Return the views of a split, or None if it is empty."""
-        pool, _ = load_split_views(views, "all", unpictured=self.dense is not None)
-        rows = [i for i, split in enumerate(pool.splits) if split == name]
-        return pool.cameras.take(rows) if rows else None
-
-    def _made(self, cameras: Cameras, **options: Any) -> Targets:
-        return make_targets(cameras, self.dense, self.background, photos=self.photos, **options)
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,28 +1,230 @@
-"""`g2ard.simplify`: choosing views for visibility weights, then running the stage."""
+"""`g2ard.simplify`, and the reductions of one scene to any budget that several commands make."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from g2ard.config.checks import checks_arguments
+from g2ard.config.checks import check_seed, checks_arguments
 from g2ard.config.choices import FormatName, RenderModel
+from g2ard.errors import InputError
 from g2ard.io import kind, read_cloud, read_scene
+from g2ard.io.scene_formats import check_positions
 from g2ard.io.types import Note
 from g2ard.jobs.budget import Budget
-from g2ard.jobs.inputs import Views, say_notes
-from g2ard.jobs.measured_budget import Reduction
+from g2ard.jobs.budget_search import (
+    Quality,
+    ResolvedBudget,
+    as_file,
+    count_for_bytes,
+    count_for_layers,
+    count_for_quality,
+    resolved_in_tiles,
+)
+from g2ard.jobs.inputs import Views, say_notes, say_regions
+from g2ard.jobs.run_views import cameras_for_weights
 from g2ard.pipeline.presets import configured
+from g2ard.poses import plan_pool
 from g2ard.progress import Progress, Say, plural, silent, unsaid
+from g2ard.rendering.visibility import SampledVisibility, visibility_source
+from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
 from g2ard.stages.lift import lift
-from g2ard.stages.simplify import Simplified, SimplifyConfig
+from g2ard.stages.simplify import Pairs, Simplified, SimplifyConfig, VisibilitySource
+from g2ard.stages.simplify import simplify as merge
 from g2ard.stages.simplify.gaps import say_gaps
+from g2ard.system.cached import cached_property
 
 if TYPE_CHECKING:
-    from g2ard.jobs.tiling import Tiling
+    from g2ard.jobs.tile_options import Tiling
+
+_QUALITY_VIEWS, _QUALITY_SIDE = 12, 400
+"""Number of views in which quality is measured, and their longer side in pixels."""
+_POOL_SAMPLE = 100_000
+"""Gaussians that those views are planned on."""
+_BYTES_SAFETY = 0.985
+"""Safety factor on the bytes if recovery will change the scene after the search."""
+
+
+@dataclass(eq=False)
+class Reduction:
+    """Reductions of one scene to any budget: count → `Simplified`, as `simplify` returns it.
+
+    Poses and visibility are computed once, and the last two results are cached. Other arguments and errors
+    are those of `simplify`.
+
+    Args:
+        cameras: cameras that give visibility weights to every method, instead of `views`.
+        recovered: whether the results are recovered afterwards, so that their gaps are not measured.
+        notes: notes on the scene's file.
+        tiles: the scene, if it is in tiles; `splats` is then a sample.
+    """
+
+    splats: Splats
+    views: Views | None = None
+    cameras: Cameras | None = None
+    blind: bool = False
+    config: SimplifyConfig = field(default_factory=SimplifyConfig)
+    beside: str | Path | None = None
+    up: Sequence[float] | None = None
+    seed: int = 0
+    recovered: bool = False
+    notes: Sequence[Note] = ()
+    progress: Progress = silent
+    say: Say = unsaid
+    _made: dict[int, Any] = field(default_factory=dict)
+    tiles: Any = field(default=None, kw_only=True)
+
+    def __post_init__(self) -> None:
+        check_seed("seed", self.seed)
+        if self.views is not None and self.blind:
+            raise InputError("views and blind exclude each other")
+        if self.views is not None and self.config.method == "paper":
+            raise InputError("has no effect on the method paper", parameter="views")
+        weighed = self.cameras is not None or self.views is not None or self.config.method == "default"
+        if isinstance(self.config, Pairs):
+            if self.config.pixel_scale != Pairs.pixel_scale and weighed and not self.blind:
+                raise InputError("has no effect with views", parameter="simplify.pixel_scale")
+            if self.config.dilation != Pairs.dilation and self.splats.antialiased:
+                raise InputError("has no effect on antialiased scenes", parameter="simplify.dilation")
+        if self.tiles is None:
+            say_regions(self.splats, self.config, "the scene", self.say)
+        else:
+            say_regions(self.splats, self.config, "a sample of the scene", unsaid)
+
+    @property
+    def total(self) -> int:
+        """Gaussians of the scene."""
+        return len(self.splats) if self.tiles is None else int(self.tiles.plan.count)
+
+    def __call__(self, count: int) -> Any:
+        if count not in self._made:
+            self._made = dict([*self._made.items(), (count, self.made(count))][-2:])
+        return self._made[count]
+
+    def made(self, count: int) -> Any:
+        """Simplify the scene."""
+        if self.tiles is not None:
+            return self.tiles.simplified(count, self.seen if count < self.total else None, self.config)
+        return merge(
+            self.splats,
+            count,
+            visibility=self._visibility if count < self.total else None,
+            gaps=not self.recovered,
+            config=self.config,
+            progress=self.progress,
+        )
+
+    @cached_property
+    def seen(self) -> Cameras | None:
+        """Views that weigh Gaussians by visibility."""
+        if self.blind or self.cameras is not None:
+            return None if self.blind else self.cameras
+        return cameras_for_weights(
+            self.splats,
+            self.views,
+            self.config.method,
+            beside=self.beside,
+            up=self.up,
+            seed=self.seed,
+            represents=self.total / len(self.splats),
+            progress=self.progress,
+            say=self.say,
+        )
+
+    @cached_property
+    def _visibility(self) -> VisibilitySource | None:
+        if self.seen is None:
+            return None
+        source = visibility_source(self.seen, progress=self.progress)
+        return _Remembering(source, source.views)
+
+    def resolved(self, budget: Budget, name: str, file: str, sh_degree: int | None = None) -> ResolvedBudget:
+        """Resolve a budget for the scene, called `name` in errors.
+
+        If recovery follows, bytes are searched with the method `fast` and a margin.
+
+        Args:
+            file: a file name; its suffix is the format for `Budget.fit`.
+            sh_degree: of the result; None is the scene's.
+        """
+        splats, say = self.splats, self.say
+        if self.tiles is not None:
+            return resolved_in_tiles(budget, self.total, splats, name, file, say)
+        if budget.min_psnr is not None or budget.min_ssim is not None:
+            return self._resolved_for_quality(Quality(budget.min_psnr or 0.0, budget.min_ssim or 0.0), file)
+
+        def tried(count: int) -> Splats:
+            small = merge(splats, count, method="fast") if self.recovered else self(count)
+            return small.splats
+
+        if budget.bytes is not None:
+            if sh_degree is not None:
+                splats = splats.with_sh_degree(sh_degree)
+            most = int(budget.bytes * _BYTES_SAFETY) if self.recovered else budget.bytes
+            found = count_for_bytes(splats, most, file, tried)
+        else:
+            found = budget.of(len(splats), name)
+            check_positions(file, splats, found)
+        if budget.layers is not None:
+            whole = found
+            found, layers = count_for_layers(whole, budget.layers, tried)
+            if found < whole:
+                say(
+                    f"{budget.fit}: near views blend more than {budget.layers} Gaussians per pixel at "
+                    f"{whole:,}, {layers:.0f} at {found:,}"
+                )
+        if budget.fit is not None:
+            fits = plural(found, "Gaussian") if budget.bytes is None else f"about {plural(found, 'Gaussian')}"
+            all_fit = f"nothing to do, all {plural(found, 'Gaussian')} already fit"
+            say(f"{budget.fit}: {all_fit if found == len(splats) else fits}")
+        return ResolvedBudget(found, budget.bytes, file)
+
+    def _resolved_for_quality(self, wanted: Quality, file: str) -> ResolvedBudget:
+        """Find the count that keeps a quality in generated views, as read back from the format of `file`."""
+        splats = self.splats
+        pool = plan_pool(splats, _QUALITY_VIEWS, seed=self.seed, rows=_POOL_SAMPLE, progress=self.progress)
+        cameras = pool.cameras.resized(_QUALITY_SIDE)
+
+        def reduce(count: int) -> Splats:
+            small = as_file(self(count).splats, file)
+            self.progress("quality", 0, 0)
+            return small
+
+        found, near = count_for_quality(splats, wanted, cameras, reduce)
+        if found == len(splats):
+            self.say(f"no smaller count was found that keeps the quality; keeping all {found:,} Gaussians")
+        else:
+            stage = " before recovery" if self.recovered else ""
+            views = plural(len(cameras), "view")
+            self.say(
+                f"{plural(found, 'Gaussian')} keep {near}{stage}, in {views} generated to choose the count"
+            )
+        return ResolvedBudget(found, file=file, wanted=wanted, dense=splats, cameras=cameras)
+
+
+class _Remembering:
+    """A source of visibility that keeps that of its first scene, with which every reduction starts."""
+
+    def __init__(self, source: VisibilitySource, views: Cameras) -> None:
+        self.source, self.views = source, views
+        self.first: tuple[Splats, SampledVisibility] | None = None
+
+    def __call__(self, scene: Splats) -> SampledVisibility:
+        if self.first is not None and _same(self.first[0], scene):
+            return self.first[1]
+        seen = self.source(scene)
+        if self.first is None:
+            self.first = scene, seen
+        return seen
+
+
+def _same(a: Splats, b: Splats) -> bool:
+    """Return whether two scenes share their geometry arrays; scales are clamped anew by each reduction."""
+    return all(getattr(a, name) is getattr(b, name) for name in ("means", "quats", "logit_opacities"))
 
 
 @contextmanager
@@ -49,7 +251,7 @@ def reducing(
     callbacks: dict[str, Any] = {"progress": progress, "say": say}
     beside = beside if isinstance(scene, Splats) else beside or scene
     if tiling is not None:
-        from g2ard.jobs.tiled import opened
+        from g2ard.jobs.in_tiles import opened
 
         how: dict[str, Any] = {"render_model": render_model, "planned": planned, **callbacks}
         with opened(Path(str(scene)), tiling, 1.0, **how) as tiles:

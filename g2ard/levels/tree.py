@@ -15,7 +15,7 @@ from g2ard.config.checks import AtLeastOne, Positive
 from g2ard.config.schema import Settings
 from g2ard.errors import InputError
 from g2ard.io.packing import rounding
-from g2ard.io.tiles import StoredScene
+from g2ard.io.tile_store import StoredScene
 from g2ard.scene.splats import Splats, check_finite
 from g2ard.scene.transform import rotation_matrices
 

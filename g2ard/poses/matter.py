@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from g2ard import _core
 from g2ard.errors import InputError
-from g2ard.poses.numbers import Floats, canonical_order, middle, norms, quantile, turned
+from g2ard.scene.reproducible import Floats, canonical_order, middle, norms, quantile, turned
 from g2ard.scene.splats import Splats
 from g2ard.scene.transform import rotation_matrices
 from g2ard.system.cached import cached_property

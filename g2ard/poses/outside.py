@@ -6,9 +6,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from g2ard.poses.numbers import Floats, between, directions, halton, quantile, turned
 from g2ard.poses.sight import Lens, Poses, Rays, Survey, gather
 from g2ard.poses.site import Site
+from g2ard.scene.reproducible import Floats, between, directions, halton, quantile, turned
 from g2ard.scene.samples import evenly_spaced
 
 _ELEVATIONS, _DISTANCES = (-5.0, 50.0), (0.9, 1.25)

@@ -12,7 +12,6 @@ from numpy.typing import ArrayLike, NDArray
 from g2ard.config.choices import POOL_KINDS
 from g2ard.errors import InputError, require
 from g2ard.io.splits import HOLD_OUT
-from g2ard.poses.numbers import middle, norms, strata
 from g2ard.poses.outside import plan_aerial, plan_orbit
 from g2ard.poses.showing import is_hidden
 from g2ard.poses.sight import Lens, Poses, Survey
@@ -30,6 +29,7 @@ from g2ard.poses.within import (
 )
 from g2ard.progress import Progress, silent
 from g2ard.scene.cameras import Camera, Cameras
+from g2ard.scene.reproducible import middle, norms, strata
 from g2ard.scene.splats import Splats
 
 _PLANNERS: dict[str, Callable[..., Poses]] = {

@@ -8,12 +8,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from g2ard.errors import InputError
-from g2ard.poses.numbers import Floats, around, between, canonical_order, halton, turned
 from g2ard.poses.outside import circle, ring
 from g2ard.poses.sight import Lens, Poses, Survey
 from g2ard.poses.site import Site
 from g2ard.poses.within import WIDE, closed, is_room, plan_inside, plan_sharp, plan_walk
 from g2ard.scene.cameras import Cameras
+from g2ard.scene.reproducible import Floats, around, between, canonical_order, halton, turned
 from g2ard.scene.samples import evenly_spaced
 from g2ard.scene.splats import Splats
 

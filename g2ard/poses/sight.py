@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from g2ard import _core
 from g2ard.config.choices import BLACK
 from g2ard.errors import require
-from g2ard.poses.numbers import Floats, canonical_order, norms, quantile
 from g2ard.poses.site import Inside, Site
 from g2ard.rendering.renderer import RasterSettings, View, view_of
 from g2ard.scene.cameras import Cameras
+from g2ard.scene.reproducible import Floats, canonical_order, norms, quantile
 from g2ard.scene.splats import Splats
 from g2ard.system.cached import cached_property
 

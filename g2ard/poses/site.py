@@ -8,8 +8,18 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from g2ard.poses.matter import Grid, Matter
-from g2ard.poses.numbers import Floats, along, between, fibonacci, halton, middle, moments, quantile, turned
 from g2ard.poses.up import Up, estimate_up, facing, given_up
+from g2ard.scene.reproducible import (
+    Floats,
+    along,
+    between,
+    fibonacci,
+    halton,
+    middle,
+    moments,
+    quantile,
+    turned,
+)
 from g2ard.scene.splats import Splats
 from g2ard.system.cached import cached_property
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from g2ard.poses.matter import Matter
-from g2ard.poses.numbers import Floats, along, fibonacci, moments, quantile
+from g2ard.scene.reproducible import Floats, along, fibonacci, moments, quantile
 from g2ard.scene.transform import unit_up
 
 _FACING, _SLOPED = np.cos(np.radians(20)), np.cos(np.radians(35))

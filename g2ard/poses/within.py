@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from g2ard.poses.numbers import Floats, between, directions, fibonacci, halton, joined, norms
 from g2ard.poses.sight import SIGHT_ROWS, Glance, Poses, Rays, Survey, gather
 from g2ard.poses.site import Site
+from g2ard.scene.reproducible import Floats, between, directions, fibonacci, halton, joined, norms
 
 Reach = tuple[NDArray[np.int64], Floats, NDArray[np.bool_]]
 

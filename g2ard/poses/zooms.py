@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from g2ard.poses.numbers import Floats, along, halton
 from g2ard.scene.cameras import ZOOM, Camera, Cameras
+from g2ard.scene.reproducible import Floats, along, halton
 from g2ard.scene.samples import evenly_spaced, spread
 from g2ard.scene.splats import Splats
 

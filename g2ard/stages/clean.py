@@ -20,10 +20,10 @@ from numpy.typing import NDArray
 
 from g2ard import _core
 from g2ard.errors import InputError, require
-from g2ard.poses.numbers import joined
 from g2ard.progress import Progress, counter, silent
 from g2ard.rendering.renderer import Renderer
 from g2ard.scene.cameras import Camera, Cameras
+from g2ard.scene.reproducible import joined
 from g2ard.scene.shape import NEEDLE_LENGTH, longer_axes
 from g2ard.scene.splats import DRAWN_LOGIT, Splats
 from g2ard.scene.transform import rotation_matrices

@@ -15,8 +15,8 @@ from g2ard import _core
 from g2ard.config.checks import Within, checks_arguments
 from g2ard.config.schema import Settings
 from g2ard.errors import InputError, require
-from g2ard.poses.numbers import middle
 from g2ard.progress import Progress, counter, silent
+from g2ard.scene.reproducible import middle
 from g2ard.scene.splats import SH_C0, Splats, unit_colors
 
 _CORE = _core.defaults()["lift"]

@@ -17,7 +17,7 @@ from g2ard.io.detect import MANIFEST
 from g2ard.io.jsonfile import Place, checked, read_json
 from g2ard.io.lock import LOCK, check_unlocked, locked
 from g2ard.io.stream import PointStream, SceneStream
-from g2ard.io.tiles import VERSION, TileStore
+from g2ard.io.tile_store import VERSION, TileStore
 from g2ard.io.types import Note
 from g2ard.progress import Progress, Say, plural, silent, unsaid
 from g2ard.stages.lift import LiftConfig

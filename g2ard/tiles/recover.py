@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard.config.schema import changed, values_of
-from g2ard.io.tiles import TileStore
+from g2ard.io.tile_store import TileStore
 from g2ard.pipeline.distill import RunViews
 from g2ard.rendering.renderer import RasterSettings, Renderer, settings_for
 from g2ard.rendering.targets import TeacherRenders

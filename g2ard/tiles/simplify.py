@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard import _core
-from g2ard.io.tiles import TileStore
+from g2ard.io.tile_store import TileStore
 from g2ard.rendering.renderer import RasterSettings, settings_for, view_of
 from g2ard.rendering.visibility import CONVERGED, NEAR, ROUND, SampledVisibility, spread
 from g2ard.scene.cameras import Cameras

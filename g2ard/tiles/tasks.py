@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from g2ard.errors import InputError
 from g2ard.io.atomic import atomic_output
-from g2ard.io.tiles import TileStore
+from g2ard.io.tile_store import TileStore
 from g2ard.rendering.renderer import RasterSettings
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.prepared import PreparedScene, as_prepared, finite_rows_of

@@ -17,7 +17,7 @@ from g2ard.io.atomic import atomic_output, drop_temporaries
 from g2ard.io.detect import MANIFEST, POINTS
 from g2ard.io.sanitize import Tally
 from g2ard.io.stream import PointStream, SceneStream
-from g2ard.io.tiles import FORMAT, VERSION, TileStore, halo_name, packed, row_width, tile_name
+from g2ard.io.tile_store import FORMAT, VERSION, TileStore, halo_name, packed, row_width, tile_name
 from g2ard.progress import Progress, Say, plural
 from g2ard.scene.kdtree import KdTree, Points, Sampler, cut_tree, margin_of, parts_of
 from g2ard.scene.splats import Splats

@@ -11,7 +11,7 @@ import pytest
 import g2ard
 from g2ard.cli.app import COMMANDS
 from g2ard.cli.console import Console
-from g2ard.cli.frame import Run
+from g2ard.cli.run import Run
 from helpers.commands import CommandLine, refused, succeeds
 from helpers.scenes import around, checkered_ball
 

@@ -356,7 +356,7 @@ def test_the_tables_hold_every_option() -> None:
     from typer.main import get_command
 
     from g2ard.cli.app import register_commands
-    from g2ard.cli.frame import app
+    from g2ard.cli.command import app
 
     register_commands()
     commands = get_command(app).commands  # type: ignore[attr-defined]

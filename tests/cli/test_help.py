@@ -18,7 +18,7 @@ def options_of(command: str) -> dict[str, Any]:
     from typer.main import get_command
 
     from g2ard.cli.app import register_commands
-    from g2ard.cli.frame import app
+    from g2ard.cli.command import app
 
     register_commands()
     params = get_command(app).commands[command].params  # type: ignore[attr-defined]

@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from g2ard.io import write_splats, write_views
-from g2ard.jobs.views import orbit
+from g2ard.jobs.run_views import orbit
 from helpers.commands import CommandLine, refused, succeeds
 from helpers.scenes import around, checkered_ball
 

@@ -15,7 +15,7 @@ from g2ard.cli.commands import render
 from g2ard.io import spz
 from g2ard.io.detect import file_format
 from g2ard.io.scene_formats import FORMATS
-from g2ard.jobs import views
+from g2ard.jobs import run_views
 from g2ard.jobs.budget import DEVICES
 from g2ard.pipeline import adapt
 from g2ard.poses import pool, within
@@ -46,7 +46,7 @@ DEFAULTS: dict[str, str] = {
     "register accept": f"{REGISTER.accept} by default",
     "convert spz_version": f"{signature(spz.write).parameters['spz_version'].default} by default",
     "poses fov": f"by default {pool._FOV:g}, and {within.WIDE:g} in rooms",
-    "render looks": f"by default {views._POOL_VIEWS}",
+    "render looks": f"by default {run_views._POOL_VIEWS}",
     "render around": f"{render._PANORAMA:,} pixels wide",
     "ingest tile_rows": f"{TILE_ROWS / 1e6:g}M by default",
     **{
@@ -188,7 +188,7 @@ def helps() -> dict[str, str]:
     from typer.main import get_command
 
     from g2ard.cli.app import register_commands
-    from g2ard.cli.frame import app
+    from g2ard.cli.command import app
 
     register_commands()
     commands = get_command(app).commands  # type: ignore[attr-defined]

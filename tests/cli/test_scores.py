@@ -223,7 +223,7 @@ def test_evaluate_scores_once_more_at_the_views_own_size(
 def test_only_some_large_views_are_scored_at_their_own_size(
     runs: Path, command_line: CommandLine, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("g2ard.jobs.views.FULL_PIXELS", 3 * 64 * 48)
+    monkeypatch.setattr("g2ard.jobs.run_views.FULL_PIXELS", 3 * 64 * 48)
     g2ard.save_views("views.json", around(8, (64, 48)))
     ask = ("evaluate", "better/scene.ply", "--teacher", "ball.ply", "--views", "views.json", "--split", "all")
     (row,) = json.loads(succeeds(command_line, runs, *ask, "--size", 32, "--json", "-").out)["scenes"]

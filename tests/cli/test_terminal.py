@@ -77,7 +77,7 @@ BAR = re.compile("^[^┏┡]*[━╸╺]|ETA|: working")
 @cache
 def example(command: str) -> list[str]:
     """Return the words of the example in a command's help, without the program's name, and its options."""
-    from g2ard.cli.frame import app
+    from g2ard.cli.command import app
 
     import_module(f"g2ard.cli.commands.{command}")
     found = next(one.epilog for one in app.registered_commands if one.name == command)

@@ -16,8 +16,8 @@ COMMANDS = {
     f"recover ball.ply {TRAIN} -o out.ply": "g2ard.jobs.recover.RecoverJob.run",
     f"adapt ball.ply {TRAIN} -o out.ply": "g2ard.pipeline.adapt.adapt",
     "lod ball.ply -r 4,8 --merge-only --views views.json -o levels": "g2ard.jobs.levels.preparing_levels",
-    "simplify ball.ply -r 8 --no-views -o out.ply": "g2ard.cli.frame.write_scene",
-    "select ball.ply --views views.json -k 3 -o out.json": "g2ard.cli.frame.write_views",
+    "simplify ball.ply -r 8 --no-views -o out.ply": "g2ard.cli.run.write_scene",
+    "select ball.ply --views views.json -k 3 -o out.json": "g2ard.cli.run.write_views",
     "render ball.ply --views views.json -o out": "g2ard.rendering.renderer.Renderer.image",
 }
 """Command → the function in it that begins another run of the same command."""

@@ -19,7 +19,7 @@ from g2ard.jobs.budget import Budget
 from g2ard.jobs.distill import preparing
 from g2ard.jobs.distill_options import DistillOptions
 from g2ard.jobs.simplify import reducing
-from g2ard.jobs.tiling import Tiling, needs_whole, refuse_whole
+from g2ard.jobs.tile_options import Tiling, needs_whole, refuse_whole
 from g2ard.pipeline.adapt import appearance_only
 from g2ard.pipeline.presets import configured
 from g2ard.scene.splats import SH_C0

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from g2ard.io import write_splats
-from g2ard.io.tiles import TileStore, packed
+from g2ard.io.tile_store import TileStore, packed
 from g2ard.scene.splats import Splats
 
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from g2ard.io import write_splats, write_views
-from g2ard.io.tiles import TileStore
+from g2ard.io.tile_store import TileStore
 from g2ard.progress import Progress, silent
 from g2ard.scene.cameras import Cameras, look_at
 from g2ard.scene.splats import Splats

@@ -9,7 +9,7 @@ import pytest
 
 from g2ard import io
 from g2ard.errors import InputError
-from g2ard.io.detect import KINDS
+from g2ard.io.detect import KINDS, MODULES
 from g2ard.io.images import load_photo
 from helpers.dataset_files import POSES, cambridge, llff, mip_nerf_360, opengl, polycam
 from helpers.faults import faulty
@@ -166,6 +166,6 @@ def test_a_colmap_model_without_a_table_says_which(part: str, tmp_path: Path) ->
 
 @pytest.mark.parametrize("name", KINDS)
 def test_every_line_of_the_table_names_a_reader(name: str, tmp_path: Path) -> None:
-    module = import_module(f"g2ard.io.{name}")
+    module = import_module(f"g2ard.io.{MODULES.get(name, name)}")
     assert hasattr(module, "read") or (hasattr(module, "Stream") and KINDS[name] != "views")
     assert not hasattr(module, "holds") or not module.holds(tmp_path)

@@ -13,7 +13,7 @@ import g2ard
 from g2ard.errors import InputError
 from g2ard.io import read_cloud, read_views
 from g2ard.io.images import load_mask, load_photo
-from g2ard.io.view_sets import read_view_set
+from g2ard.io.views import read_view_set
 from helpers.commands import CommandLine, succeeds
 from reference.rotations import rotations
 

@@ -11,7 +11,7 @@ import pytest
 
 from g2ard.io.finding import _CODE_PAGES, _MASKS, _MASKS_BESIDE, Finder, files_in, photos_in
 from g2ard.io.splits import splits_of
-from g2ard.io.view_sets import read_view_set
+from g2ard.io.views import read_view_set
 from helpers.view_files import colmap, edit, orbit, photo, transforms
 
 JUNK = ["._{}", ".DS_Store", "Thumbs.db", "desktop.ini"]

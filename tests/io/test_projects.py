@@ -13,7 +13,7 @@ from g2ard.io import kind, read_views
 from g2ard.io.finding import Finder
 from g2ard.io.images import load_mask, load_photo
 from g2ard.io.types import ViewFiles
-from g2ard.io.view_sets import read_view_set
+from g2ard.io.views import read_view_set
 from g2ard.jobs.photo_points import sparse_file, sparse_points
 from helpers.view_files import colmap, edit, orbit, photo, transforms
 

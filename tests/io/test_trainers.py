@@ -11,7 +11,7 @@ import pytest
 from g2ard.errors import InputError
 from g2ard.io import find_views, kind, read_view_set
 from g2ard.io.detect import file_format
-from g2ard.io.settings import read_settings
+from g2ard.io.trainer_yaml import read_settings
 from helpers.faults import Fault, faulty
 from helpers.trainer_files import (
     APPLIED,

@@ -13,18 +13,18 @@ from g2ard.cli.budget_options import Count, Counts
 from g2ard.errors import InputError
 from g2ard.io import read_splats, write_splats
 from g2ard.jobs.budget import DEVICES, LAYERS, Budget
-from g2ard.jobs.distill import prepare
-from g2ard.jobs.distill_options import DistillOptions
-from g2ard.jobs.measured_budget import (
+from g2ard.jobs.budget_search import (
     Quality,
-    Reduction,
     ResolvedBudget,
-    close_up,
     count_for_bytes,
     count_for_quality,
     file_bytes,
     resolved_in_tiles,
 )
+from g2ard.jobs.close_up import close_up
+from g2ard.jobs.distill import prepare
+from g2ard.jobs.distill_options import DistillOptions
+from g2ard.jobs.simplify import Reduction
 from g2ard.scene.splats import Splats
 from g2ard.stages.simplify import simplify
 from helpers.commands import CommandLine, succeeds

@@ -9,7 +9,7 @@ from PIL import Image
 
 from g2ard.io import write_views
 from g2ard.jobs.distill_options import DistillOptions
-from g2ard.jobs.views import views_of
+from g2ard.jobs.run_views import views_of
 from g2ard.pipeline.distill import RunViews
 from g2ard.poses import plan_pool
 from g2ard.rendering.visibility import visibility_source

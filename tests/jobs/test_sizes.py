@@ -46,7 +46,7 @@ def test_every_command_with_a_size_is_tried() -> None:
     from typer.main import get_command
 
     from g2ard.cli.app import register_commands
-    from g2ard.cli.frame import app
+    from g2ard.cli.command import app
 
     register_commands()
     commands: dict[str, Any] = get_command(app).commands  # type: ignore[attr-defined]

@@ -57,8 +57,8 @@ class Watch:
 @pytest.fixture
 def watch(monkeypatch: pytest.MonkeyPatch) -> Watch:
     import g2ard.jobs.distill
-    import g2ard.jobs.measured_budget
     import g2ard.jobs.recover
+    import g2ard.jobs.simplify
     import g2ard.pipeline.distill
     import g2ard.pipeline.steps
     import g2ard.stages.evaluate
@@ -77,7 +77,7 @@ def watch(monkeypatch: pytest.MonkeyPatch) -> Watch:
 
     watched(g2ard.jobs.recover, "optimize", 1, seen.trained)
     watched(g2ard.pipeline.steps, "recover", 1, seen.trained)
-    for module in (g2ard.jobs.measured_budget, g2ard.pipeline.distill):
+    for module in (g2ard.jobs.simplify, g2ard.pipeline.distill):
         watched(module, "visibility_source", 0, seen.looked)
     for module in (g2ard.stages.evaluate, g2ard.jobs.distill, g2ard.jobs.recover):
         watched(module, "evaluate", 1, seen.scored)

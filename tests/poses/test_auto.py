@@ -10,12 +10,12 @@ import pytest
 from g2ard.io import read_splats
 from g2ard.poses import plan_pool
 from g2ard.poses.matter import Matter
-from g2ard.poses.numbers import fibonacci
 from g2ard.poses.sight import Glance, Poses, Survey
 from g2ard.poses.site import Site
 from g2ard.poses.up import estimate_up
 from g2ard.poses.within import plan_inside, plan_sharp
 from g2ard.scene.cameras import Cameras
+from g2ard.scene.reproducible import fibonacci
 from g2ard.scene.splats import Splats
 from helpers.realdata import real
 from reference import poses as naive

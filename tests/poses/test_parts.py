@@ -8,9 +8,9 @@ import pytest
 from g2ard import _core
 from g2ard.poses import plan_pool
 from g2ard.poses.matter import Grid, Matter
-from g2ard.poses.numbers import halton, strata
 from g2ard.poses.sight import Glance
 from g2ard.poses.site import Site, Terrain
+from g2ard.scene.reproducible import halton, strata
 from g2ard.scene.splats import Splats
 from helpers.scenes import views_at
 from helpers.threads import on_threads

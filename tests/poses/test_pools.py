@@ -14,9 +14,9 @@ import pytest
 from g2ard.errors import InputError
 from g2ard.io import read_splats, read_views, write_splats
 from g2ard.poses import make_pool, plan_pool
-from g2ard.poses.numbers import fibonacci
 from g2ard.poses.sight import Poses, Survey
 from g2ard.poses.site import Site
+from g2ard.scene.reproducible import fibonacci
 from g2ard.scene.splats import Splats
 from helpers.commands import CommandLine
 from helpers.realdata import real

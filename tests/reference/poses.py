@@ -118,7 +118,7 @@ def box(low, high, spacing, floor=True):
 
 
 def sphere(centre, radius, spacing):
-    from g2ard.poses.numbers import fibonacci
+    from g2ard.scene.reproducible import fibonacci
 
     outward = fibonacci(int(4 * np.pi * radius**2 / spacing**2))
     return discs(np.array(centre, float) + radius * outward, outward, spacing)

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from g2ard import _core
-from g2ard.cli.frame import Run
+from g2ard.cli.run import Run
 from g2ard.io import read_splats, write_splats, write_views
 from g2ard.poses import make_pool
 from g2ard.rendering.metrics import psnr

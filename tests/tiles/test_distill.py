@@ -15,7 +15,7 @@ import pytest
 from g2ard.errors import InputError
 from g2ard.io import read_splats, write_splats, write_views
 from g2ard.jobs.memory import plan_tiles
-from g2ard.jobs.tiling import Tiling, is_tiled
+from g2ard.jobs.tile_options import Tiling, is_tiled
 from g2ard.rendering.targets import TeacherRenders
 from g2ard.scene.cameras import look_at
 from g2ard.stages.evaluate import evaluate

@@ -8,9 +8,9 @@ import pytest
 
 from g2ard.errors import InputError, OutputError
 from g2ard.io.lock import LOCK, locked
-from g2ard.io.tiles import StoredScene, TileStore
+from g2ard.io.tile_store import StoredScene, TileStore
 from g2ard.jobs.distill_options import DistillOptions
-from g2ard.jobs.tiling import needs_whole
+from g2ard.jobs.tile_options import needs_whole
 from g2ard.levels import Cut, save_levels
 from g2ard.tiles import ingest as ingest_module
 from g2ard.tiles.ingest import ingest

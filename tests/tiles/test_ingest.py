@@ -9,7 +9,7 @@ import pytest
 
 from g2ard.errors import InputError, OutputError
 from g2ard.io import read_scene, write_splats
-from g2ard.io.tiles import TileStore, packed
+from g2ard.io.tile_store import TileStore, packed
 from g2ard.scene.kdtree import Sampler
 from g2ard.tiles.ingest import ingest
 from helpers.commands import succeeds

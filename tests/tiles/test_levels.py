@@ -10,9 +10,9 @@ import pytest
 from g2ard import io
 from g2ard.errors import InputError
 from g2ard.io import sog
-from g2ard.io.tiles import StoredScene
+from g2ard.io.tile_store import StoredScene
 from g2ard.jobs.levels import Levels, preparing_levels
-from g2ard.jobs.tiling import Tiling
+from g2ard.jobs.tile_options import Tiling
 from g2ard.levels import Cut, cut, save_levels, tree
 from g2ard.progress import Say, unsaid
 from g2ard.scene.splats import Splats

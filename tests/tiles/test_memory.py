@@ -7,8 +7,8 @@ import pytest
 
 from g2ard.errors import InputError
 from g2ard.io import write_splats
-from g2ard.io.tiles import TileStore
-from g2ard.jobs import tiling as policy
+from g2ard.io.tile_store import TileStore
+from g2ard.jobs import tile_options as policy
 from g2ard.jobs.memory import (
     LEVELS_TIMES,
     RECOVERY_TIMES,
@@ -17,7 +17,7 @@ from g2ard.jobs.memory import (
     check_whole_memory,
     plan_tiles,
 )
-from g2ard.jobs.tiling import Tiling
+from g2ard.jobs.tile_options import Tiling
 from g2ard.tiles.ingest import ingest
 from helpers.tiled_scenes import town
 

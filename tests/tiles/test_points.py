@@ -9,7 +9,7 @@ import pytest
 
 from g2ard.errors import InputError, OutputError
 from g2ard.io import open_point_stream, read_cloud, write_points
-from g2ard.io.tiles import packed
+from g2ard.io.tile_store import packed
 from g2ard.io.types import Points
 from g2ard.stages.lift import LiftConfig, lift
 from g2ard.tiles.ingest import ingest

@@ -15,7 +15,7 @@ import pytest
 from g2ard import _core
 from g2ard.errors import InputError
 from g2ard.io import read_splats, write_splats
-from g2ard.io.tiles import TileStore
+from g2ard.io.tile_store import TileStore
 from g2ard.progress import silent
 from g2ard.rendering.renderer import RasterSettings
 from g2ard.rendering.targets import TeacherRenders

@@ -6,8 +6,9 @@ from typing import Annotated
 import typer
 
 from g2ard.cli import options as opt
-from g2ard.cli.frame import Run, command
+from g2ard.cli.command import command
 from g2ard.cli.resume import check_scene_run, checkpoint_beside, stoppable
+from g2ard.cli.run import Run
 from g2ard.cli.run_result import tell_plan
 from g2ard.config.schema import listed
 from g2ard.io.scene_formats import check_positions
@@ -42,7 +43,7 @@ def adapt(
 ) -> None:
     """Refit colours and opacities to new images; means, rotations and scales stay fixed."""
     from g2ard.jobs.cost import cost_of_recovery
-    from g2ard.jobs.recover import Teaching
+    from g2ard.jobs.teaching import Teaching
     from g2ard.pipeline.adapt import AdaptConfig
     from g2ard.pipeline.adapt import adapt as refit
 

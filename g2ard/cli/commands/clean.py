@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from g2ard.cli.frame import Run, command
+from g2ard.cli.command import command
 from g2ard.cli.options import SceneArgument, picture
+from g2ard.cli.run import Run
 from g2ard.errors import InputError
 from g2ard.progress import plural
 

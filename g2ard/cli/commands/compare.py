@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from g2ard.cli import options as opt
-from g2ard.cli.frame import Run, command
+from g2ard.cli.command import command
+from g2ard.cli.run import Run
 from g2ard.config.choices import BLACK, Colour, is_made
 from g2ard.io.detect import run_scene
 from g2ard.io.labels import labels_of, names_of
@@ -45,9 +46,9 @@ def compare(
     """Compare renders of two scenes: PSNR, SSIM, the worst views, and a page to look at."""
     from g2ard.jobs.comparison import dense_first
     from g2ard.jobs.inputs import load_views
+    from g2ard.jobs.run_views import at_size, is_planned, planned_at, views_or_pool
     from g2ard.jobs.view_checks import check_sight, opaque_points
     from g2ard.jobs.viewer_frame import backdrop, frame_with, level_up
-    from g2ard.jobs.views import at_size, is_planned, planned_at, views_or_pool
     from g2ard.poses import best_views
     from g2ard.rendering.targets import TeacherRenders
     from g2ard.scene.cameras import Cameras
@@ -143,7 +144,7 @@ def _closer(run: Run, first: Path, second: Path, dense: Splats, other: Splats, c
     from g2ard.errors import InputError
     from g2ard.jobs.comparison import better_line, common_of, is_run, source_of
     from g2ard.jobs.inputs import load_views, scorable
-    from g2ard.jobs.recover import Teaching
+    from g2ard.jobs.teaching import Teaching
     from g2ard.stages.evaluate import evaluate
 
     if real_path(first) == source_of(second) or real_path(second) == source_of(first):

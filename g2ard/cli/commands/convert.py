@@ -8,9 +8,10 @@ from typing import Annotated, Any, Literal, cast
 
 import typer
 
+from g2ard.cli.command import command
 from g2ard.cli.fields import ShDegreeOption
-from g2ard.cli.frame import Run, command
 from g2ard.cli.options import numbers
+from g2ard.cli.run import Run
 from g2ard.config.choices import NAMED_AXES, Axes, AxesName, PlyLayout
 from g2ard.errors import InputError, OutputError
 from g2ard.io.scene_formats import SceneFormat, check_options, scene_format, written_bytes

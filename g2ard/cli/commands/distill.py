@@ -8,10 +8,11 @@ from typing import Annotated, Any
 import typer
 
 from g2ard.cli import options as opt
-from g2ard.cli.frame import Run, command
+from g2ard.cli.command import command
 from g2ard.cli.outputs import budget_of, refuse_file
+from g2ard.cli.run import Run
 from g2ard.cli.run_result import say_fit, tell_plan, tell_run, told
-from g2ard.cli.tiling import drop_work, tiling_of, work_folder
+from g2ard.cli.work_folder import drop_work, tiling_of, work_folder
 from g2ard.config.choices import is_made
 from g2ard.io import kind
 
@@ -88,7 +89,7 @@ def distill(
     from g2ard.jobs.cost import check_job_memory, cost_of
     from g2ard.jobs.distill import preparing
     from g2ard.jobs.distill_options import DistillOptions
-    from g2ard.jobs.tiling import is_tiled, needs_whole, refuse_whole
+    from g2ard.jobs.tile_options import is_tiled, needs_whole, refuse_whole
     from g2ard.pipeline.config import DistillConfig
 
     settings, _ = run.settled(DistillConfig(), preset)

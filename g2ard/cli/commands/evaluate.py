@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from g2ard.cli import options as opt
-from g2ard.cli.frame import Run, command
+from g2ard.cli.command import command
+from g2ard.cli.run import Run
 from g2ard.config.choices import BLACK, LpipsInput
 from g2ard.errors import InputError
 from g2ard.io import check_scene
@@ -18,7 +19,7 @@ from g2ard.io.labels import names_of
 
 if TYPE_CHECKING:
     from g2ard.jobs.inputs import Views
-    from g2ard.jobs.recover import Teaching
+    from g2ard.jobs.teaching import Teaching
     from g2ard.rendering.renderer import RasterSettings
     from g2ard.rendering.targets import Targets
     from g2ard.scene.splats import Splats
@@ -83,7 +84,7 @@ def evaluate(
     from g2ard.io.describe import bytes_of
     from g2ard.jobs.comparison import better_line, common_of
     from g2ard.jobs.inputs import load_views, scorable
-    from g2ard.jobs.recover import Teaching, check_teacher
+    from g2ard.jobs.teaching import Teaching, check_teacher
     from g2ard.jobs.view_checks import check_sight
     from g2ard.rendering.metrics import load_lpips
     from g2ard.rendering.renderer import RasterSettings
@@ -200,8 +201,8 @@ def _write_ladder(
 ) -> str:
     """Write the page on results of several sizes; print and return which one suffices."""
     from g2ard.io.describe import bytes_of
+    from g2ard.jobs.run_views import is_planned
     from g2ard.jobs.viewer_frame import level_up
-    from g2ard.jobs.views import is_planned
     from g2ard.poses import best_views
     from g2ard.rendering.targets import Subset, TeacherRenders
     from g2ard.report.ladder import Dense, Rung, labels, ladder, recommendation

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from g2ard.cli import options as opt
-from g2ard.cli.frame import Run, command, one_line
+from g2ard.cli.command import command, one_line
+from g2ard.cli.run import Run
 from g2ard.errors import InputError
 from g2ard.io.detect import run_scene
 from g2ard.progress import plural
@@ -104,7 +105,7 @@ def _noted(figures: dict[str, Any], text: str) -> None:
 
 
 def _overdraw(splats: Splats) -> dict[str, Any]:
-    from g2ard.jobs.measured_budget import close_up
+    from g2ard.jobs.close_up import close_up
 
     found = close_up(splats)
     return {} if found is None else {"close_overdraw": found}

@@ -7,8 +7,9 @@ from typing import Annotated
 import typer
 
 from g2ard.cli.budget_options import Count
-from g2ard.cli.frame import Run, command
+from g2ard.cli.command import command
 from g2ard.cli.outputs import refuse_file
+from g2ard.cli.run import Run
 from g2ard.progress import plural
 from g2ard.system.peak_memory import peak_rss
 

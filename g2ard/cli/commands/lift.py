@@ -7,8 +7,9 @@ from typing import Annotated
 import typer
 
 from g2ard import io
-from g2ard.cli.frame import Run, command
+from g2ard.cli.command import command
 from g2ard.cli.options import OutputOption
+from g2ard.cli.run import Run
 from g2ard.cli.run_result import say_weight
 from g2ard.progress import plural
 

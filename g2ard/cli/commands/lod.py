@@ -12,9 +12,10 @@ import typer
 
 from g2ard.cli import options as opt
 from g2ard.cli.budget_options import Ratios
-from g2ard.cli.frame import Run, command
+from g2ard.cli.command import command
 from g2ard.cli.outputs import refuse_file
-from g2ard.cli.tiling import tiling_of, work_folder
+from g2ard.cli.run import Run
+from g2ard.cli.work_folder import tiling_of, work_folder
 from g2ard.config.choices import BLACK
 from g2ard.io.atomic import hidden_name
 from g2ard.progress import plural
@@ -134,7 +135,7 @@ def lod(
         write_level_page,
     )
     from g2ard.jobs.memory import LEVELS_TIMES, RECOVERY_TIMES, check_whole_memory
-    from g2ard.jobs.tiling import is_tiled
+    from g2ard.jobs.tile_options import is_tiled
     from g2ard.levels import Cut, save_levels
     from g2ard.system.keys import key_of
     from g2ard.system.peak_memory import peak_rss_of_all

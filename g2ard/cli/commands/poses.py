@@ -4,8 +4,9 @@ from typing import Annotated
 
 import typer
 
-from g2ard.cli.frame import Run, command
+from g2ard.cli.command import command
 from g2ard.cli.options import OutputOption, SceneArgument, ShapeOption, UpOption, ViewFormatOption
+from g2ard.cli.run import Run
 from g2ard.config.choices import PoolKind
 from g2ard.progress import direction, plural
 

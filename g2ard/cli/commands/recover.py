@@ -6,8 +6,9 @@ from typing import Annotated
 import typer
 
 from g2ard.cli import options as opt
-from g2ard.cli.frame import Run, command
+from g2ard.cli.command import command
 from g2ard.cli.resume import check_scene_run, checkpoint_beside, stoppable
+from g2ard.cli.run import Run
 from g2ard.cli.run_result import loss, tell_plan
 from g2ard.config.schema import listed
 from g2ard.io.scene_formats import check_positions
@@ -48,7 +49,8 @@ def recover(
     dry_run: opt.DryRunOption = False,
 ) -> None:
     """Optimise a fixed set of Gaussians against photos or a teacher's renders."""
-    from g2ard.jobs.recover import check_teacher, prepare
+    from g2ard.jobs.recover import prepare
+    from g2ard.jobs.teaching import check_teacher
     from g2ard.rendering.targets import kinds_of
     from g2ard.report.run import COLUMNS, cells
     from g2ard.stages.recover import RecoverConfig

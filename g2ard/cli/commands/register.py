@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from g2ard.cli import options as opt
-from g2ard.cli.frame import Run, command
+from g2ard.cli.command import command
+from g2ard.cli.run import Run
 from g2ard.config.choices import Keep, Refinement
 from g2ard.config.schema import listed
 from g2ard.errors import InputError

@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from g2ard.cli import options as opt
-from g2ard.cli.frame import Run, command
+from g2ard.cli.command import command
+from g2ard.cli.run import Run
 from g2ard.config.choices import BLACK, is_made
 from g2ard.io.atomic import atomic_folder, check_output
 from g2ard.io.paths import output_names
@@ -85,8 +86,8 @@ def render(
     """Render views of a scene as PNG or as an animation."""
     from g2ard.io.images import to_bytes, write_animation
     from g2ard.jobs.inputs import load_views
+    from g2ard.jobs.run_views import at_size, is_planned, looks_at, orbit, planned_at, views_or_pool
     from g2ard.jobs.view_checks import warn_of_sight
-    from g2ard.jobs.views import at_size, is_planned, looks_at, orbit, planned_at, views_or_pool
     from g2ard.rendering.renderer import RasterSettings, Renderer, stations
 
     if output is None and sheet is None:

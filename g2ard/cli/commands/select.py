@@ -9,7 +9,8 @@ import typer
 
 from g2ard.cli import options as opt
 from g2ard.cli.budget_options import Count
-from g2ard.cli.frame import Run, command
+from g2ard.cli.command import command
+from g2ard.cli.run import Run
 from g2ard.config.schema import listed
 from g2ard.pipeline.presets import configured
 from g2ard.progress import plural

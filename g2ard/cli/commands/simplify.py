@@ -10,10 +10,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from g2ard.cli import options as opt
-from g2ard.cli.frame import Run, command
+from g2ard.cli.command import command
 from g2ard.cli.outputs import Outputs, budgets_of
+from g2ard.cli.run import Run
 from g2ard.cli.run_result import say_fit, say_weight, tell_quality, tiles_of
-from g2ard.cli.tiling import tiling_of, work_folder
+from g2ard.cli.work_folder import tiling_of, work_folder
 from g2ard.config.choices import is_made
 from g2ard.config.schema import listed
 from g2ard.io import kind
@@ -24,7 +25,7 @@ from g2ard.progress import plural
 from g2ard.system.peak_memory import peak_rss_of_all
 
 if TYPE_CHECKING:
-    from g2ard.jobs.measured_budget import Reduction
+    from g2ard.jobs.simplify import Reduction
     from g2ard.stages.simplify import Simplified
 
 
@@ -69,7 +70,7 @@ def simplify(
     from g2ard.jobs.cost import cost_of_reduction
     from g2ard.jobs.memory import WHOLE_TIMES, check_whole_memory
     from g2ard.jobs.simplify import reducing
-    from g2ard.jobs.tiling import is_tiled, needs_whole, refuse_whole
+    from g2ard.jobs.tile_options import is_tiled, needs_whole, refuse_whole
     from g2ard.stages.simplify import SimplifyConfig
 
     config = run.settled(SimplifyConfig(), preset)[1]

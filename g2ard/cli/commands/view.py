@@ -10,7 +10,8 @@ from typing import Annotated, Any
 import typer
 
 from g2ard.cli import options as opt
-from g2ard.cli.frame import Run, command
+from g2ard.cli.command import command
+from g2ard.cli.run import Run
 from g2ard.io.detect import run_scene
 from g2ard.io.labels import labels_of
 

@@ -12,14 +12,14 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from g2ard.cli.budget_options import TILES
-from g2ard.cli.frame import Run
+from g2ard.cli.run import Run
 from g2ard.config.choices import is_made
 from g2ard.errors import G2ardError, OutputError
 from g2ard.io.atomic import drop_empty, hidden_name, parents_made
 from g2ard.io.lock import check_unlocked, locked
 
 if TYPE_CHECKING:
-    from g2ard.jobs.tiling import Tiling
+    from g2ard.jobs.tile_options import Tiling
 
 
 _WORK_NAME = re.compile(r"tiles|steps|(student|merged|level|written)-[0-9a-f]{16}")
@@ -29,7 +29,7 @@ _WORK_NAME = re.compile(r"tiles|steps|(student|merged|level|written)-[0-9a-f]{16
 def tiling_of(run: Run, scene: Path | None, output: Path) -> Tiling:
     """Check the options and return them as a `Tiling`."""
     from g2ard.jobs.memory import bytes_of
-    from g2ard.jobs.tiling import Tiling
+    from g2ard.jobs.tile_options import Tiling
 
     tile_rows, memory, workers, scheduler, work = (run.shared[name] for name in TILES)
     rows = None if tile_rows is None else int(tile_rows.value)
@@ -61,8 +61,8 @@ def _beside(output: Path) -> Path:
 def _check_rows(scene: Path, rows: int) -> None:
     """Raise a usage error if a folder of tiles was written with another --tile-rows."""
     from g2ard.io.detect import MANIFEST
-    from g2ard.io.tiles import TileStore
-    from g2ard.jobs.tiling import cut_into
+    from g2ard.io.tile_store import TileStore
+    from g2ard.jobs.tile_options import cut_into
 
     if (scene / MANIFEST).is_file() and (made := TileStore.open(scene).settings.get("tile_rows")) != rows:
         held = f"already has tiles of {made:,}" if made else "already has tiles"

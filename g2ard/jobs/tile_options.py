@@ -11,7 +11,7 @@ from g2ard.errors import InputError
 from g2ard.io import open_stream
 from g2ard.io.detect import MANIFEST, kind
 from g2ard.io.scene_formats import scene_format
-from g2ard.io.tiles import TileStore
+from g2ard.io.tile_store import TileStore
 from g2ard.jobs.budget import Budget
 from g2ard.pipeline.config import DistillConfig
 from g2ard.stages.simplify import Default, SimplifyConfig

@@ -16,14 +16,14 @@ from g2ard.io import open_stream
 from g2ard.io.detect import MANIFEST
 from g2ard.io.reports import Report
 from g2ard.io.sanitize import BLOCK
-from g2ard.io.tiles import StoredScene, TileStore
+from g2ard.io.tile_store import StoredScene, TileStore
 from g2ard.jobs.budget import Budget
+from g2ard.jobs.budget_search import ResolvedBudget, resolved_in_tiles
 from g2ard.jobs.distill_options import DistillOptions
 from g2ard.jobs.inputs import say_regions
-from g2ard.jobs.measured_budget import ResolvedBudget, resolved_in_tiles
 from g2ard.jobs.memory import TilePlan, plan_tiles
-from g2ard.jobs.tiling import Tiling
-from g2ard.jobs.views import pool_times, views_of
+from g2ard.jobs.run_views import pool_times, views_of
+from g2ard.jobs.tile_options import Tiling
 from g2ard.pipeline.config import DistillConfig
 from g2ard.pipeline.distill import RunViews, selected
 from g2ard.progress import Detail, Progress, Say, silent, unsaid

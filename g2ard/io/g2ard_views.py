@@ -1,0 +1,130 @@
+"""Reader and writer for g2ard's views .json, described in docs/formats.md."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from g2ard.errors import InputError
+from g2ard.io.finding import Finder
+from g2ard.io.jsonfile import Matrix, Number, Place, Pose, Weight, Whole, checked, read_own
+from g2ard.io.paths import beside
+from g2ard.io.photos import Frame, Lens, Listed, rigid
+from g2ard.progress import plural
+from g2ard.scene.cameras import USUAL, Cameras
+from g2ard.scene.lenses import PARAMETERS, PhotoLens
+
+_FORMAT = "g2ard-views"
+_VERSION = 1
+
+
+class _PhotoLens(msgspec.Struct):
+    model: str
+    size: tuple[Whole, Whole]
+    params: list[Number]
+    turn: Matrix
+
+
+class _View(msgspec.Struct):
+    name: str
+    width: Whole
+    height: Whole
+    K: Matrix
+    camera_from_world: Pose
+    distortion: list[Number] = []
+    image: str | None = None
+    mask: str | None = None
+    split: str | None = None
+    weight: Weight | None = None
+    kind: str | None = None
+    lens: _PhotoLens | None = None
+
+
+def read(path: Path, images: Path | None = None) -> Listed:
+    """Read views; photo paths are relative to the file unless `images`, a folder of photos, is given."""
+    content = read_own(path, _FORMAT, _VERSION).get("views", [])
+    views = checked(content, list[_View], Place(path).to("views"), entries="view")
+    if not views:
+        raise InputError("no views found ('views' is empty)", path=path)
+    finder, masks = Finder(images or path.parent), Finder(path.parent)
+    return Listed(path, [_frame(Place(path, i, "view"), view, finder, masks) for i, view in enumerate(views)])
+
+
+def _frame(place: Place, view: _View, finder: Finder, masks: Finder) -> Frame:
+    distortion = *view.distortion, *[0.0] * 5
+    return Frame(
+        name=view.name,
+        viewmat=_exact(np.array(view.camera_from_world), place.to("camera_from_world")),
+        lens=Lens(
+            (view.width, view.height),
+            np.array(view.K),
+            distortion[:5],
+            _photo_lens(view.lens, place),
+            made=True,
+        ),
+        photo=None if view.image is None else finder.photo(view.image),
+        mask=None if view.mask is None else masks.photo(view.mask),
+        split=view.split,
+        weight=view.weight,
+        kind=view.kind or USUAL,
+        listed=view.image or "",
+    )
+
+
+def _photo_lens(lens: _PhotoLens | None, place: Place) -> PhotoLens | None:
+    if lens is None:
+        return None
+    if PARAMETERS.get(lens.model) != len(lens.params) or min(lens.size) < 1:
+        raise place.to("lens").error(f"is not a lens of the model {lens.model!r}")
+    turn = tuple(np.array(lens.turn).ravel().tolist())
+    return PhotoLens(lens.model, (lens.size[0], lens.size[1]), tuple(lens.params), turn)
+
+
+def _exact(stored: NDArray[np.float64], place: Place) -> NDArray[np.float64]:
+    """Return the pose as stored if it is rigid to rounding, so that writing and reading change no bit."""
+    nearest = rigid(stored, place)
+    return stored if len(stored) == 4 and np.allclose(nearest, stored, rtol=0, atol=1e-9) else nearest
+
+
+def _written(lens: PhotoLens | None) -> dict[str, Any] | None:
+    if lens is None:
+        return None
+    turn = np.array(lens.turn).reshape(3, 3).tolist()
+    return {"model": lens.model, "size": lens.size, "params": lens.params, "turn": turn}
+
+
+def text_of(path: Path, cameras: Cameras, splits: Sequence[str | None], weights: ArrayLike | None) -> str:
+    """Return views, one per line, with exact floats; see `g2ard.io.write_views`."""
+    count = len(cameras)
+    given = np.full(count, np.nan) if weights is None else np.asarray(weights, np.float64)
+    drawn = [None if np.isnan(weight) else weight for weight in given.tolist()]
+    parts = list(splits) or [None] * count
+    if len(parts) != count or len(drawn) != count:
+        raise InputError(
+            f"{plural(count, 'view')}, {len(parts)} splits and {len(drawn)} weights do not match", path=path
+        )
+    lines = []
+    for i in range(count):
+        view: dict[str, Any] = {
+            "name": cameras.names[i],
+            "width": int(cameras.widths[i]),
+            "height": int(cameras.heights[i]),
+            "K": cameras.Ks[i].tolist(),
+            "camera_from_world": cameras.viewmats[i].tolist(),
+            "distortion": cameras.distortions[i].tolist() if cameras.distortions[i].any() else None,
+            "lens": _written(cameras.lenses[i]),
+            "image": beside(cameras.image_paths[i], path),
+            "mask": beside(cameras.mask_paths[i], path),
+            "split": parts[i],
+            "weight": drawn[i],
+            "kind": None if cameras.kinds[i] == USUAL else cameras.kinds[i],
+        }
+        lines.append(json.dumps({key: value for key, value in view.items() if value is not None}))
+    head = f'{{"format": "{_FORMAT}", "version": {_VERSION}, "views": [\n'
+    return head + ",\n".join(lines) + "\n]}\n"

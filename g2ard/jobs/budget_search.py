@@ -1,0 +1,284 @@
+"""Search for the count that fits a file size, keeps a quality or limits overdraw."""
+
+from __future__ import annotations
+
+import math
+import tempfile
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from g2ard.errors import InputError
+from g2ard.io import read_splats, write_splats
+from g2ard.io.scene_formats import scene_format, written_bytes
+from g2ard.jobs.budget import Budget
+from g2ard.jobs.close_up import close_up
+from g2ard.progress import Say, plural, unsaid
+from g2ard.rendering.metrics import psnr, ssim
+from g2ard.rendering.renderer import Renderer
+from g2ard.scene.cameras import Cameras
+from g2ard.scene.samples import evenly_spaced
+from g2ard.scene.splats import Splats
+from g2ard.stages.simplify import simplify
+
+_PROBE_ROWS = 4096
+"""Gaussians of the first probe file, which estimates the bytes per Gaussian."""
+_BYTES_PROBES, _BYTES_ACCEPTED, _BYTES_GOAL = 6, 0.98, 0.99
+"""Most files written to find a count for bytes; shares of the bytes that are accepted and sought."""
+_QUALITY_TRIALS = 8
+"""Most counts at which quality is measured."""
+_QUALITY_TOLERANCE = 0.25
+"""Excess in dB at which the search stops."""
+_GAIN_PER_DOUBLING = 4.0
+"""Expected gain in dB for twice the Gaussians, until two counts are measured."""
+_FEWEST_GAUSSIANS = 64
+"""Smallest count that a search tries."""
+_LAYER_TRIALS = 8
+"""Most counts at which overdraw is measured."""
+
+
+@dataclass(frozen=True)
+class Quality:
+    """Mean PSNR (dB) and SSIM against the dense scene's renders; as a requirement, 0 asks for nothing."""
+
+    psnr: float
+    ssim: float
+
+    def __str__(self) -> str:
+        """Format what is not 0.
+
+        >>> str(Quality(38, 0)), str(Quality(38.154, 0.98))
+        ('38.00 dB', '38.15 dB, SSIM 0.9800')
+        """
+        parts = {f"{self.psnr:.2f} dB": self.psnr, f"SSIM {self.ssim:.4f}": self.ssim}
+        return ", ".join(text for text, value in parts.items() if value)
+
+    def meets(self, wanted: Quality) -> bool:
+        """Return whether both values are reached."""
+        return self.psnr >= wanted.psnr and self.ssim >= wanted.ssim
+
+    def over(self, wanted: Quality) -> float:
+        """Return the smaller excess, dB, of PSNR and −10 log₁₀(1 − SSIM); ∞ if nothing is wanted."""
+        ssims = (max(1 - value, 1e-9) for value in (wanted.ssim, self.ssim))
+        of_ssim = 10 * math.log10(next(ssims) / next(ssims)) if wanted.ssim > 0 else math.inf
+        return min(self.psnr - wanted.psnr if wanted.psnr > 0 else math.inf, of_ssim)
+
+
+def file_bytes(splats: Splats, name: str, **options: Any) -> int:
+    """Return the bytes of the scene as `write_splats` writes it under `name`."""
+    with _written(splats, name, **options) as path:
+        return written_bytes(path)
+
+
+def as_file(splats: Splats, name: str) -> Splats:
+    """Return the scene as read back from the format of `name`: quantised and without unsupported fields."""
+    if scene_format(name).suffix in (".ply", ".usda", ".usdc"):
+        return splats
+    with _written(splats, name) as path:
+        return read_splats(path)
+
+
+@contextmanager
+def _written(splats: Splats, name: str, **options: Any) -> Iterator[Path]:
+    """Yield a temporary file of the scene in the format of `name`."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "scene" / "meta.json"
+        if scene_format(name).function == "write":
+            path = Path(folder) / f"scene{scene_format(name).suffix}"
+        write_splats(path, splats, **options)
+        yield path
+
+
+def resolved_in_tiles(
+    budget: Budget, total: int, sample: Splats, name: str, file: str, say: Say
+) -> ResolvedBudget:
+    """Resolve a budget for `total` Gaussians in tiles; `needs_whole` rejects those that need to measure them.
+
+    Args:
+        sample: some of them, with the SH degree of the result.
+        file: name of a .ply, in which all Gaussians take as many bytes.
+    """
+    if budget.layers is not None:
+        say(f"note: {budget.fit}: in tiles, Gaussians per pixel of near views are not measured")
+    if budget.bytes is None:
+        return ResolvedBudget(budget.of(total, name))
+    one, two = (file_bytes(sample.take(np.arange(rows)), file) for rows in (1, 2))
+    header = one - (two - one) + len(str(total))
+    count = min(total, (budget.bytes - header) // (two - one))
+    if count < 1:
+        raise InputError(f"{budget.bytes:,} bytes are too few; a Gaussian takes {one:,}", path=file)
+    say(f"{budget.fit}: {plural(count, 'Gaussian')}")
+    return ResolvedBudget(count, budget.bytes, file)
+
+
+def count_for_bytes(splats: Splats, wanted: int, name: str, reduce: Callable[[int], Splats]) -> int:
+    """Return approximately the most Gaussians whose file has at most `wanted` bytes.
+
+    A sample's bytes per Gaussian give the first count. Files of the scene reduced to trial counts then
+    bracket the result, until one fills 98 % of the bytes.
+    """
+    fewest, most = min(_FEWEST_GAUSSIANS, len(splats)), len(splats)
+    sample = splats.take(np.array(evenly_spaced(most, _PROBE_ROWS, floor=True)))
+    count = int(len(sample) * wanted / file_bytes(sample, name))
+    fits, over = (0, 0), (most + 1, 0)  # (count, bytes); 0 bytes means no such file yet
+    files: list[tuple[int, int]] = []
+    while len(files) < _BYTES_PROBES or not fits[0]:
+        count = min(max(count, fits[0] + 1, fewest), over[0] - 1, most)
+        size = file_bytes(reduce(count) if count < most else splats, name)
+        files.append((count, size))
+        if size <= wanted:
+            fits = (count, size)
+            if size >= _BYTES_ACCEPTED * wanted or count == most:
+                break
+        else:
+            over = (count, size)
+            if count == fewest:
+                raise InputError(
+                    f"{wanted:,} bytes are too few; {count:,} Gaussians take {size:,}", path=name
+                )
+        if over[0] - fits[0] <= 1:
+            break
+        if fits[0] and over[1]:  # file sizes grow in steps, so interpolate with limits
+            share = (_BYTES_GOAL * wanted - fits[1]) / (over[1] - fits[1])
+            count = round(fits[0] + min(max(share, 0.1), 0.9) * (over[0] - fits[0]))
+        else:
+            near = count * _BYTES_GOAL * wanted / size
+            if len(files) > 1 and (slope := _slope(*files[-2:])) > 0:  # a file has a head too
+                near = count + (_BYTES_GOAL * wanted - size) / slope
+            count = int(min(max(near, count / 4), 4 * count))
+    return fits[0]
+
+
+def _slope(before: tuple[int, int], after: tuple[int, int]) -> float:
+    return (after[1] - before[1]) / (after[0] - before[0])
+
+
+def count_for_layers(count: int, most: float, reduce: Callable[[int], Splats]) -> tuple[int, float]:
+    """Return a count up to `count` whose near views blend at most `most` Gaussians per pixel, and their mean.
+
+    Overdraw falls about with the square root of the count, which predicts the next one. The mean exceeds
+    `most` if no count tried is small enough; it is 0 for a scene without near views.
+    """
+    for _ in range(_LAYER_TRIALS):
+        near = close_up(reduce(count))
+        layers = 0.0 if near is None else near["mean"]
+        if layers <= most or count <= _FEWEST_GAUSSIANS:
+            break
+        count = max(_FEWEST_GAUSSIANS, int(count * min((_BYTES_GOAL * most / layers) ** 2, 0.95)))
+    return count, layers
+
+
+def clipped_images(splats: Splats, cameras: Cameras) -> list[NDArray[Any]]:
+    renderer = Renderer(splats)
+    return [renderer.clipped(camera) for camera in cameras]
+
+
+def quality(renders: list[Any], splats: Splats, cameras: Cameras) -> Quality:
+    """Return the quality of a scene against images in [0, 1], one per camera."""
+    pairs = list(zip(clipped_images(splats, cameras), renders, strict=True))
+    return Quality(
+        float(np.mean([psnr(image, target) for image, target in pairs])),
+        float(np.mean([ssim(image, target) for image, target in pairs])),
+    )
+
+
+def count_for_quality(
+    splats: Splats, wanted: Quality, cameras: Cameras, reduce: Callable[[int], Splats]
+) -> tuple[int, Quality]:
+    """Return approximately the fewest Gaussians that keep a quality in these views, and their quality.
+
+    They are all if no smaller count tried keeps it.
+
+    The excess in dB over the wanted quality is nearly linear in the logarithm of the count. The search starts
+    at a quarter of the scene, follows the slope, then interpolates between counts on both sides, until the
+    excess is at most 0.25 dB.
+
+    Args:
+        reduce: count → scene, by the method that makes the result.
+    """
+    renders = clipped_images(splats, cameras)
+    met, good, missed = len(splats), Quality(float("inf"), 1.0), 0
+    excesses: dict[int, float] = {}
+    count = max(_FEWEST_GAUSSIANS, len(splats) // 4)
+    while len(excesses) < _QUALITY_TRIALS and missed < count < met:
+        measured = quality(renders, reduce(count), cameras)
+        excesses[count] = excess = measured.over(wanted)
+        if excess >= 0:
+            met, good = count, measured
+        else:
+            missed = count
+        if 0 <= excess <= _QUALITY_TOLERANCE or met <= _FEWEST_GAUSSIANS:
+            break
+        count = _next_count(excesses, met, missed, len(splats))
+    return met, good
+
+
+def _next_count(excesses: Mapping[int, float], met: int, missed: int, most: int) -> int:
+    """Predict the count whose excess is half the tolerance.
+
+    Args:
+        excesses: excess in dB of the counts measured so far.
+        met: smallest count that keeps the quality, `most` until one does.
+        missed: largest count that does not, 0 until one does not.
+    """
+    goal = _QUALITY_TOLERANCE / 2
+    if missed and met < most:  # interpolate between them; otherwise extrapolate from the only known side
+        share = (goal - excesses[missed]) / max(excesses[met] - excesses[missed], 1e-12)
+        return round(missed * (met / missed) ** min(max(share, 0.05), 0.95))
+    near = met if met < most else missed
+    (a, at_a), (b, at_b) = min(excesses.items()), max(excesses.items())
+    slope = (at_b - at_a) / math.log2(b / a) if b > a else _GAIN_PER_DOUBLING
+    steps = (goal - excesses[near]) / max(slope, _GAIN_PER_DOUBLING / 4)
+    # Extrapolation is unreliable, and towards N the excess grows faster than linearly.
+    highest = math.sqrt(near * most) if met == most else most
+    return max(_FEWEST_GAUSSIANS, round(min(near * 2 ** min(max(steps, -3.0), 3.0), highest)))
+
+
+@dataclass(frozen=True, eq=False)
+class ResolvedBudget:
+    """Budget resolved for a scene.
+
+    Args:
+        bytes: largest size of the result's file; None for no limit.
+        file: a file name; its suffix is the format.
+        wanted: quality to keep; None for no requirement.
+    """
+
+    count: int
+    bytes: int | None = None
+    file: str = "scene.ply"
+    wanted: Quality | None = None
+    dense: Splats | None = None
+    cameras: Cameras | None = None
+
+    def shrink(self, splats: Splats, say: Say = unsaid) -> Splats:
+        """Merge the scene further while its file is too large."""
+        while self.bytes is not None and (size := file_bytes(splats, self.file)) > self.bytes:
+            fewer = max(1, int(len(splats) * self.bytes / size * 0.99))
+            if fewer == len(splats):
+                break
+            say(f"{size:,} bytes are too many: merging {len(splats):,} to {plural(fewer, 'Gaussian')}")
+            splats = simplify(splats, fewer, method="fast").splats
+        return splats
+
+    def judge(self, splats: Splats) -> tuple[bool, str] | None:
+        """Return whether a result keeps the quality, with a message; None if no quality is required."""
+        if self.wanted is None:
+            return None
+
+        assert self.dense is not None
+        assert self.cameras is not None
+        got = quality(clipped_images(self.dense, self.cameras), as_file(splats, self.file), self.cameras)
+        count, views = plural(len(splats), "Gaussian"), plural(len(self.cameras), "view")
+        line = f"{count} keep {got} in the {views} that chose the count"
+        if got.meets(self.wanted):
+            return True, f"{line}; requested: {self.wanted}"
+        more = f"request a count above {len(splats):,}"
+        if len(splats) >= len(self.dense):
+            more = f"{scene_format(self.file).suffix} cannot store more quality"
+        return False, f"{line}, less than the requested {self.wanted}; {more}"
