@@ -149,7 +149,7 @@ def views_of(
         planned = plan(_OFFERED_VIEWS)
     except InputError:  # the scene has no room for poses
         return RunViews(train, test.cameras, full=full)
-    train, apart, _ = mix(train, planned, select=select)
+    train, apart, _ = mix(train, planned, select=select, zoom=False)
     return RunViews(train, test.cameras, apart, full=full)
 
 
@@ -273,6 +273,7 @@ def _mixed(
     progress: Progress,
     say: Say,
     share: float = 1.0,
+    zoom: bool = True,
 ) -> _Mixed:
     """Add views of other kinds to training views: those that `complete` chooses, or of one kind with a focus.
 
@@ -280,6 +281,7 @@ def _mixed(
 
     Args:
         share: share of the pool that is used.
+        zoom: whether some of the training views become zooms.
     """
     usual, times = len(train.cameras), _times(prior, represents)
     spare, focus = max(_LEAST_APART, round(_VIEWS_APART * times * share)), select.focus
@@ -322,7 +324,7 @@ def _mixed(
         train.splits and train.splits + ("train",) * len(more),
         np.append(weights, np.ones(len(more))),  # drawn equally often
     )
-    if focus is None:
+    if focus is None and zoom:
         mixed = replace(mixed, cameras=zoomed(compact, mixed.cameras, represents=per_row, share=share))
     return mixed, others, unseen
 

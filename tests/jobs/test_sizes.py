@@ -16,7 +16,10 @@ from helpers.scenes import around, checkered_ball
 GENERATED, LARGE = 800, 816
 """Longer side of generated views, and a larger one."""
 
-OTHER = {"register": "photos shrink to it, to match features"}
+OTHER = {
+    "register": "photos shrink to it, to match features",
+    "poses": "writes views of this size, see tests/poses/test_pools.py",
+}
 
 TRAIN = "--teacher ball.ply --steps 1"
 COMMANDS = {
