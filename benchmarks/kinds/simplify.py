@@ -40,13 +40,21 @@ _FLAGS |= {
     name: ["--set", "surface_depth=inf", "--set", f"max_growth={growth:g}"]
     for name, growth in _GROWTHS.items()
 }
+_DISTIL = {
+    "distill-60": ["--steps", "60"],
+    "distill-240": ["--steps", "240"],
+    "distill-fast": ["--schedule", "fast"],
+    "distill": [],
+    "distill-best": ["--schedule", "best"],
+}
+"""`distill` by its flags: what recovery adds, in views of its own."""
 _OWN = ("default", *_GROWTHS)
 """Methods that look from views of their own."""
 
 
 @dataclass(frozen=True)
 class Simplify(Study):
-    """A study of simplifiers without recovery.
+    """A study of simplifiers without recovery, and of `distill` if asked for.
 
     Scored are every 8th pose of a generated pool, or the test split of the scene's views, which no method
     uses. "near" and "standing" views are of other kinds than any that a method sees; on them `default` runs
@@ -57,7 +65,7 @@ class Simplify(Study):
             (these three), or "all".
     """
 
-    METHODS: ClassVar[Mapping[str, Any]] = {name: name for name in (*REDUCERS, "spark", *_GROWTHS)}
+    METHODS: ClassVar[Mapping[str, Any]] = {name: name for name in (*REDUCERS, "spark", *_GROWTHS, *_DISTIL)}
     PROCESSES: ClassVar[bool] = True
 
     protocol: str = key("all", choices=tuple(PROTOCOLS), axis=True)
@@ -68,7 +76,7 @@ class Simplify(Study):
         missing = set[str]() if shutil.which("splat-transform") else {*_SPLAT_TRANSFORM}
         if not (shutil.which("node") and version_of(*_SPARK).startswith("Spark")):
             missing.add("spark")
-        return [name for name in cls.METHODS if name not in (*missing, *_GROWTHS)]
+        return [name for name in cls.METHODS if name not in (*missing, *_GROWTHS, *_DISTIL)]
 
     def cells(self, scene: SceneSpec, work: Path) -> Iterator[Cell]:
         """Yield a cell per ratio and method."""
@@ -101,7 +109,7 @@ class Simplify(Study):
         with tempfile.TemporaryDirectory(prefix="g2ard-bench-") as folder:
             output = Path(folder) / "out.ply"
             usage = measured(self._command(place, method, budget, output, own), Path(folder) / "log")
-            return usage, io.read_splats(output)
+            return usage, io.read_splats(output / "scene.ply" if method in _DISTIL else output)
 
     def _command(self, place: Workspace, method: str, budget: int, output: Path, own: bool) -> list[str]:
         """Return the command as its user types it; `own` means with the views that it makes itself."""
@@ -117,6 +125,9 @@ class Simplify(Study):
             path = output.with_name("job.json")
             path.write_text(json.dumps(job), encoding="utf-8", newline="\n")
             return [*python, "benchmarks.kinds.worker", str(path)]
+        if method in _DISTIL:
+            command = [*python, "g2ard", "distill", source, "-n", str(budget), "--views", "made"]
+            return [*command, *_DISTIL[method], "--device", "cpu", "-q", "-o", str(output)]
         views = ["--views", str(place.train)] if method in _OWN and not own else []
         command = [*python, "g2ard", "simplify", source, "-n", str(budget), "-o", str(output), "-q"]
         return [*command, *_FLAGS[method], *views]

@@ -51,6 +51,8 @@ recovery, the other is scored."""
 _USES, _LEAST_SHARE = 5.0, 0.15
 """Steps per training view, and least share of the pool that is used: runs of few steps plan, render and score
 few views."""
+_STEP_SECONDS = 0.03
+"""Time of a step that a time limit is divided by, as on two cores."""
 _LEAST_SCORED, _LEAST_APART = 6, 4
 """Least usual views that are scored, and least views of each other kind that validate and are scored."""
 _TWICE, _TWICE_VIEWS, _TWICE_LONGEST = "usual at 2×", 4, 2400
@@ -159,10 +161,15 @@ def pool_share(recover: RecoverConfig) -> float:
     >>> from g2ard.stages.recover.config import Schedule
     >>> pool_share(RecoverConfig()), round(pool_share(RecoverConfig(schedule=Schedule.named("fast"))), 2)
     (1.0, 0.34)
+    >>> round(pool_share(RecoverConfig(recovery_time=5)), 2)
+    0.24
     """
-    if recover.recovery_time is not None or not recover.schedule.means_in_scales:
+    if not recover.schedule.means_in_scales:
         return 1.0
-    steps = STEPS_FOR_RENDERS * recover.schedule.steps if recover.steps is None else recover.steps
+    if recover.recovery_time is not None:
+        steps = recover.recovery_time / _STEP_SECONDS
+    else:
+        steps = STEPS_FOR_RENDERS * recover.schedule.steps if recover.steps is None else recover.steps
     return min(1.0, max(_LEAST_SHARE, steps / (_USES * VIEWS_PER_SCHEDULE)))
 
 
