@@ -76,9 +76,23 @@ def curve(scene: str, variants: tuple[str, ...]) -> str:
     return standalone(drawn, variants)
 
 
+def frontier() -> str:
+    """Plot PSNR in unseen views of the usual kind against the CPU time of whole commands, for two scenes."""
+    names = [f"{scene}: {whose}" for scene in ("playbot", "guitar") for whose in ("g2ard", "splat-transform")]
+    points = []
+    for row in rows("amd-epyc-2c/frontier-2026-11-28.csv"):
+        whose = "splat-transform" if row["method"] == "splat-transform" else "g2ard"
+        if row["views_kind"] == "pool" and (name := f"{row['scene']}: {whose}") in names:
+            at = Point(float(row["cpu_s"]), float(row["psnr"]), names.index(name), text=row["method"])
+            points.append(at)
+    drawn = chart(points, x_label="CPU seconds", y_label="PSNR, dB", log=True, joined=True)
+    return standalone(drawn, names)
+
+
 def plots() -> dict[str, str]:
     """Return file names and their contents."""
     return {
+        "frontier.svg": frontier(),
         "simplify-pool.svg": lead("pool"),
         "simplify-standing.svg": lead("standing"),
         "recover-guitar.svg": curve("guitar 400px", ("default@300", "default@1000", "default@2000")),

@@ -107,7 +107,7 @@ class Simplify(Study):
 
     def _run(self, place: Workspace, method: str, budget: int, own: bool) -> tuple[Usage, Splats]:
         with tempfile.TemporaryDirectory(prefix="g2ard-bench-") as folder:
-            output = Path(folder) / "out.ply"
+            output = Path(folder) / ("run" if method in _DISTIL else "out.ply")
             usage = measured(self._command(place, method, budget, output, own), Path(folder) / "log")
             return usage, io.read_splats(output / "scene.ply" if method in _DISTIL else output)
 

@@ -185,7 +185,11 @@ def plan_pool(
     held = _held(survey, poses)
     wanted = round(count * max(1.0, min(grow, 1 / np.sqrt(held))))
     if len(poses) == count and wanted > _WORTH * count:
+        first, before = poses, used
         poses, used, why = _planned(survey, kind, wanted)
+        if set(before) - set(used):  # more poses from above are lower, and may be judged otherwise
+            rest = np.linspace(0, len(poses) - 1, wanted - count).round().astype(int)
+            poses, used = Poses.joined([first, poses.take(rest)]), list(dict.fromkeys([*before, *used]))
     if len(poses) < count:
         raise InputError(
             f"{len(poses)} of {count} poses found a free place with a view ({kind}: {why}); "

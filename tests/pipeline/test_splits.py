@@ -61,6 +61,7 @@ def watch(monkeypatch: pytest.MonkeyPatch) -> Watch:
     import g2ard.jobs.simplify
     import g2ard.pipeline.distill
     import g2ard.pipeline.steps
+    import g2ard.report.distilled  # before `evaluate` is watched, which its pictures call too
     import g2ard.stages.evaluate
 
     seen = Watch()

@@ -14,6 +14,7 @@ import pytest
 from g2ard.errors import InputError
 from g2ard.io import read_splats, read_views, write_splats
 from g2ard.poses import make_pool, plan_pool
+from g2ard.poses import pool as pool_module
 from g2ard.poses.sight import Poses, Survey
 from g2ard.poses.site import Site
 from g2ard.scene.reproducible import fibonacci
@@ -325,3 +326,19 @@ def test_a_pool_planned_on_a_sample_looks_at_the_same_thing(scenes: dict[str, Sp
     np.testing.assert_array_equal(again.viewmats, part.cameras.viewmats)
     with pytest.raises(InputError, match="rows: expected at least 1"):
         make_pool(splats, 4, rows=0)
+
+
+def test_a_grown_pool_keeps_the_kinds_of_the_first(monkeypatch: pytest.MonkeyPatch) -> None:
+    """More poses from above are lower, and may all look blurred where fewer do not."""
+    plan, asked = pool_module._planned, []
+
+    def flipping(survey: Survey, kind: str, count: int) -> tuple[Poses, list[str], str]:
+        asked.append(count)
+        return plan(survey, "orbit" if len(asked) == 1 else "sharp", count)
+
+    monkeypatch.setattr(pool_module, "_planned", flipping)
+    monkeypatch.setattr(pool_module, "_held", lambda survey, poses: 0.25)
+    found = plan_pool(naive.statue(), 16, grow=2.0)
+    assert asked == [16, 32]
+    assert len(found.cameras) == 32
+    assert found.kind == "orbit + sharp"
