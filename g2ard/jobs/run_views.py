@@ -53,7 +53,7 @@ _USES, _LEAST_SHARE = 5.0, 0.15
 few views."""
 _STEP_SECONDS = 0.03
 """Time of a step that a time limit is divided by, as on two cores."""
-_LEAST_SCORED, _LEAST_APART = 6, 4
+_LEAST_SCORED, _LEAST_APART = 6, 8
 """Least usual views that are scored, and least views of each other kind that validate and are scored."""
 _TWICE, _TWICE_VIEWS, _TWICE_LONGEST = "usual at 2×", 4, 2400
 """Kind of views that are scored at twice their size, their number in a whole pool, and their longest side."""

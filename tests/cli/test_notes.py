@@ -36,7 +36,7 @@ SHORT = ("distill", "ball.ply", "--steps", 5, "--size", 48)
 
 def test_a_short_run_has_no_needless_notes(command_line: CommandLine, folder: Path) -> None:
     error = succeeds(command_line, folder, *SHORT, "-r", 10, "-o", "run").err
-    assert "views: 17 train, 12 score, 6 validate; orbit; the up direction is a guess\n" in error
+    assert "views: 17 train, 18 score, 12 validate; orbit; the up direction is a guess\n" in error
     for needless in ("never acted", "of its box", "times as high", "regularisers"):
         assert needless not in error
     assert "regularisers: " in command_line(*SHORT, "-r", 10, "-o", "run", "-wv", cwd=folder)[2]

@@ -121,7 +121,7 @@ def test_runs_of_few_steps_use_few_views() -> None:
     ]
     assert len(usual[2] & usual[1]) > 0.6 * len(usual[2])  # a zoom stands where its view stood
     assert [len(views.test) for views in (whole, fast, few)] == [16, 6, 6]
-    assert [len(views.apart or ()) for views in (whole, fast, few)] == [48, 15, 12]
+    assert [len(views.apart or ()) for views in (whole, fast, few)] == [48, 24, 24]
 
 
 def test_a_few_views_are_scored_at_twice_their_size(command_line: CommandLine, folder: Path) -> None:
