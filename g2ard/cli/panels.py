@@ -101,13 +101,18 @@ def in_panel(command: str, parameter: Parameter) -> Parameter:
     return parameter.replace(annotation=Annotated[kind, option])
 
 
+_FORMER = {("distill", "--view"): "--page", ("distill", "--no-view"): "--no-page"}
+"""Command and a flag's former spelling, which scripts still use → its spelling."""
+
+
 class Command(TyperCommand):
     """A command whose `--help` shows the options people use, and `--help-all` all of them."""
 
     _all = False
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Show all options for `--help-all`."""
+        """Show all options for `--help-all`; take a flag by its former spelling."""
+        args = [_FORMER.get((str(self.name), word), word) for word in args]
         self._all = "--help-all" in args
         if self._all:
             args = ["--help"]

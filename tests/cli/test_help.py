@@ -9,7 +9,7 @@ import pytest
 
 from g2ard.cli.app import COMMANDS
 from g2ard.cli.panels import USED
-from helpers.commands import CommandLine
+from helpers.commands import CommandLine, succeeds
 from helpers.project import ROOT
 
 
@@ -63,6 +63,12 @@ def test_options_without_effect_are_left_out() -> None:
     for command in COMMANDS:  # whatever takes a seed uses it
         text = (ROOT / "g2ard" / "cli" / "commands" / f"{command}.py").read_text(encoding="utf-8")
         assert ("seed" in options_of(command)) == ("seed" in text.replace('without=("seed"', "")), command
+
+
+def test_a_flag_is_taken_by_its_former_spelling(command_line: CommandLine, tmp_path: Path) -> None:
+    for flag, page in (("--no-view", False), ("--view", True)):
+        ask = ("distill", "x.ply", "-r", 2, "-o", "run", flag, "--print-config")
+        assert f"page = {str(page).lower()}" in succeeds(command_line, tmp_path, *ask).out
 
 
 def test_lines_of_the_list_are_those_of_the_commands() -> None:
