@@ -54,7 +54,7 @@ _OWN = ("default", *_GROWTHS)
 
 @dataclass(frozen=True)
 class Simplify(Study):
-    """A study of simplifiers without recovery, and of `distill` if asked for.
+    """A study of simplifiers without recovery; `distill` can join them.
 
     Scored are every 8th pose of a generated pool, or the test split of the scene's views, which no method
     uses. "near" and "standing" views are of other kinds than any that a method sees; on them `default` runs

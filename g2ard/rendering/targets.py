@@ -28,7 +28,7 @@ from g2ard.system.shown import Shown
 from g2ard.system.threads import in_threads
 
 RENDERS = "the dense scene"
-"""What targets without photos are called."""
+"""Name of targets that are not photos."""
 CACHE_BYTES = 2_000_000_000
 """Bytes of targets cached in memory; further ones are loaded or rendered again on each access."""
 

@@ -1,4 +1,4 @@
-"""What help texts promise holds: values, files and placeholders that they name, and defaults."""
+"""Help texts keep their promises: values, files and placeholders that they name, and defaults."""
 
 import re
 import shlex
