@@ -1,4 +1,4 @@
-"""What a file format costs: bytes and decibels beside the unpacked scene."""
+"""Costs of a file format: bytes and decibels beside the unpacked scene."""
 
 from __future__ import annotations
 

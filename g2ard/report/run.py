@@ -235,7 +235,7 @@ class RunReport(Report):
 
     @property
     def stages(self) -> str:
-        """What a score before and after stands for."""
+        """Names of the scenes that are scored before and after."""
         return f"{'start' if self.photos else 'simplified'} → {RESULT}"
 
     @property

@@ -164,7 +164,7 @@ WORDS: dict[str, dict[str, str]] = {
     },
     "lod output": {"lod-meta.json": "--format sog", "tileset.json": "--format 3dtiles"},
 }
-"""What stands for a value in its call: files, and options that choose it."""
+"""Value → its words in a call: files, and options that choose it."""
 
 WRITTEN = {
     "poses format": {
@@ -180,7 +180,7 @@ WRITTEN = {
     },
     "lod output": {"lod-meta.json": "out/lod-meta.json", "tileset.json": "out/tileset.json"},
 }
-"""What a call writes: the format of its output, or a file."""
+"""Value → the format of the output of its call, or a file."""
 
 
 @cache
