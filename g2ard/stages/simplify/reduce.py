@@ -228,7 +228,7 @@ def simplify(
     lost = None
     if gaps and views is not None and budget < len(scene):
         progress("gaps", 0, 0)
-        dense = scene.take(scene.core.order)  # ties in depth go by row
+        dense = scene.with_sh_degree(0).take(scene.core.order)  # ties in depth go by row
         lost = opacity_lost(dense, splats_of(scene, out), views)
     return _simplified(splats, finite, out, lost)
 

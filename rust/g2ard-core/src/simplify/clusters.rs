@@ -1,6 +1,7 @@
 //! Gaussians from a partition of the rows: each cluster's moments in f64, from its raw members.
 
-use super::kernels::in_chunks;
+use rayon::prelude::*;
+
 use super::moments::{pool, rendered_area, sigmoid};
 use super::{GONE, Step};
 use crate::scene::limits::MAX_OPACITY;
@@ -62,61 +63,73 @@ impl Partition {
     ) -> Result<Step> {
         let (starts, rows) = self.members();
         let members = |c: usize| &rows[starts[c] as usize..starts[c + 1] as usize];
-        let make = |c: usize| make(scene, ordered, members(c), blur);
-        let made = in_chunks(self.count, control, make)?;
+        let coeffs = scene.rest + 1;
+        let mut sh = vec![[0.0; 3]; self.count * coeffs];
+        let chunks = sh.par_chunks_mut(CHUNK * coeffs).enumerate();
+        let made = chunks.map(|(chunk, sh)| {
+            control.check()?;
+            let clusters = sh.chunks_mut(coeffs).zip(chunk * CHUNK..);
+            Ok(clusters
+                .map(|(sh, c)| make(scene, ordered, members(c), blur, sh))
+                .collect::<Vec<_>>())
+        });
+        let made = made.collect::<Result<Vec<_>>>()?;
         let mut step = Step {
             splats: Splats {
-                sh_coeffs: scene.rest + 1,
+                sh,
+                sh_coeffs: coeffs,
                 ..Splats::default()
             },
             parents: self.of.clone(),
             ..Step::default()
         };
         let mut needed = Vec::with_capacity(self.count);
-        step.splats.sh.reserve(self.count * (scene.rest + 1));
-        for (c, made) in made.enumerate() {
+        for made in made.into_iter().flatten() {
             step.clamped += usize::from(made.clamped);
             step.splats.means.push(made.mean);
             step.splats.quats.push(made.quat);
             step.splats.scales.push(made.scales);
             step.splats.logit_opacities.push(made.logit);
             needed.push(made.needed);
-            average_sh(
-                scene,
-                ordered,
-                members(c),
-                &made.weights,
-                &mut step.splats.sh,
-            );
         }
         widened(&mut step.splats, &needed)?;
         Ok(step)
     }
 }
 
-/// A cluster's Gaussian; its SH are written later, into the one array of all.
+/// Clusters between two checks of the control.
+const CHUNK: usize = 256;
+
+/// A cluster's Gaussian, except its SH.
 struct Made {
     mean: [f64; 3],
     quat: [f32; 4],
     scales: [f32; 3],
     logit: f32,
-    /// Share of each member in the mass; empty for a copy.
-    weights: Vec<f64>,
     clamped: bool,
     /// Growth of the area with which α ≤ 0.99 holds the mass.
     needed: f64,
 }
 
-/// Merges a cluster's `members`; parameters are those of [`Partition::assemble`].
-fn make(scene: &SceneRef, ordered: &Ordered, members: &[u32], blur: &[f32]) -> Made {
+/// Merges a cluster's `members`, and writes its SH into `sh`; other parameters are those of [`Partition::assemble`].
+fn make(
+    scene: &SceneRef,
+    ordered: &Ordered,
+    members: &[u32],
+    blur: &[f32],
+    sh: &mut [[f32; 3]],
+) -> Made {
+    let sh_of = |i: u32| scene.sh_of(ordered.rows[i as usize] as usize);
     if let [only] = members {
         let row = ordered.rows[*only as usize] as usize;
+        let (dc, rest) = sh_of(*only);
+        sh[0] = dc;
+        sh[1..].copy_from_slice(rest);
         return Made {
             mean: ordered.gaussian(scene, row).mean,
             quat: scene.quats[row],
             scales: scene.scales[row],
             logit: scene.logit(row),
-            weights: Vec::new(),
             clamped: false,
             needed: 1.0,
         };
@@ -140,13 +153,25 @@ fn make(scene: &SceneRef, ordered: &Ordered, members: &[u32], blur: &[f32]) -> M
     let (mean, cov) = pool(&parts);
     let alpha = mass / rendered_area(&cov, least_blur);
     let total: f64 = parts.iter().map(|p| p.0).sum();
+    let mut sums = [[0.0f64; 3]; 16];
+    for (&i, (mass, ..)) in members.iter().zip(&parts) {
+        let (dc, rest) = sh_of(i);
+        let weight = mass / total;
+        for (sum, sh) in sums.iter_mut().zip(std::iter::once(&dc).chain(rest)) {
+            for k in 0..3 {
+                sum[k] += weight * f64::from(sh[k]);
+            }
+        }
+    }
+    for (out, sum) in sh.iter_mut().zip(sums) {
+        *out = sum.map(|v| v as f32);
+    }
     let gaussian = Gaussian::from_moments(mean, &cov);
     Made {
         mean: ordered.on_grid(mean),
         quat: gaussian.quat(),
         scales: gaussian.stored_scales(),
         logit: logit_of(alpha.min(MAX_OPACITY)),
-        weights: parts.iter().map(|p| p.0 / total).collect(),
         clamped: alpha > MAX_OPACITY,
         needed: (alpha / MAX_OPACITY).max(1.0),
     }
@@ -154,31 +179,4 @@ fn make(scene: &SceneRef, ordered: &Ordered, members: &[u32], blur: &[f32]) -> M
 
 fn logit_of(alpha: f64) -> f32 {
     (alpha / (1.0 - alpha)).max(f64::MIN_POSITIVE).ln() as f32
-}
-
-/// Appends a cluster's SH to `out`: the mean by `weights`, or without weights a copy of its only member's.
-fn average_sh(
-    scene: &SceneRef,
-    ordered: &Ordered,
-    members: &[u32],
-    weights: &[f64],
-    out: &mut Vec<[f32; 3]>,
-) {
-    let of = |i: u32| scene.sh_of(ordered.rows[i as usize] as usize);
-    if weights.is_empty() {
-        let (dc, rest) = of(members[0]);
-        out.push(dc);
-        out.extend_from_slice(rest);
-        return;
-    }
-    let mut sums = [[0.0f64; 3]; 16];
-    for (&i, w) in members.iter().zip(weights) {
-        let (dc, rest) = of(i);
-        for (sum, sh) in sums.iter_mut().zip(std::iter::once(&dc).chain(rest)) {
-            for k in 0..3 {
-                sum[k] += w * f64::from(sh[k]);
-            }
-        }
-    }
-    out.extend(sums[..=scene.rest].iter().map(|s| s.map(|v| v as f32)));
 }

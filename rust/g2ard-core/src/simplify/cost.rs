@@ -140,10 +140,18 @@ fn difference<T: Real>(a: &[T; 3], b: &[T; 3]) -> [T; 3] {
 impl Node {
     /// Completes a node whose mean, covariance, dilation and α are set: areas and mass.
     pub fn weighed(mut self) -> Self {
-        let s = dilated(&self.cov, self.blur);
-        self.areas = areas(&s);
-        self.mass = self.alpha * area(&s);
+        (self.areas, self.mass) = (self.areas_of(), self.mass_of());
         self
+    }
+
+    /// The areas of a node whose covariance and dilation are set.
+    pub fn areas_of(&self) -> [f32; PLACES] {
+        areas(&dilated(&self.cov, self.blur))
+    }
+
+    /// The mass of a node whose covariance, dilation and α are set.
+    pub fn mass_of(&self) -> f32 {
+        self.alpha * area(&dilated(&self.cov, self.blur))
     }
 }
 

@@ -15,6 +15,26 @@ pub struct Importance {
     pub usual: f64,
 }
 
+/// What [`Importance::of_scene`] measures of a row.
+#[derive(Debug, Clone, Copy)]
+pub struct Measured {
+    mass: f32,
+    alpha: f32,
+    /// Distance from the middle.
+    radius: f64,
+}
+
+impl From<Node> for Measured {
+    fn from(node: Node) -> Self {
+        let squares = node.mean.iter().map(|v| f64::from(*v).powi(2));
+        Self {
+            mass: node.mass,
+            alpha: node.alpha,
+            radius: squares.sum::<f64>().sqrt(),
+        }
+    }
+}
+
 impl Default for Importance {
     fn default() -> Self {
         Self {
@@ -35,22 +55,15 @@ const FAINT: f64 = -0.4;
 
 impl Importance {
     /// Measures a scene: the spread of its masses, and how far sizes follow the distance from the middle.
-    pub fn of_scene(nodes: &[Node]) -> Self {
-        let shown = || nodes.iter().filter(|n| n.mass > 0.0 && n.alpha > 0.0);
-        let radius = |n: &Node| {
-            n.mean
-                .iter()
-                .map(|v| f64::from(*v).powi(2))
-                .sum::<f64>()
-                .sqrt()
-        };
+    pub fn of_scene(rows: &[Measured]) -> Self {
+        let shown = || rows.iter().filter(|n| n.mass > 0.0 && n.alpha > 0.0);
         let Some(usual) = median(shown().map(|n| n.mass).collect()) else {
             return Self::default();
         };
         let masses = Moments::of(shown().map(|n| (f64::from(n.mass).ln(), 0.0)));
-        let sizes = Moments::of(shown().filter(|n| radius(n) > 0.0).map(|n| {
+        let sizes = Moments::of(shown().filter(|n| n.radius > 0.0).map(|n| {
             let area = f64::from(n.mass) / f64::from(n.alpha);
-            (area.ln(), radius(n).ln())
+            (area.ln(), n.radius.ln())
         }));
         let spread = ramp(masses.deviation(), SPREAD);
         let own = 1.0 - ramp(sizes.correlation(), FOLLOWS);
@@ -139,9 +152,14 @@ mod tests {
         (0..count).map(node).collect()
     }
 
+    fn measured(nodes: &[Node]) -> Importance {
+        let rows: Vec<_> = nodes.iter().map(|&node| node.into()).collect();
+        Importance::of_scene(&rows)
+    }
+
     #[test]
     fn one_size_counts_by_area_a_spread_by_number_and_distance_explains_it() {
-        let exponent = |nodes: &[Node]| Importance::of_scene(nodes).exponent;
+        let exponent = |nodes: &[Node]| measured(nodes).exponent;
         assert_eq!(exponent(&line(500, |_| 0.1)), 1.0);
         let spread = line(500, |i| 0.01 * ((i * 7919 % 500) as f32 / 60.0).exp());
         assert_eq!(exponent(&spread), 0.0);
@@ -159,7 +177,7 @@ mod tests {
                 node.alpha = if i % 2 == 0 { 0.9 } else { faint };
                 *node = node.weighed();
             }
-            Importance::of_scene(&nodes).exponent
+            measured(&nodes).exponent
         };
         assert_eq!(exponent(0.9), 1.0);
         assert_eq!(exponent(0.000_1), 1.0);
@@ -169,7 +187,7 @@ mod tests {
     fn sizes_unlike_the_distance_count_by_number() {
         // Size falls with the distance: no unbounded scene.
         let falling = line(500, |i| 0.01 * (10.0 - i as f32 / 50.0).exp());
-        assert_eq!(Importance::of_scene(&falling).exponent, 0.0);
+        assert_eq!(measured(&falling).exponent, 0.0);
         let pairs = [(1.0, 2.0), (2.0, 4.5), (3.0, 5.5), (4.0, 9.0), (5.0, 7.0)];
         let moments = Moments::of(pairs.into_iter());
         assert!((moments.deviation() - 2f64.sqrt()).abs() < 1e-12);
@@ -179,7 +197,7 @@ mod tests {
     #[test]
     fn counted_alike_a_row_weighs_what_the_median_does() {
         let nodes = line(501, |i| 0.01 * ((i * 7919 % 501) as f32 / 60.0).exp());
-        let by = Importance::of_scene(&nodes);
+        let by = measured(&nodes);
         let (low, high) = (by.of(&nodes[0]), by.of(&nodes[500]));
         assert_eq!(low, high);
         assert!((f64::from(low) / by.usual - 0.2f64.powf(FAINT)).abs() < 1e-6);

@@ -87,11 +87,9 @@ impl<'a> Leaves<'a> {
             let (weight, mass) = leaves.sums();
             leaves.floor = floor(weight, mass);
         } else {
-            let nodes: Vec<Node> = (0..leaves.len())
-                .into_par_iter()
-                .map(|i| leaves.node(i))
-                .collect();
-            leaves.importance = Importance::of_scene(&nodes);
+            let rows = (0..leaves.len()).into_par_iter();
+            let measured = rows.map(|i| leaves.without_areas(i).into());
+            leaves.importance = Importance::of_scene(&measured.collect::<Vec<_>>());
         }
         leaves
     }
@@ -100,7 +98,7 @@ impl<'a> Leaves<'a> {
     pub fn sums(&self) -> (f64, f64) {
         let masses: Vec<f32> = (0..self.len())
             .into_par_iter()
-            .map(|i| self.node(i).mass)
+            .map(|i| self.without_areas(i).mass)
             .collect();
         let mass: f64 = masses.iter().map(|&m| f64::from(m)).sum();
         let weight = |v| self.kept.iter().map(move |&i| self.weight(v, i));
@@ -137,6 +135,25 @@ impl<'a> Leaves<'a> {
         }
     }
 
+    /// A row's node, except its areas and its visibility.
+    fn without_areas(&self, i: usize) -> Node {
+        let at = self.kept[i] as usize;
+        let row = self.ordered.rows[at] as usize;
+        let mut g = self.ordered.gaussian(self.scene, row);
+        g.scales = g.scales.map(|s| (s / self.unit).min(MAX_SCALE));
+        let coordinate = |v: f64| (v / self.unit).clamp(-MAX_LENGTH, MAX_LENGTH) as f32;
+        let blur = f64::from(self.blur[at]) / (self.unit * self.unit);
+        let mut node = Node {
+            mean: g.mean.map(coordinate),
+            cov: g.covariance().map(|v| v as f32),
+            blur: blur.min(MAX_LENGTH * MAX_LENGTH) as f32,
+            alpha: (sigmoid(f64::from(self.scene.logit(row))) as f32).min(MAX_ALPHA),
+            ..Node::default()
+        };
+        node.mass = node.mass_of();
+        node
+    }
+
     fn weight(&self, visibility: Visibility, ordered: u32) -> f32 {
         visibility.weight[self.ordered.rows[ordered as usize] as usize].max(0.0)
     }
@@ -152,22 +169,10 @@ impl Rows for Leaves<'_> {
     }
 
     fn node(&self, i: usize) -> Node {
-        let at = self.kept[i] as usize;
-        let row = self.ordered.rows[at] as usize;
-        let mut g = self.ordered.gaussian(self.scene, row);
-        g.scales = g.scales.map(|s| (s / self.unit).min(MAX_SCALE));
-        let coordinate = |v: f64| (v / self.unit).clamp(-MAX_LENGTH, MAX_LENGTH) as f32;
-        let blur = f64::from(self.blur[at]) / (self.unit * self.unit);
-        let mut node = Node {
-            mean: g.mean.map(coordinate),
-            cov: g.covariance().map(|v| v as f32),
-            blur: blur.min(MAX_LENGTH * MAX_LENGTH) as f32,
-            alpha: (sigmoid(f64::from(self.scene.logit(row))) as f32).min(MAX_ALPHA),
-            ..Node::default()
-        }
-        .weighed();
+        let mut node = self.without_areas(i);
+        node.areas = node.areas_of();
         let visibility = match self.visibility {
-            Some(visibility) => self.weight(visibility, at as u32) + self.floor * node.mass,
+            Some(visibility) => self.weight(visibility, self.kept[i]) + self.floor * node.mass,
             None => self.importance.of(&node),
         };
         node.visibility = visibility.min(MAX_VISIBILITY);
@@ -182,8 +187,9 @@ impl Rows for Leaves<'_> {
         let (dc, rest) = self
             .scene
             .sh_of(self.ordered.rows[self.kept[i] as usize] as usize);
-        out[..3].copy_from_slice(&dc);
-        out[3..].copy_from_slice(rest.as_flattened());
+        let (band_0, higher) = out.split_at_mut(3);
+        band_0.copy_from_slice(&dc);
+        higher.copy_from_slice(&rest.as_flattened()[..higher.len()]);
     }
 }
 

@@ -97,6 +97,7 @@ impl Pairwise {
         let leaves = Leaves::new(scene, ordered, partition.kept(), &blur, visibility, None);
         let mut runs = RunMerging {
             geometric: self.geometric(visibility),
+            width: 0,
             partition: &mut partition,
             rounds: Vec::new(),
             control,
@@ -171,6 +172,12 @@ impl Pairwise {
     /// step, so that one step can join what another cut apart.
     fn premerge(&self, leaves: Leaves, budget: usize, runs: &mut RunMerging) -> Result<Nodes> {
         let last = (self.morton_premerge_ratio * budget as f64).min(leaves.len() as f64) as usize;
+        let band_0 = 3; // all that merging along Morton order compares
+        runs.width = if last > budget {
+            leaves.width()
+        } else {
+            band_0
+        };
         let mut targets = (0..self.morton_premerge_steps)
             .rev()
             .map(|step| (step, last.saturating_mul(1 << step.min(32))))
@@ -285,6 +292,8 @@ impl Pairwise {
 /// Merging along Morton order, and its effect on the partition.
 struct RunMerging<'a> {
     geometric: f32,
+    /// Values of SH that the nodes keep.
+    width: usize,
     partition: &'a mut Partition,
     rounds: Vec<PairwiseRound>,
     control: &'a Control,
@@ -309,7 +318,7 @@ impl RunMerging<'_> {
         drop(costs);
         self.rounds
             .push(PairwiseRound::merging(rows.len(), runs.count));
-        let nodes = rows.merged(&runs);
+        let nodes = rows.merged(&runs, self.width);
         self.control.advance(third);
         self.control.check()?;
         let every: Vec<u32> = (0..nodes.len() as u32).collect();
@@ -569,11 +578,11 @@ mod tests {
             of: rows.iter().map(|row| row / 4).collect(),
             count: ROWS / 4,
         };
-        let want = leaves.merged(&runs);
+        let want = leaves.merged(&runs, leaves.width());
         let mut nodes = leaves.nodes();
         nodes.gather(&rows.iter().rev().copied().collect::<Vec<_>>());
         let at = rows.iter().rev().copied().collect();
-        let got = Shuffled { nodes, at }.merged(&runs);
+        let got = Shuffled { nodes, at }.merged(&runs, 3);
         assert_eq!(got.geometry, want.geometry);
         assert_eq!((got.sh, got.width), (want.sh, 3));
     }

@@ -14,16 +14,15 @@ pub trait Rows: Sync {
     fn node(&self, i: usize) -> Node;
     /// Band 0.
     fn color(&self, i: usize) -> [f32; 3];
-    /// All bands, into `width` values.
+    /// As many values as `out` has, of all bands.
     fn read_sh(&self, i: usize, out: &mut [f32]);
 
-    /// Each run of rows as one node.
-    fn merged(&self, runs: &Partition) -> Nodes {
+    /// Each run of rows as one node, of the first `width` values of SH.
+    fn merged(&self, runs: &Partition, width: usize) -> Nodes {
         let mut ends: Vec<usize> = (1..runs.of.len())
             .filter(|&i| runs.of[i] != runs.of[i - 1])
             .collect();
         ends.push(runs.of.len());
-        let width = self.width();
         let mut sh = vec![0.0; runs.count * width];
         let geometry = sh
             .par_chunks_mut(width)
@@ -75,7 +74,7 @@ impl Rows for Nodes {
     }
 
     fn read_sh(&self, i: usize, out: &mut [f32]) {
-        out.copy_from_slice(&self.sh[i * self.width..(i + 1) * self.width]);
+        out.copy_from_slice(&self.sh[i * self.width..][..out.len()]);
     }
 }
 

@@ -42,7 +42,7 @@ pub fn close(
         return Ok(());
     }
     let limits = if depth.is_finite() {
-        let depths = optical_depths(splats, control)?;
+        let depths = optical_depths(splats, |i| needed[i] > LEAST_GROWTH, control)?;
         depths
             .iter()
             .map(|d| (depth / d).max(LEAST_GROWTH))
@@ -62,12 +62,16 @@ pub fn close(
 }
 
 /// Σ α exp(−½ dᵀ Σ⁻¹ d) of each Gaussian and its nearest neighbours, where they are cut by the line through its centre
-/// along its shortest axis: the optical depth of the surface there, for small α.
-fn optical_depths(splats: &Splats, control: &Control) -> Result<Vec<f64>> {
-    let every = 0..splats.len();
+/// along its shortest axis: the optical depth of the surface there, for small α; 0 for rows that are not `wanted`.
+fn optical_depths(
+    splats: &Splats,
+    wanted: impl Fn(usize) -> bool + Sync,
+    control: &Control,
+) -> Result<Vec<f64>> {
+    let every = (0..splats.len()).into_par_iter();
     let opacity = |i: usize| sigmoid(f64::from(splats.logit_opacities[i])).min(MAX_OPACITY);
+    let opacities: Vec<f64> = every.clone().map(opacity).collect();
     let covariances: Vec<Sym3> = every
-        .into_par_iter()
         .map(|i| Gaussian::of(splats, i).covariance())
         .collect();
     let tree = Tree::build(&splats.means);
@@ -76,8 +80,9 @@ fn optical_depths(splats: &Splats, control: &Control) -> Result<Vec<f64>> {
         .map(|chunk| {
             control.check()?;
             let here = chunk * CHUNK..((chunk + 1) * CHUNK).min(splats.len());
-            let mut depths = Vec::with_capacity(here.len());
-            tree.nearest(here, NEIGHBORS, |at, near| {
+            let mut depths = Vec::new();
+            let wanted = |at: usize| wanted(tree.rows()[at] as usize);
+            tree.nearest_of(here, wanted, NEIGHBORS, |at, near| {
                 let row = tree.rows()[at] as usize;
                 let own = Gaussian::of(splats, row);
                 let [a, b, _] = own.axes_by_scale();
@@ -85,9 +90,9 @@ fn optical_depths(splats: &Splats, control: &Control) -> Result<Vec<f64>> {
                 let of_others = near.iter().map(|n| {
                     let other = n.1 as usize;
                     let d = sub(own.mean, splats.means[other]);
-                    opacity(other) * falloff(&covariances[other], [u, v], [dot(u, d), dot(v, d)])
+                    opacities[other] * falloff(&covariances[other], [u, v], [dot(u, d), dot(v, d)])
                 });
-                depths.push((row as u32, opacity(row) + of_others.sum::<f64>()));
+                depths.push((row as u32, opacities[row] + of_others.sum::<f64>()));
             });
             Ok(depths)
         })
@@ -167,7 +172,7 @@ mod tests {
         splats.means = vec![[0.0; 3]; 9];
         splats.scales[0] = [0.0; 3];
         splats.scales[1] = [1.0, 0.0, 0.0];
-        let depths = optical_depths(&splats, &Control::default()).unwrap();
+        let depths = optical_depths(&splats, |_| true, &Control::default()).unwrap();
         assert!(depths.iter().all(|d| d.is_finite() && *d >= 0.98));
     }
 }

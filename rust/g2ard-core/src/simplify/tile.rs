@@ -90,7 +90,7 @@ impl Tile<'_> {
         control.begin((runs - schedule.last().map_or(runs, |&last| last.min(runs))) as u64);
         let (mut nodes, at) = if runs < leaves.len() {
             let parts = cut(costs, runs);
-            let mut merged = leaves.merged(&parts);
+            let mut merged = leaves.merged(&parts, leaves.width());
             // Runs in Morton order anew, and each kept row's run there.
             let every: Vec<u32> = (0..runs as u32).collect();
             let (from, map, _) = merged.morton(&every, [0.0; 3]);

@@ -141,13 +141,31 @@ impl<T: Coordinate> Tree<T> {
         &self,
         range: Range<usize>,
         k: usize,
+        visit: impl FnMut(usize, &mut Vec<Neighbor<T>>),
+    ) {
+        self.nearest_of(range, |_| true, k, visit);
+    }
+
+    /// The same of those `at` that are `wanted`.
+    pub fn nearest_of(
+        &self,
+        range: Range<usize>,
+        wanted: impl Fn(usize) -> bool,
+        k: usize,
         mut visit: impl FnMut(usize, &mut Vec<Neighbor<T>>),
     ) {
         let mut search = Search::new(k);
         let mut found = Vec::with_capacity(k);
         for block in range.start / WIDTH..range.end.div_ceil(WIDTH) {
-            self.search(block, &mut search);
-            for at in range.start.max(block * WIDTH)..range.end.min((block + 1) * WIDTH) {
+            let here = range.start.max(block * WIDTH)..range.end.min((block + 1) * WIDTH);
+            let lanes = here
+                .filter(|&at| wanted(at))
+                .fold(0, |lanes, at| lanes | 1 << (at % WIDTH));
+            if lanes == 0 {
+                continue;
+            }
+            self.search(block, lanes, &mut search);
+            for at in ones(lanes).map(|lane| block * WIDTH + lane) {
                 found.clear();
                 found.extend(search.found(at % WIDTH));
                 visit(at, &mut found);
@@ -156,32 +174,32 @@ impl<T: Coordinate> Tree<T> {
     }
 
     #[inline]
-    fn search(&self, block: usize, search: &mut Search<T>) {
+    fn search(&self, block: usize, lanes: u32, search: &mut Search<T>) {
         #[cfg(target_arch = "x86_64")]
         if std::arch::is_x86_feature_detected!("avx2") {
             // SAFETY: the processor has AVX2.
-            return unsafe { self.search_avx2(block, search) };
+            return unsafe { self.search_avx2(block, lanes, search) };
         }
-        self.search_block(block, search);
+        self.search_block(block, lanes, search);
     }
 
     /// The same code with wider registers; no fused operations, so the same bits.
     #[cfg(target_arch = "x86_64")]
     #[target_feature(enable = "avx2")]
-    fn search_avx2(&self, block: usize, search: &mut Search<T>) {
-        self.search_block(block, search);
+    fn search_avx2(&self, block: usize, lanes: u32, search: &mut Search<T>) {
+        self.search_block(block, lanes, search);
     }
 
-    /// Finds the nearest of every point of a block.
+    /// Finds the nearest of the points of a block that are set in `lanes`.
     #[inline(always)]
-    fn search_block(&self, own: usize, search: &mut Search<T>) {
-        search.begin(&self.blocks[own]);
+    fn search_block(&self, own: usize, lanes: u32, search: &mut Search<T>) {
+        search.begin(&self.blocks[own], lanes);
         if search.k == 0 {
             return;
         }
         // Itself and those beside it first: near enough to rule most others out.
         let beside = own.saturating_sub(1)..(own + 2).min(self.blocks.len());
-        for lane in 0..WIDTH.min(self.rows.len() - own * WIDTH) {
+        for lane in ones(lanes) {
             self.scan(own, lane, !(1 << lane), search);
             for block in beside.clone().filter(|&block| block != own) {
                 self.scan(block, lane, !0, search);

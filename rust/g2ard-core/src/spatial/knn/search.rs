@@ -28,11 +28,12 @@ impl<T: Coordinate> Search<T> {
         T::INFINITY.key(u32::MAX)
     }
 
-    pub fn begin(&mut self, points: &[Lanes<T>; 3]) {
+    /// Starts anew at the points that are set in `lanes`.
+    pub fn begin(&mut self, points: &[Lanes<T>; 3], lanes: u32) {
         self.points = *points;
         for lane in 0..WIDTH {
-            let there = points[0][lane] < T::INFINITY;
-            self.limits[lane] = if there { T::MAX } else { T::NEG_INFINITY };
+            let searched = lanes & 1 << lane != 0;
+            self.limits[lane] = if searched { T::MAX } else { T::NEG_INFINITY };
         }
         self.keys.fill(Self::nothing());
     }
