@@ -20,14 +20,16 @@ from g2ard.errors import DeviceError, InputError
 from g2ard.rendering.renderer import Renderer
 from g2ard.rendering.targets import Photos, Subset, TeacherRenders
 from g2ard.rendering.visibility import visibility
+from g2ard.scene.samples import evenly_spaced
 from g2ard.scene.splats import Splats, unit_quats
 from g2ard.stages.evaluate import evaluate
-from g2ard.stages.recover import RecoverConfig, loop, probe, recover, trials
 from g2ard.stages.recover import checkpoint as checkpoint_module
+from g2ard.stages.recover import loop, probe, trials
 from g2ard.stages.recover.anchors import REGULARIZERS, Anchors
-from g2ard.stages.recover.config import TUNED
+from g2ard.stages.recover.config import TUNED, RecoverConfig
 from g2ard.stages.recover.engine import FusedEngine
 from g2ard.stages.recover.guard import Guard, blended
+from g2ard.stages.recover.optimize import recover
 from g2ard.stages.recover.report import cut_short, outcome
 from g2ard.stages.simplify import SimplifyConfig, simplify
 from g2ard.system import devices
@@ -491,7 +493,11 @@ def test_training_views_vote_on_which_changes_were_harmful() -> None:
     colours = np.random.default_rng(0).normal(0, 0.5, start.sh0.shape).astype(np.float32)
     end = replace(start, sh0=start.sh0 + colours)
     black = replace(end, sh0=np.full_like(end.sh0, -0.5 / 0.28209479177387814))
-    training, validation = (TeacherRenders(TEACHER, around(n, (64, 48), 2.0)) for n in (9, 4))
+    nine = around(9, (64, 48), 2.0)
+    chosen = nine.take(evenly_spaced(9, 5))
+    training, asked, validation = (
+        TeacherRenders(TEACHER, views) for views in (nine, chosen, around(5, (64, 48), 2.0))
+    )
 
     def sums(targets: TeacherRenders) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Over all views, and over those that lost."""
@@ -511,7 +517,7 @@ def test_training_views_vote_on_which_changes_were_harmful() -> None:
         return total[0], total[1]
 
     alone, losing = sums(validation)
-    together = alone + sums(training)[0]
+    together = alone + sums(asked)[0]
     found = probe.harmful_changes(start, end, validation, training, (0, 0, 0))
     assert found is not None
     clear = np.minimum(abs(losing), abs(together)) > 1e-3

@@ -27,8 +27,6 @@ _LEAST_MSE = 1e-12
 """Least mean squared error, so that logarithms stay finite."""
 _TOLERATED_LOSS = 1.0
 """Loss in dB up to which no Gaussian goes back for a view."""
-_COMPARED_VIEWS = 64
-"""Training views that vote on whether a change was harmful, beside all validation views."""
 _SCORING_TIME_SHARE = 0.01
 """Share of the time that scoring the views may take while progress is shown."""
 _FIRST_SCORING_SHARE = 0.1
@@ -46,6 +44,7 @@ class Probe:
         self._targets, self._background, self._most = targets, background, most
         self._next = 0.0
         self._latest = (float("nan"), 0)
+        self._scored: tuple[Splats, float] | None = None
 
     @property
     def scored_in(self) -> str:
@@ -55,12 +54,15 @@ class Probe:
 
     def fit_exposures(self) -> None:
         """Score after a fit of exposures from now on."""
-        self._targets = Exposed(self._targets)
+        self._targets, self._scored = Exposed(self._targets), None
 
     def all_of(self, splats: Splats) -> float:
-        """Return the mean PSNR over the views."""
-        renderer = Renderer(splats, background=self._background)
-        return float(np.mean(list(in_threads(lambda view: self._score(renderer, view), self._views))))
+        """Return the mean PSNR over the views; that of the latest scene is known."""
+        if self._scored is None or self._scored[0] is not splats:
+            renderer = Renderer(splats, background=self._background)
+            scores = in_threads(lambda view: self._score(renderer, view), self._views)
+            self._scored = splats, float(np.mean(list(scores)))
+        return self._scored[1]
 
     def latest(self, splats: Callable[[], Splats], step: int, seconds: float) -> tuple[float, int]:
         """Return the mean PSNR and its step; the previous ones if scoring has used its share of the time.
@@ -103,14 +105,14 @@ def harmful_changes(
 
     With E the change of the squared error in each pixel, relative to the view's mean before, Σ αT·E over the
     pixels of a Gaussian is positive if views became worse where it is seen. It must be so over the validation
-    views that lost, and over all of them together with 64 training views: what few validation views say about
-    a Gaussian is mostly chance.
+    views that lost, and over all of them together with as many training views: what few validation views say
+    about a Gaussian is mostly chance.
     """
     held, views = _Comparison(start, result, validation, background), range(len(validation.cameras))
     losing = [lost > _TOLERATED_LOSS for lost in in_threads(held.lost, views)]
     if not any(losing):
         return None
-    compared = Subset(training, evenly_spaced(len(training.cameras), _COMPARED_VIEWS))
+    compared = Subset(training, evenly_spaced(len(training.cameras), len(views)))
     trained = _Comparison(start, result, compared, background)
     total, worse = np.zeros((2, len(result)))
     for light, loses in zip(in_threads(held.light, views), losing, strict=True):
@@ -135,24 +137,26 @@ class _Comparison:
         colours = np.zeros_like(sh0), np.zeros((len(scene), 0, 3), np.float32)
         self._grey = (means, quats, scales, logits, *colours)
 
-    def _errors(self, view: int) -> list[NDArray[np.float64]]:
+    def _errors(self, view: int) -> list[NDArray[np.float32]]:
         camera, target = self._targets.cameras[view], self._targets[view]
         mask = mask_of(self._targets, view)
-        errors = [
-            ((r.clipped(camera).astype(np.float64) - target) ** 2).mean(axis=2) for r in self._renderers
-        ]
+        errors = []
+        for renderer in self._renderers:
+            away = renderer.clipped(camera) - np.asarray(target, np.float32)
+            errors.append(np.einsum("yxc,yxc->yx", away, away) / 3)
         return errors if mask is None else [error * mask for error in errors]
 
     def lost(self, view: int) -> float:
         """Return a view's loss in dB."""
-        before, after = (max(float(error.mean()), _LEAST_MSE) for error in self._errors(view))
+        before, after = (max(float(error.mean(dtype=np.float64)), _LEAST_MSE) for error in self._errors(view))
         return 10 * math.log10(after / before)
 
     def light(self, view: int) -> NDArray[np.float32]:
         """Return a view's (N,) Σ αT·E, with E the change of the error relative to the mean before."""
         before, after = self._errors(view)
         image = np.zeros((*before.shape, 3), np.float32)
-        image[..., 0] = (after - before) / (max(float(before.mean()), _INVISIBLE_MSE) * before.size)
+        usual = max(float(before.mean(dtype=np.float64)), _INVISIBLE_MSE)
+        image[..., 0] = (after - before) / (usual * before.size)
         seen = view_of(self._cameras, view, self._settings)
         rasterizer = _core.Rasterizer()
         rasterizer.forward(self._grey, seen, self._settings, [0.0, 0.0, 0.0], 0)
