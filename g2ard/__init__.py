@@ -74,9 +74,9 @@ if TYPE_CHECKING:
     from g2ard.scene.splats import Splats
     from g2ard.stages.evaluate import Evaluation, evaluate
     from g2ard.stages.lift import lift
-    from g2ard.stages.recover import RecoverConfig, Recovered
     from g2ard.stages.recover.anchors import Regularizers
-    from g2ard.stages.recover.config import FitConfig
+    from g2ard.stages.recover.config import FitConfig, RecoverConfig
+    from g2ard.stages.recover.optimize import Recovered
     from g2ard.stages.recover.rasterize import rasterize
     from g2ard.stages.register import RegisterConfig, Registered
     from g2ard.stages.select import CoverageOptions, Selection, select
@@ -175,9 +175,9 @@ _HOMES = {
     "pipeline.adapt": ("AdaptConfig", "Adapted", "adapt"),
     "stages.evaluate": ("Evaluation", "evaluate"),
     "stages.lift": ("lift",),
-    "stages.recover": ("RecoverConfig", "Recovered"),
     "stages.recover.rasterize": ("rasterize",),
-    "stages.recover.config": ("FitConfig",),
+    "stages.recover.config": ("FitConfig", "RecoverConfig"),
+    "stages.recover.optimize": ("Recovered",),
     "stages.recover.anchors": ("Regularizers",),
     "stages.register": ("RegisterConfig", "Registered"),
     "rendering.renderer": ("RasterSettings", "Rendered", "Renderer", "render"),

@@ -26,8 +26,8 @@ from g2ard.rendering.targets import Targets
 from g2ard.rendering.visibility import visibility_source
 from g2ard.scene.shape import effective_rank, needle_share
 from g2ard.scene.splats import Splats
-from g2ard.stages.recover import recover
 from g2ard.stages.recover.anchors import Anchors, drift95, regularizers_for
+from g2ard.stages.recover.optimize import recover
 from g2ard.stages.recover.report import RecoverReport
 from g2ard.stages.simplify import simplify
 

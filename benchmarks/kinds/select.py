@@ -25,8 +25,9 @@ from g2ard.scene.cameras import Cameras
 from g2ard.scene.samples import evenly_spaced
 from g2ard.scene.splats import Splats
 from g2ard.stages.evaluate import evaluate
-from g2ard.stages.recover import RecoverConfig, recover
 from g2ard.stages.recover.anchors import REGULARIZERS
+from g2ard.stages.recover.config import RecoverConfig
+from g2ard.stages.recover.optimize import recover
 from g2ard.stages.select import CoverageOptions, Selection, select
 from g2ard.stages.simplify import simplify
 

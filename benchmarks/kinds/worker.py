@@ -123,7 +123,8 @@ def _targets(job: Job) -> StoredTargets:
 
 
 def _recover(job: Job) -> dict[str, Any]:
-    from g2ard.stages.recover import RecoverConfig, recover
+    from g2ard.stages.recover.config import RecoverConfig
+    from g2ard.stages.recover.optimize import recover
 
     student, targets = io.read_splats(job["scene"]), _targets(job)
     for view in range(len(targets.cameras)):  # load before a time limit starts

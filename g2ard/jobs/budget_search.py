@@ -17,7 +17,6 @@ from g2ard.errors import InputError
 from g2ard.io import read_splats, write_splats
 from g2ard.io.scene_formats import scene_format, written_bytes
 from g2ard.jobs.budget import Budget
-from g2ard.jobs.close_up import close_up
 from g2ard.progress import Say, plural, unsaid
 from g2ard.rendering.metrics import psnr, ssim
 from g2ard.rendering.renderer import Renderer
@@ -164,6 +163,8 @@ def count_for_layers(count: int, most: float, reduce: Callable[[int], Splats]) -
     Overdraw falls about with the square root of the count, which predicts the next one. The mean exceeds
     `most` if no count tried is small enough; it is 0 for a scene without near views.
     """
+    from g2ard.jobs.close_up import close_up  # loads planning, which others do not need
+
     for _ in range(_LAYER_TRIALS):
         near = close_up(reduce(count))
         layers = 0.0 if near is None else near["mean"]

@@ -24,11 +24,10 @@ from g2ard.report.run import KindScore, by_kind
 from g2ard.scene.cameras import USUAL
 from g2ard.scene.splats import Splats
 from g2ard.stages.evaluate import evaluate
-from g2ard.stages.recover import RecoverConfig, Recovered
-from g2ard.stages.recover import recover as optimize
 from g2ard.stages.recover.anchors import Anchors, PriorMeasures, regularizers_for
-from g2ard.stages.recover.config import Schedule
-from g2ard.stages.recover.optimize import Watch
+from g2ard.stages.recover.config import RecoverConfig, Schedule
+from g2ard.stages.recover.optimize import Recovered, Watch
+from g2ard.stages.recover.optimize import recover as optimize
 from g2ard.system.cached import cached_property
 
 

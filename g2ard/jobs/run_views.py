@@ -457,7 +457,6 @@ def _of(pool: Pool, cameras: Cameras) -> str:
 def cameras_for_weights(
     scene: Splats,
     views: Views | None,
-    method: str,
     *,
     beside: str | Path | None = None,
     up: Up = None,
@@ -468,14 +467,8 @@ def cameras_for_weights(
 ) -> Cameras | None:
     """Choose views for simplification's visibility: given, found beside the scene, or generated.
 
-    Args:
-        views: as for `views_of`; the training split is used.
-        method: those other than `default` use only given or requested views.
-
-    Other arguments are those of `views_of`. None means no views.
+    Arguments are those of `views_of`; of `views` the training split is used. None means no views.
     """
-    if views is None and method != "default":
-        return None
     given, are_found = given_or_found(views, beside, scene, ["train"], say, up=up)
     if given is not None:
         cameras = load_views(given, "train", None, say)

@@ -25,9 +25,7 @@ from g2ard.jobs.budget_search import (
     resolved_in_tiles,
 )
 from g2ard.jobs.inputs import Views, say_notes, say_regions
-from g2ard.jobs.run_views import cameras_for_weights
 from g2ard.pipeline.presets import configured
-from g2ard.poses import plan_pool
 from g2ard.progress import Progress, Say, plural, silent, unsaid
 from g2ard.rendering.visibility import SampledVisibility, visibility_source
 from g2ard.scene.cameras import Cameras
@@ -123,10 +121,13 @@ class Reduction:
         """Views that weigh Gaussians by visibility."""
         if self.blind or self.cameras is not None:
             return None if self.blind else self.cameras
+        if self.config.method != "default" and self.views is None:
+            return None
+        from g2ard.jobs.run_views import cameras_for_weights  # loads planning, which others do not need
+
         return cameras_for_weights(
             self.splats,
             self.views,
-            self.config.method,
             beside=self.beside,
             up=self.up,
             seed=self.seed,
@@ -185,6 +186,8 @@ class Reduction:
 
     def _resolved_for_quality(self, wanted: Quality, file: str) -> ResolvedBudget:
         """Find the count that keeps a quality in generated views, as read back from the format of `file`."""
+        from g2ard.poses import plan_pool  # as above
+
         splats = self.splats
         pool = plan_pool(splats, _QUALITY_VIEWS, seed=self.seed, rows=_POOL_SAMPLE, progress=self.progress)
         cameras = pool.cameras.resized(_QUALITY_SIDE)

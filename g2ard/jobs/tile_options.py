@@ -6,6 +6,7 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from g2ard.errors import InputError
 from g2ard.io import open_stream
@@ -13,9 +14,11 @@ from g2ard.io.detect import MANIFEST, kind
 from g2ard.io.scene_formats import scene_format
 from g2ard.io.tile_store import TileStore
 from g2ard.jobs.budget import Budget
-from g2ard.pipeline.config import DistillConfig
 from g2ard.stages.simplify import Default, SimplifyConfig
 from g2ard.tiles.ingest import TILE_ROWS
+
+if TYPE_CHECKING:
+    from g2ard.pipeline.config import DistillConfig
 
 _LEAST_FILE_ROW_BYTES = 4
 """Least bytes per Gaussian in a file: a smaller file is known to be small without opening it."""
@@ -134,17 +137,18 @@ def needs_whole(
     >>> needs_whole(SimplifyConfig("fast"), budgets=[Budget(min_psnr=30, min_ssim=0.9)], clean=True)
     ['--method fast', '--min-psnr 30', '--min-ssim 0.9', '--clean']
     """
-    simplify = config.simplify if isinstance(config, DistillConfig) else config
+    distill = None if isinstance(config, SimplifyConfig) else config
+    simplify = config if isinstance(config, SimplifyConfig) else config.simplify
     usual, given = Default().resolved().morton_premerge_steps, {}
     if preset is not None and preset.startswith("paper"):
         given[f"--preset {preset}"] = True
     else:
         given[f"--method {simplify.method}"] = simplify.method != "default"
-        if isinstance(config, DistillConfig):
-            given["--set select.views_count"] = config.select.views_count is not None
-            given["--schedule paper"] = config.recover.schedule.round_steps > 0
-            given["--recovery-time"] = config.recover.recovery_time is not None
-            given["--engine"] = config.recover.engine != "fused"
+        if distill is not None:
+            given["--set select.views_count"] = distill.select.views_count is not None
+            given["--schedule paper"] = distill.recover.schedule.round_steps > 0
+            given["--recovery-time"] = distill.recover.recovery_time is not None
+            given["--engine"] = distill.recover.engine != "fused"
         if isinstance(simplify, Default):
             steps = simplify.morton_premerge_steps
             given["--set simplify.morton_premerge_steps"] = steps not in (None, usual)

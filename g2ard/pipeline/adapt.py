@@ -22,9 +22,8 @@ from g2ard.rendering.visibility import visibility
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.samples import evenly_spaced
 from g2ard.scene.splats import SH_C0, Splats
-from g2ard.stages.recover import RecoverConfig
 from g2ard.stages.recover.anchors import FREE
-from g2ard.stages.recover.config import PAPER, TUNED, FitConfig, Schedule
+from g2ard.stages.recover.config import PAPER, TUNED, FitConfig, RecoverConfig, Schedule
 from g2ard.stages.recover.probe import Probe
 from g2ard.stages.recover.report import Gain, RecoverReport
 from g2ard.system.shown import Shown

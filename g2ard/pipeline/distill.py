@@ -21,7 +21,7 @@ from g2ard.rendering.visibility import visibility_source
 from g2ard.report.run import DistillReport, RoundReport, StageSeconds, ViewsReport
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
-from g2ard.stages.recover import RecoverConfig
+from g2ard.stages.recover.config import RecoverConfig
 from g2ard.stages.recover.loop import checked_weights
 from g2ard.stages.recover.optimize import Watch
 from g2ard.stages.select import SurfaceOptions, select

@@ -13,8 +13,10 @@ from numpy.typing import NDArray
 from g2ard.progress import Progress, silent
 from g2ard.rendering.targets import Targets, fill, fingerprint_of
 from g2ard.scene.splats import ARRAYS, Splats
-from g2ard.stages.recover import RecoverConfig, checkpoint, recover
+from g2ard.stages.recover import checkpoint
 from g2ard.stages.recover.anchors import Anchors
+from g2ard.stages.recover.config import RecoverConfig
+from g2ard.stages.recover.optimize import recover
 from g2ard.stages.recover.report import RecoverReport
 from g2ard.stages.simplify.reduce import SimplifyReport
 from g2ard.system.keys import key_of

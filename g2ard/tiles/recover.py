@@ -18,9 +18,10 @@ from g2ard.scene.cameras import USUAL, Cameras
 from g2ard.scene.splats import SH_C0, Splats
 from g2ard.scene.transform import join
 from g2ard.stages.evaluate import ViewScore
-from g2ard.stages.recover import RecoverConfig, recover
 from g2ard.stages.recover.anchors import Anchors
+from g2ard.stages.recover.config import RecoverConfig
 from g2ard.stages.recover.loop import checked_weights
+from g2ard.stages.recover.optimize import recover
 from g2ard.system.keys import key_of
 from g2ard.tiles.executor import Workers
 from g2ard.tiles.merging import TiledScene, finished

@@ -23,7 +23,7 @@ from g2ard.scene.splats import Splats
 FOLDER = "G2ARD_TEST_PLANS"
 """Variable of the environment: a folder in which all processes of a run of the tests keep plans."""
 _IMPORTERS = [
-    *("g2ard.poses", "g2ard.jobs.clean", "g2ard.jobs.simplify", "g2ard.jobs.register"),
+    *("g2ard.poses", "g2ard.jobs.clean", "g2ard.jobs.register"),
     *("g2ard.jobs.close_up", "g2ard.jobs.format_loss"),
     *("g2ard.jobs.run_views", "benchmarks.views", "benchmarks.kinds.select"),
 ]

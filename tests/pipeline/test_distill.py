@@ -14,8 +14,7 @@ from g2ard.io import read_splats, write_splats
 from g2ard.pipeline.config import DistillConfig, SelectConfig
 from g2ard.pipeline.distill import distill
 from g2ard.rendering.targets import Targets, TeacherRenders
-from g2ard.stages.recover import RecoverConfig
-from g2ard.stages.recover.config import PAPER, TUNED
+from g2ard.stages.recover.config import PAPER, TUNED, RecoverConfig
 from g2ard.stages.simplify import SimplifyConfig
 from helpers.cloud_files import las
 from helpers.commands import CommandLine, refused, succeeds

@@ -26,8 +26,8 @@ from g2ard.scene.cameras import Cameras
 from g2ard.scene.lenses import PhotoLens
 from g2ard.scene.prepared import PreparedScene
 from g2ard.scene.splats import Splats
-from g2ard.stages.recover import RecoverConfig
 from g2ard.stages.recover.anchors import Anchors
+from g2ard.stages.recover.config import RecoverConfig
 from g2ard.stages.recover.loop import Loop
 from g2ard.system.cached import cached_property
 from g2ard.system.keys import UNKEYED, key_of

@@ -17,9 +17,9 @@ from g2ard.pipeline.config import SelectConfig
 from g2ard.pipeline.distill import distill
 from g2ard.pipeline.presets import preset
 from g2ard.rendering.targets import TeacherRenders
-from g2ard.stages.recover import RecoverConfig, recover
 from g2ard.stages.recover.anchors import PAPER_REGULARIZERS, Anchors, Regularizers, drift95
-from g2ard.stages.recover.config import PAPER, Schedule
+from g2ard.stages.recover.config import PAPER, RecoverConfig, Schedule
+from g2ard.stages.recover.optimize import recover
 from g2ard.stages.simplify import simplify
 from helpers.commands import CommandLine, refused, succeeds
 from helpers.photos import cloud_with_photos

@@ -20,10 +20,11 @@ from g2ard.pipeline.distill import distill
 from g2ard.pipeline.presets import configured
 from g2ard.rendering.targets import Photos, TeacherRenders
 from g2ard.scene.splats import ARRAYS
-from g2ard.stages.recover import RecoverConfig, checkpoint, recover
+from g2ard.stages.recover import checkpoint
 from g2ard.stages.recover.anchors import REGULARIZERS
 from g2ard.stages.recover.config import PAPER as PAPER_SCHEDULE
-from g2ard.stages.recover.config import TUNED
+from g2ard.stages.recover.config import TUNED, RecoverConfig
+from g2ard.stages.recover.optimize import recover
 from helpers.scenes import around, checkered_ball
 
 Call = Callable[..., Any]

@@ -16,8 +16,7 @@ from g2ard.pipeline.distill import distill
 from g2ard.rendering.targets import TeacherRenders
 from g2ard.scene.cameras import Cameras, look_at
 from g2ard.scene.splats import ARRAYS
-from g2ard.stages.recover import RecoverConfig
-from g2ard.stages.recover.config import TUNED
+from g2ard.stages.recover.config import TUNED, RecoverConfig
 from g2ard.stages.select import select
 from g2ard.stages.simplify import SimplifyConfig
 from helpers.commands import CommandLine, refused, succeeds

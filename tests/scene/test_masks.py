@@ -24,8 +24,9 @@ from g2ard.rendering.targets import Photos
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.lenses import PhotoLens
 from g2ard.scene.splats import Splats
-from g2ard.stages.recover import RecoverConfig, recover
 from g2ard.stages.recover.anchors import Regularizers
+from g2ard.stages.recover.config import RecoverConfig
+from g2ard.stages.recover.optimize import recover
 from g2ard.stages.register.attempts import loaded
 from g2ard.stages.register.config import RegisterConfig
 from g2ard.stages.simplify import simplify

@@ -8,7 +8,8 @@ import pytest
 from g2ard.rendering.renderer import RasterSettings, render, settings_for
 from g2ard.rendering.targets import TeacherRenders
 from g2ard.rendering.visibility import visibility, visibility_source
-from g2ard.stages.recover import RecoverConfig, recover
+from g2ard.stages.recover.config import RecoverConfig
+from g2ard.stages.recover.optimize import recover
 from g2ard.stages.simplify import simplify
 from helpers.scenes import around, assert_same_bits, checkered_ball, in_units
 

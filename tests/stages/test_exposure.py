@@ -12,7 +12,8 @@ from g2ard.rendering.exposure import exposures_of, rendered, unexposed
 from g2ard.rendering.targets import Exposed, Photos, PhotosOrRenders
 from g2ard.scene.cameras import Cameras
 from g2ard.stages.evaluate import evaluate
-from g2ard.stages.recover import RecoverConfig, recover
+from g2ard.stages.recover.config import RecoverConfig
+from g2ard.stages.recover.optimize import recover
 from helpers.commands import CommandLine, succeeds
 from helpers.photos import photographed
 from helpers.scenes import around, assert_same_bits, checkered_ball

@@ -15,8 +15,9 @@ from g2ard.io import read_splats, write_splats, write_views
 from g2ard.rendering.targets import TeacherRenders
 from g2ard.scene.splats import Splats
 from g2ard.stages.evaluate import evaluate
-from g2ard.stages.recover import RecoverConfig, recover
+from g2ard.stages.recover.config import RecoverConfig
 from g2ard.stages.recover.loop import checked_weights, drawn
+from g2ard.stages.recover.optimize import recover
 from g2ard.stages.simplify import simplify
 from helpers.commands import succeeds
 from helpers.scenes import around, checkered_ball

@@ -22,7 +22,8 @@ from g2ard.rendering.targets import TeacherRenders
 from g2ard.rendering.visibility import visibility_source
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats
-from g2ard.stages.recover import RecoverConfig, recover
+from g2ard.stages.recover.config import RecoverConfig
+from g2ard.stages.recover.optimize import recover
 from g2ard.stages.select import surface, visible_cells
 from g2ard.stages.simplify import Simplified, flag, simplify
 from g2ard.system import devices

@@ -11,7 +11,8 @@ from helpers.project import ROOT, environment
 
 _PROGRAM = """
 from g2ard.rendering.targets import TeacherRenders
-from g2ard.stages.recover import RecoverConfig, recover
+from g2ard.stages.recover.config import RecoverConfig
+from g2ard.stages.recover.optimize import recover
 from g2ard.system import devices
 from g2ard.system.peak_memory import peak_rss
 from helpers.scenes import around, checkered_ball

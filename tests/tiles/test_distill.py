@@ -19,8 +19,8 @@ from g2ard.jobs.tile_options import Tiling, is_tiled
 from g2ard.rendering.targets import TeacherRenders
 from g2ard.scene.cameras import look_at
 from g2ard.stages.evaluate import evaluate
-from g2ard.stages.recover import RecoverConfig, recover
-from g2ard.stages.recover.config import Schedule
+from g2ard.stages.recover.config import RecoverConfig, Schedule
+from g2ard.stages.recover.optimize import recover
 from g2ard.stages.simplify import simplify
 from g2ard.tiles.ingest import ingest
 from helpers.cloud_files import columns, ply

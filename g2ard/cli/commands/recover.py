@@ -53,7 +53,7 @@ def recover(
     from g2ard.jobs.teaching import check_teacher
     from g2ard.rendering.targets import kinds_of
     from g2ard.report.run import COLUMNS, cells
-    from g2ard.stages.recover import RecoverConfig
+    from g2ard.stages.recover.config import RecoverConfig
     from g2ard.stages.recover.report import cut_short, outcome, unregularized
 
     if teacher is not None and not photos:

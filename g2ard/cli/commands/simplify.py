@@ -67,7 +67,6 @@ def simplify(
     """
     import numpy as np
 
-    from g2ard.jobs.cost import cost_of_reduction
     from g2ard.jobs.memory import WHOLE_TIMES, check_whole_memory
     from g2ard.jobs.simplify import reducing
     from g2ard.jobs.tile_options import is_tiled, needs_whole, refuse_whole
@@ -123,6 +122,8 @@ def simplify(
             _tell_plan(run, reduce, [one.count for one in wanted])
             return
         if how is not None:
+            from g2ard.jobs.cost import cost_of_reduction
+
             costs = [cost_of_reduction(reduce, one.count) for one in wanted]
             run.console.expect([stage for cost in costs for stage in cost.stages])
         rows = maps.paths(reduce.total) if maps else [None] * len(wanted)
