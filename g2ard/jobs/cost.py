@@ -162,7 +162,7 @@ def cost_of_recovery(
             ("scoring", _each(_SCORE, _mean_pixels(scored) / _USUAL_PIXELS, len(scene)) * len(scored))
         )
     dense = 0 if teacher is None else int(_KEPT_TIMES * teacher.nbytes)
-    memory = _PROGRAM_BYTES + _target_bytes(used, renders=teacher is not None) + _image_bytes(used)
+    memory = _PROGRAM_BYTES + _target_bytes(used, teacher) + _image_bytes(used)
     memory += dense + int(_KEPT_TIMES * scene.nbytes) + _TRAINER_BYTES * len(scene)
     return Cost(views, pixels, steps, tuple(stages), memory)
 
@@ -220,8 +220,7 @@ def _peak_bytes(job: DistillJob, count: int, steps: int, page: bool) -> int:
     used = [train if chosen == "auto" else train.take(range(min(chosen, len(train))))] if steps else []
     used += [part for part in (views.test, views.apart) if part is not None]
     full = [] if views.full is None else [within_pixels(views.full)]
-    targets = _target_bytes(used, renders=job.teacher is not None)
-    targets += _target_bytes(full, renders=job.teacher is not None)
+    targets = sum(_target_bytes(part, job.teacher) for part in (used, full))
     kept = _PROGRAM_BYTES + _sampled(_SURVEY, dense) + targets + _image_bytes([*used, *full]) + 2 * small
     packing = _packing_bytes(count, degree)
     if count < dense <= LARGEST_DENSE:  # shown beside the result
@@ -230,9 +229,12 @@ def _peak_bytes(job: DistillJob, count: int, steps: int, page: bool) -> int:
     return kept + int(max(_SCENE_TIMES * scene, scene + _TRAINER_BYTES * count, written))
 
 
-def _target_bytes(views: Sequence[Cameras], *, renders: bool) -> int:
-    """Return the bytes of cached targets: float32 renders, or photos of 8 bits."""
-    return min(CACHE_BYTES, (12 if renders else 3) * sum(int(_pixels(part).sum()) for part in views))
+def _target_bytes(views: Sequence[Cameras], teacher: Splats | None) -> int:
+    """Return the bytes of cached targets: renders as float32 or in 16 bits, or photos in 8."""
+    values = 3 * sum(int(_pixels(part).sum()) for part in views)
+    if teacher is not None:
+        values *= 4 if 4 * values + teacher.nbytes <= CACHE_BYTES else 2
+    return min(CACHE_BYTES, values)
 
 
 def _sampled(cost: tuple[int, int], count: int) -> int:

@@ -462,7 +462,7 @@ _RENDER_LEVELS = np.float32(65_535)
 class TeacherRenders(_Cached):
     """Renders of the dense scene: (H, W, 3) float32, clipped to [0, 1].
 
-    They are cached as float32, or rounded to 16 bits if all of them would not fit within the limit.
+    They are cached as float32, or rounded to 16 bits if all of them and the scene exceed the limit.
 
     Args:
         teacher: the dense scene.
@@ -493,7 +493,7 @@ class TeacherRenders(_Cached):
     ) -> None:
         super().__init__(cameras, limit)
         pixels = int((cameras.widths.astype(np.int64) * cameras.heights).sum())
-        self._rounded = 3 * np.float32().nbytes * pixels > limit
+        self._rounded = 3 * np.float32().nbytes * pixels + teacher.nbytes > limit
         self._teacher = teacher
         self._background, self._settings = background, settings
         self._renderer = renderer

@@ -19,7 +19,9 @@ def test_renders_beyond_the_limit_are_kept_in_16_bits() -> None:
     ball, views = checkered_ball(), around().resized(32)
     exact = [Renderer(ball).clipped(view) for view in views]
     size = sum(image.nbytes for image in exact)
-    whole, rounded = TeacherRenders(ball, views, limit=size), TeacherRenders(ball, views, limit=size // 2)
+    whole, rounded = (
+        TeacherRenders(ball, views, limit=n) for n in (size + ball.nbytes, size + ball.nbytes - 1)
+    )
     assert all(np.array_equal(whole[i], image) for i, image in enumerate(exact))
     for i, image in enumerate(exact):
         assert rounded[i].dtype == np.float32
