@@ -45,6 +45,7 @@ COLUMNS: dict[str, Column] = {
     "draw": Column(int, None, "which of several random subsets"),
     "split": Column(str, "", "which views were scored"),
     "views_kind": Column(str, "", "what was scored on: pool, near, standing or anywhere"),
+    "scale": Column(float, "g", "multiple of the views' size at which they were scored"),
     "against": Column(str, None, "photos, teacher, or either; figures of different ones never compare"),
     "submethod": Column(str, None, "method and budget in one word, in recorded rows"),
     "input_count": Column(int, None, "Gaussians before"),

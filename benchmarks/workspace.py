@@ -231,6 +231,15 @@ class Workspace:
         look = {"background": self.scene.background, "settings": settings, **options}
         return kind(teacher=self.splats, cameras=cameras, **look)
 
+    def scaled(self, kind: str, scale: float) -> Targets:
+        """Return the targets of a kind of views at a multiple of their size."""
+        targets = self.kinds_of_views[kind]
+        if scale == 1:
+            return targets
+        cameras = targets.cameras
+        longest = int(np.maximum(cameras.widths, cameras.heights).max())
+        return self.targets(cameras.scaled(round(scale * longest)), lazy=True)
+
     @cached_property
     def kinds_of_views(self) -> dict[str, Targets]:
         """Kind of views → targets: "pool" (those scored first), and the protocol's others if there is room.

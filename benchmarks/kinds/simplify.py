@@ -63,12 +63,14 @@ class Simplify(Study):
     Args:
         protocol: kinds of views to score: "pool", "standing" (near and standing views), "anywhere", "other"
             (these three), or "all".
+        scales: multiples of the views' size at which they are scored, with a row each.
     """
 
     METHODS: ClassVar[Mapping[str, Any]] = {name: name for name in (*REDUCERS, "spark", *_GROWTHS, *_DISTIL)}
     PROCESSES: ClassVar[bool] = True
 
     protocol: str = key("all", choices=tuple(PROTOCOLS), axis=True)
+    scales: tuple[float, ...] = key((1.0,), least=0.1)
 
     @classmethod
     def default_methods(cls) -> list[str]:
@@ -102,8 +104,10 @@ class Simplify(Study):
             if own not in ran:
                 ran[own] = self._run(place, method, budget, own)
             usage, small = ran[own]
-            scored = score(small, place.kinds_of_views[kind], place.scene.background)
-            yield {**row, **asdict(usage), "count": len(small), **figures(scored)}
+            for scale in self.scales:
+                scored = score(small, place.scaled(kind, scale), place.scene.background)
+                told = {"scale": scale} if len(self.scales) > 1 else {}
+                yield {**row, **told, **asdict(usage), "count": len(small), **figures(scored)}
 
     def _run(self, place: Workspace, method: str, budget: int, own: bool) -> tuple[Usage, Splats]:
         with tempfile.TemporaryDirectory(prefix="g2ard-bench-") as folder:

@@ -68,6 +68,18 @@ def test_every_kind_of_view_is_scored(tmp_path: Path) -> None:
     assert (tmp_path / "out" / "rows.csv").read_text() == text
 
 
+@needs_processes
+def test_a_scene_is_scored_at_every_size(tmp_path: Path) -> None:
+    scene = ball_of(tmp_path, 1200, views=False)
+    options = {"ratios": "4", "methods": "fast", "protocol": "pool", "size": "64"}
+    rows = measured("sizes", scene, tmp_path / "out", **options)
+    assert [row["scale"] for row in rows] == [0.5, 1, 2, 3]
+    assert len({row["psnr"] for row in rows}) == 4
+    assert len({row["cpu_s"] for row in rows}) == 1
+    (alone,) = measured("simplify", scene, tmp_path / "alone", **options)
+    assert alone["psnr"] == rows[1]["psnr"]
+
+
 def test_a_standing_file_beside_the_scene_takes_precedence(tmp_path: Path) -> None:
     splats, folder = checkered_ball(1500), tmp_path / "ball"
     folder.mkdir()
