@@ -37,7 +37,7 @@ __all__ = ["app", "command", "one_line"]
 _EXCLUSIVE_OPTIONS = (
     *combinations(("count", "ratio", "fit", "min_psnr"), 2),
     *combinations(("count", "ratio", "fit", "min_ssim"), 2),
-    ("steps", "recovery_time"),
+    *combinations(("steps", "time", "recovery_time"), 2),
     ("views", "no_views"),
 )
 """Options that exclude each other."""

@@ -1,10 +1,10 @@
 """Flags of settings, by the paths of the settings; `g2ard.cli.command.command` adds them to commands."""
 
-import re
 from typing import Annotated, Any
 
 import typer
 
+from g2ard.cli.options import duration
 from g2ard.config.choices import AdaptSchedule, Engine, Focus, Method, Policy, ScheduleName
 from g2ard.errors import InputError
 
@@ -25,13 +25,6 @@ def _spot(text: str) -> Spot:
         raise typer.BadParameter(error.message) from None
     except ValueError:
         raise typer.BadParameter(f"expected X,Y,Z,R or X,Y,Z,X,Y,Z, got {text!r}") from None
-
-
-def _duration(text: str) -> float:
-    match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*(s|m|min|h)?", text.strip())
-    if match is None or not float(match[1]) > 0:
-        raise typer.BadParameter(f"expected a time such as 90s, 2m or 1h, got {text!r}")
-    return float(match[1]) * {"s": 1, "m": 60, "min": 60, "h": 3600}[match[2] or "s"]
 
 
 _SH_DEGREE = typer.Option(min=0, max=3, help="SH degree of the result; by default that of the scene.")
@@ -69,7 +62,7 @@ FIELDS: dict[str, tuple[Any, Any]] = {
     ),
     "recover.recovery_time": (
         float,
-        typer.Option(parser=_duration, metavar="TIME", help="Time limit for recovery alone: 90s, 2m or 1h."),
+        typer.Option(parser=duration, metavar="TIME", help="Time limit for recovery alone: 90s, 2m or 1h."),
     ),
     **{f"{stage}.sh_degree": (int, _SH_DEGREE) for stage in ("recover", "adapt")},
     **{f"{stage}.engine": (Engine, _ENGINE) for stage in ("recover", "adapt")},

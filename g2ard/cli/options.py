@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -213,6 +214,24 @@ ShapeOption = Annotated[
         parser=_shape,
         metavar="PIXELS|WxH",
         help="Longer side of the images, or width and height of generated views; photos only shrink.",
+    ),
+]
+
+
+def duration(text: str) -> float:
+    """Parse a time into seconds."""
+    match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*(s|m|min|h)?", text.strip())
+    if match is None or not float(match[1]) > 0:
+        raise typer.BadParameter(f"expected a time such as 90s, 2m or 1h, got {text!r}")
+    return float(match[1]) * {"s": 1, "m": 60, "min": 60, "h": 3600}[match[2] or "s"]
+
+
+TimeOption = Annotated[
+    float | None,
+    typer.Option(
+        parser=duration,
+        metavar="TIME",
+        help="Time for the whole run, roughly; recovery gets what the rest leaves: 90s, 2m or 1h.",
     ),
 ]
 BackgroundOption = Annotated[

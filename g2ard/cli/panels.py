@@ -9,7 +9,7 @@ from typer.core import TyperCommand
 USED: dict[str, tuple[str, ...]] = {
     "distill": (
         *("output", "count", "ratio", "fit", "views"),
-        *("images", "photos", "size", "schedule", "recovery_time", "format", "resume"),
+        *("images", "photos", "size", "schedule", "time", "format", "resume"),
     ),
     "simplify": ("output", "count", "ratio", "fit", "views", "method", "no_views", "overwrite"),
     "recover": (
@@ -54,7 +54,7 @@ _PANELS = {
         *("neighbors", "spread", "normal_ratio", "max_anisotropy", "opacity"),
     ),
     "Recovery": (
-        *("recover", "schedule", "steps", "recovery_time", "weighted", "engine"),
+        *("recover", "schedule", "steps", "time", "recovery_time", "weighted", "engine"),
         *("tolerance", "prior_views", "sh_degree"),
     ),
     "Output": (

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from g2ard.config.checks import AtLeastOne, checks_arguments
+from g2ard.config.checks import AtLeastOne, Positive, checks_arguments
 from g2ard.config.choices import Colour, FormatName, RenderModel, is_made
 from g2ard.config.schema import keywords, listed
 from g2ard.errors import InputError
@@ -92,6 +92,7 @@ class DistillJob:
         recovers: whether the scene is recovered, or only merged.
         cleaned: number of Gaussians removed by kind of clutter; None without cleaning.
         began, prepared: when the preparation began and ended.
+        time: limit of the whole run in seconds; None without one.
     """
 
     prior: Splats
@@ -107,6 +108,7 @@ class DistillJob:
     cleaned: dict[str, int] | None = None
     began: float = 0.0
     prepared: float = 0.0
+    time: float | None = None
     progress: Progress = silent
     say: Say = unsaid
     tiles = None
@@ -190,11 +192,38 @@ class DistillJob:
         """Distil the scene; `work` is the folder for resuming, see `g2ard.pipeline.distill`."""
         for scored in filter(None, (self.targets.held_out, self.targets.apart)):
             fill(scored, self.progress)
-        done = self._reduced(self.prior, self.budget.count, work)
+        limited = None if self.time is None else partial(self.time_left, self.time)
+        done = self._reduced(self.prior, self.budget.count, work, time_left=limited)
         splats = self.budget.shrink(done.splats, self.say)
         return replace(done, splats=splats, held_out=done.scored_on(self.targets.held_out))
 
-    def _reduced(self, scene: Splats, count: int, work: Path | None) -> Distilled:
+    def time_left(self, limit: float) -> float:
+        """Return the seconds for recovery, of a limit for the whole run, after all that comes before it.
+
+        What comes after takes as much longer than its usual cost as what came before. Recovery gets at least
+        a twentieth.
+        """
+        from g2ard.jobs.cost import cost_of
+
+        stages, now = cost_of(self, self.budget.count).stages, time.monotonic()
+        names = [name for name, _ in stages]
+        at = names.index("recover") if "recover" in names else len(names)
+        before, after = (sum(seconds for _, seconds in part) for part in (stages[:at], stages[at + 1 :]))
+        slowness = (now - self.prepared) / before if before else 1.0
+        left = limit - (now - self.began) - slowness * after
+        least = limit / 20
+        if left < least:
+            spent = now - self.began
+            self.say(f"warning: {limit:g} s are short; after {spent:.1f} s recovery still gets {least:.1f} s")
+        return max(left, least)
+
+    def _reduced(
+        self,
+        scene: Splats,
+        count: int,
+        work: Path | None,
+        time_left: Callable[[], float] | None = None,
+    ) -> Distilled:
         """Simplify and recover the dense scene, or one derived from it."""
         return pipeline(
             scene,
@@ -205,6 +234,7 @@ class DistillJob:
             validation=self.targets.validation,
             work=work,
             progress=self.progress,
+            time_left=time_left,
         )
 
     def level(
@@ -332,6 +362,7 @@ def distill(
     render_model: RenderModel | None = None,
     format: FormatName = "ply",
     preset: str = "auto",
+    time: Positive | None = None,
     steps: AtLeastOne | None = None,
     schedule: str | Schedule | None = None,
     background: Colour | None = None,
@@ -374,6 +405,7 @@ def distill(
         clean: remove invisible and stray Gaussians first, like `g2ard clean`.
         render_model: "classic" or "antialiased": overrides what the scene's file says.
         beside: a path to look for cameras beside, if `scene` is not a path.
+        time: seconds that the whole call may take, roughly: recovery gets what the rest leaves.
         steps: steps of the final recovery; None takes the schedule's, and more where views or points need
             them.
         schedule: fast, default, best or paper.
@@ -435,6 +467,7 @@ def distill(
         render_model=render_model,
         format=format,
         preset=preset,
+        time=time,
         settings=keywords(distill, DistillConfig(), fields | named) | dict(settings or {}),
     )
     job = prepare(scene, budget, options, progress=progress, say=say)
@@ -565,6 +598,7 @@ def prepare(
         cleaned=cleaned,
         began=began,
         prepared=time.monotonic(),
+        time=options.time,
         progress=progress,
         say=say,
     )

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from g2ard.config.checks import AtLeastOne
+from g2ard.config.checks import AtLeastOne, Positive
 from g2ard.config.choices import Focus, FormatName, RenderModel
 from g2ard.config.schema import Settings, full_paths, values_of
 from g2ard.errors import InputError
@@ -17,6 +17,9 @@ from g2ard.pipeline.presets import PRESETS, configured
 from g2ard.stages.lift import LiftConfig
 from g2ard.stages.recover.anchors import Regularizers
 from g2ard.system.cached import cached_property
+
+RECOVERY_SHARE = 0.4
+"""Share of a limited time that recovery is expected to get, for which views are planned."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -28,6 +31,7 @@ class DistillOptions(Settings):
             each view's photo, or a render if it has none (sec. 3.1). A point cloud given with views needs
             their photos; without views, its lift renders the training images.
         format: file format for a budget in bytes: ply, compressed.ply, sog, spz, glb, splat, usda or usdc.
+        time: seconds that the whole run may take; recovery gets what the rest leaves.
         settings: values of `DistillConfig` by path, which override the preset.
 
     Others are those of `g2ard.distill`.
@@ -46,6 +50,7 @@ class DistillOptions(Settings):
     render_model: RenderModel | None = None
     format: FormatName = "ply"
     preset: str = "auto"
+    time: Positive | None = None
     settings: Mapping[str, Any] = field(default_factory=dict)
 
     @cached_property
@@ -65,6 +70,12 @@ class DistillOptions(Settings):
     ) -> DistillConfig:
         """Return the configuration with measured regularisers and a default SH degree."""
         settings = dict(self._full)
+        if self.time is not None:
+            for path in ("recover.steps", "recover.recovery_time"):
+                if path in settings:
+                    other = path.rpartition(".")[2]
+                    raise InputError(f"excludes {{{other}}}; give one", parameter="time")
+            settings["recover.recovery_time"] = RECOVERY_SHARE * self.time
         if sh_degree is not None:
             settings.setdefault("recover.sh_degree", sh_degree)
         if regularizers is not None:

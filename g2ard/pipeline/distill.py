@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -104,6 +104,7 @@ def distill(
     work: Path | None = None,
     progress: Progress = silent,
     watch: Watch | None = None,
+    time_left: Callable[[], float] | None = None,
 ) -> Distilled:
     """Distil a dense prior into exactly `budget` Gaussians.
 
@@ -123,6 +124,7 @@ def distill(
             settings repeats only the steps that depend on them.
         progress: called by all stages.
         watch: called after every step of every recovery, see `g2ard.stages.recover.recover`.
+        time_left: returns the time limit of the last recovery in seconds when it begins.
 
     Returns:
         The compact scene with its unrecovered version and report.
@@ -165,6 +167,7 @@ def distill(
                 stage="recover" if name == _FINAL else f"recover {name}",
                 watch=watch,
                 skip_same=True,
+                time_left=time_left if name == _FINAL else None,
             )
             recoveries.append(recovery)
         log.append(RoundReport(count, report, tuple(recoveries)))

@@ -24,6 +24,7 @@ NO_RESULT = {
     "seed": "common to all commands, and some draw nothing",
     "engine": "other engines give equal results up to rounding",
     "recovery_time": "depends on the machine",
+    "time": "depends on the machine",
     "lpips": "needs weights",
     "lpips_input": "needs weights",
 }

@@ -92,6 +92,7 @@ CALLS: dict[str, tuple[str, str]] = {
         for command in ("distill", "simplify")
     },
     "distill schedule": ("fast default best paper", "distill ball.ply -r 8 --schedule {} --dry-run"),
+    "distill time": (TIMES, "distill ball.ply -r 8 --time {} --dry-run"),
     "distill recovery_time": (TIMES, "distill ball.ply -r 8 --recovery-time {} --dry-run"),
     "recover recovery_time": (
         TIMES,

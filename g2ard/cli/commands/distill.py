@@ -58,6 +58,7 @@ def distill(
         typer.Option(metavar="VIEWS", help="Views to score on. --views is then used for training only."),
     ] = None,
     preset: opt.PresetOption = "auto",
+    time: opt.TimeOption = None,
     keep: Annotated[
         bool, typer.Option("--keep", help="Keep the simplified scene too, in RUN/simplified.")
     ] = False,
@@ -122,12 +123,14 @@ def distill(
         render_model=run.render_model,
         format=format,
         preset=preset,
+        time=time,
         settings=settings,
     )
     tiling = tiling_of(run, scene, output)
     how = tiling if scene is not None and is_tiled(scene, tiling) else None
     if scene is not None and budget is not None and how is not None:
         whole = needs_whole(options.config, preset, [budget], f"scene.{format}", clean=clean, photos=photos)
+        whole += [] if time is None else [f"--time {time:g}"]
         refuse_whole(scene, whole)
     elif scene is not None and budget is not None:
         say_fit(run, scene, budget, f"scene.{format}")

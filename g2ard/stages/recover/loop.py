@@ -61,6 +61,7 @@ _CHECKPOINT_FIELDS = (
     "geometry",
     "skipped_before",
     "tally",
+    "limit",
 )
 """Attributes of `Loop` that a checkpoint stores, besides the losses, the engine and the guard."""
 
@@ -74,6 +75,7 @@ class Loop:
         resumed: the part of `seconds` before this call.
         tally: number of steps and their seconds, without and with regularisers.
         exposures: of the photos, (C, 3, 2); None while they agree, see `exposures_of`.
+        limit: time limit in seconds, the config's until `time_left` sets it; None without one.
     """
 
     student: Splats
@@ -85,6 +87,8 @@ class Loop:
     guard: Guard = field(metadata=UNKEYED)
     validation_key: str | None
     frozen: NDArray[np.bool_] | None
+    time_left: Callable[[], float] | None = field(default=None, metadata=UNKEYED)
+    limit: float | None = field(default=None, metadata=UNKEYED)
     multiplier: float = field(default=1.0, metadata=UNKEYED)
     reach: float = field(default=math.inf, metadata=UNKEYED)
     trials: list[dict[str, float]] = field(default_factory=list, metadata=UNKEYED)
@@ -100,6 +104,7 @@ class Loop:
 
     def __post_init__(self) -> None:
         self.schedule = self.config.schedule.within(self.targets.cameras.extent)
+        self.limit = self.config.recovery_time
 
     @cached_property
     def key(self) -> str:
@@ -219,6 +224,8 @@ class Loop:
         """
         if checkpoint is not None and checkpoint.exists():
             self._resume(checkpoint)
+        elif self.time_left is not None:
+            self.limit = self.seconds + self.time_left()  # trials have taken the first
         start = copy.deepcopy(self._meta())
         while True:
             try:
@@ -261,8 +268,8 @@ class Loop:
 
     def _used_share(self) -> float:
         """Return the used share of the steps or of the time limit."""
-        if self.config.recovery_time is not None:
-            return self.seconds / self.config.recovery_time
+        if self.limit is not None:
+            return self.seconds / self.limit
         return self.done / self.config.horizon
 
     def _step(self) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -61,6 +62,7 @@ def recover(
     stage: str = "recover",
     watch: Watch | None = None,
     skip_same: bool = False,
+    time_left: Callable[[], float] | None = None,
 ) -> Recovered:
     """Optimise every attribute of a fixed set of Gaussians against targets (`eq:objective`).
 
@@ -76,6 +78,7 @@ def recover(
             during the steps.
         stage: stage name for progress.
         skip_same: take no step if the student already renders as the targets.
+        time_left: returns the time limit in seconds when the steps begin, in place of the config's.
 
     Other arguments, results and errors are those of `g2ard.recover`.
     """
@@ -112,7 +115,9 @@ def recover(
     validation_key = None if validation is None else fingerprint_of(validation)
     end = result = student
     after, blend, seen = before, 1.0, None
-    loop = Loop(student, targets, config, view_weights, anchors, probe, guard, validation_key, frozen)
+    loop = Loop(
+        student, targets, config, view_weights, anchors, probe, guard, validation_key, frozen, time_left
+    )
     if not exact:
         if checkpoint is None or not checkpoint.exists():
             loop.choose_rates(before)

@@ -1,0 +1,66 @@
+"""A limit on the time of a whole distillation."""
+
+import signal
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from g2ard.errors import InputError
+from g2ard.jobs import distill as jobs
+from g2ard.jobs.budget import Budget
+from g2ard.jobs.cost import cost_of
+from g2ard.jobs.distill import prepare
+from g2ard.jobs.distill_options import DistillOptions
+from helpers.scenes import checkered_ball
+
+
+@pytest.fixture(scope="module")
+def job() -> jobs.DistillJob:
+    return prepare(checkered_ball(1200), Budget(ratio=8), DistillOptions(size=48, time=60.0))
+
+
+def test_recovery_gets_what_the_rest_leaves(job: jobs.DistillJob, monkeypatch: pytest.MonkeyPatch) -> None:
+    stages = dict(cost_of(job, 150).stages)
+    before = sum(stages[name] for name in ("targets", "visibility", "simplify"))
+    after = sum(stages[name] for name in ("scoring", "report.html", "view.html"))
+    for slowness in (0.5, 3.0):
+        monkeypatch.setattr(jobs.time, "monotonic", lambda slowness=slowness: 12 + slowness * before)
+        found = replace(job, began=2.0, prepared=12.0).time_left(60.0)
+        assert found == pytest.approx(60 - 10 - slowness * (before + after))
+
+
+def test_too_short_a_time_is_told(job: jobs.DistillJob, monkeypatch: pytest.MonkeyPatch) -> None:
+    said: list[str] = []
+    monkeypatch.setattr(jobs.time, "monotonic", lambda: 50.0)
+    assert replace(job, began=2.0, prepared=12.0, say=said.append).time_left(40.0) == 2.0
+    assert said == ["warning: 40 s are short; after 48.0 s recovery still gets 2.0 s"]
+
+
+def test_views_are_planned_for_the_time(job: jobs.DistillJob) -> None:
+    short = prepare(checkered_ball(1200), Budget(ratio=8), DistillOptions(size=48, time=5.0))
+    assert len(short.views.train.cameras) < len(job.views.train.cameras)
+
+
+def test_an_interrupted_run_keeps_its_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The limit is decided once, and stored with the steps."""
+    limits = iter([1.5, 99.0])
+    monkeypatch.setattr(jobs.DistillJob, "time_left", lambda self, limit: next(limits))
+
+    def stop(stage: str, done: int, total: int, info: object = None) -> None:
+        if stage == "recover" and done >= 3:
+            signal.raise_signal(signal.SIGINT)
+
+    scene, budget = checkered_ball(1200), Budget(ratio=8)
+    options = DistillOptions(size=48, time=60.0)
+    with pytest.raises(KeyboardInterrupt):
+        prepare(scene, budget, options, progress=stop).run(tmp_path)
+    done = prepare(scene, budget, options).run(tmp_path)
+    assert done.report.rounds[-1].recover[-1].seconds < 10
+    assert next(limits) == 99.0
+
+
+@pytest.mark.parametrize("other", ["steps", "recovery_time"])
+def test_other_limits_are_excluded(other: str) -> None:
+    with pytest.raises(InputError, match=other):
+        DistillOptions(time=60.0, settings={f"recover.{other}": 5}).config
