@@ -52,7 +52,7 @@ FIELDS: dict[str, tuple[Any, Any]] = {
     "recover.schedule": (
         ScheduleName,
         typer.Option(
-            help="Recovery schedule: fast, default or best (at least 240, 800 or 4,800 steps, more for "
+            help="Recovery schedule: fast, default or best (at least 100, 800 or 4,800 steps, more for "
             "photos and rooms), or paper (in rounds)."
         ),
     ),

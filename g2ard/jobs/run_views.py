@@ -26,7 +26,7 @@ from g2ard.progress import Progress, Say, direction, plural, silent, unsaid
 from g2ard.scene.cameras import USUAL, Camera, Cameras, rows_by_kind
 from g2ard.scene.samples import evenly_spaced
 from g2ard.scene.splats import Splats
-from g2ard.stages.recover.config import STEPS_FOR_RENDERS, VIEWS_PER_SCHEDULE, RecoverConfig
+from g2ard.stages.recover.config import RecoverConfig, steps_for
 from g2ard.stages.select.light import complete
 from g2ard.stages.simplify import simplify
 
@@ -48,9 +48,9 @@ if a view shows little of the scene."""
 _OFFERED_VIEWS, _VIEWS_APART = 64, 16
 """Views of each other kind from which training views are chosen, and further ones: one half validates
 recovery, the other is scored."""
-_USES, _LEAST_SHARE = 5.0, 0.15
-"""Steps per training view, and least share of the pool that is used: runs of few steps plan, render and score
-few views."""
+_POOL_STEPS, _POOL_POWER, _LEAST_SHARE = 1400, 0.6, 0.15
+"""Steps for which the whole pool is used, the power of fewer ones that is the share used, and its least: runs
+of few steps plan, render and score few views."""
 _STEP_SECONDS = 0.03
 """Time of a step that a time limit is divided by, as on two cores."""
 _LEAST_SCORED, _LEAST_APART = 6, 8
@@ -120,9 +120,12 @@ def views_of(
                 "generated views have no photos", parameter="photos", hint="give {views} that have them"
             )
         held_out = None if options.held_out is None else load(options.held_out, [for_scores])[0].cameras
-        share = 1.0 if use in ("merging", "tiles") else pool_share(options.config.recover)
+        planned = plan(_POOL_VIEWS, grow=_POOL_GROWTH)
+        share = 1.0
+        if use not in ("merging", "tiles"):
+            share = pool_share(options.config.recover, prior, planned.cameras)
         return _generated(
-            plan(_POOL_VIEWS, grow=_POOL_GROWTH),
+            planned,
             held_out,
             options.size,
             partial(mix, select=select, share=share),
@@ -155,22 +158,16 @@ def views_of(
     return RunViews(train, test.cameras, apart, full=full)
 
 
-def pool_share(recover: RecoverConfig) -> float:
-    """Return the share of a generated pool that a recovery uses.
-
-    >>> from g2ard.stages.recover.config import Schedule
-    >>> pool_share(RecoverConfig()), round(pool_share(RecoverConfig(schedule=Schedule.named("fast"))), 2)
-    (1.0, 0.34)
-    >>> round(pool_share(RecoverConfig(recovery_time=5)), 2)
-    0.24
-    """
-    if not recover.schedule.means_in_scales:
+def pool_share(recover: RecoverConfig, scene: Splats, pool: Cameras) -> float:
+    """Return the share of a generated pool that a recovery of a scene uses."""
+    schedule = recover.schedule
+    if not schedule.means_in_scales:
         return 1.0
     if recover.recovery_time is not None:
         steps = recover.recovery_time / _STEP_SECONDS
     else:
-        steps = STEPS_FOR_RENDERS * recover.schedule.steps if recover.steps is None else recover.steps
-    return min(1.0, max(_LEAST_SHARE, steps / (_USES * VIEWS_PER_SCHEDULE)))
+        steps = recover.steps or steps_for(scene, pool, schedule.for_renders * schedule.steps)
+    return min(1.0, max(_LEAST_SHARE, (steps / _POOL_STEPS) ** _POOL_POWER))
 
 
 def shrunk(cameras: Cameras, size: int | None) -> Cameras | None:

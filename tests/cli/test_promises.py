@@ -20,7 +20,7 @@ from g2ard.jobs.budget import DEVICES
 from g2ard.pipeline import adapt
 from g2ard.poses import pool, within
 from g2ard.stages.clean import KINDS
-from g2ard.stages.recover.config import SCHEDULES, STEPS_FOR_RENDERS
+from g2ard.stages.recover.config import SCHEDULES
 from g2ard.stages.register import RegisterConfig
 from g2ard.tiles.ingest import TILE_ROWS
 from helpers.commands import CommandLine, refused, succeeds
@@ -56,7 +56,7 @@ DEFAULTS: dict[str, str] = {
     **{
         f"{command} schedule": (
             "at least {:.0f}, {:.0f} or {:,.0f} steps".format(
-                *(STEPS_FOR_RENDERS * SCHEDULES[name].steps for name in ("fast", "default", "best"))
+                *(SCHEDULES[name].for_renders * SCHEDULES[name].steps for name in ("fast", "default", "best"))
             )
         )
         for command in ("distill", "recover")

@@ -57,7 +57,7 @@ def test_views_are_made_where_none_are_given(command_line: CommandLine, folder: 
 )
 def test_views_of_other_kinds_join_the_usual_ones(make, focus: str | None, kinds: set[str]) -> None:
     scene = make()
-    options = DistillOptions(views="made", settings={"focus": focus})
+    options = DistillOptions(views="made", settings={"focus": focus, "schedule": "best"})
     views = views_of(scene, options, len(scene) // 10)
     rows = rows_by_kind(views.train.cameras.kinds)
     assert set(rows) <= kinds
@@ -112,7 +112,7 @@ def test_runs_of_few_steps_use_few_views() -> None:
     def made(**recover: object) -> RunViews:
         return views_of(scene, DistillOptions(views="made", settings=recover), len(scene) // 10)
 
-    whole, fast, few = made(), made(schedule="fast"), made(steps=20)
+    whole, fast, few = made(schedule="best"), made(schedule="fast"), made(steps=20)
     counts = [len(views.train.cameras) for views in (whole, fast, few)]
     assert counts[0] > 2 * counts[1] > 2 * counts[2] > 20
     usual = [

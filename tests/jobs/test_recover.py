@@ -61,7 +61,7 @@ def test_a_generated_pool_is_completed_for_the_student(folder: Path) -> None:
     assert job.held_out is not None
     assert job.held_out.cameras.kinds.count("usual") == 16
     assert set(job.validation.cameras.kinds) <= set(job.held_out.cameras.kinds)
-    assert job.config.steps == steps_for(student, job.views.cameras, 1000)
+    assert job.config.steps == steps_for(student, job.views.cameras, 800)
     names = [*job.views.cameras.names, *job.validation.cameras.names, *job.held_out.cameras.names]
     assert len(set(names)) == len(names)
     given = prepare(student, views=job.views, teacher=naive.statue(), size=32)

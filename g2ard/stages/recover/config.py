@@ -36,9 +36,6 @@ _USUAL_VIEWS, _MOST_GROWTH, VIEWS_PER_SCHEDULE = 112, 2.25, 140
 """Usual views that train if each holds the whole scene, the largest factor if it holds less, and the views
 that the schedule's steps are for."""
 
-STEPS_FOR_RENDERS = 0.8
-"""Share of the schedule's steps that renders need: they agree with each other, photos do not."""
-
 _FEW_POINTS = 1250
 """Points of photos up to which the schedule's steps suffice."""
 
@@ -100,6 +97,7 @@ class Schedule(Settings):
         finest: see `Rates`. `distill` takes 0 for points found in photos, unless it is set.
         reference_extent: `rates.means` is scaled by the cameras' extent (`Cameras.extent`) over this, so that
             the scene's unit does not matter; None takes it in scene units.
+        for_renders: share of the steps that renders take, because they agree with each other, unlike photos.
         guarded: whether a recovery that loses quality returns to the best scene or its start; otherwise all
             steps are taken and kept.
 
@@ -117,6 +115,7 @@ class Schedule(Settings):
     reach: AboveZero | None = None
     finest: NotNegative = _DEFAULT_FINEST
     reference_extent: AboveZero | None = None
+    for_renders: Positive = 0.8
     guarded: bool = True
 
     @classmethod
@@ -196,7 +195,7 @@ rates where the paper states none. Its rate of means lacks a unit; 9.2e-4 is 3DG
 extent of 5.75, so it is read that way (decision 0023). `PAPER.scaled(3000)` has a tenth of the steps."""
 
 SCHEDULES: dict[str, Schedule] = {
-    "fast": replace(TUNED, steps=300),
+    "fast": replace(TUNED, steps=300, for_renders=1 / 3),
     "default": TUNED,
     "best": replace(TUNED, steps=6000),
     "paper": PAPER,
@@ -236,8 +235,8 @@ def steps_from_points(count: int, steps: int) -> int:
     return round(steps * math.sqrt(max(1.0, count / _FEW_POINTS)))
 
 
-def steps_for(scene: Splats, cameras: Cameras, steps: int) -> int:
-    """Return the steps for views against renders, 0.8 to 2.4 times `steps`.
+def steps_for(scene: Splats, cameras: Cameras, steps: float) -> int:
+    """Return the steps for views against renders, one to three times `steps`.
 
     The least are for 140 views, each used about six times. However many usual views there are, they count as
     112/√h, at most 252, if one holds a share h of the scene: a view of an orbit shows the whole object, but a
@@ -247,7 +246,7 @@ def steps_for(scene: Splats, cameras: Cameras, steps: int) -> int:
     >>> line = Splats.create([[0, 0, 0], [9, 0, 0], [0, 0, 9], [-9, 0, 0]], scales=np.ones((4, 3)))
     >>> K = [[50, 0, 32], [0, 50, 32], [0, 0, 1]]
     >>> view = Cameras.from_lists([look_at([0, -3, 0], [0, 0, 0])], [K], [(64, 64)], ["a"])
-    >>> steps_for(line, view, 1000)
+    >>> steps_for(line, view, 800)
     1280
     """
     usual = cameras.usual()
@@ -257,7 +256,7 @@ def steps_for(scene: Splats, cameras: Cameras, steps: int) -> int:
     share = max(usual.usual_share(points), 1 / _MOST_GROWTH**2)
     views = _USUAL_VIEWS / math.sqrt(share) * (plain / len(usual))
     factor = min(max(1.0, views / VIEWS_PER_SCHEDULE), _MOST_STEPS_FACTOR)
-    return round(steps * STEPS_FOR_RENDERS * factor)
+    return round(steps * factor)
 
 
 @dataclass(frozen=True)
@@ -330,4 +329,4 @@ class RecoverConfig(FitConfig):
             return steps_from_points(len(scene), schedule.steps)
         if not schedule.means_in_scales or photos:
             return schedule.steps
-        return steps_for(scene, cameras, schedule.steps)
+        return steps_for(scene, cameras, schedule.steps * schedule.for_renders)
