@@ -15,6 +15,9 @@ from g2ard.scene.regions import Region, as_regions
 
 _RETENTION: dict[str, float] = {"default": 0.65, "fast": 0.65, "paper": 0.75}
 
+_USUAL_RATIO = 10.0
+"""Reduction from which more of the merging is done in pairs."""
+
 _CORE = _core.defaults()
 """Defaults of the Rust core, by method."""
 
@@ -49,16 +52,20 @@ class SimplifyConfig(Settings, tag="method"):
         usual = _RETENTION["paper" if recovered else self.method]
         return round_counts(count, budget, self.retention or usual, self.fold)
 
-    def resolved(self, *, antialiased: bool = False) -> Self:
-        """Return the config with None replaced by the method's constants.
+    def resolved(self, *, antialiased: bool = False, ratio: float = 1.0) -> Self:
+        """Return the config with None replaced by the method's constants, for a reduction by `ratio`.
 
         Antialiased scenes get no dilation: their renderer takes from opacity what its blur adds in area.
 
         >>> SimplifyConfig(method="paper").resolved().retention
         0.75
+        >>> SimplifyConfig().resolved(ratio=1000).morton_premerge_ratio
+        30.0
         """
         own = {"retention": _RETENTION[self.method], **_CORE[self.method]}
         given = {f.name: own[f.name] for f in fields(self) if f.name in own and getattr(self, f.name) is None}
+        if isinstance(self, Default) and "morton_premerge_ratio" in given:
+            given["morton_premerge_ratio"] *= max(1.0, math.sqrt(ratio / _USUAL_RATIO))
         if antialiased and isinstance(self, Pairs):
             given["dilation"] = 0.0
         return replace(self, **given)
@@ -85,8 +92,8 @@ class Pairs(SimplifyConfig):
 
     Args:
         morton_premerge_ratio: rows first merge along Morton order until this multiple of the budget remains,
-            then as pairs of neighbours; at least 1, infinity merges pairs only. None means 3 for `default`, 1
-            for `fast`.
+            then as pairs of neighbours; at least 1, infinity merges pairs only. None means 3 for `default`,
+            times √(ratio/10) beyond 10×, and 1 for `fast`.
         morton_premerge_steps: steps of the merging along Morton order, each on a shifted lattice. None means
             1 for `default`, 2 for `fast`.
         geometric_weight: weight of the coverage error relative to the colour error; halved without views,

@@ -11,11 +11,12 @@ from numpy.typing import NDArray
 from g2ard import _core
 from g2ard.errors import InputError
 from g2ard.progress import Progress, counter
+from g2ard.rendering.recolour import recoloured
 from g2ard.rendering.visibility import SampledVisibility
 from g2ard.scene.prepared import MAX_OPACITY, PreparedScene
 from g2ard.scene.regions import in_any
 from g2ard.scene.splats import DRAWN_LOGIT, Splats
-from g2ard.stages.simplify.config import Pairs
+from g2ard.stages.simplify.config import Default, Pairs
 
 _OPACITY_FIT_EXPONENT = 1 / 4
 """Exponent of the ratio of wanted to current visibility: ½ fits the given views by up to 0.1 dB better, and
@@ -26,6 +27,10 @@ _OPACITY_FIT_LIMITS = (0.5, 2.0)
 
 _OPACITY_FIT_FLOOR = 0.05
 """Share of the mean added to both sides of the ratio, so that hardly visible rows stay unchanged."""
+
+_MANY = 20
+"""Mean number of members from which `default` fits colours: fewer share about one colour, and a fit to some
+views loses in others as much as it gains (decision 0009)."""
 
 DRAWN_OPACITY = float(1 / (1 + np.exp(-DRAWN_LOGIT)))
 """Least α that renderers draw."""
@@ -68,7 +73,7 @@ def merge(
     progress: Progress,
 ) -> dict[str, Any]:
     """Merge by `default` or `fast`; `visibility` has one row per Gaussian of the scene."""
-    config = config.resolved(antialiased=scene.antialiased)
+    config = config.resolved(antialiased=scene.antialiased, ratio=len(scene) / budget)
     progress("simplify", 0, 0)
     return _core.simplify_pairwise(
         scene.core,
@@ -89,7 +94,7 @@ def merge_and_fit(
     progress: Progress,
 ) -> dict[str, Any]:
     """Merge by visibility, then fit each merged Gaussian's opacity so that views see as much of it as of its
-    members."""
+    members. `default` also fits colours if Gaussians join many members, and `source` has `views`."""
     visibility = rows_of(source(scene), len(scene), slice(None))
     out = merge(scene, budget, visibility, protected, config, progress)
     merged, parents = splats_of(scene, out), out["parents"]
@@ -103,8 +108,12 @@ def merge_and_fit(
     fitted = fit_opacities(merged, members, wanted, weight, wanted.mean())
     changed = fitted.logit_opacities != merged.logit_opacities
     changed |= (fitted.scales != merged.scales).any(axis=1)
+    views = getattr(source, "views", None)
+    if views is not None and isinstance(config, Default) and len(scene) >= _MANY * budget:
+        fitted = recoloured(scene.take(order), fitted, views, progress)
     return {
         **out,
+        "sh": np.concatenate([fitted.sh0, fitted.shN], axis=1),
         "scales": fitted.scales,
         "logit_opacities": fitted.logit_opacities,
         "fitted": int(np.count_nonzero(changed)),

@@ -156,12 +156,13 @@ def simplify(
 ) -> Simplified:
     """Reduce a scene to exactly `budget` Gaussians.
 
-    `default` minimises the error in the image. Down to three times the budget it merges along Morton order,
+    `default` minimises the error in the image. Down to a multiple of the budget it merges along Morton order,
     cheapest first. Then it merges the cheapest pairs of neighbours, in rounds in which each cluster merges at
     most once. Mean, covariance and SH are averaged by mass, and the mass *as rendered* m = α·A is conserved,
     with A = √tr adj(Σ + e²I) and e the renderer's blur. The cost of a merge is the squared error of its
     projections times its visibility. Without `visibility` no cameras are needed. If `visibility` is a
-    function, opacities are finally fitted to what the views see.
+    function, opacities are finally fitted to what the views see, and if it has `views` and 20 or more rows
+    join on average, colours too.
 
     `fast` merges only along Morton order, on two lattices in turn, without a neighbour graph.
 
