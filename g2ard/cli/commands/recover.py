@@ -20,7 +20,7 @@ _FIELDS = "schedule steps recovery_time sh_degree engine background seed"
 @command(
     "recover",
     example="g2ard recover small.ply --views poses.json --teacher scene.ply -o better.ply",
-    settings="g2ard.stages.recover:RecoverConfig",
+    settings="g2ard.stages.recover.config:RecoverConfig",
     fields=tuple(f"recover.{name}" for name in _FIELDS.split()),
     scenes=True,
 )
