@@ -131,8 +131,11 @@ def _meta(
 
 
 def _write_part(meta: Path, files: dict[str, bytes]) -> None:
-    """Write the files of a SOG folder, of which `meta` is the meta.json, atomically."""
-    with atomic_folder(meta.parent) as begun:
+    """Write the files of a SOG folder, of which `meta` is the meta.json, atomically.
+
+    Files that a killed call left there without their meta.json are replaced.
+    """
+    with atomic_folder(meta.parent, overwrite=True) as begun:
         for name, content in files.items():
             (begun / name).write_bytes(content)
 
