@@ -82,12 +82,13 @@ def _parameters(ctx: typer.Context, path: Path, tables: Iterable[str]) -> dict[s
 
 
 def _check_keys(table: dict[str, Any], known: dict[str, Any], problem: str) -> None:
-    """Reject unknown keys, with similar names, and letters, with the long name of their flag."""
+    """Reject unknown keys, with similar names, and letters of options that have a longer name."""
     told, long = [], [flag for flag in known if len(flag) > 1]
     for key in sorted(table):
-        if len(key) == 1 and key in known:
-            told.append(f"{key} (write {max(known[key].opts, key=len).lstrip('-')})")
-        elif _dashed(key) not in long and key != "set":
+        name = key if len(key) > 1 or key not in known else _long_name(known[key])
+        if name != key:
+            told.append(f"{key} (write {name})")
+        elif _dashed(key) not in known and key != "set":
             told.append(meant([key], long))
     if told:
         raise typer.BadParameter(f"{problem} {', '.join(told)}")
@@ -98,6 +99,12 @@ def _default(parameter: Any, value: Any) -> Any:
     if not getattr(parameter, "multiple", False) and parameter.nargs != -1:
         return _as_typed(value)
     return [_as_typed(one) for one in (value if isinstance(value, list) else [value])]
+
+
+def _long_name(parameter: Any) -> str:
+    """Return a parameter's longest flag without dashes, or its name if it has none."""
+    flags = (flag[2:] for flag in parameter.opts if flag.startswith("--"))
+    return max(flags, key=len, default=str(parameter.name))
 
 
 def _dashed(key: str) -> str:
@@ -135,8 +142,9 @@ def printed(ctx: typer.Context, values: dict[str, Any]) -> str:
             constants = list(value)
             continue
         many = parameter.nargs == -1
-        flag = max((opt for opt in parameter.opts if opt.startswith("--")), key=len, default=f"--{name}")
-        lines.append(f"{flag[2:]} = {_toml([str(item) for item in value] if many else _plain(value))}")
+        lines.append(
+            f"{_long_name(parameter)} = {_toml([str(item) for item in value] if many else _plain(value))}"
+        )
     if constants:
         lines.append(f"[{ctx.info_name}.set]")
         pairs = (text.partition("=") for text in constants)
