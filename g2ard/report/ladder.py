@@ -113,6 +113,7 @@ def ladder(
     dense: Dense | None,
     background: Colour = BLACK,
     settings: RasterSettings | None = None,
+    overwrite: bool = False,
 ) -> None:
     """Write the HTML page.
 
@@ -146,7 +147,7 @@ def ladder(
         row = targets.cameras.names.index(name)
         of = ", ".join(rung.label for rung in rungs if rung.worst.name == name)
         show(f"{name}, worst of {of}", targets, row, [rung.scores.views[row].psnr for rung in rungs])
-    page.write(path)
+    page.write(path, overwrite)
 
 
 _COLUMNS = ("scene", "size", "Gaussians", "MB", "PSNR, dB", "worst view", "SSIM")

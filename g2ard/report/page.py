@@ -177,7 +177,7 @@ class Page:
             f"<script>\n{script}</script></body></html>\n"
         )
 
-    def write(self, path: Path) -> None:
-        """Write the page atomically, replacing an existing file."""
-        with atomic_output(path, overwrite=True) as temporary:
+    def write(self, path: Path, overwrite: bool = True) -> None:
+        """Write the page atomically."""
+        with atomic_output(path, overwrite) as temporary:
             temporary.write_text(self.text(), encoding="utf-8", newline="\n")

@@ -34,6 +34,7 @@ def registration_report(
     side: int,
     told: Sequence[str],
     background: Colour,
+    overwrite: bool = False,
 ) -> None:
     """Write the HTML page of a registration, least similar photos first.
 
@@ -72,7 +73,7 @@ def registration_report(
             drawn = _matches_drawn(photo, render, matches * scale)
             count = plural(len(matches), "match", "matches")
             page.figure(drawn, f"{count} explained by the pose; at most {_LINES} are drawn")
-    page.write(path)
+    page.write(path, overwrite)
 
 
 def _matches_drawn(

@@ -231,7 +231,15 @@ def _write_ladder(
     title = f"{'photos' if top is None else top.name}: {len(rungs)} sizes"
     with run.finishing("--output"):
         ladder(
-            output, title, rungs, targets, shown, dense=top, background=teaching.background, settings=settings
+            output,
+            title,
+            rungs,
+            targets,
+            shown,
+            dense=top,
+            background=teaching.background,
+            settings=settings,
+            overwrite=run.overwrite,
         )
     run.kept.append(f"{output} is written")
     advice = recommendation(rungs)

@@ -163,7 +163,16 @@ def register(
         title = f"Photos in {names_of([scene])[0]}"
         with run.finishing("--report"):
             registration_report(
-                report, title, job.scene, job.photos, found, job.starts, config.size, lines, job.background
+                report,
+                title,
+                job.scene,
+                job.photos,
+                found,
+                job.starts,
+                config.size,
+                lines,
+                job.background,
+                overwrite=run.overwrite,
             )
     written = str(output) if len(found.cameras) else None
     result = {**found.report.as_dict(), "summary": summary.as_dict(), "output": written}
