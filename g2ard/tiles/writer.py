@@ -248,6 +248,7 @@ def lift_tiles(
     points = pour(within, cloud, tile_rows, rows, progress, say)
     writer = TileWriter(folder, points.tree, points.margin, 4 * row_width(0))
     total, done = sum(points.counts), 0
+    progress("lift", done, total)
     for index, count in enumerate(points.counts):
         splats = _lifted(points, index, cloud, config)
         for start in range(0, len(splats), _ROWS_AT_ONCE):

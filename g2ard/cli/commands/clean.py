@@ -93,7 +93,8 @@ def clean(
     for flag, path in (("--output", output), ("--split-sky", split_sky)):
         if path is not None and not dry_run:
             run.claim_scene(flag, path)
-    run.console.expect([("visibility", 11), ("depths", 16), ("clutter", 19), ("preview", 1)])  # showroom, s
+    drawn = [("preview", 1)] if preview is not None else []
+    run.console.expect([("visibility", 11), ("depths", 16), ("clutter", 19), *drawn])  # showroom, s
     run.begin("read")
     done = remove_clutter(
         scene,
