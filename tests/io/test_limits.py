@@ -20,7 +20,6 @@ from g2ard.io.images import load_photo
 from g2ard.scene.splats import Splats, unit_quats
 from g2ard.stages.simplify import simplify
 from helpers.commands import CommandLine
-from helpers.faults import Fault, faulty
 from helpers.glb_files import glb_parts, write_glb
 from helpers.packed_files import truth
 from helpers.sog_files import parts, zipped
@@ -214,47 +213,6 @@ def test_a_claim_past_the_limits_is_one_line(what: str, tmp_path: Path) -> None:
 
 
 MESH = {"mesh": 0}
-BROKEN_NODES: dict[str, tuple[list[Any], Fault]] = {
-    "negative child": ([MESH, {"children": [-2]}], ("nodes[1].children[0]", None)),
-    "absent child": ([MESH, {"children": [0, 2]}], ("nodes[1].children[1]", None)),
-    "child of lists": ([MESH, {"children": [[]]}], ("nodes[1].children[0]", None)),
-    "no object": ([MESH, 5], ("nodes[1]", None)),
-    "circle": ([MESH | {"children": [1]}, {"children": [0]}], r"node 0 is its own ancestor"),
-    "two parents": ([MESH, {"children": [0]}, {"children": [0]}], "node 0 has 2 parents"),
-    "column": ([MESH | {"translation": [[1], [2], [3]]}], ("nodes[0].translation[0]", None)),
-    "short": ([MESH | {"translation": [1]}], ("nodes[0].translation[1]", None)),
-    "far": (
-        [MESH | {"translation": [1e308] * 3}, {"children": [0], "translation": [1e308] * 3}],
-        r"invalid translation \(inf, inf, inf\)",
-    ),
-}
-
-
-@pytest.mark.filterwarnings("error")
-@pytest.mark.parametrize("what", BROKEN_NODES)
-def test_broken_nodes_of_a_glb_are_named(what: str, tmp_path: Path) -> None:
-    nodes, fault = BROKEN_NODES[what]
-    with faulty(tmp_path / "a.glb", fault):
-        read_scene(node_tree(tmp_path / "a.glb", nodes))
-
-
-@pytest.mark.parametrize("table", ["accessors", "bufferViews", "buffers"])
-@pytest.mark.parametrize("index", [-1, 99, "x", True, None, []])
-def test_an_index_in_a_glb_names_an_entry(table: str, index: Any, tmp_path: Path) -> None:
-    write_splats(tmp_path / "a.glb", truth(9, 0))
-    document, _ = glb_parts(tmp_path / "a.glb")
-    fault: Fault
-    if table == "accessors":
-        document["meshes"][0]["primitives"][0]["attributes"]["POSITION"] = index
-        fault = ("meshes[0].primitives[0].attributes.POSITION", None)
-    elif table == "bufferViews":
-        document["accessors"][0]["bufferView"] = index
-        fault = ("accessors[0].bufferView", None)
-    else:
-        document["bufferViews"][0]["buffer"] = index
-        fault = ("bufferViews[0].buffer", None)
-    with faulty(tmp_path / "a.glb", fault):
-        read_scene(node_tree(tmp_path / "a.glb", document["nodes"], document))
 
 
 def test_a_long_chain_of_nodes_is_followed_once(tmp_path: Path) -> None:

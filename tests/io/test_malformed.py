@@ -1,17 +1,25 @@
 """No damaged file ends in a traceback: readers answer with sound data or one line of InputError."""
 
 import gzip
+import json
+import math
 import re
 import struct
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 
 from fuzz_readers import fuzz, read_checked
+from g2ard.io import kind, read_scene, read_view_set
+from helpers.faults import Fault, faulty
+from helpers.glb_files import glb_parts, write_glb
 from helpers.malformations import malformed
 from helpers.project import ROOT
 from helpers.reader_cases import MAKERS, READ
+from helpers.view_files import orbit, transforms
 
 NAMED = ["transforms", "cameras.json", "views", "ns-export", "meta.json", "lod-meta.json"]
 """Files of JSON: if a property becomes the word x, the error names the property, its holder or x."""
@@ -39,6 +47,164 @@ def test_malformed_files_end_in_one_line_that_names_them(tmp_path: Path, what: s
             told = line.replace(str(tmp_path), "")
             assert any(key in told for key in keys) or re.search(r"\bx\b", told), f"{how}: {line}"
     assert refused >= 40, f"{refused} of {len(files)}"
+
+
+ABSENT = object()
+MESH, NODE_FAR = {"mesh": 0}, {"translation": [1e308] * 3}
+FAULTS: dict[str, list[tuple[str, Any, Fault]]] = {
+    "transforms": [
+        ("frames", [], "no views found"),
+        ("frames.0", 7, (None, 0)),
+        ("frames.1.file_path", ABSENT, ("file_path", 1)),
+        ("frames.1.file_path", "images/000.png", "2 views are named '000.png'"),
+        ("frames.1.transform_matrix", [[1, 2], [3, 4]], ("transform_matrix[2]", 1)),
+        ("frames.0.transform_matrix", np.diag([1, 1, -1, 1]).tolist(), ("transform_matrix", 0)),
+        ("frames.0.transform_matrix", np.diag([1, 2, 3, 1]).tolist(), ("transform_matrix", 0)),
+        ("frames.0.transform_matrix", "x", ("transform_matrix", 0)),
+        ("frames.0.transform_matrix.0.0", "x" * 999, ("transform_matrix[0][0]", 0)),
+        ("frames.1.transform_matrix.1.1", {}, ("transform_matrix[1][1]", 1)),
+        ("frames.1.transform_matrix.2.1", [], ("transform_matrix[2][1]", 1)),
+        ("frames.1.transform_matrix.2.3", ABSENT, ("transform_matrix[2][3]", 1)),
+        ("frames.0.k1", [], ("k1", 0)),
+        ("frames.0.k1", "x", ("k1", 0)),
+        ("frames.1.k4", 0.1, ("k4", 1)),
+        ("frames.0.k5", 0.1, ("k5", 0)),
+        ("k4", -2, ("k4", 0)),
+        ("s3", 1e-3, ("s3", 0)),
+        ("w", ABSENT, (None, 0)),
+        ("w", 8.5, ("w", 0)),
+        ("frames.1.h", 6.25, ("h", 1)),
+        ("fl_x", ABSENT, (None, 0)),
+        ("fl_x", -3, (None, 0)),
+        ("camera_model", "ORTHOPHOTO", "ORTHOPHOTO"),
+        ("camera_model", "EQUIRECTANGULAR", (None, 0)),
+    ],
+    "views": [
+        ("version", 2, "version 2"),
+        ("views", [], "no views found"),
+        ("views.0.K", ABSENT, ("K", 0)),
+        ("views.1.K", [1, 2], ("K[2]", 1)),
+        ("views.0.K", [[1e308, 0, 1], [0, 9, 1], [0, 0, 1]], (None, 0)),
+        ("views.1.weight", -1, ("weight", 1)),
+        ("views.1.width", 80.5, ("width", 1)),
+        ("views.0.height", math.inf, ("height", 0)),
+        ("views.0.camera_from_world", np.zeros((4, 4)).tolist(), ("camera_from_world", 0)),
+        ("views.0.split", 3, ("split", 0)),
+        ("views.0.name", 3, ("name", 0)),
+        ("views.0.distortion", [math.nan] * 5, ("distortion[0]", 0)),
+        ("views.0.distortion", [1e300], (None, 0)),
+    ],
+    "cameras.json": [
+        ("1.fx", ABSENT, ("fx", 1)),
+        ("1.fx", "wide", ("fx", 1)),
+        ("1.fx", 0, (None, 1)),
+        ("1.rotation", np.zeros((3, 3)).tolist(), ("rotation", 1)),
+        ("1.rotation", np.diag([1.0, 1, -1]).tolist(), ("rotation", 1)),
+        ("1.position", [0, math.nan, 0], ("position[1]", 1)),
+        ("1.position", [0, 1], ("position[2]", 1)),
+        ("1.position", 3, ("position", 1)),
+        ("1.width", 80.5, ("width", 1)),
+    ],
+    "dataparser_transforms.json": [
+        ("transform", None, ("transform", None)),
+        ("transform", [[1, 2], [3, 4]], ("transform[2]", None)),
+        ("transform", (2 * np.eye(4)[:3]).tolist(), ("transform", None)),
+        ("scale", 0, ("scale", None)),
+        ("scale", "big", ("scale", None)),
+    ],
+    "transforms of a run": [
+        ("applied_scale", 0, ("applied_scale", None)),
+        ("applied_scale", "x", ("applied_scale", None)),
+        ("applied_transform", [[1], [2, 3]], ("applied_transform[2]", None)),
+        ("train_filenames", 5, ("train_filenames", None)),
+    ],
+    "meta.json": [
+        ("version", 3, ("version", None)),
+        ("count", "ten", ("count", None)),
+        ("count", True, ("count", None)),
+        ("count", 0, "has no Gaussians"),
+        ("means", [], ("means", None)),
+        ("means", {}, ("means.files", None)),
+        ("means.mins", {}, ("means.mins", None)),
+        ("means.mins", [0, 1], ("means.mins[2]", None)),
+        ("means.mins", [0, None, 1], ("means.mins[1]", None)),
+        ("means.maxs", [0, 1, 1e308], ("means.maxs[2]", None)),
+        ("means.maxs", math.inf, ("means.maxs", None)),
+        ("means.files", {}, ("means.files", None)),
+        ("scales.files", [5], ("scales.files[0]", None)),
+        ("scales.files", ["a\nb"], ("scales.files[0]", None)),
+        ("scales.files", [""], ("scales.files[0]", None)),
+        ("scales.codebook", 5, ("scales.codebook", None)),
+        ("scales.codebook", [1.0], ("scales.codebook", None)),
+        ("quats", "x", ("quats", None)),
+        ("quats.files", [], ("quats.files[0]", None)),
+        ("sh0.codebook", [0, -1e308] * 128, ("sh0.codebook[1]", None)),
+        ("shN.codebook", ["x"] * 256, ("shN.codebook[0]", None)),
+        ("shN.bands", {}, ("shN.bands", None)),
+        ("g2ard", {"offset": [0, "x", 1]}, ("g2ard.offset[1]", None)),
+    ],
+    "lod-meta.json": [
+        ("filenames", ["a" * 5000 + "/meta.json"], ("filenames[0]", None)),
+        ("filenames", [5], ("filenames[0]", None)),
+        ("filenames", ["a\n/meta.json"], ("filenames[0]", None)),
+        ("tree", [], ("tree", None)),
+        ("tree", {"lods": []}, ("tree.lods", None)),
+        ("tree", {"lods": {"0": {"file": -1}}}, ("tree.lods.0.file", None)),
+        ("tree", {"lods": {"0": {"file": 2}}}, ("tree.lods.0.file", None)),
+        ("tree", {"lods": {"0": {"file": 0.5}}}, ("tree.lods.0.file", None)),
+        ("tree", {"children": [{}, 5]}, ("tree.children[1]", None)),
+        ("tree", {"children": {}}, ("tree.children", None)),
+    ],
+    "glb": [
+        ("nodes", [MESH, {"children": [-2]}], ("nodes[1].children[0]", None)),
+        ("nodes", [MESH, {"children": [0, 2]}], ("nodes[1].children[1]", None)),
+        ("nodes", [MESH, {"children": [[]]}], ("nodes[1].children[0]", None)),
+        ("nodes", [MESH, 5], ("nodes[1]", None)),
+        ("nodes", [MESH | {"children": [1]}, {"children": [0]}], "node 0 is its own ancestor"),
+        ("nodes", [MESH, {"children": [0]}, {"children": [0]}], "node 0 has 2 parents"),
+        ("nodes", [MESH | {"translation": [[1], [2], [3]]}], ("nodes[0].translation[0]", None)),
+        ("nodes", [MESH | {"translation": [1]}], ("nodes[0].translation[1]", None)),
+        ("nodes", [MESH | NODE_FAR, NODE_FAR | {"children": [0]}], r"invalid translation \(inf, inf, inf\)"),
+        *(
+            (place, index, (re.sub(r"\.(\d+)", r"[\1]", place), None))
+            for place in (
+                "meshes.0.primitives.0.attributes.POSITION",
+                "accessors.0.bufferView",
+                "bufferViews.0.buffer",
+            )
+            for index in (-1, 99, "x", True, None, [])
+        ),
+    ],
+}
+"""Kind of file → properties with another value or none, and what the error then names."""
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize(
+    ("what", "place", "value", "fault"), [(what, *row) for what, rows in FAULTS.items() for row in rows]
+)
+def test_a_wrong_property_is_named(tmp_path: Path, what: str, place: str, value: Any, fault: Fault) -> None:
+    path = (
+        transforms(tmp_path / "a.json", orbit(2), fl_y=None)
+        if what == "transforms"
+        else MAKERS[what](tmp_path)
+    )
+    document, binary = glb_parts(path) if what == "glb" else (json.loads(path.read_text()), b"")
+    holder: Any = document
+    *above, last = [int(key) if key.isdigit() else key for key in place.split(".")]
+    for key in above:
+        holder = holder[key]
+    if value is ABSENT:
+        del holder[last]
+    else:
+        holder[last] = value
+    if what == "glb":
+        write_glb(path, document, binary)
+    else:
+        path.write_text(json.dumps(document))
+    asked = tmp_path / READ[what] if what in READ else path
+    with faulty(path, fault):
+        {"splats": read_scene, "views": read_view_set}[kind(asked)](asked)
 
 
 def packed(head: bytes) -> bytes:

@@ -1,11 +1,8 @@
 """g2ard's own file of views."""
 
 import json
-import math
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +11,6 @@ from hypothesis import strategies as st
 
 from g2ard.errors import InputError, OutputError
 from g2ard.io import read_view_set, read_views, write_views
-from helpers.faults import Fault, faulty
 from helpers.view_files import edit, views
 
 
@@ -66,36 +62,6 @@ def test_own_views_name_photos_splits_and_weights(tmp_path: Path) -> None:
     assert train.weights.tolist() == [1, 2]
     (tmp_path / "photos" / "2.png").unlink()
     assert [(n.code, n.count) for n in read_view_set(path).notes] == [("missing_photos", 1)]
-
-
-@pytest.mark.parametrize(
-    ("change", "fault"),
-    [
-        (lambda c: c.update(version=2), "version 2"),
-        (lambda c: c["views"][0].pop("K"), ("K", 0)),
-        (lambda c: c["views"][1].update(K=[1, 2]), ("K[2]", 1)),
-        (lambda c: c["views"][1].update(weight=-1), ("weight", 1)),
-        (lambda c: c["views"][1].update(width=80.5), ("width", 1)),
-        (lambda c: c["views"][0].update(height=math.inf), ("height", 0)),
-        (lambda c: c.update(views=[]), "no views found"),
-        *[
-            (lambda c, change=change: c["views"][0].update(change), fault)
-            for change, fault in (
-                ({"camera_from_world": np.zeros((4, 4)).tolist()}, ("camera_from_world", 0)),
-                ({"split": 3}, ("split", 0)),
-                ({"name": 3}, ("name", 0)),
-                ({"distortion": [math.nan] * 5}, ("distortion[0]", 0)),
-                ({"distortion": [1e300]}, (None, 0)),
-                ({"K": [[1e308, 0, 1], [0, 9, 1], [0, 0, 1]]}, (None, 0)),
-            )
-        ],
-    ],
-)
-def test_bad_own_views(tmp_path: Path, change: Callable[[dict[str, Any]], Any], fault: Fault) -> None:
-    write_views(tmp_path / "a.json", views(2))
-    edit(tmp_path / "a.json", change)
-    with faulty(tmp_path / "a.json", fault):
-        read_views(tmp_path / "a.json")
 
 
 def test_a_whole_width_may_be_a_float(tmp_path: Path) -> None:
