@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from helpers.writing_commands import write_inputs
+from helpers.calls import write_inputs
 
 
 @pytest.fixture(scope="session")

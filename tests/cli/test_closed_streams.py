@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
+from helpers.calls import CALLS, FIRST, output_of
 from helpers.killed import command, forked
 from helpers.project import environment
-from helpers.writing_commands import COMMANDS, TRAIN
 
 pytestmark = pytest.mark.skipif(os.name == "nt", reason="needs a POSIX shell")
 
@@ -44,12 +44,12 @@ def run(folder: Path, words: str, closed: str) -> tuple[int, str]:
     return status, (folder / "streams").read_text()
 
 
-@pytest.mark.parametrize("output", COMMANDS)
-def test_every_command_writes_its_result(output: str, inputs: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", [*FIRST, "simplify tiles"])
+def test_every_command_writes_its_result(name: str, inputs: Path, tmp_path: Path) -> None:
     folder = shutil.copytree(inputs, tmp_path / "a")
-    words = COMMANDS[output].replace("--workers 1", "--workers 2")  # processes that inherit the streams
+    words = CALLS[name].replace("--workers 1", "--workers 2")  # processes that inherit the streams
     assert run(folder, f"{words} --json told.json", ">&- 2>&-") == (0, "")
-    assert (folder / output).exists()
+    assert (folder / output_of(name)).exists()
     assert (folder / "told.json").read_text()[0] == "{"
 
 
@@ -62,7 +62,7 @@ def test_every_command_writes_its_result(output: str, inputs: Path, tmp_path: Pa
         ("simplify ball.ply -r 8 --no-views -o small.ply -w", 0),
         ("info ball.ply", 0),
         ("info ball.ply --json -", 0),
-        (f"evaluate ball.ply {TRAIN.replace('--steps 2 ', '')}", 0),
+        (f"{CALLS['evaluate']} --teacher ball.ply", 0),
         ("info missing.ply", 1),
         ("simplify missing.ply -r 8 -o small.ply", 1),
         ("simplify", 2),

@@ -3,18 +3,14 @@
 import json
 import re
 import shutil
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
-from PIL import Image
 
-import g2ard
-from helpers.commands import CommandLine
-from helpers.photos import cloud_of, photographed
-from helpers.scenes import around, checkered_ball, under_a_sky
+from g2ard.cli.app import COMMANDS
+from helpers.calls import CALLS, VALUES, flag_of, options_of, without
+from helpers.commands import CommandLine, succeeds
 
 NO_RESULT = {
     **dict.fromkeys(("quiet", "verbose", "json"), "say more or less"),
@@ -40,233 +36,6 @@ OWN = {
 and a matcher that finds no features gives way to direct alignment; evaluate uses the photos in any case.
 """
 
-TRAIN = "--views photos.json --size 24 --steps 3"
-BASES = {
-    "distill": f"distill ball.ply -r 8 {TRAIN} --renders --no-page -o out",
-    "simplify": "simplify ball.ply -r 8 --views photos.json -o out.ply",
-    "recover": f"recover small.ply {TRAIN} --teacher ball.ply -o out.ply",
-    "adapt": f"adapt small.ply {TRAIN} --teacher ball.ply -o out.ply",
-    "lift": "lift cloud.ply -o out.ply",
-    "convert": "convert ball.ply out.ply",
-    "clean": "clean stray.ply -o out.ply",
-    "poses": "poses ball.ply -k 8 -o out.json",
-    "select": "select ball.ply --views photos.json -k 4 -o out.json",
-    "render": "render ball.ply --views photos.json --size 24 -o out",
-    "view": "view ball.ply -o out.html",
-    "lod": "lod sky.ply -r 2,4 --views photos.json --size 24 --merge-only -o out",
-    "evaluate": "evaluate small.ply --views photos.json --size 24 --json out.json",
-    "compare": "compare ball.ply small.ply --views photos.json --size 24 --json out.json",
-    "ingest": "ingest ball.ply -o out",
-    "register": (
-        "register ball.ply --images two.json --poses moved.json --matcher direct --keep all -o out.json"
-    ),
-    "info": "info ball.ply --json -",
-}
-COMMON = {
-    "views": "--views few.json",
-    "images": "--images nowhere",
-    "size": "--size 20",
-    "background": "--background 1,1,1",
-    "up": "--up 1,0,0",
-    "render_model": "--render-model antialiased",
-    "count": "-n 40",
-    "ratio": "-r 9",
-    "fit": "--fit 9kB",
-    "min_psnr": "--min-psnr 20",
-    "min_ssim": "--min-ssim 0.6",
-    "method": "--method fast",
-    "keep_region": "--keep-region 0,0,1,0.5",
-    "schedule": "--schedule paper",
-    "steps": "--steps 4",
-    "tile_rows": "--tile-rows 100",
-    "sh_degree": "--sh-degree 0",
-    "split": "--split test",
-    "preset": "--preset paper",
-    "looks": "-k 9",
-    "format": "--format inria",
-    "teacher": "--teacher sky.ply",
-    "alpha": "--alpha mask",
-    "photos": "--photos",
-    "convention": "--convention inria",
-}
-"""Words that are tried of options that several commands have."""
-
-
-def _common(names: str) -> dict[str, str]:
-    return {name: COMMON[name] for name in names.split()}
-
-
-OPTIONS: dict[str, dict[str, str]] = {
-    "distill": {
-        **_common("count ratio fit min_psnr min_ssim views alpha photos method keep_region schedule"),
-        **_common("steps sh_degree size background up tile_rows render_model"),
-        "images": "--images other --photos",
-        "held_out": "--held-out few.json",
-        "preset": "--preset lift",
-        "keep": "--keep",
-        "format": "--format splat",
-        "views_format": "--views-format inria",
-        "clean": "--clean",
-        "page": "--page",
-        "focus": "--focus far",
-    },
-    "simplify": {
-        **_common("count ratio fit min_psnr min_ssim views images preset method keep_region up"),
-        **_common("tile_rows render_model"),
-        "no_views": "--no-views",
-        "parents": "--parents rows.npy",
-    },
-    "recover": {
-        **_common("views teacher photos schedule steps sh_degree split size background render_model"),
-        "images": "--images other --photos",
-        "alpha": "--alpha mask --photos",
-        "anchors": "--anchors fewer.ply --set period=1",
-        "preset": "--preset lift --steps 200",
-        "weighted": "--no-weights",
-    },
-    "adapt": {
-        **_common("views photos alpha teacher steps schedule sh_degree split size background preset"),
-        **_common("render_model"),
-        "images": "--images other",
-        "tolerance": "--tolerance 0 --steps 600",
-        "prior_views": "--prior-views 9",
-    },
-    "lift": {
-        "neighbors": "--neighbors 5",
-        "spread": "--spread 2",
-        "normal_ratio": "--normal-ratio 0.3",
-        "max_anisotropy": "--max-anisotropy 1.1",
-        "opacity": "--opacity 0.9",
-    },
-    "convert": {
-        **_common("sh_degree render_model"),
-        "box": "--box -1,-1,0,1,1,1",
-        "sphere": "--sphere 0,0,1,0.5",
-        "where": "--where z<0",
-        "invert": "--where z<0 --invert",
-        "layout": "--layout inria",
-        "from_axes": "--from-axes RUB",
-        "transform": "--transform move.txt",
-        "scale": "--scale 2",
-        "rotate": "--rotate 0,0,90",
-        "translate": "--translate 1,0,0",
-        "recentre": "--recentre --translate 5,0,0",
-        "to_axes": "--to-axes RUB",
-        "spz_version": "--spz-version 3",
-        "compress": "--compress",
-    },
-    "clean": {
-        **_common("render_model"),
-        "only": "--only none",
-        "split_sky": "--split-sky sky_alone.ply",
-        "strength": "--strength 0.9",
-        "preview": "--preview found.png",
-    },
-    "poses": {
-        **_common("format looks up"),
-        "kind": "--kind aerial",
-        "size": "--size 64x48",
-        "fov": "--fov 30",
-    },
-    "select": {
-        **_common("format views images preset"),
-        "k": "-k 5",
-        "policy": "--policy coverage",
-        "split": "--split all",
-    },
-    "render": {
-        **_common("views images looks convention split size background up render_model"),
-        "turn": "--orbit 8 -o out.webp",
-        "fps": "--fps 9",
-        "sheet": "--sheet look.png",
-        "depth": "--depth",
-        "around": "--panorama",
-    },
-    "view": {
-        **_common("views images background up render_model"),
-        "start": "--start 3,0,0",
-    },
-    "lod": {
-        **_common("views images steps size background up tile_rows render_model"),
-        "ratios": "-r 2,5",
-        "recover": "--recover --steps 30",
-        "environment": "--environment --ratios 2,4",
-        "most": "--chunk-count 1",
-        "extent": "--chunk-extent 0.5 --chunk-min 1",
-        "least": "--chunk-min 1 --chunk-extent 0.5",
-        "kind": "--format 3dtiles",
-        "place": "--georeference 25,59,30",
-    },
-    "evaluate": {
-        **_common("views alpha convention size background render_model"),
-        "images": "--images other",
-        "teacher": "--teacher ball.ply",
-        "anchors": "--anchors fewer.ply",
-        "output": "-o page.html ball.ply --teacher ball.ply",
-        "eight_bit": "--8bit",
-        "split": "--split all",
-    },
-    "compare": {
-        **_common("views images size background render_model"),
-        "output": "-o page.html",
-        "looks": "-k 5",
-    },
-    "ingest": {
-        **_common("tile_rows render_model"),
-    },
-    "register": {
-        **_common("format split alpha background render_model"),
-        "photos": "--photos photos.json",
-        "poses": "--poses photos.json",
-        "intrinsics": "--intrinsics few.json",
-        "focal": "--focal 50",
-        "size": "--size 40",
-        "refine": "--refine none",
-        "passes": "--passes 1",
-        "accept": "--accept 0.99 --keep registered",
-        "keep": "--keep registered --accept 0.99",
-        "protocol": "--protocol gs-cpr",
-        "truth": "--truth few.json --json told.json",
-        "metres_per_unit": "--metres-per-unit 2",
-        "report": "--report page.html",
-    },
-    "info": {
-        "images": "--images other",
-        "devices": "--devices",
-    },
-}
-
-
-@pytest.fixture(scope="module")
-def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Photos are half transparent, and those in `other` are of another scene."""
-    folder = tmp_path_factory.mktemp("inputs")
-    ball, views = checkered_ball(300), around(16, (48, 36))
-    small = g2ard.simplify(ball, count=40, blind=True).splats
-    g2ard.save(folder / "ball.ply", ball)
-    g2ard.save(folder / "small.ply", small)
-    g2ard.save(folder / "fewer.ply", replace(small, means=small.means * np.float32(1.02)))
-    g2ard.save(folder / "sky.ply", under_a_sky(ball))
-    faint = replace(ball, logit_opacities=np.where(np.arange(300) < 20, -9, 3).astype(np.float32))
-    g2ard.save(folder / "stray.ply", under_a_sky(faint))
-    cloud_of(folder / "cloud.ply", ball)
-    for name, scene in (("photos", ball), ("other", checkered_ball(300, seed=1))):
-        (folder / name).mkdir()
-        pictured = photographed(folder / name, scene, views)
-        for path in (folder / name).glob("*.png"):
-            with Image.open(path) as photo:
-                photo.putalpha(Image.linear_gradient("L").resize(photo.size))
-                photo.save(path)
-        if name == "photos":
-            g2ard.save_views(folder / "photos.json", pictured, weights=np.arange(1.0, 17.0))
-            g2ard.save_views(folder / "two.json", pictured.take([0, 1]), splits=["train", "test"])
-            moved = pictured.viewmats.copy()
-            moved[:, :3, 3] += 0.1
-            g2ard.save_views(folder / "moved.json", replace(pictured, viewmats=moved))
-    g2ard.save_views(folder / "few.json", around(10, (48, 36), 2.5))
-    np.savetxt(folder / "move.txt", np.diag([2.0, 2.0, 2.0, 1.0]))
-    return folder
-
 
 def _written(folder: Path, before: set[Path], told: str) -> dict[str, Any]:
     """Return what a command wrote, without times, and what it says on stdout."""
@@ -290,10 +59,17 @@ def _timeless(content: Any) -> Any:
     return [_timeless(value) for value in content] if isinstance(content, list) else content
 
 
-def _base(command: str, preset: str) -> str:
-    words = BASES[command] + preset
-    blind = command == "simplify" and preset  # the paper's method has no views
-    return words.replace(" --views photos.json", "") if blind else words
+BUDGETS = ("count", "ratio", "fit", "min_psnr", "min_ssim")
+
+
+def _base(command: str, option: str, preset: str = "") -> str:
+    """Return the plainest call of a command that the option can be added to, with a result to compare."""
+    words = CALLS[command] + preset
+    if command == "simplify" and preset:  # the paper's method has no views
+        words = words.replace(" --views photos.json", "")
+    if " -o " not in words:
+        words += " --json -" if command == "info" else " --json out.json"
+    return words.replace(" -r 8", "") if option in BUDGETS else words
 
 
 class Runner:
@@ -315,7 +91,7 @@ class Runner:
         return error if status else "", written
 
     def base(self, command: str, preset: str) -> dict[str, Any]:
-        words = _base(command, preset)
+        words = _base(command, "", preset)
         if words not in self.usual:
             error, self.usual[words] = self.run(words)
             assert not error
@@ -329,10 +105,10 @@ def runner(inputs: Path, tmp_path_factory: pytest.TempPathFactory, command_line:
 
 OF_THE_PAPER = ("preset", "schedule", "weighted", "no_views")
 """Options that `--preset paper` sets itself."""
-CASES = [(command, name, "") for command, table in OPTIONS.items() for name in table] + [
+CASES = [(command, name, "") for command, table in VALUES.items() for name in table] + [
     (command, name, " --preset paper")
     for command in ("distill", "simplify", "recover", "adapt", "select")
-    for name in OPTIONS[command]
+    for name in VALUES[command]
     if name not in OF_THE_PAPER
 ]
 
@@ -341,11 +117,9 @@ CASES = [(command, name, "") for command, table in OPTIONS.items() for name in t
 def test_an_option_changes_the_result_or_is_refused(
     command: str, option: str, preset: str, runner: Runner
 ) -> None:
-    words, budgets = _base(command, preset), ("count", "ratio", "fit", "min_psnr", "min_ssim")
-    if option in budgets and command in ("distill", "simplify"):
-        words = words.replace(" -r 8", "")
     usual = runner.base(command, preset)
-    error, result = runner.run(f"{words} {OPTIONS[command][option]}")
+    given = f"{flag_of(command, option)} {VALUES[command][option]}"
+    error, result = runner.run(f"{_base(command, option, preset)} {given}")
     if error:
         assert error.count("\n") == 1 or error.splitlines()[-1].startswith("g2ard"), error
         assert "internal error" not in error
@@ -353,16 +127,32 @@ def test_an_option_changes_the_result_or_is_refused(
         assert result != usual
 
 
-def test_the_tables_hold_every_option() -> None:
-    from typer.main import get_command
+@pytest.mark.parametrize("command", VALUES)
+def test_a_config_file_says_the_same_as_flags(command: str, inputs: Path, command_line: CommandLine) -> None:
+    """So does the config that is printed of either."""
+    file = inputs / f"{command}.toml"
 
-    from g2ard.cli.app import register_commands
-    from g2ard.cli.command import app
+    def config(words: list[str], table: str) -> str:
+        file.write_text(f"[{command}]\n{table}")
+        return succeeds(command_line, inputs, *words, "--config", file.name, "--print-config").out
 
-    register_commands()
-    commands = get_command(app).commands  # type: ignore[attr-defined]
-    for command, table in OPTIONS.items():
-        named = {p.name for p in commands[command].params if p.param_type_name == "option"}
+    for option, given in VALUES[command].items():
+        parameter, flag = options_of(command)[option], flag_of(command, option)
+        excluded = ["views"] * (option == "no_views")
+        words = without(_base(command, option).split(), option, *excluded)
+        value, more = ("", given.split()) if parameter.is_flag else (given.split()[0], given.split()[1:])
+        by_flag = config([*words, flag, *given.split()], "")
+        on = json.dumps(value or flag not in parameter.secondary_opts)
+        key = max((found for found in parameter.opts if found[:2] == "--"), key=len, default=option).lstrip(
+            "-"
+        )
+        rest = without([command, *more], option)[1:]
+        assert config([*words, *rest], f"{key} = {on}\n") == by_flag, option
+        assert config([command], by_flag.partition("\n")[2]) == by_flag, option
+
+
+def test_the_table_holds_every_option() -> None:
+    assert VALUES.keys() == COMMANDS.keys()
+    for command, table in VALUES.items():
         apart = set(NO_RESULT) | set(OWN.get(command, ())) | {"output", "help"}
-        assert named - apart == set(table) - {"output"}, command
-    assert set(commands) == set(OPTIONS)
+        assert options_of(command).keys() - apart == set(table) - {"output"}, command

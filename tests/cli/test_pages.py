@@ -10,9 +10,9 @@ import pytest
 from PIL import Image
 
 from g2ard.config.choices import BLACK
+from helpers.calls import CALLS, write_inputs
 from helpers.commands import CommandLine, succeeds
 from helpers.photos import photos_of
-from helpers.writing_commands import write_inputs
 
 OTHER_WORDS = re.compile(r"\b(teacher|student|reference|original|recovered|distilled|prior)\b", re.I)
 """Words that nobody reads for the dense scene, the target or the result."""
@@ -62,10 +62,7 @@ PAGES: dict[str, tuple[str | None, list[str]]] = {
         "lod ball.ply -r 4,8 --merge-only --views views.json -o levels",
         ["ball.ply"],
     ),
-    "found.html": (
-        "register ball.ply --images photos.json --matcher direct --report found.html -o poses.json",
-        [],
-    ),
+    "page.html": (CALLS["register"], []),
 }
 """Page → the command that writes it, unless an earlier one did, and its labels from left to right."""
 
@@ -137,7 +134,7 @@ def test_photos_alone_show_the_photo_beside_the_result(of_photos: tuple[Path, st
 
 
 CLOUD_COMMANDS = [
-    "simplify autumn.ply -r 8 --no-views -o small.ply",
+    "simplify autumn.ply -r 8 --no-views -o reduced.ply",
     "distill autumn.ply -r 8 --views made --steps 2 --size 24 --page -o run",
     "distill autumn.ply -r 8 --views photos.json --steps 2 -o run",
     "distill autumn.ply -r 1 --views made --steps 2 --size 24 -o run",

@@ -10,49 +10,9 @@ from pathlib import Path
 import pytest
 
 import g2ard
-from g2ard.io import write_views
 from helpers.commands import CommandLine, interrupt_at_checkpoint, program, refused, succeeds
-from helpers.photos import photographed
-from helpers.scenes import around, checkered_ball
+from helpers.scenes import checkered_ball
 from helpers.systems import needs_signals
-
-
-def test_resuming_a_finished_run_says_so(command_line: CommandLine, folder: Path) -> None:
-    ask = ("distill", "ball.ply", "-r", 10, "-o", "run", "--steps", 5, "--size", 48)
-    assert command_line(*ask, cwd=folder)[0] == 0
-    before = (folder / "run" / "scene.ply").stat().st_mtime_ns
-    status, _, error = command_line(*ask, "--resume", cwd=folder)
-    assert (status, error.count("\n")) == (0, 1), error
-    assert "run: already finished" in error
-    assert (folder / "run" / "scene.ply").stat().st_mtime_ns == before
-    teacher = ("--views", "views.json", "--teacher", "ball.ply")
-    ask = ("recover", "ball.ply", *teacher, "-o", "b.ply", "--steps", 3)
-    succeeds(command_line, folder, *ask)
-    assert "b.ply: already finished" in succeeds(command_line, folder, *ask, "--resume").err
-
-
-@pytest.mark.parametrize(
-    ("words", "names"),
-    [
-        ("distill ball.ply -r 10 --no-page -o run", ("ball.ply", "photos.json", "view_003.png")),
-        ("recover ball.ply -o out.ply", ("ball.ply", "photos.json")),
-    ],
-)
-def test_a_run_of_other_inputs_is_not_finished(
-    words: str, names: tuple[str, ...], folder: Path, command_line: CommandLine
-) -> None:
-    write_views(folder / "photos.json", photographed(folder, checkered_ball(400), around(16, (48, 36))))
-    ask = (*words.split(), "--views", "photos.json", "--steps", 2)
-    succeeds(command_line, folder, *ask)
-    assert "already finished" in succeeds(command_line, folder, *ask, "--resume").err
-    for name in names:
-        path, content, times = folder / name, (folder / name).read_bytes(), (folder / name).stat()
-        path.write_bytes(content + b"\n")
-        line = refused(command_line, folder, *ask, "--resume", status=1)
-        assert f"finished before {name} changed" in line
-        path.write_bytes(content)
-        os.utime(path, ns=(times.st_atime_ns, times.st_mtime_ns))
-
 
 SHORT = ("distill", "ball.ply", "--steps", 5, "--size", 48)
 

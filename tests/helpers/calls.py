@@ -1,0 +1,312 @@
+"""Working calls of every command, a value of each of its options, and the files that they name.
+
+What holds for all commands is tested on these. The options of a command, their flags, and whether it can be
+resumed come from the command itself.
+"""
+
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+import g2ard
+from helpers.photos import cloud_of, photographed
+from helpers.scenes import around, checkered_ball, under_a_sky
+
+_VIEWED = "--views photos.json --size 24"
+_TRAINED = f"{_VIEWED} --steps 3"
+_TAUGHT = f"{_TRAINED} --teacher ball.ply"
+_TILED = "--tile-rows 150 --workers 1"
+CALLS = {
+    "distill": f"distill ball.ply -r 8 {_TRAINED} --renders --no-page -o out",
+    "distill a page": f"distill ball.ply -r 8 {_TRAINED} --renders --keep --format sog -o out",
+    "distill tiles": f"distill ball.ply -r 8 {_TRAINED} --renders --focus far --no-page {_TILED} -o out",
+    "simplify": "simplify ball.ply -r 8 --views photos.json -o out.ply",
+    "simplify blind": "simplify ball.ply -r 8 --no-views --parents rows.npy -o out.ply",
+    "simplify tiles": f"simplify ball.ply -r 8 --views photos.json {_TILED} -o out.ply",
+    "recover": f"recover small.ply {_TAUGHT} -o out.ply",
+    "recover a folder": f"recover small.ply {_TAUGHT} -o out/meta.json",
+    "adapt": f"adapt small.ply {_TAUGHT} -o out.ply",
+    "register": (
+        "register ball.ply --images two.json --poses moved.json --matcher direct --keep all "
+        "--report page.html -o out.json"
+    ),
+    "lift": "lift cloud.ply -o out.ply",
+    "ingest": "ingest ball.ply small.ply --tile-rows 150 -o out",
+    "ingest a cloud": "ingest cloud.ply --tile-rows 150 -o out",
+    "convert": "convert ball.ply -o out.ply",
+    "clean": "clean stray.ply -o out.ply",
+    "clean a sky": "clean sky.ply --split-sky far.ply --preview found.png -o out.ply",
+    "poses": "poses ball.ply -k 8 -o out.json",
+    "select": "select ball.ply --views photos.json -k 4 -o out.json",
+    "render": f"render ball.ply {_VIEWED} --sheet look.png -o out",
+    "render an orbit": "render ball.ply --orbit 4 --size 32 -o out.webp",
+    "view": "view ball.ply --views photos.json -o out.html",
+    "lod": f"lod sky.ply -r 2,4 {_VIEWED} --merge-only -o out",
+    "lod with recovery": f"lod ball.ply -r 1,4 {_TRAINED} -o out",
+    "lod tiles": f"lod ball.ply -r 1,4 {_TRAINED} {_TILED} -o out",
+    "lod as 3D Tiles": f"lod ball.ply -r 4,8 {_VIEWED} --merge-only --format 3dtiles -o out",
+    "evaluate": f"evaluate small.ply {_VIEWED}",
+    "evaluate on a page": f"evaluate ball.ply small.ply {_VIEWED} --teacher ball.ply -o out.html",
+    "compare": f"compare ball.ply small.ply {_VIEWED}",
+    "compare on a page": f"compare ball.ply small.ply {_VIEWED} -o out.html",
+    "info": "info ball.ply",
+}
+"""Name, which begins with the command → arguments, of which the last is the output if there is one."""
+
+WRITING = [name for name, words in CALLS.items() if " -o " in words]
+FIRST = list({name.split()[0]: name for name in reversed(WRITING)}.values())
+"""The first call of each command that writes an output."""
+
+
+def output_of(name: str) -> str:
+    """Return the main file or folder that a call writes."""
+    words = CALLS[name].split()
+    inside = {
+        "distill": f"scene.{'sog' if 'sog' in words else 'ply'}",
+        "lod": "tileset.json" if "3dtiles" in words else "lod-meta.json",
+        "ingest": "tiles.json",
+    }
+    return f"{words[-1]}/{inside[words[0]]}" if words[0] in inside else words[-1]
+
+
+@cache
+def options_of(name: str) -> dict[str, Any]:
+    """Return the options of a command, or of a call's command, by name, as its parser has them."""
+    from typer.main import get_command
+
+    from g2ard.cli.app import register_commands
+    from g2ard.cli.command import app
+
+    register_commands()
+    command = get_command(app).commands[name.split()[0]]  # type: ignore[attr-defined]
+    return {p.name: p for p in command.params if p.param_type_name == "option"}
+
+
+def flag_of(command: str, option: str) -> str:
+    """Return the long flag of an option; of one that is on in its command's call, its opposite."""
+    found = options_of(command)[option]
+    off = found.default is True and not {*found.secondary_opts} & {*CALLS[command].split()}
+    return max(found.secondary_opts if off else found.opts, key=len)
+
+
+def without(words: list[str], *options: str) -> list[str]:
+    """Return the words of a call without some options and their values."""
+    found = [options_of(words[0])[name] for name in options]
+    flags = {flag: option for option in found for flag in (*option.opts, *option.secondary_opts)}
+    rest, kept = iter(words), []
+    for word in rest:
+        if word not in flags:
+            kept.append(word)
+        elif not flags[word].is_flag:
+            next(rest)
+    return kept
+
+
+COMMON = {
+    "views": "few.json",
+    "images": "nowhere",
+    "size": "20",
+    "background": "0.25,0.5,0",
+    "up": "1,0,0",
+    "render_model": "antialiased",
+    "count": "40",
+    "ratio": "9",
+    "fit": "9kB",
+    "min_psnr": "20",
+    "min_ssim": "0.6",
+    "method": "fast",
+    "keep_region": "0,0,1,0.5",
+    "schedule": "paper",
+    "steps": "4",
+    "tile_rows": "100",
+    "sh_degree": "0",
+    "split": "test",
+    "preset": "paper",
+    "looks": "9",
+    "format": "inria",
+    "teacher": "sky.ply",
+    "alpha": "mask",
+    "photos": "",
+    "convention": "inria",
+}
+"""Values of options that several commands have."""
+
+
+def _common(names: str) -> dict[str, str]:
+    return {name: COMMON[name] for name in names.split()}
+
+
+VALUES: dict[str, dict[str, str]] = {
+    "distill": {
+        **_common("count ratio fit min_psnr min_ssim views alpha photos method keep_region schedule"),
+        **_common("steps sh_degree size background up tile_rows render_model"),
+        "images": "other --photos",
+        "held_out": "few.json",
+        "preset": "lift",
+        "keep": "",
+        "format": "splat",
+        "views_format": "inria",
+        "clean": "",
+        "page": "",
+        "focus": "far",
+    },
+    "simplify": {
+        **_common("count ratio fit min_psnr min_ssim views images preset method keep_region up"),
+        **_common("tile_rows render_model"),
+        "no_views": "",
+        "parents": "rows.npy",
+    },
+    "recover": {
+        **_common("views teacher photos schedule steps sh_degree split size background render_model"),
+        "images": "other --photos",
+        "alpha": "mask --photos",
+        "anchors": "fewer.ply --set period=1",
+        "preset": "lift --steps 200",
+        "weighted": "",
+    },
+    "adapt": {
+        **_common("views photos alpha teacher steps schedule sh_degree split size background preset"),
+        **_common("render_model"),
+        "images": "other",
+        "tolerance": "0 --steps 600",
+        "prior_views": "9",
+    },
+    "lift": {
+        "neighbors": "5",
+        "spread": "2",
+        "normal_ratio": "0.3",
+        "max_anisotropy": "1.1",
+        "opacity": "0.9",
+    },
+    "convert": {
+        **_common("sh_degree render_model"),
+        "box": "-1,-1,0,1,1,1",
+        "sphere": "0,0,0.5,0.9",
+        "where": "x<0.5",
+        "invert": "--where z<0",
+        "layout": "inria",
+        "from_axes": "RUB",
+        "transform": "0,-2,0,5,2,0,0,0,0,0,2,0,0,0,0,1",
+        "scale": "2",
+        "rotate": "0,0,90",
+        "translate": "1,0,0",
+        "recentre": "--translate 5,0,0",
+        "to_axes": "RUB",
+        "spz_version": "3",
+        "compress": "spz",
+    },
+    "clean": {
+        **_common("render_model"),
+        "only": "none",
+        "split_sky": "sky_alone.ply",
+        "strength": "0.9",
+        "preview": "found.png",
+    },
+    "poses": {
+        **_common("format looks up"),
+        "kind": "aerial",
+        "size": "64x48",
+        "fov": "30",
+    },
+    "select": {
+        **_common("format views images preset"),
+        "k": "5",
+        "policy": "coverage",
+        "split": "all",
+    },
+    "render": {
+        **_common("views images looks convention split size background up render_model"),
+        "turn": "8 -o out.webp",
+        "fps": "9",
+        "sheet": "other.png",
+        "depth": "",
+        "around": "",
+    },
+    "view": {
+        **_common("views images background up render_model"),
+        "start": "3,0,0",
+    },
+    "lod": {
+        **_common("views images steps size background up tile_rows render_model"),
+        "ratios": "2,5",
+        "recover": "--steps 30",
+        "environment": "--ratios 2,4",
+        "most": "1",
+        "extent": "0.5 --chunk-min 1",
+        "least": "1 --chunk-extent 0.5",
+        "kind": "3dtiles",
+        "place": "25,59,30",
+    },
+    "evaluate": {
+        **_common("views alpha convention size background render_model"),
+        "images": "other",
+        "teacher": "ball.ply",
+        "anchors": "fewer.ply",
+        "output": "page.html ball.ply --teacher ball.ply",
+        "eight_bit": "",
+        "split": "all",
+    },
+    "compare": {
+        **_common("views images size background render_model"),
+        "output": "page.html",
+        "looks": "5",
+    },
+    "ingest": _common("tile_rows render_model"),
+    "register": {
+        **_common("format split alpha background render_model"),
+        "photos": "photos.json",
+        "poses": "photos.json",
+        "intrinsics": "few.json",
+        "focal": "50",
+        "size": "40",
+        "refine": "none",
+        "passes": "1",
+        "accept": "0.99 --keep registered",
+        "keep": "registered --accept 0.99",
+        "protocol": "gs-cpr",
+        "truth": "few.json --json told.json",
+        "metres_per_unit": "2",
+        "report": "other.html",
+    },
+    "info": {
+        "images": "other",
+        "devices": "",
+    },
+}
+"""Command → each option for the result, a value of it that its plainest call has not, and further words."""
+
+
+def write_inputs(folder: Path) -> None:
+    """Write the files that `CALLS` and `VALUES` name.
+
+    Photos are half transparent, and those in `other` are of another scene.
+    """
+    ball, views = checkered_ball(400), around(16, (48, 36))
+    small = g2ard.simplify(ball, count=40, blind=True).splats
+    g2ard.save(folder / "ball.ply", ball)
+    g2ard.save(folder / "small.ply", small)
+    g2ard.save(folder / "other.ply", ball.take(range(0, 400, 2)))
+    g2ard.save(folder / "fewer.ply", replace(small, means=small.means * np.float32(1.02)))
+    g2ard.save(folder / "sky.ply", under_a_sky(ball))
+    faint = np.where(np.arange(400) < 20, -9, 3).astype(np.float32)
+    g2ard.save(folder / "stray.ply", under_a_sky(replace(ball, logit_opacities=faint)))
+    cloud_of(folder / "cloud.ply", ball)
+    g2ard.save_views(folder / "views.json", views)
+    g2ard.save_views(folder / "few.json", around(10, (48, 36), 2.5))
+    for name, scene in (("photos", ball), ("other", checkered_ball(300, seed=1))):
+        (folder / name).mkdir()
+        pictured = photographed(folder / name, scene, views)
+        for path in (folder / name).glob("*.png"):
+            with Image.open(path) as photo:
+                photo.putalpha(Image.linear_gradient("L").resize(photo.size))
+                photo.save(path)
+        if name == "photos":
+            g2ard.save_views(folder / "photos.json", pictured, weights=np.arange(1.0, 17.0))
+            g2ard.save_views(folder / "two.json", pictured.take([0, 1]), splits=["train", "test"])
+            moved = pictured.viewmats.copy()
+            moved[:, :3, 3] += 0.1
+            g2ard.save_views(folder / "moved.json", replace(pictured, viewmats=moved))
