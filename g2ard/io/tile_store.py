@@ -253,6 +253,26 @@ class TileStore:
             part.shN[:] = rows[:, 14 : 14 + 3 * rest].reshape(len(rows), rest, 3)
         return raw.activated(self.render_model, self.offset.copy(), self.up)
 
+    def __len__(self) -> int:
+        return self.count
+
+    def positions(self) -> Iterator[NDArray[np.float32]]:
+        """Yield the (n, 3) means of each tile in order, memory-mapped, after verifying its contents."""
+        for tile in self.tiles:
+            self.check(tile.index)
+            yield self.rows(tile.index)[:, :3]
+
+    def take(self, index: NDArray[np.integer]) -> Splats:
+        """Return rows by number, counted tile after tile."""
+        index = np.asarray(index)
+        starts = np.cumsum([0, *(tile.rows for tile in self.tiles)])
+        tiles = np.searchsorted(starts, index, "right") - 1
+        rows = np.empty((len(index), self.row_bytes // 4), "<f4")
+        for tile in np.unique(tiles):
+            here = tiles == tile
+            rows[here] = self.rows(tile)[index[here] - starts[tile]]
+        return self.unpacked(len(index), [rows])
+
 
 class Stream(PartsStream):
     """Tiles of a folder as a scene, read one at a time."""
@@ -263,30 +283,3 @@ class Stream(PartsStream):
         parts = counts, store.read, store.sh_degree, store.offset
         super().__init__(path, *parts, [store.key], store.notes, store.render_model)
         self.up = store.up
-
-
-class StoredScene:
-    """Random access to all tiles' own rows, numbered tile after tile."""
-
-    def __init__(self, store: TileStore) -> None:
-        self.store, self.offset, self.up = store, store.offset, store.up
-        self._starts = np.cumsum([0, *(tile.rows for tile in store.tiles)])
-
-    def __len__(self) -> int:
-        return self.store.count
-
-    def positions(self) -> Iterator[NDArray[np.float32]]:
-        """Yield the (n, 3) means of each tile in order, memory-mapped, after verifying its contents."""
-        for tile in self.store.tiles:
-            self.store.check(tile.index)
-            yield self.store.rows(tile.index)[:, :3]
-
-    def take(self, index: NDArray[np.integer]) -> Splats:
-        """Return the rows with these numbers, in order."""
-        index = np.asarray(index)
-        tiles = np.searchsorted(self._starts, index, "right") - 1
-        rows = np.empty((len(index), self.store.row_bytes // 4), "<f4")
-        for tile in np.unique(tiles):
-            here = tiles == tile
-            rows[here] = self.store.rows(tile)[index[here] - self._starts[tile]]
-        return self.store.unpacked(len(index), [rows])

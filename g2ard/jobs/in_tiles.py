@@ -16,7 +16,7 @@ from g2ard.io import open_stream
 from g2ard.io.detect import MANIFEST
 from g2ard.io.reports import Report
 from g2ard.io.sanitize import BLOCK
-from g2ard.io.tile_store import StoredScene, TileStore
+from g2ard.io.tile_store import TileStore
 from g2ard.jobs.budget import Budget
 from g2ard.jobs.budget_search import ResolvedBudget, resolved_in_tiles
 from g2ard.jobs.distill_options import DistillOptions
@@ -195,9 +195,9 @@ class TiledJob:
         return self.tiles.plan.count
 
     @property
-    def dense(self) -> StoredScene:
+    def dense(self) -> TileStore:
         """The dense scene."""
-        return StoredScene(self.tiles.written)
+        return self.tiles.written
 
     def is_kept(self, count: int) -> bool:
         """Return False: all is recovered in tiles."""
@@ -214,15 +214,14 @@ class TiledJob:
         return self._reduced(self.tiles.written, self.budget.count, self.views)
 
     def level(
-        self, finer: StoredScene, count: int, views: RunViews, work: Path | None = None
-    ) -> tuple[StoredScene, StoredScene, float, float | None]:
+        self, finer: TileStore, count: int, views: RunViews, work: Path | None = None
+    ) -> tuple[TileStore, TileStore, float, float | None]:
         """Make a level of detail, see `g2ard.jobs.levels.LevelsJob`."""
-        done = self._reduced(finer.store, count, views)
-        merged = StoredScene(self._stored(done.simplified, "merged"))
+        done = self._reduced(finer, count, views)
+        merged = self._stored(done.simplified, "merged")
         if not self.recovers:
             return merged, merged, done.scores.simplified, None
-        level = StoredScene(self._stored(done.splats, "level"))
-        return level, merged, done.scores.simplified, done.scores.recovered
+        return self._stored(done.splats, "level"), merged, done.scores.simplified, done.scores.recovered
 
     def report(self, done: TiledDistilled, file: Path) -> TiledReport:
         """Describe the run."""

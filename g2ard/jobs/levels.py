@@ -21,7 +21,7 @@ from g2ard.io.detect import kind
 from g2ard.io.labels import names_of
 from g2ard.io.reports import Report
 from g2ard.io.scenes import tell
-from g2ard.io.tile_store import StoredScene
+from g2ard.io.tile_store import TileStore
 from g2ard.jobs.budget import Budget
 from g2ard.jobs.cost import Cost, cost_of
 from g2ard.jobs.distill import DistillJob, preparing
@@ -80,7 +80,7 @@ class LevelReport(Report):
         return f"level {number}: {plural(self.count, 'Gaussian')}{told}"
 
 
-L = TypeVar("L", Splats, StoredScene)
+L = TypeVar("L", Splats, TileStore)
 
 
 @dataclass(frozen=True, eq=False)

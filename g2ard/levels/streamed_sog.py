@@ -56,7 +56,7 @@ def save_levels(
 
     Args:
         path: the output folder.
-        levels: the same scene at several levels, finest first, with equal offsets. A `StoredScene` is read
+        levels: the same scene at several levels, finest first, with equal offsets. A `TileStore` is read
             one leaf or file at a time.
         cut: splitting rule of the tree; None means `Cut()`.
         environment: sky and far background, which viewers always show; written to `env/meta.json`.

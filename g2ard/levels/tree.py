@@ -15,11 +15,11 @@ from g2ard.config.checks import AtLeastOne, Positive
 from g2ard.config.schema import Settings
 from g2ard.errors import InputError
 from g2ard.io.packing import rounding
-from g2ard.io.tile_store import StoredScene
+from g2ard.io.tile_store import TileStore
 from g2ard.scene.splats import Splats, check_finite
 from g2ard.scene.transform import rotation_matrices
 
-Level = Splats | StoredScene
+Level = Splats | TileStore
 """A level of detail: a scene in memory, or rows on disk."""
 
 Float = NDArray[np.float64]

@@ -8,7 +8,7 @@ import pytest
 
 from g2ard.errors import InputError, OutputError
 from g2ard.io.lock import LOCK, locked
-from g2ard.io.tile_store import StoredScene, TileStore
+from g2ard.io.tile_store import TileStore
 from g2ard.jobs.distill_options import DistillOptions
 from g2ard.jobs.tile_options import needs_whole
 from g2ard.levels import Cut, save_levels
@@ -124,10 +124,10 @@ def test_levels_are_not_written_from_damaged_tiles(place: Path, tmp_path: Path) 
     stop = interrupt_at("write", 2)
 
     with pytest.raises(KeyboardInterrupt):
-        save_levels(tmp_path / "out", [StoredScene(store)], cut=Cut(most=200), work=work, progress=stop)
+        save_levels(tmp_path / "out", [store], cut=Cut(most=200), work=work, progress=stop)
     flipped(store.folder / "tile-00001.f32")
     with pytest.raises(InputError, match=r"tile-00001\.f32: its contents changed"):
-        save_levels(tmp_path / "out", [StoredScene(store)], cut=Cut(most=200), work=work)
+        save_levels(tmp_path / "out", [store], cut=Cut(most=200), work=work)
     assert not (tmp_path / "out").exists()
 
 

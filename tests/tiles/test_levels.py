@@ -10,7 +10,7 @@ import pytest
 from g2ard import io
 from g2ard.errors import InputError
 from g2ard.io import sog
-from g2ard.io.tile_store import StoredScene
+from g2ard.io.tile_store import TileStore
 from g2ard.jobs.levels import Levels, preparing_levels
 from g2ard.jobs.tile_options import Tiling
 from g2ard.levels import Cut, cut, save_levels, tree
@@ -71,7 +71,7 @@ def test_levels_on_disk_give_the_files_of_levels_in_memory(tmp_path: Path, degre
         shN = rng.normal(size=(count, (degree + 1) ** 2 - 1, 3))
         scene = Splats.create(rng.normal(size=(count, 3)), scales=rng.uniform(0.02, 0.1, (count, 3)), shN=shN)
         io.write_splats(tmp_path / f"{number}.ply", scene)
-        stored.append(StoredScene(ingest(tmp_path / f"{number}.ply", tmp_path / f"{number}", tile_rows=800)))
+        stored.append(ingest(tmp_path / f"{number}.ply", tmp_path / f"{number}", tile_rows=800))
     held = [Splats(**vars(level.take(np.arange(len(level))))) for level in stored]
     (tmp_path / "work").mkdir()
     save_levels(tmp_path / "a", held, cut=Cut(most=300))
@@ -79,7 +79,7 @@ def test_levels_on_disk_give_the_files_of_levels_in_memory(tmp_path: Path, degre
     assert files_of(tmp_path / "a") == files_of(tmp_path / "b")
 
 
-def levels_in_tiles(place: Path, folder: Path, say: Say = unsaid) -> Levels[StoredScene]:
+def levels_in_tiles(place: Path, folder: Path, say: Say = unsaid) -> Levels[TileStore]:
     options: dict[str, Any] = {"ratios": (1, 3, 12), "recover": True, "steps": 12, "background": (0, 0, 0)}
     options |= {"split_sky": False, "seed": 0, "views": place / "views.json", "size": 64, "say": say}
     tiling = Tiling(tile_rows=850, workers=1, folder=folder)
@@ -90,7 +90,7 @@ def levels_in_tiles(place: Path, folder: Path, say: Say = unsaid) -> Levels[Stor
 def test_levels_have_exact_counts_and_a_stopped_chain_goes_on(place: Path, tmp_path: Path) -> None:
     whole = levels_in_tiles(place, tmp_path / "whole")
     assert [len(level) for level in whole.splats] == [3000, 1000, 250]
-    assert [len(level.store.tiles) for level in whole.splats] == [4, 2, 1]
+    assert [len(level.tiles) for level in whole.splats] == [4, 2, 1]
     for report in whole.reports[1:]:
         assert report.recovered > report.simplified > 15
 
@@ -110,7 +110,7 @@ def test_levels_have_exact_counts_and_a_stopped_chain_goes_on(place: Path, tmp_p
     rows = np.arange(250)
     one, other = (levels.splats[2].take(rows).fingerprint() for levels in (whole, again))
     assert one == other
-    assert [level.store.key for level in whole.splats] == [level.store.key for level in again.splats]
+    assert [level.key for level in whole.splats] == [level.key for level in again.splats]
 
 
 def test_the_command_in_tiles(place: Path, tmp_path: Path, command_line) -> None:

@@ -202,7 +202,7 @@ def lod(
         levels = job.run(stopped)
         begun = None  # folder for files of these levels that are begun
         if tiled:
-            content = [[one.store.key for one in levels.splats], asdict(rule)]
+            content = [[one.key for one in levels.splats], asdict(rule)]
             begun = tiling.folder / f"written-{key_of(content)}"
             begun.mkdir(exist_ok=True)
         run.begin("write")
