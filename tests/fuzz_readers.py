@@ -31,8 +31,9 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 from g2ard.errors import InputError
-from g2ard.io import kind, read_cloud, read_scene, read_view_set
+from g2ard.io import kind, read_cloud, read_view_set
 from g2ard.scene.cameras import LARGEST_IMAGE
+from helpers.opened import read_scene
 from helpers.reader_cases import MAKERS, READ
 
 EXTREMES = [

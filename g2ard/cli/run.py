@@ -18,7 +18,7 @@ from g2ard.cli.usage import in_flags
 from g2ard.config.choices import RenderModel, ViewFormat
 from g2ard.config.schema import Config, full_paths, parse_settings
 from g2ard.errors import InputError
-from g2ard.io import write_views
+from g2ard.io import Source, write_views
 from g2ard.io.atomic import atomic_output
 from g2ard.io.reports import plain
 from g2ard.io.scene_formats import axes_note, scene_format
@@ -28,9 +28,9 @@ from g2ard.progress import Detail
 from g2ard.system import devices
 
 if TYPE_CHECKING:
+    from g2ard.io.stream import SceneStream
     from g2ard.scene.cameras import Cameras
     from g2ard.scene.splats import Splats
-    from g2ard.tiles.merging import TiledScene
 
 
 _UNRECORDED = {"quiet", "verbose", "overwrite", "json", "print_config", "config"}
@@ -189,7 +189,7 @@ class Run(Claims):
         """Write the result of one budget, or of several under `runs`."""
         self.result(reports[0] if len(reports) == 1 else {"runs": reports})
 
-    def load(self, path: Path) -> Splats:
+    def load(self, path: Path | Source) -> Splats:
         """Read a scene with --render-model, and report its notes."""
         from g2ard.jobs.inputs import load_scene
 
@@ -199,7 +199,7 @@ class Run(Claims):
     def write(
         self,
         path: Path,
-        splats: Splats | TiledScene,
+        splats: Splats | SceneStream,
         *,
         overwrite: bool = False,
         compare: bool = False,
@@ -216,7 +216,7 @@ class Run(Claims):
         replaced = self.overwrite or overwrite
         if not isinstance(splats, Splats):
             if scene_format(path).suffix == ".ply":
-                write_ply(path, splats.stream(), overwrite=replaced)
+                write_ply(path, splats, overwrite=replaced)
                 self.kept.append(f"{path} is written")
                 return
             splats = splats.whole()

@@ -22,7 +22,7 @@ from g2ard.cli.resume import (
 from g2ard.cli.run import Run
 from g2ard.config.choices import BLACK, Colour, ViewFormat
 from g2ard.errors import InputError, OutputError
-from g2ard.io import write_views
+from g2ard.io import Source, write_views
 from g2ard.io.atomic import atomic_output, check_output, drop_empty, drop_temporaries
 from g2ard.io.jsonfile import read_json
 from g2ard.io.labels import DENSE, RESULT, labels_of, names_of
@@ -176,7 +176,7 @@ class RunFolder:
         write_views(self._scored, scored, splits=["test"] * len(scored), overwrite=True)
 
     def write_pages(
-        self, source: Path, job: Any, done: Any, report: RunReport | TiledReport, told: Sequence[str]
+        self, source: Source | Path, job: Any, done: Any, report: RunReport | TiledReport, told: Sequence[str]
     ) -> tuple[RunReport | TiledReport, str]:
         """Write report.html and, in one piece, preview.png and with --page view.html; return the report with
         the size of that page, and a line about it.
@@ -188,7 +188,7 @@ class RunFolder:
         from g2ard.report.distilled import distill_report, preview, tiled_report
         from g2ard.report.run import TiledReport
 
-        title = f"{names_of([source])[0]}: {report.title}"
+        title = f"{names_of([Path(str(source))])[0]}: {report.title}"
         if isinstance(report, TiledReport):
             with self._run.finishing("report.html"):
                 tiled_report(self.path / "report.html", title, report)
@@ -204,7 +204,7 @@ class RunFolder:
             preview(self.path / _PICTURE, best, scenes, recover.background)
         if not self._run.config["page"]:
             return report, ""
-        dense = None if recover.from_points else (source, job.prior)
+        dense = (source, job.prior) if isinstance(source, Source) and not recover.from_points else None
         seen = job.views.train.cameras if job.views.pool is None else best.cameras
         with self._run.finishing("view.html"):
             size, line = self.write_view(done.splats, dense, seen, recover.background)
@@ -217,13 +217,13 @@ class RunFolder:
             temporary.write_text(text + "\n", encoding="utf-8", newline="\n")
 
     def write_view(
-        self, splats: Splats, dense: tuple[Path, Splats] | None, cameras: Cameras, background: Colour
+        self, splats: Splats, dense: tuple[Source, Splats] | None, cameras: Cameras, background: Colour
     ) -> tuple[int | None, str]:
         """Write view.html unless browsers would not draw the scene smoothly; return its bytes, None if it was
         not written, and a line to print.
 
         Args:
-            dense: path of the dense scene and the scene, shown left of the result unless it would make the
+            dense: file of the dense scene and the scene, shown left of the result unless it would make the
                 page large.
         """
         count, most = len(splats), DEVICES["web"]
@@ -232,7 +232,7 @@ class RunFolder:
         stand = frame_with(splats, cameras)
         known = None if background == BLACK else background
         behind = backdrop(known, [splats if dense is None else dense[1]])
-        shown: list[Path | str] = [names_of([self.path])[0]]
+        shown: list[Source | str] = [names_of([self.path])[0]]
         scenes, roles = [splats], [RESULT]
         if dense is not None and count < len(dense[1]) <= LARGEST_DENSE:
             shown, scenes, roles = [dense[0], *shown], [dense[1], splats], [DENSE, RESULT]

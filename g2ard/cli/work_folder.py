@@ -19,6 +19,7 @@ from g2ard.io.atomic import drop_empty, hidden_name, parents_made
 from g2ard.io.lock import check_unlocked, locked
 
 if TYPE_CHECKING:
+    from g2ard.io import Source
     from g2ard.jobs.tile_options import Tiling
 
 
@@ -26,15 +27,15 @@ _WORK_NAME = re.compile(r"tiles|steps|(student|merged|level|written)-[0-9a-f]{16
 """Names that commands create in the work folder."""
 
 
-def tiling_of(run: Run, scene: Path | None, output: Path) -> Tiling:
+def tiling_of(run: Run, source: Source | None, output: Path) -> Tiling:
     """Check the options and return them as a `Tiling`."""
     from g2ard.jobs.memory import bytes_of
     from g2ard.jobs.tile_options import Tiling
 
     tile_rows, memory, workers, scheduler, work = (run.shared[name] for name in TILES)
     rows = None if tile_rows is None else int(tile_rows.value)
-    if rows is not None and scene is not None:
-        _check_rows(scene, rows)
+    if rows is not None and source is not None:
+        _check_rows(source, rows)
     with run.usage():
         size = None if memory is None else bytes_of(memory)
     if scheduler is not None and scheduler != "local" and "://" not in scheduler:
@@ -58,15 +59,16 @@ def _beside(output: Path) -> Path:
     return output.with_name(hidden_name(name, ".tiles"))
 
 
-def _check_rows(scene: Path, rows: int) -> None:
+def _check_rows(source: Source, rows: int) -> None:
     """Raise a usage error if a folder of tiles was written with another --tile-rows."""
-    from g2ard.io.detect import MANIFEST
-    from g2ard.io.tile_store import TileStore
     from g2ard.jobs.tile_options import cut_into
 
-    if (scene / MANIFEST).is_file() and (made := TileStore.open(scene).settings.get("tile_rows")) != rows:
-        held = f"already has tiles of {made:,}" if made else "already has tiles"
-        raise typer.BadParameter(f"--tile-rows: {scene} {held}; to change them, run {cut_into(scene, rows)}")
+    if source.store is not None and (made := source.store.settings.get("tile_rows")) != rows:
+        held, other = (
+            f"already has tiles of {made:,}" if made else "already has tiles",
+            cut_into(source.path, rows),
+        )
+        raise typer.BadParameter(f"--tile-rows: {source} {held}; to change them, run {other}")
 
 
 @contextmanager

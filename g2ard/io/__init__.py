@@ -2,44 +2,38 @@
 
 | reads | from |
 |---|---|
-| `read_splats`, `read_scene` | .ply (3DGS), .compressed.ply, SOG, .spz, .glb, .splat, .ksplat, OpenUSD |
+| `read_splats`, `Source` | .ply (3DGS), .compressed.ply, SOG, .spz, .glb, .splat, .ksplat, OpenUSD |
 | `read_points`, `read_cloud` | .ply, .las, .laz, .e57, COLMAP points3D |
 | `read_views`, `read_view_set` | COLMAP, transforms.json, trainers' cameras, data sets, g2ard's own |
 
-The first function of each row returns data; the second also returns notes about the file (`Note`).
+The first of each row returns data; the second also has notes about the file (`Note`).
 `find_views` finds the cameras that trainers leave beside a scene. Readers are imported on first use.
 """
 
 from g2ard.io.atomic import atomic_folder, atomic_output, check_output
 from g2ard.io.detect import find_views, kind
 from g2ard.io.scenes import (
-    check_scene,
     check_scene_output,
-    open_point_stream,
-    open_stream,
     read_cloud,
     read_points,
-    read_scene,
     read_splats,
     write_points,
     write_splats,
 )
+from g2ard.io.source import Source
 from g2ard.io.views import check_views_output, read_view_set, read_views, write_views
 
 __all__ = [
+    "Source",
     "atomic_folder",
     "atomic_output",
     "check_output",
-    "check_scene",
     "check_scene_output",
     "check_views_output",
     "find_views",
     "kind",
-    "open_point_stream",
-    "open_stream",
     "read_cloud",
     "read_points",
-    "read_scene",
     "read_splats",
     "read_view_set",
     "read_views",

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from g2ard.io import kind, read_cloud, read_scene, read_view_set
-from g2ard.io.detect import file_format, run_scene
+from g2ard.io import Source, read_view_set
+from g2ard.io.detect import run_scene
 from g2ard.io.images import colour_text, photo_traits
 from g2ard.io.sog import chunks_of
 from g2ard.io.splits import splits_of
@@ -38,12 +38,12 @@ def describe(
         and `opacity`, `largest_scale`, `smallest_scale`, `elongation` as quantiles by percentage. Point
         clouds add `color`, views `photos`, `sizes`, `fov_degrees`, `splits`.
     """
-    path, what = Path(path), kind(path)
-    if what == "splats":
-        scene = read_scene(path)
-        notes, figures = scene.notes, _splats(scene.splats) | ({} if more is None else more(scene.splats))
-    elif what == "points":
-        cloud = read_cloud(path)
+    source, path = Source(path), Path(path)
+    if source.kind == "splats":
+        splats = source.whole()
+        notes, figures = source.notes, _splats(splats) | ({} if more is None else more(splats))
+    elif source.kind == "points":
+        cloud = source.cloud().whole()
         notes, figures = cloud.notes, _points(cloud.points)
     else:
         views = read_view_set(path, images=images)
@@ -51,8 +51,8 @@ def describe(
         notes, figures = (*views.notes, *_photo_notes(views.cameras)), _views(views)
     return {
         "path": str(path),
-        "kind": what,
-        "format": file_format(path),
+        "kind": source.kind,
+        "format": source.format,
         "bytes": bytes_of(path),
         **figures,
         "notes": [{"code": n.code, "count": n.count, "text": n.text} for n in notes],

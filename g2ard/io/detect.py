@@ -128,14 +128,8 @@ def file_format(path: str | Path) -> str:
     return _of_file(path, state.st_mtime_ns, state.st_size)
 
 
-def reader(path: str | Path, expected: Kind) -> tuple[Path, Any]:
-    """Return the file or folder of a kind, and the module that reads it.
-
-    Raises:
-        InputError: it is missing, unsupported, or of another kind.
-    """
-    path = run_scene(path) if expected == "splats" else Path(path)
-    name = file_format(path)
+def reader(path: Path, name: str, expected: Kind) -> Any:
+    """Return the module that reads a file or folder of a format; reject one of another kind."""
     found = KINDS[name]
     if expected == "points" and name == "colmap":
         name = "points3d"
@@ -143,7 +137,7 @@ def reader(path: str | Path, expected: Kind) -> tuple[Path, Any]:
         what = _NAMES[found] if found != "views" else name
         hint = _OTHER_KINDS.get((expected, found))
         raise InputError(f"expected {_NAMES[expected]}, found {what}", path=path, hint=hint)
-    return path, import_module(f"g2ard.io.{MODULES.get(name, name)}")
+    return import_module(f"g2ard.io.{MODULES.get(name, name)}")
 
 
 @lru_cache(maxsize=64)

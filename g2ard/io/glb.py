@@ -27,7 +27,7 @@ from g2ard.io.jsonfile import Number, Place, Row, Vector, Whole, checked, parse_
 from g2ard.io.packing import packing_order, rounding, unit_quats, writable
 from g2ard.io.paths import check_regular, decoded
 from g2ard.io.sanitize import Raw, cleaned
-from g2ard.io.types import Note, Scene
+from g2ard.io.types import Note, Noted
 from g2ard.progress import plural
 from g2ard.scene.splats import SH_C0, Splats
 from g2ard.scene.transform import deformed, harmonic_signs, join, rotation_matrices
@@ -274,7 +274,7 @@ class _Document(msgspec.Struct, rename="camel"):
     buffers: list[dict[str, Any]] = []
 
 
-def read(path: Path) -> Scene:
+def read(path: Path) -> Noted:
     """Read the splat primitive of a .glb as its nodes place it; a mere translation becomes the `offset`."""
     content, binary = _chunks(path)
     return _scene(path, checked(content, _Document, Place(path)), binary)
@@ -316,21 +316,21 @@ def _with_buffer(path: Path, document: Any) -> tuple[Any, bytes]:
     return document, file.read_bytes()
 
 
-def _scene(path: Path, document: _Document, binary: bytes) -> Scene:
+def _scene(path: Path, document: _Document, binary: bytes) -> Noted:
     """Read all splat primitives, each as often as nodes show it."""
     others = sum(not _has_splats(primitive) for mesh in document.meshes for primitive in mesh.primitives)
     found = placed(path, _shown(path, document, binary))
     if found is None:
         raise InputError(f"has no primitive with {EXTENSION}", path=path)
     text = f"{plural(others, 'other primitive')} ignored"
-    return replace(found, notes=(Note("ignored_meshes", others, text), *found.notes)) if others else found
+    return (found[0], (Note("ignored_meshes", others, text), *found[1])) if others else found
 
 
 def _has_splats(primitive: _Primitive) -> bool:
     return bool({EXTENSION, _SPZ_ALONE} & set(primitive.extensions))
 
 
-def _shown(path: Path, document: _Document, binary: bytes) -> Iterator[tuple[Scene, NDArray[np.float64]]]:
+def _shown(path: Path, document: _Document, binary: bytes) -> Iterator[tuple[Noted, NDArray[np.float64]]]:
     """Yield each splat primitive with each of its placements."""
     shown = _nodes_shown(path, document)
     for index, mesh in enumerate(document.meshes):
@@ -342,13 +342,13 @@ def _shown(path: Path, document: _Document, binary: bytes) -> Iterator[tuple[Sce
             yield from ((scene, placement) for placement in placements)
 
 
-def placed(path: Path, parts: Iterable[tuple[Scene, NDArray[np.float64]]]) -> Scene | None:
+def placed(path: Path, parts: Iterable[tuple[Noted, NDArray[np.float64]]]) -> Noted | None:
     """Join parts by their (4, 4) placements, in the axes of a .ply; return None without parts."""
     moved, notes, uneven = list[Splats](), list[Note](), 0
-    for part, placement in parts:
-        notes += [note for note in part.notes if note not in notes]
+    for (part, own), placement in parts:
+        notes += [note for note in own if note not in notes]
         try:
-            splats, exact = deformed(part.splats, placement)
+            splats, exact = deformed(part, placement)
         except InputError as error:
             raise error.at(path=path, parameter=None, message=f"a node {error.message}") from None
         moved.append(splats)
@@ -358,10 +358,10 @@ def placed(path: Path, parts: Iterable[tuple[Scene, NDArray[np.float64]]]) -> Sc
         notes.append(Note("uneven_placement", uneven, text))
     if not moved:
         return None
-    return Scene(moved[0] if len(moved) == 1 else join(moved), tuple(notes))
+    return moved[0] if len(moved) == 1 else join(moved), tuple(notes)
 
 
-def _primitive(within: Place, document: _Document, binary: bytes, primitive: _Primitive) -> Scene:
+def _primitive(within: Place, document: _Document, binary: bytes, primitive: _Primitive) -> Noted:
     """Read a primitive of splats, in the axes of a .ply, without its placement."""
     path = within.path
     place = within.to("extensions", EXTENSION)
@@ -376,17 +376,17 @@ def _primitive(within: Place, document: _Document, binary: bytes, primitive: _Pr
     notes = [LINEAR_NOTE] if "lin" in str(splats.color_space).lower() else []
     name = next((name for name in _SPZ_EXTENSIONS if name in inside), None)
     if name is None:
-        scene = _attributes_of(within.to("attributes"), document, binary, primitive.attributes)
+        scene, own = _attributes_of(within.to("attributes"), document, binary, primitive.attributes)
     else:
         place = place.to("extensions", name)
         packed = checked(inside[name], _Compressed, place)
         view = _view(document, packed.buffer_view, place, "the SPZ")
-        scene = spz.decoded(path, binary[view.byte_offset : view.byte_offset + view.byte_length])
-        scene = replace(scene, splats=_about_y(scene.splats))
-    return replace(scene, notes=(*notes, *scene.notes))
+        scene, own = spz.decoded(path, binary[view.byte_offset : view.byte_offset + view.byte_length])
+        scene = _about_y(scene)
+    return scene, (*notes, *own)
 
 
-def _attributes_of(place: Place, document: _Document, binary: bytes, names: dict[str, Any]) -> Scene:
+def _attributes_of(place: Place, document: _Document, binary: bytes, names: dict[str, Any]) -> Noted:
     """Read the float or integer attributes of a primitive, in the axes of a .ply."""
 
     def values(name: str, width: int) -> NDArray[np.float32]:

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from g2ard.errors import InputError, damaged
 from g2ard.io.sanitize import Raw, cleaned
-from g2ard.io.types import Scene
+from g2ard.io.types import Noted
 from g2ard.scene.splats import SH_C0
 
 _HEADER = 4096  # bytes of the file's header
@@ -26,7 +26,7 @@ _SH_RANGE = (-1.5, 1.5)  # range of 8-bit harmonics if the header gives none
 _SCALE_RANGE = 32767  # half of the steps of a 16-bit position within its bucket, if a section gives none
 
 
-def read(path: Path) -> Scene:
+def read(path: Path) -> Noted:
     """Read a scene. Version 0.1 is read, the only one published.
 
     A row holds its position, linear scales, rotation (wxyz), 8-bit RGBA and harmonics, channel after channel

@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
-from g2ard.io.detect import kind
+from g2ard.io.source import Source
 from g2ard.progress import plural
 
 TARGET, DENSE, RESULT = "target", "dense scene", "result"
@@ -47,24 +47,24 @@ def _depth(parts: tuple[str, ...]) -> int:
     return next(told, last)
 
 
-def counted(count: int, scene: Path | str) -> str:
-    """Return a number of points, if the scene is the path of a point cloud, otherwise of Gaussians."""
-    return plural(count, "point" if isinstance(scene, Path) and kind(scene) == "points" else "Gaussian")
+def counted(count: int, scene: Source | str) -> str:
+    """Return a number of points, if the scene is the file of a point cloud, otherwise of Gaussians."""
+    return plural(count, "point" if isinstance(scene, Source) and scene.kind == "points" else "Gaussian")
 
 
-def labels_of(scenes: Sequence[Path | str], counts: Sequence[int], roles: Sequence[str] = ()) -> list[str]:
+def labels_of(scenes: Sequence[Source | str], counts: Sequence[int], roles: Sequence[str] = ()) -> list[str]:
     """Return a label for each scene: its role if there are roles, its name and its size.
 
     Args:
-        scenes: paths, or names of scenes without one.
+        scenes: files, or names of scenes without one.
 
     >>> labels_of(["small", "dense"], [1, 2000])
     ['small: 1 Gaussian', 'dense: 2,000 Gaussians']
-    >>> labels_of(["garden.ply"], [2000], [DENSE])
-    ['dense scene: garden.ply, 2,000 Gaussians']
+    >>> labels_of(["garden"], [2000], [DENSE])
+    ['dense scene: garden, 2,000 Gaussians']
     """
-    names = iter(names_of([scene for scene in scenes if isinstance(scene, Path)]))
-    named = [next(names) if isinstance(scene, Path) else scene for scene in scenes]
+    names = iter(names_of([scene.path for scene in scenes if isinstance(scene, Source)]))
+    named = [next(names) if isinstance(scene, Source) else scene for scene in scenes]
     sizes = [counted(count, scene) for count, scene in zip(counts, scenes, strict=True)]
     if not roles:
         return [f"{name}: {size}" for name, size in zip(named, sizes, strict=True)]

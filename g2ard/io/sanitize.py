@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from g2ard.config.choices import RenderModel
 from g2ard.errors import InputError
-from g2ard.io.types import Note, Scene
+from g2ard.io.types import Note, Noted
 from g2ard.progress import plural
 from g2ard.scene.splats import DRAWN_LOGIT, Splats
 
@@ -73,7 +73,7 @@ class Raw:
 
 def cleaned(
     path: Path, raw: Raw, notes: list[Note] | None = None, render_model: RenderModel = "classic"
-) -> Scene:
+) -> Noted:
     """Check, clamp and activate a scene, whose arrays become those of the result.
 
     Rows with NaN or meaningless infinities are dropped. Logits (|x| > 16) and log-scales (|x| > 43) are
@@ -84,7 +84,7 @@ def cleaned(
     keep = tally.clean(raw)
     notes = [*(notes or ()), *tally.notes(path)]
     splats = raw.activated(render_model, np.zeros(3))
-    return Scene(splats.take(keep) if tally.dropped else splats, tuple(notes))
+    return splats.take(keep) if tally.dropped else splats, tuple(notes)
 
 
 @dataclass

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,17 +10,15 @@ from typing import TYPE_CHECKING, Any
 from g2ard.config.checks import check_type, checks_arguments
 from g2ard.errors import InputError, OutputError
 from g2ard.io.atomic import atomic_output, check_output
-from g2ard.io.detect import file_format, reader
 from g2ard.io.scene_formats import Rounding, check_options, lost_in, scene_format
-from g2ard.io.signs import explained
+from g2ard.io.source import Source
 from g2ard.progress import Progress, Say, silent
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
+    from collections.abc import Iterable
 
     from g2ard.config.choices import RenderModel
-    from g2ard.io.stream import PointStream, SceneStream
-    from g2ard.io.types import Cloud, Note, Points, Scene
+    from g2ard.io.types import Cloud, Note, Points
     from g2ard.scene.splats import HasSplats, Splats
 
 
@@ -46,54 +43,7 @@ def read_splats(path: str | Path, *, render_model: RenderModel | None = None) ->
     >>> g2ard.load(path).scales.round(5).tolist()
     [[1.0, 1.0, 1.0], [1.0, 2.0, 3.0]]
     """
-    return read_scene(path, render_model=render_model).splats
-
-
-@explained
-def read_scene(path: str | Path, *, render_model: RenderModel | None = None) -> Scene:
-    """Read a Gaussian scene with notes on dropped rows, clamped values and ignored properties."""
-    path, module = reader(path, "splats")
-    scene: Scene = module.Stream(path).whole() if hasattr(module, "Stream") else module.read(path)
-    if render_model is None:
-        return scene
-    return replace(scene, splats=replace(scene.splats, render_model=render_model))
-
-
-@explained
-def open_stream(
-    path: str | Path | Sequence[str | Path], *, render_model: RenderModel | None = None
-) -> SceneStream:
-    """Open a scene, or several as one, for reading in blocks.
-
-    Memory holds one block of a .ply, .compressed.ply or .splat, one chunk of a SOG, one tile, or the whole
-    file of other formats. Several scenes get the offset of the first and the highest of their SH degrees;
-    their render models must agree. `render_model` overrides what files say.
-    """
-    from g2ard.io.paths import file_identity
-    from g2ard.io.stream import JoinedScenes, PartsStream
-
-    if not isinstance(path, str | Path):
-        streams = [open_stream(part, render_model=render_model) for part in path]
-        if not streams:
-            raise InputError("no scene given")
-        return streams[0] if len(streams) == 1 else JoinedScenes(streams)
-    path, module = reader(path, "splats")
-    if hasattr(module, "Stream"):
-        stream: SceneStream = module.Stream(path)
-    else:
-        scene: Scene = module.read(path)
-        splats = scene.splats
-        parts = [len(splats)], lambda _: splats, splats.sh_degree, splats.offset
-        stream = PartsStream(path, *parts, file_identity([path]), scene.notes, splats.render_model)
-        stream.up = splats.up
-    stream.render_model = render_model or stream.render_model
-    return stream
-
-
-def check_scene(path: str | Path) -> tuple[Path, str]:
-    """Return a scene's file or folder and its format; raise an `InputError` if it is not a scene."""
-    path, _ = reader(path, "splats")
-    return path, file_format(path)
+    return Source(path, render_model).whole()
 
 
 def check_scene_output(path: str | Path, overwrite: bool = False) -> Path:
@@ -233,33 +183,7 @@ def read_points(path: str | Path) -> Points:
 
 def read_cloud(path: str | Path, *, bare: bool = False) -> Cloud:
     """Read a coloured point cloud with notes on the file; a `bare` one may be black, without colours."""
-    return open_point_stream(path, bare=bare).whole()
-
-
-@explained
-def open_point_stream(path: str | Path | Sequence[str | Path], *, bare: bool = False) -> PointStream:
-    """Open a coloured point cloud, or several as one, for reading in blocks.
-
-    Memory holds one block of a .ply, .las, .laz or .e57, or the whole file of other formats. Several clouds
-    get one offset. Without colours, intensities become grey; without either, the cloud must be `bare`.
-    """
-    from g2ard.io.stream import JoinedClouds
-
-    if not isinstance(path, str | Path):
-        streams = [open_point_stream(part) for part in path]
-        if not streams:
-            raise InputError("no point cloud given")
-        return streams[0] if len(streams) == 1 else JoinedClouds(streams)
-    path, module = reader(path, "points")
-    stream: PointStream = module.Stream(path)
-    if not stream.channels and len(stream.sample) and not bare:
-        raise InputError(stream.lack, path=path, hint=_UNCOLORED)
-    return stream
-
-
-_UNCOLORED = (
-    "add colours, for example with PDAL's filters.colorization, or run `distill` with photos ({views=DIR})"
-)
+    return Source(path).cloud(bare=bare).whole()
 
 
 def write_points(path: str | Path, points: Points, *, overwrite: bool = False) -> None:

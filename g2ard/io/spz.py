@@ -22,7 +22,7 @@ from g2ard.io import packing
 from g2ard.io.atomic import atomic_output
 from g2ard.io.paths import check_unpacked
 from g2ard.io.sanitize import Raw, cleaned, logits_of
-from g2ard.io.types import Note, Scene
+from g2ard.io.types import Note, Noted
 from g2ard.progress import Progress, plural, silent
 from g2ard.scene.splats import Splats
 from g2ard.scene.transform import change_of_axes, harmonic_signs, with_axes
@@ -52,7 +52,7 @@ FLIPS = harmonic_signs((1, -1, -1))
 _USUAL_BITS, _MOST_BITS = 12, 20
 
 
-def read(path: Path) -> Scene:
+def read(path: Path) -> Noted:
     """Read an .spz of version 2, 3 or 4; bands past degree 3 are ignored with a note."""
     return decoded(path, path.read_bytes())
 
@@ -65,7 +65,7 @@ def names_axes(path: Path) -> bool:
     return _extensions(path, data)[0] != "RUB"
 
 
-def decoded(path: Path, data: bytes) -> Scene:
+def decoded(path: Path, data: bytes) -> Noted:
     """Read the bytes of an .spz like `read`; `path` names their file in messages."""
     if data[:2] == b"\x1f\x8b":
         data = _gunzip(path, data)
@@ -92,11 +92,11 @@ def decoded(path: Path, data: bytes) -> Scene:
         axes, ignored = _extensions(path, data) if version == 4 else (axes, 1)
         if ignored:
             notes.append(Note("ignored_extensions", ignored, "SPZ extensions ignored"))
-    scene = cleaned(path, raw, notes, "antialiased" if flags & _ANTIALIASED else "classic")
+    scene, told = cleaned(path, raw, notes, "antialiased" if flags & _ANTIALIASED else "classic")
     if axes == "RUB":
-        return scene
+        return scene, told
     matrix = change_of_axes(axes, "RDF") @ change_of_axes("RDF", "RUB")  # so far taken for RUB
-    return replace(scene, splats=with_axes(scene.splats, matrix))
+    return with_axes(scene, matrix), told
 
 
 def _extensions(path: Path, data: bytes) -> tuple[Axes, int]:

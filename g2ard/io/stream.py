@@ -1,5 +1,7 @@
 """Scenes and coloured point clouds in blocks, for files larger than memory."""
 
+from __future__ import annotations
+
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
@@ -13,7 +15,7 @@ from g2ard.config.choices import RenderModel
 from g2ard.io import judge
 from g2ard.io.paths import file_identity
 from g2ard.io.sanitize import BLOCK, Raw, Tally
-from g2ard.io.types import Cloud, Note, Points, Scene
+from g2ard.io.types import Cloud, Note, Points
 from g2ard.progress import plural
 from g2ard.scene.splats import ARRAYS, Splats
 from g2ard.scene.transform import one_model
@@ -60,6 +62,9 @@ class Stream(ABC, Generic[Block]):
         self.path, self.count, self.notes, self.tally = path, count, notes, Tally(item)
         self.offset = np.zeros(3) if offset is None else offset
 
+    def __len__(self) -> int:
+        return self.count
+
     def identity(self) -> list[Any]:
         """Return JSON that identifies this source, see `file_identity`."""
         return file_identity([self.path])
@@ -103,18 +108,19 @@ class SceneStream(Stream[Splats]):
         self.render_model, self.sh_degree = render_model, _DEGREE_OF_REST[rest]
         self.up: tuple[float, float, float] | None = None
 
-    def whole(self) -> Scene:
-        """Read all rows into memory."""
+    def whole(self) -> Splats:
+        """Read all rows into memory; `all_notes` are then those on these rows."""
+        self.tally = Tally()
         raw, kept = Raw.empty(self.count, (self.sh_degree + 1) ** 2 - 1), 0
         for block in self.blocks(BLOCK):
             rows = raw.take(slice(kept, kept := kept + len(block)))
             rows.fill(getattr(block, name) for name in ARRAYS)
-        notes = self.all_notes()
-        return Scene(raw.take(slice(kept)).activated(self.render_model, self.offset, self.up), notes)
+        self.all_notes()  # raises if no row is finite
+        return raw.take(slice(kept)).activated(self.render_model, self.offset, self.up)
 
 
 class RawStream(SceneStream):
-    """Scene of a file's `raw` rows, which are cleaned as in `g2ard.io.read_scene`."""
+    """Scene of a file's `raw` rows, which `Tally.clean` cleans."""
 
     @abstractmethod
     def raw(self, rows: int, start: int) -> Iterator[Raw]:
@@ -131,7 +137,11 @@ class RawStream(SceneStream):
 
 
 class PartsStream(SceneStream):
-    """Scene of clean parts that `part` loads by index, one at a time."""
+    """Scene of clean parts that `part` loads by index, one at a time.
+
+    Args:
+        identity: of the parts; None is that of the file.
+    """
 
     def __init__(
         self,
@@ -140,21 +150,33 @@ class PartsStream(SceneStream):
         part: Callable[[int], Splats],
         sh_degree: int,
         offset: NDArray[np.float64],
-        identity: list[Any],
+        identity: list[Any] | None = None,
         notes: tuple[Note, ...] = (),
         render_model: RenderModel = "classic",
     ) -> None:
         super().__init__(path, sum(counts), (sh_degree + 1) ** 2 - 1, offset, notes, render_model)
-        self._counts, self._part, self._identity = counts, part, identity
+        self.counts, self._part, self._identity = counts, part, identity
+
+    @classmethod
+    def of(cls, path: Path, splats: Splats, notes: tuple[Note, ...]) -> PartsStream:
+        """Return the scene of a file that was read as a whole."""
+        stream = cls(path, [len(splats)], lambda _: splats, splats.sh_degree, splats.offset, notes=notes)
+        stream.render_model, stream.up = splats.render_model, splats.up
+        return stream
 
     def identity(self) -> list[Any]:
-        return self._identity
+        return super().identity() if self._identity is None else self._identity
+
+    def whole(self) -> Splats:
+        if len(self.counts) > 1:
+            return super().whole()
+        return replace(self._part(0), render_model=self.render_model)
 
     def positions(self, rows: int) -> Iterator[NDArray[np.float32]]:
-        return (self._part(number).means for number in range(len(self._counts)))
+        return (self._part(number).means for number in range(len(self.counts)))
 
     def blocks(self, rows: int, start: int = 0) -> Iterator[Splats]:
-        for number, begin in from_row(self._counts, start):
+        for number, begin in from_row(self.counts, start):
             part = replace(self._part(number), render_model=self.render_model)
             for first in range(begin, len(part), rows):
                 block = part.take(slice(first, first + rows))

@@ -278,7 +278,7 @@ class Stream(PartsStream):
     """Tiles of a folder as a scene, read one at a time."""
 
     def __init__(self, path: Path) -> None:
-        store = TileStore.open(path)
+        self.store = store = TileStore.open(path)
         counts = [tile.rows for tile in store.tiles]
         parts = counts, store.read, store.sh_degree, store.offset
         super().__init__(path, *parts, [store.key], store.notes, store.render_model)

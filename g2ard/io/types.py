@@ -63,12 +63,8 @@ class Points:
         return len(self.positions)
 
 
-@dataclass(frozen=True, eq=False)
-class Scene:
-    """Gaussians of a file, with notes."""
-
-    splats: Splats
-    notes: tuple[Note, ...] = ()
+Noted = tuple[Splats, tuple[Note, ...]]
+"""Gaussians of a file, and notes."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,7 +7,6 @@ harmonic odd in them. Scales and opacities are linear. Band 0 precedes the other
 import re
 import zipfile
 from contextlib import suppress
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -21,7 +20,7 @@ from g2ard.io.glb import LINEAR_NOTE, placed
 from g2ard.io.packing import rounding, unit_quats, writable
 from g2ard.io.sanitize import Raw, cleaned
 from g2ard.io.spz import FLIPS
-from g2ard.io.types import Note, Scene
+from g2ard.io.types import Note, Noted
 from g2ard.progress import Progress, plural, silent
 from g2ard.scene.splats import SH_C0, Splats
 
@@ -127,7 +126,7 @@ def _save(pxr: Any, path: Path, splats: Splats, progress: Progress) -> None:
     stage.GetRootLayer().Save()
 
 
-def read(path: Path) -> Scene:
+def read(path: Path) -> Noted:
     """Read all visible ParticleField3DGaussianSplat of a stage, in the axes of a .ply; needs usd-core.
 
     Instances are read as often as they occur. Of time samples, the earliest count.
@@ -146,7 +145,7 @@ def read(path: Path) -> Scene:
     found = placed(path, parts) if shown else None
     if found is None:
         raise InputError(_nothing(path, held, len(fields)), path=path)
-    return replace(found, notes=(*found.notes, ignored)) if hidden else found
+    return (found[0], (*found[1], ignored)) if hidden else found
 
 
 def _not_a_stage(path: Path, error: Exception) -> InputError:
@@ -190,7 +189,7 @@ def _nothing(path: Path, held: list[Any], fields: int) -> str:
     return f"has no prim of type {_SCHEMA}" + (f", only {', '.join(types[:4])}" if types else "")
 
 
-def _read_prim(path: Path, pxr: Any, prim: Any) -> Scene:
+def _read_prim(path: Path, pxr: Any, prim: Any) -> Noted:
     means = _values(path, pxr, prim, "positions", 3, None)
     count, notes = len(means), []
     degree = _earliest(pxr, prim.GetAttribute(f"{_SH}Degree"))

@@ -11,7 +11,7 @@ from g2ard.config.checks import check_type, checks_arguments
 from g2ard.config.choices import ViewFormat
 from g2ard.errors import InputError, OutputError
 from g2ard.io.atomic import atomic_folder, atomic_output, check_output
-from g2ard.io.detect import reader, run_views
+from g2ard.io.detect import file_format, reader, run_views
 from g2ard.io.signs import explained
 from g2ard.progress import plural
 
@@ -128,7 +128,8 @@ def read_view_set(
     if not isinstance(path, ViewFiles):
         path = ViewFiles(Path(path), Path(images) if images else None, alpha)
     images, alpha = path.images, path.alpha
-    path, module = reader(run_views(path.path), "views")
+    path = run_views(path.path)
+    module = reader(path, file_format(path), "views")
     if images is not None and not images.is_dir():
         raise InputError("no such folder of photos", path=images)
     try:

@@ -14,7 +14,7 @@ from g2ard.config.checks import Degree, Positive, checks_arguments
 from g2ard.config.choices import AxesName, RenderModel
 from g2ard.config.schema import Settings
 from g2ard.errors import InputError, require
-from g2ard.io import check_scene, spz
+from g2ard.io import Source, spz
 from g2ard.io.scene_formats import FORMATS
 from g2ard.jobs.inputs import load_scene
 from g2ard.progress import Say, unsaid
@@ -167,20 +167,22 @@ def read_merged(
 ) -> Splats:
     """Read scenes and join them; the arguments are those of `convert`."""
     several = [scenes] if isinstance(scenes, Splats | str | Path) else scenes
-    return join([_loaded(scene, from_axes, render_model, say) for scene in several])
+    sources = [scene if isinstance(scene, Splats) else Source(scene, render_model) for scene in several]
+    return join([_loaded(source, from_axes, say) for source in sources])
 
 
-def _loaded(scene: Scene, axes: AxesName | None, render_model: RenderModel | None, say: Say) -> Splats:
+def _loaded(scene: Splats | Source, axes: AxesName | None, say: Say) -> Splats:
     """Read a scene whose file may store other axes than its format defines."""
-    splats = load_scene(scene, say, render_model)
+    splats = load_scene(scene, say)
     if axes is None:
         return splats
     defined = "RDF"
-    if not isinstance(scene, Splats):
-        path, name = check_scene(scene)
-        if name == "spz" and spz.names_axes(path):
-            raise InputError("names its axes, which are followed", path=path, hint="leave {from_axes} out")
-        known = (each.axes for each in FORMATS.values() if each.module == name)
+    if isinstance(scene, Source):
+        if scene.format == "spz" and spz.names_axes(scene.file):
+            raise InputError(
+                "names its axes, which are followed", path=scene.file, hint="leave {from_axes} out"
+            )
+        known = (each.axes for each in FORMATS.values() if each.module == scene.format)
         defined = next((found for found in known if found), "RDF")
     if axes == defined:
         return splats

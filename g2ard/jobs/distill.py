@@ -17,7 +17,7 @@ from g2ard.config.checks import AtLeastOne, Positive, checks_arguments
 from g2ard.config.choices import Colour, FormatName, RenderModel, is_made
 from g2ard.config.schema import keywords, listed
 from g2ard.errors import InputError
-from g2ard.io import kind, read_cloud, read_splats
+from g2ard.io import Source, read_splats
 from g2ard.io.paths import real_path
 from g2ard.io.splits import for_training
 from g2ard.io.types import Cloud, Points
@@ -334,7 +334,8 @@ class DistillJob:
         return None if unseen is None else unseen / len(self.prior)
 
 
-Scene = Splats | Points | str | Path | None
+Given = Splats | Points | Source | None
+"""What is distilled; None starts from photos alone."""
 
 _SHOWN = 3
 """Views in pictures of a run."""
@@ -345,7 +346,7 @@ _USUAL_RATIO = 10
 
 @checks_arguments
 def distill(
-    scene: Scene,
+    scene: Splats | Points | str | Path | None,
     *,
     count: int | None = None,
     ratio: float | None = None,
@@ -464,13 +465,13 @@ def distill(
         up=up,
         size=size,
         clean=clean,
-        render_model=render_model,
         format=format,
         preset=preset,
         time=time,
         settings=keywords(distill, DistillConfig(), fields | named) | dict(settings or {}),
     )
-    job = prepare(scene, budget, options, progress=progress, say=say)
+    source = Source(scene, render_model) if isinstance(scene, str | Path) else scene
+    job = prepare(source, budget, options, progress=progress, say=say)
     done = job.run(work)
     if judgement := job.budget.judge(done.splats):
         say(judgement[1])
@@ -479,7 +480,7 @@ def distill(
 
 @contextmanager
 def preparing(
-    scene: Scene,
+    scene: Given,
     budget: Budget | None,
     options: DistillOptions,
     tiling: Tiling | None = None,
@@ -492,7 +493,7 @@ def preparing(
     """Prepare a distillation in one piece, or in tiles.
 
     Args:
-        tiling: how to process the scene, a path, in tiles; None for one piece.
+        tiling: how to process the scene, a file, in tiles; None for one piece.
         planned: whether tiles are only planned: the job has a cost, but cannot run.
     """
     callbacks: dict[str, Any] = {"progress": progress, "say": say}
@@ -501,15 +502,15 @@ def preparing(
         return
     from g2ard.jobs.in_tiles import opened, prepare_tiles
 
-    assert isinstance(scene, Path)
-    began, model = time.monotonic(), options.render_model
+    assert isinstance(scene, Source)
+    began = time.monotonic()
     options.check_trained()
-    with opened(scene, tiling, RECOVERY_TIMES, render_model=model, planned=planned, **callbacks) as tiles:
+    with opened(scene, tiling, RECOVERY_TIMES, planned=planned, **callbacks) as tiles:
         yield prepare_tiles(tiles, budget, options, recovers=use != "merging", began=began, **callbacks)
 
 
 def prepare(
-    scene: Scene,
+    scene: Given,
     budget: Budget | None,
     options: DistillOptions,
     *,
@@ -679,16 +680,16 @@ class _Read:
 
 
 def _read(
-    scene: Scene, budget: Budget | None, options: DistillOptions, progress: Progress, say: Say
+    scene: Given, budget: Budget | None, options: DistillOptions, progress: Progress, say: Say
 ) -> _Read:
     """Read the dense scene, or lift points; with photos they are topped up to the budget."""
     if isinstance(scene, Splats):
         options.check_trained()
         return _Read(scene.narrowed(), False, False, options.beside, "scene", len(scene))
-    if isinstance(scene, str | Path) and kind(scene) == "splats":
+    if isinstance(scene, Source) and scene.kind == "splats":
         options.check_trained()
-        splats = load_scene(scene, say, options.render_model)
-        return _Read(splats, False, False, options.beside or scene, str(scene), len(splats))
+        splats = load_scene(scene, say)
+        return _Read(splats, False, False, options.beside or scene.path, str(scene), len(splats))
     views, recover = options.views, options.config.recover
     if views is None or is_made(views):
         if scene is None:
@@ -735,9 +736,7 @@ def _read(
     return _Read(lifted, True, True, options.beside, name, given, of_photos, usual)
 
 
-def _points(
-    scene: Points | str | Path | None, views: Views | None, say: Say
-) -> tuple[Cloud | None, str, bool]:
+def _points(scene: Points | Source | None, views: Views | None, say: Say) -> tuple[Cloud | None, str, bool]:
     """Return a cloud, or that stored with the views, its name in errors, and whether it was found in photos.
 
     With views, the cloud may be without colours.
@@ -747,8 +746,8 @@ def _points(
     sparse = None if views is None else sparse_file(views)
     if scene is None:
         return sparse_points(sparse, say), "cloud" if sparse is None else str(sparse), True
-    cloud = read_cloud(scene, bare=views is not None)
+    cloud = scene.cloud(bare=views is not None).whole()
     for note in cloud.notes:
         say(f"{scene}: {note}")
-    given = (kind(scene) == "views" and sparse_file(scene)) or Path(scene)
+    given = (scene.kind == "views" and sparse_file(scene.path)) or scene.path
     return cloud, str(scene), sparse is not None and real_path(given) == real_path(sparse)

@@ -10,12 +10,11 @@ from pathlib import Path
 
 import numpy as np
 
-from g2ard.config.choices import RenderModel
 from g2ard.errors import InputError
-from g2ard.io import open_stream
-from g2ard.io.detect import MANIFEST
 from g2ard.io.reports import Report
 from g2ard.io.sanitize import BLOCK
+from g2ard.io.source import Source
+from g2ard.io.stream import PartsStream
 from g2ard.io.tile_store import TileStore
 from g2ard.jobs.budget import Budget
 from g2ard.jobs.budget_search import ResolvedBudget, resolved_in_tiles
@@ -37,7 +36,7 @@ from g2ard.stages.simplify.gaps import say_gaps
 from g2ard.system.peak_memory import peak_rss_of_all
 from g2ard.tiles.executor import Workers, executor
 from g2ard.tiles.ingest import ingest
-from g2ard.tiles.merging import TiledScene, simplify_tiles
+from g2ard.tiles.merging import simplify_tiles
 from g2ard.tiles.recover import recover_tiles
 from g2ard.tiles.sights import Sights
 from g2ard.tiles.simplify import TiledRun, sample_stride
@@ -52,12 +51,11 @@ class Tiles:
         workers: None if nothing is to be computed.
     """
 
-    scene: Path
+    source: Source
     tiling: Tiling
     plan: TilePlan
     store: TileStore | None = None
     workers: Workers | None = None
-    render_model: RenderModel | None = None
 
     @property
     def written(self) -> TileStore:
@@ -73,14 +71,14 @@ class Tiles:
     def simplified(self, count: int, views: Cameras | None, config: SimplifyConfig) -> TiledSimplified:
         """Simplify the scene; finished steps are in the folder of its workers."""
         small = simplify_tiles(self.run(config), count, views, gaps=True)
-        parts = list(small.counts), small.views, small.unseen, small.opacity_lost
-        return TiledSimplified(small, TiledSimplifyReport(self.plan.count, len(small), *parts))
+        parts = list(small.splats.counts), small.views, small.unseen, small.opacity_lost
+        return TiledSimplified(small.splats, TiledSimplifyReport(self.plan.count, len(small.splats), *parts))
 
     def sample(self, config: SimplifyConfig) -> Splats:
         """Return a sample of the Gaussians, from which views are planned and constants chosen."""
         if self.workers is not None:
             return self.run(config).sample()
-        stream = open_stream(self.scene, render_model=self.render_model)
+        stream = self.source.scene
         stride, read, parts = sample_stride(stream.count), 0, []
         for block in stream.blocks(BLOCK):
             parts.append(block.take(slice(-read % stride, None, stride)))
@@ -90,11 +88,10 @@ class Tiles:
 
 @contextmanager
 def opened(
-    scene: Path,
+    source: Source,
     tiling: Tiling,
     times: float,
     *,
-    render_model: RenderModel | None = None,
     planned: bool = False,
     progress: Progress = silent,
     say: Say = unsaid,
@@ -106,26 +103,25 @@ def opened(
         times: memory of a tile relative to merging it.
         planned: only plan this; nothing is written.
     """
-    store = TileStore.open(scene) if (scene / MANIFEST).is_file() else None
-    if store is not None and render_model not in (None, store.render_model):
+    store, model = source.store, source.render_model
+    if store is not None and model not in (None, store.render_model):
         raise InputError(
             f"these tiles are {store.render_model}",
-            path=scene,
-            hint=f"run `g2ard ingest --render-model {render_model}` on their scene",
+            path=source.path,
+            hint=f"run `g2ard ingest --render-model {model}` on their scene",
         )
     if store is None and not planned:
         store = ingest(
-            scene,
+            source,
             tiling.folder / "tiles",
             tile_rows=tiling.most_rows,
-            render_model=render_model,
             overwrite=not tiling.keep,
             progress=progress,
             say=say,
         )
-    plan = plan_tiles(store or open_stream(scene), tiling, times)
+    plan = plan_tiles(store or source.scene, tiling, times)
     say(f"{plan.tiles:,} tiles of {plan.count:,} Gaussians, {plan.workers} at a time")
-    tiles = Tiles(scene, tiling, plan, store, render_model=render_model)
+    tiles = Tiles(source, tiling, plan, store)
     if planned:
         yield tiles
         return
@@ -136,7 +132,7 @@ def opened(
 
 @dataclass(frozen=True)
 class TiledSimplifyReport(Report):
-    """Report of a simplification in tiles; the fields are those of `TiledScene`."""
+    """Report of a simplification in tiles; the fields are those of `Merged`."""
 
     input_count: int
     output_count: int
@@ -151,7 +147,7 @@ class TiledSimplifyReport(Report):
 class TiledSimplified:
     """A simplified scene in tiles, and a report."""
 
-    splats: TiledScene
+    splats: PartsStream
     report: TiledSimplifyReport
 
 
@@ -159,8 +155,8 @@ class TiledSimplified:
 class TiledDistilled:
     """A distilled scene in tiles, with its unrecovered version and its scores."""
 
-    splats: TiledScene
-    simplified: TiledScene
+    splats: PartsStream
+    simplified: PartsStream
     scores: TiledScores
 
 
@@ -246,17 +242,17 @@ class TiledJob:
         self.around = self.around or small.sights  # the first is made from the dense scene itself
         assert self.around is not None  # views are given
         dense = self.tiles.written
-        student = self._stored(small, "student", like=dense)
+        student = self._stored(small.splats, "student", like=dense)
         steps = replace(self, views=views).steps(count) if self.recovers else 0
         splats, scores = recover_tiles(
             dense, student, self.around, views, self.config.recover, steps, run.workers
         )
-        return TiledDistilled(splats, small, scores)
+        return TiledDistilled(splats, small.splats, scores)
 
-    def _stored(self, scene: TiledScene, name: str, like: TileStore | None = None) -> TileStore:
+    def _stored(self, scene: PartsStream, name: str, like: TileStore | None = None) -> TileStore:
         """Write a derived scene in tiles of its own, or in those of another."""
-        folder = self.tiles.tiling.folder / f"{name}-{scene.key}"
-        return ingest(scene.stream(), folder, tile_rows=self.tiles.tiling.most_rows, like=like)
+        folder = self.tiles.tiling.folder / f"{name}-{scene.identity()[0]}"
+        return ingest(scene, folder, tile_rows=self.tiles.tiling.most_rows, like=like)
 
 
 def prepare_tiles(
@@ -276,17 +272,17 @@ def prepare_tiles(
     """
     total = tiles.plan.count
     if budget.bytes is None:
-        budget.of(total, str(tiles.scene))  # refused before any work
+        budget.of(total, str(tiles.source))  # refused before any work
     sample = tiles.sample(options.config.simplify)
     degree = options.config.recover.sh_degree
     stored = sample if degree is None else sample.with_sh_degree(degree)
-    wanted = resolved_in_tiles(budget, total, stored, str(tiles.scene), f"scene.{options.format}", say)
+    wanted = resolved_in_tiles(budget, total, stored, str(tiles.source), f"scene.{options.format}", say)
     say_regions(sample, options.config.simplify, "a sample of the scene", unsaid)
     views = views_of(
         sample,
         options,
         wanted.count,
-        beside=options.beside or tiles.scene,
+        beside=options.beside or tiles.source.path,
         use="tiles" if recovers else "merging",
         represents=total / len(sample),
         progress=progress,

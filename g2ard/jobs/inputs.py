@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 
 from g2ard.config.choices import RenderModel
 from g2ard.errors import InputError
-from g2ard.io import read_scene, read_view_set
+from g2ard.io import Source, read_view_set
 from g2ard.io.images import find_exposures
 from g2ard.io.splits import not_held_out, split_mask, splits_of
-from g2ard.io.types import Note, ViewFiles, ViewSet
+from g2ard.io.types import ViewFiles, ViewSet
 from g2ard.progress import Say, plural, unsaid
 from g2ard.rendering.renderer import RasterSettings
 from g2ard.rendering.targets import Photos, PhotosOrRenders, Targets, TeacherRenders, with_pixels
@@ -30,24 +30,21 @@ Split = str | Callable[..., "NDArray[np.bool_]"]  # of `split_mask`, or a functi
 
 
 def load_scene(
-    scene: Splats | str | Path, say: Say = unsaid, render_model: RenderModel | None = None
+    scene: Splats | Source | str | Path, say: Say = unsaid, render_model: RenderModel | None = None
 ) -> Splats:
-    """Return a scene; one that is a path is read, and its notes are reported."""
+    """Return a scene, which is read unless it is in memory.
+
+    Notes on its file are reported, except those that do not affect rendering: a logit beyond ±16 is α = 0 or
+    1 to within 1e-7, and only `g2ard info` reports these.
+    """
     if isinstance(scene, Splats):
         return scene
-    found = read_scene(scene, render_model=render_model)
-    say_notes(scene, found.notes, say)
-    return found.splats
-
-
-def say_notes(path: str | Path, notes: Sequence[Note], say: Say) -> None:
-    """Report notes, except those that do not affect rendering.
-
-    A logit beyond ±16 is α = 0 or 1 to within 1e-7; only `g2ard info` reports these.
-    """
-    for note in notes:
+    source = scene if isinstance(scene, Source) else Source(scene, render_model)
+    splats = source.whole()
+    for note in source.notes:
         if note.code not in _UNREPORTED_NOTES:
-            say(f"{path}: {note}")
+            say(f"{source}: {note}")
+    return splats
 
 
 def say_regions(splats: Splats, config: SimplifyConfig, name: str, say: Say) -> None:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from g2ard.config.checks import AtLeastOne, checks_arguments
 from g2ard.config.choices import BLACK, Colour, RenderModel
 from g2ard.errors import InputError
-from g2ard.io.detect import kind
+from g2ard.io import Source
 from g2ard.io.labels import names_of
 from g2ard.io.reports import Report
 from g2ard.io.scenes import tell
@@ -154,7 +154,7 @@ class LevelsJob:
 
 @contextmanager
 def preparing_levels(
-    scene: Splats | str | Path,
+    scene: Splats | Source,
     tiling: Tiling | None = None,
     *,
     ratios: Sequence[float],
@@ -180,9 +180,9 @@ def preparing_levels(
     if isinstance(scene, Splats):
         scene = scene.narrowed()  # levels and sky then have one offset
     else:
-        inputs["beside"] = inputs.get("beside") or scene
+        inputs["beside"] = inputs.get("beside") or scene.path
     if split_sky:
-        scene = load_scene(scene, say, inputs["render_model"])
+        scene = load_scene(scene, say)
         if (far := sky_mask(scene)).any():
             say(f"sky: {plural(int(far.sum()), 'Gaussian')}, kept whole")
             scene, sky = scene.take(~far), scene.take(far)
@@ -264,7 +264,7 @@ def lod(
     [800, 200, 100]
     """
     with preparing_levels(
-        scene,
+        scene if isinstance(scene, Splats) else Source(scene, render_model),
         ratios=ratios,
         recover=recover,
         steps=steps,
@@ -278,17 +278,16 @@ def lod(
         size=size,
         beside=beside,
         up=up,
-        render_model=render_model,
     ) as job:
         return job.run(work)
 
 
-def check_trained(scene: Splats | str | Path) -> None:
-    """Reject the path of a point cloud, which cannot render training images."""
-    if not isinstance(scene, Splats) and kind(scene) == "points":
+def check_trained(scene: Splats | Source) -> None:
+    """Reject the file of a point cloud, which cannot render training images."""
+    if isinstance(scene, Source) and scene.kind == "points":
         raise InputError(
             "a point cloud cannot render training images",
-            path=scene,
+            path=scene.path,
             hint="distil it first, then make levels of the result",
         )
 

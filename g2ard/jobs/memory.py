@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from g2ard.errors import InputError, require
-from g2ard.io import open_stream
+from g2ard.io.source import Source
 from g2ard.io.stream import SceneStream
 from g2ard.io.tile_store import TileStore, row_width
-from g2ard.jobs.tile_options import Tiling, cut_into, folder_of_tiles
+from g2ard.jobs.tile_options import Tiling, cut_into
 
 WHOLE_TIMES, LEVELS_TIMES = 3.6, 7.0
 """Memory in one piece as a multiple of the scene's arrays: simplification, and levels without recovery."""
@@ -108,7 +108,7 @@ def bytes_of(text: str) -> int:
     return int(size)
 
 
-def check_whole_memory(scene: Path, tiling: Tiling, times: float, tile_times: float = 1.0) -> None:
+def check_whole_memory(source: Source, tiling: Tiling, times: float, tile_times: float = 1.0) -> None:
     """Reject a scene that takes more than `--memory` in one piece.
 
     Args:
@@ -118,16 +118,16 @@ def check_whole_memory(scene: Path, tiling: Tiling, times: float, tile_times: fl
     """
     if tiling.memory is None:
         return
-    stream = open_stream(scene)
+    stream = source.scene
     row_bytes = 4 * row_width(stream.sh_degree)
     need = _TASK_BYTES + int(times * stream.count * row_bytes)
     if need > tiling.memory:
-        tiles = TileMemory(stream.count, row_bytes, tile_times, folder_of_tiles(scene))
+        tiles = TileMemory(stream.count, row_bytes, tile_times, None if source.store is None else source.path)
         raise InputError(
             f"{stream.count:,} Gaussians in one piece take about {amount(need, up=True)}, "
             f"{amount(_TASK_BYTES)} of it the program, more than {_limit_text(tiling)}; "
             f"{tiles.advice(tiling.memory, max(1, stream.count // 2))}",
-            path=scene,
+            path=source.path,
         )
 
 

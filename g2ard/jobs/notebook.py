@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from g2ard.config.checks import checks_arguments
 from g2ard.config.choices import Colour
 from g2ard.errors import InputError
-from g2ard.io.detect import run_scene
+from g2ard.io import Source
 from g2ard.io.images import contact_sheet, load_photo, png_bytes, resized
 from g2ard.io.labels import RESULT, labels_of
 from g2ard.jobs.inputs import Views, load_scene
@@ -78,17 +78,18 @@ def view(
     'view.html'
     """
     given = [scene] if other is None else [scene, other]
-    shown = [Path(one) if isinstance(one, str | Path) else one for one in given]
-    sources = [run_scene(one) if isinstance(one, Path) else None for one in shown]
-    loaded = [
-        load_scene(path or scene_of(one, name), say)  # type: ignore[arg-type] # paths have sources
-        for one, path, name in zip(given, sources, ("scene", "other"), strict=False)
+    shown = [
+        Source(one) if isinstance(one, str | Path) else scene_of(one, name)
+        for one, name in zip(given, ("scene", "other"), strict=False)
     ]
+    loaded = [load_scene(one, say) for one in shown]
     named = [
-        one if isinstance(one, Path) else "scene" if isinstance(one, Splats) else RESULT for one in shown
+        source if isinstance(source, Source) else "scene" if isinstance(one, Splats) else RESULT
+        for one, source in zip(given, shown, strict=True)
     ]
+    beside = shown[0].file if isinstance(shown[0], Source) else None
     labels = labels_of(named, [len(splats) for splats in loaded])
-    stand = frame_of(loaded[0], views, start=start, beside=sources[0], up=up, say=say)
+    stand = frame_of(loaded[0], views, start=start, beside=beside, up=up, say=say)
     page = Path(mkdtemp(prefix="g2ard-")) / "view.html" if output is None else Path(output)
     write_page(
         page,

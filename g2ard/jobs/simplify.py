@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from g2ard.config.checks import check_seed, checks_arguments
 from g2ard.config.choices import FormatName, RenderModel
 from g2ard.errors import InputError
-from g2ard.io import kind, read_cloud, read_scene
+from g2ard.io import Source
 from g2ard.io.scene_formats import check_positions
 from g2ard.io.types import Note
 from g2ard.jobs.budget import Budget
@@ -24,7 +24,7 @@ from g2ard.jobs.budget_search import (
     count_for_quality,
     resolved_in_tiles,
 )
-from g2ard.jobs.inputs import Views, say_notes, say_regions
+from g2ard.jobs.inputs import Views, load_scene, say_regions
 from g2ard.pipeline.presets import configured
 from g2ard.progress import Progress, Say, plural, silent, unsaid
 from g2ard.rendering.visibility import SampledVisibility, visibility_source
@@ -232,12 +232,11 @@ def _same(a: Splats, b: Splats) -> bool:
 
 @contextmanager
 def reducing(
-    scene: Splats | str | Path,
+    scene: Splats | Source,
     tiling: Tiling | None = None,
     *,
     planned: bool = False,
     counted: Callable[[int], None] = lambda total: None,
-    render_model: RenderModel | None = None,
     beside: str | Path | None = None,
     progress: Progress = silent,
     say: Say = unsaid,
@@ -246,45 +245,38 @@ def reducing(
     """Read a scene to be simplified, see `simplify`, or open its tiles.
 
     Args:
-        tiling: how to process the scene, a path, in tiles; None for one piece.
+        tiling: how to process the scene, a file, in tiles; None for one piece.
         planned: whether tiles are only planned.
         counted: called with the number of Gaussians before any work on them.
         options: other fields of `Reduction`.
     """
     callbacks: dict[str, Any] = {"progress": progress, "say": say}
-    beside = beside if isinstance(scene, Splats) else beside or scene
+    if isinstance(scene, Splats):
+        counted(len(scene))
+        yield Reduction(scene, beside=beside, **options, **callbacks)
+        return
+    beside = beside or scene.path
     if tiling is not None:
         from g2ard.jobs.in_tiles import opened
 
-        how: dict[str, Any] = {"render_model": render_model, "planned": planned, **callbacks}
-        with opened(Path(str(scene)), tiling, 1.0, **how) as tiles:
+        with opened(scene, tiling, 1.0, planned=planned, **callbacks) as tiles:
             counted(tiles.plan.count)
             options |= {"beside": beside, "notes": tiles.store.notes if tiles.store else (), **callbacks}
             yield Reduction(tiles.sample(options["config"]), tiles=tiles, **options)
         return
-    notes: Sequence[Note] = ()
-    if not isinstance(scene, Splats):
-        progress("read", 0, 0)
-        if kind(scene) == "points":
-            scene, notes = _lifted(scene, progress, say)
-    if not isinstance(scene, Splats):
-        found = read_scene(scene, render_model=render_model)
-        say_notes(scene, found.notes, say)
-        scene, notes = found.splats, found.notes
-    counted(len(scene))
-    yield Reduction(scene, beside=beside, notes=notes, **options, **callbacks)
-
-
-def _lifted(cloud: str | Path, progress: Progress, say: Say) -> tuple[Splats, Sequence[Note]]:
-    """Read a point cloud and lift it, like `g2ard lift`."""
-    found = read_cloud(cloud)
-    for note in found.notes:
-        say(f"{cloud}: {note}")
-    points = found.points
-    lifted = lift(points.positions, points.colors, progress=progress)
-    discs = plural(len(lifted), "disc")
-    say(f"{cloud}: {plural(len(points), 'point')} lifted to {discs}, as `g2ard lift` does")
-    return lifted, found.notes
+    progress("read", 0, 0)
+    if scene.kind == "points":
+        cloud = scene.cloud().whole()
+        for note in cloud.notes:
+            say(f"{scene}: {note}")
+        points, notes = cloud.points, cloud.notes
+        splats = lift(points.positions, points.colors, progress=progress)
+        discs = plural(len(splats), "disc")
+        say(f"{scene}: {plural(len(points), 'point')} lifted to {discs}, as `g2ard lift` does")
+    else:
+        splats, notes = load_scene(scene, say), scene.notes
+    counted(len(splats))
+    yield Reduction(splats, beside=beside, notes=notes, **options, **callbacks)
 
 
 @checks_arguments
@@ -359,8 +351,9 @@ def simplify(
     wanted = Budget(count, ratio, fit=fit, min_psnr=min_psnr, min_ssim=min_ssim)
     name = "scene" if isinstance(scene, Splats) else str(scene)
     inputs: dict[str, Any] = {"views": views, "blind": blind, "beside": beside, "up": up, "seed": seed}
-    inputs |= {"render_model": render_model, "progress": progress, "say": say}
-    with reducing(scene, config=config, **inputs) as reduce:
+    inputs |= {"progress": progress, "say": say}
+    source = scene if isinstance(scene, Splats) else Source(scene, render_model)
+    with reducing(source, config=config, **inputs) as reduce:
         budget = reduce.resolved(wanted, name, f"scene.{format}")
         small: Simplified = reduce(budget.count)
     say_gaps(small.report.opacity_lost, say)

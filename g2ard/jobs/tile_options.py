@@ -9,10 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from g2ard.errors import InputError
-from g2ard.io import open_stream
-from g2ard.io.detect import MANIFEST, kind
 from g2ard.io.scene_formats import scene_format
-from g2ard.io.tile_store import TileStore
+from g2ard.io.source import Source
 from g2ard.jobs.budget import Budget
 from g2ard.stages.simplify import Default, SimplifyConfig
 from g2ard.tiles.ingest import TILE_ROWS
@@ -20,7 +18,7 @@ from g2ard.tiles.ingest import TILE_ROWS
 if TYPE_CHECKING:
     from g2ard.pipeline.config import DistillConfig
 
-_LEAST_FILE_ROW_BYTES = 4
+_LEAST_ROW_BYTES = 4
 """Least bytes per Gaussian in a file: a smaller file is known to be small without opening it."""
 
 
@@ -78,38 +76,30 @@ def cut_into(folder: Path | None, rows: int) -> str:
     )
 
 
-def is_tiled(scene: Path, tiling: Tiling) -> bool:
+def is_tiled(source: Source, tiling: Tiling) -> bool:
     """Return whether a scene is a folder of several tiles or has too many Gaussians for one piece.
 
     Point clouds are never processed in tiles.
     """
-    if (scene / MANIFEST).is_file():
-        return len(TileStore.open(scene).tiles) > 1
-    if (
-        scene.is_file()
-        and scene.suffix.lower() != ".json"
-        and scene.stat().st_size < _LEAST_FILE_ROW_BYTES * tiling.most_rows
-    ):
+    if source.store is not None:
+        return len(source.store.tiles) > 1
+    file, most = source.file, tiling.most_rows
+    if file.is_file() and file.suffix.lower() != ".json" and file.stat().st_size < _LEAST_ROW_BYTES * most:
         return False
-
-    return kind(scene) == "splats" and open_stream(scene).count > tiling.most_rows
-
-
-def folder_of_tiles(scene: Path) -> Path | None:
-    return scene if (scene / MANIFEST).is_file() else None
+    return source.kind == "splats" and source.count > most
 
 
-def refuse_whole(scene: Path, options: Sequence[str]) -> None:
+def refuse_whole(source: Source, options: Sequence[str]) -> None:
     """Reject options, such as those of `needs_whole`, for a scene in tiles."""
     if not options:
         return
 
-    one = cut_into(folder_of_tiles(scene), open_stream(scene).count)
+    one = cut_into(None if source.store is None else source.path, source.count)
     takes = "needs" if len(options) == 1 else "need"
     raise InputError(
         f"{' and '.join(options)} {takes} the whole scene in memory, but it is processed in tiles; "
         f"use {one} for one piece",
-        path=scene,
+        path=source.path,
     )
 
 

@@ -11,11 +11,11 @@ from typing import Any
 from g2ard.config.checks import checks_arguments
 from g2ard.config.choices import RenderModel
 from g2ard.errors import InputError, OutputError, require
-from g2ard.io import kind, open_point_stream, open_stream
 from g2ard.io.atomic import drop_empty, drop_temporaries, parents_made
 from g2ard.io.detect import MANIFEST
 from g2ard.io.jsonfile import Place, checked, read_json
 from g2ard.io.lock import LOCK, check_unlocked, locked
+from g2ard.io.source import Source, joined
 from g2ard.io.stream import PointStream, SceneStream
 from g2ard.io.tile_store import VERSION, TileStore
 from g2ard.io.types import Note
@@ -36,7 +36,7 @@ _BLOCK_BYTES = 1 << 24
 
 @checks_arguments
 def ingest(
-    source: str | Path | Sequence[str | Path] | SceneStream,
+    source: str | Path | Source | Sequence[str | Path] | SceneStream,
     folder: str | Path,
     *,
     tile_rows: int = TILE_ROWS,
@@ -61,8 +61,8 @@ def ingest(
     If the tiles are complete, the call returns at once; an interrupted one leaves none.
 
     Args:
-        source: one or more scenes as accepted by `g2ard.io.open_stream`, one or more coloured point clouds as
-            accepted by `g2ard.io.open_point_stream`, or a scene stream.
+        source: one or more scenes as accepted by `g2ard.io.read_splats`, one or more coloured point clouds as
+            accepted by `g2ard.io.read_points`, or a scene stream.
         folder: output folder: absent, empty, or with these tiles.
         tile_rows: maximum Gaussians per tile; exceeded only if more of them share one position.
         block_rows: rows in memory at a time; None means 16 MiB of rows.
@@ -158,16 +158,14 @@ def _manifest(
 
 
 def _opened(
-    source: str | Path | Sequence[str | Path] | SceneStream, render_model: RenderModel | None
+    source: str | Path | Source | Sequence[str | Path] | SceneStream, render_model: RenderModel | None
 ) -> tuple[SceneStream | PointStream, list[str]]:
     """Open a source, and return the names of its files."""
     if isinstance(source, SceneStream):
         return source, [str(source.path)]
-    sources: list[str | Path] = [source] if isinstance(source, str | Path) else list(source)
-    names = [str(path) for path in sources]
-    if sources and all(kind(path) == "points" for path in sources):
-        return open_point_stream(sources), names
-    return open_stream(sources, render_model=render_model), names
+    several = [source] if isinstance(source, str | Path | Source) else source
+    sources = [one if isinstance(one, Source) else Source(one, render_model) for one in several]
+    return joined(sources), [str(one) for one in sources]
 
 
 def _done(folder: Path, key: str, overwrite: bool) -> TileStore | None:

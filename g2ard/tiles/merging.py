@@ -1,6 +1,6 @@
 """Simplification of a tiled scene to one exact budget."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -8,13 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from g2ard.config.choices import RenderModel
 from g2ard.errors import InputError
 from g2ard.io.stream import PartsStream
 from g2ard.io.tile_store import TileStore
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.splats import Splats, unit_quats
-from g2ard.scene.transform import join
 from g2ard.stages.simplify.pairs import fit_opacities
 from g2ard.system.keys import key_of
 from g2ard.tiles.sights import Sights
@@ -28,50 +26,29 @@ _PLAN_DEPTH_SHARE = 0.6
 
 
 @dataclass(frozen=True, eq=False)
-class TiledScene:
-    """A simplified scene in tiles.
+class Merged:
+    """A scene merged in tiles.
 
     Args:
-        counts: Gaussians per tile.
-        tiles: reads the Gaussians of a tile, with fitted opacities.
-        key: hash of the names of its files.
+        splats: the scene, with fitted opacities; its identity is a hash of the names of its files.
         unseen: Gaussians of the dense scene that no view sees; None without views.
         opacity_lost: share of the light that opaque pixels stop but let through in the merged scene, before
             opacities are fitted; None if not measured.
         sights: visibility of the dense tiles, for recovery; None without views.
     """
 
-    counts: tuple[int, ...]
-    tiles: Callable[[int], Splats]
-    sh_degree: int
-    offset: NDArray[np.float64]
-    key: str
-    views: int = 0
+    splats: PartsStream
+    sights: Sights | None
     unseen: int | None = None
     opacity_lost: float | None = None
-    sights: Sights | None = None
-    render_model: RenderModel = "classic"
 
-    def __len__(self) -> int:
-        return sum(self.counts)
-
-    def __iter__(self) -> Iterator[Splats]:
-        return (self.tiles(tile) for tile in range(len(self.counts)))
-
-    def stream(self) -> PartsStream:
-        """Return a stream over the tiles, as `g2ard.tiles.ingest.ingest` takes it."""
-        name = Path(f"simplified-{self.key}")
-        parts = self.counts, self.tiles, self.sh_degree, self.offset
-        return PartsStream(name, *parts, [self.key], render_model=self.render_model)
-
-    def whole(self) -> Splats:
-        """Return all tiles as one scene in memory."""
-        return join(list(self))
+    @property
+    def views(self) -> int:
+        """Number of views."""
+        return 0 if self.sights is None else len(self.sights.cameras)
 
 
-def simplify_tiles(
-    run: TiledRun, budget: int, views: Cameras | None = None, *, gaps: bool = False
-) -> TiledScene:
+def simplify_tiles(run: TiledRun, budget: int, views: Cameras | None = None, *, gaps: bool = False) -> Merged:
     """Reduce a tiled scene to exactly `budget` Gaussians with method `default`.
 
     If `budget` is the scene's count, the scene is returned unchanged. Otherwise:
@@ -96,7 +73,8 @@ def simplify_tiles(
     frame = run.sampled_frame()  # units that tiles share, so that their costs compare
     sights = None if views is None else Sights(run, views, frame)
     if budget == store.count:
-        return _scene(store, run.sizes, store.read, key_of(store.key), sights)
+        whole = scene_in_tiles(store, run.sizes, store.read, key_of(store.key), store.sh_degree)
+        return Merged(whole, sights)
     merged, counts = _merged(run, budget, frame if sights is None else sights.frame, sights)
     if sights is None:
         files, mean = [{"merged": path} for path in merged], None
@@ -113,11 +91,11 @@ def simplify_tiles(
             small = fit_opacities(small, members, wanted, weight, mean)
         return finished(small, store.sh_degree)
 
-    scene = _scene(store, counts, tile, key_of(files), sights)
+    scene = scene_in_tiles(store, counts, tile, key_of(files), store.sh_degree)
     if sights is None:
-        return scene
+        return Merged(scene, None)
     lost = _opacity_lost(run, merged, sights) if gaps else None
-    return replace(scene, opacity_lost=lost, unseen=sum(int(load(path, "unseen")[0]) for path in merged))
+    return Merged(scene, sights, sum(int(load(path, "unseen")[0]) for path in merged), lost)
 
 
 def _opacity_lost(run: TiledRun, merged: list[Path], sights: Sights) -> float:
@@ -162,19 +140,12 @@ def _merged(
     return merged, counts
 
 
-def _scene(
-    store: TileStore, counts: Sequence[int], tiles: Callable[[int], Splats], key: str, sights: Sights | None
-) -> TiledScene:
-    return TiledScene(
-        tuple(counts),
-        tiles,
-        store.sh_degree,
-        store.offset,
-        key,
-        views=0 if sights is None else len(sights.cameras),
-        sights=sights,
-        render_model=store.render_model,
-    )
+def scene_in_tiles(
+    store: TileStore, counts: Sequence[int], tile: Callable[[int], Splats], key: str, sh_degree: int
+) -> PartsStream:
+    """Return a scene whose Gaussians `tile` reads by the number of a tile of `store`."""
+    parts = counts, tile, sh_degree, store.offset
+    return PartsStream(Path(f"simplified-{key}"), *parts, [key], render_model=store.render_model)
 
 
 def finished(small: Splats, sh_degree: int) -> Splats:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard.config.schema import changed, values_of
+from g2ard.io.stream import PartsStream
 from g2ard.io.tile_store import TileStore
 from g2ard.pipeline.distill import RunViews
 from g2ard.rendering.renderer import RasterSettings, Renderer, settings_for
@@ -24,7 +25,7 @@ from g2ard.stages.recover.loop import checked_weights
 from g2ard.stages.recover.optimize import recover
 from g2ard.system.keys import key_of
 from g2ard.tiles.executor import Workers
-from g2ard.tiles.merging import TiledScene, finished
+from g2ard.tiles.merging import finished, scene_in_tiles
 from g2ard.tiles.sights import Sights, in_sight, light_of, written
 from g2ard.tiles.tasks import (
     Arguments,
@@ -163,7 +164,7 @@ def recover_tiles(
     config: RecoverConfig,
     steps: int,
     workers: Workers,
-) -> tuple[TiledScene, TiledScores]:
+) -> tuple[PartsStream, TiledScores]:
     """Recover each tile against renders of the dense scene, as if all were recovered together.
 
     A tile's Gaussians are trained. Those of other tiles within the margin, and coarse Gaussians of all other
@@ -231,15 +232,12 @@ def recover_tiles(
     pixels = int(lost[0, :, 1].sum()) // 3
     scores = TiledScores(*_psnr(lost.sum(axis=1)), pixels, kinds, sum(taken), parts)
     degree = student.sh_degree if config.sh_degree is None else config.sh_degree
-    scene = TiledScene(
-        tuple(tile.rows for tile in student.tiles),
-        lambda tile: finished(scene_of(paths[tile], "scene"), degree),
-        degree,
-        store.offset,
-        key_of([paths, degree]),
-        render_model=store.render_model,
-    )
-    return scene, scores
+    rows = [tile.rows for tile in student.tiles]
+
+    def recovered(tile: int) -> Splats:
+        return finished(scene_of(paths[tile], "scene"), degree)
+
+    return scene_in_tiles(store, rows, recovered, key_of([paths, degree]), degree), scores
 
 
 def _psnr(errors: NDArray[np.float64]) -> tuple[float, float]:

@@ -14,6 +14,7 @@ import pytest
 import g2ard
 from g2ard.config.choices import POLICIES
 from g2ard.config.schema import values_of
+from g2ard.io import Source
 from g2ard.io.types import ViewSet
 from g2ard.jobs.budget import Budget
 from g2ard.jobs.distill import preparing
@@ -241,16 +242,16 @@ def _tiles() -> tuple[Path, Tiling]:
 def _simplified_in_tiles(settings: Mapping[str, Any]) -> object:
     scene, tiling = _tiles()
     config = configured(g2ard.SimplifyConfig(), settings=settings)
-    refuse_whole(scene, needs_whole(config))
-    with reducing(scene, tiling, views=UNEVEN, config=config) as reduce:
+    refuse_whole(Source(scene), needs_whole(config))
+    with reducing(Source(scene), tiling, views=UNEVEN, config=config) as reduce:
         return reduce(BUDGET).splats.whole().fingerprint()
 
 
 def _distilled_in_tiles(settings: Mapping[str, Any]) -> object:
     scene, tiling = _tiles()
     options = DistillOptions(views=UNEVEN, size=48, settings={**FAR, **settings})
-    refuse_whole(scene, needs_whole(options.config))
-    with preparing(scene, Budget(count=BUDGET), options, tiling) as job:
+    refuse_whole(Source(scene), needs_whole(options.config))
+    with preparing(Source(scene), Budget(count=BUDGET), options, tiling) as job:
         return job.run().splats.whole().fingerprint()
 
 

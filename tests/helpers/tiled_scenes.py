@@ -69,7 +69,7 @@ def reduced(
     """Simplify in tiles without poses of its own; `where` are arguments of `executor`."""
     with executor(**where) as runs:
         run = TiledRun(store, Workers(runs, work, progress), SimplifyConfig())
-        return simplify_tiles(run, budget, views).whole()
+        return simplify_tiles(run, budget, views).splats.whole()
 
 
 def half_told(arguments: Arguments, inputs: Inputs, places: Places) -> Arrays:

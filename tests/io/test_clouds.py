@@ -9,9 +9,10 @@ import pye57
 import pytest
 
 from g2ard.errors import InputError, OutputError
-from g2ard.io import kind, open_point_stream, read_cloud, read_points, write_points
+from g2ard.io import kind, read_cloud, read_points, write_points
 from g2ard.io.types import Points
 from helpers.cloud_files import FAR, columns, las, ply
+from helpers.opened import stream_of
 
 WIDE, FLOATS = ["u2", "i4", "u4", "f4", "f8"], ["f4", "f8"]
 
@@ -34,7 +35,7 @@ def test_colors_are_read_by_their_values_whatever_their_type(
     np.testing.assert_array_equal(found.positions, places)
     np.testing.assert_allclose(found.colors, unit, atol=1e-6)
     assert (found.positions.dtype, found.colors.dtype) == (np.float64, np.float32)
-    both = open_point_stream([path, path])
+    both = stream_of([path, path])
     np.testing.assert_allclose(both.whole().points.colors, np.tile(unit, (2, 1)), atol=1e-6)
 
 
@@ -93,7 +94,7 @@ def test_offset_is_that_of_most_points(tmp_path: Path, name: str, low: float) ->
         data = bytearray(path.read_bytes())
         struct.pack_into("<6d", data, 179, *[v for _ in range(3) for v in (1e7, low)])
         path.write_bytes(data)
-    stream = open_point_stream(path)
+    stream = stream_of(path)
     near = np.concatenate(list(stream.positions(700)))
     good = np.abs(positions - FAR).max(1) < 1e3
     np.testing.assert_allclose((near + stream.offset)[good], positions[good], atol=0.01, rtol=0)
@@ -282,7 +283,7 @@ def test_a_cloud_of_nothing_moves_no_other(tmp_path: Path, rest: str, suffix: st
     if rest == "empty":
         with laspy.open(path, mode="w", header=laspy.LasHeader(point_format=2, version="1.2")):
             pass
-    stream = open_point_stream([path, tmp_path / "b.las"])
+    stream = stream_of([path, tmp_path / "b.las"])
     near = np.concatenate(list(stream.positions(500)))[-2000:]
     np.testing.assert_allclose(near + stream.offset, positions, atol=0.005, rtol=0)
     assert ("map_systems" in [note.code for note in stream.header_notes()]) == (rest == "strays")
@@ -323,7 +324,7 @@ UTM = 'PROJCS["UTM {0}N",GEOGCS["W",AUTHORITY["EPSG","4326"]],UNIT["metre",1],AU
 )
 def test_several_map_systems_are_told(tmp_path: Path, a: tuple, b: tuple, several: bool) -> None:
     paths = [systems(tmp_path / "a.las", *a), systems(tmp_path / "b.las", *b)]
-    notes = open_point_stream(paths).header_notes()
+    notes = stream_of(paths).header_notes()
     assert [note.code for note in notes] == ["map_systems"] * several
 
 

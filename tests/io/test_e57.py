@@ -8,8 +8,9 @@ import pytest
 from pye57 import libe57
 
 from g2ard.errors import InputError, MissingDependencyError
-from g2ard.io import kind, open_point_stream, read_cloud
+from g2ard.io import kind, read_cloud
 from g2ard.tiles.ingest import ingest
+from helpers.opened import stream_of
 
 TURN = np.array([np.sqrt(0.5), 0, 0, np.sqrt(0.5)])  # 90° about z
 PLACE = np.array([500_000.0, 4_000_000.0, 30.0])
@@ -54,7 +55,7 @@ def test_scans_are_joined_by_their_poses(tmp_path: Path, count: int) -> None:
 def test_blocks_begin_at_any_row(tmp_path: Path, rows: int, start: int) -> None:
     path = written(tmp_path / "a.e57", scan(0), scan(1))
     whole = read_cloud(path).points
-    blocks = list(open_point_stream(path).blocks(rows, start))
+    blocks = list(stream_of(path).blocks(rows, start))
     assert max(len(positions) for positions, _ in blocks) <= rows
     np.testing.assert_array_equal(np.concatenate([p for p, _ in blocks]), whole.positions[start:])
     np.testing.assert_allclose(np.concatenate([c for _, c in blocks]), whole.colors[start:], atol=1e-6)

@@ -12,9 +12,10 @@ import pytest
 from PIL import Image
 
 from g2ard.errors import InputError
-from g2ard.io import kind, read_scene
+from g2ard.io import kind
 from g2ard.io.signs import SIGNS, Sign, sign_of
 from g2ard.io.views import read_view_set
+from helpers.opened import read_scene
 from helpers.view_files import colmap, orbit
 
 TILESET = {"asset": {"version": "1.1"}, "geometricError": 9, "root": {"children": []}}

@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 
 from g2ard.errors import InputError
-from g2ard.io import read_scene, read_splats, write_splats
+from g2ard.io import read_splats, write_splats
 from g2ard.io.glb import EXTENSION, SPZ_EXTENSION
 from g2ard.scene.splats import Splats
 from g2ard.scene.transform import deformed, rotation_matrices
 from helpers.glb_files import glb_parts, write_glb
+from helpers.opened import read_scene
 from helpers.ply_files import scene
 from reference.rotations import covariances
 

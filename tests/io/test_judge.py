@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from plyfile import PlyData, PlyElement
 
-from g2ard.io import read_scene
 from g2ard.io.judge import judged
 from g2ard.scene.splats import SH_C0
+from helpers.opened import read_scene
 
 RNG = np.random.default_rng(5)
 COUNT = 400

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from g2ard.errors import InputError
-from g2ard.io import kind, read_scene
+from g2ard.io import kind
+from helpers.opened import read_scene
 from helpers.packed_files import truth, unpacked_ksplat
 from helpers.scenes import assert_same_bits
 

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 
+from g2ard.io import Source
 from g2ard.io.labels import labels_of, names_of
 from helpers.photos import cloud_of
 from helpers.scenes import checkered_ball
@@ -38,7 +39,7 @@ def test_the_folder_of_work_has_a_name(tmp_path: Path, monkeypatch: pytest.Monke
 def test_clouds_have_points(tmp_path: Path) -> None:
     cloud = tmp_path / "cloud.ply"
     cloud_of(cloud, checkered_ball(20))
-    assert labels_of([cloud, "small"], [20, 5], ["dense scene", "result"]) == [
+    assert labels_of([Source(cloud), "small"], [20, 5], ["dense scene", "result"]) == [
         f"dense scene: {tmp_path.name}/cloud.ply, 20 points",
         "result: small, 5 Gaussians",
     ]

@@ -15,12 +15,13 @@ import numpy as np
 import pytest
 
 from g2ard.errors import InputError
-from g2ard.io import kind, read_scene, read_splats, read_view_set, write_splats, write_views
+from g2ard.io import kind, read_splats, read_view_set, write_splats, write_views
 from g2ard.io.images import load_photo
 from g2ard.scene.splats import Splats, unit_quats
 from g2ard.stages.simplify import simplify
 from helpers.commands import CommandLine
 from helpers.glb_files import glb_parts, write_glb
+from helpers.opened import read_scene
 from helpers.packed_files import truth
 from helpers.sog_files import parts, zipped
 from helpers.trainer_files import inria

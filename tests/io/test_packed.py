@@ -12,10 +12,11 @@ import pytest
 from plyfile import PlyData, PlyElement
 
 from g2ard.errors import InputError, MissingDependencyError
-from g2ard.io import read_scene, read_splats, write_splats
+from g2ard.io import read_splats, write_splats
 from g2ard.io.sanitize import LOGIT_LIMIT
 from g2ard.scene.splats import SH_C0
 from helpers.faults import faulty
+from helpers.opened import read_scene
 from helpers.packed_files import saved, truth
 from helpers.realdata import real
 

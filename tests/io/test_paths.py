@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 
 from g2ard.errors import InputError
-from g2ard.io import read_scene, read_splats, read_views, write_splats, write_views
+from g2ard.io import read_splats, read_views, write_splats, write_views
 from g2ard.io.paths import output_names, real_path
 from g2ard.scene.splats import Splats
 from helpers.commands import CommandLine, succeeds
+from helpers.opened import read_scene
 from helpers.systems import needs_links
 from helpers.view_files import colmap, edit, orbit, views
 

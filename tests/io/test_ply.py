@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from plyfile import PlyData, PlyElement
 
 from g2ard.errors import InputError
-from g2ard.io import kind, open_stream, read_scene, read_splats, write_splats
+from g2ard.io import Source, kind, read_splats, write_splats
 from g2ard.io.sanitize import LOG_SCALE_LIMIT, LOGIT_LIMIT
 from g2ard.jobs.convert import convert
 from g2ard.jobs.viewer_frame import up_of
@@ -18,6 +18,7 @@ from g2ard.poses.site import Site
 from g2ard.scene.splats import ARRAYS, DRAWN_LOGIT, Splats
 from g2ard.stages.simplify import SimplifyConfig, simplify
 from g2ard.tiles.ingest import ingest
+from helpers.opened import read_scene, stream_of
 from helpers.ply_files import columns, save, scene
 
 
@@ -198,7 +199,7 @@ def test_missing_and_unknown_files(tmp_path: Path) -> None:
 def test_cloud_is_not_a_scene(tmp_path: Path) -> None:
     path = save(tmp_path / "a.ply", {n: np.zeros(2) for n in ("x", "y", "z", "red", "green", "blue")})
     assert kind(path) == "points"
-    for read in (read_splats, open_stream):
+    for read in (read_splats, lambda path: Source(path).scene):
         with pytest.raises(InputError, match="expected a Gaussian scene, found a coloured point cloud"):
             read(path)
 
@@ -234,7 +235,7 @@ def test_remarks_in_any_language(tmp_path: Path, keyword: str, encoding: str, op
     path = save(tmp_path / "a.ply", columns(truth), **options)
     with_header(path, lambda head: head.replace(b"element vertex", lines + b"element vertex"))
     assert_same(read_splats(path), truth)
-    assert_same(next(iter(open_stream(path).blocks(99))), truth)
+    assert_same(next(iter(stream_of(path).blocks(99))), truth)
 
 
 @pytest.mark.parametrize("mark", [b"", b"\xef\xbb\xbf"])

@@ -9,13 +9,14 @@ import pytest
 
 import g2ard
 from g2ard.errors import InputError
-from g2ard.io import describe, open_stream, read_scene, read_splats, write_splats
+from g2ard.io import describe, read_splats, write_splats
 from g2ard.rendering.metrics import psnr
 from g2ard.rendering.renderer import Renderer
 from g2ard.scene.splats import Splats
 from g2ard.scene.transform import join
 from g2ard.tiles.ingest import ingest
 from helpers.commands import CommandLine, refused, succeeds
+from helpers.opened import read_scene, stream_of
 from helpers.packed_files import saved
 from helpers.scenes import around, checkered_ball
 
@@ -49,7 +50,7 @@ def test_scores_are_equal_in_every_format_that_can_say_so(
     assert score > 40
     classic = read_splats(path, render_model="classic")
     assert psnr(images(classic), truth) < min(score - 10, 30)
-    assert all(block.antialiased for block in open_stream(path).blocks(1000))
+    assert all(block.antialiased for block in stream_of(path).blocks(1000))
     assert describe.describe(path)["render_model"] == "antialiased"
     assert not read_splats(saved(tmp_path, "other.ply", checkered_ball(20))).antialiased
 
@@ -119,7 +120,7 @@ def test_surfels_are_read_as_flat_gaussians(tmp_path: Path) -> None:
 def test_only_one_model_at_a_time(command_line: CommandLine, tmp_path: Path) -> None:
     paths = [saved(tmp_path, "ply", mip_ball()), saved(tmp_path, "b.ply", checkered_ball(50))]
     scenes = [read_splats(path) for path in paths]
-    for combine in (lambda: join(scenes), lambda: open_stream(paths), lambda: ingest(paths, tmp_path / "t")):
+    for combine in (lambda: join(scenes), lambda: stream_of(paths), lambda: ingest(paths, tmp_path / "t")):
         with pytest.raises(InputError, match="different render models"):
             combine()
     given = [path.name for path in paths] + ["c.ply"]

@@ -11,9 +11,10 @@ import pytest
 from PIL import Image
 
 from g2ard.errors import InputError
-from g2ard.io import kind, read_scene, read_splats
+from g2ard.io import kind, read_splats
 from g2ard.io.sanitize import LOGIT_LIMIT
 from helpers.faults import check_fault, faulty
+from helpers.opened import read_scene
 from helpers.realdata import real
 from helpers.scenes import assert_same_bits
 from helpers.sog_files import folder, parts, square, webp, zipped

@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 from plyfile import PlyData, PlyElement
 
-from g2ard.io import read_scene, write_splats
+from g2ard.io import write_splats
 from g2ard.io.glb import EXTENSION
 from helpers.glb_files import glb_parts, write_glb
+from helpers.opened import read_scene
 from helpers.ply_files import columns, save, scene
 from helpers.sog_files import parts, zipped
 

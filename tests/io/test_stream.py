@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from g2ard.errors import InputError
-from g2ard.io import open_stream, read_scene, write_splats
+from g2ard.io import write_splats
 from g2ard.levels import Cut, save_levels
 from g2ard.scene.splats import ARRAYS, Splats
+from helpers.opened import read_scene, stream_of
 from helpers.ply_files import columns, save, scene
 from helpers.sog_files import folder, parts
 
@@ -72,7 +73,7 @@ def test_blocks_are_the_scene(tmp_path: Path, make: Callable[[Path], Path]) -> N
         pytest.skip(f"what writes this format is not installed: {error}")
     whole = read_scene(path)
     for rows in (64, 256, 300, 10_000):
-        stream = open_stream(path)
+        stream = stream_of(path)
         assert stream.sh_degree == whole.splats.sh_degree
         np.testing.assert_array_equal(stream.offset, whole.splats.offset)
         positions = np.concatenate(list(stream.positions(rows)))
@@ -84,7 +85,7 @@ def test_blocks_are_the_scene(tmp_path: Path, make: Callable[[Path], Path]) -> N
         if not whole.notes:
             np.testing.assert_array_equal(positions, whole.splats.means)
 
-        later = open_stream(path)  # as after an interruption
+        later = stream_of(path)  # as after an interruption
         rest = list(later.blocks(rows, stream.count - 5))
         lost = stream.tally.dropped - later.tally.dropped
         assert sum(len(block) for block in rest) == 5 - later.tally.dropped
@@ -101,24 +102,24 @@ def test_several_are_one_scene(tmp_path: Path) -> None:
         write_splats(path, splats)
     first, second = (read_scene(path).splats for path in paths)
     second = second.recentred(first.offset)
-    stream = open_stream(paths)
+    stream = stream_of(paths)
     assert (stream.count, stream.sh_degree) == (500, 3)
     found = joined(list(stream.blocks(90)))
     for name in ARRAYS:
         both = [getattr(s.with_sh_degree(3), name) for s in (first, second)]
         np.testing.assert_array_equal(getattr(found, name), np.concatenate(both), err_msg=name)
     np.testing.assert_array_equal(np.concatenate(list(stream.positions(77))), found.means)
-    rest = joined(list(open_stream(paths).blocks(90, 310)))
+    rest = joined(list(stream_of(paths).blocks(90, 310)))
     assert rest.fingerprint() == found.take(slice(310, None)).fingerprint()
     with pytest.raises(InputError, match="no scene"):
-        open_stream([])
+        stream_of([])
 
 
 def test_another_time_is_another_source(tmp_path: Path) -> None:
     path = tmp_path / "a.ply"
     write_splats(path, scene(50))
-    first = open_stream(path).identity()
-    assert open_stream(path).identity() == first
+    first = stream_of(path).identity()
+    assert stream_of(path).identity() == first
     content = path.read_bytes()
     path.write_bytes(content[:-1] + bytes([content[-1] ^ 1]))
-    assert open_stream(path).identity() != first
+    assert stream_of(path).identity() != first

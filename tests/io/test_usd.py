@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from g2ard.errors import InputError
-from g2ard.io import read_scene, read_splats, write_splats
+from g2ard.io import read_splats, write_splats
 from g2ard.io.packing import unit_quats
 from g2ard.rendering.renderer import Renderer
 from g2ard.scene.cameras import Camera
@@ -17,6 +17,7 @@ from g2ard.scene.splats import Splats
 from g2ard.scene.transform import transform
 from helpers import ply_files
 from helpers.faults import faulty
+from helpers.opened import read_scene
 from reference.rotations import covariances
 
 

@@ -57,7 +57,7 @@ def test_streamed_sog_holds_the_leaves_where_the_tree_says(tmp_path: Path, offse
     meta = json.loads((tmp_path / "out" / "lod-meta.json").read_text())
     assert size == sum(p.stat().st_size for p in (tmp_path / "out").rglob("*") if p.is_file())
     assert (meta["version"], meta["count"], meta["counts"], meta["lodLevels"]) == (1, 1100, [900, 200], 2)
-    files = [sog.Stream(tmp_path / "out" / name).whole().splats for name in meta["filenames"]]
+    files = [sog.Stream(tmp_path / "out" / name).whole() for name in meta["filenames"]]
     assert [len(file) for file in files].count(0) == 0
     nodes, seen = [meta["tree"]], np.zeros((2, 2), int)
     while nodes:

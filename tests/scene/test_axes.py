@@ -9,11 +9,12 @@ import torch
 
 from g2ard.config.choices import AXES
 from g2ard.errors import InputError
-from g2ard.io import read_scene, read_splats, write_splats
+from g2ard.io import read_splats, write_splats
 from g2ard.io.spz import _ADOBE_AXES
 from g2ard.scene.splats import Splats
 from g2ard.scene.transform import change_of_axes, with_axes
 from helpers.commands import CommandLine, refused, succeeds
+from helpers.opened import read_scene
 from helpers.peers import adobe_spz, splat_transform
 from reference.raster import sh_basis
 from reference.rotations import covariances

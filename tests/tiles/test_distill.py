@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from g2ard.errors import InputError
-from g2ard.io import read_splats, write_splats, write_views
+from g2ard.io import Source, read_splats, write_splats, write_views
 from g2ard.jobs.memory import plan_tiles
 from g2ard.jobs.tile_options import Tiling, is_tiled
 from g2ard.rendering.targets import TeacherRenders
@@ -237,5 +237,5 @@ def test_tiles_make_a_folder_of_sog(command_line: CommandLine, folder: Path, tmp
 
 def test_a_cloud_is_never_in_tiles(folder: Path, tmp_path: Path) -> None:
     ply(tmp_path / "cloud.ply", columns("f4", "u1"), np.arange(240).reshape(40, 6))
-    assert not is_tiled(tmp_path / "cloud.ply", Tiling(tile_rows=10))
-    assert is_tiled(folder / "town.ply", Tiling(tile_rows=10))
+    assert not is_tiled(Source(tmp_path / "cloud.ply"), Tiling(tile_rows=10))
+    assert is_tiled(Source(folder / "town.ply"), Tiling(tile_rows=10))

@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 
 from g2ard.errors import InputError, OutputError
-from g2ard.io import read_scene, write_splats
+from g2ard.io import write_splats
 from g2ard.io.tile_store import TileStore, packed
 from g2ard.scene.kdtree import Sampler
 from g2ard.tiles.ingest import ingest
 from helpers.commands import succeeds
 from helpers.ingested import as_set, assert_same_sets, halos_of, saved, tiles_of, town
 from helpers.interruptions import interrupt_at
+from helpers.opened import read_scene
 from helpers.ply_files import columns, save
 
 

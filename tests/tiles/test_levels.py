@@ -122,7 +122,7 @@ def test_the_command_in_tiles(place: Path, tmp_path: Path, command_line) -> None
     own = peak_rss()
     assert own is None or told["peak_rss_bytes"] > own + 2e7  # the workers' too
     meta = json.loads((tmp_path / "out" / "lod-meta.json").read_text())
-    files = [sog.Stream(tmp_path / "out" / name).whole().splats for name in meta["filenames"]]
+    files = [sog.Stream(tmp_path / "out" / name).whole() for name in meta["filenames"]]
     levels = [name.split("_")[0] for name in meta["filenames"]]
     counts = {at: sum(len(f) for f, of in zip(files, levels, strict=True) if of == at) for at in "012"}
     assert counts == {"0": 3000, "1": 750, "2": 188}

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from g2ard.errors import InputError
-from g2ard.io import write_splats
+from g2ard.io import Source, write_splats
 from g2ard.io.tile_store import TileStore
 from g2ard.jobs import tile_options as policy
 from g2ard.jobs.memory import (
@@ -45,7 +45,7 @@ def test_tiles_that_are_advised_fit(scene: Path, tmp_path: Path, memory: str) ->
     with pytest.raises(
         InputError, match=r"in one piece take about 20[4-9] MB, 200 MB of it the program"
     ) as e:
-        check_whole_memory(scene, Tiling(memory=size), LEVELS_TIMES, RECOVERY_TIMES)
+        check_whole_memory(Source(scene), Tiling(memory=size), LEVELS_TIMES, RECOVERY_TIMES)
     store = tiles(scene, tmp_path / "a", advised(str(e.value)))
     assert len(store.tiles) > 1
     assert plan_tiles(store, Tiling(memory=size, folder=tmp_path / "a"), RECOVERY_TIMES).workers == 1
@@ -59,7 +59,7 @@ def test_tiles_that_are_advised_fit(scene: Path, tmp_path: Path, memory: str) ->
 def test_an_error_names_the_least_memory_that_works(scene: Path, tmp_path: Path) -> None:
     store = tiles(scene, tmp_path / "a", 6000)
     for refuse in (
-        lambda: check_whole_memory(scene, Tiling(memory=200_000_000), LEVELS_TIMES, RECOVERY_TIMES),
+        lambda: check_whole_memory(Source(scene), Tiling(memory=200_000_000), LEVELS_TIMES, RECOVERY_TIMES),
         lambda: plan_tiles(store, Tiling(memory=200_000_000, folder=tmp_path / "a"), RECOVERY_TIMES).workers,
     ):
         with pytest.raises(InputError, match="more than --memory 200 MB; the least that tiles take is") as e:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from g2ard.errors import InputError, OutputError
-from g2ard.io import open_point_stream, read_cloud, write_points
+from g2ard.io import read_cloud, write_points
 from g2ard.io.tile_store import packed
 from g2ard.io.types import Points
 from g2ard.stages.lift import LiftConfig, lift
@@ -16,6 +16,7 @@ from g2ard.tiles.ingest import ingest
 from helpers import cloud_files
 from helpers.ingested import as_set, halos_of, saved, tiles_of, town
 from helpers.interruptions import interrupt_at
+from helpers.opened import stream_of
 from helpers.ply_files import save
 
 UTM = (636_337.8, 5_427_319.25, 40.0)
@@ -53,7 +54,7 @@ def test_blocks_are_the_cloud(tmp_path: Path, name: str) -> None:
         las(path, points, 255 if name == "dim.las" else 65535)
     whole = read_cloud(path)
     for rows, start in ((100_000, 0), (700, 0), (64, 2990)):
-        stream = open_point_stream(path)
+        stream = stream_of(path)
         blocks = list(stream.blocks(rows, start))
         np.testing.assert_array_equal(np.concatenate([b[0] for b in blocks]), whole.points.positions[start:])
         colors = np.concatenate([b[1] for b in blocks])

@@ -28,7 +28,7 @@ from g2ard.stages.simplify import SimplifyConfig, simplify
 from g2ard.stages.simplify.gaps import opacity_lost
 from g2ard.tiles.executor import Workers, executor
 from g2ard.tiles.ingest import ingest
-from g2ard.tiles.merging import TiledScene, cheapest, plan_ends, simplify_tiles
+from g2ard.tiles.merging import Merged, cheapest, plan_ends, simplify_tiles
 from g2ard.tiles.simplify import GONE, TiledRun, _add_until_converged
 from g2ard.tiles.tasks import Task, far_around, scene_of
 from helpers.systems import needs_proc, workers_of
@@ -296,8 +296,8 @@ def test_every_count_from_one_per_tile_to_all_is_met(tmp_path: Path, uneven: boo
                 simplify_tiles(run, budget)
         for budget in [*range(count, count + 3), 3 * count - 1, 99, 100, 101, 120]:
             result = simplify_tiles(run, budget)
-            made = result.whole()
-            assert len(made) == len(result) == budget
+            made = result.splats.whole()
+            assert len(made) == len(result.splats) == budget
             drawn = (made.logit_opacities > -8).sum()
             assert drawn == min(budget, 100)
 
@@ -358,7 +358,7 @@ def test_a_floor_in_tiles_stays_as_closed_as_in_one_piece(tmp_path: Path, seen: 
     assert len(store.tiles) > 2
     views = ring() if seen else None
 
-    def tiled(config: SimplifyConfig, *, gaps: bool) -> TiledScene:
+    def tiled(config: SimplifyConfig, *, gaps: bool) -> Merged:
         with executor(threads=1) as runs:
             run = TiledRun(store, Workers(runs, tmp_path / "work", silent), config)
             return simplify_tiles(run, 250, views, gaps=gaps)
@@ -366,7 +366,7 @@ def test_a_floor_in_tiles_stays_as_closed_as_in_one_piece(tmp_path: Path, seen: 
     source = None if views is None else visibility_source(views)
     whole = simplify(lifted, 250, visibility=source, gaps=True)
     measured = tiled(SimplifyConfig(), gaps=True)
-    lost = [opacity_lost(lifted, small, ring()) for small in (whole.splats, measured.whole())]
+    lost = [opacity_lost(lifted, small, ring()) for small in (whole.splats, measured.splats.whole())]
     assert lost[1] == pytest.approx(lost[0], abs=0.02)
     if seen:
         assert measured.opacity_lost == pytest.approx(lost[1], abs=0.03)
@@ -374,4 +374,4 @@ def test_a_floor_in_tiles_stays_as_closed_as_in_one_piece(tmp_path: Path, seen: 
         assert measured.opacity_lost is None
     assert tiled(SimplifyConfig(), gaps=False).opacity_lost is None
     little = tiled(SimplifyConfig(max_growth=1), gaps=False)
-    assert opacity_lost(lifted, little.whole(), ring()) > lost[1] + 0.02
+    assert opacity_lost(lifted, little.splats.whole(), ring()) > lost[1] + 0.02

@@ -11,7 +11,7 @@ from g2ard.cli import options as opt
 from g2ard.cli.command import command
 from g2ard.cli.run import Run
 from g2ard.config.choices import BLACK, Colour, is_made
-from g2ard.io.detect import run_scene
+from g2ard.io import Source
 from g2ard.io.labels import labels_of, names_of
 from g2ard.io.paths import real_path
 from g2ard.progress import plural
@@ -58,19 +58,19 @@ def compare(
     if views is not None and not is_made(views):
         run.refuse_typed("on given views", "looks")
     (first, second), roles = dense_first(first, second)
-    paths = run_scene(first), run_scene(second)
+    sources = [Source(path, run.render_model) for path in (first, second)]
     if output is not None:
         run.claim_file("--output", output, page=True)
     page = [] if output is None else [("page", 1.0), ("sog", 2.0), ("sog", 0.5)]
     run.console.expect([("poses", 1.0), ("targets", 2.0), ("evaluate", 3.0), *page])
-    dense, other = (run.load(path) for path in paths)
+    dense, other = (run.load(source) for source in sources)
     known = opt.background_of(run, background, first, second)
     colour = known or BLACK
     given = opt.with_images(views, images)
     found = views_or_pool(
         dense,
         given,
-        beside=paths[0],
+        beside=sources[0].file,
         count=looks,
         size=planned_at(size),
         seed=run.seed,
@@ -116,7 +116,7 @@ def compare(
             )
             for what, name in shown.items()
         ]
-        labels = labels_of([first, second], [len(dense), len(other)], roles)
+        labels = labels_of(sources, [len(dense), len(other)], roles)
         scenes = [(label, stand.of(splats)) for label, splats in zip(labels, (dense, other), strict=True)]
         with run.finishing("--output"):
             write_page(

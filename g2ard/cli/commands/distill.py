@@ -14,7 +14,7 @@ from g2ard.cli.run import Run
 from g2ard.cli.run_result import say_fit, tell_plan, tell_run, told
 from g2ard.cli.work_folder import drop_work, tiling_of, work_folder
 from g2ard.config.choices import is_made
-from g2ard.io import kind
+from g2ard.io import Source
 
 
 @command(
@@ -104,12 +104,13 @@ def distill(
     opt.check_engine(settings.get("recover.engine"))
     refuse_file(output, f"the scene in it is scene.{format}")
     run.claim("--output", output, folder=True)
+    source = None if scene is None else Source(scene, run.render_model)
     folder = RunFolder(run, output, f"scene.{format}", resume)
     if not dry_run and (finished := folder.check(budget)):
-        drop_work(tiling_of(run, scene, output))
+        drop_work(tiling_of(run, source, output))
         run.result(finished)
         return
-    if scene is not None and kind(scene) == "views":
+    if source is not None and source.kind == "views":
         raise typer.BadParameter(
             f"{scene} holds views, not a scene; to start from photos, pass it as --views with -n COUNT"
         )
@@ -120,38 +121,37 @@ def distill(
         up=up,
         size=size,
         clean=clean,
-        render_model=run.render_model,
         format=format,
         preset=preset,
         time=time,
         settings=settings,
     )
-    tiling = tiling_of(run, scene, output)
-    how = tiling if scene is not None and is_tiled(scene, tiling) else None
-    if scene is not None and budget is not None and how is not None:
+    tiling = tiling_of(run, source, output)
+    how = tiling if source is not None and is_tiled(source, tiling) else None
+    if source is not None and budget is not None and how is not None:
         whole = needs_whole(options.config, preset, [budget], f"scene.{format}", clean=clean, photos=photos)
         whole += [] if time is None else [f"--time {time:g}"]
-        refuse_whole(scene, whole)
+        refuse_whole(source, whole)
     elif scene is not None and budget is not None:
         say_fit(run, scene, budget, f"scene.{format}")
     written = None if dry_run else how
     held = work_folder(run, written, options.views, options.held_out, again=" with --resume")
-    with held, preparing(scene, budget, options, how, planned=dry_run, **run.callbacks) as job:
+    with held, preparing(source, budget, options, how, planned=dry_run, **run.callbacks) as job:
         cost = cost_of(job, job.budget.count, page=page)
         if dry_run:
             tell_plan(run, job.budget.count, cost, job.tiles)
             return
         check_job_memory(job, tiling.memory, cost.bytes)
         run.console.expect(cost.stages)
-        source = scene or Path(str(views))
+        name = scene or Path(str(views))
         with folder.held(job):
             done: Any = job.run(folder.unfinished)
             folder.write(done, job.views, job.targets)
             with run.finishing("scoring"):
                 report: Any = job.report(done, folder.scene)
-            report, line = folder.write_pages(source, job, done, report, told(report))
+            report, line = folder.write_pages(source or name, job, done, report, told(report))
             folder.write_report(report)
-    tell_run(run, source, job, done, report, folder, line)
+    tell_run(run, name, job, done, report, folder, line)
 
 
 def _check_options(

@@ -14,7 +14,7 @@ from g2ard.cli.command import command
 from g2ard.cli.run import Run
 from g2ard.config.choices import BLACK, LpipsInput
 from g2ard.errors import InputError
-from g2ard.io import check_scene
+from g2ard.io import Source
 from g2ard.io.labels import names_of
 
 if TYPE_CHECKING:
@@ -109,8 +109,9 @@ def evaluate(
         with run.usage():
             check_teacher(views, teacher)
     given = opt.with_images(views, images, alpha) if own is None else own.views
-    for path in scenes:
-        check_scene(path)
+    sources = [Source(path, run.render_model) for path in scenes]
+    for source in sources:
+        source.check_scene()
     chosen, settings = opt.background_of(run, background, *scenes), RasterSettings(convention=convention)
     colour = chosen or BLACK
     teaching = Teaching(
@@ -139,8 +140,8 @@ def evaluate(
     rows: list[dict[str, Any]] = []
     found = []
     loaded: list[Splats] = []
-    for path in scenes:
-        splats = run.load(path)
+    for path, source in zip(scenes, sources, strict=True):
+        splats = run.load(source)
         check_sight(splats, cameras, run.say)
         if own is None and not rows:  # photos of a run, or of another scene here, are meant
             teaching.check_photos(splats, cameras)

@@ -21,6 +21,7 @@ from g2ard.io.atomic import hidden_name
 from g2ard.progress import plural
 
 if TYPE_CHECKING:
+    from g2ard.io import Source
     from g2ard.jobs.levels import LevelsJob
     from g2ard.levels import Georeference
     from g2ard.scene.splats import Splats
@@ -125,6 +126,7 @@ def lod(
         recorded,
         stoppable,
     )
+    from g2ard.io import Source
     from g2ard.io.atomic import check_output
     from g2ard.jobs.levels import (
         check_ratios,
@@ -141,15 +143,16 @@ def lod(
     from g2ard.system.peak_memory import peak_rss_of_all
 
     refuse_file(output, "levels of detail")
-    check_trained(scene)
+    source = Source(scene, run.render_model)
+    check_trained(source)
     if not recover:
         run.refuse_typed("with --merge-only", "steps")
     with run.usage():
         check_ratios(ratios)
         rule = Cut(most * 1024, extent, least * 1024)
         spot = None if place is None else _georeference(place)
-    tiling = tiling_of(run, scene, output)
-    tiled = is_tiled(scene, tiling)
+    tiling = tiling_of(run, source, output)
+    tiled = is_tiled(source, tiling)
     if spot is not None and kind == "sog":
         raise typer.BadParameter("--georeference needs --format 3dtiles")
     if environment and kind != "sog":
@@ -173,13 +176,13 @@ def lod(
         check_output(output, run.overwrite, folder=True)
     if finished or not (tiled or dry_run):
         check_stopped(run, stopped, resume or finished, meta)
-    given: Path | Splats = scene
+    given: Source | Splats = source
     if not tiled:
-        check_whole_memory(scene, tiling, LEVELS_TIMES, RECOVERY_TIMES)
+        check_whole_memory(source, tiling, LEVELS_TIMES, RECOVERY_TIMES)
         if kind == "3dtiles" and not dry_run:
             from g2ard.levels.tileset import check_tiles
 
-            given = run.load(scene)
+            given = run.load(source)
             check_tiles(output, given, max(ratios), rule)
     how = tiling if tiled else None
     if dry_run or tiled:
@@ -189,7 +192,7 @@ def lod(
     noted = recorded(run, stopped, meta) if tiled and not dry_run else nullcontext()
     options: dict[str, Any] = {"ratios": ratios, "recover": recover, "steps": steps, "background": colour}
     options |= {"split_sky": environment, "seed": run.seed, **run.callbacks}
-    options |= {"views": views, "size": size, "up": up, "render_model": run.render_model, "beside": scene}
+    options |= {"views": views, "size": size, "up": up, "beside": scene}
     with held, noted, preparing_levels(given, how, planned=dry_run, photos=False, **options) as job:
         if dry_run:
             _tell_costs(run, job)

@@ -17,7 +17,7 @@ from g2ard.cli.run_result import say_fit, say_weight, tell_quality, tiles_of
 from g2ard.cli.work_folder import tiling_of, work_folder
 from g2ard.config.choices import is_made
 from g2ard.config.schema import listed
-from g2ard.io import kind
+from g2ard.io import Source
 from g2ard.io.atomic import atomic_output
 from g2ard.io.labels import counted
 from g2ard.io.scene_formats import written_bytes
@@ -83,19 +83,20 @@ def simplify(
     given_views = views is not None and not is_made(views)
     if given_views or no_views or config.method == "paper" or (config.method == "fast" and views is None):
         run.refuse_typed("without generated views", "up")
-    tiling = tiling_of(run, scene, output)
+    source = Source(scene, run.render_model)
+    tiling = tiling_of(run, source, output)
     given = opt.with_images(views, images)
     name = "scene.ply" if output == opt.UNWRITTEN else output.name
     outputs = None if dry_run else Outputs(output, budgets, run.claim_scene)
     if outputs is not None:
         outputs.check()
-    how, maps = tiling if is_tiled(scene, tiling) else None, None
+    how, maps = tiling if is_tiled(source, tiling) else None, None
     if how is not None:
-        refuse_whole(scene, needs_whole(config, preset, budgets, name, parents=parents))
+        refuse_whole(source, needs_whole(config, preset, budgets, name, parents=parents))
     else:
         say_fit(run, scene, budgets[0], name)
-        if kind(scene) != "points":
-            check_whole_memory(scene, tiling, WHOLE_TIMES)
+        if source.kind != "points":
+            check_whole_memory(source, tiling, WHOLE_TIMES)
         if parents is not None and not dry_run:
             maps = Outputs(parents, budgets, run.claim_file, name="--parents")
         blind = no_views or config.method == "paper" or (config.method == "fast" and views is None)
@@ -116,9 +117,9 @@ def simplify(
 
     began, reports = time.perf_counter(), []
     inputs: dict[str, Any] = {"views": given, "blind": no_views, "up": up, "seed": run.seed}
-    inputs |= {"render_model": run.render_model, "planned": dry_run, "counted": counted, **run.callbacks}
+    inputs |= {"planned": dry_run, "counted": counted, **run.callbacks}
     held = work_folder(run, None if dry_run else how, given)
-    with held, reducing(scene, how, config=config, **inputs) as reduce:
+    with held, reducing(source, how, config=config, **inputs) as reduce:
         reading = (started := time.perf_counter()) - began  # shared by all budgets
         wanted = [reduce.resolved(budget, str(scene), name) for budget in budgets]
         if outputs is None:
@@ -154,7 +155,7 @@ def simplify(
                     "peak_rss_bytes": peak_rss_of_all(),
                 }
             )
-            _tell(run, scene, reduce, small, place, seconds["total"])
+            _tell(run, source, reduce, small, place, seconds["total"])
             if one.bytes is not None:
                 run.say(f"{place}: {written_bytes(place):,} of {one.bytes:,} bytes")
     run.results(reports)
@@ -178,7 +179,9 @@ def _tell_plan(run: Run, reduce: Reduction, counts: Sequence[int]) -> None:
     run.results(plans)
 
 
-def _tell(run: Run, scene: Path, reduce: Reduction, small: Simplified, output: Path, seconds: float) -> None:
+def _tell(
+    run: Run, source: Source, reduce: Reduction, small: Simplified, output: Path, seconds: float
+) -> None:
     from g2ard.stages.simplify.gaps import say_gaps
 
     if run.verbose and small.report.rounds:
@@ -187,8 +190,8 @@ def _tell(run: Run, scene: Path, reduce: Reduction, small: Simplified, output: P
     if share >= 0.02:
         run.say(f"note: no view sees {share:.0%} of the Gaussians; they are weighted by size only")
     say_gaps(small.report.opacity_lost, run.say)
-    say_weight(run, scene, output, reduce.splats)  # a sample has as much SH
-    run.say(f"{output}: {len(small.splats):,} of {counted(reduce.total, scene)} in {seconds:.1f} s")
+    say_weight(run, source.path, output, reduce.splats)  # a sample has as much SH
+    run.say(f"{output}: {len(small.splats):,} of {counted(reduce.total, source)} in {seconds:.1f} s")
 
 
 def _table(run: Run, small: Simplified) -> None:

@@ -12,7 +12,7 @@ import typer
 from g2ard.cli import options as opt
 from g2ard.cli.command import command
 from g2ard.cli.run import Run
-from g2ard.io.detect import run_scene
+from g2ard.io import Source
 from g2ard.io.labels import labels_of
 
 _LARGEST_DENSE = 2_000_000
@@ -78,13 +78,12 @@ def _is_levels(path: Path) -> bool:
 
 def _dense_of(path: Path) -> Path | None:
     """Return the scene that a run was made of, if it is there and browsers can show it."""
-    from g2ard.io.describe import describe
     from g2ard.jobs.comparison import source_of
 
     dense = source_of(path)
     if dense is None or not dense.is_file():
         return None
-    return dense if describe(dense)["count"] <= _LARGEST_DENSE else None
+    return dense if Source(dense).count <= _LARGEST_DENSE else None
 
 
 def _write(
@@ -107,12 +106,12 @@ def _write(
     views = opt.with_images(given, images)
     run.claim_file("--output", output, page=True)
     shown, roles = ([scene], ()) if other is None else dense_first(scene, other)
-    paths = [run_scene(path) for path in shown]
-    loaded = [run.load(path) for path in paths]
+    sources = [Source(path, run.render_model) for path in shown]
+    loaded = [run.load(source) for source in sources]
     if views is None and scene.is_dir() and (own := scene / "views.json").is_file():
         views = own if any(read_views(own).image_paths) else "made"  # generated ones show what trains
-    stand = frame_of(loaded[0], views, start=start, beside=paths[0], up=up, say=run.say)
-    labels = labels_of(shown, [len(splats) for splats in loaded], roles)
+    stand = frame_of(loaded[0], views, start=start, beside=sources[0].file, up=up, say=run.say)
+    labels = labels_of(sources, [len(splats) for splats in loaded], roles)
     run.begin("page")
     written, scene_sizes = write_page(
         output,
@@ -130,8 +129,8 @@ def _write(
             "output": str(output),
             "bytes": written,
             "scenes": [
-                {"scene": str(path), "count": len(splats), "bytes": size}
-                for path, splats, size in zip(paths, loaded, scene_sizes, strict=True)
+                {"scene": str(source.file), "count": len(splats), "bytes": size}
+                for source, splats, size in zip(sources, loaded, scene_sizes, strict=True)
             ],
             "start": stand.name,
             "up": stand.up.tolist(),

@@ -1,0 +1,131 @@
+"""One opened scene or coloured point cloud of any format."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from g2ard.errors import InputError
+from g2ard.io.detect import KINDS, Kind, file_format, reader, run_scene
+from g2ard.io.signs import explained
+from g2ard.system.cached import cached_property
+
+if TYPE_CHECKING:
+    from g2ard.config.choices import RenderModel
+    from g2ard.io.stream import PointStream, SceneStream
+    from g2ard.io.tile_store import TileStore
+    from g2ard.io.types import Note
+    from g2ard.scene.splats import Splats
+
+
+class Source:
+    """A scene or coloured point cloud on disk.
+
+    Its format is detected and its header read on first use, and only once.
+
+    Args:
+        path: the file or folder, or the folder of a `distill` run.
+        render_model: overrides what a scene's file says.
+
+    Attributes:
+        file: the file or folder itself, which in the folder of a run is its scene.
+    """
+
+    def __init__(self, path: str | Path, render_model: RenderModel | None = None) -> None:
+        self.path, self.file, self.render_model = Path(path), run_scene(path), render_model
+
+    def __str__(self) -> str:
+        return str(self.path)
+
+    @cached_property
+    def format(self) -> str:
+        """Name in `READERS`; an `InputError` is raised if the file is missing or unsupported."""
+        return file_format(self.file)
+
+    @property
+    def kind(self) -> Kind:
+        """Kind of the format: "splats", "points" or "views"."""
+        return KINDS[self.format]
+
+    @cached_property
+    def scene(self) -> SceneStream:
+        """Scene in blocks.
+
+        Memory holds one block of a .ply, .compressed.ply or .splat, one chunk of a SOG, one tile, or the
+        whole file of other formats.
+        """
+        stream: SceneStream = self._opened("splats")
+        stream.render_model = self.render_model or stream.render_model
+        return stream
+
+    @cached_property
+    def store(self) -> TileStore | None:
+        """The scene's tiles, if it is a folder of tiles."""
+        return self.scene.store if self.format == "tiles" else None  # type: ignore[attr-defined]
+
+    @cached_property
+    def _points(self) -> PointStream:
+        stream: PointStream = self._opened("points")
+        return stream
+
+    def cloud(self, *, bare: bool = False) -> PointStream:
+        """Return the point cloud in blocks.
+
+        Memory holds one block of a .ply, .las, .laz or .e57, or the whole file of other formats. Without
+        colours, intensities become grey; without either, the cloud must be `bare`.
+        """
+        stream = self._points
+        if not stream.channels and len(stream.sample) and not bare:
+            raise InputError(stream.lack, path=self.file, hint=_UNCOLORED)
+        return stream
+
+    @property
+    def count(self) -> int:
+        """Rows of the scene or point cloud."""
+        return (self.scene if self.kind == "splats" else self._points).count
+
+    @property
+    def notes(self) -> tuple[Note, ...]:
+        """Notes on the scene's file, known once it has been read."""
+        return self.scene.all_notes()
+
+    @explained
+    def whole(self) -> Splats:
+        """Read the scene into memory."""
+        return self.scene.whole()
+
+    def check_scene(self) -> None:
+        """Raise an `InputError` for anything but a scene."""
+        reader(self.file, self.format, "splats")
+
+    @explained
+    def _opened(self, expected: Kind) -> Any:
+        from g2ard.io.stream import PartsStream
+
+        module = reader(self.file, self.format, expected)
+        if hasattr(module, "Stream"):
+            return module.Stream(self.file)
+        return PartsStream.of(self.file, *module.read(self.file))
+
+
+_UNCOLORED = (
+    "add colours, for example with PDAL's filters.colorization, or run `distill` with photos ({views=DIR})"
+)
+
+
+def joined(sources: Sequence[Source]) -> SceneStream | PointStream:
+    """Return several scenes or point clouds as one, for reading in blocks.
+
+    Point clouds get one offset. Scenes get the offset of the first and the highest of their SH degrees; their
+    render models must agree.
+    """
+    from g2ard.io.stream import JoinedClouds, JoinedScenes
+
+    if not sources:
+        raise InputError("no scene given")
+    if all(source.kind == "points" for source in sources):
+        clouds = [source.cloud() for source in sources]
+        return clouds[0] if len(clouds) == 1 else JoinedClouds(clouds)
+    scenes = [source.scene for source in sources]
+    return scenes[0] if len(scenes) == 1 else JoinedScenes(scenes)
