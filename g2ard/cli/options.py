@@ -64,16 +64,16 @@ AlphaOption = Annotated[
 ]
 
 
-def with_images(views: Path | None, images: Path | None, alpha: Alpha = "composite") -> Any:
+def with_images(views: Path | None, folder: Path | None, alpha: Alpha = "composite") -> Any:
     """Return --views together with the options for its photos."""
     given = views is not None and not is_made(views)
-    if images is not None and not given:
+    if folder is not None and not given:
         raise typer.BadParameter("--images goes with --views VIEWS")
-    if not given or (images is None and alpha == "composite"):
+    if not given or (folder is None and alpha == "composite"):
         return views
     from g2ard.io.types import ViewFiles
 
-    return ViewFiles(Path(str(views)), images, alpha)
+    return ViewFiles(Path(str(views)), folder, alpha)
 
 
 LookOption = Annotated[

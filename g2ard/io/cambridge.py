@@ -12,7 +12,7 @@ from g2ard.io.finding import Finder
 from g2ard.io.jsonfile import Place
 from g2ard.io.paths import read_text
 from g2ard.io.photos import Frame, Lens, Listed, photo_size, posed
-from g2ard.io.types import Note
+from g2ard.io.types import Note, ViewFiles
 
 _PHOTO_SIZE = (1920, 1080)  # size of the original photos, for which focal lengths are given
 _SPLIT_FILES = {"train": "dataset_train.txt", "test": "dataset_test.txt"}
@@ -24,13 +24,14 @@ def holds(folder: Path) -> bool:
     return (folder / _NVM_FILE).is_file() and any((folder / name).is_file() for name in _SPLIT_FILES.values())
 
 
-def read(path: Path, images: Path | None = None) -> Listed:
+def read(views: ViewFiles) -> Listed:
     """Read the train and test lists of a scene's folder.
 
     A line is the photo's name, the camera's centre and the quaternion (wxyz) of camera_from_world.
     VisualSFM's radial parameter r undistorts, m_u = (1 + r·|m|²)·m. OpenCV's k1 distorts; it is −r to first
     order.
     """
+    path, images = views.path, views.images
     lenses = _lenses(path / _NVM_FILE)
     median = float(np.median([focal for focal, _ in lenses.values()]))
     frames, guessed, finder = [], 0, Finder(images or path)

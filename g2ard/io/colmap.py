@@ -20,7 +20,7 @@ from g2ard.io.jsonfile import Place
 from g2ard.io.paths import read_text
 from g2ard.io.photos import Frame, Lens, Listed, posed
 from g2ard.io.transforms import intrinsics_of
-from g2ard.io.types import Note
+from g2ard.io.types import Note, ViewFiles
 from g2ard.progress import plural
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.lenses import PARAMETERS, PhotoLens
@@ -165,14 +165,15 @@ def parsing(path: Path) -> Iterator[None]:
         raise InputError(f"{error.strerror}", path=path) from error
 
 
-def read(path: Path, images: Path | None = None) -> Listed:
+def read(views: ViewFiles) -> Listed:
     """Read the registered images of a COLMAP model as views, sorted by name.
 
     `path` is the project folder, the model's folder, one of its files, or a folder of photos beside the
     model, such as images_4. Cameras are scaled to resized photos (Mip-NeRF 360's images_2, images_4). Of
     several models in numbered folders, the one with the most images is read, unless `path` is one.
     """
-    found, beside = listed(path, images), photos_beside(path)
+    path = views.path
+    found, beside = listed(views), photos_beside(path)
     others = [other for other in _models(beside[0] if beside else path) if other != found.path]
     if not others:
         return found
@@ -181,8 +182,9 @@ def read(path: Path, images: Path | None = None) -> Listed:
     return found._replace(notes=(*found.notes, Note("other_models", len(others), text)))
 
 
-def listed(path: Path, images: Path | None = None) -> Listed:
+def listed(views: ViewFiles) -> Listed:
     """Return the frames of `read`, without a note on other models."""
+    path, images = views.path, views.images
     if images is None and (beside := photos_beside(path)):
         path, images = beside
     folder = model_folder(path)

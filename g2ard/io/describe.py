@@ -14,7 +14,7 @@ from g2ard.io.detect import run_scene
 from g2ard.io.images import colour_text, photo_traits
 from g2ard.io.sog import chunks_of
 from g2ard.io.splits import splits_of
-from g2ard.io.types import Note, Points, ViewSet
+from g2ard.io.types import Note, Points, ViewFiles, ViewSet
 from g2ard.progress import plural
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.shape import elongation
@@ -24,13 +24,12 @@ _QUANTILES = (0, 1, 25, 50, 75, 99, 100)
 
 
 def describe(
-    path: str | Path, more: Callable[[Splats], dict[str, Any]] | None = None, *, images: Path | None = None
+    given: str | Path | ViewFiles, more: Callable[[Splats], dict[str, Any]] | None = None
 ) -> dict[str, Any]:
     """Summarise a scene, point cloud or views.
 
     Args:
         more: further figures of a scene.
-        images: folder of the photos of views, if they are elsewhere.
 
     Returns:
         `path`, `kind`, `format`, `bytes`, `count`, `extent` {min, max, robust_min, robust_max: the 1st and
@@ -38,7 +37,8 @@ def describe(
         and `opacity`, `largest_scale`, `smallest_scale`, `elongation` as quantiles by percentage. Point
         clouds add `color`, views `photos`, `sizes`, `fov_degrees`, `splits`.
     """
-    source, path = Source(path), Path(path)
+    source = Source(str(given))
+    path = source.path
     if source.kind == "splats":
         splats = source.whole()
         notes, figures = source.notes, _splats(splats) | ({} if more is None else more(splats))
@@ -46,7 +46,7 @@ def describe(
         cloud = source.cloud().whole()
         notes, figures = cloud.notes, _points(cloud.points)
     else:
-        views = read_view_set(path, images=images)
+        views = read_view_set(given)
         views = replace(views, splits=splits_of(path, views.cameras.names, views.splits))
         notes, figures = (*views.notes, *_photo_notes(views.cameras)), _views(views)
     return {

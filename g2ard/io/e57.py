@@ -20,7 +20,7 @@ from g2ard.io.paths import check_unpacked, file_identity
 from g2ard.io.photos import Frame, Lens, Listed, inverse, posed
 from g2ard.io.stream import JoinedClouds, MarkedPoints, Names, PointStream, telling
 from g2ard.io.transforms import FLIP
-from g2ard.io.types import Note
+from g2ard.io.types import Note, ViewFiles
 from g2ard.progress import plural
 from g2ard.scene.lenses import PhotoLens
 from g2ard.scene.transform import rotation_matrices
@@ -197,12 +197,13 @@ def _opened(path: Path) -> Iterator[Any]:
         raise InputError(f"cannot be read as E57: {text}", path=path) from error
 
 
-def read(path: Path, images: Path | None = None) -> Listed:
+def read(views: ViewFiles) -> Listed:
     """Read photos with poses as views; their files are copied to a cache once.
 
     Panoramas of the full sphere look along x with z up; pinhole images look along −z with y up, as the format
     defines. Others (for reference, cylindrical, without a pose) are left out with a note.
     """
+    path, images = views.path, views.images
     if images is not None:
         raise InputError("has its photos inside", path=path, hint="leave {images} out")
     with _opened(path) as file:

@@ -16,6 +16,7 @@ from g2ard.io.finding import Finder
 from g2ard.io.jsonfile import Matrix, Number, Place, Pose, Weight, Whole, checked, read_own
 from g2ard.io.paths import beside
 from g2ard.io.photos import Frame, Lens, Listed, rigid
+from g2ard.io.types import ViewFiles
 from g2ard.progress import plural
 from g2ard.scene.cameras import USUAL, Cameras
 from g2ard.scene.lenses import PARAMETERS, PhotoLens
@@ -46,8 +47,9 @@ class _View(msgspec.Struct):
     lens: _PhotoLens | None = None
 
 
-def read(path: Path, images: Path | None = None) -> Listed:
+def read(given: ViewFiles) -> Listed:
     """Read views; photo paths are relative to the file unless `images`, a folder of photos, is given."""
+    path, images = given.path, given.images
     content = read_own(path, _FORMAT, _VERSION).get("views", [])
     views = checked(content, list[_View], Place(path).to("views"), entries="view")
     if not views:

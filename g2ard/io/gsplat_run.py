@@ -6,7 +6,7 @@ from g2ard.errors import InputError
 from g2ard.io import colmap
 from g2ard.io.photos import Listed
 from g2ard.io.trainer_yaml import below, read_settings
-from g2ard.io.types import Note
+from g2ard.io.types import Note, ViewFiles
 
 NAME = "cfg.yml"
 
@@ -24,13 +24,14 @@ def data_of(path: Path) -> Path | None:
     return None if named is None else below(file, named)
 
 
-def read(path: Path, images: Path | None = None) -> Listed:
+def read(views: ViewFiles) -> Listed:
     """Read a run's cameras with their splits: every `test_every`th in order of names is test.
 
     Only runs with `normalize_world_space: false` are supported. Others move the world by the points'
     principal axes, whose signs depend on the linear algebra library, and do not store the transform. Without
     `images`, photos are in the data's `images_N` for `data_factor` N, or `images`.
     """
+    path, images = views.path, views.images
     file = path / NAME if path.is_dir() else path
     settings = read_settings(file)
     if settings.word("data_type") not in (None, "colmap"):
@@ -49,7 +50,7 @@ def read(path: Path, images: Path | None = None) -> Listed:
     smaller = data / f"images_{settings.word('data_factor')}"
     photos = images or (smaller if smaller.is_dir() else None)
     try:
-        found = colmap.listed(data, photos)
+        found = colmap.listed(ViewFiles(data, photos))
         frames = found.whole()
     except InputError as error:
         raise InputError(f"data_dir: {error}", path=file) from error

@@ -458,14 +458,14 @@ def check_animation(path: Path) -> None:
 
 
 def write_animation(
-    path: Path, images: Iterable[NDArray[np.uint8]], *, fps: float = 25, overwrite: bool = False
+    path: Path, pictures: Iterable[NDArray[np.uint8]], *, fps: float = 25, overwrite: bool = False
 ) -> None:
     """Write images of one size as an endless animation in the format of the suffix.
 
     A .gif rounds their duration to hundredths of a second.
     """
     check_animation(path)
-    frames = _one_size(path, iter(images))
+    frames = _one_size(path, iter(pictures))
     with atomic_output(path, overwrite) as temporary:
         if path.suffix.lower() == ".mp4":
             _encode(temporary, frames, fps)

@@ -1,7 +1,6 @@
 """Reader and writer for cameras.json, which INRIA's trainer writes into a model's folder."""
 
 from collections import Counter
-from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -11,7 +10,7 @@ from g2ard.io.finding import Finder
 from g2ard.io.jsonfile import Matrix, Number, Place, Vector, Whole, checked, read_any_json
 from g2ard.io.photos import Frame, Lens, Listed, inverse, rigid
 from g2ard.io.transforms import json_rows
-from g2ard.io.types import Note
+from g2ard.io.types import Note, ViewFiles
 from g2ard.progress import plural
 from g2ard.scene.cameras import Cameras
 
@@ -29,13 +28,14 @@ class _Camera(msgspec.Struct):
     id: Any = None
 
 
-def read(path: Path, images: Path | None = None) -> Listed:
+def read(views: ViewFiles) -> Listed:
     """Read a model's training and test cameras from its folder or its cameras.json.
 
     `rotation` holds the rows of world_from_camera, in OpenCV axes. The principal point is the image's centre,
     as in INRIA's trainer. The id is appended to repeated names, such as r_0 of each split of NeRF's synthetic
     scenes. Without `images`, photos are in `images` beside the file.
     """
+    path, images = views.path, views.images
     file = path / NAME if path.is_dir() else path
     listed = checked(read_any_json(file), list[_Camera], Place(file), entries="camera")
     beside, names = images or file.parent / "images", [camera.img_name for camera in listed]

@@ -1,5 +1,6 @@
 """Reader for LLFF's poses_bounds.npy beside a folder of photos."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +9,7 @@ from g2ard.errors import InputError, damaged
 from g2ard.io.finding import photos_in
 from g2ard.io.jsonfile import Place
 from g2ard.io.photos import Frame, Lens, Listed, inverse, rigid
+from g2ard.io.types import ViewFiles
 from g2ard.progress import plural
 
 NAME = "poses_bounds.npy"
@@ -16,7 +18,7 @@ _LLFF_AXES = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 """Columns that turn down, right, backwards into right, down, forward."""
 
 
-def read(path: Path, images: Path | None = None) -> Listed:
+def read(views: ViewFiles) -> Listed:
     """Read the poses of all photos of a folder, in the order of their names.
 
     Each row holds a 3×5 matrix and the nearest and farthest depth, which are ignored. The matrix is
@@ -25,6 +27,7 @@ def read(path: Path, images: Path | None = None) -> Listed:
     `path` is the file or its folder. Photos lie in `images`, or in `images_4` or the like if that is missing,
     and may be smaller than the stated size.
     """
+    path = views.path
     file = path / NAME if path.is_dir() else path
     try:
         rows = np.load(
@@ -35,7 +38,7 @@ def read(path: Path, images: Path | None = None) -> Listed:
     if rows.ndim != 2 or rows.shape[1] not in (15, 17) or rows.dtype.kind != "f" or not len(rows):
         shape = "×".join(map(str, rows.shape))
         raise InputError(f"holds {shape} values of {rows.dtype}, expected N×17 numbers", path=file)
-    photos = _photos(file.parent, images)
+    photos = _photos(replace(views, path=file.parent))
     if photos and len(photos) != len(rows):
         text = f"has {plural(len(rows), 'pose')} for {plural(len(photos), 'photo')} in {photos[0].parent}"
         raise InputError(text, path=file, hint="{images=DIR} names the folder with one photo per pose")
@@ -57,10 +60,10 @@ def _frame(place: Place, matrix: np.ndarray, photo: Path | None) -> Frame:
     return Frame(name, inverse(pose), lens, photo)
 
 
-def _photos(folder: Path, images: Path | None) -> list[Path]:
+def _photos(views: ViewFiles) -> list[Path]:
     """Return the photos that belong to the rows, sorted by name; none if there is no folder of photos."""
-    named = sorted((p for p in folder.glob("images*") if p.is_dir()), key=lambda p: (len(p.name), p.name))
-    for place in [images] if images else named:
+    named = sorted((p for p in views.path.glob("images*") if p.is_dir()), key=lambda p: (len(p.name), p.name))
+    for place in [views.images] if views.images else named:
         if found := photos_in(place):
             return found
     return []

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import msgspec
@@ -13,7 +14,7 @@ from g2ard.io import colmap, transforms
 from g2ard.io.jsonfile import Place, Pose, Positive, checked, read_json
 from g2ard.io.photos import Frame, Listed, inverse, rigid
 from g2ard.io.trainer_yaml import Settings, below, read_settings
-from g2ard.io.types import Note
+from g2ard.io.types import Note, ViewFiles
 from g2ard.scene.samples import evenly_spaced
 
 NAME = "dataparser_transforms.json"
@@ -34,7 +35,7 @@ class _Applied(msgspec.Struct):
     applied_scale: Positive = 1.0
 
 
-def read(path: Path, images: Path | None = None) -> Listed:
+def read(views: ViewFiles) -> Listed:
     """Read a run's training and test cameras in the world of the exported scene.
 
     x_trained = s·(D·A⁻¹·x) with s = scale / applied_scale. D and `scale`, from dataparser_transforms.json,
@@ -44,13 +45,14 @@ def read(path: Path, images: Path | None = None) -> Listed:
     `path` is the run's folder or one of its two files. config.yml names the data; without it, the data is a
     transforms.json in the folder.
     """
+    path = views.path
     folder = path if path.is_dir() else path.parent
     file = folder / NAME
     place = Place(file)
     trained = checked(read_json(file), _Trained, place)
     D = _affine(trained.transform, place.to("transform"))
     settings = read_settings(folder / CONFIG) if (folder / CONFIG).is_file() else None
-    frames, A, applied_scale = _data(folder, settings, images)
+    frames, A, applied_scale = _data(replace(views, path=folder), settings)
     scale = trained.scale / applied_scale
     trained_from_saved = rigid(D @ np.linalg.inv(A), place.to("transform"))
     found = Listed(file, [_moved(frame, trained_from_saved, scale) for frame in frames])
@@ -61,26 +63,25 @@ def read(path: Path, images: Path | None = None) -> Listed:
     return found._replace(notes=(Note("optimised_poses", len(frames), text),))
 
 
-def _data(
-    folder: Path, settings: Settings | None, images: Path | None
-) -> tuple[Sequence[Frame], NDArray[np.float64], float]:
+def _data(views: ViewFiles, settings: Settings | None) -> tuple[Sequence[Frame], NDArray[np.float64], float]:
     """Return the data's frames, and A and the scale that were applied to them."""
+    folder = views.path
     if settings is None:
         if not (folder / "transforms.json").is_file():
             raise InputError(
                 f"neither {CONFIG} nor transforms.json, which name the data, exist beside it",
                 path=folder / NAME,
             )
-        return _saved(folder / "transforms.json", images, None)
+        return _saved(replace(views, path=folder / "transforms.json"), None)
     parser, options, data = _parser(folder / CONFIG, settings)
     place = below(folder / CONFIG, data)
     if place is None:
         raise InputError(f"data {data.as_posix()} does not exist", path=folder / CONFIG)
     if parser == "ColmapDataParser":
         model = place / (options.path("colmap_path") or "colmap/sparse/0")
-        photos = images or place / (options.path("images_path") or "images")
-        return colmap.listed(model, photos if photos.is_dir() else None).whole(), _EYE, 1.0
-    return _saved(place, images, options if parser == "NerfstudioDataParser" else None)
+        photos = views.images or place / (options.path("images_path") or "images")
+        return colmap.listed(ViewFiles(model, photos if photos.is_dir() else None)).whole(), _EYE, 1.0
+    return _saved(replace(views, path=place), options if parser == "NerfstudioDataParser" else None)
 
 
 def _parser(path: Path, settings: Settings) -> tuple[str, Settings, Path]:
@@ -97,12 +98,11 @@ def _parser(path: Path, settings: Settings) -> tuple[str, Settings, Path]:
     return name, parser[1], data
 
 
-def _saved(
-    data: Path, images: Path | None, options: Settings | None
-) -> tuple[Sequence[Frame], NDArray[np.float64], float]:
+def _saved(views: ViewFiles, options: Settings | None) -> tuple[Sequence[Frame], NDArray[np.float64], float]:
     """Return the frames, A and scale of a transforms.json, or of a folder with transforms*.json."""
+    data = views.path
     file = data / "transforms.json" if (data / "transforms.json").is_file() else data
-    frames = transforms.listed(file, images).whole()
+    frames = transforms.listed(replace(views, path=file)).whole()
     if not frames:
         raise InputError("no transforms.json in the run's data", path=data)
     place = Place(file).to("applied_transform")

@@ -11,6 +11,7 @@ from g2ard.io.finding import Finder
 from g2ard.io.jsonfile import Place, Pose, checked, read_any_json
 from g2ard.io.photos import Frame, Lens, Listed, rigid
 from g2ard.io.trainer_yaml import below
+from g2ard.io.types import ViewFiles
 
 LISTS = {"transforms_train.json": "train", "transforms_eval.json": "test"}
 """File → its split."""
@@ -30,12 +31,13 @@ def exported(folder: Path) -> list[Path]:
     return [file for file in lists if isinstance(read_any_json(file), list)]
 
 
-def read(path: Path, images: Path | None = None) -> Listed:
+def read(views: ViewFiles) -> Listed:
     """Read exported poses, {file_path, transform}: world_from_camera, 3×4, OpenGL axes, in the scene's world.
 
     `path` is one of the lists, or the folder of both. Intrinsics come from a transforms.json or a COLMAP
     model above the photos, scaled to the photos' size.
     """
+    path, images = views.path, views.images
     files = exported(path) if path.is_dir() else [path]
     lenses: dict[Path, dict[str, Lens]] = {}
     frames, finder = [], Finder(images) if images else None
@@ -82,9 +84,9 @@ def _lens(listed: Place, named: Path, place: Path | None, known: dict[Path, dict
 
 def _lenses(folder: Path) -> dict[str, Lens]:
     if (folder / "transforms.json").is_file():
-        frames = transforms.listed(folder / "transforms.json").whole()
+        frames = transforms.listed(ViewFiles(folder / "transforms.json")).whole()
     elif folder.is_dir() and colmap.model_folder(folder) is not None:
-        frames = colmap.listed(folder).whole()
+        frames = colmap.listed(ViewFiles(folder)).whole()
     else:
         return {}
     names = [Path(frame.photo.name if frame.photo else frame.name).name for frame in frames]

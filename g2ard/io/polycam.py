@@ -10,7 +10,7 @@ from g2ard.io.finding import Finder, files_in
 from g2ard.io.jsonfile import Number, Place, Whole, checked, read_json
 from g2ard.io.photos import Frame, Lens, Listed, rigid
 from g2ard.io.transforms import opencv_view
-from g2ard.io.types import Note
+from g2ard.io.types import Note, ViewFiles
 
 _FOLDERS = (("corrected_cameras", "corrected_images"), ("cameras", "images"))
 """Folders of cameras and photos: after Polycam's optimisation, and as ARKit tracked them."""
@@ -36,10 +36,11 @@ def cameras_in(path: Path) -> tuple[Path, Path] | None:
     return None
 
 
-def read(path: Path, images: Path | None = None) -> Listed:
+def read(views: ViewFiles) -> Listed:
     """Read the keyframes of a capture: fx, fy, cx, cy, width, height, and rows t_00 … t_23 of
     world_from_camera in OpenGL axes, metres, y up.
     """
+    path, images = views.path, views.images
     folders = cameras_in(path)
     if folders is None:
         raise InputError("has no keyframes/cameras with .json files", path=path)

@@ -16,7 +16,7 @@ from g2ard.io.finding import Finder, is_end
 from g2ard.io.jsonfile import Number, Place, Pose, Vector, Whole, checked, read_json
 from g2ard.io.paths import beside
 from g2ard.io.photos import Frame, Lens, Listed, fits, inverse, photo_size, rigid
-from g2ard.io.types import Note
+from g2ard.io.types import Note, ViewFiles
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.lenses import PhotoLens
 
@@ -77,26 +77,28 @@ class _Numbered(msgspec.Struct):
     rot_mat: Any
 
 
-def read(path: Path, images: Path | None = None) -> Listed:
+def read(views: ViewFiles) -> Listed:
     """Read frames with their photos and intrinsics, which override those of the file.
 
     `path` is the JSON, or a folder with transforms.json, or with transforms_train.json and
     transforms_test.json, which then are the splits. transforms_train.json finds the other beside it.
     """
+    path = views.path
     if path.name != _TRAIN:
-        return listed(path, images)
+        return listed(views)
     test, note = path.parent / _TEST, Note("test_beside", 1, f"{_TEST} beside it has the test views")
     if test.is_file():
-        found = _listed(path, {path: "train", test: "test"}, images)
+        found = _listed(path, {path: "train", test: "test"}, views.images)
         return found._replace(notes=(*found.notes, note))
     note = Note("no_test_beside", 1, f"no {_TEST} beside it; every 8th of its views is held out")
-    found = listed(path, images)
+    found = listed(views)
     return found._replace(notes=(*found.notes, note))
 
 
-def listed(path: Path, images: Path | None = None) -> Listed:
+def listed(views: ViewFiles) -> Listed:
     """Return the frames of `read`, of a transforms_train.json without the other beside it."""
-    return _listed(path, {path: None} if path.is_file() else files_of(path), images)
+    path = views.path
+    return _listed(path, {path: None} if path.is_file() else files_of(path), views.images)
 
 
 def files_of(folder: Path) -> dict[Path, str | None]:
@@ -108,16 +110,16 @@ def files_of(folder: Path) -> dict[Path, str | None]:
     return {file: split for file, split in named.items() if file.is_file()}
 
 
-def _listed(path: Path, files: Mapping[Path, str | None], images: Path | None) -> Listed:
+def _listed(path: Path, files: Mapping[Path, str | None], among: Path | None) -> Listed:
     frames, left_out, notes = list[Frame](), list[tuple[str, InputError]](), list[Note]()
     for file, split in files.items():
-        own, further = _frames(file, images, left_out, split)
+        own, further = _frames(file, among, left_out, split)
         frames, notes = frames + own, [*notes, *further]
     return Listed(path, frames, left_out, tuple(notes))
 
 
 def _frames(
-    path: Path, images: Path | None, left_out: list[tuple[str, InputError]], split: str | None
+    path: Path, among: Path | None, left_out: list[tuple[str, InputError]], split: str | None
 ) -> tuple[list[Frame], tuple[Note, ...]]:
     """Read the frames of a transforms.json, and append views with numbers that are not finite to `left_out`.
 
@@ -134,7 +136,7 @@ def _frames(
     folder, above = path.parent, path.parent.parent
     names = [str(entry.get("file_path")) for entry in lists["frames"] if isinstance(entry, dict)]
     places = [folder, folder / "images", above / "resized_images"]
-    finder = Finder(images) if images else Finder.among(names, places, [folder])
+    finder = Finder(among) if among else Finder.among(names, places, [folder])
     masks = Finder(folder, folder / "masks", above / "resized_anon_masks")
     apart = [(key, word) for key, word in _APART.items() if lists[key]]
     frames: list[Frame] = []

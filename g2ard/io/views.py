@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -125,19 +126,19 @@ def read_view_set(
     from g2ard.io.splits import split_mask
     from g2ard.io.types import ViewFiles
 
-    if not isinstance(path, ViewFiles):
-        path = ViewFiles(Path(path), Path(images) if images else None, alpha)
-    images, alpha = path.images, path.alpha
-    path = run_views(path.path)
+    given = path
+    if not isinstance(given, ViewFiles):
+        given = ViewFiles(Path(given), Path(images) if images else None, alpha)
+    path = run_views(given.path)
     module = reader(path, file_format(path), "views")
-    if images is not None and not images.is_dir():
-        raise InputError("no such folder of photos", path=images)
+    if given.images is not None and not given.images.is_dir():
+        raise InputError("no such folder of photos", path=given.images)
     try:
-        views = view_set(module.read(path, images))
+        views = view_set(module.read(replace(given, path=path)))
     except OSError as error:  # invalid photo name, unreadable folder
         raise InputError(error.strerror or str(error), path=path) from error
     views = views if unpictured else pictured(views)
-    views = alpha_as_masks(views) if alpha == "mask" else views
+    views = alpha_as_masks(views) if given.alpha == "mask" else views
     return views.take(split_mask(path, views.cameras.names, split, stated=views.splits))
 
 

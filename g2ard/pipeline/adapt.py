@@ -165,24 +165,24 @@ class AdaptConfig(FitConfig, tag="schedule"):
                 parameter="recovery",
             )
 
-    def most_steps(self, images: int) -> int:
+    def most_steps(self, count: int) -> int:
         """Return the maximum number of steps for some images.
 
-        >>> [AdaptConfig().most_steps(images) for images in (4, 43, 500)], AdaptConfig(steps=9).most_steps(4)
+        >>> [AdaptConfig().most_steps(count) for count in (4, 43, 500)], AdaptConfig(steps=9).most_steps(4)
         ([250, 2150, 7000], 9)
         """
         if self.steps is not None:
             return self.steps
         least = _FEWEST_STEPS if isinstance(self, Stretched) else _MOST_STEPS
-        return min(_MOST_STEPS, max(least, _STEPS_PER_IMAGE * images))
+        return min(_MOST_STEPS, max(least, _STEPS_PER_IMAGE * count))
 
-    def stretches(self, images: int) -> list[int]:
+    def stretches(self, count: int) -> list[int]:
         """Return the steps of each stretch, doubling; the remainder joins the last one.
 
         >>> AdaptConfig().stretches(140), AdaptConfig(steps=600).stretches(140)
         ([500, 1000, 2000, 3500], [600])
         """
-        most = self.most_steps(images)
+        most = self.most_steps(count)
         if not isinstance(self, Stretched):
             return [most]
         out, length, left = [], self.first_stretch, most

@@ -17,6 +17,7 @@ from g2ard.io.detect import run_scene
 from g2ard.progress import plural
 
 if TYPE_CHECKING:
+    from g2ard.io.types import ViewFiles
     from g2ard.scene.splats import Splats
 
 _NO_DRIVER = "no graphics driver that speaks Vulkan, Metal or DirectX 12 was found"
@@ -46,11 +47,13 @@ def info(
     if not paths:
         _devices(run)
         return
+    from g2ard.io.types import ViewFiles
+
     found, failed = [], []
     for path in paths:
         run.begin("read")
         try:
-            figures, rows = _described(path, images)
+            figures, rows = _described(ViewFiles(path, images))
             if images is not None and figures.get("kind") != "views":
                 raise InputError("holds no views", path=path, hint="leave {images} out")
         except (InputError, OSError) as error:
@@ -66,18 +69,19 @@ def info(
         raise typer.Exit(1)
 
 
-def _described(path: Path, images: Path | None) -> tuple[dict[str, Any], list[list[str]]]:
+def _described(given: ViewFiles) -> tuple[dict[str, Any], list[list[str]]]:
     """Return a file's figures, with scores for a run, and the table rows that show them."""
     from g2ard.cli.run_folder import stopped_run
     from g2ard.io.describe import describe
     from g2ard.io.jsonfile import read_json
     from g2ard.io.labels import RESULT
 
+    path = given.path
     if (stopped := stopped_run(path)) is not None:
         return stopped, _rows_of_stopped(path, stopped)
     scene = run_scene(path)
     if scene == path:
-        figures = describe(path, _overdraw, images=images)
+        figures = describe(given, _overdraw)
         if figures["kind"] == "views":
             from g2ard.jobs.photo_points import sparse_file, sparse_points
 
