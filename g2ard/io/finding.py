@@ -178,7 +178,7 @@ def _respelled(name: str) -> Iterator[str]:
                     yield data.decode(own)
 
 
-def readable(names: Sequence[str], photos: Sequence[Path | None]) -> list[str]:
+def readable(names: Sequence[str], files: Sequence[Path | None]) -> list[str]:
     """Return names without surrogates: in the character set that agrees with most of the photos' names, in
     UTF-8 with `\\x..` if none does.
 
@@ -189,7 +189,7 @@ def readable(names: Sequence[str], photos: Sequence[Path | None]) -> list[str]:
         return list(names)
 
     def agreeing(spelled: Sequence[str]) -> int:
-        own = zip(spelled, photos, strict=True)
+        own = zip(spelled, files, strict=True)
         return sum(p is not None and _folded(s).endswith(_folded(p.name)) for s, p in own)
 
     data = [name.encode("utf-8", "surrogateescape") for name in names]

@@ -102,19 +102,19 @@ class PhotoTraits:
     sizes: Mapping[tuple[int, int], int]
 
 
-def photo_traits(photos: Sequence[Path]) -> PhotoTraits:
+def photo_traits(files: Sequence[Path]) -> PhotoTraits:
     """Look at the headers of all photos and the borders of a few; unreadable photos are ignored."""
     sizes: Counter[tuple[int, int]] = Counter()
     alpha = 0
-    for photo in photos:
+    for photo in files:
         with suppress(InputError, FileNotFoundError), opened_image(photo) as header:
             sizes[header.size] += 1
             alpha += header.has_transparency_data
-    few = evenly_spaced(len(photos), _BORDER_PHOTOS, floor=True)
+    few = evenly_spaced(len(files), _BORDER_PHOTOS, floor=True)
     shown = []
     for i in few:
         with suppress(InputError):
-            shown.append(_open(photos[i]))
+            shown.append(_open(files[i]))
     if not any(image.shape[2] == 4 and image[..., 3].min() < 1 for image in shown):
         alpha = 0
     edges = [np.concatenate([image[0], image[-1], image[:, 0], image[:, -1]])[:, :3] for image in shown]

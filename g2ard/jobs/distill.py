@@ -154,7 +154,7 @@ class DistillJob:
         """Return the steps of all recoveries: after each round, if there are rounds, and of the last."""
         recover, simplify = self.config.recover, self.config.simplify
         like = self.prior.take(np.array(evenly_spaced(len(self.prior), count)))
-        last = recover.final_steps(like, self.views.train.cameras, photos=self.reads_photos)
+        last = recover.final_steps(like, self.views.train.cameras, of_photos=self.reads_photos)
         if not recover.schedule.round_steps:
             return last
         rounds = simplify.rounds(len(self.prior), count, recovered=True)
@@ -166,8 +166,8 @@ class DistillJob:
         views, say = self.views, self.say
 
         def made(cameras: Cameras, say: Say = unsaid) -> Targets:
-            background, photos = self.config.recover.background, self.photos_over_renders
-            return make_targets(cameras, self.teacher, background, photos=photos, say=say)
+            background, mixed = self.config.recover.background, self.photos_over_renders
+            return make_targets(cameras, self.teacher, background, mixed=mixed, say=say)
 
         train, held_out = made(views.train.cameras, say), scorable(made(views.test, say), say)
         validation = apart = None

@@ -202,7 +202,7 @@ class TiledJob:
     def steps(self, count: int) -> int:
         """Return the steps of a recovery of the whole scene."""
         recover = self.config.recover
-        needed = recover.final_steps(self.sample, self.views.train.cameras, photos=False)
+        needed = recover.final_steps(self.sample, self.views.train.cameras, of_photos=False)
         return needed if recover.steps is not None else round(needed * pool_times(self.total))
 
     def run(self, work: Path | None = None) -> TiledDistilled:

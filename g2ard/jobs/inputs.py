@@ -124,16 +124,16 @@ def make_targets(
     teacher: Splats | None,
     background: tuple[float, float, float],
     *,
-    photos: bool = False,
+    mixed: bool = False,
     settings: RasterSettings | None = None,
     say: Say = unsaid,
 ) -> Targets:
     """Return targets, made on access: renders of the teacher, or photos if there is no teacher.
 
-    With `photos` and a teacher, each view's photo is used, or a render if it has none.
+    With `mixed` and a teacher, each view's photo is used, or a render if it has none.
     """
     renders: Any = {"settings": settings, "lazy": True}
-    if teacher is not None and not photos:
+    if teacher is not None and not mixed:
         return TeacherRenders(teacher, cameras, background=background, **renders)
     exposures = find_exposures(cameras)
     if exposures:

@@ -190,6 +190,7 @@ def preparing_levels(
             say("sky: none found, so nothing is kept apart")
     settings = {"recover.background": background, "recover.seed": seed}
     settings |= {} if steps is None else {"recover.steps": steps}
+    inputs.setdefault("photos", False)
     with preparing(
         scene,
         Budget(ratio=ratios[-1]),

@@ -473,19 +473,19 @@ class _Rays:
     def of(
         cls,
         cameras: Cameras,
-        photos: list[_Photo],
+        shots: list[_Photo],
         view: int,
         others: NDArray[np.int64],
         pixels: NDArray[np.int64],
     ) -> _Rays:
-        photo, pose = photos[view].image, cameras.viewmats[view]
-        patch = _PATCH * photos[view].step
+        photo, pose = shots[view].image, cameras.viewmats[view]
+        patch = _PATCH * shots[view].step
         rows = np.clip(pixels[0][:, None] + patch[:, 0], 0, photo.shape[0] - 1)
         columns = np.clip(pixels[1][:, None] + patch[:, 1], 0, photo.shape[1] - 1)
         seen = np.stack([columns + 0.5, rows + 0.5, np.ones(rows.shape)], -1)
         aims = seen @ np.linalg.inv(cameras.Ks[view]).T @ pose[:3, :3]
         patches = photo[rows, columns].astype(np.float64)
-        return cls(cameras, photos, others, cameras.positions[view], aims, patches)
+        return cls(cameras, shots, others, cameras.positions[view], aims, patches)
 
     @property
     def colors(self) -> NDArray[np.float32]:

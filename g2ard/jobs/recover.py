@@ -19,7 +19,7 @@ from g2ard.jobs.inputs import Views, load_scene
 from g2ard.jobs.teaching import Teaching, check_teacher
 from g2ard.pipeline.presets import PRESETS, configured
 from g2ard.progress import Detail, Progress, Say, plural, silent, unsaid
-from g2ard.rendering.targets import Exposed, Targets, checked_targets, fill, kinds_of, kinds_told
+from g2ard.rendering.targets import RENDERS, Exposed, Targets, checked_targets, fill, kinds_of
 from g2ard.report.run import KindScore, by_kind
 from g2ard.scene.cameras import USUAL
 from g2ard.scene.splats import Splats
@@ -310,8 +310,8 @@ def prepare(
     )
     config = configured(RecoverConfig(), preset, {**given, "recover.regularizers": regularizers})
     if config.recovery_time is None:
-        of_photos = kinds_of(targets) != kinds_told(0, 1)
-        config = replace(config, steps=config.final_steps(start, chosen.cameras, photos=of_photos))
+        of_photos = kinds_of(targets) != RENDERS
+        config = replace(config, steps=config.final_steps(start, chosen.cameras, of_photos=of_photos))
     of_student = "" if teaching.dense else "; measured on the student, as there is no teacher"
     say(Detail(f"regularisers: {why}{of_student}"))
     return RecoverJob(

@@ -125,4 +125,4 @@ class Teaching:
         return pool.cameras.take(rows) if rows else None
 
     def _made(self, cameras: Cameras, **options: Any) -> Targets:
-        return make_targets(cameras, self.dense, self.background, photos=self.photos, **options)
+        return make_targets(cameras, self.dense, self.background, mixed=self.photos, **options)

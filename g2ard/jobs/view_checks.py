@@ -145,14 +145,14 @@ def check_photos(
     )
 
 
-def _likeness(splats: Splats, photos: Photos, background: Colour) -> tuple[list[float], list[float]]:
+def _likeness(splats: Splats, targets: Photos, background: Colour) -> tuple[list[float], list[float]]:
     """Return per view that the scene covers enough the correlation of brightness with its own small photo,
     and the share of the others whose correlation is lower, which is empty for a single photo."""
     renderer = Renderer(splats, background=background)
-    images = [photos[view].mean(axis=2) for view in range(len(photos.cameras))]
+    images = [targets[view].mean(axis=2) for view in range(len(targets.cameras))]
     own, beaten = [], []
     for view, image in enumerate(images):
-        drawn, mask = renderer.render(photos.cameras[view]), mask_of(photos, view)
+        drawn, mask = renderer.render(targets.cameras[view]), mask_of(targets, view)
         seen = drawn.alpha > 0.5 if mask is None else (drawn.alpha > 0.5) & mask
         if seen.mean() <= _SHOWN_SHARE:
             continue

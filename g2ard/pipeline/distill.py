@@ -258,12 +258,12 @@ def _simplified(
 
 
 def _recovery(
-    config: RecoverConfig, scene: Splats, cameras: Cameras, rounds: int, photos: bool, final: bool
+    config: RecoverConfig, scene: Splats, cameras: Cameras, rounds: int, of_photos: bool, final: bool
 ) -> RecoverConfig:
     """Return the settings of one recovery: the steps of the last one, or its share of the time for all."""
     schedule, limit = config.schedule, config.recovery_time
     if limit is None:
-        steps = config.final_steps(scene, cameras, photos=photos) if final else None
+        steps = config.final_steps(scene, cameras, of_photos=of_photos) if final else None
         return replace(config, steps=steps, final=final)
     last = schedule.steps if config.steps is None else config.steps
     limit = limit * (last if final else schedule.round_steps) / (last + rounds * schedule.round_steps)

@@ -192,10 +192,10 @@ def _common(fits: Float) -> Float:
     return np.stack([gain, gain * fits[..., 1].mean(0) / fits[..., 0].mean(0)], 1)
 
 
-def _relative(fits: Float, photos: list[int], count: int) -> Float:
+def _relative(fits: Float, rows: list[int], count: int) -> Float:
     """Return the exposures of all views relative to what those of photos have in common."""
     gain, offset = _common(fits).T
     made = np.tile([1.0, 0.0], (count, 3, 1))
-    made[photos, :, 0] = fits[..., 0] / gain
-    made[photos, :, 1] = fits[..., 1] - made[photos, :, 0] * offset
+    made[rows, :, 0] = fits[..., 0] / gain
+    made[rows, :, 1] = fits[..., 1] - made[rows, :, 0] * offset
     return made

@@ -64,15 +64,15 @@ def kinds_of(targets: Targets) -> str:
     return kinds_told(said.count("photo"), said.count("teacher"))
 
 
-def kinds_told(photos: int, renders: int) -> str:
+def kinds_told(pictured: int, renders: int) -> str:
     """Describe the kinds of targets, with counts if there are both.
 
     >>> kinds_told(7, 9), kinds_told(7, 0)
     ('7 photos and 9 renders of the dense scene', 'photos')
     """
-    if photos and renders:
-        return f"{plural(photos, 'photo')} and {plural(renders, 'render')} of the dense scene"
-    return "photos" if photos else RENDERS
+    if pictured and renders:
+        return f"{plural(pictured, 'photo')} and {plural(renders, 'render')} of the dense scene"
+    return "photos" if pictured else RENDERS
 
 
 def scored_in(targets: Targets, split: str = "") -> str:

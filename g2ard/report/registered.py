@@ -28,7 +28,7 @@ def registration_report(
     path: Path,
     title: str,
     scene: Splats,
-    photos: Cameras,
+    cameras: Cameras,
     found: Registered,
     starts: Mapping[str, NDArray[np.float64]],
     side: int,
@@ -44,7 +44,7 @@ def registration_report(
         side: longer side in pixels of the images that its matches refer to.
         told: summary lines that the command prints.
     """
-    page = Page(title, f"{plural(len(photos), 'photo')} against {plural(len(scene), 'Gaussian')}")
+    page = Page(title, f"{plural(len(cameras), 'photo')} against {plural(len(scene), 'Gaussian')}")
     for line in told:
         page.paragraph(line)
     page.table(
@@ -56,7 +56,7 @@ def registration_report(
     seen = [i for i, row in enumerate(rows) if row.camera_from_world is not None]
     renderer = Renderer(scene, background=background)
     for i in sorted(seen, key=lambda i: -1.0 if (zncc := rows[i].zncc) is None else zncc)[:_VIEWS]:
-        row, one = rows[i], photos.take([i]).resized(_SIZE)
+        row, one = rows[i], cameras.take([i]).resized(_SIZE)
         try:
             photo = to_bytes(load_photo(one, 0, background)[0])
         except InputError:
@@ -69,7 +69,7 @@ def registration_report(
         page.comparison(f"{row.name}: {row.status}", photo, shown)
         matches = found.matches.get(row.name)
         if matches is not None:
-            scale = photo.shape[1] / photos.take([i]).resized(side)[0].width
+            scale = photo.shape[1] / cameras.take([i]).resized(side)[0].width
             drawn = _matches_drawn(photo, render, matches * scale)
             count = plural(len(matches), "match", "matches")
             page.figure(drawn, f"{count} explained by the pose; at most {_LINES} are drawn")

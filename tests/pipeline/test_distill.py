@@ -132,7 +132,7 @@ def test_steps_by_need_are_for_teachers() -> None:
     part = replace(around(12), Ks=around(12).Ks * [[[4], [4], [1]]])  # a sixteenth of the ball in each
 
     def horizon(targets: Targets, config: DistillConfig) -> int | None:
-        return _recovery(config.recover, PRIOR, targets.cameras, 1, photos=False, final=True).steps
+        return _recovery(config.recover, PRIOR, targets.cameras, 1, of_photos=False, final=True).steps
 
     teacher, config = (
         TeacherRenders(PRIOR, part, lazy=True),

@@ -339,7 +339,7 @@ def test_a_recovery_that_time_ends_says_what_it_missed(student: Splats, targets:
         seen[step] = seconds, scene()
 
     done = recover(student, targets, config, watch=watch).report
-    planned = config.final_steps(student, targets.cameras, photos=False)
+    planned = config.final_steps(student, targets.cameras, of_photos=False)
     assert done.steps < planned == done.planned
     looked = 1 + min(step for step, (seconds, _) in seen.items() if seconds >= 0.75 * 6.0)
     before, after = (

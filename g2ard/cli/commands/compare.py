@@ -157,7 +157,7 @@ def _closer(run: Run, first: Path, second: Path, dense: Splats, other: Splats, c
     except InputError as error:
         return f"cannot say which is closer to their dense scene: {error}"
     assert common is not None
-    teaching = Teaching(common.teacher, colour, chosen=True, photos=common.photos, **run.callbacks)
+    teaching = Teaching(common.teacher, colour, True, common.photos, **run.callbacks)
     cameras = load_views(common.views, "test", common.size, unpictured=teaching.dense is not None)
     targets = scorable(teaching.targets(cameras))
     scores = [

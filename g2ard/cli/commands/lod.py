@@ -193,7 +193,7 @@ def lod(
     options: dict[str, Any] = {"ratios": ratios, "recover": recover, "steps": steps, "background": colour}
     options |= {"split_sky": environment, "seed": run.seed, **run.callbacks}
     options |= {"views": views, "size": size, "up": up, "beside": scene}
-    with held, noted, preparing_levels(given, how, planned=dry_run, photos=False, **options) as job:
+    with held, noted, preparing_levels(given, how, planned=dry_run, **options) as job:
         if dry_run:
             _tell_costs(run, job)
             return

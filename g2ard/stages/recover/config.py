@@ -317,7 +317,7 @@ class RecoverConfig(FitConfig):
             return self.steps
         return self.schedule.steps if self.final else self.schedule.round_steps
 
-    def final_steps(self, scene: Splats, cameras: Cameras, *, photos: bool) -> int:
+    def final_steps(self, scene: Splats, cameras: Cameras, *, of_photos: bool) -> int:
         """Return the steps of the last recovery: as set, the schedule's, or more by need.
 
         More are needed for points of photos, and for renders of which each shows little of the scene.
@@ -327,6 +327,6 @@ class RecoverConfig(FitConfig):
             return self.steps
         if schedule.means_in_scales and self.from_points:
             return steps_from_points(len(scene), schedule.steps)
-        if not schedule.means_in_scales or photos:
+        if not schedule.means_in_scales or of_photos:
             return schedule.steps
         return steps_for(scene, cameras, schedule.steps * schedule.for_renders)

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from g2ard.errors import InputError
 from g2ard.progress import Progress, plural, silent
 from g2ard.rendering.exposure import Exposure
-from g2ard.rendering.targets import Targets, fingerprint_of, kinds_of, kinds_told
+from g2ard.rendering.targets import RENDERS, Targets, fingerprint_of, kinds_of
 from g2ard.scene.cameras import unseeing
 from g2ard.scene.shape import needle_share
 from g2ard.scene.splats import Splats, unit_quats
@@ -168,4 +168,4 @@ def _planned(config: RecoverConfig, student: Splats, targets: Targets) -> int:
     """Return the steps that a recovery takes without a time limit."""
     if not config.final:
         return config.horizon
-    return config.final_steps(student, targets.cameras, photos=kinds_of(targets) != kinds_told(0, 1))
+    return config.final_steps(student, targets.cameras, of_photos=kinds_of(targets) != RENDERS)

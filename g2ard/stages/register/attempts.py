@@ -132,14 +132,14 @@ class Candidate:
     solved: Solved | None = None
 
 
-def loaded(photos: Cameras, index: int, config: RegisterConfig, background: Sequence[float]) -> Photo:
+def loaded(cameras: Cameras, index: int, config: RegisterConfig, background: Sequence[float]) -> Photo:
     """Read a photo, composited over the background and grey outside of its mask, and shrink it to each size.
 
     Raises:
         InputError: it cannot be read.
     """
     sizes = config.levels()
-    one = photos.take([index]).resized(max(config.size, sizes[-1]))
+    one = cameras.take([index]).resized(max(config.size, sizes[-1]))
     image, mask = load_photo(one, 0, background)
     everywhere = np.ones(image.shape[:2], bool) if mask is None else mask
     image[~everywhere] = 0.5

@@ -166,7 +166,7 @@ class Summary(Report):
 
 
 def summarize(
-    photos: Sequence[PhotoReport],
+    rows: Sequence[PhotoReport],
     *,
     keep: Keep = "registered",
     true: int = 0,
@@ -180,12 +180,12 @@ def summarize(
         fits = 0 < metres_per_unit < float("inf")
         require("metres_per_unit", metres_per_unit, fits, "a positive number")
     kept = KEPT[keep]
-    counts = [sum(p.status == status for p in photos) for status in ("registered", "uncertain", "refused")]
+    counts = [sum(p.status == status for p in rows) for status in ("registered", "uncertain", "refused")]
     start = found = None
     if true:
-        start = _accuracy([p.start_error for p in photos], true, metres_per_unit)
-        found = _accuracy([p.error for p in photos if p.status in kept], true, metres_per_unit)
-    return Summary(len(photos), counts[0], counts[1], counts[2], true, metres_per_unit, start, found)
+        start = _accuracy([p.start_error for p in rows], true, metres_per_unit)
+        found = _accuracy([p.error for p in rows if p.status in kept], true, metres_per_unit)
+    return Summary(len(rows), counts[0], counts[1], counts[2], true, metres_per_unit, start, found)
 
 
 def _accuracy(errors: Sequence[PoseError | None], true: int, metres: float | None) -> Accuracy:
