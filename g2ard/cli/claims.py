@@ -14,7 +14,7 @@ from g2ard.config.choices import ViewFormat
 from g2ard.errors import G2ardError
 from g2ard.io import check_scene_output, check_views_output, find_views, kind, read_view_set
 from g2ard.io.atomic import check_output
-from g2ard.io.detect import run_scene
+from g2ard.io.detect import may_hold_views, run_scene
 from g2ard.io.finding import is_photo
 from g2ard.io.paths import real_path
 from g2ard.io.scene_formats import files_of
@@ -97,7 +97,7 @@ class Claims:
     def _photos(self) -> frozenset[Path]:
         """Photos and masks of views among the inputs or beside them, and all in input folders of photos."""
         found: list[Path | None] = []
-        for path in [*self._inputs, *self._cameras]:
+        for path in filter(may_hold_views, [*self._inputs, *self._cameras]):
             try:
                 what = kind(path)
             except (G2ardError, OSError):

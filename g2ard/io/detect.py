@@ -112,6 +112,12 @@ def kind(path: str | Path) -> Kind:
     return KINDS[file_format(path)]
 
 
+def may_hold_views(path: Path) -> bool:
+    """Return whether a file's name is not one of scenes or point clouds."""
+    named = _BY_NAME.get(path.name.lower()) or _BY_NAME.get(path.suffix.lower())
+    return path.suffix.lower() != ".ply" and (named is None or KINDS[named] == "views")
+
+
 def file_format(path: str | Path) -> str:
     """Return the format of a file or folder; raise an `InputError` if it is missing or unsupported."""
     path = run_scene(path)

@@ -1,7 +1,6 @@
 """Errors for inputs that are missing, damaged or of the wrong kind."""
 
 import re
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +9,6 @@ from PIL import Image
 
 import g2ard
 from g2ard.errors import InputError
-from g2ard.io import detect
 from helpers.commands import CommandLine, refused, succeeds
 from helpers.photos import cloud_of, photos_of
 from helpers.scenes import checkered_ball
@@ -144,25 +142,3 @@ def test_a_damaged_file_comes_with_advice(suffix: str, command_line: CommandLine
     (folder / f"b{suffix}").write_bytes((folder / f"a{suffix}").read_bytes()[:-700])
     error = refused(command_line, folder, "info", f"b{suffix}", status=1)
     assert error.endswith("; the file is damaged: copy or export it again\n")
-
-
-@pytest.mark.parametrize(
-    "words",
-    [
-        "distill ball.ply -r 8 --views views.json --steps 2 --no-page -o run",
-        "lod ball.ply -r 4,8 --merge-only --views views.json -o levels",
-        "simplify ball.ply -r 8 --views views.json -o small.ply",
-    ],
-)
-def test_the_format_of_an_input_is_detected_once(
-    words: str, folder: Path, command_line: CommandLine, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    looked: list[str] = []
-
-    def counted(read: Callable[[Path], str]) -> Callable[[Path], str]:
-        return lambda path: looked.append(path.name) or read(path)  # type: ignore[func-returns-value]
-
-    for name in ("_ply_format", "_json_format"):
-        monkeypatch.setattr(detect, name, counted(getattr(detect, name)))
-    succeeds(command_line, folder, *words.split())
-    assert sorted(looked) == ["ball.ply", "views.json"]
