@@ -70,6 +70,7 @@ lint: setup
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/python tests/nodes.py
+	$(BIN)/python tests/relayed.py
 
 # The site, in site/docs/index.html. A broken link or reference is an error.
 EXTRA_DOCS := import tomllib; print(*tomllib.load(open("pyproject.toml", "rb"))["project"]["optional-dependencies"]["docs"])

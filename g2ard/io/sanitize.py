@@ -65,10 +65,10 @@ class Raw:
             self.log_scales[:] = np.log(scales.astype(np.float64))
             self.logit_opacities[:] = logits_of(alphas.astype(np.float64))
 
-    def activated(self, render_model: RenderModel, offset: NDArray[np.float64], up: _Up = None) -> Splats:
+    def activated(self, render_model: RenderModel, offset: NDArray[np.float64], axis: _Up = None) -> Splats:
         """Return the scene, after `Tally.clean` has exponentiated `log_scales` in place."""
         means, quats, scales, logits, sh0, shN = vars(self).values()
-        return Splats(means, quats, scales, logits, sh0, shN, offset, render_model, up)
+        return Splats(means, quats, scales, logits, sh0, shN, offset, render_model, axis)
 
 
 def cleaned(

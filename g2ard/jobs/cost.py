@@ -258,7 +258,7 @@ def check_job_memory(job: DistillJob | TiledJob, most: int | None, need: int) ->
     if most is None or need <= most or job.tiles is not None:
         return
     count = len(job.prior)
-    message = f"--memory: {plural(count, 'Gaussian')} in one piece take about {amount(need, up=True)}, "
+    message = f"--memory: {plural(count, 'Gaussian')} in one piece take about {amount(need, ceil=True)}, "
     message += f"more than {amount(most)}; smaller views, --size, take less"
     if job.teacher is not None and not job.lifted:  # tiles support this job
         tiles = TileMemory(count, 4 * row_width(job.prior.sh_degree), RECOVERY_TIMES)

@@ -25,14 +25,14 @@ from g2ard.jobs.budget import Budget
 from g2ard.jobs.budget_search import ResolvedBudget
 from g2ard.jobs.clean import clean as remove_clutter
 from g2ard.jobs.distill_options import DistillOptions
-from g2ard.jobs.inputs import Views, load_scene, make_targets, scorable
+from g2ard.jobs.inputs import GivenViews, Views, load_scene, make_targets, scorable
 from g2ard.jobs.memory import RECOVERY_TIMES
 from g2ard.jobs.photo_colors import colored
 from g2ard.jobs.photo_points import distinct, sparse_file, sparse_points, topped_up, usual_count
 from g2ard.jobs.run_views import Use, views_of, within_pixels
 from g2ard.jobs.simplify import Reduction
 from g2ard.jobs.view_checks import check_photos, propose_background
-from g2ard.jobs.viewer_frame import level_up
+from g2ard.jobs.viewer_frame import best_level
 from g2ard.pipeline.config import DistillConfig
 from g2ard.pipeline.distill import Distilled, RunViews
 from g2ard.pipeline.distill import distill as pipeline
@@ -184,7 +184,7 @@ class DistillJob:
         if self.teacher is None or pool is None:
             names = best_views(done.splats, _SHOWN, cameras).names
             return done.scored_on(Subset(held_out, [cameras.names.index(name) for name in names]))
-        found = best_views(self.prior, _SHOWN, up=level_up(pool.cameras))
+        found = best_level(self.prior, _SHOWN, pool.cameras)
         longest = int(np.maximum(cameras.widths, cameras.heights).max())
         return TeacherRenders(self.teacher, found.scaled(longest), background=self.config.recover.background)
 
@@ -554,8 +554,8 @@ def prepare(
         prior,
         cameras=cameras,
         blind=options.config.simplify.method == "paper",
+        given=GivenViews(seed=recover.seed),
         config=options.config.simplify,
-        seed=recover.seed,
         recovered=recovers,
         progress=progress,
         say=say,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -27,6 +27,26 @@ from g2ard.stages.simplify import Pairs, SimplifyConfig
 
 Views = Cameras | ViewSet | ViewFiles | str | Path  # cameras, or the path of views
 Split = str | Callable[..., "NDArray[np.bool_]"]  # of `split_mask`, or a function like `for_training`
+
+
+@dataclass(frozen=True, eq=False)
+class GivenViews:
+    """Views as they are given, and how to find or generate them.
+
+    Args:
+        views: cameras in world coordinates, or their path. None takes those found beside the scene, or
+            generates some; "made" always generates them.
+        beside: path of the scene, beside which cameras may be; None finds none.
+        up: (3,) direction away from the ground for generated views; None estimates it.
+        seed: seed of generated views.
+        shape: width and height of generated views in pixels.
+    """
+
+    views: Views | None = None
+    beside: str | Path | None = None
+    up: Sequence[float] | None = None
+    seed: int = 0
+    shape: tuple[int, int] = (800, 600)
 
 
 def load_scene(

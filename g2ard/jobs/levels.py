@@ -26,7 +26,7 @@ from g2ard.jobs.budget import Budget
 from g2ard.jobs.cost import Cost, cost_of
 from g2ard.jobs.distill import DistillJob, preparing
 from g2ard.jobs.distill_options import DistillOptions
-from g2ard.jobs.inputs import Views, load_scene
+from g2ard.jobs.inputs import GivenViews, Views, load_scene
 from g2ard.jobs.viewer_frame import backdrop, frame_of, up_of
 from g2ard.levels.tileset import TILE_OF_SCENE, Georeference, map_system
 from g2ard.levels.tileset import save_tileset as write_tileset
@@ -356,7 +356,7 @@ def save_tileset(
     size, notes = write_tileset(
         path,
         levels,
-        up=tileset_up(near, None, told) if up is None else up,
+        axis=tileset_up(near, None, told) if up is None else up,
         place=place,
         cut=cut,
         overwrite=overwrite,
@@ -389,10 +389,8 @@ def write_level_page(
     folder: Path,
     levels: Sequence[Level],
     kind: Literal["sog", "3dtiles"],
+    given: GivenViews,
     *,
-    views: Views | None = None,
-    beside: str | Path | None = None,
-    up: Sequence[float] | None = None,
     background: Colour | None = None,
 ) -> int:
     """Write the page that shows the levels in a folder, and return its bytes.
@@ -400,16 +398,15 @@ def write_level_page(
     Args:
         levels: the levels in the folder, finest first.
         kind: streamed SOG, or 3D Tiles with z up.
-        views, beside, up: see `g2ard.jobs.viewer_frame.frame_of`. The page's title names
-            `beside`, or else the folder.
+        given: see `g2ard.jobs.viewer_frame.frame_of`. The page's title names the scene, or else the folder.
         background: see `g2ard.jobs.viewer_frame.backdrop`.
     """
     coarse = levels[-1]
     few = coarse.take(np.array(evenly_spaced(len(coarse), _ROWS, floor=True)))
-    frame = frame_of(few, views, beside=beside, up=up)
+    frame = frame_of(few, given)
     behind = backdrop(background, [few])
     page, offset = folder / "index.html", np.asarray(few.offset)
-    title = names_of([Path(beside or folder)])[0]
+    title = names_of([Path(given.beside or folder)])[0]
     if kind == "sog":
         rotation, position = frame.placed(offset)
         placed: dict[str, Any] = {"rotation": rotation, "position": position}

@@ -66,17 +66,17 @@ class TileMemory:
         rows = _rounded_down(min((memory - _TASK_BYTES) / a_row, most))
         if rows >= least:
             return f"{cut_into(self.folder, rows)} takes less"
-        need = amount(self.of(round(_HALO_TIMES * least)), up=True)
+        need = amount(self.of(round(_HALO_TIMES * least)), ceil=True)
         return f"the least that tiles take is about {need}, with {cut_into(self.folder, least)}"
 
 
-def amount(size: float, *, up: bool = False) -> str:
+def amount(size: float, *, ceil: bool = False) -> str:
     """Format bytes: whole megabytes below a gigabyte, at most two decimals above.
 
-    >>> amount(207_100_000), amount(207_100_000, up=True), amount(1_500_000_000), amount(20_349_000_000)
+    >>> amount(207_100_000), amount(207_100_000, ceil=True), amount(1_500_000_000), amount(20_349_000_000)
     ('207 MB', '208 MB', '1.5 GB', '20.34 GB')
     """
-    rounded = math.ceil if up else math.floor
+    rounded = math.ceil if ceil else math.floor
     if (megabytes := rounded(size / 1e6)) < 1000:
         return f"{megabytes} MB"
     return f"{rounded(size / 1e7) / 100:g} GB"
@@ -124,7 +124,7 @@ def check_whole_memory(source: Source, tiling: Tiling, times: float, tile_times:
     if need > tiling.memory:
         tiles = TileMemory(stream.count, row_bytes, tile_times, None if source.store is None else source.path)
         raise InputError(
-            f"{stream.count:,} Gaussians in one piece take about {amount(need, up=True)}, "
+            f"{stream.count:,} Gaussians in one piece take about {amount(need, ceil=True)}, "
             f"{amount(_TASK_BYTES)} of it the program, more than {_limit_text(tiling)}; "
             f"{tiles.advice(tiling.memory, max(1, stream.count // 2))}",
             path=source.path,
@@ -173,12 +173,12 @@ def plan_tiles(scene: TileStore | SceneStream, tiling: Tiling, times: float = 1.
     if fit < 1:
         raise InputError(
             f"a tile of {rows:,} Gaussians and {halo:,} around it takes about "
-            f"{amount(need, up=True)}, {amount(_TASK_BYTES)} of it the program, more than "
+            f"{amount(need, ceil=True)}, {amount(_TASK_BYTES)} of it the program, more than "
             f"{_limit_text(tiling)}; {tiles.advice(memory, most or rows)}"
         )
     if tiling.workers is not None and tiling.scheduler is None and tiling.workers > fit:
         raise InputError(
-            f"--workers {tiling.workers} take about {amount(tiling.workers * need, up=True)}, more than "
+            f"--workers {tiling.workers} take about {amount(tiling.workers * need, ceil=True)}, more than "
             f"{_limit_text(tiling)}; --workers {fit} fit"
         )
     workers = tiling.workers or max(1, min(fit, tiling.usable_cores))

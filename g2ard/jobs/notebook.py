@@ -19,7 +19,7 @@ from g2ard.errors import InputError
 from g2ard.io import Source
 from g2ard.io.images import contact_sheet, load_photo, png_bytes, resized
 from g2ard.io.labels import RESULT, labels_of
-from g2ard.jobs.inputs import Views, load_scene
+from g2ard.jobs.inputs import GivenViews, Views, load_scene
 from g2ard.jobs.viewer_frame import backdrop, frame_of
 from g2ard.poses import best_views
 from g2ard.progress import Progress, Say, silent, unsaid
@@ -89,7 +89,7 @@ def view(
     ]
     beside = shown[0].file if isinstance(shown[0], Source) else None
     labels = labels_of(named, [len(splats) for splats in loaded])
-    stand = frame_of(loaded[0], views, start=start, beside=beside, up=up, say=say)
+    stand = frame_of(loaded[0], GivenViews(views, beside, up), start=start, say=say)
     page = Path(mkdtemp(prefix="g2ard-")) / "view.html" if output is None else Path(output)
     write_page(
         page,

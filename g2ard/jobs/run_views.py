@@ -15,7 +15,7 @@ from g2ard.errors import InputError
 from g2ard.io.detect import run_views
 from g2ard.io.splits import for_scores, for_training, split_mask, splits_of
 from g2ard.io.types import ViewSet
-from g2ard.jobs.inputs import Views, drop_held_out, load_view_sets, load_views
+from g2ard.jobs.inputs import GivenViews, Views, drop_held_out, load_view_sets, load_views
 from g2ard.jobs.view_checks import as_pool, check_sight, given_or_found, warn_of_sight
 from g2ard.jobs.viewer_frame import level_up
 from g2ard.pipeline.config import SelectConfig
@@ -32,7 +32,6 @@ from g2ard.stages.simplify import simplify
 
 if TYPE_CHECKING:
     from g2ard.jobs.distill_options import DistillOptions
-Up = Sequence[float] | None
 Use = Literal["distil", "levels", "tiles", "merging"]
 """Use of generated views. Levels and tiles are scored in usual views alone; merging has no recovery."""
 
@@ -100,15 +99,9 @@ def views_of(
         represents: Gaussians per row if `prior` is a sample of a larger scene; the pool grows with it.
     """
     wanted = ["train"] if options.held_out is not None else ["train", "test"]
-    given, are_found = given_or_found(options.views, beside, prior, wanted, say, up=options.up)
-    plan = partial(
-        _planned,
-        prior,
-        up=options.up,
-        seed=options.config.recover.seed,
-        represents=represents,
-        progress=progress,
-    )
+    asked = GivenViews(options.views, beside, options.up, options.config.recover.seed)
+    given, are_found = given_or_found(asked, prior, wanted, say)
+    plan = partial(_planned, prior, asked, represents=represents, progress=progress)
     load = partial(load_view_sets, size=None, say=say, unpictured=teach)
     select = replace(options.config.select, focus=options.focus)
     mix = partial(
@@ -344,14 +337,10 @@ def _compact(prior: Splats, count: int, represents: float, progress: Progress) -
 
 def views_or_pool(
     scene: Splats,
-    views: Views | None,
+    given: GivenViews,
     *,
-    beside: str | Path | None = None,
     count: int | None = None,
     student: Splats | None = None,
-    size: tuple[int, int] = _SHAPE,
-    up: Up = None,
-    seed: int = 0,
     progress: Progress = silent,
     say: Say = unsaid,
 ) -> Views:
@@ -361,16 +350,13 @@ def views_or_pool(
         count: size of a generated pool; None chooses like `distill`.
         student: a compact scene that will be recovered in a generated pool. Views of other kinds complete it
             as in `distill`, and further ones are in the splits `test` and, for validation, `val`.
-        size: width and height of generated views, pixels.
-
-    Other arguments are those of `views_of`.
     """
-    given, _ = given_or_found(views, beside, scene, [], say, up=up)
-    if given is not None:
-        return given
+    found, _ = given_or_found(given, scene, [], say)
+    if found is not None:
+        return found
     grow = _POOL_GROWTH if count is None else 1.0
     count = _POOL_VIEWS if count is None else count
-    planned = _planned(scene, count, size=size, up=up, seed=seed, progress=progress, grow=grow)
+    planned = _planned(scene, given, count, progress=progress, grow=grow)
     if student is not None:
         mix = partial(
             _mixed,
@@ -422,25 +408,22 @@ def is_planned(views: Views) -> bool:
 def looks_at(
     scene: Splats,
     count: int,
+    given: GivenViews,
     *,
-    beside: str | Path | None = None,
-    size: tuple[int, int] = _SHAPE,
-    up: Up = None,
-    seed: int = 0,
     progress: Progress = silent,
     say: Say = unsaid,
 ) -> Cameras:
     """Return the views that show a scene best, and those of a pool if `count` asks for more.
 
-    They are chosen from the cameras of photos found `beside` the scene, if there are any.
+    They are chosen from the cameras of photos found beside the scene, if there are any.
     """
-    photos = _photos_beside(scene, beside, size, up, say)
-    best = best_views(scene, count, photos, size=size, up=up)
+    photos = _photos_beside(scene, given, say)
+    best = best_views(scene, count, photos, size=given.shape, axis=given.up)
     if photos is None:
         say(f"views: {count} generated")
     if len(best) == count:
         return best
-    pool = _planned(scene, count - len(best), size=size, up=up, seed=seed, progress=progress)
+    pool = _planned(scene, given, count - len(best), progress=progress)
     return Cameras.of([*best, *pool.cameras])
 
 
@@ -453,22 +436,19 @@ def _of(pool: Pool, cameras: Cameras) -> str:
 
 def cameras_for_weights(
     scene: Splats,
-    views: Views | None,
+    given: GivenViews,
     *,
-    beside: str | Path | None = None,
-    up: Up = None,
-    seed: int = 0,
     represents: float = 1.0,
     progress: Progress = silent,
     say: Say = unsaid,
 ) -> Cameras | None:
     """Choose views for simplification's visibility: given, found beside the scene, or generated.
 
-    Arguments are those of `views_of`; of `views` the training split is used. None means no views.
+    Arguments are those of `views_of`; of `given` the training split is used. None means no views.
     """
-    given, are_found = given_or_found(views, beside, scene, ["train"], say, up=up)
-    if given is not None:
-        cameras = load_views(given, "train", None, say)
+    found, are_found = given_or_found(given, scene, ["train"], say)
+    if found is not None:
+        cameras = load_views(found, "train", None, say)
         if are_found:
             return as_pool(cameras)
         warn_of_sight(scene, cameras, say)
@@ -476,9 +456,8 @@ def cameras_for_weights(
     try:
         return _planned(
             scene,
+            given,
             _WEIGHT_VIEWS,
-            up=up,
-            seed=seed,
             rows=_WEIGHT_ROWS,
             near=_WEIGHT_NEAR_SHARE,
             represents=represents,
@@ -491,6 +470,7 @@ def cameras_for_weights(
 
 def _planned(
     prior: Splats,
+    given: GivenViews,
     count: int,
     *,
     rows: int = _POOL_SAMPLE,
@@ -499,7 +479,8 @@ def _planned(
 ) -> Pool:
     """Plan a pool as `plan_pool` does, but larger in proportion to a tiled scene's size."""
     times = _times(prior, represents)
-    return plan_pool(prior, round(count * times), rows=round(rows * times), represents=represents, **options)
+    options |= {"size": given.shape, "up": given.up, "seed": given.seed, "represents": represents}
+    return plan_pool(prior, round(count * times), rows=round(rows * times), **options)
 
 
 def _times(prior: Splats, represents: float) -> float:
@@ -546,24 +527,23 @@ def orbit(
     >>> len(orbit(scene, 4, size=(64, 48)))
     4
     """
-    photos = _photos_beside(scene, beside, size, up, say)
+    photos = _photos_beside(scene, GivenViews(None, beside, up, shape=size), say)
     level = level_up(photos) if up is None and photos is not None else None
-    views, axis = turntable(scene, count, photos, size=size, up=up if level is None else level)
+    views, axis = turntable(scene, count, photos, size=size, axis=up if level is None else level)
     if up is None:
         say(f"up: {direction(axis)}, estimated; --up X,Y,Z sets it")
     return views
 
 
-def _photos_beside(
-    scene: Splats, beside: str | Path | None, size: tuple[int, int], up: Sequence[float] | None, say: Say
-) -> Cameras | None:
+def _photos_beside(scene: Splats, given: GivenViews, say: Say) -> Cameras | None:
     """Return cameras at the poses of the photos of a run, or of those beside a scene, if there are any."""
+    beside = given.beside
     found: Views | None = None if beside is None else run_views(beside)
     if found is None or found == Path(str(beside)):
-        found, _ = given_or_found(None, beside, scene, [], say, up=up)
+        found, _ = given_or_found(replace(given, views=None), scene, [], say)
     cameras = None if found is None else load_views(found, "all", None)
     if cameras is None or not any(cameras.image_paths):
         return None
     say(f"views: from {plural(len(cameras), 'photo')} of {found}")
     bare = replace(cameras, image_paths=(), mask_paths=(), lenses=(), distortions=np.zeros((0, 5)))
-    return bare.scaled(max(size))
+    return bare.scaled(max(given.shape))

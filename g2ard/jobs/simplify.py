@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -24,7 +24,7 @@ from g2ard.jobs.budget_search import (
     count_for_quality,
     resolved_in_tiles,
 )
-from g2ard.jobs.inputs import Views, load_scene, say_regions
+from g2ard.jobs.inputs import GivenViews, Views, load_scene, say_regions
 from g2ard.pipeline.presets import configured
 from g2ard.progress import Progress, Say, plural, silent, unsaid
 from g2ard.rendering.visibility import SampledVisibility, visibility_source
@@ -55,20 +55,18 @@ class Reduction:
     are those of `simplify`.
 
     Args:
-        cameras: cameras that give visibility weights to every method, instead of `views`.
+        given: views that give visibility weights.
+        cameras: cameras that give them to every method instead.
         recovered: whether the results are recovered afterwards, so that their gaps are not measured.
         notes: notes on the scene's file.
         tiles: the scene, if it is in tiles; `splats` is then a sample.
     """
 
     splats: Splats
-    views: Views | None = None
+    given: GivenViews = field(default_factory=GivenViews)
     cameras: Cameras | None = None
     blind: bool = False
     config: SimplifyConfig = field(default_factory=SimplifyConfig)
-    beside: str | Path | None = None
-    up: Sequence[float] | None = None
-    seed: int = 0
     recovered: bool = False
     notes: Sequence[Note] = ()
     progress: Progress = silent
@@ -77,12 +75,12 @@ class Reduction:
     tiles: Any = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
-        check_seed("seed", self.seed)
-        if self.views is not None and self.blind:
+        check_seed("seed", self.given.seed)
+        if self.given.views is not None and self.blind:
             raise InputError("views and blind exclude each other")
-        if self.views is not None and self.config.method == "paper":
+        if self.given.views is not None and self.config.method == "paper":
             raise InputError("has no effect on the method paper", parameter="views")
-        weighed = self.cameras is not None or self.views is not None or self.config.method == "default"
+        weighed = self.cameras is not None or self.given.views is not None or self.config.method == "default"
         if isinstance(self.config, Pairs):
             if self.config.pixel_scale != Pairs.pixel_scale and weighed and not self.blind:
                 raise InputError("has no effect with views", parameter="simplify.pixel_scale")
@@ -121,16 +119,13 @@ class Reduction:
         """Views that weigh Gaussians by visibility."""
         if self.blind or self.cameras is not None:
             return None if self.blind else self.cameras
-        if self.config.method != "default" and self.views is None:
+        if self.config.method != "default" and self.given.views is None:
             return None
         from g2ard.jobs.run_views import cameras_for_weights  # loads planning, which others do not need
 
         return cameras_for_weights(
             self.splats,
-            self.views,
-            beside=self.beside,
-            up=self.up,
-            seed=self.seed,
+            self.given,
             represents=self.total / len(self.splats),
             progress=self.progress,
             say=self.say,
@@ -189,7 +184,9 @@ class Reduction:
         from g2ard.poses import plan_pool  # as above
 
         splats = self.splats
-        pool = plan_pool(splats, _QUALITY_VIEWS, seed=self.seed, rows=_POOL_SAMPLE, progress=self.progress)
+        pool = plan_pool(
+            splats, _QUALITY_VIEWS, seed=self.given.seed, rows=_POOL_SAMPLE, progress=self.progress
+        )
         cameras = pool.cameras.resized(_QUALITY_SIDE)
 
         def reduce(count: int) -> Splats:
@@ -237,7 +234,7 @@ def reducing(
     *,
     planned: bool = False,
     counted: Callable[[int], None] = lambda total: None,
-    beside: str | Path | None = None,
+    given: GivenViews,
     progress: Progress = silent,
     say: Say = unsaid,
     **options: Any,
@@ -253,16 +250,16 @@ def reducing(
     callbacks: dict[str, Any] = {"progress": progress, "say": say}
     if isinstance(scene, Splats):
         counted(len(scene))
-        yield Reduction(scene, beside=beside, **options, **callbacks)
+        yield Reduction(scene, given, **options, **callbacks)
         return
-    beside = beside or scene.path
+    given = replace(given, beside=given.beside or scene.path)
     if tiling is not None:
         from g2ard.jobs.in_tiles import opened
 
         with opened(scene, tiling, 1.0, planned=planned, **callbacks) as tiles:
             counted(tiles.plan.count)
-            options |= {"beside": beside, "notes": tiles.store.notes if tiles.store else (), **callbacks}
-            yield Reduction(tiles.sample(options["config"]), tiles=tiles, **options)
+            options |= {"notes": tiles.store.notes if tiles.store else (), **callbacks}
+            yield Reduction(tiles.sample(options["config"]), given, tiles=tiles, **options)
         return
     progress("read", 0, 0)
     if scene.kind == "points":
@@ -276,7 +273,7 @@ def reducing(
     else:
         splats, notes = load_scene(scene, say), scene.notes
     counted(len(splats))
-    yield Reduction(splats, beside=beside, notes=notes, **options, **callbacks)
+    yield Reduction(splats, given, notes=notes, **options, **callbacks)
 
 
 @checks_arguments
@@ -350,8 +347,8 @@ def simplify(
     config = configured(config or SimplifyConfig(), settings=given | dict(settings or {}))
     wanted = Budget(count, ratio, fit=fit, min_psnr=min_psnr, min_ssim=min_ssim)
     name = "scene" if isinstance(scene, Splats) else str(scene)
-    inputs: dict[str, Any] = {"views": views, "blind": blind, "beside": beside, "up": up, "seed": seed}
-    inputs |= {"progress": progress, "say": say}
+    given_views = GivenViews(views, beside, up, seed)
+    inputs: dict[str, Any] = {"given": given_views, "blind": blind, "progress": progress, "say": say}
     source = scene if isinstance(scene, Splats) else Source(scene, render_model)
     with reducing(source, config=config, **inputs) as reduce:
         budget = reduce.resolved(wanted, name, f"scene.{format}")

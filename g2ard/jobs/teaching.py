@@ -9,7 +9,7 @@ from typing import Any
 from g2ard.config.choices import Colour, RenderModel, is_made
 from g2ard.errors import InputError
 from g2ard.io.types import ViewSet
-from g2ard.jobs.inputs import Views, load_scene, load_split_views, make_targets, scorable
+from g2ard.jobs.inputs import GivenViews, Views, load_scene, load_split_views, make_targets, scorable
 from g2ard.jobs.run_views import shrunk, views_or_pool, within_pixels
 from g2ard.jobs.view_checks import check_photos, propose_background, warn_of_sight
 from g2ard.progress import Progress, Say, silent, unsaid
@@ -64,10 +64,8 @@ class Teaching:
             return given
         return views_or_pool(
             self.dense,
-            given,
-            beside=None if isinstance(self.teacher, Splats) else self.teacher,
+            GivenViews(given, None if isinstance(self.teacher, Splats) else self.teacher, seed=self.seed),
             student=student,
-            seed=self.seed,
             progress=self.progress,
             say=self.say,
         )

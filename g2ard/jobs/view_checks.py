@@ -1,7 +1,6 @@
 """Checks whether given or found views show a scene."""
 
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +10,7 @@ from g2ard.errors import InputError
 from g2ard.io import find_views, read_view_set
 from g2ard.io.images import colour_text, photo_traits
 from g2ard.io.splits import split_mask
-from g2ard.jobs.inputs import Views
+from g2ard.jobs.inputs import GivenViews, Views
 from g2ard.progress import Say, plural, unsaid
 from g2ard.rendering.renderer import Renderer
 from g2ard.rendering.targets import Photos, mask_of
@@ -47,26 +46,18 @@ _BLIND_VIEWS_SHARE = 0.1
 
 
 def given_or_found(
-    views: Views | None,
-    scene: str | Path | None,
-    splats: Splats,
-    splits: Sequence[str],
-    say: Say,
-    *,
-    up: Sequence[float] | None,
+    given: GivenViews, splats: Splats, splits: Sequence[str], say: Say
 ) -> tuple[Views | None, bool]:
     """Return given views, or those found beside a scene, and whether they were found; None to generate some.
 
+    Views are found by `g2ard.io.find_views`, and must see the scene.
+
     Args:
-        views: None asks for views found beside the scene that see it (`g2ard.io.find_views`), "made" for
-            generated ones.
-        scene: path of the scene; None finds nothing.
         splits: splits of found views that must not be empty.
-        up: an up direction, which only generated views need.
     """
-    if views is not None:
-        return None if is_made(views) else views, False
-    path = None if scene is None else find_views(scene)
+    if given.views is not None:
+        return None if is_made(given.views) else given.views, False
+    path = None if given.beside is None else find_views(given.beside)
     if path is None:
         return None, False
     try:
@@ -82,7 +73,7 @@ def given_or_found(
         say(f"views beside the scene are not used: {path}: {seeing} of {plural(count, 'camera')} see it")
         return None, False
     cameras = plural(count, "camera")
-    idle = "" if up is None else "; --up turns generated views only"
+    idle = "" if given.up is None else "; --up turns generated views only"
     say(f"views: {cameras} of {path} (found beside the scene{idle}; --views made for a pool of its own)")
     return path, True
 

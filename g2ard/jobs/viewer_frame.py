@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +11,7 @@ from numpy.typing import NDArray
 from g2ard.config.checks import checks_arguments
 from g2ard.config.choices import BLACK, Colour
 from g2ard.errors import InputError
-from g2ard.jobs.inputs import Views, load_views
+from g2ard.jobs.inputs import GivenViews, load_views
 from g2ard.jobs.view_checks import given_or_found, opaque_points
 from g2ard.poses import best_views
 from g2ard.poses.site import Site
@@ -99,46 +98,48 @@ class ViewerFrame:
 
 def frame_of(
     scene: Splats,
-    views: Views | None,
+    given: GivenViews,
     *,
     start: str | None = None,
-    beside: str | Path | None = None,
-    up: Sequence[float] | None = None,
     say: Say = unsaid,
 ) -> ViewerFrame:
     """Choose a frame and an initial camera, from views that are given or found beside the scene, if any.
 
     Args:
         scene: the scene, or the left one of two.
-        views: cameras, or their path; "made" ignores those beside the scene.
+        given: the views, and the up direction; None takes it from the views, or estimates it.
         start: name of the initial view; None takes the one that shows most.
-        up: (3,) direction away from the ground; None takes it from the views, or estimates it.
     """
-    found, _ = given_or_found(views, beside, scene, [], say, up=up)
+    found, _ = given_or_found(given, scene, [], say)
     cameras = None if found is None else load_views(found, "all", None, say)
     try:
-        return frame_with(scene, cameras, start=start, up=up)
+        return frame_with(scene, cameras, given.up, start=start)
     except InputError as error:
         if start is not None or cameras is not None:
             raise
         say(f"no pose to start at: {error}")
-        return ViewerFrame(_turn(up_of(scene, up)), _middle(scene))
+        return ViewerFrame(_turn(up_of(scene, given.up)), _middle(scene))
 
 
 def frame_with(
-    scene: Splats, cameras: Cameras | None, *, start: str | None = None, up: Sequence[float] | None = None
+    scene: Splats, cameras: Cameras | None, up: Sequence[float] | None = None, *, start: str | None = None
 ) -> ViewerFrame:
     """Choose a frame and an initial camera, from given cameras if there are any, like `frame_of`."""
     up = scene.up if up is None else up
     axis = level_up(cameras) if up is None and cameras is not None else None
     axis = up_of(scene, up) if axis is None else axis
     if cameras is None or start is None:
-        cameras = best_views(scene, cameras=cameras, up=axis)
+        cameras = best_views(scene, cameras=cameras, axis=axis)
     if start and start not in cameras.names:
         raise InputError(f"no view {start!r} among {', '.join(cameras.names[:4])}, …", parameter="start")
     view = cameras[cameras.names.index(start) if start else 0]
     stand = ViewerFrame(_turn(axis), _middle(scene))
     return replace(stand, start=stand.start_at(view, opaque_points(scene)), name=view.name)
+
+
+def best_level(scene: Splats, count: int, cameras: Cameras, size: tuple[int, int] = (800, 600)) -> Cameras:
+    """Return the placed views that show a scene best, upright as other cameras are."""
+    return best_views(scene, count, size=size, axis=level_up(cameras))
 
 
 def backdrop(given: Colour | None, scenes: Sequence[Splats]) -> Colour | None:

@@ -117,7 +117,7 @@ def save_tileset(
     path: str | Path,
     levels: Sequence[Level],
     *,
-    up: ArrayLike,
+    axis: ArrayLike,
     place: Georeference | None = None,
     cut: Cut | None = None,
     overwrite: bool = False,
@@ -135,7 +135,7 @@ def save_tileset(
     root = parts[0] if len(parts) == 1 else _tile(tree, size, parts)
     matrix = np.eye(4) if place is None else place.matrix()
     turn = np.eye(4)
-    turn[:3, :3] = _upright(up) @ TILE_OF_SCENE.T
+    turn[:3, :3] = _upright(axis) @ TILE_OF_SCENE.T
     root["transform"] = (matrix @ turn).T.ravel().tolist()
     extensions = [EXTENSION, SPZ_EXTENSION]
     tileset = {
@@ -168,9 +168,9 @@ def check_tiles(path: Path, splats: Splats, ratio: float, cut: Cut | None = None
     check_far(path, splats, means - middle, ratio**0.5, movable=True)
 
 
-def _upright(up: ArrayLike) -> Float:
+def _upright(direction: ArrayLike) -> Float:
     """Return the (3, 3) rotation of `up` to z, which keeps x in the plane of x and z."""
-    axis = unit_up(up)
+    axis = unit_up(direction)
     east = np.eye(3)[0 if abs(axis[0]) < 0.9 else 1]
     east = east - (east @ axis) * axis
     east /= np.linalg.norm(east)

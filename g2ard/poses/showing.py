@@ -137,7 +137,7 @@ def best_views(
     cameras: Cameras | None = None,
     *,
     size: tuple[int, int] = (800, 600),
-    up: ArrayLike | None = None,
+    axis: ArrayLike | None = None,
 ) -> Cameras:
     """Return at most `count` views that show a scene best, the best first, each different from those before.
 
@@ -148,7 +148,7 @@ def best_views(
         splats: the scene.
         cameras: views to choose from, such as photos'; None places views.
         size: width and height of placed views, pixels.
-        up: (3,) direction away from the ground; None estimates it.
+        axis: (3,) direction away from the ground; None estimates it.
 
     Raises:
         InputError: nothing in the scene is visible, or no free place sees it.
@@ -156,7 +156,7 @@ def best_views(
     cameras = cameras and cameras.usual()
     if cameras is not None and len(cameras) == 1:
         return cameras
-    return _best(_survey(splats, size, up), count, cameras)[0]
+    return _best(_survey(splats, size, axis), count, cameras)[0]
 
 
 def turntable(
@@ -165,7 +165,7 @@ def turntable(
     cameras: Cameras | None = None,
     *,
     size: tuple[int, int] = (800, 600),
-    up: ArrayLike | None = None,
+    axis: ArrayLike | None = None,
 ) -> tuple[Cameras, Floats]:
     """Return views at equal angles that begin with the best one, and the up direction.
 
@@ -174,7 +174,7 @@ def turntable(
 
     Args and Raises: as `best_views`.
     """
-    survey = _survey(splats, size, up)
+    survey = _survey(splats, size, axis)
     best, kind = _best(survey, 1, cameras and cameras.usual())
     site, first, angles = survey.site, best[0], 2 * np.pi * np.arange(count) / count
     eye, gaze = (first.position - site.origin) @ site.axes.T / site.size, best.forwards[0] @ site.axes.T
@@ -210,12 +210,12 @@ def _within_arc(angles: Floats, seen: Floats) -> Floats:
     return np.where(np.sin(angles) > 0, high, -low) * np.sin(angles)
 
 
-def _survey(splats: Splats, size: tuple[int, int], up: ArrayLike | None) -> Survey:
+def _survey(splats: Splats, size: tuple[int, int], axis: ArrayLike | None) -> Survey:
     rows = np.flatnonzero(splats.opacities > 1 / 255)
     some = splats.take(rows[canonical_order(splats, rows)[:_ROWS]])
     represents = len(rows) / max(1, len(some))
     some = some.take(some.finite_rows()) if len(some) else some
-    return Survey(some, represents, Site.of(some, up, None, represents), Lens(size))
+    return Survey(some, represents, Site.of(some, axis, None, represents), Lens(size))
 
 
 def _best(survey: Survey, count: int, cameras: Cameras | None) -> tuple[Cameras, str]:

@@ -102,17 +102,17 @@ class Site:
 
     @classmethod
     def of(
-        cls, splats: Splats, up: ArrayLike | None = None, rows: int | None = None, represents: float = 1.0
+        cls, splats: Splats, axis: ArrayLike | None = None, rows: int | None = None, represents: float = 1.0
     ) -> Site:
         """Turn a scene upright, using at most `rows` of its Gaussians, each representing `represents`.
 
         Raises:
-            InputError: nothing is visible, or `up` is not a direction.
+            InputError: nothing is visible, or `axis` is not a direction.
         """
         matter = Matter.of(splats, rows, represents)
         some = matter.first()
-        up = splats.up if up is None else up
-        found = estimate_up(some) if up is None else given_up(some, up)
+        axis = splats.up if axis is None else axis
+        found = estimate_up(some) if axis is None else given_up(some, axis)
         axes = _axes(some, found.axis)
         points = turned(some.points, axes)
         box = np.array([quantile(points[:, a], some.weights, _EXTENT) for a in range(3)]).T
@@ -173,12 +173,12 @@ class Site:
         return Inside(places, share, weight)
 
 
-def _axes(some: Matter, up: Floats) -> Floats:
+def _axes(some: Matter, axis: Floats) -> Floats:
     """Return rows: along the scene if it is long, otherwise along a coordinate axis; to its left; up."""
-    ahead = np.eye(3)[int(np.argmin(np.round(np.abs(up), 3)))]
-    ahead = ahead - (ahead @ up) * up
+    ahead = np.eye(3)[int(np.argmin(np.round(np.abs(axis), 3)))]
+    ahead = ahead - (ahead @ axis) * axis
     ahead /= np.linalg.norm(ahead)
-    left = np.cross(up, ahead)
+    left = np.cross(axis, ahead)
     weights = some.weights / some.weights.sum()
     flat = np.stack([along(some.points, ahead), along(some.points, left)], axis=1)
     flat -= (weights[:, None] * flat).sum(axis=0)
@@ -186,7 +186,7 @@ def _axes(some: Matter, up: Floats) -> Floats:
     if values[1] > _LONG * values[0]:
         x, y = vectors[:, 1] * np.copysign(1.0, vectors[np.argmax(np.abs(vectors[:, 1])), 1])
         ahead = x * ahead + y * left
-    return np.stack([ahead, np.cross(up, ahead), up])
+    return np.stack([ahead, np.cross(axis, ahead), axis])
 
 
 @dataclass(frozen=True, eq=False)

@@ -46,13 +46,13 @@ class Up:
     why: str
 
 
-def given_up(sample: Matter, up: ArrayLike) -> Up:
+def given_up(sample: Matter, direction: ArrayLike) -> Up:
     """Return the axis given by the user, and check only whether there is a ground.
 
     Raises:
         InputError: not three finite numbers, or all zero.
     """
-    axis = unit_up(up)
+    axis = unit_up(direction)
     return Up(axis, _is_flat(sample)[0] or _layer(sample, axis)[0] > _GROUND_GIVEN, "up as given")
 
 

@@ -19,6 +19,7 @@ from g2ard.io.types import ViewSet
 from g2ard.jobs.budget import Budget
 from g2ard.jobs.distill import preparing
 from g2ard.jobs.distill_options import DistillOptions
+from g2ard.jobs.inputs import GivenViews
 from g2ard.jobs.simplify import reducing
 from g2ard.jobs.tile_options import Tiling, needs_whole, refuse_whole
 from g2ard.pipeline.adapt import appearance_only
@@ -243,7 +244,7 @@ def _simplified_in_tiles(settings: Mapping[str, Any]) -> object:
     scene, tiling = _tiles()
     config = configured(g2ard.SimplifyConfig(), settings=settings)
     refuse_whole(Source(scene), needs_whole(config))
-    with reducing(Source(scene), tiling, views=UNEVEN, config=config) as reduce:
+    with reducing(Source(scene), tiling, given=GivenViews(UNEVEN), config=config) as reduce:
         return reduce(BUDGET).splats.whole().fingerprint()
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from g2ard.jobs.inputs import GivenViews
 from g2ard.jobs.levels import lod, save_tileset, write_level_page
 from g2ard.levels import Cut, Georeference, save_levels
 from g2ard.rendering.metrics import psnr
@@ -48,7 +49,9 @@ def streaming(
 ) -> None:
     """A folder of levels with the page that `lod` writes, opening at a camera."""
     save_levels(folder / name, levels, cut=Cut(4096, 1.0, 512), environment=sky, overwrite=True)
-    write_level_page(folder / name, levels, "sog", views=Cameras.of([camera]), up=(0, 0, 1), background=GREY)
+    write_level_page(
+        folder / name, levels, "sog", given=GivenViews(Cameras.of([camera]), None, (0, 0, 1)), background=GREY
+    )
 
 
 @pytest.mark.parametrize("finest", [0, 2])
@@ -162,7 +165,7 @@ def test_a_globe_page_without_cesium_says_what_it_needs(
 ) -> None:
     folder, address = site
     views = Cameras.of([FRONT])
-    write_level_page(folder, levels, "3dtiles", views=views, up=(0, 0, 1))
+    write_level_page(folder, levels, "3dtiles", GivenViews(views, None, (0, 0, 1)))
     assert "?cesium=https://" in told(browser, f"{address}/index.html")
     assert "No CesiumJS at" in told(browser, f"{address}/index.html?cesium=nowhere/")
     assert "http.server" in told(browser, (folder / "index.html").as_uri())
@@ -180,7 +183,7 @@ def test_a_globe_page_opens_at_the_view(
     name = f"page-{place is None}"
     save_tileset(folder / name, levels[-1:], up=(0, 0, 1), place=place)
     (folder / name / "cesium").symlink_to(peer)
-    write_level_page(folder / name, levels[-1:], "3dtiles", views=Cameras.of([FRONT]), up=(0, 0, 1))
+    write_level_page(folder / name, levels[-1:], "3dtiles", GivenViews(Cameras.of([FRONT]), None, (0, 0, 1)))
     assert told(browser, f"{address}/{name}/?cesium=cesium") == ""
     expected, until, found = rendered(levels[-1]), time.monotonic() + 60, 0.0
     inside = np.abs(expected - GREY).max(-1) > 0.1  # nothing behind the ball but the globe and the sky

@@ -137,7 +137,7 @@ def test_the_colourful_side_comes_first() -> None:
     ball = naive.sphere((0, 0, 0), 1.0, 0.03)
     front = np.array([0.6, -0.8, 0.0])
     faint = np.where((ball.means @ front > 0.5)[:, None, None], 1.0, 0.3).astype(np.float32)
-    view = best_views(replace(ball, sh0=ball.sh0 * faint), up=(0, 0, 1))[0]
+    view = best_views(replace(ball, sh0=ball.sh0 * faint), axis=(0, 0, 1))[0]
     assert view.position @ front > 0.7 * np.linalg.norm(view.position)
 
 
@@ -184,7 +184,7 @@ def test_a_turn_keeps_to_the_side_that_photos_show() -> None:
         Camera.facing((5 * np.cos(a), 5 * np.sin(a), 2), (0, 0, 1.2), fov=45, name=f"{i}")
         for i, a in enumerate(np.radians([-40, -15, 10, 35]))
     )
-    views, _ = turntable(statue, 12, photos, size=(320, 180), up=(0, 0, 1))
+    views, _ = turntable(statue, 12, photos, size=(320, 180), axis=(0, 0, 1))
     angles = np.degrees(np.arctan2(views.positions[:, 1], views.positions[:, 0]))
     assert angles.min() == pytest.approx(-40, abs=3)
     assert angles.max() == pytest.approx(35, abs=3)

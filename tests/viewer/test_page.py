@@ -18,9 +18,10 @@ import pytest
 
 from g2ard.cli.run_folder import RunFolder
 from g2ard.errors import InputError, OutputError
-from g2ard.io import read_splats, write_splats, write_views
+from g2ard.io import Source, read_splats, write_splats, write_views
 from g2ard.io.types import ViewSet
 from g2ard.jobs import budget
+from g2ard.jobs.inputs import GivenViews
 from g2ard.jobs.viewer_frame import frame_of, frame_with
 from g2ard.pipeline.distill import RunViews
 from g2ard.scene.cameras import Camera, Cameras
@@ -229,14 +230,14 @@ def test_a_page_starts_at_a_typical_view_with_detail_or_the_one_named() -> None:
 
 def test_a_scene_without_views_is_looked_at_from_around_and_one_without_room_as_a_whole() -> None:
     said: list[str] = []
-    stand = frame_of(checkered_ball(500), None, say=said.append)
+    stand = frame_of(checkered_ball(500), GivenViews(), say=said.append)
     assert stand.name
     assert stand.name == "view_0000"
     nothing = Splats.create([[0, 0, 0]], scales=[[1, 1, 1]], logit_opacities=[-20])
-    assert frame_of(nothing, None, say=said.append).start is None
+    assert frame_of(nothing, GivenViews(), say=said.append).start is None
     assert "no pose to start at" in said[-1]
     with pytest.raises(InputError):
-        frame_of(nothing, None, start="pose_0000")
+        frame_of(nothing, GivenViews(), start="pose_0000")
 
 
 def test_a_run_has_a_page_unless_too_large(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -247,7 +248,7 @@ def test_a_run_has_a_page_unless_too_large(tmp_path: Path, monkeypatch: pytest.M
     assert "view.html" in line
     assert Parts(path).labels == ["result: run, 300 Gaussians"]
     write_splats(tmp_path / "ball.ply", ball)
-    whole = tmp_path / "ball.ply", ball
+    whole = Source(tmp_path / "ball.ply"), ball
     folder.write_view(ball.take(range(30)), whole, around(6), (1.0, 1.0, 1.0))
     assert Parts(path).labels == ["dense scene: ball.ply, 300 Gaussians", "result: run, 30 Gaussians"]
     for dense, largest in ((ball, 299), (ball.take(range(30)), 300)):  # too large, or the same

@@ -45,11 +45,10 @@ def compare(
 ) -> None:
     """Compare renders of two scenes: PSNR, SSIM, the worst views, and a page to look at."""
     from g2ard.jobs.comparison import dense_first
-    from g2ard.jobs.inputs import load_views
+    from g2ard.jobs.inputs import GivenViews, load_views
     from g2ard.jobs.run_views import at_size, is_planned, planned_at, views_or_pool
     from g2ard.jobs.view_checks import check_sight, opaque_points
-    from g2ard.jobs.viewer_frame import backdrop, frame_with, level_up
-    from g2ard.poses import best_views
+    from g2ard.jobs.viewer_frame import backdrop, best_level, frame_with, level_up
     from g2ard.rendering.targets import TeacherRenders
     from g2ard.scene.cameras import Cameras
     from g2ard.stages.evaluate import evaluate
@@ -69,11 +68,8 @@ def compare(
     given = opt.with_images(views, images)
     found = views_or_pool(
         dense,
-        given,
-        beside=sources[0].file,
+        GivenViews(given, sources[0].file, None, run.seed, planned_at(size)),
         count=looks,
-        size=planned_at(size),
-        seed=run.seed,
         **run.callbacks,
     )
     cameras = at_size(load_views(found, "all", None, run.say), size, made=is_planned(found))
@@ -100,11 +96,11 @@ def compare(
         run.begin("page")
         points = opaque_points(dense)
         if is_planned(found):  # generated views may show only parts
-            up = level_up(cameras)
-            best = at_size(best_views(dense, size=planned_at(size), up=up), size, made=True)
+            best = at_size(best_level(dense, 1, cameras, planned_at(size)), size, made=True)
             renders = TeacherRenders(dense, best, background=colour)
             psnr[best.names[0]] = evaluate(other, renders, background=colour).psnr
-            stand = frame_with(dense, best, up=None if up is None else up.tolist())
+            axis = level_up(cameras)
+            stand = frame_with(dense, best, None if axis is None else axis.tolist())
             cameras = Cameras.of([*cameras, *best])
         else:
             stand = frame_with(dense, cameras)

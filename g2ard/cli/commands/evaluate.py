@@ -203,7 +203,7 @@ def _write_ladder(
     """Write the page on results of several sizes; print and return which one suffices."""
     from g2ard.io.describe import bytes_of
     from g2ard.jobs.run_views import is_planned
-    from g2ard.jobs.viewer_frame import level_up
+    from g2ard.jobs.viewer_frame import best_level
     from g2ard.poses import best_views
     from g2ard.rendering.targets import Subset, TeacherRenders
     from g2ard.report.ladder import Dense, Rung, labels, ladder, recommendation
@@ -224,7 +224,7 @@ def _write_ladder(
         key=lambda rung: (rung.bytes, rung.name),
     )
     if dense is not None and not teaching.photos and is_planned(views):
-        best = best_views(dense, up=level_up(cameras)).resized(max(cameras[0].width, cameras[0].height))
+        best = best_level(dense, 1, cameras).resized(max(cameras[0].width, cameras[0].height))
         shown: Targets = TeacherRenders(dense, best, background=teaching.background)
     else:
         name = best_views(rungs[-1].splats if dense is None else dense, 1, cameras).names[0]

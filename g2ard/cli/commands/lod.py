@@ -128,6 +128,7 @@ def lod(
     )
     from g2ard.io import Source
     from g2ard.io.atomic import check_output
+    from g2ard.jobs.inputs import GivenViews
     from g2ard.jobs.levels import (
         check_ratios,
         check_trained,
@@ -217,9 +218,9 @@ def lod(
             axis = tileset_up(levels.splats, up, run.say).tolist()
             written = save_tileset(output, levels.splats, up=axis, place=spot, **common)
         run.kept.append(f"{output} is written")
-        frame: dict[str, Any] = {"views": views, "beside": scene, "up": axis}
+        frame = GivenViews(views, scene, axis)
         with run.finishing("the page"):
-            written += write_level_page(output, levels.splats, kind, background=background, **frame)
+            written += write_level_page(output, levels.splats, kind, frame, background=background)
             query = "" if kind == "sog" else "/?cesium=URL (a folder of CesiumJS)"
             run.say(f"page: python -m http.server --directory {output}, then http://localhost:8000{query}")
         peak = {"peak_rss_bytes": peak_rss_of_all()} if tiled else {}

@@ -85,7 +85,7 @@ def render(
 ) -> None:
     """Render views of a scene as PNG or as an animation."""
     from g2ard.io.images import to_bytes, write_animation
-    from g2ard.jobs.inputs import load_views
+    from g2ard.jobs.inputs import GivenViews, load_views
     from g2ard.jobs.run_views import at_size, is_planned, looks_at, orbit, planned_at, views_or_pool
     from g2ard.jobs.view_checks import warn_of_sight
     from g2ard.rendering.renderer import RasterSettings, Renderer, stations
@@ -109,15 +109,14 @@ def render(
         run.claim_file("--sheet", sheet)
     splats = run.load(scene)
     found: Any
-    how: dict[str, Any]
     if turn is not None:
         found = orbit(splats, turn, size=planned_at(size), up=up, beside=scene, say=run.say)
     elif looks is not None:
-        how = {"up": up, "seed": run.seed, "beside": None if is_made(views) else scene, **run.callbacks}
-        found = looks_at(splats, looks, size=planned_at(size), **how)
+        given = GivenViews(None, None if is_made(views) else scene, up, run.seed, planned_at(size))
+        found = looks_at(splats, looks, given, **run.callbacks)
     else:
-        how = {"up": up, "seed": run.seed, **run.callbacks}
-        found = views_or_pool(splats, views, beside=scene, size=planned_at(size), **how)
+        given = GivenViews(views, scene, up, run.seed, planned_at(size))
+        found = views_or_pool(splats, given, **run.callbacks)
     cameras = load_views(found, split, None, run.say)
     if around:
         cameras = stations(cameras)

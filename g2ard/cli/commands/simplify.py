@@ -67,6 +67,7 @@ def simplify(
     """
     import numpy as np
 
+    from g2ard.jobs.inputs import GivenViews
     from g2ard.jobs.memory import WHOLE_TIMES, check_whole_memory
     from g2ard.jobs.simplify import reducing
     from g2ard.jobs.tile_options import is_tiled, needs_whole, refuse_whole
@@ -116,7 +117,7 @@ def simplify(
                 budget.of(total, str(scene))
 
     began, reports = time.perf_counter(), []
-    inputs: dict[str, Any] = {"views": given, "blind": no_views, "up": up, "seed": run.seed}
+    inputs: dict[str, Any] = {"given": GivenViews(given, None, up, run.seed), "blind": no_views}
     inputs |= {"planned": dry_run, "counted": counted, **run.callbacks}
     held = work_folder(run, None if dry_run else how, given)
     with held, reducing(source, how, config=config, **inputs) as reduce:

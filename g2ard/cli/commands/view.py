@@ -100,6 +100,7 @@ def _write(
     """Write the page of one scene or two."""
     from g2ard.io import read_views
     from g2ard.jobs.comparison import dense_first
+    from g2ard.jobs.inputs import GivenViews
     from g2ard.jobs.viewer_frame import backdrop, frame_of
     from g2ard.viewer.page import write_page
 
@@ -110,7 +111,7 @@ def _write(
     loaded = [run.load(source) for source in sources]
     if views is None and scene.is_dir() and (own := scene / "views.json").is_file():
         views = own if any(read_views(own).image_paths) else "made"  # generated ones show what trains
-    stand = frame_of(loaded[0], views, start=start, beside=sources[0].file, up=up, say=run.say)
+    stand = frame_of(loaded[0], GivenViews(views, sources[0].file, up), start=start, say=run.say)
     labels = labels_of(sources, [len(splats) for splats in loaded], roles)
     run.begin("page")
     written, scene_sizes = write_page(

@@ -162,13 +162,13 @@ def fit_opacities(
 def splats_of(like: Splats, out: dict[str, Any]) -> Splats:
     sh: NDArray[np.float32] = out["sh"]
     return Splats(
-        means=out["means"].astype(like.means.dtype, copy=False),
-        quats=out["quats"],
-        scales=out["scales"],
-        logit_opacities=out["logit_opacities"],
-        sh0=np.ascontiguousarray(sh[:, :1]),
-        shN=np.ascontiguousarray(sh[:, 1:]),
-        offset=like.offset,
-        render_model=like.render_model,
-        up=like.up,
+        out["means"].astype(like.means.dtype, copy=False),
+        out["quats"],
+        out["scales"],
+        out["logit_opacities"],
+        np.ascontiguousarray(sh[:, :1]),
+        np.ascontiguousarray(sh[:, 1:]),
+        like.offset,
+        like.render_model,
+        like.up,
     )
