@@ -95,6 +95,10 @@ class Source:
         """Read the scene into memory."""
         return self.scene.whole()
 
+    def drawn_as(self, render_model: RenderModel | None) -> Source:
+        """Return the same file with another render model, None for the one it has."""
+        return self if render_model in (None, self.render_model) else Source(self.path, render_model)
+
     def check_scene(self) -> None:
         """Raise an `InputError` for anything but a scene."""
         reader(self.file, self.format, "splats")

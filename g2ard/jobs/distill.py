@@ -505,7 +505,8 @@ def preparing(
     assert isinstance(scene, Source)
     began = time.monotonic()
     options.check_trained()
-    with opened(scene, tiling, RECOVERY_TIMES, planned=planned, **callbacks) as tiles:
+    source = scene.drawn_as(options.render_model)
+    with opened(source, tiling, RECOVERY_TIMES, planned=planned, **callbacks) as tiles:
         yield prepare_tiles(tiles, budget, options, recovers=use != "merging", began=began, **callbacks)
 
 
@@ -688,7 +689,7 @@ def _read(
         return _Read(scene.narrowed(), False, False, options.beside, "scene", len(scene))
     if isinstance(scene, Source) and scene.kind == "splats":
         options.check_trained()
-        splats = load_scene(scene, say)
+        splats = load_scene(scene.drawn_as(options.render_model), say)
         return _Read(splats, False, False, options.beside or scene.path, str(scene), len(splats))
     views, recover = options.views, options.config.recover
     if views is None or is_made(views):

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from g2ard.config.checks import AtLeastOne, Positive
-from g2ard.config.choices import Focus, FormatName
+from g2ard.config.choices import Focus, FormatName, RenderModel
 from g2ard.config.schema import Settings, full_paths, values_of
 from g2ard.errors import InputError
 from g2ard.jobs.inputs import Views
@@ -47,6 +47,7 @@ class DistillOptions(Settings):
     up: Sequence[float] | None = None
     size: AtLeastOne | None = None
     clean: bool = False
+    render_model: RenderModel | None = None
     format: FormatName = "ply"
     preset: str = "auto"
     time: Positive | None = None
