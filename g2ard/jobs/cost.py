@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,8 +22,6 @@ from g2ard.rendering.targets import CACHE_BYTES
 from g2ard.system.threads import threads_used
 
 if TYPE_CHECKING:
-    from g2ard.jobs.distill import DistillJob
-    from g2ard.jobs.in_tiles import TiledJob, Tiles
     from g2ard.jobs.simplify import Reduction
     from g2ard.scene.cameras import Cameras
     from g2ard.scene.splats import Splats
@@ -98,10 +96,11 @@ class Cost:
         return sum(seconds for _, seconds in self.stages)
 
 
-def cost_of(job: DistillJob | TiledJob, count: int, *, page: bool = True) -> Cost:
+def cost_of(job: Any, count: int, *, page: bool = True) -> Cost:
     """Return the cost of distilling a prepared job's scene to `count` Gaussians.
 
     Args:
+        job: a `DistillJob` or `TiledJob`; their modules use this one.
         page: whether pages with the result are written.
     """
     train, test = job.views.train.cameras, job.views.test
@@ -194,7 +193,7 @@ def cost_of_reduction(reduce: Reduction, count: int) -> Cost:
     return Cost(views, pixels, 0, tuple(stages), memory)
 
 
-def _tiled_stages(tiles: Tiles, views: int, *, gaps: bool) -> list[tuple[str, float]]:
+def _tiled_stages(tiles: Any, views: int, *, gaps: bool) -> list[tuple[str, float]]:
     """Return the stages of a simplification in tiles by some views, if any.
 
     Args:
@@ -211,7 +210,7 @@ def _tiled_stages(tiles: Tiles, views: int, *, gaps: bool) -> list[tuple[str, fl
     ]
 
 
-def _peak_bytes(job: DistillJob, count: int, steps: int, page: bool) -> int:
+def _peak_bytes(job: Any, count: int, steps: int, page: bool) -> int:
     """Return the peak memory: of simplification, of recovery, or of what is written at the end."""
     given, views, train = job.config.recover.sh_degree, job.views, job.views.train.cameras
     degree = job.prior.sh_degree if given is None else given
@@ -253,7 +252,7 @@ def _packing_bytes(count: int, degree: int) -> int:
     return _PACKED_BYTES * count + (_PALETTE_BYTES * palette_size(count) if degree else 0)
 
 
-def check_job_memory(job: DistillJob | TiledJob, most: int | None, need: int) -> None:
+def check_job_memory(job: Any, most: int | None, need: int) -> None:
     """Reject a job in one piece that needs more than `most` bytes; None means no limit."""
     if most is None or need <= most or job.tiles is not None:
         return

@@ -8,12 +8,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from helpers.writing_commands import COMMANDS
 
 from g2ard.cli import app
 from g2ard.io import detect
 from g2ard.io.source import Source
 from helpers.commands import CommandLine, succeeds
-from helpers.writing_commands import COMMANDS
 
 READING = {
     **COMMANDS,
