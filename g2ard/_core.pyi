@@ -144,6 +144,7 @@ class Rasterizer:
 def adam_rows(
     attributes: list[tuple[Any, ...]],
     counts: NDArray[np.int64],
+    momentum: float,
 ) -> int: ...
 
 class Trainer:

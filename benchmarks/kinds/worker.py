@@ -182,9 +182,10 @@ def _schedule(name: str, cameras: Cameras) -> Schedule:
         ),
         steps=5_000,
         means_in_scales=False,
-        cosine_floor=None,
+        final_rate=None,
         multiplier=1.0,
         reach=math.inf,
+        momentum=0.9,
     )
 
 

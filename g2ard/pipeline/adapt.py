@@ -40,7 +40,7 @@ _HALF_SEEN_WEIGHT = 10.0
 """Σ αT over these renders at which a view counts as half."""
 _STEPS_PER_IMAGE, _FEWEST_STEPS, _MOST_STEPS = 50, 250, 7000
 """Default steps: per image, at least, and at most as in the paper. A base colour moves by at most 0.28 × 0.03
-in a step and by half of that over a cosine, so that 250 steps span all of its range."""
+in a step and by half of that over a stretch, so that 250 steps span all of its range."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,7 +137,7 @@ class AdaptConfig(FitConfig, tag="schedule"):
     """Settings of adaptation, in addition to `FitConfig`; the schedule `default` has more.
 
     Args:
-        schedule: "default" takes stretches of 500, 1,000, 2,000 … steps with cosine decay; "paper" takes all
+        schedule: "default" takes stretches of 500, 1,000, 2,000 … steps with falling rates; "paper" takes all
             steps at once, with rates that decay to a tenth, without colour change or blending.
         steps: maximum number of steps. None takes 50 per image, at least 250 and at most the paper's 7,000,
             which "paper" always takes.

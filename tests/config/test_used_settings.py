@@ -81,11 +81,12 @@ RECOVER: dict[str, Any] = {
     "schedule.rates.logit_opacities": 0.5,
     "schedule.rates.sh0": 0.5,
     "schedule.rates.shN": 0.5,
-    "schedule.cosine_floor": 0.9,
+    "schedule.final_rate": 0.9,
     "schedule.appearance_decay": (0.5, 0.5),
     "schedule.multiplier": 0.1,
     "schedule.reach": 1e-3,
     "schedule.finest": 9.0,
+    "schedule.momentum": 0.1,
     "schedule.reference_extent": 0.5,
     "schedule.guarded": False,
     "steps": 9,
@@ -109,7 +110,7 @@ ADAPT: dict[str, Any] = {
     "prior_views": 9.0,
     "first_stretch": 1,
     "colour_worth": 99.0,
-    "recovery": replace(appearance_only(Schedule.named("paper")), cosine_floor=0.5),
+    "recovery": replace(appearance_only(Schedule.named("paper")), final_rate=0.5),
 }
 REGISTER: dict[str, Any] = {
     "size": 100,

@@ -47,7 +47,7 @@ def _results() -> Iterator[NDArray[Any]]:
     trainer.step(view, np.clip(image, 0, 1), Rates(1e-4, 1e-4, 1e-4, 1e-4, 1e-4, 1e-4))
     yield from trainer.arrays()
     values = [np.ones(90, np.float32) for _ in range(4)]
-    _core.adam_rows([(*values, 0.1, None)], np.zeros(30, np.int64))
+    _core.adam_rows([(*values, 0.1, None)], np.zeros(30, np.int64), 0.9)
     yield values[0]
     yield _core.codebook(ball.sh0.ravel(), 8)
     yield _core.palette(ball.sh0[:, 0], 8, 2)[0]

@@ -279,7 +279,9 @@ def test_layers_as_wide_as_the_sky_do_not_shake_the_image() -> None:
     start = under_a_sky(simplify(TEACHER, 1500, config=NARROW).splats)
     held, free = (
         recover(
-            start, targets, RecoverConfig(schedule=replace(TUNED, multiplier=1.0, reach=reach), steps=150)
+            start,
+            targets,
+            RecoverConfig(schedule=replace(TUNED, multiplier=1.0, reach=reach, momentum=0.9), steps=150),
         )
         for reach in (None, math.inf)
     )

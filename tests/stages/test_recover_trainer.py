@@ -60,10 +60,12 @@ def step(
     regularizers: Any = None,
     reach: float | None = None,
     finest: float = 0.0,
+    momentum: float = 0.9,
 ) -> tuple[float, int]:
     view = view_of(v, 0, SETTINGS)
     share = math.inf if reach is None else reach / max(target.shape)
-    return trainer.step(view, target, Rates(**RATES, reach=share, finest=finest), regularizers)
+    rates = Rates(**RATES, reach=share, finest=finest, momentum=momentum)
+    return trainer.step(view, target, rates, regularizers)
 
 
 def problem(n: int = 200, degree: int = 3, views: int = 3) -> tuple[Params, list[Cameras], list[Any]]:
@@ -119,6 +121,7 @@ class Twin:
         extra: Any = None,
         reach: float = math.inf,
         finest: float = 0.0,
+        momentum: float = 0.9,
     ) -> float:
         shares = naive_shares(self.p, cameras, reach, finest)
         mine = tensors_of({k: v.astype(np.float32) for k, v in self.p.items()})
@@ -134,9 +137,9 @@ class Twin:
         for k, g in grads.items():
             r = rows.reshape(-1, *[1] * (g.ndim - 1))
             t = np.maximum(self.t, 1).reshape(r.shape)
-            self.m[k] = np.where(r, 0.9 * self.m[k] + 0.1 * g, self.m[k])
+            self.m[k] = np.where(r, momentum * self.m[k] + (1 - momentum) * g, self.m[k])
             self.v[k] = np.where(r, 0.999 * self.v[k] + 0.001 * g * g, self.v[k])
-            m, v = self.m[k] / (1 - 0.9**t), self.v[k] / (1 - 0.999**t)
+            m, v = self.m[k] / (1 - momentum**t), self.v[k] / (1 - 0.999**t)
             unit = self.units.reshape(r.shape) if k == "means" else 1.0
             unit = unit * shares.get(k, 1.0)
             self.p[k] = np.where(r, self.p[k] - RATES[k] * unit * m / (np.sqrt(v) + 1e-15), self.p[k])
@@ -157,14 +160,14 @@ def assert_close(
 
 
 @every_isa
-@pytest.mark.parametrize("degree", [0, 2, 3])
-def test_steps_are_torch_s(degree: int, on: str) -> None:
+@pytest.mark.parametrize(("degree", "momentum"), [(0, 0.9), (2, 0.0), (3, 0.6)])
+def test_steps_are_torch_s(degree: int, momentum: float, on: str) -> None:
     p, cameras, targets = problem(degree=degree)
     units = np.exp(p["log_scales"]).max(1)
     trainer, twin = trainer_of(p, units, on), Twin(p, units)
     for i in range(6):
-        loss, updated = step(trainer, cameras[i % 3], targets[i % 3])
-        want = twin.step(cameras[i % 3], targets[i % 3])
+        loss, updated = step(trainer, cameras[i % 3], targets[i % 3], momentum=momentum)
+        want = twin.step(cameras[i % 3], targets[i % 3], momentum=momentum)
         assert abs(loss - want) < 1e-4
         assert 0 < updated <= len(p["means"])
     assert_close(trainer.arrays(), twin.p, p, to=2e-2)

@@ -65,6 +65,7 @@ class Rates(Settings):
         shN: higher-band coefficients.
         reach: share of the image's longer side; infinite treats all sizes alike. Set by the schedule.
         finest: pixels; 0 treats all sizes alike. Set by the schedule.
+        momentum: Adam's β₁. Set by the schedule.
 
     Raises:
         InputError: a value out of range.
@@ -78,6 +79,7 @@ class Rates(Settings):
     shN: NotNegative
     reach: AboveZero = field(default=math.inf, metadata={"setting": False})
     finest: NotNegative = field(default=0.0, metadata={"setting": False})
+    momentum: Annotated[float, Within("[0, 1)")] = field(default=0.9, metadata={"setting": False})
 
 
 @dataclass(frozen=True)
@@ -90,11 +92,12 @@ class Schedule(Settings):
         round_steps: recovery steps of each intermediate round; 0 recovers at the final count only.
         means_in_scales: `rates.means` is a share of each Gaussian's radius, the geometric mean of its longer
             scales, and thus independent of the scene's unit.
-        cosine_floor: rates follow a cosine down to this share; None keeps geometry rates constant.
+        final_rate: rates fall in a straight line to this share; None keeps geometry rates constant.
         appearance_decay: shares (rounds, final) to which appearance rates decay exponentially; 1 keeps them.
         multiplier: factor on all rates; None chooses it by short trials, starting at `multiplier_for`.
         reach: see `Rates`; None chooses it from the initial error (`reach_for`).
         finest: see `Rates`. `distill` takes 0 for points found in photos, unless it is set.
+        momentum: Adam's β₁, the share of its mean gradient that a step keeps.
         reference_extent: `rates.means` is scaled by the cameras' extent (`Cameras.extent`) over this, so that
             the scene's unit does not matter; None takes it in scene units.
         for_renders: share of the steps that renders take, because they agree with each other, unlike photos.
@@ -109,11 +112,12 @@ class Schedule(Settings):
     steps: AtLeastOne
     round_steps: Annotated[int, Within("[0, inf)")] = 0
     means_in_scales: bool = True
-    cosine_floor: Share | None = 0.01
+    final_rate: Share | None = 0.01
     appearance_decay: tuple[_Decay, _Decay] = (1.0, 1.0)
     multiplier: AboveZero | None = None
     reach: AboveZero | None = None
     finest: NotNegative = _DEFAULT_FINEST
+    momentum: Annotated[float, Within("[0, 1)")] = 0.6
     reference_extent: AboveZero | None = None
     for_renders: Positive = 0.8
     guarded: bool = True
@@ -154,11 +158,9 @@ class Schedule(Settings):
 
     def at(self, t: float, *, final: bool, multiplier: float = 1.0, reach: float = math.inf) -> Rates:
         """Return the rates at the share `t` of the steps, from 0 at the first to 1 after the last."""
-        cosine = 1.0
-        if self.cosine_floor is not None:
-            cosine = self.cosine_floor + (1 - self.cosine_floor) * 0.5 * (1 + math.cos(math.pi * t))
+        fall = 1.0 if self.final_rate is None else 1 - (1 - self.final_rate) * t
         decay = self.appearance_decay[1 if final else 0] ** t
-        geometry, appearance, first = cosine * multiplier, cosine * decay * multiplier, self.rates
+        geometry, appearance, first = fall * multiplier, fall * decay * multiplier, self.rates
         return Rates(
             first.means * geometry,
             first.log_scales * geometry,
@@ -168,6 +170,7 @@ class Schedule(Settings):
             first.shN * appearance,
             reach,
             self.finest,
+            self.momentum,
         )
 
 
@@ -175,18 +178,19 @@ TUNED = Schedule(
     rates=Rates(means=0.05, log_scales=6e-2, quats=1.5e-2, logit_opacities=7e-2, sh0=3e-2, shN=3e-3),
     steps=1000,
 )
-"""g2ard's schedule: rates in units of each Gaussian and a cosine to 1 % (figures in decision 0016)."""
+"""g2ard's schedule: rates in units of each Gaussian, falling to 1 % (figures in decisions 0016 and 0037)."""
 
 PAPER = Schedule(
     rates=Rates(means=9.2e-4, log_scales=5e-3, quats=1e-3, logit_opacities=5e-3, sh0=2.5e-3, shN=1.25e-4),
     steps=30_000,
     round_steps=8_000,
     means_in_scales=False,
-    cosine_floor=None,
+    final_rate=None,
     appearance_decay=(0.36, 0.1),
     multiplier=1.0,
     reach=math.inf,
     finest=0.0,
+    momentum=0.9,
     reference_extent=5.75,
     guarded=False,
 )

@@ -50,11 +50,11 @@ class SelectiveAdam:
         """Take one step for every row that has a gradient.
 
         Args:
-            rates: learning rate of each parameter.
+            rates: learning rate of each parameter, and `momentum`, β₁.
             shares: factors on the rates of some parameters, per row or value.
         """
         rows = [self._arrays(name, rates[name], shares.get(name)) for name in self._parameters]
-        self.skipped += _core.adam_rows(rows, self.counts.numpy())
+        self.skipped += _core.adam_rows(rows, self.counts.numpy(), rates["momentum"])
 
     def _arrays(self, name: str, rate: float, share: Tensor | None) -> tuple[Any, ...]:
         """Return a parameter, its moments, gradient, rate and share for the kernel, without copies."""

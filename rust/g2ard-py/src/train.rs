@@ -36,6 +36,7 @@ struct PyRates {
     reach: f64,
     /// Pixels.
     finest: f32,
+    momentum: f32,
 }
 
 impl PyRates {
@@ -55,6 +56,7 @@ impl From<PyRates> for Rates {
             logit_opacities: rates.logit_opacities,
             sh0: rates.sh0,
             sh_n: rates.sh_n,
+            momentum: rates.momentum,
         }
     }
 }
@@ -310,12 +312,13 @@ fn writable<'a>(
     array.as_slice_mut().map_err(strided)
 }
 
-/// Take an Adam step in place with each row that has a gradient; return the number of rows skipped.
+/// Take an Adam step in place with each row that has a gradient, with β₁ = `momentum`; return the number of rows skipped.
 #[pyfunction]
 pub fn adam_rows(
     py: Python<'_>,
     attributes: Vec<PyAttribute<'_>>,
     mut counts: PyReadwriteArray1<'_, i64>,
+    momentum: f32,
 ) -> PyResult<usize> {
     /// What earlier calls worked out. Locked only with the GIL held: see `work::POOL`.
     static BIASES: Mutex<Option<Biases>> = Mutex::new(None);
@@ -327,7 +330,7 @@ pub fn adam_rows(
     let counts = (counts.as_slice_mut())
         .map_err(|_| invalid("counts", "a C-contiguous array", "strides"))?;
     let mut biases = kept().take().unwrap_or_default();
-    let skipped = work::quick(py, || step_rows(&mut all, counts, &mut biases));
+    let skipped = work::quick(py, || step_rows(&mut all, counts, momentum, &mut biases));
     *kept() = Some(biases);
     skipped
 }

@@ -8,41 +8,47 @@ use crate::raster::project::{RowGradients, unproject};
 use crate::raster::rasterizer::ChunkSums;
 use crate::raster::simd::{Kernel, LANES, Lanes, Lanes16, Mask};
 
-pub const BETA1: f64 = 0.9;
 pub const BETA2: f64 = 0.999;
 /// Added to the root of the second moment; `SelectiveAdam` has the same.
 pub const EPSILON: f32 = 1e-15;
 /// Beyond this the square of a gradient leaves f32: such a row is skipped as not finite.
 pub const GRADIENT_MAX: f32 = 1e18;
 
-/// 1/(1 − β₁ᵗ) and 1/√(1 − β₂ᵗ) for each count of steps t, worked out in f64.
+/// 1/(1 − β₁ᵗ) and 1/√(1 − β₂ᵗ) for each count of steps t, worked out in f64. β₁ is the rates' momentum.
 #[derive(Debug, Default)]
-pub struct Biases(Vec<[f32; 2]>);
+pub struct Biases {
+    momentum: f32,
+    pairs: Vec<[f32; 2]>,
+}
 
 /// From this count on both are 1 in f32.
 const UNBIASED: usize = 1 << 15;
 
 impl Biases {
-    pub fn extend_to(&mut self, steps: usize) {
-        while self.0.len() <= steps.min(UNBIASED) {
-            let t = self.0.len().max(1) as f64;
+    pub fn extend_to(&mut self, momentum: f32, steps: usize) {
+        if momentum != self.momentum {
+            self.momentum = momentum;
+            self.pairs.clear();
+        }
+        while self.pairs.len() <= steps.min(UNBIASED) {
+            let t = self.pairs.len().max(1) as f64;
             let bias = |beta: f64| -(t * beta.ln()).exp_m1();
-            self.0.push([
-                (1.0 / bias(BETA1)) as f32,
+            self.pairs.push([
+                (1.0 / bias(momentum.into())) as f32,
                 (1.0 / bias(BETA2).sqrt()) as f32,
             ]);
         }
     }
 
-    /// The pairs of every count of steps up to the last one that differs from 1, and one more.
-    pub fn table() -> Vec<[f32; 2]> {
+    /// The second of every count of steps up to the last one that differs from 1, and one more.
+    pub fn table() -> Vec<f32> {
         let mut biases = Self::default();
-        biases.extend_to(UNBIASED);
-        biases.0
+        biases.extend_to(0.0, UNBIASED);
+        biases.pairs.iter().map(|pair| pair[1]).collect()
     }
 
     pub(super) fn of(&self, steps: usize) -> [f32; 2] {
-        self.0[steps.min(UNBIASED)]
+        self.pairs[steps.min(UNBIASED)]
     }
 }
 
@@ -153,6 +159,8 @@ fn finite<F: Lanes>(g: &RowGradients<F>) -> F::Mask {
 /// Values that the attributes of one block share.
 struct Step<F: Lanes> {
     good: F::Mask,
+    /// 1 − β₁.
+    new: F,
     bias1: F,
     bias2: F,
 }
@@ -171,6 +179,7 @@ impl Update<'_> {
         }
         let step = Step {
             good: F::Mask::from_bits(good),
+            new: F::splat(1.0 - self.rates.momentum),
             bias1: F::load(&bias[0]),
             bias2: F::load(&bias[1]),
         };
@@ -232,7 +241,7 @@ impl<F: Lanes> Step<F> {
     fn attribute(&self, block: &mut Block, attribute: usize, g: F, rate: F) {
         let (first, second) = (&mut block.first[attribute], &mut block.second[attribute]);
         let (m, v) = (F::load(first), F::load(second));
-        let m_new = (g - m).fma(F::splat((1.0 - BETA1) as f32), m);
+        let m_new = (g - m).fma(self.new, m);
         let v_new = v.fma(
             F::splat(BETA2 as f32),
             g * g * F::splat((1.0 - BETA2) as f32),
@@ -252,30 +261,32 @@ mod tests {
 
     #[test]
     fn biases_of_any_count_are_those_of_f64() {
-        let exact = |steps: usize| {
-            let left = |beta: f64| 1.0 - (steps as f64 * beta.ln()).exp();
-            [
-                (1.0 / left(BETA1)) as f32,
-                (1.0 / left(BETA2).sqrt()) as f32,
-            ]
-        };
         let mut biases = Biases::default();
-        biases.extend_to(usize::MAX);
-        for steps in [
-            1,
-            2,
-            100,
-            9999,
-            UNBIASED - 1,
-            UNBIASED,
-            UNBIASED + 1,
-            1 << 40,
-        ] {
-            for (got, want) in biases.of(steps).iter().zip(exact(steps)) {
-                assert!((got - want).abs() <= 1e-6 * want, "{steps}: {got} {want}");
+        for momentum in [0.0, 0.6, 0.9] {
+            let exact = |steps: usize| {
+                let left = |beta: f64| 1.0 - beta.powf(steps as f64);
+                [
+                    (1.0 / left(momentum.into())) as f32,
+                    (1.0 / left(BETA2).sqrt()) as f32,
+                ]
+            };
+            biases.extend_to(momentum, usize::MAX);
+            for steps in [
+                1,
+                2,
+                100,
+                9999,
+                UNBIASED - 1,
+                UNBIASED,
+                UNBIASED + 1,
+                1 << 40,
+            ] {
+                for (got, want) in biases.of(steps).iter().zip(exact(steps)) {
+                    assert!((got - want).abs() <= 1e-6 * want, "{steps}: {got} {want}");
+                }
             }
+            assert_eq!(exact(UNBIASED), [1.0; 2]);
+            assert_eq!(biases.of(UNBIASED - 1), [1.0; 2]);
         }
-        assert_eq!(exact(UNBIASED), [1.0; 2]);
-        assert_eq!(biases.of(UNBIASED - 1), [1.0; 2]);
     }
 }

@@ -12,7 +12,7 @@ mod store;
 #[cfg(test)]
 mod tests;
 
-pub use adam::{BETA1, BETA2, Biases, EPSILON, GRADIENT_MAX};
+pub use adam::{BETA2, Biases, EPSILON, GRADIENT_MAX};
 pub use anchors::{Anchors, Regularizers, anchor_rows};
 pub use row_major::{Attribute, step_rows};
 pub use store::{Exported, Store};
@@ -29,7 +29,7 @@ use adam::Update;
 /// Smaller losses, about 40 dB, are hardly visible.
 pub const LEAST_LOSS: f32 = 0.005;
 
-/// Adam's learning rate of each attribute.
+/// Adam's learning rate of each attribute, and its β₁.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct Rates {
     /// Times each Gaussian's own unit, if the trainer was given units.
@@ -39,6 +39,8 @@ pub struct Rates {
     pub logit_opacities: f32,
     pub sh0: f32,
     pub sh_n: f32,
+    /// Share of the mean gradient that a step keeps, β₁.
+    pub momentum: f32,
 }
 
 /// Inputs of one step: a view, its target, and the rates.
@@ -81,6 +83,8 @@ impl StepInput<'_> {
             refuse!(!(reach > 0.0 && reach.is_finite()) => "reach", "pixels, more than 0", reach);
         }
         refuse!(!(self.finest >= 0.0 && self.finest.is_finite()) => "finest", "pixels, at least 0", self.finest);
+        let momentum = self.rates.momentum;
+        refuse!(!(0.0..1.0).contains(&momentum) => "momentum", "a share below 1", momentum);
         refuse!(self.regularizers.is_some() && !anchored => "regularizers", "anchors set before", "none");
         let pixels = shape.height * shape.width;
         let counts = self.mask.map_or(pixels, <[bool]>::len);
@@ -238,7 +242,8 @@ impl Trainer {
 
     /// The backward pass and Adam; returns how many Gaussians moved and how many were skipped.
     fn adam_step(&mut self, input: &StepInput) -> (usize, usize) {
-        self.biases.extend_to(self.store.most_steps() as usize + 1);
+        self.biases
+            .extend_to(input.rates.momentum, self.store.most_steps() as usize + 1);
         let (biases, anchors, isa) = (&self.biases, self.anchors.as_ref(), self.isa);
         let free = &self.free[..];
         let blocks = self.store.blocks();

@@ -2,7 +2,7 @@
 
 use rayon::prelude::*;
 
-use super::adam::{BETA1, BETA2, Biases, EPSILON, GRADIENT_MAX};
+use super::adam::{BETA2, Biases, EPSILON, GRADIENT_MAX};
 use crate::raster::disjoint::DisjointSlice;
 use crate::{Error, Result};
 
@@ -40,6 +40,7 @@ struct Shared<'a> {
 pub fn step_rows(
     attributes: &mut [Attribute],
     counts: &mut [i64],
+    momentum: f32,
     biases: &mut Biases,
 ) -> Result<usize> {
     let rows = counts.len();
@@ -56,7 +57,7 @@ pub fn step_rows(
         }
     }
     let most = counts.par_iter().copied().max().unwrap_or(0);
-    biases.extend_to(usize::try_from(most).unwrap_or(0) + 1);
+    biases.extend_to(momentum, usize::try_from(most).unwrap_or(0) + 1);
     let shared: Vec<Shared> = attributes
         .iter_mut()
         .map(|a| Shared {
@@ -94,7 +95,7 @@ pub fn step_rows(
                 *count += 1;
                 let bias = biases.of(*count as usize);
                 for attribute in &shared {
-                    attribute.step(row, bias);
+                    attribute.step(row, momentum, bias);
                 }
             }
             skipped
@@ -104,7 +105,7 @@ pub fn step_rows(
 
 impl Shared<'_> {
     /// One row's step; rows of one chunk are one thread's.
-    fn step(&self, row: usize, [bias1, bias2]: [f32; 2]) {
+    fn step(&self, row: usize, momentum: f32, [bias1, bias2]: [f32; 2]) {
         let (from, width) = (row * self.width, self.width);
         // SAFETY: the arrays hold `width` values of every row, and each row is one thread's.
         let (values, first, second) = unsafe {
@@ -122,7 +123,7 @@ impl Shared<'_> {
         let rate = self.rate * whole * bias1;
         for k in 0..width {
             let g = gradients[k];
-            let m = first[k] + (g - first[k]) * (1.0 - BETA1) as f32;
+            let m = first[k] + (g - first[k]) * (1.0 - momentum);
             let v = second[k] * BETA2 as f32 + g * g * (1.0 - BETA2) as f32;
             let own = match self.share {
                 Some(share) if self.shares > 1 => share[from + k],

@@ -23,6 +23,7 @@ fn steps_give_the_same_bits_on_any_number_of_threads_and_learn() {
                 logit_opacities: 0.02,
                 sh0: 0.02,
                 sh_n: 1e-3,
+                momentum: 0.6,
             },
             reach: None,
             finest: 0.0,

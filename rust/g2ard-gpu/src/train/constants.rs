@@ -44,6 +44,9 @@ pub struct Step {
     thickness: f32,
     rank: f32,
     rank_offset: f32,
+    momentum: f32,
+    /// To a multiple of sixteen bytes.
+    unused: [u32; 3],
 }
 
 /// A number as two f32, and what the first lacks.
@@ -119,6 +122,7 @@ impl Step {
                 0.0
             },
             rank_offset: weights.rank_offset,
+            momentum: rates.momentum,
             ..Self::image(camera, &input.settings, input.background, values)
         }
     }

@@ -38,6 +38,7 @@ struct Step {
     thickness: f32,
     rank: f32,
     rank_offset: f32,
+    momentum: f32, // Adam's β₁
 }
 
 @group(0) @binding(0) var<uniform> task: Step;

@@ -118,6 +118,7 @@ const RATES: Rates = Rates {
     logit_opacities: 5e-2,
     sh0: 2e-2,
     sh_n: 2e-3,
+    momentum: 0.6,
 };
 
 fn input<'a>(camera: &'a Camera, target: &'a [f32]) -> StepInput<'a> {

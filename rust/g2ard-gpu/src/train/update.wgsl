@@ -13,7 +13,7 @@ struct Row {
 @group(0) @binding(4) var<storage, read> splats: array<Splat>;
 @group(0) @binding(5) var<storage, read> sums: array<array<f32, 9>>;
 @group(0) @binding(6) var<storage, read> anchors: array<f32>; // one value after the other: mean, frame, 1/r∥, 1/r⊥
-@group(0) @binding(7) var<storage, read> biases: array<vec2<f32>>;
+@group(0) @binding(7) var<storage, read> biases: array<f32>; // 1/√(1 − β₂ᵗ) of each count of steps t
 @group(0) @binding(8) var<storage, read_write> state: array<atomic<u32>>;
 
 const ANCHOR_FRAME = 3u;
@@ -216,7 +216,7 @@ fn share_of(variance: f32) -> f32 {
 fn move_value(k: u32, i: u32, g: f32, rate: f32, bias: vec2<f32>) {
     let at = k * task.rows + i;
     let old = moments[at];
-    let first = old.x + (g - old.x) * 0.1;
+    let first = old.x + (g - old.x) * (1.0 - task.momentum);
     let second = old.y * 0.999 + g * g * 0.001;
     moments[at] = vec2(first, second);
     values[at] -= rate * bias.x * first / (sqrt(second) * bias.y + 1e-15);
@@ -264,7 +264,7 @@ fn update(@builtin(global_invocation_id) id: vec3<u32>, @builtin(num_workgroups)
     atomicAdd(&state[UPDATED], 1u);
     let steps = rows[i].steps + 1u;
     rows[i].steps = steps;
-    let bias = biases[min(steps, arrayLength(&biases) - 1u)];
+    let bias = vec2(1.0 / (1.0 - pow(max(task.momentum, 1e-6), f32(steps))), biases[min(steps, arrayLength(&biases) - 1u)]);
 
     // Sizes on the screen before dilation, px²; 0 behind the near plane. The larger eigenvalue of MMᵀ is a root of squares.
     let shown = select(0.0, 1.0, p.depth >= task.near);
