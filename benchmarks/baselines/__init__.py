@@ -13,7 +13,7 @@ from g2ard.scene.splats import Splats
 
 __all__ = ["METHODS", "reduce"]
 
-METHODS = ("random", "opacity-area", "lightgaussian", "pup", "mini-splatting", "nanogs")
+METHODS = ("random", "opacity-area", "lightgaussian", "pup", "mini-splatting", "coreset", "nanogs")
 
 
 def reduce(
@@ -25,7 +25,7 @@ def reduce(
         name: name of the method.
         splats: the scene.
         budget: Gaussians to keep, 1 to N.
-        cameras: training views, by which LightGaussian, PUP and Mini-Splatting score Gaussians.
+        cameras: training views, by which all but nanogs, opacity-area and random score Gaussians.
         seed: seed of random methods (random, Mini-Splatting).
         indoor: whether Mini-Splatting uses its importance for rooms.
 
@@ -48,6 +48,8 @@ def reduce(
         scores = pruning.optical_mass(splats)
     elif name == "lightgaussian":
         scores = pruning.global_significance(splats, cameras)
+    elif name == "coreset":
+        scores = pruning.largest_share(splats, cameras)
     else:  # pup in one round; the release has two (`pup.rounds`)
         scores = sensitivity(splats, cameras)
     return pruning.keep_best(splats, scores, budget)

@@ -1,4 +1,4 @@
-"""Scores of pruning methods other than PUP: optical mass, LightGaussian and Mini-Splatting."""
+"""Scores of pruning methods other than PUP: optical mass, LightGaussian, Mini-Splatting and a coreset."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from g2ard.scene.cameras import Cameras
 from g2ard.scene.shape import longer_axes
 from g2ard.scene.splats import Splats
 
-__all__ = ["global_significance", "importance", "keep_best", "optical_mass", "sample"]
+__all__ = ["global_significance", "importance", "keep_best", "largest_share", "optical_mass", "sample"]
 
 _VOLUME_POWER = 0.1
 _VOLUME_RANK = 0.9
@@ -49,6 +49,18 @@ def global_significance(splats: Splats, cameras: Cameras) -> NDArray[np.float64]
     typical = np.sort(volume)[::-1][int(_VOLUME_RANK * len(volume))]
     relative = volume / max(typical, np.finfo(np.float64).tiny)
     return splats.opacities.astype(np.float64) * touched * relative**_VOLUME_POWER
+
+
+def largest_share(splats: Splats, cameras: Cameras) -> NDArray[np.float64]:
+    """Return (N,) the largest share of a view's light, Σ αT over all Gaussians, that comes from each of them.
+
+    This is the sensitivity that a coreset keeps: no view loses a row that gives much of its picture.
+    """
+    largest = np.zeros(len(splats))
+    for view in range(len(cameras)):
+        weight = visibility(splats, cameras.take([view])).weight
+        largest = np.maximum(largest, weight / max(weight.sum(), np.finfo(np.float64).tiny))
+    return largest
 
 
 def importance(splats: Splats, cameras: Cameras, *, indoor: bool = False) -> NDArray[np.float64]:

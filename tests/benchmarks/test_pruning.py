@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from benchmarks.baselines import METHODS, reduce
-from benchmarks.baselines.pruning import global_significance, importance, sample
+from benchmarks.baselines.pruning import global_significance, importance, largest_share, sample
 from benchmarks.baselines.pup import _log_det, _quarter, fisher, rounds
 from g2ard.config.choices import BLACK
 from g2ard.errors import InputError
@@ -93,6 +93,14 @@ def test_mini_splattings_importance_equals_the_twins(indoor: bool) -> None:
     expected[leads == 0] = 0
     assert (expected == 0).any()
     np.testing.assert_allclose(importance(s, VIEWS, indoor=indoor), expected, rtol=1e-4)
+
+
+def test_the_coresets_shares_equal_the_twins() -> None:
+    params, s = case(14)
+    light = np.stack([out.weight.numpy().sum(1) for out in seen(params)])
+    np.testing.assert_allclose(
+        largest_share(s, VIEWS), (light / light.sum(1, keepdims=True)).max(0), rtol=1e-4
+    )
 
 
 def test_sampling_follows_the_weights() -> None:
