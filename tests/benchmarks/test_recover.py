@@ -43,7 +43,8 @@ def test_curves_compare_schedules(scene: SceneSpec, tmp_path: Path) -> None:
     found = ask(scene, tmp_path, "curves", methods="default", ratios="2", steps="50,200")
     ends = [row for row in found if row["final"]]
     assert [row["variant"] for row in ends] == ["default@50", "default@200"]
-    assert ends[1]["psnr"] > ends[0]["psnr"]
+    for end in ends:
+        assert end["psnr"] > next(row["psnr"] for row in found if row["variant"] == end["variant"])
     assert ends[1]["seconds"] > ends[0]["seconds"]
     slow = {**ends[0], "variant": "paper/10", "seconds": 100.0, "psnr": ends[0]["psnr"] - 0.01}
     summary = read_study(DEFINITIONS / "recover-curves.toml").summary
