@@ -8,21 +8,20 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from helpers.writing_commands import COMMANDS
 
 from g2ard.cli import app
 from g2ard.io import detect
 from g2ard.io.source import Source
+from helpers.calls import CALLS
 from helpers.commands import CommandLine, succeeds
 
 READING = {
-    **COMMANDS,
+    **CALLS,
     "info": "info ball.ply cloud.ply",
     "lifted": "simplify cloud.ply -r 4 --no-views -o lifted.ply",
-    "tiled run": "distill ball.ply -r 2 --views views.json --tile-rows 150 --workers 1 --dry-run",
     **{
-        f"{name}, planned": f"{COMMANDS[name]} --dry-run"
-        for name in ("run/scene.sog", "recovered.ply", "small.ply", "tiled.ply", "levels/lod-meta.json")
+        f"{name}, planned": f"{CALLS[name]} --dry-run"
+        for name in ("distill", "distill tiles", "simplify", "simplify tiles", "recover", "lod")
     },
 }
 

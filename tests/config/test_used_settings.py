@@ -343,7 +343,9 @@ def test_values_of_a_preset_may_have_no_effect() -> None:
         configured(g2ard.SimplifyConfig(), "paper", {"method": "fast", "fold": 0.5})
 
 
-_BESIDES = "method engine matcher schedule.steps schedule.round_steps schedule.means_in_scales"
+_BESIDES = (
+    "method engine matcher schedule.steps schedule.for_renders schedule.round_steps schedule.means_in_scales"
+)
 """Settings that choose a run, or that only its schedule sets."""
 
 

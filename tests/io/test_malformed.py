@@ -13,10 +13,11 @@ import numpy as np
 import pytest
 
 from fuzz_readers import fuzz, read_checked
-from g2ard.io import kind, read_scene, read_view_set
+from g2ard.io import kind, read_view_set
 from helpers.faults import Fault, faulty
 from helpers.glb_files import glb_parts, write_glb
 from helpers.malformations import malformed
+from helpers.opened import read_scene
 from helpers.project import ROOT
 from helpers.reader_cases import MAKERS, READ
 from helpers.view_files import orbit, transforms

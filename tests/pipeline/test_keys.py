@@ -62,8 +62,8 @@ KEYED: dict[type, tuple[Any, str]] = {
             "validation",
             np.zeros(40, bool),
         ),
-        "probe guard multiplier reach trials done seconds resumed losses geometry skipped_before tally "
-        "exposures _epoch",
+        "probe guard time_left limit multiplier reach trials done seconds resumed losses geometry "
+        "skipped_before tally exposures _epoch",
     ),
     Photos: (
         Photos(VIEWS, IMAGES, exposures=EXPOSURES),
