@@ -457,7 +457,7 @@ fn gradients_are_finite_differences() {
         let gradient: Vec<f64> = (start.first.iter().enumerate())
             .map(|(at, m)| {
                 if within(at) {
-                    10.0 * f64::from(*m)
+                    f64::from(*m) / f64::from(1.0 - input.rates.momentum)
                 } else {
                     0.0
                 }
