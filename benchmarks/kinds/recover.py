@@ -33,6 +33,7 @@ from g2ard.stages.simplify import simplify
 
 __all__ = ["Recover", "Variant"]
 
+_RETRAINED = ("mcmc", "gaussianspa", "fastgs")
 _FIRST_LOOK = 25
 """Steps before the first score; the steps then double."""
 
@@ -47,14 +48,14 @@ class Variant:
         preset: preset of a whole distillation, from selection on; None only recovers, from a simplification
             that all such variants share.
         settings: settings of the distillation by full path. Without `recover.steps`, the study's are taken.
-        retrains: whether to train anew by MCMC instead, from points of the prior.
+        retrains: method that trains instead: "mcmc" anew from points of the prior, the others from the prior.
     """
 
     name: str
     each: bool = key(False)
     preset: str | None = key(None, choices=tuple(PRESETS))
     settings: Mapping[str, Any] = key({})
-    retrains: bool = key(False)
+    retrains: str | None = key(None, choices=_RETRAINED)
 
 
 @dataclass(frozen=True)
@@ -217,20 +218,29 @@ class _Run:
         return [*self.found, *({**row, **end} for row in self._looks(done, steps, spent, 1))]
 
     def _retrained(self) -> list[Row]:
-        """Train anew; return a row per score and kind of views."""
+        """Train by another method; return a row per score and kind of views."""
         place = self.place
         targets, colour = place.train_targets, place.scene.background
         self.cpu_began = time.process_time()
-        done, seconds = mcmc.train(
-            place.splats,
-            self.budget,
-            targets,
-            self.steps,
-            gsplat=place.study.gsplat,
-            background=colour,
-            seed=self.seed,
-            watch=self._watch,
-        )
+        if self.variant.retrains == "mcmc":
+            done, seconds = mcmc.train(
+                place.splats,
+                self.budget,
+                targets,
+                self.steps,
+                gsplat=place.study.gsplat,
+                background=colour,
+                seed=self.seed,
+                watch=self._watch,
+            )
+        else:
+            from benchmarks.baselines.fastgs import FastGS
+            from benchmarks.baselines.gaussianspa import GaussianSpa
+            from benchmarks.baselines.thinning import Training
+
+            method = GaussianSpa if self.variant.retrains == "gaussianspa" else FastGS
+            training = Training(place.splats, targets, self.steps, background=colour, seed=self.seed)
+            done, seconds = training.run(method(self.budget, self.steps), self._watch)
         self._count_cpu()
         _check_finite(done, [])
         return [*self.found, *self._looks(done, self.steps, seconds, 1)]

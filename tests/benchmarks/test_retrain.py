@@ -1,4 +1,4 @@
-"""Training anew by MCMC: over g2ard's rasteriser, and over stand-ins for gsplat."""
+"""Training by MCMC, over g2ard's rasteriser and stand-ins for gsplat, and by methods that thin a scene."""
 
 import sys
 from dataclasses import replace
@@ -10,9 +10,12 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks.baselines import mcmc
+from benchmarks.baselines import fastgs, mcmc
+from benchmarks.baselines.gaussianspa import GaussianSpa
+from benchmarks.baselines.thinning import Training
 from g2ard.errors import InputError
 from g2ard.rendering.targets import TeacherRenders
+from g2ard.rendering.visibility import visibility
 from g2ard.scene.transform import transform
 from g2ard.stages.evaluate import evaluate
 from g2ard.stages.recover import losses
@@ -74,6 +77,54 @@ def test_the_study_scores_training_like_recovery(tmp_path: Path) -> None:
     trained = [row for row in rows if row["variant"] == "mcmc@30"]
     assert [(row["step"], row["count"], row["final"]) for row in trained] == [(25, 40, 0), (30, 40, 1)]
     assert 0 < trained[0]["seconds"] <= trained[1]["seconds"]
+
+
+@pytest.mark.parametrize("method", ["gaussianspa", "fastgs"])
+def test_thinning_ends_at_the_same_count(tmp_path: Path, method: str) -> None:
+    options = {"ratios": "10", "steps": "60", "protocol": "pool", "size": "40", "methods": method}
+    rows = measured("retrain", ball_of(tmp_path, 400), tmp_path / "run", **options)
+    assert [(row["variant"], row["step"], row["final"]) for row in rows] == [
+        (f"{method}@60", 25, 0),
+        (f"{method}@60", 50, 0),
+        (f"{method}@60", 60, 1),
+    ]
+    assert rows[0]["count"] > rows[1]["count"] == rows[2]["count"] == 40
+    assert rows[2]["psnr"] > rows[1]["psnr"]
+
+
+def test_the_scene_returns_where_it_was() -> None:
+    training = Training(BALL, TARGETS, 1)
+    done = training.splats()
+    np.testing.assert_allclose(done.means + done.offset, BALL.means + BALL.offset, atol=1e-5)
+    np.testing.assert_allclose(done.scales, BALL.scales, rtol=1e-4)
+    assert evaluate(done, TARGETS).psnr > 50
+
+
+def test_projection_draws_the_faint_to_zero_and_leaves_the_others() -> None:
+    """After two projections of the same opacities, z − λ is −2α for the faint half and α for the other."""
+    logits = np.where(np.arange(400) < 200, -2, 0.5).astype(np.float32)
+    training, strategy = Training(replace(BALL, logit_opacities=logits), TARGETS, 1), GaussianSpa(200, 1000)
+    first = strategy.penalty(training)
+    strategy._project(training)
+    alpha = 1 / (1 + np.exp(-logits))
+    np.testing.assert_allclose(strategy._goal.numpy(), np.where(logits < 0, -2 * alpha, alpha), rtol=1e-5)
+    second = strategy.penalty(training)
+    assert second.item() == pytest.approx(9 / 4 * first.item(), rel=1e-5)
+    second.backward()
+    gradients = training.values["logit_opacities"].grad.numpy()
+    assert (gradients[:200] > 0).all()
+    np.testing.assert_allclose(gradients[200:], 0, atol=1e-9)
+
+
+def test_the_footprint_counts_pixels() -> None:
+    """Over all pixels, it is what `visibility` counts with the same conventions."""
+    training = Training(BALL, TARGETS, 1)
+    pixels = torch.ones(18, 24)
+    touched = visibility(BALL, VIEWS.take([0]), settings=fastgs._FOOTPRINT).hits
+    found = fastgs.footprint(training, 0, pixels).numpy()
+    assert np.corrcoef(found, touched)[0, 1] > 0.99
+    pixels[:, :12] = 0
+    assert (fastgs.footprint(training, 0, pixels).numpy() <= found).all()
 
 
 def test_gsplat_is_called_as_documented(gsplat: list[Strategy]) -> None:
