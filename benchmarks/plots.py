@@ -89,10 +89,24 @@ def frontier() -> str:
     return standalone(drawn, names)
 
 
+def sizes() -> str:
+    """Plot PSNR in unseen views of the usual kind against their size, for two scenes."""
+    methods = {"splat-transform": "splat-transform", "default": "simplify", "distill": "distill"}
+    names = [f"{scene}: {method}" for scene in ("playbot", "guitar") for method in methods.values()]
+    points = []
+    for row in rows("amd-epyc-2c/sizes-2026-11-28.csv"):
+        if row["views_kind"] == "pool" and row["method"] in methods:
+            name = f"{row['scene']}: {methods[row['method']]}"
+            points.append(Point(float(row["scale"]), float(row["psnr"]), names.index(name), text=name))
+    drawn = chart(points, x_label="size of views / 800 px", y_label="PSNR, dB", log=True, joined=True)
+    return standalone(drawn, names)
+
+
 def plots() -> dict[str, str]:
     """Return file names and their contents."""
     return {
         "frontier.svg": frontier(),
+        "sizes.svg": sizes(),
         "simplify-pool.svg": lead("pool"),
         "simplify-standing.svg": lead("standing"),
         "recover-guitar.svg": curve("guitar 400px", ("default@300", "default@1000", "default@2000")),
