@@ -102,7 +102,7 @@ def _default(parameter: Any, value: Any) -> Any:
 
 
 def _long_name(parameter: Any) -> str:
-    """Return a parameter's longest flag without dashes, or its name if it has none."""
+    """Return a parameter's longest flag without dashes, or its name if there is no long flag."""
     flags = (flag[2:] for flag in parameter.opts if flag.startswith("--"))
     return max(flags, key=len, default=str(parameter.name))
 

@@ -173,7 +173,7 @@ def load_mask(cameras: Cameras, index: int) -> NDArray[np.bool_] | None:
 
 
 def _mask(cameras: Cameras, index: int, image: NDArray[np.float32] | None) -> NDArray[np.bool_] | None:
-    """Return the mask of a photo, which is read if it is its own mask and `image` is None."""
+    """Return the mask of a photo. A photo that is its own mask is read, unless `image` holds it."""
     held, path = _held(cameras, index), cameras.mask_paths[index]
     if path is None:
         return held

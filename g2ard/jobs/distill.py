@@ -335,7 +335,7 @@ class DistillJob:
 
 
 Given = Splats | Points | Source | None
-"""What is distilled; None starts from photos alone."""
+"""Input of a distillation; None starts from photos alone."""
 
 _SHOWN = 3
 """Views in pictures of a run."""

@@ -256,7 +256,7 @@ def distinct(points: Points) -> Points:
 
 
 def sparse_points(file: Path | None, say: Say = unsaid) -> Cloud | None:
-    """Read the points of `sparse_file`; return None, and say why, if there are none that can be read."""
+    """Read the points of `sparse_file`; return None, and say why, if no point is readable."""
     try:
         cloud = None if file is None else read_cloud(file, bare=True)
     except G2ardError as error:

@@ -1,4 +1,4 @@
-"""What holds for every command, tested on the calls of `helpers/calls.py`."""
+"""Properties of every command, tested on the calls of `helpers/calls.py`."""
 
 import json
 import os
@@ -148,7 +148,7 @@ def test_kernels_run_within_stages_that_were_expected(words: str, ran: Ran) -> N
 def test_outputs_are_replaced_only_on_request(
     name: str, made: Path, inputs: Path, command_line: CommandLine
 ) -> None:
-    """By no other output either. A printed config repeats the call, and --dry-run writes nothing."""
+    """No call writes another output. A printed config repeats the call, and --dry-run writes nothing."""
     words, files = CALLS[name].split(), left(made)
     assert output_of(name) in files or (made / output_of(name)).is_dir()
     for path in sorted(files.keys() - left(inputs).keys()):

@@ -278,7 +278,7 @@ APART = {
     r"such as the dense scene|such as( '|(?= RDF| RFU| 4GB))|such as in axes": "no value to give",
     r"\[FILE\.\w+(\|NUMBERS)?\]|5MB\|DEVICE": "a metavar",
 }
-"""Pattern of what looks like a promise → where it is tested, or why it is none."""
+"""Pattern of what looks like a promise → where it is tested, or why it promises nothing."""
 
 LOOKS_LIKE = re.compile(r"default|such as|\{\w+\}|(?<![\w.])\.[a-z]\w+|\d")
 

@@ -8,7 +8,7 @@ use crate::{Control, Error, Result};
 
 /// Steps between looks at which entries are neighbours.
 const RENEWED: usize = 3;
-/// Steps end once at most one row in so many moves; the rest would lower the RMSE by a thousandth.
+/// Steps end once the share of rows that move is at most one over this; later ones lower the RMSE by a thousandth.
 const SETTLED: usize = 100;
 
 /// A palette, and the entry of each row.
