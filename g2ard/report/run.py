@@ -47,6 +47,7 @@ class KindScore(Report):
         worst_psnr: PSNR of that view, dB.
         lost: number of views that lost over 0.05 dB.
         edge_psnr: mean PSNR of gradients, dB; None for a scene in tiles.
+        detail: mean correlation of gradients; None for a scene in tiles.
     """
 
     kind: str
@@ -57,6 +58,7 @@ class KindScore(Report):
     worst_psnr: Change
     lost: int
     edge_psnr: Change | None = None
+    detail: Change | None = None
 
 
 def by_kind(
@@ -94,12 +96,13 @@ def by_kind(
                 psnr[worst],
                 sum(change.gain < -LOST for change in psnr),
                 mean_if_scored("edge_psnr", rows),
+                mean_if_scored("detail", rows),
             )
         )
     return tuple(scores)
 
 
-COLUMNS = ("kind of view", "views", "PSNR, dB", "worst view", "SSIM")
+COLUMNS = ("kind of view", "views", "PSNR, dB", "worst", "detail", "SSIM")
 
 
 def cells(kinds: Iterable[KindScore]) -> list[list[str]]:
@@ -109,7 +112,8 @@ def cells(kinds: Iterable[KindScore]) -> list[list[str]]:
             kind.kind,
             str(kind.views),
             f"{kind.psnr.before:.2f} → {kind.psnr.after:.2f}",
-            f"{kind.worst} {kind.worst_psnr.after:.2f}",
+            f"{kind.worst_psnr.after:.2f}",
+            f"{kind.detail.before:.2f} → {kind.detail.after:.2f}" if kind.detail else "–",
             f"{kind.ssim.before:.4f} → {kind.ssim.after:.4f}" if kind.ssim else "–",
         ]
         for kind in kinds

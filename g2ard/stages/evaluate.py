@@ -16,7 +16,7 @@ from g2ard.io.images import as_saved
 from g2ard.io.reports import Report
 from g2ard.progress import Progress, plural, silent
 from g2ard.rendering.exposure import rendered
-from g2ard.rendering.metrics import Lpips, edge_psnr, psnr, ssim
+from g2ard.rendering.metrics import Lpips, detail, edge_psnr, psnr, ssim
 from g2ard.rendering.renderer import RasterSettings, Renderer
 from g2ard.rendering.targets import Targets, against_of, checked_targets, fill, mask_of, scored_in
 from g2ard.scene.cameras import USUAL
@@ -26,8 +26,8 @@ from g2ard.system.threads import in_threads
 
 @dataclass(frozen=True)
 class ViewScore:
-    """Scores of one view: PSNR and that of gradients in dB, SSIM in [−1, 1], LPIPS by network (empty without
-    weights); NaN where not measured.
+    """Scores of one view: PSNR and that of gradients in dB, SSIM and the correlation of gradients in [−1, 1],
+    LPIPS by network (empty without weights); NaN where not measured.
 
     `against` is "photo" or "teacher" if the targets say so, `kind` the kind of view (`Cameras.kinds`),
     `size` the width and height of the images in pixels.
@@ -37,6 +37,7 @@ class ViewScore:
     psnr: float
     ssim: float = math.nan
     edge_psnr: float = math.nan
+    detail: float = math.nan
     lpips: Mapping[str, float] = field(default_factory=dict)
     against: str | None = None
     kind: str = USUAL
@@ -50,6 +51,7 @@ class Means(Report):
     psnr: float
     ssim: float
     edge_psnr: float
+    detail: float
     scored_in: str
 
 
@@ -89,6 +91,11 @@ class Evaluation(Report):
         return float(np.mean([v.edge_psnr for v in self.views]))
 
     @property
+    def detail(self) -> float:
+        """Mean of the views' correlation of gradients."""
+        return float(np.mean([v.detail for v in self.views]))
+
+    @property
     def lpips(self) -> dict[str, float]:
         """Mean of the views' LPIPS, by network."""
         return {net: float(np.mean([v.lpips[net] for v in self.views])) for net in self.views[0].lpips}
@@ -96,7 +103,7 @@ class Evaluation(Report):
     @property
     def means(self) -> Means:
         """Means of the scores, and where they were measured."""
-        return Means(self.psnr, self.ssim, self.edge_psnr, self.scored_in)
+        return Means(self.psnr, self.ssim, self.edge_psnr, self.detail, self.scored_in)
 
     def as_dict(self) -> dict[str, Any]:
         """Return the content of `g2ard evaluate --json`."""
@@ -106,6 +113,7 @@ class Evaluation(Report):
             "psnr": self.psnr,
             "ssim": self.ssim,
             "edge_psnr": self.edge_psnr,
+            "detail": self.detail,
             "lpips": self.lpips or None,
             "scored_in": self.scored_in,
             "views": [
@@ -115,6 +123,7 @@ class Evaluation(Report):
                     "psnr": v.psnr,
                     "ssim": v.ssim,
                     "edge_psnr": v.edge_psnr,
+                    "detail": v.detail,
                 }
                 | ({"against": v.against} if v.against else {})
                 | ({"kind": v.kind} if v.kind != USUAL else {})
@@ -139,8 +148,9 @@ def evaluate(
 
     PSNR = −10·log₁₀ of the mean squared difference over pixels and channels, in dB, at most 100; SSIM (Wang
     et al. 2004) has an 11×11 Gaussian window, σ 1.5, zero-padded, values in 0–1; the PSNR of gradients is
-    that of differences between neighbouring pixels, for thin structures. Renders are clamped to [0, 1]
-    without 8-bit rounding, unless `eight_bit` is set. If a photo has a mask, only masked pixels count.
+    that of differences between neighbouring pixels, and detail their correlation, for thin structures.
+    Renders are clamped to [0, 1] without 8-bit rounding, unless `eight_bit` is set. If a photo has a mask,
+    only masked pixels count.
 
     Args:
         splats: the scene; cameras are in world coordinates, including its offset.
@@ -188,6 +198,7 @@ def evaluate(
             psnr(image, target, mask),
             ssim(image, target, mask),
             edge_psnr(image, target, mask),
+            detail(image, target, mask),
             perceived,
             against_of(targets, view),
             cameras.kinds[view],

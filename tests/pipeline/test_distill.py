@@ -84,6 +84,10 @@ def test_command_on_a_trained_scene(command_line: CommandLine, tmp_path: Path) -
         worst["psnr"],
     )
     assert re.search(r"│ near +│", error)
+    assert max(len(line) for line in error.splitlines() if "│" in line) <= 80
+    for kind in report["kinds"]:
+        assert 0 < kind["detail"]["before"] <= kind["detail"]["after"] <= 1
+        assert f"{kind['detail']['before']:.2f} → {kind['detail']['after']:.2f}" in error
     left = sorted(p.name for p in (tmp_path / "run").iterdir())
     assert left == [
         *("preview.png", "report.html", "report.json", "scene.ply", "scored.json", "view.html", "views.json")

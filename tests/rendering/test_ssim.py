@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from g2ard import _core
 from g2ard.config.choices import BLACK
 from g2ard.errors import InputError
-from g2ard.rendering.metrics import edge_psnr, psnr, ssim
+from g2ard.rendering.metrics import detail, edge_psnr, psnr, ssim
 from g2ard.rendering.renderer import Renderer
 from g2ard.scene.cameras import Cameras
 from g2ard.stages.recover.losses import l1_ssim
@@ -147,21 +147,42 @@ def test_masked_ssim_is_between_minus_one_and_one_and_sees_the_mask_alone(
         np.testing.assert_array_equal(other_gradient, gradient)
 
 
-def test_edges_are_the_twin_s() -> None:
+def test_gradients_are_the_twin_s() -> None:
     rng = np.random.default_rng(0)
     a, b = rng.random((2, 9, 7, 3)).astype(np.float32)
+    b = (0.7 * a + 0.3 * b).astype(np.float32)
     mask = rng.random((9, 7)) < 0.7
     for chosen in (None, mask):
-        squares = []
+        pairs = []
         for y, x in np.ndindex(9, 7):
             for down, right in ((1, 0), (0, 1)):
                 there = y + down, x + right
                 inside = there[0] < 9 and there[1] < 7
                 if inside and (chosen is None or (chosen[y, x] and chosen[there])):
-                    steps = (image[there].astype(float) - image[y, x] for image in (a, b))
-                    squares.append((next(steps) - next(steps)) ** 2)
-        want = -10 * np.log10(np.mean(squares))
+                    pairs.append([image[there].astype(float) - image[y, x] for image in (a, b)])
+        own, wanted = np.array(pairs).swapaxes(0, 1)
+        want = -10 * np.log10(np.mean((own - wanted) ** 2))
         assert edge_psnr(a, b, chosen) == pytest.approx(want, abs=1e-4)
+        want = (own * wanted).sum() / np.sqrt((own**2).sum() * (wanted**2).sum())
+        assert detail(a, b, chosen) == pytest.approx(want, abs=1e-6)
+
+
+def test_detail_counts_lines_whatever_their_area() -> None:
+    target = np.full((64, 64, 3), 0.5, np.float32)
+    target[:, 20] = 0.6  # a wire
+    flat, brighter, moved = np.full_like(target, 0.5), target + 0.2, np.roll(target, 3, 1)
+    noise = np.random.default_rng(0).normal(0, 0.05, target.shape).astype(np.float32)
+    assert psnr(flat, target) > 35 > psnr(brighter, target)
+    assert detail(brighter, target) == pytest.approx(1, abs=1e-4)
+    for lost in (flat, moved, flat + noise):
+        assert abs(detail(lost, target)) < 0.1
+    assert detail(1 - target, target) == pytest.approx(-1, abs=1e-2)
+    assert 0.3 < detail(target + 0.4 * noise, target) < 0.5  # a sixth of the energy is the wire's
+    assert detail(flat, flat + np.float32(0.1)) == detail(target[:1, :1], noise[:1, :1]) == 1
+    mask = np.zeros(target.shape[:2], bool)
+    assert detail(target, noise, mask) == 1
+    mask[:, :10] = True
+    assert detail(flat, target, mask) == 1  # the wire is outside
 
 
 def test_edges_see_a_blurred_line_before_a_wrong_colour() -> None:
@@ -183,7 +204,7 @@ def test_nan_is_no_perfect_score() -> None:
     spoilt[3, 4] = np.nan
     everywhere = np.ones(image.shape[:2], bool)
     for mask in (None, everywhere):
-        assert np.isnan([score(image, spoilt, mask) for score in (psnr, ssim, edge_psnr)]).all()
+        assert np.isnan([score(image, spoilt, mask) for score in (psnr, ssim, edge_psnr, detail)]).all()
     targets = Spoilt(views)
     assert np.isnan(Probe(targets, BLACK).all_of(ball))
     assert np.isnan(Probe(targets, BLACK, 40.0).all_of(ball))
@@ -207,6 +228,8 @@ def test_shapes_must_fit() -> None:
         _core.ssim(a, a[:3])
     with pytest.raises(InputError, match="target: expected the image's shape"):
         edge_psnr(a, a[:3])
+    with pytest.raises(InputError, match="target: expected the image's shape"):
+        detail(a, a[:3])
     with pytest.raises(InputError, match="image"):
         _core.psnr(a[:0], a[:0])
     with pytest.raises(InputError, match=r"target: expected \(H, W, C\) float32"):

@@ -24,7 +24,7 @@ def opened(browser: Browser, page: Page, path: Path, width: int = 1000) -> None:
     browser.run("new Promise(done => { onload = done; document.readyState === 'complete' && done() })")
 
 
-ROW = ["anywhere", "128", "29.34 → 32.27", "pose_0113_anywhere 27.01", "0.7896 → 0.8607"]
+ROW = ["anywhere", "128", "29.34 → 32.27", "27.01", "0.79 → 0.86", "0.7896 → 0.8607"]
 
 
 @pytest.mark.parametrize("width", [360, 1000])

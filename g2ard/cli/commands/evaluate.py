@@ -282,6 +282,7 @@ def _table(run: Run, title: str, rows: list[dict[str, Any]]) -> None:
         "PSNR": [f"{r['psnr']:.2f}" for r in rows],
         "SSIM": [f"{r['ssim']:.4f}" for r in rows],
         "edges": [f"{r['edge_psnr']:.2f}" for r in rows],
+        "detail": [f"{r['detail']:.2f}" for r in rows],
         "needles": [f"{r['needle']:.1%}" for r in rows],
         "overdraw": [f"{r['overdraw']:.1f}" for r in rows],
     }
@@ -292,6 +293,7 @@ def _table(run: Run, title: str, rows: list[dict[str, Any]]) -> None:
     cells = [list(row) for row in zip(*columns.values(), strict=True)]
     run.console.table(title, list(columns), cells, stdout=run.json != "-")
     run.say(
-        "PSNR in dB; edges: PSNR of the images' gradients, in dB; needles: share of long, thin Gaussians; "
+        "PSNR in dB; edges: PSNR of the images' gradients, in dB; detail: their correlation, at most 1; "
+        "needles: share of long, thin Gaussians; "
         "overdraw: Gaussians blended per pixel"
     )
