@@ -13,6 +13,7 @@ from g2ard.io.scene_formats import scene_format
 from g2ard.io.source import Source
 from g2ard.jobs.budget import Budget
 from g2ard.stages.simplify import Default, SimplifyConfig
+from g2ard.system.memory import usable_memory
 from g2ard.tiles.ingest import TILE_ROWS
 
 if TYPE_CHECKING:
@@ -59,14 +60,7 @@ class Tiling:
     @property
     def usable_memory(self) -> int:
         """Bytes for all workers together."""
-        return self.memory or int(0.8 * _physical_memory())
-
-
-def _physical_memory() -> int:
-    try:
-        return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    except (AttributeError, ValueError, OSError):
-        return 8_000_000_000
+        return self.memory or int(0.8 * usable_memory())
 
 
 def cut_into(folder: Path | None, rows: int) -> str:

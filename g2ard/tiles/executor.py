@@ -131,7 +131,7 @@ class _Pool:
     def run(self, tasks: Sequence[Task], told: Told) -> None:
         self._pool = self._pool or self._opened()
         try:
-            futures = {self._pool.submit(_work, task, self._threads): task for task in tasks}
+            futures = {self._pool.submit(_work, task.absolute(), self._threads): task for task in tasks}
             pending = set(futures)
             while pending:  # wait briefly: Ctrl-C does not end a longer wait on Windows
                 done, pending = wait(pending, timeout=0.2, return_when=FIRST_COMPLETED)

@@ -1,5 +1,7 @@
 """Tasks (pure functions from files to one file), and the scenes and cameras in those files."""
 
+from __future__ import annotations
+
 import math
 import time
 import zipfile
@@ -7,7 +9,7 @@ import zlib
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from contextvars import ContextVar
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -72,6 +74,15 @@ class Task:
     inputs: Mapping[str, Path | list[Path]] = field(default_factory=dict)
     places: Mapping[str, Path] = field(default_factory=dict, metadata=UNKEYED)
     cost: int = field(default=1, metadata=UNKEYED)
+
+    def absolute(self) -> Task:
+        """Return the task for a process that may run in another folder."""
+        inputs = {
+            name: [path.absolute() for path in value] if isinstance(value, list) else value.absolute()
+            for name, value in self.inputs.items()
+        }
+        places = {name: path.absolute() for name, path in self.places.items()}
+        return replace(self, folder=self.folder.absolute(), inputs=inputs, places=places)
 
     @property
     def key(self) -> str:

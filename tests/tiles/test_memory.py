@@ -80,7 +80,7 @@ def test_the_machines_memory_is_the_default(
     scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     store = tiles(scene, tmp_path, 6000)
-    monkeypatch.setattr(policy, "_physical_memory", lambda: 4_000_000_000)
+    monkeypatch.setattr(policy, "usable_memory", lambda: 4_000_000_000)
     told = r"--workers 1000 take about 20\d[\d.]* GB, more than the 3\.2 GB used of the machine's"
     with pytest.raises(InputError, match=told + r" memory; --workers 1\d fit$"):
         plan_tiles(store, Tiling(folder=tmp_path, workers=1000)).workers
