@@ -185,6 +185,7 @@ def _execute(run: Run, fn: Callable[..., None], options: dict[str, Any]) -> None
             os.environ["RAYON_NUM_THREADS"] = str(run.threads)  # for child processes
         with run.console, _device(run):
             fn(run, **options)
+        run.end()
     except KeyboardInterrupt:
         _stopped(run)
     except (G2ardError, OSError, MemoryError) as e:

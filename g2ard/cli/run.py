@@ -67,6 +67,7 @@ class Run(Claims):
         self._adapter: str | None = None  # last adapter in use
         self.kept: list[str] = []  # outputs and checkpoints that remain, for messages of errors and Ctrl-C
         self._failed: str | None = None  # what an error ended after the scene was written
+        self._unshown: Exception | None = None  # the error of a page or picture
         told = {**options, **{name: value for name, value in common.items() if name not in _UNRECORDED}}
         self.config = {name: _flat(value) for name, value in told.items()}
 
@@ -125,6 +126,22 @@ class Run(Claims):
         except Exception:
             self._failed = self._failed or what
             raise
+
+    @contextmanager
+    def showing(self, what: str) -> Iterator[None]:
+        """Begin a page or picture of a result; if it fails, the command does the rest, then ends in its
+        error."""
+        self.begin(what.removeprefix("--"))
+        try:
+            yield
+        except Exception as error:
+            if self._unshown is None:
+                self._failed, self._unshown = what, error
+
+    def end(self) -> None:
+        """Raise the error of the first page or picture that failed."""
+        if self._unshown is not None:
+            raise self._unshown
 
     def failure(self, reason: str) -> str:
         """Return the message of an error: what failed, why, and what remains."""

@@ -190,23 +190,28 @@ class RunFolder:
 
         title = f"{names_of([Path(str(source))])[0]}: {report.title}"
         if isinstance(report, TiledReport):
-            with self._run.finishing("report.html"):
+            with self._run.showing("report.html"):
                 tiled_report(self.path / "report.html", title, report)
             return report, ""
         scenes = [] if report.photos else [("simplified", done.simplified)]  # a start of photos is a blur
         scenes.append((RESULT, done.splats))
         targets = list(filter(None, (done.held_out, job.targets.apart)))
         recover, page = job.config.recover, self.path / "report.html"
-        with self._run.finishing("report.html"):
+        best = None
+        with self._run.showing("choosing views for report.html"):
             best = job.best(done)
+        if best is None:
+            return report, ""
+        with self._run.showing("report.html"):
             distill_report(page, title, scenes, targets, report, recover.background, told, best=best)
-        with self._run.finishing(_PICTURE):
+        with self._run.showing(_PICTURE):
             preview(self.path / _PICTURE, best, scenes, recover.background)
         if not self._run.config["page"]:
             return report, ""
         dense = (source, job.prior) if isinstance(source, Source) and not recover.from_points else None
         seen = job.views.train.cameras if job.views.pool is None else best.cameras
-        with self._run.finishing("view.html"):
+        size, line = None, ""
+        with self._run.showing("view.html"):
             size, line = self.write_view(done.splats, dense, seen, recover.background)
         return replace(report, bytes={**report.bytes, "view": size}), line
 
@@ -246,7 +251,8 @@ class RunFolder:
         picture = self.path / _PICTURE
         scene = f"scene: {self.scene} ({self.scene.stat().st_size / 1e6:.2f} MB)"
         shown = f"picture: {picture}" if picture.exists() else ""
-        report = f"report: {self.path / 'report.html'}, {self._report}"
+        reports = [path for path in (self.path / "report.html", self._report) if path.exists()]
+        report = f"report: {', '.join(map(str, reports))}"
         self._run.say("\n".join(filter(None, (scene, shown, report, page))))
         self._run.kept.append(f"{self.path} is finished")
 

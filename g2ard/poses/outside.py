@@ -22,6 +22,9 @@ _FILLED, _WHOLE, _ROUNDS = 0.9, 0.998, 6
 """Share of the frame that a view of the whole fills, the share of the matter that is the whole, and steps in
 which such a view finds its place."""
 
+_NEAREST = 1e-9
+"""Least distance of a point in front of a view that is fitted, in scene sizes."""
+
 _FITTED = 24
 """Poses of a circle that are fitted, at most."""
 
@@ -87,7 +90,7 @@ def ring(survey: Survey, rises: Sequence[float], turns: int) -> Poses:
 
     Poses in matter are dropped.
     """
-    site = survey.site
+    site, body = survey.site, survey.site.body
     points, (wide, tall) = site.points[:_OUTLINE], np.array(survey.lens.tangents) * _FILLED
     rise, turn = (part.ravel() for part in np.meshgrid(np.radians(rises), np.arange(turns) / turns))
     gazes = -directions(turn, np.cos(rise), np.sin(rise))
@@ -96,29 +99,38 @@ def ring(survey: Survey, rises: Sequence[float], turns: int) -> Poses:
         x, y, z = turned(points, frame).T
         eye = np.zeros(3)
         for _ in range(_ROUNDS):  # aim at the middle of what the frame shows, as near as it fits
-            away = np.maximum(np.abs(x - eye[0]) / wide, np.abs(y - eye[1]) / tall) - z
+            away = _away(x - eye[0], y - eye[1], wide, tall, body) - z
             eye[2] = -float(quantile(away, site.weights[:_OUTLINE], _WHOLE))
             ahead = np.flatnonzero(away <= -eye[2])
             for axis, across in ((0, x), (1, y)):
-                slopes = (across[ahead] - eye[axis]) / (z[ahead] - eye[2])
+                slopes = (across[ahead] - eye[axis]) / np.maximum(z[ahead] - eye[2], _NEAREST)
                 eye[axis] -= eye[2] * (slopes.max() + slopes.min()) / 2
         eyes[i] = eye @ frame
     return Poses(eyes, gazes).take(site.is_free(eyes, 2, _LOWEST))
 
 
+def _away(x: Floats, y: Floats, wide: float, tall: float, body: float) -> Floats:
+    """Return the distances from which points (x, y) off the line of sight, and `body` around them, are in
+    frame."""
+    return np.maximum((np.abs(x) + body) / wide, (np.abs(y) + body) / tall) + body
+
+
 def circle(survey: Survey, gazes: Floats) -> Poses:
     """Return poses on a level circle around a scene, with all of it just in frame."""
-    target = survey.site.box.mean(axis=0)
+    target, body = survey.site.box.mean(axis=0), survey.site.body
     points, weights = survey.site.points[:_OUTLINE] - target, survey.site.weights[:_OUTLINE]
     wide, tall = np.array(survey.lens.tangents) * _FILLED
     frames = Poses(gazes, gazes).frames()
     seen = [turned(points, frames[i]).T for i in evenly_spaced(len(gazes), _FITTED)]
     away = down = 0.0
     for _ in range(_ROUNDS):  # aim at the middle of what the frames show, as near as it fits all of them
-        needed = [np.maximum(np.abs(x) / wide, np.abs(y - down) / tall) - z for x, y, z in seen]
+        needed = [_away(x, y - down, wide, tall, body) - z for x, y, z in seen]
         away = max(float(quantile(one, weights, _WHOLE)) for one in needed)
         slopes = np.concatenate(
-            [((y - down) / (z + away))[one <= away] for (_, y, z), one in zip(seen, needed, strict=True)]
+            [
+                ((y - down) / np.maximum(z + away, _NEAREST))[one <= away]
+                for (_, y, z), one in zip(seen, needed, strict=True)
+            ]
         )
         down += away * float(slopes.max() + slopes.min()) / 2
     return Poses(target + down * frames[:, 1] - away * gazes, gazes)

@@ -82,6 +82,8 @@ class Site:
         points: (K, 3) a sample of the matter.
         weights: (K,) weights of the points.
         box: (2, 3) low and high corner of the robust extents.
+        body: how far views must see around each point: more than 0 if the scene is no larger than one of its
+            Gaussians along any axis.
         terrain: height of the ground; None without a ground.
         grid: opaque cells of the box and a margin around it.
         axes: (3, 3) rows are this frame's axes in world coordinates.
@@ -93,6 +95,7 @@ class Site:
     points: Floats
     weights: Floats
     box: Floats
+    body: float
     terrain: Terrain | None
     grid: Grid
     axes: Floats
@@ -116,14 +119,15 @@ class Site:
         axes = _axes(some, found.axis)
         points = turned(some.points, axes)
         box = np.array([quantile(points[:, a], some.weights, _EXTENT) for a in range(3)]).T
-        body = _BODY * middle(matter.scales[:, 2])  # for a scene no larger than its Gaussians
-        box += np.maximum(0, body - (box[1] - box[0]) / 2) * np.array([[-1.0], [1.0]])
+        missing = np.maximum(0, _BODY * middle(matter.scales[:, 2]) - (box[1] - box[0]) / 2)
+        box += missing * np.array([[-1.0], [1.0]])
         margin = _MARGIN[0] * (box[1] - box[0]) + _MARGIN[1]
         grid = Grid.of(box[0] - margin, box[1] + margin, matter, axes)
         ground = facing(some, found.axis)
         terrain = Terrain.of(points[ground], some.weights[ground], box) if found.grounded else None
         origin = splats.offset + matter.origin
-        return cls(points, some.weights, box, terrain, grid, axes, origin, matter.size, found)
+        body = 2 * float(missing.min())  # a Gaussian is drawn as far as three standard deviations
+        return cls(points, some.weights, box, body, terrain, grid, axes, origin, matter.size, found)
 
     def ground(self, points: Floats) -> Floats:
         """Return (M,) heights of the ground under points, or of the box's bottom without a ground."""

@@ -34,6 +34,34 @@ def checkered_ball(n: int = 3000, seed: int = 0) -> Splats:
     )
 
 
+def _at(places: ArrayLike, opacity: ArrayLike = 2.0) -> Splats:
+    """Return round Gaussians of several colours at some places, far from the origin."""
+    count = len(np.asarray(places))
+    return Splats.create(
+        np.asarray(places, np.float32),
+        offset=(300.0, -20.0, 7.0),
+        scales=np.full((count, 3), 0.05),
+        logit_opacities=np.broadcast_to(opacity, count),
+        sh0=np.random.default_rng(count).normal(size=(count, 1, 3)),
+    )
+
+
+def degenerate_scenes() -> dict[str, Splats]:
+    """Return scenes without an extent along some axes, or of next to nothing, by name."""
+    spread = np.random.default_rng(0).normal(size=(60, 3))
+    line = np.linspace(0, 1, 30)[:, None]
+    return {
+        **{f"{count}": _at(spread[:count]) for count in range(1, 6)},
+        **{f"{count} in one place": _at(np.zeros((count, 3))) for count in (2, 50)},
+        "nearly in one place": _at(1e-3 * spread),
+        "one visible": _at(spread, np.where(np.arange(60) == 7, 2.0, -9.0)),
+        "on a line": _at(line * [1.0, 2.0, 3.0]),
+        "on an axis": _at(line * [0.0, 1.0, 0.0]),
+        "on a plane": _at(spread * [1.0, 0.0, 1.0]),
+        "on a slope": _at(spread[:, :2] @ [[1.0, 0.0, 0.3], [0.0, 1.0, 0.7]]),
+    }
+
+
 def under_a_sky(scene: Splats, count: int = 300, seed: int = 0) -> Splats:
     """Surround a scene with `count` faint layers, each wider than the scene and almost flat."""
     rng = np.random.default_rng(seed)

@@ -121,9 +121,9 @@ def clean(
             else:
                 run.say(f"{split_sky}: not written; {output} is the whole scene")
     if preview is not None and done.cameras is not None:
-        with run.finishing("--preview"):
+        with run.showing("--preview"):
             _paint(preview, done, done.cameras, run.overwrite)
-        run.say(f"picture: {preview}")
+            run.say(f"picture: {preview}")
     counts = {"input_count": total + sky_count, "output_count": kept, "found": done.clutter.counts}
     run.result(counts if done.sky is None else {**counts, "sky_count": sky_count})
 

@@ -93,28 +93,27 @@ def compare(
         stdout=run.json != "-",
     )
     if output is not None:
-        run.begin("page")
-        points = opaque_points(dense)
-        if is_planned(found):  # generated views may show only parts
-            best = at_size(best_level(dense, 1, cameras, planned_at(size)), size, made=True)
-            renders = TeacherRenders(dense, best, background=colour)
-            psnr[best.names[0]] = evaluate(other, renders, background=colour).psnr
-            axis = level_up(cameras)
-            stand = frame_with(dense, best, None if axis is None else axis.tolist())
-            cameras = Cameras.of([*cameras, *best])
-        else:
-            stand = frame_with(dense, cameras)
-        shown = {"typical": str(stand.name)} | {f"worst {i}": v.name for i, v in enumerate(worst, 1)}
-        stops = [
-            (
-                f"{what}: {name}, {psnr[name]:.1f} dB",
-                stand.start_at(cameras[cameras.names.index(name)], points),
-            )
-            for what, name in shown.items()
-        ]
-        labels = labels_of(sources, [len(dense), len(other)], roles)
-        scenes = [(label, stand.of(splats)) for label, splats in zip(labels, (dense, other), strict=True)]
-        with run.finishing("--output"):
+        with run.showing("--output"):
+            points = opaque_points(dense)
+            if is_planned(found):  # generated views may show only parts
+                best = at_size(best_level(dense, 1, cameras, planned_at(size)), size, made=True)
+                renders = TeacherRenders(dense, best, background=colour)
+                psnr[best.names[0]] = evaluate(other, renders, background=colour).psnr
+                axis = level_up(cameras)
+                stand = frame_with(dense, best, None if axis is None else axis.tolist())
+                cameras = Cameras.of([*cameras, *best])
+            else:
+                stand = frame_with(dense, cameras)
+            shown = {"typical": str(stand.name)} | {f"worst {i}": v.name for i, v in enumerate(worst, 1)}
+            stops = [
+                (
+                    f"{what}: {name}, {psnr[name]:.1f} dB",
+                    stand.start_at(cameras[cameras.names.index(name)], points),
+                )
+                for what, name in shown.items()
+            ]
+            labels = labels_of(sources, [len(dense), len(other)], roles)
+            scenes = [(label, stand.of(splats)) for label, splats in zip(labels, (dense, other), strict=True)]
             write_page(
                 output,
                 scenes,
@@ -124,8 +123,8 @@ def compare(
                 overwrite=run.overwrite,
                 progress=run.progress,
             )
-        run.kept.append(f"{output} is written")
-        run.say(f"{output}: opens at {stand.name}; the arrows below lead to the worst views")
+            run.kept.append(f"{output} is written")
+            run.say(f"{output}: opens at {stand.name}; the arrows below lead to the worst views")
     closer = _closer(run, first, second, dense, other, colour)
     if closer is not None:
         run.say(closer)

@@ -182,7 +182,8 @@ def evaluate(
     advice = None
     if output is not None:
         results = zip(scenes, loaded, found, strict=True)
-        advice = _write_ladder(run, output, list(results), targets, teaching, found_views, settings)
+        with run.showing("--output"):
+            advice = _write_ladder(run, output, list(results), targets, teaching, found_views, settings)
     counts = Counter(view["against"] for view in rows[0]["views"])
     single = {"photo": "photos", "teacher": "teacher"}
     against = counts if len(counts) > 1 else single[next(iter(counts))]
@@ -230,18 +231,17 @@ def _write_ladder(
         name = best_views(rungs[-1].splats if dense is None else dense, 1, cameras).names[0]
         shown = Subset(targets, [cameras.names.index(name)])
     title = f"{'photos' if top is None else top.name}: {len(rungs)} sizes"
-    with run.finishing("--output"):
-        ladder(
-            output,
-            title,
-            rungs,
-            targets,
-            shown,
-            dense=top,
-            background=teaching.background,
-            settings=settings,
-            overwrite=run.overwrite,
-        )
+    ladder(
+        output,
+        title,
+        rungs,
+        targets,
+        shown,
+        dense=top,
+        background=teaching.background,
+        settings=settings,
+        overwrite=run.overwrite,
+    )
     run.kept.append(f"{output} is written")
     advice = recommendation(rungs)
     run.say(f"{output}: {advice}")

@@ -219,7 +219,7 @@ def lod(
             written = save_tileset(output, levels.splats, up=axis, place=spot, **common)
         run.kept.append(f"{output} is written")
         frame = GivenViews(views, scene, axis)
-        with run.finishing("the page"):
+        with run.showing("the page"):
             written += write_level_page(output, levels.splats, kind, frame, background=background)
             query = "" if kind == "sog" else "/?cesium=URL (a folder of CesiumJS)"
             run.say(f"page: python -m http.server --directory {output}, then http://localhost:8000{query}")

@@ -161,7 +161,7 @@ def register(
         from g2ard.io.labels import names_of
 
         title = f"Photos in {names_of([scene])[0]}"
-        with run.finishing("--report"):
+        with run.showing("--report"):
             registration_report(
                 report,
                 title,

@@ -154,10 +154,11 @@ def render(
         with nullcontext() if output is None else atomic_folder(output, run.overwrite) as folder:
             deque(draw(folder), maxlen=0)
     run.kept += [f"{output} is written"] if output is not None else []
+    written = [str(path) for path in (output, animation) if path]
     if sheet is not None:
-        with run.finishing("--sheet"):
+        with run.showing("--sheet") if written else run.finishing("--sheet"):
             _write_sheet(sheet, shown, cameras.names, run.overwrite)
-    written = [str(path) for path in (output, animation, sheet) if path]
+            written.append(str(sheet))
     run.say(f"{plural(len(cameras), 'image')} in {' and '.join(written)}")
     run.result({"images": len(cameras), "output": written[0]})
 
