@@ -98,9 +98,9 @@ def _record_of(place: Path, output: Path) -> dict[str, Any] | None:
 
 
 def _content(output: Path) -> list[Any]:
-    """Return the identity of an output, whatever its time."""
-    ((name, size, _, digest),) = file_identity([output])
-    return [name, size, digest]
+    """Return the identity of an output."""
+    ((name, digest),) = file_identity([output])
+    return [name, digest]
 
 
 @contextmanager

@@ -11,7 +11,7 @@ from g2ard.errors import InputError
 from g2ard.io.colmap import model_folder
 from g2ard.io.finding import usable
 from g2ard.io.jsonfile import read_json
-from g2ard.io.paths import read_text, real_path
+from g2ard.io.paths import content_hash, read_text, real_path
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.lenses import photo_of
 
@@ -171,14 +171,35 @@ def _listed(names: Sequence[str], wanted: Sequence[str]) -> NDArray[np.bool_]:
 
 
 def not_held_out(cameras: Cameras, held_out: Cameras) -> NDArray[np.bool_]:
-    """Return the (C,) mask of views that are not held out, compared by photo or by exact pose."""
-    photos = {real_path(path) for path in held_out.image_paths if path is not None}
-    poses = {view.tobytes() for view in np.round(held_out.viewmats, 9) + 0.0}
-    mine = np.round(cameras.viewmats, 9) + 0.0
-    return np.array(
-        [
-            (path is None or real_path(path) not in photos) and view.tobytes() not in poses
-            for path, view in zip(cameras.image_paths, mine, strict=True)
-        ],
-        bool,
-    )
+    """Return the (C,) mask of views that are not held out: no view held out has their photo, a copy of it, or
+    their pose."""
+    alike = same_photos(cameras.image_paths, held_out.image_paths, copies=True)
+    places = np.concatenate([cameras.positions, held_out.positions])
+    slack = _SAME_POSE * np.ptp(places, axis=0).max() + np.finfo(np.float64).eps * np.abs(places).max()
+    for place, turn in zip(held_out.positions, held_out.viewmats[:, :3, :3], strict=True):
+        near = (np.abs(cameras.positions - place) <= slack).all(1)
+        alike |= near & (np.abs(cameras.viewmats[:, :3, :3] - turn) <= _SAME_POSE).all((1, 2))
+    return ~alike
+
+
+_SAME_POSE = 1e-6
+"""Difference of rotations, and of positions as a share of their extent, that single precision may make."""
+
+
+def same_photos(
+    photos: Sequence[Path | None], others: Sequence[Path | None], *, copies: bool = False
+) -> NDArray[np.bool_]:
+    """Return whether each photo is one of `others`, by whatever name; with `copies`, also by content."""
+    known = {real_path(path) for path in others if path is not None}
+    alike = np.array([path is not None and real_path(path) in known for path in photos], bool)
+    if copies:
+        sizes, hashes = {_size(path) for path in known}, set[str]()
+        for row, path in enumerate(photos):
+            if path is not None and not alike[row] and _size(path) in sizes - {None}:
+                hashes = hashes or {content_hash(other) for other in known if _size(other) is not None}
+                alike[row] = content_hash(path) in hashes
+    return alike
+
+
+def _size(path: Path) -> int | None:
+    return path.stat().st_size if path.is_file() else None

@@ -19,13 +19,12 @@ from g2ard.config.schema import keywords, listed
 from g2ard.errors import InputError
 from g2ard.io import Source, read_splats
 from g2ard.io.paths import real_path
-from g2ard.io.splits import for_training
-from g2ard.io.types import Cloud, Points
+from g2ard.io.types import Cloud, Points, ViewSet
 from g2ard.jobs.budget import Budget
 from g2ard.jobs.budget_search import ResolvedBudget
 from g2ard.jobs.clean import clean as remove_clutter
 from g2ard.jobs.distill_options import DistillOptions
-from g2ard.jobs.inputs import GivenViews, Views, load_scene, make_targets, scorable
+from g2ard.jobs.inputs import GivenViews, Views, load_scene, make_targets, scorable, split_views
 from g2ard.jobs.memory import RECOVERY_TIMES
 from g2ard.jobs.photo_colors import colored
 from g2ard.jobs.photo_points import distinct, sparse_file, sparse_points, topped_up, usual_count
@@ -544,6 +543,7 @@ def prepare(
         prior,
         options,
         usual if budget.is_measured else budget.of(len(prior), read.name),
+        given=read.views,
         beside=read.beside,
         teach=not read.needs_photos and options.photos is not True,
         use=use,
@@ -668,6 +668,7 @@ class _Read:
         given: number of Gaussians, the first ones, from points that were not found in the photos.
         from_photos: whether the points, or some of them, were found in the photos, by COLMAP or here.
         usual: count of the result, if no budget is given.
+        views: the views to learn from and those to score, if the points needed them, see `split_views`.
     """
 
     prior: Splats
@@ -678,6 +679,7 @@ class _Read:
     given: int
     from_photos: bool = False
     usual: int | None = None
+    views: tuple[ViewSet, Cameras] | None = None
 
 
 def _read(
@@ -703,14 +705,15 @@ def _read(
         return _Read(lifted, True, False, options.beside, name, len(lifted))
     cloud, name, of_photos = _points(scene, views, say)
     points: Points | None = None
+    parts = split_views(views, options.held_out, say)
+    train = parts[0].cameras
     if cloud is not None:
-        split = "train" if options.held_out is None else for_training
-        points = distinct(colored(cloud, views, split, name, progress=progress, say=say))
+        points = distinct(colored(cloud, train, name, progress=progress, say=say))
     given = 0 if points is None or scene is None else len(points)
     usual = None
     if budget is None:
         sparse = 0 if points is None else len(points)
-        usual = usual_count(views, options.held_out, options.size, sparse, say)
+        usual = usual_count(train, options.size, sparse, say)
     wanted = usual or (budget and budget.count) or 0
     if points is None and budget is not None and not wanted:
         raise InputError(
@@ -723,8 +726,7 @@ def _read(
         of_photos = True
         points = topped_up(
             points,
-            views,
-            options.held_out,
+            train,
             wanted,
             background=recover.background,
             seed=recover.seed,
@@ -734,7 +736,7 @@ def _read(
     # Each point has its disc, for as many are needed, also where positions are equal about another middle.
     config = options.config.lift
     lifted, _ = lift_rows(points.positions, points.colors, config, progress, merge=False)
-    return _Read(lifted, True, True, options.beside, name, given, of_photos, usual)
+    return _Read(lifted, True, True, options.beside, name, given, of_photos, usual, parts)
 
 
 def _points(scene: Points | Source | None, views: Views | None, say: Say) -> tuple[Cloud | None, str, bool]:

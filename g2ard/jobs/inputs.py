@@ -15,7 +15,15 @@ from g2ard.config.choices import RenderModel
 from g2ard.errors import InputError
 from g2ard.io import Source, read_view_set
 from g2ard.io.images import find_exposures
-from g2ard.io.splits import not_held_out, split_mask, splits_of
+from g2ard.io.splits import (
+    for_scores,
+    for_training,
+    not_held_out,
+    same_photos,
+    split_mask,
+    splits_of,
+    states_splits,
+)
 from g2ard.io.types import ViewFiles, ViewSet
 from g2ard.progress import Say, plural, unsaid
 from g2ard.rendering.renderer import RasterSettings
@@ -97,11 +105,25 @@ def load_view_sets(
 ) -> list[ViewSet]:
     """Read views once and return several splits at a longer side, with their weights."""
     found, path = _read(views, say, unpictured=unpictured)
-    parts = []
-    for split in splits:
-        chosen = partial(split_mask, which=split) if isinstance(split, str) else split
-        parts.append(found.take(chosen(path, found.cameras.names, stated=found.splits)).fitted(size))
-    return parts
+    return [found.take(_mask(found, path, split)).fitted(size) for split in splits]
+
+
+def split_views(
+    views: Views, held_out: Views | None, say: Say = unsaid, *, unpictured: bool = False
+) -> tuple[ViewSet, Cameras]:
+    """Return the views to learn from and those to score; no view scored is among the first.
+
+    Whatever a job learns from photos takes them from the first, which is made once.
+
+    Args:
+        held_out: views to score; None scores the test split of `views`.
+    """
+    load = partial(load_view_sets, size=None, say=say, unpictured=unpictured)
+    if held_out is None:
+        train, test = load(views, ["train", "test"])
+        return train, test.cameras
+    (train,), (test,) = load(views, [for_training]), load(held_out, [for_scores])
+    return drop_held_out(train, test.cameras, say), test.cameras
 
 
 def drop_held_out(train: ViewSet, held_out: Cameras, say: Say = unsaid) -> ViewSet:
@@ -122,9 +144,22 @@ def load_split_views(
 ) -> tuple[ViewSet, NDArray[np.bool_]]:
     """Read all views with their splits, stated or by the rule, and the mask of the views in `split`."""
     found, path = _read(views, say, unpictured=unpictured)
-    names = found.cameras.names
-    mask = split_mask(path, names, split, stated=found.splits)
-    return replace(found, splits=splits_of(path, names, found.splits)), mask
+    mask = _mask(found, path, split)
+    return replace(found, splits=splits_of(path, found.cameras.names, found.splits)), mask
+
+
+def _mask(views: ViewSet, path: Path | None, split: Split) -> NDArray[np.bool_]:
+    """Return the mask of the views in a split; a photo of the test split trains under no other name."""
+    names, photos = views.cameras.names, views.cameras.image_paths
+    choose = partial(split_mask, which=split) if isinstance(split, str) else split
+    mask: NDArray[np.bool_] = choose(path, names, stated=views.splits)
+    if split != "train" and (split is not for_training or not states_splits(path, views.splits)):
+        return mask
+    tested = [word == "test" for word in splits_of(path, names, views.splits)]
+    left = mask & ~same_photos(photos, [photo for photo, test in zip(photos, tested, strict=True) if test])
+    if not left.any():
+        raise InputError("no view is left for training: each photo is in the test split too", path=path)
+    return left
 
 
 def _read(views: Views, say: Say, *, unpictured: bool = False) -> tuple[ViewSet, Path | None]:

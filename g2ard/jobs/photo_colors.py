@@ -7,7 +7,6 @@ from numpy.typing import NDArray
 
 from g2ard.io.images import load_photo
 from g2ard.io.types import Cloud, Points
-from g2ard.jobs.inputs import Split, Views, load_view_sets
 from g2ard.progress import Progress, Say, plural, silent
 from g2ard.scene.cameras import Cameras
 
@@ -21,14 +20,12 @@ _DEPTH_SLACK = 0.05
 """Relative depth behind the nearest point of a cell within which points are seen."""
 
 
-def colored(
-    cloud: Cloud, views: Views, split: Split, name: str, *, progress: Progress = silent, say: Say
-) -> Points:
+def colored(cloud: Cloud, train: Cameras, name: str, *, progress: Progress = silent, say: Say) -> Points:
     """Return a cloud's points, those without a colour with that of training photos, where any sees them."""
     points, bare = cloud.points, ~cloud.colored
     if not bare.any():
         return points
-    cameras = load_view_sets(views, [split], _PHOTO_SIDE)[0].cameras
+    cameras = train.fitted(_PHOTO_SIDE)
     rows = [row for row, path in enumerate(cameras.image_paths) if path is not None]
     found, seen = median_colors(points.positions, bare, cameras.take(rows), progress)
     colors = points.colors.copy()

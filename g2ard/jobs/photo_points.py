@@ -21,9 +21,8 @@ from g2ard.io.detect import file_format
 from g2ard.io.finding import Finder
 from g2ard.io.images import composited, load_photo
 from g2ard.io.jsonfile import read_json
-from g2ard.io.splits import for_training
-from g2ard.io.types import Cloud, Points, ViewFiles, ViewSet
-from g2ard.jobs.inputs import Split, Views, load_view_sets
+from g2ard.io.types import Cloud, Points, ViewFiles
+from g2ard.jobs.inputs import Views
 from g2ard.progress import Progress, Say, plural, silent, unsaid
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.samples import evenly_spaced
@@ -177,8 +176,7 @@ _RAYS = 2048
 
 def topped_up(
     points: Points | None,
-    views: Views,
-    held_out: Views | None,
+    train: Cameras,
     count: int,
     *,
     background: Colour,
@@ -186,27 +184,13 @@ def topped_up(
     progress: Progress,
     say: Say,
 ) -> Points:
-    """Add points along the camera rays of training views until there are `count`.
-
-    Args:
-        held_out: separate views for scoring; all of `views` are then for training.
-    """
+    """Add points along the camera rays of training views until there are `count`."""
     sparse = 0 if points is None else len(points)
     parts = [] if points is None else [points]
     told = [plural(sparse, "sparse point")] if sparse else []
     if (missing := count - sparse) > 0:
-        which: list[Split] = ["train" if held_out is None else for_training, "all"]
-        train, every = load_view_sets(views, which, _PHOTO_SIDE)
-        if len(train.cameras) < 3:
-            found = f"{len(train.cameras)} of {plural(len(every.cameras), 'view')}"
-            raise InputError(
-                f"points along camera rays need 3 training views; there are {found}",
-                path=None if isinstance(views, Cameras | ViewSet) else str(views),
-                hint="pass more photos, a point cloud or a scene",
-            )
-        parts.append(
-            points_along_rays(train.cameras, missing, background=background, seed=seed, progress=progress)
-        )
+        small = train.fitted(_PHOTO_SIDE)
+        parts.append(points_along_rays(small, missing, background=background, seed=seed, progress=progress))
         told.append(f"{plural(missing, 'point')} along camera rays")
     say(f"starting from {' and '.join(told)}")
     return Points(
@@ -214,7 +198,7 @@ def topped_up(
     )
 
 
-def usual_count(views: Views, held_out: Views | None, size: int | None, sparse: int, say: Say) -> int:
+def usual_count(train: Cameras, size: int | None, sparse: int, say: Say) -> int:
     """Return the Gaussians of a scene that starts from photos alone, to two digits, and say so.
 
     A Gaussian of SH degree 3 has 59 numbers, as many as 20 pixels. One per 100 pixels of the training photos
@@ -222,10 +206,9 @@ def usual_count(views: Views, held_out: Views | None, size: int | None, sparse: 
     two cores, or as many as sparse points.
 
     Args:
-        held_out: separate views for scoring; all of `views` are then for training.
+        train: training views.
         size: longer side of the photos in pixels, if they are larger.
     """
-    train = load_view_sets(views, ["train" if held_out is None else for_training], None)[0].cameras
     cameras, small = train.resized(size), train.resized(_PHOTO_SIDE)
     shares = [_shown_share(small, view) for view in evenly_spaced(len(small), _SAMPLED_PHOTOS)]
     pixels = float((cameras.widths.astype(np.int64) * cameras.heights).sum()) * float(np.mean(shares))
@@ -311,7 +294,10 @@ def points_along_rays(
         `count` points at different positions in world coordinates, with the colour of their ray's pixel.
     """
     if len(cameras) < 3:
-        raise InputError(f"photos: expected at least 3 views, got {len(cameras)}; pass more, or a scene")
+        raise InputError(
+            f"points along camera rays need 3 training views; there are {len(cameras)}",
+            hint="pass more photos, a point cloud or a scene",
+        )
     bare = [name for name, path in zip(cameras.names, cameras.image_paths, strict=True) if path is None]
     if bare:
         raise InputError(

@@ -13,9 +13,16 @@ import numpy as np
 from g2ard.config.checks import AtLeastOne, checks_arguments
 from g2ard.errors import InputError
 from g2ard.io.detect import run_views
-from g2ard.io.splits import for_scores, for_training, split_mask, splits_of
+from g2ard.io.splits import for_scores, split_mask, splits_of
 from g2ard.io.types import ViewSet
-from g2ard.jobs.inputs import GivenViews, Views, drop_held_out, load_view_sets, load_views
+from g2ard.jobs.inputs import (
+    GivenViews,
+    Views,
+    drop_held_out,
+    load_view_sets,
+    load_views,
+    split_views,
+)
 from g2ard.jobs.view_checks import as_pool, check_sight, given_or_found, warn_of_sight
 from g2ard.jobs.viewer_frame import level_up
 from g2ard.pipeline.config import SelectConfig
@@ -75,6 +82,7 @@ def views_of(
     options: DistillOptions,
     count: int,
     *,
+    given: tuple[ViewSet, Cameras] | None = None,
     beside: str | Path | None = None,
     teach: bool = True,
     use: Use = "distil",
@@ -92,6 +100,7 @@ def views_of(
         options: the views, or None for those found beside the scene or generated; `focus`, the kind of views
             added to views that are given without photos or generated.
         count: Gaussians of the compact scene.
+        given: the result of `split_views` if the views are read already.
         beside: path beside which to look for cameras.
         teach: whether the scene can render targets; otherwise views without a photo are skipped and no views
             are generated.
@@ -100,19 +109,20 @@ def views_of(
     """
     wanted = ["train"] if options.held_out is not None else ["train", "test"]
     asked = GivenViews(options.views, beside, options.up, options.config.recover.seed)
-    given, are_found = given_or_found(asked, prior, wanted, say)
+    found, are_found = given_or_found(asked, prior, wanted, say)
     plan = partial(_planned, prior, asked, represents=represents, progress=progress)
-    load = partial(load_view_sets, size=None, say=say, unpictured=teach)
     select = replace(options.config.select, focus=options.focus)
     mix = partial(
         _mixed, prior=prior, count=count, represents=represents, size=options.size, progress=progress, say=say
     )
-    if given is None:
+    if found is None:
         if not teach:
             raise InputError(
                 "generated views have no photos", parameter="photos", hint="give {views} that have them"
             )
-        held_out = None if options.held_out is None else load(options.held_out, [for_scores])[0].cameras
+        held_out = None
+        if options.held_out is not None:
+            held_out = load_view_sets(options.held_out, [for_scores], None, say, unpictured=teach)[0].cameras
         planned = plan(_POOL_VIEWS, grow=_POOL_GROWTH)
         share = 1.0
         if use not in ("merging", "tiles"):
@@ -126,29 +136,25 @@ def views_of(
             say,
             share=share,
         )
-    if options.held_out is None:
-        train, test = load(given, ["train", "test"])
-    else:
-        (train,), (test,) = load(given, [for_training]), load(options.held_out, [for_scores])
-        train = drop_held_out(train, test.cameras, say)
+    train, test = given or split_views(found, options.held_out, say, unpictured=teach)
     if not are_found:
         check_sight(prior, train.cameras, say)
     else:
-        train, test = (replace(part, cameras=as_pool(part.cameras)) for part in (train, test))
-    full = shrunk(test.cameras, options.size)
+        train, test = replace(train, cameras=as_pool(train.cameras)), as_pool(test)
+    full = shrunk(test, options.size)
     train, test = train.fitted(options.size), test.fitted(options.size)
     if not teach or any(train.cameras.image_paths):
         if options.config.select.focus:
             say("warning: --focus has no effect on views with photos")
         select = replace(select, focus="far")
     if not teach:
-        return RunViews(train, test.cameras, full=full)
+        return RunViews(train, test, full=full)
     try:
         planned = plan(_OFFERED_VIEWS)
     except InputError:  # the scene has no room for poses
-        return RunViews(train, test.cameras, full=full)
+        return RunViews(train, test, full=full)
     train, apart, _ = mix(train, planned, select=select, zoom=False)
-    return RunViews(train, test.cameras, apart, full=full)
+    return RunViews(train, test, apart, full=full)
 
 
 def pool_share(recover: RecoverConfig, scene: Splats, pool: Cameras) -> float:

@@ -80,7 +80,6 @@ def test_points_of_photos_are_at_as_many_places_as_asked(repeated: int, tmp_path
     found = topped_up(
         points,
         cameras,
-        None,
         2_000,  # of 73,728 pixels, so that some are drawn twice
         background=(0.0, 0.0, 0.0),
         seed=0,
@@ -209,5 +208,6 @@ def test_no_count_is_above_its_limit_but_for_sparse_points(
 ) -> None:
     photos_of(tmp_path / "photos")
     monkeypatch.setattr("g2ard.jobs.photo_points._MOST_USUAL_COUNT", 50)
+    train = g2ard.load_views(tmp_path / "photos", split="train")
     for sparse, expected in ((0, 50), (70, 70)):
-        assert usual_count(tmp_path / "photos", None, None, sparse, unsaid) == expected
+        assert usual_count(train, None, sparse, unsaid) == expected
