@@ -21,6 +21,7 @@ from typer.main import get_command as typer_parser
 
 import g2ard
 from g2ard.io import write_views
+from helpers.keys import lasting_keys
 from helpers.plans import FOLDER, SIZE, share_plans
 from helpers.project import environment
 from helpers.scenes import around, checkered_ball
@@ -159,6 +160,13 @@ def shared_plans(request: pytest.FixtureRequest) -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patches:
         if request.path.parent.name != "poses":
             share_plans(patches, **{} if request.path.stem in _USUAL_VIEWS else {"size": SIZE})
+        yield
+
+
+@pytest.fixture(autouse=True)
+def keys_of_jobs() -> Iterator[None]:
+    """Fail a test that runs a job whose key changes until its end: it could not be resumed."""
+    with lasting_keys():
         yield
 
 

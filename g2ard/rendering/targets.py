@@ -175,21 +175,19 @@ _BYTE_LIKE = 1.5
 """Largest value above which floats are probably bytes."""
 
 
-class _Sourced:
-    """Targets identified by all their attributes except `_UNKEYED` and those that subclasses describe."""
+class _Sourced(ABC):
+    """Targets identified by what they were made from, never by what they computed since."""
 
     cameras: Cameras
-    _UNKEYED: tuple[str, ...] = ()
 
     @cached_property
     def source(self) -> str:
         """Identity of the images' source, which `fingerprint_of` joins with that of the cameras."""
-        own = {name: value for name, value in vars(self).items() if name not in ("cameras", *self._UNKEYED)}
-        return key_of([type(self).__name__, own, self._described()])
+        return key_of([type(self).__name__, *self._given()])
 
-    def _described(self) -> Any:
-        """Return what identifies attributes that are not keyed as they are."""
-        return None
+    @abstractmethod
+    def _given(self) -> Sequence[Any]:
+        """Return all that the images depend on besides the cameras."""
 
 
 class _Chosen(_Sourced):
@@ -202,9 +200,7 @@ class _Chosen(_Sourced):
     def __init__(self, cameras: Cameras, places: Sequence[tuple[Targets, int]]) -> None:
         self.cameras, self._places = cameras, places
 
-    _UNKEYED: tuple[str, ...] = ("_places",)
-
-    def _described(self) -> Any:
+    def _given(self) -> Sequence[Any]:
         """Return the sources of the other targets, and which of them has each view in which row."""
         parts = [targets for targets, _ in self._parts()]
         numbers = {id(targets): number for number, targets in enumerate(parts)}
@@ -263,11 +259,9 @@ class _Converted(_Chosen):
         super().__init__(cameras, [(targets, view) for view in range(len(cameras))])
         self._parameter = parameter
 
-    _UNKEYED = ("_places", "_parameter")
-
-    def _described(self) -> Any:
+    def _given(self) -> Sequence[Any]:
         """Return a hash of the converted images."""
-        return _content(self)
+        return [_content(self)]
 
     def __getitem__(self, view: int) -> NDArray[np.float32]:
         try:
@@ -302,10 +296,8 @@ _KEEPING = threading.Lock()
 """Held while targets change what they keep; one for all, so that targets can be pickled."""
 
 
-class _Cached(_Sourced, Shown, ABC):
+class _Cached(_Sourced, Shown):
     """Cache of what `_make` returns, up to `limit` bytes, first come first kept."""
-
-    _UNKEYED = ("_limit", "_kept", "_bytes", "_masks", "_renderer")
 
     def __init__(self, cameras: Cameras, limit: int) -> None:
         require("limit", limit, limit >= 0, "at least 0 bytes")
@@ -404,10 +396,11 @@ class Photos(_Cached):
             if exposures and name in exposures
         }
 
-    def _described(self) -> Any:
-        """Return the identities of the files of photos and masks."""
+    def _given(self) -> Sequence[Any]:
+        """Return images, identities of the files of photos and masks, background and exposures."""
         paths = (*self.cameras.image_paths, *self.cameras.mask_paths)
-        return [path and file_identity([path]) for path in paths]
+        files = [path and file_identity([path]) for path in paths]
+        return [files, self._images, self._background, self._undo]
 
     def against(self, view: int) -> str:
         """Return the kind, see `against_of`."""
@@ -499,6 +492,9 @@ class TeacherRenders(_Cached):
         self._renderer = renderer
         if not lazy:
             self.fill(progress)
+
+    def _given(self) -> Sequence[Any]:
+        return [self._teacher, self._background, self._settings, self._rounded]
 
     def fill(self, progress: Progress, views: Sequence[int] | None = None) -> None:
         """Render the views, all by default, that the cache will hold, so that later steps take equal time."""

@@ -4,6 +4,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -66,6 +67,9 @@ class TileTargets(TeacherRenders):
         self.shown = [view for view, mask in enumerate(masks) if mask.sum() >= _FEWEST_OWNED_PIXELS]
         self._masks = [masks[view] for view in self.shown]
         super().__init__(teacher, cameras.take(self.shown), background=background, lazy=True)
+
+    def _given(self) -> Sequence[Any]:
+        return [*super()._given(), self._masks]
 
     def mask(self, view: int) -> NDArray[np.bool_]:
         """Return the (H, W) mask of owned pixels."""

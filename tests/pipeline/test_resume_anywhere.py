@@ -34,8 +34,7 @@ _TIMES = re.compile(r"seconds|resumed|^share$")
 
 VIEWS = around(7, (24, 18))
 BALL, SMALL = checkered_ball(90), checkered_ball(40, seed=3)
-TARGETS = TeacherRenders(BALL, VIEWS)
-NEAR = TeacherRenders(BALL, around(3, (24, 18), 2.0))
+IMAGES = list(TeacherRenders(BALL, VIEWS))
 WEIGHTS = np.linspace(0, 3, len(VIEWS)) ** 2
 NOISY = replace(REGULARIZERS["lift"], period=4)
 WILD = replace(TUNED, multiplier=20.0, reach=math.inf)  # goes back to the start
@@ -47,7 +46,25 @@ class Broken:
     cameras = VIEWS
 
     def __getitem__(self, view: int) -> Any:
-        return TARGETS[view] * np.float32(np.nan if view == 4 else 1)
+        return IMAGES[view] * np.float32(np.nan if view == 4 else 1)
+
+
+def renders() -> TeacherRenders:
+    """Return targets that were in no call before: what a call computes is not known to the next."""
+    return TeacherRenders(BALL, VIEWS)
+
+
+def near() -> TeacherRenders:
+    return TeacherRenders(BALL, around(3, (24, 18), 2.0))
+
+
+def photos(image: Callable[[int], Any]) -> Photos:
+    return Photos(VIEWS, [image(view) for view in range(len(VIEWS))])
+
+
+def made(given: dict[str, Any]) -> dict[str, Any]:
+    """Return arguments, those that are functions called."""
+    return {name: value() if callable(value) else value for name, value in given.items()}
 
 
 def recovery(**settings: Any) -> Call:
@@ -61,14 +78,16 @@ def recovery(**settings: Any) -> Call:
     def call(work: Path | None, progress: Any) -> Any:
         file = None if work is None else work / "c.npz"
         return recover(
-            SMALL, config=config, checkpoint=file, progress=progress, **{"targets": TARGETS, **given}
+            SMALL, config=config, checkpoint=file, progress=progress, **made({"targets": renders, **given})
         )
 
     return call
 
 
 def distillation(config: DistillConfig, **more: Any) -> Call:
-    return lambda work, progress: distill(BALL, 30, TARGETS, config, work=work, progress=progress, **more)
+    return lambda work, progress: distill(
+        BALL, 30, renders(), config, work=work, progress=progress, **made(more)
+    )
 
 
 ROUNDS = replace(TUNED, steps=9, round_steps=5)
@@ -79,17 +98,17 @@ PAPER = changed(
 
 CASES: dict[str, Call] = {
     "recover": recovery(),
-    "recover-torch": recovery(engine="torch", steps=12, targets=Broken(), schedule=PAPER_SCHEDULE),
+    "recover-torch": recovery(engine="torch", steps=12, targets=Broken, schedule=PAPER_SCHEDULE),
     "recover-weights": recovery(weights=WEIGHTS, sh_degree=2),
     "recover-trials": recovery(steps=100),
     "recover-back": recovery(schedule=WILD),
-    "recover-validation": recovery(validation=NEAR),
+    "recover-validation": recovery(validation=near),
     "recover-exposures": recovery(
-        targets=Photos(VIEWS, [TARGETS[i] * 0.8 ** (i % 3) for i in range(len(VIEWS))]), steps=60
+        targets=partial(photos, lambda view: IMAGES[view] * 0.8 ** (view % 3)), steps=60
     ),
     "recover-frozen": recovery(frozen=np.arange(len(SMALL)) % 3 == 0),
-    "recover-skipping": recovery(targets=Broken(), schedule=PAPER_SCHEDULE),
-    "distill": distillation(DistillConfig(recover=RecoverConfig(steps=12)), validation=NEAR),
+    "recover-skipping": recovery(targets=Broken, schedule=PAPER_SCHEDULE),
+    "distill": distillation(DistillConfig(recover=RecoverConfig(steps=12)), validation=near),
     "distill-rounds": distillation(
         DistillConfig(
             SelectConfig(views_count=4, reselect=True), recover=RecoverConfig(schedule=ROUNDS, sh_degree=0)
@@ -98,7 +117,7 @@ CASES: dict[str, Call] = {
     "paper": distillation(PAPER),
     "adapt": lambda work, progress: adapt(
         SMALL,
-        Photos(VIEWS, [1 - TARGETS[i] for i in range(len(VIEWS))]),
+        photos(lambda view: 1 - IMAGES[view]),
         AdaptConfig(steps=21, first_stretch=5, tolerance=0, sh_degree=1),
         work=work,
         progress=progress,
@@ -205,23 +224,23 @@ def test_runs_that_share_a_folder_do_not_mix(tmp_path: Path) -> None:
     rounds = replace(PAPER, recover=replace(PAPER.recover, seed=1))
     calls: list[Call] = [
         *(
-            partial(adapt, scene, targets, how)
+            partial(adapt, scene, targets(), how)
             for scene, targets, how in (
-                (SMALL, TARGETS, config),
-                (SMALL, TARGETS, replace(config, seed=1)),
-                (brighter, TARGETS, config),
-                (SMALL, NEAR, config),
+                (SMALL, renders, config),
+                (SMALL, renders, replace(config, seed=1)),
+                (brighter, renders, config),
+                (SMALL, near, config),
             )
         ),
         *(
-            partial(distill, scene, budget, targets, how, weights=weights)
+            partial(distill, scene, budget, targets(), how, weights=weights)
             for scene, budget, targets, how, weights in (
-                (BALL, 30, TARGETS, PAPER, None),
-                (BALL, 30, TARGETS, rounds, None),
-                (BALL, 29, TARGETS, PAPER, None),
-                (BALL, 30, TARGETS, PAPER, WEIGHTS),
-                (replace(BALL, sh0=BALL.sh0 + np.float32(0.1)), 30, TARGETS, PAPER, None),
-                (BALL, 30, NEAR, PAPER, None),
+                (BALL, 30, renders, PAPER, None),
+                (BALL, 30, renders, rounds, None),
+                (BALL, 29, renders, PAPER, None),
+                (BALL, 30, renders, PAPER, WEIGHTS),
+                (replace(BALL, sh0=BALL.sh0 + np.float32(0.1)), 30, renders, PAPER, None),
+                (BALL, 30, near, PAPER, None),
             )
         ),
     ]
