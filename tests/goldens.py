@@ -407,6 +407,17 @@ def differences(was: Found, now: Found, elsewhere: bool) -> list[str]:
     return [*lines, *differing(was["files"], now["files"])]
 
 
+def refusals(results: dict[str, Found]) -> list[str]:
+    """Return the cases that must not be recorded: failures outside errors/, and misspelt options anywhere."""
+    found = []
+    for name, line in results.items():
+        errors = line.get("errors", [])
+        if any(line.get("status", [])) and not name.startswith("errors/"):
+            found.append(f"{name}: exit statuses {line['status']}: {' '.join(errors)}")
+        found += [f"{name}: {error}" for error in errors if "No such option" in error]
+    return found
+
+
 def written(record: Found) -> str:
     """Format a record, one line per case."""
     rows = sorted(record["cases"].items())
@@ -434,11 +445,13 @@ def main() -> int:
     here = {"machine": machine(asked.isa), "cases": results}
     known = json.loads(asked.record.read_text()) if asked.record.exists() else None
     if asked.action == "record":
+        failed += refusals(results)
+        if failed:
+            sys.exit("nothing is recorded:\n" + "\n".join(failed))
         if len(chosen) < len(list(all_cases())) and known:
             if known["machine"] != here["machine"]:
                 sys.exit(f"{asked.record} is of another machine: record all cases")
             here["cases"] = known["cases"] | results
-        here["cases"] = {name: line for name, line in here["cases"].items() if "files" in line}
         for name, line in results.items():
             for end in set(line.get("again", [])) - {SAME}:
                 print(f"recorded as it is: {name}: {end}")

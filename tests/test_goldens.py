@@ -75,6 +75,14 @@ def test_what_depends_on_a_processor_counts_on_the_same_alone(
     assert (there, here) == (anywhere or False, anywhere is not None)
 
 
+def test_a_failure_is_recorded_only_where_one_is_expected() -> None:
+    misspelt = LINE | {"status": [2], "errors": ["g2ard simplify: No such option: --no-pages"]}
+    assert not goldens.refusals({"a": LINE | {"status": [0, 0], "errors": []}, "errors/a": LINE})
+    assert len(goldens.refusals({"simplify/a": LINE})) == 1
+    assert len(goldens.refusals({"errors/a": misspelt})) == 1
+    assert not goldens.refusals(json.loads(goldens.RECORD.read_text(encoding="utf-8"))["cases"])
+
+
 def test_keys_are_those_outside_lists() -> None:
     text = '{"b": {"c": 1, "a": [{"d": 2}]}, "a": null}'
     assert list(goldens.keys(text, "f")) == ["f.a", "f.b", "f.b.a", "f.b.c"]
