@@ -37,11 +37,11 @@ test: setup
 	cargo test --quiet --workspace --profile bench
 	OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 RAYON_NUM_THREADS=2 $(BIN)/python -m pytest --numprocesses $(TEST_PROCESSES) --dist loadfile
 
-# The part of `make test` that needs what a fresh machine has not (an adapter, a browser, Node packages): it must skip there.
+# The part of `make test` that needs what a fresh machine has not (ffmpeg, an adapter, a browser, Node packages): it skips there.
 # With `-p g2ard-gpu`, cargo would compile wgpu once more, for other features of what it depends on.
 test-fresh: setup
 	cargo test --quiet --profile bench --workspace --exclude g2ard-core
-	$(BIN)/python -m pytest $$(grep -lE '^from helpers.(browser|peers) import|adapters\(\)' -r tests --include='test_*.py')
+	$(BIN)/python tests/machines.py without
 
 # What the documentation prints, against what the program prints; `tests/printed.py record` writes it anew.
 printed: setup

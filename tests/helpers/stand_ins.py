@@ -5,6 +5,8 @@
 
 import re
 import shutil
+import subprocess
+import sys
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import pairwise
@@ -18,6 +20,7 @@ from g2ard.io import write_views
 from helpers import dataset_files, lpips_weights
 from helpers.feature_scenes import blotched
 from helpers.photos import cloud_of, photographed, photos_of, rgba_photos_of
+from helpers.project import environment
 from helpers.scenes import around, checkered_ball, under_a_sky
 
 SCENE = checkered_ball(1000)
@@ -156,6 +159,18 @@ def _rough(path: Path) -> None:
     g2ard.save_views(path, replace(_new_photos(), viewmats=moved))
 
 
+def _run(folder: Path) -> None:
+    """A distilled scene; the files that `distill` read are not in it."""
+    dense = folder.with_name("scene.ply")
+    _trained(dense)
+    asked = ("distill", dense.name, "-r", "4", "--steps", "2", "--size", "32", "--no-page", "-o", folder.name)
+    subprocess.run(
+        [sys.executable, "-m", "g2ard", *asked, "-q"], cwd=folder.parent, env=environment(), check=True
+    )
+    dense.unlink()
+    dense.with_name("cameras.json").unlink()
+
+
 def _views(path: Path) -> None:
     g2ard.save_views(path, around(6))
 
@@ -219,7 +234,7 @@ PLACEHOLDERS = {
 
 OF_PAGE: dict[str, dict[str, Callable[[Path], None]]] = {
     "README.md": {"scene.ply": _small, "new": _new_with_lenses},
-    "docs/how-to/web-delivery.md": {"project": _map_colmap},
+    "docs/how-to/web-delivery.md": {"project": _map_colmap, "run": _run},
     "docs/how-to/lidar-map.md": {"project": _map_colmap},
     "docs/how-to/clean-floaters.md": {"scene.ply": _sky},
     "docs/how-to/own-views.md": {"views.json": _views},

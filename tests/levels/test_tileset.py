@@ -157,6 +157,7 @@ def test_the_command_writes_3d_tiles(tmp_path: Path, command_line: CommandLine) 
 
 
 def test_python_decides_up_and_place_as_the_command_does(tmp_path: Path, command_line: CommandLine) -> None:
+    pytest.importorskip("pyproj")
     write_splats(tmp_path / "ball.ply", checkered_ball(400))
     ask = ("-r", "1,4", "--merge-only", "--size", 48, "--format", "3dtiles", "--georeference", "EPSG:32635")
     succeeds(command_line, tmp_path, "lod", "ball.ply", *ask, "-o", "globe")
