@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import product
 from typing import Any
 
@@ -11,13 +11,18 @@ from numpy.typing import NDArray
 
 from g2ard import _core
 from g2ard.errors import InputError
+from g2ard.poses.votes import Votes
 from g2ard.scene.reproducible import Floats, canonical_order, middle, norms, quantile, turned
 from g2ard.scene.splats import Splats
 from g2ard.scene.transform import rotation_matrices
 from g2ard.system.cached import cached_property
 
 _FAR = 7.0
-"""Distance of floaters and sky from the centre, as a multiple of the radius of two thirds of the opacity."""
+"""Distance of floaters and a sky without a gap before it, as a multiple of the radius of two thirds of the
+opacity."""
+
+_BEYOND = 4096
+"""Gaussians that represent what is not near."""
 
 _WIDEST = 16.0
 """Largest area that counts, in median areas; otherwise a sky of a few hundred rows outweighs the rest."""
@@ -60,6 +65,10 @@ class Matter:
         origin: (3,) relative to the scene's offset.
         size: scene units per unit here: half the diagonal of the box that holds 98 % along each axis.
         represents: Gaussians per row, more than 1 in a sample.
+        beyond: (F, 3) a sample of the Gaussians that are not near: sky, surroundings, floaters.
+        beyond_share: share of the visible Gaussians that are not near.
+        centre: (3,) the middle of the places from which people looked at the scene.
+        horizon: distance from `centre` at which a sky begins; inf without one.
     """
 
     points: Floats
@@ -71,6 +80,10 @@ class Matter:
     origin: Floats
     size: float
     represents: float = 1.0
+    beyond: Floats = field(default_factory=lambda: np.zeros((0, 3)))
+    beyond_share: float = 0.0
+    centre: Floats = field(default_factory=lambda: np.zeros(3))
+    horizon: float = np.inf
 
     @classmethod
     def of(cls, splats: Splats, limit: int | None = None, represents: float = 1.0) -> Matter:
@@ -98,7 +111,8 @@ class Matter:
                 "the scene has no visible Gaussian with a surface, so no poses can be planned; give views"
             )
         weights = opacities * np.minimum(areas / middle(areas[areas > 0]), _WIDEST)
-        near = _near(means, opacities)
+        votes = Votes.of(means, np.sqrt(areas), opacities, represents)
+        near = _near(means, opacities, votes)
         some = np.flatnonzero(near)[:_SAMPLE]
         box = np.array([quantile(means[some, a], weights[some], [0.01, 0.99]) for a in range(3)])
         size = float(norms((box[:, 1] - box[:, 0])[None])[0]) / 2
@@ -114,6 +128,10 @@ class Matter:
             origin=origin,
             size=size,
             represents=represents,
+            beyond=(means[~near][:_BEYOND] - origin) / size,
+            beyond_share=float(1 - near.mean()),
+            centre=(votes.centre - origin) / size,
+            horizon=votes.horizon / size,
         )
 
     def first(self, count: int = _SAMPLE) -> Matter:
@@ -138,12 +156,16 @@ class Matter:
         return np.take_along_axis(axes, self.order[rows][:, :, None], axis=1)
 
 
-def _near(means: Floats, weights: Floats) -> NDArray[np.bool_]:
-    """Return the rows within `_FAR` typical distances of the centre, repeated after dropping the farthest.
+def _near(means: Floats, weights: Floats, votes: Votes) -> NDArray[np.bool_]:
+    """Return the rows that people look at from near: without a sky, surroundings and floaters.
 
-    Rows are weighed by opacity alone, because a sky has few rows and much area.
+    What lies beyond a gap is judged by votes. Of the rest, rows within `_FAR` typical distances of the centre
+    are near, repeated after dropping the farthest. Rows are weighed by opacity alone, because a sky has few
+    rows and much area.
     """
-    near = np.ones(len(means), bool)
+    rows = np.flatnonzero(norms(means - votes.centre) <= votes.radius)
+    means, weights, every = means[rows], weights[rows], len(means)
+    near = np.ones(len(rows), bool)
     for _ in range(4):
         some = np.flatnonzero(near)[:_SAMPLE]
         centre = np.array([quantile(means[some, a], weights[some], 0.5) for a in range(3)])
@@ -152,7 +174,9 @@ def _near(means: Floats, weights: Floats) -> NDArray[np.bool_]:
         if (within == near).all():
             break
         near = within
-    return near
+    found = np.zeros(every, bool)
+    found[rows[near]] = True
+    return found
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,7 +8,7 @@ import numpy as np
 
 from g2ard.poses.sight import Lens, Poses, Rays, Survey, gather
 from g2ard.poses.site import Site
-from g2ard.scene.reproducible import Floats, between, directions, halton, quantile, turned
+from g2ard.scene.reproducible import Floats, between, directions, halton, norms, quantile, turned
 from g2ard.scene.samples import evenly_spaced
 
 _ELEVATIONS, _DISTANCES = (-5.0, 50.0), (0.9, 1.25)
@@ -27,6 +27,9 @@ _NEAREST = 1e-9
 
 _FITTED = 24
 """Poses of a circle that are fitted, at most."""
+
+_BELOW_SKY = 0.8
+"""Largest distance of a pose from the centre, in distances to the sky."""
 
 _OUTSIDE = 1.2
 """Least distance from the centre: everything lies within about 1 of it."""
@@ -66,6 +69,7 @@ def plan_orbit(survey: Survey, count: int, shift: int = 0, first: int | None = N
         z = between(np.sin(np.radians(_ELEVATIONS)), rise)
         outward = directions(turn, np.sqrt(1 - z * z), z)
         distances = _fitting(site, target, outward, lens) * between(_DISTANCES, chance)
+        distances = np.minimum(distances, _BELOW_SKY * site.horizon - norms((target - site.centre)[None]))
         poses = Poses(target + distances[:, None] * outward, -outward)
         free = site.is_free(poses.eyes, 2, _LOWEST)
         clear = Rays(survey, poses).close > _CLEAR_CELLS * site.grid.cell

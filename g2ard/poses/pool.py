@@ -19,8 +19,10 @@ from g2ard.poses.site import Site
 from g2ard.poses.within import (
     WIDE,
     Reach,
+    framed,
     is_room,
     plan_anywhere,
+    plan_beyond,
     plan_inside,
     plan_near,
     plan_sharp,
@@ -47,6 +49,10 @@ by which their number must grow before they are planned again."""
 _COARSE = (0.2, 0.4)
 """Shares of the matter seen only below a pixel between which more and more poses step nearer. Measured:
 objects .06–.17, whole scenes .01–.06, two chunks cut from a room, seen from outside, .44 and .55."""
+
+_BEYOND = (0.05, 0.1)
+"""Share of the scene beyond near matter that no frame needs to hold, and the largest share of a pool that
+looks there: a sky has few details."""
 
 _FOV = 50.0
 """Horizontal field of view in degrees of poses around or above a scene."""
@@ -196,13 +202,14 @@ def plan_pool(
             f"request {'fewer, or ' if len(poses) else ''}another kind (`g2ard poses --kind`), "
             "or give views of the scene"
         )
+    poses, looks_beyond = _with_beyond(survey, poses)
+    used += ["beyond"] if looks_beyond else []
     reach = reach_of(survey, poses)
     more = partial(_more, survey, poses, reach)
     need = max(float(np.interp(reach[2].mean(), _COARSE, (0, 1))), 1 - held)
     near_poses = plan_near(survey, poses, reach, int(near * need * len(poses)), 1)
     if len(near_poses):
-        kept = np.linspace(0, len(poses) - 1, len(poses) - len(near_poses)).round().astype(int)
-        poses, used = Poses.joined([poses.take(kept), near_poses]), [*used, "near"]
+        poses, used = _replaced(poses, near_poses), [*used, "near"]
         reach = reach_of(survey, poses)
     spread = max(float(np.ptp(poses.eyes, axis=0).max()), np.finfo(float).tiny)
     features = np.concatenate([poses.eyes / spread, poses.gazes / 4], axis=1)  # close for similar poses
@@ -217,6 +224,23 @@ def plan_pool(
         coarse=float(reach[2].mean()),
         more=more,
     )
+
+
+def _replaced(poses: Poses, others: Poses) -> Poses:
+    """Return as many poses as before, of which `others` take the places of evenly spread ones."""
+    kept = np.linspace(0, len(poses) - 1, len(poses) - len(others)).round().astype(int)
+    return Poses.joined([poses.take(kept), others])
+
+
+def _with_beyond(survey: Survey, poses: Poses) -> tuple[Poses, bool]:
+    """Let some poses look at a sky or surroundings that no frame holds; return whether any does."""
+    if not len(survey.site.beyond):
+        return poses, False
+    missing = ~framed(survey, poses, survey.site.beyond)
+    share = survey.site.beyond_share * float(missing.mean()) - _BEYOND[0]
+    others = round(float(np.clip(share, 0, _BEYOND[1])) * len(poses))
+    points = survey.site.beyond[missing]
+    return _replaced(poses, plan_beyond(survey, poses, points, others)), others > 0
 
 
 def _planned(survey: Survey, kind: str, count: int) -> tuple[Poses, list[str], str]:

@@ -17,6 +17,7 @@ from g2ard.scene.reproducible import (
     halton,
     middle,
     moments,
+    norms,
     quantile,
     turned,
 )
@@ -31,6 +32,9 @@ _BODY = 1.5
 
 _MARGIN = (0.1, 0.02)
 """Margin of the grid around the box: a share of its sides, plus a length in scene sizes."""
+
+_BELOW_SKY = 0.9
+"""Share of the distance to a sky within which poses stand."""
 
 _TALL = 0.98
 """Quantile of the heights above the ground that is the height of what stands there."""
@@ -90,6 +94,10 @@ class Site:
         origin: (3,) in world coordinates.
         size: scene units per unit here.
         up: the up direction, and the reason for it.
+        beyond: (F, 3) a sample of what is not near: sky, surroundings, floaters.
+        beyond_share: share of the visible Gaussians that are not near.
+        centre: (3,) the middle of the places from which people looked at the scene.
+        horizon: distance from `centre` at which a sky begins; inf without one.
     """
 
     points: Floats
@@ -102,6 +110,10 @@ class Site:
     origin: Floats
     size: float
     up: Up
+    beyond: Floats
+    beyond_share: float
+    centre: Floats
+    horizon: float
 
     @classmethod
     def of(
@@ -127,7 +139,22 @@ class Site:
         terrain = Terrain.of(points[ground], some.weights[ground], box) if found.grounded else None
         origin = splats.offset + matter.origin
         body = 2 * float(missing.min())  # a Gaussian is drawn as far as three standard deviations
-        return cls(points, some.weights, box, body, terrain, grid, axes, origin, matter.size, found)
+        return cls(
+            points=points,
+            weights=some.weights,
+            box=box,
+            body=body,
+            terrain=terrain,
+            grid=grid,
+            axes=axes,
+            origin=origin,
+            size=matter.size,
+            up=found,
+            beyond=turned(matter.beyond, axes),
+            beyond_share=matter.beyond_share,
+            centre=turned(matter.centre[None], axes)[0],
+            horizon=matter.horizon,
+        )
 
     def ground(self, points: Floats) -> Floats:
         """Return (M,) heights of the ground under points, or of the box's bottom without a ground."""
@@ -140,8 +167,9 @@ class Site:
         return points[:, 2] - self.ground(points) if self.terrain else np.full(len(points), np.inf)
 
     def is_free(self, points: Floats, cells: float, above: float = -np.inf) -> NDArray[np.bool_]:
-        """Return whether points are more than `cells` cells from matter and `above` above the ground."""
-        return (self.grid.distance(points) > cells * self.grid.cell) & (self.above_ground(points) > above)
+        """Return whether points are over `cells` cells from matter, `above` the ground and below a sky."""
+        free = (self.grid.distance(points) > cells * self.grid.cell) & (self.above_ground(points) > above)
+        return free & (norms(points - self.centre) < _BELOW_SKY * self.horizon)
 
     @cached_property
     def tallness(self) -> float:

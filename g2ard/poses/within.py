@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from g2ard.poses.sight import SIGHT_ROWS, Glance, Poses, Rays, Survey, gather
 from g2ard.poses.site import Site
-from g2ard.scene.reproducible import Floats, between, directions, fibonacci, halton, joined, norms
+from g2ard.scene.reproducible import Floats, between, directions, fibonacci, halton, joined, norms, turned
 
 Reach = tuple[NDArray[np.int64], Floats, NDArray[np.bool_]]
 
@@ -75,6 +75,10 @@ target in the middle."""
 
 _LOWEST = 0.01
 """Least height of a near pose above the ground, in scene sizes."""
+
+
+_OUTLOOKS = 8
+"""Places that are tried for a view of what lies beyond the near matter."""
 
 
 def is_room(survey: Survey) -> bool:
@@ -249,3 +253,32 @@ def plan_near(survey: Survey, poses: Poses, reach: Reach, count: int, shift: int
     near = Poses(eyes[free], gazes[free])
     clear = Rays(survey, near).close > 2 * site.grid.cell
     return near.take(clear).take(slice(count))
+
+
+def framed(survey: Survey, poses: Poses, points: Floats) -> NDArray[np.bool_]:
+    """Return (F,) whether any pose has each point in its frame."""
+    wide, tall = survey.lens.tangents
+    found = np.zeros(len(points), bool)
+    for eye, frame in zip(poses.eyes, poses.frames(), strict=True):
+        x, y, z = turned(points - eye, frame).T
+        found |= (z > 0) & (np.abs(x) < wide * z) & (np.abs(y) < tall * z)
+    return found
+
+
+def plan_beyond(survey: Survey, poses: Poses, points: Floats, count: int) -> Poses:
+    """Plan at most `count` poses at the given places that look at points beyond the near matter.
+
+    Each looks at a point that none before has in its frame, from where near matter hides little of the view.
+    """
+    chances = halton(0, max(1, count), 2, survey.seed + 6)
+    missing, found = points, Poses.joined([])
+    for aim, place in chances[:count]:
+        if not len(missing):
+            missing = points
+        eyes = poses.eyes[(np.arange(_OUTLOOKS) + int(place * len(poses))) % len(poses)]
+        ways = missing[int(aim * len(missing))] - eyes
+        tried = Poses(eyes, ways / norms(ways)[:, None])
+        chosen = tried.take(np.argsort(Rays(survey, tried).covered, kind="stable")[:1])
+        missing = missing[~framed(survey, chosen, missing)]
+        found = Poses.joined([found, chosen])
+    return found
