@@ -11,6 +11,7 @@ import tempfile
 from collections import Counter
 from collections.abc import Callable, Iterator
 from functools import cache
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -48,7 +49,11 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def pytest_collection_finish() -> None:
-    """Spare the garbage collector what stays to the end: modules and collected tests."""
+    """Spare the garbage collector what stays to the end: modules and collected tests.
+
+    Hypothesis's plugin imports it at the end otherwise, where Python 3.11 may fail to parse (gh-106905).
+    """
+    import_module("hypothesis")
     gc.collect()
     gc.freeze()
 

@@ -4,6 +4,8 @@ What holds for all commands is tested on these. The options of a command, their 
 resumed come from the command itself.
 """
 
+import json
+import shutil
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -108,7 +110,7 @@ def without(words: list[str], *options: str) -> list[str]:
 
 COMMON = {
     "views": "few.json",
-    "images": "nowhere",
+    "images": "half",
     "size": "20",
     "background": "0.25,0.5,0",
     "up": "1,0,0",
@@ -187,7 +189,7 @@ VALUES: dict[str, dict[str, str]] = {
         "box": "-1,-1,0,1,1,1",
         "sphere": "0,0,0.5,0.9",
         "where": "x<0.5",
-        "invert": "--where z<0",
+        "invert": "",
         "layout": "inria",
         "from_axes": "RUB",
         "transform": "0,-2,0,5,2,0,0,0,0,0,2,0,0,0,0,1",
@@ -196,7 +198,7 @@ VALUES: dict[str, dict[str, str]] = {
         "translate": "1,0,0",
         "recentre": "--translate 5,0,0",
         "to_axes": "RUB",
-        "spz_version": "3",
+        "spz_version": "4",
         "compress": "spz",
     },
     "clean": {
@@ -220,7 +222,7 @@ VALUES: dict[str, dict[str, str]] = {
     },
     "render": {
         **_common("views images looks convention split size background up render_model"),
-        "turn": "8 -o out.webp",
+        "turn": "8",
         "fps": "9",
         "sheet": "other.png",
         "depth": "",
@@ -228,7 +230,7 @@ VALUES: dict[str, dict[str, str]] = {
     },
     "view": {
         **_common("views images background up render_model"),
-        "start": "3,0,0",
+        "start": "view_009",
     },
     "lod": {
         **_common("views images steps size background up tile_rows render_model"),
@@ -260,13 +262,13 @@ VALUES: dict[str, dict[str, str]] = {
         **_common("format split alpha background render_model"),
         "photos": "photos.json",
         "poses": "photos.json",
-        "intrinsics": "few.json",
+        "intrinsics": "wide.json",
         "focal": "50",
         "size": "40",
         "refine": "none",
         "passes": "1",
-        "accept": "0.99 --keep registered",
-        "keep": "registered --accept 0.99",
+        "accept": "0.9",
+        "keep": "registered",
         "protocol": "gs-cpr",
         "truth": "few.json --json told.json",
         "metres_per_unit": "2",
@@ -279,11 +281,84 @@ VALUES: dict[str, dict[str, str]] = {
 }
 """Command → each option for the result, a value of it that its plainest call has not, and further words."""
 
+_REGISTER = "register ball.ply --keep all --poses moved.json -o out.json"
+_MATCHED = f"{_REGISTER} --images two.json --matcher matches:grid"
+ON: dict[str, dict[str, str]] = {
+    "simplify": {
+        **dict.fromkeys(("no_views", "preset", "up"), "simplify ball.ply -r 8 -o out.ply"),
+        "images": "simplify ball.ply -r 8 --views sizeless.json -o out.ply",
+    },
+    "select": {"images": "select ball.ply --views sizeless.json -k 4 -o out.json"},
+    "distill": {
+        "views_format": "distill ball.ply -r 8 --steps 3 --size 24 --views made --no-page -o out",
+    },
+    "adapt": dict.fromkeys(("alpha", "images"), "adapt small.ply --views photos.json --steps 3 -o out.ply"),
+    "convert": {
+        "compress": "convert ball.ply -o out.glb",
+        "spz_version": "convert ball.ply -o out.spz",
+        "invert": "convert ball.ply --sphere 0,0,0.5,0.9 -o out.ply",
+    },
+    "lod": {
+        "images": "lod ball.ply -r 1,4 --views sizeless.json --steps 3 -o out",
+        "steps": "lod ball.ply -r 1,4 --views photos.json --size 24 -o out",
+        "place": "lod ball.ply -r 4,8 --views photos.json --size 24 --merge-only --format 3dtiles -o out",
+    },
+    "render": {
+        "images": "render ball.ply --views sizeless.json -o out",
+        "fps": "render ball.ply --orbit 4 --size 32 -o out.webp",
+        "turn": "render ball.ply --size 32 -o out",
+        "looks": "render ball.ply --size 32 -o out",
+        "up": "render ball.ply --orbit 4 --size 32 -o out",
+    },
+    "view": {"images": "view ball.ply --views sizeless.json -o out.html"},
+    "evaluate": {"views": f"evaluate small.ply --teacher ball.ply {_VIEWED}"},
+    "compare": {
+        "images": "compare ball.ply small.ply --views sizeless.json",
+        "looks": "compare ball.ply small.ply --size 24",
+    },
+    "register": {
+        "focal": f"{_REGISTER} --images pair --focal 48 --matcher direct",
+        "intrinsics": f"{_REGISTER} --images pair --intrinsics photos.json --matcher direct",
+        "metres_per_unit": f"{CALLS['register']} --truth photos.json --json told.json",
+        "accept": f"{_MATCHED} --json told.json",
+        "keep": _MATCHED,
+        "passes": f"{_MATCHED} --refine none",
+        "protocol": _MATCHED,
+        "refine": _MATCHED,
+    },
+    "info": {"images": "info photos.json --json -"},
+}
+"""Command → option that has no effect on its plainest call: the call that it is added to."""
+
+REFUSED: dict[tuple[str, str], str] = {
+    ("distill", "fit"): "8,865 bytes are too few",
+    ("distill", "keep_region"): "no effect on the method paper",
+    ("distill", "tile_rows"): "--preset paper needs the whole scene in memory",
+    ("simplify", "images"): "no effect on the method paper",
+    ("simplify", "keep_region"): "no effect on the method paper",
+    ("simplify", "tile_rows"): "--preset paper needs the whole scene in memory",
+    ("simplify", "up"): "no effect without generated views",
+    ("simplify", "views"): "no effect on the method paper",
+    ("adapt", "prior_views"): "no effect on the schedule paper",
+    ("adapt", "tolerance"): "no effect on the schedule paper",
+}
+"""Command and option that `--preset paper` refuses → words of the refusal."""
+
+
+_MATCHES = """import numpy as np
+
+
+def grid(photo, render):
+    pixels = np.stack(np.meshgrid(np.arange(2.0, 47, 3), np.arange(2.0, 35, 3)), -1).reshape(-1, 2)
+    return pixels, pixels + (0.5, 0)
+"""
+
 
 def write_inputs(folder: Path) -> None:
-    """Write the files that `CALLS` and `VALUES` name.
+    """Write the files that `CALLS`, `VALUES` and `ON` name.
 
-    Photos are half transparent, and those in `other` are of another scene.
+    Photos are half transparent. Those in `other` are of another scene, those in `half` half as wide, which
+    only `sizeless.json` takes from them. `matches.grid` matches pixels.
     """
     ball, views = checkered_ball(400), around(16, (48, 36))
     small = g2ard.simplify(ball, count=40, blind=True).splats
@@ -310,3 +385,17 @@ def write_inputs(folder: Path) -> None:
             moved = pictured.viewmats.copy()
             moved[:, :3, 3] += 0.1
             g2ard.save_views(folder / "moved.json", replace(pictured, viewmats=moved))
+    (folder / "half").mkdir()
+    for path in (folder / "photos").glob("*.png"):
+        with Image.open(path) as photo:
+            photo.resize((24, 18)).save(folder / "half" / path.name)
+    (folder / "pair").mkdir()
+    for name in ("view_000.png", "view_001.png"):
+        shutil.copy(folder / "photos" / name, folder / "pair" / name)
+    g2ard.save_views(folder / "wide.json", replace(views, Ks=views.Ks * [[[0.8], [0.8], [1.0]]]))
+    sizeless = {"fl_x": 48.0, "fl_y": 48.0, "frames": []}
+    for view in views:
+        pose = np.linalg.inv(view.viewmat) * [1, -1, -1, 1]
+        sizeless["frames"].append({"file_path": f"photos/{view.name}.png", "transform_matrix": pose.tolist()})
+    (folder / "sizeless.json").write_text(json.dumps(sizeless))
+    (folder / "matches.py").write_text(_MATCHES)
