@@ -68,7 +68,7 @@ def _image(cameras: Cameras, index: int) -> NDArray[np.float32]:
     try:
         target = int(cameras.widths[index]), int(cameras.heights[index])
         lens = cameras.lenses[index]
-        image = _open(path, target) if lens is None else _opened(path, path.stat().st_mtime_ns, lens.size)
+        image = _open(path, target) if lens is None else _opened(path, _modified(path), lens.size)
     except InputError as error:
         raise error.at(hint="; ".join(filter(None, (error.hint, named))) or None) from error
     height, width = image.shape[:2]
@@ -107,7 +107,7 @@ def photo_traits(files: Sequence[Path]) -> PhotoTraits:
     sizes: Counter[tuple[int, int]] = Counter()
     alpha = 0
     for photo in files:
-        with suppress(InputError, FileNotFoundError), opened_image(photo) as header:
+        with suppress(InputError), opened_image(photo) as header:
             sizes[header.size] += 1
             alpha += header.has_transparency_data
     few = evenly_spaced(len(files), _BORDER_PHOTOS, floor=True)
@@ -220,22 +220,19 @@ _WHOLE = 0.999  # share of a pixel above which it counts as whole
 
 def _open(path: Path, like: tuple[int, int] | None = None) -> NDArray[np.float32]:
     """Decode a photo as (H, W, 3) RGB, or as premultiplied (H, W, 4) RGBA; for `like` see `turns`."""
-    try:
-        with opened_image(path) as stored:
-            image = ImageOps.exif_transpose(stored) if turns(stored, like) else stored
-            if image.mode.startswith("I") or image.mode == "F":  # 16-bit grey has several modes
-                values = np.asarray(image, np.float32)
-                values = values / np.float32(1.0 if image.mode == "F" else 65535.0)
-                if not (values.min() >= 0 and values.max() <= 1):  # also NaN
-                    raise InputError("expected values in [0, 1]", path=path)
-                return np.repeat(values[..., None], 3, axis=2)
-            if image.has_transparency_data:
-                rgba = np.asarray(image.convert("RGBA"), np.float32) / np.float32(255)
-                rgba[..., :3] *= rgba[..., 3:]
-                return rgba
-            return np.asarray(image.convert("RGB"), np.float32) / np.float32(255)
-    except FileNotFoundError as error:
-        raise InputError("no such photo", path=path) from error
+    with opened_image(path) as stored:
+        image = ImageOps.exif_transpose(stored) if turns(stored, like) else stored
+        if image.mode.startswith("I") or image.mode == "F":  # 16-bit grey has several modes
+            values = np.asarray(image, np.float32)
+            values = values / np.float32(1.0 if image.mode == "F" else 65535.0)
+            if not (values.min() >= 0 and values.max() <= 1):  # also NaN
+                raise InputError("expected values in [0, 1]", path=path)
+            return np.repeat(values[..., None], 3, axis=2)
+        if image.has_transparency_data:
+            rgba = np.asarray(image.convert("RGBA"), np.float32) / np.float32(255)
+            rgba[..., :3] *= rgba[..., 3:]
+            return rgba
+        return np.asarray(image.convert("RGB"), np.float32) / np.float32(255)
 
 
 def _undistorted(
@@ -284,8 +281,16 @@ def _lookup(width: int, height: int, K: tuple[float, ...], distortion: tuple[flo
     return above, left, *fractions, held
 
 
+def _modified(path: Path) -> int | None:
+    """Return a photo's time, None if it is missing, as `_open` will say."""
+    try:
+        return path.stat().st_mtime_ns
+    except OSError:
+        return None
+
+
 @lru_cache(maxsize=1)  # several views of a photo follow each other
-def _opened(path: Path, modified: int, like: tuple[int, int]) -> NDArray[np.float32]:
+def _opened(path: Path, modified: int | None, like: tuple[int, int]) -> NDArray[np.float32]:
     return _open(path, like)
 
 

@@ -124,7 +124,7 @@ class Listed(NamedTuple):
 def opened_image(path: Path, content: IO[bytes] | None = None) -> Iterator[Image.Image]:
     """Open `path`, or `content`, as a Pillow image after checking its size.
 
-    Exceptions in the block become an `InputError` about a damaged image, except for `FileNotFoundError`.
+    A missing file is an `InputError`; so are exceptions in the block, about a damaged image.
     """
     from PIL import Image, UnidentifiedImageError
 
@@ -134,8 +134,10 @@ def opened_image(path: Path, content: IO[bytes] | None = None) -> Iterator[Image
         with Image.open(content or path) as image:
             check_image(*image.size, path=path)
             yield image
-    except (InputError, FileNotFoundError):
+    except InputError:
         raise
+    except FileNotFoundError as error:
+        raise InputError("no such photo", path=path) from error
     except Image.DecompressionBombError as error:
         raise InputError(f"has more than {LARGEST_IMAGE:,} pixels", path=path) from error
     except UnidentifiedImageError as error:
@@ -198,7 +200,7 @@ def exif_focal(path: Path) -> float | None:
     try:
         with opened_image(path) as image:
             size, tags = image.size, image.getexif().get_ifd(_EXIF)
-    except (InputError, OSError):
+    except InputError:
         return None
     with suppress(TypeError, ValueError, ZeroDivisionError):
         film = float(tags.get(_FILM_FOCAL, 0))
@@ -428,5 +430,5 @@ def has_alpha(photo: Path) -> bool:
     try:
         with opened_image(photo) as image:
             return image.has_transparency_data
-    except (InputError, FileNotFoundError):
+    except InputError:
         return False

@@ -3,6 +3,7 @@
 import base64
 import re
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 from html import unescape
 from io import BytesIO
@@ -15,7 +16,12 @@ import pytest
 from PIL import Image
 
 import g2ard
+from g2ard.errors import InputError
+from g2ard.io.images import load_photo
+from g2ard.rendering.targets import fingerprint_of
+from g2ard.scene.lenses import PhotoLens
 from helpers.scenes import around, checkered_ball
+from helpers.view_files import photo as photo_file
 
 BALL = checkered_ball(600)
 VIEWS = around(3)
@@ -120,3 +126,38 @@ def test_view_shows_the_whole_page_in_a_notebook(monkeypatch: pytest.MonkeyPatch
     assert unescape(content[1:-1]).startswith("<!doctype html>")
     shell.kernel = None  # IPython in a terminal
     assert isinstance(g2ard.view(BALL), Path)
+
+
+LENSES = {
+    "pinhole": {},
+    "distorted": {"distortions": np.full((3, 5), 0.01)},
+    "fisheye": {"lenses": (PhotoLens("SIMPLE_FISHEYE", (64, 48), (30.0, 32.0, 24.0)),) * 3},
+    "panorama": {"lenses": (PhotoLens("EQUIRECTANGULAR", (64, 48), ()),) * 3},
+}
+
+
+@pytest.mark.parametrize("moved", ["photo", "mask"])
+@pytest.mark.parametrize("lens", LENSES)
+def test_a_photo_or_mask_that_moved_is_named(lens: str, moved: str, tmp_path: Path) -> None:
+    """By whatever reads it, through every lens."""
+    photo, mask = photo_file(tmp_path / "photo.png", (64, 48)), photo_file(tmp_path / "mask.png", (64, 48))
+    views = replace(VIEWS, image_paths=(photo,) * 3, mask_paths=(mask,) * 3, **LENSES[lens])
+    shown = g2ard.Photos(views)
+    (tmp_path / f"{moved}.png").unlink()
+    reading: dict[str, Callable[[], Any]] = {
+        "image": lambda: shown[0],
+        "mask": lambda: shown.mask(1),
+        "alpha": lambda: shown.alpha(2),
+        "load": lambda: load_photo(views, 0),
+        "key": lambda: fingerprint_of(shown),
+    }
+    for name, read in reading.items():
+        said = ""
+        try:
+            read()
+        except InputError as error:
+            said = str(error)
+        if said or name not in ("mask", "alpha"):  # which need not both
+            assert f"{moved}.png" in said
+    assert f"{moved}.png" in shown._repr_html_()
+    assert f"{moved}.png" in views[0]._repr_html_()
