@@ -209,7 +209,7 @@ def _generated(
     pool = ViewSet(
         Cameras.of([*train.cameras, *test]),
         splits=("train",) * len(train.cameras) + ("test",) * len(test),
-    )
+    ).fitted(size)  # runs are compared in the views that they write
     counts = _uses(use, len(train.cameras), len(test if held_out is None else held_out), len(apart or ()))
     say(f"views: {counts}; {_of(planned, pool.cameras)}")
     train, scored = train.fitted(size), test

@@ -77,3 +77,35 @@ def test_a_larger_size_holds_except_for_photos(
     side, height = (48, 36) if views == "photos.json" else (LARGE, LARGE * 3 // 4)
     assert f"{side}×{height} px" in text or f'"size": {side}' in text, text
     assert f"{GENERATED}×" not in text
+
+
+@pytest.mark.parametrize("size", [24, 400])
+@pytest.mark.parametrize("views", ["made", "views.json", "photos.json"])
+@pytest.mark.parametrize("more", ["", "--held-out few.json", "--tile-rows 150 --renders"])
+def test_all_views_of_a_run_have_its_size(
+    more: str, views: str, size: int, inputs: Path, tmp_path: Path, command_line: CommandLine
+) -> None:
+    """Those that train and those that are scored, so that a run's score is that of its views."""
+    folder = shutil.copytree(inputs, tmp_path / "there")
+    g2ard.save_views(folder / "few.json", around(3, (48, 36), 2.5))
+    words = [*COMMANDS["distill"].split(), "--views", views, *more.split(), "--size", size]
+    if "--held-out" in more and views == "photos.json":
+        words.append("--renders")
+    succeeds(command_line, folder, *words)
+    for name in ("views.json", "scored.json"):
+        if (folder / "out" / name).exists():
+            found = g2ard.load_views(folder / "out" / name)
+            photo = views == "photos.json" and name == "views.json"
+            assert set(found.widths.tolist()) <= ({min(size, 48), size} if photo else {size}), name
+
+
+def test_runs_compared_are_scored_at_their_size(
+    inputs: Path, tmp_path: Path, command_line: CommandLine
+) -> None:
+    folder = shutil.copytree(inputs, tmp_path / "there")
+    for name, seed in (("a", 0), ("b", 1)):
+        ask = ("distill", "ball.ply", "-r", 8, "--steps", 1, "--no-page", "--size", 40, "--seed", seed)
+        succeeds(command_line, folder, *ask, "-o", name)
+    out, error = succeeds(command_line, folder, "evaluate", "a", "b")
+    assert " 40×30 px" in out + error
+    assert f"{GENERATED}×" not in out + error
