@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from g2ard.errors import InputError
 from g2ard.io.sog_write import palette_size
 from g2ard.io.tile_store import row_width
+from g2ard.jobs.distill_options import LEAST_RECOVERY_SHARE
 from g2ard.jobs.memory import RECOVERY_TIMES, TileMemory, amount
 from g2ard.jobs.run_views import within_pixels
 from g2ard.progress import plural
@@ -107,10 +108,11 @@ def cost_of(job: Any, count: int, *, page: bool = True) -> Cost:
     apart = 0 if job.views.apart is None else len(job.views.apart)
     pixels = _mean_pixels(train)
     kept, size = job.is_kept(count), pixels / _USUAL_PIXELS
-    steps = 0 if kept or not job.recovers else job.steps(count)
     views = len(test) + apart + (len(train) if job.recovers else 0)
     tiles = 1 if job.tiles is None else job.tiles.plan.tiles
-    recovery = job.config.recover.recovery_time or _each(_STEP, size, count / tiles) * steps
+    step = _each(_STEP, size, count / tiles)
+    steps = 0 if kept or not job.recovers else job.steps(count)
+    steps, recovery = _within(job.config.recover.recovery_time, steps, step)
     if job.tiles is not None:
         seen = min(tiles, _SEEN_TILES)
         render = _each(_RENDER, size, job.tiles.plan.count * seen / tiles)
@@ -124,11 +126,24 @@ def cost_of(job: Any, count: int, *, page: bool = True) -> Cost:
     stages = [("targets", target * (views if steps else len(test) + apart))]
     if not kept:
         stages += [("visibility", _VISIBILITY * len(train)), ("simplify", _SIMPLIFY * len(job.prior))]
-        stages += [("recover", recovery)] if job.recovers else []
     scored = len(test) + apart // 2 + twice  # the others validate
-    stages.append(("scoring", _each(_SCORE, size, count) * scored + target * twice))
-    stages += [("report.html", _REPORT), ("view.html", _PAGE)] if page else []
+    after = [("scoring", _each(_SCORE, size, count) * scored + target * twice)]
+    after += [("report.html", _REPORT), ("view.html", _PAGE)] if page else []
+    if steps:
+        if job.time is not None:
+            others = job.prepared - job.began + sum(seconds for _, seconds in [*stages, *after])
+            left = max(job.time - others, LEAST_RECOVERY_SHARE * job.time)
+            steps, recovery = _within(left, steps, step)
+        stages.append(("recover", recovery))
+    stages += after
     return Cost(views, pixels, steps, tuple(stages), _peak_bytes(job, count, steps, page))
+
+
+def _within(limit: float | None, steps: int, step: float) -> tuple[int, float]:
+    """Return the steps of `step` seconds within a time limit, if there are any, and their seconds."""
+    if limit is None or not steps:
+        return steps, step * steps
+    return max(1, round(limit / step)), limit
 
 
 def cost_of_recovery(
@@ -155,7 +170,8 @@ def cost_of_recovery(
     pixels, views = _mean_pixels(training), sum(map(len, used))
     size = pixels / _USUAL_PIXELS
     stages = [] if teacher is None else [("targets", _each(_RENDER, size, len(teacher)) * views)]
-    stages.append((stage, seconds or _each(_STEP, size, len(scene)) * steps))
+    steps, fit = _within(seconds, steps, _each(_STEP, size, len(scene)))
+    stages.append((stage, fit))
     if scored is not None:
         stages.append(
             ("scoring", _each(_SCORE, _mean_pixels(scored) / _USUAL_PIXELS, len(scene)) * len(scored))

@@ -23,7 +23,7 @@ from g2ard.io.types import Cloud, Points, ViewSet
 from g2ard.jobs.budget import Budget
 from g2ard.jobs.budget_search import ResolvedBudget
 from g2ard.jobs.clean import clean as remove_clutter
-from g2ard.jobs.distill_options import DistillOptions
+from g2ard.jobs.distill_options import LEAST_RECOVERY_SHARE, DistillOptions
 from g2ard.jobs.inputs import GivenViews, Views, load_scene, make_targets, scorable, split_views
 from g2ard.jobs.memory import RECOVERY_TIMES
 from g2ard.jobs.photo_colors import colored
@@ -210,7 +210,7 @@ class DistillJob:
         before, after = (sum(seconds for _, seconds in part) for part in (stages[:at], stages[at + 1 :]))
         slowness = (now - self.prepared) / before if before else 1.0
         left = limit - (now - self.began) - slowness * after
-        least = limit / 20
+        least = LEAST_RECOVERY_SHARE * limit
         if left < least:
             spent = now - self.began
             self.say(f"warning: {limit:g} s are short; after {spent:.1f} s recovery still gets {least:.1f} s")

@@ -20,6 +20,8 @@ from g2ard.system.cached import cached_property
 
 RECOVERY_SHARE = 0.4
 """Share of a limited time that recovery is expected to get, for which views are planned."""
+LEAST_RECOVERY_SHARE = 1 / 20
+"""Share of a limited time that recovery gets at least."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

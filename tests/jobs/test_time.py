@@ -1,17 +1,21 @@
 """A limit on the time of a whole distillation."""
 
+import json
 import signal
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from g2ard import save
 from g2ard.errors import InputError
 from g2ard.jobs import distill as jobs
 from g2ard.jobs.budget import Budget
 from g2ard.jobs.cost import cost_of
 from g2ard.jobs.distill import prepare
 from g2ard.jobs.distill_options import DistillOptions
+from helpers.commands import CommandLine, succeeds
 from helpers.scenes import checkered_ball
 
 
@@ -64,3 +68,40 @@ def test_an_interrupted_run_keeps_its_time(tmp_path: Path, monkeypatch: pytest.M
 def test_other_limits_are_excluded(other: str) -> None:
     with pytest.raises(InputError, match=other):
         DistillOptions(time=60.0, settings={f"recover.{other}": 5}).config
+
+
+LIMITED = {
+    "distill": "distill ball.ply -r 8 -o run --size 48 --time",
+    "the paper": "distill ball.ply -r 8 -o run --size 48 --preset paper --time",
+    "views": "distill ball.ply -r 8 -o run --views views.json --time",
+    "recovery": "distill ball.ply -r 8 -o run --size 48 --recovery-time",
+    "the paper's recovery": "distill ball.ply -r 8 -o run --size 48 --preset paper --recovery-time",
+    "recover": "recover small.ply --teacher ball.ply -o out.ply --size 48 --recovery-time",
+}
+
+
+@pytest.mark.parametrize("limit", [60, 3600])
+@pytest.mark.parametrize("name", LIMITED)
+def test_a_dry_run_plans_the_time_that_is_given(
+    name: str, limit: int, folder: Path, command_line: CommandLine
+) -> None:
+    """Its steps are as many as its seconds of recovery allow, and with --time all takes the time."""
+    save(folder / "small.ply", checkered_ball(50))
+
+    def planned(ask: str) -> tuple[dict[str, Any], float]:
+        words = (*ask.split(), "--dry-run", "--json", "-")
+        told = json.loads(succeeds(command_line, folder, *words).out)
+        return told, dict(told["stages"])["recover"]
+
+    ask, flag = LIMITED[name].rsplit(" ", 1)
+    told, recovery = planned(f"{ask} {flag} {limit}s")
+    schedule = "" if "paper" in name else "--steps 700"
+    usual, by_steps = planned(f"{ask} {schedule}")
+    assert told["steps"] * by_steps / usual["steps"] == pytest.approx(recovery, rel=0.1)
+    total = told["seconds"] if flag == "--time" else recovery
+    assert total == pytest.approx(limit, rel=0.1)
+
+
+def test_recovery_is_expected_to_get_its_least_share(job: jobs.DistillJob) -> None:
+    """As it does, see `test_too_short_a_time_is_told`."""
+    assert dict(cost_of(replace(job, time=0.5), 150).stages)["recover"] == pytest.approx(0.025)
