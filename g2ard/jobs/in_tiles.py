@@ -8,8 +8,6 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
-
 from g2ard.errors import InputError
 from g2ard.io.reports import Report
 from g2ard.io.sanitize import BLOCK
@@ -24,7 +22,7 @@ from g2ard.jobs.memory import TilePlan, plan_tiles
 from g2ard.jobs.run_views import pool_times, views_of
 from g2ard.jobs.tile_options import Tiling
 from g2ard.pipeline.config import DistillConfig
-from g2ard.pipeline.distill import RunViews, selected
+from g2ard.pipeline.distill import RunViews, draw_weights
 from g2ard.progress import Detail, Progress, Say, silent, unsaid
 from g2ard.report.run import TiledReport, TiledScores
 from g2ard.scene.cameras import Cameras
@@ -292,16 +290,6 @@ def prepare_tiles(
     config = options.configured(regularizers)
     if recovers:
         say(Detail(f"regularisers: {why}"))
-        views = _weighted(views, sample, config, progress)
+        weights = draw_weights(sample, views.train, config, progress)  # as in one piece
+        views = replace(views, train=replace(views.train, weights=weights))
     return TiledJob(tiles, wanted, sample, views, config, recovers, began, say)
-
-
-def _weighted(views: RunViews, sample: Splats, config: DistillConfig, progress: Progress) -> RunViews:
-    """Return views with the sampling weights that a distillation in one piece would use; 0 is never drawn."""
-    train = views.train
-    given = train.weights if config.select.weighted else None
-    rows, weights, _ = selected(sample, train.cameras, config, given, progress)
-    if weights is not None and rows is not None:
-        weights, drawn = np.zeros(len(train.cameras)), weights
-        weights[rows] = drawn
-    return replace(views, train=replace(train, weights=weights))

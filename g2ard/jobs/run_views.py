@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from g2ard.config.checks import AtLeastOne, checks_arguments
 from g2ard.errors import InputError
@@ -26,7 +27,7 @@ from g2ard.jobs.inputs import (
 from g2ard.jobs.view_checks import as_pool, check_sight, given_or_found, warn_of_sight
 from g2ard.jobs.viewer_frame import level_up
 from g2ard.pipeline.config import SelectConfig
-from g2ard.pipeline.distill import RunViews
+from g2ard.pipeline.distill import RunViews, draw_weights
 from g2ard.poses import Pool, best_views, plan_pool, turntable
 from g2ard.poses.zooms import zoomed
 from g2ard.progress import Progress, Say, direction, plural, silent, unsaid
@@ -153,7 +154,8 @@ def views_of(
         planned = plan(_OFFERED_VIEWS)
     except InputError:  # the scene has no room for poses
         return RunViews(train, test, full=full)
-    train, apart, _ = mix(train, planned, select=select, zoom=False)
+    weigh = partial(draw_weights, prior, train, options.config, progress)
+    train, apart, _ = mix(train, planned, select=select, weigh=weigh, zoom=False)
     return RunViews(train, test, apart, full=full)
 
 
@@ -276,6 +278,7 @@ def _mixed(
     progress: Progress,
     say: Say,
     share: float = 1.0,
+    weigh: Callable[[], NDArray[np.float64] | None] = lambda: None,
     zoom: bool = True,
 ) -> _Mixed:
     """Add views of other kinds to training views: those that `complete` chooses, or of one kind with a focus.
@@ -284,6 +287,8 @@ def _mixed(
 
     Args:
         share: share of the pool that is used.
+        weigh: returns the weights of training views; None draws them equally often, as planned ones, which
+            are not crowded. The others are drawn as often as these on average.
         zoom: whether some of the training views become zooms.
     """
     usual, times = len(train.cameras), _times(prior, represents)
@@ -320,12 +325,13 @@ def _mixed(
         more = more.take(order) if len(order) else None
     if more is None:
         return train, others, unseen
-    weights = np.ones(usual) if train.weights is None else train.weights / train.weights.mean()
+    own = weigh()
+    weights = np.ones(usual) if own is None else own / own.mean()
     mixed = ViewSet(
         Cameras.of([*train.cameras, *more]).fitted(size),
         train.notes,
         train.splits and train.splits + ("train",) * len(more),
-        np.append(weights, np.ones(len(more))),  # drawn equally often
+        np.append(weights, np.ones(len(more))),
     )
     if focus is None and zoom:
         mixed = replace(mixed, cameras=zoomed(compact, mixed.cameras, represents=per_row, share=share))

@@ -216,6 +216,22 @@ def selected(
     return chosen.order[order], weights, report
 
 
+def draw_weights(
+    scene: Splats, train: ViewSet, config: DistillConfig, progress: Progress = silent
+) -> NDArray[np.float64] | None:
+    """Return the weights by which all training views are drawn, as stated or selected; 0 is never drawn.
+
+    None draws them equally often.
+    """
+    given = train.weights if config.select.weighted else None
+    rows, weights, _ = selected(scene, train.cameras, config, given, progress)
+    if weights is None or rows is None:
+        return weights
+    every = np.zeros(len(train.cameras))
+    every[rows] = weights
+    return every
+
+
 def _simplified(
     steps: Steps,
     number: int,

@@ -1,6 +1,7 @@
 """Views generated where none are given."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,9 +9,10 @@ import pytest
 from PIL import Image
 
 from g2ard.io import write_views
+from g2ard.io.types import ViewSet
 from g2ard.jobs.distill_options import DistillOptions
 from g2ard.jobs.run_views import views_of
-from g2ard.pipeline.distill import RunViews
+from g2ard.pipeline.distill import RunViews, draw_weights
 from g2ard.poses import plan_pool
 from g2ard.rendering.visibility import visibility_source
 from g2ard.scene.cameras import Cameras, rows_by_kind
@@ -103,6 +105,37 @@ def test_given_views_stay_first(tmp_path: Path) -> None:
     assert mixed.names[: len(plain)] == plain.names
     assert set(mixed.kinds[len(plain) :]) == {"anywhere"}
     assert len(mixed) - len(plain) == round(len(plain) / 3)
+
+
+@pytest.mark.parametrize("focus", [None, "near", "standing", "anywhere"])
+@pytest.mark.parametrize("crowded", [0, 31])
+def test_crowded_views_have_their_weights_whatever_joins(crowded: int, focus: str | None) -> None:
+    """Among views of other kinds, the others are drawn as often relative to each other as alone."""
+    room, rng = naive.room(), np.random.default_rng(0)
+    pool = plan_pool(room, 12).cameras
+
+    def moved(viewmat: np.ndarray) -> np.ndarray:
+        return viewmat + np.pad(rng.normal(0, 1e-3, (3, 1)), ((0, 1), (3, 0)))
+
+    crowd = [replace(pool[0], viewmat=moved(pool[0].viewmat), name=f"crowd_{row}") for row in range(crowded)]
+    given = Cameras.of([*pool, *crowd])
+
+    def found(focus: str | None, **settings: object) -> ViewSet:
+        views = ViewSet(given, splits=("train",) * (len(given) - 1) + ("test",))
+        return views_of(room, DistillOptions(views=views, settings={"focus": focus, **settings}), 300).train
+
+    alone, mixed = found("far"), found(focus)
+    usual = len(alone.cameras)
+    assert len(mixed.cameras) > usual or focus is None
+    expected = draw_weights(room, alone, DistillOptions().config)
+    assert expected is not None
+    own = mixed.weights if mixed.weights is not None else expected
+    np.testing.assert_allclose(own[:usual], expected / expected.mean(), rtol=1e-9)
+    np.testing.assert_array_equal(own[usual:], 1.0)
+    if crowded:
+        assert own[12:usual].sum() < 0.3 * own[:usual].sum()
+    even = found(focus, **{"select.weighted": False})
+    assert even.weights is None or np.ptp(even.weights) == 0
 
 
 def test_runs_of_few_steps_use_few_views() -> None:
