@@ -2,22 +2,25 @@
 
 import concurrent.futures
 import os
+import platform
 import signal
 import threading
+import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from multiprocessing import get_context, parent_process
 from pathlib import Path
 from typing import Any
 
 from g2ard import _core
-from g2ard.errors import InputError, missing
+from g2ard.errors import G2ardError, InputError, missing
 from g2ard.io.atomic import drop_temporaries
 from g2ard.progress import Progress, silent
+from g2ard.system.keys import key_of
 from g2ard.system.peak_memory import forget_workers, note_worker, peak_rss
 from g2ard.tiles.tasks import Task, run_task
 
@@ -29,6 +32,12 @@ _POOL_SHUTDOWN_SECONDS = 5.0
 
 The thread releases semaphores; otherwise Python warns about them at exit.
 """
+
+_WORKER_SECONDS = 60.0
+"""Seconds that a cluster may be without a worker."""
+
+_POLL_SECONDS = 5.0
+"""Seconds between two questions to a scheduler whether it has workers."""
 
 Told = Callable[[Task, float], None]
 Executor = Callable[[Sequence[Task], Told], None]
@@ -107,9 +116,11 @@ def executor(
         return
     with ExitStack() as opened:
         pool: Any = partial(ProcessPoolExecutor, workers, get_context("spawn"), _begin)
+        cluster = None
         if scheduler:
-            pool = partial(_dask_client(scheduler, workers, opened).get_executor, pure=False)
-        yield opened.enter_context(closing(_Pool(pool, threads))).run
+            cluster = _Cluster(scheduler, _dask_client(scheduler, workers, opened))
+            pool = partial(cluster.client.get_executor, pure=False)
+        yield opened.enter_context(closing(_Pool(pool, threads, cluster))).run
 
 
 def _run_here(tasks: Sequence[Task], told: Told) -> None:
@@ -118,26 +129,71 @@ def _run_here(tasks: Sequence[Task], told: Told) -> None:
         told(task, 1.0)
 
 
+class _Cluster:
+    """A connection to a Dask scheduler, which is asked from time to time whether it has workers."""
+
+    def __init__(self, scheduler: str, client: Any) -> None:
+        self.scheduler, self.client = scheduler, client
+        self._asked = self._manned = time.monotonic()
+
+    def check(self) -> None:
+        """Raise an `InputError` if the scheduler has had no worker for a while."""
+        now = time.monotonic()
+        if now < self._asked + _POLL_SECONDS:
+            return
+        self._asked = now
+        if self.client.nthreads():
+            self._manned = now
+        elif now > self._manned + _WORKER_SECONDS:
+            raise InputError(
+                f"--scheduler {self.scheduler}: no worker for {now - self._manned:.0f} s; start some with "
+                f"`dask worker {self.scheduler}`, then run the same command again"
+            )
+
+    def check_answer(self, error: Exception) -> None:
+        """Raise an `InputError` if an error is due to a scheduler that no longer answers."""
+        try:
+            if self.client.status == "running" and self.client.nthreads() is not None:
+                return
+        except Exception as found:  # whatever the connection raises
+            error = found
+        raise InputError(
+            f"--scheduler {self.scheduler}: the connection was lost ({type(error).__name__}); start the "
+            "scheduler, and run the same command again"
+        ) from None
+
+
 class _Pool:
     """A pool of processes or of Dask's workers, opened again after one of them is killed.
 
-    Results are paths and the workers' memory, because Dask cannot spill what workers hold in Rust's memory.
+    Results are what workers tell of themselves, because Dask cannot spill what they hold in Rust's memory.
     """
 
-    def __init__(self, opened: Callable[[], concurrent.futures.Executor], threads: int):
-        self._opened, self._threads = opened, threads
+    def __init__(
+        self,
+        opened: Callable[[], concurrent.futures.Executor],
+        threads: int,
+        cluster: _Cluster | None = None,
+    ):
+        self._opened, self._threads, self._cluster = opened, threads, cluster
+        self._lanes: dict[str, str] = {}  # instruction set → one worker that has it
         self._pool: concurrent.futures.Executor | None = None
 
     def run(self, tasks: Sequence[Task], told: Told) -> None:
         self._pool = self._pool or self._opened()
         try:
-            futures = {self._pool.submit(_work, task.absolute(), self._threads): task for task in tasks}
+            asked = self._threads, program()
+            futures = {self._pool.submit(_work, task.absolute(), *asked): task for task in tasks}
             pending = set(futures)
             while pending:  # wait briefly: Ctrl-C does not end a longer wait on Windows
                 done, pending = wait(pending, timeout=0.2, return_when=FIRST_COMPLETED)
                 for future in done:
-                    note_worker(*future.result())
+                    worker = future.result()
+                    note_worker(worker.process, worker.peak)
+                    self._check_lanes(worker)
                     told(futures[future], 1.0)
+                if self._cluster is not None:
+                    self._cluster.check()
                 for future in pending:
                     if future.running():
                         told(futures[future], futures[future].share)
@@ -145,7 +201,16 @@ class _Pool:
             self.close()
             if isinstance(error, BrokenProcessPool) or type(error).__name__ == "KilledWorker":
                 raise WorkerDiedError from None
+            if self._cluster is not None and not isinstance(error, G2ardError):
+                self._cluster.check_answer(error)
             raise
+
+    def _check_lanes(self, worker: "_Worker") -> None:
+        """Raise an `InputError` if two workers have other instructions, which round differently."""
+        self._lanes.setdefault(worker.lanes, worker.host)
+        if len(self._lanes) > 1:
+            told = " and ".join(f"{lanes} on {host}" for lanes, host in self._lanes.items())
+            raise InputError(f"workers compute with {told}, whose last bits differ; use workers of one kind")
 
     def close(self) -> None:
         """Cancel unfinished tasks, and kill the processes of this pool."""
@@ -164,11 +229,34 @@ class _Pool:
         self._pool = None
 
 
-def _work(task: Task, threads: int) -> tuple[int, int | None]:
-    """Run a task in a worker; return the worker's process ID and its peak memory."""
+@dataclass(frozen=True)
+class _Worker:
+    """A worker after a task: host, process ID, peak memory in bytes, and its fastest instruction set."""
+
+    host: str
+    process: int
+    peak: int | None
+    lanes: str
+
+
+@cache
+def program() -> str:
+    """Return the version of g2ard, with a hash of its sources and of the core's defaults."""
+    package = Path(__file__).parents[1]
+    sources = [path.read_bytes() for path in sorted(package.rglob("*.py"))]
+    return f"{_core.__version__}-{key_of([*sources, repr(_core.defaults())])[:8]}"
+
+
+def _work(task: Task, threads: int, client: str) -> _Worker:
+    """Run a task in a worker that has the client's program; return what the worker tells of itself."""
+    host = platform.node()
+    if program() != client:
+        raise InputError(
+            f"the worker on {host} runs g2ard {program()}, this program is {client}; install the same on all"
+        )
     _core.set_num_threads(threads)
     run_task(task)
-    return os.getpid(), peak_rss()
+    return _Worker(host, os.getpid(), peak_rss(), _core.instruction_sets()[0])
 
 
 def _begin() -> None:
