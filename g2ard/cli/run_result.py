@@ -106,6 +106,7 @@ def told(report: RunReport | TiledReport, *, verbose: bool = False) -> list[str]
     lines.append(gaps_line(report.opacity_lost, RECOVERED_GAPS))
     if report.unseen and report.unseen > _LEAST_REPORTED_SHARE:
         lines.append(f"{report.unseen:.0%} of the scene is in no view: simplified but not recovered")
+    lines += report.warnings or ()
     if report.packed:
         size, unpacked = report.bytes["file"] or 0, report.scores["recovered"].psnr
         lines += score_lines(report.packed, size, unpacked, report.size)

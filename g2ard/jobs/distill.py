@@ -24,6 +24,7 @@ from g2ard.jobs.budget import Budget
 from g2ard.jobs.budget_search import ResolvedBudget
 from g2ard.jobs.clean import clean as remove_clutter
 from g2ard.jobs.distill_options import LEAST_RECOVERY_SHARE, DistillOptions
+from g2ard.jobs.doubts import doubts_of_regions, doubts_of_views
 from g2ard.jobs.inputs import GivenViews, Views, load_scene, make_targets, scorable, split_views
 from g2ard.jobs.memory import RECOVERY_TIMES
 from g2ard.jobs.photo_colors import colored
@@ -302,6 +303,7 @@ class DistillJob:
             own_size=None if full is None else {name: found.means for name, found in full.items()},
             kinds=by_kind(before, after, USUAL if made else "given"),
             unseen=self._unseen(done),
+            warnings=self._warnings(done),
             opacity_lost=None if from_points else opacity_lost(self.prior, done.splats, cameras),
             overdraw=overdraw(done.splats, cameras, self.progress),
             against=kinds_of(targets.held_out),
@@ -320,6 +322,15 @@ class DistillJob:
         score = now - self.prepared + 2 * resumed - sum(stages.values())
         total = now - self.began + resumed
         return {"prepare": self.prepared - self.began, **stages, "score": score, "total": total}
+
+    def _warnings(self, done: Distilled) -> tuple[str, ...]:
+        """Return warnings about the views, and about regions of the result."""
+        told = doubts_of_views(self.prior, self.views.train.cameras)
+        if not self.config.recover.from_points:
+            told += doubts_of_regions(self.prior, done.splats)
+        if self.views.guess is not None:
+            told.append(f"warning: the up direction is a guess ({self.views.guess}); --up X,Y,Z sets it")
+        return tuple(told)
 
     def _unseen(self, done: Distilled) -> float | None:
         """Return the share of the scene that no view sees, or None for the paper's method.

@@ -221,7 +221,9 @@ def _generated(
     twice = None
     if use == "distil" and held_out is None:
         twice = _twice(scored, max(2, round(share * _TWICE_VIEWS)))
-    return RunViews(train, scored, apart and apart.fitted(size), pool, unseen, full, twice)
+    apart = apart and apart.fitted(size)
+    guess = planned.why.rpartition("; ")[2] if "guess" in planned.why else None
+    return RunViews(train, scored, apart, pool, unseen, full, twice, guess)
 
 
 def _twice(cameras: Cameras, count: int) -> Cameras | None:

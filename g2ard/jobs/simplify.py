@@ -131,6 +131,18 @@ class Reduction:
             say=self.say,
         )
 
+    def warnings(self, small: Splats) -> list[str]:
+        """Return warnings about the views, and about regions of a result; none for a scene in tiles."""
+        if self.tiles is not None or len(small) >= self.total:
+            return []
+        from g2ard.jobs.doubts import doubt_of_distances, doubts_of_regions, doubts_of_views  # as above
+
+        told = doubts_of_regions(self.splats, small)
+        if self.seen is None:
+            return told + doubt_of_distances(self.splats)
+        given = self.cameras is not None or self.given.views is not None
+        return told + (doubts_of_views(self.splats, self.seen) if given else [])
+
     @cached_property
     def _visibility(self) -> VisibilitySource | None:
         if self.seen is None:

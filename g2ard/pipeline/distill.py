@@ -42,6 +42,7 @@ class RunViews:
         full: the usual views for scoring at their own size, if a requested size shrank them.
         unseen: share of the sampled matter that no view of the pool sees.
         twice: a few of the usual views for scoring at twice their size, if they were generated.
+        guess: how the up direction of generated views was guessed; None if it is more than a guess.
     """
 
     train: ViewSet
@@ -51,6 +52,7 @@ class RunViews:
     unseen: float | None = None
     full: Cameras | None = None
     twice: Cameras | None = None
+    guess: str | None = None
 
     def resized(self, longest: int) -> RunViews:
         """Shrink all views for training and scoring."""

@@ -195,6 +195,7 @@ class RunReport(Report):
         size: image size of these views.
         own_size: means at the views' own size if a requested one shrank them, or None.
         unseen: share of the scene that no view sees; None for the paper's method.
+        warnings: views that do not show what the scene resolves, and regions that lost too much.
         opacity_lost: share of the light of opaque pixels that the result lets through; None for points from
             photos.
         overdraw: Gaussians per pixel.
@@ -216,6 +217,7 @@ class RunReport(Report):
     own_size: dict[str, Means] | None
     kinds: tuple[KindScore, ...]
     unseen: float | None
+    warnings: tuple[str, ...]
     opacity_lost: float | None
     overdraw: float
     against: str

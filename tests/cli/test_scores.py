@@ -182,7 +182,7 @@ def test_a_size_that_harms_is_a_warning_with_the_way_out() -> None:
         for psnr in (20.0, 34.8, 27.3, 32)
     ]
     before, at_size, harmed, usual = means
-    fields = dict.fromkeys(("unseen", "packed", "opacity_lost", "photos"))
+    fields = dict.fromkeys(("unseen", "warnings", "packed", "opacity_lost", "photos"))
     for own, warned in ((harmed, True), (usual, False)):
         own_size = {"simplified": before, "recovered": own}
         scores = {"recovered": at_size}

@@ -76,6 +76,7 @@ def test_command_on_a_trained_scene(command_line: CommandLine, tmp_path: Path) -
         view["name"] for view in apart["recovered"]["views"]
     }
     assert 0 <= report["unseen"] < 0.5
+    assert all(line.startswith("warning: ") and line in error for line in report["warnings"])
     assert [row["kind"] for row in report["kinds"]][:2] == ["usual", "near"]
     near = (view for view in apart["recovered"]["views"] if view["kind"] == "near")
     worst = min(near, key=lambda view: view["psnr"])

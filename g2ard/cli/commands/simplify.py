@@ -146,9 +146,11 @@ def simplify(
             written = time.perf_counter()
             seconds = {"read": reading, "simplify": simplified - started, "write": written - simplified}
             seconds["total"], started = sum(seconds.values()), written
+            warnings = reduce.warnings(small.splats)
             reports.append(
                 {
                     **small.report.as_dict(),
+                    "warnings": warnings,
                     "method": config.method,
                     "settings": listed(config.resolved(antialiased=reduce.splats.antialiased)),
                     "notes": {note.code: note.count for note in reduce.notes},
@@ -156,6 +158,8 @@ def simplify(
                     "peak_rss_bytes": peak_rss_of_all(),
                 }
             )
+            for warning in warnings:
+                run.say(warning)
             _tell(run, source, reduce, small, place, seconds["total"])
             if one.bytes is not None:
                 run.say(f"{place}: {written_bytes(place):,} of {one.bytes:,} bytes")

@@ -1,0 +1,133 @@
+"""Warnings about views that do not show what a scene resolves, and about regions that lost too much."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from g2ard.poses.votes import Votes
+from g2ard.progress import plural
+from g2ard.scene.cameras import Cameras
+from g2ard.scene.reproducible import Floats, canonical_order, norms
+from g2ard.scene.splats import Splats
+
+_SAMPLE = 8192
+"""Gaussians that represent a scene."""
+
+_COARSE, _UNFRAMED = 0.2, 0.5
+"""Shares of the scene below a pixel in all views, and in no view, above which views are warned of."""
+
+_EMPTIED, _LEVELS = 10.0, 3
+"""Factor on the requested reduction above which a region is warned of, and halvings that make regions."""
+
+_REGION_ROWS, _FEWEST = 400_000, 1024
+"""Most Gaussians whose regions are counted, and fewest of a scene that has regions."""
+
+_FAR = 0.05
+"""Share of the Gaussians beyond a gap above which the scene has a sky or surroundings."""
+
+
+def doubts_of_views(scene: Splats, cameras: Cameras) -> list[str]:
+    """Return warnings about views that frame little, show it below a pixel, or stand outside a sky."""
+    some = _visible(scene)
+    if len(some) < _FEWEST or not len(cameras):
+        return []
+    points, sizes = _points(some), _sizes(some)
+    framed, resolved = np.zeros((2, len(some)), bool)
+    for view in cameras:
+        depths = (points - view.position) @ view.viewmat[2, :3]
+        rows = view.holds(points)
+        framed |= rows
+        resolved |= rows & (sizes * np.sqrt(view.K[0, 0] * view.K[1, 1]) >= depths)
+    told, seen = [], max(1, int(framed.sum()))
+    unframed, coarse = 1 - float(framed.mean()), 1 - float(resolved.sum()) / seen
+    if unframed > _UNFRAMED:
+        told.append(f"warning: {unframed:.0%} of the scene is in no view; --views of all of it would show it")
+    elif coarse > _COARSE:
+        told.append(
+            f"warning: {coarse:.0%} of the scene is smaller than a pixel in all views; nearer --views, or a "
+            "larger --size, would show it"
+        )
+    votes = Votes.of(points, sizes, some.opacities.astype(np.float64), len(scene) / len(some))
+    outside = norms(cameras.positions - votes.centre) > votes.horizon
+    if outside.mean() > 0.5:
+        told.append(
+            f"warning: {int(outside.sum())} of {plural(len(cameras), 'view')} stand outside the sky, which "
+            "hides the scene from them"
+        )
+    return told
+
+
+def doubts_of_regions(scene: Splats, small: Splats) -> list[str]:
+    """Return a warning if an eighth of the scene, or what is near, lost ten times more than the whole."""
+    every = max(1, len(scene) // _REGION_ROWS)
+    before, after = _points(scene)[::every], _points(small)
+    if len(before) < _FEWEST or not len(after):
+        return []
+    regions = [(before, after)]
+    for _ in range(_LEVELS):
+        regions = [half for region in regions for half in _halved(*region)]
+    votes = _votes(scene)
+    if np.isfinite(votes.radius):
+        regions.append((_within(before, votes), _within(after, votes)))
+    ratio = len(before) / len(after)
+    factors = [len(old) / max(1, len(new)) / ratio for old, new in regions]
+    emptied = [i for i, factor in enumerate(factors) if factor > _EMPTIED]
+    if not emptied:
+        return []
+    largest = max(emptied, key=lambda i: len(regions[i][0]))
+    old, new = regions[largest]
+    middle = ", ".join(f"{value:.3g}" for value in np.median(old, axis=0))
+    return [
+        f"warning: a region around {middle} kept {len(new):,} of {every * len(old):,} Gaussians, "
+        f"{factors[largest]:,.0f} times fewer than the whole; --views of it, or --keep-region, keeps more"
+    ]
+
+
+def doubt_of_distances(scene: Splats) -> list[str]:
+    """Return a warning if a reduction without views meets a scene with a sky or distant surroundings."""
+    if len(scene) < _FEWEST:
+        return []
+    votes = _votes(scene)
+    far = float(votes.weights[votes.distances > votes.radius].sum())
+    if far <= _FAR:
+        return []
+    return [
+        f"warning: {far:.0%} of the scene lies far beyond the rest; without views it is weighed by its size, "
+        "so give --views, or use --method default"
+    ]
+
+
+def _visible(scene: Splats) -> Splats:
+    rows = np.flatnonzero(scene.opacities > 1 / 255)
+    some = scene.take(rows[canonical_order(scene, rows)[:_SAMPLE]])
+    return some.take(some.finite_rows())
+
+
+def _points(scene: Splats) -> Floats:
+    means = scene.means.astype(np.float64)
+    return means[np.isfinite(means).all(axis=1)] + scene.offset
+
+
+def _sizes(scene: Splats) -> Floats:
+    scales = np.sort(np.abs(scene.scales.astype(np.float64)), axis=1)
+    return np.sqrt(scales[:, 1] * scales[:, 2])
+
+
+def _votes(scene: Splats) -> Votes:
+    some = _visible(scene)
+    represents = len(scene) / max(1, len(some))
+    return Votes.of(_points(some), _sizes(some), some.opacities.astype(np.float64), represents)
+
+
+def _within(points: Floats, votes: Votes) -> Floats:
+    return points[norms(points - votes.centre) <= votes.radius]
+
+
+def _halved(before: Floats, after: Floats) -> list[tuple[Floats, Floats]]:
+    """Halve a region along its widest axis."""
+    axis = int(np.argmax(np.ptp(before, axis=0)))
+    cut = np.median(before[:, axis])
+    return [
+        (before[before[:, axis] <= cut], after[after[:, axis] <= cut]),
+        (before[before[:, axis] > cut], after[after[:, axis] > cut]),
+    ]
