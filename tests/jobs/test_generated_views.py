@@ -11,12 +11,13 @@ from PIL import Image
 from g2ard.io import write_views
 from g2ard.io.types import ViewSet
 from g2ard.jobs.distill_options import DistillOptions
-from g2ard.jobs.run_views import views_of
+from g2ard.jobs.run_views import _twice, views_of
 from g2ard.pipeline.distill import RunViews, draw_weights
 from g2ard.poses import plan_pool
 from g2ard.rendering.visibility import visibility_source
 from g2ard.scene.cameras import Cameras, rows_by_kind
 from helpers.commands import CommandLine, refused, succeeds
+from helpers.scenes import around
 from reference import poses as naive
 
 
@@ -162,3 +163,13 @@ def test_a_few_views_are_scored_at_twice_their_size(command_line: CommandLine, f
     told = json.loads(succeeds(command_line, folder, *ask, "--json", "-").out)
     kinds = {row["kind"]: row["views"] for row in told["kinds"]}
     assert kinds["usual at 2×"] == 2
+
+
+@pytest.mark.parametrize(("side", "some"), [(1200, True), (1201, False)])
+def test_very_large_views_are_not_scored_at_twice_their_size(side: int, some: bool) -> None:
+    """Twice 1,200 pixels is the most: a score of larger ones would take longer than the run."""
+    found = _twice(around(9, (side, 40)), 3)
+    assert (found is not None) == some
+    if found is not None:
+        assert {*found.widths.tolist()} == {2 * side}
+        assert {*found.kinds} == {"usual at 2×"}

@@ -64,3 +64,16 @@ def test_gaussians_that_no_view_shows_keep_their_colours() -> None:
     assert (fitted.sh0[:-1] != small.sh0[:-1]).any()
     for name in ("means", "quats", "scales", "logit_opacities", "shN"):
         assert getattr(fitted, name) is getattr(small, name)
+
+
+def test_gaussians_that_views_hardly_show_hardly_change() -> None:
+    """All around a speck is wrong by 1; it hardly shows there, and its views say little about its colour."""
+    dense = checkered_ball(300).with_sh_degree(0)
+    dense = replace(dense, sh0=np.full((300, 1, 3), 0.7, np.float32))
+    pale = replace(dense, sh0=dense.sh0 + np.float32(1))
+    speck = Splats.create([[0, 0, 1.3]], scales=[[2e-3] * 3], logit_opacities=[-3], sh0=[[[0.7] * 3]])
+    small = join([pale, speck])
+    shift = (recoloured(dense, small, VIEWS).sh0 - small.sh0)[:, 0]
+    assert np.median(shift[:-1]) < -0.5
+    assert (shift[-1] > -0.3).all()
+    assert (shift[-1] < 0).all()

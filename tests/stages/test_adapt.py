@@ -3,6 +3,7 @@
 import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,15 +12,19 @@ import g2ard
 from g2ard.errors import InputError
 from g2ard.pipeline.adapt import (
     AdaptConfig,
+    _fit,
     adapt,
     blended_appearance,
     colour_change,
     recoloured,
     views_seeing,
 )
+from g2ard.progress import silent
 from g2ard.rendering.renderer import render
 from g2ard.rendering.targets import Subset, TeacherRenders
+from g2ard.scene.splats import Splats
 from g2ard.stages.evaluate import evaluate
+from g2ard.stages.recover.config import RecoverConfig
 from g2ard.stages.simplify import simplify
 from helpers.commands import CommandLine, succeeds
 from helpers.scenes import around, checkered_ball
@@ -200,3 +205,18 @@ def test_few_images_also_change_unseen_gaussians() -> None:
     assert psnr[1.0] > evaluate(compact, others).psnr + 2
     assert psnr[1.0] > psnr[0.0] + 0.3
     assert 0.3 < done.report.prior_share < 0.95
+
+
+def test_each_stretch_draws_views_in_another_order() -> None:
+    """With one seed, the views that a stretch leaves out would be left out of the beginning of all."""
+    seeds, ball = [], checkered_ball(40)
+
+    def recover(name: str, scene: Splats, targets: object, how: RecoverConfig, **_: object) -> object:
+        seeds.append(how.seed)
+        return scene, SimpleNamespace(psnr=SimpleNamespace(before=0.0, after=1.0))
+
+    targets, steps = SimpleNamespace(cameras=VIEWS), SimpleNamespace(recover=recover)
+    config = AdaptConfig(steps=4000, seed=5)
+    _fit(ball, targets, config, steps, silent)  # type: ignore[arg-type]
+    assert len(seeds) == len(config.stretches(24)) == 3
+    assert seeds == [5, 6, 7]

@@ -609,3 +609,37 @@ def test_scenes_that_no_view_sees_are_refused(student: Splats, targets: TeacherR
     behind = replace(TEACHER, means=(TEACHER.means - 99 * ahead.forwards[0]).astype(np.float32))
     with pytest.raises(InputError, match="none of 1 view sees the scene"):
         recover(behind, TeacherRenders(TEACHER, ahead), RecoverConfig(steps=2))
+
+
+def test_after_the_score_changes_the_best_scene_is_scored_anew() -> None:
+    """Otherwise a later scene is measured against a score of another kind."""
+    start, better = checkered_ball(50), checkered_ball(50, seed=1)
+    scores = {id(start): 20.0, id(better): 25.0}
+    guard = Guard(lambda scene: scores[id(scene)], start, 20.0)
+    guard.look(better, 0.1, 1)
+    assert (guard.best, guard.best_score) == (better, 25.0)
+    scores |= {id(start): 30.0, id(better): 34.0}
+    guard.before = 30.0
+    guard.rescore()
+    assert guard.best_score == 34.0
+    guard.best = start
+    guard.rescore()
+    assert guard.best_score == 30.0
+
+
+@pytest.mark.parametrize("known", [False, True])
+def test_exposures_that_are_found_change_all_scores(known: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Those that were known from the start change none."""
+    told: list[str] = []
+    running = SimpleNamespace(
+        exposures=np.ones((4, 3)) if known else None,
+        done=9,
+        targets=SimpleNamespace(cameras=around(4)),
+        config=SimpleNamespace(background=(0.0, 0.0, 0.0)),
+        guard=SimpleNamespace(rescore=lambda: told.append("best")),
+        _score_exposed=lambda: told.append("start"),
+    )
+    monkeypatch.setattr(loop, "exposures_of", lambda *_, **__: np.full((4, 3), 2.0))
+    loop.Loop._look_at_exposures(running, checkered_ball(9), 0.5)  # type: ignore[arg-type]
+    assert told == ([] if known else ["start", "best"])
+    assert (running.exposures == 2).all()

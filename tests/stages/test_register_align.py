@@ -11,9 +11,11 @@ from hypothesis import strategies as st
 from g2ard import _core
 from g2ard.rendering.renderer import Renderer
 from g2ard.stages.register.align import Aligned, Shot, align, level_of, normal_equations, shot_of
+from g2ard.stages.register.attempts import Search
+from g2ard.stages.register.config import RegisterConfig
 from g2ard.stages.register.grey import blurred, blurred_back, grey_of, local_zncc, shift_between, zncc
 from g2ard.stages.register.polish import Energy, polish
-from g2ard.stages.register.pose import moved, pose_error
+from g2ard.stages.register.pose import motion_between, moved, pose_error
 from helpers.registration import BALL, CONFIG, off, pyramid_of
 from helpers.scenes import around
 from reference import register as twin
@@ -219,3 +221,46 @@ def test_a_shift_is_that_of_the_best_correlation_without_wrapping(shape: tuple[i
         right, down, score = shift_between(a, b)
         assert (right, down) == best
         assert score == pytest.approx(found[best], abs=1e-6)
+
+
+def _informed(rng: np.random.Generator) -> np.ndarray:
+    """Return the information of a pose and a focal length from ten measurements."""
+    rows = rng.normal(size=(10, 7))
+    return rows.T @ rows
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_features_and_light_are_joined_like_their_measurements(seed: int) -> None:
+    """Both have the prior of the focal length, which counts once: one least squares of all."""
+    rng = np.random.default_rng(seed)
+    of_features, of_light, focal_sigma = _informed(rng), _informed(rng), 0.5
+    prior = np.zeros((7, 7))
+    prior[6, 6] = focal_sigma**-2  # of the logarithm of the focal length over the given one, about 0
+    solved_at = np.array([0, 0, 0, 0, 0, 0, 0.2])
+    near_at = rng.normal(0, 0.1, 7) * [1, 1, 1, 0, 0, 0, 1]  # motions without rotation add up
+    # Each estimate is (Λ + Λ₀)⁻¹ Λ m of its measurements m.
+    measured = (of_features + prior) @ solved_at + (of_light + prior) @ near_at
+    of_all = of_features + of_light + prior
+    expected = np.linalg.solve(of_all, measured)
+    pose = np.eye(4)
+
+    def aligned(at: np.ndarray, covariance: np.ndarray | None) -> Aligned:
+        return Aligned(moved(pose, at[:6]), 1.0, 0.0, covariance, 1.0, 3, 2.0, float(np.exp(at[6])))
+
+    solved = SimpleNamespace(
+        viewmat=pose, information=of_features, focal_sigma=focal_sigma, depth=2.0, zoom=float(np.exp(0.2))
+    )
+    found = {}
+    for refine in ("auto", "none", "photometric"):
+        search = SimpleNamespace(
+            config=RegisterConfig(refine=refine),
+            _aligned=lambda *_: aligned(near_at, np.linalg.inv(of_light + prior)),
+            _likeness=lambda *_: 1.0,
+        )
+        photo = SimpleNamespace(pyramid=[])
+        found[refine] = Search._refined(search, None, solved, photo).found  # type: ignore[arg-type]
+    joined = np.array([*motion_between(pose, found["auto"].viewmat), np.log(found["auto"].zoom)])
+    np.testing.assert_allclose(joined, expected, atol=1e-9)
+    np.testing.assert_allclose(found["auto"].covariance, np.linalg.inv(of_all), atol=1e-9)
+    np.testing.assert_allclose(found["none"].covariance, np.linalg.inv(of_features + prior), atol=1e-9)
+    np.testing.assert_allclose(found["photometric"].covariance, np.linalg.inv(of_light + prior), atol=1e-9)
