@@ -28,6 +28,7 @@ from g2ard.io.sanitize import Raw, logits_of
 from g2ard.io.stream import RawStream
 from g2ard.progress import plural
 from g2ard.scene.splats import SH_C0, Splats
+from g2ard.scene.transform import as_stored
 
 _CHUNK_ROWS = 256
 _SCALE_LIMIT = 20.0
@@ -66,6 +67,7 @@ class Stream(RawStream):
         model: RenderModel = "antialiased" if mode == "antialiased" else "classic"
         super().__init__(path, len(vertex), len(rest) // 3, offset, render_model=model)
         self.up = plyfiles.up_of(header.comments)
+        self.restore(plyfiles.axes_of(path, header))
         self._vertex, self._sh, self._rest = vertex, sh[0] if sh else None, len(rest) // 3
         self._chunk, self._colored = np.array(chunk), "min_r" in chunk_properties
 
@@ -117,15 +119,16 @@ def _coefficient(codes: NDArray[Any]) -> NDArray[np.float64]:
 def write(path: Path, splats: Splats, *, overwrite: bool = False) -> float:
     """Write a .compressed.ply: 16 bytes per Gaussian, plus one per harmonic past band 0.
 
-    Gaussians are written in `packing_order`, which keeps the bounds of chunks tight. An `offset`, the render
-    model and the up direction are stored in comments, as in .ply. Return the largest change of a position by
-    rounding.
+    Gaussians are written in `packing_order`, which keeps the bounds of chunks tight. An `offset`, axes, the
+    render model and the up direction are stored in comments, as in .ply. Return the largest change of a
+    position by rounding.
     """
     from plyfile import PlyData, PlyElement
 
     given = writable(path, splats)
     given = given.take(packing_order(given.means, _CHUNK_ROWS))
-    splats = given.narrowed()
+    error = rounding(given, given.narrowed())
+    splats = as_stored(given)
     bounds: dict[str, NDArray[np.float32]] = {}
     words = np.empty(len(splats), [(name, "<u4") for name in _PACKED])
     words["packed_position"] = _packed(_within(bounds, "", "xyz", splats.means), _VECTOR_BITS)
@@ -142,11 +145,11 @@ def write(path: Path, splats: Splats, *, overwrite: bool = False) -> float:
     elements = [PlyElement.describe(chunk, "chunk"), PlyElement.describe(words, "vertex")]
     if splats.sh_degree:
         elements.append(PlyElement.describe(_harmonics(splats), "sh"))
-    comments = plyfiles.comments_of(splats.offset, splats.render_model, splats.up)
+    comments = plyfiles.comments_of(splats.offset, splats.render_model, splats.up, splats.axes)
     with atomic_output(path, overwrite) as temporary, temporary.open("wb") as file:
         PlyData(elements, byte_order="<", comments=comments).write(file)
     of, shares = np.arange(len(splats)) // _CHUNK_ROWS, _unpacked(words["packed_position"], _VECTOR_BITS)
-    return rounding(given, _between(chunk, of, "{}_{}", "xyz", shares) + splats.offset)
+    return error + rounding(splats, _between(chunk, of, "{}_{}", "xyz", shares) + splats.offset)
 
 
 def _within(

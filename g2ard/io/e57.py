@@ -97,6 +97,7 @@ class _Scan(PointStream):
         limits = _limits(header, "intensity") if self._color == _INTENSITY else None
         scales = judge.full_scales(np.dtype(np.float64))
         super().__init__(path, self.count, sample, scales, limits)
+        self.axes = "RFU"
         if self.channels == 3 and (stated := _limits(header, "colorRed")):
             dark, full = self._range
             white = next((scale for scale in scales if scale >= stated[1]), full)

@@ -13,13 +13,14 @@ import struct
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, TypeVar, cast
 from urllib.parse import unquote
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from g2ard.config.choices import AXES, Axes
 from g2ard.errors import InputError, damaged, require
 from g2ard.io import judge, spz
 from g2ard.io.atomic import atomic_output
@@ -30,7 +31,14 @@ from g2ard.io.sanitize import Raw, cleaned
 from g2ard.io.types import Note, Noted
 from g2ard.progress import plural
 from g2ard.scene.splats import SH_C0, Splats
-from g2ard.scene.transform import deformed, harmonic_signs, join, rotation_matrices
+from g2ard.scene.transform import (
+    as_stored,
+    deformed,
+    harmonic_signs,
+    join,
+    restored,
+    rotation_matrices,
+)
 
 EXTENSION = "KHR_gaussian_splatting"
 SPZ_EXTENSION = f"{EXTENSION}_compression_spz_2"
@@ -52,14 +60,15 @@ def write(path: Path, splats: Splats, *, overwrite: bool = False, compress: str 
     """Write a .glb with KHR_gaussian_splatting; equal scenes give equal bytes.
 
     SCALE and OPACITY are linear, ROTATION is x y z w. COLOR_0 is for viewers that only draw points: the base
-    colour clipped to [0, 1] and decoded from sRGB, and α. `offset` is the node's translation.
-    `compress="spz"` writes an SPZ of version 3 instead of attributes, for CesiumJS.
+    colour clipped to [0, 1] and decoded from sRGB, and α. `offset` is the node's translation, and its extras
+    name axes other than those of a .ply, to which reading turns. `compress="spz"` writes an SPZ of version 3
+    instead of attributes, for CesiumJS.
 
     Return the largest change of a position by rounding.
     """
     require("compress", repr(compress), compress in (None, "spz"), "spz")
-    given, splats = splats, writable(path, splats).narrowed()
-    error = rounding(given, splats)
+    error = rounding(splats, writable(path, splats).narrowed())
+    splats = as_stored(splats)
     if compress is None:
         content = _plain(path, splats)
     else:
@@ -96,6 +105,7 @@ def _plain(path: Path, splats: Splats) -> list[bytes]:
     node: dict[str, Any] = {"mesh": 0}
     if splats.offset.any():
         node["translation"] = (splats.offset * _GLTF_TURN).tolist()
+    node |= _extras(splats)
     document = _document(node, list(attributes), views, accessors, start)
     return _glb(path, document, blobs)
 
@@ -125,7 +135,7 @@ def spz_glb(
     # CesiumJS needs a `matrix`, and takes the SPZ from the first buffer view.
     matrix = np.eye(4)
     matrix[3, :3] = (splats.offset + centre) * _GLTF_TURN
-    node = {"mesh": 0, "matrix": matrix.ravel().tolist()}
+    node = {"mesh": 0, "matrix": matrix.ravel().tolist(), **_extras(splats)}
     view = {"buffer": 0, "byteOffset": 0, "byteLength": len(blob)}
     blob += b"\0" * (-len(blob) % 4)
     document = _document(node, list(names), [view], accessors, len(blob))
@@ -133,6 +143,11 @@ def spz_glb(
     splatting["extensions"] = {SPZ_EXTENSION: {"bufferView": 0}}
     document["extensionsUsed"] = document["extensionsRequired"] = [EXTENSION, SPZ_EXTENSION]
     return _glb(path, document, [blob]), spz.rounding(means, bits)
+
+
+def _extras(splats: Splats) -> dict[str, Any]:
+    """Return what a node states of a scene that is turned: the axes of its coordinates."""
+    return {} if splats.axes == "RDF" else {"extras": {"g2ard": {"axes": splats.axes}}}
 
 
 def _about_y(splats: Splats) -> Splats:
@@ -232,6 +247,7 @@ class _Mesh(msgspec.Struct):
 
 class _Node(msgspec.Struct):
     mesh: Any = None
+    extras: Any = None
     children: list[Whole] = []
     matrix: Annotated[list[Number], msgspec.Meta(min_length=16, max_length=16)] | None = None
     translation: Vector = (0.0, 0.0, 0.0)
@@ -323,7 +339,18 @@ def _scene(path: Path, document: _Document, binary: bytes) -> Noted:
     if found is None:
         raise InputError(f"has no primitive with {EXTENSION}", path=path)
     text = f"{plural(others, 'other primitive')} ignored"
+    found = restored(found[0], _axes(document.nodes)), found[1]
     return (found[0], (Note("ignored_meshes", others, text), *found[1])) if others else found
+
+
+def _axes(nodes: list[_Node]) -> Axes:
+    """Return the axes that g2ard stated in a node, or those of a .ply."""
+    for node in nodes:
+        own = node.extras.get("g2ard") if isinstance(node.extras, dict) else None
+        name = own.get("axes") if isinstance(own, dict) else None
+        if name in AXES:
+            return cast("Axes", name)
+    return "RDF"
 
 
 def _has_splats(primitive: _Primitive) -> bool:

@@ -55,7 +55,7 @@ class Stream(PointStream):
 
         self._color, sample = telling(choices, sampled)
         super().__init__(path, count, sample, judge.full_scales(np.dtype(np.uint16)), notes=notes)
-        self.system = system
+        self.system, self.axes = system, "RFU"
         if choices[0] != _RGB:
             number = header.point_format.id
             self.lack = (

@@ -10,9 +10,13 @@ from numpy.typing import NDArray
 from g2ard.errors import InputError
 from g2ard.io.sanitize import LOG_SCALE_LIMIT
 from g2ard.scene.splats import Splats
+from g2ard.scene.transform import as_stored
 
 _MORTON_BITS = 21
 _NEAR = 4.0  # distance of near rows from the median, as a multiple of the 75th percentile of all distances
+
+FAR_FROM_ORIGIN = 32_752.0
+"""Distance of a scene's middle from the origin beyond which half floats may overflow: half their largest."""
 
 _OTHER_COMPONENTS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
 """Indices of the components of a quaternion other than one."""
@@ -26,6 +30,12 @@ def writable(path: Path, splats: Splats) -> Splats:
     if len(bad):
         raise InputError(f"not written: Gaussian {bad[0]} is not finite", path=path)
     return splats
+
+
+def own_place(stored: Splats) -> dict[str, Any]:
+    """Return what a file states under "g2ard" of a scene `as_stored`: unusual offset and axes."""
+    own: dict[str, Any] = {"offset": stored.offset.tolist()} if stored.offset.any() else {}
+    return own if stored.axes == "RDF" else {**own, "axes": stored.axes}
 
 
 def rounding(splats: Splats, stored: Splats | NDArray[np.float64]) -> float:
@@ -42,20 +52,14 @@ def rounding(splats: Splats, stored: Splats | NDArray[np.float64]) -> float:
     return float(np.nanmax(np.abs(world - splats.means)))
 
 
-def world_means(path: Path, splats: Splats, what: str) -> NDArray[np.float64]:
-    """Return (N, 3) means + offset for a float32 format `what` without an offset."""
-    means = splats.means.astype(np.float64) + splats.offset
-    if splats.narrowed().offset.any():
-        step = float(np.spacing(np.abs(means).max().astype(np.float32)))
-        thin = float(np.median(splats.scales.min(axis=1)))
-        if step > thin:
-            raise InputError(
-                f"{what} has no offset, and float32 is too coarse at these coordinates (steps of {step:g})",
-                path=path,
-                hint="write .ply, .compressed.ply, .sog or .glb, or drop the offset with "
-                "`g2ard convert --recentre`",
-            )
-    return means
+def as_packed(path: Path, splats: Splats) -> Splats:
+    """Return a scene `as_stored` for a format of a few bits per coordinate: about its middle if that is far.
+
+    Viewers keep such positions in half floats, which end at 65,504.
+    """
+    form = as_stored(writable(path, splats))
+    middle = np.rint(np.median(form.means.astype(np.float64), axis=0))
+    return form.recentred(form.offset + middle) if np.abs(middle).max() > FAR_FROM_ORIGIN else form
 
 
 def packing_order(means: NDArray[Any], chunk: int = 1) -> NDArray[np.intp]:

@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Iterable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from g2ard.io.stream import RawStream, SceneStream
 from g2ard.io.types import Note
 from g2ard.progress import plural
 from g2ard.scene.splats import SH_C0, Splats, far_middle, unit_quats
+from g2ard.scene.transform import as_stored
 
 _MEANS = ["x", "y", "z"]
 _DC = ["f_dc_0", "f_dc_1", "f_dc_2"]
@@ -74,6 +76,7 @@ class Stream(RawStream):
         model: RenderModel = "antialiased" if mode == "antialiased" and not flat else "classic"
         super().__init__(path, len(rows), kept, offset, tuple(notes), model)
         self.up = plyfiles.up_of(header.comments)
+        self.restore(plyfiles.axes_of(path, header))
         self._shift, self._flat = shift, flat
         self._rest, self._stored, self._kept = rest, stored, kept
         self._read, self._white = self._judged()
@@ -83,7 +86,7 @@ class Stream(RawStream):
         for _, block in plyfiles.row_blocks(self.path, self._rows, rows):
             with np.errstate(over="ignore", invalid="ignore"):
                 means = self._means(block)
-            yield means
+            yield self.in_axes(means)
 
     def raw(self, rows: int, start: int) -> Iterator[Raw]:
         for _, block in plyfiles.row_blocks(self.path, self._rows, rows, start):
@@ -205,7 +208,8 @@ def write(
 ) -> float:
     """Write a binary little-endian 3DGS .ply: x y z, f_dc, f_rest, opacity, scale, rot.
 
-    A non-zero `offset` and an antialiased render model are stored in comments, which `Stream` restores.
+    A non-zero `offset`, other axes than y down and an antialiased render model are stored in comments, which
+    `Stream` restores.
     `normals` adds zero nx ny nz after x y z. The layout "inria" is that of INRIA's trainer, for programs that
     go by position: normals, and SH degree 3 padded with zeros, 248 bytes per Gaussian. A stream is written
     block by block.
@@ -217,21 +221,32 @@ def write(
     normals, degree = normals or layout == "inria", 3 if layout == "inria" else scene.sh_degree
     error = 0.0
     if isinstance(scene, Splats):
-        given, scene = scene, scene.narrowed()
-        count, parts, error = len(scene), iter([scene]), rounding(given, scene)
+        error, frame = rounding(scene, scene.narrowed()), as_stored(scene)
+        count, parts = len(frame), iter([frame])
     else:
-        count, parts = scene.count, scene.blocks(BLOCK)
+        frame = as_stored(_nothing_of(scene))
+        count, parts = scene.count, map(as_stored, scene.blocks(BLOCK))
     if not count:
         raise InputError("not written: the scene has no Gaussians", path=path)
     names = [*_MEANS, *(_NORMALS if normals else []), *_DC]
     names += [f"f_rest_{k}" for k in range(3 * ((degree + 1) ** 2 - 1))]
     names += ["opacity", *_SCALES, *_QUATS]
     blocks = _blocks(path, (part.with_sh_degree(degree) for part in parts), names, normals)
-    comments = plyfiles.comments_of(scene.offset, scene.render_model, scene.up)
+    comments = plyfiles.comments_of(frame.offset, frame.render_model, frame.up, frame.axes)
     if layout == "inria":
         comments = comments[1:]  # those that carry values: importers by position may count lines
     plyfiles.write_rows(path, dict.fromkeys(names, "<f4"), count, blocks, overwrite, comments)
     return error
+
+
+def _nothing_of(scene: SceneStream) -> Splats:
+    """Return a scene without rows that stands as the stream does."""
+    nothing = np.zeros((0, 3))
+    return replace(
+        Splats.create(nothing, scales=nothing, offset=scene.offset, render_model=scene.render_model),
+        up=scene.up,
+        axes=scene.axes,
+    )
 
 
 def _blocks(

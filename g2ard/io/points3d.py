@@ -30,6 +30,7 @@ class Stream(PointStream):
         whole = (self._colors == np.rint(self._colors)).all()
         sample = self._positions, self._colors, np.zeros(len(rgb), bool)
         super().__init__(path, len(rgb), sample, (255.0,) if whole else (1.0, 255.0))
+        self.axes = self.axes or "RDF"
 
     def raw(self, rows: int, start: int) -> Iterator[MarkedPoints]:
         for first in range(start, self.count, rows):

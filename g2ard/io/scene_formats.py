@@ -97,10 +97,27 @@ def lost_in(path: str | Path, splats: Splats, **options: object) -> list[Note]:
         suffix = output_format.suffix
         text = f"{suffix} cannot say that the scene is antialiased; other programs draw it too opaque"
         notes.append(Note("lost_render_model", 1, text))
+    if output_format.module == "splat" and (place := _unstated(path, splats)):
+        notes.append(Note("lost_place", 1, place))
     if is_spz and len(splats) > LARGEST_SPZ:
         text = f"readers of SPZ from before May 2026 refuse more than {LARGEST_SPZ:,} Gaussians"
         notes.append(Note("large_spz", len(splats), text))
     return notes
+
+
+def _unstated(path: str | Path, splats: Splats) -> str | None:
+    """Return how to get back coordinates that a .splat cannot state."""
+    from g2ard.io.splat import form_of
+
+    form = form_of(Path(path), splats)
+    if form.axes == "RDF" and not form.offset.any():
+        return None
+    move = f" --translate={','.join(f'{v:.12g}' for v in form.offset)}" if form.offset.any() else ""
+    turn = "" if form.axes == "RDF" else f" --to-axes {form.axes}"
+    return (
+        "cannot state map coordinates: positions are relative to the scene's middle, y down; "
+        f"`g2ard convert {Path(path).name} OUT.ply{move}{turn}` puts them back"
+    )
 
 
 def check_positions(path: str | Path, splats: Splats, count: int | None = None) -> None:
@@ -109,10 +126,12 @@ def check_positions(path: str | Path, splats: Splats, count: int | None = None) 
     Gaussians of surfaces widen with the root of the ratio when the scene is reduced to `count`.
     """
     if scene_format(path).module == "spz" and len(splats):
+        from g2ard.io.packing import as_packed
         from g2ard.io.spz import check_far
 
-        means = splats.means.astype(float) + splats.offset
-        check_far(Path(path), splats, means, (len(splats) / (count or len(splats))) ** 0.5)
+        packed = as_packed(Path(path), splats)
+        widened = (len(splats) / (count or len(splats))) ** 0.5
+        check_far(Path(path), packed, packed.means.astype(float), widened)
 
 
 @dataclass

@@ -46,6 +46,16 @@ def read_splats(path: str | Path, *, render_model: RenderModel | None = None) ->
     return Source(path, render_model).whole()
 
 
+def read_back(path: str | Path, splats: Splats) -> Splats:
+    """Read what was written of a scene, where the scene is even if the format cannot say so."""
+    read = read_splats(path)
+    if scene_format(path).module != "splat":
+        return read
+    from g2ard.io import splat
+
+    return splat.read_back(Path(path), splats, read)
+
+
 def check_scene_output(path: str | Path, overwrite: bool = False) -> Path:
     """Raise the `OutputError` that `write_splats` would raise, before any work."""
     if scene_format(path).function == "write_folder":

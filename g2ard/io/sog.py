@@ -21,7 +21,7 @@ from msgspec import UNSET, UnsetType
 from numpy.typing import NDArray
 from PIL.Image import Image
 
-from g2ard.config.choices import RenderModel
+from g2ard.config.choices import Axes, RenderModel
 from g2ard.errors import InputError, damaged
 from g2ard.io.jsonfile import FileName, Place, Vector, Whole, checked, parse_json, read_json
 from g2ard.io.packing import from_smallest_three
@@ -66,8 +66,9 @@ class _Rest(_Part):
     bands: Annotated[int, msgspec.Meta(ge=0, le=3)] | UnsetType = UNSET
 
 
-class _Own(msgspec.Struct):
+class _Own(msgspec.Struct, frozen=True):
     offset: Vector = (0.0, 0.0, 0.0)
+    axes: Axes = "RDF"
 
 
 class _Meta(msgspec.Struct):
@@ -368,10 +369,10 @@ def _chunk_at(file: Path) -> Path:
     return file if file.suffix.lower() == ".sog" else file.parent
 
 
-def _offset(chunks: list[_Chunk]) -> NDArray[np.float64]:
-    """Return the offset that g2ard stored under "g2ard"; zeros if it is missing or chunks differ."""
-    found = {chunk.meta.g2ard.offset for chunk in chunks}
-    return np.array(found.pop() if len(found) == 1 else (0, 0, 0), np.float64)
+def _own(chunks: list[_Chunk]) -> _Own:
+    """Return what g2ard stored under "g2ard"; the defaults if it is missing or chunks differ."""
+    found = {chunk.meta.g2ard for chunk in chunks}
+    return found.pop() if len(found) == 1 else _Own()
 
 
 def _left_out(path: Path, read_count: int) -> list[Note]:
@@ -395,12 +396,11 @@ class Stream(RawStream):
         with _opened(path) as chunks:
             self._counts = [chunk.count() for chunk in chunks]
             self._rest = max((chunk.rest() for chunk in chunks), default=0)
-            offset, model = (
-                _offset(chunks),
-                one_model([chunk.meta.render_model for chunk in chunks] or ["classic"]),
-            )
+            own = _own(chunks)
+            model = one_model([chunk.meta.render_model for chunk in chunks] or ["classic"])
         notes = tuple(_left_out(path, len(chunks)))
-        super().__init__(path, sum(self._counts), self._rest, offset, notes, model)
+        super().__init__(path, sum(self._counts), self._rest, np.array(own.offset, np.float64), notes, model)
+        self.restore(own.axes)
 
     def identity(self) -> list[Any]:
         if self.path.suffix.lower() == ".sog":
@@ -411,7 +411,7 @@ class Stream(RawStream):
     def positions(self, rows: int) -> Iterator[NDArray[np.float32]]:
         with _opened(self.path) as chunks:
             for chunk, count in zip(chunks, self._counts, strict=True):
-                yield chunk.means(count)
+                yield self.in_axes(chunk.means(count))
 
     def raw(self, rows: int, start: int) -> Iterator[Raw]:
         with _opened(self.path) as chunks:

@@ -23,10 +23,20 @@ from g2ard import _core
 from g2ard._core import __version__
 from g2ard.errors import InputError
 from g2ard.io.atomic import atomic_folder, atomic_output
-from g2ard.io.packing import coded, log_scales, packing_order, rounding, smallest_three, unit_quats, writable
+from g2ard.io.packing import (
+    coded,
+    log_scales,
+    own_place,
+    packing_order,
+    rounding,
+    smallest_three,
+    unit_quats,
+    writable,
+)
 from g2ard.progress import Progress, silent
 from g2ard.scene.shape import longer_axes
 from g2ard.scene.splats import Splats
+from g2ard.scene.transform import as_stored
 
 _PALETTE_COLUMNS = 64  # entries of the palette per row of its image
 _LONGEST_WEBP_SIDE = 16_383  # longest side of a WebP image, pixels
@@ -64,10 +74,11 @@ def write_folder(
 
 def largest_rounding(splats: Splats) -> float:
     """Return the largest change of a position by rounding."""
-    near = splats.narrowed()
+    near = as_stored(splats)
     low, high, codes = _means(near)
     logs = low + codes / 65535 * (high - low)
-    return rounding(splats, np.sign(logs) * np.expm1(np.abs(logs)) + near.offset)
+    packed = rounding(near, np.sign(logs) * np.expm1(np.abs(logs)) + near.offset)
+    return rounding(splats, splats.narrowed()) + packed
 
 
 def palette_size(count: int) -> int:
@@ -84,9 +95,10 @@ def sog_files(
 ) -> dict[str, bytes]:
     """Return the files of a scene by name, meta.json last; rows in `packing_order` unless already `ordered`.
 
-    An `offset` is stored under "g2ard" in meta.json; other programs show the recentred scene.
+    An `offset`, and other axes than y down, are stored under "g2ard" in meta.json; other programs show the
+    recentred scene, upright.
     """
-    splats = writable(path, splats).narrowed()
+    splats = as_stored(writable(path, splats))
     if not ordered:
         splats = splats.take(packing_order(splats.means))
     width, height = _size(path, len(splats))
@@ -122,8 +134,8 @@ def sog_files(
         files["shN_centroids.webp"] = _webp(centroids)
         names = ["shN_centroids.webp", image("shN_labels", np.column_stack([entry & 255, entry >> 8]))]
         meta["shN"] = {"count": count, "bands": splats.sh_degree, "codebook": book.tolist(), "files": names}
-    if splats.offset.any():
-        meta["g2ard"] = {"offset": splats.offset.tolist()}
+    if own := own_place(splats):
+        meta["g2ard"] = own
     files["meta.json"] = json.dumps(meta, separators=(",", ":")).encode()
     return files
 

@@ -1,17 +1,19 @@
 """Reader and writer for antimatter15's .splat: 32 bytes per Gaussian, no header, SH degree 0."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from g2ard.errors import InputError, damaged
 from g2ard.io.atomic import atomic_output
-from g2ard.io.packing import as_bytes, world_means, writable
+from g2ard.io.packing import FAR_FROM_ORIGIN, as_bytes, as_packed
 from g2ard.io.plyfiles import spread_rows
 from g2ard.io.sanitize import Raw
 from g2ard.io.stream import RawStream
 from g2ard.scene.splats import SH_C0, Splats, unit_quats
+from g2ard.scene.transform import restored
 
 _ROW = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
 
@@ -52,21 +54,41 @@ class Stream(RawStream):
             yield raw
 
 
+def form_of(path: Path, splats: Splats) -> Splats:
+    """Return a scene as a .splat holds it: y down, and relative to an offset if it is far from the origin."""
+    form = as_packed(path, splats)
+    world = form.means.astype(np.float64) + form.offset
+    step = np.spacing(np.abs(world).max().astype(np.float32))
+    far = np.abs(np.median(world, axis=0)).max() > FAR_FROM_ORIGIN
+    if far or step > np.median(form.scales.min(axis=1)):
+        return form
+    return replace(form, means=world.astype(np.float32), offset=np.zeros(3))
+
+
+def read_back(path: Path, splats: Splats, read: Splats) -> Splats:
+    """Return what was `read` of a file of the scene where the scene is, which the file cannot state."""
+    form = form_of(path, splats)
+    return restored(replace(read, offset=form.offset), form.axes)
+
+
 def write(path: Path, splats: Splats, *, overwrite: bool = False) -> float:
     """Write a .splat, largest and most opaque first as its viewers expect; bands past 0 are dropped.
 
-    Return the largest change of a position by rounding.
+    It cannot state an `offset` or axes: see `form_of`. Return the largest change of a position by rounding.
     """
-    splats = writable(path, splats)
+    form = form_of(path, splats)
+    exact = splats.means.astype(np.float64) + splats.offset
+    again = restored(form, form.axes)
+    error = float(np.abs(again.means.astype(np.float64) + again.offset - exact).max())
+    splats = form
     weight = splats.scales.astype(np.float64).prod(1) * splats.opacities
     splats = splats.take(np.argsort(-weight, kind="stable"))
     rows = np.empty(len(splats), _ROW)
-    means = world_means(path, splats, ".splat")
-    rows["mean"] = means
+    rows["mean"] = splats.means
     rows["scale"] = splats.scales
     rows["rgba"][:, :3] = as_bytes(splats.colors * 255)
     rows["rgba"][:, 3] = as_bytes(splats.opacities * 255)
     rows["quat"] = as_bytes(unit_quats(splats.quats) * 128 + 128)
     with atomic_output(path, overwrite) as temporary:
         temporary.write_bytes(rows.tobytes())
-    return float(np.abs(rows["mean"] - means).max())
+    return error

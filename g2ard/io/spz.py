@@ -5,6 +5,7 @@ quaternion's y and z and every harmonic odd in them. Version 4 may name other ax
 of type, length and content between header and table of streams.
 """
 
+import json
 import math
 import struct
 import sys
@@ -13,6 +14,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,12 +22,14 @@ from g2ard.config.choices import Axes
 from g2ard.errors import InputError, damaged, missing, require
 from g2ard.io import packing
 from g2ard.io.atomic import atomic_output
+from g2ard.io.jsonfile import Place as JsonPlace
+from g2ard.io.jsonfile import Vector, checked, parse_json
 from g2ard.io.paths import check_unpacked
 from g2ard.io.sanitize import Raw, cleaned, logits_of
 from g2ard.io.types import Note, Noted
 from g2ard.progress import Progress, plural, silent
 from g2ard.scene.splats import Splats
-from g2ard.scene.transform import change_of_axes, harmonic_signs, with_axes
+from g2ard.scene.transform import change_of_axes, harmonic_signs, restored, with_axes
 
 _MAGIC = b"NGSP"
 _HEADER = 16  # size of the header, bytes
@@ -34,6 +38,10 @@ _POSITION_BITS = 24
 _COEFFICIENTS = (0, 3, 8, 15, 24)
 _ANTIALIASED, _HAS_EXTENSIONS = 0x1, 0x2
 _COORDINATE_SYSTEM = 0xADBE0003
+_OWN_PLACE = 0x67320001
+"""Record of version 4 with `own_place` as JSON, which older versions have in their gzip header's comment."""
+
+_COMMENTED = 0x10  # flag of a gzip header with a comment
 _HEADER_4 = 32  # size of the header of version 4, bytes
 
 _ADOBE_AXES: tuple[Axes, ...] = (
@@ -58,8 +66,10 @@ def read(path: Path) -> Noted:
 
 
 def names_axes(path: Path) -> bool:
-    """Return whether a file of version 4 names its axes."""
+    """Return whether a file names its axes, as one of version 4 can, or a file of g2ard's of a map."""
     data = path.read_bytes()
+    if b'"stored"' in _comment(data):
+        return True
     if len(data) < _HEADER_4 or data[:4] != _MAGIC or data[4] != 4 or not data[14] & _HAS_EXTENSIONS:
         return False
     return _extensions(path, data)[0] != "RUB"
@@ -67,6 +77,7 @@ def names_axes(path: Path) -> bool:
 
 def decoded(path: Path, data: bytes) -> Noted:
     """Read the bytes of an .spz like `read`; `path` names their file in messages."""
+    own = _comment(data)
     if data[:2] == b"\x1f\x8b":
         data = _gunzip(path, data)
     sizes = _sizes(path, data)
@@ -89,19 +100,47 @@ def decoded(path: Path, data: bytes) -> Noted:
         notes.append(Note("ignored_bands", 1, "spherical harmonics past degree 3 ignored"))
     axes: Axes = "RUB"
     if flags & _HAS_EXTENSIONS:
-        axes, ignored = _extensions(path, data) if version == 4 else (axes, 1)
+        axes, own, ignored = _extensions(path, data) if version == 4 else (axes, own, 1)
         if ignored:
             notes.append(Note("ignored_extensions", ignored, "SPZ extensions ignored"))
     scene, told = cleaned(path, raw, notes, "antialiased" if flags & _ANTIALIASED else "classic")
-    if axes == "RUB":
-        return scene, told
-    matrix = change_of_axes(axes, "RDF") @ change_of_axes("RDF", "RUB")  # so far taken for RUB
-    return with_axes(scene, matrix), told
+    if axes != "RUB":
+        matrix = change_of_axes(axes, "RDF") @ change_of_axes("RDF", "RUB")  # so far taken for RUB
+        scene = with_axes(scene, matrix)
+    return _in_place(path, scene, own), told
 
 
-def _extensions(path: Path, data: bytes) -> tuple[Axes, int]:
-    """Return the axes that the records of version 4 name, and the number of other records."""
-    axes, others, at = _ADOBE_AXES[3], 0, _HEADER_4
+class _Own(msgspec.Struct):
+    """What g2ard states: offset and axes of the scene, and those of the file if not of the definition."""
+
+    offset: Vector = (0.0, 0.0, 0.0)
+    axes: Axes = "RDF"
+    stored: Axes = "RUB"
+
+
+class _Comment(msgspec.Struct):
+    g2ard: _Own
+
+
+def _in_place(path: Path, scene: Splats, own: bytes) -> Splats:
+    """Return a scene with the offset and axes that g2ard stated in a comment or record, if it is one."""
+    if b'"g2ard"' not in own:
+        return scene
+    place = checked(parse_json(path, own.decode("latin-1")), _Comment, JsonPlace(path)).g2ard
+    if place.stored != "RUB":
+        scene = with_axes(scene, change_of_axes(place.stored, "RUB"))
+    return restored(replace(scene, offset=np.array(place.offset, np.float64)), place.axes)
+
+
+def _comment(data: bytes) -> bytes:
+    """Return the comment of a gzip header whose only optional part it is."""
+    commented = data[:3] == b"\x1f\x8b\x08" and data[3:4] == bytes([_COMMENTED])
+    return data[10 : data.find(b"\0", 10)] if commented else b""
+
+
+def _extensions(path: Path, data: bytes) -> tuple[Axes, bytes, int]:
+    """Return the axes that the records of version 4 name, g2ard's own record, and the number of others."""
+    axes, own, others, at = _ADOBE_AXES[3], b"", 0, _HEADER_4
     (end,) = struct.unpack_from("<I", data, 16)
     while at + 8 <= min(end, len(data)):
         kind, size = struct.unpack_from("<II", data, at)
@@ -112,10 +151,12 @@ def _extensions(path: Path, data: bytes) -> tuple[Axes, int]:
             if number > len(_ADOBE_AXES):
                 raise InputError(f"unknown coordinate system {number}; expected 0 to 16", path=path)
             axes = _ADOBE_AXES[number - 1] if number else axes
+        elif kind == _OWN_PLACE:
+            own = data[at + 8 : at + 8 + size]
         else:
             others += 1
         at += 8 + size
-    return axes, others
+    return axes, own, others
 
 
 def _gunzip(path: Path, data: bytes) -> bytes:
@@ -246,17 +287,23 @@ def write(
             path=path,
             hint="{spz_version=4} can name others",
         )
-    splats = packing.writable(path, splats)
-    bits = fraction_bits(path, packing.world_means(path, splats, ".spz"), splats)
+    error = packing.rounding(splats, splats.narrowed()) if len(splats) else 0.0
+    splats = packing.as_packed(path, splats)
+    own = packing.own_place(splats)
+    bits = fraction_bits(path, splats.means.astype(np.float64), splats)
+    splats = replace(splats, offset=np.zeros(3))
     if axes != "RUB":
         splats = with_axes(splats, change_of_axes("RUB", "RDF") @ change_of_axes("RDF", axes))
     splats = splats.take(packing.packing_order(splats.means))
-    means = packing.world_means(path, splats, ".spz")
+    means = splats.means.astype(np.float64)
     named: Axes = axes if spz_version == 4 else "RUB"
-    content = encoded(path, splats, means, bits, spz_version, named, progress)
+    if own and axes != named:
+        own["stored"] = axes
+    comment = json.dumps({"g2ard": own}, separators=(",", ":")).encode() if own else b""
+    content = encoded(path, splats, means, bits, spz_version, named, progress, comment)
     with atomic_output(path, overwrite) as temporary:
         temporary.write_bytes(content)
-    return rounding(means, bits)
+    return error + rounding(means, bits)
 
 
 def rounding(means: NDArray[Any], bits: int) -> float:
@@ -273,16 +320,24 @@ def encoded(
     spz_version: int,
     axes: Axes = "RUB",
     progress: Progress = silent,
+    comment: bytes = b"",
 ) -> bytes:
-    """Return the bytes of an .spz with these means, in `bits` fractional bits and the order of the rows."""
+    """Return the bytes of an .spz with these means, in `bits` fractional bits and the order of the rows.
+
+    The `comment`, text, is in the gzip header, or in version 4 a record that other readers skip.
+    """
     streams = _streams(splats, means, bits, spz_version)
     flags, records = _ANTIALIASED if splats.antialiased else 0, b""
     if axes != "RUB":
         flags |= _HAS_EXTENSIONS
         records = struct.pack("<III", _COORDINATE_SYSTEM, 4, _ADOBE_AXES.index(axes) + 1)
+    if comment and spz_version == 4:
+        comment += b" " * (-len(comment) % 4)
+        flags |= _HAS_EXTENSIONS
+        records += struct.pack("<II", _OWN_PLACE, len(comment)) + comment
     head = _MAGIC + struct.pack("<IIBBB", spz_version, len(splats), splats.sh_degree, bits, flags)
     if spz_version < 4:
-        return _gzipped(head + b"\0" + b"".join(streams), progress)
+        return _gzipped(head + b"\0" + b"".join(streams), progress, comment)
     zstd = _zstandard(path)
     packed = []
     for number, stream in enumerate(streams):
@@ -295,14 +350,17 @@ def encoded(
     return head + start + records + table + b"".join(packed)
 
 
-def _gzipped(content: bytes, progress: Progress) -> bytes:
-    """Return what `gzip.compress(content, 9, mtime=0)` does."""
+def _gzipped(content: bytes, progress: Progress, comment: bytes) -> bytes:
+    """Return what `gzip.compress(content, 9, mtime=0)` does, with a comment in the header."""
     packer, parts = zlib.compressobj(9, wbits=31), []
     for start in range(0, len(content), _GZIP_BLOCK):
         progress("pack", start, len(content))
         parts.append(packer.compress(content[start : start + _GZIP_BLOCK]))
     progress("pack", len(content), len(content))
-    return b"".join([*parts, packer.flush()])
+    packed = b"".join([*parts, packer.flush()])
+    if not comment:
+        return packed
+    return packed[:3] + bytes([_COMMENTED]) + packed[4:10] + comment + b"\0" + packed[10:]
 
 
 def check_far(
@@ -341,7 +399,7 @@ def fraction_bits(path: Path, means: NDArray[np.float64], splats: Splats, *, mov
         raise InputError(
             f".spz is too coarse at {farthest:g} from the origin {steps}",
             path=path,
-            hint="write another format, or drop the offset with `g2ard convert --recentre`",
+            hint="write another format",
         )
     near = np.delete(splats.means, far, axis=0).astype(np.float64) + splats.offset
     ends = [*np.floor(near.min(axis=0)), *np.ceil(near.max(axis=0))]

@@ -11,14 +11,14 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from g2ard.config.choices import RenderModel
+from g2ard.config.choices import Axes, RenderModel
 from g2ard.io import judge
 from g2ard.io.paths import file_identity
 from g2ard.io.sanitize import BLOCK, Raw, Tally
 from g2ard.io.types import Cloud, Note, Points
 from g2ard.progress import plural
 from g2ard.scene.splats import ARRAYS, Splats
-from g2ard.scene.transform import one_model
+from g2ard.scene.transform import change_of_axes, common_axes, one_model, restored
 
 _DEGREE_OF_REST = {0: 0, 3: 1, 8: 2, 15: 3}
 _POINTS_AT_ONCE = 1 << 20
@@ -93,6 +93,7 @@ class SceneStream(Stream[Splats]):
         sh_degree: 0–3.
         render_model: see `Splats`; may be changed before reading.
         up: the up direction that the source states.
+        axes: axes of the coordinates, see `Splats`.
     """
 
     def __init__(
@@ -107,6 +108,7 @@ class SceneStream(Stream[Splats]):
         super().__init__(path, count, offset, notes)
         self.render_model, self.sh_degree = render_model, _DEGREE_OF_REST[rest]
         self.up: tuple[float, float, float] | None = None
+        self.axes: Axes = "RDF"
 
     def whole(self) -> Splats:
         """Read all rows into memory; `all_notes` are then those on these rows."""
@@ -116,23 +118,37 @@ class SceneStream(Stream[Splats]):
             rows = raw.take(slice(kept, kept := kept + len(block)))
             rows.fill(getattr(block, name) for name in ARRAYS)
         self.all_notes()  # raises if no row is finite
-        return raw.take(slice(kept)).activated(self.render_model, self.offset, self.up)
+        splats = raw.take(slice(kept)).activated(self.render_model, self.offset, self.up)
+        return replace(splats, axes=self.axes)
 
 
 class RawStream(SceneStream):
-    """Scene of a file's `raw` rows, which `Tally.clean` cleans."""
+    """Scene of a file's `raw` rows, which `Tally.clean` cleans, and which `restore` may turn."""
+
+    def restore(self, axes: Axes) -> None:
+        """Turn what the file holds, y down, to coordinates of these axes."""
+        whole = Raw.empty(0, 0).activated(self.render_model, self.offset, self.up)
+        found = restored(whole, axes)
+        self.axes, self.offset, self.up = axes, found.offset, found.up
+
+    def in_axes(self, means: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return stored means in the scene's axes."""
+        if self.axes == "RDF":
+            return means
+        return np.asarray(means @ change_of_axes("RDF", self.axes).T.astype(np.float32), np.float32)
 
     @abstractmethod
     def raw(self, rows: int, start: int) -> Iterator[Raw]:
         """Yield the source's rows from `start`, at most `rows` at a time; callers may change the arrays."""
 
     def positions(self, rows: int) -> Iterator[NDArray[np.float32]]:
-        return (raw.means for raw in self.raw(rows, 0))
+        return (self.in_axes(raw.means) for raw in self.raw(rows, 0))
 
     def blocks(self, rows: int, start: int = 0) -> Iterator[Splats]:
         for raw in self.raw(rows, start):
             before, keep = self.tally.dropped, self.tally.clean(raw)
-            splats = raw.activated(self.render_model, self.offset)
+            splats = restored(raw.activated(self.render_model, np.zeros(3)), self.axes)
+            splats = replace(splats, offset=self.offset, up=self.up)
             yield splats if self.tally.dropped == before else splats.take(keep)
 
 
@@ -161,7 +177,7 @@ class PartsStream(SceneStream):
     def of(cls, path: Path, splats: Splats, notes: tuple[Note, ...]) -> PartsStream:
         """Return the scene of a file that was read as a whole."""
         stream = cls(path, [len(splats)], lambda _: splats, splats.sh_degree, splats.offset, notes=notes)
-        stream.render_model, stream.up = splats.render_model, splats.up
+        stream.render_model, stream.up, stream.axes = splats.render_model, splats.up, splats.axes
         return stream
 
     def identity(self) -> list[Any]:
@@ -170,14 +186,14 @@ class PartsStream(SceneStream):
     def whole(self) -> Splats:
         if len(self.counts) > 1:
             return super().whole()
-        return replace(self._part(0), render_model=self.render_model)
+        return replace(self._part(0), render_model=self.render_model, axes=self.axes)
 
     def positions(self, rows: int) -> Iterator[NDArray[np.float32]]:
         return (self._part(number).means for number in range(len(self.counts)))
 
     def blocks(self, rows: int, start: int = 0) -> Iterator[Splats]:
         for number, begin in from_row(self.counts, start):
-            part = replace(self._part(number), render_model=self.render_model)
+            part = replace(self._part(number), render_model=self.render_model, axes=self.axes)
             for first in range(begin, len(part), rows):
                 block = part.take(slice(first, first + rows))
                 self.tally.add(block)
@@ -195,6 +211,7 @@ class PointStream(Stream[RawPoints]):
         channels: 3 for colours, 1 for intensities, 0 if there is nothing to colour points by.
         lack: why there are no colours.
         system: the map system that the file states.
+        axes: axes of the coordinates: z is up in maps; None if neither the format nor a map tells.
     """
 
     def __init__(
@@ -221,6 +238,7 @@ class PointStream(Stream[RawPoints]):
         self.channels, self.scales = values.shape[1], scales
         self.lack = "has neither colours nor intensities that vary"
         self.system: str | None = None
+        self.axes: Axes | None = "RFU" if far else None
         self._range = 0.0, 1.0
         if self.channels == 3:
             self._range = 0.0, judge.white(values[good], scales)
@@ -293,7 +311,7 @@ class PointStream(Stream[RawPoints]):
         notes = self.all_notes()
         colors = colors[:kept]
         colored = (colors.max(axis=1, initial=0) >= _BLACK) & (self.channels == 3)
-        return Cloud(Points(positions[:kept], colors), notes, colored)
+        return Cloud(Points(positions[:kept], colors), notes, colored, self.axes)
 
 
 _DEGREES = Note(
@@ -334,6 +352,7 @@ class JoinedScenes(Joined[Splats], SceneStream):
         SceneStream.__init__(self, streams[0].path, count, rest, streams[0].offset, render_model=model)
         ups = {stream.up for stream in streams}
         self.up = ups.pop() if len(ups) == 1 else None
+        self.axes = common_axes([stream.axes for stream in streams])
 
     def positions(self, rows: int) -> Iterator[NDArray[np.float32]]:
         for stream in self.streams:
@@ -364,6 +383,7 @@ class JoinedClouds(Joined[RawPoints], PointStream):
         sample = at, np.zeros((len(at), 0), np.float32), np.zeros(len(at), bool)
         PointStream.__init__(self, streams[0].path, sum(s.count for s in streams), sample)
         self.channels, self.lack = max(stream.channels for stream in streams), streams[0].lack
+        self.axes = streams[0].axes if len({stream.axes for stream in streams}) == 1 else self.axes
         self.notes = tuple(_several_systems(streams))
 
     def header_notes(self) -> tuple[Note, ...]:

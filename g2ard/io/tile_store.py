@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -17,7 +17,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from g2ard.config.choices import RenderModel
+from g2ard.config.choices import Axes, RenderModel
 from g2ard.errors import InputError
 from g2ard.io.detect import MANIFEST
 from g2ard.io.jsonfile import Number, Place, Vector, Whole, checked, read_own
@@ -88,6 +88,7 @@ class _Manifest(msgspec.Struct):
     settings: dict[str, Any]
     render_model: RenderModel = "classic"
     up: Vector | None = None
+    axes: Axes = "RDF"
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,7 +106,7 @@ class TileStore:
         notes: notes from ingestion.
         key: SHA-256 of everything that determines the content: source and settings.
         settings: the settings of ingestion.
-        render_model, up: see `Splats`.
+        render_model, up, axes: see `Splats`.
     """
 
     folder: Path
@@ -120,6 +121,7 @@ class TileStore:
     settings: Mapping[str, Any]
     render_model: RenderModel = "classic"
     up: Vector | None = None
+    axes: Axes = "RDF"
 
     @classmethod
     def open(cls, folder: str | Path) -> TileStore:
@@ -251,7 +253,8 @@ class TileStore:
             part.means[:], part.quats[:], part.log_scales[:] = rows[:, :3], rows[:, 3:7], rows[:, 7:10]
             part.logit_opacities[:], part.sh0[:, 0] = rows[:, 10], rows[:, 11:14]
             part.shN[:] = rows[:, 14 : 14 + 3 * rest].reshape(len(rows), rest, 3)
-        return raw.activated(self.render_model, self.offset.copy(), self.up)
+        splats = raw.activated(self.render_model, self.offset.copy(), self.up)
+        return replace(splats, axes=self.axes)
 
     def __len__(self) -> int:
         return self.count
@@ -282,4 +285,4 @@ class Stream(PartsStream):
         counts = [tile.rows for tile in store.tiles]
         parts = counts, store.read, store.sh_degree, store.offset
         super().__init__(path, *parts, [store.key], store.notes, store.render_model)
-        self.up = store.up
+        self.up, self.axes = store.up, store.axes

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from g2ard.config.choices import Alpha
+from g2ard.config.choices import Alpha, Axes
 from g2ard.errors import InputError
 from g2ard.progress import plural
 from g2ard.scene.cameras import Cameras
@@ -73,11 +73,13 @@ class Cloud:
 
     Args:
         colored: (N,) whether a point has a colour, neither grey from intensities nor black.
+        axes: axes of the coordinates; None if neither the format nor a map tells.
     """
 
     points: Points
     notes: tuple[Note, ...]
     colored: NDArray[np.bool_]
+    axes: Axes | None = None
 
     def __len__(self) -> int:
         return len(self.points)

@@ -13,6 +13,7 @@ from typing import Any, TextIO
 import numpy as np
 from numpy.typing import NDArray
 
+from g2ard.config.choices import AXES
 from g2ard.errors import InputError, OutputError, missing
 from g2ard.io import judge
 from g2ard.io.atomic import atomic_output
@@ -23,6 +24,7 @@ from g2ard.io.spz import FLIPS
 from g2ard.io.types import Note, Noted
 from g2ard.progress import Progress, plural, silent
 from g2ard.scene.splats import SH_C0, Splats
+from g2ard.scene.transform import as_stored, restored
 
 _SCHEMA = "ParticleField3DGaussianSplat"
 _KERNEL = "ParticleFieldKernelGaussianEllipsoidAPI"
@@ -30,6 +32,7 @@ _NAME = "Splats"
 _SH = "radiance:sphericalHarmonics"
 _COLOR = "primvars:displayColor"
 _USD_TURN, _QUAT_TURN = np.array([1.0, -1, -1]), np.array([1.0, 1, -1, -1])
+_AXES = "g2ardAxes"  # name of the axes that the scene is turned to, in the layer's custom data
 _TEXT_ROWS = 8192  # rows formatted together as text
 _EXTENT_SIGMAS = 3.0  # extent of a Gaussian, as a multiple of its largest scale
 
@@ -37,10 +40,12 @@ _EXTENT_SIGMAS = 3.0  # extent of a Gaussian, as a multiple of its largest scale
 def write(path: Path, splats: Splats, *, overwrite: bool = False, progress: Progress = silent) -> float:
     """Write a .usda, or a .usdc if usd-core is installed; equal scenes give equal text.
 
-    `offset` becomes the prim's translation. Units are metres. Return the largest change of a position by
+    `offset` becomes the prim's translation; the layer's custom data name axes other than those of a .ply, to
+    which reading turns. Units are metres. Return the largest change of a position by
     rounding.
     """
-    given, splats = splats, writable(path, splats).narrowed()
+    error = rounding(splats, writable(path, splats).narrowed())
+    splats = as_stored(splats)
     binary = path.suffix.lower() != ".usda"
     pxr = _pxr(path) if binary else None
     with atomic_output(path, overwrite) as temporary:
@@ -53,7 +58,7 @@ def write(path: Path, splats: Splats, *, overwrite: bool = False, progress: Prog
         else:
             with temporary.open("w", encoding="utf-8", newline="\n") as file:
                 _print(file, splats, progress)
-    return rounding(given, splats)
+    return error
 
 
 def _attributes(splats: Splats) -> dict[str, tuple[str, NDArray[np.float32]]]:
@@ -73,8 +78,10 @@ def _attributes(splats: Splats) -> dict[str, tuple[str, NDArray[np.float32]]]:
 
 
 def _print(file: TextIO, splats: Splats, progress: Progress) -> None:
+    own = f'    customLayerData = {{\n        string {_AXES} = "{splats.axes}"\n    }}\n'
+    own = "" if splats.axes == "RDF" else own
     file.write(
-        f'#usda 1.0\n(\n    defaultPrim = "{_NAME}"\n    metersPerUnit = 1\n    upAxis = "Y"\n)\n\n'
+        f'#usda 1.0\n(\n{own}    defaultPrim = "{_NAME}"\n    metersPerUnit = 1\n    upAxis = "Y"\n)\n\n'
         f'def {_SCHEMA} "{_NAME}"\n{{\n'
         f"    uniform int {_SH}Degree = {splats.sh_degree}\n"
         '    uniform token projectionModeHint = "perspective"\n'
@@ -123,6 +130,8 @@ def _save(pxr: Any, path: Path, splats: Splats, progress: Progress) -> None:
         prim.GetAttribute(name).Set(arrays.get(kind, pxr.Vt.Vec3fArray).FromNumpy(values))
     if splats.offset.any():
         field.AddTranslateOp().Set(pxr.Gf.Vec3d(*(splats.offset * _USD_TURN).tolist()))
+    if splats.axes != "RDF":
+        stage.GetRootLayer().customLayerData = {_AXES: splats.axes}
     stage.GetRootLayer().Save()
 
 
@@ -145,7 +154,9 @@ def read(path: Path) -> Noted:
     found = placed(path, parts) if shown else None
     if found is None:
         raise InputError(_nothing(path, held, len(fields)), path=path)
-    return (found[0], (*found[1], ignored)) if hidden else found
+    axes = stage.GetRootLayer().customLayerData.get(_AXES)
+    scene = restored(found[0], axes) if axes in AXES else found[0]
+    return scene, (*found[1], ignored) if hidden else found[1]
 
 
 def _not_a_stage(path: Path, error: Exception) -> InputError:

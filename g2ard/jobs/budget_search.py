@@ -14,8 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard.errors import InputError
-from g2ard.io import read_splats, write_splats
+from g2ard.io import write_splats
 from g2ard.io.scene_formats import scene_format, written_bytes
+from g2ard.io.scenes import read_back
 from g2ard.jobs.budget import Budget
 from g2ard.progress import Say, plural, unsaid
 from g2ard.rendering.metrics import psnr, ssim
@@ -79,7 +80,7 @@ def as_file(splats: Splats, name: str) -> Splats:
     if scene_format(name).suffix in (".ply", ".usda", ".usdc"):
         return splats
     with _written(splats, name) as path:
-        return read_splats(path)
+        return read_back(path, splats)
 
 
 @contextmanager

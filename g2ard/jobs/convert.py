@@ -87,7 +87,9 @@ class Changes(Settings):
             splats = replace(splats, offset=np.zeros(3))
         if self.sh_degree is not None:
             splats = splats.with_sh_degree(self.sh_degree)
-        return splats if self.to_axes is None else with_axes(splats, change_of_axes("RDF", self.to_axes))
+        if self.to_axes is None:
+            return splats
+        return replace(with_axes(splats, change_of_axes(splats.axes, self.to_axes)), axes="RDF")
 
     def _matrix(self) -> NDArray[np.float64] | None:
         """Return the (4, 4) matrix of `transform` and then of `scale`, `rotate` and `translate`."""
@@ -176,6 +178,8 @@ def _loaded(scene: Splats | Source, axes: AxesName | None, say: Say) -> Splats:
     splats = load_scene(scene, say)
     if axes is None:
         return splats
+    if splats.axes != "RDF" and isinstance(scene, Source):
+        raise InputError("names its axes, which are followed", path=scene.file, hint="leave {from_axes} out")
     defined = "RDF"
     if isinstance(scene, Source):
         if scene.format == "spz" and spz.names_axes(scene.file):

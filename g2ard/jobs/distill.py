@@ -25,7 +25,7 @@ from g2ard.jobs.budget_search import ResolvedBudget
 from g2ard.jobs.clean import clean as remove_clutter
 from g2ard.jobs.distill_options import LEAST_RECOVERY_SHARE, DistillOptions
 from g2ard.jobs.doubts import doubts_of_regions, doubts_of_views
-from g2ard.jobs.inputs import GivenViews, Views, load_scene, make_targets, scorable, split_views
+from g2ard.jobs.inputs import GivenViews, Views, axes_of, load_scene, make_targets, scorable, split_views
 from g2ard.jobs.memory import RECOVERY_TIMES
 from g2ard.jobs.photo_colors import colored
 from g2ard.jobs.photo_points import distinct, sparse_file, sparse_points, topped_up, usual_count
@@ -45,7 +45,7 @@ from g2ard.scene.cameras import USUAL, Cameras
 from g2ard.scene.samples import evenly_spaced
 from g2ard.scene.splats import Splats
 from g2ard.stages.evaluate import Evaluation, evaluate
-from g2ard.stages.lift import lift, lift_rows
+from g2ard.stages.lift import in_axes, lift, lift_rows
 from g2ard.stages.recover.anchors import FREE, PriorMeasures, Regularizers, measure_prior, regularizers_for
 from g2ard.stages.recover.config import Schedule
 from g2ard.stages.simplify import simplify
@@ -712,7 +712,8 @@ def _read(
         assert cloud is not None
         say("no photos: the lifted points render the training images; photos, given as views, show more")
         xyz, rgb = cloud.points.positions, cloud.points.colors
-        lifted = lift(xyz, rgb, **vars(options.config.lift), progress=progress)
+        axes = axes_of(cloud, name, say)
+        lifted = lift(xyz, rgb, axes=axes, **vars(options.config.lift), progress=progress)
         return _Read(lifted, True, False, options.beside, name, len(lifted))
     cloud, name, of_photos = _points(scene, views, say)
     points: Points | None = None
@@ -747,6 +748,7 @@ def _read(
     # Each point has its disc, for as many are needed, also where positions are equal about another middle.
     config = options.config.lift
     lifted, _ = lift_rows(points.positions, points.colors, config, progress, merge=False)
+    lifted = in_axes(lifted, (cloud and cloud.axes) or "RDF")
     return _Read(lifted, True, True, options.beside, name, given, of_photos, usual, parts)
 
 

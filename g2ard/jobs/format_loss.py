@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 
 from g2ard.errors import InputError
-from g2ard.io import read_splats
 from g2ard.io.scene_formats import scene_format
+from g2ard.io.scenes import read_back
+from g2ard.io.spz import names_axes
 from g2ard.jobs.budget_search import clipped_images, quality
 from g2ard.poses import plan_pool
 from g2ard.report.run import Packed
@@ -55,8 +56,9 @@ def loss_warning(path: Path, splats: Splats, options: dict[str, Any]) -> str | N
         cameras = plan_pool(splats, _LOSS_VIEWS, size=_LOSS_SIZE, rows=_LOSS_ROWS).cameras
     except InputError:
         return None
-    stored = read_splats(path)
-    if options.get("axes") == "RDF" and options.get("spz_version", 3) != 4:  # unnamed, so read as RUB
+    stored = read_back(path, splats)
+    unnamed = options.get("axes") == "RDF" and options.get("spz_version", 3) != 4  # so read as RUB
+    if unnamed and not names_axes(path):
         stored = with_axes(stored, change_of_axes("RDF", "RUB"))
     away = quality(clipped_images(splats, cameras), stored, cameras).psnr
     lowered = -10 * float(np.log10(10 ** (-_GOOD_PSNR / 10) + 10 ** (-away / 10)))

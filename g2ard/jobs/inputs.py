@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from g2ard.config.choices import RenderModel
+from g2ard.config.choices import Axes, RenderModel
 from g2ard.errors import InputError
 from g2ard.io import Source, read_view_set
 from g2ard.io.images import find_exposures
@@ -24,13 +24,15 @@ from g2ard.io.splits import (
     splits_of,
     states_splits,
 )
-from g2ard.io.types import ViewFiles, ViewSet
+from g2ard.io.types import Cloud, ViewFiles, ViewSet
 from g2ard.progress import Say, plural, unsaid
 from g2ard.rendering.renderer import RasterSettings
 from g2ard.rendering.targets import Photos, PhotosOrRenders, Targets, TeacherRenders, with_pixels
 from g2ard.scene.cameras import Cameras
 from g2ard.scene.regions import in_any
 from g2ard.scene.splats import Splats
+from g2ard.scene.transform import up_in
+from g2ard.stages.lift import guessed_axes
 from g2ard.stages.simplify import Pairs, SimplifyConfig
 
 Views = Cameras | ViewSet | ViewFiles | str | Path  # cameras, or the path of views
@@ -73,6 +75,17 @@ def load_scene(
         if note.code not in _UNREPORTED_NOTES:
             say(f"{source}: {note}")
     return splats
+
+
+def axes_of(cloud: Cloud, name: str, say: Say = unsaid) -> Axes:
+    """Return the axes of a cloud's coordinates; if neither its format nor a map tells, guess and say so."""
+    if cloud.axes is not None:
+        return cloud.axes
+    axes = guessed_axes(cloud.points.positions)
+    up = "xyz"[int(np.argmax(np.abs(up_in(axes))))]
+    sign = "−" if min(up_in(axes)) < 0 else ""
+    say(f"note: {name}: {sign}{up} is taken for up, a guess from its surfaces; results stand upright by it")
+    return axes
 
 
 def say_regions(splats: Splats, config: SimplifyConfig, name: str, say: Say) -> None:

@@ -408,7 +408,7 @@ def write_level_page(
     page, offset = folder / "index.html", np.asarray(few.offset)
     title = names_of([Path(given.beside or folder)])[0]
     if kind == "sog":
-        rotation, position = frame.placed(offset)
+        rotation, position = frame.placed(offset, few.axes)
         placed: dict[str, Any] = {"rotation": rotation, "position": position}
         antialiased = few.antialiased
         return write_stream_page(

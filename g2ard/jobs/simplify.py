@@ -24,7 +24,7 @@ from g2ard.jobs.budget_search import (
     count_for_quality,
     resolved_in_tiles,
 )
-from g2ard.jobs.inputs import GivenViews, Views, load_scene, say_regions
+from g2ard.jobs.inputs import GivenViews, Views, axes_of, load_scene, say_regions
 from g2ard.pipeline.presets import configured
 from g2ard.progress import Progress, Say, plural, silent, unsaid
 from g2ard.rendering.visibility import SampledVisibility, visibility_source
@@ -279,7 +279,8 @@ def reducing(
         for note in cloud.notes:
             say(f"{scene}: {note}")
         points, notes = cloud.points, cloud.notes
-        splats = lift(points.positions, points.colors, progress=progress)
+        axes = axes_of(cloud, str(scene), say)
+        splats = lift(points.positions, points.colors, axes=axes, progress=progress)
         discs = plural(len(splats), "disc")
         say(f"{scene}: {plural(len(points), 'point')} lifted to {discs}, as `g2ard lift` does")
     else:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard.config.checks import checks_arguments
-from g2ard.config.choices import BLACK, Colour
+from g2ard.config.choices import BLACK, Axes, Colour
 from g2ard.errors import InputError
 from g2ard.jobs.inputs import GivenViews, load_views
 from g2ard.jobs.view_checks import given_or_found, opaque_points
@@ -19,7 +19,7 @@ from g2ard.progress import Say, unsaid
 from g2ard.scene.cameras import Camera, Cameras
 from g2ard.scene.samples import evenly_spaced
 from g2ard.scene.splats import Splats
-from g2ard.scene.transform import quaternion_of, transform, unit_up
+from g2ard.scene.transform import change_of_axes, quaternion_of, transform, unit_up, up_in
 from g2ard.stages.recover.anchors import measure_prior
 from g2ard.viewer.page import Start
 
@@ -64,13 +64,13 @@ class ViewerFrame:
         """Transform a scene to this frame, without offset."""
         turn = np.eye(4)
         turn[:3, :3] = self.rotation
-        return transform(replace(splats.recentred(self.origin), offset=np.zeros(3)), turn)
+        return transform(replace(splats.recentred(self.origin), offset=np.zeros(3), axes="RDF"), turn)
 
-    def placed(self, offset: NDArray[np.float64]) -> tuple[list[float], list[float]]:
-        """Return quaternion x y z w and translation that put a scene with this offset where `of` and the
-        viewer put it."""
+    def placed(self, offset: NDArray[np.float64], axes: Axes = "RDF") -> tuple[list[float], list[float]]:
+        """Return quaternion x y z w and translation that put the files of a scene with this offset and these
+        axes where `of` and the viewer put it."""
         turn = _TO_VIEWER @ self.rotation
-        w, *xyz = quaternion_of(turn).tolist()
+        w, *xyz = quaternion_of(turn @ change_of_axes("RDF", axes)).tolist()
         return [*xyz, w], (turn @ (offset - self.origin)).tolist()
 
     def world(self, point: Sequence[float]) -> NDArray[np.float64]:
@@ -125,7 +125,7 @@ def frame_with(
     scene: Splats, cameras: Cameras | None, up: Sequence[float] | None = None, *, start: str | None = None
 ) -> ViewerFrame:
     """Choose a frame and an initial camera, from given cameras if there are any, like `frame_of`."""
-    up = scene.up if up is None else up
+    up = stated_up(scene) if up is None else up
     axis = level_up(cameras) if up is None and cameras is not None else None
     axis = up_of(scene, up) if axis is None else axis
     if cameras is None or start is None:
@@ -164,6 +164,11 @@ def level_up(cameras: Cameras) -> NDArray[np.float64] | None:
     return unit_up(up) if any(cameras.image_paths) and np.linalg.norm(up) > _UPRIGHT_MEAN else None
 
 
+def stated_up(scene: Splats) -> tuple[float, float, float] | None:
+    """Return the (3,) up direction that a scene's file or, of a scan, its axes state."""
+    return scene.up if scene.up is not None or scene.axes == "RDF" else up_in(scene.axes)
+
+
 @checks_arguments
 def up_of(scene: Splats, up: Sequence[float] | None = None) -> NDArray[np.float64]:
     """Return a scene's up direction.
@@ -184,7 +189,7 @@ def up_of(scene: Splats, up: Sequence[float] | None = None) -> NDArray[np.float6
     >>> np.abs(up_of(Splats.create(floor, scales=flat, logit_opacities=np.full(400, 4)))).round(3).tolist()
     [0.0, 1.0, 0.0]
     """
-    up = scene.up if up is None else up
+    up = stated_up(scene) if up is None else up
     if up is not None:
         return unit_up(up)
     try:

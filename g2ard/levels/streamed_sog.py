@@ -33,6 +33,7 @@ from g2ard.levels.tree import Cut, Level, Node, aligned
 from g2ard.levels.tree import cut as cut_tree
 from g2ard.progress import Progress, Say, silent
 from g2ard.scene.splats import Splats
+from g2ard.scene.transform import change_of_axes
 
 _ENVIRONMENT_META = "env/meta.json"
 
@@ -192,7 +193,8 @@ class _Files:
 
 
 def _node(tree: Node, files: _Files) -> dict[str, Any]:
-    node: dict[str, Any] = {"bound": {"min": _rounded(tree.low), "max": _rounded(tree.high)}}
+    ends = np.array([tree.low, tree.high]) @ change_of_axes(files.levels[0].axes, "RDF").T
+    node: dict[str, Any] = {"bound": {"min": _rounded(ends.min(axis=0)), "max": _rounded(ends.max(axis=0))}}
     if tree.children:
         return {**node, "children": [_node(child, files) for child in tree.children]}
     placed = {str(level): files.place(level, rows) for level, rows in enumerate(tree.rows) if len(rows)}

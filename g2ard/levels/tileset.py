@@ -211,7 +211,8 @@ class _Tiles:
     def content(self, name: str) -> list[bytes]:
         """Return the .glb of a tile, whose node is moved to the middle of its box."""
         level, rows, middle = self.files[name]
-        splats = replace(self.levels[level].take(np.concatenate(rows)), offset=np.zeros(3))
+        some = self.levels[level].take(np.concatenate(rows))
+        splats = replace(some, offset=np.zeros(3), axes="RDF")
         parts, error = spz_glb(self.path / name, writable(self.path / name, splats), np.rint(middle))
         self.rounding.add(self.error + error, splats)
         return parts

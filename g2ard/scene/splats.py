@@ -8,7 +8,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from g2ard.config.choices import RENDER_MODELS, RenderModel
+from g2ard.config.choices import AXES, RENDER_MODELS, Axes, RenderModel
 from g2ard.errors import InputError, require
 from g2ard.progress import plural
 from g2ard.system.cached import cached_property
@@ -50,6 +50,8 @@ class Splats(Shown):
         render_model: the rendering that the scene was trained for: "classic", or "antialiased" with
             Mip-Splatting's factor on opacities. All renders follow it.
         up: (3,) direction away from the ground, if the scene's file states it.
+        axes: axes of the coordinates. Trained scenes are "RDF", as files store them. Scans are "RFU", z up:
+            their files are turned y down for viewers and name these axes, and reading turns them back.
 
     Other arrays of numbers are converted to these types.
 
@@ -71,6 +73,7 @@ class Splats(Shown):
     offset: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
     render_model: RenderModel = "classic"
     up: tuple[float, float, float] | None = field(default=None, metadata=UNKEYED)
+    axes: Axes = field(default="RDF", metadata=UNKEYED)
 
     def __post_init__(self) -> None:
         for name in ARRAYS:
@@ -93,6 +96,7 @@ class Splats(Shown):
         require("shN", rest, rest in _DEGREE_OF_REST, "0, 3, 8 or 15 coefficients")
         model = self.render_model
         require("render_model", repr(model), model in RENDER_MODELS, " or ".join(RENDER_MODELS))
+        require("axes", repr(self.axes), self.axes in AXES, f"one of {', '.join(AXES)}")
 
     @classmethod
     def create(

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from g2ard.config.choices import AXES, NAMED_AXES, RenderModel
+from g2ard.config.choices import AXES, NAMED_AXES, Axes, RenderModel
 from g2ard.errors import InputError, require
 from g2ard.scene.splats import ARRAYS, Splats
 
@@ -273,19 +273,58 @@ def change_of_axes(source: str, target: str) -> NDArray[np.float64]:
 
 
 def with_axes(splats: Splats, matrix: NDArray[np.float64]) -> Splats:
-    """Return a scene in other axes: means, rotations and harmonics by `change_of_axes`.
+    """Return a scene in other axes, by a matrix M of `change_of_axes`.
 
-    A mirror is a rotation followed by x ↦ −x, which leaves the shape of a Gaussian as it is.
+    A Gaussian's frame R becomes M·R·Mᵀ, and its scales change places as the axes do. So quaternions keep
+    their w and permute the rest like a vector, with all digits, and no rotation is rounded.
     """
     sign = np.sign(np.linalg.det(matrix))
-    rotation = np.eye(4)
-    rotation[:3, :3] = sign * matrix
-    turned = transform(splats, rotation)
-    if sign > 0:
-        return turned
-    odd = harmonic_signs((-1, -1, -1))[: splats.shN.shape[1], None]
-    up = None if turned.up is None else (-turned.up[0], -turned.up[1], -turned.up[2])
-    return replace(turned, means=-turned.means, offset=-turned.offset, shN=turned.shN * odd, up=up)
+    axis, places = matrix.astype(np.float32), np.abs(matrix).argmax(axis=1)
+    quats = np.concatenate([splats.quats[:, :1], splats.quats[:, 1:] @ (np.float32(sign) * axis).T], axis=1)
+    shN = rotate_harmonics(splats.shN, sign * matrix)
+    if sign < 0:
+        shN *= harmonic_signs((-1, -1, -1))[: shN.shape[1], None]
+    return replace(
+        splats,
+        means=splats.means @ matrix.astype(splats.means.dtype).T,
+        quats=quats,
+        scales=np.ascontiguousarray(splats.scales[:, places]),
+        shN=shN,
+        offset=matrix @ splats.offset,
+        up=None if splats.up is None else tuple((matrix @ splats.up).tolist()),
+    )
+
+
+def as_stored(splats: Splats) -> Splats:
+    """Return a scene with float32 means as files hold it, y down; `axes` are still those of its coordinates.
+
+    >>> flat = Splats.create([[1, 2, 3]], scales=[[1, 1, 1]])
+    >>> as_stored(replace(flat, axes="RFU")).means.tolist()
+    [[1.0, -3.0, 2.0]]
+    """
+    near = splats.narrowed()
+    return near if near.axes == "RDF" else with_axes(near, change_of_axes(near.axes, "RDF"))
+
+
+def restored(splats: Splats, axes: Axes) -> Splats:
+    """Return the scene whose `as_stored` form this is, in coordinates of these axes.
+
+    >>> restored(Splats.create([[1, -3, 2]], scales=[[1, 1, 1]]), "RFU").means.tolist()
+    [[1.0, 2.0, 3.0]]
+    """
+    if axes == "RDF":
+        return splats
+    return replace(with_axes(splats, change_of_axes("RDF", axes)), axes=axes)
+
+
+def up_in(axes: Axes) -> tuple[float, float, float]:
+    """Return the (3,) up direction in a system of axes.
+
+    >>> up_in("RFU"), up_in("RDF")
+    ((0.0, 0.0, 1.0), (0.0, -1.0, 0.0))
+    """
+    x, y, z = (change_of_axes("RUB", axes) @ (0.0, 1.0, 0.0) + 0.0).tolist()
+    return x, y, z
 
 
 def join(scenes: Sequence[Splats]) -> Splats:
@@ -304,7 +343,13 @@ def join(scenes: Sequence[Splats]) -> Splats:
     together = {name: np.concatenate([getattr(part, name) for part in parts]) for name in ARRAYS}
     ups = {scene.up for scene in scenes}
     up = ups.pop() if len(ups) == 1 else None
-    return Splats(**together, offset=scenes[0].offset, render_model=model, up=up)
+    axes = common_axes([scene.axes for scene in scenes])
+    return Splats(**together, offset=scenes[0].offset, render_model=model, up=up, axes=axes)
+
+
+def common_axes(axes: Sequence[Axes]) -> Axes:
+    """Return the axes that all scenes share, or those of files."""
+    return axes[0] if len(set(axes)) == 1 else "RDF"
 
 
 def one_model(models: Sequence[RenderModel]) -> RenderModel:

@@ -5,19 +5,28 @@ Distil *from* this prior, with photos as targets; rendered as it is, it looks fl
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Annotated, Any
+from dataclasses import dataclass, replace
+from typing import Annotated, Any, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from g2ard import _core
 from g2ard.config.checks import Within, checks_arguments
+from g2ard.config.choices import NAMED_AXES, Axes, AxesName
 from g2ard.config.schema import Settings
 from g2ard.errors import InputError, require
+from g2ard.poses.site import Site
 from g2ard.progress import Progress, counter, silent
 from g2ard.scene.reproducible import middle
 from g2ard.scene.splats import SH_C0, Splats, unit_colors
+from g2ard.scene.transform import up_in
+
+_FAR_FROM_ORIGIN = 32_752.0
+"""Distance from the origin, in units, beyond which a scene gets an offset."""
+
+_GUESSED_BY = 20_000
+"""Points that tell which axis is up, if the format does not."""
 
 _CORE = _core.defaults()["lift"]
 """Defaults of the Rust core, which are the paper's."""
@@ -44,6 +53,7 @@ def lift(
     normal_ratio: float = LiftConfig.normal_ratio,
     max_anisotropy: float = LiftConfig.max_anisotropy,
     opacity: float = LiftConfig.opacity,
+    axes: AxesName = "RDF",
     progress: Progress = silent,
 ) -> Splats:
     """Turn each coloured point into a flat disc (supplement, "Dense Prior Construction").
@@ -63,6 +73,8 @@ def lift(
         normal_ratio: normal over tangential scale (0.1 in the paper).
         max_anisotropy: largest ratio of the tangential scales (4 in the paper, to avoid needles).
         opacity: opacity of every disc, in (0, 1) (0.5 in the paper).
+        axes: axes of the points' coordinates: "z-up" for scans and maps, so that files of the scene stand
+            upright in viewers.
         progress: called with the number of points done.
 
     Returns:
@@ -79,7 +91,25 @@ def lift(
     (64, 5400003.0, True)
     """
     config = LiftConfig(neighbors, spread, normal_ratio, max_anisotropy, opacity)
-    return lift_rows(points, colors, config, progress)[0]
+    found: Axes = NAMED_AXES.get(axes) or cast("Axes", axes)
+    return in_axes(lift_rows(points, colors, config, progress)[0], found)
+
+
+def in_axes(splats: Splats, axes: Axes) -> Splats:
+    """Return a scene whose coordinates are stated to have these axes."""
+    return splats if axes == "RDF" else replace(splats, axes=axes)
+
+
+def guessed_axes(positions: NDArray[np.float64]) -> Axes:
+    """Guess the axes of points by their ground: z up, y up, or those of photos, y down."""
+    some = positions[:: max(1, len(positions) // _GUESSED_BY)]
+    discs, _ = lift_rows(some, np.full(some.shape, 0.5), LiftConfig())
+    try:
+        up = Site.of(discs, None, _GUESSED_BY).up.axis
+    except InputError:  # nothing to see
+        return "RDF"
+    systems: tuple[Axes, ...] = ("RDF", "RFU", "RUB")
+    return max(systems, key=lambda name: float(up @ up_in(name)))
 
 
 def lift_rows(
@@ -114,7 +144,8 @@ def lift_rows(
     quats, scales = _core.lift_points(xyz - _anchor(xyz), config, counter(progress, "lift"))
     n = len(centered)
     step = np.spacing(np.float32(np.abs(xyz).max()))
-    near = step <= 0.01 * np.median(scales[:, 0])  # of a disc; other programs ignore offsets
+    # Other programs ignore offsets, and some keep positions in half floats, which end at 65,504.
+    near = step <= 0.01 * np.median(scales[:, 0]) and np.abs(origin).max() <= _FAR_FROM_ORIGIN
     splats = Splats.create(
         (xyz if near else centered).astype(np.float32),
         quats=quats,

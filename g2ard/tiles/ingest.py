@@ -20,7 +20,7 @@ from g2ard.io.stream import PointStream, SceneStream
 from g2ard.io.tile_store import VERSION, TileStore
 from g2ard.io.types import Note
 from g2ard.progress import Progress, Say, plural, silent, unsaid
-from g2ard.stages.lift import LiftConfig
+from g2ard.stages.lift import LiftConfig, guessed_axes
 from g2ard.system.keys import key_of
 from g2ard.tiles.writer import clear, is_tile_file, lift_tiles, pour, row_bytes
 
@@ -154,7 +154,9 @@ def _manifest(
         "settings": settings,
         "notes": [asdict(note) for note in notes],
     }
-    return manifest if scene is None or scene.up is None else {**manifest, "up": scene.up}
+    if scene is not None:
+        return {**manifest, "axes": scene.axes} | ({} if scene.up is None else {"up": scene.up})
+    return {**manifest, "axes": stream.axes or guessed_axes(stream.sample)}
 
 
 def _opened(

@@ -145,7 +145,9 @@ def scene_in_tiles(
 ) -> PartsStream:
     """Return a scene whose Gaussians `tile` reads by the number of a tile of `store`."""
     parts = counts, tile, sh_degree, store.offset
-    return PartsStream(Path(f"simplified-{key}"), *parts, [key], render_model=store.render_model)
+    scene = PartsStream(Path(f"simplified-{key}"), *parts, [key], render_model=store.render_model)
+    scene.up, scene.axes = store.up, store.axes
+    return scene
 
 
 def finished(small: Splats, sh_degree: int) -> Splats:

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ from g2ard.io import write_splats
 from g2ard.rendering.metrics import psnr
 from g2ard.rendering.renderer import Renderer
 from g2ard.scene.cameras import Camera
+from g2ard.scene.transform import moving, transform
 from helpers.browser import Browser
 from helpers.pages import served
 from helpers.peers import package
@@ -87,3 +89,27 @@ def test_spark_shows_a_file(
         browser.run(f"show('{name}', {json.dumps(turn)}, {json.dumps(matrix.T.ravel().tolist())}, {fov})")
         likeness = psnr(browser.picture() / np.float32(255), expected)
         assert (likeness > 30) == (turn == turned), likeness
+
+
+@pytest.mark.parametrize(
+    ("name", "turned"),
+    [
+        ("map.ply", True),
+        ("map.compressed.ply", True),
+        ("map.sog", True),
+        ("map.spz", False),
+        ("map.splat", True),
+    ],
+)
+def test_spark_shows_a_map_upright(shown: tuple[Path, Browser], name: str, turned: bool) -> None:
+    """A scan with z up, at coordinates of a map that half floats do not hold."""
+    folder, browser = shown
+    ball = checkered_ball(2000)
+    scan = transform(ball, moving(1.0, (-90, 0, 0), (0, 0, 0)))  # −y of the ball is z of the scan
+    write_splats(folder / name, replace(scan, axes="RFU", offset=np.array([5e5, 6e6, 0.0])))
+    flip = np.diag([1.0, -1, -1, 1])
+    matrix = flip @ np.linalg.inv(VIEW.viewmat) @ flip
+    fov = float(np.degrees(2 * np.arctan(HEIGHT / 2 / VIEW.K[1, 1])))
+    browser.run(f"show('{name}', {json.dumps(turned)}, {json.dumps(matrix.T.ravel().tolist())}, {fov})")
+    expected = np.clip(Renderer(ball).image(VIEW), 0, 1)
+    assert psnr(browser.picture() / np.float32(255), expected) > 30

@@ -238,4 +238,4 @@ def blended(start: Splats, end: Splats, share: ArrayLike) -> Splats:
         (a + weight.reshape(-1, *[1] * (a.ndim - 1)) * (b - a)).astype(np.float32) for a, b in pairs
     )
     scales = np.exp(log_scales.astype(np.float64)).astype(np.float32)
-    return Splats(means, quats, scales, logits, sh0, shN, end.offset, end.render_model, end.up)
+    return Splats(means, quats, scales, logits, sh0, shN, end.offset, end.render_model, end.up, end.axes)

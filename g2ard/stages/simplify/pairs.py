@@ -171,4 +171,5 @@ def splats_of(like: Splats, out: dict[str, Any]) -> Splats:
         like.offset,
         like.render_model,
         like.up,
+        like.axes,
     )
