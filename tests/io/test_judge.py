@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from plyfile import PlyData, PlyElement
 
-from g2ard.io.judge import judged
+from g2ard.io.judge import full_scales, judged, white
 from g2ard.scene.splats import SH_C0
 from helpers.opened import read_scene
 
@@ -97,3 +97,35 @@ def test_a_ply_of_bytes(tmp_path: Path) -> None:
     np.testing.assert_allclose(found.colors, RGB, atol=1e-5)
     own = found.quats / np.linalg.norm(found.quats, axis=1, keepdims=True)
     assert np.abs((own * quats).sum(1)).min() > 0.999
+
+
+def test_black_tells_nothing_of_white() -> None:
+    """A cloud without colours has the full range of its type; one that is mostly black that of the rest."""
+    sixteen = full_scales(np.dtype("u2"))
+    assert white(np.zeros((99, 3)), sixteen) == 65535
+    mostly = np.zeros((9000, 3))
+    mostly[:60] = 200
+    assert white(mostly, sixteen) == 255
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "logits"),
+    [(0.1, 1.05, False), (0.1, 1.2, True), (-0.05, 0.9, False), (-0.2, 0.9, True), (-7.0, -1.0, True)],
+)
+def test_linear_opacities_are_logits_if_they_leave_their_range(low: float, high: float, logits: bool) -> None:
+    """A tenth beyond 0 or 1 is noise."""
+    read = judged(SCALES, np.linspace(low, high, COUNT), BASE, logs=False)
+    assert (read.opaque is None) == logits
+
+
+@pytest.mark.parametrize(("least", "logs"), [(-0.5, True), (0.0, False)])
+def test_linear_scales_are_logarithms_if_they_are_below_0(least: float, logs: bool) -> None:
+    scales = np.linspace(least, 2, 3 * COUNT).reshape(COUNT, 3)
+    assert judged(scales, ALPHAS, BASE, logs=False).log_scales == logs
+
+
+@pytest.mark.parametrize(("low", "white_at"), [(0, 255), (-40, None)])
+def test_whole_numbers_below_0_are_no_colours(low: int, white_at: float | None) -> None:
+    colors = np.tile(np.arange(low, 256.0), (3, 1)).T
+    count = len(colors)
+    assert judged(SCALES[:count], ALPHAS[:count], colors, logs=False).white == white_at

@@ -643,3 +643,29 @@ def test_exposures_that_are_found_change_all_scores(known: bool, monkeypatch: py
     loop.Loop._look_at_exposures(running, checkered_ball(9), 0.5)  # type: ignore[arg-type]
     assert told == ([] if known else ["start", "best"])
     assert (running.exposures == 2).all()
+
+
+def test_hardly_better_is_not_worth_to_take_changes_back() -> None:
+    """A shrinkage that gains 0.02 dB leaves the result as it is; one that gains 0.2 dB is taken."""
+    start = checkered_ball(2)
+    end = replace(start, means=start.means + 1)
+    views = np.array([2.0, 2.0])
+
+    def way(scene: Splats) -> float:
+        return float((scene.means - start.means).mean())
+
+    for worth, chosen in ((0.08, 0.0), (0.8, 2.0)):
+
+        def others(scene: Splats, worth: float = worth) -> dict[str, float]:
+            return {"near": 5.0 - worth * abs(way(scene) - 0.5)}  # best at half of the way, which k = 2 goes
+
+        guard = Guard(lambda scene: 10 * min(way(scene), 0.5), start, 0.0, others)
+        assert guard.choose_by_validation(end, views, 9)[1] == chosen
+
+
+@pytest.mark.parametrize(("loss", "decision"), [(0.4, "on"), (0.6, "stop")])
+def test_validation_stops_runs_that_lose_half_a_decibel(loss: float, decision: str) -> None:
+    start, later = checkered_ball(2), checkered_ball(3)
+    guard = Guard(lambda scene: 1.0, start, 0.0, lambda scene: {"near": 9.0 - loss * (scene is later)})
+    assert guard.look(later, 0.5, 40) == decision
+    assert guard.stopped == (40 if decision == "stop" else None)

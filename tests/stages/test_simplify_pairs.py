@@ -13,6 +13,7 @@ from g2ard.rendering.visibility import visibility_source
 from g2ard.scene.splats import Splats
 from g2ard.scene.transform import join
 from g2ard.stages.simplify import SimplifyConfig, simplify
+from g2ard.stages.simplify.pairs import fit_opacities
 from helpers.scenes import around, assert_same_bits, checkered_ball
 from helpers.simplify_cases import Views, all_alike, assert_kept, assert_sound, opaque_wall, scene
 from reference import simplify as naive
@@ -195,3 +196,36 @@ def test_a_scene_is_put_in_order_once(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(_core, "Scene", counted)
     simplify(checkered_ball(600), 60, visibility=visibility_source(around(4)))
     assert made == [600, 60]  # the input, then the result whose opacities are fitted
+
+
+def _fitted(alphas: list[float], members: int, wanted: float, now: float) -> tuple[Splats, Splats]:
+    """Return round Gaussians but for a short axis, before and after a fit of their opacities."""
+    alpha, count = np.array(alphas), len(alphas)
+    before = Splats.create(
+        np.eye(3)[:count],
+        scales=np.tile([0.2, 0.1, 0.3], (count, 1)),
+        logit_opacities=np.log(alpha / (1 - alpha)),
+    )
+    rows = np.ones(count)
+    return before, fit_opacities(before, members * rows, wanted * rows, now * rows, 1.0)
+
+
+def test_fits_keep_gaussians_of_one_row() -> None:
+    before, after = _fitted([0.3, 0.6], 1, 2.0, 1.0)
+    assert_same_bits(before, after)
+    before, after = _fitted([0.3, 0.6], 2, 2.0, 1.0)
+    assert (after.opacities > 1.1 * before.opacities).all()
+
+
+def test_fits_let_no_gaussian_vanish() -> None:
+    """Below 1/255 renderers draw nothing: a row just above stays, one well above is fitted."""
+    before, after = _fitted([1.01 / 255, 0.5], 3, 0.2, 1.0)
+    assert after.logit_opacities[0] == before.logit_opacities[0]
+    assert after.opacities[1] < 0.9 * before.opacities[1]
+
+
+def test_what_opacity_cannot_hold_widens_the_longer_axes() -> None:
+    before, after = _fitted([0.98], 3, 16.0, 1.0)
+    growth = 0.98 * 2**0.25 / 0.99  # the ratio of visibility is limited to 2
+    np.testing.assert_allclose(after.opacities, 0.99, rtol=1e-5)
+    np.testing.assert_allclose(after.scales / before.scales, [[growth**0.5, 1, growth**0.5]], rtol=1e-5)
