@@ -29,6 +29,14 @@ _STANDING, _GAZES = 32, (-0.35, 0.15)
 _PLACES, _ROOFED = 256, 0.25
 """Places, and the share of the free ones with matter above in most directions that a ceiling needs."""
 
+_WALLED, _HORIZON, _HEIGHTS = 0.8, 0.1, (0.2, 0.6)
+"""Share of the directions up to `_HORIZON` above and below the level that meet matter between walls, and the
+range of heights of places, in heights of what stands on the ground."""
+
+_FINER = 0.5
+"""Votes for views from around, relative to those for places between walls, below which a scene without a roof
+is shown from within."""
+
 _PHOTOS = 64
 """Photos that are judged, at most."""
 
@@ -99,8 +107,9 @@ def _within(survey: Survey, every: int = 1) -> Outlook:
 
 
 def is_hidden(survey: Survey) -> bool:
-    """Return whether views from around see little of what clear views within do, as above a ceiling."""
-    return _is_roofed(survey) and _sees_less(_outside(survey, 2), _within(survey, 2))
+    """Return whether views from around see little of what clear views within do, as above a ceiling, or show
+    below a pixel what walls surround."""
+    return is_walled(survey) or (_is_roofed(survey) and _sees_less(_outside(survey, 2), _within(survey, 2)))
 
 
 def _is_roofed(survey: Survey) -> bool:
@@ -113,6 +122,24 @@ def _is_roofed(survey: Survey) -> bool:
     return bool((above > 0.5).sum() > _ROOFED * len(above))
 
 
+def is_walled(survey: Survey) -> bool:
+    """Return whether most free places at eye height lie between walls, and resolve far more than views from
+    around, as in a hall without a roof."""
+    site = survey.site
+    if site.terrain is None:
+        return False
+    at = halton(0, _PLACES, 3, 1)
+    places = between(site.box, at)
+    places[:, 2] = site.ground(places) + site.tallness * between(_HEIGHTS, at[:, 2])
+    places = places[site.is_free(places, 2)]
+    within = places[closed(site, places, 24, -_HORIZON, _HORIZON) > _WALLED]
+    if len(within) <= len(places) / 2:
+        return False
+    votes = survey.votes
+    around = votes.at(ring(survey, _RISES[1:2], _TURNS).eyes)
+    return bool(len(around) and around.mean() < _FINER * votes.at(within).mean())
+
+
 def _sees_less(around: Outlook, within: Outlook) -> bool:
     seen = around.seen.max(axis=0, initial=0.0)
     both = within.seen[within.clear > _GOOD].max(axis=0, initial=0.0)
@@ -123,6 +150,7 @@ def _looks(survey: Survey) -> tuple[Outlook, str]:
     """Return views that show a scene "within" it, planned only if it may be shown so, or from "around"."""
     around, room = _outside(survey), is_room(survey)
     blurred = around.clear.sum() <= _CRISP * len(around.cameras)
+    room = room or (not blurred and is_walled(survey))
     if room or blurred or _is_roofed(survey):
         within = _within(survey)
         good = within.clear.max(initial=0.0) > _GOOD

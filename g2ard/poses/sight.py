@@ -13,9 +13,10 @@ from g2ard import _core
 from g2ard.config.choices import BLACK
 from g2ard.errors import require
 from g2ard.poses.site import Inside, Site
+from g2ard.poses.votes import Votes
 from g2ard.rendering.renderer import RasterSettings, View, view_of
 from g2ard.scene.cameras import Cameras
-from g2ard.scene.reproducible import Floats, canonical_order, norms, quantile
+from g2ard.scene.reproducible import Floats, canonical_order, norms, quantile, turned
 from g2ard.scene.splats import Splats
 from g2ard.system.cached import cached_property
 
@@ -119,7 +120,7 @@ class Glance:
         some = rows[canonical_order(splats, rows)[:limit]]
         sample = splats.take(some[splats.take(some).finite_rows()])
         scales = np.sort(sample.scales.astype(np.float64), axis=1)
-        self._sigma = np.sqrt(scales[:, 1] * scales[:, 2])
+        self.sizes = np.sqrt(scales[:, 1] * scales[:, 2])
         self._middle = sample.offset + np.median(sample.means.astype(np.float64), axis=0)
         means = sample.means.astype(np.float64) + sample.offset - self._middle
         most = _MOST_WIDENED * limit / _ROWS
@@ -152,7 +153,7 @@ class Glance:
             seen = (weight > 0) & (depth <= (np.inf if reach is None else reach[i]))
             figures[:, i] = weight.sum(), 0.0, np.inf
             if seen.any():
-                angle = self._sigma[seen] / np.maximum(depth[seen], np.finfo(float).tiny)
+                angle = self.sizes[seen] / np.maximum(depth[seen], np.finfo(float).tiny)
                 fine = weight[seen][angle < _FINE].sum()
                 figures[1:, i] = fine, quantile(angle, weight[seen], _COARSEST)
         return figures
@@ -176,7 +177,7 @@ class Glance:
         for i, (sums, depth, view) in enumerate(self._renders(cameras, near)):
             image = np.clip(rasterizer.image(self._arrays, view, settings, list(BLACK)), 0, 1)
             weight = sums["weight"] / image[..., 0].size
-            covered[i], fine[i] = weight.sum(), weight[self._sigma < _FINE * depth].sum()
+            covered[i], fine[i] = weight.sum(), weight[self.sizes < _FINE * depth].sum()
             seen[i] = sums["transmittance"] / np.maximum(1, sums["hits"])
             detail[i] = sum(np.abs(np.diff(image, axis=axis)).mean(dtype=np.float64) for axis in (0, 1))
             shown = sums["weight"].astype(np.float64)
@@ -250,6 +251,13 @@ class Survey:
     def inside(self) -> Inside:
         """Places within rooms."""
         return self.site.inside(self.seed)
+
+    @cached_property
+    def votes(self) -> Votes:
+        """Votes of the scene's Gaussians for places in the site's coordinates."""
+        site, glance = self.site, self.glance
+        points = turned((glance.points - site.origin) / site.size, site.axes)
+        return Votes.of(points, glance.sizes / site.size, glance.opacities.astype(np.float64))
 
     @cached_property
     def glance(self) -> Glance:

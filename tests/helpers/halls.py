@@ -40,6 +40,23 @@ def hall(spacing: float = 0.09, plate: float = 0.5) -> Splats:
     return joined(*parts)
 
 
+def open_hall(spacing: float = 0.085) -> Splats:
+    """Return a wide hall without a roof: a tiled floor of 60 by 40, walls with pictures and crates."""
+    rng, (x, y, z) = np.random.default_rng(7), (60.0, 40.0, 5.0)
+    parts = [painted(rectangle((0, 0, 0), (x, 0, 0), (0, y, 0), spacing, (0, 0, 1)), "tiles")]
+    for corner, along, normal in (
+        ((0, 0, 0), (x, 0, 0), (0, 1, 0)),
+        ((0, y, 0), (x, 0, 0), (0, 1, 0)),
+        ((0, 0, 0), (0, y, 0), (1, 0, 0)),
+        ((x, 0, 0), (0, y, 0), (1, 0, 0)),
+    ):
+        parts.append(painted(rectangle(corner, along, (0, 0, z), spacing, normal), "pictures"))
+    for _ in range(20):
+        low = (*rng.uniform((2, 2), (x - 3, y - 3)), 0.0)
+        parts.append(_block(low, rng.uniform(0.6, 1.6, 3), spacing / 1.5, rng.random(3)))
+    return joined(*parts)
+
+
 def _block(low, sides, spacing, colour) -> Splats:
     from reference.poses import box
 

@@ -15,7 +15,7 @@ from g2ard.rendering.renderer import arrays_of, settings_for, view_of
 from g2ard.scene.cameras import Camera, Cameras
 from g2ard.scene.splats import Splats
 from g2ard.stages.lift import lift
-from helpers.halls import SIZE, hall
+from helpers.halls import SIZE, hall, open_hall
 from helpers.realdata import real
 from reference import poses as naive
 
@@ -106,6 +106,15 @@ def test_the_best_views_are_whole_or_within_sharp_and_apart(name: str) -> None:
         assert (resolved > 0.4).all()
         assert frames[0] > 0.15
         assert least_angle(views) >= 20
+
+
+def test_a_hall_without_a_roof_is_shown_and_seen_from_within() -> None:
+    scene = open_hall()
+    views, pool = best_views(scene, 4), plan_pool(scene, 16, rows=100_000).cameras
+    for cameras in (views, pool):
+        assert ((cameras.positions > 0) & (cameras.positions < (60, 40, 5))).all()
+    coarse = open_hall(0.25)  # resolved from around
+    assert (best_views(coarse, 2).positions[:, 2] > 5).all()
 
 
 def test_a_hall_that_is_no_room_still_trains_from_within(monkeypatch: pytest.MonkeyPatch) -> None:
