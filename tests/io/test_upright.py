@@ -7,6 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import laspy
 import numpy as np
 import pytest
 
@@ -175,7 +176,6 @@ def test_axes_of_a_scan_can_be_had_again(command_line: CommandLine, tmp_path: Pa
 
 
 def write_las(path: Path, shift: Any = (0.0, 0.0, 0.0)) -> None:
-    laspy = pytest.importorskip("laspy")
     header = laspy.LasHeader(point_format=3, version="1.4")
     header.scales, header.offsets = np.full(3, 0.001), np.array(shift)
     las = laspy.LasData(header)
