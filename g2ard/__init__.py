@@ -36,10 +36,9 @@ Modules load on first use.
 
 from __future__ import annotations
 
-TYPE_CHECKING = False
-if TYPE_CHECKING:
-    from typing import Any
+from typing import TYPE_CHECKING, Any
 
+if TYPE_CHECKING:
     from g2ard._core import __version__
     from g2ard.errors import G2ardError, InputError, MissingDependencyError, OutputError
     from g2ard.io import read_points as load_points

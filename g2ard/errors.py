@@ -61,6 +61,10 @@ class G2ardError(Exception):
     def __str__(self) -> str:
         return self.line()
 
+    def _render_traceback_(self) -> list[str]:
+        """Return what a notebook prints instead of a traceback: one line, as in a terminal."""
+        return [f"{type(self).__name__}: {self}"]
+
     def line(self, spelled: Callable[[str, str | None], str] = _as_argument) -> str:
         """Return the fields as one line.
 
@@ -94,6 +98,10 @@ class G2ardError(Exception):
 
 class InputError(G2ardError, ValueError):
     """Invalid input: a bad file, shape, dtype or value."""
+
+
+class UsageError(G2ardError, TypeError):
+    """A call with unknown, missing or too many arguments."""
 
 
 class OutputError(G2ardError, OSError):

@@ -18,11 +18,36 @@ def silent(stage: str, done: int, total: int, info: Mapping[str, Any] | None = N
 
 _WIDTH = 60
 """Characters of the line that `show_progress` redraws."""
-_last_shown = 0.0
+_BAR = 20
+"""Characters of its bar in a notebook."""
+
+
+class _Line:
+    """The line that `show_progress` redraws, and when its stage began."""
+
+    def __init__(self) -> None:
+        self.stage, self.began, self.drawn = "", 0.0, 0.0
+        self.cell: tuple[int, Any] | None = None  # of a notebook: number, and handle of the line in it
+
+    def show(self, text: str, shell: Any) -> None:
+        """Redraw the line: by its handle in the cell of a notebook, otherwise on stderr."""
+        if shell is None:
+            print(f"\r{text:{_WIDTH}.{_WIDTH}}", end="", file=sys.stderr, flush=True)
+            return
+        from IPython.display import display
+
+        content = {"text/plain": text}
+        if self.cell is None or self.cell[0] != shell.execution_count:
+            self.cell = shell.execution_count, display(content, raw=True, display_id=True)
+        else:
+            self.cell[1].update(content, raw=True)
+
+
+_line = _Line()
 
 
 def show_progress(stage: str, done: int, total: int, info: Mapping[str, Any] | None = None) -> None:
-    """Show the stage in one line of stderr that is redrawn, in a terminal or a notebook.
+    """Show the stage in one line that is redrawn, on stderr or, with a bar, in the cell of a notebook.
 
     Pass it to any function of g2ard that takes `progress`.
 
@@ -35,14 +60,27 @@ def show_progress(stage: str, done: int, total: int, info: Mapping[str, Any] | N
     >>> import g2ard
     >>> small = g2ard.distill("scene.ply", ratio=10, progress=g2ard.show_progress)  # doctest: +SKIP
     """
-    global _last_shown
-    now, ended = time.monotonic(), 0 < total <= done
-    if ended:
+    now, ended, shell = time.monotonic(), 0 < total <= done, kernel()
+    if stage != _line.stage:
+        _line.stage, _line.began, _line.drawn = stage, now, 0.0
+    if ended and shell is None:
         print(f"\r{'':{_WIDTH}}\r", end="", file=sys.stderr, flush=True)
-    elif now - _last_shown >= (0.1 if sys.stderr.isatty() else 1):
-        _last_shown = now
+    elif ended or now - _line.drawn >= (0.1 if sys.stderr.isatty() else 1):
+        _line.drawn = now
         text = f"{stage}: {done:,}/{total:,}" if total > 1 else stage
-        print(f"\r{text:{_WIDTH}.{_WIDTH}}", end="", file=sys.stderr, flush=True)
+        if shell is not None and total > 1:
+            filled = _BAR * done // total
+            spent = now - _line.began
+            left = f"{spent * (total - done) / done:.0f} s left" if 0 < done < total else f"{spent:.1f} s"
+            text = f"{text} {'█' * filled}{'░' * (_BAR - filled)} {left}"
+        _line.show(text, shell)
+
+
+def kernel() -> Any:
+    """Return the shell of a notebook's kernel, whose cells show HTML; None elsewhere."""
+    ipython = sys.modules.get("IPython")
+    shell = None if ipython is None else ipython.get_ipython()
+    return shell if getattr(shell, "kernel", None) is not None else None
 
 
 def counter(progress: Progress, stage: str) -> Callable[[int, int], None]:

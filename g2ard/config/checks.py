@@ -13,7 +13,7 @@ from numbers import Integral, Real
 from typing import Annotated, Any, Literal, ParamSpec, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from g2ard.config.choices import Engine
-from g2ard.errors import InputError, require
+from g2ard.errors import InputError, UsageError, require
 
 P = ParamSpec("P")
 Result = TypeVar("Result")
@@ -151,8 +151,12 @@ def checks_arguments(function: Callable[P, Result]) -> Callable[P, Result]:
         unknown = [] if loose else [name for name in kwargs if name not in signature.parameters]
         if unknown:
             near = nearest(unknown[0], [name for name in signature.parameters if name != "self"])
-            raise TypeError(f"{function.__name__}() has no keyword {unknown[0]!r}; {near}")
-        for name, value in signature.bind(*args, **kwargs).arguments.items():
+            raise UsageError(f"{function.__name__}() has no keyword {unknown[0]!r}; {near}")
+        try:
+            bound = signature.bind(*args, **kwargs)
+        except TypeError as error:
+            raise UsageError(f"{function.__name__}(): {error}") from None
+        for name, value in bound.arguments.items():
             if name in kinds and name not in loose:
                 _check(name, value, kinds[name])
         return function(*args, **kwargs)

@@ -28,6 +28,24 @@ The same page derives it.
 
 _BYTES = re.compile(r"(\d+(?:\.\d+)?)\s*([kKmMgG])[bB]")
 _UNITS = {"k": 1e3, "m": 1e6, "g": 1e9}
+_COUNT = re.compile(r"(\d+(?:\.\d+)?)\s*([kKmM]?)")
+
+
+def count_of(given: int | str | None) -> int | None:
+    """Return a count that is given as a number, or as text such as 50k, 1.5M or 50_000.
+
+    >>> count_of("50k"), count_of("1.5M"), count_of(" 50_000 "), count_of(7)
+    (50000, 1500000, 50000, 7)
+    """
+    if not isinstance(given, str):
+        return given
+    match = _COUNT.fullmatch(given.strip().replace("_", ""))
+    count = float(match[1]) * _UNITS.get(match[2].lower(), 1) if match else 0.5
+    if count != round(count):
+        raise InputError(
+            f"expected a whole number, or text such as 50k or 1.5M, got {given!r}", parameter="count"
+        )
+    return round(count)
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ from g2ard.errors import InputError
 from g2ard.io import Source, read_splats
 from g2ard.io.paths import real_path
 from g2ard.io.types import Cloud, Points, ViewSet
-from g2ard.jobs.budget import Budget
+from g2ard.jobs.budget import Budget, count_of
 from g2ard.jobs.budget_search import ResolvedBudget
 from g2ard.jobs.clean import clean as remove_clutter
 from g2ard.jobs.distill_options import LEAST_RECOVERY_SHARE, DistillOptions
@@ -358,7 +358,7 @@ _USUAL_RATIO = 10
 def distill(
     scene: Splats | Points | str | Path | None,
     *,
-    count: int | None = None,
+    count: int | str | None = None,
     ratio: float | None = None,
     fit: str | None = None,
     min_psnr: float | None = None,
@@ -463,10 +463,11 @@ def distill(
     >>> small = distill("cloud.laz", ratio=10)  # doctest: +SKIP
     >>> small = distill("cloud.ply", count=100_000, views="photos/", size=1600)  # doctest: +SKIP
     """
+    named = {"steps": steps, "schedule": schedule, "background": background, "seed": seed}
+    changed = keywords(distill, DistillConfig(), fields | named)
     budget = None
     if scene is not None or {count, ratio, fit, min_psnr, min_ssim} != {None}:
-        budget = Budget(count, ratio, fit=fit, min_psnr=min_psnr, min_ssim=min_ssim)
-    named = {"steps": steps, "schedule": schedule, "background": background, "seed": seed}
+        budget = Budget(count_of(count), ratio, fit=fit, min_psnr=min_psnr, min_ssim=min_ssim)
     options = DistillOptions(
         views=views,
         photos=photos,
@@ -478,7 +479,7 @@ def distill(
         format=format,
         preset=preset,
         time=time,
-        settings=keywords(distill, DistillConfig(), fields | named) | dict(settings or {}),
+        settings=changed | dict(settings or {}),
     )
     source = Source(scene, render_model) if isinstance(scene, str | Path) else scene
     job = prepare(source, budget, options, progress=progress, say=say)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import sys
 from collections.abc import Sequence
 from html import escape
 from pathlib import Path
@@ -22,7 +21,7 @@ from g2ard.io.labels import RESULT, labels_of
 from g2ard.jobs.inputs import GivenViews, Views, load_scene
 from g2ard.jobs.viewer_frame import backdrop, frame_of
 from g2ard.poses import best_views
-from g2ard.progress import Progress, Say, silent, unsaid
+from g2ard.progress import Progress, Say, kernel, silent, unsaid
 from g2ard.rendering.renderer import Renderer
 from g2ard.rendering.targets import Targets
 from g2ard.scene.cameras import Camera, Cameras
@@ -34,6 +33,8 @@ _SIZE = (480, 360)
 """Width and height in pixels of a scene's picture."""
 _TARGETS, _TARGET = 4, 240
 """Targets in a picture, and the longer side of each in pixels."""
+_LARGEST = 10_000_000
+"""Bytes of a page that a notebook embeds, and that its file then holds, at most."""
 _FRAME = 640
 """Height of a page in a cell, pixels."""
 
@@ -67,7 +68,8 @@ def view(
         say: called with log messages.
 
     Returns:
-        In a notebook, an `IFrame` of the whole page, for the cell to show. Elsewhere, the page's path.
+        In a notebook, an `IFrame` of the whole page, for the cell to show, and a line with its size. Pages of
+        more than 10 MB are not embedded: a picture and the path. Elsewhere, the page's path.
 
     Raises:
         InputError: an unreadable scene or views, or a scene too large for a page.
@@ -99,7 +101,7 @@ def view(
         overwrite=overwrite,
         progress=progress,
     )
-    return _inline(page) if _in_notebook() else page
+    return _inline(page, loaded[0]) if kernel() is not None else page
 
 
 def html_of(shown: Any) -> str:
@@ -116,6 +118,8 @@ def _picture(shown: Any) -> str:
         if shown.image_path is None:
             return _wedge(shown)
         return _embedded(_small(load_photo(Cameras.of([shown]), 0)[0]))
+    if isinstance(shown, Cameras):
+        return " ".join(_picture(shown[int(view)]) for view in evenly_spaced(len(shown), _TARGETS))
     if hasattr(shown, "cameras"):
         return _embedded(_row(shown))
     scene = scene_of(shown)
@@ -151,15 +155,13 @@ def _wedge(camera: Camera) -> str:
     )
 
 
-def _in_notebook() -> bool:
-    """Return whether this runs in a kernel, whose cells show HTML."""
-    ipython = sys.modules.get("IPython")
-    shell = None if ipython is None else ipython.get_ipython()
-    return getattr(shell, "kernel", None) is not None
+def _inline(page: Path, scene: Splats) -> Any:
+    from IPython.display import HTML, IFrame
 
-
-def _inline(page: Path) -> Any:
-    from IPython.display import IFrame
-
+    size = page.stat().st_size
+    if size > _LARGEST:
+        text = f"{page}: {size / 1e6:.1f} MB are too many to embed; open it in a browser"
+        return HTML(f"<div>{escape(text)}<br>{_picture(scene)}</div>")
+    print(f"{page.name}: {size / 1e6:.1f} MB are embedded in this notebook")
     content = escape(page.read_text(encoding="utf-8"))
     return IFrame("about:blank", "100%", _FRAME, extras=[f'srcdoc="{content}"'])

@@ -14,7 +14,7 @@ from g2ard.errors import InputError
 from g2ard.io import Source
 from g2ard.io.scene_formats import check_positions
 from g2ard.io.types import Note
-from g2ard.jobs.budget import Budget
+from g2ard.jobs.budget import Budget, count_of
 from g2ard.jobs.budget_search import (
     Quality,
     ResolvedBudget,
@@ -293,7 +293,7 @@ def reducing(
 def simplify(
     scene: Splats | str | Path,
     *,
-    count: int | None = None,
+    count: int | str | None = None,
     ratio: float | None = None,
     fit: str | None = None,
     min_psnr: float | None = None,
@@ -358,7 +358,7 @@ def simplify(
     fields = {"method": method, "keep_region": keep_region}
     given = {name: value for name, value in fields.items() if value is not None}
     config = configured(config or SimplifyConfig(), settings=given | dict(settings or {}))
-    wanted = Budget(count, ratio, fit=fit, min_psnr=min_psnr, min_ssim=min_ssim)
+    wanted = Budget(count_of(count), ratio, fit=fit, min_psnr=min_psnr, min_ssim=min_ssim)
     name = "scene" if isinstance(scene, Splats) else str(scene)
     given_views = GivenViews(views, beside, up, seed)
     inputs: dict[str, Any] = {"given": given_views, "blind": blind, "progress": progress, "say": say}

@@ -139,7 +139,7 @@ class Camera(Shown):
 
 
 @dataclass(frozen=True, eq=False)
-class Cameras:
+class Cameras(Shown):
     """C views.
 
     Args:

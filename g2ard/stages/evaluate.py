@@ -20,7 +20,7 @@ from g2ard.rendering.metrics import Lpips, detail, edge_psnr, psnr, ssim
 from g2ard.rendering.renderer import RasterSettings, Renderer
 from g2ard.rendering.targets import Targets, against_of, checked_targets, fill, mask_of, scored_in
 from g2ard.scene.cameras import USUAL
-from g2ard.scene.splats import Splats
+from g2ard.scene.splats import HasSplats, Splats, scene_of
 from g2ard.system.threads import in_threads
 
 
@@ -134,7 +134,7 @@ class Evaluation(Report):
 
 @checks_arguments
 def evaluate(
-    splats: Splats,
+    splats: Splats | HasSplats,
     targets: Targets,
     *,
     background: Colour = BLACK,
@@ -153,7 +153,7 @@ def evaluate(
     only masked pixels count.
 
     Args:
-        splats: the scene; cameras are in world coordinates, including its offset.
+        splats: the scene, or a result that holds one; cameras are in world coordinates, including its offset.
         targets: photos or teacher renders; scores against the two are not comparable. With
             `g2ard.rendering.targets.Exposed` scores are measured after a fit of exposures.
         background: RGB in [0, 1] behind the scene.
@@ -179,7 +179,7 @@ def evaluate(
     >>> len(scores.views), 0 < scores.ssim < 1 < scores.psnr < 100
     (4, True)
     """
-    targets = checked_targets(targets)
+    splats, targets = scene_of(splats), checked_targets(targets)
     cameras = targets.cameras
     fill(targets, progress)
     renderer = Renderer(splats, background=background, settings=settings)

@@ -127,13 +127,21 @@ function sortToTheEnd(app) {
   look();
 }
 
+// The viewer resolves names against the page's address, which fails in about:srcdoc, the address of notebooks' frames:
+// embedded scenes, which nothing fetches, get whole addresses.
+function content(index) {
+  if (!document.getElementById(`scene${index}`)) return { contentUrl: files[index] }; // streamed from beside the page
+  return {
+    contentUrl: `https://embedded.invalid/${files[index]}`,
+    contents: Promise.resolve(new Response(bytes(read(`scene${index}`))))
+  };
+}
+
 async function viewer(createViewer, index, container) {
   const handle = await createViewer({
     container,
     settings,
-    contentUrl: files[index],
-    ...(document.getElementById(`scene${index}`) // otherwise streamed from beside the page
-      ? { contents: Promise.resolve(new Response(bytes(read(`scene${index}`)))) } : {}),
+    ...content(index),
     renderer: 'webgl',
     ui: index === 0,
     noanim: true

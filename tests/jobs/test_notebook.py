@@ -1,5 +1,6 @@
 """What notebooks show: pages inline, and a line with a picture of scenes, views, targets and results."""
 
+import ast
 import base64
 import re
 import sys
@@ -20,6 +21,7 @@ from g2ard.errors import InputError
 from g2ard.io.images import load_photo
 from g2ard.rendering.targets import fingerprint_of
 from g2ard.scene.lenses import PhotoLens
+from helpers.project import ROOT
 from helpers.scenes import around, checkered_ball
 from helpers.view_files import photo as photo_file
 
@@ -112,20 +114,111 @@ def test_view_returns_its_page(tmp_path: Path, results: dict[str, Any]) -> None:
         g2ard.view(BALL, output=two)
 
 
-def test_view_shows_the_whole_page_in_a_notebook(monkeypatch: pytest.MonkeyPatch) -> None:
+class Shell(SimpleNamespace):
+    """IPython's shell and displays, as far as g2ard uses them."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        super().__init__(kernel=object(), execution_count=1, cells=[])
+        frames = SimpleNamespace(
+            IFrame=lambda src, width, height, extras: SimpleNamespace(extras=extras),
+            HTML=lambda data: SimpleNamespace(data=data),
+            display=self.display,
+        )
+        monkeypatch.setitem(sys.modules, "IPython", SimpleNamespace(get_ipython=lambda: self))
+        monkeypatch.setitem(sys.modules, "IPython.display", frames)
+
+    def display(self, content: dict[str, str], *, raw: bool, display_id: bool) -> Any:
+        assert raw
+        assert display_id
+        self.cells.append([content["text/plain"]])
+        return SimpleNamespace(update=lambda content, raw: self.cells[-1].append(content["text/plain"]))
+
+
+def test_view_shows_the_whole_page_in_a_notebook(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     """IPython's `IFrame(src, width, height, extras)` writes the extras as attributes of its frame."""
-    shell = SimpleNamespace(kernel=object())
-    frames = SimpleNamespace(IFrame=lambda src, width, height, extras: SimpleNamespace(extras=extras))
-    monkeypatch.setitem(sys.modules, "IPython", SimpleNamespace(get_ipython=lambda: shell))
-    monkeypatch.setitem(sys.modules, "IPython.display", frames)
+    shell = Shell(monkeypatch)
     (attribute,) = g2ard.view(BALL).extras
     name, _, content = attribute.partition("=")
     assert name == "srcdoc"
     assert content[0] == content[-1] == '"'
     assert '"' not in content[1:-1]
     assert unescape(content[1:-1]).startswith("<!doctype html>")
+    said = capsys.readouterr().out
+    assert re.fullmatch(r"view.html: \d+\.\d MB are embedded in this notebook\n", said)
+    monkeypatch.setattr("g2ard.jobs.notebook._LARGEST", 1000)
+    html = g2ard.view(BALL).data
+    assert "MB are too many to embed" in html
+    assert embedded(html).std() > 5
     shell.kernel = None  # IPython in a terminal
     assert isinstance(g2ard.view(BALL), Path)
+
+
+def test_progress_is_one_line_per_cell(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shell = Shell(monkeypatch)
+    monkeypatch.setattr("g2ard.progress.time", SimpleNamespace(monotonic=iter(range(1000, 2000, 2)).__next__))
+    for cell in (1, 2):
+        shell.execution_count = cell
+        for stage in ("read", "recover"):
+            for done in range(5):
+                g2ard.show_progress(stage, done, 4)
+    assert capsys.readouterr() == ("", "")
+    first, second = shell.cells
+    assert len(first) == len(second) == 10
+    assert first[7].startswith("recover: 2/4 ██████████░░░░░░░░░░ ")
+    assert first[7].endswith("4 s left")
+    assert "█" * 20 in first[-1]
+
+
+def test_errors_of_users_are_one_line_in_a_notebook() -> None:
+    calls: list[Any] = [
+        lambda: g2ard.load("missing.ply"),
+        lambda: g2ard.simplify(BALL, ratoi=4),
+        lambda: g2ard.simplify(),
+        lambda: g2ard.distill(BALL, budget=50),
+        lambda: g2ard.save("a.xyz", BALL),
+    ]
+    for call in calls:
+        with pytest.raises(g2ard.G2ardError) as caught:
+            call()
+        (line,) = caught.value._render_traceback_()
+        assert "\n" not in line
+        assert line == f"{type(caught.value).__name__}: {caught.value}"
+
+
+def test_words_that_people_try(results: dict[str, Any]) -> None:
+    with pytest.raises(g2ard.InputError, match="unknown keyword 'budget'"):
+        g2ard.distill(BALL, budget=50)
+    assert len(g2ard.simplify(BALL, count="0.1k", blind=True).splats) == 100
+    for wrong in ("50 percent", "1.5", "k"):
+        with pytest.raises(g2ard.InputError, match="count: expected a whole number, or text such as 50k"):
+            g2ard.simplify(BALL, count=wrong, blind=True)
+    done = results["Distilled"]
+    assert g2ard.evaluate(done, done.held_out).psnr == g2ard.evaluate(done.splats, done.held_out).psnr
+
+
+def test_cameras_show_a_few_frames() -> None:
+    assert 1 < VIEWS._repr_html_().count("<svg") <= 4
+
+
+def test_names_are_visible_without_running() -> None:
+    """Editors read the imports for type checkers; jedi does unless their condition is literally false."""
+    tree = ast.parse((ROOT / "g2ard" / "__init__.py").read_text(encoding="utf-8"))
+    assert not [n for n in tree.body if isinstance(n, ast.Assign) and ast.unparse(n.value) == "False"]
+    block = next(node for node in tree.body if isinstance(node, ast.If))
+    imports = [alias.asname or alias.name for node in block.body for alias in getattr(node, "names", [])]
+    assert set(imports) >= set(g2ard.__all__)
+
+
+def test_jedi_completes_public_names() -> None:
+    jedi = pytest.importorskip("jedi")
+    project = jedi.Project(ROOT, sys_path=[str(ROOT)])
+    script = jedi.Script("import g2ard\ng2ard.\n", project=project)
+    names = {completion.name for completion in script.complete(2, 6)}
+    assert names >= set(g2ard.__all__)
 
 
 LENSES = {
