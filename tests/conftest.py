@@ -46,6 +46,7 @@ def pytest_configure(config: pytest.Config) -> None:
         plans = tempfile.TemporaryDirectory(prefix="plans")
         config.add_cleanup(plans.cleanup)
         os.environ[FOLDER] = plans.name
+        os.environ["XDG_CACHE_HOME"] = os.environ["LOCALAPPDATA"] = plans.name
 
 
 def pytest_collection_finish() -> None:

@@ -124,9 +124,7 @@ def printed_text(data: bytes, root: Path) -> str:
 
 
 def content(path: Path, root: Path) -> bytes:
-    """Return what is hashed of a file; records of finished runs hold times."""
-    if path.suffix == ".finished":
-        return b""
+    """Return what is hashed of a file."""
     data = path.read_bytes()
     if path.suffix == ".json":
         return printed_text(data, root).encode()

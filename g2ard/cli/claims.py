@@ -115,11 +115,36 @@ class Claims:
         found = (find_views(path) for path in self._inputs)
         return frozenset(real_path(path) for path in found if path is not None)
 
+    def named_inputs(self) -> list[Path]:
+        """Return the real paths of the inputs that options name."""
+        return [real_path(path) for path in self._inputs]
+
     def input_files(self) -> list[Path]:
-        """Return all files that the command reads: its inputs, files in input folders, photos and cameras."""
+        """Return all files that the command reads: inputs, files in input folders, cameras that are found,
+        photos, and what is found beside views."""
         found = {*map(run_scene, self._inputs), *self._cameras}
         inside = {path for folder in found if folder.is_dir() for path in folder.rglob("*")}
-        return sorted(path for path in found | inside | self._photos if path.is_file())
+        files = (path for path in found | inside | self._photos | self._beside if path.is_file())
+        return sorted(path for path in files if not self._writes(path))
+
+    def _writes(self, path: Path) -> bool:
+        """Return whether a file is among the outputs, as in a folder of views that a run is written into."""
+        place = real_path(path)
+        return not self._outputs.keys().isdisjoint((place, *place.parents))
+
+    @cached_property
+    def _beside(self) -> set[Path]:
+        """Splits, points and exposures that are found beside views and photos."""
+        from g2ard.io.images import exposure_file
+        from g2ard.io.splits import split_files
+        from g2ard.jobs.photo_points import sparse_file
+
+        found: set[Path] = {exposure_file(photo) for photo in self._photos}
+        for path in filter(may_hold_views, [*self._inputs, *self._cameras]):
+            found.update(split_files(path))
+            with suppress(G2ardError, OSError):  # the command will say it
+                found.update(filter(None, [sparse_file(path)]))
+        return found
 
 
 _DATA_FILES = re.compile(

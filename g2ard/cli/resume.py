@@ -3,7 +3,7 @@
 import json
 import shutil
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -22,8 +22,9 @@ from g2ard.io.atomic import (
 )
 from g2ard.io.jsonfile import read_json
 from g2ard.io.lock import check_unlocked, lock_file, locked
-from g2ard.io.paths import file_identity, real_path
+from g2ard.io.paths import file_identity, real_path, user_cache
 from g2ard.io.scene_formats import files_of
+from g2ard.system.keys import key_of
 
 OPTIONS = "options.json"
 """File in a folder of checkpoints with the options of their run."""
@@ -36,16 +37,11 @@ CALL_OPTIONS = (
 """Options that may differ from a finished run's: also budgets of the same count."""
 
 
-def record_file(place: Path, output: Path) -> Path:
-    """Return the hidden file that records with which options and inputs `output` was finished."""
-    return place.parent / hidden_name(_locked_name(place, output), ".finished")
-
-
 def is_finished(run: Run, place: Path, resume: bool, output: Path) -> bool:
     """Return whether --resume finds `output` finished; raise an error for other options or inputs."""
     if not resume or run.overwrite or left_at(place):
         return False
-    record = _record_of(place, output)
+    record = record_of(output)
     if record is None:
         return False
     check_same(run, record, output)
@@ -67,13 +63,16 @@ def check_same(run: Run, record: Mapping[str, Any], output: Path, *others: str) 
             path=output,
             hint="-w without --resume starts over",
         )
-    known = record.get("inputs", {})
-    present = [*run.input_files(), *(path for path in map(Path, known) if path.is_file())]
-    for name, identity in identities(present).items():
-        if identity != known.get(name):
-            raise OutputError(
-                f"finished before {name} changed", path=output, hint="-w without --resume starts over"
-            )
+    known, present = record.get("inputs", {}), identities(run.input_files())
+    missing = [path for path in run.named_inputs() if not path.exists()]  # without them, nothing is read anew
+    gone = [Path(name) for name in known if name not in present and not Path(name).is_file()]
+    lost = [str(path) for path in gone if not {real_path(path), *real_path(path).parents} & set(missing)]
+    present |= identities(Path(name) for name in known if name not in present and Path(name).is_file())
+    changed = [name for name, identity in present.items() if identity != known.get(name)]
+    for name in sorted([*changed, *lost]):
+        raise OutputError(
+            f"finished before {name} changed", path=output, hint="-w without --resume starts over"
+        )
 
 
 def identities(files: Iterable[Path]) -> dict[str, Any]:
@@ -84,35 +83,38 @@ def identities(files: Iterable[Path]) -> dict[str, Any]:
     return dict(zip(map(str, paths), file_identity(paths), strict=True))
 
 
-def _record_of(place: Path, output: Path) -> dict[str, Any] | None:
-    """Return the record of a finished output, or None if it is missing or the output is another file."""
-    file = record_file(place, output)
+def record_of(output: Path) -> dict[str, Any] | None:
+    """Return the options and inputs of the command that finished the output, or None if that is not known,
+    as of an output that was moved or is another file."""
+    file = _record_file(output)
     if not (file.is_file() and is_taken(output)):
         return None
     try:
         record = read_json(file)
     except InputError:
         return None
-    known = isinstance(record, dict) and record.get("output") == _content(output)
+    known = isinstance(record, dict) and record.get("output") == file_identity([output])
     return record if known else None
 
 
-def _content(output: Path) -> list[Any]:
-    """Return the identity of an output."""
-    ((name, digest),) = file_identity([output])
-    return [name, digest]
+def _record_file(output: Path) -> Path:
+    """Return the file in the user's cache for the record of a finished output."""
+    return user_cache() / "finished" / f"{key_of(str(real_path(output)))}.json"
 
 
 @contextmanager
-def recorded(run: Run, place: Path, output: Path) -> Iterator[None]:
+def recorded(run: Run, output: Path) -> Iterator[None]:
     """Record options and inputs when `output` is written, so that --resume finds it finished."""
-    file, inputs = record_file(place, output), identities(run.input_files())
-    file.unlink(missing_ok=True)
+    inputs = identities(run.input_files())
     yield
     if is_taken(output):
-        record = {"config": run.config, "inputs": inputs, "output": _content(output)}
-        with atomic_output(file, overwrite=True) as temporary:
-            temporary.write_text(json.dumps(record, default=str), encoding="utf-8", newline="\n")
+        record = {"config": run.config, "inputs": inputs, "output": file_identity([output])}
+        text = json.dumps(record, default=str)
+        with suppress(OSError, OutputError):  # without a cache, --resume answers that the output exists
+            file = _record_file(output)
+            file.parent.mkdir(parents=True, exist_ok=True)
+            with atomic_output(file, overwrite=True) as temporary:
+                temporary.write_text(text, encoding="utf-8", newline="\n")
 
 
 def began_output(place: Path, output: Path) -> bool:
@@ -130,7 +132,7 @@ def began_output(place: Path, output: Path) -> bool:
 
 def drop_ended(run: Run, place: Path, resume: bool, output: Path) -> bool:
     """Remove checkpoints of a run that was killed after it recorded its output, and return whether it was."""
-    record = _record_of(place, output) if resume and not run.overwrite and place.exists() else None
+    record = record_of(output) if resume and not run.overwrite and place.exists() else None
     if record is None:
         return False
     check_same(run, record, output)
@@ -150,7 +152,6 @@ def check_scene_run(run: Run, place: Path, resume: bool, output: Path) -> None:
     """Check that the command may write the scene `output`, or resume from the checkpoints at `place`."""
     run.claim("--output", *files_of(output))
     run.claim("--resume", place, folder=True)
-    run.claim("--resume", record_file(place, output))
     drop_ended(run, place, resume, output)
     if not is_finished(run, place, resume, output):
         run.overwrite |= resume and began_output(place, place.parent / _locked_name(place, output))
@@ -187,7 +188,7 @@ def stoppable(run: Run, place: Path, resume: bool, output: Path) -> Iterator[Non
             if is_taken(output) and not run.overwrite:  # another run wrote it since it was checked
                 raise OutputError("exists", path=output, hint="{overwrite=True} replaces it")
             _drop_temporaries(place, output)
-            with kept(run, place, resume, output, f"from {place}"), recorded(run, place, output):
+            with kept(run, place, resume, output, f"from {place}"), recorded(run, output):
                 yield
     finally:
         drop_empty(made)

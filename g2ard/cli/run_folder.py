@@ -58,6 +58,9 @@ _VIEW_FILES: dict[ViewFormat, str] = {
 """Names of generated views for other programs, beside views.json."""
 
 
+_VIEW_DEFAULTS: tuple[ViewFormat | None, ...] = (None, "g2ard")
+
+
 class RunFolder:
     """Folder of a run with one budget.
 
@@ -83,19 +86,36 @@ class RunFolder:
         killed = self.path.is_dir() and [path.name for path in self.path.iterdir()] == [_WORK_FOLDER]
         done = self._resume and not self._run.overwrite and not left
         done = done and self.scene.exists() and self._report.exists()
-        if not left and not done and not killed:
+        if done:
+            record = self._finished(budget)
+            if not (lacking := self._lacking(record)):
+                self._run.say(f"{self.path}: already finished; -w without --resume starts over")
+                return record
+            self._run.say(f"{self.path}: finished without {', '.join(lacking)}; the run is repeated")
+            self._run.overwrite = True
+        if not left and not killed:
             check_output(self.path, self._run.overwrite, folder=True)
         if left or not self._resume:
             check_stopped(self._run, self.unfinished, self._resume, self.scene)
-        return self._finished(budget) if done else None
+        return None
 
     def _finished(self, budget: Budget | None) -> dict[str, Any]:
         """Return the finished run's report; raise an `OutputError` if its budget, options or input files were
         others."""
         record = read_json(self._report)
         check_same(self._run, record, self.path, *_other_budget(record, budget))
-        self._run.say(f"{self.path}: already finished; -w without --resume starts over")
+        assert isinstance(record, dict)
         return record
+
+    def _lacking(self, record: Mapping[str, Any]) -> list[str]:
+        """Return the options of this command whose files a finished run was not asked for."""
+        then, now = record.get("config", {}), self._run.config
+        asked = {
+            "--keep": now["keep"] and not self._simplified.exists(),
+            "--page": now["page"] and not then.get("page", True),
+            "--views-format": now["views_format"] not in (*_VIEW_DEFAULTS, then.get("views_format")),
+        }
+        return [name for name, lacks in asked.items() if lacks]
 
     @contextmanager
     def held(self, job: DistillJob | TiledJob) -> Iterator[None]:

@@ -1,9 +1,7 @@
 """Reader for laser scans, .e57, with pye57: their points, and their photos as views."""
 
 import hashlib
-import os
 import re
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -16,7 +14,7 @@ from numpy.typing import NDArray
 from g2ard.errors import G2ardError, InputError, missing
 from g2ard.io import judge
 from g2ard.io.atomic import atomic_output
-from g2ard.io.paths import check_unpacked, file_identity
+from g2ard.io.paths import check_unpacked, file_identity, user_cache
 from g2ard.io.photos import Frame, Lens, Listed, inverse, posed
 from g2ard.io.stream import JoinedClouds, MarkedPoints, Names, PointStream, telling
 from g2ard.io.transforms import FLIP
@@ -283,6 +281,4 @@ def _cache_of(path: Path) -> Path:
     """Return the folder of a file's photos below the user's cache folder; another file has another one."""
     state = path.stat()
     key = f"{path.resolve()}\n{state.st_size}\n{state.st_mtime_ns}"
-    usual = os.environ.get("LOCALAPPDATA") if sys.platform == "win32" else os.environ.get("XDG_CACHE_HOME")
-    base = Path(usual) if usual else Path.home() / ".cache"
-    return base / "g2ard" / "e57" / f"{path.stem}-{hashlib.sha256(key.encode()).hexdigest()[:16]}"
+    return user_cache() / "e57" / f"{path.stem}-{hashlib.sha256(key.encode()).hexdigest()[:16]}"

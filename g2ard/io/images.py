@@ -148,7 +148,7 @@ def find_exposures(cameras: Cameras) -> dict[str, NDArray[np.float64]]:
     for name, photo in zip(cameras.names, cameras.image_paths, strict=True):
         if photo is None:
             continue
-        path = photo.parent.parent / "exposure.json"
+        path = exposure_file(photo)
         if path not in tables:
             content = read_json(path) if path.is_file() else {}
             tables[path] = {
@@ -161,6 +161,11 @@ def find_exposures(cameras: Cameras) -> dict[str, NDArray[np.float64]]:
                 exposures[name] = table[key]
                 break
     return exposures
+
+
+def exposure_file(photo: Path) -> Path:
+    """Return the path of the table with a photo's exposure, which may not exist."""
+    return photo.parent.parent / "exposure.json"
 
 
 def load_mask(cameras: Cameras, index: int) -> NDArray[np.bool_] | None:

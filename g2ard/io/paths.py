@@ -4,6 +4,7 @@ import codecs
 import hashlib
 import os
 import re
+import sys
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from pathlib import Path, PurePosixPath, PureWindowsPath
@@ -132,3 +133,9 @@ def content_hash(path: Path) -> str:
     except OSError as error:
         raise InputError(f"{error.strerror}", path=path) from error
     return digest.hexdigest()
+
+
+def user_cache() -> Path:
+    """Return the folder in the user's cache for what can be made again or done without."""
+    usual = os.environ.get("LOCALAPPDATA") if sys.platform == "win32" else os.environ.get("XDG_CACHE_HOME")
+    return (Path(usual) if usual else Path.home() / ".cache") / "g2ard"

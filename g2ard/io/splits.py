@@ -127,6 +127,16 @@ def _masks(
     return masks
 
 
+def split_files(views: Path) -> list[Path]:
+    """Return the files with splits that are beside views, see `split_mask`."""
+    model = model_folder(views)
+    places = [*_places(views), *([model] if model else ())]
+    return [place / name for place in places for name in _SPLIT_FILES if usable(place / name)]
+
+
+_SPLIT_FILES = ("split.json", "test.txt", "train.txt")
+
+
 def _read_split(views: Path) -> dict[str, list[str]] | None:
     """Read split.json from the views' folder; for a COLMAP model in sparse/ or sparse/N also from the folders
     above it, up to that of sparse/."""

@@ -180,7 +180,7 @@ def test_a_stopped_run_with_other_options(
         "continues after final, simplified-1"
         in succeeds(command_line, tmp_path, *given[:-1], "64", "--resume").err
     )
-    assert {path.name for path in tmp_path.iterdir()} == {"ball.ply", "v.json", "out", ".out.finished"}
+    assert {path.name for path in tmp_path.iterdir()} == {"ball.ply", "v.json", "out"}
 
 
 def test_the_sky_is_the_environment(tmp_path: Path, command_line) -> None:

@@ -19,7 +19,7 @@ CALLS = {
 }
 """A call of each command with the options of tiles."""
 
-NAMED = ("report.json", "report.html", "index.html", ".levels.finished")
+NAMED = ("report.json", "report.html", "index.html")
 """Files that hold times, options or the output's name."""
 
 

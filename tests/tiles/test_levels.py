@@ -127,7 +127,7 @@ def test_the_command_in_tiles(place: Path, tmp_path: Path, command_line) -> None
     counts = {at: sum(len(f) for f, of in zip(files, levels, strict=True) if of == at) for at in "012"}
     assert counts == {"0": 3000, "1": 750, "2": 188}
     assert len(io.read_splats(tmp_path / "out")) == 3000
-    assert {path.name for path in tmp_path.iterdir()} == {"out", ".out.finished", "told.json"}
+    assert {path.name for path in tmp_path.iterdir()} == {"out", "told.json"}
     assert "already finished" in succeeds(command_line, tmp_path, *tiled, "--resume").err
     (tmp_path / ".z.tiles" / "steps").mkdir(parents=True)
     (tmp_path / ".z.tiles" / "steps" / "coarse-00000-0123456789abcdef.npz").write_bytes(b"of another run")

@@ -122,7 +122,7 @@ def lod(
         check_stopped,
         drop_ended,
         is_finished,
-        record_file,
+        record_of,
         recorded,
         stoppable,
     )
@@ -166,13 +166,12 @@ def lod(
     run.spare_inputs(meta)
     run.claim("--output", output, folder=True)
     run.claim("--resume", stopped, folder=True)
-    run.claim("--resume", record_file(stopped, meta))
     work = tiling.folder if tiled else stopped
     finished = not dry_run and is_finished(run, stopped, resume, meta)
     if not (dry_run or (tiled and tiling.keep)):
         finished |= drop_ended(run, work, resume or tiled, meta)
     if not (finished or dry_run):
-        ended = record_file(stopped, meta).exists()
+        ended = record_of(meta) is not None
         run.overwrite |= (tiled or resume) and not ended and began_output(work, output)
         check_output(output, run.overwrite, folder=True)
     if finished or not (tiled or dry_run):
@@ -190,7 +189,7 @@ def lod(
         held = work_folder(run, None if dry_run else how, views)
     else:
         held = stoppable(run, stopped, resume, meta)
-    noted = recorded(run, stopped, meta) if tiled and not dry_run else nullcontext()
+    noted = recorded(run, meta) if tiled and not dry_run else nullcontext()
     options: dict[str, Any] = {"ratios": ratios, "recover": recover, "steps": steps, "background": colour}
     options |= {"split_sky": environment, "seed": run.seed, **run.callbacks}
     options |= {"views": views, "size": size, "up": up, "beside": scene}
