@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 __all__ = ["DEFINITIONS", "SceneSpec", "Study", "checked", "key", "read_study", "scene_label"]
 
 DEFINITIONS = Path(__file__).parent / "definitions"
-KINDS = ("matched", "simplify", "recover", "select", "ship", "register", "raster", "devices")
+KINDS = ("matched", "simplify", "recover", "select", "ship", "register", "raster", "boxes", "devices")
 """Modules of `benchmarks.kinds`; each holds the subclass of `Study` of the same name, capitalised."""
 
 _VARIABLE = re.compile(r"\$\{?(\w+)")

@@ -115,10 +115,12 @@ class VisibilityAccumulator:
     def add(
         self, views: list[_View], options: RasterSettings, progress: Callable[[int, int], None] | None = None
     ) -> int: ...
+    def add_box(self, view: _View, options: RasterSettings, corners: _Corners, light: _F32) -> None: ...
     def by_row(self) -> tuple[_F32, _F32]: ...
 
 _F32 = NDArray[np.float32]
 _Arrays = tuple[_F32, ...]
+_Corners = tuple[list[float], list[float]]
 _View = tuple[list[list[float]], list[float], tuple[int, int], float]
 
 def instruction_sets() -> list[str]: ...
@@ -136,6 +138,14 @@ class Rasterizer:
     def image(
         self, scene: _Arrays, view: _View, options: RasterSettings, background: list[float]
     ) -> _F32: ...
+    def draw(
+        self,
+        arrays: _Arrays,
+        view: _View,
+        options: RasterSettings,
+        corners: _Corners,
+        planes: tuple[_F32, _F32, _F32 | None, _F32 | None],
+    ) -> None: ...
     def backward(
         self, arrays: _Arrays, image: _F32, alpha: _F32 | None = None, depth: _F32 | None = None
     ) -> list[_F32]: ...
@@ -169,6 +179,10 @@ class Trainer:
     @property
     def skipped(self) -> int: ...
 
+def light_on(light: _F32, view: _View, options: RasterSettings, corners: _Corners) -> float: ...
+def reaching(
+    means: _F32, scales: _F32, opacities: _F32, views: list[_View], corners: _Corners
+) -> NDArray[np.bool_]: ...
 def accumulate(
     arrays: _Arrays,
     views: list[_View],

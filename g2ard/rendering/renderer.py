@@ -23,6 +23,7 @@ from g2ard.scene.prepared import DRAWN_LOG_SCALES, DRAWN_LOGITS, MAX_OPACITY
 from g2ard.scene.splats import HasSplats, Splats, scene_of, unit_quats
 
 _Floats = NDArray[np.float32]
+Corners = tuple[list[float], list[float]]
 View = tuple[list[list[float]], list[float], tuple[int, int], float]
 
 
@@ -97,6 +98,12 @@ def view_of(cameras: Cameras, index: int, settings: RasterSettings) -> View:
         (int(cameras.widths[index]), int(cameras.heights[index])),
         settings.near_of(index),
     )
+
+
+def corners_of(box: NDArray[np.float64]) -> Corners:
+    """Convert a (2, 3) box to the form that `_core` takes."""
+    low, high = np.asarray(box, np.float64).tolist()
+    return low, high
 
 
 def arrays_of(splats: Splats) -> tuple[_Floats, _Floats, _Floats, _Floats, _Floats, _Floats]:
@@ -213,6 +220,20 @@ class Renderer:
         )
         assert depth is not None
         return Rendered(image, alpha, depth, middle)
+
+    def draw(
+        self,
+        camera: Camera,
+        box: NDArray[np.float64],
+        color: _Floats,
+        light: _Floats,
+        depth: _Floats | None = None,
+        median: _Floats | None = None,
+    ) -> None:
+        """Draw a box of the scene on the planes of a `rendering.boxes.Canvas`, in place."""
+        planes = color, light, depth, median
+        corners = corners_of(box - self._offset)
+        self._rasterizer.draw(self._arrays, self._view(camera), self._settings, corners, planes)
 
     @checks_arguments
     def panorama(self, camera: Camera, *, width: Annotated[int, Within("[4, inf)")] = 2048) -> Rendered:

@@ -70,9 +70,13 @@ def render(
     inria: bool = False,
     alpha_max: float = 0.99,
     clip_margin: float = 1e-4,
+    box: tuple[Tensor, Tensor] | None = None,
+    light: Tensor | None = None,
 ) -> Oracle:
     """All arguments float64. Returns flat pixels (P = H·W) in `Oracle.weight`, images otherwise.
 
+    `box`: low and high corner. A pair counts if its pixel's ray is in it at the Gaussian's depth.
+    `light`: (H, W) light in front of the scene or box; at most `STOP` where the pixel has stopped.
     `clip_margin`: how near, relatively, to `alpha_max` an α makes its pixel doubtful.
     """
     W, t = viewmat[:3, :3], viewmat[:3, 3]
@@ -111,20 +115,29 @@ def render(
     q = (C[:, None] * dx * dx - 2 * B[:, None] * dx * dy + A[:, None] * dy * dy) / det[:, None]
     raw = opacity[:, None] * torch.exp(-0.5 * q)
     alpha = raw.clamp(max=alpha_max)
-    hit = alpha >= ALPHA_MIN
+    hit = hit_anywhere = alpha >= ALPHA_MIN
     decisions = {"order": rows, "skip": hit}
     if inria:
         decisions["tile"] = inria_tiles(u, v, A, C, det, width, height)
         hit = hit & decisions["tile"]
+    near_face = torch.zeros_like(hit)
+    if box is not None:
+        rays = torch.stack([(px.reshape(-1) - cx) / fx, (py.reshape(-1) - cy) / fy], -1)
+        rays = torch.cat([rays, torch.ones_like(rays[:, :1])], -1) @ W
+        points = -W.T @ t + z[:, None, None] * rays[None]
+        hit = hit & (points >= box[0]).all(-1) & (points < box[1]).all(-1)
+        gaps = torch.minimum((points - box[0]).abs(), (points - box[1]).abs()).min(-1).values
+        near_face = gaps < 1e-5 * (1 + points.abs().max(-1).values)
+    front = torch.ones(height * width, dtype=means.dtype) if light is None else light.reshape(-1)
     alpha = torch.where(hit, alpha, torch.zeros_like(alpha))
-    after = torch.cumprod(1 - alpha, 0)
+    after = front * torch.cumprod(1 - alpha, 0)
     going = after.detach() > STOP
     going = torch.cumprod(going.to(torch.int8), 0).bool()
     alpha = torch.where(going, alpha, torch.zeros_like(alpha))
-    after = torch.cumprod(1 - alpha, 0)
-    before = torch.cat([torch.ones_like(after[:1]), after[:-1]]) if len(after) else after
+    after = front * torch.cumprod(1 - alpha, 0)
+    before = torch.cat([front[None], after[:-1]]) if len(after) else after
     weight = alpha * before
-    left = after[-1] if len(after) else torch.ones(height * width, dtype=means.dtype)
+    left = after[-1] if len(after) else front
 
     position = -W.T @ t
     direction = means[rows] - position
@@ -155,7 +168,7 @@ def render(
         median=median.reshape(height, width),
         weight=full,
         before=full_before,
-        doubtful=(near_edge | near_stop).any(0).reshape(height, width),
+        doubtful=(near_edge | near_stop | (near_face & hit_anywhere)).any(0).reshape(height, width),
         decisions=decisions,
     )
 

@@ -1,7 +1,10 @@
 //! numpy ↔ slices of fixed-size rows, without copying.
 
 use numpy::ndarray::Dimension;
-use numpy::{Element, PyArray1, PyArray2, PyArrayMethods, PyReadonlyArray, PyUntypedArrayMethods};
+use numpy::{
+    Element, PyArray1, PyArray2, PyArrayMethods, PyReadonlyArray, PyReadwriteArrayDyn,
+    PyUntypedArrayMethods,
+};
 use pyo3::prelude::*;
 
 use crate::error::invalid;
@@ -36,6 +39,15 @@ pub fn optional<'a, T: Element>(
     array: &'a Option<PyReadonlyArray<'_, T, impl Dimension>>,
 ) -> PyResult<Option<&'a [T]>> {
     array.as_ref().map(|array| flat(name, array)).transpose()
+}
+
+/// A C-contiguous array as one slice to write to.
+pub fn writable<'a>(
+    name: &'static str,
+    array: &'a mut PyReadwriteArrayDyn<'_, f32>,
+) -> PyResult<&'a mut [f32]> {
+    let strided = |_| invalid(name, "a C-contiguous array", "strides");
+    array.as_slice_mut().map_err(strided)
 }
 
 /// Rows as an (N, C) array; the memory moves, nothing is copied.

@@ -34,7 +34,9 @@ mod _core {
     #[pymodule_export]
     use crate::quantize::{codebook, palette};
     #[pymodule_export]
-    use crate::raster::{PyRasterizer, accumulate, accumulate_each, instruction_sets};
+    use crate::raster::{
+        PyRasterizer, accumulate, accumulate_each, instruction_sets, light_on, reaching,
+    };
     #[pymodule_export]
     use crate::register::{flow, local_zncc, normal_equations, shot};
     #[pymodule_export]

@@ -3,20 +3,23 @@
 use g2ard_core::Result;
 use g2ard_core::raster::simd::Isa;
 use g2ard_core::raster::{
-    Accumulated, Camera, Gradients, Image, ImageGradients, Params, PoseGradient, Rasterizer,
-    Settings,
+    Accumulated, Camera, Canvas, Gradients, Image, ImageGradients, Params, PoseGradient,
+    Rasterizer, Settings, light_on as core_light_on, reaching as core_reaching,
 };
-use numpy::{IntoPyArray, PyArray1, PyArrayMethods, PyReadonlyArrayDyn, PyUntypedArrayMethods};
+use numpy::{
+    IntoPyArray, PyArray1, PyArrayMethods, PyReadonlyArray1, PyReadonlyArray2, PyReadonlyArrayDyn,
+    PyReadwriteArrayDyn, PyUntypedArrayMethods,
+};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use rayon::prelude::*;
 use std::sync::{Mutex, PoisonError};
 use std::thread::{self, ThreadId};
 
-use crate::arrays::{flat, optional};
+use crate::arrays::{self, flat, optional, writable};
 use crate::device::{self, Drawn};
 use crate::error::{invalid, to_py};
-use crate::views::{RasterOptions, View};
+use crate::views::{Corners, RasterOptions, View};
 use crate::work;
 
 pub type Floats<'py> = PyReadonlyArrayDyn<'py, f32>;
@@ -64,6 +67,27 @@ pub fn isa_named(name: Option<&str>) -> PyResult<Isa> {
 #[pyfunction]
 pub fn instruction_sets() -> Vec<&'static str> {
     Isa::available().into_iter().map(Isa::name).collect()
+}
+
+/// The planes of a canvas: color (H, W, 3), light, depth and median (H, W).
+#[derive(FromPyObject)]
+pub struct Planes<'py>(
+    PyReadwriteArrayDyn<'py, f32>,
+    PyReadwriteArrayDyn<'py, f32>,
+    Option<PyReadwriteArrayDyn<'py, f32>>,
+    Option<PyReadwriteArrayDyn<'py, f32>>,
+);
+
+impl Planes<'_> {
+    fn canvas(&mut self) -> PyResult<Canvas<'_>> {
+        let plane = |name, plane: Option<_>| plane.map(|p| writable(name, p)).transpose();
+        Ok(Canvas {
+            rgb: writable("color", &mut self.0)?,
+            light: writable("light", &mut self.1)?,
+            depth: plane("depth", self.2.as_mut())?,
+            median: plane("median", self.3.as_mut())?,
+        })
+    }
 }
 
 /// Buffers of one view; calls from several threads take turns.
@@ -219,6 +243,29 @@ impl PyRasterizer {
         ))
     }
 
+    /// Draw a box of the scene behind what the planes (color, light, depth, median) show, in place.
+    fn draw(
+        &self,
+        py: Python<'_>,
+        arrays: Arrays<'_>,
+        view: View,
+        options: RasterOptions,
+        corners: Corners,
+        mut planes: Planes<'_>,
+    ) -> PyResult<()> {
+        let params = arrays.params()?;
+        let (camera, settings, region) = (view.camera(), options.settings()?, corners.into());
+        let mut canvas = planes.canvas()?;
+        let mut rendering = work::locked(py, &self.0);
+        let inner = &mut rendering.inner;
+        work::quick(py, || {
+            inner.draw(&params, &camera, &settings, &region, &mut canvas)
+        })?;
+        rendering.thread = thread::current().id();
+        rendering.elsewhere = None;
+        Ok(())
+    }
+
     /// Return gradients of the six arrays, each in its array's shape.
     #[pyo3(signature = (arrays, image, alpha = None, depth = None))]
     fn backward<'py>(
@@ -293,6 +340,40 @@ impl PyRasterizer {
             rendering.inner.pose_gradient(&params, &gradients)
         })
     }
+}
+
+/// Return the most light left in pixels that are still going and whose rays meet a box.
+#[pyfunction]
+pub fn light_on(
+    py: Python<'_>,
+    light: PyReadonlyArray2<'_, f32>,
+    view: View,
+    options: RasterOptions,
+    corners: Corners,
+) -> PyResult<f32> {
+    let (camera, settings, region) = (view.camera(), options.settings()?, corners.into());
+    let light = flat("light", &light)?;
+    work::quick(py, || core_light_on(&region, &camera, light, &settings))
+}
+
+/// Return (N,) whether a Gaussian may have pairs in a box in some view, from means, largest scales and opacities.
+#[pyfunction]
+pub fn reaching<'py>(
+    py: Python<'py>,
+    means: PyReadonlyArray2<'_, f32>,
+    scales: PyReadonlyArray1<'_, f32>,
+    opacities: PyReadonlyArray1<'_, f32>,
+    views: Vec<View>,
+    corners: Corners,
+) -> PyResult<Bound<'py, PyArray1<bool>>> {
+    let (means, scales) = (arrays::rows("means", &means)?, flat("scales", &scales)?);
+    let opacities = flat("opacities", &opacities)?;
+    let (cameras, region) = (views.iter().map(View::camera), corners.into());
+    let cameras: Vec<_> = cameras.collect();
+    let rows = work::long(py, None, |_| {
+        core_reaching(&region, &cameras, means, scales, opacities)
+    })?;
+    Ok(rows.into_pyarray(py))
 }
 
 /// Return sums per Gaussian over all `views`: a dict of (N,) arrays.

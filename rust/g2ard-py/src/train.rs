@@ -14,7 +14,7 @@ use pyo3::prelude::*;
 use pyo3::types::{IntoPyDict, PyDict};
 use std::sync::{Mutex, PoisonError};
 
-use crate::arrays::{flat, optional};
+use crate::arrays::{flat, optional, writable};
 use crate::constants::Config;
 use crate::device::{kernels, stop_training};
 use crate::error::{invalid, to_py};
@@ -302,14 +302,6 @@ impl PyAttribute<'_> {
             share: optional("shares", &self.5)?,
         })
     }
-}
-
-fn writable<'a>(
-    name: &'static str,
-    array: &'a mut PyReadwriteArrayDyn<'_, f32>,
-) -> PyResult<&'a mut [f32]> {
-    let strided = |_| invalid(name, "a C-contiguous array", "strides");
-    array.as_slice_mut().map_err(strided)
 }
 
 /// Take an Adam step in place with each row that has a gradient, with β₁ = `momentum`; return the number of rows skipped.

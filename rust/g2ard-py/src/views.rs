@@ -1,6 +1,6 @@
 //! Cameras and the rasteriser's options, as Python holds them.
 
-use g2ard_core::raster::{Camera, Convention, Settings};
+use g2ard_core::raster::{Camera, Convention, Region, Settings};
 use pyo3::prelude::*;
 
 use crate::error::invalid;
@@ -23,6 +23,16 @@ impl View {
             height,
             near: self.3,
         }
+    }
+}
+
+/// Low and high corner of a box, (2, 3).
+#[derive(FromPyObject)]
+pub struct Corners([f64; 3], [f64; 3]);
+
+impl From<Corners> for Region {
+    fn from(Corners(low, high): Corners) -> Self {
+        Self { low, high }
     }
 }
 

@@ -5,7 +5,8 @@ use super::bins::Pair;
 use super::blocks::{BlockMasks, blocks, row_and_part};
 use super::grid::TileRect;
 use super::project::Splat;
-use super::simd::{Kernel, LANES, Lanes, Lanes16, Mask, Real, Vector};
+use super::region::Within;
+use super::simd::{Kernel, Lanes, Lanes16, Mask, Real, Vector};
 use super::tile_batch::{TileBatch, alpha, block_coordinates, log2_alpha};
 use super::{ALPHA_MIN, ROWS, Settings};
 
@@ -30,33 +31,32 @@ impl Pixels {
     }
 }
 
-/// Blends a tile. `block_masks` holds the pairs that contributed to each block afterwards.
-pub struct Forward<'a, const DEPTH: bool> {
+/// Blends a tile's pairs behind what its pixels show already. `block_masks` holds the pairs that contributed to each block
+/// afterwards.
+pub struct Forward<'a, W: Within, const DEPTH: bool> {
     pub pairs: &'a [Pair],
     pub splats: &'a [Splat],
     pub rect: TileRect,
     pub settings: &'a Settings,
     /// Masks of each batch.
     pub block_masks: &'a mut [BlockMasks],
+    /// The light that would remain if no pixel ever stopped. A stopped pixel's light only falls further below the
+    /// minimum, so stopping needs no state, and the loop over pairs depends on one product alone.
+    pub light: &'a mut [Lanes16; ROWS],
     pub transmittance: &'a mut [Lanes16; ROWS],
     /// Number within the tile of each pixel's last pair, −1 for none.
     pub last: &'a mut [Lanes16; ROWS],
     pub pixels: &'a mut Pixels,
     pub tile_batch: &'a mut TileBatch,
+    pub within: W,
 }
 
-impl<const DEPTH: bool> Kernel for Forward<'_, DEPTH> {
+impl<W: Within, const DEPTH: bool> Kernel for Forward<'_, W, DEPTH> {
     /// Batches processed before every pixel had stopped.
     type Output = usize;
 
     #[inline(always)]
     fn run<F: Lanes>(self) -> usize {
-        *self.pixels = Pixels::default();
-        *self.transmittance = [Lanes16([1.0; LANES]); ROWS];
-        *self.last = [Lanes16([-1.0; LANES]); ROWS];
-        // The light that would remain if no pixel ever stopped. A stopped pixel's light only falls further below the
-        // minimum, so stopping needs no state, and the loop below depends on one product alone.
-        let mut unstopped = self.rect.light::<F>();
         let minimum = F::Block::splat(ALPHA_MIN.log2());
         let stop = F::Block::splat(self.settings.transmittance_min);
         let clip = F::Block::splat(self.settings.alpha_max);
@@ -71,7 +71,7 @@ impl<const DEPTH: bool> Kernel for Forward<'_, DEPTH> {
             for block in 0..blocks::<F::Block>() {
                 let (row, part) = row_and_part::<F::Block>(block);
                 let mut todo = block_masks[block];
-                let mut t = F::Block::load_part(&unstopped[row], part);
+                let mut t = F::Block::load_part(&self.light[row], part);
                 if todo == 0 || !t.gt(stop).any() {
                     any |= t.gt(stop).any();
                     block_masks[block] = 0;
@@ -91,7 +91,9 @@ impl<const DEPTH: bool> Kernel for Forward<'_, DEPTH> {
                     todo &= todo - 1;
                     let splat = &s.splats[p];
                     let (_, _, log2) = log2_alpha(splat, x, y);
-                    let hit = log2.ge(minimum);
+                    let hit = self
+                        .within
+                        .at::<F::Block>(log2.ge(minimum), splat.depth, row, part);
                     let a = alpha(log2).min(clip).only(hit);
                     let next = a.fnma(t, t);
                     let going = next.gt(stop); // pixels that the splat does not stop
@@ -114,7 +116,7 @@ impl<const DEPTH: bool> Kernel for Forward<'_, DEPTH> {
                 }
                 block_masks[block] = kept;
                 any |= light;
-                t.store_part(&mut unstopped[row], part);
+                t.store_part(&mut self.light[row], part);
                 left.store_part(&mut self.transmittance[row], part);
                 last.store_part(&mut self.last[row], part);
                 for c in 0..3 {

@@ -2,7 +2,7 @@
 
 use std::ops::Range;
 
-use super::simd::{LANES, Lanes, Lanes16, Mask};
+use super::simd::{LANES, Lanes16};
 use super::{Camera, ROWS, TILE};
 
 /// Whole rows of an image's tiles, numbered row by row from the first of them.
@@ -73,24 +73,18 @@ impl TileRect {
     }
 
     /// The light of every row's pixels before the first splat: 1, but 0 off the image.
-    #[inline(always)]
-    pub fn light<F: Lanes>(&self) -> [Lanes16; ROWS] {
+    pub fn light(&self) -> [Lanes16; ROWS] {
+        if self.columns == TILE && self.rows == TILE {
+            return [Lanes16([1.0; LANES]); ROWS];
+        }
         let mut light = [Lanes16::default(); ROWS];
         for (row, light) in light.iter_mut().enumerate() {
-            let on_image = F::Mask::from_bits(self.lanes(row));
-            F::splat(1.0).only(on_image).store(light);
+            for (l, light) in light.0.iter_mut().enumerate() {
+                let (x, y) = pixel_of(row, l);
+                *light = f32::from(x < self.columns && y < self.rows);
+            }
         }
         light
-    }
-
-    /// The lanes of a row that are on the image.
-    pub fn lanes(&self, row: usize) -> u16 {
-        let mut bits = 0;
-        for l in 0..LANES {
-            let (x, y) = pixel_of(row, l);
-            bits |= u16::from(x < self.columns && y < self.rows) << l;
-        }
-        bits
     }
 }
 

@@ -23,6 +23,7 @@ pub(crate) mod params;
 mod pose;
 pub(crate) mod project;
 pub(crate) mod rasterizer;
+mod region;
 mod sh;
 pub mod simd;
 #[cfg(test)]
@@ -35,7 +36,8 @@ pub use accumulate::Accumulated;
 pub use gradients::Gradients;
 pub use params::Params;
 pub use pose::PoseGradient;
-pub use rasterizer::{Image, ImageGradients, Rasterizer};
+pub use rasterizer::{Canvas, Image, ImageGradients, Rasterizer};
+pub use region::{Region, light_on, reaching};
 pub use simd::Isa;
 
 use crate::Result;

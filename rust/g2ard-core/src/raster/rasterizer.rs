@@ -1,6 +1,7 @@
 //! The passes in order, and the buffers of one view that they share and reuse from call to call.
 
 mod accumulated;
+mod boxed;
 mod posed;
 #[cfg(test)]
 mod tests;
@@ -27,6 +28,8 @@ use super::tile_lists::{TileIntersector, TileList};
 use super::{Camera, ROWS, Settings};
 use crate::{Error, Result};
 
+pub(crate) use accumulated::Behind;
+pub use boxed::Canvas;
 pub use views::{Image, ImageGradients};
 
 /// Groups of sixteen rows projected as one piece of work; one under Miri, which runs few rows.

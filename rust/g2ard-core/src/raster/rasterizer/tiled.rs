@@ -9,7 +9,8 @@ use crate::raster::backward::{self, Backward, Incoming};
 use crate::raster::disjoint::DisjointSlice;
 use crate::raster::forward::{Forward, Pixels};
 use crate::raster::memory;
-use crate::raster::simd::{Lanes16, dispatch};
+use crate::raster::region::Everywhere;
+use crate::raster::simd::{LANES, Lanes16, dispatch};
 use crate::raster::tile_batch::{TileBatch, for_stretches};
 
 /// Tiles that a thread takes at a time: few, so that all threads finish together.
@@ -19,6 +20,7 @@ pub(super) const MOST_TILES: usize = 8;
 struct Scratch {
     tile_batch: TileBatch,
     pixels: Pixels,
+    light: [Lanes16; ROWS],
     incoming: Incoming,
 }
 
@@ -69,16 +71,22 @@ impl Rasterizer {
                     // SAFETY: every tile has its own batches, and the pixels written below are its own.
                     let block_masks =
                         unsafe { block_masks.slice(batch.0, pairs.len().div_ceil(BATCH)) };
-                    let forward = Forward::<DEPTH> {
+                    scratch.pixels = Pixels::default();
+                    scratch.light = rect.light();
+                    *transmittance = [Lanes16([1.0; LANES]); ROWS];
+                    *last = [Lanes16([-1.0; LANES]); ROWS];
+                    let forward = Forward::<_, DEPTH> {
                         pairs,
                         splats,
                         rect,
                         settings: &state.settings,
                         block_masks,
+                        light: &mut scratch.light,
                         transmittance,
                         last,
                         pixels: &mut scratch.pixels,
                         tile_batch: &mut scratch.tile_batch,
+                        within: Everywhere,
                     };
                     batch.1 = dispatch(isa, forward);
                     let pixels = &scratch.pixels;

@@ -13,10 +13,11 @@ use crate::raster::disjoint::DisjointSlice;
 use crate::raster::frustum::Frustum;
 use crate::raster::grid::TileGrid;
 use crate::raster::params::check_count;
+use crate::raster::rasterizer::Behind;
 use crate::raster::simd::LANES;
-use crate::raster::{Camera, Rasterizer, Settings};
+use crate::raster::{Camera, Rasterizer, Region, Settings};
 use crate::scene::{Means, Ordered, SceneRef};
-use crate::{Control, Cpu, Result};
+use crate::{Control, Cpu, Error, Result};
 use groups::{Bounds, Group, VisibleGroup, VisibleGroups};
 
 /// Kernels over a scene that views look at. An implementation may differ from [`Cpu`]'s within a stated tolerance.
@@ -130,6 +131,35 @@ impl VisibilityAccumulator {
     ///
     /// The image is drawn in bands of rows, each from the groups that it meets.
     pub fn add(&mut self, camera: &Camera, settings: &Settings) -> Result<()> {
+        self.add_behind(camera, settings, None)
+    }
+
+    /// Adds what a box of a scene contributes to a view, of which the boxes in front were added. `light` is the light in
+    /// front of the box, pixel by pixel, and becomes that behind it; below the smallest that [`Settings`] allows a pixel
+    /// has stopped. The box is in the scene's coordinates.
+    pub fn add_box(
+        &mut self,
+        camera: &Camera,
+        settings: &Settings,
+        region: &Region,
+        light: &mut [f32],
+    ) -> Result<()> {
+        region.validate()?;
+        Error::unless_equal("light", light.len(), camera.width * camera.height, "values")?;
+        let moved = |corner: [f64; 3]| [0, 1, 2].map(|k| corner[k] - self.shift[k]);
+        let region = &Region {
+            low: moved(region.low),
+            high: moved(region.high),
+        };
+        self.add_behind(camera, settings, Some(&mut Behind { region, light }))
+    }
+
+    fn add_behind(
+        &mut self,
+        camera: &Camera,
+        settings: &Settings,
+        mut behind: Option<&mut Behind>,
+    ) -> Result<()> {
         camera.validate()?;
         settings.validate()?;
         let camera = self.relative(camera);
@@ -144,7 +174,8 @@ impl VisibilityAccumulator {
                 .filter(|group| group.tile_rows[0] <= last && group.tile_rows[1] >= first)
                 .map(|group| group.number)
                 .collect();
-            self.add_band(&camera, settings, grid.with_rows(rows), &in_band)?;
+            let grid = grid.with_rows(rows);
+            self.add_band(&camera, settings, grid, &in_band, behind.as_deref_mut())?;
         }
         Ok(())
     }
@@ -172,6 +203,7 @@ impl VisibilityAccumulator {
         settings: &Settings,
         grid: TileGrid,
         in_band: &[u32],
+        behind: Option<&mut Behind>,
     ) -> Result<()> {
         let Some(&last) = in_band.last() else {
             return Ok(());
@@ -189,7 +221,7 @@ impl VisibilityAccumulator {
             unsafe { *weight.at(row) += total.weight };
         };
         self.rasterizer
-            .accumulate_from::<SQUARED, _>(source, camera, settings, grid, add)
+            .accumulate_from::<SQUARED, _>(source, camera, settings, grid, behind, add)
     }
 
     /// Rows that some view saw.
@@ -352,7 +384,7 @@ mod tests {
             };
             let grid = TileGrid::of(&camera);
             rasterizer
-                .accumulate_from::<SQUARED, _>(params, &camera, &settings, grid, add)
+                .accumulate_from::<SQUARED, _>(params, &camera, &settings, grid, None, add)
                 .unwrap();
             let frustum = Frustum::of(&camera);
             let alone = views.bounds.iter().map(|b| b.tile_rows(&frustum).is_some());
