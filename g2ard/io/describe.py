@@ -35,7 +35,8 @@ def describe(
         `path`, `kind`, `format`, `bytes`, `count`, `extent` {min, max, robust_min, robust_max: the 1st and
         99th percentiles} and `notes` [{code, count, text}]. Scenes add `sh_degree`, `render_model`, `odd`,
         and `opacity`, `largest_scale`, `smallest_scale`, `elongation` as quantiles by percentage. Point
-        clouds add `color`, views `photos`, `sizes`, `fov_degrees`, `splits`.
+        clouds add `color`, views `photos`, `sizes`, `fov_degrees`, `splits`. Point clouds and tiles of a map
+        add its `map_system`.
     """
     source = Source(str(given))
     path = source.path
@@ -49,6 +50,8 @@ def describe(
         views = read_view_set(given)
         views = replace(views, splits=splits_of(path, views.cameras.names, views.splits))
         notes, figures = (*views.notes, *_photo_notes(views.cameras)), _views(views)
+    system = source.map_system
+    figures |= {} if system is None else {"map_system": system}
     return {
         "path": str(path),
         "kind": source.kind,

@@ -37,6 +37,7 @@ READERS: dict[Kind, dict[str, tuple[str, ...]]] = {
         "e57": (".e57",),
         "points3d": ("points3d.bin", "points3d.txt"),
         "cloud_text": (".pcd", ".xyz", ".pts", ".asc"),
+        "clouds": (),
     },
     "views": {
         "views": (),
@@ -310,6 +311,8 @@ def _folder_format(path: Path) -> str:
         raise InputError("has unfinished tiles", path=path, hint="run the same `g2ard ingest` again")
     if error := incomplete(path):
         raise error
+    if import_module("g2ard.io.clouds").holds(path):
+        return "clouds"
     raise InputError(_unsupported(path), path=path)
 
 

@@ -20,20 +20,27 @@ if TYPE_CHECKING:
 
 
 class Source:
-    """A scene or coloured point cloud on disk.
+    """A scene or coloured point cloud on disk, or several as one.
 
     Its format is detected and its header read on first use, and only once.
 
     Args:
         path: the file or folder, or the folder of a `distill` run.
         render_model: overrides what a scene's file says.
+        others: further scenes or point clouds that belong to it.
 
     Attributes:
         file: the file or folder itself, which in the folder of a run is its scene.
     """
 
-    def __init__(self, path: str | Path, render_model: RenderModel | None = None) -> None:
+    def __init__(
+        self,
+        path: str | Path,
+        render_model: RenderModel | None = None,
+        others: Sequence[Path] = (),
+    ) -> None:
         self.path, self.file, self.render_model = Path(path), run_scene(path), render_model
+        self.others = tuple(Source(other, render_model) for other in others)
 
     def __str__(self) -> str:
         return str(self.path)
@@ -62,7 +69,8 @@ class Source:
     @cached_property
     def store(self) -> TileStore | None:
         """The scene's tiles, if it is a folder of tiles."""
-        return self.scene.store if self.format == "tiles" else None  # type: ignore[attr-defined]
+        tiled = self.format == "tiles" and not self.others
+        return self.scene.store if tiled else None  # type: ignore[attr-defined]
 
     @cached_property
     def _points(self) -> PointStream:
@@ -86,6 +94,14 @@ class Source:
         return (self.scene if self.kind == "splats" else self._points).count
 
     @property
+    def map_system(self) -> str | None:
+        """Map system that the file states, if it is a point cloud or tiles."""
+        if self.kind == "points":
+            return self._points.system
+        store = self.store if self.kind == "splats" else None
+        return None if store is None else store.system
+
+    @property
     def notes(self) -> tuple[Note, ...]:
         """Notes on the scene's file, known once it has been read."""
         return self.scene.all_notes()
@@ -97,7 +113,9 @@ class Source:
 
     def drawn_as(self, render_model: RenderModel | None) -> Source:
         """Return the same file with another render model, None for the one it has."""
-        return self if render_model in (None, self.render_model) else Source(self.path, render_model)
+        if render_model in (None, self.render_model):
+            return self
+        return Source(self.path, render_model, [other.path for other in self.others])
 
     def check_scene(self) -> None:
         """Raise an `InputError` for anything but a scene."""
@@ -108,6 +126,8 @@ class Source:
         from g2ard.io.stream import PartsStream
 
         module = reader(self.file, self.format, expected)
+        if self.others:
+            return joined([Source(self.path, self.render_model), *self.others])
         if hasattr(module, "Stream"):
             return module.Stream(self.file)
         return PartsStream.of(self.file, *module.read(self.file))
@@ -124,12 +144,11 @@ def joined(sources: Sequence[Source]) -> SceneStream | PointStream:
     Point clouds get one offset. Scenes get the offset of the first and the highest of their SH degrees; their
     render models must agree.
     """
-    from g2ard.io.stream import JoinedClouds, JoinedScenes
+    from g2ard.io.stream import JoinedScenes, joined_clouds
 
     if not sources:
         raise InputError("no scene given")
     if all(source.kind == "points" for source in sources):
-        clouds = [source.cloud() for source in sources]
-        return clouds[0] if len(clouds) == 1 else JoinedClouds(clouds)
+        return joined_clouds([source.cloud() for source in sources])
     scenes = [source.scene for source in sources]
     return scenes[0] if len(scenes) == 1 else JoinedScenes(scenes)

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from g2ard.config.choices import Axes, RenderModel
+from g2ard.errors import InputError
 from g2ard.io import judge
 from g2ard.io.paths import file_identity
 from g2ard.io.sanitize import BLOCK, Raw, Tally
@@ -373,7 +374,11 @@ class JoinedScenes(Joined[Splats], SceneStream):
 
 
 class JoinedClouds(Joined[RawPoints], PointStream):
-    """Several point clouds as one, with the offset of all."""
+    """Several point clouds as one, with the offset of all.
+
+    Raises:
+        InputError: they state different map systems.
+    """
 
     streams: Sequence[PointStream]
 
@@ -384,7 +389,12 @@ class JoinedClouds(Joined[RawPoints], PointStream):
         PointStream.__init__(self, streams[0].path, sum(s.count for s in streams), sample)
         self.channels, self.lack = max(stream.channels for stream in streams), streams[0].lack
         self.axes = streams[0].axes if len({stream.axes for stream in streams}) == 1 else self.axes
-        self.notes = tuple(_several_systems(streams))
+        stated = {stream.system: stream.path.name for stream in reversed(streams) if stream.system}
+        if len(stated) > 1:
+            words = ", ".join(f"{name} in {system}" for system, name in stated.items())
+            raise InputError(f"several map systems: {words}; project all to one first", path=streams[0].path)
+        self.system = next(iter(stated), None)
+        self.notes = tuple(_far_apart(streams))
 
     def header_notes(self) -> tuple[Note, ...]:
         return (*self.notes, *super().header_notes())
@@ -401,13 +411,13 @@ class JoinedClouds(Joined[RawPoints], PointStream):
             self.tally.join(own)
 
 
-def _several_systems(streams: Sequence[PointStream]) -> Iterator[Note]:
-    """Yield a note if clouds state several map systems, or lie far apart."""
-    stated = {stream.system: stream.path.name for stream in reversed(streams) if stream.system}
-    if len(stated) > 1:
-        words = ", ".join(f"{name} in {system}" for system, name in stated.items())
-        yield Note("map_systems", len(stated), f"several map systems: {words}; project all to one first")
-        return
+def joined_clouds(streams: Sequence[PointStream]) -> PointStream:
+    """Return several point clouds as one."""
+    return streams[0] if len(streams) == 1 else JoinedClouds(streams)
+
+
+def _far_apart(streams: Sequence[PointStream]) -> Iterator[Note]:
+    """Yield a note if clouds lie so far apart that they may be in several map systems."""
     boxes = [(s.path.name, *np.percentile(s.sample, (1, 99), axis=0)) for s in streams if len(s.sample)]
     for number, (name, low, high) in enumerate(boxes):
         others = [box for i, box in enumerate(boxes) if i != number]

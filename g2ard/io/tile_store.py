@@ -89,6 +89,7 @@ class _Manifest(msgspec.Struct):
     render_model: RenderModel = "classic"
     up: Vector | None = None
     axes: Axes = "RDF"
+    system: str | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,6 +108,7 @@ class TileStore:
         key: SHA-256 of everything that determines the content: source and settings.
         settings: the settings of ingestion.
         render_model, up, axes: see `Splats`.
+        system: map system of the point clouds that it was lifted from, if they state one.
     """
 
     folder: Path
@@ -122,6 +124,7 @@ class TileStore:
     render_model: RenderModel = "classic"
     up: Vector | None = None
     axes: Axes = "RDF"
+    system: str | None = None
 
     @classmethod
     def open(cls, folder: str | Path) -> TileStore:
@@ -219,6 +222,16 @@ class TileStore:
         for start in range(0, len(rows), _ROWS_AT_ONCE):
             crc = zlib.crc32(rows[start : start + _ROWS_AT_ONCE].data, crc)
         self._check_contents(tile_name(index), crc, self.tiles[index].checks[0])
+
+    def check_all(self) -> None:
+        """Verify the checksums of all rows and halos.
+
+        Raises:
+            InputError: as for `read`.
+        """
+        for tile in self.tiles:
+            self.check(tile.index)
+            self.read_halo(tile.index, sh=False)
 
     def _check_contents(self, name: str, crc: int, expected: int) -> None:
         if crc != expected:

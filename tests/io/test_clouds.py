@@ -322,10 +322,15 @@ UTM = 'PROJCS["UTM {0}N",GEOGCS["W",AUTHORITY["EPSG","4326"]],UNIT["metre",1],AU
         ((32632, None), (None, None), False),
     ],
 )
-def test_several_map_systems_are_told(tmp_path: Path, a: tuple, b: tuple, several: bool) -> None:
+def test_several_map_systems_are_refused(tmp_path: Path, a: tuple, b: tuple, several: bool) -> None:
     paths = [systems(tmp_path / "a.las", *a), systems(tmp_path / "b.las", *b)]
-    notes = stream_of(paths).header_notes()
-    assert [note.code for note in notes] == ["map_systems"] * several
+    if several:
+        with pytest.raises(InputError, match=r"a\.las: several map systems: a\.las in .*, b\.las in "):
+            stream_of(paths)
+        return
+    stream = stream_of(paths)
+    assert not stream.header_notes()
+    assert stream.system == "EPSG:32632"
 
 
 @pytest.mark.parametrize("value", [0.0, np.nan, np.inf])
